@@ -18,15 +18,17 @@ printed as it comes out, also where that is bad.
 
     {command}
 
-Commit {commit}. The data are public, but have no licence that would allow to ship them; where they are from stands
+Commit {commit}: a record stays until it is made again, and later versions may say otherwise (the changelog has what
+changed). The data are public, but have no licence that would allow to ship them; where they are from stands
 with each group.
 
 How to read it. *G*, *μ*: mean ± standard deviation; a number in brackets has no interval, for the reason that follows
 it. *After the window*: how many of the readings that were not fitted lie in the 90 % bands of what was expected of
 them, and their distance from the medians in per cent of R_max (root mean square); the window ends at the second
 minimum, if there are two. χ² per degree of freedom: of ln G or ln μ about their weighted mean, 1 if bubbles of one gel
-differ by no more than their intervals say; density, scale and pressure are common to the bubbles of a folder and make
-it smaller.
+differ by no more than their intervals say, and far above 1 if intervals are too narrow or the bubbles' gels differ; the
+readings after the window go on to the end of the record, through oscillations of which none was fitted. Density,
+scale and pressure are common to the bubbles of a folder and make χ² smaller.
 """
 PRESSURE = re.compile(r"ambient pressure of ([\d.]+) ?MPa")
 ATMOSPHERE = 0.1  # MPa, which init takes for granted

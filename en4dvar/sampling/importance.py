@@ -6,6 +6,11 @@ The draws of the first round come from a proposal given from outside. Those of a
 Student t fitted to all before, whose weights are tempered as long as few of them count, so that the proposals close in
 on the posterior from outside. q is the mixture of all rounds (Cornuet, Marin, Mira & Robert 2012, Scand. J. Stat. 39,
 798). Coordinates z are those in which the prior is N(0, 1).
+
+Such a mixture is dense where the draws lie that it was fitted to, which makes the weights of these too small; and where
+none of them lies nothing tells that something is missing. :class:`ClosingDraws` therefore fits its proposals to a power
+of the posterior, with covariances that few draws do not make flat; what judges the posterior are :class:`FixedDraws` of
+the last proposal alone, made afresh: their mean weight is unbiased.
 """
 
 from __future__ import annotations
@@ -20,6 +25,9 @@ from en4dvar.sampling.mixture import StudentMixture, effective_number, resampled
 FEWEST = 60.0  # effective draws that a proposal is fitted to: with fewer, to tempered weights
 COMPONENTS = 4
 FITTED = 2000  # points that few parts are fitted to
+SETTLED, PARTS = 150.0, 8  # the same of proposals to a power of the posterior
+EACH = 4  # effective draws for each coordinate of a component: fitted to fewer it is flat in some direction
+MOST = 3.0  # times √D mean weights of D draws: more than that none counts (Ionides 2008)
 
 
 def standard(n: int) -> StudentMixture:
@@ -50,6 +58,11 @@ class Importance:
         self.proposals = [first]
         self.z, self.target, self.mixture = np.empty((0, n)), np.empty(0), np.empty(0)  # mixture: ln Σ_t q_t
         self.log_weights, self.log, self.effective = np.empty(0), -np.inf, 0.0
+
+    @property
+    def lowest(self) -> float:
+        """J of the lowest draw."""
+        return float(-self.target.max() - 0.5 * self.z.shape[1] * np.log(2 * np.pi))
 
     @property
     def shares(self) -> Array:
@@ -96,3 +109,54 @@ class Importance:
         where = resampled(weights / weights.sum(), count, self.stream)
         fitted = StudentMixture.fitted(self.z[where], self.stream, parts)
         return replace(fitted, root=self.wider * fitted.root)
+
+
+class ClosingDraws(Importance):
+    """Proposals are fitted to the posterior to the power of ``wider``⁻², which of a Gaussian is wider by that factor,
+    and of another shape most where that has tails.
+    """
+
+    @property
+    def tempered(self) -> Array:
+        """Log weights (D,) of that power."""
+        alive = np.isfinite(self.log_weights)
+        logs = np.where(alive, self.log_weights - (1 - self.wider**-2) * np.where(alive, self.target, 0.0), -np.inf)
+        return np.asarray(logs - logs.max()) if alive.any() else logs
+
+    @property
+    def near(self) -> bool:
+        """Whether so many draws tell that power that it need not be flattened further."""
+        return bool(np.isfinite(self.log)) and effective_number(np.exp(self.tempered)) >= SETTLED
+
+    def next_proposal(self) -> StudentMixture:
+        n = self.z.shape[1]
+        if np.isfinite(self.log_weights).sum() <= 2 * (n + 1):
+            return self.proposals[0]
+        logs, power = self.tempered, 1.0
+        while (effective := effective_number(np.exp(power * logs))) < SETTLED and power > 1e-4:
+            power *= 0.8
+        weights = np.exp(power * logs)
+        where = resampled(weights / weights.sum(), 2 * self.count, self.stream)
+        parts = max(1, min(PARTS, int(effective / (EACH * n))))
+        return StudentMixture.fitted(self.z[where], self.stream, parts, alike=2 * n * len(where) / effective)
+
+
+class FixedDraws(Importance):
+    """Draws of one proposal that stays. The largest of their weights are cut off, but not those behind ``log``.
+
+    Source: Ionides (2008), J. Comput. Graph. Stat. 17, 295.
+    """
+
+    def draw(self) -> Array:
+        return self.proposals[0].draw(self.count, self.stream)
+
+    def add(self, z: Array, log_likelihood: Array) -> None:
+        target = log_likelihood - 0.5 * np.sum(z**2, axis=1) - 0.5 * z.shape[1] * np.log(2 * np.pi)
+        self.z, self.target = np.concatenate([self.z, z]), np.concatenate([self.target, target])
+        self.mixture = np.concatenate([self.mixture, self.proposals[0].log_density(z)])
+        self.log_weights = self.target - self.mixture
+        top = float(self.log_weights.max())
+        if np.isfinite(top):
+            self.log = top + float(np.log(np.exp(self.log_weights - top).mean()))
+            self.log_weights = np.minimum(self.log_weights, self.log + np.log(MOST * np.sqrt(len(self.z))))
+            self.effective = effective_number(np.exp(self.log_weights - self.log_weights.max()))

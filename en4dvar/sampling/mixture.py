@@ -24,9 +24,9 @@ class StudentMixture:
     root: Array
 
     @classmethod
-    def fitted(cls, draws: Array, stream: np.random.Generator, components: int) -> StudentMixture:
-        """To draws (D, d)."""
-        share, centre, covariance = fit_gaussians(draws, stream, components, rounds=40)
+    def fitted(cls, draws: Array, stream: np.random.Generator, components: int, alike: float = 0.0) -> StudentMixture:
+        """To draws (D, d); ``alike`` as of :func:`fit_gaussians`."""
+        share, centre, covariance = fit_gaussians(draws, stream, components, rounds=40, alike=alike)
         return cls(share, centre, np.asarray(np.linalg.cholesky(covariance), dtype=float))
 
     def draw(self, count: int, stream: np.random.Generator) -> Array:
@@ -57,8 +57,14 @@ def effective_number(weights: Array) -> float:
     return float(weights.sum() ** 2 / np.sum(weights**2))
 
 
-def fit_gaussians(x: Array, rng: np.random.Generator, components: int, rounds: int) -> tuple[Array, Array, Array]:
-    """Shares (M,), means (M, n) and covariances (M, n, n) of a mixture for points (D, n); expectation maximisation."""
+def fit_gaussians(
+    x: Array, rng: np.random.Generator, components: int, rounds: int, alike: float = 0.0
+) -> tuple[Array, Array, Array]:
+    """Shares (M,), means (M, n) and covariances (M, n, n) of a mixture for points (D, n); expectation maximisation.
+
+    Covariances are drawn towards that of all points, of a size that M parts of it have, as if ``alike`` more points of
+    each component said so: its mode under the inverse Wishart prior (Fraley & Raftery 2007, J. Classif. 24, 155).
+    """
     count, n = x.shape
     middle, root = x.mean(axis=0), np.linalg.cholesky(np.atleast_2d(np.cov(x, rowvar=False)))
     z = np.linalg.solve(root, (x - middle).T).T
@@ -71,7 +77,7 @@ def fit_gaussians(x: Array, rng: np.random.Generator, components: int, rounds: i
     of_part = np.empty((count, components))
     for _ in range(rounds):
         _expect(z, share, centre, covariance, of_part)
-        _maximise(z, of_part, share, centre, covariance)
+        _maximise(z, of_part, share, centre, covariance, alike)
     return share, middle + centre @ root.T, root @ covariance @ root.T
 
 
@@ -104,10 +110,11 @@ def _expect(z: Array, share: Array, centre: Array, covariance: Array, of_part: A
 
 
 @kernel
-def _maximise(z: Array, of_part: Array, share: Array, centre: Array, covariance: Array) -> None:
+def _maximise(z: Array, of_part: Array, share: Array, centre: Array, covariance: Array, alike: float) -> None:
     """Share, centre and covariance of the components are overwritten with what their points say."""
     count, parts = of_part.shape
     apart = np.empty(z.shape[1])
+    common = alike * parts ** (-2.0 / apart.size)
     for m in range(parts):
         size = 1e-9 * count
         centre[m] = 0.0
@@ -125,6 +132,8 @@ def _maximise(z: Array, of_part: Array, share: Array, centre: Array, covariance:
                     covariance[m, i, k] += of_part[d, m] * apart[i] * apart[k]
         for i in range(apart.size):
             for k in range(i + 1):
-                covariance[m, i, k] = covariance[m, i, k] / size + (SMALLEST if i == k else 0.0)
+                if i == k:
+                    covariance[m, i, k] += common
+                covariance[m, i, k] = covariance[m, i, k] / (size + alike) + (SMALLEST if i == k else 0.0)
                 covariance[m, k, i] = covariance[m, i, k]
     share /= share.sum()

@@ -17,15 +17,16 @@ from en4dvar.descent.minima import Minimum
 from en4dvar.ensemble.linalg import with_moments
 from en4dvar.model.state import Array
 from en4dvar.priors.prior import Prior, member_stream
-from en4dvar.sampling.importance import Importance
+from en4dvar.sampling.importance import ClosingDraws, FixedDraws, Importance
 from en4dvar.sampling.mixture import StudentMixture, effective_number, resampled
 
 DRAWS = 400  # of a round
 ENOUGH, MOST_RUNS = 1500.0, 8.0  # effective draws that end the rounds, and runs for each of them
 LAST_RUNS = 30.0  # for each, as long as too few are effective
-WIDER = 1.8  # at 1 the tail of a bent posterior is not found: standard deviations were up to 30 % too small
+CLOSING = (2, 3, 6)  # rounds in which proposals close in, at least: two, and one for three directions, up to six
+WIDER = 1.8  # at 1 the tail of a bent posterior is not found: standard deviations were up to half too small
 FEW = 6  # directions up to which that is the factor of each; of more it is smaller, and their volume grows no further
-TOO_FEW = 200.0  # below so many the draws stand for nothing
+TOO_FEW = 60.0  # below so many the draws stand for nothing
 OF_PRIOR = 0.2  # share of the first draws that come from the prior: what no descent found is not excluded
 
 Cost = Callable[[Array], Array]
@@ -91,28 +92,41 @@ def sample_modes(
     """Draws of exp(−J) until ``enough`` of them (default: :data:`ENOUGH`) are effective, by eight runs each, or more as
     long as these are :data:`TOO_FEW`, or until J of one is ``below`` a value.
 
-    ``cost``: J (B,) of control vectors (B, n), with the prior's own mean and covariance, +inf where the model fails.
+    Rounds of draws from proposals that close in on the posterior tell the proposal of those that count. ``cost``:
+    J (B,) of control vectors (B, n), with the prior's own mean and covariance, +inf where the model fails.
     Deterministic in ``seed``.
     """
-    wider = WIDER ** min(1.0, FEW / len(prior.names))
-    sampler = Importance(_about(prior, minima), member_stream(seed, "modes"), DRAWS, wider)
-    enough = ENOUGH if enough is None else enough
-    for _ in range(math.ceil(LAST_RUNS * enough / DRAWS)):
+    enough, n = ENOUGH if enough is None else enough, len(prior.names)
+    most = math.ceil(LAST_RUNS * enough / DRAWS)
+    closing = min(CLOSING[0] + n // CLOSING[1], CLOSING[2])
+
+    def more(sampler: Importance) -> bool:
+        """A round; whether no draw of it is low enough to end them all."""
         z = sampler.draw()
         sampler.add(z, 0.5 * np.sum(z**2, axis=1) - cost(prior.from_white(z)))
-        wanted = enough if len(sampler.z) < MOST_RUNS * enough else min(TOO_FEW, enough)
-        if sampler.effective >= wanted or _lowest(sampler) < below:
-            break
+        return sampler.lowest >= below
+
+    sampler: Importance
+    sampler = first = ClosingDraws(
+        _about(prior, minima), member_stream(seed, "modes"), DRAWS, WIDER ** min(1.0, FEW / n)
+    )
+    rounds, going = 1, more(first)
+    while going and rounds < most and not (rounds >= closing and first.near):
+        rounds, going = rounds + 1, more(first)
+    if going:
+        sampler = FixedDraws(first.next_proposal(), first.stream, DRAWS)
+        while going and (not len(sampler.z) or (_unsettled(sampler, enough) and rounds < most)):
+            rounds, going = rounds + 1, more(sampler)
     if not np.isfinite(sampler.log):
         raise ValueError("no draw about a minimum of J can be run")
     x = prior.from_white(sampler.z)
-    proposal = sampler.next_proposal()
+    proposal = sampler.proposals[-1]
     return WeightedDraws(
         x=x,
         shares=sampler.shares,
         mode=nearest(prior, minima, x),
         log_evidence=sampler.log,
-        lowest=_lowest(sampler),
+        lowest=sampler.lowest,
         best=x[np.argmax(sampler.target)],
         proposal=StudentMixture(
             proposal.share, prior.from_white(proposal.centre), _of_columns(prior.from_white_change, proposal.root)
@@ -120,9 +134,10 @@ def sample_modes(
     )
 
 
-def _lowest(sampler: Importance) -> float:
-    """J of the lowest draw."""
-    return float(-sampler.target.max() - 0.5 * sampler.z.shape[1] * np.log(2 * np.pi))
+def _unsettled(sampler: Importance, enough: float) -> bool:
+    """Whether too few draws are effective yet."""
+    wanted = enough if len(sampler.z) < MOST_RUNS * enough else min(TOO_FEW, enough)
+    return sampler.effective < wanted
 
 
 def _about(prior: Prior, minima: Sequence[Minimum]) -> StudentMixture:

@@ -125,8 +125,8 @@ def over_widths(values, scale):
 def test_an_estimated_width_of_the_walk_is_sampled(truth):
     """A cheap model: ``refine: auto`` draws some 13 000 by importance; about 2000 of them count.
 
-    They miss a part of the long tail of the width: over members 48 to 800 and three seeds its std was 0.74 to 0.92 of
-    the exact one, and the log evidence 0.13 to 0.34 low.
+    They miss a part of the long tail of the width: over three seeds and both truths its std was 0.77 to 0.90 of the
+    exact one, and the log evidence 0.26 low to 0.09 high.
     """
     constant, model = problem(truth, knots=()), Batched()
     model.compiled = True
@@ -137,8 +137,8 @@ def test_an_estimated_width_of_the_walk_is_sampled(truth):
     pieces, own = a.pieces(walk, a.posterior), a.posterior[:, p.prior.names.index("r_change_std")]
     assert np.max(np.abs(pieces.mean(axis=0) - mean) / std) < 0.25
     assert own.mean() == pytest.approx(width, rel=0.15)
-    assert 0.65 < own.std() / width_std < 1.2
-    assert -0.4 < a.log_evidence - log_evidence < 0.1
+    assert 0.72 < own.std() / width_std < 1.2
+    assert -0.3 < a.log_evidence - log_evidence < 0.2
     assert a.log_evidence_constant == pytest.approx(smoother(p.observations.values, 0.0)[1], abs=1e-8)
     assert p.constant.prior == constant.prior
 

@@ -14,6 +14,7 @@ from en4dvar.executor import ThreadsExecutor
 from en4dvar.model.state import Parameter
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.sampling import mcmc
+from en4dvar.sampling.modes import sample_modes
 from en4dvar.sampling.refine import Refined, mode_cautions, shares_of
 from en4dvar.schemes.settings import AssimilationSettings
 
@@ -115,3 +116,40 @@ def test_modes_that_overlap_are_only_worth_knowing(apart: float, severity: str) 
     assert (told.code, told.severity) == ("several-modes", severity)
     (told,) = mode_cautions(prior, minima, weights, True, None)  # members describe one of them alone
     assert told.severity == "serious"
+
+
+def test_the_tail_of_a_posterior_that_is_bent_is_sampled() -> None:
+    """The logarithm of a modulus that readings tell only with a pressure: flat where the modulus is small.
+
+    With s = 0.25, y = 1.5 N(g(z_0) + 0.9 z_1 + 0.7 z_2, s²) and ten more directions that Gaussians tell; the marginal
+    density of z_0 is that of y ~ N(g, s² + 0.9² + 0.7²), integrated by a sum.
+    """
+    y, s, n = 1.5, 0.25, 13
+    widths = np.linspace(0.1, 0.8, n - 3)
+
+    def misfit(z):
+        g = 0.75 * np.exp(np.clip(1.6 * z[:, 0], -50, 20)) + 0.9 * z[:, 1] + 0.7 * z[:, 2]
+        return 0.5 * ((y - g) / s) ** 2 + 0.5 * np.sum((z[:, 3:] / widths) ** 2, axis=1)
+
+    grid = np.linspace(-8, 4, 24001)
+    variance = s**2 + 0.9**2 + 0.7**2
+    logs = -0.5 * grid**2 - 0.5 * (y - 0.75 * np.exp(1.6 * grid)) ** 2 / variance
+    density = np.exp(logs - logs.max()) / np.exp(logs - logs.max()).sum()
+    mean = density @ grid
+    std = np.sqrt(density @ (grid - mean) ** 2)
+    evidence = np.log(np.exp(logs).sum() * (grid[1] - grid[0]) / np.sqrt(2 * np.pi)) + np.log(s / np.sqrt(variance))
+    evidence += np.sum(0.5 * np.log(widths**2 / (1 + widths**2)))
+
+    prior = Prior(tuple(PriorTerm.normal(Parameter(f"z{i}", "1"), 0.0, 1.0) for i in range(n)))
+    slope = np.array([0.75 * 1.6 * np.exp(1.6 * 0.3), 0.9, 0.7]) / s
+    precision = np.diag(np.append(np.ones(3), 1 + 1 / widths**2))
+    precision[:3, :3] += np.outer(slope, slope)
+    about = Minimum(np.append(0.3, np.zeros(n - 1)), np.linalg.inv(precision), 1.0)
+    sampled = [
+        sample_modes(lambda z: misfit(z) + 0.5 * np.sum(z**2, axis=1), prior, [about], seed, 1000.0)
+        for seed in range(4)
+    ]
+    assert np.mean([draws.mean[0] for draws in sampled]) == pytest.approx(mean, abs=0.2 * std)
+    # judged by the draws that proposals were fitted to it was 0.6 of the exact one, and the evidence 0.6 lower
+    assert 0.8 < np.mean([np.sqrt(draws.covariance[0, 0]) for draws in sampled]) / std < 1.1
+    assert np.mean([draws.log_evidence for draws in sampled]) == pytest.approx(evidence, abs=0.15)
