@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from fnmatch import fnmatchcase
@@ -15,6 +17,7 @@ from en4dvar.config.schema import Name, Section, section_of
 from en4dvar.estimation.population import HyperPrior
 from en4dvar.plumbing.errors import ConfigError, Fault
 from en4dvar.plumbing.hints import shown, suggest
+from en4dvar.plumbing.units import UnitError, parse_quantity
 
 if TYPE_CHECKING:
 
@@ -28,7 +31,9 @@ class PopulationSection(_HyperPrior):
     """Mean and spread of parameters over the data sets of the run, estimated at its end."""
 
     of: Annotated[tuple[str, ...], Field(min_length=1)]
-    """Parameters that vary from data set to data set about a common mean, e.g. [G, mu]."""
+    """Parameters that vary from data set to data set about a common median, e.g. [G, mu]."""
+    reference: Annotated[dict[Name, str], Field(default_factory=dict)]
+    """Values of others to compare with, e.g. {G: 7.7 ± 1.1 kPa, source: indentation}; they change no number."""
 
     @property
     def hyper(self) -> HyperPrior:
@@ -50,6 +55,31 @@ def _unfit(section: PopulationSection, entries: Sequence[Entry], document: Docum
             yield document.fault(where, f"{name}: not estimated, it has no prior{suggest(name, estimated)}")
         elif estimated[name].needs_data:
             yield document.fault(where, f"{name}: its prior depends on the data set ('maximum'), a population has one")
+    for name, text in section.reference.items():
+        said = ("population", "reference", name)
+        if name != SOURCE and name not in section.of:
+            yield document.fault(said, f"{shown(name)}: neither 'source' nor among 'of'{suggest(name, section.of)}")
+        elif name in estimated:
+            try:
+                reference_value(text, estimated[name].parameter.unit)
+            except UnitError as error:
+                yield document.fault(said, str(error))
+
+
+SOURCE = "source"  # of a reference: where it is from
+_REFERENCE = re.compile(r"\s*([-+.\deE]+)\s*(?:(?:±|\+/?-)\s*([.\deE+-]+))?\s*(.*)")
+
+
+def reference_value(text: str, unit: str) -> tuple[float, float]:
+    """Value and std in ``unit`` of a text such as ``7.7 ± 1.1 kPa``; NaN where no std is stated.
+
+    Raises :class:`UnitError`.
+    """
+    match = _REFERENCE.fullmatch(text)
+    if match is None:
+        raise UnitError(f"{shown(text)} is no value such as '7.7 ± 1.1 kPa'")
+    value = parse_quantity(f"{match[1]} {match[3]}".strip(), unit)
+    return value, parse_quantity(f"{match[2]} {match[3]}".strip(), unit) if match[2] else math.nan
 
 
 ALL = "all"

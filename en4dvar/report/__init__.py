@@ -19,16 +19,17 @@ from en4dvar.plumbing.hints import suggest
 from en4dvar.plumbing.tables import write_csv
 from en4dvar.report.drawing import draw
 from en4dvar.report.figures import all_figures
-from en4dvar.report.overview import SetSummary, overview_figures, render_overview
+from en4dvar.report.overview import Headline, SetSummary, overview_figures, render_overview
 from en4dvar.report.page import IDENTIFIERS, render_set
 from en4dvar.report.responses import ENTRY_COLUMNS, SHIFT_COLUMNS, Lines, response_lines
 from en4dvar.report.varying import PIECE_COLUMNS, piece_lines
 from en4dvar.report.withheld import COLUMNS as WITHHELD_COLUMNS
 from en4dvar.report.withheld import withheld_lines
 from en4dvar.results.campaign_file import failed_datasets
-from en4dvar.results.joint_file import FILE
+from en4dvar.results.joint_file import FILE, load_joint
 from en4dvar.results.pack import PACK
 from en4dvar.results.population_file import FILE as POPULATION
+from en4dvar.results.population_file import load_population
 from en4dvar.results.run_results import RunResults
 from en4dvar.results.store import StoredResult, load_stored
 
@@ -124,10 +125,25 @@ def _write_campaign(
             elif isinstance(value, Exception):
                 raise value
     figures = draw(overview_figures(sets), folder=inside(run_dir, "figures") if files else None)
-    joint = JOINT_FILES[0] if (run_dir / FILE).exists() else ""
-    population = POPULATION_FILES[0] if (run_dir / POPULATION).exists() else ""
     pages = {s.stem: quote(f"pages/{s.stem}.html") for s in paged}
-    return write_text(run_dir / "report.html", render_overview(sets, pages, failures, figures, joint, population))
+    return write_text(run_dir / "report.html", render_overview(sets, pages, failures, figures, _headlines(run_dir)))
+
+
+def _headlines(run_dir: Path) -> list[Headline]:
+    """What the data sets say together, where the run estimated it."""
+    from en4dvar.report import joint, population  # with the estimates themselves, which other pages do not need
+
+    headlines = []
+    if (run_dir / POPULATION).exists():
+        of = load_population(run_dir / POPULATION)
+        words = "The population behind them"
+        lines = population.sentences(of)
+        headlines.append(Headline(POPULATION_FILES[0], words, lines, population.figure(of), population.caption(of)))
+    if (run_dir / FILE).exists():
+        shared = load_joint(run_dir / FILE)
+        lines = tuple(joint.joint_lines(shared))
+        headlines.append(Headline(JOINT_FILES[0], "All of them together", lines, joint.figure(shared), joint.CAPTION))
+    return headlines
 
 
 def _write_page(run_dir: Path, stem: str, copies: str | None, trail: Sequence[tuple[str, str]]) -> None:

@@ -17,7 +17,7 @@ from en4dvar.plumbing.units import convert
 from en4dvar.report.chart import COLUMN, PAGE, POINTS, Chart, Panel, in_columns
 from en4dvar.report.html import render
 from en4dvar.report.svg import svg
-from en4dvar.report.text import figure_text, with_unit
+from en4dvar.report.text import figure_text, number_like, pretty_unit, with_unit
 from en4dvar.results.joint_file import QUANTILES, StoredGroups, StoredJoint
 
 MOST_FITS = 12  # panels of the figure
@@ -75,6 +75,24 @@ def _estimate(
     return JointRow(name, label, symbol, dataset, mean, std, q05, q50, q95, shown, untrusted(cautions, name), without)
 
 
+def joint_lines(joint: StoredJoint) -> list[str]:
+    """What is shared, a line each, for the page of the campaign."""
+    lines = []
+    for e in (e for e in estimates(joint) if not e.dataset):
+        unit = f" {pretty_unit(e.unit)}" if e.unit != "1" else ""
+        without = f" without {e.without}" if e.without else f", one value in {len(joint.datasets)} data sets"
+        interval = f"5–95 %: {number_like(e.q05, e.std)} … {number_like(e.q95, e.std)}{unit}"
+        doubt = f"not to be trusted: {', '.join(e.untrusted)}" if e.untrusted else interval
+        lines.append(f"{e.label} {e.name} = {number_like(e.q50, e.std)}{unit} ({doubt}){without}")
+    return lines
+
+
+def figure(joint: StoredJoint) -> str:
+    """All data sets over what they share, as SVG."""
+    shared = {name: joint.group("posterior")[name] for name in joint.shared}
+    return svg(forest(joint, joint.datasets, shared), "forest", CAPTION)
+
+
 def joint_table(joint: StoredJoint) -> str:
     """What is shared, for the terminal."""
     rows = [
@@ -93,8 +111,11 @@ def _numbers(e: JointRow) -> list[str]:
     return [f"{value:.4g}" for value in (e.std, e.q05, e.q50, e.q95)]
 
 
-def forest(groups: StoredGroups, datasets: Sequence[str], common: Mapping[str, xr.DataArray]) -> Chart:
-    """Each data set alone, and the draws of what is ``common``, one panel each.
+def forest(
+    groups: StoredGroups, datasets: Sequence[str], common: Mapping[str, xr.DataArray],
+    reference: Mapping[str, tuple[float, float]] | None = None,
+) -> Chart:  # fmt: skip
+    """Each data set alone, and the draws of what is ``common``, one panel each; of some a ``reference`` of others.
 
     Where the posterior has the parameter for each data set too, that is drawn below what the data set says alone.
     """
@@ -110,6 +131,9 @@ def forest(groups: StoredGroups, datasets: Sequence[str], common: Mapping[str, x
         if not untrusted(groups.cautions, name):
             panel.band([low, high], np.full(2, -count), np.ones(2), "posterior", 0.2)
         panel.line([middle, middle], [-count, 1], "posterior")
+        if reference and name in reference:
+            value = convert(reference[name][0], *units)
+            panel.line([value, value], [-count, 1], "ink", dash=":")
         rows = convert(alone[name].values, *units)
         has = np.flatnonzero(np.isfinite(rows[:, 1]))
         panel.intervals(rows[has, 0], rows[has, 2], -has, "prior")
@@ -165,7 +189,6 @@ def write_joint(joint: StoredJoint, folder: Path) -> Path:
     columns = ("name", "dataset", "without", "mean", "std", "q05", "q50", "q95", "unit")
     cells = [[getattr(e, c) for c in columns] + [" ".join(e.untrusted)] for e in rows]
     write_text(folder / "joint.csv", csv_text([[*columns, "warnings"], *cells]))
-    shared = {name: joint.group("posterior")[name] for name in joint.shared}
     page = render(
         "joint.html.j2",
         title="Joint estimate",
@@ -175,7 +198,7 @@ def write_joint(joint: StoredJoint, folder: Path) -> Path:
         count=len(joint.datasets),
         shared=[e for e in rows if not e.dataset],
         own=[e for e in rows if e.dataset],
-        forest=svg(forest(joint, joint.datasets, shared), "forest", CAPTION),
+        forest=figure(joint),
         caption=CAPTION,
         fits=svg(fits(joint), "fits", FITS),
         fits_caption=FITS + (f" The first {MOST_FITS}." if len(joint.datasets) > MOST_FITS else ""),

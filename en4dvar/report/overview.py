@@ -59,18 +59,28 @@ class SetSummary:
         return ", ".join(codes(self.cautions))
 
 
+@dataclass(frozen=True)
+class Headline:
+    """What data sets say together: ``lines`` of the answer, a figure (SVG), ``words`` for the page at ``address``."""
+
+    address: str
+    words: str
+    lines: Sequence[str]
+    figure: str
+    caption: str
+
+
 def render_overview(
     sets: Sequence[SetSummary],
     pages: Mapping[str, str],
     failures: Mapping[str, str],
     figures: Sequence[Drawing],
-    joint: str = "",
-    population: str = "",
+    headlines: Sequence[Headline] = (),
 ) -> str:
     """The page as HTML.
 
-    ``joint``, ``population``: addresses of the pages of such estimates. ``pages``: stem of a data set → address of its
-    page, for those that have one; ``failures``: name of a data set without a posterior → reason.
+    ``headlines``: what all data sets say together, where that was estimated. ``pages``: stem of a data set → address
+    of its page, for those that have one; ``failures``: name of a data set without a posterior → reason.
     """
     listed = set(map(id, sorted(sets, key=lambda s: -s.gravity)[:LISTED]))
     return render(
@@ -85,8 +95,7 @@ def render_overview(
         sets=sets,
         listed=[dataset for dataset in sets if id(dataset) in listed],
         pages=pages,
-        joint=joint,
-        population=population,
+        headlines=headlines,
         without_page=sum(1 for dataset in sets if dataset.stem not in pages),
         warned=sum(1 for dataset in sets if dataset.cautions),
         tally=_tally(sets),

@@ -20,16 +20,16 @@ from en4dvar.report.html import render
 from en4dvar.report.joint import forest
 from en4dvar.report.svg import svg
 from en4dvar.report.text import number_like, percent, plain_number, plus_minus, pretty_unit, shown
-from en4dvar.results.population_file import WORDS, StoredPopulation
+from en4dvar.results.population_file import StoredPopulation
 
-CAPTION = "Median and 5–95 % of each data set alone (grey) and given all (below it); band: the mean of the population."
+CAPTION = "Median and 5–95 % of each data set alone (grey) and given all (below it); band: the {} of the population{}."
 
 
 def summaries(stored: StoredPopulation, group: str = "posterior") -> list[Found]:
-    """Mean, spread and the next one; of the posterior also each data set, given all of them."""
+    """Median, mean, spread and the next one; of the posterior also each data set, given all of them."""
     posterior, prior = stored.group(group), stored.group("prior")
     rows: list[Found] = []
-    for what, words in WORDS.items():
+    for what, words in stored.words.items():
         of_it = [_row(stored, name, posterior[f"{name}_{what}"], prior[f"{name}_{what}"]) for name in stored.names]
         rows.append((words, tuple(of_it), stored.cautions))
     if group != "posterior":
@@ -55,19 +55,24 @@ def _row(stored: StoredPopulation, name: str, posterior: xr.DataArray, prior: xr
 
 def sentences(stored: StoredPopulation) -> tuple[str, ...]:
     """The answer: one sentence a parameter, and what the data determine together only."""
-    (_, means, _), (_, spreads, _), *_ = summaries(stored)
-    (_, free_means, _), (_, free_spreads, _), _ = summaries(stored, "without_hyperprior")
+    of = dict(zip(stored.words, (rows for _, rows, _ in summaries(stored)), strict=False))
+    free_of = dict(zip(stored.words, (rows for _, rows, _ in summaries(stored, "without_hyperprior")), strict=True))
+    centres, free_centres, free_spreads = of[stored.headline], free_of[stored.headline], free_of["between"]
     lines = []
-    for mean, spread in zip(means, spreads, strict=True):
-        lines += [_sentence(stored, mean, spread), *_parts(stored, mean)]
-    lines += [_one_by_one(stored, mean) for mean in means if "empirical" in stored.tree.children]
+    for centre, mean, spread in zip(centres, of["mean"], of["between"], strict=True):
+        lines += [_sentence(stored, centre, mean, spread), *_parts(stored, centre), *_compared(stored, centre)]
+    if "empirical" in stored.tree.children:
+        lines += [_one_by_one(stored, centre) for centre in centres if not centre.untrusted]
     lines += [_together(stored, combination) for combination in stored.combinations]
     effective = float(stored.tree.attrs["effective_draws_without_hyperprior"])
     if effective < FEWEST:
-        words = "the data leave mean or spread open, or lie in its tail"
+        words = f"the data leave {stored.headline} or spread open, or lie in its tail"
         return (*lines, f"What would hold without the hyperprior cannot be told from it: {words}.")
-    free = (f"{m.name} {_range(m)}, spread {_range(s)}" for m, s in zip(free_means, free_spreads, strict=True))
-    return (*lines, f"Without the hyperprior (mean and spread equally likely everywhere): {'; '.join(free)}.")
+    free = (f"{m.name} {_range(m)}, spread {_range(s)}" for m, s in zip(free_centres, free_spreads, strict=True))
+    return (
+        *lines,
+        f"Without the hyperprior ({stored.headline} and spread equally likely everywhere): {'; '.join(free)}.",
+    )
 
 
 def _range(row: ParameterSummary) -> str:
@@ -75,24 +80,49 @@ def _range(row: ParameterSummary) -> str:
     return f"{number_like(row.q05, row.std)} … {number_like(row.q95, row.std)}{unit}"
 
 
-def _sentence(stored: StoredPopulation, mean: ParameterSummary, between: ParameterSummary) -> str:
-    unit = f" {pretty_unit(mean.unit)}" if mean.unit != "1" else ""
-    if mean.untrusted:
-        return f"{mean.label} {mean.name} = {plain_number(mean.mean, 3)}{unit}, not to be trusted: see the warnings."
+def _sentence(
+    stored: StoredPopulation, centre: ParameterSummary, mean: ParameterSummary, between: ParameterSummary
+) -> str:
+    """The population's median (its geometric mean where it is lognormal) with its interval, mean and spread beside."""
+    if centre.untrusted and "empirical" in stored.tree.children:
+        words = f"the draws of the population are not to be trusted ({', '.join(centre.untrusted)}): see the warnings"
+        return f"{centre.label}: {_of_sets(stored, centre)}; {words}."
+    unit = f" {pretty_unit(centre.unit)}" if centre.unit != "1" else ""
     spread = f"{number_like(between.q50, between.std)}{unit} ({_range(between)})"
-    draws = [stored.group("posterior")[f"{mean.name}_{what}"] for what in ("mean", "between")]
-    if _logarithmic(draws[0]):
+    draws = [stored.group("posterior")[f"{centre.name}_{what}"] for what in ("mean", "between")]
+    logarithmic = _logarithmic(draws[0])
+    if logarithmic:
         low, middle, high = map(percent, np.quantile(draws[1].values / draws[0].values, (0.05, 0.5, 0.95)))
         spread = f"{middle} ({low} … {high})"
-    words = f"{mean.label} {mean.name} = {plus_minus(mean.mean, mean.std)}{unit} (5–95 %: {_range(mean)})"
-    words += f"; from data set to data set it varies by {spread}"
-    return words + (f"; its mean is {mean.informed}." if mean.dfs < DETERMINED and mean.informed else ".")
+    what = "median (geometric mean)" if logarithmic and stored.headline == "median" else stored.headline
+    words = f"{centre.label} {centre.name} = {number_like(centre.q50, centre.std)}{unit} (5–95 %: {_range(centre)}), "
+    words += f"the {what} of the population; from data set to data set it varies by {spread}"
+    if logarithmic and stored.headline == "median":
+        words += f"; its arithmetic mean is {number_like(mean.q50, mean.std)}{unit} ({_range(mean)})"
+    if centre.untrusted:
+        return f"{words}; not to be trusted: see the warnings."
+    return words + (f"; the median is {centre.informed}." if centre.dfs < DETERMINED and centre.informed else ".")
+
+
+def _compared(stored: StoredPopulation, centre: ParameterSummary) -> Iterator[str]:
+    """The value of others that the configuration gives."""
+    if centre.name not in stored.reference:
+        return
+    posterior = stored.group("posterior")[f"{centre.name}_{stored.headline}"]
+    value, std = (float(convert(x, str(posterior.attrs["units"]), centre.unit)) for x in stored.reference[centre.name])
+    unit = f" {pretty_unit(centre.unit)}" if centre.unit != "1" else ""
+    source = str(stored.tree.attrs.get("reference_source", ""))
+    stated = plus_minus(value, std) if std == std else plain_number(value, 4)
+    below = float(np.mean(shown(posterior) < value))
+    words = f"reference: {centre.name} = {stated}{unit}{f', {source}' if source else ''}"
+    side, chance = ("below", below) if below > 0.5 else ("above", 1 - below)
+    yield f"{words}; the estimate lies {side} it with probability {chance:.2f}."
 
 
 def _parts(stored: StoredPopulation, mean: ParameterSummary) -> Iterator[str]:
-    """What the interval of a mean is made of, where data sets have anything in common."""
+    """What the interval is made of, where data sets have anything in common."""
     if stored.common and not mean.untrusted:
-        yield _in_parts(stored, mean, stored.group("posterior")[f"{mean.name}_mean"], mean.std)
+        yield _in_parts(stored, mean, stored.group("posterior")[f"{mean.name}_{stored.headline}"], mean.std)
 
 
 def _in_parts(stored: StoredPopulation, mean: ParameterSummary, of: xr.DataArray, std: float) -> str:
@@ -108,16 +138,21 @@ def _in_parts(stored: StoredPopulation, mean: ParameterSummary, of: xr.DataArray
     )
 
 
-def _one_by_one(stored: StoredPopulation, mean: ParameterSummary) -> str:
+def _one_by_one(stored: StoredPopulation, centre: ParameterSummary) -> str:
     """The median over the data sets, which needs no model of how they vary."""
-    of = stored.group("empirical")[mean.name]
-    low, middle, high = map(float, convert(of.values, str(of.attrs["units"]), mean.unit))
-    std, unit = (high - low) / 3.29, f" {pretty_unit(mean.unit)}" if mean.unit != "1" else ""
+    return f"Check without a model of the population: {_of_sets(stored, centre)}."
+
+
+def _of_sets(stored: StoredPopulation, centre: ParameterSummary) -> str:
+    of = stored.group("empirical")[centre.name]
+    low, middle, high = map(float, convert(of.values, str(of.attrs["units"]), centre.unit))
+    std, unit = (high - low) / 3.29, f" {pretty_unit(centre.unit)}" if centre.unit != "1" else ""
     words = (
-        f"Check without a model of the population: the median of {len(stored.datasets)} data sets one by one is "
-        f"{mean.name} = {number_like(middle, std)}{unit} (5–95 %: {number_like(low, std)} … {number_like(high, std)})."
+        f"the median of {len(stored.datasets)} data sets one by one is {centre.name} = "
+        f"{number_like(middle, std)}{unit} (5–95 %: {number_like(low, std)} … {number_like(high, std)})"
     )
-    return f"{words} {_in_parts(stored, mean, of, std)}" if mean.untrusted and stored.common else words
+    parts = _in_parts(stored, centre, of, std).removesuffix(".") if centre.untrusted and stored.common else ""
+    return f"{words}. {parts}" if parts else words
 
 
 def _together(stored: StoredPopulation, combination: Combination) -> str:
@@ -136,9 +171,21 @@ def _logarithmic(draws: xr.DataArray) -> bool:
 
 def population_lines(stored: StoredPopulation) -> Iterator[str]:
     """What the terminal shows."""
-    yield results_table({words: rows for words, rows, _ in summaries(stored)[: len(WORDS)]})
+    yield results_table({words: rows for words, rows, _ in summaries(stored)[: len(stored.words)]})
     yield ""
     yield from sentences(stored)
+
+
+def figure(stored: StoredPopulation) -> str:
+    """All data sets over the population, as SVG."""
+    posterior = stored.group("posterior")
+    centres = {name: posterior[f"{name}_{stored.headline}"] for name in stored.names}
+    return svg(forest(stored, stored.datasets, centres, stored.reference), "forest", caption(stored))
+
+
+def caption(stored: StoredPopulation) -> str:
+    """Of the figure."""
+    return CAPTION.format(stored.headline, "; dotted: the reference" if stored.reference else "")
 
 
 def write_population(stored: StoredPopulation, folder: Path) -> Path:
@@ -146,7 +193,6 @@ def write_population(stored: StoredPopulation, folder: Path) -> Path:
     rows = summaries(stored)
     write_csv(folder / "population.csv", summary_rows(rows, {}))
     write_text(folder / "population.tex", latex_table(rows))
-    posterior = stored.group("posterior")
     page = render(
         "population.html.j2",
         title="Population",
@@ -155,12 +201,10 @@ def write_population(stored: StoredPopulation, folder: Path) -> Path:
         runs=str(stored.tree.attrs["runs"]),
         count=len(stored.datasets),
         sentences=sentences(stored),
-        population=rows[: len(WORDS)],
-        sets=rows[len(WORDS) :],
-        forest=svg(
-            forest(stored, stored.datasets, {n: posterior[f"{n}_mean"] for n in stored.names}), "forest", CAPTION
-        ),
-        caption=CAPTION,
+        population=rows[: len(stored.words)],
+        sets=rows[len(stored.words) :],
+        forest=figure(stored),
+        caption=caption(stored),
         belongs=list(stored.belongs.items()),
         attributes=stored.tree.attrs,
         cautions=[(c, "") for c in stored.cautions],

@@ -20,7 +20,13 @@ from en4dvar.results.joint_file import QUANTILES, StoredGroups, load_groups
 from en4dvar.results.netcdf import Group, Groups, Variable, to_bytes, understood, variable
 
 FILE = "population.nc"
-WORDS = {"mean": "mean of the population", "between": "standard deviation between data sets", "next": "the next one"}
+WORDS = {
+    "median": "median of the population",
+    "mean": "mean of the population",
+    "between": "standard deviation between data sets",
+    "next": "the next one",
+}
+HEADLINE = "median"
 _DRAWS = ("chain", "draw")
 
 
@@ -77,7 +83,8 @@ def _about(p: Parameter) -> dict[str, Any]:
 
 
 def _draws(population: CampaignPopulation, draws: Draws) -> dict[str, Variable]:
-    learned = dict(zip(("mean", "between"), population.learned, strict=True))
+    of_centre, of_spread = population.learned
+    learned = {"median": of_centre, "mean": of_centre, "between": of_spread}
     result = {}
     for j, term in enumerate(population.terms):
         p = term.parameter
@@ -86,7 +93,7 @@ def _draws(population: CampaignPopulation, draws: Draws) -> dict[str, Variable]:
             more: dict[str, Any] = {"transform": term.transform}
             if what in learned:
                 more["learned"] = float(learned[what][j])
-            if what == "mean" and draws is population.posterior:
+            if what == HEADLINE and draws is population.posterior:
                 more["std_between"], more["std_common"] = (float(part[j]) for part in population.parts)
             result[f"{p.name}_{what}"] = variable(_DRAWS, values, p.unit, f"{p.label}: {words}", **_about(p), **more)
     return result
@@ -144,6 +151,22 @@ class StoredPopulation(StoredGroups):
     def names(self) -> tuple[str, ...]:
         """Parameters of the population."""
         return tuple(str(self.tree.attrs["parameters"]).split())
+
+    @property
+    def headline(self) -> str:
+        """What stands for the population: its median; in files of version 1.0 the mean, for they hold no other."""
+        return HEADLINE if f"{self.names[0]}_{HEADLINE}" in self.group("posterior") else "mean"
+
+    @property
+    def words(self) -> dict[str, str]:
+        """What is stored of a population → in words."""
+        return {what: words for what, words in WORDS.items() if what in (self.headline, "mean", "between", "next")}
+
+    @property
+    def reference(self) -> dict[str, tuple[float, float]]:
+        """Parameter → a value of others to compare with and its std (NaN if not stated), in the parameter's unit."""
+        lines = (line.split() for line in str(self.tree.attrs.get("reference", "")).splitlines())
+        return {name: (float(value), float(std)) for name, value, std in lines}
 
     @property
     def common(self) -> tuple[str, ...]:

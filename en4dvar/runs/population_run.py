@@ -5,11 +5,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from en4dvar.config import Config
+from en4dvar.config.sharing import SOURCE, reference_value
 from en4dvar.diagnosis.diagnostics import HARDLY_INFORMED
 from en4dvar.estimation.population import Effort, HyperPrior
 from en4dvar.estimation.population import campaign as of_campaign
@@ -87,7 +88,8 @@ class PopulationKind(TogetherKind):
         tell(f"{population.estimate.forward_runs} forward runs, {population.estimate.size:.0f} effective draws")
         used = [s for s in sets if s.name not in population.left_out]
         cautions = (*_cautions(population), *carried(used))
-        save_population(path, population, [s.members for s in used], cautions, {**attributes, "seed": config.seed})
+        about = {**attributes, "seed": config.seed, **_reference(config, population)}
+        save_population(path, population, [s.members for s in used], cautions, about)
 
     @classmethod
     def page(cls, folder: Path, datasets: Sequence[str] = (), workers: int = 1, figures: bool = False) -> Path:
@@ -111,13 +113,23 @@ def require_population(config: Config, problem: InverseProblem, count: int) -> N
         raise ConfigError([config.document.fault(("population",), str(error), at_key=True)]) from None
 
 
+def _reference(config: Config, population: CampaignPopulation) -> dict[str, str]:
+    """What the configuration says to compare with: lines of name, value and std, and its source."""
+    asked = config.population.reference if config.population else {}
+    values = [
+        (term.parameter.name, *reference_value(asked[term.parameter.name], term.parameter.unit))
+        for term in population.terms
+        if term.parameter.name in asked
+    ]
+    lines = "\n".join(f"{name} {value:.17g} {std:.17g}" for name, value, std in values)
+    return {"reference": lines, "reference_source": asked.get(SOURCE, "")} if lines else {}
+
+
 def _cautions(population: CampaignPopulation) -> Iterator[Caution]:
     if not population.estimate.converged:
-        words = (
-            f"only {population.estimate.size:.0f} effective draws stand behind the population; the median of the data "
-        )
-        words += "sets one by one needs none"
-        yield caution("chain-not-converged", words)
+        words = f"only {population.estimate.size:.0f} effective draws stand behind the population"
+        advice = "the median of the data sets one by one, which needs none, stands in the place of its numbers"
+        yield replace(caution("chain-not-converged", words), advice=advice)
     odd = [
         f"{problem.observations.name} (with probability {share:.2g})"
         for problem, share in zip(population.problems, 1 - population.belongs, strict=True)

@@ -134,6 +134,23 @@ def test_names_are_quoted_where_yaml_needs_it() -> None:
         assert parse_document(f"x: {{name: {quoted(text)}, unit: m}}").data == {"x": {"name": text, "unit": "m"}}
 
 
+def test_of_three_bubbles_the_run_ends_with_their_gel(tmp_path: Path) -> None:
+    """What varies is written down, what is common is told, and the file is valid as it stands; of two it is not."""
+    folder = tmp_path / "gel"
+    folder.mkdir()
+    for n in (1, 2):
+        write(folder / f"b{n}.csv", scale=1 + n / 20)
+    assert call("init", "--data", folder, *UNITS).exit_code == 0
+    assert proposed(Path("gel.yaml")).population is None
+    write(folder / "b3.csv")
+    done = call("init", "--data", folder, *UNITS, "--force")
+    assert "3 bubbles: the run ends with what they say of one gel together" in done.output
+    asked = proposed(Path("gel.yaml")).population
+    assert asked is not None
+    assert asked.of == ("G", "mu")
+    assert "rho, c, p_inf, reading_scale have one value in all bubbles" in Path("gel.yaml").read_text()
+
+
 def test_one_table_of_many_bubbles(tmp_path: Path) -> None:
     text = write(tmp_path / "b.csv").read_text().splitlines()[1:]
     rows = [f"{name},{line}" for name in ("one", "two") for line in (text if name == "one" else text[::-1])]

@@ -15,8 +15,10 @@ from en4dvar.cli import main
 from en4dvar.estimation.population import Effort, HyperPrior
 from en4dvar.estimation.population.campaign import CampaignPopulation, Draws, population_of
 from en4dvar.estimation.population.estimate import Population
+from en4dvar.plumbing.caution import caution
 from en4dvar.plumbing.errors import ConfigError, OutputError
 from en4dvar.priors.prior import Prior, PriorTerm
+from en4dvar.report.population import sentences
 from en4dvar.results.population_file import load_population
 from en4dvar.runs.population_run import population
 from en4dvar.runs.runner import run_campaign
@@ -47,12 +49,36 @@ def test_files_and_the_answer(found):
     assert posterior["A"].dims == ("chain", "draw", "dataset")
     page = (folder / "population.html").read_text()
     assert "varies by" in page
+    assert "the median (geometric mean) of the population" in page
+    assert page.index("varies by") < page.index('id="forest"') < page.index("<h2>The population</h2>")
     assert "k_mean" not in page
     rows = (folder / "population.csv").read_text().splitlines()
-    assert rows[1].startswith("mean of the population,k,")
+    assert rows[1].startswith("median of the population,k,")
     assert "set3,k," in "\n".join(rows)
     assert r"\toprule" in (folder / "population.tex").read_text()
     assert 1.5 < float(posterior["k_mean"].median()) < 2.2  # the springs are 1.6 to 2.05
+
+
+def test_the_median_of_a_lognormal_population_lies_below_its_mean(found):
+    """exp(ν) and exp(ν + τ²/2), draw by draw; the second is larger by half the square of the relative spread."""
+    posterior = found[0].group("posterior")
+    median, mean, between = (posterior[f"k_{what}"].values for what in ("median", "mean", "between"))
+    np.testing.assert_allclose((mean / median) ** 2, 1 + (between / mean) ** 2, rtol=1e-10)
+    assert posterior["k_median"].attrs["std_common"] == 0
+
+
+def test_where_draws_are_few_the_median_one_by_one_stands_with_its_interval(found):
+    """Warned draws give no number away, and withhold none."""
+    stored = found[0]
+    line = caution("chain-not-converged", "only 8 effective draws stand behind the population").line
+    tree = stored.tree.copy()
+    tree.attrs["warnings"] = line
+    (first, *_) = sentences(replace(stored, tree=tree))
+    low, _, high = stored.group("empirical")["k"].values
+    assert "the median of 4 data sets one by one is k =" in first
+    assert "chain-not-converged" in first
+    low_text, high_text = first.split("5–95 %: ")[1].split(")")[0].split(" … ")
+    assert (float(low_text), float(high_text)) == pytest.approx((low, high), abs=0.02)
 
 
 def test_the_next_spring_is_less_certain_than_the_mean(found):
@@ -126,7 +152,7 @@ def test_what_is_determined_together_only():
     free, sharp = rng.standard_normal((2, 4000))
     nu = np.stack([(free + 0.01 * sharp) / np.sqrt(2), (-free + 0.01 * sharp) / np.sqrt(2)], axis=1)
     tau = np.abs(0.5 * rng.standard_normal(nu.shape))
-    draws = Draws(nu, tau, nu, nu, tau)
+    draws = Draws(nu, nu, tau, nu, nu, tau)
     estimate = Population(("a", "b"), prior, nu, tau, nu[:, None], (400.0, 400.0), 0.0, 0)
     found = CampaignPopulation(problems, HyperPrior(), estimate, draws, draws, nu[:, None])
     (one,) = found.combinations()

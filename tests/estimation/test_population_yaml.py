@@ -21,7 +21,7 @@ from en4dvar.runs.runner import run_campaign
 SMALL = Effort(
     rounds=30, refits=1, degree=2, components=2, hyper_walkers=16, hyper_rounds=30, draws=400, exact=100, passes=1
 )
-ASKED = "population: {of: [k], mean_std: 2, spread: 0.7}\n"
+ASKED = "population: {of: [k], mean_std: 2, spread: 0.7, reference: {k: 1.9 ± 0.1 N/m, source: balance}}\n"
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -66,7 +66,11 @@ def test_it_is_what_the_command_says_and_has_a_page(finished, tmp_path):
     for name, values in after.group("posterior").data_vars.items():
         assert np.array_equal(values, within.group("posterior")[name]), name
     write_report(run)
-    assert 'href="population.html"' in (run / "report.html").read_text()
+    page = (run / "report.html").read_text()
+    assert page.index("<h1>") < page.index("the median (geometric mean) of the population") < page.index("<svg")
+    assert page.index("Reference: k = 1.90 ± 0.10 N/m, balance") < page.index("Each data set by itself")
+    assert 'href="population.html"' in page
+    assert within.reference == {"k": (1.9, 0.1)}
     listed = (run / ".en4dvar-files").read_text()
     assert all(name in listed for name in ("population.nc", "population.html", "population.csv", "population.tex"))
 
@@ -89,6 +93,9 @@ def test_killed_and_resumed_to_the_same_bits(tmp_path):
         (3, "population: {of: [c]}\n", r"yaml:\d+:\d+: population\.of\.0: c: not estimated"),
         (3, "population: {of: [A]}\n", r"A: its prior depends on the data set"),
         (3, "population: {of: []}\n", r"yaml:\d+:\d+: population\.of: "),
+        (3, "population: {of: [k], reference: {q: 2 N/m}}\n", r"yaml:\d+:\d+: population\.reference\.q: 'q': neither"),
+        (3, "population: {of: [k], reference: {k: 2 ± 1 s}}\n", r"yaml:\d+:\d+: population\.reference\.k: '2 s'"),
+        (3, "population: {of: [k], reference: {k: soft}}\n", r"population\.reference\.k: 'soft' is no value such as"),
         (3, "population: {of: [k], spread: 0}\n", r"yaml:\d+:\d+: population\.spread: "),
         (2, ASKED, r"yaml:\d+:\d+: population: a population needs at least 3 data sets, not 2"),
     ],

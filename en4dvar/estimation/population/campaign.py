@@ -10,7 +10,7 @@ population enters the hierarchy (:mod:`~en4dvar.estimation.population.hierarchy`
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -39,10 +39,11 @@ NEAR = 5  # draws of a data set among which one is chosen for what is its own
 
 @dataclass(frozen=True)
 class Draws:
-    """Physical draws (M, p) of the population mean, of the standard deviation between data sets, and of the next one;
-    in units of the prior ``nu`` and ``tau``.
+    """Physical draws (M, p) of the population's median and mean, of the standard deviation between data sets, and of
+    the next one; in units of the prior ``nu`` and ``tau``. The median of a lognormal population is its geometric mean.
     """
 
+    median: Array
     mean: Array
     between: Array
     next: Array
@@ -92,10 +93,10 @@ class CampaignPopulation:
 
     @property
     def parts(self) -> tuple[Array, Array]:
-        """(p,) each: the standard deviation of the population's mean that is left where the common quantities are
+        """(p,) each: the standard deviation of the population's median that is left where the common quantities are
         known, and what these add, by regression of the draws.
         """
-        apart, theta = self.posterior.mean - self.posterior.mean.mean(axis=0), self.theta
+        apart, theta = self.posterior.median - self.posterior.median.mean(axis=0), self.theta
         if not theta.shape[1]:
             return apart.std(axis=0), np.zeros(apart.shape[1])
         centred = theta - theta.mean(axis=0)
@@ -112,7 +113,7 @@ class CampaignPopulation:
         logs = 0.5 * np.sum((d.nu / h.mean_std) ** 2 + (d.tau / h.spread) ** 2, axis=1)
         weights = np.exp(logs - logs.max())
         taken = resampled(weights / weights.sum(), len(weights), member_stream(seed, "without hyperprior"))
-        kept = Draws(d.mean[taken], d.between[taken], d.next[taken], d.nu[taken], d.tau[taken])
+        kept = Draws(*(getattr(d, field.name)[taken] for field in fields(Draws)))
         return kept, effective_number(weights) / len(weights) * self.estimate.size
 
     def combinations(self) -> tuple[Combination, ...]:
@@ -310,6 +311,9 @@ def white_prior(names: Sequence[str]) -> Prior:
 def _draws(terms: Sequence[PriorTerm], nu: Array, tau: Array, stream: np.random.Generator) -> Draws:
     """Physical draws of white ν and τ (M, p)."""
     mean, std = np.array([term.mean for term in terms]), np.array([term.std for term in terms])
-    x = mean + std * (nu + tau * stream.standard_normal(nu.shape))
-    following = np.stack([term.to_physical(x[:, j]) for j, term in enumerate(terms)], axis=1)
-    return Draws(*moments(terms, mean + std * nu, std * tau), following, nu, tau)
+    centre = mean + std * nu
+    x = centre + std * tau * stream.standard_normal(nu.shape)
+    median, following = (
+        np.stack([term.to_physical(of[:, j]) for j, term in enumerate(terms)], axis=1) for of in (centre, x)
+    )
+    return Draws(median, *moments(terms, centre, std * tau), following, nu, tau)

@@ -30,8 +30,10 @@ from en4dvar.sampling.importance import Importance, standard
 from en4dvar.sampling.mixture import StudentMixture, fit_gaussians, resampled
 from en4dvar.sampling.walkers import advance
 
-DRAWS, MOST_ROUNDS = 400, 24  # of a round of importance sampling, and the most rounds
-ENOUGH = 400.0  # effective draws that end the rounds
+DRAWS, MOST_ROUNDS = 200, 48  # of a round of importance sampling, and the most rounds
+ENOUGH = 200.0  # effective draws that end the rounds: they know a mean to 7 % of its std
+BEHIND_EACH = 8.0  # effective draws a dimension behind each part of a proposal
+OF_PRIOR = 0.2  # of the first draws
 KEPT = 2000  # equally likely draws of each data set
 WALKERS, MOVES, WALKED = 80, 5, 16  # moves of half of them while the other half stands still, and turns of both
 MOST_PARTS, ROUNDS = 4, 60  # components of a mixture; rounds of expectation maximisation
@@ -80,7 +82,7 @@ def own_draws(problem: InverseProblem, start: Array, seed: int, executor: Execut
     def cost(z: Array) -> Array:
         return np.asarray(0.5 * np.sum(z**2, axis=1) - log_likelihood(z))
 
-    sampler = Importance(_about(start), member_stream(seed, "population: own draws"), DRAWS)
+    sampler = Importance(_about(start), member_stream(seed, "population: own draws"), DRAWS, behind_each=BEHIND_EACH)
     for _ in range(MOST_ROUNDS):
         z = sampler.draw()
         sampler.add(z, log_likelihood(z))
@@ -96,12 +98,12 @@ def own_draws(problem: InverseProblem, start: Array, seed: int, executor: Execut
 
 
 def _about(start: Array) -> StudentMixture:
-    """The prior and, as often, Student t about members (N, n)."""
+    """Student t about members (N, n) and, now and then, the prior."""
     n = start.shape[1]
     covariance = np.cov(start, rowvar=False).reshape(n, n) + NARROWEST**2 * np.eye(n)
     wide = standard(n)
     return StudentMixture(
-        np.full(2, 0.5),
+        np.array([OF_PRIOR, 1 - OF_PRIOR]),
         np.vstack([wide.centre, start.mean(axis=0)]),
         np.concatenate([wide.root, np.linalg.cholesky(covariance)[None]]),
     )

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from en4dvar.estimation.population.estimate import FEWEST_SETS
 from en4dvar.model.state import READING_SCALE
 from en4dvar_bubble.media import MEDIA, known_medium
 
@@ -47,3 +48,16 @@ def known(medium: str) -> Sequence[Known]:
             Known("c", f"{it.c:.4g} m/s", float(f"{it.c_log_std:.2g}"), f"speed of sound in {medium}"),
         )
     return (*of_medium, PRESSURE, SCALE)
+
+
+def population(names: Sequence[str], count: int, medium: str) -> tuple[str, ...]:
+    """Lines for the section of the parameters ``names`` of one gel behind ``count`` bubbles; () of too few of them."""
+    if count < FEWEST_SETS or not names:
+        return ()
+    common = ", ".join(quantity.key for quantity in known(medium))
+    return (
+        "population: # of the gel behind its bubbles, at the end of the run",
+        f"  of: [{', '.join(names)}] # these vary from bubble to bubble about one median",
+        f"  # {common} have one value in all bubbles; the others are each bubble's own",
+        f"  # reference: {{{names[0]}: VALUE ± STD UNIT, source: NAME}} # a value to compare with, on the page",
+    )

@@ -97,6 +97,7 @@ def yaml_text(name: str, source: Source, proposal: Proposal, command: str) -> st
         *_comparison(name, proposal.simpler),
         "parameters: # a prior is estimated, a quantity such as 'mu: 0.1 Pa s' is fixed",
         *_section(proposal.parameters),
+        *proposal.population,
         "assimilation:",
         *_section(proposal.assimilation),
     ]

@@ -67,6 +67,7 @@ class Proposal:
     """What goes into the configuration; ``remarks`` and ``warnings`` are told to the user.
 
     ``simpler``: keys of the model, and their values, of quicker physics to compare with; empty where there is none.
+    ``population``: what varies from bubble to bubble of one gel, line by line; empty where there are too few of them.
     """
 
     data: tuple[Entry, ...]
@@ -79,6 +80,7 @@ class Proposal:
         Entry("members", "48"),
         Entry("draws", "400", "effective ones where the posterior is sampled: its mean is known to 5 % of its std"),
     )
+    population: tuple[str, ...] = ()
 
 
 def propose(
@@ -128,13 +130,15 @@ def propose(
             f"no G and mu of {model.law.name} give this {'R_max and ' if chosen == 'acoustic' else ''}collapse time: "
             + ("is the driving that of your experiment?" if chosen == "acoustic" else "are scale and frame rate right?")
         )
+    together = elsewhere.population([p.name for p in model.law.parameters], len(views), medium)
     return Proposal(
         _data(chosen, look, model, {**others, **guess.values}, histories),
         _model(law_name, chosen, look),
         _parameters(model, chosen, look, believed, tops(looks, histories), medium),
         SIMPLER[chosen],
-        tuple(told),
+        (*told, *[f"{len(views)} bubbles: the run ends with what they say of one gel together"] * bool(together)),
         tuple(warnings),
+        together,
     )
 
 
