@@ -76,11 +76,11 @@ class Proposal:
     simpler: Mapping[str, str]
     remarks: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+    population: tuple[str, ...] = ()
     assimilation: tuple[Entry, ...] = (
         Entry("members", "48"),
         Entry("draws", "400", "effective ones where the posterior is sampled: its mean is known to 5 % of its std"),
     )
-    population: tuple[str, ...] = ()
 
 
 def propose(
