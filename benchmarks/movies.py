@@ -2,6 +2,7 @@
 
 python benchmarks/movies.py real          needs ../shared/data
 python benchmarks/movies.py rendered 60 0 bias and coverage of 60 movies a class, from seed 0 on (and names of classes)
+python benchmarks/movies.py nasty 20 0    what trips a tracker, 20 movies a kind (nasty_movies.py; and names of kinds)
 python benchmarks/movies.py speed         1000 frames of 512 × 512
 """
 
@@ -17,8 +18,11 @@ from itertools import groupby
 from pathlib import Path
 
 import numpy as np
+from nasty_movies import KINDS
+from nasty_movies import film as film_nasty
 
 from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import DataError
 from en4dvar_movie.frames import Frame, Movie, open_movie
 from en4dvar_movie.scene import Scene, render
 from en4dvar_movie.tracking import Track, track
@@ -104,6 +108,55 @@ def tell_rendered(movies: int, first: int, kinds: Iterable[str]) -> None:
         )
 
 
+def nasty(kind: str, number: int) -> dict[str, Array]:
+    """Of the frames of one movie (K,): error in pixels (NaN: not used), the same in stated std, whether it is good.
+
+    ``own`` is the error in std without what all frames of the movie share, which is no independent error.
+    """
+    filmed = film_nasty(kind, number)
+    try:
+        readings = track(replace(movie_of(filmed.frames), rate=1.0), point=filmed.point).readings
+    except DataError:
+        nothing = np.full(len(filmed.frames), np.nan)
+        return {"wrong": nothing, "score": nothing, "own": nothing, "good": filmed.good}
+    radius, std = np.array([(r.radius, r.errors.std) if r.used else (np.nan, np.nan) for r in readings]).T
+    candidates = [np.where(np.isnan(truth), 1e3, radius - truth) for truth in filmed.radius]
+    at_most = 1 if KINDS[kind].marked else len(candidates)  # without a mark any bubble will do, if it is the same one
+    wrong = min(candidates[:at_most], key=lambda off: float(np.nansum(np.abs(off))))
+    wrong[np.isnan(radius)] = np.nan
+    near = (np.abs(wrong) <= np.maximum(5 * std, 2)) & filmed.good
+    weight = np.where(near, 1 / std**2, 0.0)
+    shared = np.nansum(weight * wrong) / max(np.nansum(weight), 1e-30)
+    left = np.sqrt(np.maximum(1 - weight / max(np.nansum(weight), 1e-30), 1e-3))
+    return {
+        "wrong": wrong,
+        "score": wrong / std,
+        "own": np.where(near, (wrong - shared) / std / left, np.nan),
+        "good": filmed.good,
+    }
+
+
+def tell_nasty(movies: int, first: int, kinds: Iterable[str]) -> None:
+    print(
+        f"{'kind':26s} {'used':>5s} {'wrong':>6s} {'of good kept':>12s} {'rms px':>7s} {'std of z':>8s} {'worst z':>7s}"
+    )
+    bad = used = kept = good = 0
+    for kind in kinds:
+        parts = [nasty(kind, number) for number in range(first, first + movies)]
+        of = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
+        read = np.isfinite(of["wrong"])
+        fell = read & (np.abs(of["wrong"]) > 2) & (np.abs(of["score"]) > 5)
+        keep = read & ~fell & of["good"].astype(bool)
+        z = of["own"][np.isfinite(of["own"])]
+        print(
+            f"{kind:26s} {read.sum():5d} {fell.sum():6d} {keep.sum() / of['good'].sum():12.1%} "
+            f"{np.sqrt(np.mean(of['wrong'][keep] ** 2)):7.3f} {np.std(z):8.2f} {np.abs(z).max(initial=0):7.1f}",
+            flush=True,
+        )
+        bad, used, kept, good = bad + fell.sum(), used + read.sum(), kept + keep.sum(), good + of["good"].sum()
+    print(f"{used} frames used, {bad} ({bad / used:.2%}) beyond 5 std and 2 px; {kept / good:.1%} of good frames kept")
+
+
 def tell_speed(count: int = 1000) -> None:
     import tifffile
 
@@ -132,6 +185,9 @@ if __name__ == "__main__":
         print(f"within 1 px {np.mean(size < 1):.1%}, within 2 px {np.mean(size < 2):.2%}, worst {size.max():.1f} px")
     elif what == "speed":
         tell_speed()
+    elif what == "nasty":
+        movies, first = (*map(int, sys.argv[2:4]), *(20, 0)[len(sys.argv[2:4]) :])
+        tell_nasty(movies, first, sys.argv[4:] or KINDS)
     else:
         movies, first = (*map(int, sys.argv[2:4]), *(60, 0)[len(sys.argv[2:4]) :])
         tell_rendered(movies, first, sys.argv[4:] or CLASSES)

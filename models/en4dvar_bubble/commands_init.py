@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from en4dvar_bubble.starter.proposal import Proposal
     from en4dvar_bubble.starter.summaries import Summaries
 
-_OF_MOVIE = ("pixel", "frame_rate", "exposure", "flashes", "raw", "corrections")
+_OF_MOVIE = ("pixel", "frame_rate", "exposure", "flashes", "raw", "corrections", "bubble", "region", "mask")
 _OF_LAYOUT = ("by", "sheet", "unsorted", "repeated", "format")
 _OF_COLUMNS = ("time_unit", "radius_unit", "time_column", "radius_column", "time_step", "frame_rate", "pixel")
 _KEY = re.compile(rf"data\.({'|'.join(_OF_LAYOUT)})\b(?:: (\w+))?")
@@ -43,6 +43,11 @@ _MOVIES = (".tif", ".tiff", ".png", ".mp4", ".avi", ".mov", ".mkv", ".cine")
 @click.option("--flashes", metavar="TIMES", help="Flashes of one exposure of the movie, as '0 us, 2 us, 4 us'.")
 @click.option("--raw", metavar="WxHxBITS", help="Shape of the frames of a movie without header, e.g. 512x128x8.")
 @click.option("--corrections", metavar="FILE", type=click.Path(), help="Frames of the movie corrected by hand.")
+@click.option("--bubble", metavar="X,Y", help="A place within the bubble that is meant in the movie (pixels).")
+@click.option("--region", metavar="X,Y,WIDTH,HEIGHT", help="Part of the movie's frames that is looked at (pixels).")
+@click.option(
+    "--mask", metavar="FILE", type=click.Path(), help="Picture: where it is black the movie is not looked at."
+)
 @click.option("--example", type=click.Choice(["quickstart"]), help="An example and its synthetic data instead.")
 @click.option("--time-unit", metavar="UNIT", help="Unit of the times in the file, e.g. us.")
 @click.option("--radius-unit", metavar="UNIT", help="Unit of the radii in the file, e.g. um.")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -20,12 +21,20 @@ from en4dvar_movie.locate import TILE, locate
 from en4dvar_movie.outline import Circle, Optics
 
 Image = npt.NDArray[Any]  # brightness (H, W), of any precision
+DEAD = 0.25  # of the brightness about it: where a background shows nothing of a bubble, as writing does
+STRUCTURE = 0.1  # of that brightness: structure that a bubble darkens as it does the rest
+FLICKER = 0.2  # of the brightness: what a lamp may change from frame to frame
+LIVELY = 0.4  # share of the rim of a patch that changes in a bubble, not in what stands still
+OFTEN = 0.1  # of the frames: in how many it does
+RESTLESS, LEAST_PAIRS = 0.25, 5  # share and number of steps from frame to frame in which writing changes
+WRITING = (24, 14, 3)  # pixels: largest height of writing; how far about its changing part the rest of it lies
 LEADING = 40  # frames looked at for the background
 SAMPLES = 24  # frames looked at for what they share
 SMOOTH = 12.0  # pixels: the brightness that contrasts are relative to varies slowly
 LEAST_SPREAD = 0.002  # of the contrast
 NOISY = 0.1  # of a pixel's noise: what a contrast can be uncertain by for the noise
 SHARPEST = 5  # per cent of the frames: those where the bubble moved least within the exposure
+BLOB = 120  # pixels: the smallest patch of a first frame that may be a bubble
 SPECK = 100  # pixels: the largest change that is no bubble
 LEAST_CONTRAST = 0.08  # of the background's brightness
 BRIGHT = 0.25  # of the contrast: how much brighter a flash is
@@ -36,6 +45,7 @@ CHANGED = 0.3  # share of tiles that a flash changes
 @dataclass(frozen=True)
 class Background:
     """``level`` and ``gain`` (H, W): a frame becomes (frame − level) gain, zero without a bubble and negative inside.
+    Where the gain is NaN nothing is looked at: writing that changes, black or saturated parts, what the user masks.
 
     ``noise`` is the std of a pixel so normalised; ``frames`` how many the level is made of, 0 where none is empty.
     """
@@ -47,9 +57,13 @@ class Background:
     relative: bool = True
 
     def normalised(self, frame: Frame) -> tuple[Array, Array]:
-        """The image (H, W) and its tiles."""
+        """The image (H, W) and its tiles, without what the lamp flickers."""
         image, tiles = normalise(frame, self.level, self.gain, TILE)
-        return image, tiles
+        change = float(np.median(tiles[:: -(-tiles.size // STEADY)])) if self.relative else 0.0
+        if abs(change) > FLICKER:  # a bubble that fills the frame, or a flash
+            return image, tiles
+        scale = np.float32(1 / (1 + change))
+        return (image - np.float32(change)) * scale, np.where(tiles == 0, 0, (tiles - np.float32(change)) * scale)
 
     def steadied(self, image: Array, tiles: Array, bubble: Circle) -> Array:
         """The image at the background's own brightness: what the light does far from the bubble is taken out."""
@@ -61,19 +75,31 @@ class Background:
         return (image - change) / (1 + change if self.relative else np.float32(1))
 
 
-def find_background(movie: Movie, circles: int = 1) -> tuple[Background, Optics]:
-    """Background and optics of a movie, from its first frames and some along it. Raises :class:`DataError`."""
+def find_background(
+    movie: Movie, circles: int = 1, watched: npt.NDArray[np.bool_] | None = None
+) -> tuple[Background, Optics]:
+    """Background and optics of a movie, from its first frames and some along it.
+
+    ``watched`` (H, W) is what is looked at.
+
+    Raises
+    ------
+    DataError: no frame can be read or shows a bubble.
+    """
     leading, samples = _look(movie)
     first = leading[0].astype(np.float32)
     if not any(float(np.ptp(frame)) > 0 for frame in (*leading, *samples)):
         words = "black" if not np.any(first) else "white" if _is_white(leading[0]) else "of one brightness"
         raise DataError(f"{movie.path}: every frame is {words}; no bubble can be seen")
     noise = pixel_noise(first)
-    empty = 0 if _holds_a_blob(first, noise) else _quiet(leading, first, noise)
+    blind = _writing(leading, noise)
+    if watched is not None:
+        blind |= ~watched
+    empty = 0 if _begins_with_a_bubble(first, samples, noise, blind) else _quiet(leading, first, noise, blind)
     level = np.mean(np.array(leading[:empty], dtype=np.float32), axis=0) if empty else smooth_surface(samples)
     if empty > 2:
         noise = pixel_noise(np.array([f - level for f in leading[:empty]])) * float(np.sqrt(empty / (empty - 1)))
-    background = _with_sign(level, samples, noise, empty)
+    background = _with_sign(level, samples, noise, empty, blind)
     if empty:
         background = _refined(background, samples)
     return background, _optics(background, samples, movie, circles)
@@ -122,33 +148,89 @@ def smooth_surface(frames: Sequence[Frame]) -> Array:
     return surface
 
 
-def _holds_a_blob(first: Image, noise: float) -> bool:
-    """True if a frame differs from a smooth surface in one large patch."""
+def _changed(frame: Image, other: Image, noise: float, side: int = 5) -> npt.NDArray[np.bool_]:
+    """Where two frames differ by more than noise, in means over squares, whatever the lamp does (H, W)."""
+    lamp = float(np.median(frame)) / max(float(np.median(other)), 1e-6)
+    off = ndimage.uniform_filter(frame - (lamp if abs(lamp - 1) < FLICKER else 1.0) * other, side)
+    return np.asarray(np.abs(off) > max(7 * noise / side, 0.06 * float(np.median(other))))
+
+
+def _writing(leading: Sequence[Frame], noise: float) -> npt.NDArray[np.bool_]:
+    """Where something low changes all the time (H, W), brighter here and darker there at once: time stamps."""
+    none = np.zeros(leading[0].shape, dtype=bool)
+    steps = len(leading) - 1
+    if steps < LEAST_PAIRS:
+        return none
+    frames = [frame.astype(np.float32) for frame in leading]
+    changes = [_changed(b, a, noise, 3) for a, b in pairwise(frames)]
+    often = np.mean(changes, axis=0) > RESTLESS
+    height, across, down = WRITING
+    labels, _ = ndimage.label(ndimage.binary_dilation(often, np.ones((3, across))))
+    for number, box in enumerate(ndimage.find_objects(labels), 1):
+        rows, columns = np.nonzero(often[box] & (labels[box] == number))
+        if np.ptp(rows) + 1 > height or _one_way(frames, changes, box):
+            continue
+        top, left = box[0].start + rows.min() - down, box[1].start + columns.min() - across
+        none[max(top, 0) : box[0].start + rows.max() + down + 1,
+             max(left, 0) : box[1].start + columns.max() + across + 1] = True  # fmt: skip
+    return none
+
+
+def _one_way(frames: Sequence[Image], changes: Sequence[Image], box: tuple[slice, slice]) -> bool:
+    """True if, from frame to frame, all that changes becomes darker or all becomes brighter, as about a bubble."""
+    mixed: list[float] = []
+    for (a, b), changed in zip(pairwise(frames), changes, strict=True):
+        step = (b[box] - a[box])[changed[box]]
+        if len(step):
+            mixed.append(float(min(np.mean(step > 0), np.mean(step < 0))))
+    return float(np.median(mixed or [0.0])) < 0.15
+
+
+def _begins_with_a_bubble(first: Image, samples: Sequence[Frame], noise: float, blind: npt.NDArray[np.bool_]) -> bool:
+    """True if the first frame differs from a smooth surface in large patches whose rims other frames show elsewhere."""
     surface = smooth_surface([first])
     far = np.abs(ndimage.uniform_filter(first - surface, 5)) > max(4 * noise, 0.25 * float(np.median(np.abs(surface))))
-    labels, count = ndimage.label(far)
-    return bool(count and np.bincount(labels.ravel())[1:].max() > max(60, 2e-4 * first.size))
+    labels, _ = ndimage.label(far & ~blind)
+    sizes = np.bincount(labels.ravel())
+    large = [n for n in range(1, len(sizes)) if sizes[n] > max(BLOB, 2e-4 * first.size)]
+    if not large:
+        return False
+    changed = np.array([_changed(frame.astype(np.float32), first, noise) for frame in samples])
+    if not changed.any():
+        return True  # nothing moves in the movie: what is there must be the bubble
+    moved = changed.mean(axis=0) > OFTEN
+    patches = np.isin(labels, large)
+    rim = ndimage.binary_dilation(patches, iterations=2) & ~ndimage.binary_erosion(patches, iterations=2)
+    return bool(np.mean(moved[rim]) > LIVELY)
 
 
-def _quiet(leading: Sequence[Frame], first: Image, noise: float) -> int:
+def _quiet(leading: Sequence[Frame], first: Image, noise: float, blind: npt.NDArray[np.bool_]) -> int:
     """How many leading frames look like the first."""
     for number, frame in enumerate(leading):
-        off = np.abs(ndimage.uniform_filter(frame - first, 5)) > max(2 * noise, 0.06 * float(np.median(first)))
-        labels, count = ndimage.label(off)
+        labels, count = ndimage.label(_changed(frame.astype(np.float32), first, noise) & ~blind)
         if count and np.bincount(labels.ravel())[1:].max() > SPECK:  # larger than dirt that drifts
             return number
     return len(leading)
 
 
-def _with_sign(level: Array, samples: Sequence[Frame], noise: float, empty: int) -> Background:
+def _with_sign(
+    level: Array, samples: Sequence[Frame], noise: float, empty: int, blind: npt.NDArray[np.bool_]
+) -> Background:
     """Dark on bright, relative to the background; or bright on dark, as it is: by what differs most in most frames."""
-    votes = [float(np.percentile(d, 99.5) + np.percentile(d, 0.5)) for d in (f - level for f in samples)]
+    votes = [float(np.percentile(d, 99.5) + np.percentile(d, 0.5)) for d in ((f - level)[~blind] for f in samples)]
     if float(np.median([v for v in votes if abs(v) > 4 * noise] or [-1.0])) > 0:
         full = _full(samples, level)
-        return Background(level, np.full_like(level, -1.0 / full), noise / full, empty, relative=False)
+        gain = np.full_like(level, -1.0 / full)
+        return Background(level, np.where(blind, np.float32(np.nan), gain), noise / full, empty, relative=False)
     smooth = ndimage.gaussian_filter(level, SMOOTH)
-    gain = (1 / np.maximum(smooth, max(float(np.median(smooth)) * 0.05, 1.0))).astype(np.float32)
-    return Background(level, gain, noise * float(np.median(gain)), empty)
+    smooth = np.maximum(smooth, max(float(np.median(smooth)) * 0.05, 1.0))
+    if empty:  # what stands still is in the level, and a bubble takes its share of that light
+        sharp = ndimage.gaussian_filter(level, 1.0)
+        full = np.iinfo(samples[0].dtype).max if samples[0].dtype.kind in "ui" else np.inf
+        blind = blind | (level < DEAD * smooth) | ((level > 0.99 * full) & (level > (1 + STRUCTURE) * smooth))
+        smooth = np.where(np.abs(sharp / smooth - 1) > STRUCTURE, np.maximum(sharp, DEAD * smooth), smooth)
+    gain = np.where(blind, np.nan, 1 / smooth).astype(np.float32)
+    return Background(level, gain, noise * float(np.nanmedian(gain)), empty)
 
 
 def _full(samples: Sequence[Frame], level: Array) -> float:
@@ -162,13 +244,13 @@ def _refined(background: Background, samples: Sequence[Frame]) -> Background:
     y, x = np.mgrid[: total.shape[0], : total.shape[1]]
     for frame in samples:
         image, tiles = background.normalised(frame)
-        circles = locate(tiles, background.noise / TILE, LEAST_CONTRAST)
-        if circles is None or share_changed(tiles, background.noise) > CHANGED:
+        places = locate(tiles, background.noise / TILE, LEAST_CONTRAST)
+        if not places or share_changed(tiles, background.noise) > CHANGED:
             continue
-        circle, _ = circles
-        outside = np.hypot(x - circle.x, y - circle.y) > 1.3 * circle.R + 10
-        quiet = outside & (np.abs(image) < 5 * background.noise)
-        total[quiet] += frame[quiet]
+        quiet = np.abs(image) < 5 * background.noise
+        for circle, _ in places:
+            quiet &= (x - circle.x) ** 2 + (y - circle.y) ** 2 > (1.3 * circle.R + 10) ** 2
+        total[quiet] += (background.level + image / background.gain)[quiet]  # at the lamp's brightness of the level
         count[quiet] += 1
     return replace(background, level=(total / count).astype(np.float32))
 
@@ -183,11 +265,11 @@ def _optics(background: Background, samples: Sequence[Frame], movie: Movie, circ
     optics = []
     for frame in samples:
         image, tiles = background.normalised(frame)
-        place = locate(tiles, background.noise / TILE, LEAST_CONTRAST)
-        if place is None or share_changed(tiles, background.noise) > CHANGED:
+        places = locate(tiles, background.noise / TILE, LEAST_CONTRAST)
+        if not places or share_changed(tiles, background.noise) > CHANGED:
             continue
-        steady = background.steadied(image, tiles, place[0])
-        outlines = fit_outline(steady, place[0], Optics(-place[1]), circles)
+        place, contrast = places[0]
+        outlines = fit_outline(background.steadied(image, tiles, place), place, Optics(-contrast), circles)
         if outlines is not None and outlines[0].seen > 0.15 and outlines[0].contrast < 0:
             optics.append(outlines[0])
     if not optics:

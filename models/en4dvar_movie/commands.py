@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -22,8 +22,14 @@ if TYPE_CHECKING:
 @click.option("--flashes", metavar="TIMES", help="Flashes of one exposure, as '0 us, 2 us, 4 us': nested circles.")
 @click.option("--raw", metavar="WxHxBITS", help="Shape of the frames of a file without header, e.g. 512x128x8.")
 @click.option(
-    "--corrections", type=click.Path(path_type=Path), help="Text file: FRAME out, or FRAME X Y RADIUS (pixels)."
+    "--corrections",
+    type=click.Path(path_type=Path),
+    help="Text file: FRAME out, FRAME ok, or FRAME X Y RADIUS (pixels).",
 )
+@click.option("--bubble", metavar="X,Y", help="A place within the bubble that is meant, in some frame (pixels).")
+@click.option("--region", metavar="X,Y,WIDTH,HEIGHT", help="Part of the frames that is looked at (pixels).")
+@click.option("--mask", type=click.Path(path_type=Path), help="Picture of a frame's size: black is not looked at.")
+@click.option("--all", "every", is_flag=True, help="Also write the tables of other bubbles, a file each.")
 @click.option("--out", type=click.Path(path_type=Path), help="CSV file to write; default <name of the movie>.csv.")
 @click.option("--page", type=click.Path(path_type=Path), help="HTML page to write; default beside the CSV file.")
 @click.option("--outlined", type=click.Path(path_type=Path), help="Also write the movie with the outlines drawn in.")
@@ -32,7 +38,7 @@ if TYPE_CHECKING:
 def track(
     movie: Path, pixel: str | None, frame_rate: str | None, exposure: str | None,
     flashes: str | None, raw: str | None, corrections: Path | None, out: Path | None, page: Path | None,
-    outlined: Path | None, force: bool, workers: int | None,
+    outlined: Path | None, force: bool, workers: int | None, **choice: Any,
 ) -> None:  # fmt: skip
     """Read the bubble's radius and its error from every frame of a movie.
 
@@ -47,11 +53,14 @@ def track(
     from en4dvar.commands.common import command_line, refuse_to_replace
     from en4dvar.executor import available_cores
     from en4dvar.plumbing.files import write_text
+    from en4dvar_movie.choice import place, watched
     from en4dvar_movie.corrections import read_corrections
+    from en4dvar_movie.following import MOST
     from en4dvar_movie.frames import open_movie
     from en4dvar_movie.outlined import outlined as outlined_frames
     from en4dvar_movie.page import page_text
     from en4dvar_movie.table import to_csv
+    from en4dvar_movie.tracking import doubted
     from en4dvar_movie.tracking import track as track_movie
     from en4dvar_movie.writing import require_suffix, write_movie
 
@@ -60,15 +69,20 @@ def track(
     shown = page or table.with_suffix(".html")
     if outlined:
         require_suffix(outlined)
-    for target in (table, shown, outlined):
+    more = [table.with_name(f"{table.stem}_{n}{table.suffix}") for n in range(2, MOST + 1)] if choice["every"] else []
+    for target in (table, shown, outlined, *more):
         refuse_to_replace(target, force)
     fixed = read_corrections(corrections) if corrections else {}
+    point = place(choice["bubble"])
+    part = watched(opened, choice["region"], choice["mask"])
     with _bar(opened.count) as progress:
-        track = track_movie(opened, workers or available_cores(), fixed, progress, scale.flashes)
-    for note in opened.notes:
+        track = track_movie(opened, workers or available_cores(), fixed, progress, scale.flashes, point, part)
+    for note in (*opened.notes, *track.notes):
         click.echo(f"note: {note}", err=True)
     words = command_line()
     write_text(table, to_csv(track.readings, scale, str(movie), words))
+    for other, readings in zip(more, track.others, strict=False):
+        write_text(other, to_csv(readings, scale, str(movie), words))
     write_text(shown, page_text(opened, track, scale, words))
     if outlined:
         pictures = outlined_frames(opened, track)
@@ -76,6 +90,10 @@ def track(
     used = [r for r in track.readings if r.used]
     what = "frames" if len(scale.flashes) == 1 else "circles"
     click.echo(f"{len(used)} of {len(track.readings)} {what} read; the others and why: see the page")
+    if doubtful := doubted(track.readings):
+        click.echo(f"doubtful, and not used until a line of --corrections confirms them: {doubtful}")
+    for other, readings in zip(more, track.others, strict=False):
+        click.echo(f"another bubble: {other}, {sum(r.used for r in readings)} {what}")
     click.echo(f"readings: {table}\npage: {shown}\nnext: en4dvar init --data {table}")
 
 

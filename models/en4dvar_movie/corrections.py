@@ -2,6 +2,7 @@
 
 # frame  what
 12       out   blurred, two bubbles
+15       ok    what was read is right, whatever makes it doubtful
 19       270.5 64.0 28.0   start here: x, y and radius in pixels
 """
 
@@ -18,7 +19,8 @@ from en4dvar_movie.outline import Circle
 
 @dataclass(frozen=True)
 class Correction:
-    """``out``: the frame is left out. Else the outline is looked for about ``start``."""
+    """``out``: the frame is left out. Else the outline is looked for about ``start``, or where there is none, what was
+    read is confirmed."""
 
     out: bool
     start: Circle | None
@@ -35,7 +37,9 @@ def read_corrections(path: Path) -> dict[int, Correction]:
         where = f"{path}:{line}"
         frame, *rest = text.split()
         if not frame.isdigit() or not rest:
-            raise DataError(f"{where}: write FRAME out WORDS, or FRAME X Y RADIUS WORDS with numbers in pixels")
+            raise DataError(
+                f"{where}: write FRAME out WORDS, FRAME ok WORDS, or FRAME X Y RADIUS WORDS with numbers in pixels"
+            )
         if int(frame) in corrections:
             raise DataError(f"{where}: frame {frame} was corrected before")
         corrections[int(frame)] = _correction(rest, where)
@@ -45,10 +49,12 @@ def read_corrections(path: Path) -> dict[int, Correction]:
 def _correction(rest: list[str], where: str) -> Correction:
     if rest[0].lower() == "out":
         return Correction(True, None, " ".join(rest[1:]))
+    if rest[0].lower() == "ok":
+        return Correction(False, None, " ".join(rest[1:]))
     try:
         x, y, radius = map(float, rest[:3])
     except ValueError:
-        raise DataError(f"{where}: {' '.join(rest[:3])!r} is neither 'out' nor X Y RADIUS in pixels") from None
+        raise DataError(f"{where}: {' '.join(rest[:3])!r} is neither 'out' nor 'ok' nor X Y RADIUS in pixels") from None
     if not radius > 0:
         raise DataError(f"{where}: the radius {radius:g} is not positive")
     return Correction(False, Circle(x, y, radius), " ".join(rest[3:]))

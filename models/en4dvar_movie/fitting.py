@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from en4dvar.model.state import Array
-from en4dvar_movie.kernels import SHAPE, influence, normal_equations, residuals
+from en4dvar_movie.kernels import SHAPE, influence, normal_equations, of_rows, residuals
 from en4dvar_movie.outline import MODES, Circle, Optics, Outline, share_inside
 
 ROUNDS = 30
@@ -20,6 +20,9 @@ CUTOFF = 5.0  # of Tukey's weights, in robust std
 DARKER = 3.0  # std of the contrast: no bubble is darker than the movie's clearest by more
 REACH = 4.0  # how far from the outline pixels are used, in widths of the edge
 APART = 1.5  # widths of the edge: nested circles that are closer are not told apart
+SHARP = 1.35  # widths of the movie's sharp edges: what is no wider is blurred by nothing else
+TWO = 2.6  # their own widths by which two edges lie apart that are no blurred one
+SURE = 0.05  # share of the squares that two edges must explain and a blurred one does not
 X, Y, R, W, LEVEL, CONTRAST, GLARE, RIM = range(SHAPE)
 
 
@@ -28,6 +31,25 @@ def fit_outline(image: Array, start: Circle, optics: Optics, circles: int = 1) -
 
     With several ``circles``, nested about one centre, one of each, the largest first.
     """
+    fitted = _fit(image, start, optics, circles)
+    return None if fitted is None else _outlines(image, *fitted, optics)
+
+
+def two_edges(image: Array, start: Circle, optics: Optics) -> float:
+    """How far apart two sharp edges lie (pixels) where a blurred one was fitted; 0 if the image does not show them."""
+    single, double = (_fit(image, start, optics, circles) for circles in (1, 2))
+    if single is None or double is None:
+        return 0.0
+    (p, modes, _), (q, q_modes, noise) = single, double
+    ring = _ring(p, q[-1:])
+    fits = (p, modes), (q, q_modes)
+    wrong, less = (float(np.sum(np.minimum(residuals(image, *of, ring) / noise, 5.0) ** 2)) for of in fits)
+    sharp = q[W] < SHARP * optics.width and q[-1] > TWO * q[W]
+    return float(q[-1]) if sharp and wrong - less > SURE * wrong else 0.0
+
+
+def _fit(image: Array, start: Circle, optics: Optics, circles: int) -> tuple[Array, int, float] | None:
+    """Parameters (P,), the highest mode and the noise."""
     radii = nested_radii(image, start, optics, circles)
     p = np.zeros(SHAPE + circles - 1)
     p[[X, Y, R, W, CONTRAST]] = start.x, start.y, radii[0], optics.width, optics.contrast
@@ -48,7 +70,7 @@ def fit_outline(image: Array, start: Circle, optics: Optics, circles: int = 1) -
             return None
         p = _sorted(fitted, circles)
         noise = max(1.4826 * float(np.median(np.abs(residuals(image, p, modes, ring)))), 1e-6)
-    return _outlines(image, p, modes, noise, optics)
+    return p, modes, noise
 
 
 def nested_radii(image: Array, start: Circle, optics: Optics, circles: int) -> Array:
@@ -57,7 +79,7 @@ def nested_radii(image: Array, start: Circle, optics: Optics, circles: int) -> A
         return np.array([start.R])
     y, x = np.indices(image.shape)
     r = np.hypot(x - start.x, y - start.y).astype(int).ravel()
-    profile = np.bincount(r, image.ravel()) / np.maximum(np.bincount(r), 1) / optics.contrast
+    profile = np.bincount(r, np.nan_to_num(image.ravel())) / np.maximum(np.bincount(r), 1) / optics.contrast
     dark = np.maximum.accumulate(profile[: int(2 * start.R) + 20][::-1])  # from outside
     at = [len(dark) - 1 - int(np.argmax(dark > (s + 0.5) / circles)) for s in range(circles)]
     radii = np.array([a if dark[-1] > (s + 0.5) / circles else np.nan for s, a in enumerate(at)]) + 0.5
@@ -165,6 +187,8 @@ def _outlines(image: Array, p: Array, modes: int, noise: float, optics: Optics) 
     shape = p[SHAPE : SHAPE + 2 * (modes - 1)].reshape(-1, 2).T if modes > 1 else np.zeros((2, 0))
     mode_variance = float(np.diag(inverse)[SHAPE : SHAPE + shape.size].mean()) if modes > 1 else 0.0
     free = len(p) - 2 * _glare_is_far(p, gaps, ring)
+    squared, product = of_rows(image, p, modes, ring)
+    slopes = np.maximum(squared, 1e-30)
     outlines: list[Outline] = []
     for group in _groups(np.append(0.0, gaps), APART * p[W]):
         # of the radius, or of the mean of radii that cannot be told apart
@@ -187,6 +211,8 @@ def _outlines(image: Array, p: Array, modes: int, noise: float, optics: Optics) 
             common=float(common),
             mode_std=float(np.sqrt(max(mode_variance, 0) * squares / total)),
             seen=share_inside(image.shape, circle),
+            rows=float(np.subtract(*(product / slopes))),
+            rows_std=float(noise * np.sqrt(np.sum(1 / slopes))),
             # as if evenly spread over the distance from which they are told apart
             joined=float(np.hypot(APART * p[W] / 12**0.5, np.std(inside))) if len(group) > 1 else 0.0,
         )

@@ -139,6 +139,17 @@ def _tiff(path: Path) -> Movie:
     return Movie(path, lambda: decoded(tiff_frames, path, allowed=MOVIES), about.pages, about.pixel, about.rate)
 
 
+def open_picture(path: Path) -> Any:
+    """A single picture (H, W) or (H, W, channels). Raises :class:`DataError`."""
+    if path.suffix.lower() not in (*TIFF, *IMAGES):
+        raise DataError(f"{path}: not a picture by its suffix ({', '.join((*IMAGES, *TIFF))})")
+    read = _tiff(path).open() if path.suffix.lower() in TIFF else decoded(image, path, allowed=MOVIES)
+    try:
+        return next(iter(read))
+    except En4dvarError as error:
+        raise DataError(f"{path}: cannot be read as a picture: {error}") from None
+
+
 def _folder(path: Path) -> Movie:
     files = [p for p in path.iterdir() if p.suffix.lower() in (*TIFF, *IMAGES) and not p.name.startswith(".")]
     if not files:

@@ -7,7 +7,7 @@ The image near the outline is modelled as
 in polar coordinates about the centre (x, y): an edge of width w (std of the blur), contrast c, and the bright centre of
 a bubble that acts as a lens, g and ρ_g. Where S flashes light one exposure, S nested circles share the contrast; the
 outermost has the radius R, the others lie d_s inside it. The order of the parameters is that of :data:`NAMES`, then
-A_2, B_2, A_3, … and d_2, d_3, …
+A_2, B_2, A_3, … and d_2, d_3, … Pixels that are not looked at are NaN.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def residuals(image, p, modes, ring):
     for j in range(top, bottom):
         for i in range(left, right):
             far = (i - ring[0]) ** 2 + (j - ring[1]) ** 2
-            if ring[2] ** 2 <= far <= ring[3] ** 2:
+            if ring[2] ** 2 <= far <= ring[3] ** 2 and not math.isnan(image[j, i]):
                 values[n] = image[j, i] - _row(j, i, p, modes, row)
                 n += 1
     return values[:n]
@@ -138,7 +138,7 @@ def normal_equations(image, p, modes, ring, cutoff):
     for j in range(top, bottom):
         for i in range(left, right):
             far = (i - ring[0]) ** 2 + (j - ring[1]) ** 2
-            if far < ring[2] ** 2 or far > ring[3] ** 2:
+            if far < ring[2] ** 2 or far > ring[3] ** 2 or math.isnan(image[j, i]):
                 continue
             r = image[j, i] - _row(j, i, p, modes, row)
             u = min(1.0, abs(r) / cutoff)
@@ -178,7 +178,7 @@ def influence(image, p, modes, ring, cutoff, weights, sectors):
     for j in range(top, bottom):
         for i in range(left, right):
             far = (i - ring[0]) ** 2 + (j - ring[1]) ** 2
-            if far < ring[2] ** 2 or far > ring[3] ** 2:
+            if far < ring[2] ** 2 or far > ring[3] ** 2 or math.isnan(image[j, i]):
                 continue
             r = image[j, i] - _row(j, i, p, modes, row)
             u = 0.0
@@ -198,8 +198,26 @@ def influence(image, p, modes, ring, cutoff, weights, sectors):
 
 
 @kernel
+def of_rows(image, p, modes, ring):
+    """Of even and of odd rows (2,): Σ (dm/dR)² and Σ r dm/dR; their quotient is how much larger they show it."""
+    row = np.zeros(len(p))
+    squares, sums = np.zeros(2), np.zeros(2)
+    top, bottom, left, right = _bounds(image.shape, ring[0], ring[1], ring[3])
+    for j in range(top, bottom):
+        for i in range(left, right):
+            far = (i - ring[0]) ** 2 + (j - ring[1]) ** 2
+            if far < ring[2] ** 2 or far > ring[3] ** 2 or math.isnan(image[j, i]):
+                continue
+            r = image[j, i] - _row(j, i, p, modes, row)
+            squares[j % 2] += row[2] * row[2]
+            sums[j % 2] += r * row[2]
+    return squares, sums
+
+
+@kernel
 def normalise(frame, level, gain, step):
-    """(frame − level) gain (H, W), and its means over tiles of ``step`` × ``step`` pixels."""
+    """(frame − level) gain (H, W), and its means over tiles of ``step`` × ``step`` pixels; where the gain is NaN, NaN
+    and, in the means, zero."""
     height, width = frame.shape
     image = np.empty((height, width), dtype=np.float32)
     tiles = np.zeros((height // step, width // step), dtype=np.float32)
@@ -207,6 +225,6 @@ def normalise(frame, level, gain, step):
         for i in range(width):
             value = (np.float32(frame[j, i]) - level[j, i]) * gain[j, i]
             image[j, i] = value
-            if j // step < tiles.shape[0] and i // step < tiles.shape[1]:
+            if j // step < tiles.shape[0] and i // step < tiles.shape[1] and not math.isnan(value):
                 tiles[j // step, i // step] += value
     return image, tiles / np.float32(step * step)

@@ -1,8 +1,11 @@
-"""Where the bubble is, roughly: the largest patch that differs from the background, and a circle through its rim."""
+"""Where bubbles may be, roughly: the patches that differ from the background, and a circle through the rim of each."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+import numpy.typing as npt
 from scipy import ndimage
 
 from en4dvar.model.state import Array
@@ -10,30 +13,37 @@ from en4dvar_movie.outline import Circle
 
 TILE = 2  # pixels are averaged over tiles of this side
 LEAST = 6  # tiles of a patch
+MOST = 4  # patches of a frame
 
 
-def patch(tiles: Array, noise: float, least_contrast: float) -> tuple[Array, float] | None:
-    """The largest patch (H, W) of tiles darker than the background, and its contrast; None without any.
+def patches(tiles: Array, noise: float, least_contrast: float) -> list[tuple[Array, float]]:
+    """The largest patches (H, W) of tiles darker than the background and their contrasts, the largest first.
 
     ``tiles`` are zero on the background and negative in a bubble; ``noise`` is the std of a tile.
     """
     smooth = ndimage.uniform_filter(tiles, 3, mode="nearest")
     floor = max(5 * noise / 3, least_contrast)
-    labels, count = ndimage.label(smooth < -floor)
-    if not count:
-        return None
+    labels, sizes = _labelled(smooth < -floor)
+    largest = np.argsort(-sizes, kind="stable")[:MOST]
+    boxes = ndimage.find_objects(labels) if sizes[largest[:1]].sum() else []
+    result = []
+    for label in largest[sizes[largest] >= LEAST]:
+        box = boxes[label - 1]
+        inside = labels[box] == label
+        contrast = -float(np.percentile(smooth[box][inside], 10))
+        cores, core_sizes = _labelled(inside & (smooth[box] < -0.5 * contrast))
+        whole = np.zeros(tiles.shape, dtype=bool)
+        whole[box] = cores == int(np.argmax(core_sizes))
+        result.append((whole, contrast))
+    return result
+
+
+def _labelled(mask: Array) -> tuple[npt.NDArray[Any], npt.NDArray[np.intp]]:
+    """The connected patches of a mask, and the size of each by its number; 0 of what belongs to none."""
+    labels, _ = ndimage.label(mask)
     sizes = np.bincount(labels.ravel())
     sizes[0] = 0
-    largest = int(np.argmax(sizes))
-    if sizes[largest] < LEAST:
-        return None
-    inside = labels == largest
-    contrast = -float(np.percentile(smooth[inside], 10))
-    core = inside & (smooth < -0.5 * contrast)
-    labels, count = ndimage.label(core)
-    sizes = np.bincount(labels.ravel())
-    sizes[0] = 0
-    return labels == int(np.argmax(sizes)), contrast
+    return labels, sizes
 
 
 def rim(inside: Array) -> Array:
@@ -76,14 +86,12 @@ def circle_through(points: Array) -> Circle | None:
     return circle
 
 
-def locate(tiles: Array, noise: float, least_contrast: float) -> tuple[Circle, float] | None:
-    """A circle in pixels near the bubble's outline and the contrast inside; None where there is no patch."""
-    bubble = patch(tiles, noise, least_contrast)
-    if bubble is None:
-        return None
-    inside, contrast = bubble
-    circle = circle_through(rim(inside))
-    if circle is None:
-        return None
+def locate(tiles: Array, noise: float, least_contrast: float) -> list[tuple[Circle, float]]:
+    """Circles in pixels near the outlines of what may be bubbles, and the contrast inside; the largest patch first."""
     shift = (TILE - 1) / 2
-    return Circle(TILE * circle.x + shift, TILE * circle.y + shift, TILE * circle.R), contrast
+    result = []
+    for inside, contrast in patches(tiles, noise, least_contrast):
+        circle = circle_through(rim(inside))
+        if circle is not None:
+            result.append((Circle(TILE * circle.x + shift, TILE * circle.y + shift, TILE * circle.R), contrast))
+    return result

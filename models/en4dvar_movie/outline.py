@@ -40,7 +40,8 @@ class Outline:
     ``width`` is the std of the edge's blur, ``modes`` (2, M−1) are A_n and B_n, ``variance`` that of R if pixels were
     independent and ``ratio`` what sectors of the outline say in units of it, ``common`` the variance that comes from
     the contrast of the movie; ``mode_std`` is the std of a mode's amplitude. ``seen`` is the share of the
-    outline inside the frame. ``joined`` is the std for nested circles that lie too close to be told apart, which all
+    outline inside the frame. ``rows`` is by how much even rows show a larger bubble than odd ones, ``rows_std`` what
+    noise makes of it. ``joined`` is the std for nested circles that lie too close to be told apart, which all
     have their mean radius.
     """
 
@@ -54,6 +55,8 @@ class Outline:
     common: float
     mode_std: float
     seen: float
+    rows: float = 0.0
+    rows_std: float = 1.0
     joined: float = 0.0
 
     def amplitude(self, n: int) -> float:

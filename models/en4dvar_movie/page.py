@@ -36,7 +36,7 @@ def page_text(movie: Movie, track: Track, scale: Scale, command: str) -> str:
         light=Markup(css_variables(LIGHT)),
         dark=Markup(css_variables(DARK)),
         movie=movie.path.name,
-        notes=movie.notes,
+        notes=[*movie.notes, *track.notes],
         command=command,
         count=len(track.readings),
         used=len(used),
@@ -92,13 +92,17 @@ def _strip(movie: Movie, track: Track) -> list[dict[str, Any]]:
 def _picture(number: int, frame: Frame, readings: list[Reading], full: float) -> dict[str, Any]:
     step = -(-max(frame.shape) // SIDE)
     small = grey(frame[::step, ::step], full)
-    outlines = [r.sighting.outline.points(TURN) / step for r in readings if r.sighting.outline is not None and r.used]
+    shown = [r for r in readings if r.sighting.outline is not None and (r.used or r.doubt)]
+    outlines = [(r.sighting.outline.points(TURN) / step, r.doubt) for r in shown if r.sighting.outline is not None]
     return {
         "frame": str(number),
         "png": png(small),
         "width": str(small.shape[1]),
         "height": str(small.shape[0]),
-        "outlines": [" ".join(f"{x + 0.5:.2f},{y + 0.5:.2f}" for x, y in points) for points in outlines],
+        "outlines": [
+            (" ".join(f"{x + 0.5:.2f},{y + 0.5:.2f}" for x, y in points), "doubtful" if doubt else "")
+            for points, doubt in outlines
+        ],
         "words": "; ".join(dict.fromkeys(r.reason for r in readings if r.reason)),
     }
 

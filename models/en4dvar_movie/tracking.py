@@ -1,4 +1,5 @@
-"""From a movie to readings: every frame by itself, in any order, then what neighbouring frames say of the errors."""
+"""From a movie to readings: candidates of every frame by itself, in any order, then the bubble that continues through
+them, then what neighbouring frames say of the errors."""
 
 from __future__ import annotations
 
@@ -8,20 +9,19 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
-from en4dvar_movie.background import CHANGED, LEAST_CONTRAST, Background, find_background, share_changed
+from en4dvar.plumbing.errors import DataError
+from en4dvar_movie.background import Background, find_background
+from en4dvar_movie.candidates import Candidate, Look, look_at
 from en4dvar_movie.corrections import Correction
-from en4dvar_movie.fitting import fit_outline
 from en4dvar_movie.flashes import in_time
+from en4dvar_movie.following import Chain, chains, doubts, reasons, target
 from en4dvar_movie.frames import Frame, Movie
-from en4dvar_movie.locate import TILE, locate
-from en4dvar_movie.outline import Circle, Optics, Outline
-from en4dvar_movie.uncertainty import NEIGHBOURS, Errors, errors_of
+from en4dvar_movie.outline import Optics, Outline
+from en4dvar_movie.uncertainty import NOTHING, Errors, errors_of
 
-LEAST_SEEN = 0.12  # share of the outline inside the frame
-LEAST_RADIUS = 2.5  # pixels
-ROUGH = 0.08  # of the contrast: scatter about a real outline, beside the noise of the camera
-MOST_BLUR = 0.12  # of the radius, of an outline that the frame cuts
+AWAY = 10.0  # pixels from a bubble that a point may be to mean it
 
 
 @dataclass(frozen=True)
@@ -36,23 +36,32 @@ class Sighting:
 
 @dataclass(frozen=True)
 class Reading:
-    """A frame's radius and its errors, in pixels, ready for the table; ``used`` False where ``reason`` says why."""
+    """A frame's radius and its errors, in pixels, ready for the table; ``used`` False where ``reason`` says why.
+
+    ``doubt`` is why an outline that is there is not used until a correction confirms it.
+    """
 
     sighting: Sighting
     radius: float
     errors: Errors
     used: bool
     reason: str
+    doubt: str = ""
 
 
 @dataclass(frozen=True)
 class Track:
-    """The readings of a movie, in the order of time, and what its frames share; ``flashes`` (S,) of a frame, s."""
+    """The readings of a movie, in the order of time, and what its frames share; ``flashes`` (S,) of a frame, s.
+
+    ``others`` are the readings of further bubbles, ``notes`` what a user should know of the choice between them.
+    """
 
     readings: tuple[Reading, ...]
     background: Background
     optics: Optics
     flashes: tuple[float, ...] = (0.0,)
+    others: tuple[tuple[Reading, ...], ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 def track(
@@ -61,56 +70,78 @@ def track(
     corrections: Mapping[int, Correction] | None = None,
     progress: Callable[[int], None] = lambda done: None,
     flashes: tuple[float, ...] = (0.0,),
+    point: tuple[float, float] | None = None,
+    watched: npt.NDArray[np.bool_] | None = None,
 ) -> Track:
-    """Readings of every frame, or of every flash of each; the same numbers for any number of workers.
+    """Readings of a bubble in every frame, or at every flash of each; the same numbers for any number of workers.
+
+    Parameters
+    ----------
+    point: x and y within the bubble, in some frame; by default the bubble is that of the laser's spot, or the one whose
+        wall travels furthest.
+    watched: (H, W) the part of the frames that is looked at.
 
     Raises
     ------
-    DataError: the movie cannot be read or shows no bubble.
+    DataError: the movie cannot be read or shows no bubble, or none near the point.
     """
-    background, optics = find_background(movie, len(flashes))
+    background, optics = find_background(movie, len(flashes), watched)
     fixed = corrections or {}
 
-    def look(numbered: tuple[int, Frame]) -> list[Sighting]:
+    def look(numbered: tuple[int, Frame]) -> Look:
         number, frame = numbered
         if number in movie.damaged:
-            return [Sighting(number, None, "the file is damaged here")]
-        return find_bubble(number, frame, background, optics, fixed.get(number), len(flashes))
+            return Look(number, (), "the file is damaged here")
+        start = fixed[number].start if number in fixed else None
+        return look_at(number, frame, background, optics, start, len(flashes))
 
-    sightings = []
+    looks = []
     for of_frame in in_order(look, enumerate(movie.frames()), workers):
-        sightings.append(of_frame)
-        progress(len(sightings))
-    if len(flashes) > 1:
-        sightings = ordered(sightings, movie.rate, flashes)
-    flat = [circle for of_frame in sightings for circle in of_frame]
-    return Track(tuple(readings_of(flat, optics, fixed)), background, optics, flashes)
+        looks.append(of_frame)
+        progress(len(looks))
+    by_hand = [number for number, correction in fixed.items() if correction.start is not None]
+    bubbles = chains(looks, by_hand)
+    notes: list[str] = []
+    if bubbles:
+        chosen, note = target(bubbles, looks, point, by_hand)
+        bubbles.insert(0, bubbles.pop(chosen))
+        notes = [note] * bool(note)
+    if point is not None and (not bubbles or bubbles[0].distance(*point)[0] > AWAY):
+        raise DataError(f"{movie.path}: no bubble is seen near {point[0]:g},{point[1]:g} in any frame")
+    read = [
+        tuple(_readings(looks, bubbles, n, fixed if n == 0 else {}, optics, (movie.rate, flashes)))
+        for n in range(max(len(bubbles), 1))
+    ]
+    return Track(read[0], background, optics, flashes, tuple(read[1:]), tuple(notes))
 
 
-def find_bubble(
+def _readings(
+    looks: Sequence[Look],
+    bubbles: Sequence[Chain],
     number: int,
-    frame: Frame,
-    background: Background,
+    corrections: Mapping[int, Correction],
     optics: Optics,
-    correction: Correction | None = None,
-    circles: int = 1,
-) -> list[Sighting]:
-    """The bubble's outline in one frame, or its nested ones, the largest first; one entry where there is none."""
-    image, tiles = background.normalised(frame)
-    if correction is not None and correction.start is not None:
-        place: tuple[Circle, float] | None = (correction.start, -optics.contrast)
-    elif number < background.frames:
-        return [Sighting(number, None, "no bubble: the frame is one of the background's")]
-    else:
-        if share_changed(tiles, background.noise) > CHANGED:
-            return [Sighting(number, None, "flash: much of the frame is brighter than the background")]
-        place = locate(tiles, background.noise / TILE, LEAST_CONTRAST)
-    if place is None:
-        return [Sighting(number, None, "no bubble: nothing differs from the background")]
-    outlines = fit_outline(background.steadied(image, tiles, place[0]), place[0], optics, circles)
-    if outlines is None:
-        return [Sighting(number, None, "no circle fits the outline")]
-    return [Sighting(number, o, _fault(o, optics, background.noise)) for o in outlines]
+    times: tuple[float, Sequence[float]],
+) -> Iterator[Reading]:
+    """Readings of one of the bubbles, or of a movie without any."""
+    bubble = bubbles[number] if bubbles else Chain(())
+    doubtful = doubts(bubble, [*bubbles[:number], *bubbles[number + 1 :]])
+    why = reasons(looks, bubble)
+    of_frame = {c.frame: c for c in bubble.candidates}
+    sightings = [
+        _sightings(of_frame[look.frame]) if look.frame in of_frame else [Sighting(look.frame, None, why[look.frame])]
+        for look in looks
+    ]
+    rate, flashes = times
+    if len(flashes) > 1:
+        sightings = ordered(sightings, rate, flashes)
+    flat = [circle for circles in sightings for circle in circles]
+    doubtful.update({c.frame: c.doubt for c in bubble.candidates if c.doubt})
+    yield from readings_of(flat, optics, corrections, doubtful)
+
+
+def _sightings(candidate: Candidate) -> list[Sighting]:
+    return [Sighting(candidate.frame, outline, "") for outline in candidate.outlines]
 
 
 def ordered(sightings: list[list[Sighting]], rate: float, flashes: Sequence[float]) -> list[list[Sighting]]:
@@ -128,29 +159,14 @@ def ordered(sightings: list[list[Sighting]], rate: float, flashes: Sequence[floa
     return result
 
 
-def _fault(outline: Outline, optics: Optics, noise: float) -> str:
-    """Why an outline is none; "" where it is one."""
-    if outline.circle.R < LEAST_RADIUS:
-        return f"too small: the radius is below {LEAST_RADIUS:g} pixels"
-    if outline.seen < LEAST_SEEN:
-        return f"cut: {outline.seen:.0%} of the outline lies in the frame"
-    if outline.seen < 0.9 and outline.width > MOST_BLUR * outline.circle.R:
-        return f"cut and blurred: {outline.seen:.0%} of the outline lies in the frame, and it is no edge"
-    if outline.noise > 2.5 * noise + ROUGH * abs(optics.contrast):
-        return "the brightness next to the outline is not that of a bubble"
-    if outline.contrast > 0.25 * optics.contrast:
-        return "faint: the outline has no contrast"
-    return ""
-
-
 def in_order(
-    look: Callable[[tuple[int, Frame]], list[Sighting]], frames: Iterable[tuple[int, Frame]], workers: int
-) -> Iterator[list[Sighting]]:
+    look: Callable[[tuple[int, Frame]], Look], frames: Iterable[tuple[int, Frame]], workers: int
+) -> Iterator[Look]:
     """``look`` at each frame in threads; a few frames are held at a time."""
     if workers == 1:
         yield from map(look, frames)
         return
-    waiting: deque[Future[list[Sighting]]] = deque()
+    waiting: deque[Future[Look]] = deque()
     with ThreadPoolExecutor(workers) as pool:
         for numbered in frames:
             waiting.append(pool.submit(look, numbered))
@@ -160,30 +176,39 @@ def in_order(
             yield waiting.popleft().result()
 
 
-def elsewhere(sightings: Sequence[Sighting]) -> list[Sighting]:
-    """The same, with a reason for outlines that lie outside the bubble of the frames about them: specks of dirt."""
-    good = [k for k, sighting in enumerate(sightings) if sighting.outline is not None and not sighting.reason]
-    circles = np.array([(c.x, c.y, c.R) for k in good if (o := sightings[k].outline) is not None for c in [o.circle]])
-    result = list(sightings)
-    for n, k in enumerate(good):
-        near = circles[max(0, n - NEIGHBOURS) : n + NEIGHBOURS + 1]
-        x, y = np.median(near[:, :2], axis=0)
-        if np.hypot(circles[n, 0] - x, circles[n, 1] - y) > max(near[:, 2].max(), 2 * circles[n, 2]):
-            result[k] = replace(sightings[k], reason="elsewhere: the outline lies outside the bubble of other frames")
-    return result
-
-
-def readings_of(sightings: list[Sighting], optics: Optics, corrections: Mapping[int, Correction]) -> Iterator[Reading]:
-    """Radii with their errors, and what is left out by hand or for the neighbours' sake."""
-    sightings = elsewhere(sightings)
-    good = [sighting.outline if not sighting.reason else None for sighting in sightings]
+def readings_of(
+    sightings: Sequence[Sighting], optics: Optics, corrections: Mapping[int, Correction], doubtful: Mapping[int, str]
+) -> Iterator[Reading]:
+    """Radii with their errors, and what is left out by hand or for a doubt that no correction removes."""
+    out = {frame for frame, correction in corrections.items() if correction.out}
+    doubted = {frame: words for frame, words in doubtful.items() if frame not in corrections}
+    good = [None if s.frame in doubted or s.frame in out else s.outline for s in sightings]
     errors = errors_of(good, optics)
     for sighting, outline, error in zip(sightings, good, errors, strict=True):
-        correction = corrections.get(sighting.frame)
+        correction, doubt = corrections.get(sighting.frame), doubted.get(sighting.frame, "")
         if correction is not None and correction.out:
-            yield Reading(sighting, float("nan"), error, False, f"left out by hand: {correction.words}".rstrip(": "))
+            words = f"left out by hand: {correction.words}".rstrip(": ")
+            yield Reading(sighting, float("nan"), NOTHING, False, words)
         elif outline is None:
-            yield Reading(sighting, float("nan"), error, False, sighting.reason)
+            yield Reading(sighting, float("nan"), NOTHING, False, doubt or sighting.reason, doubt)
         else:
             words = f"by hand: {correction.words}".rstrip(": ") if correction is not None else error.words
             yield Reading(sighting, error.radius, error, True, words)
+
+
+def doubted(readings: Sequence[Reading]) -> str:
+    """In a line, the doubtful frames by what is doubtful: ``interlaced: 7-19; jump: 24``; "" without any."""
+    kinds: dict[str, list[int]] = {}
+    for reading in readings:
+        if reading.doubt:
+            frames = kinds.setdefault(reading.doubt.split(":")[0], [])
+            frames += [reading.sighting.frame] * (reading.sighting.frame not in frames)
+    return "; ".join(f"{kind}: {_ranges(frames)}" for kind, frames in kinds.items())
+
+
+def _ranges(frames: Sequence[int]) -> str:
+    starts = [n for n, frame in enumerate(frames) if n == 0 or frame != frames[n - 1] + 1]
+    ends = [*(n - 1 for n in starts[1:]), len(frames) - 1]
+    return ", ".join(
+        f"{frames[a]}" if a == b else f"{frames[a]}-{frames[b]}" for a, b in zip(starts, ends, strict=True)
+    )

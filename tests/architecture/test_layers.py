@@ -30,7 +30,8 @@ BUBBLE = (
 # and inside the reader of movies
 MOVIE = (
     "decoders", "frames", "kernels", "outline", "fitting", "locate", "background", "corrections", "uncertainty",
-    "flashes", "tracking", "table", "outlined", "page", "scene", "writing", "filming", "commands", "warm_up",
+    "flashes", "candidates", "following", "choice", "tracking", "table", "outlined", "page", "scene", "writing",
+    "filming", "commands", "warm_up",
 )  # fmt: skip
 
 

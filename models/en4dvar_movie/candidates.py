@@ -1,0 +1,116 @@
+"""What may be the bubble in a frame: patches with the outline of a bubble, and what is doubtful in them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from en4dvar.model.state import Array
+from en4dvar_movie.background import BRIGHT, CHANGED, LEAST_CONTRAST, Background, share_changed
+from en4dvar_movie.fitting import fit_outline, two_edges
+from en4dvar_movie.frames import Frame
+from en4dvar_movie.locate import TILE, locate
+from en4dvar_movie.outline import Circle, Optics, Outline
+
+LEAST_SEEN = 0.12  # share of the outline inside the frame
+LEAST_RADIUS = 2.5  # pixels
+ROUGH = 0.08  # of the contrast: scatter about a real outline, beside the noise of the camera
+MOST_BLUR = 0.12  # of the radius, of an outline that the frame cuts
+ROWS, ROWS_STD = 0.5, 6.0  # pixels and std by which even and odd rows must differ in an interlaced frame
+WIDER = 1.4  # widths of the movie's sharp edges from which an edge may be two
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """Outlines in a frame, the largest first, of as many flashes; ``fault``: why they are no bubble, ``doubt``: why
+    they may mislead."""
+
+    frame: int
+    outlines: tuple[Outline, ...]
+    fault: str = ""
+    doubt: str = ""
+
+    @property
+    def circle(self) -> Circle:
+        """The outermost."""
+        return self.outlines[0].circle
+
+
+@dataclass(frozen=True)
+class Look:
+    """The candidates of a frame, the largest patch first, or the ``reason`` why there is none; ``spot`` is the place
+    (x, y) and brightness of light that the background lacks, as the laser's."""
+
+    frame: int
+    candidates: tuple[Candidate, ...] = ()
+    reason: str = ""
+    spot: tuple[float, float, float] | None = None
+
+
+def look_at(
+    number: int, frame: Frame, background: Background, optics: Optics, start: Circle | None = None, circles: int = 1
+) -> Look:
+    """The candidates of a frame, or the outlines near ``start`` alone."""
+    image, tiles = background.normalised(frame)
+    spot = _spot(tiles, background.noise / TILE)
+    if start is not None:
+        places = [start]
+    elif number < background.frames:
+        return Look(number, (), "no bubble: the frame is one of the background's", spot)
+    elif share_changed(tiles, background.noise) > CHANGED:
+        return Look(number, (), "flash: much of the frame is brighter than the background", spot)
+    else:
+        places = [place for place, _ in locate(tiles, background.noise / TILE, LEAST_CONTRAST)]
+    if not places:
+        return Look(number, (), "no bubble: nothing differs from the background", spot)
+    candidates: list[Candidate] = []
+    for place in places:
+        steady = background.steadied(image, tiles, place)
+        outlines = fit_outline(steady, place, optics, circles)
+        if outlines is None or any(_same(outlines[0].circle, c.circle) for c in candidates):
+            continue
+        candidate = Candidate(number, tuple(outlines), _fault(outlines, optics, background.noise))
+        doubt = "" if candidate.fault else _doubt(steady, outlines[0], optics, circles)
+        candidates.append(replace(candidate, doubt=doubt))
+    return Look(number, tuple(candidates), "" if candidates else "no circle fits the outline", spot)
+
+
+def _same(a: Circle, b: Circle) -> bool:
+    return bool(np.hypot(a.x - b.x, a.y - b.y) < 0.5 * max(a.R, b.R))
+
+
+def _spot(tiles: Array, noise: float) -> tuple[float, float, float] | None:
+    """The middle of the brightest part of a frame, and its brightness, where light is that the background lacks."""
+    most = float(tiles.max())
+    if most < max(8 * noise, BRIGHT):
+        return None
+    y, x = np.nonzero(tiles > 0.7 * most)
+    return float(TILE * np.median(x) + 0.5), float(TILE * np.median(y) + 0.5), most
+
+
+def _fault(outlines: list[Outline], optics: Optics, noise: float) -> str:
+    """Why outlines are none of a bubble; "" where they are."""
+    return next((fault for o in outlines if (fault := _fault_of(o, optics, noise))), "")
+
+
+def _fault_of(outline: Outline, optics: Optics, noise: float) -> str:
+    if outline.circle.R < LEAST_RADIUS:
+        return f"too small: the radius is below {LEAST_RADIUS:g} pixels"
+    if outline.seen < LEAST_SEEN:
+        return f"cut: {outline.seen:.0%} of the outline lies in the frame"
+    if outline.seen < 0.9 and outline.width > MOST_BLUR * outline.circle.R:
+        return f"cut and blurred: {outline.seen:.0%} of the outline lies in the frame, and it is no edge"
+    if outline.noise > 2.5 * noise + ROUGH * abs(optics.contrast):
+        return "the brightness next to the outline is not that of a bubble"
+    if outline.contrast > 0.25 * optics.contrast:
+        return "faint: the outline has no contrast"
+    return ""
+
+
+def _doubt(image: Array, outline: Outline, optics: Optics, circles: int) -> str:
+    if abs(outline.rows) > max(ROWS, ROWS_STD * outline.rows_std):
+        return f"interlaced: even and odd rows show radii {abs(outline.rows):.1f} pixels apart"
+    if circles == 1 and outline.width > WIDER * optics.width and (apart := two_edges(image, outline.circle, optics)):
+        return f"two edges {apart:.1f} pixels apart: several flashes that --flashes does not announce?"
+    return ""
