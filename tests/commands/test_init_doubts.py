@@ -145,7 +145,7 @@ def test_rows_of_summaries_are_taken_where_their_units_leave_no_doubt(tmp_path: 
     assert done.exit_code == 0
     assert "pIMR_array(:,3) are 3 rows of R_max, R_max/R_eq and collapse time in SI units" in done.stdout
     savemat("b.mat", {"a": rows * [1e6, 1, 1]})  # in micrometres, which nobody said
-    assert "--radius-column NAME" in call("init", "--data", "b.mat").stderr
+    assert "--radius-column NAME" in call("init", "--data", "b.mat", "--out", "c.yaml").stderr
 
 
 def test_a_pixel_that_the_file_holds_is_told(tmp_path: Path) -> None:
