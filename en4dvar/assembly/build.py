@@ -10,7 +10,7 @@ from en4dvar.assembly.find_files import find_files, with_parts
 from en4dvar.assembly.reading import read_observations
 from en4dvar.config import Config, SequenceConfig
 from en4dvar.config.initial_state import Perturbed
-from en4dvar.config.parameters import Fixed, Tied, Uncertain, inside_bounds
+from en4dvar.config.parameters import Fixed, Scalar, Tied, Uncertain, inside_bounds
 from en4dvar.config.series import DataPlan, SeriesPlan
 from en4dvar.data.observations import Observations
 from en4dvar.descent.field_gain import gain_of
@@ -181,7 +181,8 @@ def resolve_parameters(
             if isinstance(entry, Fixed):
                 fixed[entry.parameter.name] = entry.value
             elif isinstance(entry, Uncertain):
-                terms.append(entry.term(_maximum(entry, config, observations)))
+                unit = entry.parameter.unit
+                terms.append(entry.term(_of_data(config, observations, unit) if observations is not None else None))
             elif isinstance(entry, Tied):
                 tied.append(entry)
             elif observations is None:
@@ -204,11 +205,14 @@ def resolve_parameters(
     return tuple(terms), fixed
 
 
-def _maximum(entry: Uncertain, config: Config | SequenceConfig, observations: Observations | None) -> float | None:
-    """The observed maximum in the parameter's unit, where the entry asks for it."""
-    if observations is None or not entry.needs_data:
-        return None
-    if observations.parts:
-        key = "mean" if entry.spec.mean == "maximum" else "median"
-        raise ConfigError("'maximum' is defined only for a single series without places; give a value", key)
-    return convert(float(observations.values.max()), config.observable.unit, entry.parameter.unit)
+def _of_data(config: Config | SequenceConfig, observations: Observations, unit: str) -> Callable[[str | Scalar], float]:
+    """What a location of a prior is that the data say, in the parameter's ``unit``."""
+
+    def value(where: str | Scalar) -> float:
+        if isinstance(where, Scalar):
+            return where.value(observations.scalars, observations.source)
+        if observations.parts:
+            raise ConfigError("'maximum' is defined only for a single series without places; give a value")
+        return convert(float(observations.values.max()), config.observable.unit, unit)
+
+    return value

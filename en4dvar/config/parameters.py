@@ -56,10 +56,48 @@ def inside_bounds(value: float, parameter: Parameter, shown: str = "") -> float:
 
 
 Value = Annotated[float | None, Made(lambda text, context: _bounded(text, context.subject))]
-Location = Annotated[
-    float | Literal["maximum"] | None,
-    Made(lambda text, context: text if text == "maximum" else _bounded(text, context.subject)),
-]
+
+
+class FromFile(Section):
+    """A scalar that the data file holds."""
+
+    from_file: Annotated[str, Field(min_length=1)]
+    """Name of a scalar in the data file, e.g. Req, or of a column with one value a data set (data.by)."""
+    unit: Annotated[str, unit_of(subject_unit)]
+    """Unit of that scalar in the file."""
+
+
+@dataclass(frozen=True)
+class Scalar:
+    """A parameter held at a scalar of the data file."""
+
+    needs_data: ClassVar[bool] = True
+    parameter: Parameter
+    name: str
+    unit: str
+
+    @classmethod
+    def of(cls, written: Any, context: Context) -> Scalar:
+        scalar = FromFile.model_validate(written, context=context)
+        return cls(context.subject, scalar.from_file, scalar.unit)
+
+    def value(self, scalars: Mapping[str, float], source: str) -> float:
+        """The value in the parameter's unit. Raises :class:`ConfigError` when the file does not hold it."""
+        if self.name not in scalars:
+            raise ConfigError(
+                f"{source}: no scalar {self.name!r} for {self.parameter.name}{suggest(self.name, scalars)}"
+            )
+        return _bounded(f"{scalars[self.name]!r} {self.unit}", self.parameter)
+
+
+def _location(written: Any, context: Context) -> float | str | Scalar:
+    """Of a prior: a quantity, ``maximum``, or a scalar of the data file."""
+    if isinstance(written, dict):
+        return Scalar.of(written, context)
+    return written if written == "maximum" else _bounded(written, context.subject)
+
+
+Location = Annotated[float | Literal["maximum"] | Scalar | None, Made(_location)]
 
 
 class PriorSection(Section):
@@ -97,15 +135,6 @@ class PriorSection(Section):
     shared: Annotated[str | None, Field(min_length=1)] = None
     """The data sets have one value of it, estimated together after each by itself: ``all`` of them, or those of one
     group of a kind in ``groups:``, e.g. gel."""
-
-
-class FromFile(Section):
-    """A value fixed at a scalar that the data file holds."""
-
-    from_file: Annotated[str, Field(min_length=1)]
-    """Name of a scalar in the data file, e.g. Req."""
-    unit: Annotated[str, unit_of(subject_unit)]
-    """Unit of that scalar in the file."""
 
 
 class TiedSection(Section):
@@ -153,24 +182,6 @@ class Fixed:
 
 
 @dataclass(frozen=True)
-class Scalar:
-    """A parameter held at a scalar of the data file."""
-
-    needs_data: ClassVar[bool] = True
-    parameter: Parameter
-    name: str
-    unit: str
-
-    def value(self, scalars: Mapping[str, float], source: str) -> float:
-        """The value in the parameter's unit. Raises :class:`ConfigError` when the file does not hold it."""
-        if self.name not in scalars:
-            raise ConfigError(
-                f"{source}: no scalar {self.name!r} for {self.parameter.name}{suggest(self.name, scalars)}"
-            )
-        return _bounded(f"{scalars[self.name]!r} {self.unit}", self.parameter)
-
-
-@dataclass(frozen=True)
 class Uncertain:
     """A parameter with a prior; ``maximum`` as a location is the observed maximum in the window.
 
@@ -188,12 +199,15 @@ class Uncertain:
 
     @property
     def needs_data(self) -> bool:
-        return "maximum" in (self.spec.mean, self.spec.median)
+        return any(isinstance(where, str | Scalar) for where in (self.spec.mean, self.spec.median))
 
-    def term(self, maximum: float | None = None) -> PriorTerm:
-        """The prior; ``maximum`` is in the parameter's unit. Raises :class:`ConfigError`, its path the faulty key."""
+    def term(self, of_data: Callable[[str | Scalar], float] | None = None) -> PriorTerm:
+        """The prior; ``of_data`` says what ``maximum`` or a scalar of the file is, in the parameter's unit.
+
+        Raises :class:`ConfigError`, its path the faulty key.
+        """
         try:
-            return self._term(self._location("mean", maximum), self._location("median", maximum))
+            return self._term(self._location("mean", of_data), self._location("median", of_data))
         except ConfigError as error:
             own = f"prior of {self.parameter.name}: "
             raise ConfigError([replace(f, message=f.message.removeprefix(own)) for f in error.problems]) from None
@@ -236,7 +250,7 @@ class Uncertain:
         elif not self.needs_data:
             self.term()
         elif self.spec.prior != "logit":
-            self.term(maximum=1.0)  # the other values do not wait for the data
+            self.term(lambda where: 1.0)  # the other values do not wait for the data
 
     @property
     def _bounds(self) -> tuple[float, float]:
@@ -262,13 +276,17 @@ class Uncertain:
                 [replace(f, path=f"varies.{f.path}" if f.path else "varies") for f in error.problems]
             ) from None
 
-    def _location(self, key: Literal["mean", "median"], maximum: float | None) -> float:
-        value: float | Literal["maximum"] | None = getattr(self.spec, key)
-        if value != "maximum":
+    def _location(self, key: Literal["mean", "median"], of_data: Callable[[str | Scalar], float] | None) -> float:
+        value: float | str | Scalar | None = getattr(self.spec, key)
+        if not isinstance(value, str | Scalar):
             return value or 0.0
-        if maximum is None:
-            raise ConfigError("'maximum' is known only from the data, and there are none", key)
-        return maximum
+        if of_data is None:
+            name = value.name if isinstance(value, Scalar) else value
+            raise ConfigError(f"{name!r} is known only from the data, and there are none", key)
+        try:
+            return of_data(value)
+        except ConfigError as error:
+            raise ConfigError([replace(fault, path=key) for fault in error.problems]) from None
 
     def _std(self, mean: float) -> float:
         std = self.spec.std
@@ -289,8 +307,7 @@ def _entry(written: Any, context: Context) -> Entry:
     if not isinstance(written, dict):
         return Fixed(parameter, _bounded(written, parameter))
     if "from_file" in written:
-        scalar = FromFile.model_validate(written, context=context)
-        return Scalar(parameter, scalar.from_file, scalar.unit)
+        return Scalar.of(written, context)
     if "tied" in written:
         tied = TiedSection.model_validate(written, context=context)
         return Tied(parameter, tied.tied, tied.factor)

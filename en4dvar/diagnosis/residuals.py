@@ -103,7 +103,7 @@ class Residuals:
         """Runs of one sign, and how many are expected of independent residuals."""
         positive = self.white > 0
         n, above = len(positive), int(positive.sum())
-        changes, share = (positive[1:] != positive[:-1]) & self.follows, float(self.follows.mean())
+        changes, share = (positive[1:] != positive[:-1]) & self.follows, float(np.sum(self.follows)) / max(1, n - 1)
         return 1 + int(np.sum(changes)), 1 + 2 * above * (n - above) / n * share
 
     @cached_property

@@ -184,7 +184,7 @@ class Estimates:
         for (name, unit), values in self._values.items():
             quantiles = np.quantile(values, (0.05, 0.5, 0.95)) if values else (np.nan,) * 3
             counts = str(self._counts[name, unit]), str(len(values))
-            lines.append([name, unit, *counts, *(f"{value:.4g}" for value in quantiles)])
+            lines.append([name, unit, *counts, *(f"{value:.4g}" if value == value else "-" for value in quantiles)])
         return table(lines)
 
 

@@ -21,8 +21,11 @@ CHANCE = 0.01  # probability below which a trend is told, that any of those look
 def trends(problems: Sequence[InverseProblem], values: Array, names: Sequence[str]) -> Iterator[Caution]:
     """Of ``values`` (S, p) of the parameters ``names`` that S data sets give one by one; NaN where one has none.
 
-    By Kendall's rank correlation (1938, Biometrika 30, 81), whose probability is exact for few data sets.
+    By Kendall's rank correlation (1938, Biometrika 30, 81), whose probability is exact for few data sets. Nothing is
+    said of data sets with fewer readings than parameters: each tells a combination, which its size decides.
     """
+    if min((len(p.observations.used) for p in problems), default=0) < max(2, len(names)):
+        return
     from scipy.stats import kendalltau  # whose import takes longer than all of this
 
     covariates = list(_covariates(problems))

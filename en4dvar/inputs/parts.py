@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +33,7 @@ def columns_of(
                 at = table.position(layout.by)
                 table.rows = [(line, row) for line, row in table.rows if _cell(row, at) == part]
             scalars = scalars_in(path) if kind == "csv" else {}
+            scalars |= _constant(table) if layout.by is not None else {}
             return _of_table(table, wanted), scalars, [line for line, _ in table.rows]
         _refuse_by(path, layout)
         variables = mat_variables(path).of(part)
@@ -82,6 +85,16 @@ def _groups(table: Table, by: str) -> tuple[str, ...]:
         line = table.rows[cells.index("")][0]
         raise DataError(f"{table.path}:{line}: column {by!r} does not say which data set this is")
     return tuple(dict.fromkeys(cells))
+
+
+def _constant(table: Table) -> dict[str, float]:
+    """Columns of numbers that are the same in all rows of a data set: they belong to it, as a radius at rest does."""
+    held: dict[str, float] = {}
+    for i, name in enumerate(table.names):
+        cells = {_cell(row, i) for _, row in table.rows}
+        with suppress(DataError):
+            held |= {name: float(table.numbers(i, name)[0])} if len(cells) == 1 else {}
+    return {name: value for name, value in held.items() if math.isfinite(value)}
 
 
 def _cell(row: Sequence[str], i: int) -> str:

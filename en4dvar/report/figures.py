@@ -216,7 +216,7 @@ def neighbours(white: Array) -> tuple[Array, float]:
 
 def _autocorrelation(white: Array) -> Panel:
     correlation, limit = neighbours(white)
-    ylim = min(-0.6, *correlation), max(1.0, *correlation)
+    ylim = min((-0.6, *correlation)), max((1.0, *correlation))
     panel = Panel("readings apart", "correlation", xticks=4, whole=True, ylim=ylim)
     panel.span(-limit, limit, "posterior", 0.16)
     panel.rule(0)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from en4dvar.inputs.asked import Layout
     from en4dvar_bubble.starter.asked import Asked
     from en4dvar_bubble.starter.proposal import Proposal
+    from en4dvar_bubble.starter.summaries import Summaries
 
 _OF_MOVIE = ("pixel", "frame_rate", "exposure", "flashes", "raw", "corrections", "bubble", "region", "mask")
 _OF_LAYOUT = ("by", "sheet", "unsorted", "repeated", "format")
@@ -108,6 +109,7 @@ def init(
     from en4dvar_bubble.starter.config import propose_config, run_name
     from en4dvar_bubble.starter.page import SCHEMA_FILE, Source, yaml_text
     from en4dvar_bubble.starter.proposal import starter
+    from en4dvar_bubble.starter.summaries import propose_from_times, source_of
 
     name = run_name(str(out or data or movie or "bubble"))  # a file that is called my_gel is run as my_gel
     words = command_line()
@@ -126,10 +128,14 @@ def init(
         layout = Layout(**of_layout)
         with _in_words_of_options():
             columns = _columns_of(data, options, layout)
-            proposed = propose_config(
-                data, **columns, start=start, law=law, medium=medium, folder=target.parent, name=name, command=words
-            )
-        text, proposal = proposed.text, proposed.proposal
+            if isinstance(columns, dict):
+                proposed = propose_config(
+                    data, **columns, start=start, law=law, medium=medium, folder=target.parent, name=name, command=words
+                )
+                text, proposal = proposed.text, proposed.proposal
+            else:
+                proposal = propose_from_times(columns, law)
+                text = yaml_text(name, source_of(_table_beside(target, data, columns.table, force)), proposal, words)
     write_text(target, text)
     write_text(target.parent / SCHEMA_FILE, schema_text())
     _tell(target, proposal, example_only=data is None)
@@ -171,6 +177,19 @@ def _tracked(movie: Path, target: Path, options: Mapping[str, str], force: bool)
     return table
 
 
+def _table_beside(target: Path, data: str, text: str, force: bool) -> str:
+    """Write the table of the bubbles beside the configuration ``target``; its name. Raises :class:`OutputError`."""
+    from en4dvar.plumbing.errors import OutputError
+    from en4dvar.plumbing.files import write_text
+
+    table = target.with_name(f"{target.stem}_bubbles.csv")
+    if table.exists() and not force:
+        raise OutputError(f"{table}: exists; give --force to replace it, or another --out")
+    write_text(table, text)
+    click.echo(f"table: {table}, a row a bubble of {data}")
+    return table.name
+
+
 def _write_example(name: str, force: bool) -> None:
     from en4dvar.config.json_schema import schema_text
     from en4dvar.plumbing.files import write_text
@@ -183,13 +202,14 @@ def _write_example(name: str, force: bool) -> None:
     click.echo(f"next: en4dvar validate {file}, then en4dvar run {file}")
 
 
-def _columns_of(data: str, options: Mapping[str, str | None], layout: Layout) -> dict[str, Any]:
-    """Columns and units for ``propose_config``: by option, by a telling name, or asked for.
+def _columns_of(data: str, options: Mapping[str, str | None], layout: Layout) -> dict[str, Any] | Summaries:
+    """Columns and units for ``propose_config``: by option, by a telling name, or asked for; or a row a bubble.
 
     Raises one :class:`ConfigError` that names every option to add.
     """
     from en4dvar.assembly.find_files import find_files
     from en4dvar_bubble.starter.asked import Asked, first_with_columns
+    from en4dvar_bubble.starter.summaries import summaries
 
     _refuse_movie(Path(data))
     files = list(find_files(Path.cwd(), [data]).values())
@@ -202,6 +222,8 @@ def _columns_of(data: str, options: Mapping[str, str | None], layout: Layout) ->
         told = ", ".join(f"{name} {value:g}" for name, value in contents.scalars.items())
         click.echo(f"others in the file: {told}", err=True)
     asked = asked.by_names()
+    if not asked.complete_columns and (rows := summaries(contents.columns)) is not None:
+        return rows
     if _interactive() and asked.needed():
         asked = _answered(asked)
     if needed := asked.needed():

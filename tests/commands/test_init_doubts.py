@@ -137,15 +137,15 @@ def test_a_rate_that_the_times_contradict_is_told(tmp_path: Path) -> None:
     assert "data.columns.time.rate: " in call("validate", "b.yaml").stderr
 
 
-def test_rows_of_summaries_are_explained(tmp_path: Path) -> None:
+def test_rows_of_summaries_are_taken_where_their_units_leave_no_doubt(tmp_path: Path) -> None:
     radius = np.array([365e-6, 399e-6, 298e-6])
     rows = np.column_stack([radius, [6.1, 5.9, 6.3], 0.9 * RAYLEIGH * radius / 10])
     savemat("b.mat", {"pIMR_array": rows})
     done = call("init", "--data", "b.mat")
-    assert done.exit_code == 2
-    assert "pIMR_array(:,3) are 3 rows of R_max, R_max/R_eq and collapse time in SI units" in done.stderr
+    assert done.exit_code == 0
+    assert "pIMR_array(:,3) are 3 rows of R_max, R_max/R_eq and collapse time in SI units" in done.stdout
     savemat("b.mat", {"a": rows * [1e6, 1, 1]})  # in micrometres, which nobody said
-    assert "--radius-column NAME" in call("init", "--data", "b.mat").stderr
+    assert "--radius-column NAME" in call("init", "--data", "b.mat", "--out", "c.yaml").stderr
 
 
 def test_a_pixel_that_the_file_holds_is_told(tmp_path: Path) -> None:

@@ -53,7 +53,8 @@ class Case:
     @property
     def absurd(self) -> bool:
         """Whether the stated error is larger than half of what the readings span: hardly an error, perhaps its unit."""
-        return self.stated > 0.5 * float(np.ptp(self.a.observations.values)) and self.scatter < SHARE
+        span = float(np.ptp(self.a.observations.values))
+        return 0 < span < 2 * self.stated and self.scatter < SHARE
 
     @property
     def cause(self) -> str:

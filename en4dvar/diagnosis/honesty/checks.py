@@ -63,7 +63,7 @@ def fit(chi2: float, n_observations: int, total_dfs: float) -> Findings:
     words = f"χ² of the residuals is {chi2:.3g} where about {degrees:.3g} is expected"
     if not chi2 <= high:
         yield caution("misfit", f"{words}: the model does not explain the data within the stated observation error")
-    elif chi2 < low:
+    elif chi2 < low and n_observations - total_dfs > 1:
         words = f"{words}: the stated observation error is larger than the scatter of the data"
         yield caution("overstated-error", words)
 

@@ -16,7 +16,6 @@ from en4dvar.plumbing.errors import ConfigError, DataError
 from en4dvar.plumbing.units import as_unit, convert
 from en4dvar_bubble.starter.config import FRAMES, PIXELS
 from en4dvar_bubble.starter.page import TRACKED, TRACKED_COLUMNS
-from en4dvar_bubble.starter.summaries import summary_rows
 
 _TIME = re.compile(r"(?i)t|time|t[ _(\[].*|time[ _(\[].*")
 _STEP = re.compile(r"(?i)delta_?t|dt|t_?step|time_?step")
@@ -92,6 +91,11 @@ class Asked:
         named = FRAMES.fullmatch(self.time_column or "")
         return self.time_unit in _AS_FRAMES or bool(self.time_unit is None and named)
 
+    @property
+    def complete_columns(self) -> bool:
+        """Whether it is known which columns are times and radii."""
+        return not any(option.endswith("column") for option, _, _ in self.needed())
+
     def needed(self) -> list[tuple[str, str, str]]:
         """Options that are missing: each with what stands for its value, and a hint, "" where there is none."""
         if self.tracked:
@@ -122,8 +126,6 @@ class Asked:
         """The error that names what is :meth:`needed`."""
         needed = self.needed()
         columns_lack = any(option.endswith("column") for option, _, _ in needed)
-        if columns_lack and (rows := summary_rows(self.contents.columns)):
-            return ConfigError(f"{file}: {rows}")
         options = ", ".join(f"{option} {value}{f' ({hint})' if hint else ''}" for option, value, hint in needed)
         columns = ", ".join(self.contents.columns) or "none"
         message = f"{file}: columns with numbers: {columns}; units are never guessed: add {options}"

@@ -32,6 +32,7 @@ class Source:
     errors: tuple[str, ...] = ()
     step_unit: str | None = None
     rate: str | None = None
+    observable: str = "radius"
 
     @property
     def layout_entries(self) -> list[str]:
@@ -86,7 +87,7 @@ def yaml_text(name: str, source: Source, proposal: Proposal, command: str) -> st
         *source.layout_entries,
         "  columns:",
         f"    time: {source.time_entry}",
-        f"    radius: {source.radius_entry}",
+        f"    {source.observable}: {source.radius_entry}",
     ]
     lines = [
         *head,
@@ -98,8 +99,7 @@ def yaml_text(name: str, source: Source, proposal: Proposal, command: str) -> st
         *_section(proposal.parameters),
         *proposal.population,
         "assimilation:",
-        "  members: 48",
-        "  draws: 400 # effective ones where the posterior is sampled: its mean is known to 5 % of its std",
+        *_section(proposal.assimilation),
     ]
     return "\n".join(lines) + "\n"
 

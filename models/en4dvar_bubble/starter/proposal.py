@@ -77,6 +77,10 @@ class Proposal:
     remarks: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     population: tuple[str, ...] = ()
+    assimilation: tuple[Entry, ...] = (
+        Entry("members", "48"),
+        Entry("draws", "400", "effective ones where the posterior is sampled: its mean is known to 5 % of its std"),
+    )
 
 
 def propose(
@@ -96,7 +100,7 @@ def propose(
     looks = _looks(histories, start)
     views = list(looks.values())
     chosen = views[0].start
-    model, law_name = _built(chosen, law)
+    model, law_name = built(chosen, law)
     look = _typical(views)
     others = _others(model, look)
     observed = {"R_max": look.lobe.R_max, "t_c": look.lobe.t_c, "rebound": look.rebound}
@@ -156,11 +160,11 @@ def _doubted(looks: Mapping[str, Look], model: BubbleModel) -> list[str]:
 
 def starter(start: Start, law: str | None) -> Proposal:
     """A proposal without data: examples to be replaced."""
-    model, law_name = _built(start, law)
+    model, law_name = built(start, law)
     data = [Entry("error", "{radius_std: 1 % of maximum}", "how well a radius is known: put yours")]
     if start == "laser":
         data[:0] = [Entry("window", "{from: R_max, to: minimum 2}"), Entry("time_zero", "window")]
-    lines = [_example(p, model) for p in model.law.parameters]
+    lines = [example(p, model) for p in model.law.parameters]
     lines += _radii(start, None)
     lines += [Entry("t_s", "{prior: normal, mean: 0 us, std: 0.5 us}", "the clock of the data against the model's")]
     return Proposal(tuple(data), _model(law_name, start, None), tuple(lines), SIMPLER[start])
@@ -180,7 +184,7 @@ def with_columns(proposal: Proposal, errors: Sequence[str], common: str) -> Prop
     return replace(proposal, data=data, parameters=(*proposal.parameters, *[alike] * bool(common)))
 
 
-def _built(start: Start, law: str | None) -> tuple[BubbleModel, str]:
+def built(start: Start, law: str | None) -> tuple[BubbleModel, str]:
     """The model, and how the file names its law. Raises :class:`ConfigError` where there is no such law."""
     name = qualified(law) if law else LAWS[start]
     settings = BubbleSettings.model_validate({**MODEL[start], "start": start, "law": name})
@@ -364,7 +368,7 @@ def _parameters(
             words += "narrow it to what you knew before"
             lines.append(Entry(p.name, f"{{prior: lognormal, median: {value}, log_std: {width}}}", words))
         else:
-            lines.append(_example(p, model))
+            lines.append(example(p, model))
     lines += _radii(start, look, top)
     mean, std = (0.0, 0.5e-6) if start == "acoustic" or top is None else top.t_s
     prior = f"{{prior: normal, mean: {_text(mean, 's', 'us', 4)}, std: {_text(std, 's', 'us')}}}"
@@ -383,7 +387,7 @@ def _parameters(
     )
 
 
-def _example(p: Parameter, model: BubbleModel) -> Entry:
+def example(p: Parameter, model: BubbleModel) -> Entry:
     """A prior about the law's example value; of α one that spans the gels."""
     if p.name == "alpha":
         prior = f"{{prior: lognormal, median: {STIFFENING[0]:g}, log_std: {STIFFENING[1]:g}}}"

@@ -1,22 +1,56 @@
-"""Tables with a row a bubble, R_max, R_max/R_eq and collapse time, which are no radius histories."""
+"""Tables with a row a bubble, R_max, R_max/R_eq and collapse time: one gel is estimated from the times of all.
+
+The collapse time of one bubble tells G or μ, never both; those of bubbles of several sizes do. What is known of each
+bubble enters with an error of its own.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from en4dvar.model.state import Array
+from en4dvar.inputs.asked import ANY
+from en4dvar.model.state import Array, Parameter
+from en4dvar.plumbing.tables import csv_text
 from en4dvar_bubble.collapse import RAYLEIGH
 from en4dvar_bubble.medium import Medium
+from en4dvar_bubble.model import BubbleModel
+from en4dvar_bubble.starter.page import Source
+from en4dvar_bubble.starter.proposal import WHY, Entry, Proposal, built, example
 
 RADII = (1e-6, 0.1)  # m
 STRETCHES = (1.5, 50.0)  # R_max/R_eq
 RATIOS = (0.3, 3.0)  # of the collapse time to Rayleigh's
+COLUMNS = ("bubble", "R_max_um", "R_eq_um", "collapse_us")
+PRIORS = {
+    "G": ("5 kPa", 1.5),
+    "mu": ("0.05 Pa s", 1.2),
+}  # median, log_std: they span the gels that bubbles were used on
+TIME_STD, RADIUS_STD = "20 ns", 0.005
 
 
-def summary_rows(columns: Mapping[str, Array]) -> str:
-    """In words what three neighbouring columns are, where the numbers leave no doubt; "" where there are none."""
+@dataclass(frozen=True)
+class Summaries:
+    """A row a bubble, SI: ``R_max`` (n,), ``stretch`` R_max/R_eq (n,), ``t_c`` (n,); ``names`` of the columns."""
+
+    names: tuple[str, ...]
+    R_max: Array
+    stretch: Array
+    t_c: Array
+
+    @property
+    def table(self) -> str:
+        """The rows as CSV, in the units that the names of :data:`COLUMNS` say."""
+        values = np.column_stack([1e6 * self.R_max, 1e6 * self.R_max / self.stretch, 1e6 * self.t_c])
+        digits = len(str(len(values)))
+        rows = [(f"{i:0{digits}d}", *(f"{value:.9g}" for value in row)) for i, row in enumerate(values.tolist(), 1)]
+        return csv_text([COLUMNS, *rows])
+
+
+def summaries(columns: Mapping[str, Array]) -> Summaries | None:
+    """Three neighbouring columns whose numbers leave no doubt about what they are; None where there are none."""
     names = list(columns)
     for trio in zip(names, names[1:], names[2:], strict=False):
         radius, stretch, time = (columns[name] for name in trio)
@@ -25,16 +59,52 @@ def summary_rows(columns: Mapping[str, Array]) -> str:
         medium = Medium()
         with np.errstate(all="ignore"):
             ratio = time / (RAYLEIGH * radius * np.sqrt(medium.rho / medium.p_inf))
-        if all(
-            _between(values, span)
-            for values, span in zip((radius, stretch, ratio), (RADII, STRETCHES, RATIOS), strict=True)
-        ):
-            return (
-                f"{', '.join(trio)} are {len(radius)} rows of R_max, R_max/R_eq and collapse time in SI units, one a "
-                "bubble; init proposes from radius histories, a radius at each of many times"
-            )
-    return ""
+        spans = zip((radius, stretch, ratio), (RADII, STRETCHES, RATIOS), strict=True)
+        if all(np.all((values > low) & (values < high)) for values, (low, high) in spans):
+            return Summaries(trio, radius, stretch, time)
+    return None
 
 
-def _between(values: Array, span: tuple[float, float]) -> bool:
-    return bool(np.all((values > span[0]) & (values < span[1])))
+def source_of(table: str) -> Source:
+    """How the table is read: each row is a data set of one reading."""
+    time = (COLUMNS[3], "us")
+    return Source(table, time, None, time, replace(ANY, by=COLUMNS[0]), observable="collapse_time")
+
+
+def propose_from_times(rows: Summaries, law: str | None) -> Proposal:
+    """A gel common to all bubbles, and each bubble's own radii. Raises :class:`ConfigError`: unknown law."""
+    model, law_name = built("laser", law)
+    told = f"{', '.join(rows.names)} are {len(rows.t_c)} rows of R_max, R_max/R_eq and collapse time in SI units"
+    radii = [
+        Entry(name, f"{{prior: lognormal, median: {{from_file: {column}, unit: um}}, log_std: {RADIUS_STD}}}", words)
+        for name, column, words in (
+            ("R_max", COLUMNS[1], "each bubble's own, known to 0.5 %: put what you know of your camera"),
+            ("R_eq", COLUMNS[2], "the same"),
+        )
+    ]
+    return Proposal(
+        (Entry("error", f"{{collapse_time_std: {TIME_STD}}}", "how well a time is known: put what you know"),),
+        (
+            Entry("name", "bubble"),
+            Entry("law", law_name, "others: en4dvar laws"),
+            Entry("start", "laser", "the clock starts at R_max"),
+            *(Entry(key, value, WHY[value]) for key, value in {"gas": "heat", "vapour": "transport"}.items()),
+        ),
+        (*(_shared(p, model) for p in model.law.parameters), *radii),
+        {},
+        (f"{told}, one a bubble; the gel is common to all",),
+        assimilation=(
+            Entry("refine", "none", "a bubble by itself tells little and only begins the estimate of all together"),
+            Entry("emulator", '"off"'),
+            Entry("what_if", "false"),
+        ),
+    )
+
+
+def _shared(p: Parameter, model: BubbleModel) -> Entry:
+    if p.name not in PRIORS:
+        line = example(p, model)
+        return replace(line, value=f"{line.value[:-1]}, shared: all}}")
+    median, log_std = PRIORS[p.name]
+    prior = f"{{prior: lognormal, median: {median}, log_std: {log_std}, shared: all}}"
+    return Entry(p.name, prior, f"{p.label}: wide; narrow it to what you knew before")
