@@ -59,7 +59,7 @@ class Child:
         errors: IO[bytes] | int = subprocess.DEVNULL,
         input: IO[bytes] | int = subprocess.DEVNULL,
     ):
-        _guard(os.getpid(), Path(tempfile.gettempdir()))
+        _guard(os.getpid(), _temporary())
         self.alive, held = os.pipe()
         try:
             self.process = subprocess.Popen(
@@ -263,6 +263,14 @@ def _guard(process: int, parent: Path) -> None:
     )
     guard.returncode = 0  # nobody waits for it: it ends after this process
     os.close(here)
+
+
+def _temporary() -> Path:
+    """Where scratch folders are; where nothing can be written there are none, and there is nothing to remove."""
+    try:
+        return Path(tempfile.gettempdir())
+    except FileNotFoundError:
+        return Path(os.sep)
 
 
 def _mark() -> str:
