@@ -59,7 +59,8 @@ class Child:
         errors: IO[bytes] | int = subprocess.DEVNULL,
         input: IO[bytes] | int = subprocess.DEVNULL,
     ):
-        _guard(os.getpid(), _temporary())
+        # without a folder nothing is left behind; to look for the temporary one is to write there
+        _guard(os.getpid(), Path(tempfile.gettempdir() if folder else os.sep))
         self.alive, held = os.pipe()
         try:
             self.process = subprocess.Popen(
@@ -263,14 +264,6 @@ def _guard(process: int, parent: Path) -> None:
     )
     guard.returncode = 0  # nobody waits for it: it ends after this process
     os.close(here)
-
-
-def _temporary() -> Path:
-    """Where scratch folders are; where nothing can be written there are none, and there is nothing to remove."""
-    try:
-        return Path(tempfile.gettempdir())
-    except FileNotFoundError:
-        return Path(os.sep)
 
 
 def _mark() -> str:
