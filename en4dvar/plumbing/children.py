@@ -59,7 +59,8 @@ class Child:
         errors: IO[bytes] | int = subprocess.DEVNULL,
         input: IO[bytes] | int = subprocess.DEVNULL,
     ):
-        _guard(os.getpid(), Path(tempfile.gettempdir()))
+        # without a folder nothing is left behind; to look for the temporary one is to write there
+        _guard(os.getpid(), Path(tempfile.gettempdir() if folder else os.sep))
         self.alive, held = os.pipe()
         try:
             self.process = subprocess.Popen(
