@@ -28,7 +28,9 @@ them, and their distance from the medians in per cent of R_max (root mean square
 minimum, if there are two. χ² per degree of freedom: of ln G or ln μ about their weighted mean, 1 if bubbles of one gel
 differ by no more than their intervals say, and far above 1 if intervals are too narrow or the bubbles' gels differ; the
 readings after the window go on to the end of the record, through oscillations of which none was fitted. Density,
-scale and pressure are common to the bubbles of a folder and make χ² smaller.
+scale and pressure are common to the bubbles of a folder and make χ² smaller. Where far fewer than 90 % of the readings
+after the window lie in their bands, or χ² is far above 1, the stated intervals are too narrow: what real bubbles do
+after a collapse, above all a gas that is no longer that of before, is not yet in the model or its discrepancy.
 """
 PRESSURE = re.compile(r"ambient pressure of ([\d.]+) ?MPa")
 ATMOSPHERE = 0.1  # MPa, which init takes for granted
