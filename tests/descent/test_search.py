@@ -97,6 +97,8 @@ def test_a_well_without_a_member_is_found_where_noise_and_prior_explain_nothing_
         assert told.runs > 20 * 48
         assert "misfit" not in {c.code for c in analysis.cautions}
     monkeypatch.setattr(Search, "widened", lambda self, found: found)
+    # nor is a draw of the sampler followed that happens to fall into the well
+    monkeypatch.setattr(Stages, "searched_from", lambda self, outcome, ends, x: (outcome, ends))
     lost = assimilate(hidden(15), AssimilationSettings(), 15)
     assert lost.modes[0].cost > 100
     assert "misfit" in {c.code for c in lost.cautions}
