@@ -10,6 +10,7 @@ from en4dvar.descent.search import Search
 from en4dvar.diagnosis.analysis import Descents, StartRecord
 from en4dvar.estimation import stages
 from en4dvar.estimation.assimilate import LoopState, assimilate
+from en4dvar.estimation.stages import Stages
 from en4dvar.priors.prior import PriorTerm
 from en4dvar.results.codec import decode, encode
 from en4dvar.sampling import refine
