@@ -182,7 +182,7 @@ import time
 import numpy as np
 from en4dvar_bubble import Accuracy, simulate
 gel = {"G": 6900.0, "alpha": 0.025, "mu": 0.15, "R0": 1.3e-6}
-accuracy, times = Accuracy(rtol=1e-17, step_limit=10**9, time_limit=8.0), np.linspace(6e-6, 80e-6, 60)
+accuracy, times = Accuracy(rtol=1e-17, step_limit=10**9, time_limit=8.0), np.linspace(6e-6, 2e-3, 60)
 simulate(parameters=gel, times=times[:1], accuracy=Accuracy())
 print("begins", flush=True)
 begun = time.process_time()
