@@ -83,7 +83,7 @@ class Calibration:
     def verdicts(self) -> tuple[Verdict, ...]:
         """One a quantity that has a truth."""
         known = [j for j in range(len(self.quantities)) if np.isfinite(self.good[0].rank[j])] if self.good else []
-        p = {j: self._reference(j).p_value(self.column("rank", j)) for j in known}
+        p = {j: self.uniform.p_value(self.column("rank", j)) for j in known}
         off: set[int] = set()
         for left, j in zip(range(len(known), 0, -1), sorted(known, key=p.__getitem__), strict=True):
             if p[j] * left > LEVEL:
@@ -136,7 +136,9 @@ class Calibration:
     def __repr__(self) -> str:
         return f"<Calibration of {self.name}: {len(self.good)} of {len(self.sets)} sets, in {self.directory}>"
 
-    def _reference(self, j: int) -> Uniform:
+    @property
+    def uniform(self) -> Uniform:
+        """What the ranks of a calibrated posterior look like; there must be a good set."""
         return uniform_ranks(len(self.good), self.good[0].members)
 
     def _verdict(self, j: int, p: float, off: bool) -> Verdict:
@@ -158,7 +160,7 @@ def curves(calibration: Calibration) -> Chart:
     panels, names = [], [name for name, _ in calibration.quantities]
     for verdict in calibration.verdicts:
         j = names.index(verdict.quantity)
-        uniform = uniform_ranks(verdict.sets, calibration.good[0].members)
+        uniform = calibration.uniform
         x, (low, high) = uniform.shares, uniform.band
         title = f"{figure_text(verdict.quantity)}: p = {verdict.p:.2g}"
         panel = Panel("rank of the truth, 0 to 1", "difference of shares", title=title, xlim=(0.0, 1.0))
