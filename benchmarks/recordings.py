@@ -139,7 +139,7 @@ def verbatim(text: str, law: str, words: list[str], quick: bool) -> Record:
         for key in (*NUMBERS, "alpha", "R_eq", "R_max", "t_s"):
             if key in rows:
                 found[key] = _posterior(result.posterior[key].values.ravel(), rows[key])
-        found["withheld"] = _withheld(result.sample_stats.attrs, found["R_max"]["mean"])
+        found["withheld"] = _withheld(result.sample_stats.attrs, found.get("R_max", {"mean": np.nan})["mean"])
         return found
 
 

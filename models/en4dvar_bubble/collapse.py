@@ -6,7 +6,8 @@ E 85, 066303, for an empty bubble in a liquid:
     R(t) = R_max [1 − ((t − t_max)/t_c)²]^{2/5},        t_c = 0.9147 R_max √(ρ/p_∞),
 
 so that R^{5/2} is a parabola in t: three numbers by linear least squares from the samples between the maximum and 40 %
-of it, whether the collapse itself was seen or fell between two frames (2 % late, as Rayleigh's exact solution tells).
+of it, less far down where a thick gel lets it creep, whether the collapse itself was seen or fell between two frames
+(2 % late, as Rayleigh's exact solution tells).
 
 In a gel the ratio r = t_c/(0.9147 R_max √(ρ/p_∞)) differs from one: elasticity and surface tension shorten the
 collapse, viscosity, gas and vapour prolong it. The energy of an incompressible liquid bounds it from below: a
@@ -41,7 +42,12 @@ from en4dvar.plumbing.errors import DataError
 from en4dvar_bubble.medium import Medium
 
 RAYLEIGH = 0.914681  # of the empty bubble: Rayleigh (1917)
-LOWEST = 0.4  # of R_max: the part of the collapse that R^{5/2} is fitted to
+LOWEST = (
+    0.4,
+    0.6,
+    0.75,
+)  # of R_max: R^{5/2} is fitted to what lies above, to less where a thick gel lets it creep
+BEFORE = 1.0  # of the time that is fitted to: a parabola whose top lies further before the first sample shows none
 TOLD = 0.6  # of R_max: a window that ends above does not tell the collapse time
 SOFT = 1.02  # r of a large bubble in a soft gel, whose gas and viscosity prolong its collapse a little
 APART = 1.05  # noise and physics that the model lacks move r by less than this
@@ -81,14 +87,22 @@ class Lobe:
 
 def lobe(times: Array, radius: Array) -> Lobe:
     """Maximum and collapse time, see the head of the module. Raises :class:`DataError`."""
-    where = _falling(radius)
-    if where.stop - where.start < 4:
-        raise DataError("fewer than four samples between the maximum and its collapse; is this a radius history?")
-    t, r = times[where], radius[where]
-    scale = max(float(np.ptp(t)), 1e-300)
-    z, y = (t - times[int(np.argmax(radius))]) / scale, np.clip(r / radius.max(), 1e-3, None)
-    c, b, a = np.polyfit(z, y**2.5, 2, w=y**-1.5)  # an error of R is one of 5/2 R^{3/2} in R^{5/2}
-    if not c < 0:
+    for lowest in LOWEST:
+        where = _falling(radius, lowest)
+        if where.stop - where.start < 4:
+            if lowest == LOWEST[0]:
+                raise DataError(
+                    "fewer than four samples between the maximum and its collapse; is this a radius history?"
+                )
+            continue
+        t, r = times[where], radius[where]
+        scale = max(float(np.ptp(t)), 1e-300)
+        z, y = (t - times[int(np.argmax(radius))]) / scale, np.clip(r / radius.max(), 1e-3, None)
+        c, b, a = np.polyfit(z, y**2.5, 2, w=y**-1.5)  # an error of R is one of 5/2 R^{3/2} in R^{5/2}
+        near = c < 0 and -b / (2 * c) > z[0] - BEFORE
+        if near or (c < 0 and lowest == LOWEST[-1]):
+            break
+    else:
         raise DataError("the radius does not turn at its maximum: no collapse can be told")
     middle = -b / (2 * c)
     peak = a - b**2 / (4 * c)
@@ -110,12 +124,12 @@ def _margin(z: Array, y: Array, fit: Array) -> float:
     return float(stdtrit(left, SURE) * np.sqrt(slope @ covariance @ slope))
 
 
-def _falling(radius: Array) -> slice:
-    """From just before the maximum down to ``LOWEST`` of it, or to the end of the descent."""
+def _falling(radius: Array, lowest: float) -> slice:
+    """From just before the maximum down to ``lowest`` of it, or to the end of the descent."""
     top = first = last = int(np.argmax(radius))
     while first > 0 and radius[first - 1] > 0.95 * radius[top]:
         first -= 1
-    while last + 1 < len(radius) and LOWEST * radius[top] < radius[last + 1]:
+    while last + 1 < len(radius) and lowest * radius[top] < radius[last + 1]:
         if radius[last + 1 : last + 3].min() > radius[last] + 0.1 * radius[top]:  # one reading alone may be high
             break
         last += 1

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from en4dvar_bubble.model import BubbleModel
+from en4dvar_bubble.settings import BubbleSettings
 from en4dvar_bubble.starter.look import look
 from en4dvar_bubble.starter.scatter import bad, noise
 from en4dvar_bubble.starter.top import Top, top
@@ -73,3 +75,18 @@ def test_fragments_are_no_bubble_at_rest() -> None:
     seen = look(t, grows)
     assert np.isnan(seen.rest)
     assert "where it should rest" in seen.drift
+
+
+@pytest.mark.parametrize(("mu", "grown"), [(0.3, 0.6), (0.5, 0.0), (0.7, 0.0)])
+def test_a_bubble_that_creeps_back_has_a_top_and_is_no_driven_one(mu: float, grown: float) -> None:
+    """In a thick gel there is no rebound, and R^(5/2) is a parabola near the top alone."""
+    settings = {"start": "laser", "law": "newtonian", "gas": "isothermal"}
+    model = BubbleModel.from_settings(BubbleSettings.model_validate(settings))
+    largest, t = 120e-6, np.arange(-grown * 12e-6, 60e-6, 0.9e-6)
+    theta = {"mu": np.array([mu]), "R_max": np.array([largest]), "R_eq": np.array([20e-6])}
+    (path,) = model.trajectories(model.initial_states(theta), t)
+    seen = look(t, path["R"] + 0.004 * largest * np.random.default_rng(9).standard_normal(len(t)))
+    assert seen.start == "laser"
+    assert np.isnan(seen.rebound)
+    assert abs(seen.top.time) < 3 * seen.top.time_std
+    assert seen.top.height == pytest.approx(largest, abs=3 * seen.top.height_std)

@@ -20,13 +20,11 @@ import numpy as np
 from scipy.linalg import cho_solve, solve_triangular
 
 from en4dvar.data.noise.correlated import CorrelatedNoise
-from en4dvar.data.noise.discrepancy import DiscrepancyNoise, augmented, both_sides, whitened
+from en4dvar.data.noise.discrepancy import DiscrepancyNoise, augmented, both_sides, in_rows, whitened
 from en4dvar.data.noise.huber import HuberNoise
 from en4dvar.data.noise.predicted import Linearisation, Predicted
+from en4dvar.data.noise.state_space import NEWTON, REWEIGHTED, SETTLED, boxed, innovations
 from en4dvar.model.state import Array
-
-NEWTON, REWEIGHTED = 30, 500  # iterations; the latter follow where the former go round in circles
-SETTLED = 1e-13  # change of a weight
 
 
 @dataclass(frozen=True)
@@ -146,6 +144,9 @@ class RobustDiscrepancyNoise(DiscrepancyNoise):
     def _terms(self, values: Array, predicted: Predicted) -> Array:
         """Terms of J_o (…, K), β and ln std apart; NaN where a prediction is not finite."""
 
+        if self.correlation is None and self.kernel.ordered:
+            return self._filtered(values, predicted)
+
         def of(runs: Predicted) -> tuple[Array, ...]:
             residual, s, covariance = self._residual(values, runs)
             u, _ = solve_boxed(residual, s, covariance, self.threshold)
@@ -155,6 +156,19 @@ class RobustDiscrepancyNoise(DiscrepancyNoise):
             return (np.asarray(self.huber._loss((residual - delta) / s) + 0.5 * u * delta + shrunk),)
 
         return np.asarray(self._in_parts(predicted, 1, of)[0])
+
+    def _filtered(self, values: Array, predicted: Predicted) -> Array:
+        """:meth:`_terms` in O(K)."""
+        runs, c, kappa = in_rows(predicted), self.threshold, self._curvature
+        with np.errstate(over="ignore", invalid="ignore"):
+            amplitude, length = self._amplitude_and_length(runs)
+            a = amplitude[:, None] * self.kernel.growth(runs.rates)
+            residual, s, a = np.broadcast_arrays(values - runs.values, self.error_std(runs), a)
+            own = self.kernel.nugget * a**2
+            u, delta = boxed(residual, s, own, a, length, self.kernel.steps, self.kernel.smoothness, c)
+            _, roots = innovations(residual, s**2 / kappa + own, a, length, self.kernel.steps, self.kernel.smoothness)
+            terms = self.huber._loss((residual - delta) / s) + 0.5 * u * delta + np.log(roots) + 0.5 * math.log(kappa)
+        return np.asarray(terms).reshape(predicted.values.shape)
 
     def _residual(self, values: Array, runs: Predicted) -> tuple[Array, Array, Array]:
         """y − m and s (B, K), A (B, K, K); NaN and one where either is not finite."""

@@ -5,8 +5,11 @@ A Matérn process of smoothness p + ½ is the first component of a linear system
 y_k − m_k = a_k f(t_k) + ε_k gives what is new in each reading, v_k, and its standard deviation L_kk: the numbers of
 the Cholesky factor of R + A, which takes K³/3 operations.
 
+With Huber's loss for ε the mode of f is found by the same filter and its adjoint, the disturbance smoother: a reading
+in the tails pulls with the constant force c/s, which moves the mean and leaves the covariance as it is.
+
 Source: Hartikainen & Särkkä (2010), Proc. IEEE MLSP, 379; Särkkä & Solin (2019), Applied Stochastic Differential
-Equations, § 12.3.
+Equations, § 12.3; Durbin & Koopman (2012), Time Series Analysis by State Space Methods, § 4.5.
 """
 
 from __future__ import annotations
@@ -39,10 +42,7 @@ def _filter(
     order: int, residuals: Array, errors: Array, amplitudes: Array, rates: Array, steps: Array, white: Array
 ) -> None:
     """``white`` (2, B, K), run by run."""
-    stationary = np.eye(order)
-    if order == 3:
-        stationary[1, 1] = 1.0 / 3.0
-        stationary[0, 2] = stationary[2, 0] = -1.0 / 3.0
+    stationary = _stationary(order)
     move, half = np.empty((order, order)), np.empty((order, order))
     apart = np.empty((order, order))  # P − P_∞
     mean, column = np.empty(order), np.empty(order)
@@ -65,6 +65,142 @@ def _filter(
                 mean[i] += column[i] * missed / variance
                 for j in range(order):
                     apart[i, j] -= column[i] * column[j] / variance
+
+
+def boxed(
+    residuals: Array, std: Array, own: Array, amplitudes: Array, lengths: Array, steps: Array, nu: float, c: float
+) -> Array:
+    """u = ρ'(ε/s)/s and δ (2, B, K) of B runs at the mode of Huber's loss and the process; NaN where r is not finite.
+
+    Parameters
+    ----------
+    residuals: (B, K) y − m. std: (B, K) s of ε. own: (B, K) variances of what in δ each reading has of its own.
+    amplitudes: (B, K) a g. lengths: (B,) ℓ. steps: (K − 1,) > 0 between readings. nu: ½, 3/2 or 5/2. c: threshold.
+    """
+    found = np.empty((2, *residuals.shape))
+    with np.errstate(all="ignore"):
+        rates = np.sqrt(2 * nu) / lengths
+    r, s, nuggets, a, rates, steps = (
+        np.ascontiguousarray(part, dtype=float) for part in (residuals, std, own, amplitudes, rates, steps)
+    )
+    _boxed(int(nu + 0.5), r, s, nuggets, a, rates, steps, c, found)
+    return found
+
+
+NEWTON, REWEIGHTED = 30, 500  # iterations; the latter follow where the former go round in circles
+SETTLED = 1e-13  # change of a weight
+
+
+@kernel
+def _boxed(
+    order: int,
+    residuals: Array,
+    std: Array,
+    own: Array,
+    amplitudes: Array,
+    rates: Array,
+    steps: Array,
+    c: float,
+    found: Array,
+) -> None:
+    """``found`` (2, B, K), run by run: Newton's method on which readings are in the tails, else reweighting."""
+    count = residuals.shape[1]
+    errors, force, before = np.empty(count), np.empty(count), np.empty(count)
+    for run in range(residuals.shape[0]):
+        r, s, nugget, a, u, delta = (
+            residuals[run], std[run], own[run], amplitudes[run], found[0, run], found[1, run],
+        )  # fmt: skip
+        if not np.isfinite(np.sum(r) + np.sum(s) + np.sum(a) + rates[run]):
+            found[:, run] = np.nan
+            continue
+        errors[:], force[:], settled = s * s, np.nan, False
+        for _ in range(NEWTON):
+            _mode(order, r, errors, nugget, force, a, rates[run], steps, u, delta)
+            settled = True
+            for k in range(count):
+                left = r[k] - delta[k]
+                new = np.sign(left) * c / s[k] if abs(left) > c * s[k] else np.nan
+                settled = settled and (new == force[k] or (np.isnan(new) and np.isnan(force[k])))
+                force[k] = new
+            if settled:
+                break
+        if settled:
+            continue
+        force[:], before[:] = np.nan, 0.0
+        for _ in range(REWEIGHTED):
+            _mode(order, r, errors, nugget, force, a, rates[run], steps, u, delta)
+            moved = 0.0
+            for k in range(count):
+                weight = c * s[k] / max(abs(r[k] - delta[k]), c * s[k])
+                errors[k] = s[k] * s[k] / weight
+                moved = max(moved, abs(weight - before[k]))
+                before[k] = weight
+            if moved < SETTLED:
+                break
+
+
+@called
+def _mode(
+    order: int, r: Array, errors: Array, own: Array, force: Array, a: Array, rate: float, steps: Array, u: Array,
+    delta: Array,
+) -> None:  # fmt: skip
+    """u and δ of one run for Gaussian errors of variance ``errors``, or for a constant u where ``force`` is no NaN."""
+    count, move, column = len(r), np.empty((order, order)), np.empty(order)
+    expected, towards, variance = np.empty(count), np.empty((count, order)), np.empty(count)
+    _ahead(r, errors + own, force, a, rate, steps, u, expected, towards, variance)
+    adjoint = np.zeros(order)  # of the state before reading k, once that is reached
+    for k in range(count - 1, -1, -1):
+        if k < count - 1:
+            _set_transition(order, rate * steps[k], move)
+            column[:] = adjoint
+            for i in range(order):
+                adjoint[i] = 0.0
+                for j in range(order):
+                    adjoint[i] += move[j, i] * column[j]
+        for i in range(order):
+            u[k] -= towards[k, i] * adjoint[i] / variance[k]
+        adjoint[0] += a[k] * u[k]
+        delta[k] = expected[k] + own[k] * u[k]
+        for i in range(order):
+            delta[k] += towards[k, i] * adjoint[i]
+
+
+@called
+def _ahead(
+    r: Array, errors: Array, force: Array, a: Array, rate: float, steps: Array, u: Array, expected: Array,
+    towards: Array, variance: Array,
+) -> None:  # fmt: skip
+    """The filter: a f as ``expected`` (K,) of each reading, what moves the state ``towards`` it (K, order), and what is
+    new in it, over its ``variance`` (K,), infinite of a constant force.
+    """
+    order = towards.shape[1]
+    stationary, move, half = _stationary(order), np.empty((order, order)), np.empty((order, order))
+    mean, apart, column = np.zeros(order), np.zeros((order, order)), np.empty(order)
+    for k in range(len(r)):
+        if k > 0:
+            _set_transition(order, rate * steps[k - 1], move)
+            _advance(move, mean, apart, column, half)
+        expected[k] = a[k] * mean[0]
+        for i in range(order):
+            towards[k, i] = a[k] * (stationary[i, 0] + apart[i, 0])
+        variance[k], u[k] = np.inf, force[k]
+        if np.isnan(force[k]):
+            variance[k] = a[k] * towards[k, 0] + errors[k]
+            u[k] = (r[k] - expected[k]) / variance[k]
+        for i in range(order):
+            mean[i] += towards[k, i] * u[k]
+            for j in range(order):
+                apart[i, j] -= towards[k, i] * towards[k, j] / variance[k]
+
+
+@called
+def _stationary(order: int) -> Array:
+    """P_∞ of a process of unit variance."""
+    stationary = np.eye(order)
+    if order == 3:
+        stationary[1, 1] = 1.0 / 3.0
+        stationary[0, 2] = stationary[2, 0] = -1.0 / 3.0
+    return stationary
 
 
 @called

@@ -135,6 +135,9 @@ def _shift(
             break
         step, decrease = response.step(changed.observations, predicted, moved, of_prior)
         moved = moved + step
+        if np.any(np.abs(moved / std)[of_errors] > FAR):
+            reason = "too large a change to extrapolate"
+            break
         correction = float(np.max(np.abs(step / std)))
         small = SETTLED * np.maximum(1.0, np.abs(moved / std)) if attempt else np.full(len(std), SMALL)
         if np.all(np.abs(step / std) <= small):
@@ -142,8 +145,6 @@ def _shift(
         if not reason or correction > before:
             break
         before = correction
-    if np.any(np.abs(moved / std)[of_errors] > FAR):
-        reason = "too large a change to extrapolate"
     if reason:
         return Shift(*about, unknown, unknown, unknown, np.nan, runs, reason)
     prior = problem.prior

@@ -25,6 +25,7 @@ UNKNOWN = 0.01  # of R_max: errors where the scatter cannot be told
 DRIFTS = 0.15  # of ln R from one quarter of a history to the next
 GAS = 0.6  # of R_max: a bubble at rest is smaller
 ACOUSTIC_BEGINS = 0.1  # of R_max: one that begins below has grown from a nucleus
+CREEPS = 1.5  # collapse times after the maximum: a history that goes on for longer without a rebound is damped
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,7 @@ def look(times: Array, radius: Array, start: Start | None = None) -> Look:
     rebound = second_maximum(radius)
     first = float(radius[0] / radius[largest])
     rest, drift = _rest(times, radius, peak) if np.isfinite(rebound) else (float("nan"), "")
-    chosen, reason, clear = _start(first, np.isfinite(rebound))
+    chosen, reason, clear = _start(first, np.isfinite(rebound), times[-1] > peak.t_max + CREEPS * peak.t_c)
     if start is not None and start != chosen:
         chosen, reason, clear = start, "as you say", True
     return Look(
@@ -146,8 +147,8 @@ def second_maximum(radius: Array) -> float:
     return float(between[peak] / radius[top]) if 0 < peak < len(between) - 1 else float("nan")
 
 
-def _start(first: float, rebounds: bool) -> tuple[Start, str, bool]:
-    """The start that the data suggest, from the first radius over the maximum."""
+def _start(first: float, rebounds: bool, creeps: bool) -> tuple[Start, str, bool]:
+    """The start that the data suggest, from the first radius over the maximum and what follows the collapse."""
     begins = f"the history begins at {100 * first:.0f} % of R_max"
     if first >= LASER_BEGINS:
         return "laser", begins, True
@@ -155,6 +156,8 @@ def _start(first: float, rebounds: bool) -> tuple[Start, str, bool]:
         return "acoustic", f"{begins}: it grows from small", True
     if rebounds:
         return "laser", f"{begins}, but goes on through a rebound, as gas made by a laser does", False
+    if creeps:
+        return "laser", f"{begins}, but goes on after the collapse, which a thick gel damps", False
     return "acoustic", f"{begins}, grows and ends with the first collapse", False
 
 

@@ -47,7 +47,7 @@ TIMING = 0.05  # of the step between samples
 NUCLEUS = 0.5e-6  # m: order of the stress-free radii in Mancia et al. (2021), Table 1
 GAS_FRACTION = 0.12  # R_eq/R_max of laser-induced bubbles, where no radius at rest is seen
 # Bounds of the log_std of a guess: it errs by that much, so that a narrower prior would exclude what made the data.
-WIDTHS = {"G": (1.5, 2.0), "mu": (1.0, 1.5)}
+WIDTHS = {"G": (1.5, 2.0), "mu": (1.5, 2.0)}
 BETWEEN = 1.645  # standard deviations from the median to 5 and 95 %
 SAME_CLOCK = 2e-6  # s: what a first guess can be off by
 BUBBLES = (1e-7, 0.1)  # m: between these radii
