@@ -87,23 +87,25 @@ class Lobe:
 
 def lobe(times: Array, radius: Array) -> Lobe:
     """Maximum and collapse time, see the head of the module. Raises :class:`DataError`."""
+    turning = None
     for lowest in LOWEST:
         where = _falling(radius, lowest)
         if where.stop - where.start < 4:
-            if lowest == LOWEST[0]:
-                raise DataError(
-                    "fewer than four samples between the maximum and its collapse; is this a radius history?"
-                )
-            continue
+            break
         t, r = times[where], radius[where]
         scale = max(float(np.ptp(t)), 1e-300)
         z, y = (t - times[int(np.argmax(radius))]) / scale, np.clip(r / radius.max(), 1e-3, None)
         c, b, a = np.polyfit(z, y**2.5, 2, w=y**-1.5)  # an error of R is one of 5/2 R^{3/2} in R^{5/2}
         near = c < 0 and -b / (2 * c) > z[0] - BEFORE
-        if near or (c < 0 and lowest == LOWEST[-1]):
+        if near or (c < 0 and turning is None):
+            turning = z, y, scale, c, b, a
+        if near:
             break
-    else:
-        raise DataError("the radius does not turn at its maximum: no collapse can be told")
+    if turning is None:
+        few = where.stop - where.start < 4 and lowest == LOWEST[0]
+        words = "fewer than four samples between the maximum and its collapse; is this a radius history?"
+        raise DataError(words if few else "the radius does not turn at its maximum: no collapse can be told")
+    z, y, scale, c, b, a = turning
     middle = -b / (2 * c)
     peak = a - b**2 / (4 * c)
     t_max = times[int(np.argmax(radius))] + scale * middle
