@@ -76,7 +76,7 @@ class Program:
                 within_limit(lambda: self._fill(folder, parameters, times))
                 self._run(folder, parameters, end)
                 outputs = self.outputs.items()
-                return within_limit(lambda: {name: output.read(folder, times) for name, output in outputs})
+                return within_limit(lambda: {n: output.read(folder, times, self.time_limit) for n, output in outputs})
         except OSError as error:
             raise ProgramError(f"{error.filename or 'scratch folder'}: {error.strerror}") from None
         except (TimeLimitError, subprocess.TimeoutExpired):
