@@ -144,9 +144,7 @@ def kept(siege: Siege, folder: Path, rng: np.random.Generator) -> Attack:
 
 
 def resumed(siege: Siege, folder: Path, rng: np.random.Generator) -> Attack:
-    """One damage to what a finished run of any kind keeps, and ``--resume``: it mends, to the same bits, or says by name
-    what it cannot.
-    """
+    """One damage to what a finished run of any kind keeps, and ``--resume``: it mends, to the same bits, or refuses."""
     name = ("campaign", "campaign", "campaign", "single", "twin", "series-run", "plan")[rng.integers(7)]
     run = siege.copy(name, folder / name)
     # the log is only added to; a page is written anew by report
