@@ -129,10 +129,6 @@ def read_control(path: Path) -> ControlFile:
 def text_of(path: Path) -> str:
     """The text of a file. Raises :class:`ConfigError`."""
     try:
-        text = read_text(path)
+        return read_text(path)
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from None
-    if "\0" in text:
-        line = text[: text.index("\0")].count("\n") + 1
-        raise ConfigError(f"{path}:{line}: a null byte, which no text holds; the file is damaged")
-    return text
