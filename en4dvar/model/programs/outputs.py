@@ -82,10 +82,10 @@ def _found(folder: Path, file: str, pattern: str, seconds: float | None) -> list
     """The matches, by another process: a pattern may take years, in which nothing else of this one would run."""
     allowed = Allowed(min(Allowed.seconds, math.ceil(seconds or Allowed.seconds)), size=LONGEST)
     try:
-        found: list[str] = decoded_whole(matches, folder / file, pattern, allowed=allowed)
+        texts: list[str] = decoded_whole(matches, folder / file, pattern, allowed=allowed)
     except (DataError, DecodeError) as error:
         raise ProgramError(str(error).replace(str(folder / file), file)) from None
-    return found
+    return texts
 
 
 def matches(path: Path, pattern: str) -> Iterator[list[str]]:
