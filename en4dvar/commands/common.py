@@ -58,6 +58,14 @@ def echo(text: str, err: bool = False) -> None:
     click.echo(printable(text), err=err)
 
 
+def from_here(path: Path) -> str:
+    """A path as seen from the working directory; from another drive it stays as it is."""
+    try:
+        return os.path.relpath(path)
+    except ValueError:
+        return str(path)
+
+
 def parted(items: Iterable[str], option: str) -> dict[str, str]:
     """Dotted keys → values of ``items`` KEY=VALUE, given with an ``option``."""
     settings = {}
@@ -163,7 +171,7 @@ class Together:
         echo(table)
         for caution in cautions:
             echo(f"{caution.kind}: {caution}", err=True)
-        echo(f"report: {page if self.told else os.path.relpath(page)}")
+        echo(f"report: {page if self.told else from_here(page)}")
 
 
 def several_runs(kind: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Literal
 
@@ -14,6 +13,7 @@ from en4dvar.commands.common import (
     deliver,
     echo,
     folder_of,
+    from_here,
     refuse_to_replace,
     tell,
     trust_option,
@@ -90,7 +90,7 @@ def compare(
         from en4dvar.report.overlay import write_comparison
 
         page = write_comparison(comparison, out or folder_of("compare", run_dirs))
-        echo(f"report: {page if out else os.path.relpath(page)}")
+        echo(f"report: {page if out else from_here(page)}")
 
 
 @click.command()

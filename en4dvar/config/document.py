@@ -250,7 +250,10 @@ class _Tree:
         except yaml.MarkedYAMLError as error:
             mark = error.problem_mark or error.context_mark
             where = (mark.line + 1, mark.column + 1) if mark else (0, 0)
-            self.faults.append(Fault(f"not valid YAML: {error.problem or error.context}", "", self.file, *where))
+            words = f"not valid YAML: {error.problem or error.context}"
+            if "escape character" in words or "escape sequence" in words:
+                words += "; in double quotes a backslash stands for another sign: use single quotes, or / in paths"
+            self.faults.append(Fault(words, "", self.file, *where))
         except yaml.YAMLError as error:
             self.faults.append(Fault(f"not valid YAML: {str(error).splitlines()[0]}", file=self.file))
         except RecursionError:

@@ -95,7 +95,7 @@ def matches(path: Path, pattern: str) -> Iterator[list[str]]:
 
 def _text(folder: Path, file: str) -> str:
     try:
-        return read_plain(folder / file, LONGEST).decode("utf-8", errors="replace")
+        return read_plain(folder / file, LONGEST).decode("utf-8", errors="replace").replace("\r\n", "\n")
     except OSError as error:
         raise ProgramError(f"no output file {file}: {error.strerror}") from None
 
