@@ -7,6 +7,7 @@ Exit codes: 0 done; 1 the run failed, or some data sets of a campaign; 2 usage, 
 from __future__ import annotations
 
 import errno
+import io
 import os
 import sys
 import threading
@@ -107,6 +108,9 @@ def _settle_surroundings() -> None:
                 os.dup2(handle, number)
                 os.close(handle)
             setattr(sys, name, os.fdopen(number, "r" if name == "stdin" else "w", encoding="utf-8", closefd=False))
+    for stream in (sys.stdout, sys.stderr):  # a console that lacks a sign shows another
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     epoch = os.environ.get("SOURCE_DATE_EPOCH")
     if epoch is not None and not epoch.isdecimal():  # what draws figures would raise
         click.echo(f"SOURCE_DATE_EPOCH={printable(epoch)}: not a number of seconds; unset it", err=True)

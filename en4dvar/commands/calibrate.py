@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from en4dvar.commands.common import Source, command_line, config_options, continuable, note_beginning, parted
+from en4dvar.commands.common import Source, command_line, config_options, continuable, echo, note_beginning, parted
 
 
 @click.command()
@@ -44,7 +44,7 @@ def calibrate(
             source.path, sets, overrides=overrides, made_with=parted(made, "--made-with"), out=out, force=force,
             resume=resume, progress=progress, command=command_line(),
         )  # fmt: skip
-    click.echo(str(result))
+    echo(str(result))
     for remark in result.remarks:
-        click.echo(f"note: {remark}", err=True)
-    click.echo(f"report: {result.directory / 'calibration.html'}")
+        echo(f"note: {remark}", err=True)
+    echo(f"report: {result.directory / 'calibration.html'}")

@@ -53,6 +53,19 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
 
 
+def echo(text: str, err: bool = False) -> None:
+    """Print :func:`printable` lines."""
+    click.echo(printable(text), err=err)
+
+
+def from_here(path: Path) -> str:
+    """A path as seen from the working directory; from another drive it stays as it is."""
+    try:
+        return os.path.relpath(path)
+    except ValueError:
+        return str(path)
+
+
 def parted(items: Iterable[str], option: str) -> dict[str, str]:
     """Dotted keys → values of ``items`` KEY=VALUE, given with an ``option``."""
     settings = {}
@@ -139,7 +152,7 @@ def ask(question: str) -> bool:
 
 def tell(words: str) -> None:
     """Print on standard error which step is being done."""
-    click.echo(words, err=True)
+    echo(words, err=True)
 
 
 @dataclass(frozen=True)
@@ -155,10 +168,10 @@ class Together:
 
     def conclude(self, table: str, cautions: Iterable[Caution], page: Path) -> None:
         """Print what was found; warnings go to standard error."""
-        click.echo(table)
+        echo(table)
         for caution in cautions:
-            click.echo(f"{caution.kind}: {caution}", err=True)
-        click.echo(f"report: {page if self.told else os.path.relpath(page)}")
+            echo(f"{caution.kind}: {caution}", err=True)
+        echo(f"report: {page if self.told else from_here(page)}")
 
 
 def several_runs(kind: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
@@ -200,7 +213,7 @@ def deliver(text: str, out: Path | None, what: str) -> None:
     if out is None:
         click.echo(text, nl=False)
     elif what:
-        click.echo(f"{what}: {write_text(out, text)}")
+        echo(f"{what}: {write_text(out, text)}")
     else:
         write_text(out, text)
 
@@ -215,7 +228,7 @@ def note_beginning(run_dir: Path, resume: bool) -> None:
     from en4dvar.runs.rundir import holds_run
 
     if resume and not holds_run(run_dir):
-        click.echo(f"note: {run_dir} holds no run yet; this one begins", err=True)
+        echo(f"note: {run_dir} holds no run yet; this one begins", err=True)
 
 
 def to_continue(kept: object) -> Failed:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from en4dvar.commands.common import Source, command_line, config_options, continuable
+from en4dvar.commands.common import Source, command_line, config_options, continuable, echo
 
 
 @click.command()
@@ -37,7 +37,7 @@ def design(source: Source, after: Path | None, out: Path | None, force: bool, re
             source.path, overrides=source.overrides(), after=after, out=out, force=force, resume=resume,
             on_design=on_design, command=command_line(),
         )  # fmt: skip
-    click.echo(design_table(plan))
+    echo(design_table(plan))
     for remark in remarks(plan):
-        click.echo(f"note: {remark}", err=True)
-    click.echo(f"report: {directory / 'design.html'}")
+        echo(f"note: {remark}", err=True)
+    echo(f"report: {directory / 'design.html'}")

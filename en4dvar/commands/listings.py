@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from en4dvar.commands.common import deliver
+from en4dvar.commands.common import deliver, echo
 
 
 @click.command()
@@ -19,7 +19,7 @@ def models() -> None:
     """
     from en4dvar.commands.listing import model_listing
 
-    click.echo(model_listing())
+    echo(model_listing())
 
 
 @click.command()

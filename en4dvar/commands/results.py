@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Literal
 
@@ -12,7 +11,9 @@ from en4dvar.commands.common import (
     Failed,
     ask,
     deliver,
+    echo,
     folder_of,
+    from_here,
     refuse_to_replace,
     tell,
     trust_option,
@@ -41,7 +42,7 @@ def report(run_dir: Path, datasets: tuple[str, ...], figures: bool) -> None:
     from en4dvar.executor import available_cores
     from en4dvar.runs.engine import write_report
 
-    click.echo(f"report: {write_report(run_dir, datasets, available_cores(), figures)}")
+    echo(f"report: {write_report(run_dir, datasets, available_cores(), figures)}")
 
 
 @click.command()
@@ -74,7 +75,7 @@ def compare(
     if any(map(series_file, run_dirs)):
         from en4dvar.report.compare_cycles import compare_sequences, sequences_table
 
-        click.echo(sequences_table(compare_sequences(run_dirs)))
+        echo(sequences_table(compare_sequences(run_dirs)))
         return
     comparison = compare_runs(run_dirs)
     if not (stored or comparison.incomparable):
@@ -83,13 +84,13 @@ def compare(
         evidences = [sampled_evidences(run_dir, workers, trust, None, tell) for run_dir in run_dirs]
         comparison = with_evidences(comparison, evidences)
     if len(comparison.estimates) <= MOST_ROWS:
-        click.echo(f"{estimates_table(comparison)}\n")
-    click.echo(comparison_table(comparison))
+        echo(f"{estimates_table(comparison)}\n")
+    echo(comparison_table(comparison))
     if not no_report:
         from en4dvar.report.overlay import write_comparison
 
         page = write_comparison(comparison, out or folder_of("compare", run_dirs))
-        click.echo(f"report: {page if out else os.path.relpath(page)}")
+        echo(f"report: {page if out else from_here(page)}")
 
 
 @click.command()
@@ -117,11 +118,11 @@ def export(run_dir: Path, kind: Literal["csv", "latex", "members", "netcdf"], ou
 
     cycles = series_file(run_dir)
     if kind == "netcdf" and cycles:
-        click.echo(f"{cycles} is netCDF as it is: xarray.open_dataset({str(cycles)!r}); nothing to export")
+        echo(f"{cycles} is netCDF as it is: xarray.open_dataset({str(cycles)!r}); nothing to export")
         return
     if kind == "netcdf":
         path = posterior_file(run_dir)
-        click.echo(f"{path} follows the ArviZ schema as it is: arviz.from_netcdf({str(path)!r}); nothing to export")
+        echo(f"{path} follows the ArviZ schema as it is: arviz.from_netcdf({str(path)!r}); nothing to export")
         return
     if cycles:
         from en4dvar.report.export_cycles import cycles_table
@@ -158,6 +159,6 @@ def rerun(run_dir: Path, workers: int | None, trust: bool) -> None:
     from en4dvar.runs.rerun import rerun as repeat
 
     repeated = repeat(run_dir, workers, trust=trust, ask=ask)
-    click.echo(str(repeated))
+    echo(str(repeated))
     if not repeated.same:
         raise Failed("the run is not reproduced", 1)

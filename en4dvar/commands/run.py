@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from en4dvar.commands.common import Failed, Source, command_line, config_options, continuable, note_beginning
+from en4dvar.commands.common import Failed, Source, command_line, config_options, continuable, echo, note_beginning
 
 if TYPE_CHECKING:
     from en4dvar.config import Config, SequenceConfig, TwinConfig
@@ -104,16 +104,16 @@ def _tell(campaign: Campaign, with_report: bool) -> None:
             shown[outcome.name] = outcome.summary
         spread.add(outcome.summary)
         warnings.add(outcome.name, outcome.warnings)
-    click.echo(results_table(shown) if few else str(spread))
+    echo(results_table(shown) if few else str(spread))
     for remark in campaign.outcomes[0].remarks if len(campaign.outcomes) == 1 else ():
-        click.echo(f"{campaign.outcomes[0].name}: {remark}")
+        echo(f"{campaign.outcomes[0].name}: {remark}")
     _tell_what_sets_share(campaign.directory, warnings)
     for notice in campaign.notices:
-        click.echo(f"warning: {notice}", err=True)
+        echo(f"warning: {notice}", err=True)
     for line in warnings.lines():
-        click.echo(line, err=True)
+        echo(line, err=True)
     if len(campaign) and with_report:
-        click.echo(f"report: {campaign.directory / 'report.html'}")
+        echo(f"report: {campaign.directory / 'report.html'}")
     if campaign.failures:
         reasons = [f"{o.name}: {o.failure}" for o in campaign.failures]
         head = f"{len(reasons)} of {len(campaign.outcomes)} data sets failed:"
@@ -129,13 +129,13 @@ def _tell_what_sets_share(directory: Path, warnings: _Warnings) -> None:
         from en4dvar.report.joint import joint_table
 
         together = joint_file.load_joint(directory / joint_file.FILE)
-        click.echo(f"\n{joint_table(together)}")
+        echo(f"\n{joint_table(together)}")
         warnings.add("all together", together.cautions)
     if (directory / population_file.FILE).exists():
         from en4dvar.report.population import population_lines
 
         population = population_file.load_population(directory / population_file.FILE)
-        click.echo("\n" + "\n".join(population_lines(population)))
+        echo("\n" + "\n".join(population_lines(population)))
         warnings.add("population", population.cautions)
 
 
@@ -178,7 +178,7 @@ def _conduct(config: TwinConfig, force: bool, resume: bool) -> None:
 
     with continuable(), cycle_progress(config.experiment.cycles) as on_cycle:
         result = run_twin(config, force=force, resume=resume, on_cycle=on_cycle, command=command_line())
-    click.echo(scores_table(result))
+    echo(scores_table(result))
     _tell_series(config, "twin.nc", config.experiment.members, result)
 
 
@@ -190,7 +190,7 @@ def _follow(config: SequenceConfig, force: bool, resume: bool) -> None:
 
     with continuable(), cycle_progress(len(build_sequence(config).series.times)) as on_cycle:
         result = run_sequence(config, force=force, resume=resume, on_cycle=on_cycle, command=command_line())
-    click.echo(estimates_table(result))
+    echo(estimates_table(result))
     _tell_series(config, "sequence.nc", config.assimilation.members, result)
 
 
@@ -200,9 +200,9 @@ def _tell_series(
     """Warnings on standard error, and where the files are."""
     if result.run.failures:
         lost = f"{len(result.run.failures)} of {members} members lost"
-        click.echo(f"warning: {config.name}: {lost}, the last: {result.run.failures[-1]}", err=True)
+        echo(f"warning: {config.name}: {lost}, the last: {result.run.failures[-1]}", err=True)
     for warning in result.warnings:
-        click.echo(f"warning: {config.name}: {warning}", err=True)
-    click.echo(f"result: {config.directory / file}")
+        echo(f"warning: {config.name}: {warning}", err=True)
+    echo(f"result: {config.directory / file}")
     if config.report:
-        click.echo(f"report: {config.directory / 'report.html'}")
+        echo(f"report: {config.directory / 'report.html'}")

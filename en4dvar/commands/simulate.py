@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from en4dvar.commands.common import Source, command_line, config_options, deliver, refuse_to_replace
+from en4dvar.commands.common import Source, command_line, config_options, deliver, echo, refuse_to_replace
 from en4dvar.commands.forms import WithForms, asked, write_form
 
 
@@ -57,7 +57,7 @@ def simulate(
     instants = parse_times(times, config.model.time_unit) if times else None
     seed = config.seed if seed is None else seed
     for name, (path, settings) in others.items():
-        click.echo(write_form(name, config, instants, path, settings, seed))
+        echo(write_form(name, config, instants, path, settings, seed))
     if others and out is None:  # the table was not asked for
         return
     simulation = simulate(config, instants)
@@ -82,6 +82,4 @@ def _simulate_campaign(source: Source, out: Path | None, seed: int | None, force
     sets = draw_campaign(plan)
     truth = write_campaign(plan, sets, command_line(), force)
     fits = [s.nrmse for s in sets]
-    click.echo(
-        f"{len(sets)} synthetic data sets, NRMSE of the truth {min(fits):.3f} to {max(fits):.3f}; truth: {truth}"
-    )
+    echo(f"{len(sets)} synthetic data sets, NRMSE of the truth {min(fits):.3f} to {max(fits):.3f}; truth: {truth}")

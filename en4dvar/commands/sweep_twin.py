@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from en4dvar.commands.common import Source, command_line, config_options, continuable, note_beginning, parted
+from en4dvar.commands.common import Source, command_line, config_options, continuable, echo, note_beginning, parted
 
 
 @click.command(name="sweep-twin")
@@ -41,7 +41,7 @@ def sweep_twin(
     from en4dvar.runs.twin_sweep import sweep_twin as sweep
 
     def tell(done: int, of: int) -> None:
-        click.echo(f"{done} of {of} runs", err=True)
+        echo(f"{done} of {of} runs", err=True)
 
     vary = parted(varied, "--vary")
     if out is not None:
@@ -51,7 +51,7 @@ def sweep_twin(
             source.path, vary, seeds, overrides=source.overrides(), out=out, workers=workers, force=force,
             resume=resume, progress=tell, command=command_line(),
         )  # fmt: skip
-    click.echo(str(result))
+    echo(str(result))
     for reason in dict.fromkeys(run.failure for runs in result.runs for run in runs if run.failure):
-        click.echo(f"failed: {reason}", err=True)
-    click.echo(f"averages: {result.directory / 'sweep.csv'}")
+        echo(f"failed: {reason}", err=True)
+    echo(f"averages: {result.directory / 'sweep.csv'}")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from en4dvar.commands.common import Source, config_options
+from en4dvar.commands.common import Source, config_options, echo
 
 if TYPE_CHECKING:
     from en4dvar.config import Config
@@ -37,7 +37,7 @@ def validate(source: Source, plot: bool) -> None:
 
         if plot:
             raise click.UsageError("a twin experiment has no data to plot the prior over")
-        click.echo(twin_summary(loaded))
+        echo(twin_summary(loaded))
         return
     if isinstance(loaded, SequenceConfig):
         from en4dvar.assembly.build_sequence import build_sequence
@@ -45,7 +45,7 @@ def validate(source: Source, plot: bool) -> None:
 
         if plot:
             raise click.UsageError("--plot is for estimations; the report of a sequence shows its forecasts")
-        click.echo(sequence_summary(loaded, build_sequence(loaded)))
+        echo(sequence_summary(loaded, build_sequence(loaded)))
         return
     from en4dvar.assembly.build import build
     from en4dvar.commands.describe import cost_summary, problem_summary
@@ -53,15 +53,15 @@ def validate(source: Source, plot: bool) -> None:
     from en4dvar.priors.prior import own_seed
 
     problems = build(loaded)
-    click.echo(problem_summary(loaded, problems))
+    echo(problem_summary(loaded, problems))
     chosen = problems[: _panels()] if plot else problems[:1]
     seeds = [own_seed(loaded.seed, problem.observations.name) for problem in chosen]
     previews = [preview(p, loaded.assimilation, seed, whole=plot) for p, seed in zip(chosen, seeds, strict=True)]
-    click.echo(cost_summary(loaded, previews[0], len(problems)))
+    echo(cost_summary(loaded, previews[0], len(problems)))
     for shown in previews:
         _warn(shown)
     if plot:
-        click.echo(f"prior predictive: {_draw(loaded, previews, problems)}")
+        echo(f"prior predictive: {_draw(loaded, previews, problems)}")
 
 
 def _panels() -> int:
@@ -77,13 +77,13 @@ def _warn(preview: Preview) -> None:
     name, reasons = preview.problem.observations.name, [reason for reason in preview.run.failures if reason]
     if reasons:
         lost = f"{len(reasons)} of {len(preview.run.failures)} prior members cannot be run"
-        click.echo(f"warning: {name}: {lost}, e.g.: {reasons[0]}", err=True)
+        echo(f"warning: {name}: {lost}, e.g.: {reasons[0]}", err=True)
     of_model = doubts(preview.problem, preview.members, preview.run.predictions)
     for doubt in (*preview.problem.observations.doubts, *of_model):
-        click.echo(f"warning: {name}: {doubt.words}", err=True)
+        echo(f"warning: {name}: {doubt.words}", err=True)
     if preview.outside > 0.1:
         share = f"{100 * preview.outside:.0f} % of the observations lie outside everything the prior expects"
-        click.echo(f"warning: {name}: {share}; check units, clock and window (--plot shows them)", err=True)
+        echo(f"warning: {name}: {share}; check units, clock and window (--plot shows them)", err=True)
 
 
 def _draw(config: Config, previews: Sequence[Preview], problems: Sequence[InverseProblem]) -> str:

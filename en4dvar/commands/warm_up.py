@@ -9,6 +9,8 @@ from importlib.metadata import entry_points
 
 import click
 
+from en4dvar.commands.common import echo
+
 GROUP = "en4dvar.warm_up"
 """Entry points whose value is a function without arguments: what is compiled, in words → a small call that does."""
 
@@ -29,8 +31,8 @@ def warm_up() -> None:
         before, start = compilations(), time.perf_counter()
         call()
         took = f"compiled in {time.perf_counter() - start:.1f} s" if compilations() > before else "there already"
-        click.echo(f"{what}: {took}")
-    click.echo(f"compiled code is kept below {os.path.commonpath([kernel.stats.cache_path for kernel in KERNELS])}")
+        echo(f"{what}: {took}")
+    echo(f"compiled code is kept below {os.path.commonpath([kernel.stats.cache_path for kernel in KERNELS])}")
 
 
 def examples() -> Iterator[tuple[str, Callable[[], object]]]:

@@ -28,6 +28,7 @@ Mark = tuple[int, int]  # line and column, from 1
 
 LONGEST = 1_000_000  # bytes of a file, some ten seconds to read: the paths of 10 000 data sets and more
 
+NULL = "a null byte, which no name, word or number holds"
 _INT = re.compile(r"[-+]?\d{1,40}")
 _FLOAT = re.compile(r"[-+]?(\.\d+|\d+(\.\d*)?)([eE][-+]?\d{1,3})?")
 _WORDS = {
@@ -133,9 +134,11 @@ def _plain(value: Any, path: Key, document: Document, faults: list[Fault]) -> An
         value = tolist()
     if isinstance(value, list | tuple | set | frozenset):
         return [_plain(item, (*path, i), document, faults) for i, item in enumerate(value)]
-    if value is None or type(value) in (bool, int, float, str):
+    known = value is None or type(value) in (bool, int, float, str)
+    if known and not (isinstance(value, str) and "\0" in value):
         return value
-    faults.append(Fault(f"{shown(value)} is neither number, text, list nor dict", _dotted(path), document.file))
+    what = NULL if known else f"{shown(value)} is neither number, text, list nor dict"
+    faults.append(Fault(what, _dotted(path), document.file))
     return None
 
 
@@ -220,6 +223,8 @@ class _Loader(yaml.SafeLoader):
             raise _Refused("aliases are not used here; repeat the value", event.start_mark)
         if getattr(event, "tag", None) is not None:
             raise _Refused(f"tag {shown(event.tag)}: tags are not used here", event.start_mark)
+        if "\0" in getattr(event, "value", ""):
+            raise _Refused(NULL, event.start_mark)
         return super().compose_node(parent, index)
 
 
@@ -245,7 +250,10 @@ class _Tree:
         except yaml.MarkedYAMLError as error:
             mark = error.problem_mark or error.context_mark
             where = (mark.line + 1, mark.column + 1) if mark else (0, 0)
-            self.faults.append(Fault(f"not valid YAML: {error.problem or error.context}", "", self.file, *where))
+            words = f"not valid YAML: {error.problem or error.context}"
+            if "escape character" in words or "escape sequence" in words:
+                words += "; in double quotes a backslash stands for another sign: use single quotes, or / in paths"
+            self.faults.append(Fault(words, "", self.file, *where))
         except yaml.YAMLError as error:
             self.faults.append(Fault(f"not valid YAML: {str(error).splitlines()[0]}", file=self.file))
         except RecursionError:

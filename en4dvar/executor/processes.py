@@ -212,8 +212,8 @@ def _serve(pipe: Connection, limits: Limits, folder: str) -> None:
     def tell(message: Any) -> None:
         pipe.send_bytes(TOLD + bytes(ForkingPickler.dumps(message)))
 
-    pipe.send_bytes(ANSWER + pickle.dumps(None))  # ready: from here on a death may be a call's fault
     with contextlib.suppress(EOFError, OSError):  # of a pipe that is closed
+        pipe.send_bytes(ANSWER + pickle.dumps(None))  # ready: from here on a death may be a call's fault
         while True:
             answer = _answer(pipe.recv_bytes(), tell)
             pipe.send_bytes(ANSWER + answer)

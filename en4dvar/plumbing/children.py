@@ -26,14 +26,18 @@ from functools import cache
 from pathlib import Path
 from typing import IO, TypeVar
 
-from en4dvar.plumbing.files import owner, temporary_folder
+from en4dvar.plumbing.files import POSIX, owner, temporary_folder
 from en4dvar.plumbing.user_code import Stop
+
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None  # type: ignore[assignment]
 
 T = TypeVar("T")
 MARK = "EN4DVAR_STARTED_BY"
 _BORN = secrets.token_hex(8)
 PATIENCE = 1.0  # s for processes to be gone that were killed
-_POSIX = os.name == "posix"
 _children: dict[int, Child] = {}  # thread → what it waits for
 _stopped: set[int] = set()  # threads that start no child any more
 _changing = threading.Lock()
@@ -52,7 +56,7 @@ class Child:
 
     def __init__(
         self,
-        words: Sequence[str],
+        words: Sequence[str] | str,
         folder: Path | None = None,
         environment: Mapping[str, str] | None = None,
         output: IO[bytes] | int = subprocess.DEVNULL,
@@ -71,7 +75,7 @@ class Child:
                 stdout=output,
                 stderr=errors,
                 start_new_session=True,
-                pass_fds=(held,) if _POSIX else (),
+                pass_fds=(held,) if POSIX else (),
             )
         except BaseException:
             os.close(self.alive)
@@ -97,7 +101,7 @@ class Child:
         try:
             self.kill()
             self.process.wait()
-            if _POSIX and not _closed(self.alive, 0.0):
+            if POSIX and not _closed(self.alive, 0.0):
                 self._end_what_escaped()
         finally:
             os.close(self.alive)
@@ -120,7 +124,7 @@ class Child:
 
     def kill(self) -> None:
         """End the process and those of its session."""
-        if not _POSIX:  # its children with it
+        if not POSIX:  # its children with it
             subprocess.run(["taskkill", "/F", "/T", "/PID", str(self.process.pid)], capture_output=True, check=False)
         elif self.process.returncode is None:
             with suppress(ProcessLookupError, PermissionError):
@@ -176,9 +180,7 @@ def limit_memory(size: int) -> None:
 
     Compiled code that does not check ends the process.
     """
-    if sys.platform == "linux":
-        import resource
-
+    if sys.platform == "linux" and resource:
         status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
         held = int(status.partition("VmData:")[2].split()[0]) * 1024
         _, hard = resource.getrlimit(resource.RLIMIT_DATA)
@@ -188,9 +190,7 @@ def limit_memory(size: int) -> None:
 
 def limit_time(seconds: int) -> None:
     """From now on, more processor time than this ends this process, without a dump of its memory."""
-    if sys.platform != "win32":
-        import resource
-
+    if sys.platform != "win32" and resource:
         used = resource.getrusage(resource.RUSAGE_SELF)
         _, hard = resource.getrlimit(resource.RLIMIT_CPU)
         allowed = int(used.ru_utime + used.ru_stime) + 1 + seconds
@@ -251,7 +251,7 @@ def scratch(parent: Path | None) -> Iterator[Path]:
 @cache
 def _guard(process: int, parent: Path) -> None:
     """Have what this process leaves behind ended and removed; started once for it and a parent of scratch folders."""
-    if not _POSIX:
+    if not POSIX:
         return
     here, _ = os.pipe()  # our end is closed by the system, however this process ends
     guard = subprocess.Popen(

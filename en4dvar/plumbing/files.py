@@ -17,6 +17,7 @@ import shutil
 import socket
 import stat
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
@@ -39,8 +40,10 @@ _KINDS = {
     stat.S_IFCHR: "a device",
     stat.S_IFBLK: "a device",
 }
-# A link is not followed and a pipe not waited for; Windows knows neither flag.
-_CAREFUL = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+POSIX = hasattr(os, "killpg")  # sessions, signals and links of POSIX; not so on Windows
+# A link is not followed and a pipe not waited for; Windows knows neither flag, but one by which bytes stay as they are.
+_CAREFUL = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+PATIENCE = (0.02, 0.1, 0.3, 1.0)  # s between attempts to rename a file that another program holds open
 
 
 def inside(root: str | Path, name: str | Path) -> Path:
@@ -152,10 +155,10 @@ def atomic_path(path: str | Path, durable: bool = True) -> Iterator[Path]:
         _make_anew(partial)  # an unwritable place gives the system's reason here, not a library's guess later
         yield partial
         if durable:
-            _fsync(partial)
-        partial.replace(path)
-        if durable and os.name == "posix":  # elsewhere a directory cannot be opened
-            _fsync(path.parent)
+            _fsync(partial, os.O_RDWR)
+        replace_file(partial, path)
+        if durable and POSIX:  # elsewhere a directory cannot be opened
+            _fsync(path.parent, os.O_RDONLY)
     except OSError as error:
         raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from None
     finally:
@@ -213,7 +216,7 @@ def _remove_leftovers(folder: Path, names: re.Pattern[str]) -> None:
 
 def _is_gone(process: int) -> bool:
     """True if no process has this number; on Windows, where asking might end it, it is taken to be there."""
-    if os.name != "posix":
+    if not POSIX:
         return False
     try:
         os.kill(process, 0)
@@ -283,8 +286,21 @@ def _make_anew(path: Path) -> None:
     os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
 
 
-def _fsync(path: Path) -> None:
-    handle = os.open(path, os.O_RDONLY)
+def replace_file(source: Path, target: Path) -> None:
+    """Rename a file or folder, in the place of a file; again a few times where another program has it open, which
+    Windows then refuses (a virus scanner, the synchronisation of a folder). Raises :class:`OSError`.
+    """
+    for seconds in () if POSIX else PATIENCE:
+        try:
+            source.replace(target)
+            return
+        except PermissionError:
+            time.sleep(seconds)
+    source.replace(target)
+
+
+def _fsync(path: Path, flags: int) -> None:
+    handle = os.open(path, flags)
     try:
         os.fsync(handle)
     finally:

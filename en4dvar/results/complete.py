@@ -78,12 +78,14 @@ def _curve_faults(path: str, group: Group, nodes: Groups) -> Iterator[str]:
 
 
 def _label_faults(path: str, group: Group, declared: Mapping[str, Declared]) -> Iterator[str]:
-    """What keeps variables from being shown: a missing label or unit, a unit or a symbol that cannot be understood."""
+    """What keeps variables from being shown: other dimensions, a label or unit that is missing or means nothing."""
     for name, variable in group.every.items():
         about = variable.attrs
         wanted = ["units", *["display_units"] * ("symbol" in about)]
         if name in declared:
-            wanted = [*declared[name].unit.keys, "long_name"]
+            wanted, dims = [*declared[name].unit.keys, "long_name"], declared[name].dims.split()
+            if len(dims) != len(variable.dims):
+                yield f"{path}/{name} has {len(variable.dims)} dimensions instead of {len(dims)}"
         if missing := [key for key in wanted if key not in about]:
             yield f"{path}/{name} has no attribute {', '.join(missing)}"
         try:

@@ -95,7 +95,8 @@ def heeded(end: Callable[[str], object]) -> Iterator[None]:
             tell_error(kind, error, trace)
 
     come, written = os.pipe()
-    os.set_blocking(written, False)
+    if hasattr(os, "set_blocking"):
+        os.set_blocking(written, False)
     threading.Thread(target=_listen, args=(come, end), daemon=True).start()
     before = signal.set_wakeup_fd(written, warn_on_full_buffer=False)
     signal.signal(signal.SIGINT, interrupt)

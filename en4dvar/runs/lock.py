@@ -5,14 +5,13 @@ from __future__ import annotations
 import errno
 import os
 import socket
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from en4dvar.plumbing.errors import OutputError
-from en4dvar.plumbing.files import inside, own_file
+from en4dvar.plumbing.files import POSIX, inside, own_file
 
 LOCK = ".en4dvar-lock"
 PATIENCE = 3.0  # s for the lock of a dead process to go
@@ -37,10 +36,14 @@ def locked(directory: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        if _is_at(file, directory / LOCK):
+        ours = _is_at(file, directory / LOCK)
+        if not POSIX:  # nobody can remove a file that is open, which is why nobody else's is removed here
+            os.close(file)
+        if ours:
             with suppress(OSError):
                 (directory / LOCK).unlink()
-        os.close(file)
+        if POSIX:
+            os.close(file)
 
 
 def _acquire(directory: Path) -> int:
@@ -90,7 +93,7 @@ def _is_dead(owner: str) -> bool:
     if owner == _OTHER:  # not written yet
         return True
     number, _, host = owner.removeprefix("process ").partition(" on ")
-    if host != socket.gethostname() or not number.isdecimal() or sys.platform == "win32":
+    if host != socket.gethostname() or not number.isdecimal() or not POSIX:
         return False
     try:
         os.kill(int(number), 0)
@@ -101,14 +104,14 @@ def _is_dead(owner: str) -> bool:
     return False
 
 
-if sys.platform == "win32":
-    import msvcrt
+def _lock(file: int) -> None:
+    """Lock a file that is open. Raises :class:`OSError`."""
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        import msvcrt
 
-    def _lock(file: int) -> None:
         os.lseek(file, 1 << 20, os.SEEK_SET)  # beyond the text, so that others can read it
-        msvcrt.locking(file, msvcrt.LK_NBLCK, 1)
-else:
-    import fcntl
-
-    def _lock(file: int) -> None:
+        msvcrt.locking(file, msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
+    else:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -120,13 +120,14 @@ class LiveProgress:
     def ended(self, name: str, done: int, words: str = "") -> None:
         """A data set has ended, of several with one line of ``words``; ``done`` are done now."""
         if words and self._total > 1:
-            self._bar.console.print(f"{name}: {words}", markup=False, highlight=False, soft_wrap=True)
+            self._bar.console.print(without_control(f"{name}: {words}"), markup=False, highlight=False, soft_wrap=True)
         if name in self._open:
             self._lengths.append(self._open.pop(name))
         self._done = done
         self._show("files and report" if done == self._total else None)
 
     def _show(self, description: str | None) -> None:
+        description = description and without_control(description)
         fields = {"completed": self._done, "total": self._total or None, "left": self._left()}
         self._bar.update(self._task, **fields, **({"description": description} if description else {}))
 

@@ -13,7 +13,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from en4dvar.plumbing.errors import OutputError
-from en4dvar.plumbing.files import inside, open_plain, write_text
+from en4dvar.plumbing.files import inside, open_plain, replace_file, write_text
 from en4dvar.results.store import COMPLETE, NEXT
 
 LISTING = ".en4dvar-files"
@@ -41,9 +41,9 @@ def replace_earlier_run(path: Path) -> None:
     for name, target in zip(names, targets, strict=True):
         if (following / name).exists():
             target.parent.mkdir(parents=True, exist_ok=True)
-            (following / name).replace(target)
+            replace_file(following / name, target)
     write_list(path, names)
-    following.rename(path / OLD)  # at once: half of this folder would look like an interrupted run
+    replace_file(following, path / OLD)  # at once: half of this folder would look like an interrupted run
     remove_folder(path / OLD)
 
 

@@ -135,7 +135,7 @@ class EstimateKind(RunKind[Campaign]):
             PopulationKind(asked.of, asked.hyper).within(work, executor)
         if work.good() and self.config.report:
             self.page(run.directory.work, workers=self.report_workers, figures=self.config.figures)
-        elif not run.directory.at(SUMMARY).exists():  # it is there where there was nothing left to estimate
+        else:
             work.summarise()
         return work.campaign()
 

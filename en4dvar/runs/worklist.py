@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from en4dvar.executor import Executor, ExecutorError, SerialExecutor, ThreadsExe
 from en4dvar.executor.chunks import CommonValue
 from en4dvar.inputs.asked import DataFile
 from en4dvar.plumbing.errors import En4dvarError, OutputError
-from en4dvar.plumbing.files import atomic_path, readable, remove_file
+from en4dvar.plumbing.files import atomic_path, open_plain, readable, remove_file
 from en4dvar.plumbing.tables import csv_text
 from en4dvar.results.checkpoint import FOLDER, Keeper, file_digest
 from en4dvar.results.codec import decode_text, encode_text
@@ -107,13 +107,17 @@ class Worklist:
         return Campaign(self.config.directory, self.outcomes(directory.home), tuple(self.run.notices), in_order)
 
     def summarise(self) -> None:
-        """Write the table of all data sets. Raises :class:`OutputError`."""
-        directory = self.run.directory
+        """Write the table of all data sets, unless it is there as it should be. Raises :class:`OutputError`."""
+        path = self.run.directory.at(SUMMARY)
+        if not _consists_of(path, self._table()):
+            with atomic_path(path) as partial, partial.open("wb") as file:
+                file.writelines(self._table())
+
+    def _table(self) -> Iterator[bytes]:
         header, *failures = summary_rows((), self.failures())
-        with atomic_path(directory.at(SUMMARY)) as partial, partial.open("w", encoding="utf-8", newline="") as file:
-            file.write(csv_text([header]))
-            file.writelines(self.outcomes(directory.work).lines())
-            file.write(csv_text(failures))
+        yield csv_text([header]).encode()
+        yield from map(str.encode, self.outcomes(self.run.directory.work).lines())
+        yield csv_text(failures).encode()
 
     @property
     def record(self) -> str:
@@ -287,6 +291,15 @@ class Worklist:
         self._reached.pop(d.name, None)
         if isinstance(self.progress, LiveProgress):
             self.progress.ended(d.name, len(self.ended), _in_one_line(decode_text(outcome, DatasetOutcome)))
+
+
+def _consists_of(path: Path, parts: Iterable[bytes]) -> bool:
+    """Whether a file is there and holds these parts, one after the other, and nothing else."""
+    try:
+        with open_plain(path) as file:
+            return all(file.read(len(part)) == part for part in parts) and not file.read(1)
+    except OSError:
+        return False
 
 
 def _in_one_line(outcome: DatasetOutcome) -> str:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
+from en4dvar.commands.common import echo
 from en4dvar_bubble.commands import completed_law
 
 if TYPE_CHECKING:
@@ -186,7 +187,7 @@ def _table_beside(target: Path, data: str, text: str, force: bool) -> str:
     if table.exists() and not force:
         raise OutputError(f"{table}: exists; give --force to replace it, or another --out")
     write_text(table, text)
-    click.echo(f"table: {table}, a row a bubble of {data}")
+    echo(f"table: {table}, a row a bubble of {data}")
     return table.name
 
 
@@ -198,8 +199,8 @@ def _write_example(name: str, force: bool) -> None:
 
     file = write_example(name, Path(), force)
     write_text(Path(SCHEMA_FILE), schema_text())  # that the first line of the configuration names
-    click.echo(f"configuration: {file}, its data are synthetic")
-    click.echo(f"next: en4dvar validate {file}, then en4dvar run {file}")
+    echo(f"configuration: {file}, its data are synthetic")
+    echo(f"next: en4dvar validate {file}, then en4dvar run {file}")
 
 
 def _columns_of(data: str, options: Mapping[str, str | None], layout: Layout) -> dict[str, Any] | Summaries:
@@ -217,10 +218,10 @@ def _columns_of(data: str, options: Mapping[str, str | None], layout: Layout) ->
     asked = Asked(contents, **{key: options[key] for key in _OF_COLUMNS})
     commas = ", decimal commas" if layout.decimal == "," else ""
     one_of = f"; one of {len(files)} files" if len(files) > 1 else ""
-    click.echo(f"{first}{commas}: {'; '.join(map(asked.shown, contents.columns))}{one_of}", err=True)
+    echo(f"{first}{commas}: {'; '.join(map(asked.shown, contents.columns))}{one_of}", err=True)
     if contents.scalars:
         told = ", ".join(f"{name} {value:g}" for name, value in contents.scalars.items())
-        click.echo(f"others in the file: {told}", err=True)
+        echo(f"others in the file: {told}", err=True)
     asked = asked.by_names()
     if not asked.complete_columns and (rows := summaries(contents.columns)) is not None:
         return rows
@@ -271,18 +272,18 @@ def _ask_unit(column: str, dimension: str, examples: str) -> str:
         try:
             convert(1.0, unit, dimension)
         except UnitError as error:
-            click.echo(str(error), err=True)
+            echo(str(error), err=True)
         else:
             return unit
 
 
 def _tell(target: Path, proposal: Proposal, example_only: bool) -> None:
     for line in proposal.remarks:
-        click.echo(line)
+        echo(line)
     for warning in proposal.warnings:
-        click.echo(f"warning: {_with_options(warning)}", err=True)
+        echo(f"warning: {_with_options(warning)}", err=True)
     file = shlex.quote(str(target))
-    click.echo(f"configuration: {target}")
+    echo(f"configuration: {target}")
     if example_only:
-        click.echo("every value in it is an example; with --data FILE it is proposed from your data")
-    click.echo(f"next: en4dvar validate {file} --plot, then en4dvar run {file}")
+        echo("every value in it is an example; with --data FILE it is proposed from your data")
+    echo(f"next: en4dvar validate {file} --plot, then en4dvar run {file}")

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from en4dvar.commands.common import echo
+
 if TYPE_CHECKING:
     from en4dvar_movie.frames import Movie
     from en4dvar_movie.table import Scale
@@ -79,7 +81,7 @@ def track(
         shutter = scale.exposure if scale.exposure > 0 else 0.0
         track = track_movie(opened, workers or available_cores(), fixed, progress, scale.flashes, point, part, shutter)
     for note in (*opened.notes, *track.notes):
-        click.echo(f"note: {note}", err=True)
+        echo(f"note: {note}", err=True)
     words = command_line()
     write_text(table, to_csv(track.readings, scale, str(movie), words))
     for other, readings in zip(more, track.others, strict=False):
@@ -90,12 +92,12 @@ def track(
         write_movie(outlined, pictures, len({r.sighting.frame for r in track.readings}), scale.pixel, scale.rate)
     used = [r for r in track.readings if r.used]
     what = "frames" if len(scale.flashes) == 1 else "circles"
-    click.echo(f"{len(used)} of {len(track.readings)} {what} read; the others and why: see the page")
+    echo(f"{len(used)} of {len(track.readings)} {what} read; the others and why: see the page")
     if doubtful := doubted(track.readings):
-        click.echo(f"doubtful, and not used until a line of --corrections confirms them: {doubtful}")
+        echo(f"doubtful, and not used until a line of --corrections confirms them: {doubtful}")
     for other, readings in zip(more, track.others, strict=False):
-        click.echo(f"another bubble: {other}, {sum(r.used for r in readings)} {what}")
-    click.echo(f"readings: {table}\npage: {shown}\nnext: en4dvar init --data {table}")
+        echo(f"another bubble: {other}, {sum(r.used for r in readings)} {what}")
+    echo(f"readings: {table}\npage: {shown}\nnext: en4dvar init --data {table}")
 
 
 def _scaled(

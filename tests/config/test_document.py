@@ -22,6 +22,8 @@ def test_scalars_of_the_core_schema() -> None:
     [
         ("a: 1\nb:\n  c: 2\n  c: 3\n", "f.yaml:4:3: b: duplicate key 'c', first given on line 3"),
         ("a: &x 1\nb: *x\n", "f.yaml:2:4: aliases are not used here"),
+        ('a: 1\nb: "x\\0y"\n', "f.yaml:2:4: a null byte"),
+        ('a: 1\n"x\\0y": 2\n', "f.yaml:2:1: a null byte"),
         (
             "a: !!python/object/apply:os.system ['true']\n",
             "f.yaml:1:4: tag 'tag:yaml.org,2002:python/object/apply:os.system'",

@@ -1,5 +1,8 @@
 """The numbers do not depend on where members run."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from same_bits import assert_same_bits
@@ -77,3 +80,13 @@ def test_make_executor_chooses_by_model():
     assert isinstance(make_executor(Decay(), 2), ProcessesExecutor)
     with pytest.raises(ValueError, match="at least 1"):
         ThreadsExecutor(0)
+
+
+def test_a_worker_whose_main_process_is_gone_as_it_starts_says_nothing():
+    code = (
+        "from multiprocessing import Pipe; from en4dvar.executor.limits import NO_LIMITS; "
+        "from en4dvar.executor.processes import _serve; "
+        "ours, theirs = Pipe(); ours.close(); _serve(theirs, NO_LIMITS, '.')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")

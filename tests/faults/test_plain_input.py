@@ -7,10 +7,12 @@ import fcntl
 import io
 import os
 import re
+import shutil
 import warnings
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import xarray as xr
@@ -29,6 +31,7 @@ from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.errors import ConfigError, OutputError
 from en4dvar.plumbing.tables import csv_text as table_text
 from en4dvar.priors.prior import PriorTerm
+from en4dvar.report import write_pages
 from en4dvar.report.export import latex_symbol
 from en4dvar.report.result import Result as Posterior
 from en4dvar.report.result import load_result
@@ -225,6 +228,21 @@ def altered(stored: Path, folder: Path, group: str, variable: str | None, attrib
     xr.DataTree.from_dict(nodes).to_netcdf(folder / "posterior.nc", engine="netcdf4")
     seal_file(folder / "posterior.nc")
     return folder
+
+
+@pytest.mark.fault("result-incomplete")
+def test_a_result_sealed_again_with_a_variable_of_other_dimensions(stored: Path, tmp_path: Path) -> None:
+    shutil.copy(stored, tmp_path)
+    with h5py.File(tmp_path / "posterior.nc", "r+") as file:
+        was = file["sample_stats/influence_change"]
+        attributes = {key: was.attrs[key] for key in ("units", "long_name")}
+        del file["sample_stats/influence_change"]
+        file["sample_stats/influence_change"] = 0.0
+        file["sample_stats/influence_change"].attrs.update(attributes)
+    seal_file(tmp_path / "posterior.nc")
+    told = "posterior.nc: not a result of en4dvar: /sample_stats/influence_change has 0 dimensions instead of 2"
+    with pytest.raises(OutputError, match=re.escape(told)):
+        write_pages(tmp_path)
 
 
 @pytest.mark.fault("result-incomplete")

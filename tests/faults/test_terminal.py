@@ -179,6 +179,21 @@ def test_a_terminal_that_is_gone(quiet, tmp_path, kind):
     assert_same_results(out, quiet)
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="names of files that other systems refuse")
+def test_a_terminal_and_a_log_obey_no_name(tmp_path):
+    path, out = make_campaign(tmp_path, 3), tmp_path / "run"
+    for i, name in enumerate(("a\x1b[2J\x07", "b\x9b2J\x1b]0;title\x07")):
+        (tmp_path / "data" / f"set{i}.csv").rename(tmp_path / "data" / f"{name}.csv")
+    (tmp_path / "data" / "c\x1b[2J.csv").write_text("no,table\n")
+    terminal = Terminal(command("run", path, "--out", out, "--no-report"))
+    terminal.read_until("(?!)")  # to its end
+    assert terminal.close() == 1
+    written = [(out / name).read_text(encoding="utf-8") for name in ("run.log", "summary.csv")]
+    for text in (terminal.told, *written):
+        assert not re.search(r"\x1b\[2J|[\x07\x9b]|\x1b\]", text)
+        assert all(name in text for name in (r"a\x1b[2J\x07", r"b\x9b2J\x1b]0;title\x07", r"c\x1b[2J"))
+
+
 def test_nohup_stays_in_force():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:

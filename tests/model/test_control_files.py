@@ -266,6 +266,7 @@ def test_public_control_files_are_read_or_refused_by_name():
         ("* model command line", "* svd assist", "line.pst: no section '* model command line'"),
         ("line.ins line.out", "", "line.pst: no instruction file"),
         ("line.tpl", "none.tpl", "none.tpl: No such file or directory"),
+        ("A log factor 1.0 0.1", "A log factor 1.0 0", "line.pst:9: a is log, but its lower bound 0 is not above 0"),
     ],
 )
 def test_what_cannot_be_read_is_told_with_its_line(control, old, new, words):

@@ -85,14 +85,17 @@ def test_no_child_survives_its_program(tmp_path: Path, way: str) -> None:
 @pytest.mark.parametrize(
     ("line", "told"),
     [
-        ("mkfifo out", "no output file out: not a plain file but a pipe"),
-        ("ln -s /dev/zero out", "no output file out: not a plain file but a device"),
-        ("mkdir out", "no output file out: Is a directory"),
-        ("truncate -s 1T out", "no output file out: 1.1 TB; at most 256 MB are read"),
+        ("mkfifo out", "out: not a plain file but a pipe"),
+        ("ln -s /dev/zero out", "out: not a plain file but a device"),
+        ("mkdir out", "out: Is a directory"),
+        ("truncate -s 1T out", "out: 1.1 TB; at most 256 MB are read"),
     ],
 )
-def test_an_output_that_cannot_be_read_is_a_lost_member(tmp_path: Path, line: str, told: str) -> None:
-    outcome = run(tmp_path, line, outputs={"y": {"file": "out", "pattern": r"(\S+)"}}, time_limit="5 s")
+@pytest.mark.parametrize("way", [{"pattern": r"(\S+)"}, {"column": 1}], ids=["pattern", "column"])
+def test_an_output_that_cannot_be_read_is_a_lost_member(
+    tmp_path: Path, line: str, told: str, way: dict[str, Any]
+) -> None:
+    outcome = run(tmp_path, line, outputs={"y": {"file": "out", **way}}, time_limit="5 s")
     assert row("program-output").told(outcome.reason)
     assert told in outcome.reason
 
@@ -105,6 +108,22 @@ def test_a_template_without_end_is_past_its_time(tmp_path: Path) -> None:
     outcome = run(tmp_path, "echo 1; echo 2", templates="in.j2", time_limit="0.3 s")
     assert outcome.reason.endswith("not done after 0.3 s")
     assert time.monotonic() - began < 10
+
+
+@pytest.mark.fault("program-output")
+def test_a_template_that_swells_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "in.j2").write_text("{% for i in range(99999) %}{{ 'x' * 10 ** 7 }}{% endfor %}{{ a }}")
+    before = psutil.Process().memory_info().rss
+    outcome = run(tmp_path, "echo 1; echo 2", templates="in.j2")
+    assert "in.j2: makes an input file of more than 256 MB" in outcome.reason
+    assert psutil.Process().memory_info().rss - before < 300e6
+
+
+@pytest.mark.fault("program-output")
+def test_a_pattern_without_end_is_past_its_time(tmp_path: Path) -> None:
+    outputs = {"y": {"file": "stdout", "pattern": r"(?:a*)*(\d)b"}}
+    outcome = run(tmp_path, "printf '%5000s' | tr ' ' a", outputs=outputs, time_limit="1 s")
+    assert "stdout: takes more than 1 s of processor time" in outcome.reason or "not done after" in outcome.reason
 
 
 def test_a_program_that_says_without_end_what_is_wrong_takes_no_memory(tmp_path: Path) -> None:
@@ -121,6 +140,7 @@ STUCK = {
         "touch {folder}/begun; echo 1; echo 2", "stdout",
         "templates: in.j2",
     ),
+    "pattern": ("printf '%5000s' | tr ' ' a; touch {folder}/begun", "stdout", ""),
 }  # fmt: skip
 
 
@@ -132,7 +152,8 @@ STUCK = {
         ("program", signal.SIGTERM, "serial"), ("child", signal.SIGTERM, "threads"),
         ("child", signal.SIGTERM, "processes"), ("child", signal.SIGKILL, "threads"),
         ("child", signal.SIGKILL, "processes"), ("template", signal.SIGTERM, "threads"),
-        ("template", signal.SIGTERM, "processes"),
+        ("template", signal.SIGTERM, "processes"), ("pattern", signal.SIGTERM, "threads"),
+        ("pattern", signal.SIGKILL, "threads"), ("pattern", signal.SIGTERM, "processes"),
     ],
 )  # fmt: skip
 def test_a_stop_is_heeded_wherever_a_program_stands_and_nothing_survives(
@@ -143,7 +164,7 @@ def test_a_stop_is_heeded_wherever_a_program_stands_and_nothing_survives(
     (tmp_path / "in.j2").write_text("{% for i in range(99999) %}{% for j in range(99999) %}{% endfor %}{% endfor %}")
     (tmp_path / "data.csv").write_text("t,y\n0,1\n1,2\n2,3\n")
     text = CONFIG.format(command=line.replace("{folder}", str(tmp_path)), file=file, more=more)
-    (tmp_path / "config.yaml").write_text(text)
+    (tmp_path / "config.yaml").write_text(text.replace("(\\S+)", "(?:a*)*(.)b") if where == "pattern" else text)
     words = command(
         "run", tmp_path / "config.yaml", "--out", tmp_path / "run", "--set", f"execution.executor={executor}"
     )
@@ -153,7 +174,7 @@ def test_a_stop_is_heeded_wherever_a_program_stands_and_nothing_survives(
     )  # fmt: skip
     begun = tmp_path / ("run/run.log" if where == "template" else "begun")
     assert wait_until(lambda: begun.exists() or process.poll() is not None, 60)
-    time.sleep(1.0 if where == "template" else 0.1)
+    time.sleep(0.1 if where in ("program", "child") else 1.0)
     assert process.poll() is None, process.communicate()[1]
     process.send_signal(number)
     began = time.monotonic()

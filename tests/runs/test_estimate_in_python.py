@@ -159,6 +159,7 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "name of a prior": ({"priors": {"a b": 1.0}}, "priors: 'a b' cannot be the name of a parameter"),
     "nothing estimated": ({"priors": {"a": 1.0, "b": 2.0}}, "no parameter has a prior; nothing to estimate"),
     "an object": ({"priors": {"a": {"prior": object}}}, "priors.a.prior: <class 'object'> is neither number, text"),
+    "a null byte": ({"priors": {"a": {"prior": "no\0rmal"}}}, "priors.a.prior: a null byte"),
     "odd section": ({"asimilation": {}}, "asimilation: unknown key 'asimilation'; did you mean 'assimilation'?"),
     "setting": ({"assimilation": {"member": 3}}, "assimilation.member: unknown key 'member'; did you mean 'members'?"),
     "window": ({"window": {"form": 1}}, "window.form: unknown key 'form'; did you mean 'from'?"),

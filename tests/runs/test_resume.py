@@ -78,6 +78,27 @@ def test_a_finished_data_set_is_not_computed_again(quiet, tmp_path):
     assert_same_results(out, run)
 
 
+@pytest.mark.parametrize(
+    "damaged",
+    [
+        lambda text: text[:40] + bytes([text[40] ^ 1]) + text[41:],
+        lambda text: text[:-1],
+        lambda text: text + b"set9,",
+        lambda text: b"\xff" + text,
+        lambda _: b"",
+    ],
+    ids=["a bit", "cut", "longer", "no text", "empty"],
+)
+def test_a_damaged_table_of_a_finished_run_is_written_again(quiet, tmp_path, damaged):
+    path, run, _ = quiet
+    out = tmp_path / "run"
+    run_campaign(configuration(path, out))
+    table = (out / "summary.csv").read_bytes()
+    (out / "summary.csv").write_bytes(damaged(table))
+    run_campaign(configuration(path, out), resume=True)
+    assert (out / "summary.csv").read_bytes() == table == (run / "summary.csv").read_bytes()
+
+
 def changed_seed(path, out):
     path.write_text(path.read_text().replace("seed: 3", "seed: 4"))
     return r"-seed: 3\n\+seed: 4"

@@ -290,7 +290,7 @@ def _placed(command: str, base: Path, shell: bool) -> str:
         split(command, shell)
         return command
     first, *others = split(command, shell)
-    if os.sep in first:
+    if Path(first).name != first:
         path = base / expanded(first)
         if not path.is_file():
             raise ValueError(no_such_file(path))

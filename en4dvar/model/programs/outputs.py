@@ -5,8 +5,9 @@ from __future__ import annotations
 import csv
 import functools
 import json
+import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,8 @@ import numpy as np
 from en4dvar.model.programs import pest
 from en4dvar.model.programs.errors import ProgramError
 from en4dvar.model.state import Array
+from en4dvar.plumbing.decoding import Allowed, DecodeError, decoded_whole
+from en4dvar.plumbing.errors import DataError
 from en4dvar.plumbing.files import read_plain, read_text
 from en4dvar.plumbing.hints import listed, short
 
@@ -43,10 +46,13 @@ class ProgramOutput:
     observations: tuple[str, ...] | None = None
     delimiters: str = ""
 
-    def read(self, folder: Path, times: Array) -> Array:
-        """The values at ``times`` (K,). Raises :class:`ProgramError`."""
-        text = "" if self.instructions else _text(folder, self.file)
-        values = self._instructed(folder, self.instructions) if self.instructions else self._values(text)
+    def read(self, folder: Path, times: Array, seconds: float | None = None) -> Array:
+        """The values at ``times`` (K,); a pattern may take ``seconds``. Raises :class:`ProgramError`."""
+        if self.pattern is not None:
+            values, text = _numbers(_found(folder, self.file, self.pattern, seconds), self.file), ""
+        else:
+            text = "" if self.instructions else _text(folder, self.file)
+            values = self._instructed(folder, self.instructions) if self.instructions else self._values(text)
         if self.time is None:
             if len(values) != len(times):
                 raise ProgramError(
@@ -59,10 +65,8 @@ class ProgramOutput:
     def _values(self, text: str) -> Array:
         if self.column is not None:
             return _column(text, self.column, self.file)
-        if self.key is not None:
-            return _key(text, self.key, self.file)
-        assert self.pattern is not None
-        return _numbers(re.findall(self.pattern, text, re.MULTILINE), self.file)
+        assert self.key is not None
+        return _key(text, self.key, self.file)
 
     def _instructed(self, folder: Path, instructions: Mapping[str, Sequence[Path]]) -> Array:
         values: dict[str, float] = {}
@@ -74,9 +78,24 @@ class ProgramOutput:
         return np.array([values[name] for name in names])
 
 
+def _found(folder: Path, file: str, pattern: str, seconds: float | None) -> list[str]:
+    """The matches, by another process: a pattern may take years, in which nothing else of this one would run."""
+    allowed = Allowed(min(Allowed.seconds, math.ceil(seconds or Allowed.seconds)), size=LONGEST)
+    try:
+        texts: list[str] = decoded_whole(matches, folder / file, pattern, allowed=allowed)
+    except (DataError, DecodeError) as error:
+        raise ProgramError(str(error).replace(str(folder / file), file)) from None
+    return texts
+
+
+def matches(path: Path, pattern: str) -> Iterator[list[str]]:
+    """What a regular expression with one group finds in a file; see :mod:`en4dvar.plumbing.decoding`."""
+    yield re.findall(pattern, _text(path.parent, path.name), re.MULTILINE)
+
+
 def _text(folder: Path, file: str) -> str:
     try:
-        return read_plain(folder / file, LONGEST).decode("utf-8", errors="replace")
+        return read_plain(folder / file, LONGEST).decode("utf-8", errors="replace").replace("\r\n", "\n")
     except OSError as error:
         raise ProgramError(f"no output file {file}: {error.strerror}") from None
 

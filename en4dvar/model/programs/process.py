@@ -25,6 +25,7 @@ from en4dvar.model.programs.outputs import ProgramOutput
 from en4dvar.model.programs.template import filled
 from en4dvar.model.state import Array
 from en4dvar.plumbing.children import Child, TimeLimitError, require_going_on, scratch, within
+from en4dvar.plumbing.files import POSIX
 
 OUTPUT = "output"  # the file that {output} names
 STDOUT = "stdout"  # what the program prints, as a file
@@ -76,7 +77,7 @@ class Program:
                 within_limit(lambda: self._fill(folder, parameters, times))
                 self._run(folder, parameters, end)
                 outputs = self.outputs.items()
-                return within_limit(lambda: {name: output.read(folder, times) for name, output in outputs})
+                return within_limit(lambda: {n: output.read(folder, times, self.time_limit) for n, output in outputs})
         except OSError as error:
             raise ProgramError(f"{error.filename or 'scratch folder'}: {error.strerror}") from None
         except (TimeLimitError, subprocess.TimeoutExpired):
@@ -87,15 +88,18 @@ class Program:
             shutil.copy(file, folder)
         for name, template in self.templates.items():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            (folder / name).write_text(filled(template, parameters, times), encoding="utf-8")
+            (folder / name).write_text(filled(template, parameters, times), encoding="utf-8", newline="")
 
     def _run(self, folder: Path, parameters: Mapping[str, float], end: float | None) -> None:
         values = {name: repr(float(value)) for name, value in parameters.items()}
         values |= {"input": next(iter(self.templates), ""), "output": OUTPUT}
         words = [fill(word, values) for word in self.words]
-        words = ["/bin/sh", "-c", *words] if self.shell else words
+        if self.shell:  # which takes its line as it is
+            line: list[str] | str = ["/bin/sh", "-c", *words] if POSIX else f'cmd /d /s /c "{words[0]}"'
+        else:
+            line = words
         with (folder / STDOUT).open("wb") as printed, tempfile.TemporaryFile(dir=folder) as said:
-            with Child(words, folder, self.environment, printed, said) as child:
+            with Child(line, folder, self.environment, printed, said) as child:
                 status = child.wait(None if end is None else end - time.monotonic())
             if status:
                 said.seek(max(0, said.seek(0, os.SEEK_END) - LONGEST_ERRORS))
@@ -112,7 +116,11 @@ def fill(word: str, values: Mapping[str, str]) -> str:
 
 def split(command: str, shell: bool) -> tuple[str, ...]:
     """The words of a command. Raises ValueError where quotes are left open or there is none."""
-    words = (command,) if shell else tuple(shlex.split(command))
+    lexer = shlex.shlex(command, posix=True, punctuation_chars=False)
+    lexer.whitespace_split, lexer.commenters = True, ""
+    if not POSIX:  # a backslash separates folders
+        lexer.escape = ""
+    words = (command,) if shell else tuple(lexer)
     if not words or not words[0].strip():
         raise ValueError("write the program and its arguments")
     return words

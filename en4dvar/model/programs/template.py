@@ -18,10 +18,11 @@ from jinja2.sandbox import ImmutableSandboxedEnvironment
 from en4dvar.model.programs import pest
 from en4dvar.model.programs.errors import ProgramError
 from en4dvar.model.state import Array
-from en4dvar.plumbing.files import read_text
+from en4dvar.plumbing.files import in_bytes, read_text
 from en4dvar.plumbing.hints import suggest
 
 TIMES = "times"
+LONGEST = 256_000_000  # characters of an input file
 SUFFIXES = (".j2", ".tpl", ".template")
 
 
@@ -51,12 +52,17 @@ def check_template(template: Path, names: Collection[str]) -> None:
 
 
 def filled(template: Path, parameters: Mapping[str, float], times: Array) -> str:
-    """The input file of a member; ``times`` (K,) are where it is observed."""
+    """The input file of a member; ``times`` (K,) are where it is observed. Raises :class:`ProgramError`."""
     text = _text(template)
     if pest.is_template(text):
         return pest.filled(text, parameters)
     values: dict[str, Any] = {name: float(value) for name, value in parameters.items()}
-    return str(_compiled(text).render(values | {TIMES: times.tolist()}))
+    parts, left = list[str](), LONGEST
+    for part in _compiled(text).generate(values | {TIMES: times.tolist()}):
+        parts.append(part)
+        if (left := left - len(part)) < 0:
+            raise ProgramError(f"{template.name}: makes an input file of more than {in_bytes(LONGEST)}")
+    return "".join(parts)
 
 
 @functools.cache
