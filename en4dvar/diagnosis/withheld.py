@@ -7,8 +7,9 @@ residuals in the window say of the discrepancy there and of the errors
     F(y) = (1/N) Σ_i Φ((y − m_i − δ_i)/s_i),
 
 whose 5 and 95 % quantiles are a band that a reading lies in with a chance of 90 %, if model, errors and posterior are
-right. Nothing was fitted to these readings: how many of them lie in their bands is the one test of a real experiment
-that no choice of priors or errors has passed beforehand.
+right. A quantity that the model calls :attr:`~en4dvar.model.forward.ForwardModel.unforeseen` changes at the last
+maximum of the window, by normal scores in a fixed order. Nothing was fitted to these readings: how many of them lie in
+their bands is the one test of a real experiment that no choice of priors or errors has passed beforehand.
 """
 
 from __future__ import annotations
@@ -16,11 +17,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import ndtr
+from scipy.special import ndtr, ndtri
 
 from en4dvar.ensemble.forecast import Composite
 from en4dvar.executor import Executor
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, Field
+from en4dvar.priors.varying import StateChanges
 from en4dvar.problem import InverseProblem
 
 BAND = (0.05, 0.95)
@@ -60,7 +62,8 @@ def predict_withheld(problem: InverseProblem, members: Array, executor: Executor
     within, whole = problem.observations, problem.observations.continued
     if whole is None:
         return None
-    run = Composite(replace(problem, observations=whole), executor)(members)
+    changed, theirs = _unforeseen(problem, members)
+    run = Composite(replace(changed, observations=whole), executor)(theirs)
     begin, alive = len(within), np.flatnonzero(np.isfinite(run.predicted.values).all(axis=1))
     if len(alive) < 2:
         return None
@@ -68,6 +71,22 @@ def predict_withheld(problem: InverseProblem, members: Array, executor: Executor
     mean, std = (np.stack(part) for part in zip(*expected, strict=True))
     low, median, high = (_quantile(mean, std, level) for level in (BAND[0], 0.5, BAND[1]))
     return Withheld(whole.times[begin:], whole.values[begin:], low, median, high, len(members))
+
+
+def _unforeseen(problem: InverseProblem, members: Array) -> tuple[InverseProblem, Array]:
+    """The problem with the change that its model does not foresee, and the members with theirs."""
+    model, values = problem.model, problem.observations.values
+    if model.unforeseen is None:
+        return problem, members
+    name, std = model.unforeseen
+    top = len(values) - 1
+    while top > 1 and max(values[top - 2 : top]) > values[top]:  # one reading that is lower is noise
+        top -= 1
+    field = next((field for field in model.layout.fields if field.name == name), Field(name, unit="1"))
+    change = StateChanges.of(model, field, [float(problem.observations.times[top])], std, relative=True)
+    count = len(members)
+    scores = np.random.default_rng(count).permutation(ndtri((np.arange(count) + 0.5) / count))
+    return problem.varied([change]), np.insert(members, len(problem.prior.terms), std * scores, axis=1)
 
 
 def _quantile(mean: Array, std: Array, level: float) -> Array:

@@ -92,6 +92,8 @@ class Dynamics:
     """Its distance from the bubble, m (:mod:`emission`)."""
     wall: Wall | None = None
     """A plane whose image of the bubble, taken to move at the same instant, adds its pressure."""
+    gas_change: float = 0.0
+    """Standard deviation of ln of what the amount of gas is multiplied by at a collapse, by what no equation says."""
     named: tuple[str, ...] = ()
     """Those of the :attr:`optional_parameters` that are parameters."""
 

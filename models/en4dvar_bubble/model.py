@@ -28,7 +28,7 @@ from en4dvar_bubble.dynamics import MACH_LIMITS, Dynamics, Wall
 from en4dvar_bubble.emission import OBSERVABLE
 from en4dvar_bubble.events import OBSERVABLES
 from en4dvar_bubble.numbers import NAMES
-from en4dvar_bubble.packing import pack
+from en4dvar_bubble.packing import pack, with_gas
 from en4dvar_bubble.paths import Paths
 from en4dvar_bubble.settings import BubbleSettings
 from en4dvar_bubble.solver.driver import Solution
@@ -76,6 +76,7 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
             vapour=settings.vapour,
             medium_heat=settings.medium_heat,
             hydrophone=settings.hydrophone,
+            gas_change=settings.gas_change,
             wall=None if settings.wall is None else Wall(settings.wall.distance, settings.wall.kind),
         )
 
@@ -100,6 +101,15 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
     def alternatives(self) -> tuple[Alternative, ...]:  # type: ignore[override]
         """See :mod:`en4dvar_bubble.alternatives`."""
         return alternatives(self)
+
+    @property
+    def unforeseen(self) -> tuple[str, float] | None:  # type: ignore[override]
+        """The amount of gas, vapour apart: a bubble breaks up, gas dissolves, or is set free."""
+        return ("gas", self.gas_change) if self.gas_change else None
+
+    def changed(self, name: str, x: Array, change: Array) -> Array:
+        """See :meth:`ForwardModel.changed`; ``gas`` changes at the temperature and the vapour pressure that it has."""
+        return with_gas(self, x, np.exp(change)) if name == "gas" else super().changed(name, x, change)
 
     def doubts(
         self, observable: str, times: Array, values: Array, predicted: Array, members: Mapping[str, Array]

@@ -15,6 +15,7 @@ from en4dvar_bubble.gas import (
     SATURATION,
     SATURATION_TEMPERATURE,
     kirchhoff,
+    mass_fraction,
     mole_fraction,
     saturated_vapour_pressure,
 )
@@ -139,6 +140,22 @@ def _states(model: Dynamics, x: Array, own: Mapping[str, Array]) -> tuple[Array,
         par[:, rows.LOG_GAS] = np.log(gas) + 3 * model.exponent(medium) * log_R
     par[:, rows.LOG_R0] = np.log(column[model.stress_free_radius] * 1e6)
     return initial, par
+
+
+def with_gas(model: Dynamics, x: Array, factor: Array) -> Array:
+    """States (N, n_state) with ``factor`` (N,) times the gas of ``x``, and its temperatures and pressure of vapour."""
+    own, layout, changed = model.parameter_values(x), model.layout, np.array(x)
+    medium, around = model.medium_of(own), model.medium_of(own, 1)
+    before = x[:, layout["p_b"].start]
+    vapour: float | Array = medium.p_v
+    if model.system.vapour:
+        vapour = saturated_vapour_pressure(x[:, layout["T"].stop - 1] if model.system.wall else medium.T_inf)
+    after = vapour + factor * (before - vapour)
+    changed[:, layout["p_b"].start] = after
+    if model.system.vapour:
+        gas = (1 - mole_fraction(x[:, layout["C"]], around)) * (factor * before / after)[:, None]
+        changed[:, layout["C"]] = mass_fraction(np.maximum(1 - gas, 0.0), around)
+    return changed
 
 
 def _memory(

@@ -173,6 +173,8 @@ class BubbleSettings(Section):
     """Constants of medium and gas: the name of a set, or a section that replaces some of them."""
     wall: WallSettings | None = None
     """A plane near the bubble; with ``wall_distance`` under ``parameters`` its distance is estimated."""
+    gas_change: Annotated[float, Field(ge=0, le=3)] = 0.0
+    """How far the amount of gas may change unforeseen, std of its ln: for what is expected after the window."""
     hydrophone: Annotated[float, Quantity("m"), Field(gt=0)] = 1.0
     """How far from the bubble acoustic_pressure is read."""
     accuracy: AccuracyName = "standard"

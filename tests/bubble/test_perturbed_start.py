@@ -12,6 +12,7 @@ from en4dvar.estimation.assimilate import assimilate, forecast
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
 from en4dvar.schemes.settings import AssimilationSettings
+from en4dvar_bubble.gas import saturated_vapour_pressure
 from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.settings import BubbleSettings
 
@@ -80,3 +81,32 @@ def test_twin_with_a_moving_wall_is_recovered():
     )
     assert wrong.iterations[-1].chi2_per_observation > 3 > analysis.iterations[-1].chi2_per_observation
     assert any("does not explain the data" in words for words in wrong.warnings)
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.0, 3.0])
+@pytest.mark.parametrize(
+    "physics",
+    [
+        {"gas": "isothermal", "vapour_pressure": "saturated"},
+        {"gas": "heat", "vapour": "transport"},
+        {"gas": "heat", "vapour": "transport", "medium_heat": "conducting"},
+    ],
+)
+def test_gas_that_changes_on_the_way_is_that_of_the_radius_at_rest(physics, factor):
+    """p_g R³ at rest, T_∞ again, is ``factor`` times that of R_eq: no elasticity, the pressure of an equilibrium."""
+    settings = {**physics, "start": "laser", "law": "newtonian", "driving": {"kind": "none"}}
+    model = BubbleModel.from_settings(BubbleSettings.model_validate(settings))
+    theta = {"mu": np.array([0.08]), "R_eq": np.array([30e-6]), "R_max": np.array([150e-6])}
+    path = model.integrate(model.initial_states(theta), np.array([[18e-6]]))
+    assert path["R"][0, 0] > 35e-6  # on the way, with a Ṙ
+    changed = model.changed("gas", path.states[:, 0], np.log([factor]))
+    rest = model.integrate(changed, np.array([[2e-3]]), 18e-6)["R"][0, 0]
+    medium = model.medium
+    vapour = saturated_vapour_pressure(medium.T_inf) if physics.get("vapour") == "transport" else medium.p_v
+
+    def amount(R):
+        return (medium.p_inf + 2 * medium.S / R - vapour) * R**3
+
+    assert amount(rest) == pytest.approx(factor * amount(30e-6), rel=0.01)
+    other = model.changed("mu", path.states[:, 0], np.log([factor]))
+    assert other[0, model.layout["mu"]] == pytest.approx(0.08 * factor)

@@ -9,12 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from toys import OBSERVABLE, Linear, make_observations, make_problem, with_discrepancy
+from varying_models import Ramp
 
 import en4dvar
 from en4dvar.data.noise import Kernel, Predicted, noise_of
 from en4dvar.diagnosis.withheld import predict_withheld
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.executor import SerialExecutor
+from en4dvar.priors.prior import Prior, PriorTerm
+from en4dvar.problem import InverseProblem
 from en4dvar.report import write_pages
 from en4dvar.report.result import Result
 from en4dvar.results.store import load_stored
@@ -75,6 +78,24 @@ def test_bands_are_those_of_a_linear_model():
     std = np.sqrt(np.diag(rest @ np.linalg.inv(precision) @ rest.T) + 0.01)
     assert a.withheld.median == pytest.approx(rest @ mean, abs=0.01)
     assert a.withheld.high - a.withheld.low == pytest.approx(2 * 1.645 * std, rel=0.02)
+
+
+def test_bands_allow_for_a_change_that_the_model_does_not_foresee():
+    """y' = r, and y is e^z times larger from the last maximum of the window on: quantiles of a lognormal."""
+    model = Ramp()
+    model.unforeseen = ("y", 0.5)
+    times, later = np.array([1.0, 2.0, 3.0]), np.array([4.0, 6.0])
+    observed = make_observations(times, np.array([0.5, 1.0, 0.9]), 1e-6)
+    whole = make_observations(np.append(times, later), np.array([0.5, 1.0, 0.9, 1.0, 1.0]), 1e-6)
+    terms = [PriorTerm.normal(model.parameters[0], 0.0, 1.0)]
+    problem = InverseProblem(model, model.observables[0], replace(observed, continued=whole), Prior(terms))
+    found = predict_withheld(problem, np.full((401, 1), 0.2), SerialExecutor())
+    at_top, since = 1 + 0.2 * 2.0, 0.2 * (later - 2.0)
+    for level, values in ((-1.645, found.low), (0.0, found.median), (1.645, found.high)):
+        assert values == pytest.approx(at_top * np.exp(0.5 * level) + since, rel=0.01)
+    model.unforeseen = None
+    found = predict_withheld(problem, np.full((401, 1), 0.2), SerialExecutor())
+    assert found.high == pytest.approx(1 + 0.2 * later, rel=1e-4)
 
 
 def test_nine_in_ten_readings_lie_in_their_bands():

@@ -121,25 +121,32 @@ def over_widths(values, scale):
     return mean, std, width, np.sqrt(weights @ (widths - width) ** 2), log_evidence
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("truth", [(1.2, 1.2, 0.6, 0.6), (1.0,) * 4])
 def test_an_estimated_width_of_the_walk_is_sampled(truth):
     """A cheap model: ``refine: auto`` draws some 13 000 by importance; about 2000 of them count.
 
-    They miss a part of the long tail of the width: over three seeds and both truths its std was 0.77 to 0.90 of the
-    exact one, and the log evidence 0.26 low to 0.09 high.
+    They miss a part of the long tail of the width. Of eight seeds of each truth its mean was 0.65 to 1.10 of the exact
+    one, its std 0.57 to 0.91, and the log evidence 0.33 low to 0.07 high; another processor rounds differently, and a
+    seed is then another run, so that six of them are averaged.
     """
     constant, model = problem(truth, knots=()), Batched()
     model.compiled = True
     walk = RandomWalk.of(model, constant.prior.terms[0], KNOTS, 0.5, estimated=True)
     p = replace(constant, model=model).varied([walk])
-    a = assimilate(p, AssimilationSettings(members=200), 1)
     mean, std, width, width_std, log_evidence = over_widths(p.observations.values, 0.5)
-    pieces, own = a.pieces(walk, a.posterior), a.posterior[:, p.prior.names.index("r_change_std")]
-    assert np.max(np.abs(pieces.mean(axis=0) - mean) / std) < 0.25
-    assert own.mean() == pytest.approx(width, rel=0.15)
-    assert 0.72 < own.std() / width_std < 1.2
-    assert -0.3 < a.log_evidence - log_evidence < 0.2
-    assert a.log_evidence_constant == pytest.approx(smoother(p.observations.values, 0.0)[1], abs=1e-8)
+    off, seen = [], []
+    for seed in range(6):
+        a = assimilate(p, AssimilationSettings(members=200), seed)
+        pieces, own = a.pieces(walk, a.posterior), a.posterior[:, p.prior.names.index("r_change_std")]
+        off.append((pieces.mean(axis=0) - mean) / std)
+        seen.append((own.mean() / width, own.std() / width_std, a.log_evidence - log_evidence))
+        assert a.log_evidence_constant == pytest.approx(smoother(p.observations.values, 0.0)[1], abs=1e-8)
+    of_width, of_std, of_evidence = np.mean(seen, axis=0)
+    assert np.max(np.abs(np.mean(off, axis=0))) < 0.2
+    assert of_width == pytest.approx(1, abs=0.2)
+    assert 0.65 < of_std < 1.1
+    assert -0.3 < of_evidence < 0.1
     assert p.constant.prior == constant.prior
 
 

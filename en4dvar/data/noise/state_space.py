@@ -5,7 +5,7 @@ A Matérn process of smoothness p + ½ is the first component of a linear system
 y_k − m_k = a_k f(t_k) + ε_k gives what is new in each reading, v_k, and its standard deviation L_kk: the numbers of
 the Cholesky factor of R + A, which takes K³/3 operations.
 
-With Huber's loss for ε the mode of f is found by the same filter and its adjoint, the disturbance smoother: a reading
+With Huber's loss for ε the mode of f is had by the same filter and its adjoint, the disturbance smoother: a reading
 in the tails pulls with the constant force c/s, which moves the mean and leaves the covariance as it is.
 
 Source: Hartikainen & Särkkä (2010), Proc. IEEE MLSP, 379; Särkkä & Solin (2019), Applied Stochastic Differential
@@ -77,14 +77,14 @@ def boxed(
     residuals: (B, K) y − m. std: (B, K) s of ε. own: (B, K) variances of what in δ each reading has of its own.
     amplitudes: (B, K) a g. lengths: (B,) ℓ. steps: (K − 1,) > 0 between readings. nu: ½, 3/2 or 5/2. c: threshold.
     """
-    found = np.empty((2, *residuals.shape))
+    mode = np.empty((2, *residuals.shape))
     with np.errstate(all="ignore"):
         rates = np.sqrt(2 * nu) / lengths
     r, s, nuggets, a, rates, steps = (
         np.ascontiguousarray(part, dtype=float) for part in (residuals, std, own, amplitudes, rates, steps)
     )
-    _boxed(int(nu + 0.5), r, s, nuggets, a, rates, steps, c, found)
-    return found
+    _boxed(int(nu + 0.5), r, s, nuggets, a, rates, steps, c, mode)
+    return mode
 
 
 NEWTON, REWEIGHTED = 30, 500  # iterations; the latter follow where the former go round in circles
@@ -101,17 +101,17 @@ def _boxed(
     rates: Array,
     steps: Array,
     c: float,
-    found: Array,
+    mode: Array,
 ) -> None:
-    """``found`` (2, B, K), run by run: Newton's method on which readings are in the tails, else reweighting."""
+    """``mode`` (2, B, K), run by run: Newton's method on which readings are in the tails, else reweighting."""
     count = residuals.shape[1]
     errors, force, before = np.empty(count), np.empty(count), np.empty(count)
     for run in range(residuals.shape[0]):
         r, s, nugget, a, u, delta = (
-            residuals[run], std[run], own[run], amplitudes[run], found[0, run], found[1, run],
+            residuals[run], std[run], own[run], amplitudes[run], mode[0, run], mode[1, run],
         )  # fmt: skip
         if not np.isfinite(np.sum(r) + np.sum(s) + np.sum(a) + rates[run]):
-            found[:, run] = np.nan
+            mode[:, run] = np.nan
             continue
         errors[:], force[:], settled = s * s, np.nan, False
         for _ in range(NEWTON):

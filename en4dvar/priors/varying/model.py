@@ -118,9 +118,9 @@ class PiecewiseModel(ForwardModel):
         for process in self.state_changes:
             if knot not in process.knots:
                 continue
-            members, where = walk.alive[concerned[walk.alive]], self.model.layout[process.name]
+            members = walk.alive[concerned[walk.alive]]
             change = walk.x[members, self.layout[process.own.name].start + process.knots.index(knot)]
-            inner[members, where], inside = process.applied(inner[members, where], change)
+            inner[members], inside = process.applied(self.model, inner[members], change)
             for i in members[~inside].tolist():
                 low, high = process.field.bounds
                 reason = f"{process.name} outside ({low:g}, {high:g}) {process.field.unit} after its change"

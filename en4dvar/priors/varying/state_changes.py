@@ -66,8 +66,15 @@ class StateChanges:
         """Changes (N, m) from those of the control vector, (N,) by name."""
         return np.stack([theta[term.parameter.name] for term in self.changes], axis=-1)
 
-    def applied(self, values: Array, change: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
-        """The field's ``values`` (N, size) after a ``change`` (N,), and which members (N,) stay inside its bounds."""
-        changed = values * np.exp(change[:, None]) if self.relative else values + change[:, None]
+    def applied(self, model: ForwardModel, x: Array, change: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
+        """The states ``x`` (N, n_state) after a ``change`` (N,), and which members (N,) stay inside the bounds."""
         low, high = self.field.bounds
-        return changed, np.asarray(np.all((changed > low) & (changed < high), axis=1))
+        if self.relative:
+            changed = model.changed(self.name, x, change)
+        else:
+            changed = x.copy()
+            changed[:, model.layout[self.name]] += change[:, None]
+        if self.name not in model.layout.names:
+            return changed, np.asarray(np.isfinite(changed).all(axis=1))
+        values = changed[:, model.layout[self.name]]
+        return changed, np.asarray(np.all((values > low) & (values < high), axis=1))
