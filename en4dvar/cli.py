@@ -11,6 +11,7 @@ import io
 import os
 import sys
 import threading
+from contextlib import suppress
 from typing import Any
 
 import click
@@ -110,7 +111,8 @@ def _settle_surroundings() -> None:
             setattr(sys, name, os.fdopen(number, "r" if name == "stdin" else "w", encoding="utf-8", closefd=False))
     for stream in (sys.stdout, sys.stderr):  # a console that lacks a sign shows another
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
+            with suppress(OSError):  # of a stream that was led elsewhere since it was opened
+                stream.reconfigure(errors="backslashreplace")
     epoch = os.environ.get("SOURCE_DATE_EPOCH")
     if epoch is not None and not epoch.isdecimal():  # what draws figures would raise
         click.echo(f"SOURCE_DATE_EPOCH={printable(epoch)}: not a number of seconds; unset it", err=True)
