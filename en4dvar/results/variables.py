@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.diagnosis.response.ledger import QUANTILES
@@ -40,13 +41,20 @@ def _predictive(members: Callable[[Analysis], Array]) -> Table:
 def _paths(members: Callable[[Analysis], Array]) -> Table:
     """Paths of members; those of several series stand side by side."""
 
-    def path(a: Analysis, item: Item) -> Array:
+    def path(a: Analysis, item: Item) -> Array | npt.NDArray[np.float32]:
         width = len(a.trajectory_times)
         place = [part.name for part in a.problem.parts if part.has_path].index(item.held.name)
-        return members(a)[None, :, place * width : (place + 1) * width]
+        return _to_draw(members(a)[None, :, place * width : (place + 1) * width])
 
     dims = f"{MEMBER} path_time"
     return (Declared("{series}_path", dims, "{label}, noise-free prediction along the path", path, OWN, PATH),)
+
+
+def _to_draw(path: Array) -> Array | npt.NDArray[np.float32]:
+    """In single precision, unless that cannot hold a value: curves are for figures, and most of what a result is."""
+    with np.errstate(over="ignore", under="ignore"):
+        single = path.astype(np.float32)
+    return single if np.allclose(single, path, rtol=1e-6, atol=0.0, equal_nan=True) else path
 
 
 OBSERVED = (

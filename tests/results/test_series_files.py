@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -46,7 +47,17 @@ def test_each_series_has_its_dimension(analysis, result):
     assert np.array_equal(result.observed_data["f_place"].values, [0.0, 2.0, 3.5, 6.0])
     curves = result.dataset("posterior_predictive")
     assert "f_path" not in curves
-    assert np.array_equal(np.hstack([curves["p_path"][0], curves["q_path"][0]]), analysis.posterior_trajectories)
+    paths = np.hstack([curves["p_path"][0], curves["q_path"][0]])
+    assert paths.dtype == np.float32
+    np.testing.assert_allclose(paths, analysis.posterior_trajectories, rtol=2.0**-24)
+
+
+@pytest.mark.parametrize("scale", [1e50, 1e-50])
+def test_a_curve_that_single_precision_cannot_hold_is_kept_to_the_bit(analysis, scale, tmp_path):
+    steep = replace(analysis, posterior_trajectories=scale * analysis.posterior_trajectories)
+    Result.from_analysis(steep, {}).save(tmp_path / "posterior.nc")
+    curves = load_result(tmp_path / "posterior.nc").dataset("posterior_paths")
+    assert np.array_equal(np.hstack([curves["p_path"][0], curves["q_path"][0]]), steep.posterior_trajectories)
 
 
 def test_the_observations_come_back_to_the_bit(analysis, result):
