@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from en4dvar.data.noise import noise_of
-from en4dvar.data.noise.state_space import innovations
+from en4dvar.data.noise.state_space import boxed, innovations
 from en4dvar.data.observations import Observations
 from en4dvar.sampling.mixture import fit_gaussians
 from en4dvar.sampling.nearest import best_over_shifts, targets
@@ -21,6 +21,7 @@ def examples() -> dict[str, Callable[[], object]]:
 def _discrepancy() -> None:
     unit = np.ones((1, 3))
     innovations(unit, unit, unit, np.ones(1), np.ones(2), 1.5)
+    boxed(unit, unit, unit, unit, np.ones(1), np.ones(2), 1.5, 1.0)
 
 
 def _mixture() -> None:
