@@ -30,11 +30,8 @@ differ by no more than their intervals say, and far above 1 if intervals are too
 readings after the window go on to the end of the record, through oscillations of which none was fitted. Density,
 scale and pressure are common to the bubbles of a folder and make χ² smaller. Where χ² is far above 1, the stated
 intervals are too narrow. The bands allow for gas that a collapse takes or sets free (`gas_change`, see
-[physics](physics.md#vapour-and-a-warm-medium)); without it 36 % of these readings lay in them at bcbfefc, and where far
-more than 90 % do now, it allows for too much.
-
-Of three bubbles at 1 MHz one takes many minutes, in a Markov chain, and the folder was left out; at bcbfefc their
-moduli were 4.4, 2.8 and 15.6 kPa, apart by far more than their intervals.
+[physics](physics.md#vapour-and-a-warm-medium)); where far more than 90 % lie in them, it allows for too much, and where
+far fewer do, something else happens to the bubble.
 """
 PRESSURE = re.compile(r"ambient pressure of ([\d.]+) ?MPa")
 ATMOSPHERE = 0.1  # MPa, which init takes for granted
@@ -95,8 +92,9 @@ def page(groups: Mapping[str, Sequence[Record]], command: str) -> str:
 
 def _overview(groups: Mapping[str, Sequence[Record]]) -> str:
     lines = [
-        "| | bubbles | intervals of G | χ² of ln G | intervals of μ | χ² of ln μ | readings after window | inside |",
-        "|---|---|---|---|---|---|---|---|",
+        "| | bubbles | intervals of G | χ² of ln G | intervals of μ | χ² of ln μ "
+        "| readings to the next minimum | inside | all after the window | inside |",
+        "|---|---|---|---|---|---|---|---|---|---|",
     ]
     every = [record for records in groups.values() for record in records]
     for title, records in [*((GROUPS[name].title, r) for name, r in groups.items()), ("all", every)]:
@@ -105,8 +103,9 @@ def _overview(groups: Mapping[str, Sequence[Record]]) -> str:
             logs = intervals(records, key)
             some = any(key in record for record in records)
             cells += [str(len(logs)) if some else "–", f"{chi2(logs):.2f}" if len(logs) > 1 and title != "all" else "–"]
-        count, inside = after(records)
-        cells += [str(count), f"{inside:.0%}" if count else "–"]
+        for part in ("next", "withheld"):
+            count, inside = after(records, part)
+            cells += [str(count), f"{inside:.0%}" if count else "–"]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
@@ -153,9 +152,9 @@ def chi2(logs: np.ndarray) -> float:
     return float(np.sum(((mean - np.log(average(logs))) / std) ** 2) / (len(logs) - 1))
 
 
-def after(records: Sequence[Record]) -> tuple[int, float]:
-    """Readings after the windows, and the share of them in their bands."""
-    told = [record["withheld"] for record in records if record.get("withheld")]
+def after(records: Sequence[Record], key: str = "withheld") -> tuple[int, float]:
+    """Readings after the windows, or ("next") up to the next minimum, and the share of them in their bands."""
+    told = [record[key] for record in records if record.get(key)]
     count = sum(int(each[0]) for each in told)
     return count, sum(each[0] * each[1] for each in told) / max(1, count)
 

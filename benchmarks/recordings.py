@@ -42,7 +42,11 @@ from records import Record, fill
 
 import en4dvar
 from en4dvar.cli import main as command_line
+from en4dvar.inputs.window import minima
 from en4dvar.model.forward import Failure
+from en4dvar.report.result import Result
+from en4dvar.report.text import shown
+from en4dvar.report.withheld import withheld_lines
 from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.settings import BubbleSettings
 
@@ -53,6 +57,7 @@ FRAMES = (6.0, 80.0)  # of a collapse, between which a camera is set
 CELLS = 4000  # instants of the model's path that readings are interpolated from
 INSIDE = {90: (0.05, 0.95), 50: (0.25, 0.75)}
 SILENT = 3.5
+PROMINENT = 0.03  # of the range of readings: a minimum after the window
 NUMBERS = ("G", "mu")
 
 
@@ -140,6 +145,7 @@ def verbatim(text: str, law: str, words: list[str], quick: bool) -> Record:
             if key in rows:
                 found[key] = _posterior(result.posterior[key].values.ravel(), rows[key])
         found["withheld"] = _withheld(result.sample_stats.attrs, found.get("R_max", {"mean": np.nan})["mean"])
+        found["next"] = _next(result)
         return found
 
 
@@ -148,6 +154,14 @@ def _withheld(stats: Any, largest: float) -> tuple[int, float, float] | None:
     if "withheld_readings" not in stats:
         return None
     return int(stats["withheld_readings"]), float(stats["withheld_inside"]), float(stats["withheld_rms"]) / largest
+
+
+def _next(result: Result) -> tuple[int, float] | None:
+    """How many readings follow the window to the next minimum, and their share in the 90 % bands."""
+    lines, within = withheld_lines(result), shown(result.group("observed_data")["radius"])
+    ends = minima(np.concatenate([within, [float(str(line[4])) for line in lines]]), PROMINENT)
+    count = next((int(end) + 1 - len(within) for end in ends if end > len(within)), 0)
+    return (count, float(np.mean([line[-1] == 1 for line in lines[:count]]))) if count else None
 
 
 def _posterior(members: Any, row: dict[str, str]) -> Record:
@@ -210,8 +224,9 @@ def agreement(records: list[Record]) -> None:
             print(
                 f"{key}: {len(logs)} of {len(records)} intervals; χ² of ln {key} per degree of freedom {chi2(logs):.2f}"
             )
-    count, inside = after(records)
-    print(f"readings after the windows: {count}, {inside:.0%} in their 90 % bands")
+    for key, words in (("withheld", "after the windows"), ("next", "from there to the next minimum")):
+        count, inside = after(records, key)
+        print(f"readings {words}: {count}, {inside:.0%} in their 90 % bands")
 
 
 def measured(folder: Path, law: str, medium: str, o: argparse.Namespace) -> list[Record]:

@@ -11,12 +11,13 @@ leave). With a constant R and the same prior this is δx = C JᵀR⁻¹ (δy −
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from en4dvar.data.noise import Linearisation, Predicted
+from en4dvar.data.noise import Linearisation
 from en4dvar.data.observations import Observations
 from en4dvar.diagnosis.influence import ReadingTangent
 from en4dvar.model.state import Array
@@ -57,19 +58,25 @@ class LinearResponse:
         return np.asarray(np.linalg.lstsq(self.directions.T, changes.T, rcond=None)[0].T)
 
     def step(
-        self, observations: Observations, predicted: Predicted, moved: Array, prior_shift: Array
+        self,
+        observations: Observations,
+        linear: Linearisation,
+        moved: Array,
+        prior_shift: Array,
+        damping: Sequence[float] = (0.0,),
     ) -> tuple[Array, float]:
-        """δx (n,) to the mode of a changed problem, from ``at`` + ``moved`` (n,), where it was ``predicted`` (one run),
-        and by how much its J falls on the way, as far as it is quadratic.
+        """δx (D, n) to the mode of a changed problem, from ``at`` + ``moved`` (n,), where ``linear`` has its prediction
+        and a tangent, and by how much its J falls on the way of the first, as far as it is quadratic.
+
+        One δx for each ``damping``, by which the prior's precision is multiplied further (Levenberg 1944).
 
         ``observations`` are the changed ones, ``prior_shift`` (n,) is the change of the prior's mean.
         """
-        d, S = self.whitened
-        changed, tangent = observations.whiten(replace(self.linear, prediction=predicted))
-        offset = self.coordinates(moved - prior_shift)
-        gradient = self.precision * offset - tangent.T @ changed + S.T @ d
-        step = -np.linalg.solve(self._hessian(tangent), gradient)
-        return np.asarray(step @ self.directions), -0.5 * float(gradient @ step)
+        changed, tangent = observations.whiten(linear)
+        gradient = self.precision * self.coordinates(moved - prior_shift) - tangent.T @ changed + self._of_prior
+        hessian, more = self._hessian(tangent), self.precision * np.eye(len(gradient))
+        steps = np.array([-np.linalg.solve(hessian + factor * more, gradient) for factor in damping])
+        return np.asarray(steps @ self.directions), -0.5 * float(gradient @ steps[0])
 
     def tangent(self, members: Array) -> ReadingTangent:
         """The rows of each reading, of independent errors, beside control vectors (N, n).
@@ -80,6 +87,21 @@ class LinearResponse:
         k = len(self.observations)
         rows = d.reshape(-1, k).T, S.reshape(-1, k, S.shape[1]).transpose(1, 0, 2)
         return ReadingTangent(*rows, self.coordinates(members - self.at), self.directions)
+
+    def background(self, offsets: Array) -> Array:
+        """The prior's part of J (…,) at offsets (…, n) from the mode, up to a constant."""
+        c = self.coordinates(offsets)
+        return np.asarray(0.5 * self.precision * np.sum(c**2, axis=-1) + c @ self._of_prior)
+
+    def factor(self, observations: Observations, linear: Linearisation) -> Array:
+        """L (r, r), lower triangular, of the Hessian A = LLᵀ of J with a tangent: rows of L⁻¹E are half-widths."""
+        return np.asarray(np.linalg.cholesky(self._hessian(observations.whiten(linear)[1])), dtype=float)
+
+    @cached_property
+    def _of_prior(self) -> Array:
+        """(r,) gradient of the prior's part of J at the mode, where that of the readings takes it away."""
+        d, S = self.whitened
+        return np.asarray(S.T @ d)
 
     def _hessian(self, S: Array) -> Array:
         return np.asarray(self.precision * np.eye(S.shape[1]) + S.T @ S)

@@ -2,8 +2,8 @@
 
 The first run of an alternative, at the mode, gives the linear response. Unless that is small anyway each further one,
 where it leads, corrects it with the same tangent (a chord iteration), until what it changes is small in every
-parameter. An alternative that does not settle within :data:`MOST_RUNS` is beyond linear response, and said to be: only
-a fit tells.
+parameter. An alternative that does not settle within :data:`MOST_RUNS` is beyond linear response and is fitted again
+from the mode (:mod:`en4dvar.diagnosis.response.refit`). Where that ends nowhere, the reason is kept.
 """
 
 from __future__ import annotations
@@ -13,7 +13,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from en4dvar.data.noise import Predicted
 from en4dvar.diagnosis.response.linear import LinearResponse
+from en4dvar.diagnosis.response.refit import refit
 from en4dvar.ensemble.forecast import Composite
 from en4dvar.executor import Executor
 from en4dvar.model.forward import Alternative
@@ -23,6 +25,7 @@ from en4dvar.problem import InverseProblem
 MOST_RUNS = 6  # of one alternative
 SETTLED = 0.1  # of each parameter's shift, and of its std: a correction below one of them counts as small
 FAR = 3.0  # posterior standard deviations that a parameter of R may move: further away a chord seems to settle anywhere
+NOWHERE = "no minimum of J was reached from this one"
 SMALL = 0.3  # posterior standard deviations of a first step that is believed without a second
 
 
@@ -109,51 +112,79 @@ def _shift(
     executor: Executor,
     alternative: Alternative,
 ) -> Shift:
-    runs, unknown = 0, np.full(len(std), np.nan)
+    unknown = np.full(len(std), np.nan)
     about = alternative.name, _words(problem, alternative)
     try:
         changed = changed_problem(problem, alternative)
         of_prior = prior_shift(problem, tuple(alternative.parameters.items()))
         composite = Composite(changed, executor)
     except Exception as error:  # a model may offer what does not suit the problem; the reason is kept
-        return Shift(*about, unknown, unknown, unknown, np.nan, runs, f"cannot be set up: {error}")
-    moved, reason, before = np.zeros(len(std)), "too large a change to extrapolate", np.inf
+        return Shift(*about, unknown, unknown, unknown, np.nan, 0, f"cannot be set up: {error}")
     of_errors = np.array([name in problem.of_errors for name in problem.prior.names])
-    for attempt in range(MOST_RUNS):
-        if attempt == 0 and _same_run(problem, changed):
-            predicted = response.linear.prediction
-        else:
-            run = composite((response.at + moved)[None])
-            runs += 1
-            if run.failures[0] and attempt:  # where linear response led
-                break
-            if run.failures[0]:
-                return Shift(*about, unknown, unknown, unknown, np.nan, runs, f"cannot be run: {run.failures[0]}")
-            predicted = run.predicted[0]
-        misfit = float(changed.observations.cost(predicted))
-        if not np.isfinite(misfit):  # parameters of R can be led where it cannot be factored
-            break
-        step, decrease = response.step(changed.observations, predicted, moved, of_prior)
-        moved = moved + step
-        if np.any(np.abs(moved / std)[of_errors] > FAR):
-            reason = "too large a change to extrapolate"
-            break
-        correction = float(np.max(np.abs(step / std)))
-        small = SETTLED * np.maximum(1.0, np.abs(moved / std)) if attempt else np.full(len(std), SMALL)
-        if np.all(np.abs(step / std) <= small):
-            reason = ""
-        if not reason or correction > before:
-            break
-        before = correction
-    if reason:
-        return Shift(*about, unknown, unknown, unknown, np.nan, runs, reason)
+    first = response.linear.prediction if _same_run(problem, changed) else None
+    chord = _chord(composite, response, std, of_prior, of_errors, first)
+    moved, known, of_readings, runs = chord.moved, chord.known, chord.of_readings, chord.runs
+    if chord.failure:
+        return Shift(*about, unknown, unknown, unknown, np.nan, runs, f"cannot be run: {chord.failure}")
+    if not chord.settled:
+        end, of_readings, more = refit(composite, changed.observations, response, std, of_prior)
+        runs += more
+        if end is None:
+            return Shift(*about, unknown, unknown, unknown, np.nan, runs, NOWHERE)
+        moved = known = end
     prior = problem.prior
-    z = prior.white_change(response.at + moved - step - prior.mean - of_prior)
-    there = 0.5 * float(z @ z) + misfit - decrease
+    z = prior.white_change(response.at + known - prior.mean - of_prior)
+    there = 0.5 * float(z @ z) + of_readings
     mode, positive = prior.to_physical(response.at), prior.bounds[0] >= 0
     change = prior.to_physical(response.at + moved) - mode
     relative = np.divide(change, mode, out=unknown.copy(), where=positive & (mode > 0))
     return Shift(*about, change, relative, moved / std, there - cost, runs)
+
+
+@dataclass(frozen=True)
+class _Chord:
+    """Where a chord iteration led: ``moved`` (n,), its last run at ``known`` (n,), the readings' part of J at the end,
+    as far as it is quadratic; ``failure`` of the run at the mode.
+    """
+
+    settled: bool
+    moved: Array
+    known: Array
+    of_readings: float
+    runs: int
+    failure: str = ""
+
+
+def _chord(
+    changed: Composite, response: LinearResponse, std: Array, of_prior: Array, of_errors: Array, first: Predicted | None
+) -> _Chord:
+    """``first``: what is predicted at the mode, where that is known; ``of_errors`` (n,) tells the parameters of R."""
+    moved, before, runs = np.zeros(len(std)), np.inf, 0
+    observations, misfit = changed.problem.observations, np.nan
+    for attempt in range(MOST_RUNS):
+        predicted = None if attempt else first
+        if predicted is None:
+            run = changed((response.at + moved)[None])
+            runs += 1
+            if run.failures[0]:  # at the mode, or where linear response led
+                return _Chord(False, moved, moved, misfit, runs, "" if attempt else run.failures[0])
+            predicted = run.predicted[0]
+        misfit = float(observations.cost(predicted))
+        if not np.isfinite(misfit):  # parameters of R can be led where it cannot be factored
+            break
+        linear = replace(response.linear, prediction=predicted)
+        (step,), decrease = response.step(observations, linear, moved, of_prior)
+        known, moved = moved, moved + step
+        if np.any(np.abs(moved / std)[of_errors] > FAR):
+            break
+        correction = float(np.max(np.abs(step / std)))
+        small = SETTLED * np.maximum(1.0, np.abs(moved / std)) if attempt else np.full(len(std), SMALL)
+        if np.all(np.abs(step / std) <= small):
+            return _Chord(True, moved, known, misfit - decrease, runs)
+        if correction > before:
+            break
+        before = correction
+    return _Chord(False, moved, moved, misfit, runs)
 
 
 def _same_run(problem: InverseProblem, changed: InverseProblem) -> bool:
