@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from en4dvar.diagnosis import diagnostics as diag
 from en4dvar.diagnosis.analysis import Analysis, Progress
 from en4dvar.diagnosis.honesty import ControlEnsembles, examine
 from en4dvar.diagnosis.response.ledger import ledger
-from en4dvar.diagnosis.response.what_if import what_if
+from en4dvar.diagnosis.response.what_if import Fit, Shift, what_if
 from en4dvar.diagnosis.withheld import predict_withheld
 from en4dvar.ensemble.forecast import Forecast, cost, forecast, log_posterior
 from en4dvar.estimation import conclusions
@@ -110,7 +111,10 @@ def _concluded(
     log_evidence_constant = _log_evidence_constant(stages)
     response = conclusions.response_of(space, descent, ends.mode, last)
     std = ends.members.std(axis=0, ddof=1)
-    shifts = what_if(problem, response, std, control.centre_cost, space.executor) if stages.settings.what_if else ()
+    shifts: tuple[Shift, ...] = ()
+    if stages.settings.what_if:
+        fitted = partial(_fitted, stages)
+        shifts = what_if(problem, response, std, control.centre_cost, space.executor, fitted)
     path = ledger(problem, response, std) if stages.settings.what_if else None
     withheld = predict_withheld(problem, ends.members, space.executor)
     others = sum(shift.runs for shift in shifts) + (path.runs if path else 0)
@@ -141,6 +145,18 @@ def _concluded(
         withheld=withheld,
         ledger=path,
     )
+
+
+def _fitted(stages: Stages, changed: InverseProblem) -> Fit | None:
+    """The mode of a changed problem, searched like that of the problem itself; None where too few members survive."""
+    settings = replace(stages.settings, what_if=False, refine="none", emulator="off")
+    within = replace(changed.observations, continued=None)
+    other = Stages(replace(changed, observations=within), settings, stages.seed, stages.space.executor, None, None)
+    try:
+        end = _through(other, None)
+    except TooFewMembersError:
+        return None
+    return Fit(changed.prior.from_physical(end.centre), end.iterations[-1].cost, other.space.forward_runs)
 
 
 def _log_evidence_constant(stages: Stages) -> float | None:

@@ -233,19 +233,20 @@ def test_a_known_discrepancy_is_a_correlated_error():
 class Leading(LinearResponse):
     """Leads to a large amplitude and a long time, and stays there."""
 
-    def step(self, observations, linear, moved, prior_shift, damping=(0.0,)):
-        return np.tile(0.0 if moved.any() else [0.0, 0.0, 40.0, 100.0], (len(damping), 1)) * np.ones(4), 0.0
+    def step(self, observations, linear, moved, prior_shift):
+        return np.zeros(4) if moved.any() else np.array([0.0, 0.0, 40.0, 100.0]), 0.0
 
 
-def test_an_alternative_that_leads_to_a_huge_discrepancy_ends_all_the_same():
+def test_an_alternative_that_leads_to_a_huge_discrepancy_is_fitted_again():
     problem = with_discrepancy(make_problem(Linear(("a", "b")), [1.0, 1.3]))
     problem.model.alternatives = (Alternative("other", "it were so", Linear(("a", "b"))),)
     x = problem.prior.mean
     like = forecast(problem, x[None]).predicted[0]
     linear = Linearisation.of_stacked(like, like.stacked, np.ones((2, like.stacked.shape[0])))
     response = Leading(x, linear, np.eye(2, 4), 11.0, problem.observations)
-    (shift,) = what_if(problem, response, np.ones(4), 0.0, SerialExecutor())
-    assert shift.reason == NOWHERE or np.isfinite(shift.cost_change)  # and not an error of linear algebra
+    (shift,) = what_if(problem, response, np.ones(4), 0.0, SerialExecutor(), lambda changed: None)
+    assert shift.reason == NOWHERE
+    assert shift.runs == 1  # another run there could not be weighed against the readings
 
 
 @functools.cache

@@ -11,7 +11,6 @@ leave). With a constant R and the same prior this is δx = C JᵀR⁻¹ (δy −
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -58,25 +57,18 @@ class LinearResponse:
         return np.asarray(np.linalg.lstsq(self.directions.T, changes.T, rcond=None)[0].T)
 
     def step(
-        self,
-        observations: Observations,
-        linear: Linearisation,
-        moved: Array,
-        prior_shift: Array,
-        damping: Sequence[float] = (0.0,),
+        self, observations: Observations, linear: Linearisation, moved: Array, prior_shift: Array
     ) -> tuple[Array, float]:
-        """δx (D, n) to the mode of a changed problem, from ``at`` + ``moved`` (n,), where ``linear`` has its prediction
-        and a tangent, and by how much its J falls on the way of the first, as far as it is quadratic.
-
-        One δx for each ``damping``, by which the prior's precision is multiplied further (Levenberg 1944).
+        """δx (n,) to the mode of a changed problem, from ``at`` + ``moved`` (n,), where ``linear`` has its prediction
+        and a tangent, and by how much its J falls on the way, as far as it is quadratic.
 
         ``observations`` are the changed ones, ``prior_shift`` (n,) is the change of the prior's mean.
         """
+        d, S = self.whitened
         changed, tangent = observations.whiten(linear)
-        gradient = self.precision * self.coordinates(moved - prior_shift) - tangent.T @ changed + self._of_prior
-        hessian, more = self._hessian(tangent), self.precision * np.eye(len(gradient))
-        steps = np.array([-np.linalg.solve(hessian + factor * more, gradient) for factor in damping])
-        return np.asarray(steps @ self.directions), -0.5 * float(gradient @ steps[0])
+        gradient = self.precision * self.coordinates(moved - prior_shift) - tangent.T @ changed + S.T @ d
+        step = -np.linalg.solve(self._hessian(tangent), gradient)
+        return np.asarray(step @ self.directions), -0.5 * float(gradient @ step)
 
     def tangent(self, members: Array) -> ReadingTangent:
         """The rows of each reading, of independent errors, beside control vectors (N, n).
@@ -87,21 +79,6 @@ class LinearResponse:
         k = len(self.observations)
         rows = d.reshape(-1, k).T, S.reshape(-1, k, S.shape[1]).transpose(1, 0, 2)
         return ReadingTangent(*rows, self.coordinates(members - self.at), self.directions)
-
-    def background(self, offsets: Array) -> Array:
-        """The prior's part of J (…,) at offsets (…, n) from the mode, up to a constant."""
-        c = self.coordinates(offsets)
-        return np.asarray(0.5 * self.precision * np.sum(c**2, axis=-1) + c @ self._of_prior)
-
-    def factor(self, observations: Observations, linear: Linearisation) -> Array:
-        """L (r, r), lower triangular, of the Hessian A = LLᵀ of J with a tangent: rows of L⁻¹E are half-widths."""
-        return np.asarray(np.linalg.cholesky(self._hessian(observations.whiten(linear)[1])), dtype=float)
-
-    @cached_property
-    def _of_prior(self) -> Array:
-        """(r,) gradient of the prior's part of J at the mode, where that of the readings takes it away."""
-        d, S = self.whitened
-        return np.asarray(S.T @ d)
 
     def _hessian(self, S: Array) -> Array:
         return np.asarray(self.precision * np.eye(S.shape[1]) + S.T @ S)

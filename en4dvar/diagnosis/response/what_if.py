@@ -2,20 +2,18 @@
 
 The first run of an alternative, at the mode, gives the linear response. Unless that is small anyway each further one,
 where it leads, corrects it with the same tangent (a chord iteration), until what it changes is small in every
-parameter. An alternative that does not settle within :data:`MOST_RUNS` is beyond linear response and is fitted again
-from the mode (:mod:`en4dvar.diagnosis.response.refit`). Where that ends nowhere, the reason is kept.
+parameter. An alternative that does not settle within :data:`MOST_RUNS` is beyond linear response and is fitted again.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from en4dvar.data.noise import Predicted
 from en4dvar.diagnosis.response.linear import LinearResponse
-from en4dvar.diagnosis.response.refit import refit
 from en4dvar.ensemble.forecast import Composite
 from en4dvar.executor import Executor
 from en4dvar.model.forward import Alternative
@@ -25,8 +23,20 @@ from en4dvar.problem import InverseProblem
 MOST_RUNS = 6  # of one alternative
 SETTLED = 0.1  # of each parameter's shift, and of its std: a correction below one of them counts as small
 FAR = 3.0  # posterior standard deviations that a parameter of R may move: further away a chord seems to settle anywhere
-NOWHERE = "no minimum of J was reached from this one"
+NOWHERE = "too few members survive"
 SMALL = 0.3  # posterior standard deviations of a first step that is believed without a second
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The mode (n,) of a problem, transformed, J there, and the forward runs it took."""
+
+    centre: Array
+    cost: float
+    runs: int
+
+
+Fitted = Callable[[InverseProblem], Fit | None]
 
 
 @dataclass(frozen=True)
@@ -64,12 +74,12 @@ class Shift:
 
 
 def what_if(
-    problem: InverseProblem, response: LinearResponse, std: Array, cost: float, executor: Executor
+    problem: InverseProblem, response: LinearResponse, std: Array, cost: float, executor: Executor, fitted: Fitted
 ) -> tuple[Shift, ...]:
     """The shifts of all alternatives of the problem's model: the largest first, then those unknown, then small ones.
 
-    ``std`` (n,) of the posterior, transformed; ``cost`` J at ``response.at``. A scale that is estimated has an
-    uncertainty of its own.
+    ``std`` (n,) of the posterior, transformed; ``cost`` J at ``response.at``; ``fitted`` minimises J of a problem, None
+    where that fails. A scale that is estimated has an uncertainty of its own.
     """
     if not response.defined or not np.all(std > 0):
         return ()
@@ -78,7 +88,7 @@ def what_if(
         for alternative in problem.alternatives
         if alternative.values == 1.0 or not problem.has_reading_scale
     ]
-    shifts = [_shift(problem, response, std, cost, executor, alternative) for alternative in offered]
+    shifts = [_shift(problem, response, std, cost, executor, fitted, alternative) for alternative in offered]
     return tuple(sorted(shifts, key=lambda shift: -shift.largest))
 
 
@@ -110,6 +120,7 @@ def _shift(
     std: Array,
     cost: float,
     executor: Executor,
+    fitted: Fitted,
     alternative: Alternative,
 ) -> Shift:
     unknown = np.full(len(std), np.nan)
@@ -123,18 +134,19 @@ def _shift(
     of_errors = np.array([name in problem.of_errors for name in problem.prior.names])
     first = response.linear.prediction if _same_run(problem, changed) else None
     chord = _chord(composite, response, std, of_prior, of_errors, first)
-    moved, known, of_readings, runs = chord.moved, chord.known, chord.of_readings, chord.runs
+    moved, runs = chord.moved, chord.runs
     if chord.failure:
         return Shift(*about, unknown, unknown, unknown, np.nan, runs, f"cannot be run: {chord.failure}")
-    if not chord.settled:
-        end, of_readings, more = refit(composite, changed.observations, response, std, of_prior)
-        runs += more
-        if end is None:
-            return Shift(*about, unknown, unknown, unknown, np.nan, runs, NOWHERE)
-        moved = known = end
     prior = problem.prior
-    z = prior.white_change(response.at + known - prior.mean - of_prior)
-    there = 0.5 * float(z @ z) + of_readings
+    if not chord.settled:
+        terms = tuple(replace(t, mean=t.mean + by) for t, by in zip(prior.terms, of_prior, strict=True))
+        fit = fitted(replace(changed, prior=prior.of(terms)))
+        if fit is None:
+            return Shift(*about, unknown, unknown, unknown, np.nan, runs, NOWHERE)
+        moved, there, runs = fit.centre - response.at, fit.cost, runs + fit.runs
+    else:
+        z = prior.white_change(response.at + chord.known - prior.mean - of_prior)
+        there = 0.5 * float(z @ z) + chord.of_readings
     mode, positive = prior.to_physical(response.at), prior.bounds[0] >= 0
     change = prior.to_physical(response.at + moved) - mode
     relative = np.divide(change, mode, out=unknown.copy(), where=positive & (mode > 0))
@@ -173,7 +185,7 @@ def _chord(
         if not np.isfinite(misfit):  # parameters of R can be led where it cannot be factored
             break
         linear = replace(response.linear, prediction=predicted)
-        (step,), decrease = response.step(observations, linear, moved, of_prior)
+        step, decrease = response.step(observations, linear, moved, of_prior)
         known, moved = moved, moved + step
         if np.any(np.abs(moved / std)[of_errors] > FAR):
             break
