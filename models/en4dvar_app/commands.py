@@ -6,34 +6,36 @@ from pathlib import Path
 
 import click
 
-from en4dvar.commands.common import echo
+from en4dvar.commands.common import echo, trust_option
 
 
 @click.command()
-@click.argument("folder", type=click.Path(exists=True, path_type=Path), default=".")
+@click.argument("path", metavar="[FILE or FOLDER]", type=click.Path(exists=True, path_type=Path), default=".")
 @click.option("--port", type=click.IntRange(0, 65535), default=0, help="Port of this computer; default: a free one.")
 @click.option("--no-browser", is_flag=True, help="Only print the address.")
-def app(folder: Path, port: int, no_browser: bool) -> None:
-    """Open a page in the browser that leads from a movie to an estimate.
+@trust_option
+def app(path: Path, port: int, no_browser: bool, trust: bool) -> None:
+    """Open a page in the browser that leads from a movie or a table to an estimate.
 
-    FOLDER, or the folder of a FILE, holds the movies; only files below it are read and written. Every step shows the
-    command line that repeats it. The address is for this computer only and holds a secret.
+    Only files of the folder, or of the folder of the file, are read and written. Every step shows the command line
+    that repeats it. The address is for this computer only and holds a secret.
 
     \b
     Example:
-      en4dvar app my_movies
+      en4dvar app configs/data
     """
     try:
         from en4dvar_app.server import serve
-    except ImportError:
-        raise click.UsageError("en4dvar app needs tornado: pip install 'en4dvar[app]'") from None
-    root = (folder if folder.is_dir() else folder.parent).resolve()
+    except ImportError as error:
+        missing = (error.name or "tornado").partition(".")[0]
+        raise click.UsageError(f"en4dvar app needs {missing}: pip install '.[app]'") from None
+    root = (path if path.is_dir() else path.parent).resolve()
 
     def ready(address: str) -> None:
-        echo(f"{address}\nCtrl-C ends the page; commands that run go on, and the page finds them again.")
+        echo(f"{address}\nCtrl-C ends the page; commands go on, and the page shows them again.")
         if not no_browser:
             import webbrowser
 
             webbrowser.open(address)
 
-    serve(root, port, ready)
+    serve(root, port, trust, ready)

@@ -1,7 +1,9 @@
 """A command of the page: a process of its own that outlives the server, and a folder of files that tells about it.
 
-``python -m en4dvar_app.job FOLDER`` runs ``FOLDER/command.json`` in the folder two above; it writes ``output`` and, at
-the end, ``code``.
+``python -m en4dvar_app.job FOLDER`` runs the command in ``FOLDER/command.json`` in the folder two above. It holds the
+lock of ``FOLDER`` while it works, writes ``output`` and at the end ``code``, and ends the command where a file
+``cancel`` appears. Nothing of this needs POSIX. Python's option ``-P`` keeps modules that lie in the folder from being
+imported in place of installed ones.
 """
 
 from __future__ import annotations
@@ -9,90 +11,127 @@ from __future__ import annotations
 import json
 import os
 import shlex
-import signal
 import subprocess
 import sys
+import time
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from en4dvar.plumbing.errors import En4dvarError, OutputError
+from en4dvar.plumbing.files import inside, write_text
+from en4dvar.runs.lock import locked
+from en4dvar_app.trusted import require_harmless
+
 JOBS = ".en4dvar_app"
+LONGEST = 20_000  # characters of output on the page
+INTERRUPTED = 130
+_begun: dict[Path, subprocess.Popen[bytes]] = {}  # by this process
 
 
-def start(folder: Path, step: str, words: list[str]) -> Path:
-    """Begin ``en4dvar WORDS`` in ``folder``; return the job's folder."""
-    jobs = folder / JOBS
+def start(root: Path, step: str, subject: str, words: list[str], trust: bool) -> int:
+    """Begin ``en4dvar WORDS`` in the folder ``root``; the number of the job. Raises :class:`OutputError`."""
+    jobs = inside(root, JOBS)
     jobs.mkdir(exist_ok=True)
-    number = 1 + max((int(p.name) for p in jobs.iterdir() if p.name.isdigit()), default=0)
+    number = 1 + max(map(int, _names(jobs)), default=0)
     job = jobs / str(number)
-    job.mkdir()
-    (job / "command.json").write_text(json.dumps({"step": step, "words": words}), encoding="utf-8")
-    process = subprocess.Popen(
-        [sys.executable, "-m", "en4dvar_app.job", str(job)], start_new_session=True,
+    try:
+        job.mkdir()
+    except FileExistsError:
+        raise OutputError("another window begins a command: look at the page again") from None
+    about = {"step": step, "subject": subject, "words": words, "trust": trust}
+    write_text(job / "command.json", json.dumps(about))
+    _begun[job] = subprocess.Popen(
+        [sys.executable, "-P", "-m", "en4dvar_app.job", str(job)], start_new_session=True,
+        creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
         stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
     )  # fmt: skip
-    (job / "pid").write_text(str(process.pid), encoding="utf-8")
-    return job
+    return number
 
 
-def told(job: Path) -> dict[str, Any]:
-    """What the page shows of a job: its command line, output and state (running, done, failed or stopped)."""
-    command = json.loads((job / "command.json").read_text(encoding="utf-8"))
-    output = (job / "output").read_text(encoding="utf-8", errors="replace") if (job / "output").exists() else ""
-    state = "running"
-    if (job / "code").exists():
-        code = int((job / "code").read_text(encoding="utf-8"))
-        state = "done" if code == 0 else "stopped" if code in (-signal.SIGINT, 130) else "failed"
-    elif not _alive(job):
-        state = "stopped"
-    line = shlex.join(["en4dvar", *command["words"]])
-    return {"number": int(job.name), "step": command["step"], "line": line, "output": output[-20_000:], "state": state}
+def every(root: Path, most: int = 40) -> list[dict[str, Any]]:
+    """The last jobs of a folder, the oldest first: command line, output, state (running, done, failed or stopped)."""
+    jobs = inside(root, JOBS)
+    numbers = sorted(map(int, _names(jobs)))[-most:]
+    return [about for number in numbers if (about := _described(jobs / str(number)))]
 
 
-def every(folder: Path) -> list[dict[str, Any]]:
-    """Jobs of a folder, the oldest first."""
-    jobs = folder / JOBS
-    found = [p for p in jobs.iterdir() if (p / "command.json").is_file()] if jobs.is_dir() else []
-    return [told(job) for job in sorted(found, key=lambda p: int(p.name))]
+def cancel(root: Path, number: int) -> None:
+    """Interrupt a job as Ctrl-C does; what it has written stays, and ``--resume`` continues a run."""
+    write_text(inside(root, f"{JOBS}/{number}/cancel"), "")
 
 
-def cancel(job: Path) -> None:
-    """Interrupt a running job as Ctrl-C does; what it has written stays, and ``--resume`` continues a run."""
-    if told(job)["state"] == "running":
-        with suppress(ProcessLookupError):
-            os.killpg(int((job / "pid").read_text(encoding="utf-8")), signal.SIGINT)
+def _names(jobs: Path) -> list[str]:
+    names = os.listdir(jobs) if jobs.is_dir() else []
+    return [name for name in names if name.isascii() and name.isdecimal() and len(name) < 9]
 
 
-def _alive(job: Path) -> bool:
-    """Whether the job's process is there, and is this job's: numbers of processes are used again."""
+def _described(job: Path) -> dict[str, Any] | None:
+    """None: the folder is not one of ours."""
     try:
-        pid = int((job / "pid").read_text(encoding="utf-8"))
-        with suppress(ChildProcessError):
-            os.waitpid(pid, os.WNOHANG)
-        command = Path(f"/proc/{pid}/cmdline")
-        if Path("/proc/self").exists():
-            return str(job).encode() in command.read_bytes()
-        os.kill(pid, 0)
-    except (OSError, ValueError):
-        return False
-    return True
+        about = json.loads((job / "command.json").read_text(encoding="utf-8"))
+        line = shlex.join(["en4dvar", *map(str, about["words"])])
+        whole = {"number": int(job.name), "step": str(about["step"]), "subject": str(about["subject"]), "line": line}
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return {**whole, "output": end_of(job / "output"), "state": _state(job)}
 
 
-def _main(job: Path) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # meant for the command
-    words = json.loads((job / "command.json").read_text(encoding="utf-8"))["words"]
-    with (job / "output").open("wb") as output:
-        code = subprocess.call(
-            [sys.executable, "-m", "en4dvar.cli", *words], cwd=job.parent.parent, stdin=subprocess.DEVNULL,
-            stdout=output, stderr=subprocess.STDOUT, env={**os.environ, "COLUMNS": "100"}, preexec_fn=_listen,
-        )  # fmt: skip
-    (job / "code.partial").write_text(str(code), encoding="utf-8")
-    (job / "code.partial").replace(job / "code")
+def end_of(path: Path) -> str:
+    """The last characters of a file; "" where there is none."""
+    try:
+        with path.open("rb") as file:
+            file.seek(max(0, path.stat().st_size - LONGEST))
+            return file.read().decode("utf-8", "replace")
+    except OSError:
+        return ""
 
 
-def _listen() -> None:
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+def _state(job: Path) -> str:
+    with suppress(OSError, ValueError):
+        code = int((job / "code").read_text(encoding="utf-8"))
+        cancelled = code == INTERRUPTED or (job / "cancel").exists()
+        return "done" if code == 0 else "stopped" if cancelled else "failed"
+    process = _begun.get(job)
+    if process is not None:
+        return "running" if process.poll() is None else "stopped"
+    try:
+        with locked(job):
+            return "stopped"
+    except OutputError:
+        return "running"
+    except OSError:
+        return "stopped"
+
+
+def _main(job: Path) -> int:
+    about = json.loads((job / "command.json").read_text(encoding="utf-8"))
+    root, words = job.parent.parent, [str(word) for word in about["words"]]
+    with locked(job):
+        with (job / "output").open("wb") as output:
+            try:
+                if about["step"] in ("validate", "run", "resume"):
+                    require_harmless(root, root / words[1], about["trust"])
+                code = _command(job, root, words, output)
+            except En4dvarError as error:
+                output.write(f"{error}\n".encode())
+                code = error.exit_code
+        write_text(job / "code", str(code))
+    return code
+
+
+def _command(job: Path, root: Path, words: list[str], output: Any) -> int:
+    process = subprocess.Popen(
+        [sys.executable, "-P", "-m", "en4dvar.cli", *words], cwd=root, stdin=subprocess.DEVNULL,
+        stdout=output, stderr=subprocess.STDOUT, env={**os.environ, "COLUMNS": "100"},
+    )  # fmt: skip
+    while process.poll() is None:
+        if (job / "cancel").exists():
+            process.terminate()
+            return process.wait()
+        time.sleep(0.1)
+    return process.wait()
 
 
 if __name__ == "__main__":
-    _main(Path(sys.argv[1]))
+    sys.exit(_main(Path(sys.argv[1]).resolve()))
