@@ -5,14 +5,14 @@ const FIELDS = ["movie", "pixel", "frame-rate", "exposure", "flashes", "bubble",
 const MINE = {
   track: ["movie", "pixel", "frame-rate", "exposure", "flashes", "bubble", "region", "mask", "raw"],
   init: ["table", "time-column", "time-unit", "radius-column", "radius-unit", "by", "law", "medium", "start", "proposal"],
-  validate: ["config"], run: ["config", "run"], resume: ["config", "run"], export: ["run"], compare: [],
+  validate: ["config"], prior: ["config"], run: ["config", "run"], resume: ["config", "run"], export: ["run"], compare: [],
 };
-const BOX = { resume: "run", export: "compare" };
-let state = null, before = "", lastStates = {}, table = null;
+const BOX = { prior: "validate", resume: "run", export: "compare" };
+let state = null, before = "", lastJobs = null, table = null;
 
 function say(words) { $("message").textContent = words; if (words) $("message").scrollIntoView({ block: "nearest" }); }
 
-async function look(what, fields) {
+async function fetched(what, fields) {
   const answer = await fetch(`look/${what}?` + new URLSearchParams(fields));
   if (!answer.ok) throw new Error(await answer.text());
   return answer.headers.get("Content-Type").startsWith("image/") ? answer.blob() : answer.json();
@@ -53,6 +53,9 @@ function show(now) {
   const last = {};
   for (const job of now.jobs) last[BOX[job.step] || job.step] = job;
   for (const [step, job] of Object.entries(last)) showJob(step, job);
+  const ended = now.jobs.filter((job) => job.state === "done" && lastJobs && lastJobs.get(job.number) !== "done");
+  lastJobs = new Map(now.jobs.map((job) => [job.number, job.state]));
+  ended.forEach(finished);
   showRuns(now.runs);
   const pages = now.pages.filter((p) => p.startsWith("comparisons/"));
   $("pages").replaceChildren(...pages.map((p) => item(link(p, p))));
@@ -68,18 +71,21 @@ function showJob(step, job) {
   const words = document.createElement("pre");
   words.textContent = `$ ${job.line}\n${job.output}`;
   box.replaceChildren(`${job.state}; the command that repeats this step, in this folder:`, words);
-  const stem = job.subject.replace(/\.[^.]*$/, ""), run = (job.line.match(/--out=(runs\/[^' ]+)/) || [])[1];
-  if (job.state === "done" && step === "track") box.append(link(`${stem}.html`, "Open the page of all outlines"));
-  if (job.state === "done" && step === "run" && run) box.append(link(`${run}/report.html`, "Open the result"));
-  if (lastStates[step] === "running" && job.state === "done") finished(step, job);
-  lastStates[step] = job.state;
+  const prior = job.output.match(/^prior predictive: (.*\.png) and/m);
+  if (job.state === "done" && step === "track") box.append(link(job.out.replace(/csv$/, "html"), "Open the page of all outlines"));
+  if (job.state === "done" && step === "run") box.append(link(`${job.out}/report.html`, "Open the result"));
+  if (prior) {
+    const picture = document.createElement("img");
+    picture.src = link(prior[1].replace(`${state.folder}/`, ""), "").href;
+    picture.alt = "The prior over the data";
+    box.append(picture);
+  }
   if (step === "validate") showFaults(job);
 }
 
-function finished(step, job) {
-  if (step === "track") { readMovie(false); $("table").value = `${job.subject.replace(/\.[^.]*$/, "")}.csv`; changed("table"); }
-  const made = job.line.match(/--out='?([^' ]+\.yaml)/);
-  if (step === "init" && made) { options($("config"), [...new Set([...state.configs, made[1]])], "choose"); $("config").value = made[1]; changed("config"); }
+function finished(job) {
+  if (job.step === "track" && movie && job.subject === movie.name) { readMovie(false); $("table").value = job.out; changed("table"); }
+  if (job.step === "init" && $("text").value === before) { $("config").value = job.out; changed("config"); }
 }
 
 function showFaults(job) {
@@ -122,7 +128,7 @@ async function refresh() {
   }
   const running = state?.jobs.find((job) => job.state === "running" && ["run", "resume"].includes(job.step));
   $("log").hidden = !running;
-  if (running) $("log").textContent = (await look("log", { run: running.line.match(/--out='?runs\/([^' ]+)/)[1] }).catch(() => ({ text: "" }))).text;
+  if (running) $("log").textContent = (await fetched("log", { run: running.out.replace("runs/", "") }).catch(() => ({ text: "" }))).text;
 }
 
 const freeName = (stem, names, end = "") => {
@@ -132,7 +138,7 @@ const freeName = (stem, names, end = "") => {
 async function readTable() {
   const name = $("table").value;
   table = null;
-  if (name) try { table = await look("table", { table: name }); } catch (error) { say(error.message); }
+  if (name) try { table = await fetched("table", { table: name }); } catch (error) { say(error.message); }
   const names = table ? Object.keys(table.columns) : [];
   options($("by"), names, "the file");
   for (const [id, own] of [["time-column", table?.time], ["radius-column", table?.radius]]) {
@@ -153,7 +159,7 @@ function plotTable() {
 
 async function readConfig() {
   const config = $("config").value;
-  $("text").value = before = config ? (await look("text", { config })).text : "";
+  $("text").value = before = config ? (await fetched("text", { config })).text : "";
   if (config) $("run").value = freeName(config.replace(/\.[^.]*$/, ""), (state?.runs || []).map((run) => run.name));
   $("faults").replaceChildren();
 }
@@ -166,7 +172,7 @@ async function keep() {
 }
 
 async function begin(step) {
-  if (["validate", "run", "resume"].includes(step) && $("text").value !== before && !(await keep())) return;
+  if (["validate", "prior", "run", "resume"].includes(step) && $("text").value !== before && !(await keep())) return;
   const fields = Object.fromEntries(MINE[step].map((id) => [id, $(id).value]));
   if (step === "compare") fields.runs = [...document.querySelectorAll("#runs input:checked")].map((box) => box.value).join("\n");
   await post(step, fields);
@@ -179,5 +185,6 @@ $("cancel").addEventListener("click", async () => { await post("cancel", {}); aw
 $("table").addEventListener("change", readTable);
 $("config").addEventListener("change", readConfig);
 for (const id of ["time-column", "radius-column", "time-unit", "radius-unit"]) $(id).addEventListener("change", plotTable);
-look("laws", {}).then(({ laws }) => $("laws").replaceChildren(...laws.map((law) => new Option(law, law)))).catch(() => {});
+fetched("laws", {}).then(({ laws }) => $("laws").replaceChildren(...laws.map((law) => new Option(law, law)))).catch(() => {});
+window.addEventListener("beforeunload", (event) => { if ($("text").value !== before) event.preventDefault(); });
 window.addEventListener("load", () => { refresh(); setInterval(refresh, 1000); });

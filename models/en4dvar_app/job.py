@@ -71,10 +71,11 @@ def _described(job: Path) -> dict[str, Any] | None:
     try:
         about = json.loads((job / "command.json").read_text(encoding="utf-8"))
         line = shlex.join(["en4dvar", *map(str, about["words"])])
-        whole = {"number": int(job.name), "step": str(about["step"]), "subject": str(about["subject"]), "line": line}
-    except (OSError, ValueError, KeyError, TypeError):
+        out = next((word[6:] for word in about["words"] if word.startswith("--out=")), "")
+        whole = {"number": int(job.name), "step": str(about["step"]), "subject": str(about["subject"])}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
-    return {**whole, "output": end_of(job / "output"), "state": _state(job)}
+    return {**whole, "line": line, "out": out, "output": end_of(job / "output"), "state": _state(job)}
 
 
 def end_of(path: Path) -> str:
@@ -110,7 +111,7 @@ def _main(job: Path) -> int:
     with locked(job):
         with (job / "output").open("wb") as output:
             try:
-                if about["step"] in ("validate", "run", "resume"):
+                if about["step"] in ("validate", "prior", "run", "resume"):
                     require_harmless(root, root / words[1], about["trust"])
                 code = _command(job, root, words, output)
             except En4dvarError as error:

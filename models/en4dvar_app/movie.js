@@ -8,7 +8,7 @@ async function readMovie(afresh = true) {
   const name = $("movie").value;
   if (!name) return;
   try {
-    const seen = await look("movie", { movie: name, raw: $("raw").value });
+    const seen = await fetched("movie", { movie: name, raw: $("raw").value });
     movie = { name, raw: $("raw").value, ...seen };
   } catch (error) { movie = null; $("inspector").hidden = true; return say(error.message); }
   if (afresh) {
@@ -16,7 +16,7 @@ async function readMovie(afresh = true) {
     for (const id of ["bubble", "region", "mask"]) $(id).value = "";
     if (movie.pixel && !$("pixel").value) $("pixel").value = `${+(movie.pixel * 1e6).toPrecision(9)} um`;
     if (movie.rate && !$("frame-rate").value) $("frame-rate").value = `${+movie.rate.toPrecision(9)} Hz`;
-    $("corrections").value = kept = (await look("text", { movie: name })).text;
+    $("corrections").value = kept = (await fetched("text", { movie: name })).text;
   }
   movie.rows = new Map((movie.readings?.rows || []).map((row) => [row.frame, row]));
   $("corrections-name").textContent = `${name.replace(/\.[^.]*$/, "")}.corrections.txt`;
@@ -27,7 +27,7 @@ async function readMovie(afresh = true) {
 
 function bitmap(n) {
   if (!bitmaps.has(n)) {
-    bitmaps.set(n, look("frame", { movie: movie.name, raw: movie.raw, n }).then(createImageBitmap));
+    bitmaps.set(n, fetched("frame", { movie: movie.name, raw: movie.raw, n }).then(createImageBitmap));
     if (bitmaps.size > 400) bitmaps.delete(bitmaps.keys().next().value);
   }
   return bitmaps.get(n);

@@ -140,6 +140,7 @@ STEPS: dict[str, Callable[[Path, Fields], list[str]]] = {
     "track": _track,
     "init": _init,
     "validate": lambda root, fields: ["validate", _config(root, fields)],
+    "prior": lambda root, fields: ["validate", _config(root, fields), "--plot"],
     "run": _run,
     "resume": _resume,
     "compare": _compare,
