@@ -94,6 +94,8 @@ ROWS = tuple(
          "{run}: in use by process {pid} on {machine}; wait for it to end, or give another --out", "2",
          "the first run"),
         ("stale-lock", "the lock of a run that was killed", "", "0", "the lock goes with its process"),
+        ("no-locks", "the file system knows no locks (some network file systems)", "", "0",
+         "everything, but nobody is kept from starting a second run there"),
         ("worker-killed", "a worker process is killed (processes, dask), by the system for its memory, or by hand", "",
          "0", "everything; its work is repeated, to the same bits"),
         ("worker-always", "a data set kills every worker that tries it",
