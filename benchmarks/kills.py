@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 from children import Task
-from siege import LONGEST, Siege, same
+from siege import ATTACKED, LONGEST, Siege, same
 from siege_commands import Command, commands
 
 from en4dvar.results.provenance import cpu_model, git_commit
@@ -48,7 +48,7 @@ def main() -> int:
     parser.add_argument("names", nargs="*", metavar="COMMAND")
     parser.add_argument("--seed", type=int, default=1)
     asked = parser.parse_args()
-    os.environ["PYTHONPATH"] = os.pathsep.join(sys.path[:5])
+    os.environ["PYTHONPATH"] = os.pathsep.join(ATTACKED)
     faults = []
     with tempfile.TemporaryDirectory() as folder:
         siege = Siege(Path(folder) / "base")

@@ -28,7 +28,8 @@ from pathlib import Path
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT / "tests" / name) for name in ("faults", "", "fuzz", "model")]
+ATTACKED = [str(ROOT / "tests" / name) for name in ("faults", "", "fuzz", "model")]  # where the commands find modules
+sys.path[:0] = ATTACKED
 
 import damage  # noqa: E402
 import fuzz_seeds  # noqa: E402
@@ -325,7 +326,7 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=0, help="number of the first attack of each kind")
     asked = parser.parse_args()
     kinds = asked.kinds or list(KINDS)
-    os.environ["PYTHONPATH"] = os.pathsep.join(sys.path[:4])
+    os.environ["PYTHONPATH"] = os.pathsep.join(ATTACKED)
     counts: dict[str, Counter[str]] = {kind: Counter() for kind in kinds}
     places: Counter[str] = Counter()
     with tempfile.TemporaryDirectory() as folder:
