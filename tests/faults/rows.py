@@ -104,7 +104,7 @@ ROWS = tuple(
         ("worker-memory",
          "a dask worker passes its limit of memory whenever it is at a data set, and is ended by its nanny",
          "{n} of {all} members failed in the {stage}; at least {few} must survive. Most frequent reasons: a worker "
-         "process died", "1", "all other data sets; where it does so once: everything, to the same bits"),
+         "process died", "3", "all other data sets; where it does so once: everything, to the same bits"),
         ("worker-paused", "all dask workers are paused for a minute, near their limit of memory",
          "dask scheduler {address}: has had no worker for {time} s that takes work: all are paused near their limit of "
          "memory (dask worker --memory-limit); {n} of {all} data sets are done and kept in {run}; give --resume to "

@@ -1,6 +1,6 @@
 """The page of faults and the tests that prove it say the same."""
 
-from rows import FINDINGS, PAGE, ROWS, proofs, rendered, functions_in
+from rows import FINDINGS, PAGE, ROWS, functions_in, proofs, rendered
 
 
 def test_every_row_has_its_test_and_every_test_its_row():
