@@ -1,4 +1,4 @@
-"""Frames of a movie as PNG, and tables as numbers, for the page."""
+"""Frames of a movie as pictures, and tables as numbers, for the page."""
 
 from __future__ import annotations
 
@@ -58,12 +58,12 @@ class Pictures:
         while self._size > HELD and len(self._held) > 1:
             self._size -= self._held.popitem(last=False)[1].nbytes
 
-    def png(self, number: int) -> bytes:
-        """One frame as PNG, 8 bit; more bits are stretched over the range of the first frame."""
+    def bmp(self, number: int) -> bytes:
+        """One frame as BMP, which takes no time to compress; 16 bit are stretched over the range of the first frame."""
         from PIL import Image
 
         out = io.BytesIO()
-        Image.fromarray(self._grey(self.frame(number))).save(out, "png", compress_level=1)
+        Image.fromarray(self._grey(self.frame(number))).save(out, "bmp")
         return out.getvalue()
 
     def _grey(self, frame: Frame) -> npt.NDArray[np.uint8]:

@@ -33,7 +33,7 @@ function plot(canvas, points, xName, yName, cursor) {
     draw.beginPath(); draw.arc(px(p.x), py(p.y), 2.6, 0, 7); draw.fill();
     canvas.points.push({ ...p, left: px(p.x), top: py(p.y) });
   }
-  if (Number.isFinite(cursor)) { draw.strokeStyle = "#a3330a"; draw.strokeRect(px(cursor), 10, 0, base - 10); }
+  if (cursor >= low && cursor <= high) { draw.strokeStyle = "#a3330a"; draw.strokeRect(px(cursor), 10, 0, base - 10); }
 }
 
 function nearest(canvas, event) {

@@ -173,7 +173,7 @@ class Look(Guarded):
         arguments = {key: self.get_query_argument(key) for key in self.request.query_arguments}
         shown = await self.made(partial(getattr(self, f"look_{what}"), arguments))
         if isinstance(shown, bytes):
-            self.set_header("Content-Type", "image/png")
+            self.set_header("Content-Type", "image/bmp")
         if shown is not None:
             self.write(shown)
 
@@ -193,7 +193,7 @@ class Look(Guarded):
 
     def look_frame(self, arguments: dict[str, str]) -> bytes:
         number = arguments.get("n", "")
-        return self._opened(arguments).png(int(number) if number.isdecimal() and len(number) < 9 else 0)
+        return self._opened(arguments).bmp(int(number) if number.isdecimal() and len(number) < 9 else 0)
 
     def look_table(self, arguments: dict[str, str]) -> dict[str, Any]:
         return pictures.columns(below(self.root, steps.existing(self.root, arguments, "table")))
