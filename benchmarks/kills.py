@@ -16,8 +16,7 @@ import zlib
 from pathlib import Path
 
 import numpy as np
-from children import Task
-from siege import ATTACKED, LONGEST, Siege, same
+from siege import ATTACKED, LONGEST, Siege, Task, same  # where the tests are found
 from siege_commands import Command, commands
 
 from en4dvar.results.provenance import cpu_model, git_commit

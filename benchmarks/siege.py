@@ -90,14 +90,14 @@ class Siege:
             "population": ["population", str(self.base / "campaign"), "--of", "k"],
         }
         for name, words in self.made.items():
-            (done,) = self.children.attempt([Task([*words, "--out", str(self.base / name)])])
+            (done,) = self.children.attempt([Task([*words, "--out", str(self.base / name)], seconds=LONGEST)])
             assert done.code == 0, (words, done.told)
 
     def undisturbed(self, command: Command) -> Path:
         """Where the results are of a command that nothing has stopped."""
         out = self.base / "whole" / str(zlib.crc32(" ".join(command.words).encode()))
         if not out.exists():
-            (done,) = self.children.attempt([Task(command.into(out))])
+            (done,) = self.children.attempt([Task(command.into(out), seconds=LONGEST)])
             assert done.code == 0, (command, done.told)
         return out
 
