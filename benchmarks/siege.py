@@ -3,8 +3,9 @@
 Every attack is a command in a process of its own, given files that were damaged (also such as are sealed again, so that
 no checksum tells), or stopped at a random moment. It holds where the command ends within its time with an exit code of
 ours and words, without a traceback; where no data set that a run has kept vanishes without a word; where a stop is
-heeded within two seconds, nothing that the command has started is left, and --resume ends in the same bits. Whatever
-does not hold is printed with the place it comes from, and its files are kept below ``runs/siege``.
+heeded within two seconds (of a machine that does nothing else: a loop beside tells how busy it is), nothing that the
+command has started is left, and --resume ends in the same bits. Whatever does not hold is printed with the place it
+comes from, and its files are kept below ``runs/siege``.
 """
 
 from __future__ import annotations
@@ -27,13 +28,15 @@ from pathlib import Path
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT / "tests" / name) for name in ("faults", "", "fuzz", "model")]
+ATTACKED = [str(ROOT / "tests" / name) for name in ("faults", "", "fuzz", "model")]  # where the commands find modules
+sys.path[:0] = ATTACKED
 
 import damage  # noqa: E402
 import fuzz_seeds  # noqa: E402
 from children import Children, Outcome, Task  # noqa: E402
 from drift_series import write as write_series  # noqa: E402
 from run_files import assert_same_results, make_campaign  # noqa: E402
+from siege_commands import Command, commands  # noqa: E402
 from siege_files import movies, pest_case, small_study  # noqa: E402
 from test_commands import CAMPAIGN, TWIN  # noqa: E402
 
@@ -43,7 +46,7 @@ from en4dvar.results.provenance import cpu_model, git_commit  # noqa: E402
 
 FOUND = ROOT / "runs" / "siege"
 LONGEST = 600  # s for a command of which an undisturbed one takes a second, on a machine that is never quiet
-HEEDED = 2.0  # s
+HEEDED = 2.0  # s of a machine that does nothing else; times the slowness of Outcome
 OURS = (0, 1, 2, 3, 130)
 
 
@@ -62,6 +65,7 @@ class Siege:
     base: Path
     children: Children = field(default_factory=Children)
     made: dict[str, list[str]] = field(default_factory=dict)
+    heeded: list[tuple[float, float]] = field(default_factory=list)  # s after which a stop was, and the slowness then
 
     def prepare(self) -> None:
         make_campaign(self.base, 3)
@@ -80,19 +84,21 @@ class Siege:
             "twin": ["run", str(self.base / "twin.yaml"), "--no-report"],
             "series-run": ["run", str(next((self.base / "series").glob("*.yaml"))), "--no-report"],
             "plan": ["design", str(ROOT / "configs" / "linear_design.yaml")],
+            "calibration": ["calibrate", toy, "--sets", "4"],
+            "rings": ["sweep-twin", str(self.base / "twin.yaml"), "--vary", "assimilation.members=[14, 15]"],
             "joint": ["joint", str(self.base / "campaign"), "--share", "k"],
             "population": ["population", str(self.base / "campaign"), "--of", "k"],
         }
         for name, words in self.made.items():
-            (done,) = self.children.attempt([Task([*words, "--out", str(self.base / name)])])
+            (done,) = self.children.attempt([Task([*words, "--out", str(self.base / name)], seconds=LONGEST)])
             assert done.code == 0, (words, done.told)
 
-    def undisturbed(self, words: list[str]) -> Path:
+    def undisturbed(self, command: Command) -> Path:
         """Where the results are of a command that nothing has stopped."""
-        out = self.base / "whole" / str(zlib.crc32(" ".join(words).encode()))
+        out = self.base / "whole" / str(zlib.crc32(" ".join(command.words).encode()))
         if not out.exists():
-            (done,) = self.children.attempt([Task([*words, "--out", str(out)])])
-            assert done.code == 0, (words, done.told)
+            (done,) = self.children.attempt([Task(command.into(out), seconds=LONGEST)])
+            assert done.code == 0, (command, done.told)
         return out
 
     def copy(self, name: str, to: Path) -> Path:
@@ -145,14 +151,15 @@ def kept(siege: Siege, folder: Path, rng: np.random.Generator) -> Attack:
 
 def resumed(siege: Siege, folder: Path, rng: np.random.Generator) -> Attack:
     """One damage to what a finished run of any kind keeps, and ``--resume``: it mends, to the same bits, or refuses."""
-    name = ("campaign", "campaign", "campaign", "single", "twin", "series-run", "plan")[rng.integers(7)]
+    names = ("campaign", "campaign", "campaign", "single", "twin", "series-run", "plan", "calibration", "rings")
+    name = names[rng.integers(len(names))]
     run = siege.copy(name, folder / name)
     # the log is only added to; a page is written anew by report
     files = [p for p in sorted(run.rglob("*")) if p.is_file() and p.suffix not in (".log", ".html")]
     path = files[rng.integers(len(files))]
     path.write_bytes(damage.of_bytes(path.read_bytes(), rng))
     task = Task([*siege.made[name], "--out", str(run), "--resume"])
-    return Attack(task, lambda found: _same(run, siege.base / name) if found.code == 0 else "")
+    return Attack(task, lambda found: same(run, siege.base / name) if found.code == 0 else "")
 
 
 def checkpoints(siege: Siege, folder: Path, rng: np.random.Generator) -> Attack:
@@ -171,7 +178,8 @@ def movies_of_anybody(siege: Siege, folder: Path, rng: np.random.Generator) -> A
     path = files[rng.integers(len(files))]
     to = folder / path.name
     to.write_bytes(damage.of_bytes(path.read_bytes(), rng, first=4 * int(rng.integers(2))))
-    return Attack(Task(["track", str(to), "--pixel", "2.5 um", "--frame-rate", "400 kHz", "--workers", "1"]))
+    out = ["--workers", "1", "--out", str(folder / "out.csv")]
+    return Attack(Task(["track", str(to), "--pixel", "2.5 um", "--frame-rate", "400 kHz", *out]))
 
 
 def tables(siege: Siege, folder: Path, rng: np.random.Generator) -> Attack:
@@ -198,57 +206,32 @@ def pest(siege: Siege, folder: Path, rng: np.random.Generator) -> Attack:
 
 
 def stops(siege: Siege, folder: Path, rng: np.random.Generator) -> Attack:
-    """SIGTERM, SIGINT or SIGKILL at a random moment; what can be resumed ends in the same bits."""
-    toy, campaign, out = str(siege.base / "toy.yaml"), str(siege.base / "campaign"), folder / "out"
-    movie, twin = str(siege.base / "movies" / "a.tif"), str(siege.base / "twin.yaml")
-    words, resumable = [
-        *((["run", toy, "--set", f"execution.executor={how}"], True) for how in ("serial", "threads", "processes")),
-        (["run", toy, "--set", "assimilation.refine=mcmc", "--no-report"], True),
-        (["run", twin], True),
-        (["sweep", toy, "--trajectories", "64", "--shift", "1 ns", "--step", "1 ms"], True),
-        (
-            [
-                "sweep-twin",
-                str(siege.base / "twin.yaml"),
-                "--vary",
-                "assimilation.inflation=[1.0, 1.1]",
-                "--seeds",
-                "3",
-            ],
-            True,
-        ),
-        (["design", str(ROOT / "configs" / "linear_design.yaml")], True),
-        (["study", str(siege.base / "study" / "study.yaml")], True),
-        (["python", "siege_files", "pest", str(siege.base / "pest" / "line.pst")], False),
-        (["joint", campaign, "--share", "k"], False),
-        (["population", campaign, "--of", "k"], False),
-        (["compare", campaign, str(siege.base / "other")], False),
-        (["rerun", campaign], False),
-        (["report", str(shutil.copytree(siege.base / "campaign", folder / "own"))], False),
-        (["track", movie, "--pixel", "2.5 um", "--frame-rate", "400 kHz", "--force"], False),
-    ][rng.integers(15)]
-    whole = siege.undisturbed(words) if resumable else out
-    if words[0] not in ("rerun", "report", "track"):
-        words += [str(out)] if words[0] == "python" else ["--out", str(out)]
-    words += ["--workers", "2"] if "executor=processes" in " ".join(words) else []
+    """SIGTERM, SIGINT or SIGKILL at a random moment; what can be continued ends in the same bits."""
+    known, out = commands(siege.base), folder / "out"
+    name = list(known)[rng.integers(len(known))]
+    command = known[name]
     number = (signal.SIGTERM, signal.SIGINT, signal.SIGKILL)[rng.integers(3)]
     (folder / "tmp").mkdir()
+    words = command.into(out)
     task = Task(words, stop=number, after=float(rng.exponential(0.6)), mark=str(folder / "tmp"))
 
     def holds(found: Outcome) -> str:
         if found.code not in (0, 130, -number):
-            return f"exit code {found.code}\n{found.told}"
-        if found.seconds > HEEDED and number != signal.SIGKILL and found.code:
-            return f"{signal.Signals(number).name} heeded after {found.seconds:.1f} s"
+            return f"{name}: exit code {found.code}\n{found.told}"
+        if number != signal.SIGKILL and found.code:
+            siege.heeded.append((found.seconds, found.slowness))
+            if found.seconds > HEEDED * found.slowness:
+                told = f"{found.seconds:.1f} s, on a machine slower {found.slowness:.1f} times"
+                return f"{name}: {signal.Signals(number).name} heeded after {told}"
         if left := _left(folder / "tmp"):
-            return f"left behind: {left}"
-        if not resumable:
+            return f"{name}: left behind: {left}"
+        if command.again is None:
             return ""
         for _ in range(2):  # the second finds everything done
-            (done,) = siege.children.attempt([Task([*words, "--resume"], seconds=LONGEST)])
+            (done,) = siege.children.attempt([Task([*words, *command.again], seconds=LONGEST)])
             if done.code:
-                return f"--resume after {signal.Signals(number).name}: exit code {done.code}\n{done.told}"
-        return _same(out, whole)
+                return f"{name}: continued after {signal.Signals(number).name}: exit code {done.code}\n{done.told}"
+        return same(out, siege.undisturbed(command))
 
     return Attack(task, holds)
 
@@ -270,7 +253,7 @@ def _left(mark: Path) -> str:
         time.sleep(0.05)
 
 
-def _same(a: Path, b: Path) -> str:
+def same(a: Path, b: Path) -> str:
     tables = [p.relative_to(b) for p in sorted(b.rglob("*.csv"))]
     if different := [str(p) for p in tables if not (a / p).exists() or (a / p).read_bytes() != (b / p).read_bytes()]:
         return f"other numbers in {', '.join(different)}"
@@ -326,6 +309,15 @@ def place_of(fault: str) -> str:
     return f"{':'.join(own[-1])}: {last[:120]}" if own else re.sub(r"[\d.]+ s", "n s", last[:120])
 
 
+def _tell_stops(heeded: list[tuple[float, float]]) -> None:
+    """How soon stops were heeded, by the clock and for a machine that does nothing else."""
+    if heeded:
+        clock, slowness = np.array(heeded).T
+        print(f"{len(clock)} stops heeded after {np.median(clock):.2f} s (median), at most {clock.max():.2f} s, "
+              f"{np.sum(clock > HEEDED)} beyond {HEEDED:g} s; slowness {np.median(slowness):.2f}, at most "
+              f"{slowness.max():.2f}; time by slowness at most {np.max(clock / slowness):.2f} s")  # fmt: skip
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("kinds", nargs="*", metavar="KIND", help=f"default: all of {', '.join(KINDS)}")
@@ -334,7 +326,7 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=0, help="number of the first attack of each kind")
     asked = parser.parse_args()
     kinds = asked.kinds or list(KINDS)
-    os.environ["PYTHONPATH"] = os.pathsep.join(sys.path[:4])
+    os.environ["PYTHONPATH"] = os.pathsep.join(ATTACKED)
     counts: dict[str, Counter[str]] = {kind: Counter() for kind in kinds}
     places: Counter[str] = Counter()
     with tempfile.TemporaryDirectory() as folder:
@@ -354,6 +346,7 @@ def main() -> int:
             number += 1
         print(f"{time.monotonic() - begin - latest:.0f} s since the last finding, or the beginning")
         siege.children.close()
+    _tell_stops(siege.heeded)
     print("| attacks | tried | done | refused | stopped or killed | findings |\n|---|---|---|---|---|---|")
     for kind, count in (*counts.items(), ("in all", sum(counts.values(), Counter()))):
         ended = count["stopped"] + count["killed"]

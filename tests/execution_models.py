@@ -49,6 +49,20 @@ class DiesAlways(Oscillator):
         return super().trajectories(x, times)
 
 
+class Hungry(Slow):
+    """Takes 2 GB at a data set of large amplitude: always, or once where ``EN4DVAR_TEST_FLAG`` names a file."""
+
+    def trajectories(self, x, times):
+        flag = Path(os.environ.get("EN4DVAR_TEST_FLAG", ""))
+        if is_large(x) and not flag.is_file():
+            if flag.name:
+                flag.touch()
+            held = np.ones(250_000_000)
+            time.sleep(60)
+            del held
+        return super().trajectories(x, times)
+
+
 class Breaks(Oscillator):
     """Loses every member at a data set of large amplitude."""
 

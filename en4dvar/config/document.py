@@ -165,13 +165,18 @@ def document_from(source: str | Path | Mapping[str, Any]) -> tuple[Document, Pat
     return read_document(path), path.resolve().parent
 
 
-def override(document: Document, overrides: Mapping[str, Any]) -> Document:
-    """Set values at dotted paths; text is parsed as YAML. Raises :class:`ConfigError`."""
+def override(document: Document, overrides: Mapping[str, Any], option: str = "--set") -> Document:
+    """Set values at dotted paths; text is parsed as YAML.
+
+    Raises :class:`ConfigError`, which names the ``option`` that they were given with.
+    """
     data = _copy(document.data)
     origins = dict(document.origins)
     faults: list[Fault] = []
     for dotted, value in overrides.items():
-        path, origin = tuple(dotted.split(".")), "--data" if dotted == "data.path" else f"--set {dotted}"
+        path, origin = tuple(dotted.split(".")), f"{option} {dotted}"
+        if (dotted, option) == ("data.path", "--set"):
+            origin = "--data"
         if isinstance(value, str):
             tree = _Tree(origin)
             value = tree.read(value)

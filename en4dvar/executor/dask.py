@@ -18,7 +18,7 @@ import pickle
 import queue
 import signal
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from typing import TYPE_CHECKING, Any
 
 from en4dvar.executor.base import Call, ExecutorError, T, Tell, WorkerLostError
@@ -154,10 +154,13 @@ class DaskExecutor(FuturesExecutor):
         """Raises :class:`ExecutorError` where the cluster is gone, or has had no worker for too long."""
         if self._client is None or self._client.status != "running":
             raise self._lost()
-        if self._client.scheduler_info()["workers"]:
+        workers = self._client.scheduler_info()["workers"].values()
+        if any(map(_takes_work, workers)):
             self._seen = time.monotonic()
         elif time.monotonic() - self._seen > NO_WORKER_TIMEOUT:
             reason = f"has had no worker for {NO_WORKER_TIMEOUT:.0f} s"
+            if workers:
+                reason += " that takes work: all are paused near their limit of memory (dask worker --memory-limit)"
             raise ExecutorError(f"dask scheduler {self._address or 'of this machine'}: {reason}")
 
     def _lost(self) -> ExecutorError:
@@ -184,6 +187,14 @@ class DaskExecutor(FuturesExecutor):
             with contextlib.suppress(OSError, TimeoutError):
                 cluster.sync(end_workers)
         self.close()
+
+
+def _takes_work(worker: Mapping[str, Any]) -> bool:
+    """Whether a worker, as its scheduler describes it, will begin a call, or is at one.
+
+    Dask pauses a worker near its memory limit: it ends the calls that it is at, and begins none.
+    """
+    return worker.get("status") != "paused" or worker["metrics"]["task_counts"].get("executing", 0) > 0
 
 
 def dask_setup(_: Any) -> None:

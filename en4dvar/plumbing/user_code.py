@@ -24,8 +24,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, cast
 
-import numpy as np
-
 from en4dvar.plumbing.errors import ConfigError, En4dvarError
 from en4dvar.plumbing.files import here, read_plain
 
@@ -115,6 +113,8 @@ def kept_apart() -> Iterator[None]:
     mine = threading.current_thread() is threading.main_thread()
     handlers: dict[int, Any] = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)} if mine else {}
     try:
+        import numpy as np  # here, for it is most of the time that a process which decodes takes to start
+
         with np.errstate():
             yield
     finally:

@@ -13,13 +13,15 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from textwrap import indent
 from typing import Any
 
 import numpy as np
 import yaml
 
 from en4dvar.assembly.build import build_one, data_files, inverse_plan
-from en4dvar.config import Config, load_config
+from en4dvar.config import Config, load_config, resolve
+from en4dvar.config.document import document_from, override
 from en4dvar.diagnosis.intervals import member_quantiles
 from en4dvar.ensemble.forecast import Composite
 from en4dvar.estimation.assimilate import assimilate
@@ -77,11 +79,14 @@ def calibrate(
     if sets < FEWEST:
         raise ConfigError(f"{sets} sets tell nothing; give at least {FEWEST}, better 200")
     own = load_config(config, overrides)
-    made = load_config(config, {**(overrides or {}), **made_with}) if made_with else own
-    changed = yaml.safe_dump({"made_with": {k: str(v) for k, v in made_with.items()}}) if made_with else ""
+    made, changed = own, ""
+    if made_with:
+        document, base = document_from(config)
+        made = resolve(override(override(document, overrides or {}), made_with, "--made-with"), base)
+        changed = yaml.safe_dump({"made_with": {k: str(v) for k, v in made_with.items()}})
     path = Path(out) if out else own.directory.with_name(f"{own.directory.name}_calibration")
-    own = replace(own, directory=path, resolved=own.resolved + changed)
-    return conduct_run(CalibrationKind(own, made, sets, progress), force, resume, command)
+    own = replace(own, directory=path, resolved=own.resolved + indent(changed, "# "))
+    return conduct_run(CalibrationKind(own, made, sets, progress, changed), force, resume, command)
 
 
 @dataclass(frozen=True)
@@ -93,7 +98,9 @@ class CalibrationState:
 
 @dataclass(frozen=True)
 class CalibrationKind(RunKind[Calibration]):
-    """A configuration, and the one that readings are ``made`` with; each of the ``sets`` is a unit of work."""
+    """A configuration, and the one that readings are ``made`` with, which is ``changed`` (YAML); each of the ``sets``
+    is a unit of work.
+    """
 
     name = "calibrate"
     result = "calibration.csv"
@@ -104,6 +111,11 @@ class CalibrationKind(RunKind[Calibration]):
     made: Config
     sets: int
     progress: Callable[[int, int], None] | None = None
+    changed: str = ""
+
+    @property
+    def settings(self) -> str:
+        return self.config.resolved + self.changed
 
     @cached_property
     def data(self) -> Mapping[str, DataFile]:

@@ -81,7 +81,7 @@ def _session(kind: RunKind[Any], directory: RunDirectory, command: str) -> Itera
     """
     config = kind.config
     with tell_interrupt(kind.kept):
-        who = identity(config.resolved, kind.model, kind.data)
+        who = identity(kind.settings, kind.model, kind.data)
         attributes = {
             **provenance(config.text, config.document.file, command),
             "configuration_resolved": config.resolved,

@@ -72,6 +72,11 @@ class RunKind(Kind, ABC, Generic[R]):
         """Name of each data set → its file."""
         return {}
 
+    @property
+    def settings(self) -> str:
+        """What decides the numbers, as YAML: the resolved configuration, and what a kind is asked beside it."""
+        return str(self.config.resolved)
+
     def check(self) -> None:
         """Refuse, before anything is written, what cannot be computed. Raises errors of ours."""
 

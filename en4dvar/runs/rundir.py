@@ -148,7 +148,7 @@ class RunDirectory:
         with suppress(OSError, OutputError):
             if self.resumed or any(self.at(name).exists() for name in listed_files(self.work)):
                 return
-            for name in (LISTING, LOG):
+            for name in (LOG, LISTING):  # the list last: by it the rest is known as a run's
                 self.at(name).unlink(missing_ok=True)
             if self.work != self.home:
                 remove_folder(self.work)

@@ -45,14 +45,14 @@ class Session:
         Raises :class:`OutputError`: the run is not the same (says what has changed), the directory cannot be written.
         """
         directory, config = self.directory, self.config
-        directory.folder(FOLDER)
         earlier = self.earlier()
         if earlier is not None and (difference := self.identity.difference(earlier, retried)):
             raise OutputError(
                 f"{directory.path}: the run cannot be resumed to the same result, for this has changed:\n{difference}\n"
                 "give --force to compute everything again, or another --out"
             )
-        directory.claim(*OF_EVERY_RUN, IDENTITY, *files)
+        directory.claim(*OF_EVERY_RUN, IDENTITY, *files)  # before anything is made that a failure would leave
+        directory.folder(FOLDER)
         write_text(directory.at("config.yaml"), config.text)
         write_text(directory.at("config.resolved.yaml"), config.resolved)
         write_checkpoint(directory.at(IDENTITY), "run", self.identity)

@@ -1,14 +1,7 @@
-"""Pages of a run, a campaign and a comparison, opened by a headless Chromium through Playwright.
-
-Needed are Playwright (extra ``dev``; its own browsers are not used and need not be downloaded) and Chromium: on Debian
-and Ubuntu ``apt-get install chromium``, or any Chrome named by the variable ``CHROMIUM``. Without them the tests are
-skipped by name; with ``CI=true`` that is a failure.
-"""
+"""Pages of a run, a campaign and a comparison, opened by a headless Chromium (tests/chromium.py)."""
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -16,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from chromium import browser  # noqa: F401  a fixture
 from run_files import add_to_pack
 
 from en4dvar import report
@@ -26,34 +20,7 @@ from en4dvar.report.figures import all_figures
 from en4dvar.report.result import Result
 from en4dvar.results.provenance import provenance
 
-NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-FLAGS = (
-    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
-    "--disable-component-update", "--disable-sync",
-)  # fmt: skip
 EVIL = "<script>window.hacked=1</script><img src=x onerror='window.hacked=2'>"
-
-
-def missing(what: str) -> None:
-    if os.environ.get("CI") == "true":
-        pytest.fail(f"{what}: the browser tests must run in CI; see tests/browser/conftest.py")
-    pytest.skip(f"{what}: see tests/browser/conftest.py")
-
-
-@pytest.fixture(scope="session")
-def browser() -> Iterator[Any]:
-    """A Chromium with a fresh profile."""
-    found = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, NAMES)), None)
-    if found is None:
-        missing("no Chromium")
-    try:
-        from playwright.sync_api import sync_playwright
-    except ImportError:
-        missing("no Playwright")
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=found, args=list(FLAGS))
-        yield browser
-        browser.close()
 
 
 @dataclass
@@ -66,7 +33,7 @@ class Seen:
 
 
 @pytest.fixture
-def opened(browser: Any) -> Iterator[Any]:
+def opened(browser: Any) -> Iterator[Any]:  # noqa: F811
     """``opened(path, scheme="light", width=1200)``: the page at ``path``, from file://."""
     contexts = []
 

@@ -27,6 +27,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+PACE = 0.02  # s of work, and of rest
 STOPS = (signal.SIGINT, signal.SIGTERM)
 TESTS = Path(__file__).resolve().parents[1]
 USED_LATER = (
@@ -65,13 +66,15 @@ class Task:
 @dataclass
 class Outcome:
     """``code``: exit code, negative for a signal; ``operations`` on files, where the end was reached; ``seconds`` that
-    it took, from the first signal on where it got one.
+    it took, from the first signal on where it got one; ``slowness``: how long a second of processor time took a plain
+    loop beside it meanwhile, in s of the clock (1 on a machine that does nothing else).
     """
 
     code: int
     told: str
     operations: int
     seconds: float = 0.0
+    slowness: float = 1.0
 
 
 class Children:
@@ -84,9 +87,10 @@ class Children:
         )
 
     def attempt(self, tasks: list[Task], timeout: float = 300) -> list[Outcome]:
-        """What came of each task, in order."""
+        """What came of each task, in order, within a ``timeout`` beyond the time that they have themselves."""
         assert self.process.stdin is not None
         assert self.process.stdout is not None
+        timeout += sum(task.seconds for task in tasks)
         watch = threading.Timer(timeout, self.process.kill)
         watch.start()
         try:
@@ -152,9 +156,18 @@ def _child(task: Task, told: int) -> None:
     os._exit(code)
 
 
-def _stop(pid: int, task: Task, ended: threading.Event) -> None:
-    if not ended.wait(task.after):
-        os.kill(pid, task.stop)
+def _stop(pid: int, task: Task, ended: threading.Event, slowness: list[float]) -> None:
+    """Send the signal; until the end, a loop that takes half of a core tells how busy the machine is."""
+    if ended.wait(task.after):
+        return
+    os.kill(pid, task.stop)
+    clock = worked = 0.0
+    while not ended.wait(PACE):
+        began, begin = time.monotonic(), time.thread_time()
+        while time.thread_time() - begin < PACE:
+            pass
+        clock, worked = clock + time.monotonic() - began, worked + time.thread_time() - begin
+        slowness[:] = [max(1.0, clock / worked)]
 
 
 def _break(name: str, number: int) -> None:
@@ -177,9 +190,9 @@ def _do(task: Task) -> Outcome:
     signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPS)
     os.close(write)
     began = time.monotonic() + task.after
-    ended = threading.Event()
+    ended, slowness = threading.Event(), [1.0]
     if task.stop:
-        threading.Thread(target=_stop, args=(pid, task, ended), daemon=True).start()
+        threading.Thread(target=_stop, args=(pid, task, ended, slowness), daemon=True).start()
     with os.fdopen(read, errors="replace") as pipe:
         told = pipe.read()
     ended.set()  # before its number can be that of another
@@ -187,8 +200,8 @@ def _do(task: Task) -> Outcome:
     seconds = time.monotonic() - began
     lines, _, operations = told.rstrip("\n").rpartition("\n")
     if code < 0 or not operations.isdigit():  # ended where it stood
-        return Outcome(code, told, 0, seconds)
-    return Outcome(code, lines, int(operations), seconds)
+        return Outcome(code, told, 0, seconds, slowness[0])
+    return Outcome(code, lines, int(operations), seconds, slowness[0])
 
 
 def _of_few(draw: Callable[..., Any]) -> Callable[..., Any]:

@@ -1,6 +1,6 @@
 """The rows of docs/faults.md: what goes wrong, what the user sees, what is kept. Tests name the row they prove.
 
-``python tests/faults/rows.py`` writes the table of the page again.
+``python tests/faults/rows.py`` writes the tables of the page again: these rows, and what attacks have found.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "faults.md"
 BEGIN, END = "<!-- table: python tests/faults/rows.py -->\n", "<!-- end of the table -->\n"
+FOUND, FOUND_END = "<!-- findings: python tests/faults/rows.py -->\n", "<!-- end of the findings -->\n"
 
 
 @dataclass(frozen=True)
@@ -94,10 +95,20 @@ ROWS = tuple(
          "{run}: in use by process {pid} on {machine}; wait for it to end, or give another --out", "2",
          "the first run"),
         ("stale-lock", "the lock of a run that was killed", "", "0", "the lock goes with its process"),
+        ("no-locks", "the file system knows no locks (some network file systems)", "", "0",
+         "everything, but nobody is kept from starting a second run there"),
         ("worker-killed", "a worker process is killed (processes, dask), by the system for its memory, or by hand", "",
          "0", "everything; its work is repeated, to the same bits"),
         ("worker-always", "a data set kills every worker that tries it",
          "{data set}: WorkerLostError: a worker process died", "1", "all other data sets"),
+        ("worker-memory",
+         "a dask worker passes its limit of memory whenever it is at a data set, and is ended by its nanny",
+         "{n} of {all} members failed in the {stage}; at least {few} must survive. Most frequent reasons: a worker "
+         "process died", "3", "all other data sets; where it does so once: everything, to the same bits"),
+        ("worker-paused", "all dask workers are paused for a minute, near their limit of memory",
+         "dask scheduler {address}: has had no worker for {time} s that takes work: all are paused near their limit of "
+         "memory (dask worker --memory-limit); {n} of {all} data sets are done and kept in {run}; give --resume to "
+         "continue", "1", DONE),
         ("scheduler-lost", "the dask scheduler is lost",
          "lost the connection to the dask scheduler {address}; {n} of {all} data sets are done and kept in {run}; "
          "give --resume to continue", "1", DONE),
@@ -189,6 +200,10 @@ ROWS = tuple(
          "everything"),
         ("result-incomplete", "a result file that lacks something, or holds a unit or symbol that means nothing, with "
          "a good seal", "{file}: not a result of en4dvar: {what}", "2", "the file stays as it is"),
+        ("environment", "a variable of the environment with which nothing can be computed or drawn "
+         "(`NUMBA_DISABLE_JIT`, a `SOURCE_DATE_EPOCH` that is no number)", "{name}; unset it", "2", "nothing is begun"),
+        ("left-behind", "files half written and temporary folders of a process that was killed", "", "0",
+         "they are removed by the next that writes there, files of others never"),
         ("formula", "names that a spreadsheet takes for formulas, symbols that LaTeX takes for commands", "", "0",
          "everything; in CSV behind an apostrophe, in LaTeX as text"),
         ("model-warns", "the model overflows or divides by zero", "", "0",
@@ -197,6 +212,51 @@ ROWS = tuple(
          "everything"),
     )
 )  # fmt: skip
+
+
+FINDINGS = (
+    ("code that a result names by `/proc/self/cwd/…` or an absolute path was run without asking",
+     "faults/test_strangers.py::test_a_law_of_a_strangers_file"),
+    ("`design --force` and `sweep-twin` overwrote a file of the user's",
+     "runs/test_kinds.py::test_a_foreign_file_is_never_replaced"),
+    ("a data set vanished without a word from a damaged or cut `datasets.pack`; `--resume` called a damaged set done",
+     "faults/test_packs.py::test_no_set_vanishes_from_a_damaged_pack "
+     "faults/test_packs.py::test_no_set_vanishes_from_many_damaged_packs"),
+    ("children of a program survived it", "model/test_ending.py::test_no_child_survives_its_program"),
+    ("a program's output that is a pipe or a device, or its template, blocked the run, and a stop was not heeded",
+     "model/test_ending.py::test_an_output_that_cannot_be_read_is_a_lost_member "
+     "model/test_ending.py::test_a_template_without_end_is_past_its_time "
+     "model/test_ending.py::test_a_stop_is_heeded_wherever_a_program_stands_and_nothing_survives"),
+    ("a TIFF that points to itself, a page of 30 000 × 30 000, 20 MB of metadata, a pipe among frames, a cut mp4",
+     "faults/test_gate.py::test_a_tiff_that_does_not_end faults/test_gate.py::test_a_pipe_is_refused "
+     "faults/test_gate.py::test_a_cut_mp4_is_told faults/test_gate.py::test_a_frame_of_a_folder_that_is_too_large"),
+    ("a workbook of 313 kB took 13.6 GB",
+     "faults/test_gate.py::test_a_workbook_that_is_wide_where_nothing_stands "
+     "faults/test_gate.py::test_limits_of_decoding"),
+    ("a result with external storage, virtual data or links gave bytes of another file",
+     "faults/test_gate.py::test_a_result_with_numbers_in_another_file_is_refused"),
+    ("tracebacks of damaged results and checkpoints with a good seal, and of PEST's files",
+     "faults/test_gate.py::test_a_series_with_a_good_seal_that_lacks_something "
+     "faults/test_gate.py::test_a_sealed_file_that_takes_its_library_down "
+     "faults/test_gate.py::test_an_estimate_of_several_with_a_good_seal_that_lacks_something "
+     "faults/test_plain_input.py::test_a_result_sealed_again_without_what_is_read "
+     "faults/test_siege.py::test_an_attack_holds "
+     "faults/test_gate.py::test_control_files_of_pest_that_mean_nothing"),
+    ("sparse files of a terabyte were read",
+     "faults/test_gate.py::test_a_sparse_file_of_a_terabyte_is_refused "
+     "faults/test_gate.py::test_a_manifest_of_a_terabyte_is_refused"),
+    ("tracebacks for a closed standard output, `NUMBA_DISABLE_JIT=1` and `SOURCE_DATE_EPOCH=junk`",
+     "faults/test_surroundings.py::test_an_environment_that_cannot_be_worked_in "
+     "faults/test_surroundings.py::test_standard_output_that_is_closed"),
+    ("escape sequences in names reached `run.log`, `summary.csv` and the terminal",
+     "faults/test_terminal.py::test_a_terminal_and_a_log_obey_no_name"),
+    ("half-written files and temporary folders stayed behind after kills",
+     "faults/test_surroundings.py::test_what_a_killed_process_has_left_is_removed_by_the_next"),
+    ("a run that hit a limit of 300 bytes a file could not be resumed",
+     "faults/test_commands.py::test_no_room "
+     "runs/test_run_directory.py::test_a_run_that_could_not_begin_is_begun_by_resume"),
+)  # fmt: skip
+"""What the second siege found on earlier code, and the tests (``file::function`` below ``tests/``) that fail there."""
 
 
 def row(name: str) -> Row:
@@ -230,11 +290,28 @@ def table() -> str:
     return "".join(f"{line}\n" for line in lines)
 
 
+def findings() -> str:
+    """The table of findings in Markdown."""
+    lines = ["| found | test |", "|---|---|"]
+    for found, tests in FINDINGS:
+        names = "<br>".join(f"`{name}`" for name in tests.split())
+        lines.append(f"| {found} | {names} |")
+    return "".join(f"{line}\n" for line in lines)
+
+
+def functions_in(file: str) -> set[str]:
+    """Names of the test functions of a file below ``tests/``."""
+    tree = ast.parse((ROOT / "tests" / file).read_text(encoding="utf-8"))
+    return {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
+
+
 def rendered(page: str) -> str:
-    """The page with the table of today."""
-    before, _, rest = page.partition(BEGIN)
-    _, _, after = rest.partition(END)
-    return f"{before}{BEGIN}\n{table()}\n{END}{after}"
+    """The page with the tables of today."""
+    for begin, end, lines in ((BEGIN, END, table()), (FOUND, FOUND_END, findings())):
+        before, _, rest = page.partition(begin)
+        _, _, after = rest.partition(end)
+        page = f"{before}{begin}\n{lines}\n{end}{after}"
+    return page
 
 
 if __name__ == "__main__":

@@ -114,6 +114,27 @@ def test_a_program_whose_files_end_lines_as_there(away, tmp_path):
     assert "not done after 0.3 s" in ran(away, "run", tmp_path / "config.yaml", "--out", tmp_path / "late", code=3)
 
 
+def test_the_page_in_the_browser_begins_and_cancels_commands(away, tmp_path):
+    from page_server import start
+
+    shutil.copytree(ROOT / "configs" / "data", tmp_path / "data")
+    shutil.copy(ROOT / "configs" / "quickstart.yaml", tmp_path)
+    server = start(tmp_path, **{**environment(), **away})
+    try:
+        assert server.post("validate", config="quickstart.yaml")[0] == 200
+        assert server.last()["state"] == "done", server.last()
+        assert server.post("run", config="quickstart.yaml", run="a")[0] == 200
+        while b"iteration" not in server.ask("/look/log?run=a")[1]:
+            assert server.state()["jobs"][-1]["state"] == "running", server.last()
+            time.sleep(0.05)
+        assert server.post("cancel")[0] == 200
+        assert server.last()["state"] == "stopped"
+        assert server.post("resume", config="quickstart.yaml", run="a")[0] == 200
+        assert server.last()["state"] == "done", server.last()
+    finally:
+        server.end()
+
+
 def test_a_file_that_something_else_holds_open_is_replaced_a_little_later(away, tmp_path):
     code = """
 import os, threading, time

@@ -4,6 +4,7 @@ import datetime
 import itertools
 import os
 import resource
+import shlex
 import subprocess
 import sys
 import time
@@ -16,9 +17,11 @@ from cheap_model import write_campaign
 from first_starts import start_together
 from growth import measured
 from many import estimate_many
+from rows import row
 from run_files import assert_same_results, command, configuration, environment, make_campaign, run_cli
 from toy_config import csv_text, write_toy
 
+from en4dvar.plumbing import files
 from en4dvar.runs.runner import run_campaign
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
@@ -133,3 +136,38 @@ def test_names_that_are_not_text(tmp_path):
     (failed,) = campaign.failures
     assert "\\udcff.csv: " in failed.failure
     assert (tmp_path / "run" / "summary.csv").read_text(encoding="utf-8").count("\\udcff") == 2
+
+
+@pytest.mark.parametrize(("name", "value"), [("NUMBA_DISABLE_JIT", "1"), ("SOURCE_DATE_EPOCH", "junk")])
+@pytest.mark.fault("environment")
+def test_an_environment_that_cannot_be_worked_in(tmp_path, name, value):
+    done = run_cli("run", write_toy(tmp_path), "--out", tmp_path / "run", **{name: value})
+    assert str(done.returncode) == row("environment").exit_code
+    assert row("environment").told(done.stderr)
+    assert name in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-"])
+def test_standard_output_that_is_closed(tmp_path, closed):
+    words = shlex.join(command("run", write_toy(tmp_path), "--out", tmp_path / "run", "--no-report"))
+    done = subprocess.run(["sh", "-c", f"{words} {closed}"], capture_output=True, text=True, env=environment())
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stdout + done.stderr
+    assert (tmp_path / "run" / "posterior.nc").is_file()
+
+
+@pytest.mark.fault("left-behind")
+def test_what_a_killed_process_has_left_is_removed_by_the_next(tmp_path):
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    theirs, ours = files.owner()[:-7] + f"{gone.pid:07d}", files.owner()
+    left = [tmp_path / f".joint.csv.{theirs}.tmp", tmp_path / f"en4dvar-{theirs}-ab_1"]
+    kept = [tmp_path / f".joint.csv.{ours}.tmp", tmp_path / "en4dvar-mine", tmp_path / ".mine.tmp"]
+    for path in (*left, *kept):
+        path.mkdir() if path.name.startswith("en4dvar") else path.touch()
+    with files.temporary_folder(tmp_path):
+        files.write_text(tmp_path / "a.csv", "")
+    assert [path.name for path in left if path.exists()] == []
+    assert [path.name for path in kept if not path.exists()] == []

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import yaml
 from click.testing import CliRunner
 from toy_config import write_toy
 
@@ -55,6 +56,9 @@ def test_a_value_that_is_wrong_is_seen(toy, tmp_path):
     """A damping that the readings have and the estimate has not moves k."""
     result = sixty(toy, tmp_path / "out", sets=40, made_with={"parameters.c": "0.03 N s/m"})
     assert any(verdict.off for verdict in result.verdicts)
+    kept = tmp_path / "out" / "config.resolved.yaml"
+    assert "# made_with:\n#   parameters.c: 0.03 N s/m\n" in kept.read_text()
+    assert yaml.safe_load(load_config(kept).resolved) == yaml.safe_load(kept.read_text())
 
 
 def test_more_sets_leave_the_first_as_they_were_for_any_workers(toy, tmp_path):
@@ -84,7 +88,7 @@ def test_what_cannot_be_done_is_told(toy, tmp_path):
         sixty(toy, tmp_path / "out", sets=1)
     with pytest.raises(DataError, match="not at the times"):
         sixty(toy, tmp_path / "out", made_with={"data.window": {"end": "100 ms"}})
-    with pytest.raises(ConfigError, match="unknown key"):
+    with pytest.raises(ConfigError, match=r"--made-with data\.windo: data\.windo: unknown key"):
         sixty(toy, tmp_path / "out", made_with={"data.windo": 3})
     (tmp_path / "out").mkdir(exist_ok=True)
     (tmp_path / "out" / "calibration.csv").write_text("set,data_set\n1,\n")

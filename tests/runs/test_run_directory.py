@@ -1,5 +1,8 @@
 """One run at a time; an earlier result stays until the new one is complete, wherever the new one fails."""
 
+import errno
+import fcntl
+import os
 import shutil
 import signal
 import subprocess
@@ -13,10 +16,12 @@ from run_files import assert_same_results, command, configuration, environment, 
 from toy_config import write_toy
 
 from en4dvar.cli import main
+from en4dvar.plumbing import files
 from en4dvar.plumbing.errors import DataError, OutputError, TooFewMembersError
 from en4dvar.results.pack import PACK, results_of
-from en4dvar.runs import rundir
+from en4dvar.runs import replacement, rundir, session
 from en4dvar.runs.lock import LOCK, locked
+from en4dvar.runs.replacement import LISTING
 from en4dvar.runs.rundir import NEXT, RunDirectory
 from en4dvar.runs.runner import run, run_campaign
 
@@ -54,6 +59,25 @@ def test_lock_goes_with_its_holder(tmp_path):
         assert "in use by process" in other.stderr
     with locked(tmp_path):
         pass
+
+
+@pytest.mark.fault("no-locks")
+@pytest.mark.parametrize("number", ["ENOLCK", "EOPNOTSUPP"])
+def test_a_file_system_without_locks_refuses_no_run(tmp_path, monkeypatch, number):
+    """Some network file systems have none; the bits are those of any other."""
+    path, out = write_toy(tmp_path), tmp_path / "run"
+    run(configuration(path, tmp_path / "quiet"))
+    tried = []
+
+    def unknown(file, how):
+        tried.append(how)
+        raise OSError(getattr(errno, number), os.strerror(getattr(errno, number)))
+
+    monkeypatch.setattr(fcntl, "flock", unknown)
+    assert run(configuration(path, out)).name == "toy"
+    assert tried
+    assert not (out / LOCK).exists()
+    assert_same_results(out, tmp_path / "quiet")
 
 
 @pytest.fixture
@@ -180,6 +204,27 @@ def test_resume_of_a_job_killed_before_it_began(tmp_path, left):
     again = CliRunner().invoke(main, ["run", str(path), "--out", str(out), "--no-report", "--resume"])
     assert again.exit_code == 0
     assert "note: " not in again.stderr
+
+
+@pytest.mark.fault("disk-failing")
+@pytest.mark.parametrize("failing", [LISTING, "config.yaml"])
+def test_a_run_that_could_not_begin_is_begun_by_resume(tmp_path, monkeypatch, failing):
+    """Full before the files of the run are listed, or right after: nothing is left that looks like another's."""
+    path, out = write_toy(tmp_path), tmp_path / "run"
+    written = files.write_text
+
+    def full(file, text):
+        if file.name == failing and (text or failing != LISTING):  # an empty list fits
+            raise OutputError(f"{file}: cannot be written: No space left on device")
+        return written(file, text)
+
+    for module in (replacement, session):
+        monkeypatch.setattr(module, "write_text", full)
+    with pytest.raises(OutputError, match="No space left"):
+        run(configuration(path, out))
+    assert out.exists() == (failing != LISTING)
+    monkeypatch.undo()
+    assert run(configuration(path, out), resume=True).name == "toy"
 
 
 def test_resume_needs_a_run_or_nothing(tmp_path):

@@ -6,8 +6,7 @@ import csv
 import functools
 import json
 import math
-import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,10 +18,10 @@ from en4dvar.model.programs.errors import ProgramError
 from en4dvar.model.state import Array
 from en4dvar.plumbing.decoding import Allowed, DecodeError, decoded_whole
 from en4dvar.plumbing.errors import DataError
-from en4dvar.plumbing.files import read_plain, read_text
+from en4dvar.plumbing.files import read_text
 from en4dvar.plumbing.hints import listed, short
+from en4dvar.plumbing.patterns import LONGEST, matches, text_of
 
-LONGEST = 256_000_000  # bytes of an output
 COMMENT = ("#", "%", "//")
 
 
@@ -88,16 +87,11 @@ def _found(folder: Path, file: str, pattern: str, seconds: float | None) -> list
     return texts
 
 
-def matches(path: Path, pattern: str) -> Iterator[list[str]]:
-    """What a regular expression with one group finds in a file; see :mod:`en4dvar.plumbing.decoding`."""
-    yield re.findall(pattern, _text(path.parent, path.name), re.MULTILINE)
-
-
 def _text(folder: Path, file: str) -> str:
     try:
-        return read_plain(folder / file, LONGEST).decode("utf-8", errors="replace").replace("\r\n", "\n")
-    except OSError as error:
-        raise ProgramError(f"no output file {file}: {error.strerror}") from None
+        return text_of(folder / file)
+    except DataError as error:
+        raise ProgramError(str(error).replace(str(folder / file), file)) from None
 
 
 @functools.cache

@@ -1,0 +1,98 @@
+"""The pictures of docs/app.md, and how fast the page is: ``python benchmarks/app_page.py [FOLDER_OF_PICTURES]``.
+
+A synthetic movie of the quick start's bubble goes through the page in a headless Chromium. Printed are the time to the
+page and to the first frame, and the frames a second that are shown while an arrow key is held, of 512 × 512 pixels.
+"""
+
+from __future__ import annotations
+
+import io
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+ROOT = Path(__file__).resolve().parents[1]
+TRUTH = "parameters={G: 0.42 kPa, alpha: 0.029, mu: 0.086 Pa s, R0: 0.43 um, t_s: 0 us}"
+FRAMES = 60
+
+
+def command(*words: str) -> list[str]:
+    return [sys.executable, "-m", "en4dvar.cli", *words]
+
+
+def film(folder: Path) -> None:
+    """Movie of 60 instants, 512 × 512."""
+    words = ["simulate", str(ROOT / "configs" / "quickstart.yaml"), "--set", TRUTH, "--times", "5.6 us:29.4 us:0.4 us"]
+    made = [
+        "--movie",
+        str(folder / "bubble.tif"),
+        "--movie-set",
+        "shape=512x512",
+        "--movie-set",
+        "pixel=1 um",
+        "--movie-set",
+        "noise=1",
+    ]
+    subprocess.run(command(*words, *made, "--seed", "5"), check=True, stdout=subprocess.DEVNULL)
+
+
+def walk(page: Any, address: str, pictures: Path) -> None:
+    """Open the page, read the movie, correct a frame, propose a model; the pictures."""
+    begun = time.perf_counter()
+    page.goto(address)
+    print(f"page: {time.perf_counter() - begun:.2f} s")
+    page.wait_for_selector("#inspector:not([hidden])")
+    print(f"first frame: {time.perf_counter() - begun:.2f} s")
+    rate = page.evaluate(
+        f"(async () => {{ const t = performance.now(); for (let n = 0; n < {FRAMES}; n++) await go(n);"
+        f" return {FRAMES} / (performance.now() - t) * 1000; }})()"
+    )
+    print(f"scrubbing: {rate:.0f} frames/s")
+    page.fill("#exposure", "100 ns")
+    page.click("button[data-step=track]")
+    page.wait_for_selector("#job-track.done", timeout=300_000)
+    page.evaluate("go(20)")
+    page.wait_for_timeout(1000)
+    picture(page, "#movies", pictures / "app_movie.png")
+    page.select_option("#table", "bubble.csv")
+    page.wait_for_timeout(1000)
+    page.click("button[data-step=init]")
+    page.wait_for_selector("#job-init.done", timeout=300_000)
+    page.wait_for_timeout(1500)
+    page.click("button[data-step=prior]")
+    page.wait_for_selector("#job-validate.done img", timeout=300_000)
+    page.wait_for_timeout(1000)
+    picture(page, "#model", pictures / "app_model.png")
+
+
+def picture(page: Any, part: str, path: Path) -> None:
+    """A part of the page, at two thirds of its size and in 64 colours: small files."""
+    shot = Image.open(io.BytesIO(page.locator(part).screenshot())).convert("RGB")
+    small = shot.resize((2 * shot.width // 3, 2 * shot.height // 3), Image.Resampling.LANCZOS)
+    small.quantize(64).save(path, optimize=True)
+
+
+def main(pictures: Path, width: int = 1280) -> None:
+    from playwright.sync_api import sync_playwright
+
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name) / "movies"
+        folder.mkdir()
+        film(folder)
+        server = subprocess.Popen(command("app", str(folder), "--no-browser"), stdout=subprocess.PIPE, text=True)
+        assert server.stdout is not None
+        address = server.stdout.readline().strip()
+        with sync_playwright() as playwright:
+            browser = playwright.chromium.launch(executable_path="/usr/bin/chromium", args=["--no-sandbox"])
+            walk(browser.new_page(viewport={"width": width, "height": 900}), address, pictures)
+            browser.close()
+        server.terminate()
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]) if sys.argv[1:] else ROOT / "docs" / "assets", *map(int, sys.argv[2:]))

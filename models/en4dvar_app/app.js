@@ -1,0 +1,190 @@
+"use strict";
+const $ = (id) => document.getElementById(id);
+const FIELDS = ["movie", "pixel", "frame-rate", "exposure", "flashes", "bubble", "region", "mask", "raw", "table", "time-column",
+  "time-unit", "radius-column", "radius-unit", "by", "law", "medium", "start", "proposal", "config", "run"];
+const MINE = {
+  track: ["movie", "pixel", "frame-rate", "exposure", "flashes", "bubble", "region", "mask", "raw"],
+  init: ["table", "time-column", "time-unit", "radius-column", "radius-unit", "by", "law", "medium", "start", "proposal"],
+  validate: ["config"], prior: ["config"], run: ["config", "run"], resume: ["config", "run"], export: ["run"], compare: [],
+};
+const BOX = { prior: "validate", resume: "run", export: "compare" };
+let state = null, before = "", lastJobs = null, table = null;
+
+function say(words) { $("message").textContent = words; if (words) $("message").scrollIntoView({ block: "nearest" }); }
+
+async function fetched(what, fields) {
+  const answer = await fetch(`look/${what}?` + new URLSearchParams(fields));
+  if (!answer.ok) throw new Error(await answer.text());
+  return answer.headers.get("Content-Type").startsWith("image/") ? answer.blob() : answer.json();
+}
+
+async function post(step, fields) {
+  const answer = await fetch(step, { method: "POST", body: JSON.stringify(fields) });
+  say(answer.ok ? "" : await answer.text());
+  return answer.ok;
+}
+
+function options(select, names, empty) {
+  const now = select.value, wanted = empty === undefined ? names : ["", ...names];
+  if ([...select.options].map((o) => o.value).join("\n") === wanted.join("\n") && select.options.length) return false;
+  select.replaceChildren(...wanted.map((name) => new Option(name || empty, name)));
+  select.value = wanted.includes(now) ? now : wanted[0] ?? "";
+  return select.value !== now || !now;
+}
+
+const changed = (id) => $(id).dispatchEvent(new Event("change"));
+
+function link(page, words) {
+  const made = document.createElement("a");
+  made.href = "file/" + page.split("/").map(encodeURIComponent).join("/");
+  made.target = "_blank"; made.rel = "noopener"; made.textContent = words;
+  return made;
+}
+
+function show(now) {
+  state = now;
+  $("folder").textContent = now.folder;
+  for (const [id, names, empty] of [["movie", now.movies, now.movies.length ? undefined : "no movie in this folder"],
+    ["table", now.tables, "choose"], ["config", now.configs, "choose"]])
+    if (options($(id), names, empty)) changed(id);
+  const running = now.jobs.some((job) => job.state === "running");
+  for (const button of document.querySelectorAll("button[data-step]")) button.disabled = running;
+  $("cancel").disabled = !running;
+  const last = {};
+  for (const job of now.jobs) last[BOX[job.step] || job.step] = job;
+  for (const [step, job] of Object.entries(last)) showJob(step, job);
+  const ended = now.jobs.filter((job) => job.state === "done" && lastJobs && lastJobs.get(job.number) !== "done");
+  lastJobs = new Map(now.jobs.map((job) => [job.number, job.state]));
+  ended.forEach(finished);
+  showRuns(now.runs);
+  const pages = now.pages.filter((p) => p.startsWith("comparisons/"));
+  $("pages").replaceChildren(...pages.map((p) => item(link(p, p))));
+}
+
+function item(...parts) { const li = document.createElement("li"); li.append(...parts); return li; }
+
+function showJob(step, job) {
+  const box = $(`job-${step}`), whole = JSON.stringify(job);
+  if (!box || box.dataset.whole === whole) return;
+  box.dataset.whole = whole;
+  box.className = `job ${job.state}`;
+  const words = document.createElement("pre");
+  words.textContent = `$ ${job.line}\n${job.output}`;
+  box.replaceChildren(`${job.state}; the command that repeats this step, in this folder:`, words);
+  const prior = job.output.match(/^prior predictive: (.*\.png) and/m);
+  if (job.state === "done" && step === "track") box.append(link(job.out.replace(/csv$/, "html"), "Open the page of all outlines"));
+  if (job.state === "done" && step === "run") box.append(link(`${job.out}/report.html`, "Open the result"));
+  if (prior) {
+    const picture = document.createElement("img");
+    picture.src = link(prior[1].replace(`${state.folder}/`, ""), "").href;
+    picture.alt = "The prior over the data";
+    box.append(picture);
+  }
+  if (step === "validate") showFaults(job);
+}
+
+function finished(job) {
+  if (job.step === "track" && movie && job.subject === movie.name) { readMovie(false); $("table").value = job.out; changed("table"); }
+  if (job.step === "init" && $("text").value === before) { $("config").value = job.out; changed("config"); }
+}
+
+function showFaults(job) {
+  const faults = [...job.output.matchAll(/^(?:error: )?\S*\.ya?ml:(\d+):(\d+): (.*)$/gm)];
+  $("faults").replaceChildren(...faults.map(([, line, column, words]) => {
+    const button = document.createElement("button");
+    button.className = "plain"; button.textContent = `line ${line}: ${words}`;
+    button.addEventListener("click", () => {
+      const lines = $("text").value.split("\n"), at = lines.slice(0, line - 1).join("\n").length + (line > 1);
+      $("text").focus(); $("text").setSelectionRange(at, at + lines[line - 1].length);
+      $("text").scrollTop = (line - 4) * parseFloat(getComputedStyle($("text")).lineHeight);
+    });
+    return item(button);
+  }));
+}
+
+function showRuns(runs) {
+  const whole = JSON.stringify(runs), list = $("runs");
+  if (list.dataset.whole === whole) return;
+  list.dataset.whole = whole;
+  const chosen = new Set([...list.querySelectorAll("input:checked")].map((box) => box.value));
+  list.replaceChildren(...runs.map(({ name, done }) => {
+    const box = document.createElement("input"), label = document.createElement("label");
+    box.type = "checkbox"; box.value = name; box.checked = chosen.has(name); label.append(box, ` ${name} `);
+    return item(label, done ? link(`runs/${name}/report.html`, "open the result") : "not finished");
+  }));
+}
+
+async function refresh() {
+  try {
+    const answer = await fetch("state");
+    if (!answer.ok) throw new Error();
+    show(await answer.json());
+    if ($("message").dataset.lost) { delete $("message").dataset.lost; say(""); }
+  } catch (error) {
+    if (error instanceof TypeError || !error.message) {
+      $("message").dataset.lost = "1";
+      say("The server does not answer. Nothing is lost: start 'en4dvar app' again and open the address that it prints.");
+    } else throw error;
+  }
+  const running = state?.jobs.find((job) => job.state === "running" && ["run", "resume"].includes(job.step));
+  $("log").hidden = !running;
+  if (running) $("log").textContent = (await fetched("log", { run: running.out.replace("runs/", "") }).catch(() => ({ text: "" }))).text;
+}
+
+const freeName = (stem, names, end = "") => {
+  for (let n = 1; ; n++) { const name = `${stem}${n > 1 ? `_${n}` : ""}${end}`; if (!names.includes(name)) return name; }
+};
+
+async function readTable() {
+  const name = $("table").value;
+  table = null;
+  if (name) try { table = await fetched("table", { table: name }); } catch (error) { say(error.message); }
+  const names = table ? Object.keys(table.columns) : [];
+  options($("by"), names, "the file");
+  for (const [id, own] of [["time-column", table?.time], ["radius-column", table?.radius]]) {
+    options($(id), names, table?.tracked ? "as the table says" : "choose");
+    $(id).value = (!table?.tracked && own) || "";
+  }
+  if (name) $("proposal").value = freeName(name.replace(/\.[^.]*$/, ""), state.configs, ".yaml");
+  $("about-table").textContent = !table ? "" : table.tracked ? "A table of 'en4dvar track': it says its columns and units itself."
+    : `${table.files} file(s); of ${table.file}${table.decimal === "," ? ", with decimal commas" : ""}. Units are never guessed: give them.`;
+  plotTable();
+}
+
+function plotTable() {
+  const own = table?.tracked, x = own ? "t_us" : $("time-column").value, y = own ? "R_um" : $("radius-column").value;
+  const points = table?.columns[x] && table.columns[y] ? table.columns[x].map((t, i) => ({ x: t ?? NaN, y: table.columns[y][i] ?? NaN })) : [];
+  plot($("plot"), points, `${x} ${own ? "" : $("time-unit").value}`, `${y} ${own ? "" : $("radius-unit").value}`);
+}
+
+async function readConfig() {
+  const config = $("config").value;
+  $("text").value = before = config ? (await fetched("text", { config })).text : "";
+  if (config) $("run").value = freeName(config.replace(/\.[^.]*$/, ""), (state?.runs || []).map((run) => run.name));
+  $("faults").replaceChildren();
+}
+
+async function keep() {
+  const fields = { config: $("config").value, before, text: $("text").value };
+  if (!(await post("keep", fields))) return false;
+  before = fields.text;
+  return true;
+}
+
+async function begin(step) {
+  if (["validate", "prior", "run", "resume"].includes(step) && $("text").value !== before && !(await keep())) return;
+  const fields = Object.fromEntries(MINE[step].map((id) => [id, $(id).value]));
+  if (step === "compare") fields.runs = [...document.querySelectorAll("#runs input:checked")].map((box) => box.value).join("\n");
+  await post(step, fields);
+  await refresh();
+}
+
+for (const button of document.querySelectorAll("button[data-step]")) button.addEventListener("click", () => begin(button.dataset.step));
+$("keep").addEventListener("click", keep);
+$("cancel").addEventListener("click", async () => { await post("cancel", {}); await refresh(); });
+$("table").addEventListener("change", readTable);
+$("config").addEventListener("change", readConfig);
+for (const id of ["time-column", "radius-column", "time-unit", "radius-unit"]) $(id).addEventListener("change", plotTable);
+fetched("laws", {}).then(({ laws }) => $("laws").replaceChildren(...laws.map((law) => new Option(law, law)))).catch(() => {});
+window.addEventListener("beforeunload", (event) => { if ($("text").value !== before) event.preventDefault(); });
+window.addEventListener("load", () => { refresh(); setInterval(refresh, 1000); });

@@ -1,0 +1,125 @@
+"""Frames of a movie as pictures, and tables as numbers, for the page."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+import threading
+from collections import OrderedDict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from en4dvar.inputs.opened import readable
+from en4dvar.plumbing.errors import DataError, En4dvarError
+from en4dvar.plumbing.files import read_plain
+from en4dvar_movie.frames import Frame, Movie, open_movie
+
+HELD = 300_000_000  # bytes of frames that are kept, so that going back reads nothing again
+PLOTTED = 4000  # readings of a column
+LARGEST_TABLE = 50_000_000  # bytes
+
+
+class Pictures:
+    """The frames of one movie, read forward and kept as far as there is room. Used by several threads."""
+
+    def __init__(self, path: Path, raw: str | None = None):
+        self.movie: Movie = open_movie(path, raw)
+        self._frames: Iterator[Frame] = iter(())
+        self._next, self._size = 0, 0
+        self._held: OrderedDict[int, Frame] = OrderedDict()
+        self._range: tuple[float, float] | None = None
+        self._lock = threading.Lock()
+        self.shape: tuple[int, ...] = self.frame(0).shape
+        self.count = self.movie.count or sum(1 for _ in self.movie.frames())
+
+    def frame(self, number: int) -> Frame:
+        """One frame (H, W). Raises :class:`DataError`."""
+        with self._lock:
+            if number in self._held:
+                return self._held[number]
+            if number < self._next or self._next == 0:
+                self._frames, self._next = self.movie.frames(), 0
+            for frame in self._frames:
+                self._keep(self._next, frame)
+                self._next += 1
+                if self._next > number:
+                    return frame
+        raise DataError(f"{self.movie.path}: there is no frame {number}")
+
+    def _keep(self, number: int, frame: Frame) -> None:
+        if number not in self._held:
+            self._held[number] = frame
+            self._size += frame.nbytes
+        while self._size > HELD and len(self._held) > 1:
+            self._size -= self._held.popitem(last=False)[1].nbytes
+
+    def bmp(self, number: int) -> bytes:
+        """One frame as BMP, which takes no time to compress; 16 bit are stretched over the range of the first frame."""
+        from PIL import Image
+
+        out = io.BytesIO()
+        Image.fromarray(self._grey(self.frame(number))).save(out, "bmp")
+        return out.getvalue()
+
+    def _grey(self, frame: Frame) -> npt.NDArray[np.uint8]:
+        if frame.dtype == np.uint8:
+            return frame
+        if self._range is None:
+            first = self.frame(0)
+            self._range = float(first.min()), float(first.max())
+        low, high = self._range
+        return np.clip(255 * (frame - low) / max(high - low, 1e-12), 0, 255).astype(np.uint8)
+
+
+def readings(path: Path) -> dict[str, Any]:
+    """The table of ``en4dvar track``: pixel (um), and rows with frame, t_us, R_um, R_std_um, x_um, y_um, used, reason.
+
+    Raises :class:`DataError` where it is no such table.
+    """
+    with readable(path):
+        text = read_plain(path, LARGEST_TABLE).decode("utf-8", "replace")
+    pixel = re.search(r"; pixel: ([\d.e+-]+) um;", text)
+    lines = [line for line in text.splitlines() if not line.startswith("#")]
+    rows = list(csv.DictReader(lines))
+    if pixel is None or not rows or "frame" not in rows[0]:
+        raise DataError(f"{path}: is not a table of 'en4dvar track'")
+    return {"pixel": float(pixel[1]), "rows": [{key: _number(row.get(key)) for key in row if key} for row in rows]}
+
+
+def _number(text: str | None) -> float | str | None:
+    try:
+        return float(text) if text else None
+    except ValueError:
+        return text
+
+
+def columns(path: Path) -> dict[str, Any]:
+    """Columns of a table with their numbers (thinned out if many), and which would be taken for times and radii."""
+    from en4dvar.inputs.asked import SUFFIXES, Layout
+    from en4dvar_bubble.starter.asked import Asked, first_with_columns
+
+    files = sorted(p for p in path.iterdir() if p.suffix.lower() in SUFFIXES) if path.is_dir() else [path]
+    if not files:
+        raise DataError(f"{path}: the folder holds no data file ({', '.join(SUFFIXES)})")
+    first, contents, layout = first_with_columns(files, Layout())
+    asked = Asked(contents)
+    try:
+        asked = asked.by_names()
+        needed = [option.removeprefix("--") for option, _, _ in asked.needed()]
+    except En4dvarError:
+        needed = []
+    step = max(1, max((len(v) for v in contents.columns.values()), default=0) // PLOTTED)
+    shown = {name: [_finite(v) for v in values[::step]] for name, values in contents.columns.items()}
+    return {
+        "file": first.name, "files": len(files), "columns": shown, "decimal": layout.decimal,
+        "tracked": asked.tracked, "needed": needed, "time": asked.time_column, "radius": asked.radius_column,
+    }  # fmt: skip
+
+
+def _finite(value: Any) -> float | None:
+    return float(value) if np.isfinite(value) else None

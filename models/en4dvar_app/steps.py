@@ -1,0 +1,174 @@
+"""Fields of the page → the words of one command, whose files all lie in the folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from en4dvar.plumbing.errors import En4dvarError, OutputError
+from en4dvar.plumbing.files import read_plain, write_text
+from en4dvar_app.trusted import below
+
+OF_TRACK = ("pixel", "frame-rate", "exposure", "flashes", "raw", "bubble", "region")
+OF_INIT = (
+    "start", "law", "medium", "time-unit", "radius-unit", "time-column", "radius-column", "time-step", "frame-rate",
+    "pixel", "by", "sheet",
+)  # fmt: skip
+LONGEST = 1_000_000  # bytes of a text
+TRACKED = b"# en4dvar track, "  # begins a table that may be read anew
+Fields = Mapping[str, str]
+
+
+class FieldError(En4dvarError):
+    """A field of the page that is missing or cannot be."""
+
+
+def words_of(root: Path, step: str, fields: Fields) -> list[str]:
+    """The words after ``en4dvar``. Raises :class:`FieldError`, and :class:`OutputError` for a path."""
+    return STEPS[step](root, fields)
+
+
+def corrections_of(movie: str) -> str:
+    """The name of the text file with the corrections of a movie."""
+    return f"{movie.rpartition('.')[0] or movie}.corrections.txt"
+
+
+def table_of(movie: str) -> str:
+    """The name of the table that is read from a movie."""
+    return f"{movie.rpartition('.')[0] or movie}.csv"
+
+
+def existing(root: Path, fields: Fields, key: str) -> str:
+    """The name of a file or folder of ``root``, which holds no link that leads out of it."""
+    name = fields.get(key, "")
+    if not name:
+        raise FieldError(f"choose a {key} first")
+    path = below(root, name)
+    if not path.exists():
+        raise FieldError(f"{name}: is not in the folder any more")
+    for part in path.iterdir() if path.is_dir() else ():
+        below(root, part.relative_to(root).as_posix())
+    return name
+
+
+def _options(fields: Fields, names: tuple[str, ...]) -> list[str]:
+    return [f"--{name}={fields[name].strip()}" for name in names if fields.get(name, "").strip()]
+
+
+def _track(root: Path, fields: Fields) -> list[str]:
+    movie = existing(root, fields, "movie")
+    table, corrections = table_of(movie), corrections_of(movie)
+    words = ["track", movie, *_options(fields, OF_TRACK)]
+    if fields.get("mask"):
+        words.append(f"--mask={existing(root, fields, 'mask')}")
+    if below(root, corrections).is_file() and (root / corrections).read_text(encoding="utf-8").strip():
+        words.append(f"--corrections={corrections}")
+    below(root, f"{Path(table).stem}.html")
+    if below(root, table).exists():
+        with (root / table).open("rb") as file:
+            if not file.read(len(TRACKED)) == TRACKED:
+                raise FieldError(f"{table}: is there and was not read from a movie; rename it first")
+        words.append("--force")  # the same table, read anew
+    return [*words, f"--out={table}"]
+
+
+def _init(root: Path, fields: Fields) -> list[str]:
+    data, out = existing(root, fields, "table"), _new(root, fields, "proposal", ".yaml")
+    return ["init", f"--data={data}", *_options(fields, OF_INIT), f"--out={out}"]
+
+
+def _new(root: Path, fields: Fields, key: str, suffix: str) -> str:
+    """The name of a file that is not there: no command of the page replaces what somebody may have edited."""
+    name = fields.get(key, "").strip()
+    if not name or Path(name).name != name or name.startswith("."):
+        raise FieldError(f"give the new {key} a name without '/', such as gel{suffix}")
+    name = name if name.endswith(suffix) else f"{name}{suffix}"
+    if below(root, name).exists():
+        raise FieldError(f"{name}: exists and is not replaced; give the new {key} another name")
+    return name
+
+
+def _config(root: Path, fields: Fields) -> str:
+    name = existing(root, fields, "config")
+    if not name.endswith((".yaml", ".yml")):
+        raise FieldError(f"{name}: is not a configuration by its suffix (.yaml)")
+    return name
+
+
+def _run_dir(root: Path, fields: Fields, key: str = "run") -> str:
+    name = fields.get(key, "").strip()
+    if not name or name in (".", "..") or "/" in name or "\\" in name or name.startswith("-"):
+        raise FieldError("give the run a name without '/'")
+    below(root, f"runs/{name}")
+    return f"runs/{name}"
+
+
+def _run(root: Path, fields: Fields) -> list[str]:
+    out = _run_dir(root, fields)
+    if (root / out).exists():
+        raise FieldError(f"{out}: exists and is not replaced; give the new run another name, or continue that run")
+    return ["run", _config(root, fields), f"--out={out}"]
+
+
+def _resume(root: Path, fields: Fields) -> list[str]:
+    return ["run", _config(root, fields), f"--out={_run_dir(root, fields)}", "--resume"]
+
+
+def _compare(root: Path, fields: Fields) -> list[str]:
+    runs = [_run_dir(root, {"run": name}) for name in fields.get("runs", "").split("\n") if name]
+    if len(runs) < 2:
+        raise FieldError("choose two runs or more")
+    return ["compare", *runs, "--stored", f"--out={_compared(root)}"]
+
+
+def _compared(root: Path) -> str:
+    number = 1
+    while below(root, f"comparisons/{number}").exists():
+        number += 1
+    return f"comparisons/{number}"
+
+
+def _export(root: Path, fields: Fields) -> list[str]:
+    run = _run_dir(root, fields)
+    out = f"{Path(run).name}_results.csv"
+    if below(root, out).exists():
+        raise FieldError(f"{out}: exists and is not replaced; rename it first")
+    return ["export", run, f"--out={out}"]
+
+
+STEPS: dict[str, Callable[[Path, Fields], list[str]]] = {
+    "track": _track,
+    "init": _init,
+    "validate": lambda root, fields: ["validate", _config(root, fields)],
+    "prior": lambda root, fields: ["validate", _config(root, fields), "--plot"],
+    "run": _run,
+    "resume": _resume,
+    "compare": _compare,
+    "export": _export,
+}
+
+
+def text_of(root: Path, fields: Fields) -> str:
+    """The text of a configuration, or of the corrections of a movie ("" where there are none yet)."""
+    path = _text_file(root, fields)
+    return read_plain(path, LONGEST).decode("utf-8", "replace") if path.exists() else ""
+
+
+def kept(root: Path, fields: Fields) -> None:
+    """Write a text of the page: a configuration that is there, or the corrections of a movie.
+
+    Raises
+    ------
+    FieldError: another window or program has changed the file since the page read it.
+    """
+    path = _text_file(root, fields)
+    if text_of(root, fields) not in (fields.get("before", ""), fields.get("text", "")):
+        raise FieldError(f"{path.name}: another window or program has changed it; load the page again to see it")
+    write_text(path, fields.get("text", ""))
+
+
+def _text_file(root: Path, fields: Fields) -> Path:
+    name = _config(root, fields) if "config" in fields else corrections_of(existing(root, fields, "movie"))
+    if below(root, name) != root / name:
+        raise OutputError(f"{name}: is a link, which the page does not follow")
+    return root / name
