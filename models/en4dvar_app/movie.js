@@ -9,7 +9,7 @@ async function readMovie(afresh = true) {
   if (!name) return;
   try {
     const seen = await fetched("movie", { movie: name, raw: $("raw").value });
-    movie = { name, raw: $("raw").value, ...seen };
+    movie = { name, raw: $("raw").value, picture: afresh ? null : movie?.picture, ...seen };
   } catch (error) { movie = null; $("inspector").hidden = true; return say(error.message); }
   if (afresh) {
     bitmaps.clear(); at = 0; bar = null;
@@ -67,12 +67,13 @@ function tell() {
 }
 
 function draw(picture) {
+  if (picture) movie.picture = picture;
+  if (!movie.picture) return; // it is on its way
   const canvas = $("frame"), scale = canvas.clientWidth / movie.width, ratio = window.devicePixelRatio || 1;
   canvas.width = canvas.clientWidth * ratio; canvas.height = scale * movie.height * ratio;
   const pen = canvas.getContext("2d");
   pen.imageSmoothingEnabled = false;
   pen.setTransform(scale * ratio, 0, 0, scale * ratio, 0, 0);
-  if (picture) movie.picture = picture;
   pen.drawImage(movie.picture, 0, 0, movie.width, movie.height);
   pen.lineWidth = 2 / scale;
   const own = drag?.circle || circle(at);

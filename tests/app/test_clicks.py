@@ -180,7 +180,7 @@ def at(page, x, y):
 def test_of_two_bubbles_the_clicked_one_is_read(visit, serve, two_bubbles):
     folder, centres = two_bubbles
     page = visit(serve(folder))
-    page.wait_for_selector("#inspector:not([hidden])")
+    until(page, "!!movie?.picture")
     page.fill("#pixel", "1 um")
     page.fill("#frame-rate", "100 kHz")
     for n, centre in enumerate(centres):
@@ -203,7 +203,7 @@ def test_corrections_are_those_of_the_file_in_every_window(visit, serve, two_bub
     server = serve(folder)
     page, other = visit(server), visit(server)
     for each in (page, other):
-        each.wait_for_selector("#inspector:not([hidden])")
+        until(each, "!!movie?.picture")
         assert each.input_value("#corrections") == file.read_text()
     page.focus("#frame")
     for key in ("ArrowRight", "Shift+ArrowRight", "ArrowLeft", "o"):
@@ -243,7 +243,7 @@ def test_the_public_movie_to_a_proposal(visit, serve, tmp_path):
         each.mkdir()
         shutil.copy(MOVIE, each / "gel.mp4")
     page = visit(serve(folder))
-    page.wait_for_selector("#inspector:not([hidden])")
+    until(page, "!!movie?.picture")
     page.fill("#frame-rate", "270 kHz")
     page.check("input[value=scale]")
     page.fill("#length", "276 um")
@@ -283,7 +283,7 @@ def test_the_public_movie_to_a_proposal(visit, serve, tmp_path):
 @pytest.mark.parametrize("width", [1280, 1920, 400])
 def test_everything_has_a_name_and_can_be_read(visit, serve, two_bubbles, width):
     page = visit(serve(two_bubbles[0]), width)
-    page.wait_for_selector("#inspector:not([hidden])")
+    until(page, "!!movie?.picture")
     page.evaluate(LOOK)
     faint = page.evaluate("window.look.faint()")
     assert faint["seen"] > 40
