@@ -193,7 +193,8 @@ def tables(siege: Siege, folder: Path, rng: np.random.Generator) -> Attack:
     seeds = fuzz_seeds.of(target)
     path = folder / f"case{suffix}"
     path.write_bytes(change(seeds[rng.integers(len(seeds))], rng))
-    return Attack(Task(["init", "--data", str(path), "--out", str(folder / "case.yaml"), "--time-unit", "us"]))
+    units = ["--time-unit", "us", "--radius-unit", "um"]
+    return Attack(Task(["init", "--data", str(path), "--out", str(folder / "case.yaml"), *units]))
 
 
 def pest(siege: Siege, folder: Path, rng: np.random.Generator) -> Attack:
