@@ -19,16 +19,27 @@ pytestmark = pytest.mark.usefixtures("own_folder")
 
 
 def test_without_units_and_terminal_one_error_says_what_to_add(tmp_path: Path) -> None:
-    done = call("init", "--data", write(tmp_path / "b.csv"))
+    done = call("init", "--data", write(tmp_path / "b.csv", "t,R"))
     assert done.exit_code == 2
     fault, following = done.stderr.splitlines()[-2:]
-    assert "columns with numbers: t_us, R_um; units are never guessed" in fault
+    assert "columns with numbers: t, R; units are never guessed" in fault
     assert "add --time-unit UNIT (e.g. us), --radius-unit UNIT (e.g. um)" in fault
     assert following.endswith("--time-unit UNIT --radius-unit UNIT")
     done = call("init", "--data", write(tmp_path / "b.csv", "a,b"), "--time-unit", "us")
     needed = "add --time-column NAME, --radius-column NAME, --radius-unit UNIT (e.g. um)"
     assert needed in done.stderr
     assert not list(tmp_path.glob("*.yaml"))
+
+
+@pytest.mark.parametrize("head", ["t_us,R_um", "time [us],radius [um]", "Time (us),Radius(µm)"])
+def test_units_that_the_names_of_columns_state_are_taken(tmp_path: Path, head: str) -> None:
+    data, named = write(tmp_path / "b.csv", head), tmp_path / "named.yaml"
+    assert call("init", "--data", data, "--out", named).exit_code == 0
+    assert re.search(r"time: \{name: .*, unit: us\}\n +radius: \{name: .*, unit: .?[uµ]m.?\}", named.read_text())
+    assert build(load_config(named))[0].observations.values.max() < 1e-3
+    other = call("init", "--data", data, "--time-unit", "ms", "--out", tmp_path / "other.yaml")
+    assert other.exit_code == 0
+    assert "unit: ms}" in (tmp_path / "other.yaml").read_text()
 
 
 @pytest.mark.parametrize(

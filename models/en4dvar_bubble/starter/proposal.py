@@ -410,11 +410,15 @@ def _radii(start: Start, look: Look | None, top: Tops | None = None) -> list[Ent
     if start == "acoustic":
         value = _text(NUCLEUS, "m", "um")
         return [
-            Entry(R0.name, f"{{prior: lognormal, median: {value}, log_std: 0.5}}", f"{R0.label}: the data hardly tell")
+            Entry(
+                R0.name,
+                f"{{prior: lognormal, median: {value}, log_std: 0.5}}",
+                f"{R0.label}: readings say little about it",
+            )
         ]
     known = look is not None and np.isfinite(look.rest)
     words = (
-        "the radius at rest; wide, for gas leaks into the gel, and the model's does not"
+        "the radius at rest; wide, because a real bubble loses gas to the gel and the model's bubble keeps it"
         if known
         else f"{GAS_FRACTION:g} R_max: no radius at rest is seen"
     )
