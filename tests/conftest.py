@@ -16,6 +16,7 @@ from typing import Any
 import hypothesis
 import numpy as np
 import pytest
+from chromium import browser  # noqa: F401  a fixture: one for all, since Playwright runs once in a process
 from tenths import is_of_tenth
 from threadpoolctl import threadpool_limits
 

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from chromium import browser  # noqa: F401  a fixture
 from run_files import assert_same_results, command
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -21,7 +20,7 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture
-def visit(browser, serve):  # noqa: F811
+def visit(browser, serve):
     """``visit(folder)``: a page on a server of its own; a complaint of the browser fails the test."""
     contexts, complaints = [], []
 

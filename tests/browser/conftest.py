@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from chromium import browser  # noqa: F401  a fixture
 from run_files import add_to_pack
 
 from en4dvar import report
@@ -33,7 +32,7 @@ class Seen:
 
 
 @pytest.fixture
-def opened(browser: Any) -> Iterator[Any]:  # noqa: F811
+def opened(browser: Any) -> Iterator[Any]:
     """``opened(path, scheme="light", width=1200)``: the page at ``path``, from file://."""
     contexts = []
 
