@@ -117,8 +117,9 @@ def columns(path: Path, sheet: str = "") -> dict[str, Any]:
     step = max(1, max((len(v) for v in contents.columns.values()), default=0) // PLOTTED)
     shown = {name: [_finite(v) for v in values[::step]] for name, values in contents.columns.items()}
     return {
-        "file": first.name, "files": len(files), "columns": shown, "words": [*contents.others], "decimal": layout.decimal,
-        "tracked": asked.tracked, "needed": needed, "time": asked.time_column, "radius": asked.radius_column,
+        "file": first.name, "files": len(files), "columns": shown, "words": [*contents.others],
+        "decimal": layout.decimal, "tracked": asked.tracked, "needed": needed, "time": asked.time_column,
+        "radius": asked.radius_column,
     }  # fmt: skip
 
 

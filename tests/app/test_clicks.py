@@ -3,76 +3,19 @@
 from __future__ import annotations
 
 import re
-import shlex
 import shutil
-import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
 from app_page import clicks_counted, from_movie_to_interval, pull
-from run_files import assert_same_results, command
+from clicking import LONG, at, done, point_of, proposed, repeat, until, words_of
+from run_files import assert_same_results
 
 ROOT = Path(__file__).resolve().parents[2]
 MOVIE = ROOT.parent / "shared" / "data" / "PAstiff_xy002.mp4"
 LOOK = (ROOT / "tests" / "browser" / "look.js").read_text(encoding="utf-8")
-LONG = 240_000  # ms: a command of a step
 pytestmark = pytest.mark.slow
-
-
-@pytest.fixture
-def visit(browser, serve):
-    """``visit(folder)``: a page on a server of its own; a complaint of the browser fails the test."""
-    contexts, complaints = [], []
-
-    def opened(server, width=1280, prepare=lambda page: None):
-        contexts.append(browser.new_context(viewport={"width": width, "height": 900}))
-        page = contexts[-1].new_page()
-        prepare(page)
-        page.on("pageerror", lambda error: complaints.append(str(error)))
-        page.on("request", lambda r: complaints.append(r.url) if "127.0.0.1" not in r.url[:30] else None)
-        page.goto(f"http://127.0.0.1:{server.port}{server.secret}")
-        until(page, "state !== null")
-        return page
-
-    yield opened
-    for context in contexts:
-        context.close()
-    assert [words for words in complaints if not words.startswith(("data:", "blob:"))] == []
-
-
-def until(page, expression):
-    """Wait until an expression of JavaScript is true; Playwright's own way is what the page's policy forbids."""
-    for _ in range(LONG // 100):
-        if page.evaluate(expression):
-            return
-        page.wait_for_timeout(100)
-    raise AssertionError(f"{expression} is never true; the page says: {page.inner_text('#message')}")
-
-
-def done(page, step, ended="done"):
-    """Click a step and wait for its end; the words of its command."""
-    page.click(f"button[data-step={step}]")
-    box = {"prior": "validate", "resume": "run", "export": "compare"}.get(step, step)
-    page.wait_for_selector(f"#job-{box}.running", timeout=LONG)
-    page.wait_for_selector(f"#job-{box}.{ended}", timeout=LONG)
-    return words_of(page, box)
-
-
-def words_of(page, box):
-    """The words of the command that a box of the page prints."""
-    return shlex.split(re.search(r"^\$ en4dvar (.*)$", page.inner_text(f"#job-{box} pre"), re.M)[1])
-
-
-def point_of(page, frame):
-    """Where the reading of a frame is on the canvas of R(t)."""
-    point = page.evaluate(f"document.getElementById('history').points.find((p) => p.frame === {frame})")
-    return {"x": point["left"], "y": point["top"]}
-
-
-def repeat(folder, *commands):
-    for words in commands:
-        subprocess.run(command(*words), cwd=folder, check=True, capture_output=True)
 
 
 @pytest.fixture
@@ -85,17 +28,6 @@ def german(tmp_path):
     text = "Zeit;Radius\n" + "".join(f"{t};{r}\n".replace(".", ",") for t, r in rows)
     (folder / "messung.csv").write_text(text, encoding="utf-8")
     return folder
-
-
-def proposed(page, table, **fields):
-    """Choose columns and units of a table, and propose a model."""
-    page.select_option("#table", table)
-    for key, value in fields.items():
-        select = key.endswith("column")
-        (page.select_option if select else page.fill)(f"#{key.replace('_', '-')}", value)
-    words = done(page, "init")
-    until(page, "document.getElementById('text').value !== ''")
-    return words
 
 
 def test_a_german_table_to_an_interval(visit, serve, german, tmp_path):
@@ -170,23 +102,6 @@ def test_a_campaign_compared_and_written(visit, serve, german):
     page.wait_for_selector("#pages a")
     done(page, "export")
     assert (german / "again_results.csv").is_file()
-
-
-@pytest.fixture
-def two_bubbles(tmp_path):
-    """A folder with a movie of two bubbles side by side, and their centres (2, 2)."""
-    tifffile = pytest.importorskip("tifffile")
-    from nasty_movies import film
-
-    filmed = film("side by side, pointed at", 0)
-    tifffile.imwrite(tmp_path / "two.tif", np.array(filmed.frames))
-    return tmp_path, np.nanmedian(filmed.centre, axis=1)
-
-
-def at(page, x, y):
-    """Where a place in the frame, pixels, is on the canvas."""
-    box = page.evaluate("(({ clientWidth, clientHeight }) => [clientWidth, clientHeight])(frame)")
-    return {"x": x * box[0] / page.evaluate("movie.width"), "y": y * box[1] / page.evaluate("movie.height")}
 
 
 def test_of_two_bubbles_the_clicked_one_is_read(visit, serve, two_bubbles):
