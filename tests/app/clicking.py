@@ -8,7 +8,7 @@ import subprocess
 
 from run_files import command
 
-LONG = 240_000  # ms: a command of a step
+LONG = 100_000  # ms: a command of a step
 
 
 def until(page, expression):

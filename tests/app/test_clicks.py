@@ -18,18 +18,6 @@ LOOK = (ROOT / "tests" / "browser" / "look.js").read_text(encoding="utf-8")
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture
-def german(tmp_path):
-    """A folder with a table as a German spreadsheet writes it."""
-    lines = (ROOT / "configs" / "data" / "agarose_synthetic.csv").read_text(encoding="utf-8").splitlines()
-    rows = [line.split(",") for line in lines if not line.startswith("#")][1:]
-    folder = tmp_path / "tables"
-    folder.mkdir()
-    text = "Zeit;Radius\n" + "".join(f"{t};{r}\n".replace(".", ",") for t, r in rows)
-    (folder / "messung.csv").write_text(text, encoding="utf-8")
-    return folder
-
-
 def test_a_german_table_to_an_interval(visit, serve, german, tmp_path):
     server = serve(german)
     page = visit(server)
