@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from app_page import clicks_counted, from_movie_to_interval, pull
-from clicking import LONG, at, done, point_of, proposed, repeat, until, words_of
+from clicking import LONG, at, done, point_of, proposed, repeat, require_accessible, until, words_of
 from run_files import assert_same_results
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -198,5 +198,6 @@ def test_everything_has_a_name_and_can_be_read(visit, serve, two_bubbles, width)
         (e) => e.getClientRects().length && !e.labels?.length && !e.getAttribute("aria-label") && !e.innerText.trim()
     ).map((e) => e.id)"""
     assert page.evaluate(nameless) == []
+    require_accessible(page)
     for landmark in ("main", "h1", "html[lang=en]"):
         assert page.locator(landmark).count() == 1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import yaml
-from clicking import done, proposed, until
+from clicking import done, proposed, require_accessible, until
 
 UNITS = {"time_column": "Zeit", "radius_column": "Radius", "time_unit": "us", "radius_unit": "um"}
 pytestmark = pytest.mark.slow
@@ -34,6 +34,7 @@ def test_a_prior_changed_in_its_fields_is_that_of_the_text(visit, serve, german)
     assert f"line {at + 1}: " in page.inner_text("#faults")
     assert "did you mean" in page.inner_text("#faults")
     assert invalid(page) == ["G: median or mean", "G: unit", "G: width"]
+    require_accessible(page)
     changed(page, "G: median or mean", "700")
     changed(page, "G: unit", "Pa")
     changed(page, "G: width", "0.9")
