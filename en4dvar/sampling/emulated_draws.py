@@ -28,7 +28,7 @@ from en4dvar.sampling.mixture import StudentMixture, resampled
 from en4dvar.sampling.walkers import advance
 
 NEAR = 3.0  # n τ above the lowest J: runs up to there are fitted
-COUNT, CLOSING = 2000, 3  # draws of a round, rounds that close in, on the emulator
+COUNT, CLOSING = 2000, 5  # draws of a round, rounds that close in, on the emulator
 ROUNDS = 20  # more, at most
 OTHERS, MOVES = 1000, 30  # resampled draws are moved apart by so many moves about so many others
 LARGEST = 2000  # outputs of a run beyond which emulating them costs more than it is worth

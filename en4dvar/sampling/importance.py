@@ -26,7 +26,8 @@ from en4dvar.sampling.mixture import StudentMixture, effective_number, resampled
 FEWEST = 60.0  # effective draws that a proposal is fitted to: with fewer, to tempered weights
 COMPONENTS = 4
 FITTED = 2000  # points that few parts are fitted to
-SETTLED, PARTS = 150.0, 8  # the same of proposals to a power of the posterior
+SETTLED, PARTS = 150.0, 8  # the same of proposals to a power of the posterior,
+MOST_FITTED = 1000  # and points that these are fitted to
 EACH = 4  # effective draws for each coordinate of a component: fitted to fewer it is flat in some direction
 MOST = 3.0  # times √D mean weights of D draws: more than that none counts (Ionides 2008)
 
@@ -155,7 +156,7 @@ class ClosingDraws(Importance):
         while (effective := effective_number(np.exp(power * logs))) < SETTLED and power > 1e-4:
             power *= 0.8
         weights = np.exp(power * logs)
-        where = resampled(weights / weights.sum(), 2 * self.count, self.stream)
+        where = resampled(weights / weights.sum(), min(2 * self.count, MOST_FITTED), self.stream)
         parts = max(1, min(PARTS, int(effective / (EACH * n))))
         return StudentMixture.fitted(self.z[where], self.stream, parts, alike=2 * n * len(where) / effective)
 

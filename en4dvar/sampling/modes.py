@@ -22,7 +22,7 @@ from en4dvar.sampling.importance import ClosingDraws, FixedDraws, Importance
 from en4dvar.sampling.mixture import StudentMixture, effective_number, resampled
 
 DRAWS = 400  # of a round
-HEATS = (4.0, 3.0, 2.0, 1.5)  # of the rounds that train an emulator
+HEATS = (8.0, 4.0, 2.0, 1.5)  # of the rounds that train an emulator
 LAST_HEAT = 1.15  # of those that judge it: draws reach a little beyond what it says
 TRIED = 4  # such rounds, at most, and
 GOOD = 0.25  # the effective share of one that ends them
@@ -102,13 +102,15 @@ def sample_modes(
     """Draws of exp(−J) until ``enough`` of them (default: :data:`ENOUGH`) are effective, by eight runs each, or more as
     long as these are :data:`TOO_FEW`, or until J of one is ``below`` a value.
 
-    Rounds of draws from proposals that close in on the posterior tell the proposal of those that count. ``cost``:
-    J (B,) of control vectors (B, n), with the prior's own mean and covariance, +inf where the model fails.
+    Rounds of draws from proposals that close in on the posterior tell the proposal of those that count: a mixture, or
+    where that keeps too few of its draws and ``cost`` has recorded what the runs gave, the emulated posterior.
+    ``cost``: J (B,) of control vectors (B, n), with the prior's own mean and covariance, +inf where the model fails.
     Deterministic in ``seed``.
     """
     enough, n = ENOUGH if enough is None else enough, len(prior.names)
     most = math.ceil(LAST_RUNS * enough / DRAWS)
     closing = min(CLOSING[0] + n // CLOSING[1], CLOSING[2])
+    runs = cost if isinstance(cost, RecordedRuns) else None
 
     def more(sampler: Importance) -> bool:
         """A round; whether no draw of it is low enough to end them all."""
@@ -118,20 +120,20 @@ def sample_modes(
 
     mixture = _about(prior, minima)
     first = ClosingDraws(mixture, member_stream(seed, "modes"), DRAWS, WIDER ** min(1.0, FEW / n))
-    sampler: Importance = first
     rounds, going = 1, more(first)
-    recorded = isinstance(cost, RecordedRuns) and cost.emulates
-    while going and rounds < most and not (rounds >= closing and (first.near or recorded)):
+    while going and rounds < most and not (rounds >= closing and (first.near or (runs and runs.emulates))):
         rounds, going = rounds + 1, more(first)
+    sampler: Importance = first
     if going:
         mixture = first.next_proposal()
-        sampler = FixedDraws(mixture, first.stream, DRAWS)
-        if first.near:
+        sampler, rounds = FixedDraws(mixture, first.stream, DRAWS), rounds + 1
+        going = more(sampler)
+    while going and _unsettled(sampler, enough) and rounds < most:
+        if runs and sampler.effective < THIN * len(sampler.z):
+            sampler, mixture, going = _guided(runs, sampler, mixture, more)
+            runs = None
+        else:
             rounds, going = rounds + 1, more(sampler)
-    if going and isinstance(cost, RecordedRuns) and sampler.effective < THIN * min(DRAWS, enough):
-        sampler, mixture, going = _guided(cost, sampler, mixture, more)
-    while going and (not len(sampler.z) or (_unsettled(sampler, enough) and rounds < most)):
-        rounds, going = rounds + 1, more(sampler)
     if not np.isfinite(sampler.log):
         raise ValueError("no draw about a minimum of J can be run")
     x = prior.from_white(sampler.z)
@@ -151,9 +153,8 @@ def sample_modes(
 def _guided(
     runs: RecordedRuns, mixed: Importance, mixture: StudentMixture, more: Callable[[Importance], bool]
 ) -> tuple[Importance, StudentMixture, bool]:
-    """Draws of the emulated posterior, after rounds by ``more`` that train the emulator, or those of a mixture,
-    ``mixed``, where these keep a larger share effective; and a mixture about them. False where a draw of a round ends
-    them all.
+    """A round of draws of the emulated posterior, after others that train the emulator, or ``mixed``, those of a
+    mixture, where these keep a larger share effective; and a mixture about them. False where a draw ends them all.
     """
     start, share = mixture, 0.0
     for heat in (*HEATS, *(LAST_HEAT,) * TRIED):
@@ -169,11 +170,12 @@ def _guided(
     final = EmulatedProposal.fitted(runs, start, mixed.stream, LAST_HEAT, POOL)
     if final is None or share * len(mixed.z) < mixed.effective:
         return mixed, mixture, True
-    return FixedDraws(final, mixed.stream, DRAWS), final.mixture, True
+    sampler = FixedDraws(final, mixed.stream, DRAWS)
+    return sampler, final.mixture, more(sampler)
 
 
 def _unsettled(sampler: Importance, enough: float) -> bool:
-    """Whether too few draws are effective yet."""
+    """True if too few draws are effective yet."""
     wanted = enough if len(sampler.z) < MOST_RUNS * enough else min(TOO_FEW, enough)
     return sampler.effective < wanted
 
