@@ -83,7 +83,7 @@ class EmulatedCost:
 
 
 @dataclass(frozen=True)
-class Runs:
+class ModelRuns:
     """Members that could be run: control vectors (B, n), outputs (B, Ky) of the make of ``make``, J (B,)."""
 
     x: Array
@@ -91,10 +91,10 @@ class Runs:
     costs: Array
     make: Predicted
 
-    def __getitem__(self, chosen: npt.NDArray[np.intp]) -> Runs:
+    def __getitem__(self, chosen: npt.NDArray[np.intp]) -> ModelRuns:
         return replace(self, x=self.x[chosen], outputs=self.outputs[chosen], costs=self.costs[chosen])
 
-    def joined(self, other: Runs) -> Runs:
+    def joined(self, other: ModelRuns) -> ModelRuns:
         x, outputs = np.concatenate([self.x, other.x]), np.concatenate([self.outputs, other.outputs])
         return replace(self, x=x, outputs=outputs, costs=np.concatenate([self.costs, other.costs]))
 
@@ -148,12 +148,12 @@ def emulate(
     return replace(emulated, ceiling=ceiling, share=share, draws=np.concatenate(settled[SETTLED // 3 :]))
 
 
-def _run(run: Run, prior: Prior, observations: Observations, x: Array) -> Runs:
+def _run(run: Run, prior: Prior, observations: Observations, x: Array) -> ModelRuns:
     """Run control vectors (B, n); the survivors."""
     outcome = run(x)
     costs = _prior_cost(prior, x) + observations.cost(outcome.predicted)
     alive = outcome.active & np.isfinite(costs)
-    return Runs(x[alive], outcome.predicted.stacked[alive], costs[alive], outcome.predicted[:0])
+    return ModelRuns(x[alive], outcome.predicted.stacked[alive], costs[alive], outcome.predicted[:0])
 
 
 def _prior_cost(prior: Prior, x: Array) -> Array:
@@ -165,7 +165,7 @@ def fitted_cost(
     prior: Prior,
     observations: Observations,
     degree: int,
-    runs: Runs,
+    runs: ModelRuns,
     near: float,
     coordinates: Coordinates | None = None,
 ) -> EmulatedCost:

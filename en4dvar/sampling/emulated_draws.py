@@ -22,7 +22,7 @@ from en4dvar.data.observations import Observations
 from en4dvar.ensemble.forecast import Forecast
 from en4dvar.model.state import Array
 from en4dvar.priors.prior import Prior
-from en4dvar.sampling.emulated_cost import EmulatedCost, Runs, fitted_cost, needed_runs
+from en4dvar.sampling.emulated_cost import EmulatedCost, ModelRuns, fitted_cost, needed_runs
 from en4dvar.sampling.importance import ClosingDraws, FixedDraws
 from en4dvar.sampling.mixture import StudentMixture, resampled
 from en4dvar.sampling.walkers import advance
@@ -45,14 +45,14 @@ class RecordedRuns:
         observations: Observations,
     ):
         self._run, self._costs, self.prior, self.observations = run, costs, prior, observations
-        self.runs: Runs | None = None
+        self.runs: ModelRuns | None = None
 
     def __call__(self, x: Array) -> Array:
         outcome = self._run(x)
         costs = self._costs(x, outcome)
         alive = np.isfinite(costs)
         if outcome.predicted.stacked.shape[1] <= LARGEST:
-            new = Runs(x[alive], outcome.predicted.stacked[alive], costs[alive], outcome.predicted[:0])
+            new = ModelRuns(x[alive], outcome.predicted.stacked[alive], costs[alive], outcome.predicted[:0])
             self.runs = new if self.runs is None else self.runs.joined(new)
         return costs
 
