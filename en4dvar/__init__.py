@@ -53,6 +53,8 @@ if TYPE_CHECKING:
     from en4dvar.report.compare import Comparison as Comparison
     from en4dvar.report.compare import compare_runs as compare_runs
     from en4dvar.report.export import export_table as export_table
+    from en4dvar.report.populations import PopulationsCompared as PopulationsCompared
+    from en4dvar.report.populations import compare_populations as compare_populations
     from en4dvar.report.result import Result as Result
     from en4dvar.report.result import load_result as load_result
     from en4dvar.runs.calibration_run import calibrate as calibrate
@@ -92,6 +94,7 @@ _HOME = {
     "series.model_error": ("ModelError",),
     "plumbing.errors": ("ConfigError", "DataError", "En4dvarError", "OutputError", "TooFewMembersError"),
     "report.export": ("export_table",),
+    "report.populations": ("PopulationsCompared", "compare_populations"),
     "model.forward": ("Failure", "ForwardModel", "Observable", "StateField", "Trajectory"),
     "model.function_model": ("FunctionModel",),
     "data.noise": ("noise_of",),

@@ -87,6 +87,7 @@ def read_one(plan: SeriesPlan, file: DataFile, fewest: int = 3) -> Series:
             continued=(read.times[whole] - float(zero), read.values[whole], errors(whole))
             if window.stop < len(read.times) and data.error.separate and not places
             else None,
+            error_unit=data.error.std.unit if data.error.std else "",
         )
     except (ValueError, DataError) as error:
         words = str(error)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import click
 
@@ -19,8 +19,20 @@ from en4dvar.commands.common import (
     trust_option,
     workers_option,
 )
+from en4dvar.plumbing.errors import OutputError
+
+if TYPE_CHECKING:
+    from en4dvar.report.populations import PopulationsCompared
 
 MOST_ROWS = 60  # of estimates on the terminal
+
+
+def _numbers(text: str | None) -> tuple[float, ...]:
+    """Numbers between commas. Raises :class:`click.BadParameter`."""
+    try:
+        return tuple(map(float, text.split(","))) if text else ()
+    except ValueError:
+        raise click.BadParameter(f"{text!r} is no list of numbers such as 5,7.5,10") from None
 
 
 @click.command()
@@ -52,12 +64,24 @@ def report(run_dir: Path, datasets: tuple[str, ...], figures: bool) -> None:
 )
 @click.option("--no-report", is_flag=True, help="Print the tables only.")
 @click.option("--stored", is_flag=True, help="Take the evidences stored in the results; run nothing.")
+@click.option(
+    "--against", metavar="A,B,...", callback=lambda _, __, text: _numbers(text),
+    help="A number of each run, in their order, e.g. concentrations: the populations' medians as a line of it.",
+)  # fmt: skip
+@click.option(
+    "--apart", multiple=True, metavar="NAME",
+    help="A common quantity that each population has a value of its own of, e.g. rho; any number of times.",
+)  # fmt: skip
 @workers_option
 @trust_option
 def compare(
-    run_dirs: tuple[Path, ...], out: Path | None, no_report: bool, stored: bool, workers: int | None, trust: bool
-) -> None:
+    run_dirs: tuple[Path, ...], out: Path | None, no_report: bool, stored: bool, against: tuple[float, ...],
+    apart: tuple[str, ...], workers: int | None, trust: bool,
+) -> None:  # fmt: skip
     """Compare runs: posteriors over each other and, on the same data, evidence and model probabilities.
+
+    Of runs of different data that end with populations (or of folders of 'en4dvar population') the medians are
+    compared first: by how much that of one is larger, and how surely, where what all have in common cancels.
 
     Evidences are sampled with forward runs if the model is cheap. Code outside the current folder and installed
     packages is run only with --trust.
@@ -68,8 +92,11 @@ def compare(
     \b
     Example:
       en4dvar compare runs/neo_hookean runs/quadratic
+      en4dvar compare runs/gel_5 runs/gel_8 runs/gel_10 --against 5,8,10
     """
-    from en4dvar.report.compare import compare_runs, comparison_table, estimates_table, with_evidences
+    from en4dvar.report.compare import Comparison, compare_runs, comparison_table, estimates_table, with_evidences
+    from en4dvar.report.populations import hold_populations
+    from en4dvar.results.run_results import has_results
     from en4dvar.results.series_file import series_file
 
     if any(map(series_file, run_dirs)):
@@ -77,20 +104,46 @@ def compare(
 
         echo(sequences_table(compare_sequences(run_dirs)))
         return
-    comparison = compare_runs(run_dirs)
-    if not (stored or comparison.incomparable):
+    only = hold_populations(run_dirs) and not any(map(has_results, run_dirs))
+    of = _populations(run_dirs, against, apart, only)
+    comparison = Comparison(()) if only else compare_runs(run_dirs)
+    if not (stored or only or comparison.incomparable):
         from en4dvar.runs.evidence_run import sampled_evidences
 
         evidences = [sampled_evidences(run_dir, workers, trust, None, tell) for run_dir in run_dirs]
         comparison = with_evidences(comparison, evidences)
-    if len(comparison.estimates) <= MOST_ROWS:
+    if not only and len(comparison.estimates) <= MOST_ROWS:
         echo(f"{estimates_table(comparison)}\n")
-    echo(comparison_table(comparison))
+    if not only:
+        echo(comparison_table(comparison))
     if not no_report:
         from en4dvar.report.overlay import write_comparison
 
-        page = write_comparison(comparison, out or folder_of("compare", run_dirs))
+        page = write_comparison(comparison, out or folder_of("compare", run_dirs), of)
         echo(f"report: {page if out else from_here(page)}")
+
+
+def _populations(
+    run_dirs: tuple[Path, ...], against: tuple[float, ...], apart: tuple[str, ...], only: bool
+) -> PopulationsCompared | None:
+    """The populations of the runs side by side, told on standard output; None where there are none to compare.
+
+    Raises :class:`OutputError`: they cannot be compared, and nothing else can be, or options ask for it.
+    """
+    from en4dvar.report.populations import compare_populations, hold_populations, medians_table, sentences
+
+    asked = only or against or apart
+    if not (asked or hold_populations(run_dirs)):
+        return None
+    try:
+        of = compare_populations(run_dirs, against, apart)
+    except OutputError as error:
+        if asked:
+            raise
+        echo(f"populations are not compared: {error}", err=True)
+        return None
+    echo("\n".join([medians_table(of), "", *sentences(of), ""]))
+    return of
 
 
 @click.command()

@@ -133,6 +133,7 @@ class Spread:
 
     value: float
     relative: bool = False
+    unit: str = ""  # as it is written
 
     def absolute(self, whole: float) -> float:
         """The standard deviation in the unit of ``whole``."""

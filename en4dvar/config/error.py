@@ -28,7 +28,7 @@ from en4dvar.data.noise import SMOOTHNESS, Kernel
 from en4dvar.inputs.asked import Column, Matrix
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.files import expanded
-from en4dvar.plumbing.units import UnitError, convert, parse_quantity
+from en4dvar.plumbing.units import UnitError, convert, parse_quantity, split_quantity
 from en4dvar.priors.prior import PriorTerm
 
 _RELATIVE = re.compile(r"(.*%)\s+of\s+(?:the\s+)?maximum")
@@ -41,7 +41,7 @@ def parse_error_std(text: Any, unit: str) -> Spread:
     if relative:
         return Spread(parse_quantity(relative[1], "1"), relative=True)
     try:
-        return Spread(parse_quantity(text, unit))
+        return Spread(parse_quantity(text, unit), unit=split_quantity(word)[1])
     except UnitError as error:
         hint = f"; write '{word} of maximum'" if word.endswith("%") else ""
         raise UnitError(f"{error}{hint}") from None

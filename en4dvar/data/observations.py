@@ -43,6 +43,7 @@ class Observations:
     parts: which readings belong to which series, see :meth:`of_series`; () where all are of one observable, which has
         one value at a time.
     continued: these readings and those after the window, which are predicted; None where there are none.
+    error_unit: in which the user states the errors of one series; "": the display unit of the observable.
 
     Raises
     ------
@@ -59,6 +60,7 @@ class Observations:
     doubts: tuple[Caution, ...] = ()
     parts: tuple[Part, ...] = ()
     continued: Observations | None = None
+    error_unit: str = ""
 
     @classmethod
     def of_series(
@@ -115,6 +117,7 @@ class Observations:
             doubts=tuple(doubt for readings in series for doubt in readings.doubts),
             parts=() if len(series) == 1 and series[0].places is None else parts,
             continued=None if more is None else cls(*more, np.ones(len(more[0])), name),
+            error_unit=series[0].error_unit if len(series) == 1 else "",
         )
 
     def __post_init__(self) -> None:

@@ -144,10 +144,8 @@ def as_unit(quantity: str, unit: str) -> str:
     """
     if not parse_quantity(quantity, unit) > 0:
         raise UnitError(f"{shown(quantity)} is not positive")
-    number = _NUMBER.match(quantity.strip())
-    assert number is not None
-    symbol = quantity.strip()[number.end() :].strip()
-    return f"{number[0].lstrip('+')}*{symbol if symbol.isalpha() else f'({symbol})'}"
+    number, symbol = split_quantity(quantity)
+    return f"{number.lstrip('+')}*{symbol if symbol.isalpha() else f'({symbol})'}"
 
 
 def _product(tokens: list[re.Match[str]], i: int, text: str) -> tuple[Unit, int]:
@@ -205,6 +203,12 @@ def convert(value: float | Array, from_unit: str, to_unit: str) -> float | Array
     return value * float(factor) if factor >= 1 else value / float(1 / factor)
 
 
+def split_quantity(text: str) -> tuple[str, str]:
+    """Number and unit as they are written, each "" where there is none."""
+    number = _NUMBER.match(text.strip())
+    return (number[0], text.strip()[number.end() :].strip()) if number else ("", "")
+
+
 def parse_quantity(value: str | float, unit: str) -> float:
     """A quantity such as ``"0.42 kPa"`` or ``"2.5 µs"``, expressed in ``unit``.
 
@@ -216,12 +220,11 @@ def parse_quantity(value: str | float, unit: str) -> float:
     if isinstance(value, bool) or not isinstance(value, str | int | float):
         raise UnitError(f"{shown(value)} is not a quantity; write a number and a unit such as '1 {unit}'")
     text = str(value).strip()
-    number = _NUMBER.match(text)
-    if number is None:
+    number, symbol = split_quantity(text)
+    if not number:
         raise UnitError(f"{shown(value)} is not a quantity; write a number and a unit such as '1 {unit}'")
-    if len(number[0]) > LONGEST:
-        raise UnitError(f"{shown(value)}: a number of {len(number[0])} characters")
-    symbol = text[number.end() :].strip()
+    if len(number) > LONGEST:
+        raise UnitError(f"{shown(value)}: a number of {len(number)} characters")
     if not symbol and parse_unit(unit).powers != ONE.powers:
         raise UnitError(f"{text} has no unit; write e.g. '{text} {unit}'")
     try:
@@ -229,7 +232,7 @@ def parse_quantity(value: str | float, unit: str) -> float:
     except UnitError as error:
         raise UnitError(f"{shown(text)}: {error}") from None
     try:
-        return float(Fraction(number[0]) * factor)
+        return float(Fraction(number) * factor)
     except OverflowError:
         raise UnitError(f"{shown(text)}: larger than any number of the computer") from None
 

@@ -149,7 +149,7 @@ def compare_runs(runs: Sequence[str | Path] | Mapping[str, str | Path | StoredRe
         if any(isinstance(run, StoredResult) for run in runs):
             raise OutputError("results at hand have no names: give {'one': result, 'other': result}")
         paths = [Path(run) for run in runs]
-        runs = dict(zip(_labels(paths), paths, strict=True))
+        runs = dict(zip(labels_of(paths), paths, strict=True))
     results = {name: _results(run) for name, run in runs.items()}
     datasets = list(dict.fromkeys(dataset for held in results.values() for dataset in held))
     pairs = [(name, d, held[d]) for d in datasets for name, held in results.items() if d in held]
@@ -254,7 +254,7 @@ def estimates_table(comparison: Comparison) -> str:
     return table([header, *rows])
 
 
-def _labels(runs: Sequence[Path]) -> list[str]:
+def labels_of(runs: Sequence[Path]) -> list[str]:
     """Names of the directories; their paths where names repeat."""
     names = [run.resolve().name for run in runs]
     labels = names if len(set(names)) == len(names) else [str(run) for run in runs]

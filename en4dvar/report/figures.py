@@ -147,8 +147,8 @@ def all_figures(result: StoredResult) -> Iterator[Captioned]:
         yield (
             "posterior",
             "What is known after the readings (posterior, blue) and what was before (prior, grey), each scaled to its "
-            "peak. Bar: the 90 % interval, with (?) and no bar where it is not to be trusted; ticks: the members that "
-            "stand for the posterior; dashed: the best fit.",
+            "peak. Bar: the 90 % interval; a number whose interval cannot be quoted, for a warning, has a (?) and "
+            "no bar. Ticks: the members that stand for the posterior. Dashed: the best fit.",
             histograms(result),
         )
     if "/fields" in result.groups:

@@ -15,11 +15,13 @@ from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.files import make_folder, write_text
 from en4dvar.plumbing.tables import csv_text
 from en4dvar.plumbing.units import UnitError, convert
+from en4dvar.report import populations
 from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, in_columns
 from en4dvar.report.compare import ComparedEstimate, Comparison, ModelScore
 from en4dvar.report.drawing import keep
 from en4dvar.report.html import render
 from en4dvar.report.page import DFS_WORDS
+from en4dvar.report.populations import PopulationsCompared
 from en4dvar.report.svg import svg
 from en4dvar.report.text import figure_text, with_unit
 
@@ -69,22 +71,34 @@ def _colour(i: int) -> str:
     return COLOURS[i % len(COLOURS)]
 
 
-def write_comparison(comparison: Comparison, out: str | Path) -> Path:
-    """Write ``compare.html``, ``posteriors.png`` and ``.pdf``, ``estimates.csv`` and ``evidence.csv`` to a folder.
+def write_comparison(comparison: Comparison, out: str | Path, of: PopulationsCompared | None = None) -> Path:
+    """Write ``compare.html``, ``posteriors.png`` and ``.pdf``, ``estimates.csv`` and ``evidence.csv`` to a folder; of
+    populations ``populations.png`` and ``.pdf`` and ``differences.csv``, and these alone where there are no scores.
 
     Files of an earlier comparison there are replaced. Returns the path of the page. Raises :class:`OutputError`.
     """
     out = make_folder(out)
-    chart = overlay(comparison)
-    keep(chart, out, "posteriors")
-    write_text(out / "estimates.csv", _estimates_csv(comparison))
-    write_text(out / "evidence.csv", _evidence_csv(comparison))
+    content = {"populations": (), "figure": ""}
+    if of:
+        chart = populations.figure(of)
+        keep(chart, out, "populations")
+        populations.write_tables(of, out)
+        content |= {
+            "populations": tuple(populations.sentences(of)),
+            "populations_figure": svg(chart, "populations", populations.CAPTION),
+            "populations_caption": populations.CAPTION,
+        }
+    if comparison.scores:
+        chart = overlay(comparison)
+        keep(chart, out, "posteriors")
+        write_text(out / "estimates.csv", _estimates_csv(comparison))
+        write_text(out / "evidence.csv", _evidence_csv(comparison))
+        content |= {"figure": svg(chart, "posteriors", CAPTION)}
     page = render(
         "compare.html.j2",
-        title=" – ".join(comparison.runs),
+        title=" – ".join(of.populations if of else comparison.runs),
         sortable=True,
         charts=True,
-        figure=svg(chart, "posteriors", CAPTION),
         caption=CAPTION,
         incomparable=comparison.incomparable,
         verdicts=[(name, comparison.verdict(name)) for name in comparison.datasets],
@@ -92,6 +106,7 @@ def write_comparison(comparison: Comparison, out: str | Path) -> Path:
         scores=comparison.scores,
         cautions=[(c.caution, f"{c.run}, {c.dataset}: ") for c in comparison.cautions],
         dfs_words=DFS_WORDS,
+        **content,
     )
     return write_text(out / "compare.html", page)
 

@@ -156,7 +156,7 @@ def _fit(estimate: JointEstimate) -> dict[str, Variable]:
     alive_counts = np.array([int(run.active[:-1].sum()) for run in estimate.forecasts])
     return {
         "chi2_per_observation": variable("dataset", estimate.chi2, "1", "misfit per observation at the mode"),
-        "alive": variable("dataset", alive_counts, "1", "members alive"),
+        "alive": variable("dataset", alive_counts, "1", "members that ran"),
         "observable": variable("dataset", labels, "", "what was observed"),
         "unit": variable("dataset", units, "", "unit of values and bands"),
         "time_unit": variable("dataset", time_units, "", "unit of times"),

@@ -4,6 +4,7 @@ what each said alone.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,8 @@ from en4dvar.estimation.population.campaign import CampaignPopulation, Combinati
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.caution import Caution, worst_first
 from en4dvar.priors.prior import PriorTerm
+from en4dvar.problem import InverseProblem
+from en4dvar.results.checkpoint import digest
 from en4dvar.results.joint_file import QUANTILES, StoredGroups, load_groups
 from en4dvar.results.netcdf import Group, Groups, Variable, to_bytes, understood, variable
 
@@ -68,7 +71,8 @@ def population_groups(
         "/posterior": Group(_draws(population, population.posterior) | _sets(population), datasets),
         "/prior": Group(_draws(population, population.prior)),
         "/without_hyperprior": Group(_draws(population, free)),
-        "/alone": Group(_alone(population, alone) | _belongs(population), datasets),
+        "/white": Group(_white(population)),
+        "/alone": Group(_alone(population, alone) | _belongs(population) | _readings(population.problems), datasets),
         "/empirical": Group(_empirical(population)),
     }
 
@@ -97,6 +101,28 @@ def _draws(population: CampaignPopulation, draws: Draws) -> dict[str, Variable]:
                 more["std_between"], more["std_common"] = (float(part[j]) for part in population.parts)
             result[f"{p.name}_{what}"] = variable(_DRAWS, values, p.unit, f"{p.label}: {words}", **_about(p), **more)
     return result
+
+
+def _white(population: CampaignPopulation) -> dict[str, Variable]:
+    """(chain, draw) of the centres and of what is common in units of their priors, as the draws of ``posterior``."""
+    first, draws = population.problems[0].prior, (population.posterior.nu, population.theta)
+    columns = np.hstack([part for part in draws if part.size])
+    return {
+        name: variable(_DRAWS, columns[None, :, j], "1", f"{name} in units of its prior", prior=_prior_line(term))
+        for j, name in enumerate((*population.names, *population.common))
+        for term in (first.terms[first.names.index(name)],)
+    }
+
+
+def _prior_line(term: PriorTerm) -> str:
+    return json.dumps([term.transform, term.mean, term.std, [*term.bounds], [*term.shape]])
+
+
+def _readings(problems: Sequence[InverseProblem]) -> dict[str, Variable]:
+    """(dataset,) which tells whether two populations hold the same readings."""
+    each = [digest(p.observations.times.tobytes() + p.observations.values.tobytes()) for p in problems]
+    words = "SHA-256 of times and values of the readings"
+    return {"readings": variable("dataset", np.array(each, dtype=object), "", words)}
 
 
 def _belongs(population: CampaignPopulation) -> dict[str, Variable]:
@@ -180,6 +206,26 @@ class StoredPopulation(StoredGroups):
         if "belongs" not in alone:
             return {}
         return dict(zip(self.datasets, map(float, alone["belongs"].values), strict=True))
+
+    @property
+    def readings(self) -> dict[str, str]:
+        """Digest of its readings → data set; empty in files of version 1.0."""
+        alone = self.group("alone")
+        return dict(zip(map(str, alone["readings"].values), self.datasets, strict=True)) if "readings" in alone else {}
+
+    def white(self, name: str) -> Array:
+        """Draws (M,) of a centre or of what is common, in units of its prior."""
+        return np.asarray(self.group("white")[name].values, dtype=float).ravel()
+
+    def prior_of(self, name: str) -> PriorTerm:
+        """The prior of a parameter of the population, or of what is common."""
+        about = self.group("posterior")[name].attrs
+        transform, mean, std, bounds, shape = json.loads(self.group("white")[name].attrs["prior"])
+        p = Parameter(
+            name, str(about["units"]), label=str(about["label"]), symbol=str(about["symbol"]),
+            display_unit=str(about["display_units"]),
+        )  # fmt: skip
+        return PriorTerm(p, transform, mean, std, tuple(bounds), tuple(shape))
 
     @property
     def combinations(self) -> tuple[Combination, ...]:

@@ -124,6 +124,11 @@ def result_files(run_dir: Path) -> list[Path]:
     return results.files
 
 
+def has_results(run_dir: Path) -> bool:
+    """Whether a folder holds results of data sets, whole or not."""
+    return any((run_dir / name).exists() for name in ("posterior.nc", PACK))
+
+
 def _planned(run_dir: Path) -> list[str]:
     """The data sets of the run, in order; none where it does not say, or that is damaged."""
     try:

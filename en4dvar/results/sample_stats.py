@@ -105,7 +105,7 @@ READINGS = (
     Declared("{shared}influence_pareto_shape", "{time}", "Pareto shape of the weights", _influence("pareto_shape"),
              when=TOLD),
     Declared("{shared}influence_how", "{time}",
-             "0 by importance weights, 1 by linear response, 2: only another fit tells",
+             "0: found by weighting the members, 1: by linear response, 2: needs a fit without the reading",
              of_series(lambda a: a.influence.how.astype(float)), when=TOLD),
 )  # fmt: skip
 

@@ -123,7 +123,7 @@ OBSERVED = (
 )  # fmt: skip
 SAMPLE_STATS = (
     Attribute("n_members", "members", lambda a: len(a.posterior_failures), needed=True),
-    Attribute("n_active", "members alive", lambda a: int(active_members(a.posterior_failures).sum()), needed=True),
+    Attribute("n_active", "members that ran", lambda a: int(active_members(a.posterior_failures).sum()), needed=True),
     Attribute("n_observations", "readings", lambda a: len(a.observations), needed=True),
     Attribute("n_weighted", "readings that count", lambda a: len(a.observations.used), needed=True),
     Attribute("nrmse", "1 − ‖y − ŷ‖/‖y − ȳ‖ of the ensemble mean", _nrmse_of_mean, needed=True),

@@ -99,7 +99,7 @@ ITERATIONS = (
     _iteration("chi2_per_observation", "chi2_per_observation", "chi-squared per observation"),
     _iteration("dfs", "dfs", "degrees of freedom for signal"),
     _iteration("spread", "spread", "ensemble spread"),
-    _iteration("active", "active", "members alive"),
+    _iteration("active", "active", "members that ran"),
     Declared("{parameter}", "iteration draw", "{label}",
              lambda a, i: np.stack([r.members[:, i.held] for r in a.iterations]), OWN, needed=True),
     Declared("{parameter}_centre", "iteration", "{label}, centre",

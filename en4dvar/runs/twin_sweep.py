@@ -80,9 +80,9 @@ class TwinSweep:
 
     def summary(self) -> pd.DataFrame:
         """:attr:`rows` as a table."""
-        import pandas as pd
+        from en4dvar.plumbing.whole_table import WholeTable
 
-        return pd.DataFrame(self.rows)
+        return WholeTable(self.rows)
 
     def plot(self) -> Figure:
         """RMSE of each estimate, with its standard error, over the settings."""

@@ -36,7 +36,10 @@ from en4dvar_bubble.solver.driver import Solution
 
 @dataclass(frozen=True, eq=False)
 class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
-    """A spherical gas bubble in a viscoelastic medium; what it assumes and its options: :class:`Dynamics`."""
+    """A spherical gas bubble in a viscoelastic medium.
+
+    What it assumes and its options: :class:`Dynamics`.
+    """
 
     Settings: ClassVar[type[BubbleSettings]] = BubbleSettings
     time_display_unit = "us"

@@ -204,6 +204,25 @@ def test_pixels_and_frame_numbers(tmp_path: Path) -> None:
         assert read.observations.times == pytest.approx(known.observations.times, rel=1e-12)
 
 
+@pytest.mark.parametrize("header", ["R_um", "R_um,quality"])
+def test_a_table_without_times_needs_the_frame_rate_alone(tmp_path: Path, header: str) -> None:
+    R = np.loadtxt(write(tmp_path / "b.csv"), delimiter=",", skiprows=1)[:, 1]
+    Path("rows.csv").write_text("\n".join([header, *(f"{r:g}{',1' * header.count(',')}" for r in R), ""]))
+    done = call("init", "--data", "rows.csv", "--frame-rate", f"{1 / 0.7:.17g} MHz")
+    assert done.exit_code == 0, done.output
+    (read,) = build(proposed(Path("rows.yaml")))
+    assert call("init", "--data", "b.csv", *UNITS).exit_code == 0
+    (known,) = build(proposed(Path("b.yaml")))
+    assert read.observations.times == pytest.approx(known.observations.times, rel=1e-9)
+    assert read.observations.values == pytest.approx(known.observations.values, rel=1e-12)
+
+
+def test_a_column_that_may_be_times_is_not_passed_over_for_the_frame_rate(tmp_path: Path) -> None:
+    done = call("init", "--data", write(tmp_path / "b.csv", "clock,R_um"), "--frame-rate", "270 kHz")
+    assert done.exit_code == 2
+    assert "add --time-unit UNIT" in done.stderr
+
+
 @pytest.mark.parametrize(
     ("options", "needed", "following"),
     [

@@ -13,6 +13,7 @@ from en4dvar.config import models
 def test_models_are_listed_with_parameters_and_units() -> None:
     done = CliRunner().invoke(main, ["models"])
     assert done.exit_code == 0, done.output
+    assert ":`" not in done.output  # roles of reStructuredText
     blocks = {block.split(":")[0]: block for block in done.output.split("\n\n")}
     assert set(blocks) >= {"bubble", "linear", "lorenz63", "lorenz96"}
     lines = [" ".join(line.split()) for line in blocks["bubble"].splitlines()]

@@ -39,6 +39,13 @@ def test_each_reading_has_its_own_error_in_the_unit_of_its_column(tmp_path):
     np.testing.assert_allclose(noise.time_std, [2e-10, 3e-10, 1e-10])
 
 
+@pytest.mark.parametrize(
+    ("error", "unit"), [("1.4 mm", "mm"), ("1 % of maximum", ""), ("{column: s, unit: nm}", "nm"), ("{column: s}", "")]
+)
+def test_the_unit_of_the_error_as_it_is_stated_is_that_of_the_advice(tmp_path, error, unit):
+    assert problem(tmp_path, f"{{radius_std: {error}}}").observations.error_unit == unit
+
+
 def test_what_the_model_misses_is_added_in_squares(tmp_path):
     noise = problem(tmp_path, "{radius_std: {column: s}, model_std: 5 % of maximum}").observations.noise
     np.testing.assert_allclose(noise.std, np.hypot([1e-6, 4e-6, 3e-6], 0.05 * 80e-6))

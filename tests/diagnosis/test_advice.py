@@ -188,6 +188,8 @@ def test_an_error_in_the_wrong_unit_is_told_as_such():
     assert not any("discrepancy" in advice for advice in advices.values())
     again = follow(a, told(a, "overstated-error"), None)
     assert "unit" not in " ".join(c.advice for c in again.cautions)
+    in_mm = run(replace(problem, observations=replace(problem.observations, error_unit="mm")))
+    assert "check the unit of data.error: 5e+05 mm is stated" in told(in_mm, "overstated-error").advice
 
 
 class Late(Vectorised):

@@ -56,6 +56,15 @@ def test_nothing_is_loaded_from_elsewhere(site):
         assert re.findall(r"url\([\"']?https?:", sheet.read_text(encoding="utf-8")) == [], sheet.name
 
 
+def test_signatures_are_wrapped(site):
+    page = (site / "reference_api.html").read_text(encoding="utf-8")
+    signatures = re.findall(r'<div class="[^"]*doc-signature[^>]*>.*?</div>', page, re.DOTALL)
+    assert len(signatures) > 50
+    for signature in signatures:
+        lines = html.unescape(re.sub(r"<[^>]+>", "", signature)).splitlines()
+        assert all(len(line) <= 80 or '"' in line for line in lines), lines[0]  # texts are not cut
+
+
 def test_formulas_are_drawn_by_the_browser(site):
     total = 0
     for page in site.glob("*.html"):

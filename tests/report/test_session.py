@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from toy_config import csv_text, write_toy
 
@@ -34,6 +35,8 @@ def test_a_posterior_is_shown_in_one_line_with_units(result: Result, analysis: e
 
 def test_the_summary_is_a_table_in_display_units(result: Result) -> None:
     table = result.summary()
+    with pd.option_context("display.max_columns", 3):  # as in a narrow terminal
+        assert set(table.columns) <= set(str(table).split())
     assert list(table.index) == [row.name for row in result.rows]
     for row in result.rows:
         assert table.loc[row.name, "unit"] == row.unit

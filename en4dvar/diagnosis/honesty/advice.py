@@ -63,9 +63,10 @@ class Case:
         return f"settle the warning {first} first, which may be the reason" if first else ""
 
     def reading(self, value: float) -> str:
-        """A size of readings in their display unit."""
+        """A size of readings in the unit in which their errors are stated."""
         observable = self.a.problem.observable
-        return f"{convert(value, observable.unit, observable.display_unit):.2g} {observable.display_unit}"
+        unit = self.a.observations.error_unit or observable.display_unit
+        return f"{convert(value, observable.unit, unit):.2g} {unit}"
 
     def moment(self, value: float) -> str:
         """A time in the display unit."""
@@ -88,7 +89,8 @@ def _not_converged(case: Case) -> str:
     now = getattr(case.a.settings.own, "max_iterations", ENOUGH)
     if now < ENOUGH:
         return f"set assimilation.max_iterations: {max(20, 2 * now)} (it is {now})"
-    return "narrow the priors of what the data hardly tell, or set assimilation.refine: mcmc, which needs no minimum"
+    unsure = "narrow the priors of the parameters that the data hardly constrain"
+    return f"{unsure}, or set assimilation.refine: mcmc, which needs no minimum"
 
 
 def _members(case: Case) -> str:

@@ -72,7 +72,9 @@ class Asked:
             if len(names) == 2:  # one tells what the other is
                 first, second = names
                 other = {first: second, second: first}
-                time, radius = time or other.get(radius or ""), radius or other.get(time or "")
+                radius = radius or other.get(time or "")
+                if not time and radius and (self.frame_rate is None or np.all(np.diff(names[other[radius]]) > 0)):
+                    time = other[radius]
             if _only(_STEP, self.contents.scalars) is None:
                 time = time or _only(FRAMES, names)
         times = self.time_unit or (None if self.frame_rate else _unit_in(time, "s"))
@@ -86,9 +88,18 @@ class Asked:
             if asked.radius_unit not in (None, *_AS_PIXELS):
                 raise ConfigError("--pixel makes pixels the unit of radii: give it, or --radius-unit, not both")
             asked = replace(asked, radius_unit=as_unit(asked.pixel, "m"))
-        if asked.frame_rate is not None and asked._in_frames:
-            asked = replace(asked, time_unit=f"1/({as_unit(asked.frame_rate, 'Hz')})", frame_rate=None)
+        if asked.frame_rate is not None and (asked._in_frames or asked._frame_each_row):
+            between = f"1/({as_unit(asked.frame_rate, 'Hz')})"
+            step = f"{convert(1.0, between, 'us'):.12g} us" if asked._frame_each_row else asked.time_step
+            asked = replace(asked, time_unit=between, time_step=step, frame_rate=None)
         return asked
+
+    @property
+    def _frame_each_row(self) -> bool:
+        """Whether no column can hold times: none is named, and none but the radii increases from row to row."""
+        others = (values for name, values in self.contents.columns.items() if name != self.radius_column)
+        named = self.time_column or self.time_step or self.time_unit or self.step
+        return not named and not any(np.all(np.diff(values) > 0) for values in others)
 
     @property
     def _in_frames(self) -> bool:

@@ -1,0 +1,120 @@
+r"""Centres of several populations drawn together, so that what they have in common cancels in their differences.
+
+Each population k has by itself draws of its centre x_k (the transformed median) and of common quantities θ ~ N(0, I),
+white. With Gaussian θ and a regression of x_k on θ they say
+
+    p(x_k, θ | data_k) = N(θ; m_k, S_k) · [x_k = x̄_k + c_k (θ − m_k) + r_k],
+
+with the r_k as they were drawn. Quantities that several populations share have one value in all of them, their prior
+counts once, and the populations' information about them adds:
+
+    θ | all data ~ N(P⁻¹ h, P⁻¹),    P = I + Σ_k (S_k⁻¹ − I),    h = Σ_k S_k⁻¹ m_k.
+
+For a linear Gaussian hierarchy this is exact (product of the posteriors over the shared prior). A spread that is known
+badly makes r_k anything but Gaussian, which is kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from en4dvar.estimation.population.estimate import FEWEST
+from en4dvar.model.state import Array
+from en4dvar.priors.prior import member_stream
+from en4dvar.sampling.mixture import effective_number, resampled
+
+
+@dataclass(frozen=True)
+class Centre:
+    """What one population says by itself: draws ``x`` (M,) of its transformed median and ``theta`` (M, c) of its common
+    quantities, white; ``common`` (c,) tells these apart: equal ones are one quantity. ``x`` has a flat prior unless
+    ``pulled`` by its hyperprior.
+    """
+
+    x: Array
+    theta: Array
+    common: tuple[Hashable, ...]
+    pulled: bool = False
+
+
+def without_pull(
+    x: Array, nu: Array, theta: Array, common: tuple[Hashable, ...], mean_std: float, draws: float, seed: int
+) -> Centre:
+    """Draws ``x`` (M,) without the hyperprior N(0, ``mean_std``²) of all centres ``nu`` (M, p) of the population, which
+    pulls populations together; with it where fewer than a hundred of the effective ``draws`` would count.
+    """
+    logs = 0.5 * np.sum((nu / mean_std) ** 2, axis=1)
+    weights = np.exp(logs - logs.max())
+    if effective_number(weights) / len(weights) * draws < FEWEST:
+        return Centre(x, theta, common, pulled=True)
+    taken = resampled(weights / weights.sum(), len(weights), member_stream(seed, "without the pull of the hyperprior"))
+    return Centre(x[taken], theta[taken], common)
+
+
+def drawn_together(centres: Sequence[Centre], seed: int) -> Array:
+    """(M, K) draws of the transformed medians of all populations, given the data of all; M those of the first."""
+    known = list(dict.fromkeys(name for centre in centres for name in centre.common))
+    precision, information = np.eye(len(known)), np.zeros(len(known))
+    for centre in centres:
+        if centre.common:
+            where = [known.index(name) for name in centre.common]
+            mean, told = centre.theta.mean(axis=0), _precision(centre.theta)
+            precision[np.ix_(where, where)] += told - np.eye(len(where))
+            information[where] += told @ mean
+    stream, count = member_stream(seed, "populations together"), len(centres[0].x)
+    root = np.linalg.cholesky(np.linalg.inv(precision))
+    theta = np.linalg.solve(precision, information) + stream.standard_normal((count, len(known))) @ root.T
+    columns = []
+    for centre in centres:
+        mean, centred = centre.theta.mean(axis=0), centre.theta - centre.theta.mean(axis=0)
+        slope = np.linalg.lstsq(centred, centre.x - centre.x.mean(), rcond=None)[0]
+        rest = (centre.x - centred @ slope)[stream.integers(len(centre.x), size=count)]
+        columns.append(rest + (theta[:, [known.index(name) for name in centre.common]] - mean) @ slope)
+    return np.stack(columns, axis=1)
+
+
+def _precision(theta: Array) -> Array:
+    """S⁻¹ of draws, not below that of the prior: data only add information, and the rest is noise of the draws."""
+    values, vectors = np.linalg.eigh(np.atleast_2d(np.cov(theta.T)))
+    return np.asarray((vectors / np.minimum(values, 1.0)) @ vectors.T)
+
+
+@dataclass(frozen=True)
+class StraightLine:
+    """Populations' centres as a straight line of a number: draws (M,) of ``slope`` and of ``level`` at number 0.
+
+    ``misfit``: χ² of the centres about the line, of ``freedom`` degrees; ``chance``: of one as large.
+    Where χ² exceeds ``freedom`` both are wider by the square root of their ratio (Birge 1932, Phys. Rev. 40, 207), for
+    the populations then differ by more than the line says.
+    """
+
+    slope: Array
+    level: Array
+    misfit: float
+    freedom: int
+
+    @property
+    def chance(self) -> float:
+        return float(chi2.sf(self.misfit, self.freedom)) if self.freedom else 1.0
+
+
+def line(x: Array, numbers: Array) -> StraightLine:
+    """Through draws ``x`` (M, K) at ``numbers`` (K,), by generalised least squares with the covariance of the draws.
+
+    Raises :class:`ValueError`: all numbers are the same.
+    """
+    if np.ptp(numbers) == 0:
+        raise ValueError("a line needs populations of at least two different numbers")
+    design = np.stack([np.ones(len(numbers)), numbers], axis=1)
+    weighed = np.linalg.solve(np.cov(x.T), design)
+    fit = np.linalg.solve(design.T @ weighed, weighed.T)  # (2, K)
+    drawn, middle = x @ fit.T, x.mean(axis=0) @ fit.T
+    apart, freedom = x.mean(axis=0) - design @ middle, len(numbers) - 2
+    misfit = float(apart @ np.linalg.solve(np.cov(x.T), apart))
+    wider = np.sqrt(max(1.0, misfit / freedom)) if freedom else 1.0
+    drawn = middle + wider * (drawn - middle)
+    return StraightLine(drawn[:, 1], drawn[:, 0], misfit, freedom)

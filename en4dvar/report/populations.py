@@ -1,0 +1,310 @@
+"""Populations side by side: is one gel stiffer than another, by how much, how surely, and how it goes with a number."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+from en4dvar.diagnosis.intervals import member_quantiles
+from en4dvar.estimation.population.contrast import Centre, StraightLine, drawn_together, line, without_pull
+from en4dvar.model.state import Array, Parameter
+from en4dvar.plumbing.caution import untrusted
+from en4dvar.plumbing.errors import OutputError
+from en4dvar.plumbing.files import write_text
+from en4dvar.plumbing.hints import suggest
+from en4dvar.plumbing.tables import csv_text, table
+from en4dvar.plumbing.units import convert
+from en4dvar.priors.prior import PriorTerm
+from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, in_columns
+from en4dvar.report.compare import labels_of
+from en4dvar.report.text import figure_text, number_like, plain_number, pretty_unit, with_unit
+from en4dvar.results.joint_file import QUANTILES
+from en4dvar.results.netcdf import understood
+from en4dvar.results.population_file import FILE, StoredPopulation, load_population
+
+SURE = 0.999  # no number of draws says more
+OFF_THE_LINE = 0.05  # probability below which populations differ by more than a line says
+CAPTION = (
+    "Median and 5–95 % of the median of each population, given the data of all; what is common moves them together."
+)
+
+
+@dataclass(frozen=True)
+class Difference:
+    """The median of one parameter in ``first`` against that in ``second``: 5, 50 and 95 % of their ratio (NaN where the
+    prior allows values of both signs) and of their difference in ``unit``; ``greater``: probability that the first is.
+
+    ``apart`` (3,): the quantiles of ratio or difference if nothing were common. ``untrusted``: codes of warnings.
+    """
+
+    parameter: str
+    first: str
+    second: str
+    unit: str
+    ratio: tuple[float, float, float]
+    difference: tuple[float, float, float]
+    greater: float
+    apart: tuple[float, float, float]
+    untrusted: str = ""
+
+    @classmethod
+    def of(
+        cls, parameter: str, first: str, second: str, unit: str, together: Array, alone: Array, is_ratio: bool,
+        doubts: str,
+    ) -> Difference:  # fmt: skip
+        """Of draws (2, M) of both medians with what is common, and without."""
+        (a, b), (own_a, own_b) = together, alone
+        ratio = _three(a / b) if is_ratio else (np.nan,) * 3
+        apart = _three(own_a / own_b if is_ratio else own_a - own_b)
+        return cls(parameter, first, second, unit, ratio, _three(a - b), float(np.mean(a > b)), apart, doubts)
+
+    @property
+    def is_ratio(self) -> bool:
+        return self.ratio[1] == self.ratio[1]
+
+
+@dataclass(frozen=True)
+class PopulationsCompared:
+    """``medians``: parameter → draws (M, K) in its display unit, of all populations together; ``lines``: the
+    straight line of them, of their logarithm where it is in ``logarithmic``, against a number of each population.
+
+    ``common``: quantities with one value in several populations; ``notes``: what else has to be known.
+    """
+
+    populations: tuple[str, ...]
+    parameters: Mapping[str, Parameter]
+    medians: Mapping[str, Array]
+    differences: tuple[Difference, ...]
+    common: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+    lines: Mapping[str, StraightLine] = field(default_factory=dict)
+    logarithmic: frozenset[str] = frozenset()
+
+
+def hold_populations(run_dirs: Iterable[str | Path]) -> bool:
+    """Whether each is the folder of a population, or of a run that ended with one."""
+    return all((Path(run_dir) / FILE).is_file() for run_dir in run_dirs)
+
+
+def compare_populations(
+    runs: Sequence[str | Path] | Mapping[str, str | Path],
+    numbers: Sequence[float] = (),
+    apart: Sequence[str] = (),
+    seed: int = 1,
+) -> PopulationsCompared:
+    """Compare the populations behind runs, e.g. of two gels; ``runs``: folders, or name → folder.
+
+    Quantities that are common to the data sets of each population, of the same name and prior, have one value in all
+    populations, but for those named ``apart``. ``numbers``: of each run one, e.g. a concentration, that the medians are
+    seen as a straight line of.
+
+    Raises
+    ------
+    OutputError: fewer than two, no population in a folder or one of an earlier version, no parameter of all of them,
+        data sets that two of them hold, not a number for each or all the same, a name that nothing common has.
+    """
+    if len(runs) < 2:
+        raise OutputError("compare needs at least two run directories")
+    if not isinstance(runs, Mapping):
+        paths = [Path(run) for run in runs]
+        runs = dict(zip(labels_of(paths), paths, strict=True))
+    stored = {name: _stored(Path(run)) for name, run in runs.items()}
+    names = [n for n in next(iter(stored.values())).names if all(n in s.names for s in stored.values())]
+    if not names:
+        raise OutputError("compare: the populations have no parameter in common")
+    if words := same_readings(stored):
+        raise OutputError(f"compare: {words}")
+    if numbers and (len(numbers) != len(stored) or np.ptp(numbers) == 0 or not np.isfinite(numbers).all()):
+        raise OutputError(f"compare: {len(stored)} numbers are needed, one for each run and not all the same")
+    keys = {name: _common(s, apart, name) for name, s in stored.items()}
+    every = [key for of_one in keys.values() for key in of_one]
+    common = tuple(dict.fromkeys(key[0] for key in every if every.count(key) > 1))
+    known = tuple(dict.fromkeys(n for s in stored.values() for n in s.common))
+    for name in apart:
+        if name not in known:
+            raise OutputError(f"compare: {name}: not common to the data sets of any population{suggest(name, known)}")
+    terms = {name: [s.prior_of(name) for s in stored.values()] for name in names}
+    logarithmic = frozenset(name for name in names if all(t.transform == "lognormal" for t in terms[name]))
+    medians: dict[str, Array] = {}
+    lines: dict[str, StraightLine] = {}
+    differences, notes = [], [*_other_priors(known, common, apart)]
+    for name in names:
+        centres = {label: _centre(name, s, keys[label], seed) for label, s in stored.items()}
+        alone = [replace(c, common=tuple((label, key) for key in c.common)) for label, c in centres.items()]
+        medians[name] = _physical(drawn_together([*centres.values()], seed), terms[name])
+        independent = _physical(drawn_together(alone, seed), terms[name])
+        for (i, a), (j, b) in combinations(enumerate(stored), 2):
+            doubts = dict.fromkeys((*untrusted(stored[a].cautions, name), *untrusted(stored[b].cautions, name)))
+            together, own = medians[name][:, [i, j]].T, independent[:, [i, j]].T
+            unit = terms[name][0].parameter.display_unit
+            differences.append(Difference.of(name, a, b, unit, together, own, name in logarithmic, " ".join(doubts)))
+        if held := [label for label, c in centres.items() if c.pulled]:
+            notes.append(f"{name}: the data of {', '.join(held)} leave its median open: the hyperprior holds it")
+        if numbers:
+            of_it = np.log(medians[name]) if name in logarithmic else medians[name]
+            lines[name] = line(of_it, np.asarray(numbers, dtype=float))
+    parameters = {name: terms[name][0].parameter for name in names}
+    return PopulationsCompared(
+        tuple(stored), parameters, medians, tuple(differences), common, tuple(notes), lines, logarithmic
+    )
+
+
+def _physical(white: Array, terms: Sequence[PriorTerm]) -> Array:
+    """Draws (M, K) in the display unit of the first."""
+    p = terms[0].parameter
+    columns = [t.to_physical(t.mean + t.std * white[:, k]) for k, t in enumerate(terms)]
+    return np.stack([convert(column, p.unit, p.display_unit) for column in columns], axis=1)
+
+
+def same_readings(stored: Mapping[str, StoredPopulation]) -> str:
+    """Why populations are not independent; "" where they are."""
+    for (a, first), (b, second) in combinations(stored.items(), 2):
+        if both := [first.readings[key] for key in first.readings.keys() & second.readings.keys()]:
+            return (
+                f"{a} and {b} hold the same readings ({', '.join(sorted(both)[:3])}): what differs between them is the "
+                "law and not the gel"
+            )
+    return ""
+
+
+def _centre(name: str, s: StoredPopulation, keys: tuple[tuple[str, str], ...], seed: int) -> Centre:
+    nu, x = np.stack([s.white(n) for n in s.names], axis=1), s.white(name)
+    theta = np.stack([s.white(n) for n in s.common], axis=1) if s.common else np.empty((len(x), 0))
+    attributes = s.tree.attrs
+    return without_pull(
+        x, nu, theta, keys, float(attributes["hyperprior_mean_std"]), float(attributes["effective_draws"]), seed
+    )
+
+
+def _three(values: Array) -> tuple[float, float, float]:
+    low, middle, high = map(float, member_quantiles(values, QUANTILES))
+    return low, middle, high
+
+
+def _stored(folder: Path) -> StoredPopulation:
+    path = folder / FILE
+    if not path.is_file():
+        words = (
+            "a run whose configuration has 'population:' ends with one, 'en4dvar population' makes one of finished runs"
+        )
+        raise OutputError(f"{folder}: holds no population; {words}")
+    stored = load_population(path)
+    with understood(path):
+        if "white" not in stored.tree.children:
+            raise OutputError(
+                f"{path}: written by an earlier version of en4dvar; make the population again to compare it"
+            )
+        for name in (*stored.names, *stored.common):
+            _ = stored.white(name), stored.prior_of(name)
+    return stored
+
+
+def _common(s: StoredPopulation, apart: Sequence[str], label: str) -> tuple[tuple[str, str], ...]:
+    """Of each common quantity what makes it the same in two populations."""
+    priors = {name: str(s.group("white")[name].attrs["prior"]) for name in s.common}
+    return tuple((name, label if name in apart else prior) for name, prior in priors.items())
+
+
+def _other_priors(known: Sequence[str], common: Sequence[str], apart: Sequence[str]) -> Iterator[str]:
+    own = [name for name in known if name not in common and name not in apart]
+    if own:
+        yield f"{', '.join(own)}: of one population alone, or with other priors: taken as each population's own"
+
+
+def sentences(c: PopulationsCompared) -> Iterator[str]:
+    """The answer: one sentence a pair and parameter, one a line, and what is taken to be common."""
+    for d in c.differences:
+        yield _sentence(d)
+    for name, of_it in c.lines.items():
+        yield _line_sentence(c, name, of_it)
+    if c.common:
+        yield f"Of one value in all of them, so that it cancels as far as it moves them alike: {', '.join(c.common)}."
+    yield from (f"{note}." for note in c.notes)
+
+
+def _sentence(d: Difference) -> str:
+    unit = f" {pretty_unit(d.unit)}" if d.unit != "1" else ""
+    by = f"{_range(d.difference, plain=True)}{unit}"
+    sure, side = (d.greater, "larger") if d.greater >= 0.5 else (1 - d.greater, "smaller")
+    chance = f"over {SURE}" if sure > SURE else f"{sure:.3f}" if sure > 0.99 else f"{sure:.2f}"
+    if d.is_ratio:
+        words = f"{d.parameter} of {d.first} is {_range(d.ratio)} times that of {d.second}, and {by} more"
+    else:
+        words = f"{d.parameter} of {d.first} is {by} more than that of {d.second}"
+    words += f"; it is {side} with probability {chance}"
+    alone = f"{number_like(d.apart[0], _std(d.apart))} … {number_like(d.apart[2], _std(d.apart))}"
+    words += f" (were nothing common: {alone}{' times' if d.is_ratio else unit})"
+    return f"{words}; not to be trusted: {d.untrusted.replace(' ', ', ')}." if d.untrusted else f"{words}."
+
+
+def _line_sentence(c: PopulationsCompared, name: str, of_it: StraightLine) -> str:
+    unit = pretty_unit(c.parameters[name].display_unit)
+    slope = _three(np.exp(of_it.slope) if name in c.logarithmic else of_it.slope)
+    rising = float(np.mean(of_it.slope > 0))
+    what = (
+        f"grows by a factor of {_range(slope)}"
+        if name in c.logarithmic
+        else f"grows by {_range(slope)} {unit}".rstrip()
+    )
+    words = f"{name} {what} for each unit of the number; it rises with probability {min(rising, SURE):.3f}"
+    if of_it.chance < OFF_THE_LINE:
+        chi = plain_number(of_it.misfit, 2)
+        return f"{words}; they do not lie on a line (χ² {chi} of {of_it.freedom}), for which the interval is widened."
+    return f"{words}."
+
+
+def _std(three: Sequence[float]) -> float:
+    return (three[2] - three[0]) / 3.29
+
+
+def _range(three: tuple[float, float, float], plain: bool = False) -> str:
+    low, middle, high = (number_like(value, _std(three)) for value in three)
+    return f"{middle} ({low} … {high})" if plain else f"{middle} (5–95 %: {low} … {high})"
+
+
+def medians_table(c: PopulationsCompared) -> str:
+    """What the terminal shows: the median of each parameter in each population."""
+    rows: list[tuple[str, ...]] = [("population", "parameter", "unit", "5 %", "50 %", "95 %")]
+    for name, draws in c.medians.items():
+        for label, column in zip(c.populations, draws.T, strict=True):
+            three = _three(column)
+            cells = (number_like(value, _std(three)).replace("−", "-") for value in three)
+            rows.append((label, name, c.parameters[name].display_unit, *cells))
+    return table(rows)
+
+
+def figure(c: PopulationsCompared) -> Chart:
+    """The median of each population, one panel a parameter."""
+    panels = []
+    for name, draws in c.medians.items():
+        p, places = c.parameters[name], -np.arange(float(len(c.populations)))
+        low, middle, high = member_quantiles(draws, QUANTILES, axis=0)
+        panel = Panel(with_unit(p.symbol, p.display_unit), ylim=(-float(len(places)), 1.0))
+        panel.yticks, panel.y_names = [*places], [figure_text(label) for label in c.populations]
+        panel.intervals(low, high, places, "posterior")
+        panel.dots(middle, places, "posterior", 3.0)
+        panels.append(panel)
+    height = (2.0 + 0.6 * len(c.populations)) * POINTS
+    return in_columns(panels, height, width=COLUMN * (2 if len(panels) > 1 else 1))
+
+
+def write_tables(c: PopulationsCompared, folder: Path) -> None:
+    """``differences.csv`` and, with numbers, ``lines.csv``. Raises :class:`OutputError`."""
+    three = [f"{what}_{q}" for what in ("ratio", "difference", "apart") for q in ("q05", "q50", "q95")]
+    head = ["parameter", "first", "second", "unit", *three, "greater", "untrusted"]
+    rows = [
+        [d.parameter, d.first, d.second, d.unit, *d.ratio, *d.difference, *d.apart, d.greater, d.untrusted]
+        for d in c.differences
+    ]
+    write_text(folder / "differences.csv", csv_text([head, *rows]))
+    if c.lines:
+        three = [f"{what}_{q}" for what in ("slope", "level") for q in ("q05", "q50", "q95")]
+        lines = [
+            [name, "ln" if name in c.logarithmic else "", *_three(it.slope), *_three(it.level), it.misfit, it.freedom]
+            for name, it in c.lines.items()
+        ]
+        write_text(folder / "lines.csv", csv_text([["parameter", "of", *three, "chi2", "freedom"], *lines]))

@@ -1,0 +1,131 @@
+"""``en4dvar compare`` of runs that end with populations: springs of two kinds, and what their files hold."""
+
+from __future__ import annotations
+
+import csv
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from run_files import make_campaign
+from toy_config import csv_text
+
+import en4dvar
+from en4dvar.cli import main
+from en4dvar.estimation.population import Effort
+from en4dvar.plumbing.errors import OutputError
+from en4dvar.report.populations import Difference, _sentence
+from en4dvar.results.population_file import load_population
+from en4dvar.runs.population_run import population
+from en4dvar.runs.runner import run_campaign
+
+STIFFER = 1.3
+SMALL = Effort(rounds=36, refits=1, degree=2, components=2, hyper_walkers=32, draws=1500, exact=400)
+
+
+@pytest.fixture(scope="module")
+def gels(tmp_path_factory):
+    """Four oscillators whose springs are 1.6 to 2.05, and four of stiffer ones: runs, and folders of populations."""
+    folders = []
+    for name, stiffer in (("soft", 1.0), ("stiff", STIFFER)):
+        folder = tmp_path_factory.mktemp(name)
+        path = make_campaign(folder, n=4)
+        for i in range(4):
+            (folder / "data" / f"set{i}.csv").write_text(csv_text(k=stiffer * (1.6 + 0.15 * i)))
+        run = run_campaign(path, overrides={"output.report": False, "output.directory": str(folder / name)}).directory
+        population([run], ["k"], folder / f"{name}_only", effort=SMALL)
+        folders.append(folder)
+    return folders
+
+
+def only(gels):
+    return [gels[0] / "soft_only", gels[1] / "stiff_only"]
+
+
+def test_how_much_stiffer_and_how_surely(gels):
+    found = en4dvar.compare_populations({"soft": only(gels)[0], "stiff": only(gels)[1]})
+    (d,) = found.differences
+    assert (d.parameter, d.first, d.second) == ("k", "soft", "stiff")
+    medians = [load_population(f / "population.nc").group("posterior")["k_median"].values.ravel() for f in only(gels)]
+    ratio, logs = np.median(medians[0]) / np.median(medians[1]), np.log(d.ratio)
+    assert d.ratio[1] == pytest.approx(ratio, rel=0.1)
+    assert d.ratio[1] == pytest.approx(1 / STIFFER, rel=0.15)
+    expected = np.hypot(*(np.log(m).std() for m in medians))
+    assert (logs[2] - logs[0]) / 3.29 == pytest.approx(expected, rel=0.35)  # nothing is common, and no pull is left
+    assert d.greater < 0.1
+    assert found.common == ()
+
+
+def test_the_command_its_page_and_tables(gels, tmp_path):
+    out = tmp_path / "compared"
+    asked = ["compare", *map(str, only(gels)), "--out", str(out), "--against", "5,10"]
+    result = CliRunner().invoke(main, asked)
+    assert result.exit_code == 0, result.output
+    assert "times that of stiff_only" in result.output
+    assert "smaller with probability" in result.output
+    page = (out / "compare.html").read_text()
+    assert "times that of stiff_only" in page
+    assert 'id="populations"' in page
+    assert "Evidence and fit" not in page
+    (row,) = csv.DictReader((out / "differences.csv").read_text().splitlines())
+    assert float(row["ratio_q05"]) < float(row["ratio_q50"]) < float(row["ratio_q95"]) < 1
+    (of_line,) = csv.DictReader((out / "lines.csv").read_text().splitlines())
+    assert float(of_line["slope_q50"]) == pytest.approx(-np.log(float(row["ratio_q50"])) / 5, rel=0.02)
+
+
+def test_runs_that_hold_their_population_are_compared_as_ever_too(gels, tmp_path):
+    runs = [tmp_path / "soft", tmp_path / "stiff"]
+    for run, gel, held in zip(runs, gels, only(gels), strict=True):
+        shutil.copytree(gel / run.name, run)
+        shutil.copy(held / "population.nc", run)
+    out = tmp_path / "compared"
+    result = CliRunner().invoke(main, ["compare", *map(str, runs), "--stored", "--out", str(out)])
+    assert result.exit_code == 0, result.output
+    assert result.output.index("times that of stiff") < result.output.index("log-evidence")
+    page = (out / "compare.html").read_text()
+    assert page.index("times that of stiff") < page.index("Evidence and fit")
+    laws = CliRunner().invoke(
+        main, ["compare", str(runs[0]), str(shutil.copytree(runs[0], tmp_path / "law")), "--stored"]
+    )
+    assert laws.exit_code == 0, laws.output
+    assert "populations are not compared: compare: soft and law hold the same readings" in laws.output
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (["--against", "5"], "2 numbers are needed"),
+        (["--against", "5,5"], "not all the same"),
+        (["--against", "5;6"], "no list of numbers"),
+        (["--apart", "rho"], "rho: not common to the data sets of any population"),
+    ],
+)
+def test_bad_questions(gels, tmp_path, more, words):
+    result = CliRunner().invoke(main, ["compare", *map(str, only(gels)), "--out", str(tmp_path / "out"), *more])
+    assert result.exit_code == 2
+    assert words in " ".join(result.output.split())
+    assert "Traceback" not in result.output
+
+
+def test_folders_that_cannot_be_compared(gels, tmp_path):
+    with pytest.raises(OutputError, match="at least two"):
+        en4dvar.compare_populations(only(gels)[:1])
+    with pytest.raises(OutputError, match="holds no population"):
+        en4dvar.compare_populations([only(gels)[0], tmp_path])
+    with pytest.raises(OutputError, match="the same readings"):
+        en4dvar.compare_populations({"one": only(gels)[0], "law": only(gels)[0]})
+
+
+def test_words_of_a_difference():
+    d = Difference("G", "a", "b", "kPa", (2.0, 3.0, 4.0), (4.0, 5.0, 6.0), 0.9996, (1.5, 3.0, 6.0))
+    assert _sentence(d) == (
+        "G of a is 3.00 (5–95 %: 2.00 … 4.00) times that of b, and 5.00 (4.00 … 6.00) kPa more; it is larger with "
+        "probability over 0.999 (were nothing common: 1.5 … 6.0 times)."
+    )
+    shift = replace(
+        d, ratio=(np.nan,) * 3, difference=(-6.0, -5.0, -4.0), greater=0.02, untrusted="chain-not-converged"
+    )
+    assert _sentence(shift).startswith("G of a is −5.00 (−6.00 … −4.00) kPa more than that of b; it is smaller with")
+    assert _sentence(shift).endswith("not to be trusted: chain-not-converged.")
