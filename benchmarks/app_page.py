@@ -1,16 +1,23 @@
-"""The pictures of docs/app.md, and how fast the page is: ``python benchmarks/app_page.py [FOLDER_OF_PICTURES]``.
+"""The pictures of docs/app.md, and how fast the page is.
+
+    python benchmarks/app_page.py [FOLDER_OF_PICTURES [WIDTH]]
+    python benchmarks/app_page.py MOVIE
 
 A synthetic movie of the quick start's bubble goes through the page in a headless Chromium. Printed are the time to the
 page and to the first frame, and the frames a second that are shown while an arrow key is held, of 512 × 512 pixels.
+With a movie (of the public bubble in polyacrylamide, which is not shipped), printed are the clicks and the seconds from
+the first request to the interval of its shear modulus.
 """
 
 from __future__ import annotations
 
 import io
+import shutil
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +77,60 @@ def walk(page: Any, address: str, pictures: Path) -> None:
     picture(page, "#model", pictures / "app_model.png")
 
 
+def clicks_counted(page: Any) -> None:
+    """Count the presses of the mouse in ``window.name``, before anything is opened."""
+    page.add_init_script("addEventListener('pointerdown', (e) => { if (e.isTrusted) name = +name + 1; }, true)")
+
+
+def pull(page: Any, start: tuple[float, float], end: tuple[float, float]) -> None:
+    """Draw on the frame, from place to place in its pixels."""
+    page.locator("#frame").scroll_into_view_if_needed()
+    box, scale = page.locator("#frame").bounding_box(), page.evaluate("frame.clientWidth / movie.width")
+    for (x, y), act in ((start, page.mouse.down), (end, page.mouse.up)):
+        page.mouse.move(box["x"] + x * scale, box["y"] + y * scale, steps=3)
+        act()
+
+
+def from_movie_to_interval(page: Any, wait: Callable[[str], None]) -> None:
+    """By mouse and keys on an open page: rate, scale bar, a circle drawn in the collapse (frame 28), and three steps.
+
+    ``wait(expression)`` returns once an expression of JavaScript is true.
+    """
+    wait("!!movie?.picture")
+    page.click("#frame-rate")
+    page.keyboard.type("270 kHz")
+    page.click("input[value=scale]")
+    page.click("#length")
+    page.keyboard.type("276 um")
+    pull(page, (100, 110), (200, 110))
+    page.click("input[value=circle]")
+    track = page.locator("#number").bounding_box()
+    page.locator("#number").click(position={"x": 8 + 0.28 * (track["width"] - 16), "y": track["height"] / 2})
+    while (ahead := 28 - page.evaluate("at")) != 0:
+        page.keyboard.press("ArrowRight" if ahead > 0 else "ArrowLeft")
+    pull(page, (271, 68), (287, 68))
+    wait("kept.startsWith('28 ')")
+    for step, next_one in (("track", "document.getElementById('table').value"), ("init", "text.value"), ("run", "1")):
+        page.click(f"button[data-step={step}]")
+        wait(f"!!document.querySelector('#job-{step}.done') && !!{next_one}")
+
+
+def timed(page: Any, address: str) -> None:
+    """Print clicks and seconds, and what the page then says of the shear modulus."""
+    clicks_counted(page)
+    begun = time.perf_counter()
+
+    def wait(expression: str) -> None:
+        while not page.evaluate(expression):
+            page.wait_for_timeout(50)
+
+    page.goto(address)
+    wait("state !== null")
+    from_movie_to_interval(page, wait)
+    print(f"{page.evaluate('name')} clicks, {time.perf_counter() - begun:.0f} s")
+    print(*(line for line in page.inner_text("#job-run pre").splitlines() if " G " in line), sep="\n")
+
+
 def picture(page: Any, part: str, path: Path) -> None:
     """A part of the page, at two thirds of its size and in 64 colours: small files."""
     shot = Image.open(io.BytesIO(page.locator(part).screenshot())).convert("RGB")
@@ -77,19 +138,20 @@ def picture(page: Any, part: str, path: Path) -> None:
     small.quantize(64).save(path, optimize=True)
 
 
-def main(pictures: Path, width: int = 1280) -> None:
+def main(given: Path, width: int = 1280) -> None:
     from playwright.sync_api import sync_playwright
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name) / "movies"
         folder.mkdir()
-        film(folder)
+        shutil.copy(given, folder) if given.is_file() else film(folder)
         server = subprocess.Popen(command("app", str(folder), "--no-browser"), stdout=subprocess.PIPE, text=True)
         assert server.stdout is not None
         address = server.stdout.readline().strip()
         with sync_playwright() as playwright:
             browser = playwright.chromium.launch(executable_path="/usr/bin/chromium", args=["--no-sandbox"])
-            walk(browser.new_page(viewport={"width": width, "height": 900}), address, pictures)
+            page = browser.new_page(viewport={"width": width, "height": 900})
+            timed(page, address) if given.is_file() else walk(page, address, given)
             browser.close()
         server.terminate()
 

@@ -252,10 +252,10 @@ def frame(summaries: Mapping[str, Iterable[ParameterSummary]]) -> pd.DataFrame:
     """A row a data set and parameter, in display units; NaN where a number is not to be quoted."""
     import pandas as pd  # takes long to import
 
-    from en4dvar.plumbing.frame import Frame
+    from en4dvar.plumbing.whole_table import WholeTable
 
     rows = [[dataset, *csv_cells(row)] for dataset, summary in summaries.items() for row in summary]
-    table = Frame(rows, columns=["dataset", *CSV_COLUMNS]).set_index(["dataset", "name"])
+    table = WholeTable(rows, columns=["dataset", *CSV_COLUMNS]).set_index(["dataset", "name"])
     numbers = [name for name in table if name not in ("unit", "informed", "untrusted")]
     return table.assign(**{name: pd.to_numeric(table[name]) for name in numbers})
 

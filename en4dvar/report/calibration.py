@@ -120,9 +120,9 @@ class Calibration:
 
     def summary(self) -> pd.DataFrame:
         """A row a quantity."""
-        from en4dvar.plumbing.frame import Frame
+        from en4dvar.plumbing.whole_table import WholeTable
 
-        return Frame([vars(verdict) for verdict in self.verdicts])
+        return WholeTable([vars(verdict) for verdict in self.verdicts])
 
     def plot(self) -> Figure:
         """The distribution of the ranks of each quantity, less that of uniform ones."""

@@ -29,10 +29,10 @@ class TwinOutcome(TwinResult):
 
     def summary(self) -> pd.DataFrame:
         """RMSE and spread after the burn-in, a row an estimate."""
-        from en4dvar.plumbing.frame import Frame
+        from en4dvar.plumbing.whole_table import WholeTable
 
         rows = {name: (score.mean_rmse, score.mean_spread) for name, score in self.scores.items()}
-        return Frame.from_dict(rows, orient="index", columns=["rmse", "spread"])
+        return WholeTable.from_dict(rows, orient="index", columns=["rmse", "spread"])
 
     def plot(self) -> Figure:
         """RMSE and spread in time."""
@@ -55,9 +55,9 @@ class SequenceOutcome(SeriesResult):
 
     def summary(self) -> pd.DataFrame:
         """Mean and standard deviation at the last time, a row a variable."""
-        from en4dvar.plumbing.frame import Frame
+        from en4dvar.plumbing.whole_table import WholeTable
 
-        return Frame(estimates(self), columns=["variable", "mean", "std", "unit"]).set_index("variable")
+        return WholeTable(estimates(self), columns=["variable", "mean", "std", "unit"]).set_index("variable")
 
     def plot(self) -> Figure:
         """The state in time, or the parameters where it is known."""

@@ -80,9 +80,9 @@ class TwinSweep:
 
     def summary(self) -> pd.DataFrame:
         """:attr:`rows` as a table."""
-        from en4dvar.plumbing.frame import Frame
+        from en4dvar.plumbing.whole_table import WholeTable
 
-        return Frame(self.rows)
+        return WholeTable(self.rows)
 
     def plot(self) -> Figure:
         """RMSE of each estimate, with its standard error, over the settings."""

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from en4dvar.data.noise import Predicted
 from en4dvar.data.observations import Observations
@@ -82,7 +83,7 @@ class EmulatedCost:
 
 
 @dataclass(frozen=True)
-class _Runs:
+class ModelRuns:
     """Members that could be run: control vectors (B, n), outputs (B, Ky) of the make of ``make``, J (B,)."""
 
     x: Array
@@ -90,7 +91,10 @@ class _Runs:
     costs: Array
     make: Predicted
 
-    def joined(self, other: _Runs) -> _Runs:
+    def __getitem__(self, chosen: npt.NDArray[np.intp]) -> ModelRuns:
+        return replace(self, x=self.x[chosen], outputs=self.outputs[chosen], costs=self.costs[chosen])
+
+    def joined(self, other: ModelRuns) -> ModelRuns:
         x, outputs = np.concatenate([self.x, other.x]), np.concatenate([self.outputs, other.outputs])
         return replace(self, x=x, outputs=outputs, costs=np.concatenate([self.costs, other.costs]))
 
@@ -127,7 +131,7 @@ def emulate(
     runs = _run(run, prior, observations, coordinates.back(random.standard_normal((count, n))))
     if len(runs.x) < ENOUGH_ALIVE * count:
         return None
-    emulated = _fit(prior, observations, coordinates, degree, runs)
+    emulated = fitted_cost(prior, observations, degree, runs, 2 * n, coordinates)
     kept, share = runs.x, math.nan
     walkers = kept[random.permutation(len(kept))[:WALKERS]]
     for _ in range(fits - 1):
@@ -138,18 +142,18 @@ def emulate(
             return None
         share = effective_share(emulated.cost(new.x) - new.costs) * len(new.x) / count  # of the fit without them
         runs = runs.joined(new)
-        emulated = _fit(prior, observations, coordinates, degree, runs)
+        emulated = fitted_cost(prior, observations, degree, runs, 2 * n, coordinates)
     settled = emulated.walk(walkers, kept, random, SETTLED)
     ceiling = float(np.min(runs.costs - _prior_cost(prior, runs.x))) + CEILING
     return replace(emulated, ceiling=ceiling, share=share, draws=np.concatenate(settled[SETTLED // 3 :]))
 
 
-def _run(run: Run, prior: Prior, observations: Observations, x: Array) -> _Runs:
+def _run(run: Run, prior: Prior, observations: Observations, x: Array) -> ModelRuns:
     """Run control vectors (B, n); the survivors."""
     outcome = run(x)
     costs = _prior_cost(prior, x) + observations.cost(outcome.predicted)
     alive = outcome.active & np.isfinite(costs)
-    return _Runs(x[alive], outcome.predicted.stacked[alive], costs[alive], outcome.predicted[:0])
+    return ModelRuns(x[alive], outcome.predicted.stacked[alive], costs[alive], outcome.predicted[:0])
 
 
 def _prior_cost(prior: Prior, x: Array) -> Array:
@@ -157,8 +161,19 @@ def _prior_cost(prior: Prior, x: Array) -> Array:
     return np.asarray(0.5 * (z * z).sum(axis=1))
 
 
-def _fit(prior: Prior, observations: Observations, coordinates: Coordinates, degree: int, runs: _Runs) -> EmulatedCost:
-    """A run whose J exceeds the lowest by the width of a posterior, 2n, counts half."""
-    excess = (runs.costs - runs.costs.min()) / (2 * len(coordinates.centre))
-    emulator = Emulator.fitted(coordinates, degree, runs.x, runs.outputs, 1 / (1 + excess**2), RIDGE)
+def fitted_cost(
+    prior: Prior,
+    observations: Observations,
+    degree: int,
+    runs: ModelRuns,
+    near: float,
+    coordinates: Coordinates | None = None,
+) -> EmulatedCost:
+    """Ĵ fitted to runs; one whose J exceeds the lowest by ``near`` counts half.
+
+    ``coordinates``: of the polynomials, by default those in which the runs have unit covariance.
+    """
+    excess = (runs.costs - runs.costs.min()) / near
+    about = Coordinates.about(runs.x) if coordinates is None else coordinates
+    emulator = Emulator.fitted(about, degree, runs.x, runs.outputs, 1 / (1 + excess**2), RIDGE)
     return EmulatedCost(emulator, prior, observations, runs.make)

@@ -16,6 +16,7 @@ the last proposal alone, made afresh: their mean weight is unbiased.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 
@@ -25,9 +26,24 @@ from en4dvar.sampling.mixture import StudentMixture, effective_number, resampled
 FEWEST = 60.0  # effective draws that a proposal is fitted to: with fewer, to tempered weights
 COMPONENTS = 4
 FITTED = 2000  # points that few parts are fitted to
-SETTLED, PARTS = 150.0, 8  # the same of proposals to a power of the posterior
+SETTLED, PARTS = 150.0, 8  # the same of proposals to a power of the posterior,
+MOST_FITTED = 1000  # and points that these are fitted to
 EACH = 4  # effective draws for each coordinate of a component: fitted to fewer it is flat in some direction
 MOST = 3.0  # times √D mean weights of D draws: more than that none counts (Ionides 2008)
+
+
+class Proposal(Protocol):
+    """A density in n coordinates that can be drawn from."""
+
+    @property
+    def dimensions(self) -> int:
+        """n."""
+
+    def draw(self, count: int, stream: np.random.Generator) -> Array:
+        """(count, n)."""
+
+    def log_density(self, x: Array) -> Array:
+        """(B,) at points (B, n)."""
 
 
 def standard(n: int) -> StudentMixture:
@@ -47,15 +63,15 @@ class Importance:
 
     def __init__(
         self,
-        first: StudentMixture,
+        first: Proposal,
         stream: np.random.Generator,
         count: int,
         wider: float = 1.0,
         behind_each: float = 0.0,
     ):
-        n = first.centre.shape[1]
+        n = first.dimensions
         self.stream, self.count, self.wider, self.behind_each = stream, count, wider, behind_each
-        self.proposals = [first]
+        self.proposals: list[Proposal] = [first]
         self.z, self.target, self.mixture = np.empty((0, n)), np.empty(0), np.empty(0)  # mixture: ln Σ_t q_t
         self.log_weights, self.log, self.effective = np.empty(0), -np.inf, 0.0
 
@@ -92,7 +108,7 @@ class Importance:
             self.log = top + float(np.log(weights.mean()))
             self.effective = effective_number(weights)
 
-    def next_proposal(self) -> StudentMixture:
+    def next_proposal(self) -> Proposal:
         """Fitted to the draws so far; the first one while hardly any of them has a weight."""
         if np.isfinite(self.log_weights).sum() <= 2 * (self.z.shape[1] + 1):
             return self.proposals[0]
@@ -116,6 +132,10 @@ class ClosingDraws(Importance):
     and of another shape most where that has tails.
     """
 
+    def __init__(self, first: StudentMixture, stream: np.random.Generator, count: int, wider: float):
+        super().__init__(first, stream, count, wider)
+        self.first = first
+
     @property
     def tempered(self) -> Array:
         """Log weights (D,) of that power."""
@@ -131,12 +151,12 @@ class ClosingDraws(Importance):
     def next_proposal(self) -> StudentMixture:
         n = self.z.shape[1]
         if np.isfinite(self.log_weights).sum() <= 2 * (n + 1):
-            return self.proposals[0]
+            return self.first
         logs, power = self.tempered, 1.0
         while (effective := effective_number(np.exp(power * logs))) < SETTLED and power > 1e-4:
             power *= 0.8
         weights = np.exp(power * logs)
-        where = resampled(weights / weights.sum(), 2 * self.count, self.stream)
+        where = resampled(weights / weights.sum(), min(2 * self.count, MOST_FITTED), self.stream)
         parts = max(1, min(PARTS, int(effective / (EACH * n))))
         return StudentMixture.fitted(self.z[where], self.stream, parts, alike=2 * n * len(where) / effective)
 

@@ -17,15 +17,25 @@ from en4dvar.descent.minima import Minimum
 from en4dvar.ensemble.linalg import with_moments
 from en4dvar.model.state import Array
 from en4dvar.priors.prior import Prior, member_stream
+from en4dvar.sampling.emulated_draws import EmulatedProposal, RecordedRuns
 from en4dvar.sampling.importance import ClosingDraws, FixedDraws, Importance
 from en4dvar.sampling.mixture import StudentMixture, effective_number, resampled
 
 DRAWS = 400  # of a round
+HEATS = (8.0, 4.0, 2.0, 1.5)  # of the rounds that train an emulator
+LAST_HEAT = 1.15  # of those that judge it: draws reach a little beyond what it says
+TRIED = 4  # such rounds, at most, and
+GOOD = 0.25  # the effective share of one that ends them
+TRAINING, POOL = (
+    400.0,
+    1500.0,
+)  # effective draws of the emulated posterior behind such a round, and behind the last ones
 ENOUGH, MOST_RUNS = 1500.0, 8.0  # effective draws that end the rounds, and runs for each of them
 LAST_RUNS = 30.0  # for each, as long as too few are effective
 CLOSING = (2, 3, 6)  # rounds in which proposals close in, at least: two, and one for three directions, up to six
 WIDER = 1.8  # at 1 the tail of a bent posterior is not found: standard deviations were up to half too small
 FEW = 6  # directions up to which that is the factor of each; of more it is smaller, and their volume grows no further
+THIN = 0.15  # effective share of the first round of a mixture below which the posterior is drawn by an emulator
 TOO_FEW = 60.0  # below so many the draws stand for nothing
 OF_PRIOR = 0.2  # share of the first draws that come from the prior: what no descent found is not excluded
 
@@ -92,13 +102,15 @@ def sample_modes(
     """Draws of exp(−J) until ``enough`` of them (default: :data:`ENOUGH`) are effective, by eight runs each, or more as
     long as these are :data:`TOO_FEW`, or until J of one is ``below`` a value.
 
-    Rounds of draws from proposals that close in on the posterior tell the proposal of those that count. ``cost``:
-    J (B,) of control vectors (B, n), with the prior's own mean and covariance, +inf where the model fails.
+    Rounds of draws from proposals that close in on the posterior tell the proposal of those that count: a mixture, or
+    where that keeps too few of its draws and ``cost`` has recorded what the runs gave, the emulated posterior.
+    ``cost``: J (B,) of control vectors (B, n), with the prior's own mean and covariance, +inf where the model fails.
     Deterministic in ``seed``.
     """
     enough, n = ENOUGH if enough is None else enough, len(prior.names)
     most = math.ceil(LAST_RUNS * enough / DRAWS)
     closing = min(CLOSING[0] + n // CLOSING[1], CLOSING[2])
+    runs = cost if isinstance(cost, RecordedRuns) else None
 
     def more(sampler: Importance) -> bool:
         """A round; whether no draw of it is low enough to end them all."""
@@ -106,21 +118,25 @@ def sample_modes(
         sampler.add(z, 0.5 * np.sum(z**2, axis=1) - cost(prior.from_white(z)))
         return sampler.lowest >= below
 
-    sampler: Importance
-    sampler = first = ClosingDraws(
-        _about(prior, minima), member_stream(seed, "modes"), DRAWS, WIDER ** min(1.0, FEW / n)
-    )
+    mixture = _about(prior, minima)
+    first = ClosingDraws(mixture, member_stream(seed, "modes"), DRAWS, WIDER ** min(1.0, FEW / n))
     rounds, going = 1, more(first)
-    while going and rounds < most and not (rounds >= closing and first.near):
+    while going and rounds < most and not (rounds >= closing and (first.near or (runs and runs.emulates))):
         rounds, going = rounds + 1, more(first)
+    sampler: Importance = first
     if going:
-        sampler = FixedDraws(first.next_proposal(), first.stream, DRAWS)
-        while going and (not len(sampler.z) or (_unsettled(sampler, enough) and rounds < most)):
+        mixture = first.next_proposal()
+        sampler, rounds = FixedDraws(mixture, first.stream, DRAWS), rounds + 1
+        going = more(sampler)
+    while going and _unsettled(sampler, enough) and rounds < most:
+        if runs and sampler.effective < THIN * len(sampler.z):
+            sampler, mixture, going = _guided(runs, sampler, mixture, more)
+            runs = None
+        else:
             rounds, going = rounds + 1, more(sampler)
     if not np.isfinite(sampler.log):
         raise ValueError("no draw about a minimum of J can be run")
     x = prior.from_white(sampler.z)
-    proposal = sampler.proposals[-1]
     return WeightedDraws(
         x=x,
         shares=sampler.shares,
@@ -129,13 +145,37 @@ def sample_modes(
         lowest=sampler.lowest,
         best=x[np.argmax(sampler.target)],
         proposal=StudentMixture(
-            proposal.share, prior.from_white(proposal.centre), _of_columns(prior.from_white_change, proposal.root)
+            mixture.share, prior.from_white(mixture.centre), _of_columns(prior.from_white_change, mixture.root)
         ),
     )
 
 
+def _guided(
+    runs: RecordedRuns, mixed: Importance, mixture: StudentMixture, more: Callable[[Importance], bool]
+) -> tuple[Importance, StudentMixture, bool]:
+    """A round of draws of the emulated posterior, after others that train the emulator, or ``mixed``, those of a
+    mixture, where these keep a larger share effective; and a mixture about them. False where a draw ends them all.
+    """
+    start, share = mixture, 0.0
+    for heat in (*HEATS, *(LAST_HEAT,) * TRIED):
+        proposal = EmulatedProposal.fitted(runs, start, mixed.stream, heat, TRAINING)
+        if proposal is None:
+            return mixed, mixture, True
+        sampler = FixedDraws(proposal, mixed.stream, DRAWS)
+        if not more(sampler):
+            return sampler, proposal.mixture, False
+        start, share = proposal.mixture, sampler.effective / DRAWS
+        if heat == LAST_HEAT and share >= GOOD:
+            break
+    final = EmulatedProposal.fitted(runs, start, mixed.stream, LAST_HEAT, POOL)
+    if final is None or share * len(mixed.z) < mixed.effective:
+        return mixed, mixture, True
+    sampler = FixedDraws(final, mixed.stream, DRAWS)
+    return sampler, final.mixture, more(sampler)
+
+
 def _unsettled(sampler: Importance, enough: float) -> bool:
-    """Whether too few draws are effective yet."""
+    """True if too few draws are effective yet."""
     wanted = enough if len(sampler.z) < MOST_RUNS * enough else min(TOO_FEW, enough)
     return sampler.effective < wanted
 

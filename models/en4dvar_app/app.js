@@ -1,10 +1,8 @@
 "use strict";
 const $ = (id) => document.getElementById(id);
-const FIELDS = ["movie", "pixel", "frame-rate", "exposure", "flashes", "bubble", "region", "mask", "raw", "table", "time-column",
-  "time-unit", "radius-column", "radius-unit", "by", "law", "medium", "start", "proposal", "config", "run"];
 const MINE = {
   track: ["movie", "pixel", "frame-rate", "exposure", "flashes", "bubble", "region", "mask", "raw"],
-  init: ["table", "time-column", "time-unit", "radius-column", "radius-unit", "by", "law", "medium", "start", "proposal"],
+  init: ["table", "sheet", "time-column", "time-unit", "radius-column", "radius-unit", "by", "law", "medium", "start"],
   validate: ["config"], prior: ["config"], run: ["config", "run"], resume: ["config", "run"], export: ["run"], compare: [],
 };
 const BOX = { prior: "validate", resume: "run", export: "compare" };
@@ -30,6 +28,18 @@ function options(select, names, empty) {
   select.replaceChildren(...wanted.map((name) => new Option(name || empty, name)));
   select.value = wanted.includes(now) ? now : wanted[0] ?? "";
   return select.value !== now || !now;
+}
+
+// What was typed about a movie or a table: in this window, or else for the last command about it.
+function recall(step) {
+  const [of, ...ids] = MINE[step], name = $(of).value, last = state.jobs.findLast((job) => job.step === step && job.subject === name);
+  const known = { ...last?.options, ...JSON.parse(sessionStorage.getItem(`${step} ${name}`)) };
+  for (const id of ids) if (id in known) $(id).value = known[id];
+}
+
+function remember(step) {
+  const [of, ...ids] = MINE[step];
+  sessionStorage.setItem(`${step} ${$(of).value}`, JSON.stringify(Object.fromEntries(ids.map((id) => [id, $(id).value]))));
 }
 
 const changed = (id) => $(id).dispatchEvent(new Event("change"));
@@ -138,14 +148,17 @@ const freeName = (stem, names, end = "") => {
 async function readTable() {
   const name = $("table").value;
   table = null;
-  if (name) try { table = await fetched("table", { table: name }); } catch (error) { say(error.message); }
+  $("sheet").value = "";
+  recall("init");
+  if (name) $("proposal").value = freeName(name.replace(/\.[^.]*$/, ""), state.configs, ".yaml");
+  if (name) try { table = await fetched("table", { table: name, sheet: $("sheet").value }); say(""); } catch (error) { say(error.message); }
   const names = table ? Object.keys(table.columns) : [];
-  options($("by"), names, "the file");
+  options($("by"), [...(table?.words || []), ...names], "the file");
   for (const [id, own] of [["time-column", table?.time], ["radius-column", table?.radius]]) {
     options($(id), names, table?.tracked ? "as the table says" : "choose");
     $(id).value = (!table?.tracked && own) || "";
   }
-  if (name) $("proposal").value = freeName(name.replace(/\.[^.]*$/, ""), state.configs, ".yaml");
+  recall("init");
   $("about-table").textContent = !table ? "" : table.tracked ? "A table of 'en4dvar track': it says its columns and units itself."
     : `${table.files} file(s); of ${table.file}${table.decimal === "," ? ", with decimal commas" : ""}. Units are never guessed: give them.`;
   plotTable();
@@ -173,7 +186,7 @@ async function keep() {
 
 async function begin(step) {
   if (["validate", "prior", "run", "resume"].includes(step) && $("text").value !== before && !(await keep())) return;
-  const fields = Object.fromEntries(MINE[step].map((id) => [id, $(id).value]));
+  const fields = Object.fromEntries([...MINE[step], "proposal"].map((id) => [id, $(id).value]));
   if (step === "compare") fields.runs = [...document.querySelectorAll("#runs input:checked")].map((box) => box.value).join("\n");
   await post(step, fields);
   await refresh();
@@ -182,7 +195,8 @@ async function begin(step) {
 for (const button of document.querySelectorAll("button[data-step]")) button.addEventListener("click", () => begin(button.dataset.step));
 $("keep").addEventListener("click", keep);
 $("cancel").addEventListener("click", async () => { await post("cancel", {}); await refresh(); });
-$("table").addEventListener("change", readTable);
+for (const step of ["track", "init"]) for (const id of MINE[step].slice(1)) $(id).addEventListener("change", () => remember(step));
+for (const id of ["table", "sheet"]) $(id).addEventListener("change", readTable);
 $("config").addEventListener("change", readConfig);
 for (const id of ["time-column", "radius-column", "time-unit", "radius-unit"]) $(id).addEventListener("change", plotTable);
 fetched("laws", {}).then(({ laws }) => $("laws").replaceChildren(...laws.map((law) => new Option(law, law)))).catch(() => {});

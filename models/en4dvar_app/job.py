@@ -71,11 +71,14 @@ def _described(job: Path) -> dict[str, Any] | None:
     try:
         about = json.loads((job / "command.json").read_text(encoding="utf-8"))
         line = shlex.join(["en4dvar", *map(str, about["words"])])
-        out = next((word[6:] for word in about["words"] if word.startswith("--out=")), "")
-        whole = {"number": int(job.name), "step": str(about["step"]), "subject": str(about["subject"])}
+        named = [str(word)[2:].split("=", 1) for word in about["words"] if str(word).startswith("--")]
+        options = {word[0]: word[1] for word in named if len(word) == 2}
+        subject = options.get("data", str(about["subject"]))
+        whole = {"number": int(job.name), "step": str(about["step"]), "subject": subject, "options": options}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
-    return {**whole, "line": line, "out": out, "output": end_of(job / "output"), "state": _state(job)}
+    whole |= {"line": line, "out": options.get("out", ""), "output": end_of(job / "output")}
+    return {**whole, "state": _state(job)}
 
 
 def end_of(path: Path) -> str:

@@ -7,15 +7,17 @@ const LINE = /^\s*(\d+)\s+(\S.*)$/;
 async function readMovie(afresh = true) {
   const name = $("movie").value;
   if (!name) return;
+  if (afresh) for (const id of ["bubble", "region", "mask", "raw"]) $(id).value = "";
+  if (afresh) recall("track");
   try {
     const seen = await fetched("movie", { movie: name, raw: $("raw").value });
     movie = { name, raw: $("raw").value, picture: afresh ? null : movie?.picture, ...seen };
   } catch (error) { movie = null; $("inspector").hidden = true; return say(error.message); }
   if (afresh) {
     bitmaps.clear(); at = 0; bar = null;
-    for (const id of ["bubble", "region", "mask"]) $(id).value = "";
-    if (movie.pixel && !$("pixel").value) $("pixel").value = `${+(movie.pixel * 1e6).toPrecision(9)} um`;
-    if (movie.rate && !$("frame-rate").value) $("frame-rate").value = `${+movie.rate.toPrecision(9)} Hz`;
+    if (movie.pixel) $("pixel").value = `${+(movie.pixel * 1e6).toPrecision(9)} um`;
+    if (movie.rate) $("frame-rate").value = `${+movie.rate.toPrecision(9)} Hz`;
+    recall("track");
     $("corrections").value = kept = (await fetched("text", { movie: name })).text;
   }
   movie.rows = new Map((movie.readings?.rows || []).map((row) => [row.frame, row]));
@@ -155,13 +157,14 @@ $("frame").addEventListener("pointerup", async (event) => {
   if (tool() === "bubble") $("bubble").value = rounded(p.x, p.y).join(",");
   if (tool() === "region") $("region").value = moved && region && region[2] > 1 && region[3] > 1 ? region.join(",") : "";
   if (tool() === "scale") scaled();
+  remember("track");
   draw();
 });
 
 // The pixel from the bar that was drawn and its length, as typed: 100 um.
 function scaled() {
   const typed = $("length").value.trim().match(/^([\d.]+)\s*(\S+)$/), pixels = bar ? Math.hypot(bar[2] - bar[0], bar[3] - bar[1]) : 0;
-  if (typed && pixels > 1) { $("pixel").value = `${+(typed[1] / pixels).toPrecision(5)} ${typed[2]}`; say(""); }
+  if (typed && pixels > 1) { $("pixel").value = `${+(typed[1] / pixels).toPrecision(5)} ${typed[2]}`; remember("track"); say(""); }
   else if (pixels > 1) say("Type the length of the scale bar, such as 100 um.");
 }
 

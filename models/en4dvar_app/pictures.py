@@ -98,15 +98,16 @@ def _number(text: str | None) -> float | str | None:
         return text
 
 
-def columns(path: Path) -> dict[str, Any]:
-    """Columns of a table with their numbers (thinned out if many), and which would be taken for times and radii."""
+def columns(path: Path, sheet: str = "") -> dict[str, Any]:
+    """Columns of a table with their numbers (thinned out if many), which would be taken for times and radii, and the
+    names of those of words. Raises :class:`DataError`."""
     from en4dvar.inputs.asked import SUFFIXES, Layout
     from en4dvar_bubble.starter.asked import Asked, first_with_columns
 
     files = sorted(p for p in path.iterdir() if p.suffix.lower() in SUFFIXES) if path.is_dir() else [path]
     if not files:
         raise DataError(f"{path}: the folder holds no data file ({', '.join(SUFFIXES)})")
-    first, contents, layout = first_with_columns(files, Layout())
+    first, contents, layout = first_with_columns(files, Layout(sheet=sheet))
     asked = Asked(contents)
     try:
         asked = asked.by_names()
@@ -116,8 +117,9 @@ def columns(path: Path) -> dict[str, Any]:
     step = max(1, max((len(v) for v in contents.columns.values()), default=0) // PLOTTED)
     shown = {name: [_finite(v) for v in values[::step]] for name, values in contents.columns.items()}
     return {
-        "file": first.name, "files": len(files), "columns": shown, "decimal": layout.decimal,
-        "tracked": asked.tracked, "needed": needed, "time": asked.time_column, "radius": asked.radius_column,
+        "file": first.name, "files": len(files), "columns": shown, "words": [*contents.others],
+        "decimal": layout.decimal, "tracked": asked.tracked, "needed": needed, "time": asked.time_column,
+        "radius": asked.radius_column,
     }  # fmt: skip
 
 

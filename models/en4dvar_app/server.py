@@ -21,7 +21,7 @@ from en4dvar_app.trusted import below
 
 HERE = Path(__file__).parent
 LARGEST = 1_000_000  # bytes of a request: a configuration or corrections, never a movie
-MOVIES = (".mp4", ".avi", ".mov", ".mkv", ".tif", ".tiff")
+MOVIES = (".mp4", ".avi", ".mov", ".mkv", ".tif", ".tiff", ".raw")
 FRAMES, TABLES, CONFIGS = (
     (".tif", ".tiff", ".png"),
     (".csv", ".txt", ".dat", ".tsv", ".xlsx", ".mat"),
@@ -196,7 +196,8 @@ class Look(Guarded):
         return self._opened(arguments).bmp(int(number) if number.isdecimal() and len(number) < 9 else 0)
 
     def look_table(self, arguments: dict[str, str]) -> dict[str, Any]:
-        return pictures.columns(below(self.root, steps.existing(self.root, arguments, "table")))
+        path = below(self.root, steps.existing(self.root, arguments, "table"))
+        return pictures.columns(path, arguments.get("sheet", ""))
 
     def look_text(self, arguments: dict[str, str]) -> dict[str, str]:
         return {"text": steps.text_of(self.root, arguments)}

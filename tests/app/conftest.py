@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
+from clicking import until
 from page_server import Server, start
 
 
@@ -22,3 +24,35 @@ def serve() -> Iterator[Callable[..., Server]]:
     yield started
     for server in servers:
         server.end()
+
+
+@pytest.fixture
+def visit(browser, serve):
+    """``visit(folder)``: a page on a server of its own; a complaint of the browser fails the test."""
+    contexts, complaints = [], []
+
+    def opened(server, width=1280, prepare=lambda page: None):
+        contexts.append(browser.new_context(viewport={"width": width, "height": 900}))
+        page = contexts[-1].new_page()
+        prepare(page)
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        page.on("request", lambda r: complaints.append(r.url) if "127.0.0.1" not in r.url[:30] else None)
+        page.goto(f"http://127.0.0.1:{server.port}{server.secret}")
+        until(page, "state !== null")
+        return page
+
+    yield opened
+    for context in contexts:
+        context.close()
+    assert [words for words in complaints if not words.startswith(("data:", "blob:"))] == []
+
+
+@pytest.fixture
+def two_bubbles(tmp_path):
+    """A folder with a movie of two bubbles side by side, and their centres (2, 2)."""
+    tifffile = pytest.importorskip("tifffile")
+    from nasty_movies import film
+
+    filmed = film("side by side, pointed at", 0)
+    tifffile.imwrite(tmp_path / "two.tif", np.array(filmed.frames))
+    return tmp_path, np.nanmedian(filmed.centre, axis=1)

@@ -3,63 +3,19 @@
 from __future__ import annotations
 
 import re
-import shlex
 import shutil
-import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
-from run_files import assert_same_results, command
+from app_page import clicks_counted, from_movie_to_interval, pull
+from clicking import LONG, at, done, point_of, proposed, repeat, until, words_of
+from run_files import assert_same_results
 
 ROOT = Path(__file__).resolve().parents[2]
 MOVIE = ROOT.parent / "shared" / "data" / "PAstiff_xy002.mp4"
 LOOK = (ROOT / "tests" / "browser" / "look.js").read_text(encoding="utf-8")
-LONG = 240_000  # ms: a command of a step
 pytestmark = pytest.mark.slow
-
-
-@pytest.fixture
-def visit(browser, serve):
-    """``visit(folder)``: a page on a server of its own; a complaint of the browser fails the test."""
-    contexts, complaints = [], []
-
-    def opened(server, width=1280):
-        contexts.append(browser.new_context(viewport={"width": width, "height": 900}))
-        page = contexts[-1].new_page()
-        page.on("pageerror", lambda error: complaints.append(str(error)))
-        page.on("request", lambda r: complaints.append(r.url) if "127.0.0.1" not in r.url[:30] else None)
-        page.goto(f"http://127.0.0.1:{server.port}{server.secret}")
-        until(page, "state !== null")
-        return page
-
-    yield opened
-    for context in contexts:
-        context.close()
-    assert [words for words in complaints if not words.startswith(("data:", "blob:"))] == []
-
-
-def until(page, expression):
-    """Wait until an expression of JavaScript is true; Playwright's own way is what the page's policy forbids."""
-    for _ in range(LONG // 100):
-        if page.evaluate(expression):
-            return
-        page.wait_for_timeout(100)
-    raise AssertionError(f"{expression} is never true; the page says: {page.inner_text('#message')}")
-
-
-def done(page, step, ended="done"):
-    """Click a step and wait for its end; the words of its command."""
-    page.click(f"button[data-step={step}]")
-    box = {"prior": "validate", "resume": "run", "export": "compare"}.get(step, step)
-    page.wait_for_selector(f"#job-{box}.running", timeout=LONG)
-    page.wait_for_selector(f"#job-{box}.{ended}", timeout=LONG)
-    return shlex.split(re.search(r"^\$ en4dvar (.*)$", page.inner_text(f"#job-{box} pre"), re.M)[1])
-
-
-def repeat(folder, *commands):
-    for words in commands:
-        subprocess.run(command(*words), cwd=folder, check=True, capture_output=True)
 
 
 @pytest.fixture
@@ -72,17 +28,6 @@ def german(tmp_path):
     text = "Zeit;Radius\n" + "".join(f"{t};{r}\n".replace(".", ",") for t, r in rows)
     (folder / "messung.csv").write_text(text, encoding="utf-8")
     return folder
-
-
-def proposed(page, table, **fields):
-    """Choose columns and units of a table, and propose a model."""
-    page.select_option("#table", table)
-    for key, value in fields.items():
-        select = key.endswith("column")
-        (page.select_option if select else page.fill)(f"#{key.replace('_', '-')}", value)
-    words = done(page, "init")
-    until(page, "document.getElementById('text').value !== ''")
-    return words
 
 
 def test_a_german_table_to_an_interval(visit, serve, german, tmp_path):
@@ -159,23 +104,6 @@ def test_a_campaign_compared_and_written(visit, serve, german):
     assert (german / "again_results.csv").is_file()
 
 
-@pytest.fixture
-def two_bubbles(tmp_path):
-    """A folder with a movie of two bubbles side by side, and their centres (2, 2)."""
-    tifffile = pytest.importorskip("tifffile")
-    from nasty_movies import film
-
-    filmed = film("side by side, pointed at", 0)
-    tifffile.imwrite(tmp_path / "two.tif", np.array(filmed.frames))
-    return tmp_path, np.nanmedian(filmed.centre, axis=1)
-
-
-def at(page, x, y):
-    """Where a place in the frame, pixels, is on the canvas."""
-    box = page.evaluate("(({ clientWidth, clientHeight }) => [clientWidth, clientHeight])(frame)")
-    return {"x": x * box[0] / page.evaluate("movie.width"), "y": y * box[1] / page.evaluate("movie.height")}
-
-
 def test_of_two_bubbles_the_clicked_one_is_read(visit, serve, two_bubbles):
     folder, centres = two_bubbles
     page = visit(serve(folder))
@@ -213,13 +141,7 @@ def test_corrections_are_those_of_the_file_in_every_window(visit, serve, two_bub
     until(page, "kept.includes('10 ok')")
     page.mouse.wheel(0, 0)
     page.keyboard.press("ArrowRight")
-    page.locator("#frame").scroll_into_view_if_needed()
-    box = page.locator("#frame").bounding_box()
-    start, end = at(page, 40, 50), at(page, 60, 50)
-    page.mouse.move(box["x"] + start["x"], box["y"] + start["y"])
-    page.mouse.down()
-    page.mouse.move(box["x"] + end["x"], box["y"] + end["y"], steps=4)
-    page.mouse.up()
+    pull(page, (40, 50), (60, 50))
     until(page, "/^11 [\\d. ]+$/m.test(kept)")
     x, y, radius = map(float, file.read_text().splitlines()[-1].split()[1:])
     assert np.allclose([x, y, radius], [39.5, 49.5, 20], atol=0.6)
@@ -234,49 +156,43 @@ def test_corrections_are_those_of_the_file_in_every_window(visit, serve, two_bub
     until(other, "corrections.value.includes('10 ok')")
 
 
-def test_the_public_movie_to_a_proposal(visit, serve, tmp_path):
+def test_the_public_movie_to_an_interval(visit, serve, tmp_path):
     if not MOVIE.is_file():
         pytest.skip(f"{MOVIE} is not there")
     folder, other = tmp_path / "movies", tmp_path / "other"
     for each in (folder, other):
         each.mkdir()
         shutil.copy(MOVIE, each / "gel.mp4")
-    page = visit(serve(folder))
-    until(page, "!!movie?.picture")
-    page.fill("#frame-rate", "270 kHz")
-    page.check("input[value=scale]")
-    page.fill("#length", "276 um")
-    page.locator("#frame").scroll_into_view_if_needed()
-    box = page.locator("#frame").bounding_box()
-    for call, x in ((page.mouse.move, 100), (None, 0), (page.mouse.move, 200)):
-        place = at(page, x, 64)
-        call(box["x"] + place["x"], box["y"] + place["y"]) if call else page.mouse.down()
-    page.mouse.up()
+    server = serve(folder)
+    page = visit(server, prepare=clicks_counted)
+    from_movie_to_interval(page, lambda expression: until(page, expression))
+    page.click("#history", position=point_of(page, 40))
+    until(page, "at === 40")
+    assert int(page.evaluate("name")) <= 12
     value, unit = page.input_value("#pixel").split()
     assert unit == "um"
-    assert float(value) == pytest.approx(2.76, rel=0.02)
-    page.fill("#pixel", "2.76 um")
-    page.focus("#number")
-    for _ in range(28):
-        page.keyboard.press("ArrowRight")
-    until(page, "at === 28")
-    page.click("button[data-mark=out]")
-    until(page, "kept.includes('28 out')")
-    commands = [done(page, "track")]
+    assert float(value) == pytest.approx(2.76, rel=0.01)
+    correction = (folder / "gel.corrections.txt").read_text().split()
+    assert np.allclose(np.array(correction, float), [28, 270.5, 67.5, 16], atol=0.6)
+    fields = page.inner_text("#job-run pre").split(" G ")[1].split()
+    low, high = float(fields[3]), float(fields[5])
+    assert fields[0] == "kPa"
+    assert low < 7.7 < high  # Estrada et al. 2018, the same gel
+    commands = [words_of(page, step) for step in ("track", "init")]
     assert "--corrections=gel.corrections.txt" in commands[0]
-    until(page, "document.getElementById('reading').innerText.includes('left out by hand')")
-    history = page.locator("#history")
-    history.scroll_into_view_if_needed()
-    point = page.evaluate("document.getElementById('history').points.find((p) => p.frame === 40)")
-    history.click(position={"x": point["left"], "y": point["top"]})
-    until(page, "at === 40")
-    until(page, "document.getElementById('table').value === 'gel.csv'")
-    until(page, "document.getElementById('proposal').value === 'gel.yaml'")
-    commands.append(done(page, "init"))
     shutil.copy(folder / "gel.corrections.txt", other)
     repeat(other, *commands)
     for name in ("gel.csv", "gel.yaml"):
         assert (folder / name).read_bytes() == (other / name).read_bytes()
+    page.fill("#exposure", "500 ns")
+    page.press("#exposure", "Tab")
+    page.reload()
+    until(page, "!!movie?.picture")
+    new = visit(server)
+    until(new, "!!movie?.picture")
+    for each, exposure in ((page, "500 ns"), (new, "")):
+        fields = [each.input_value(field) for field in ("#pixel", "#frame-rate", "#exposure")]
+        assert fields == [f"{value} um", "270 kHz", exposure]
 
 
 @pytest.mark.parametrize("width", [1280, 1920, 400])

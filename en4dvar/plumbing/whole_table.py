@@ -5,12 +5,12 @@ from __future__ import annotations
 import pandas as pd
 
 
-class Frame(pd.DataFrame):  # type: ignore[misc]
+class WholeTable(pd.DataFrame):  # type: ignore[misc]
     """A table whose text has every column, below each other where the terminal is narrow; pandas leaves some out."""
 
     @property
-    def _constructor(self) -> type[Frame]:
-        return Frame
+    def _constructor(self) -> type[WholeTable]:
+        return WholeTable
 
     def __repr__(self) -> str:
         with pd.option_context("display.max_columns", None, "display.width", None):

@@ -1,0 +1,102 @@
+"""Draws of a posterior that is a thin bent valley, whose moments and evidence one integral tells."""
+
+import numpy as np
+import pytest
+
+from en4dvar.data.noise import Predicted, noise_of
+from en4dvar.data.observations import Observations
+from en4dvar.descent.minima import Minimum
+from en4dvar.ensemble.forecast import Forecast
+from en4dvar.model.state import Parameter
+from en4dvar.priors.prior import Prior, PriorTerm
+from en4dvar.sampling.emulated_draws import RecordedRuns
+from en4dvar.sampling.modes import sample_modes
+
+N, WIDTH = 8, 0.03
+BEND = np.array([0.6, -0.5, 0.4, 0.3])  # of the readings of z_1 to z_4
+
+
+def bent(z0):
+    """What z_0 adds to the readings; no polynomial."""
+    return BEND * (np.cosh(0.9 * z0)[..., None] - 1)
+
+
+class Valley:
+    """y_k = z_k + bent_k(z_0) within 0.03 for k = 1 to 4, and z_5 to z_7 that no reading tells."""
+
+    def __init__(self, lost=lambda z: np.zeros(len(z), dtype=bool)):
+        self.prior = Prior(tuple(PriorTerm.normal(Parameter(f"z{i}", "1"), 0.0, 1.0) for i in range(N)))
+        values = 0.7 * BEND + 0.1
+        self.observations = Observations(np.arange(4) + 1.0, values, noise_of(np.full(4, WIDTH)), np.ones(4))
+        self.lost, self.runs = lost, 0
+
+    def run(self, z):
+        self.runs += len(z)
+        gone = self.lost(z)
+        values = np.where(gone[:, None], np.nan, z[:, 1:5] + bent(z[:, 0]))
+        return Forecast(Predicted(values), np.empty((len(z), 0)), tuple("lost" * int(g) for g in gone))
+
+    def costs(self, z, outcome):
+        observed = self.observations.cost(outcome.predicted)
+        return np.where(outcome.active, 0.5 * np.sum(z**2, axis=1) + observed, np.inf)
+
+    @property
+    def recorded(self):
+        return RecordedRuns(self.run, self.costs, self.prior, self.observations)
+
+    @property
+    def about(self):
+        """The Gaussian about a point of the valley, by the tangent there."""
+        z0 = 0.5
+        at = np.concatenate([[z0], self.observations.values - bent(z0), np.zeros(3)])
+        slope = np.zeros((4, N))
+        slope[:, 1:5], slope[:, 0] = np.eye(4), BEND * 0.9 * np.sinh(0.9 * z0)
+        precision = np.eye(N) + slope.T @ slope / WIDTH**2
+        return Minimum(at, np.linalg.inv(precision), float(0.5 * at @ at))
+
+    @property
+    def exact(self):
+        """Quantiles 5, 50, 95 % of z_0, and the evidence without the constant of the readings' errors."""
+        z0 = np.linspace(-6, 6, 48001)
+        apart = self.observations.values - bent(z0)
+        logs = -0.5 * z0**2 - 0.5 * np.sum(apart**2, axis=1) / (1 + WIDTH**2)
+        logs += 2 * np.log(WIDTH**2 / (1 + WIDTH**2))  # four of √(s²/(1 + s²))
+        density = np.exp(logs - logs.max())
+        evidence = logs.max() + np.log(density.sum() * (z0[1] - z0[0]) / np.sqrt(2 * np.pi))
+        return np.interp([0.05, 0.5, 0.95], np.cumsum(density) / density.sum(), z0), evidence
+
+
+def weighted_quantiles(draws):
+    z0, order = draws.x[:, 0], np.argsort(draws.x[:, 0])
+    return np.interp([0.05, 0.5, 0.95], np.cumsum(draws.shares[order]), z0[order])
+
+
+def test_a_thin_bent_valley_is_sampled_to_its_tails_and_its_evidence_is_known():
+    valley = Valley()
+    expected, evidence = valley.exact
+    several = [sample_modes(valley.recorded, valley.prior, [valley.about], seed, 400.0) for seed in range(3)]
+    assert np.mean([weighted_quantiles(draws) for draws in several], axis=0) == pytest.approx(expected, abs=0.15)
+    assert np.mean([draws.log_evidence for draws in several]) == pytest.approx(evidence, abs=0.1)
+    assert min(draws.effective / len(draws.x) for draws in several) > 0.2
+    # the same seeds without an emulator: a mixture keeps a small share of its draws
+    mixed = [sample_modes(lambda z: valley.costs(z, valley.run(z)), valley.prior, [valley.about], seed, 400.0)
+             for seed in range(3)]  # fmt: skip
+    assert max(draws.effective / len(draws.x) for draws in mixed) < 0.15
+
+
+def test_where_the_model_cannot_be_run_nothing_is_drawn():
+    valley = Valley(lost=lambda z: z[:, 0] > 0.3)
+    draws = sample_modes(valley.recorded, valley.prior, [valley.about], 1, 400.0)
+    assert draws.x[draws.shares > 0, 0].max() <= 0.3
+    z0 = np.linspace(-6, 0.3, 48001)
+    logs = -0.5 * z0**2 - 0.5 * np.sum((valley.observations.values - bent(z0)) ** 2, axis=1) / (1 + WIDTH**2)
+    density = np.exp(logs - logs.max())
+    expected = np.interp([0.05, 0.5, 0.95], np.cumsum(density) / density.sum(), z0)
+    assert weighted_quantiles(draws) == pytest.approx(expected, abs=0.25)
+
+
+def test_a_draw_below_what_is_looked_for_ends_them_all():
+    valley = Valley()
+    draws = sample_modes(valley.recorded, valley.prior, [valley.about], 1, 400.0, below=1e9)
+    assert valley.runs == 400
+    assert draws.lowest < 1e9
