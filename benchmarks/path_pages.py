@@ -67,10 +67,11 @@ def table(folder: Path, shoot: Shoot) -> None:
 
 def many(folder: Path, shoot: Shoot) -> None:
     """The page of a campaign."""
-    (folder / "configs").symlink_to(ROOT / "configs")
-    for words in files_of("many_bubbles.md", folder):
-        call(folder, *words)
-    shoot("runs/gel/report.html", "path_many", 1000)
+    files_of("many_bubbles.md", folder)
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    for line in re.findall(r"^\$ (.*)$", (ROOT / "docs" / "many_bubbles.md").read_text(encoding="utf-8"), re.M):
+        subprocess.run(line, shell=True, cwd=folder, check=True, env={**os.environ, "PATH": path})
+    shoot("runs/gel/report.html", "path_many", 800)
 
 
 def law(folder: Path, shoot: Shoot) -> None:

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import re
-import shlex
 from pathlib import Path
 
 import pytest
 import yaml
-from click.testing import CliRunner
 from doc_pages import ROOT
-
-from en4dvar.cli import main
 
 MOST_WORDS = 1200
 LARGEST = 120_000  # bytes of a picture
@@ -48,16 +44,3 @@ def test_a_page_of_the_path_is_short_and_has_a_picture(page: Path) -> None:
 @pytest.mark.parametrize("page", section("How to"), ids=lambda p: p.stem)
 def test_a_page_of_the_how_to_is_short(page: Path) -> None:
     assert (words(page) > MOST_WORDS) == (page.stem in LONG), f"{page.name} has {words(page)} words"
-
-
-@pytest.mark.slow
-@pytest.mark.long
-def test_the_commands_of_many_bubbles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "configs").symlink_to(ROOT / "configs")
-    for command in re.findall(r"^\$ en4dvar (.*)$", (ROOT / "docs" / "many_bubbles.md").read_text("utf-8"), re.M):
-        done = CliRunner().invoke(main, shlex.split(command))
-        assert done.exit_code == 0, done.output
-    page = (tmp_path / "runs" / "gel" / "report.html").read_text(encoding="utf-8")
-    assert "the median (geometric mean) of the population" in " ".join(page.split())
-    assert {"summary.csv", "population.csv"} <= {p.name for p in (tmp_path / "runs" / "gel").iterdir()}
