@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -13,6 +13,7 @@ from en4dvar.descent.step_control import Trials
 from en4dvar.diagnosis import diagnostics as diag
 from en4dvar.ensemble.forecast import NO_TIMES, Composite, Forecast
 from en4dvar.ensemble.linalg import FEW, Hessian, ThinTransform, anomaly_basis, centre
+from en4dvar.ensemble.missing import filled
 from en4dvar.ensemble.repeat import check_repeats
 from en4dvar.executor import Executor
 from en4dvar.model.state import Array
@@ -113,6 +114,10 @@ class WeightSpace:
         self.forward_runs += len(x)
         return self.composite(x, extra_times)
 
+    def whole(self, x: Array, extra_times: Array = NO_TIMES) -> Forecast:
+        """The forecast of an ensemble, with the readings that some of its members lack by regression on the others."""
+        return filled(self.forecast(x, extra_times), x)
+
     def check_repeats(self, prior_run: Forecast, extra_times: Array) -> None:
         """Run two members of the prior forecast again, at the same instants.
 
@@ -121,7 +126,9 @@ class WeightSpace:
 
         def again(members: list[int]) -> tuple[Array, tuple[str, ...]]:
             run = self.forecast(self.members[members], extra_times)
-            return run.predictions, run.failures
+            lacks = run.partial[:, None] & np.isnan(run.predictions)
+            reasons = tuple("" if some else reason for some, reason in zip(run.partial, run.failures, strict=True))
+            return np.where(lacks, alive.predictions[members], run.predictions), reasons
 
         alive = prior_run[: len(self.members)]
         check_repeats(self.problem.model, alive.predictions, alive.failures, again, self.problem.observations.name)
@@ -135,9 +142,16 @@ class WeightSpace:
         z = self.problem.prior.white(x)
         return np.where(run.active, 0.5 * np.sum(z**2, axis=1) + self.observation_cost(run), np.inf)
 
-    def try_out(self, w: Array) -> Trials:
-        """J and predictions of central trajectories at weights (B, N)."""
+    def try_out(self, w: Array, expected: Callable[[Array], Array] | None = None) -> Trials:
+        """J and predictions of central trajectories at weights (B, N).
+
+        A reading that one lacks is taken as ``expected``: weights → (B, Ky) as ``Predicted.stacked``.
+        """
         run = self.forecast(self.control(w))
+        if expected and (partial := run.partial).any():
+            stacked = run.predicted.stacked
+            stacked = np.where(partial[:, None] & np.isnan(stacked), expected(w), stacked)
+            run = replace(run, predicted=run.predicted.unstacked(stacked))
         return Trials(diag.background_cost(w) + self.observation_cost(run), run.predictions)
 
     def require_members(self, failures: Sequence[str], stage: str) -> None:

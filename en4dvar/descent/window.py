@@ -23,6 +23,7 @@ from en4dvar.diagnosis.analysis import IterationRecord, Record
 from en4dvar.diagnosis.diagnostics import UNSEEN
 from en4dvar.ensemble.forecast import NO_TIMES, Forecast
 from en4dvar.ensemble.linalg import ThinTransform
+from en4dvar.ensemble.missing import filled
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import TooFewMembersError
 from en4dvar.priors.prior import member_stream
@@ -126,6 +127,7 @@ class DataWindow(Objective[Descent]):
     ):
         self.space, self.seed, self.save, self.tell, self.first, self.grid = space, seed, save, tell, first, grid
         self.scheme, self.observations = space.scheme, space.problem.observations
+        self.tangents: list[tuple[Array, Array, Array]] = []  # weights (N,), reference (Ky,) and anomalies there
 
     @property
     def minimiser(self) -> Minimiser:
@@ -137,11 +139,13 @@ class DataWindow(Objective[Descent]):
         self.save()
 
     def linearise(self, going: Sequence[Descent]) -> list[EnsembleSystem | None]:
+        self.tangents = []
         each = zip(going, self.run(going), strict=True)
         return [None if runs is None else self._system(descent, runs) for descent, runs in each]
 
     def _system(self, descent: Descent, runs: Runs) -> EnsembleSystem:
         reference, anomalies = self.scheme.linearise(descent.weights, runs)
+        self.tangents.append((descent.weights.w, reference, anomalies))
         evaluation = self.whiten(descent, reference, anomalies)
         return EnsembleSystem(self.scheme, descent.weights, evaluation, descent.iteration, self.draw)
 
@@ -187,7 +191,14 @@ class DataWindow(Objective[Descent]):
         return None if self.scheme.minimiser is None or self._settles(descent) else self.searched(descent)
 
     def try_out(self, candidates: Array) -> Trials:
-        return self.space.try_out(candidates)
+        return self.space.try_out(candidates, self._expected)
+
+    def _expected(self, w: Array) -> Array:
+        """Predictions (B, Ky) at weights (B, N), by the linearisation about the closest of the descents."""
+        basis, centres = self.space.basis, np.array([centre for centre, _, _ in self.tangents])
+        closest = np.argmin(np.linalg.norm(w[:, None] - centres, axis=2), axis=1)
+        each = ((at, *self.tangents[i]) for at, i in zip(w, closest, strict=True))
+        return np.array([reference + (at - centre) @ basis @ anomalies for at, centre, reference, anomalies in each])
 
     def searched(self, descent: Descent) -> Search:
         """By the configured step control."""
@@ -318,9 +329,11 @@ class DataWindow(Objective[Descent]):
     def _arrive(self, descent: Descent, run: Forecast) -> Runs | None:
         """J at the new iterate; what its runs, members and centre, are to the scheme."""
         space, weights = self.space, descent.weights
+        if any(run.failures[:-1]) or run.partial.any():
+            x = space.control(np.array([*self.scheme.members(weights), weights.w]))
+            directions = len(run) <= len(space.members)  # one is lost: run all members
+            run = space.whole(x) if directions else filled(run, x)
         members, central = run[:-1], run[-1:]
-        if len(members) < len(space.members) and any(members.failures):  # a direction is lost: run all members
-            members = space.forecast(space.control(self.scheme.members(weights)))
         background = float(diag.background_cost(weights.w))
         descent.at = at = Iterate(members, central, background, float(space.observation_cost(central)[0]))
         descent.cost = at.cost

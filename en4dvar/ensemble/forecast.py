@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from en4dvar.data.noise import Predicted
-from en4dvar.ensemble.members import EVERYONE, Indices, InitialStates, Reading, out_of_bounds
+from en4dvar.ensemble.members import EVERYONE, NOT_FINITE, Indices, InitialStates, Reading, out_of_bounds
 from en4dvar.ensemble.readout import Readout, batched, operators_of
 from en4dvar.executor import Executor, SerialExecutor
 from en4dvar.model.state import NOISE_SCALE, OF_READINGS, READING_OFFSET, READING_SCALE, TIME_SHIFT, Array, Parameter
@@ -24,13 +24,14 @@ SAME_INSTANT = 1e-9  # of the window: an extra time this close to an observation
 
 @dataclass(frozen=True)
 class Forecast:
-    """Predictions of B members; NaN rows where a member failed.
+    """Predictions of B members; NaN where a member failed, or the reading is missing.
 
     ``predicted`` (B, …) at the observations: predictions (B, K), their rates where R depends on them, the noise scale
     and the discrepancy where there is one; ``path`` (B, P M) at the extra times, one after the other for the P parts of
     the observations that have one value at a time (P = 1 of a single observable), ``failures`` (B,) reasons, "" for
     members alive, ``extremes`` (B, V) what the members reached of the model's V limits of validity, ``beyond`` (B, V)
-    since when they exceed these, on the clock of the observations (both empty without extra times).
+    since when they exceed these, on the clock of the observations (both empty without extra times). ``filled`` is the
+    share of the readings that :func:`en4dvar.ensemble.missing.filled` has put in.
     """
 
     predicted: Predicted
@@ -38,6 +39,7 @@ class Forecast:
     failures: tuple[str, ...]
     extremes: Array = field(default_factory=lambda: np.empty((0, 0)))
     beyond: Array = field(default_factory=lambda: np.empty((0, 0)))
+    filled: float = 0.0
 
     @property
     def predictions(self) -> Array:
@@ -49,6 +51,12 @@ class Forecast:
         """(B,) bool."""
         return np.array([not reason for reason in self.failures])
 
+    @property
+    def partial(self) -> Array:
+        """(B,) bool: members that failed for nothing but NaN in some of their readings."""
+        failed = np.array([reason == NOT_FINITE for reason in self.failures])
+        return np.asarray(failed & np.isfinite(self.predictions).any(axis=1))
+
     def __len__(self) -> int:
         return len(self.failures)
 
@@ -59,6 +67,7 @@ class Forecast:
             self.failures[members],
             self.extremes[members],
             self.beyond[members],
+            self.filled,
         )
 
 

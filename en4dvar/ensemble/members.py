@@ -117,6 +117,9 @@ def _followed(tie: Tie, values: Array) -> Array:
     return np.asarray(followed)
 
 
+NOT_FINITE = "non-finite prediction"  # of a member that gives other readings, perhaps
+
+
 class MisshapenError(ValueError):
     """An observation operator gave another number of values than there are instants."""
 
@@ -139,7 +142,8 @@ class Reading:
 
     def observe(self, outcomes: Sequence[Outcome], n_times: int) -> tuple[Array, Array, list[str]]:
         """Quantities (Q, B, T) of B outcomes, how far and since when they are beyond the limits (B, V, 2), both NaN
-        where a member failed, and reasons (B,).
+        where a member failed, and reasons (B,). Where some of a member's are NaN and none is infinite,
+        it keeps the others.
         """
         if (isinstance(outcomes, Batch) and outcomes.whole) or not any(isinstance(o, Failure) for o in outcomes):
             try:
@@ -165,9 +169,10 @@ class Reading:
                 continue
             if predictions[0].shape[2:] != (n_times,):
                 reasons[i] = "misshapen prediction"
-            elif not np.isfinite(predictions[0]).all():
-                reasons[i] = "non-finite prediction"
-            else:
+                continue
+            if not np.isfinite(predictions[0]).all():
+                reasons[i] = NOT_FINITE
+            if not np.isinf(predictions[0]).any():
                 values[:, i], beyond[i] = predictions[0][:, 0], predictions[1][0]
         return values, beyond, reasons
 

@@ -96,6 +96,9 @@ def _through(stages: Stages, resume: LoopState | None) -> Analysis:
     cautions = (*start.warnings, *(sampled.refined.warnings if sampled.refined else ()))
     if len(outcome.tried) == 1:
         cautions = (*cautions, caution("one-descent", "one descent only: another minimum is not excluded"))
+    if share := ends.run.filled:
+        words = f"{100 * share:.2g} % of the members' readings in the posterior forecast are missing (NaN)"
+        cautions = (*cautions, caution("readings-missing", f"{words}; each is regressed on the members that have it"))
     if counting:
         weights = np.array([mode.weight for mode in analysis.modes])
         cautions = (*cautions, *mode_cautions(prior, counting, weights, agree, sampled.refined))

@@ -80,7 +80,7 @@ class Stages:
     def descend(self, resume: LoopState | None = None) -> tuple[Forecast, LoopState, Descent]:
         """The prior forecast, where the iterations started, and their end."""
         space = self.space
-        prior_run = space.forecast(np.vstack([space.members, space.mean]), self.grid)
+        prior_run = space.whole(np.vstack([space.members, space.mean]), self.grid)
         space.require_members(prior_run[:-1].failures, "prior forecast")
         if not self.settings.stochastic_model:
             space.check_repeats(prior_run, self.grid)
@@ -191,7 +191,7 @@ class Stages:
             return Ends(members, mode, descent.iterate.members, descent.iterate.central)
         if problem.discrepancy and descent.iterate.linear is not None:
             members = marginal_members(space, descent.iterate.linear, mode, members, self.seed)
-        final = space.forecast(np.vstack([members, mode]), self.grid)
+        final = space.whole(np.vstack([members, mode]), self.grid)
         return Ends(members, mode, final[:-1], final[-1:])
 
     def sampled(
@@ -214,7 +214,7 @@ class Stages:
         sampled = self.refine(ends.members, minima, earlier, looking)
         if sampled.lower is not None:
             return Sampled(ends, sampled, {})
-        run = space.forecast(sampled.members, self.grid)
+        run = space.whole(sampled.members, self.grid)
         central = ends.central if self.minimiser else space.forecast(ends.mode[None], self.grid)
         return Sampled(Ends(sampled.members, ends.mode, run, central), sampled, {})
 

@@ -38,7 +38,8 @@ class FunctionModel(ForwardModel):
     Parameters
     ----------
     function: gets ``parameters``, a dict of name → float in the parameters' own units, and ``times`` (K,); it may raise
-        or return NaN, which loses that member. It is called once a member and keeps nothing between calls.
+        or return nothing but NaN, which loses that member; where some are NaN, others tell them.
+        It is called once a member and keeps nothing between calls.
     parameters: what the function reads.
     observables: name → unit of what it returns; the first is the default.
     dense: whether times beside the observations cost next to nothing, for smooth curves in plots. A function that is

@@ -53,6 +53,11 @@ CATALOGUE: dict[str, tuple[Severity, str]] = {
         "caution",
         "the posterior holds only where the model runs: narrow the prior there, or find out why the model fails",
     ),
+    "readings-missing": (
+        "caution",
+        "the posterior holds where readings are missing whatever their value, and are nearly linear in the parameters "
+        "among the members; else find out why the model does not give them",
+    ),
     "at-bound": ("caution", "widen the bound if physics allows it; else quote a limit, not mean ± std"),
     "odd-data-set": (
         "caution",
@@ -134,6 +139,7 @@ TRIGGERS = {
         "posterior has a J lower than any minimum found"
     ),
     "members-lost": "members failed in a forecast; serious if more than a tenth did",
+    "readings-missing": "the model gives NaN for some readings of some members of the posterior forecast",
     "at-bound": (
         "at least a fifth of the posterior members lie within 5 % of the interval's width from a bound, and more than "
         "three times the prior's share"

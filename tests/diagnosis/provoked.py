@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from toys import Decay, Fragile, Toy, Vectorised, Wave, make_problem, with_discrepancy, with_noise
 
 from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.estimation.assimilate import assimilate
-from en4dvar.model.forward import ValidityLimit
+from en4dvar.model.forward import Observable, ValidityLimit
 from en4dvar.model.state import Parameter
 from en4dvar.priors.prior import PriorTerm
 from en4dvar.problem import InverseProblem
@@ -134,6 +135,7 @@ PROVOKED: dict[str, Callable[[], Analysis]] = {
     "members-lost": lambda: run(
         make_problem(Fragile(0.2, names=TWO), (-1.0, 0.5)), members=40, min_active_fraction=0.2
     ),
+    "readings-missing": lambda: run(replace(linear(), observable=Observable("y", "m", gappy))),
     "at-bound": lambda: run(bounded(1.6, lambda a: PriorTerm.logit(a, (0.0, 1.0), 0.5, 1.5), (0.0, 1.0))),
     "non-gaussian": lambda: run(make_problem(Product(TWO), (1.0, 1.0), std=0.1)),
     "several-modes": lambda: run(signless(), members=16),
@@ -149,6 +151,13 @@ PROVOKED: dict[str, Callable[[], Analysis]] = {
     "not-bayesian": lambda: run(make_problem(Vectorised(TWO), (1.0, 0.5), weights=1 / 9)),
     "not-informed": lambda: run(half_known()),
 }
+
+
+def gappy(path: Any) -> Any:
+    """y, of which some members lack the fourth reading."""
+    y = np.array(path["y"], dtype=float)
+    y[3] = np.nan if str(float(y[0]))[-1] in "0369" else y[3]
+    return y
 
 
 def replace_std(problem: InverseProblem, std: float) -> InverseProblem:

@@ -145,6 +145,7 @@ LEFT_TO_JUDGEMENT: dict[str, Callable[[], InverseProblem]] = {
     "implausible-data": linear,  # the units were wrong
     "model-validity": linear,  # a model without that limit
     "members-lost": narrow,
+    "readings-missing": linear,  # a model that gives them
     "residual-structure": lambda: make_problem(Vectorised(TWO), (1.0, 0.5), k=40, std=0.05),  # a model with the wave
     "at-bound": in_bounds,
     "several-modes": positive,
