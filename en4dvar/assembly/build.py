@@ -14,6 +14,7 @@ from en4dvar.config.parameters import Fixed, Scalar, Tied, Uncertain, inside_bou
 from en4dvar.config.series import DataPlan, SeriesPlan
 from en4dvar.data.observations import Observations
 from en4dvar.descent.field_gain import gain_of
+from en4dvar.descent.start import given
 from en4dvar.ensemble.forecast import check_problem
 from en4dvar.inputs.asked import Column, DataFile
 from en4dvar.plumbing.errors import ConfigError, DataError, Fault
@@ -22,6 +23,7 @@ from en4dvar.priors.field_prior import FieldPrior
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.priors.varying import Varying
 from en4dvar.problem import InverseProblem, Tie, discrepancy_parameters
+from en4dvar.schemes.base import Minimiser
 
 
 def build(config: Config) -> tuple[InverseProblem, ...]:
@@ -83,6 +85,9 @@ def problem_of(config: Config, observations: Observations) -> InverseProblem:
         problem = problem.varied(varying)
     with config.document.placing():
         check_problem(problem)
+    if isinstance(asked.own, Minimiser) and not isinstance(asked.own.start, str):
+        with config.document.placing("assimilation", "start"):
+            given(prior, asked.own.start)
     if localised:
         with config.document.placing("assimilation", "localisation"):
             gain_of(problem, asked)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Generic, Literal, TypeVar
 
@@ -17,9 +17,10 @@ from en4dvar.config.document import Document, document_from, override, parse_doc
 from en4dvar.config.initial_state import PERTURBED, Initial, Perturbed
 from en4dvar.config.models import read_model
 from en4dvar.config.parameters import Entry, Fixed, entries
-from en4dvar.config.schema import Assimilation, Execution, File, Output, Section
+from en4dvar.config.schema import Assimilation, Execution, File, GivenStart, Output, Section
 from en4dvar.config.series import DATA, DataPlan
 from en4dvar.config.sharing import Groups, PopulationSection, Sharing, check_population, sharing_of
+from en4dvar.config.start import values_of
 from en4dvar.config.times import Times, read_times
 from en4dvar.config.validate import check
 from en4dvar.config.varies import MODEL_ERROR, ErrorOf
@@ -27,6 +28,7 @@ from en4dvar.model.forward import ForwardModel, Observable
 from en4dvar.model.state import NOISE_SCALE, Array
 from en4dvar.plumbing.errors import ConfigError, Fault
 from en4dvar.priors.dependence import Dependence
+from en4dvar.schemes.base import Minimiser
 from en4dvar.schemes.settings import AssimilationSettings
 
 KINDS = {"twin": "a twin experiment", "sequence": "a sequence"}  # sections that mark other kinds of files
@@ -163,13 +165,16 @@ def resolve(document: Document, base: Path, model: ForwardModel | None = None) -
     parameters, blocks = resolved(file.parameters, file.prior, file.prior_correlation or (), others, apart, document)
     if file.population is not None:
         check_population(file.population, parameters, document)
+    settings = file.assimilation.settings
+    if isinstance(settings.own, Minimiser) and isinstance(settings.start, GivenStart):
+        settings = replace(settings, own=replace(settings.own, start=values_of(settings.start, parameters, document)))
     return Config(
         **read.common(file.parameters),
         model=read.model,
         observable=observed_in(file.data, read),
         parameters=parameters,
         data=file.data,
-        assimilation=file.assimilation.settings,
+        assimilation=settings,
         weights=file.assimilation.weights,
         execution=file.execution,
         simulate_times=file.simulate.times if file.simulate else None,

@@ -15,7 +15,9 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, get_t
 from pydantic import (
     AfterValidator,
     ConfigDict,
+    Discriminator,
     Field,
+    Tag,
     WithJsonSchema,
     create_model,
     model_validator,
@@ -27,6 +29,7 @@ from en4dvar.config.context import Context, Made, Unknown, quantity
 from en4dvar.config.validate import Faults
 from en4dvar.executor.limits import Limits, parse_bytes
 from en4dvar.plumbing.described import Described
+from en4dvar.plumbing.files import expanded
 from en4dvar.plumbing.units import Quantity, parse_quantity
 from en4dvar.schemes import DEFAULT, ON_A_WINDOW, keys_of, unread
 from en4dvar.schemes.base import Scheme
@@ -192,6 +195,25 @@ def _localisation_of(section: LocalisationSection, context: Context) -> Localisa
     return Localisation(section.radius, at, section.threshold)
 
 
+def _place(value: str | dict[str, QuantityText], context: Context) -> Path | dict[str, QuantityText]:
+    return context.base.absolute() / expanded(value) if isinstance(value, str) else value
+
+
+class GivenStart(Section):
+    """Where the one descent starts; the prior stays as it is."""
+
+    place: Annotated[
+        Path | dict[str, QuantityText],
+        Made(_place, Annotated[str, Field(min_length=1)] | Annotated[dict[str, QuantityText], Field(min_length=1)]),
+    ] = Field(alias="from")
+    """Values, such as ``{G: 5 kPa}`` (the others start at the prior's mean), or a file of members such as posterior.nc
+    of an earlier run, whose medians are taken."""
+
+    def as_written(self, section: Mapping[str, Any]) -> dict[str, Any]:
+        """As given, with an absolute path."""
+        return {"from": str(self.place)} if isinstance(self.place, Path) else super().as_written(section)
+
+
 class OfScheme(Section):
     """A section that names a scheme. Its keys are its own and those of the scheme; those of others are errors."""
 
@@ -251,6 +273,12 @@ class Assimilation(_Settings):
     weights: Literal["sum", "mean", "balanced"] = "sum"
     """sum: every observation counts (the Bayesian posterior); mean: β = 1/K, as in the published code; balanced: every
     series, or group of series, counts as if it had as many readings as the others. The latter two are not Bayesian."""
+    start: Annotated[
+        Annotated[Literal["best-member", "prior-mean"], Tag("a word")] | Annotated[GivenStart, Tag("a place")],
+        Discriminator(lambda start: "a place" if isinstance(start, dict | GivenStart) else "a word"),
+    ] = "best-member"
+    """Where the iterations start: the prior members of lowest J, the prior mean, or a place that is given, from which
+    one descent goes (en4dvar)."""
     localisation: Annotated[Localisation, Made(_localisation_of, LocalisationSection)] | None = None
     """Which readings act on what, for fields and for many parameters. Default: all readings on everything."""
 

@@ -106,6 +106,6 @@ def expected_runs(space: WeightSpace) -> int:
     economical = scheme.economical(space.basis)
     tangent = 1 + (space.basis.shape[1] if economical else n_members)
     starts = scheme.starts if scheme.start == "best-member" and economical else 1
-    challenger = CHALLENGER if scheme.starts > 1 and economical else 0.0
+    challenger = CHALLENGER if scheme.searches and economical else 0.0
     iterations = (starts + challenger) * min(ITERATIONS, scheme.max_iterations)
     return 2 * (n_members + 1) + round(iterations * (tangent + SEARCH))

@@ -17,7 +17,16 @@ import numpy as np
 
 from en4dvar.descent.loop import minimise
 from en4dvar.descent.minima import Minimum, merged
-from en4dvar.descent.start import AGREE, Rounds, StartState, affordable, descent_from, highest_plausible, side_by_side
+from en4dvar.descent.start import (
+    AGREE,
+    Rounds,
+    StartState,
+    affordable,
+    descent_at,
+    descent_from,
+    highest_plausible,
+    side_by_side,
+)
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.descent.window import DataWindow, Descent
 from en4dvar.diagnosis.analysis import Record, StartRecord
@@ -209,11 +218,6 @@ def from_draw(space: WeightSpace, outcome: Outcome, x: Array, seed: int, tell: C
         return outcome
     runs = outcome.runs + space.forward_runs - before
     return replace(after, tried=(*outcome.tried, draw), runs=runs, rounds=rounds)
-
-
-def descent_at(space: WeightSpace, x: Array, number: int) -> Descent:
-    """One that starts at a control vector x (n,) that is no member."""
-    return Descent(space.start(space.weights_of(x)), members=(number,))
 
 
 def challenger(space: WeightSpace, run: Forecast, outcome: Outcome) -> int:

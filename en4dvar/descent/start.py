@@ -8,7 +8,7 @@ J is higher than noise and prior explain, other members are tried, as many again
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +21,10 @@ from en4dvar.descent.window import DataWindow, Descent
 from en4dvar.diagnosis import diagnostics as diag
 from en4dvar.diagnosis.analysis import Record, StartRecord
 from en4dvar.ensemble.forecast import Forecast
+from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, caution
+from en4dvar.plumbing.errors import ConfigError, Fault
+from en4dvar.priors.prior import Prior
 from en4dvar.schemes.base import Minimiser
 
 ROUGH = 1e-2  # relative decrease of J at which a descent stops that only has to tell basins apart
@@ -67,6 +70,9 @@ def choose_start(
     resume from, ``tell`` after it.
     """
     warnings: tuple[Caution, ...] = ()
+    if not isinstance(scheme.start, str):
+        beyond = len(space.members) + 1
+        return Start(descent_at(space, given(space.problem.prior, scheme.start), beyond), tried=(beyond,))
     if scheme.start == "prior-mean":
         if np.isfinite(space.observation_cost(run)[-1]):
             mean = len(space.members)
@@ -94,6 +100,28 @@ def choose_start(
 def descent_from(space: WeightSpace, member: int) -> Descent:
     """One that starts from a member of the prior ensemble, or, of number N, from the mean."""
     return Descent(space.start(space.drawn.at_member(member)), members=(member,))
+
+
+def descent_at(space: WeightSpace, x: Array, number: int) -> Descent:
+    """One that starts at a control vector x (n,) that is no member."""
+    return Descent(space.start(space.weights_of(x)), members=(number,))
+
+
+def given(prior: Prior, values: Mapping[str, float]) -> Array:
+    """The control vector (n,) of ``values`` of parameters, in their units; the others are at the prior's mean.
+
+    Raises :class:`ConfigError`: a parameter that is not estimated, or a value where the prior has none.
+    """
+    x, faults = np.array(prior.mean, dtype=float), []
+    for name, value in values.items():
+        try:
+            j = prior.names.index(name)
+            x[j] = prior.terms[j].from_physical(np.array(value))
+        except ValueError as error:
+            faults.append(Fault(str(error) if name in prior.names else f"{name}: not estimated", f"from.{name}"))
+    if faults:
+        raise ConfigError(faults)
+    return x
 
 
 def affordable(space: WeightSpace, scheme: Minimiser, run: Forecast) -> list[int]:

@@ -136,7 +136,7 @@ class Stages:
         if start.search is None:
             minima = merged([Minimum.of(space, descent), *minima])
         outcome = Outcome(descent, before, minima, start.tried, begun.runs, begun.over)
-        if scheme.starts < 2 or not scheme.economical(space.basis):
+        if not scheme.searches or not scheme.economical(space.basis):
             return outcome, self.gaussian(descent)
         if start.search is not None:
             space.forward_runs = start.forward_runs

@@ -11,7 +11,7 @@ centre and row i of the ensemble transform T.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Annotated, Any, ClassVar, Literal, Protocol, cast
@@ -248,8 +248,8 @@ class Minimiser(Scheme):
         "What keeps J from rising along the iterations; full takes the whole step or, where that raises J, none.",
     ] = "line-search"
     start: Annotated[
-        Literal["best-member", "prior-mean"],
-        "Where the iterations start: the prior members of lowest J, or the prior mean.",
+        Literal["best-member", "prior-mean"] | Mapping[str, float],
+        "Where the iterations start: the prior members of lowest J, the prior mean, or values of parameters.",
     ] = "best-member"
     starts: Annotated[
         int, Ge(1), "How many prior members of lowest J start a descent; others follow while none explains the data."
@@ -265,6 +265,11 @@ class Minimiser(Scheme):
     @property
     def minimiser(self) -> Minimiser:
         return self
+
+    @property
+    def searches(self) -> bool:
+        """Whether descents from several places are compared: not where there is one, or the start is given."""
+        return self.starts > 1 and isinstance(self.start, str)
 
     @property
     def regresses(self) -> bool:

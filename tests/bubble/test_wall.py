@@ -13,6 +13,7 @@ from en4dvar_bubble import WATER_25C, Accuracy, BubbleModel, get_law, simulate
 from en4dvar_bubble.collapse import RAYLEIGH
 from en4dvar_bubble.driving import tabulated
 from en4dvar_bubble.dynamics import Wall
+from en4dvar_bubble.starter.proposal import propose
 
 APECSS = Path(__file__).resolve().parents[3] / "shared" / "reference" / "apecss"
 TIGHT = Accuracy(nodes=12, rtol=1e-9)
@@ -98,3 +99,20 @@ def test_two_equal_bubbles_are_one_at_a_wall(apart, tmp_path):
     options = {"driving": wave, "gas": "polytropic", "medium": medium, "accuracy": TIGHT}
     pair = simulate("newtonian", {"mu": 1.002e-3, "R0": 10e-6}, t[1:], wall=Wall(apart * 0.5e-6), **options).R[0].values
     assert np.abs(pair - R[1:]).max() < 1e-4 * 10e-6
+
+
+@pytest.mark.parametrize(("wall", "near"), [(Wall(300e-6, "rigid"), True), (None, False)])
+def test_a_slow_collapse_in_a_liquid_proposes_a_wall_whose_prior_holds_the_true_one(wall, near):
+    """Written down with Rattray's time, though the gas slows the collapse as well."""
+    times = np.arange(0, 90e-6, 0.5e-6)
+    R = path(wall, times=times)
+    proposal = propose({"bubble": (times, R)}, "laser", "newtonian", "water")
+    lines = {entry.key: entry.value for entry in (*proposal.model, *proposal.parameters)}
+    assert ("wall" in lines) == ("wall_distance" in lines) == near
+    if near:
+        median = float(lines["wall"].split()[1])
+        assert abs(np.log((300 - 220) / (median - 220))) < 1.5  # of the prior's std, from 1.1 R_max on
+        assert f"um, median: {median:g} um, logit_std: 1.5" in lines["wall_distance"]
+        assert 210 < float(lines["wall_distance"].split()[3]) < 230
+    in_gel = propose({"bubble": (times, R)}, "laser", "neo-hookean-kelvin-voigt")
+    assert "wall" not in {entry.key for entry in in_gel.model}

@@ -23,7 +23,13 @@ def run_here(page: Path) -> list[Block]:
 
 def marked(page: Path) -> object:
     """The page, a long test where its examples take a minute or more and other tests do much the same."""
-    slowest = page.stem in ("cluster", "tutorial_own_forward_model", "polyacrylamide", "collapse_times")
+    slowest = page.stem in (
+        "cluster",
+        "tutorial_own_forward_model",
+        "own_model_further",
+        "polyacrylamide",
+        "collapse_times",
+    )
     return pytest.param(page, marks=pytest.mark.long) if slowest else page
 
 

@@ -132,7 +132,7 @@ parameters: {G: 8 kPa, mu: 0.1 Pa s, R_eq: 40 um, R_max: 200 um}
 
 @pytest.mark.slow
 def test_the_movie_of_a_laser_bubble_and_back(tmp_path, monkeypatch):
-    """The commands of docs/movies.md, against the table of the same simulation."""
+    """The commands of docs/render_movies.md, against the table of the same simulation."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "laser.yaml").write_text(LASER)
     asked = ["--movie-set", "pixel=4 um", "--movie-set", "exposure=500 ns", "--movie-set", "noise=5"]

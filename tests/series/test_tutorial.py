@@ -1,4 +1,4 @@
-"""The page "Your own forward model" does what it says: its files are written and its commands run, in order."""
+"""The pages on a model of your own do what they say: its files are written and its commands run, in order."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from en4dvar.cli import main
 from en4dvar.config import load_twin
 from en4dvar.report.result import load_result
 
-PAGE = (Path(__file__).parents[2] / "docs" / "tutorial_own_forward_model.md").read_text(encoding="utf-8")
+DOCS = Path(__file__).parents[2] / "docs"
+PAGE = "".join((DOCS / f"{name}.md").read_text("utf-8") for name in ("tutorial_own_forward_model", "own_model_further"))
 FILES = dict(re.findall(r"```(?:python|yaml)\n# ([\w.]+)\n(.*?)```", PAGE, re.S))
 COMMANDS = re.findall(r"^\$ en4dvar (.*)$", PAGE, re.M)
 TRUTH = {"c": 0.1, "k": 4.0, "b": 3.0}

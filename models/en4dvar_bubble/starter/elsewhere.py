@@ -19,6 +19,9 @@ ANY = "gel"
 CHOICES = (ANY, *MEDIA)
 """Media that may be named; the first stands for any gel or solution that is mostly water."""
 
+SLOW = 1.08
+"""Of the Rayleigh time: a collapse in a liquid that takes longer may have a wall nearby."""
+
 
 @dataclass(frozen=True)
 class Known:
@@ -48,6 +51,18 @@ def known(medium: str) -> Sequence[Known]:
             Known("c", f"{it.c:.4g} m/s", float(f"{it.c_log_std:.2g}"), f"speed of sound in {medium}"),
         )
     return (*of_medium, PRESSURE, SCALE)
+
+
+def wall(radius: float, slowness: float) -> tuple[str, str, str]:
+    """The distance of a plane that makes the collapse of a bubble of ``radius`` (m) take ``slowness`` times as long,
+    1 + 0.205 R_max/h (Rattray 1951), its prior, from where the bubble touches it to where nothing is seen of it, and
+    the source. Such a liquid may be viscous instead: the prior is wide.
+    """
+    nearest, middle, farthest = (1e6 * radius * of_it for of_it in (1.1, max(1.5, 0.205 / (slowness - 1)), 20))
+    distance = f"{float(f'{middle:.2g}'):g} um"
+    prior = f"{{prior: logit, lower: {nearest:.4g} um, upper: {farthest:.4g} um, median: {distance}, logit_std: 1.5}}"
+    source = f"the collapse takes {slowness:.2f} of the Rayleigh time, as beside a plane or in a viscous liquid"
+    return distance, prior, source
 
 
 def population(names: Sequence[str], count: int, medium: str) -> tuple[str, ...]:

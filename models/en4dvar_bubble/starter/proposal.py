@@ -131,11 +131,15 @@ def propose(
             f"no G and mu of {model.law.name} give this {'R_max and ' if chosen == 'acoustic' else ''}collapse time: "
             + ("is the driving that of your experiment?" if chosen == "acoustic" else "are scale and frame rate right?")
         )
+    wall: tuple[tuple[Entry, ...], tuple[Entry, ...]] = (), ()
+    if chosen == "laser" and ratio > elsewhere.SLOW and "G" not in {p.name for p in model.law.parameters}:
+        distance, prior, source = elsewhere.wall(look.lobe.R_max, ratio)
+        wall = (Entry("wall", f"{{distance: {distance}}}", source),), (Entry("wall_distance", prior, "of that plane"),)
     together = elsewhere.population([p.name for p in model.law.parameters], len(views), medium)
     return Proposal(
         _data(chosen, look, model, {**others, **guess.values}, histories),
-        _model(law_name, chosen, look),
-        _parameters(model, chosen, look, believed, tops(looks, histories), medium),
+        (*_model(law_name, chosen, look), *wall[0]),
+        (*_parameters(model, chosen, look, believed, tops(looks, histories), medium), *wall[1]),
         SIMPLER[chosen],
         (*told, *[f"{len(views)} bubbles: the run ends with what they say of one gel together"] * bool(together)),
         tuple(warnings),

@@ -1,0 +1,119 @@
+"""``start: {from: …}``: the one descent goes from there, and the prior stays as it is."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import en4dvar
+from en4dvar.config import load_config
+from en4dvar.config.context import Context
+from en4dvar.config.parameters import Uncertain
+from en4dvar.config.schema import GivenStart
+from en4dvar.config.start import values_of
+from en4dvar.model.state import Parameter
+
+TIMES = np.linspace(0.1, 2.0, 12)
+PRIORS = {"a": {"prior": "normal", "mean": 0.3, "std": 1.5}, "b": {"prior": "lognormal", "median": 1.0, "log_std": 0.5}}
+
+
+def square(parameters, times):
+    """The sign of a cannot be told: minima near a = 1.2 and a = −1.2, the latter less likely by the prior."""
+    return parameters["a"] ** 2 * np.exp(-parameters["b"] * times)
+
+
+def fit(start, priors=PRIORS, directory=None, **more):
+    values = 1.44 * np.exp(-0.8 * TIMES) + 0.05 * np.random.default_rng(3).standard_normal(12)
+    settings = {"start": start, "refine": "none", "what_if": False, **more}
+    options = {"error": 0.05, "report": False, "progress": False, "directory": directory}
+    return en4dvar.estimate(square, (TIMES, values), priors, assimilation=settings, **options)
+
+
+def cost(a, b):
+    """J by hand, of the formulas of the priors and of Gaussian errors."""
+    values = 1.44 * np.exp(-0.8 * TIMES) + 0.05 * np.random.default_rng(3).standard_normal(12)
+    misfit = (values - square({"a": a, "b": b}, TIMES)) / 0.05
+    return 0.5 * (((a - 0.3) / 1.5) ** 2 + (np.log(b) / 0.5) ** 2 + misfit @ misfit)
+
+
+@pytest.mark.parametrize(("at", "sign"), [(0.9, 1), (1.8, 1), (-0.9, -1), (-1.8, -1)])
+def test_it_ends_in_the_minimum_of_its_start(at, sign):
+    found = fit({"from": {"a": at}})
+    centre = found.summary()["centre"]
+    a, b = centre["a"], centre["b"]
+    assert np.sign(a) == sign
+    assert abs(a) == pytest.approx(1.2, abs=0.1)
+    least = cost(a, b)
+    assert all(cost(a + da, b * fb) > least for da, fb in ((0.02, 1), (-0.02, 1), (0, 1.02), (0, 0.98)))
+    assert any(c.code == "one-descent" for c in found.cautions)
+
+
+def test_the_prior_does_not_change():
+    near, far = (fit({"from": {"a": at, "b": 1.4}}).summary() for at in (1.0, 1.6))
+    for column in ("prior_mean", "prior_std"):
+        assert near[column].tolist() == far[column].tolist()
+    assert near["centre"].to_numpy() == pytest.approx(far["centre"].to_numpy(), rel=1e-4)
+    assert near["std"].to_numpy() == pytest.approx(far["std"].to_numpy(), rel=1e-3)
+
+
+def test_from_an_earlier_result(tmp_path):
+    fit({"from": {"a": -1.0}}, directory=tmp_path / "before")
+    (file,) = (tmp_path / "before").rglob("posterior.nc")
+    assert fit({"from": str(file)}).summary()["centre"]["a"] == pytest.approx(-1.2, abs=0.1)
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2 :] = b""
+    damaged = tmp_path / "damaged.nc"
+    damaged.write_bytes(content)
+    for bad, words in ((damaged, "damaged.nc"), (tmp_path / "none.nc", "none.nc"), (tmp_path, str(tmp_path))):
+        told(bad, words)
+    foreign = tmp_path / "foreign.csv"
+    foreign.write_text("c,d\n1,2\n3,4\n")
+    told(foreign, "no column 'a'")
+
+
+def told(start, words):
+    with pytest.raises(en4dvar.ConfigError) as caught:
+        fit({"from": str(start)})
+    assert words in str(caught.value)
+    assert "assimilation.start.from" in str(caught.value)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+FAULTS = {
+    "a stranger": ({"from": {"c": 1.0}}, "assimilation.start.from.c: not estimated"),
+    "a unit": ({"from": {"a": "1 Pa"}}, "assimilation.start.from.a: "),
+    "outside the prior": ({"from": {"b": -1.0}}, "assimilation.start.from.b: "),
+    "nothing": ({"from": {}}, "assimilation.start.from"),
+    "another key": ({"at": {"a": 1.0}}, "assimilation.start"),
+    "another word": ("somewhere", "assimilation.start"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_what_is_wrong_is_told_where(fault):
+    start, words = FAULTS[fault]
+    with pytest.raises(en4dvar.ConfigError) as caught:
+        fit(start)
+    assert words in str(caught.value)
+
+
+def test_a_scheme_that_does_not_search_has_no_start():
+    with pytest.raises(en4dvar.ConfigError, match="start"):
+        fit({"from": {"a": 1.0}}, scheme="es-mda")
+
+
+def test_the_resolved_configuration_starts_there_again(tmp_path):
+    quick = Path(__file__).parents[2] / "configs" / "quickstart.yaml"
+    asked = {"assimilation.start": {"from": {"G": "2 kPa", "mu": "0.2 Pa s"}}}
+    config = load_config(quick, asked)
+    assert config.assimilation.start == pytest.approx({"G": 2000.0, "mu": 0.2})
+    (tmp_path / "again.yaml").write_text(config.resolved, encoding="utf-8")
+    assert load_config(tmp_path / "again.yaml").assimilation == config.assimilation
+
+
+def test_a_relative_file_lies_beside_the_configuration_and_is_recorded_in_full(tmp_path):
+    (tmp_path / "before.csv").write_text("a,b\n0.9,1.1\n1.1,1.2\n1.0,1.6\n", encoding="utf-8")
+    section = GivenStart.model_validate({"from": "before.csv"}, context=Context(tmp_path))
+    assert section.as_written({"from": "before.csv"}) == {"from": str(tmp_path / "before.csv")}
+    read = {name: Uncertain(Parameter(name, "1"), spec=None) for name in ("a", "b")}
+    assert values_of(section, tuple(read.values()), None) == {"a": 1.0, "b": 1.2}
