@@ -31,8 +31,9 @@ class Pictures:
     def __init__(self, path: Path, raw: str | None = None):
         self.movie: Movie = open_movie(path, raw)
         self._frames: Iterator[Frame] = iter(())
-        self._next, self._size = 0, 0
-        self._held: OrderedDict[int, Frame] = OrderedDict()
+        self._next = 0
+        self._held: OrderedDict[int, int] = OrderedDict()  # place of a frame in the room
+        self._room: Frame | None = None  # one block: what threads allocate by themselves grows without end
         self._range: tuple[float, float] | None = None
         self._lock = threading.Lock()
         self.shape: tuple[int, ...] = self.frame(0).shape
@@ -41,8 +42,9 @@ class Pictures:
     def frame(self, number: int) -> Frame:
         """One frame (H, W). Raises :class:`DataError`."""
         with self._lock:
-            if number in self._held:
-                return self._held[number]
+            if self._room is not None and number in self._held:
+                kept: Frame = self._room[self._held[number]].copy()
+                return kept
             if number < self._next or self._next == 0:
                 self._frames, self._next = self.movie.frames(), 0
             for frame in self._frames:
@@ -53,11 +55,12 @@ class Pictures:
         raise DataError(f"{self.movie.path}: there is no frame {number}")
 
     def _keep(self, number: int, frame: Frame) -> None:
-        if number not in self._held:
-            self._held[number] = frame
-            self._size += frame.nbytes
-        while self._size > HELD and len(self._held) > 1:
-            self._size -= self._held.popitem(last=False)[1].nbytes
+        if self._room is None:
+            self._room = np.empty((max(1, HELD // frame.nbytes), *frame.shape), frame.dtype)
+        if number not in self._held and frame.dtype == self._room.dtype:
+            full = len(self._held) == len(self._room)
+            place = self._held.popitem(last=False)[1] if full else len(self._held)
+            self._room[place], self._held[number] = frame, place
 
     def bmp(self, number: int) -> bytes:
         """One frame as BMP, which takes no time to compress; 16 bit are stretched over the range of the first frame."""
