@@ -6,7 +6,10 @@ const MINE = {
   validate: ["config"], prior: ["config"], run: ["config", "run"], resume: ["config", "run"], export: ["run"], compare: [],
 };
 const BOX = { prior: "validate", resume: "run", export: "compare" };
-let state = null, before = "", lastJobs = null, table = null;
+// A prior of the text: '  G: {prior: lognormal, median: 3.6 kPa, log_std: 1.6} # why'.
+const PRIOR = /^(\s+)(\w+)(: \{prior: \w+, (?:median|mean): )([^\s,}]+)( ?)([^,}]*)(, (?:log_std|std): )([^,}]+)(\}.*)$/;
+const PARTS = { 4: "median or mean", 6: "unit", 8: "width" };
+let state = null, before = "", lastJobs = null, table = null, checks = false, queue = Promise.resolve();
 
 function say(words) { $("message").textContent = words; if (words) $("message").scrollIntoView({ block: "nearest" }); }
 
@@ -57,9 +60,8 @@ function show(now) {
   for (const [id, names, empty] of [["movie", now.movies, now.movies.length ? undefined : "no movie in this folder"],
     ["table", now.tables, "choose"], ["config", now.configs, "choose"]])
     if (options($(id), names, empty)) changed(id);
-  const running = now.jobs.some((job) => job.state === "running");
-  for (const button of document.querySelectorAll("button[data-step]")) button.disabled = running;
-  $("cancel").disabled = !running;
+  for (const button of document.querySelectorAll("button[data-step]")) button.disabled = !!runs(...Object.keys(MINE).filter((s) => s !== "validate"));
+  $("cancel").disabled = !runs(...Object.keys(MINE));
   const last = {};
   for (const job of now.jobs) last[BOX[job.step] || job.step] = job;
   for (const [step, job] of Object.entries(last)) showJob(step, job);
@@ -70,6 +72,8 @@ function show(now) {
   const pages = now.pages.filter((p) => p.startsWith("comparisons/"));
   $("pages").replaceChildren(...pages.map((p) => item(link(p, p))));
 }
+
+const runs = (...steps) => state?.jobs.find((job) => job.state === "running" && steps.includes(job.step));
 
 function item(...parts) { const li = document.createElement("li"); li.append(...parts); return li; }
 
@@ -110,6 +114,40 @@ function showFaults(job) {
     });
     return item(button);
   }));
+  for (const input of document.querySelectorAll("#priors input"))
+    input.setAttribute("aria-invalid", faults.some(([, line]) => line === input.dataset.line));
+}
+
+// The text is the truth: its priors as fields, which change one line of it.
+function showPriors() {
+  const found = $("text").value.split("\n").map((line, i) => [line.match(PRIOR), i + 1]).filter(([m]) => m), names = found.map(([m]) => m[2]).join();
+  $("priors").hidden = !names;
+  if ($("priors").dataset.names !== names) $("priors").tBodies[0].replaceChildren(...found.map(([m]) => {
+    const row = document.createElement("tr"), head = document.createElement("th");
+    head.scope = "row"; head.textContent = m[2]; row.append(head);
+    for (const [part, words] of Object.entries(PARTS)) {
+      const input = row.insertCell().appendChild(document.createElement("input"));
+      input.dataset.part = part; input.setAttribute("aria-label", `${m[2]}: ${words}`);
+      input.addEventListener("change", () => writePrior(input));
+    }
+    return row;
+  }));
+  $("priors").dataset.names = names;
+  found.forEach(([m, line], i) => $("priors").tBodies[0].rows[i].querySelectorAll("input").forEach((input) => {
+    input.value = m[input.dataset.part]; input.dataset.line = line; }));
+}
+
+function writePrior({ value, dataset: { line, part } }) {
+  const lines = $("text").value.split("\n"), m = lines[line - 1].match(PRIOR), words = value.trim();
+  if (/[,{}#]/.test(words) || (!words && part !== "6")) say("Give a number or a unit, such as 3.6, kPa or 5 %.");
+  else {
+    m[part] = words; m[5] = m[6] && " ";
+    lines[line - 1] = m.slice(1).join("");
+    $("text").value = lines.join("\n");
+    if (!checks) begin("validate");
+    checks = true;
+  }
+  showPriors();
 }
 
 function showRuns(runs) {
@@ -136,7 +174,7 @@ async function refresh() {
       say("The server does not answer. Nothing is lost: start 'en4dvar app' again and open the address that it prints.");
     } else throw error;
   }
-  const running = state?.jobs.find((job) => job.state === "running" && ["run", "resume"].includes(job.step));
+  const running = runs("run", "resume");
   $("log").hidden = !running;
   if (running) $("log").textContent = (await fetched("log", { run: running.out.replace("runs/", "") }).catch(() => ({ text: "" }))).text;
 }
@@ -173,6 +211,7 @@ function plotTable() {
 async function readConfig() {
   const config = $("config").value;
   $("text").value = before = config ? (await fetched("text", { config })).text : "";
+  showPriors();
   if (config) $("run").value = freeName(config.replace(/\.[^.]*$/, ""), (state?.runs || []).map((run) => run.name));
   $("faults").replaceChildren();
 }
@@ -184,7 +223,12 @@ async function keep() {
   return true;
 }
 
-async function begin(step) {
+// One after the other: what is clicked while a text is checked begins after that.
+function begin(step) { queue = queue.then(() => begun(step)).catch((error) => say(error.message)); }
+
+async function begun(step) {
+  while (runs("validate")) { await new Promise((wait) => setTimeout(wait, 200)); await refresh(); }
+  if (step === "validate") checks = false;
   if (["validate", "prior", "run", "resume"].includes(step) && $("text").value !== before && !(await keep())) return;
   const fields = Object.fromEntries([...MINE[step], "proposal"].map((id) => [id, $(id).value]));
   if (step === "compare") fields.runs = [...document.querySelectorAll("#runs input:checked")].map((box) => box.value).join("\n");
@@ -193,6 +237,7 @@ async function begin(step) {
 }
 
 for (const button of document.querySelectorAll("button[data-step]")) button.addEventListener("click", () => begin(button.dataset.step));
+$("text").addEventListener("input", showPriors);
 $("keep").addEventListener("click", keep);
 $("cancel").addEventListener("click", async () => { await post("cancel", {}); await refresh(); });
 for (const step of ["track", "init"]) for (const id of MINE[step].slice(1)) $(id).addEventListener("change", () => remember(step));

@@ -1,6 +1,6 @@
 "use strict";
 // The inspector: frames with outlines beside R(t). Corrections are lines of the text file that `track` reads.
-let movie = null, at = 0, kept = "", drag = null, bar = null, waiting = 0;
+let movie = null, at = 0, kept = "", drag = null, bar = null, waiting = 0, covered = null;
 const bitmaps = new Map();
 const LINE = /^\s*(\d+)\s+(\S.*)$/;
 
@@ -21,10 +21,19 @@ async function readMovie(afresh = true) {
     $("corrections").value = kept = (await fetched("text", { movie: name })).text;
   }
   movie.rows = new Map((movie.readings?.rows || []).map((row) => [row.frame, row]));
-  $("corrections-name").textContent = `${name.replace(/\.[^.]*$/, "")}.corrections.txt`;
+  $("corrections-name").textContent = `${stem()}.corrections.txt`;
+  if (afresh) showMask();
   $("inspector").hidden = false;
   $("number").max = movie.count - 1;
   go(at);
+}
+
+const stem = () => movie.name.replace(/\.[^.]*$/, "");
+
+async function showMask() {
+  const name = $("mask").value, answer = name.endsWith(".png") ? await fetch(link(name, "").href) : {};
+  covered = answer.ok ? await createImageBitmap(await answer.blob()) : null;
+  draw();
 }
 
 function bitmap(n) {
@@ -78,6 +87,10 @@ function draw(picture) {
   pen.setTransform(scale * ratio, 0, 0, scale * ratio, 0, 0);
   pen.drawImage(movie.picture, 0, 0, movie.width, movie.height);
   pen.lineWidth = 2 / scale;
+  pen.globalCompositeOperation = "multiply"; pen.globalAlpha = 0.7;
+  if (covered) pen.drawImage(covered, 0, 0, movie.width, movie.height);
+  pen.globalCompositeOperation = "source-over"; pen.globalAlpha = 1;
+  if (drag?.outline) { pen.strokeStyle = "#ff7070"; pen.beginPath(); drag.outline.forEach((p) => pen.lineTo(p.x, p.y)); pen.stroke(); }
   const own = drag?.circle || circle(at);
   if (own) {
     pen.strokeStyle = own.by === "track" ? "#00c8ff" : "#ffb000";
@@ -126,7 +139,7 @@ $("frame").addEventListener("pointerdown", (event) => {
   if (!movie) return;
   const p = where(event), own = circle(at);
   $("frame").setPointerCapture(event.pointerId);
-  drag = { from: p, own };
+  drag = { from: p, own, outline: tool() === "mask" ? [p] : null };
   if (tool() === "circle" && own) {
     const far = Math.hypot(p.x - own.x - 0.5, p.y - own.y - 0.5);
     drag.how = Math.abs(far - own.r) < Math.max(6, 0.25 * own.r) ? "size" : far < own.r ? "move" : "new";
@@ -145,18 +158,24 @@ $("frame").addEventListener("pointermove", (event) => {
   } else if (tool() === "region") {
     const [x, y] = [Math.max(0, Math.round(Math.min(p.x, from.x))), Math.max(0, Math.round(Math.min(p.y, from.y)))];
     drag.region = [x, y, Math.min(movie.width - x, Math.round(Math.abs(dx))), Math.min(movie.height - y, Math.round(Math.abs(dy)))];
-  } else if (tool() === "scale") bar = [from.x, from.y, p.x, p.y];
+  } else if (drag.outline) drag.outline.push(p);
+  else if (tool() === "scale") bar = [from.x, from.y, p.x, p.y];
   draw();
 });
 
 $("frame").addEventListener("pointerup", async (event) => {
   if (!drag) return;
-  const { circle: own, region, moved } = drag, p = where(event);
+  const { circle: own, region, outline, moved } = drag, p = where(event);
   drag = null;
   if (tool() === "circle" && own && own.r > 0) await correct(at, rounded(own.x, own.y, own.r).join(" "));
   if (tool() === "bubble") $("bubble").value = rounded(p.x, p.y).join(",");
   if (tool() === "region") $("region").value = moved && region && region[2] > 1 && region[3] > 1 ? region.join(",") : "";
   if (tool() === "scale") scaled();
+  if (outline) {
+    const text = outline.map(({ x, y }) => rounded(x, y).join(",")).join(" "), own = { movie: movie.name, raw: movie.raw, outline: text };
+    $("mask").value = moved && (await post("mask", { ...own, uncovers: event.shiftKey ? "1" : "" })) ? `${stem()}.mask.png` : "";
+    await showMask();
+  }
   remember("track");
   draw();
 });
@@ -179,6 +198,7 @@ $("circle").addEventListener("click", () => {
 });
 $("corrections").addEventListener("change", keepCorrections);
 $("length").addEventListener("change", scaled);
+$("mask").addEventListener("change", () => movie && showMask());
 for (const id of ["region", "bubble"]) $(id).addEventListener("change", () => movie && draw());
 for (const id of ["movie", "raw"]) $(id).addEventListener("change", () => readMovie());
 $("inspector").addEventListener("keydown", (event) => {

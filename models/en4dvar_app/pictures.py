@@ -8,6 +8,7 @@ import re
 import threading
 from collections import OrderedDict
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -109,17 +110,13 @@ def columns(path: Path, sheet: str = "") -> dict[str, Any]:
         raise DataError(f"{path}: the folder holds no data file ({', '.join(SUFFIXES)})")
     first, contents, layout = first_with_columns(files, Layout(sheet=sheet))
     asked = Asked(contents)
-    try:
+    with suppress(En4dvarError):
         asked = asked.by_names()
-        needed = [option.removeprefix("--") for option, _, _ in asked.needed()]
-    except En4dvarError:
-        needed = []
     step = max(1, max((len(v) for v in contents.columns.values()), default=0) // PLOTTED)
     shown = {name: [_finite(v) for v in values[::step]] for name, values in contents.columns.items()}
     return {
         "file": first.name, "files": len(files), "columns": shown, "words": [*contents.others],
-        "decimal": layout.decimal, "tracked": asked.tracked, "needed": needed, "time": asked.time_column,
-        "radius": asked.radius_column,
+        "decimal": layout.decimal, "tracked": asked.tracked, "time": asked.time_column, "radius": asked.radius_column,
     }  # fmt: skip
 
 

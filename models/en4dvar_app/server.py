@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import secrets
+import threading
 from collections.abc import Callable
 from contextlib import suppress
 from functools import lru_cache, partial
@@ -28,6 +29,7 @@ FRAMES, TABLES, CONFIGS = (
     (".yaml", ".yml"),
 )
 MOST = 2000  # names of a folder
+_turn = threading.Lock()  # of two windows that write, one reads what the other wrote
 KINDS = {
     ".html": "text/html; charset=utf-8", ".css": "text/css", ".js": "text/javascript", ".png": "image/png",
     ".csv": "text/plain; charset=utf-8",
@@ -166,6 +168,11 @@ def _pictures(path: Path, raw: str, changed: int) -> pictures.Pictures:
     return pictures.Pictures(path, raw or None)
 
 
+def _opened(root: Path, fields: steps.Fields) -> pictures.Pictures:
+    path = below(root, steps.existing(root, fields, "movie"))
+    return _pictures(path, fields.get("raw", ""), path.stat().st_mtime_ns)
+
+
 class Look(Guarded):
     """A movie, one of its frames, a table, or a text."""
 
@@ -177,12 +184,8 @@ class Look(Guarded):
         if shown is not None:
             self.write(shown)
 
-    def _opened(self, arguments: dict[str, str]) -> pictures.Pictures:
-        path = below(self.root, steps.existing(self.root, arguments, "movie"))
-        return _pictures(path, arguments.get("raw", ""), path.stat().st_mtime_ns)
-
     def look_movie(self, arguments: dict[str, str]) -> dict[str, Any]:
-        opened, name = self._opened(arguments), arguments["movie"]
+        opened, name = _opened(self.root, arguments), arguments["movie"]
         height, width = opened.shape
         scale = {"pixel": opened.movie.pixel, "rate": opened.movie.rate}
         known = {key: value for key, value in scale.items() if value > 0}
@@ -193,7 +196,7 @@ class Look(Guarded):
 
     def look_frame(self, arguments: dict[str, str]) -> bytes:
         number = arguments.get("n", "")
-        return self._opened(arguments).bmp(int(number) if number.isdecimal() and len(number) < 9 else 0)
+        return _opened(self.root, arguments).bmp(int(number) if number.isdecimal() and len(number) < 9 else 0)
 
     def look_table(self, arguments: dict[str, str]) -> dict[str, Any]:
         path = below(self.root, steps.existing(self.root, arguments, "table"))
@@ -222,17 +225,20 @@ class Step(Guarded):
         await self.made(partial(self._done, step, fields))
 
     def _done(self, step: str, fields: steps.Fields) -> None:
-        running = next((j for j in job.every(self.root) if j["state"] == "running"), None)
-        if step == "cancel":
-            if running:
-                job.cancel(self.root, running["number"])
-        elif step == "keep":
-            steps.kept(self.root, fields)
-        elif running:
-            raise steps.FieldError("another command is running: wait for it, or cancel it")
-        else:
-            words = steps.words_of(self.root, step, fields)
-            job.start(self.root, step, words[1], words, self.trust)
+        with _turn:
+            running = next((j for j in job.every(self.root) if j["state"] == "running"), None)
+            if step == "cancel":
+                if running:
+                    job.cancel(self.root, running["number"])
+            elif step == "keep":
+                steps.kept(self.root, fields)
+            elif step == "mask":
+                steps.masked(self.root, fields, _opened(self.root, fields).shape)
+            elif running:
+                raise steps.FieldError("another command is running: wait for it, or cancel it")
+            else:
+                words = steps.words_of(self.root, step, fields)
+                job.start(self.root, step, words[1], words, self.trust)
 
 
 def serve(root: Path, port: int, trust: bool, ready: Callable[[str], None]) -> None:
@@ -252,7 +258,7 @@ async def _serve(root: Path, port: int, trust: bool, ready: Callable[[str], None
             (r"/file/(.+)", Files, common),
             (r"/state", State, common),
             (r"/look/(movie|frame|table|text|log|laws)", Look, common),
-            (rf"/({'|'.join(steps.STEPS)}|cancel|keep)", Step, common),
+            (rf"/({'|'.join(steps.STEPS)}|cancel|keep|mask)", Step, common),
         ],
         log_function=lambda handler: None,
         default_handler_class=Nothing,

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import io
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+import numpy as np
+from PIL import Image, ImageDraw
+
 from en4dvar.plumbing.errors import En4dvarError, OutputError
-from en4dvar.plumbing.files import read_plain, write_text
+from en4dvar.plumbing.files import read_plain, write_bytes, write_text
 from en4dvar_app.trusted import below
+from en4dvar_movie.frames import open_picture
 
 OF_TRACK = ("pixel", "frame-rate", "exposure", "flashes", "raw", "bubble", "region")
 OF_INIT = (
@@ -16,6 +22,7 @@ OF_INIT = (
 )  # fmt: skip
 LONGEST = 1_000_000  # bytes of a text
 TRACKED = b"# en4dvar track, "  # begins a table that may be read anew
+OUTLINE = re.compile(r"(?:-?\d{1,5}(?:\.\d{1,9})?,-?\d{1,5}(?:\.\d{1,9})? ){3,}")  # of three corners at least
 Fields = Mapping[str, str]
 
 
@@ -36,6 +43,11 @@ def corrections_of(movie: str) -> str:
 def table_of(movie: str) -> str:
     """The name of the table that is read from a movie."""
     return f"{movie.rpartition('.')[0] or movie}.csv"
+
+
+def mask_of(movie: str) -> str:
+    """The name of the picture that says which part of a movie is looked at."""
+    return f"{movie.rpartition('.')[0] or movie}.mask.png"
 
 
 def existing(root: Path, fields: Fields, key: str) -> str:
@@ -165,6 +177,27 @@ def kept(root: Path, fields: Fields) -> None:
     if text_of(root, fields) not in (fields.get("before", ""), fields.get("text", "")):
         raise FieldError(f"{path.name}: another window or program has changed it; load the page again to see it")
     write_text(path, fields.get("text", ""))
+
+
+def masked(root: Path, fields: Fields, shape: tuple[int, ...]) -> None:
+    """Blacken or (``uncovers``) whiten the polygon ``outline``, "x,y x,y ...", in the mask of a movie of (H, W) pixels.
+
+    Raises
+    ------
+    FieldError: the outline is none, or the mask is no picture of that size.
+    """
+    path, outline = below(root, mask_of(existing(root, fields, "movie"))), fields.get("outline", "")
+    if not OUTLINE.fullmatch(f"{outline} "):
+        raise FieldError("draw around what shall not be looked at")
+    picture = open_picture(path) if path.exists() else np.full(shape, 255, dtype=np.uint8)
+    if picture.shape[:2] != shape:
+        raise FieldError(f"{path.name}: is no picture of the size of the frames; rename it first")
+    image = Image.fromarray(picture).convert("L")
+    corners = [float(number) for number in re.split("[ ,]", outline)]
+    ImageDraw.Draw(image).polygon(corners, fill=255 if fields.get("uncovers") else 0)
+    out = io.BytesIO()
+    image.save(out, "png")
+    write_bytes(path, out.getvalue())
 
 
 def _text_file(root: Path, fields: Fields) -> Path:

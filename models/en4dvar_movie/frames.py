@@ -146,7 +146,7 @@ def open_picture(path: Path) -> Any:
     read = _tiff(path).open() if path.suffix.lower() in TIFF else decoded(image, path, allowed=MOVIES)
     try:
         return next(iter(read))
-    except En4dvarError as error:
+    except (DecodeError, En4dvarError) as error:
         raise DataError(f"{path}: cannot be read as a picture: {error}") from None
 
 

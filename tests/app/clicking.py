@@ -6,6 +6,7 @@ import re
 import shlex
 import subprocess
 
+import pytest
 from run_files import command
 
 LONG = 240_000  # ms: a command of a step
@@ -61,3 +62,12 @@ def at(page, x, y):
     """Where a place in the frame, pixels, is on the canvas."""
     box = page.evaluate("(({ clientWidth, clientHeight }) => [clientWidth, clientHeight])(frame)")
     return {"x": x * box[0] / page.evaluate("movie.width"), "y": y * box[1] / page.evaluate("movie.height")}
+
+
+def require_accessible(page):
+    """What axe-core, a checker of others, finds wrong with the page as it is now: nothing."""
+    axe = pytest.importorskip("axe_playwright_python.base")
+    page.evaluate(axe.AXE_FILE_PATH.read_text(encoding="utf-8"))
+    judged = page.evaluate("axe.run()")
+    assert len(judged["passes"]) > 20
+    assert [(fault["id"], [node["html"] for node in fault["nodes"]]) for fault in judged["violations"]] == []

@@ -10,6 +10,8 @@ import pytest
 from clicking import until
 from page_server import Server, start
 
+ROOT = Path(__file__).resolve().parents[2]
+
 
 @pytest.fixture(scope="module")
 def serve() -> Iterator[Callable[..., Server]]:
@@ -56,3 +58,15 @@ def two_bubbles(tmp_path):
     filmed = film("side by side, pointed at", 0)
     tifffile.imwrite(tmp_path / "two.tif", np.array(filmed.frames))
     return tmp_path, np.nanmedian(filmed.centre, axis=1)
+
+
+@pytest.fixture
+def german(tmp_path):
+    """A folder with a table as a German spreadsheet writes it."""
+    lines = (ROOT / "configs" / "data" / "agarose_synthetic.csv").read_text(encoding="utf-8").splitlines()
+    rows = [line.split(",") for line in lines if not line.startswith("#")][1:]
+    folder = tmp_path / "tables"
+    folder.mkdir()
+    text = "Zeit;Radius\n" + "".join(f"{t};{r}\n".replace(".", ",") for t, r in rows)
+    (folder / "messung.csv").write_text(text, encoding="utf-8")
+    return folder

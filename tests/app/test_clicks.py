@@ -9,25 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from app_page import clicks_counted, from_movie_to_interval, pull
-from clicking import LONG, at, done, point_of, proposed, repeat, until, words_of
+from clicking import LONG, at, done, point_of, proposed, repeat, require_accessible, until, words_of
 from run_files import assert_same_results
 
 ROOT = Path(__file__).resolve().parents[2]
 MOVIE = ROOT.parent / "shared" / "data" / "PAstiff_xy002.mp4"
 LOOK = (ROOT / "tests" / "browser" / "look.js").read_text(encoding="utf-8")
 pytestmark = pytest.mark.slow
-
-
-@pytest.fixture
-def german(tmp_path):
-    """A folder with a table as a German spreadsheet writes it."""
-    lines = (ROOT / "configs" / "data" / "agarose_synthetic.csv").read_text(encoding="utf-8").splitlines()
-    rows = [line.split(",") for line in lines if not line.startswith("#")][1:]
-    folder = tmp_path / "tables"
-    folder.mkdir()
-    text = "Zeit;Radius\n" + "".join(f"{t};{r}\n".replace(".", ",") for t, r in rows)
-    (folder / "messung.csv").write_text(text, encoding="utf-8")
-    return folder
 
 
 def test_a_german_table_to_an_interval(visit, serve, german, tmp_path):
@@ -210,5 +198,6 @@ def test_everything_has_a_name_and_can_be_read(visit, serve, two_bubbles, width)
         (e) => e.getClientRects().length && !e.labels?.length && !e.getAttribute("aria-label") && !e.innerText.trim()
     ).map((e) => e.id)"""
     assert page.evaluate(nameless) == []
+    require_accessible(page)
     for landmark in ("main", "h1", "html[lang=en]"):
         assert page.locator(landmark).count() == 1

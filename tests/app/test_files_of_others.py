@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from app_page import pull
 from clicking import done, proposed, repeat, until
+from PIL import Image
 
 from en4dvar_app.pictures import readings
 
@@ -36,6 +37,48 @@ def test_what_lies_outside_the_drawn_region_is_not_read(visit, serve, two_bubble
     before = (folder / "two.csv").read_bytes()
     repeat(folder, words)
     assert (folder / "two.csv").read_bytes() == before
+
+
+def drawn(page, *places):
+    """Draw on the frame and wait until the new mask is shown."""
+    page.evaluate("() => { window.old = covered; }")
+    pull(page, *places)
+    until(page, "covered !== window.old")
+    assert page.input_value("#mask") == "two.mask.png"
+
+
+def test_what_is_covered_on_the_frame_is_not_read(visit, serve, two_bubbles):
+    folder, centres = two_bubbles
+    page = visit(serve(folder))
+    until(page, "!!movie?.picture")
+    page.fill("#pixel", "1 um")
+    page.fill("#frame-rate", "100 kHz")
+    height, width = page.evaluate("[movie.height, movie.width]")
+    middle = round(centres[:, 0].mean())
+    left, right = ([(x, 0), (x + middle, 0), (x + middle, height), (x, height)] for x in (0, middle))
+    page.check("input[value=mask]")
+    for n, cover in ((0, right), (1, left)):
+        if n:
+            page.keyboard.down("Shift")
+            drawn(page, *right)
+            page.keyboard.up("Shift")
+        drawn(page, *cover)
+        light = np.asarray(Image.open(folder / "two.mask.png"))
+        assert light.shape == (height, width)
+        sides = light[5:-5, 5 : middle - 5], light[5:-5, middle + 5 : -5]
+        assert [side.mean() for side in sides] == ([0, 255] if n else [255, 0])
+        words = done(page, "track")
+        assert "--mask=two.mask.png" in words
+        table = readings(folder / "two.csv")
+        seen = np.array([[row["x_um"], row["y_um"]] for row in table["rows"] if row["x_um"]]) / table["pixel"]
+        assert np.hypot(*(np.median(seen, axis=0) - centres[n])) < 5
+    page.click("#frame")
+    until(page, "mask.value === ''")
+    assert "--mask" not in " ".join(done(page, "track"))
+    (folder / "two.mask.png").write_text("of somebody else")
+    pull(page, *left)
+    until(page, "message.innerText.includes('cannot be read as a picture')")
+    assert (folder / "two.mask.png").read_text() == "of somebody else"
 
 
 @pytest.fixture
