@@ -54,18 +54,23 @@ def outcome_of(
         prior=prior.to_physical(of.before),
         posterior=prior.to_physical(of.after),
         centre=prior.to_physical(of.centre),
-        prior_predictions=prior_run.predictions,
-        posterior_predictions=run.predictions,
+        prior_predictions=_whole_rows(prior_run.predictions),
+        posterior_predictions=_whole_rows(run.predictions),
         centre_predictions=of.central.predictions[0],
         log_likelihood=problem.observations.log_likelihood(run.predicted),
-        prior_trajectories=prior_run.path,
-        posterior_trajectories=run.path,
+        prior_trajectories=_whole_rows(prior_run.path),
+        posterior_trajectories=_whole_rows(run.path),
         prior_failures=prior_run.failures,
         posterior_failures=run.failures,
         extremes=run.extremes,
         beyond=run.beyond,
         **more,
     )
+
+
+def _whole_rows(values: Array) -> Array:
+    """(B, K) with nothing but NaN in the row of a member that lacks a reading, which has failed."""
+    return np.where(np.isnan(values).any(axis=1, keepdims=True), np.nan, values)
 
 
 def descents_of(outcome: Outcome, n_members: int) -> Descents | None:

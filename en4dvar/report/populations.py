@@ -166,7 +166,7 @@ def same_readings(stored: Mapping[str, StoredPopulation]) -> str:
         if both := [first.readings[key] for key in first.readings.keys() & second.readings.keys()]:
             return (
                 f"{a} and {b} hold the same readings ({', '.join(sorted(both)[:3])}): what differs between them is the "
-                "law and not the gel"
+                "model and not what was measured"
             )
     return ""
 

@@ -45,7 +45,9 @@ def test_it_ends_in_the_minimum_of_its_start(at, sign):
     assert abs(a) == pytest.approx(1.2, abs=0.1)
     least = cost(a, b)
     assert all(cost(a + da, b * fb) > least for da, fb in ((0.02, 1), (-0.02, 1), (0, 1.02), (0, 0.98)))
-    assert any(c.code == "one-descent" for c in found.cautions)
+    (alone,) = [c for c in found.cautions if c.code == "one-descent"]
+    assert alone.advice == "set assimilation.start: best-member"
+    assert not any(c.code == "one-descent" for c in fit("best-member").cautions)
 
 
 def test_the_prior_does_not_change():
