@@ -84,7 +84,7 @@ def trust(result: StoredResult) -> str:
     words = f"No warnings: the {size.partition(';')[0]}{_neighbours_words(result)}."
     if moved := len(exceeding(stored_shifts(result))):
         which = "one assumption matters" if moved == 1 else f"{moved} assumptions matter"
-        words += f" They hold for what was assumed: {which} by more than an error bar, see below."
+        words += f" The numbers hold for what was assumed: {which} by more than an error bar, see below."
     return words
 
 
