@@ -23,7 +23,6 @@ from en4dvar.priors.field_prior import FieldPrior
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.priors.varying import Varying
 from en4dvar.problem import InverseProblem, Tie, discrepancy_parameters
-from en4dvar.schemes.base import Minimiser
 
 
 def build(config: Config) -> tuple[InverseProblem, ...]:
@@ -85,9 +84,10 @@ def problem_of(config: Config, observations: Observations) -> InverseProblem:
         problem = problem.varied(varying)
     with config.document.placing():
         check_problem(problem)
-    if isinstance(asked.own, Minimiser) and not isinstance(asked.own.start, str):
+    minimiser = asked.own.minimiser
+    if minimiser and not isinstance(minimiser.start, str):
         with config.document.placing("assimilation", "start"):
-            given(prior, asked.own.start)
+            given(prior, minimiser.start)
     if localised:
         with config.document.placing("assimilation", "localisation"):
             gain_of(problem, asked)

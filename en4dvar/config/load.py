@@ -28,7 +28,6 @@ from en4dvar.model.forward import ForwardModel, Observable
 from en4dvar.model.state import NOISE_SCALE, Array
 from en4dvar.plumbing.errors import ConfigError, Fault
 from en4dvar.priors.dependence import Dependence
-from en4dvar.schemes.base import Minimiser
 from en4dvar.schemes.settings import AssimilationSettings
 
 KINDS = {"twin": "a twin experiment", "sequence": "a sequence"}  # sections that mark other kinds of files
@@ -166,8 +165,9 @@ def resolve(document: Document, base: Path, model: ForwardModel | None = None) -
     if file.population is not None:
         check_population(file.population, parameters, document)
     settings = file.assimilation.settings
-    if isinstance(settings.own, Minimiser) and isinstance(settings.start, GivenStart):
-        settings = replace(settings, own=replace(settings.own, start=values_of(settings.start, parameters, document)))
+    minimiser = settings.own.minimiser
+    if minimiser and isinstance(minimiser.start, GivenStart):
+        settings = replace(settings, own=replace(minimiser, start=values_of(minimiser.start, parameters, document)))
     return Config(
         **read.common(file.parameters),
         model=read.model,

@@ -70,10 +70,11 @@ def choose_start(
     resume from, ``tell`` after it.
     """
     warnings: tuple[Caution, ...] = ()
-    if not isinstance(scheme.start, str):
+    begin = scheme.start
+    if not isinstance(begin, str):
         beyond = len(space.members) + 1
-        return Start(descent_at(space, given(space.problem.prior, scheme.start), beyond), tried=(beyond,))
-    if scheme.start == "prior-mean":
+        return Start(descent_at(space, given(space.problem.prior, begin), beyond), tried=(beyond,))
+    if begin == "prior-mean":
         if np.isfinite(space.observation_cost(run)[-1]):
             mean = len(space.members)
             return Start(descent_from(space, mean), tried=(mean,))

@@ -228,13 +228,16 @@ def sentences(c: PopulationsCompared) -> Iterator[str]:
 
 def _sentence(d: Difference) -> str:
     unit = f" {pretty_unit(d.unit)}" if d.unit != "1" else ""
-    by = f"{_range(d.difference, plain=True)}{unit}"
+    by = f"{_range(d.difference, plain=True)}{unit} more"
+    if d.difference[1] < 0:
+        low, middle, high = (-value for value in d.difference)
+        by = f"{_range((high, middle, low), plain=True)}{unit} less"
     sure, side = (d.greater, "larger") if d.greater >= 0.5 else (1 - d.greater, "smaller")
     chance = f"over {SURE}" if sure > SURE else f"{sure:.3f}" if sure > 0.99 else f"{sure:.2f}"
     if d.is_ratio:
-        words = f"{d.parameter} of {d.first} is {_range(d.ratio)} times that of {d.second}, and {by} more"
+        words = f"{d.parameter} of {d.first} is {_range(d.ratio)} times that of {d.second}, and {by}"
     else:
-        words = f"{d.parameter} of {d.first} is {by} more than that of {d.second}"
+        words = f"{d.parameter} of {d.first} is {by} than that of {d.second}"
     words += f"; it is {side} with probability {chance}"
     alone = f"{number_like(d.apart[0], _std(d.apart))} … {number_like(d.apart[2], _std(d.apart))}"
     words += f" (were nothing common: {alone}{' times' if d.is_ratio else unit})"

@@ -127,5 +127,5 @@ def test_words_of_a_difference():
     shift = replace(
         d, ratio=(np.nan,) * 3, difference=(-6.0, -5.0, -4.0), greater=0.02, untrusted="chain-not-converged"
     )
-    assert _sentence(shift).startswith("G of a is −5.00 (−6.00 … −4.00) kPa more than that of b; it is smaller with")
+    assert _sentence(shift).startswith("G of a is 5.00 (4.00 … 6.00) kPa less than that of b; it is smaller with")
     assert _sentence(shift).endswith("not to be trusted: chain-not-converged.")
