@@ -23,7 +23,6 @@ from en4dvar.executor import Executor
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.problem import InverseProblem
-from en4dvar.sampling.emulated_draws import RecordedRuns
 from en4dvar.sampling.mcmc import ChainState
 from en4dvar.sampling.refine import Refined, in_doubt, refined, samples
 from en4dvar.sampling.shape import CLEARED, examine_shape
@@ -221,7 +220,9 @@ class Stages:
     def refine(self, posterior: Array, minima: Sequence[Minimum], earlier: Refinement | None, looking: bool) -> Refined:
         """What takes the place of the posterior ensemble (N, n); for the rest see :meth:`sampled`."""
         space = self.space
-        cost = RecordedRuns(space.forecast, space.costs, self.problem.prior, self.problem.observations)
+
+        def cost(x: Array) -> Array:
+            return space.costs(x, space.forecast(x))
 
         def keep(state: ChainState) -> None:
             self.keep(lambda: replace(self.latest, refinement=Refinement(state, space.forward_runs)))

@@ -64,7 +64,7 @@ class Difference:
 
     @property
     def is_ratio(self) -> bool:
-        return self.ratio[1] == self.ratio[1]
+        return bool(np.isfinite(self.ratio[1]))
 
 
 @dataclass(frozen=True)

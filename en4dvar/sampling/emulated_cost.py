@@ -91,6 +91,12 @@ class ModelRuns:
     costs: Array
     make: Predicted
 
+    @classmethod
+    def of(cls, x: Array, outcome: Forecast, costs: Array) -> ModelRuns:
+        """Those of control vectors (B, n) and J (B,) that could be run."""
+        alive = outcome.active & np.isfinite(costs)
+        return cls(x[alive], outcome.predicted.stacked[alive], costs[alive], outcome.predicted[:0])
+
     def __getitem__(self, chosen: npt.NDArray[np.intp]) -> ModelRuns:
         return replace(self, x=self.x[chosen], outputs=self.outputs[chosen], costs=self.costs[chosen])
 
@@ -151,9 +157,7 @@ def emulate(
 def _run(run: Run, prior: Prior, observations: Observations, x: Array) -> ModelRuns:
     """Run control vectors (B, n); the survivors."""
     outcome = run(x)
-    costs = _prior_cost(prior, x) + observations.cost(outcome.predicted)
-    alive = outcome.active & np.isfinite(costs)
-    return ModelRuns(x[alive], outcome.predicted.stacked[alive], costs[alive], outcome.predicted[:0])
+    return ModelRuns.of(x, outcome, _prior_cost(prior, x) + observations.cost(outcome.predicted))
 
 
 def _prior_cost(prior: Prior, x: Array) -> Array:

@@ -45,32 +45,30 @@ class RecordedRuns:
         observations: Observations,
     ):
         self._run, self._costs, self.prior, self.observations = run, costs, prior, observations
+        self._wanted = needed_runs(len(prior.names))
         self.runs: ModelRuns | None = None
 
     def __call__(self, x: Array) -> Array:
         outcome = self._run(x)
         costs = self._costs(x, outcome)
-        alive = np.isfinite(costs)
         if outcome.predicted.stacked.shape[1] <= LARGEST:
-            new = ModelRuns(x[alive], outcome.predicted.stacked[alive], costs[alive], outcome.predicted[:0])
+            new = ModelRuns.of(x, outcome, costs)
             self.runs = new if self.runs is None else self.runs.joined(new)
         return costs
 
     @property
     def emulates(self) -> bool:
         """Whether there are enough runs that an emulator can be fitted to."""
-        wanted = needed_runs(len(self.prior.names))
-        return self.runs is not None and wanted is not None and len(self.runs.x) >= wanted[1]
+        return self.runs is not None and self._wanted is not None and len(self.runs.x) >= self._wanted[1]
 
     def emulated(self, heat: float) -> EmulatedCost | None:
         """J emulated by the runs so far, those of low J most; None where there are too few of them."""
-        n = len(self.prior.names)
-        wanted = needed_runs(n)
-        if self.runs is None or wanted is None or not self.emulates:
+        if self.runs is None or self._wanted is None or not self.emulates:
             return None
+        (degree, fewest), n = self._wanted, len(self.prior.names)
         near = int(np.sum(self.runs.costs - self.runs.costs.min() < NEAR * n * heat))
-        chosen = np.argsort(self.runs.costs, kind="stable")[: max(wanted[1], near)]
-        return fitted_cost(self.prior, self.observations, wanted[0], self.runs[chosen], n * heat)
+        chosen = np.argsort(self.runs.costs, kind="stable")[: max(fewest, near)]
+        return fitted_cost(self.prior, self.observations, degree, self.runs[chosen], n * heat)
 
 
 @dataclass(frozen=True)

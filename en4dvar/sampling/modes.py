@@ -26,16 +26,13 @@ HEATS = (8.0, 4.0, 2.0, 1.5)  # of the rounds that train an emulator
 LAST_HEAT = 1.15  # of those that judge it: draws reach a little beyond what it says
 TRIED = 4  # such rounds, at most, and
 GOOD = 0.25  # the effective share of one that ends them
-TRAINING, POOL = (
-    400.0,
-    1500.0,
-)  # effective draws of the emulated posterior behind such a round, and behind the last ones
+TRAINING, POOL = 400.0, 1500.0  # effective draws of the emulated posterior behind a round that trains, and at last
 ENOUGH, MOST_RUNS = 1500.0, 8.0  # effective draws that end the rounds, and runs for each of them
 LAST_RUNS = 30.0  # for each, as long as too few are effective
 CLOSING = (2, 3, 6)  # rounds in which proposals close in, at least: two, and one for three directions, up to six
 WIDER = 1.8  # at 1 the tail of a bent posterior is not found: standard deviations were up to half too small
 FEW = 6  # directions up to which that is the factor of each; of more it is smaller, and their volume grows no further
-THIN = 0.15  # effective share of the first round of a mixture below which the posterior is drawn by an emulator
+THIN = 0.15  # effective share of draws of a mixture below which the posterior is drawn by an emulator
 TOO_FEW = 60.0  # below so many the draws stand for nothing
 OF_PRIOR = 0.2  # share of the first draws that come from the prior: what no descent found is not excluded
 

@@ -19,6 +19,7 @@ from en4dvar.priors.prior import Prior, member_stream
 from en4dvar.problem import InverseProblem
 from en4dvar.sampling import mcmc
 from en4dvar.sampling.emulated_cost import needed_runs
+from en4dvar.sampling.emulated_draws import RecordedRuns
 from en4dvar.sampling.modes import TOO_FEW, WeightedDraws, nearest, sample_modes
 from en4dvar.sampling.shape import doubtful, guide
 from en4dvar.schemes.settings import AssimilationSettings
@@ -137,7 +138,11 @@ def refined(
     prior, exact, enough = space.problem.prior, space.settings.sampling == "exact", space.settings.draws
     chain = space.settings.refine == "mcmc"
     below = minima[0].cost - MISSED if looking and minima else -math.inf
-    draws = sample_modes(cost, prior, minima, seed, enough, below) if len(minima) > 1 or not chain else None
+    draws = None
+    if len(minima) > 1 or not chain:  # the runs of these draws are kept; those of a chain would be too many
+        recorded = RecordedRuns(space.forecast, space.costs, prior, space.problem.observations)
+        drawn_by = cost if space.settings.emulator == "off" else recorded
+        draws = sample_modes(drawn_by, prior, minima, seed, enough, below)
     if draws is not None and draws.lowest < below:
         return Refined(posterior, {}, lowest=draws.lowest, lower=draws.best)
     if draws is not None and not chain and draws.effective >= TOO_FEW:

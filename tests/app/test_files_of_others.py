@@ -16,13 +16,25 @@ DATA = Path(__file__).resolve().parents[2] / "configs" / "data" / "agarose_synth
 pytestmark = pytest.mark.slow
 
 
-def test_what_lies_outside_the_drawn_region_is_not_read(visit, serve, two_bubbles, tmp_path):
-    folder, centres = two_bubbles
+def opened(visit, serve, folder):
+    """The page with the movie of two bubbles and its scales, and height and width of a frame."""
     page = visit(serve(folder))
     until(page, "!!movie?.picture")
     page.fill("#pixel", "1 um")
     page.fill("#frame-rate", "100 kHz")
-    height, width = page.evaluate("[movie.height, movie.width]")
+    return page, page.evaluate("[movie.height, movie.width]")
+
+
+def seen_at(folder):
+    """Median place of the bubble that was read, and in how many frames, in pixels."""
+    table = readings(folder / "two.csv")
+    seen = np.array([[row["x_um"], row["y_um"]] for row in table["rows"] if row["x_um"]]) / table["pixel"]
+    return np.median(seen, axis=0), len(seen)
+
+
+def test_what_lies_outside_the_drawn_region_is_not_read(visit, serve, two_bubbles, tmp_path):
+    folder, centres = two_bubbles
+    page, (height, width) = opened(visit, serve, folder)
     middle = centres[:, 0].mean()
     page.check("input[value=region]")
     for n, (start, end) in enumerate(((1, middle), (middle, width - 1))):
@@ -30,10 +42,9 @@ def test_what_lies_outside_the_drawn_region_is_not_read(visit, serve, two_bubble
         words = done(page, "track")
         x, _, w, _ = map(int, next(word for word in words if word.startswith("--region=")).split("=")[1].split(","))
         assert np.allclose([x, x + w], [start, end], atol=1.6)
-        table = readings(folder / "two.csv")
-        seen = np.array([[row["x_um"], row["y_um"]] for row in table["rows"] if row["x_um"]]) / table["pixel"]
-        assert len(seen) > 20
-        assert np.hypot(*(np.median(seen, axis=0) - centres[n])) < 5
+        place, frames = seen_at(folder)
+        assert frames > 20
+        assert np.hypot(*(place - centres[n])) < 5
     before = (folder / "two.csv").read_bytes()
     repeat(folder, words)
     assert (folder / "two.csv").read_bytes() == before
@@ -49,11 +60,7 @@ def drawn(page, *places):
 
 def test_what_is_covered_on_the_frame_is_not_read(visit, serve, two_bubbles):
     folder, centres = two_bubbles
-    page = visit(serve(folder))
-    until(page, "!!movie?.picture")
-    page.fill("#pixel", "1 um")
-    page.fill("#frame-rate", "100 kHz")
-    height, width = page.evaluate("[movie.height, movie.width]")
+    page, (height, width) = opened(visit, serve, folder)
     middle = round(centres[:, 0].mean())
     left, right = ([(x, 0), (x + middle, 0), (x + middle, height), (x, height)] for x in (0, middle))
     page.check("input[value=mask]")
@@ -69,9 +76,7 @@ def test_what_is_covered_on_the_frame_is_not_read(visit, serve, two_bubbles):
         assert [side.mean() for side in sides] == ([0, 255] if n else [255, 0])
         words = done(page, "track")
         assert "--mask=two.mask.png" in words
-        table = readings(folder / "two.csv")
-        seen = np.array([[row["x_um"], row["y_um"]] for row in table["rows"] if row["x_um"]]) / table["pixel"]
-        assert np.hypot(*(np.median(seen, axis=0) - centres[n])) < 5
+        assert np.hypot(*(seen_at(folder)[0] - centres[n])) < 5
     page.click("#frame")
     until(page, "mask.value === ''")
     assert "--mask" not in " ".join(done(page, "track"))

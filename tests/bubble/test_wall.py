@@ -101,7 +101,7 @@ def test_two_equal_bubbles_are_one_at_a_wall(apart, tmp_path):
     assert np.abs(pair - R[1:]).max() < 1e-4 * 10e-6
 
 
-@pytest.mark.parametrize(("wall", "near"), [(Wall(300e-6, "rigid"), True), (None, False)])
+@pytest.mark.parametrize(("wall", "near"), [(Wall(450e-6, "rigid"), True), (None, False)])
 def test_a_slow_collapse_in_a_liquid_proposes_a_wall_whose_prior_holds_the_true_one(wall, near):
     """Written down with Rattray's time, though the gas slows the collapse as well."""
     times = np.arange(0, 90e-6, 0.5e-6)
@@ -111,7 +111,8 @@ def test_a_slow_collapse_in_a_liquid_proposes_a_wall_whose_prior_holds_the_true_
     assert ("wall" in lines) == ("wall_distance" in lines) == near
     if near:
         median = float(lines["wall"].split()[1])
-        assert abs(np.log((300 - 220) / (median - 220))) < 1.5  # of the prior's std, from 1.1 R_max on
+        assert median > 300  # by Rattray's time, not the nearest that is written down
+        assert abs(np.log((450 - 220) / (median - 220))) < 1.5  # of the prior's std, from 1.1 R_max on
         assert f"um, median: {median:g} um, logit_std: 1.5" in lines["wall_distance"]
         assert 210 < float(lines["wall_distance"].split()[3]) < 230
     in_gel = propose({"bubble": (times, R)}, "laser", "neo-hookean-kelvin-voigt")
