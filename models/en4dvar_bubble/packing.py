@@ -76,7 +76,8 @@ def pack(model: Dynamics, x: Array, start: Array | float, times: Array) -> Packe
 
     some = sampled(first)
     if some is None:
-        elastic = law.table(values) / model.medium_of(own, 2).rho
+        elastic = law.table(values)
+        elastic[..., :6] /= model.medium_of(own, 2).rho  # not what tells of halved cells
     else:
         samples = np.empty((n_members, some.shape[1]))
         samples[first] = some

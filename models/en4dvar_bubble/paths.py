@@ -159,7 +159,7 @@ class Paths(Batch):
         V = self.solution.states[:, :, -2]
         log_stretch = self.solution.states[:, :, -1] - self.par[:, None, rows.LOG_R0]
         values = self.model.law_values(self.initial)
-        stress = evaluate(self.model.law.table(values) / self.medium(2).rho, GRID.span, log_stretch)
+        stress = evaluate(self.model.law.table(values), GRID.span, log_stretch) / rho
         if system.memory:
             stress = stress + self.solution.states[:, :, system.first_memory : -2].sum(axis=2)
         if system.shear:

@@ -2,7 +2,9 @@
 
 A table is built from samples on a uniform grid with four extra points at either end. Derivatives at the nodes come from
 eighth-order central differences, each cell is the quintic Hermite polynomial of value, slope and curvature. A cell
-takes eight doubles (six coefficients, one cache line).
+takes eight doubles (six coefficients, one cache line). In tables of sharp functions (:mod:`laws.refined`) a cell may be
+halved, and its halves again: the seventh number is how many times narrower a cell is than those of the grid (zero where
+none is halved), the eighth the place of its left half, which its right half follows.
 """
 
 from __future__ import annotations
@@ -36,8 +38,8 @@ class Grid:
 
     @property
     def span(self) -> Array:
-        """(first, last, cells per unit, cells): what the kernel needs to look up a value."""
-        return np.array([self.origin, self.origin + self.step * self.cells, 1.0 / self.step, float(self.cells)])
+        """(first, last, cells per unit, cells, 0 times halved): what the kernel needs to look up a value."""
+        return np.array([self.origin, self.origin + self.step * self.cells, 1.0 / self.step, float(self.cells), 0.0])
 
 
 @called
@@ -130,7 +132,7 @@ def _area(first, second, third, j):
 
 @kernel
 def evaluate(table, span, x):
-    """Values (N, K) of the tables (N, cells, 8) at ``x`` (N, K); NaN where ``x`` is NaN."""
+    """Values (N, K) of the tables (N, cells, 8), halved cells after the others, at ``x`` (N, K); NaN where it is."""
     n, k = x.shape
     out = np.empty((n, k))
     for i in range(n):
@@ -141,6 +143,10 @@ def evaluate(table, span, x):
             position = (x[i, q] - span[0]) * span[2]
             cell = int(min(max(np.floor(position), 0.0), span[3] - 1.0))
             s = position - cell
+            while table[i, cell, 7] > 0:
+                right = int(s >= 0.5)
+                cell = int(table[i, cell, 7]) + right
+                s = 2 * s - right
             value = 0.0
             for power in range(5, -1, -1):
                 value = value * s + table[i, cell, power]

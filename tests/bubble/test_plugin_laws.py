@@ -268,27 +268,3 @@ class TestCommand:
 
     def test_unknown_law(self):
         assert self.run("--check", "nowhere.py:Law").exit_code == 2
-
-
-class Shell(NeoHookeanKelvinVoigt):
-    r"""$\sigma = \chi(\lambda^2-1)$ between buckling and rupture (Marmottant et al. 2005), of a radius of 1 µm."""
-
-    title = "lipid shell"
-    width = 0.0
-
-    def stress(self, stretch, p):
-        from_buckling = np.clip(stretch**2 - 1, 0.0, 0.073)
-        if self.width:
-            from_buckling = 0.0365 * (1 + np.tanh(np.log(stretch) / self.width))
-        return -2 * (from_buckling - 0.0365 * bool(self.width)) / (1e-6 * stretch) + 0 * p.G
-
-
-class SmoothShell(Shell):
-    width = 1.0
-
-
-def test_a_law_too_sharp_for_its_table_is_refused_by_name():
-    times, values = np.linspace(0, 1e-6, 3), {"mu": 1e-3, "G": 0.0, "R0": 1e-6}
-    with pytest.raises(ConfigError, match=r"Shell: its stress changes too sharply .* at λ = (0\.9|1\.0)"):
-        simulate(Shell(), values, times)
-    assert not simulate(SmoothShell(), values, times).status.any()

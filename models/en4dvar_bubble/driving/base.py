@@ -136,7 +136,7 @@ class Driving:
         if self.silent:
             return np.empty(0)
         inside = [1e6 * t for t in sorted(set(self.stops)) if self.begin < t < self.end]
-        first, last, _, _ = self.grid.span
+        first, last = self.grid.span[:2]
         return np.array([first, *(t for t in inside if first < t < last), last])
 
     def of_each(self, t: Array, values: Mapping[str, Array]) -> Array:

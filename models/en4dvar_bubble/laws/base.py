@@ -10,16 +10,17 @@ rate (K,). Everything is tabulated per member before the compiled integration st
 from __future__ import annotations
 
 from collections.abc import Mapping
-from types import SimpleNamespace
-from typing import Any, ClassVar, Protocol, cast
+from typing import Any, ClassVar
 
 import numpy as np
 
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.user_file import is_from_file
+from en4dvar_bubble.laws.exactness import is_sharp
 from en4dvar_bubble.laws.memory import MemoryTables, MemoryVariable
-from en4dvar_bubble.laws.parameters import MU
+from en4dvar_bubble.laws.parameters import MU, Values, columns
+from en4dvar_bubble.laws.refined import Refined, refine
 from en4dvar_bubble.laws.tabulate import (
     GRID,
     STRETCH,
@@ -37,12 +38,6 @@ _EXAMPLE_BY_UNIT = {"Pa": 5e3, "Pa s": 0.1, "s": 1e-6, "1": 0.5}
 
 
 Limits = tuple[tuple[type["ConstitutiveLaw"], Mapping[str, float]], ...]
-
-
-class Values(Protocol):
-    """The parameters of a law, each a column (N, 1) under its name: ``p.G``."""
-
-    def __getattr__(self, name: str) -> Array: ...
 
 
 class ConstitutiveLaw:
@@ -120,9 +115,16 @@ class ConstitutiveLaw:
         has_memory = type(self).memory is not ConstitutiveLaw.memory
         return len(self.memory(columns(self.example_values()))) if has_memory else 0
 
+    @property
+    def sharp(self) -> bool:
+        """True for a law of a user's that a uniform table does not hold: its table has halved cells."""
+        return bool(is_sharp(type(self)))  # type: ignore[arg-type]  # mypy takes the class for unhashable
+
     def samples(self, values: Mapping[str, Array]) -> Array | None:
-        """J_e in Pa of N members at the nodes of the grid and its halo, (N, K); None where the law is W′(λ)."""
-        if not self.closed_form:
+        """J_e in Pa of N members at the nodes of the grid and its halo, (N, K); None of a law by W′(λ), and of a sharp
+        one.
+        """
+        if not self.closed_form or self.sharp:
             return None
         n = members(values)
         samples = np.empty((n, len(GRID.nodes)))
@@ -133,13 +135,36 @@ class ConstitutiveLaw:
         return samples
 
     def table(self, values: Mapping[str, Array]) -> Array:
-        """J_e against ln λ for N members: (N, cells, 8) coefficients on :data:`GRID`, Pa. ``values``: name → (N,)."""
+        """J_e against ln λ for N members: (N, cells, 8) coefficients on :data:`GRID`, Pa. ``values``: name → (N,).
+
+        Of a :attr:`sharp` law, halved cells follow those of the grid, as many as the member takes that takes most.
+        """
         samples = self.samples(values)
         if samples is not None:
             return from_values(samples)
+        if self.sharp:
+            tables = [
+                self.refined({name: v[i : i + 1] for name, v in values.items()}).table for i in range(members(values))
+            ]
+            most = max(map(len, tables))
+            return np.stack([np.pad(table, ((0, most - len(table)), (0, 0))) for table in tables])
         p = columns(values)
         with np.errstate(all="ignore"):
             return from_strain_energy(lambda stretch: self.strain_energy_rate(stretch, p), members(values))
+
+    def refined(self, values: Mapping[str, Array]) -> Refined:
+        """J_e of one member (``values``: name → (1,)), with cells halved where it takes."""
+        p = columns(values)
+
+        def function(x: Array) -> Array:
+            stretch = np.exp(x)
+            if self.closed_form:
+                return np.ravel(np.broadcast_to(self.stress(stretch, p), (1, len(x)))).astype(float)
+            slope = -stretch * self.strain_energy_rate(stretch, p) / np.expm1(3 * x)
+            return np.ravel(np.broadcast_to(slope, (1, len(x))))
+
+        with np.errstate(all="ignore"):
+            return refine(function, slope=not self.closed_form)
 
     def viscous_table(self, values: Mapping[str, Array]) -> Array:
         """μ̄ (Pa s) against z = ln(|V| s), constant below the first node: (N, cells, 8) on :data:`VISCOUS_GRID`.
@@ -187,12 +212,6 @@ class Liquid(ConstitutiveLaw):
 
     def stress(self, stretch: Array, p: Values) -> Array:
         return np.zeros_like(stretch)
-
-
-def columns(values: Mapping[str, Array]) -> Values:
-    """The ``p`` of a law's methods: values as columns (N, 1), so that they broadcast against a row of stretches."""
-    columns = {name: np.asarray(v, dtype=float)[:, None] for name, v in values.items()}
-    return cast(Values, SimpleNamespace(**columns))
 
 
 def members(values: Mapping[str, Array]) -> int:

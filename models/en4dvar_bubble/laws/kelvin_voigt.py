@@ -7,8 +7,8 @@ from typing import ClassVar
 import numpy as np
 
 from en4dvar.model.state import Array, Parameter
-from en4dvar_bubble.laws.base import ConstitutiveLaw, Limits, Values
-from en4dvar_bubble.laws.parameters import ALPHA, MU, G, positive
+from en4dvar_bubble.laws.base import ConstitutiveLaw, Limits
+from en4dvar_bubble.laws.parameters import ALPHA, MU, G, Values, positive
 
 
 class NeoHookeanKelvinVoigt(ConstitutiveLaw):

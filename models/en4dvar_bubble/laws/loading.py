@@ -17,8 +17,9 @@ from en4dvar.plumbing import user_file
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.hints import suggest
 from en4dvar.plumbing.user_code import imported, loading, reason_of
-from en4dvar_bubble.laws.base import REGISTRY, ConstitutiveLaw, columns
+from en4dvar_bubble.laws.base import REGISTRY, ConstitutiveLaw
 from en4dvar_bubble.laws.memory import MemoryVariable
+from en4dvar_bubble.laws.parameters import columns
 
 RESERVED = ("R", "Rdot", "p_b", "S", "T", "C", "R0", "R_eq", "R_max", "t_s")
 """Names of the state vector and of the model's own parameters."""

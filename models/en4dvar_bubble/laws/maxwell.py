@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import ClassVar
 
 from en4dvar.model.state import Parameter
-from en4dvar_bubble.laws.base import Limits, Liquid, Values
+from en4dvar_bubble.laws.base import Limits, Liquid
 from en4dvar_bubble.laws.memory import MemoryVariable, linear_maxwell, upper_convected_maxwell
-from en4dvar_bubble.laws.parameters import MU, MU_P, RELAXATION_TIME
+from en4dvar_bubble.laws.parameters import MU, MU_P, RELAXATION_TIME, Values
 from en4dvar_bubble.laws.viscous import Newtonian
 
 

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import SimpleNamespace
+from typing import Protocol, cast
+
 import numpy as np
 
-from en4dvar.model.state import Parameter
+from en4dvar.model.state import Array, Parameter
 
 
 def positive(
@@ -26,3 +30,15 @@ RELAXATION_TIME = positive("relaxation_time", "s", "relaxation time", r"$\theta$
 MU_0 = positive("mu_0", "Pa s", "viscosity at rest", r"$\mu_0$", _THINNING)
 MU_INF = positive("mu_inf", "Pa s", "viscosity at high shear rate", r"$\mu_\infty$", _THINNING)
 SHEAR_TIME = positive("shear_time", "s", "time constant of shear thinning", r"$\lambda_c$", _THINNING, "us")
+
+
+class Values(Protocol):
+    """The parameters of a law, each a column (N, 1) under its name: ``p.G``."""
+
+    def __getattr__(self, name: str) -> Array: ...
+
+
+def columns(values: Mapping[str, Array]) -> Values:
+    """The ``p`` of a law's methods: values as columns (N, 1), so that they broadcast against a row of stretches."""
+    columns = {name: np.asarray(v, dtype=float)[:, None] for name, v in values.items()}
+    return cast(Values, SimpleNamespace(**columns))

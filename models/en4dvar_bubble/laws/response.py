@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from en4dvar.model.state import Array
-from en4dvar_bubble.laws.base import ConstitutiveLaw, columns
+from en4dvar_bubble.laws.base import ConstitutiveLaw
+from en4dvar_bubble.laws.parameters import columns
 
 
 @dataclass(frozen=True)

@@ -72,7 +72,8 @@ def _coarsen(fine: Array, ratio: int, cells: int) -> Array:
 def differentiate(table: Array) -> Array:
     """The derivative with respect to ln λ of tables (…, cells, 8) on :data:`GRID`, as tables."""
     out = np.zeros_like(table)
-    out[..., :5] = table[..., 1:6] * np.arange(1, 6) / GRID.step
+    out[..., :5] = table[..., 1:6] * np.arange(1, 6) / GRID.step * np.maximum(table[..., 6:7], 1.0)
+    out[..., 6:] = table[..., 6:]
     return out
 
 

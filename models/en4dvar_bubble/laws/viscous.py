@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import ClassVar
 
 from en4dvar.model.state import Array, Parameter
-from en4dvar_bubble.laws.base import Limits, Liquid, Values
-from en4dvar_bubble.laws.parameters import MU, MU_0, MU_INF, SHEAR_TIME
+from en4dvar_bubble.laws.base import Limits, Liquid
+from en4dvar_bubble.laws.parameters import MU, MU_0, MU_INF, SHEAR_TIME, Values
 
 
 class Newtonian(Liquid):

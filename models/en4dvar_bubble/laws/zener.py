@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import ClassVar
 
 from en4dvar.model.state import Parameter
-from en4dvar_bubble.laws.base import Limits, Values
+from en4dvar_bubble.laws.base import Limits
 from en4dvar_bubble.laws.kelvin_voigt import NeoHookeanKelvinVoigt, QuadraticKelvinVoigt
 from en4dvar_bubble.laws.maxwell import Jeffreys, Maxwell
 from en4dvar_bubble.laws.memory import MemoryVariable, linear_maxwell
-from en4dvar_bubble.laws.parameters import ALPHA, MU, MU_P, RELAXATION_TIME, G
+from en4dvar_bubble.laws.parameters import ALPHA, MU, MU_P, RELAXATION_TIME, G, Values
 
 
 class ZenerNeoHookean(NeoHookeanKelvinVoigt):

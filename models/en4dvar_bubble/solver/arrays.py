@@ -32,7 +32,7 @@ class Members(NamedTuple):
     times: Array  # (N, K) output times, increasing, µs
     samples: Array  # (N, nodes) of J_e, tabulated when a member's turn comes; or (0, nodes)
     factor: float  # of the samples
-    tables: Array  # (N, cells, 8) of J_e where there are no samples
+    tables: Array  # (N, cells, 8) of J_e where there are no samples; of sharp laws with halved cells behind
 
 
 class Dims(NamedTuple):
@@ -60,7 +60,7 @@ class Equations(NamedTuple):
     size: Any
     dims: Dims
     gas: Array  # collocation: gas+1 rows of d/dy (the last is the wall), gas of the Laplacian, radii, averaging weights
-    elastic_span: Array  # of the tables against ln λ: first, last, cells per unit, cells
+    elastic_span: Array  # of the tables against ln λ: first, last, cells per unit, cells, times halved at most
     driving: Array  # table of the far-field pressure over its amplitude; of members of their own shape, one each
     driving_span: Array
     reading: int  # when the driving is read, see :mod:`rows`

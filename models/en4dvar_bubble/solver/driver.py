@@ -14,6 +14,7 @@ from en4dvar.model.state import Array
 from en4dvar.plumbing.kernel_cache import stamp_with_sources
 from en4dvar_bubble import tables as tables_module
 from en4dvar_bubble.driving import Driving, Reading
+from en4dvar_bubble.laws.refined import HALVINGS
 from en4dvar_bubble.laws.tabulate import GRID, VISCOUS_GRID
 from en4dvar_bubble.solver import integrate, rows
 from en4dvar_bubble.solver.apart import address
@@ -160,6 +161,7 @@ class System:
 
 
 _ELASTIC_SPAN, _VISCOUS_SPAN = GRID.span, VISCOUS_GRID.span
+_REFINED_SPAN = np.append(_ELASTIC_SPAN[:4], HALVINGS)
 
 
 @dataclass(frozen=True)
@@ -254,22 +256,25 @@ class Solver:
         every = np.arange(system.size)
         return kept_tiles(np.ones((len(every), len(every)), dtype=bool), every), every
 
-    def equations(self, memory: Array, viscous: Array, pulse: Array) -> Equations:
-        """What the compiled equations read beside the members' parameters; tables of laws and pulses (…, cells, 8)."""
+    def equations(self, memory: Array, viscous: Array, pulse: Array, halved: bool = False) -> Equations:
+        """What the compiled equations read beside the members' parameters; tables of laws and pulses (…, cells, 8).
+
+        ``halved``: the elastic tables have halved cells.
+        """
         system, driving = self.system, self.driving
         medium = _medium_operators(system.medium, system.medium_length)
         general: tuple[Any, Any, Any, Any] = (None,) * 4  # what nobody reads need not be compiled either
         if system.general:
             general = medium, memory, viscous, _VISCOUS_SPAN
         gas, reading = _gas_operators(system.gas, system.clustering), READINGS[self.reading]
-        shared = gas, _ELASTIC_SPAN, pulse, driving.span
+        shared = gas, _REFINED_SPAN if halved else _ELASTIC_SPAN, pulse, driving.span
         where, places = self.tiles
         return Equations(*self.lengths, system.dims, *shared, reading, *general, where, places)
 
     @cached_property
     def control(self) -> Control:
         """How the compiled integration chooses its steps, and when it gives a member up."""
-        accuracy, (begin, end, _, _) = self.accuracy, self.driving.span
+        accuracy, (begin, end) = self.accuracy, self.driving.span[:2]
         return Control(
             breaks=self.driving.breaks,
             tolerances=self.system.tolerances(accuracy.rtol),
@@ -296,20 +301,21 @@ class Solver:
             np.zeros(n_members, dtype=np.int64),
             np.zeros((n_members, integrate.RECORD)),
         )
-        equations, control = self.equations(memory, viscous, pulse), self.control
+        cells = max(members.tables.shape[1], GRID.cells)
+        equations, control = self.equations(memory, viscous, pulse, cells > GRID.cells), self.control
 
         def call() -> None:
-            working = self._scratch(members.parameters.shape[1])
+            working = self._scratch(members.parameters.shape[1], cells)
             shared = Shared(members, control, output, working, equations.dims, equations.driving_span)
             integrate.integrate(address(integrate.between_steps, shared), shared, equations)
 
         return call, Solution(*output)
 
-    def _scratch(self, parameters: int) -> Scratch:
+    def _scratch(self, parameters: int, cells: int) -> Scratch:
         system, (where, _) = self.system, self.tiles
         matrix = 0 if system.general else system.size**2
         of_tiles = (0, 0) if where is None else ((where.max() + 1) * AREA, len(where) * EDGE)
         border = system.size - system.wall_row + sums.py_func(system.dims) if system.general else 0
         of_fields = scratch_rows(system.dims)
-        of_lanes = parameters, int(_ELASTIC_SPAN[3]), _FIRST_STEP
+        of_lanes = parameters, cells, _FIRST_STEP
         return scratch(system.dims, matrix, of_tiles, border, of_fields, *of_lanes)

@@ -9,12 +9,26 @@ from en4dvar_bubble.solver.rows import AMPLITUDE, PULSE_RATE, PULSE_SHIFT, PULSE
 
 @inlined
 def lookup(table, offset, span, x):
-    """Value, first and second derivative of a piecewise quintic; beyond its ends the last interval is extended."""
-    origin, per_unit, intervals = span[0], span[2], span[3]
+    """Value, first and second derivative of a piecewise quintic; beyond its ends the last interval is extended.
+
+    A cell whose eighth number is not zero is halved: the number is the place of its left half, the right one follows.
+    """
+    origin, intervals = span[0], span[3]
+    per_unit = splat(span[2])
     position = (x - origin) * per_unit
     cell = minimum(maximum(floor(position), 0.0), intervals - 1.0)
     s = position - cell
-    c0, c1, c2, c3, c4, c5 = gather_rows(table, offset + cell * 8.0)
+    at = offset + cell * 8.0
+    for _ in range(int(span[4])):
+        half = gather_rows(table, at + 2.0)[5]
+        halved = half > 0.5
+        if not any_lane(halved):
+            break
+        right = select(s < 0.5, 0.0, 1.0)
+        at = select(halved, offset + (half + right) * 8.0, at)
+        s = select(halved, s * 2.0 - right, s)
+        per_unit = select(halved, per_unit * 2.0, per_unit)
+    c0, c1, c2, c3, c4, c5 = gather_rows(table, at)
     value = ((((c5 * s + c4) * s + c3) * s + c2) * s + c1) * s + c0
     first = (((c5 * 5.0 * s + c4 * 4.0) * s + c3 * 3.0) * s + c2 * 2.0) * s + c1
     second = ((c5 * 20.0 * s + c4 * 12.0) * s + c3 * 6.0) * s + c2 * 2.0
