@@ -131,6 +131,15 @@ def _tell_what_sets_share(directory: Path, warnings: _Warnings) -> None:
         together = joint_file.load_joint(directory / joint_file.FILE)
         echo(f"\n{joint_table(together)}")
         warnings.add("all together", together.cautions)
+    groups = population_file.load_groups_of(directory)
+    if groups:
+        from en4dvar.report.groups import group_lines
+        from en4dvar.report.population import population_lines
+
+        echo("\n" + "\n".join(group_lines(directory)))
+        for name, (_, of) in groups.items():
+            echo(f"\n{name}\n" + "\n".join(population_lines(of)))
+            warnings.add(f"population of {name}", of.cautions)
     if (directory / population_file.FILE).exists():
         from en4dvar.report.population import population_lines
 
