@@ -97,8 +97,6 @@ def write_comparison(comparison: Comparison, out: str | Path, of: PopulationsCom
     page = render(
         "compare.html.j2",
         title=" – ".join(of.populations if of else comparison.runs),
-        sortable=True,
-        charts=True,
         caption=CAPTION,
         incomparable=comparison.incomparable,
         verdicts=[(name, comparison.verdict(name)) for name in comparison.datasets],
