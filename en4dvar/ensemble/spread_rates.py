@@ -56,6 +56,6 @@ def spread_rates(problem: InverseProblem) -> SpreadRates | None:
         size = physical[prior.names.index(name)] if name in prior.names else problem.fixed[name]
         time_std = np.hypot(time_std, size / o.noise.grows_beyond)
     wanted = np.vstack([o.times, o.times + NODES[:, None] * time_std])
-    instants, found = np.unique(wanted, return_inverse=True)
-    found = found.reshape(wanted.shape)
-    return SpreadRates(time_std, instants, found[0], found[1:])
+    instants, where = np.unique(wanted, return_inverse=True)
+    where = where.reshape(wanted.shape)
+    return SpreadRates(time_std, instants, where[0], where[1:])
