@@ -140,8 +140,8 @@ def _headlines(run_dir: Path) -> list[Headline]:
         for name, (folder, of) in load_groups_of(run_dir).items()
     }
     if (run_dir / POPULATION).exists():
-        found[""] = "", load_population(run_dir / POPULATION)
-    for name, (folder, of) in found.items():
+        stored[""] = "", load_population(run_dir / POPULATION)
+    for name, (folder, of) in stored.items():
         words = f"The population of {name}" if name else "The population behind them"
         told = [f"{name}: {line}" if name else line for line in population.sentences(of)]
         address = quote(f"{folder}{POPULATION_FILES[0]}")

@@ -18,11 +18,11 @@ def numbers_of(names: Sequence[str]) -> tuple[tuple[float, ...], str]:
     """The number in each of the names and their unit, as of ``gel_5kPa`` and ``gel_8kPa``; nothing where a name has
     none or several, units differ, or all numbers are the same.
     """
-    found = [[(number, unit) for number, unit in _NUMBER.findall(name) if _is_unit(unit)] for name in names]
-    units = {unit for of_name in found for _, unit in of_name}
-    if any(len(of_name) != 1 for of_name in found) or len(units) != 1:
+    of_names = [[(number, unit) for number, unit in _NUMBER.findall(name) if _is_unit(unit)] for name in names]
+    units = {unit for of_name in of_names for _, unit in of_name}
+    if any(len(of_name) != 1 for of_name in of_names) or len(units) != 1:
         return (), ""
-    numbers = tuple(float(of_name[0][0]) for of_name in found)
+    numbers = tuple(float(of_name[0][0]) for of_name in of_names)
     return (numbers, units.pop()) if len(set(numbers)) > 1 else ((), "")
 
 

@@ -24,7 +24,7 @@ from en4dvar.results.checkpoint import FOLDER
 from en4dvar.results.netcdf import understood
 from en4dvar.results.population_file import FILE, GROUPS, StoredPopulation, load_population, save_population
 from en4dvar.runs.finished import Finished, carried
-from en4dvar.runs.together import Group, Tell, TogetherKind
+from en4dvar.runs.together import SetGroup, Tell, TogetherKind
 from en4dvar.runs.trust import Ask
 
 ODD = 0.5  # probability from which a data set is named as odd
@@ -101,7 +101,7 @@ class PopulationKind(TogetherKind):
             return write_population(load_population(folder / FILE), folder)
 
 
-def groups_of(config: Config, names: Iterable[str]) -> list[Group]:
+def groups_of(config: Config, names: Iterable[str]) -> list[SetGroup]:
     """The groups that have a population each, in the order of the configuration; none where it asks for no groups.
 
     Raises :class:`ConfigError`: a data set is in no group, or in several.
@@ -112,7 +112,7 @@ def groups_of(config: Config, names: Iterable[str]) -> list[Group]:
     for name in names:
         sets[config.sharing.group_of(kind, name)].add(name)
     return [
-        Group(group, f"{GROUPS}/{i}_{re.sub(r'[^A-Za-z0-9.+-]', '_', group)}", frozenset(of_it))
+        SetGroup(group, f"{GROUPS}/{i}_{re.sub(r'[^A-Za-z0-9.+-]', '_', group)}", frozenset(of_it))
         for i, (group, of_it) in enumerate(sets.items(), 1)
     ]
 

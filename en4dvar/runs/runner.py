@@ -23,7 +23,7 @@ from en4dvar.runs.joint_run import JointKind
 from en4dvar.runs.kind import FIGURES, REPORT, RunKind
 from en4dvar.runs.population_run import PopulationKind, groups_of, require_population
 from en4dvar.runs.session import Session
-from en4dvar.runs.together import Group
+from en4dvar.runs.together import SetGroup
 from en4dvar.runs.worklist import ENDED, ITERATIONS, SUMMARY, Worklist, datasets
 
 if TYPE_CHECKING:
@@ -135,7 +135,7 @@ class EstimateKind(RunKind[Campaign]):
         if self.config.sharing:
             JointKind().within(work, executor)
         if asked := self.config.population:
-            groups: Sequence[Group | None] = groups_of(self.config, self.data) or [None]
+            groups: Sequence[SetGroup | None] = groups_of(self.config, self.data) or [None]
             for group in groups:
                 PopulationKind(asked.of, asked.hyper).within(work, executor, group)
         if work.good() and self.config.report:

@@ -25,7 +25,7 @@ Tell = Callable[[str], None]
 
 
 @dataclass(frozen=True)
-class Group:
+class SetGroup:
     """Names of ``datasets`` that are estimated together, with a ``folder`` of the run directory of their own."""
 
     name: str
@@ -76,7 +76,7 @@ class TogetherKind(Kind, ABC):
         assert page is not None
         return out / self.result, out / page.name
 
-    def within(self, work: Worklist, executor: Executor, group: Group | None = None) -> None:
+    def within(self, work: Worklist, executor: Executor, group: SetGroup | None = None) -> None:
         """Of the data sets of a run (or of one ``group`` of them) that have a posterior, at its end; too few of them
         are told. A file that a resumed run finds, made of the same, is kept.
 
