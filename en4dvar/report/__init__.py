@@ -135,7 +135,7 @@ def _headlines(run_dir: Path) -> list[Headline]:
     from en4dvar.report import joint, population  # with the estimates themselves, which other pages do not need
 
     headlines = [*_side_by_side(run_dir)]
-    found = {
+    stored = {
         name: (f"{folder.relative_to(run_dir).as_posix()}/", of)
         for name, (folder, of) in load_groups_of(run_dir).items()
     }
