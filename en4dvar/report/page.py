@@ -43,7 +43,6 @@ def render_set(
     attributes, judged = result.attributes, result.group("sample_stats")
     return render(
         "set.html.j2",
-        charts=True,
         title=result.name,
         trail=trail,
         copies=copies,
