@@ -33,6 +33,7 @@ MOST_NAMED = 3  # data sets of a warning
     help="Continue the interrupted run in the run directory, to the same bits; if there is none, begin.",
 )
 @click.option("--no-report", is_flag=True, help="Write no page; 'en4dvar report' writes it later.")
+@click.option("--with-what-if", is_flag=True, help="Let the intervals hold the assumptions of the what-if table too.")
 @click.option("--workers", type=click.IntRange(min=1), help="Parallel workers; the numbers do not depend on it.")
 @click.option("--scheduler", metavar="ADDRESS", help="Work on a dask cluster, e.g. tcp://10.0.0.1:8786.")
 def run(
@@ -41,6 +42,7 @@ def run(
     force: bool,
     resume: bool,
     no_report: bool,
+    with_what_if: bool,
     workers: int | None,
     scheduler: str | None,
 ) -> None:
@@ -59,6 +61,7 @@ def run(
     special = {
         "output.directory": str(out) if out else None,
         "output.report": False if no_report else None,
+        "assimilation.what_if": "added" if with_what_if else None,
         "execution.workers": workers,
         "execution.address": scheduler,
     }
