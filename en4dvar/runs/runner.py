@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from en4dvar.assembly.build import build_one, data_files, inverse_plan
-from en4dvar.config import Config, load_config
+from en4dvar.config import Config, load_config, loaded
 from en4dvar.diagnosis.analysis import Progress
 from en4dvar.executor import Executor
 from en4dvar.inputs.asked import DataFile
@@ -56,7 +56,7 @@ def run(
     ConfigError, DataError, OutputError: before anything is computed; also where a changed run cannot be resumed.
     TooFewMembersError: the ensemble is lost. ExecutorError: the workers are gone. Interrupted: Ctrl-C or SIGTERM.
     """
-    config = _loaded(config, overrides)
+    config = loaded(config, load_config, overrides)
     count = len(data_files(inverse_plan(config)))
     if count != 1:
         raise ConfigError(f"data.path names {count} data sets; use run_campaign, or name one")
@@ -83,7 +83,7 @@ def run_campaign(
 
     ``report_workers``: processes that draw the report. They import the main script, which must guard what it does then.
     """
-    kind = EstimateKind(_loaded(config, overrides), resume, progress, report_workers)
+    kind = EstimateKind(loaded(config, load_config, overrides), resume, progress, report_workers)
     return conduct_run(kind, force, resume, command)
 
 
@@ -205,11 +205,3 @@ def _estimate(work: Worklist, executor: Executor) -> None:
                 raise
             repeated.update(error.names)
             work.estimate_again(error.names)
-
-
-def _loaded(config: Config | str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None) -> Config:
-    if not isinstance(config, Config):
-        return load_config(config, overrides)
-    if overrides:
-        raise ConfigError("overrides apply to a file or dict; give them to load_config instead")
-    return config
