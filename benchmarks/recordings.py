@@ -2,6 +2,7 @@
 
     python benchmarks/recordings.py                          24 synthetic recordings of seed 1, and a table
     python benchmarks/recordings.py --seed 7 --start 24 --n 24 --minutes 5    a piece; the next call goes on
+    python benchmarks/recordings.py --world wall-3 --with-what-if --n 50    readings the fit cannot make
     python benchmarks/recordings.py --measured ../shared/data/bubbles/stiff_polyacrylamide
     python benchmarks/recordings.py --measured ../shared/data/bubbles/peg_water --law newtonian --medium water
     python benchmarks/recordings.py --page bubbles.md --measured ../shared/data/bubbles/*    folders of known names
@@ -39,16 +40,15 @@ import numpy as np
 from click.testing import CliRunner
 from measured_page import GROUPS, after, chi2, intervals, page, said, stated
 from records import Record, fill
+from wrong_worlds import WORLDS, Wrong
 
 import en4dvar
 from en4dvar.cli import main as command_line
 from en4dvar.inputs.window import minima
-from en4dvar.model.forward import Failure
 from en4dvar.report.result import Result
 from en4dvar.report.text import shown
 from en4dvar.report.withheld import withheld_lines
 from en4dvar_bubble.model import BubbleModel
-from en4dvar_bubble.settings import BubbleSettings
 
 LAWS = {"neo-hookean-kelvin-voigt": 0.5, "quadratic-kelvin-voigt": 0.3, "newtonian": 0.2}  # and how often
 FULL = {"gas": "heat", "vapour": "transport", "medium_heat": "conducting"}
@@ -66,9 +66,12 @@ def between(stream: np.random.Generator, low: float, high: float) -> float:
     return float(np.exp(stream.uniform(np.log(low), np.log(high))))
 
 
-def laboratory(stream: np.random.Generator, physics: dict[str, str]) -> tuple[str, dict[str, float], BubbleModel]:
+def laboratory(
+    stream: np.random.Generator, physics: dict[str, str], world: Wrong | None
+) -> tuple[str, dict[str, float], BubbleModel]:
     """Law, true values, and the model of one experiment."""
     law = str(stream.choice(list(LAWS), p=list(LAWS.values())))
+    law = world.fitted if world else law
     truth = {"mu": between(stream, 0.01, 1.0), "R_max": between(stream, 50e-6, 600e-6)}
     truth["R_eq"] = truth["R_max"] * float(np.exp(np.log(0.13) + 0.3 * stream.standard_normal()))
     gel = law != "newtonian"
@@ -78,27 +81,27 @@ def laboratory(stream: np.random.Generator, physics: dict[str, str]) -> tuple[st
         truth["alpha"] = between(stream, 0.02, 1.0)
     density = stream.uniform(1000.0, 1060.0) if gel else stream.uniform(995.0, 1035.0)
     constants = {"rho": f"{density} kg/m^3", "p_inf": f"{101.325 * (1 + 0.01 * stream.standard_normal())} kPa"}
-    settings = BubbleSettings.model_validate({**physics, "start": "laser", "law": law, "constants": constants})
-    return law, truth, BubbleModel.from_settings(settings)
+    return law, truth, (world or Wrong(law)).model(truth, physics, constants)
 
 
-def recording(seed: int, physics: dict[str, str]) -> tuple[str, dict[str, float], str]:
+def recording(seed: int, physics: dict[str, str], world: Wrong | None = None) -> tuple[str, dict[str, float], str]:
     """Law, true values, and the file's text."""
     stream = np.random.default_rng([33, seed])
     while True:
-        law, truth, model = laboratory(stream, physics)
+        law, truth, model = laboratory(stream, physics, world)
         medium = model.medium
         t_c = 0.9147 * truth["R_max"] * np.sqrt(medium.rho / medium.p_inf)
         rate = between(stream, 0.1e6, 5e6)
         if not FRAMES[0] < rate * t_c < FRAMES[1]:
             continue
         times = np.linspace(0.0, 8 * t_c, CELLS)
-        (path,) = model.trajectories(model.initial_states({k: np.array([v]) for k, v in truth.items()}), times)
-        if not isinstance(path, Failure):
-            return law, truth, _filmed(stream, times, path["R"], rate, t_c)
+        radius = (world or Wrong(law)).radius(model, truth, times)
+        if radius is not None:
+            said = world.rate if world else 1.0
+            return law, truth, _filmed(stream, times, radius, rate, t_c, said)
 
 
-def _filmed(stream: np.random.Generator, times: Any, radius: Any, rate: float, t_c: float) -> str:
+def _filmed(stream: np.random.Generator, times: Any, radius: Any, rate: float, t_c: float, faster: float) -> str:
     noise = between(stream, 0.002, 0.03) * radius[0]
     grown = stream.uniform(0.2, 0.9) if stream.random() < 0.7 else 0.0  # of the collapse time, seen before R_max
     last = min(stream.uniform(3.0, 7.5) * t_c, 256 / rate)
@@ -113,11 +116,11 @@ def _filmed(stream: np.random.Generator, times: Any, radius: Any, rate: float, t
         read[stream.integers(len(t))] += stream.choice([-1, 1]) * stream.uniform(6, 15) * noise
     scale = 1 + 0.005 * stream.standard_normal()
     kept = ~gap & (read > 0.005 * radius[0])
-    rows = [f"{1e6 * (a - t[0]):.6g},{1e6 * scale * b:.6g}" for a, b in zip(t[kept], read[kept], strict=True)]
+    rows = [f"{faster * 1e6 * (a - t[0]):.6g},{1e6 * scale * b:.6g}" for a, b in zip(t[kept], read[kept], strict=True)]
     return "\n".join(["t_us,R_um", *rows]) + "\n"
 
 
-def verbatim(text: str, law: str, words: list[str], quick: bool) -> Record:
+def verbatim(text: str, law: str, words: list[str], quick: bool, with_what_if: bool = False) -> Record:
     """What ``init`` and ``run`` say of a file, from a folder of its own, beside what its head states."""
     begun = time.process_time()
     with TemporaryDirectory() as name:
@@ -131,6 +134,7 @@ def verbatim(text: str, law: str, words: list[str], quick: bool) -> Record:
         changes: dict[str, Any] = {"execution.workers": 1, "output.report": False}
         changes |= {"output.directory": str(folder / "run")}
         changes |= {f"model.{key}": value for key, value in QUICK.items()} if quick else {}
+        changes |= {"assimilation.what_if": "added"} if with_what_if else {}
         changes |= stated(text)
         try:
             with warnings.catch_warnings():
@@ -172,9 +176,9 @@ def _posterior(members: Any, row: dict[str, str]) -> Record:
     return {**said, **moments, "ln": (float(logs.mean()), float(logs.std(ddof=1))), "untrusted": row["untrusted"]}
 
 
-def synthetic(seed: int, quick: bool) -> Record:
-    law, truth, text = recording(seed, QUICK if quick else FULL)
-    return {"law": law, "truth": truth, **verbatim(text, law, [], quick)}
+def synthetic(seed: int, o: argparse.Namespace) -> Record:
+    law, truth, text = recording(seed, QUICK if o.quick else FULL, WORLDS.get(o.world))
+    return {"law": law, "truth": truth, **verbatim(text, law, [], o.quick, o.with_what_if)}
 
 
 def table(records: list[Record]) -> None:
@@ -251,6 +255,8 @@ def main() -> None:
     parser.add_argument("--n", type=int, default=24)
     parser.add_argument("--minutes", type=float, default=np.inf, help="start no set after so long")
     parser.add_argument("--quick", action="store_true", help="isothermal gas in truth and fit")
+    parser.add_argument("--world", default="", choices=["", *WORLDS], help="what the fit does not know of")
+    parser.add_argument("--with-what-if", action="store_true", help="as of run")
     parser.add_argument("--measured", type=Path, nargs="*", default=[], help="folders of measured bubbles instead")
     parser.add_argument("--law", default="neo-hookean-kelvin-voigt", help="of the measured material")
     parser.add_argument("--medium", default="", help="of the measured material, as init takes it")
@@ -261,8 +267,8 @@ def main() -> None:
     o = parser.parse_args()
     if not o.measured:
         keys = [str(1000 * o.seed + i) for i in range(o.start, o.start + o.n)]
-        path = o.records / f"{'quick' if o.quick else 'full'}.jsonl"
-        table(list(fill(path, keys, lambda key: synthetic(int(key), o.quick), o.minutes).values()))
+        kind = f"{'quick' if o.quick else 'full'}{o.world and '_' + o.world}{'_what_if' * o.with_what_if}"
+        table(list(fill(o.records / f"{kind}.jsonl", keys, lambda key: synthetic(int(key), o), o.minutes).values()))
     groups = {}
     for folder in o.measured:
         group = GROUPS.get(folder.name)

@@ -6,7 +6,7 @@ import glob
 import itertools
 import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from pathlib import Path
 
 from en4dvar.inputs.asked import ANY, SUFFIXES, Column, DataFile, Layout
@@ -35,8 +35,11 @@ def with_parts(
 
 
 def find_files(base: Path, texts: Sequence[str]) -> dict[str, Path]:
-    """:func:`data_files` of paths, folders and patterns relative to ``base``. Raises :class:`DataError`."""
+    """:func:`data_files` of paths, folders and patterns relative to ``base``. Of a folder without data files those of
+    its subfolders are taken, and each is named after its subfolder and itself. Raises :class:`DataError`.
+    """
     paths: list[Path] = []
+    grouped: set[Path] = set()
     for text in texts:
         try:
             path = base / expanded(text)
@@ -48,16 +51,20 @@ def find_files(base: Path, texts: Sequence[str]) -> dict[str, Path]:
                 raise DataError(f"{path}: no file matches")
             paths += matches
         elif os.path.isdir(path):
-            held = [p for p in _beside(path) if p.suffix.lower() in SUFFIXES and not p.name.startswith(".")]
+            held = _data_files(path)
+            if not held:
+                folders = sorted((p for p in _beside(path) if p.is_dir() and p.name[0] != "."), key=natural)
+                held = [file for folder in folders for file in _data_files(folder)]
+                grouped.update(held)
             if not held:
                 raise DataError(f"{path}: the folder holds no data file ({', '.join(SUFFIXES)})")
-            paths += sorted(held, key=natural)
+            paths += held
         else:
             paths.append(path)
     again = [path for path, count in Counter(os.path.abspath(p) for p in paths).items() if count > 1]
     if again:
         raise DataError(f"{again[0]}: occurs more than once in data.path")
-    return dict(zip(_unique_names(paths), paths, strict=True))
+    return dict(zip(_unique_names(paths, grouped), paths, strict=True))
 
 
 def _beside(folder: Path) -> list[Path]:
@@ -67,11 +74,16 @@ def _beside(folder: Path) -> list[Path]:
         raise DataError(f"{folder}: cannot be read: {error.strerror}") from None
 
 
-def _unique_names(paths: list[Path]) -> list[str]:
+def _data_files(folder: Path) -> list[Path]:
+    held = [p for p in _beside(folder) if p.suffix.lower() in SUFFIXES and not p.name.startswith(".")]
+    return sorted(held, key=natural)
+
+
+def _unique_names(paths: list[Path], grouped: Set[Path]) -> list[str]:
     stems = Counter(p.stem for p in paths)
     names: dict[str, None] = {}
     for path in paths:
-        name = path.stem if stems[path.stem] == 1 else f"{path.parent.name}_{path.stem}"
+        name = path.stem if stems[path.stem] == 1 and path not in grouped else f"{path.parent.name}_{path.stem}"
         same = itertools.chain([name], (f"{name}_{i}" for i in itertools.count(2)))
         names[next(n for n in same if n not in names)] = None
     return list(map(readable, names))

@@ -80,8 +80,8 @@ def compare(
 ) -> None:  # fmt: skip
     """Compare runs: posteriors over each other and, on the same data, evidence and model probabilities.
 
-    Of runs of different data that end with populations (or of folders of 'en4dvar population') the medians are
-    compared first: by how much that of one is larger, and how surely, where what all have in common cancels.
+    Of runs of different data that end with populations (or of folders of 'en4dvar population') the medians alone are
+    compared: by how much that of one is larger, and how surely, where what all have in common cancels.
 
     Evidences are sampled with forward runs if the model is cheap. Code outside the current folder and installed
     packages is run only with --trust.
@@ -95,7 +95,6 @@ def compare(
       en4dvar compare runs/gel_5 runs/gel_8 runs/gel_10 --against 5,8,10
     """
     from en4dvar.report.compare import Comparison, compare_runs, comparison_table, estimates_table, with_evidences
-    from en4dvar.report.populations import hold_populations
     from en4dvar.results.run_results import has_results
     from en4dvar.results.series_file import series_file
 
@@ -104,17 +103,16 @@ def compare(
 
         echo(sequences_table(compare_sequences(run_dirs)))
         return
-    only = hold_populations(run_dirs) and not any(map(has_results, run_dirs))
-    of = _populations(run_dirs, against, apart, only)
-    comparison = Comparison(()) if only else compare_runs(run_dirs)
-    if not (stored or only or comparison.incomparable):
+    of = _populations(run_dirs, against, apart, not any(map(has_results, run_dirs)))
+    comparison = Comparison(()) if of else compare_runs(run_dirs)
+    if not (stored or of or comparison.incomparable):
         from en4dvar.runs.evidence_run import sampled_evidences
 
         evidences = [sampled_evidences(run_dir, workers, trust, None, tell) for run_dir in run_dirs]
         comparison = with_evidences(comparison, evidences)
-    if not only and len(comparison.estimates) <= MOST_ROWS:
+    if not of and len(comparison.estimates) <= MOST_ROWS:
         echo(f"{estimates_table(comparison)}\n")
-    if not only:
+    if not of:
         echo(comparison_table(comparison))
     if not no_report:
         from en4dvar.report.overlay import write_comparison
@@ -124,16 +122,18 @@ def compare(
 
 
 def _populations(
-    run_dirs: tuple[Path, ...], against: tuple[float, ...], apart: tuple[str, ...], only: bool
+    run_dirs: tuple[Path, ...], against: tuple[float, ...], apart: tuple[str, ...], alone: bool
 ) -> PopulationsCompared | None:
     """The populations of the runs side by side, told on standard output; None where there are none to compare.
 
-    Raises :class:`OutputError`: they cannot be compared, and nothing else can be, or options ask for it.
+    ``alone``: the folders hold nothing else. Raises :class:`OutputError`: they cannot be compared, and nothing else
+    can be, or options ask for it.
     """
     from en4dvar.report.populations import compare_populations, hold_populations, medians_table, sentences
 
-    asked = only or against or apart
-    if not (asked or hold_populations(run_dirs)):
+    held = hold_populations(run_dirs)
+    asked = (held and alone) or against or apart
+    if not (asked or held):
         return None
     try:
         of = compare_populations(run_dirs, against, apart)

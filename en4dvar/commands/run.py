@@ -33,6 +33,7 @@ MOST_NAMED = 3  # data sets of a warning
     help="Continue the interrupted run in the run directory, to the same bits; if there is none, begin.",
 )
 @click.option("--no-report", is_flag=True, help="Write no page; 'en4dvar report' writes it later.")
+@click.option("--with-what-if", is_flag=True, help="Let the intervals hold the assumptions of the what-if table too.")
 @click.option("--workers", type=click.IntRange(min=1), help="Parallel workers; the numbers do not depend on it.")
 @click.option("--scheduler", metavar="ADDRESS", help="Work on a dask cluster, e.g. tcp://10.0.0.1:8786.")
 def run(
@@ -41,6 +42,7 @@ def run(
     force: bool,
     resume: bool,
     no_report: bool,
+    with_what_if: bool,
     workers: int | None,
     scheduler: str | None,
 ) -> None:
@@ -59,6 +61,7 @@ def run(
     special = {
         "output.directory": str(out) if out else None,
         "output.report": False if no_report else None,
+        "assimilation.what_if": "added" if with_what_if else None,
         "execution.workers": workers,
         "execution.address": scheduler,
     }
@@ -131,6 +134,15 @@ def _tell_what_sets_share(directory: Path, warnings: _Warnings) -> None:
         together = joint_file.load_joint(directory / joint_file.FILE)
         echo(f"\n{joint_table(together)}")
         warnings.add("all together", together.cautions)
+    groups = population_file.load_groups_of(directory)
+    if groups:
+        from en4dvar.report.groups import group_lines
+        from en4dvar.report.population import population_lines
+
+        echo("\n" + "\n".join(group_lines(directory)))
+        for name, (_, of) in groups.items():
+            echo(f"\n{name}\n" + "\n".join(population_lines(of)))
+            warnings.add(f"population of {name}", of.cautions)
     if (directory / population_file.FILE).exists():
         from en4dvar.report.population import population_lines
 

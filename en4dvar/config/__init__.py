@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from en4dvar.config.document import Document, document_from, override
 from en4dvar.config.load import Config, load_config, resolve
@@ -15,9 +15,10 @@ from en4dvar.plumbing.errors import ConfigError, Fault
 
 __all__ = [
     "AnyConfig", "Config", "SequenceConfig", "TwinConfig", "load_any", "load_config", "load_sequence", "load_twin",
-    "resolve", "resolve_any", "resolve_sequence", "time_grid",
+    "loaded", "resolve", "resolve_any", "resolve_sequence", "time_grid",
 ]  # fmt: skip
 
+Loaded = TypeVar("Loaded", Config, TwinConfig, SequenceConfig)
 AnyConfig = Config | TwinConfig | SequenceConfig
 
 
@@ -49,4 +50,15 @@ def load_sequence(source: str | Path | Mapping[str, Any], overrides: Mapping[str
     config = load_any(source, overrides)
     if not isinstance(config, SequenceConfig):
         raise ConfigError([Fault("not a sequence: it has no sequence: section", file=config.document.file)])
+    return config
+
+
+def loaded(
+    config: Loaded | str | Path | Mapping[str, Any], load: Callable[..., Loaded], overrides: Mapping[str, Any] | None
+) -> Loaded:
+    """A configuration that is loaded already, or by ``load`` with ``overrides``. Raises :class:`ConfigError`: both."""
+    if isinstance(config, str | Path | Mapping):
+        return load(config, overrides)
+    if overrides:
+        raise ConfigError(f"overrides apply to a file or dict; give them to {load.__name__} instead")
     return config

@@ -163,7 +163,7 @@ def resolve(document: Document, base: Path, model: ForwardModel | None = None) -
     others = [initial.term.parameter.name for initial in file.initial_state or () if isinstance(initial, Perturbed)]
     parameters, blocks = resolved(file.parameters, file.prior, file.prior_correlation or (), others, apart, document)
     if file.population is not None:
-        check_population(file.population, parameters, document)
+        check_population(file.population, parameters, file.groups or {}, document)
     settings = file.assimilation.settings
     minimiser = settings.own.minimiser
     if minimiser and isinstance(minimiser.start, GivenStart):

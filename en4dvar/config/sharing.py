@@ -32,6 +32,8 @@ class PopulationSection(_HyperPrior):
 
     of: Annotated[tuple[str, ...], Field(min_length=1)]
     """Parameters that vary from data set to data set about a common median, e.g. [G, mu]."""
+    by: Name | None = None
+    """A kind of group under ``groups``: each group has a population of its own, and they are compared."""
     reference: Annotated[dict[Name, str], Field(default_factory=dict)]
     """Values of others to compare with, e.g. {G: 7.7 ± 1.1 kPa, source: indentation}; they change no number."""
 
@@ -41,9 +43,17 @@ class PopulationSection(_HyperPrior):
         return HyperPrior(**{field.name: getattr(self, field.name) for field in fields(HyperPrior)})
 
 
-def check_population(section: PopulationSection, entries: Sequence[Entry], document: Document) -> None:
-    """Raises :class:`ConfigError`: every parameter that is not estimated, or whose prior depends on the data set."""
-    if faults := list(_unfit(section, entries, document)):
+def check_population(
+    section: PopulationSection, entries: Sequence[Entry], groups: Mapping[str, object], document: Document
+) -> None:
+    """Raises :class:`ConfigError`: every parameter that is not estimated, or whose prior depends on the data set; an
+    unknown kind of group.
+    """
+    faults = list(_unfit(section, entries, document))
+    if section.by is not None and section.by not in groups:
+        words = f"no kind of 'groups:' is called {shown(section.by)}{suggest(section.by, groups)}"
+        faults.append(document.fault(("population", "by"), words))
+    if faults:
         raise ConfigError(faults)
 
 
@@ -100,9 +110,10 @@ class Sharing:
 
     def of_dataset(self, name: str) -> dict[str, str]:
         """Shared parameter → group of a data set, "" for all. Raises :class:`ConfigError`: it is in none or several."""
-        return {parameter: "" if kind == ALL else self._group(kind, name) for parameter, kind in self.kinds.items()}
+        return {parameter: "" if kind == ALL else self.group_of(kind, name) for parameter, kind in self.kinds.items()}
 
-    def _group(self, kind: str, name: str) -> str:
+    def group_of(self, kind: str, name: str) -> str:
+        """Group of a data set. Raises :class:`ConfigError`: it is in none or several."""
         groups = [
             group
             for group, patterns in self.groups[kind].items()

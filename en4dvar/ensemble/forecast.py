@@ -12,6 +12,7 @@ import numpy as np
 from en4dvar.data.noise import Predicted
 from en4dvar.ensemble.members import EVERYONE, NOT_FINITE, Indices, InitialStates, Reading, out_of_bounds
 from en4dvar.ensemble.readout import Readout, batched, operators_of
+from en4dvar.ensemble.spread_rates import spread_rates
 from en4dvar.executor import Executor, SerialExecutor
 from en4dvar.model.state import NOISE_SCALE, OF_READINGS, READING_OFFSET, READING_SCALE, TIME_SHIFT, Array, Parameter
 from en4dvar.plumbing.errors import ConfigError
@@ -87,6 +88,7 @@ class Composite:
         self._operators = _operators(problem)
         self._batched = batched(problem)
         self._scaled, self._discrepancy = problem.has_noise_scale, problem.discrepancy
+        self._spread = spread_rates(problem)
 
     def __call__(self, x: Array, extra_times: Array = NO_TIMES) -> Forecast:
         """Run control vectors ``x`` (B, n; transformed) through F and H.
@@ -97,7 +99,7 @@ class Composite:
         finite numbers.
         """
         problem = self.problem
-        times, reading, size, at_observations, at_extra = self._reading(extra_times)
+        times, reading, size, at_observations, at_extra, at_nodes = self._reading(extra_times)
         named = len(problem.prior.terms)
         physical = problem.prior.to_physical(x[:, :named])
         failures = out_of_bounds(problem.prior, physical)
@@ -118,7 +120,7 @@ class Composite:
         observed = as_read(problem, physical, observed)
         predicted = Predicted(
             observed[0][:, at_observations],
-            observed[1][:, at_observations] if len(observed) > 1 else None,
+            self._rates(observed, at_observations, at_nodes) if len(observed) > 1 else None,
             _of_framework(problem, physical, NOISE_SCALE, 1.0) if self._scaled else None,
             np.stack([_of_framework(problem, physical, p, np.nan) for p in self._discrepancy], axis=1)
             if self._discrepancy
@@ -127,25 +129,36 @@ class Composite:
         extremes, beyond = limits[..., 0], limits[..., 1] - shift[:, None]
         return Forecast(predicted, observed[0][:, at_extra], tuple(failures), extremes, beyond)
 
-    def _reading(self, extra_times: Array) -> tuple[Array, Reading, int, Indices, Indices]:
-        """The instants; what is read there and how many numbers that are; which of them are observations, and curves.
+    def _rates(self, observed: Array, at: Indices, nodes: Indices) -> Array:
+        rates: Array = observed[1][:, at]
+        if self._spread is None:
+            return rates
+        return self._spread.rates(np.moveaxis(observed[0][:, nodes], 1, 0), rates)
+
+    def _reading(self, extra_times: Array) -> tuple[Array, Reading, int, Indices, Indices, Indices]:
+        """The instants; what is read there and how many numbers that are; which of them are observations, and curves,
+        and the nodes of rates.
 
         A single observable is read at all instants, and picked from them for all members at once.
         """
         observations = self.problem.observations
         limits = tuple(self.problem.model.validity) if len(extra_times) else ()
-        instants, rows = observations.instants
+        spread = self._spread
+        instants, rows = observations.instants if spread is None else (spread.instants, spread.at)
         times, at_instants, at_extra = _union(instants, extra_times)
+        nodes: Indices = slice(0, 0) if spread is None else spread.nodes
+        if not isinstance(at_instants, slice):
+            rows = at_instants[rows]
+            nodes = at_instants[nodes]
         if not observations.parts:
             quantities = tuple(of_parts[0] for of_parts in self._operators)
-            return times, Reading(quantities, limits, self._batched), len(times), at_instants, at_extra
-        rows = rows if isinstance(at_instants, slice) else at_instants[rows]
+            return times, Reading(quantities, limits, self._batched), len(times), rows, at_extra, nodes
         readouts = tuple(
             Readout(operator, observations.parts, len(times), rows, at_extra) for operator in self._operators
         )
         k, curves = len(observations), sum(part.has_path for part in observations.parts)
         size = k + curves * len(extra_times)
-        return times, Reading(readouts, limits, self._batched), size, slice(0, k), slice(k, size)
+        return times, Reading(readouts, limits, self._batched), size, slice(0, k), slice(k, size), nodes
 
 
 def plotting_times(problem: InverseProblem) -> Array:

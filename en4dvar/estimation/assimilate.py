@@ -12,7 +12,7 @@ from en4dvar.diagnosis import diagnostics as diag
 from en4dvar.diagnosis.analysis import Analysis, Progress
 from en4dvar.diagnosis.honesty import ControlEnsembles, examine
 from en4dvar.diagnosis.response.ledger import ledger
-from en4dvar.diagnosis.response.what_if import Fit, Shift, what_if
+from en4dvar.diagnosis.response.what_if import Fit, Shift, what_if, with_shifts
 from en4dvar.diagnosis.withheld import predict_withheld
 from en4dvar.ensemble.forecast import Forecast, cost, forecast, log_posterior
 from en4dvar.estimation import conclusions
@@ -102,7 +102,11 @@ def _through(stages: Stages, resume: LoopState | None) -> Analysis:
     if counting:
         weights = np.array([mode.weight for mode in analysis.modes])
         cautions = (*cautions, *mode_cautions(prior, counting, weights, agree, sampled.refined))
-    return replace(analysis, cautions=examine(analysis, control, outcome.descent.worst_loss, cautions))
+    analysis = replace(analysis, cautions=examine(analysis, control, outcome.descent.worst_loss, cautions))
+    if stages.settings.what_if == "added":  # last, since what is examined is the posterior of the data
+        widened = with_shifts(ends.members, analysis.what_if, stages.seed)
+        analysis = replace(analysis, posterior=prior.to_physical(widened))
+    return analysis
 
 
 def _concluded(

@@ -134,6 +134,9 @@ def remarks(a: Analysis) -> tuple[str, ...]:
         share, count = a.withheld.inside, len(a.withheld.values)
         lines.insert(0, f"after the window: {share:.0%} of {count} readings lie in their 90 % bands")
     known = [name for name in a.problem.model.path_parameters if name in a.problem.prior.names]
+    if a.settings.what_if == "added":
+        count = sum(shift.settled for shift in a.what_if)
+        lines.insert(0, f"the intervals hold {count} assumptions of the what-if table, each as one standard deviation")
     lines[:0] = [words for name in known if (words := budget_words(a, name))]
     return (*lines, *([f"what if: {more} more exceed the error bar, or may; see the report"] if more else []))
 

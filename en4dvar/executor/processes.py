@@ -93,6 +93,7 @@ class ProcessesExecutor(PoolExecutor):
     reads = True
 
     def __init__(self, workers: int, limits: Limits = NO_LIMITS):
+        end_unguarded()
         super().__init__(workers)
         self.limits = limits
         self._idle: list[_Worker] = []
@@ -188,8 +189,8 @@ class ProcessesExecutor(PoolExecutor):
         self.close()
 
 
-class UnguardedError(ExecutorError):
-    """A script starts worker processes, which run it again."""
+class UnguardedError(SystemExit, ExecutorError):
+    """A script starts worker processes, which run it again. Where it is not caught Python ends with its words alone."""
 
 
 def end_unguarded() -> None:

@@ -7,7 +7,7 @@ the worst warned of get theirs at once and the others when they are asked for by
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from urllib.parse import quote
 
@@ -22,6 +22,7 @@ from en4dvar.report.figures import all_figures
 from en4dvar.report.overview import Headline, SetSummary, overview_figures, render_overview
 from en4dvar.report.page import IDENTIFIERS, render_set
 from en4dvar.report.responses import ENTRY_COLUMNS, SHIFT_COLUMNS, Lines, response_lines
+from en4dvar.report.svg import svg
 from en4dvar.report.varying import PIECE_COLUMNS, piece_lines
 from en4dvar.report.withheld import COLUMNS as WITHHELD_COLUMNS
 from en4dvar.report.withheld import withheld_lines
@@ -29,7 +30,7 @@ from en4dvar.results.campaign_file import failed_datasets
 from en4dvar.results.joint_file import FILE, load_joint
 from en4dvar.results.pack import PACK
 from en4dvar.results.population_file import FILE as POPULATION
-from en4dvar.results.population_file import load_population
+from en4dvar.results.population_file import load_groups_of, load_population
 from en4dvar.results.run_results import RunResults
 from en4dvar.results.store import StoredResult, load_stored
 
@@ -133,17 +134,37 @@ def _headlines(run_dir: Path) -> list[Headline]:
     """What the data sets say together, where the run estimated it."""
     from en4dvar.report import joint, population  # with the estimates themselves, which other pages do not need
 
-    headlines = []
+    headlines = [*_side_by_side(run_dir)]
+    stored = {
+        name: (f"{folder.relative_to(run_dir).as_posix()}/", of)
+        for name, (folder, of) in load_groups_of(run_dir).items()
+    }
     if (run_dir / POPULATION).exists():
-        of = load_population(run_dir / POPULATION)
-        words = "The population behind them"
-        lines = population.sentences(of)
-        headlines.append(Headline(POPULATION_FILES[0], words, lines, population.figure(of), population.caption(of)))
+        stored[""] = "", load_population(run_dir / POPULATION)
+    for name, (folder, of) in stored.items():
+        words = f"The population of {name}" if name else "The population behind them"
+        told = [f"{name}: {line}" if name else line for line in population.sentences(of)]
+        address = quote(f"{folder}{POPULATION_FILES[0]}")
+        headlines.append(Headline(address, words, told, population.figure(of), population.caption(of)))
     if (run_dir / FILE).exists():
         shared = load_joint(run_dir / FILE)
         lines = tuple(joint.joint_lines(shared))
         headlines.append(Headline(JOINT_FILES[0], "All of them together", lines, joint.figure(shared), joint.CAPTION))
     return headlines
+
+
+def _side_by_side(run_dir: Path) -> Iterator[Headline]:
+    """The groups of the run compared, where there are two of them; their tables are written."""
+    from en4dvar.report import groups, populations
+
+    of = groups.groups_compared(run_dir)
+    if isinstance(of, str):
+        yield Headline("summary.csv", "All data sets", [of], "", "")
+    elif of is not None:
+        populations.write_tables(of, run_dir)
+        drawn = svg(populations.figure(of), "populations", populations.CAPTION)
+        lines = [f"Compared: {line}" for line in groups.group_sentences(of)]  # names of parameters keep their case
+        yield Headline("differences.csv", "The differences", lines, drawn, populations.CAPTION)
 
 
 def _write_page(run_dir: Path, stem: str, copies: str | None, trail: Sequence[tuple[str, str]]) -> None:

@@ -182,7 +182,6 @@ def write_calibration(folder: Path) -> Path:
         head=HEAD,
         level=LEVEL,
         figures=draw(figures),
-        charts=True,
         configuration=_configuration(folder),
     )
     return write_text(folder / "calibration.html", page)

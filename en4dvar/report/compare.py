@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -26,6 +27,7 @@ from en4dvar.report.text import fixed
 from en4dvar.results.run_results import result_files
 from en4dvar.results.store import StoredResult, load_stored
 
+T = TypeVar("T")
 MOST_WARNINGS = 12  # on the terminal
 MEANINGLESS = (
     2.0  # p_WAIC beyond so many times the number of parameters tells of members that do not fit, no complexity
@@ -125,9 +127,7 @@ class Comparison:
         if self.incomparable:
             return f"not compared: {self.incomparable}"
         best, second = sorted(self.of(dataset), key=lambda score: -score.log_evidence)[:2]
-        words = f"{best.run} is preferred: log-evidence {-second.difference:.2f} above {second.run}"
-        if -second.difference < UNDECIDABLE:
-            words = f"undecidable: {best.run} and {second.run} differ by {-second.difference:.2f} in log-evidence"
+        words = preferred(best.run, second.run, -second.difference)
         doubts = [f"{score.run} ({score.doubted})" for score in (best, second) if score.doubted]
         return (
             f"{words}; not to be trusted before the warnings of {' and '.join(doubts)} are settled" if doubts else words
@@ -143,14 +143,7 @@ def compare_runs(runs: Sequence[str | Path] | Mapping[str, str | Path | StoredRe
     ------
     OutputError: fewer than two runs, a run given twice, a directory without results, or results without names.
     """
-    if len(runs) < 2:
-        raise OutputError("compare needs at least two run directories")
-    if not isinstance(runs, Mapping):
-        if any(isinstance(run, StoredResult) for run in runs):
-            raise OutputError("results at hand have no names: give {'one': result, 'other': result}")
-        paths = [Path(run) for run in runs]
-        runs = dict(zip(labels_of(paths), paths, strict=True))
-    results = {name: _results(run) for name, run in runs.items()}
+    results = {name: _results(run) for name, run in named(runs).items()}
     datasets = list(dict.fromkeys(dataset for held in results.values() for dataset in held))
     pairs = [(name, d, held[d]) for d in datasets for name, held in results.items() if d in held]
     estimates = tuple(
@@ -198,6 +191,13 @@ def _difference(results: Mapping[str, Mapping[str, StoredResult]]) -> str:
                     "or weights do not compare"
                 )
     return ""
+
+
+def preferred(best: str, second: str, by: float) -> str:
+    """That one of two runs has the log-evidence that is larger ``by`` so much, or that the data do not decide."""
+    if by < UNDECIDABLE:
+        return f"undecidable: {best} and {second} differ by {by:.2f} in log-evidence"
+    return f"{best} is preferred: log-evidence {by:.2f} above {second}"
 
 
 def model_probabilities(log_evidence: Array) -> Array:
@@ -254,13 +254,20 @@ def estimates_table(comparison: Comparison) -> str:
     return table([header, *rows])
 
 
-def labels_of(runs: Sequence[Path]) -> list[str]:
-    """Names of the directories; their paths where names repeat."""
-    names = [run.resolve().name for run in runs]
-    labels = names if len(set(names)) == len(names) else [str(run) for run in runs]
+def named(runs: Sequence[str | Path] | Mapping[str, T]) -> Mapping[str, T | Path]:
+    """Name → run: names of the folders, or their paths where names repeat; at least two runs."""
+    if len(runs) < 2:
+        raise OutputError("compare needs at least two run directories")
+    if isinstance(runs, Mapping):
+        return runs
+    if any(isinstance(run, StoredResult) for run in runs):
+        raise OutputError("results at hand have no names: give {'one': result, 'other': result}")
+    paths = [Path(run) for run in runs]
+    names = [path.resolve().name for path in paths]
+    labels = names if len(set(names)) == len(names) else [str(path) for path in paths]
     if len(set(labels)) < len(labels):
         raise OutputError("compare: a run directory is given twice")
-    return labels
+    return dict(zip(labels, paths, strict=True))
 
 
 def _results(run: str | Path | StoredResult) -> dict[str, StoredResult]:

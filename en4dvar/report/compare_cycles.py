@@ -15,7 +15,7 @@ import numpy as np
 
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.tables import table
-from en4dvar.report.compare import UNDECIDABLE, model_probabilities
+from en4dvar.report.compare import model_probabilities, named, preferred
 from en4dvar.results.netcdf import Group
 from en4dvar.results.series_file import read_series, series_file
 
@@ -41,11 +41,7 @@ def compare_sequences(run_dirs: Sequence[Path]) -> tuple[SequenceScore, ...]:
     ------
     OutputError: fewer than two, one of them no sequence, without an evidence, or of other readings.
     """
-    if len(run_dirs) < 2:
-        raise OutputError("compare needs at least two run directories")
-    runs = {str(run_dir): _sequence(run_dir) for run_dir in run_dirs}
-    if len(runs) < len(run_dirs):
-        raise OutputError("compare: a run directory is given twice")
+    runs = {name: _sequence(run_dir) for name, run_dir in named(run_dirs).items()}
     _require_same_readings(runs)
     evidence = np.array([float(data.attrs["log_evidence"]) for data in runs.values()])
     each = zip(runs.items(), evidence, model_probabilities(evidence), strict=True)
@@ -63,10 +59,7 @@ def sequences_table(scores: Sequence[SequenceScore]) -> str:
         for s in scores
     ]
     best, second = sorted(scores, key=lambda score: -score.log_evidence)[:2]
-    words = f"{best.run} is preferred: log-evidence {-second.difference:.2f} above {second.run}"
-    if -second.difference < UNDECIDABLE:
-        words = f"undecidable: {best.run} and {second.run} differ by {-second.difference:.2f} in log-evidence"
-    return f"{table([header, *rows])}\n\n{words}"
+    return f"{table([header, *rows])}\n\n{preferred(best.run, second.run, -second.difference)}"
 
 
 def _sequence(run_dir: Path) -> Group:

@@ -50,7 +50,6 @@ def write_cycles_page(
         warnings=_lines(a.get("warnings", "")),
         lost=_lines(a["members_lost_why"]),
         provenance=provenance_rows(a),
-        charts=True,
         configuration=str(a["configuration_resolved"]),
     )
     return write_text(run_dir / "report.html", page)

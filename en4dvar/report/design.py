@@ -202,8 +202,6 @@ def write_design(designs: Designs, folder: Path) -> Path:
     page = render(
         "design.html.j2",
         title="Designs compared",
-        sortable=True,
-        charts=True,
         name=designs.attributes.get("name", ""),
         asked=", ".join(designs.asked.parameters),
         laws=designs.asked.laws,

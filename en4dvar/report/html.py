@@ -21,16 +21,13 @@ WRITERS = (  # what templates call
 )  # fmt: skip
 
 
-def render(template: str, *, sortable: bool = False, charts: bool = False, **content: Any) -> str:
-    """The page of a template as text. ``sortable``: with the script that sorts tables; ``charts``: that of charts.
+def render(template: str, **content: Any) -> str:
+    """The page of a template as text, with the scripts of charts and of tables that are sorted.
 
     A content security policy forbids the page every address and every script but these: what escaping might miss
     would still not run.
     """
-    script = "".join(_text(name) for name, asked in (("table.js", sortable), ("chart.js", charts)) if asked)
-    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    policy = f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"
-    return _environment().get_template(template).render(policy=policy, style=_style(), script=Markup(script), **content)
+    return _environment().get_template(template).render(**content)
 
 
 @cache
@@ -43,17 +40,19 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.filters["upper_first"] = lambda words: words[:1].upper() + words[1:]
+    script = _text("table.js") + _text("chart.js")
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    policy = f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"
+    environment.globals |= {"policy": policy, "style": _style(), "script": Markup(script)}
     environment.globals |= {write.__name__: write for write in WRITERS}
     return environment
 
 
-@cache
 def _style() -> Markup:
     light, dark = css_variables(LIGHT), css_variables(DARK)
     palette = f":root {{ {light} }}\n@media screen and (prefers-color-scheme: dark) {{ :root {{ {dark} }} }}\n"
     return Markup(palette + _text("style.css"))
 
 
-@cache
 def _text(name: str) -> str:
     return files("en4dvar.report").joinpath(name).read_text(encoding="utf-8")

@@ -192,8 +192,6 @@ def write_joint(joint: StoredJoint, folder: Path) -> Path:
     page = render(
         "joint.html.j2",
         title="Joint estimate",
-        sortable=True,
-        charts=True,
         runs=str(joint.tree.attrs["runs"]),
         count=len(joint.datasets),
         shared=[e for e in rows if not e.dataset],

@@ -72,8 +72,8 @@ def _colour(i: int) -> str:
 
 
 def write_comparison(comparison: Comparison, out: str | Path, of: PopulationsCompared | None = None) -> Path:
-    """Write ``compare.html``, ``posteriors.png`` and ``.pdf``, ``estimates.csv`` and ``evidence.csv`` to a folder; of
-    populations ``populations.png`` and ``.pdf`` and ``differences.csv``, and these alone where there are no scores.
+    """Write ``compare.html``, ``posteriors.png`` and ``.pdf``, ``estimates.csv`` and ``evidence.csv`` to a folder; or
+    in place of all but the page, of populations, ``populations.png`` and ``.pdf`` and ``differences.csv``.
 
     Files of an earlier comparison there are replaced. Returns the path of the page. Raises :class:`OutputError`.
     """
@@ -88,7 +88,7 @@ def write_comparison(comparison: Comparison, out: str | Path, of: PopulationsCom
             "populations_figure": svg(chart, "populations", populations.CAPTION),
             "populations_caption": populations.CAPTION,
         }
-    if comparison.scores:
+    else:
         chart = overlay(comparison)
         keep(chart, out, "posteriors")
         write_text(out / "estimates.csv", _estimates_csv(comparison))
@@ -97,8 +97,6 @@ def write_comparison(comparison: Comparison, out: str | Path, of: PopulationsCom
     page = render(
         "compare.html.j2",
         title=" – ".join(of.populations if of else comparison.runs),
-        sortable=True,
-        charts=True,
         caption=CAPTION,
         incomparable=comparison.incomparable,
         verdicts=[(name, comparison.verdict(name)) for name in comparison.datasets],

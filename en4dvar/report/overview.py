@@ -85,8 +85,6 @@ def render_overview(
     listed = set(map(id, sorted(sets, key=lambda s: -s.gravity)[:LISTED]))
     return render(
         "campaign.html.j2",
-        sortable=True,
-        charts=True,
         title=f"{len(sets)} data sets",
         created=sets[0].about.get("date_created", ""),
         configuration=sets[0].about.get("configuration", ""),

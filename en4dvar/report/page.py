@@ -43,7 +43,6 @@ def render_set(
     attributes, judged = result.attributes, result.group("sample_stats")
     return render(
         "set.html.j2",
-        charts=True,
         title=result.name,
         trail=trail,
         copies=copies,
@@ -59,6 +58,7 @@ def render_set(
         discrepancy_share=judged.attrs.get("discrepancy_share"),
         what_if=(what_if := stored_shifts(result)),
         exceeding=exceeding(what_if),
+        what_if_added=_recorded(result)["what_if"] == "added",
         entries=stored_ledger(result),
         readings=readings.reading_words(result),
         withheld=withheld_words(result),
@@ -205,9 +205,13 @@ def _iterations(result: StoredResult) -> list[tuple[str, ...]]:
     return list(zip(*columns, strict=True))
 
 
+def _recorded(result: StoredResult) -> dict[str, Any]:
+    return dict(json.loads(str(result.attributes["assimilation_settings"])))
+
+
 def _settings(result: StoredResult) -> list[tuple[str, str]]:
     """The scheme's settings and how observations are weighted."""
-    recorded = json.loads(str(result.attributes["assimilation_settings"]))
+    recorded = _recorded(result)
     weights = result.of_readings("observed_data", "weights", shared=True)
     total = f"{len(weights)} observations, weights sum to {plain_number(float(weights.sum()))}"
     return [*((key.replace("_", " "), str(value)) for key, value in recorded.items()), ("observations", total)]

@@ -196,8 +196,6 @@ def write_population(stored: StoredPopulation, folder: Path) -> Path:
     page = render(
         "population.html.j2",
         title="Population",
-        sortable=True,
-        charts=True,
         runs=str(stored.tree.attrs["runs"]),
         count=len(stored.datasets),
         sentences=sentences(stored),

@@ -20,7 +20,7 @@ from en4dvar.plumbing.tables import csv_text, table
 from en4dvar.plumbing.units import convert
 from en4dvar.priors.prior import PriorTerm
 from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, in_columns
-from en4dvar.report.compare import labels_of
+from en4dvar.report.compare import named
 from en4dvar.report.text import figure_text, number_like, plain_number, pretty_unit, with_unit
 from en4dvar.results.joint_file import QUANTILES
 from en4dvar.results.netcdf import understood
@@ -107,12 +107,7 @@ def compare_populations(
     OutputError: fewer than two, no population in a folder or one of an earlier version, no parameter of all of them,
         data sets that two of them hold, not a number for each or all the same, a name that nothing common has.
     """
-    if len(runs) < 2:
-        raise OutputError("compare needs at least two run directories")
-    if not isinstance(runs, Mapping):
-        paths = [Path(run) for run in runs]
-        runs = dict(zip(labels_of(paths), paths, strict=True))
-    stored = {name: _stored(Path(run)) for name, run in runs.items()}
+    stored = {name: _stored(Path(run)) for name, run in named(runs).items()}
     names = [n for n in next(iter(stored.values())).names if all(n in s.names for s in stored.values())]
     if not names:
         raise OutputError("compare: the populations have no parameter in common")

@@ -16,6 +16,7 @@ from en4dvar.diagnosis.intervals import member_quantiles
 from en4dvar.estimation.population.campaign import CampaignPopulation, Combination, Draws
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.caution import Caution, worst_first
+from en4dvar.plumbing.hints import natural
 from en4dvar.priors.prior import PriorTerm
 from en4dvar.problem import InverseProblem
 from en4dvar.results.checkpoint import digest
@@ -23,6 +24,7 @@ from en4dvar.results.joint_file import QUANTILES, StoredGroups, load_groups
 from en4dvar.results.netcdf import Group, Groups, Variable, to_bytes, understood, variable
 
 FILE = "population.nc"
+GROUPS = "groups"  # the folder of a run directory that holds one folder a group, each with its FILE
 WORDS = {
     "median": "median of the population",
     "mean": "mean of the population",
@@ -245,3 +247,13 @@ def load_population(path: Path) -> StoredPopulation:
     with understood(path):
         _ = population.datasets, population.names, population.combinations, population.cautions
     return population
+
+
+def load_groups_of(run_dir: Path) -> dict[str, tuple[Path, StoredPopulation]]:
+    """Group of data sets of a run → the folder of its population, and this; in the order of the configuration.
+
+    Raises :class:`OutputError`, see :func:`load_population`.
+    """
+    folders = sorted((file.parent for file in (run_dir / GROUPS).glob(f"*/{FILE}")), key=natural)
+    stored = [(folder, load_population(folder / FILE)) for folder in folders]
+    return {str(of.tree.attrs.get("group", folder.name)): (folder, of) for folder, of in stored}

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from en4dvar.executor import ExecutorError, one_blas_thread
-from en4dvar.executor.processes import UnguardedError, end_unguarded
+from en4dvar.executor.processes import UnguardedError
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.results.fingerprint import identity
 from en4dvar.results.provenance import provenance
@@ -24,7 +24,6 @@ R = TypeVar("R")
 
 def conduct_run(kind: RunKind[R], force: bool = False, resume: bool = False, command: str = "") -> R:
     """Conduct a run in its directory; arguments and errors as of :func:`en4dvar.run`."""
-    end_unguarded()
     with (
         one_blas_thread(),
         terminate_as_interrupt(),

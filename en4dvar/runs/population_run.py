@@ -4,7 +4,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import re
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,9 +22,9 @@ from en4dvar.plumbing.errors import ConfigError, TooFewMembersError
 from en4dvar.problem import InverseProblem
 from en4dvar.results.checkpoint import FOLDER
 from en4dvar.results.netcdf import understood
-from en4dvar.results.population_file import FILE, StoredPopulation, load_population, save_population
+from en4dvar.results.population_file import FILE, GROUPS, StoredPopulation, load_population, save_population
 from en4dvar.runs.finished import Finished, carried
-from en4dvar.runs.together import Tell, TogetherKind
+from en4dvar.runs.together import SetGroup, Tell, TogetherKind
 from en4dvar.runs.trust import Ask
 
 ODD = 0.5  # probability from which a data set is named as odd
@@ -66,7 +67,7 @@ class PopulationKind(TogetherKind):
     fewest = FEWEST_SETS
     result = FILE
     files = (FILE,)
-    records = (f"{FOLDER}/population",)
+    records = (f"{FOLDER}/population", f"{FOLDER}/population_groups_*")
     pages = ("population.html", "population.csv", "population.tex")
 
     names: Sequence[str] = ()
@@ -100,16 +101,35 @@ class PopulationKind(TogetherKind):
             return write_population(load_population(folder / FILE), folder)
 
 
-def require_population(config: Config, problem: InverseProblem, count: int) -> None:
-    """Refuse a run before anything is computed, whose ``count`` data sets, such as ``problem``, have no population.
+def groups_of(config: Config, names: Iterable[str]) -> list[SetGroup]:
+    """The groups that have a population each, in the order of the configuration; none where it asks for no groups.
+
+    Raises :class:`ConfigError`: a data set is in no group, or in several.
+    """
+    if config.population is None or (kind := config.population.by) is None:
+        return []
+    sets: dict[str, set[str]] = {group: set() for group in config.sharing.groups[kind]}
+    for name in names:
+        sets[config.sharing.group_of(kind, name)].add(name)
+    return [
+        SetGroup(group, f"{GROUPS}/{i}_{re.sub(r'[^A-Za-z0-9.+-]', '_', group)}", frozenset(of_it))
+        for i, (group, of_it) in enumerate(sets.items(), 1)
+    ]
+
+
+def require_population(config: Config, problem: InverseProblem, names: Collection[str]) -> None:
+    """Refuse a run before anything is computed, whose data sets ``names``, such as ``problem``, have no population.
 
     Raises :class:`ConfigError`.
     """
     if config.population is None:
         return
+    groups = groups_of(config, names)
+    count = max((len(group.datasets) for group in groups), default=len(names))
     try:
         if count < FEWEST_SETS:
-            raise ConfigError(f"a population needs at least {FEWEST_SETS} data sets, not {count}")
+            where = " in the largest group" if groups else ""
+            raise ConfigError(f"a population needs at least {FEWEST_SETS} data sets, not {count}{where}")
         of_campaign.require_population([problem], config.population.of)
     except ConfigError as error:
         raise ConfigError([config.document.fault(("population",), str(error), at_key=True)]) from None

@@ -16,6 +16,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Literal
 
+from en4dvar.executor.processes import end_unguarded
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.files import inside, make_folder, remove_file, write_text
 from en4dvar.results.store import COMPLETE, NEXT, require_settled
@@ -67,6 +68,7 @@ class RunDirectory:
         OutputError: the directory is in use; it is not empty (``new``) or holds no run (``resume``); it cannot be
             written, or holds a foreign file where the run would write its own, or a link.
         """
+        end_unguarded()
         path = Path(path)
         home = path.absolute()
         if mode == "report" and not path.is_dir():

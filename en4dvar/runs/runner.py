@@ -9,19 +9,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from en4dvar.assembly.build import build_one, data_files, inverse_plan
-from en4dvar.config import Config, load_config
+from en4dvar.config import Config, load_config, loaded
 from en4dvar.diagnosis.analysis import Progress
 from en4dvar.executor import Executor
 from en4dvar.inputs.asked import DataFile
 from en4dvar.plumbing.errors import ConfigError, DataError, Fault
 from en4dvar.results.campaign_file import DamagedError, save_campaign
 from en4dvar.results.pack import PACK
+from en4dvar.results.population_file import GROUPS, load_groups_of
 from en4dvar.runs.campaign import Campaign
 from en4dvar.runs.engine import conduct_run
 from en4dvar.runs.joint_run import JointKind
 from en4dvar.runs.kind import FIGURES, REPORT, RunKind
-from en4dvar.runs.population_run import PopulationKind, require_population
+from en4dvar.runs.population_run import PopulationKind, groups_of, require_population
 from en4dvar.runs.session import Session
+from en4dvar.runs.together import SetGroup
 from en4dvar.runs.worklist import ENDED, ITERATIONS, SUMMARY, Worklist, datasets
 
 if TYPE_CHECKING:
@@ -54,7 +56,7 @@ def run(
     ConfigError, DataError, OutputError: before anything is computed; also where a changed run cannot be resumed.
     TooFewMembersError: the ensemble is lost. ExecutorError: the workers are gone. Interrupted: Ctrl-C or SIGTERM.
     """
-    config = _loaded(config, overrides)
+    config = loaded(config, load_config, overrides)
     count = len(data_files(inverse_plan(config)))
     if count != 1:
         raise ConfigError(f"data.path names {count} data sets; use run_campaign, or name one")
@@ -77,11 +79,11 @@ def run_campaign(
     A data set that cannot be read or loses its ensemble does not end the campaign: it is named with its reason in
     ``Campaign.failures``, in ``summary.csv`` and in the log. Where the configuration shares parameters, all that have a
     posterior are then estimated together (``joint.nc``), and with ``population:`` the population behind them
-    (``population.nc``).
+    (``population.nc``), or with its ``by:`` one of each group.
 
     ``report_workers``: processes that draw the report. They import the main script, which must guard what it does then.
     """
-    kind = EstimateKind(_loaded(config, overrides), resume, progress, report_workers)
+    kind = EstimateKind(loaded(config, load_config, overrides), resume, progress, report_workers)
     return conduct_run(kind, force, resume, command)
 
 
@@ -93,11 +95,12 @@ class EstimateKind(RunKind[Campaign]):
     result = "posterior.nc"
     files = (
         result, PACK, ENDED, ITERATIONS, JointKind.result, PopulationKind.result, *JointKind.records,
-        *PopulationKind.records,
+        *PopulationKind.records, f"{GROUPS}/*/{PopulationKind.result}",
     )  # fmt: skip
     pages = (
         REPORT, SUMMARY, "what_if.csv", "ledger.csv", "varying.csv", "withheld.csv", *JointKind.pages,
-        *PopulationKind.pages, *FIGURES, "pages/*.html",
+        *PopulationKind.pages, *(f"{GROUPS}/*/{page}" for page in PopulationKind.pages), "differences.csv", "lines.csv",
+        *FIGURES, "pages/*.html",
     )  # fmt: skip
 
     config: Config
@@ -132,7 +135,9 @@ class EstimateKind(RunKind[Campaign]):
         if self.config.sharing:
             JointKind().within(work, executor)
         if asked := self.config.population:
-            PopulationKind(asked.of, asked.hyper).within(work, executor)
+            groups: Sequence[SetGroup | None] = groups_of(self.config, self.data) or [None]
+            for group in groups:
+                PopulationKind(asked.of, asked.hyper).within(work, executor, group)
         if work.good() and self.config.report:
             self.page(run.directory.work, workers=self.report_workers, figures=self.config.figures)
         else:
@@ -150,6 +155,8 @@ class EstimateKind(RunKind[Campaign]):
         for kind in (JointKind, PopulationKind):
             if (folder / kind.result).exists():
                 kind.page(folder)
+        for of_group, _ in load_groups_of(folder).values():
+            PopulationKind.page(of_group)
         return write_pages(folder, datasets, workers, figures)
 
 
@@ -159,11 +166,12 @@ def _require_one_usable(config: Config, files: Mapping[str, DataFile]) -> None:
     """
     for name in files:
         config.sharing.of_dataset(name)  # before anything is computed
+    groups_of(config, files)
     faults: list[Fault] = []
     unusable: list[DataError] = []
     for name, file in files.items():
         try:
-            require_population(config, build_one(config, name, file), len(files))
+            require_population(config, build_one(config, name, file), files)
         except ConfigError as error:
             faults += error.problems
         except DataError as error:
@@ -197,11 +205,3 @@ def _estimate(work: Worklist, executor: Executor) -> None:
                 raise
             repeated.update(error.names)
             work.estimate_again(error.names)
-
-
-def _loaded(config: Config | str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None) -> Config:
-    if not isinstance(config, Config):
-        return load_config(config, overrides)
-    if overrides:
-        raise ConfigError("overrides apply to a file or dict; give them to load_config instead")
-    return config

@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 
 from en4dvar.assembly.build_sequence import build_sequence, sequence_data
-from en4dvar.config import SequenceConfig, load_sequence
+from en4dvar.config import SequenceConfig, load_sequence, loaded
 from en4dvar.executor import Executor
 from en4dvar.inputs.asked import DataFile
-from en4dvar.plumbing.errors import ConfigError
 from en4dvar.report.outcomes import SequenceOutcome
 from en4dvar.results.checkpoint import FOLDER
 from en4dvar.results.netcdf import Group, understood
@@ -40,11 +39,8 @@ def run_sequence(
 
     Raises :class:`ConfigError` for ``overrides`` of a configuration that is loaded already.
     """
-    if not isinstance(config, SequenceConfig):
-        config = load_sequence(config, overrides)
-    elif overrides:
-        raise ConfigError("overrides apply to a file or dict; give them to load_sequence instead")
-    return SequenceOutcome(**vars(conduct_run(SequenceKind(config, on_cycle), force, resume, command)))
+    kind = SequenceKind(loaded(config, load_sequence, overrides), on_cycle)
+    return SequenceOutcome(**vars(conduct_run(kind, force, resume, command)))
 
 
 class SequenceKind(Cycles[SeriesResult]):

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -21,6 +22,15 @@ from en4dvar.runs.trust import Ask
 from en4dvar.runs.worklist import Worklist
 
 Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class SetGroup:
+    """Names of ``datasets`` that are estimated together, with a ``folder`` of the run directory of their own."""
+
+    name: str
+    folder: str
+    datasets: frozenset[str]
 
 
 class TogetherKind(Kind, ABC):
@@ -66,24 +76,30 @@ class TogetherKind(Kind, ABC):
         assert page is not None
         return out / self.result, out / page.name
 
-    def within(self, work: Worklist, executor: Executor) -> None:
-        """Of the data sets of a run that have a posterior, at its end; too few of them are told. A file that a resumed
-        run finds, made of the same, is kept.
+    def within(self, work: Worklist, executor: Executor, group: SetGroup | None = None) -> None:
+        """Of the data sets of a run (or of one ``group`` of them) that have a posterior, at its end; too few of them
+        are told. A file that a resumed run finds, made of the same, is kept.
 
         Raises what :meth:`estimate` does.
         """
-        config, run, good = work.config, work.run, work.good()
+        config, run = work.config, work.run
+        good = [d for d in work.good() if group is None or d.name in group.datasets]
+        what = f"{self.what} of {group.name}" if group else self.what
         if len(good) < self.fewest:
-            run.notice(f"no {self.what}, for which {self.fewest} data sets need a posterior")
+            run.notice(f"no {what}, for which {self.fewest} data sets need a posterior; {len(good)} have one")
             return
         digests = (f"{d.name}: {work.pack.entries[d.stem].content_digest}" for d in good)
         made_of = [run.identity.settings, *digests]
         fingerprint, path = digest("\n".join(made_of).encode()), run.directory.at(self.result)
-        (record,) = self.records
-        done = run.restore(record, fingerprint, str, f"the {self.what} is made again")
+        record = self.records[0]
+        if group:
+            path = run.directory.folder(group.folder) / self.result
+            record = f"{record}_{group.folder.replace('/', '_')}"
+        done = run.restore(record, fingerprint, str, f"the {what} is made again")
         if done is not None and path.exists() and file_digest(path) == done:
             return
         sets = [finished_set(config, load_stored(run.directory.work / d.file), run.directory.path) for d in good]
         attributes = {**run.attributes, "identity": run.identity.settings, "runs": config.name}
-        self.estimate(sets, config, executor, attributes, path, lambda words: run.log.write(f"{self.what}: {words}"))
+        attributes |= {"group": group.name} if group else {}
+        self.estimate(sets, config, executor, attributes, path, lambda words: run.log.write(f"{what}: {words}"))
         write_checkpoint(run.directory.at(record), fingerprint, file_digest(path))

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from en4dvar.config import TwinConfig, load_twin
+from en4dvar.config import TwinConfig, load_twin, loaded
 from en4dvar.executor import Executor
 from en4dvar.model.forward import ForwardModel
 from en4dvar.report.outcomes import TwinOutcome
@@ -33,9 +33,8 @@ def run_twin(
 
     ``on_cycle`` is called with the number of each cycle, from 0.
     """
-    if not isinstance(config, TwinConfig):
-        config = load_twin(config, overrides)
-    return TwinOutcome(**vars(conduct_run(TwinKind(config, on_cycle), force, resume, command)))
+    kind = TwinKind(loaded(config, load_twin, overrides), on_cycle)
+    return TwinOutcome(**vars(conduct_run(kind, force, resume, command)))
 
 
 class TwinKind(Cycles[TwinResult]):

@@ -70,8 +70,9 @@ class AssimilationSettings:
         "A few hundred more runs to tell how Gaussian the posterior is: auto (compiled models), on, or off.",
     ] = "auto"
     what_if: Annotated[
-        bool,
-        "Say what the result would be under the model's alternatives, and which part of the path informed it.",
+        bool | Literal["added"],
+        "Say what the result would be under the model's alternatives, and which part of the path informed it; "
+        "added: and let the posterior's width hold these as well (run --with-what-if).",
     ] = True
     stochastic_model: Annotated[
         bool,

@@ -3,7 +3,7 @@
 Sizes: a hydrophone states the amplitude within 5 to 10 %; weather moves the ambient pressure by 2 % about its mean,
 1000 m of height by 11 %; the rheometry codes take 0.056 to 0.072 N/m for the surface tension of water in a gel; a
 calibration target gives the scale of the picture within about 1 %; the density of a gel is water's or up to 6 % more,
-its speed of sound that of water or 3 % more.
+its speed of sound that of water or 3 % more; the walls of a dish or of the holder of a gel are millimetres away.
 """
 
 from __future__ import annotations
@@ -14,24 +14,32 @@ from functools import lru_cache
 from typing import Any, cast
 
 from en4dvar.model.forward import Alternative, ForwardModel
-from en4dvar_bubble.dynamics import Dynamics
+from en4dvar_bubble.dynamics import Dynamics, Wall
 from en4dvar_bubble.gas import saturated_vapour_pressure
+from en4dvar_bubble.numbers import WALL_DISTANCE
 
-PULSE, AMBIENT, SURFACE, REST, SCALE, CLOCK = 1.05, 1.02, 0.8, 1.1, 1.01, 1.01
-DENSITY, SOUND = 1.03, 1.03
+PULSE, REST, SCALE, CLOCK = 1.05, 1.1, 1.01, 1.01
+NEARBY = 3e-3  # m
+MEDIUM = (  # parameter, unless it is one that is named; alternative, factor, words
+    ("p_inf", "ambient_pressure", 1.02, "the ambient pressure were 2 % higher"),
+    ("rho", "density", 1.03, "the medium were 3 % denser"),
+    ("c", "sound_speed", 1.03, "sound were 3 % faster in the medium"),
+    ("surface_tension", "surface_tension", 0.8, "the surface tension were 20 % lower"),
+)
 
 
 @lru_cache(maxsize=4)  # the data sets of a campaign share their model; not in the model, which is sent to workers
 def alternatives(model: ForwardModel) -> tuple[Alternative, ...]:
-    """Those of a bubble: pulse, ambient pressure, surface tension, gas, medium, vapour, radius at rest, scale, time
-    step; none in whose equations a parameter of the model has no place.
+    """Those of a bubble: pulse, medium, wall, gas, vapour, radius at rest, scale, time step.
+
+    None in whose equations a parameter of the model has no place.
     """
     assert isinstance(model, Dynamics)
     return tuple(a for a in _alternatives(model) if a.model is None or _names(a.model) == _names(model))
 
 
 def _names(model: ForwardModel) -> list[str]:
-    return [p.name for p in model.parameters]
+    return [p.name for p in model.parameters if p.name != WALL_DISTANCE.name]  # stated with the wall itself
 
 
 def _alternatives(model: Dynamics) -> Iterator[Alternative]:
@@ -43,18 +51,12 @@ def _alternatives(model: Dynamics) -> Iterator[Alternative]:
     if not driving.silent and "p_A" not in model.named:  # what is a parameter has its own uncertainty
         stronger = replace(driving, amplitude=PULSE * driving.amplitude)
         yield changed("pulse_amplitude", "the pulse were 5 % stronger", driving=stronger)
-    if "p_inf" not in model.named:
-        pressure = replace(medium, p_inf=AMBIENT * medium.p_inf)
-        yield changed("ambient_pressure", "the ambient pressure were 2 % higher", medium=pressure)
-    if "rho" not in model.named:
-        denser = replace(medium, rho=DENSITY * medium.rho)
-        yield changed("density", "the medium were 3 % denser", medium=denser)
-    if "c" not in model.named:
-        faster = replace(medium, c=SOUND * medium.c)
-        yield changed("sound_speed", "sound were 3 % faster in the medium", medium=faster)
-    if "surface_tension" not in model.named:
-        tension = replace(medium, S=SURFACE * medium.S)
-        yield changed("surface_tension", "the surface tension were 20 % lower", medium=tension)
+    for name, key, factor, words in MEDIUM:
+        if name not in model.named:
+            of = "S" if name == "surface_tension" else name
+            yield changed(key, words, medium=replace(medium, **{of: factor * getattr(medium, of)}))
+    if model.wall is None:
+        yield changed("wall", "a rigid wall were 3 mm away", wall=Wall(NEARBY))
     if model.gas != "heat":
         yield changed("gas_model", "the gas conducted heat to the wall (gas: heat)", gas="heat")
     else:

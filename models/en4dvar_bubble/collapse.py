@@ -102,9 +102,14 @@ def lobe(times: Array, radius: Array) -> Lobe:
         if near:
             break
     if turning is None:
-        few = where.stop - where.start < 4 and lowest == LOWEST[0]
-        words = "fewer than four samples between the maximum and its collapse; is this a radius history?"
-        raise DataError(words if few else "the radius does not turn at its maximum: no collapse can be told")
+        top = f"its maximum, reading {np.argmax(radius) + 1} of {len(radius)}"
+        if where.stop - where.start < 4 and lowest == LOWEST[0]:
+            raise DataError(f"fewer than four samples from {top}, down to its collapse; is this a radius history?")
+        raise DataError(
+            f"the radius does not turn at {top}, but creeps from there as in a thick gel, where G, mu and the time of "
+            "the true maximum make up for each other; give the readings before it as well, or, where there are none, "
+            "write a configuration whose priors say what is known of them (en4dvar init --start laser, without --data)"
+        )
     z, y, scale, c, b, a = turning
     middle = -b / (2 * c)
     peak = a - b**2 / (4 * c)

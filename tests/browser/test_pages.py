@@ -44,9 +44,14 @@ def test_contrast_is_adequate(opened, pages, kind, scheme):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_fits_a_phone(opened, pages, kind):
-    wide = look(opened(pages[kind], width=360), "wide")
-    assert wide["scroll"] <= wide["width"] == 360
+@pytest.mark.parametrize("width", [360, 700, 960])
+def test_fits_a_phone_and_a_narrow_window(opened, pages, kind, width):
+    page = opened(pages[kind], width=width).page
+    for row in page.locator("table.lead td:last-child").all():
+        row.evaluate("e => (e.textContent = 'determined by the data, and partly by its prior')")
+    page.evaluate(LOOK)
+    wide = page.evaluate("window.look.wide()")
+    assert wide["scroll"] <= wide["width"] == width
 
 
 @pytest.mark.parametrize("kind", KINDS)

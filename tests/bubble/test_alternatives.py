@@ -118,6 +118,7 @@ def test_every_alternative_is_told_or_has_a_reason(fits, start):
     offered = {one.name for one in problem.model.alternatives}
     driven = {"pulse_amplitude"} if start == "acoustic" else set()
     common = {"ambient_pressure", "density", "sound_speed", "surface_tension", "gas_model", "vapour", "radius_at_rest"}
+    common |= {"wall"}
     assert offered == driven | common | {"length_scale", "time_scale"}
     assert {one.name for one in analysis.what_if} == offered
     for shift in analysis.what_if:

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from init_files import UNITS, call, proposed, simulate, write
 
-from en4dvar.assembly.build import build
+from en4dvar.assembly.build import build, data_files, inverse_plan
 from en4dvar.config import load_config
 from en4dvar.config.document import parse_document
+from en4dvar.runs.population_run import groups_of
 from en4dvar_bubble import commands_init
 from en4dvar_bubble.starter.page import quoted
 
@@ -160,6 +161,27 @@ def test_of_three_bubbles_the_run_ends_with_their_gel(tmp_path: Path) -> None:
     assert asked is not None
     assert asked.of == ("G", "mu")
     assert "rho, c, p_inf, reading_scale have one value in all bubbles" in Path("gel.yaml").read_text()
+
+
+def test_subfolders_are_gels_that_are_compared(tmp_path: Path) -> None:
+    """The same file names in each; the name of one folder begins as that of another; what is no gel's file is named."""
+    for folder in ("gel", "gel_8 kPa"):
+        (tmp_path / "gels" / folder).mkdir(parents=True)
+        for n in (1, 2, 3):
+            write(tmp_path / "gels" / folder / f"b{n}.csv", scale=1 + n / 20)
+    done = call("init", "--data", tmp_path / "gels", *UNITS)
+    assert done.exit_code == 0, done.output
+    assert "the run ends with one gel a folder, and compares them: gel (3), gel_8 kPa (3)" in done.output
+    config = proposed(Path("gels.yaml"))
+    assert config.population is not None
+    assert config.population.by == "folder"
+    groups = {group.name: sorted(group.datasets) for group in groups_of(config, data_files(inverse_plan(config)))}
+    assert groups == {f: [f"{f}_b{n}" for n in (1, 2, 3)] for f in ("gel", "gel_8 kPa")}
+    for n in (1, 2):
+        (tmp_path / "gels" / "gel_8 kPa" / f"b{n}.csv").write_text("a,b\n1,2\n")
+    done = call("init", "--data", tmp_path / "gels", *UNITS, "--force")
+    assert done.exit_code == 0, done.output
+    assert "b1.csv: no column" in done.stderr
 
 
 def test_one_table_of_many_bubbles(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 from diagnosis.provoked import PROVOKED, chain_not_converged
+from diagnosis.provoked_by_several import OF_SEVERAL
 
 from en4dvar.plumbing.caution import CATALOGUE, SEVERITIES, TRIGGERS, Caution, caution
 from en4dvar.sampling import mcmc
@@ -23,9 +24,6 @@ def test_the_problem_built_for_it_is_warned_of(code):
 def test_chain_that_has_not_mixed(monkeypatch):
     monkeypatch.setattr(mcmc.sample, "__kwdefaults__", {**mcmc.sample.__kwdefaults__, "max_steps": 60})
     assert "chain-not-converged" in {c.code for c in chain_not_converged().cautions}
-
-
-OF_SEVERAL = ("odd-data-set", "data-sets-differ", "trend")  # data sets: tests/estimation/test_agreement.py
 
 
 def test_every_code_has_its_test():

@@ -9,6 +9,7 @@ import pytest
 from scipy.optimize import minimize
 from toys import Decay, Linear, make_problem, with_noise
 
+from en4dvar.diagnosis.response.budget import ASSUMED, budget
 from en4dvar.diagnosis.response.what_if import MOST_RUNS, NOWHERE, changed_problem
 from en4dvar.ensemble.forecast import cost
 from en4dvar.estimation.assimilate import assimilate
@@ -187,3 +188,22 @@ def test_the_posterior_is_the_same_and_its_runs_are_counted():
     (line,) = remarks(second)
     assert line.startswith("what if …: ")
     assert "std)" in line
+
+
+def test_the_shifts_are_added_to_the_covariance_and_the_mean_stays():
+    """Two assumptions of a linear problem, known in closed form; the data speak against the second."""
+    problem = make_problem(Linear(("a", "b")), [1.0, 0.5])
+    offering(problem, Alternative("scale", "…", values=1.2), Alternative("offset", "…", Offset(0.3, names=("a", "b"))))
+    plain, added = (assimilate(problem, replace(SETTINGS, what_if=what), 1) for what in (True, "added"))
+    by_name = {shift.name: shift for shift in added.what_if}
+    parts = np.array([by_name[name].change for name in ("scale", "offset")])
+    likely = np.exp([-max(0.0, by_name[name].cost_change) for name in ("scale", "offset")])
+    assert min(likely) < 0.9
+    wanted = np.cov(plain.posterior.T) + np.einsum("k,ki,kj->ij", likely, parts, parts)
+    np.testing.assert_allclose(np.cov(added.posterior.T), wanted, rtol=1e-9)
+    np.testing.assert_allclose(added.posterior.mean(axis=0), plain.posterior.mean(axis=0), rtol=0, atol=1e-12)
+    plain_parts, added_parts = budget(plain, "a"), budget(added, "a")
+    assert sum(added_parts.values()) == pytest.approx(1.0)
+    share = 1 - np.var(plain.posterior[:, 0]) / np.var(added.posterior[:, 0])
+    assert added_parts[ASSUMED] == pytest.approx(share)
+    assert added_parts["b"] == pytest.approx((1 - share) * plain_parts["b"])

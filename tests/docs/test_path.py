@@ -12,8 +12,7 @@ from doc_pages import ROOT
 MOST_WORDS = 1200
 LARGEST = 120_000  # bytes of a picture
 LONG = {  # pages of the how-to that are longer still; none may join them
-    "joint", "observation_errors", "own_data", "population", "priors_and_noise", "programs", "sequences",
-    "tutorial_library",
+    "observation_errors", "own_data", "population", "priors_and_noise", "tutorial_library",
 }  # fmt: skip
 
 

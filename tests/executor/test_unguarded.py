@@ -16,19 +16,27 @@ twin = {
 }
 en4dvar.sweep_twin(twin, {"assimilation.inflation": [1.0, 1.1]}, seeds=1, workers=2)
 """
+CALLS = """
+from en4dvar.executor import ProcessesExecutor
+with ProcessesExecutor(2) as executor:
+    list(executor.map(abs, [(-1,), (-2,)]))
+"""
 
 
 @pytest.mark.slow
-def test_a_script_without_main_guard_gets_one_error(tmp_path: Path) -> None:
-    script = tmp_path / "sweep.py"
-    script.write_text(TWIN)
-    done = subprocess.run([sys.executable, script], cwd=tmp_path, capture_output=True, text=True, timeout=120)
+@pytest.mark.parametrize("words", [TWIN, CALLS])
+def test_a_script_without_main_guard_gets_one_line_and_no_traceback(tmp_path: Path, words: str) -> None:
+    done = told_by(tmp_path, words)
     assert done.returncode == 1
-    assert done.stderr.count("Traceback") == 1, done.stderr
-    assert done.stderr.splitlines()[-1].endswith("put what it does below   if __name__ == '__main__':")
-    guarded = TWIN.replace("\nen4dvar.sweep", "\nif __name__ == '__main__': en4dvar.sweep").replace(
-        "seeds=1", "seeds=1, resume=True"
-    )
-    script.write_text(guarded)
-    done = subprocess.run([sys.executable, script], cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    (line,) = done.stderr.splitlines()
+    assert line.endswith("put what it does below   if __name__ == '__main__':")
+    guarded = words.replace("\nen4dvar.sweep", "\nif __name__ == '__main__': en4dvar.sweep")
+    guarded = guarded.replace("\nwith", "\nif __name__ == '__main__':\n  with").replace("\n    ", "\n      ")
+    done = told_by(tmp_path, guarded.replace("seeds=1", "seeds=1, resume=True"))
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def told_by(folder: Path, words: str) -> subprocess.CompletedProcess[str]:
+    script = folder / "script.py"
+    script.write_text(words)
+    return subprocess.run([sys.executable, script], cwd=folder, capture_output=True, text=True, timeout=120)

@@ -111,7 +111,7 @@ def test_page_is_well_formed_and_self_contained(html):
     assert len(page.ids) == len(set(page.ids))
     assert set(page.targets) <= set(page.ids)
     assert page.tags.count("svg") == len(FIGURES)
-    assert page.tags.count("script") == 1  # that of the charts
+    assert page.tags.count("script") == 1  # that of charts and tables
     assert not re.search(r"(?:https?:)?//[\w.-]+\.\w", html)
     assert "prefers-color-scheme: dark" in html
 
@@ -204,7 +204,7 @@ def test_campaign_is_a_table_with_a_page_for_each_data_set(campaign_dir):
     page = Page(html)
     assert page.faults == []
     assert len(page.ids) == len(set(page.ids))
-    assert page.tags.count("script") == 1  # the one that sorts
+    assert page.tags.count("script") == 1  # that of charts and tables
     assert "<script>alert" not in html
     addresses = {"pages/one.html": "one", "pages/two.html": "two", "pages/%C3%A9%20100%25.html": "alert('é')"}
     assert set(page.links) == set(addresses)

@@ -14,6 +14,7 @@ from rows import row
 from run_files import make_campaign
 from test_twin_sweep import CONFIG as RING
 
+import en4dvar
 from en4dvar.cli import main
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.report import TABLES
@@ -126,3 +127,19 @@ def test_a_page_replaces_no_foreign_file(prepared: Path, tmp_path: Path) -> None
 
 def test_the_tables_of_a_report_are_declared() -> None:
     assert set(TABLES) <= set(kind_named("estimate").pages)
+
+
+@pytest.mark.parametrize(
+    ("conduct", "load", "file"),
+    [
+        (en4dvar.run, en4dvar.load_config, "campaign/toy.yaml"),
+        (en4dvar.run_sequence, en4dvar.load_sequence, "series/drift.yaml"),
+        (en4dvar.run_twin, en4dvar.load_twin, "ring.yaml"),
+    ],
+)
+def test_overrides_of_what_is_loaded_already_are_refused(prepared, tmp_path, monkeypatch, conduct, load, file):
+    """They would change nothing, without a word."""
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(en4dvar.ConfigError, match=f"give them to {load.__name__}"):
+        conduct(load(prepared / file), overrides={"seed": 5})
+    assert list(tmp_path.iterdir()) == []

@@ -75,7 +75,7 @@ def test_sequences_are_compared_by_their_evidence(folder):
     one, other = compare_sequences([right, wrong])
     assert other.difference == other.log_evidence - one.log_evidence < -1
     assert one.probability == pytest.approx(1 / (1 + np.exp(other.difference)))
-    assert "runs/drift is preferred" in sequences_table((one, other))
+    assert "drift is preferred" in sequences_table((one, other))
     done = run_cli("compare", right, wrong)
     assert done.stdout == sequences_table((one, other)) + "\n", done.stderr
 

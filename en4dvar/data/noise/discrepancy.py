@@ -72,9 +72,12 @@ class DiscrepancyNoise(Noise):
     def needs_rates(self) -> bool:
         return self.timed or self.kernel.grows
 
+    @property
+    def grows_beyond(self) -> float:
+        return self.kernel.grows_beyond
+
     def attributes(self) -> dict[str, float]:
-        grows = self.kernel.grows_beyond
-        return {"discrepancy_smoothness": self.kernel.smoothness, "discrepancy_grows_beyond": grows}
+        return {"discrepancy_smoothness": self.kernel.smoothness, "discrepancy_grows_beyond": self.grows_beyond}
 
     def matrices(self) -> dict[str, tuple[Array, str]]:
         if self.correlation is None:

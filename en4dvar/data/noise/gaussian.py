@@ -66,6 +66,11 @@ class Noise:
         """True if R depends on the rate of the observable."""
         return self.timed
 
+    @property
+    def grows_beyond(self) -> float:
+        """Rate of the observable beyond which a discrepancy grows in proportion to it."""
+        return math.inf
+
     @cached_property
     def plain(self) -> bool:
         """True if J_o is ½ Σ β (y − m)²/std² as long as no noise scale is given."""

@@ -17,18 +17,19 @@ import numpy as np
 
 from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.diagnosis.diagnostics import active_members
+from en4dvar.diagnosis.response.what_if import in_std_as_likely
 from en4dvar.model.state import Array
 
+ASSUMED = "the assumptions of the what-if table"
 READINGS, MISSED, OWN = "the errors of the readings", "what the model misses", "its own prior"
 TOLD = 0.03  # share from which a source is named
 
 
-def shares_of_priors(posterior: Array, prior_variance: Array) -> Array:
+def shares_of_priors(covariance: Array, prior_variance: Array) -> Array:
     """(n, n): the share of parameter i's variance that comes from the prior of parameter j.
 
-    ``posterior`` (N, n) and ``prior_variance`` (n,), both transformed; parameters independent before.
+    ``covariance`` (n, n) of the posterior and ``prior_variance`` (n,), transformed; parameters independent before.
     """
-    covariance = np.atleast_2d(np.cov(posterior.T))
     return np.asarray(covariance**2 / (prior_variance * np.diag(covariance)[:, None]))
 
 
@@ -41,14 +42,22 @@ def budget(a: Analysis, name: str) -> Mapping[str, float]:
     if prior.blocks or alive.sum() <= len(prior.names):
         return {}
     i = prior.names.index(name)
-    of_priors = shares_of_priors(prior.from_physical(a.posterior[alive]), prior.std**2)[i]
-    of_priors = of_priors / max(1.0, of_priors.sum())  # rounding and sampling may exceed the whole
+    covariance = np.atleast_2d(np.cov(prior.from_physical(a.posterior[alive]).T))
+    assumed = 0.0
+    if a.settings.what_if == "added":  # s² (1 + t) is the variance with shifts whose squares sum to t
+        in_std = in_std_as_likely(a.what_if)
+        with_all = np.diag(covariance)
+        moved = in_std * np.sqrt(with_all / (1 + np.sum(in_std**2, axis=0)))
+        covariance = covariance - moved.T @ moved
+        assumed = 1 - float(covariance[i, i] / with_all[i])
+    of_priors = shares_of_priors(covariance, prior.std**2)[i]
+    of_priors = of_priors * (1 - assumed) / max(1.0, of_priors.sum())  # rounding and sampling may exceed the whole
     shares = {OWN if j == i else other: float(of_priors[j]) for j, other in enumerate(prior.names)}
-    rest, missed = 1.0 - float(of_priors.sum()), 0.0
+    rest, missed = 1.0 - assumed - float(of_priors.sum()), 0.0
     if a.discrepancy is not None:
         errors, discrepancy, _ = a.discrepancy.shares[i]
         missed = float(discrepancy / (errors + discrepancy)) if errors + discrepancy > 0 else 0.0
-    shares |= {READINGS: rest * (1 - missed), MISSED: rest * missed}
+    shares |= {READINGS: rest * (1 - missed), MISSED: rest * missed, ASSUMED: assumed}
     return dict(sorted(shares.items(), key=lambda source: -source[1]))
 
 

@@ -18,6 +18,7 @@ from en4dvar.ensemble.forecast import Composite
 from en4dvar.executor import Executor
 from en4dvar.model.forward import Alternative
 from en4dvar.model.state import Array
+from en4dvar.priors.prior import member_stream, whiten_sample
 from en4dvar.problem import InverseProblem
 
 MOST_RUNS = 6  # of one alternative
@@ -90,6 +91,28 @@ def what_if(
     ]
     shifts = [_shift(problem, response, std, cost, executor, fitted, alternative) for alternative in offered]
     return tuple(sorted(shifts, key=lambda shift: -shift.largest))
+
+
+def with_shifts(members: Array, shifts: Sequence[Shift], seed: int) -> Array:
+    """Members (N, n) of a posterior, transformed, whose variance holds that of the assumptions as well.
+
+    Every settled shift s_k (n,) counts as one standard deviation along its direction, as far as the data allow it:
+    a member is moved by Σ_k ξ_k s_k exp(−½ max(ΔJ_k, 0)) with ξ of zero mean and unit covariance over the members that
+    is uncorrelated with them (where N exceeds n and the number of shifts together), so that
+    C + Σ_k s_k s_kᵀ exp(−max(ΔJ_k, 0)) is met exactly.
+    """
+    moved = in_std_as_likely(shifts) * members.std(axis=0, ddof=1)
+    z = member_stream(seed, "what if").standard_normal((len(members), len(moved)))
+    apart = len(members) > members.shape[1] + len(moved) + 1
+    drawn = whiten_sample(np.hstack([members, z]))[:, members.shape[1] :] if apart else z
+    return np.asarray(members + drawn @ moved)
+
+
+def in_std_as_likely(shifts: Sequence[Shift]) -> Array:
+    """The settled shifts (S, n) in posterior standard deviations, each times exp(−½ max(ΔJ, 0))."""
+    told = [shift for shift in shifts if shift.settled]
+    size = np.exp([-0.5 * max(shift.cost_change, 0.0) for shift in told])
+    return np.asarray(size[:, None] * np.array([shift.in_std for shift in told])) if told else np.zeros((0, 1))
 
 
 def changed_problem(problem: InverseProblem, alternative: Alternative) -> InverseProblem:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -38,7 +39,11 @@ def doubts(
             f"the data sets differ{by} (probability {_chance(agreed.chance)} if they share one value): the "
             "interval of one shared value is too narrow"
         )
-        yield caution("data-sets-differ", words)
+        of = " ".join(dict.fromkeys(f"--of {name}" for name, _ in joint.shared))
+        advice = f"ask how much they vary and not for one value (en4dvar population {of})"
+        if agreed.degrees:
+            advice += f", or, where errors were stated too small, state them {agreed.scatter:.1f} times as large"
+        yield replace(caution("data-sets-differ", words), advice=advice)
     yield from _misfits(joint, chi2, kept)
     yield from _trends(joint, singles)
 

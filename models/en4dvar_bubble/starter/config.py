@@ -17,7 +17,7 @@ from en4dvar.inputs.readers import Readings, read_series
 from en4dvar.inputs.steps import step_doubts
 from en4dvar.inputs.variables import indexed
 from en4dvar.plumbing.errors import ConfigError, DataError
-from en4dvar.plumbing.files import expanded
+from en4dvar.plumbing.files import expanded, readable
 from en4dvar.plumbing.hints import shown, suggest
 from en4dvar.plumbing.units import UnitError, convert, parse_quantity, parse_unit
 from en4dvar_bubble.starter.elsewhere import CHOICES
@@ -89,7 +89,13 @@ def propose_config(
         find_files(Path.cwd(), [str(data)]), Column(*source.radius, "m"), layout, time[0] if time else None
     )
     readings, unusable = histories(files, source)
-    proposal = propose({name: (series.times, series.values) for name, series in readings.items()}, start, law, medium)
+    proposal = propose(
+        {name: (series.times, series.values) for name, series in readings.items()},
+        start,
+        law,
+        medium,
+        _by_folder(files, data),
+    )
     proposal = _with_rest(proposal, readings, source.radius[1])
     if errors:
         common = max(series.scalars.get(TRACKED_COMMON, 0.0) for series in readings.values())
@@ -100,6 +106,16 @@ def propose_config(
     for dataset in readings:
         build_one(config, dataset, files[dataset])
     return Proposed(text, proposal)
+
+
+def _by_folder(files: Mapping[str, DataFile], data: str | Path) -> dict[str, list[str]]:
+    """Subfolder of ``data`` → names of its data sets; none where there are not several."""
+    top, groups = (Path.cwd() / expanded(str(data))).absolute(), dict[str, list[str]]()
+    for name, file in files.items():
+        if file.path.absolute().parent.parent != top:
+            return {}
+        groups.setdefault(readable(file.path.parent.name), []).append(name)
+    return groups if len(groups) > 1 else {}
 
 
 def histories(files: Mapping[str, DataFile], source: Source) -> tuple[dict[str, Readings], list[str]]:

@@ -8,7 +8,9 @@ interval.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import glob
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from en4dvar.estimation.population.estimate import FEWEST_SETS
@@ -65,14 +67,36 @@ def wall(radius: float, slowness: float) -> tuple[str, str, str]:
     return distance, prior, source
 
 
-def population(names: Sequence[str], count: int, medium: str) -> tuple[str, ...]:
-    """Lines for the section of the parameters ``names`` of one gel behind ``count`` bubbles; () of too few of them."""
-    if count < FEWEST_SETS or not names:
+NO_GROUPS: Mapping[str, Sequence[str]] = {}
+
+
+def population(
+    names: Sequence[str], count: int, medium: str, groups: Mapping[str, Sequence[str]] = NO_GROUPS
+) -> tuple[str, ...]:
+    """Lines for the section of the parameters ``names`` of one gel behind ``count`` bubbles; () of too few of them.
+
+    ``groups``: folder → names of its bubbles, where there are several, one gel each; () where all have too few.
+    """
+    if max(map(len, groups.values()), default=0) < FEWEST_SETS if groups else count < FEWEST_SETS:
+        return ()
+    if not names:
         return ()
     common = ", ".join(quantity.key for quantity in known(medium))
     return (
         "population: # of the gel behind its bubbles, at the end of the run",
         f"  of: [{', '.join(names)}] # these vary from bubble to bubble about one median",
         f"  # {common} have one value in all bubbles; the others are each bubble's own",
+        *["  by: folder # each folder has its own median and spread; they are compared"] * bool(groups),
         f"  # reference: {{{names[0]}: VALUE ± STD UNIT, source: NAME}} # a value to compare with, on the page",
+        *(["groups:", "  folder:"] if groups else []),
+        *(f"    {json.dumps(name, ensure_ascii=False)}: {_patterns(name, groups)}" for name in groups),
     )
+
+
+def _patterns(folder: str, groups: Mapping[str, Sequence[str]]) -> str:
+    """What the names of a folder's bubbles have in common where no other folder's have it, or else the names."""
+    start, others = f"{folder}_", [name for key, names in groups.items() if key != folder for name in names]
+    names = [glob.escape(name) for name in groups[folder]]
+    if not any(name.startswith(start) for name in others):
+        return json.dumps(f"{glob.escape(start)}*", ensure_ascii=False)
+    return json.dumps(names, ensure_ascii=False)

@@ -92,10 +92,11 @@ def propose(
     start: Start | None = None,
     law: str | None = None,
     medium: str = "gel",
+    groups: Mapping[str, Sequence[str]] = elsewhere.NO_GROUPS,
 ) -> Proposal:
     """A proposal for one or several data sets: name → times (K,) s, radius (K,) m.
 
-    ``medium``: one of those of :mod:`en4dvar_bubble.starter.elsewhere`.
+    ``medium``: one of those of :mod:`en4dvar_bubble.starter.elsewhere`. ``groups``: folder → names of its data sets.
 
     Raises
     ------
@@ -138,16 +139,23 @@ def propose(
     if chosen == "laser" and ratio > elsewhere.SLOW and "G" not in {p.name for p in model.law.parameters}:
         distance, prior, source = elsewhere.wall(look.lobe.R_max, ratio)
         wall = (Entry("wall", f"{{distance: {distance}}}", source),), (Entry("wall_distance", prior, "of that plane"),)
-    together = elsewhere.population([p.name for p in model.law.parameters], len(views), medium)
+    together = elsewhere.population([p.name for p in model.law.parameters], len(views), medium, groups)
     return Proposal(
         _data(chosen, look, model, {**others, **guess.values}, histories),
         (*_model(law_name, chosen, look), *wall[0]),
         (*_parameters(model, chosen, look, believed, tops(looks, histories), medium), *wall[1]),
         SIMPLER[chosen],
-        (*told, *[f"{len(views)} bubbles: the run ends with what they say of one gel together"] * bool(together)),
+        (*told, *[f"{len(views)} bubbles: {_ends_with(groups)}"] * bool(together)),
         tuple(warnings),
         together,
     )
+
+
+def _ends_with(groups: Mapping[str, Sequence[str]]) -> str:
+    if not groups:
+        return "the run ends with what they say of one gel together"
+    told = ", ".join(f"{name} ({len(names)})" for name, names in groups.items())
+    return f"the run ends with one gel a folder, and compares them: {told}"
 
 
 def _bad_words(name: str, view: Look) -> str:

@@ -1,0 +1,143 @@
+"""``population: {by: KIND}``: one population a group of data sets in one run, and their comparison."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from execution_models import Stops
+from run_files import assert_same_results, configuration, interrupt
+from test_population_yaml import SMALL
+from toy_config import csv_text, write_toy
+
+from en4dvar.cli import main
+from en4dvar.plumbing.errors import ConfigError
+from en4dvar.report.groups import numbers_of
+from en4dvar.report.populations import compare_populations
+from en4dvar.results.population_file import load_groups_of, load_population
+from en4dvar.runs.engine import write_report
+from en4dvar.runs.runner import run_campaign
+
+ASKED = (
+    "population: {of: [k], by: folder, mean_std: 2, spread: 0.7}\n"
+    "groups: {folder: {gel 5kPa: 'gel 5kPa_*', gel 8kPa: 'gel 8kPa_*'}}\n"
+)
+SOFT, STIFF = (1.5, 1.6, 1.7), (2.2, 2.3, 2.4)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _small():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("en4dvar.estimation.population.campaign.Effort", lambda: SMALL)
+        yield
+
+
+def springs(folder, stiff=STIFF, asked=ASKED, model="toy_models:Oscillator"):
+    """Springs of two kinds, of the same file names in two folders."""
+    path = write_toy(folder, ("path: toy.csv", "path: data"), ("toy_models:Oscillator", model))
+    for name, of_it in (("gel 5kPa", SOFT), ("gel 8kPa", stiff)):
+        (folder / "data" / name).mkdir(parents=True)
+        for i, k in enumerate(of_it):
+            (folder / "data" / name / f"set{i}.csv").write_text(csv_text(k=k))
+    path.write_text(path.read_text() + asked)
+    return path
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A run with two groups and an unreadable file in the first, and what it printed."""
+    folder = tmp_path_factory.mktemp("springs")
+    path, run = springs(folder), folder / "run"
+    (folder / "data" / "gel 5kPa" / "broken.csv").write_text("a,b\n1,2\n")
+    result = CliRunner().invoke(main, ["run", str(path), "--out", str(run)])
+    return run, result.output
+
+
+@pytest.mark.slow
+def test_each_group_is_the_population_of_its_data_sets_alone(finished, tmp_path):
+    """The same files as a run of their own, whose draws differ."""
+    run, _ = finished
+    alone = springs(tmp_path, asked="population: {of: [k], mean_std: 2, spread: 0.7}\n")
+    alone.write_text(alone.read_text().replace("path: data", "path: data/gel 8kPa"))
+    by_itself = load_population(run_campaign(configuration(alone, tmp_path / "alone")).directory / "population.nc")
+    for name, (folder, within) in load_groups_of(run).items():
+        assert within.datasets == tuple(f"{name}_set{i}" for i in range(3))
+        assert (folder / "population.html").is_file()
+    x, y = within.white("k"), by_itself.white("k")
+    assert abs(x.mean() - y.mean()) < 0.3 * y.std()
+    medians = {n: float(of.group("posterior")["k_median"].median()) for n, (_, of) in load_groups_of(run).items()}
+    assert 1.45 < medians["gel 5kPa"] < 1.75
+    assert 2.15 < medians["gel 8kPa"] < 2.45
+
+
+@pytest.mark.slow
+def test_terminal_and_page_open_with_the_comparison(finished):
+    run, output = finished
+    folders = {name: folder for name, (folder, _) in load_groups_of(run).items()}
+    of = compare_populations(folders, (5.0, 8.0))
+    (difference,) = of.differences
+    assert difference.ratio[0] < 1.6 / 2.3 < difference.ratio[2]
+    page = (run / "report.html").read_text()
+    answer = "k of gel 5kPa is "
+    assert answer in output
+    assert "broken.csv: no column" in output
+    assert page.index("<h1>") < page.index(answer) < page.index("Each data set by itself")
+    assert page.index("in kPa.") < page.index('href="groups/1_gel_5kPa/population.html"')
+    assert 'href="groups/2_gel_8kPa/population.html"' in page
+    assert (run / "differences.csv").is_file()
+    listed = (run / ".en4dvar-files").read_text().splitlines()
+    assert "groups/2_gel_8kPa/population.nc" in listed
+    write_report(run)
+    assert (run / "report.html").read_text() == page
+
+
+@pytest.mark.slow
+def test_a_group_of_one_is_told_and_the_other_has_its_number(tmp_path):
+    path = springs(tmp_path, stiff=(2.3,))
+    result = CliRunner().invoke(main, ["run", str(path), "--out", str(tmp_path / "run")])
+    assert result.exit_code == 0, result.output
+    assert "no population of gel 8kPa, for which 3 data sets need a posterior; 1 have one" in result.output
+    assert list(load_groups_of(tmp_path / "run")) == ["gel 5kPa"]
+
+
+@pytest.mark.slow
+def test_killed_and_resumed_to_the_same_bits(tmp_path, monkeypatch):
+    monkeypatch.setattr(Stops, "calls", 0)  # whatever ran before
+    path = springs(tmp_path, model="execution_models:Stops")
+    whole = run_campaign(configuration(path, tmp_path / "whole"))
+    interrupt(path, tmp_path / "cut", Stops.calls - 3)  # in the midst of the second population
+    assert list(load_groups_of(tmp_path / "cut")) == ["gel 5kPa"]
+    run_campaign(configuration(path, tmp_path / "cut"), resume=True)
+    assert_same_results(whole.directory, tmp_path / "cut")
+    for folder in ("1_gel_5kPa", "2_gel_8kPa"):
+        one, other = (load_population(tmp_path / r / "groups" / folder / "population.nc") for r in ("whole", "cut"))
+        assert np.array_equal(one.white("k"), other.white("k"))
+
+
+@pytest.mark.parametrize(
+    ("stiff", "asked", "words"),
+    [
+        (STIFF, ASKED.replace("by: folder", "by: foldr"), r"population\.by: no kind of 'groups:' is called 'foldr'"),
+        (STIFF, ASKED.replace("'gel 8kPa_*'", "other"), r"groups\.folder: data set 'gel 8kPa_set0' is in none of them"),
+        (STIFF, ASKED.replace("'gel 8kPa_*'", "'*'"), r"data set 'gel 5kPa_set0' is in several of them"),
+    ],
+)
+def test_groups_that_are_wrong_are_told_before_anything_is_computed(tmp_path, stiff, asked, words):
+    with pytest.raises(ConfigError, match=words):
+        run_campaign(configuration(springs(tmp_path, stiff, asked), tmp_path / "run"))
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("names", "numbers"),
+    [
+        (("5kPa", "8 kPa"), ((5.0, 8.0), "kPa")),
+        (("gel_5.5%", "gel_8 %", "10%"), ((5.5, 8.0, 10.0), "%")),
+        (("5kPa", "8 MPa"), ((), "")),
+        (("day1", "day2"), ((), "")),
+        (("5kPa", "stiff"), ((), "")),
+        (("5kPa_a", "5kPa_b"), ((), "")),
+    ],
+)
+def test_numbers_of_names(names, numbers):
+    assert numbers_of(names) == numbers
