@@ -9,7 +9,8 @@ to a reading. So the rate is the one that has the variance of the path itself,
 
 by Gauss–Hermite quadrature with five points, which is exact for polynomials in δ of degree four. T² is the sum of
 the squares of the reading's ``time_std`` and of a/v, where a discrepancy of size a (the median of its prior) grows in
-proportion to the rate beyond v: such a discrepancy is a model that is early or late by a/v.
+proportion to the rate beyond v: such a discrepancy is a model that is early or late by a/v. Before the model begins the
+path is taken to stand still.
 """
 
 from __future__ import annotations
@@ -55,7 +56,8 @@ def spread_rates(problem: InverseProblem) -> SpreadRates | None:
         physical = prior.to_physical(prior.mean)
         size = physical[prior.names.index(name)] if name in prior.names else problem.fixed[name]
         time_std = np.hypot(time_std, size / o.noise.grows_beyond)
-    wanted = np.vstack([o.times, o.times + NODES[:, None] * time_std])
+    beginning = min(0.0, float(o.times[0]))  # a model starts at time zero and need not know what was before
+    wanted = np.vstack([o.times, np.maximum(o.times + NODES[:, None] * time_std, beginning)])
     instants, where = np.unique(wanted, return_inverse=True)
     where = where.reshape(wanted.shape)
     return SpreadRates(time_std, instants, where[0], where[1:])

@@ -49,7 +49,7 @@ def rates_at(problem, theta):
 
 
 def test_of_a_parabola_it_is_exact():
-    time_std = np.array([0.0, 0.01, 0.1, 0.3, 1.0])
+    time_std = np.array([0.0, 0.01, 0.1, 0.3, 0.5])
     (rates,) = rates_at(problem_of(Parabola(), time_std), TRUTH)
     np.testing.assert_allclose(rates, np.hypot(2 * TIMES, np.sqrt(2) * time_std), rtol=1e-12)
 
@@ -92,3 +92,17 @@ def test_a_discrepancy_that_grows_with_the_rate_is_a_model_that_is_late():
     problem = replace(made, observations=observations, prior=Prior((*made.prior.terms, *terms)))
     (rates,) = rates_at(problem, [*TRUTH, np.log(size), np.log(0.1)])
     np.testing.assert_allclose(rates, np.hypot(2 * TIMES, np.sqrt(2) * np.hypot(0.004, size / beyond)), rtol=1e-12)
+
+
+def test_a_model_is_not_asked_for_what_was_before_it_began():
+    class Begun(Parabola):
+        def trajectories(self, x, times):
+            assert np.min(times) >= 0
+            return super().trajectories(x, times)
+
+    made = problem_of(Begun(), 0.3)
+    times = TIMES - TIMES[0]
+    observed = make_observations(times, times**2, std=0.01, time_std=0.3)
+    run = forecast(replace(made, observations=observed), TRUTH[None])
+    assert run.failures == ("",)
+    assert 0 < run.predicted.rates[0, 0] < np.sqrt(2) * 0.3  # of δ² where δ > 0, and of zero before
