@@ -79,7 +79,8 @@ class Data(Section):
     """Where the observations are, what they mean and how well they are known; in the model's units."""
 
     path: Annotated[Files, Made(_files, Annotated[str | tuple[str, ...], AfterValidator(_not_empty)])]
-    """A data file, a folder, a pattern such as data/*.csv, or a list of them; relative to this file's folder."""
+    """A data file, a folder (one without data files: its subfolders), a pattern such as data/*.csv, or a list of them;
+    relative to this file's folder."""
     name: Name | None = None
     """Name of the data set, where there is one; default: that of its file (of several series, of the first's)."""
     format: Format | None = None

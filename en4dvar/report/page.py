@@ -58,7 +58,7 @@ def render_set(
         discrepancy_share=judged.attrs.get("discrepancy_share"),
         what_if=(what_if := stored_shifts(result)),
         exceeding=exceeding(what_if),
-        what_if_added=_recorded(result)["what_if"] == "added",
+        what_if_added=_recorded(result).get("what_if") == "added",
         entries=stored_ledger(result),
         readings=readings.reading_words(result),
         withheld=withheld_words(result),
