@@ -68,10 +68,11 @@ def between(stream: np.random.Generator, low: float, high: float) -> float:
 
 def laboratory(
     stream: np.random.Generator, physics: dict[str, str], world: Wrong | None
-) -> tuple[str, dict[str, float], BubbleModel]:
-    """Law, true values, and the model of one experiment."""
-    law = str(stream.choice(list(LAWS), p=list(LAWS.values())))
-    law = world.fitted if world else law
+) -> tuple[Wrong, dict[str, float], BubbleModel]:
+    """The world (without one: what is fitted is right), true values, and the model of one experiment."""
+    drawn = str(stream.choice(list(LAWS), p=list(LAWS.values())))
+    world = world or Wrong(drawn)
+    law = world.fitted
     truth = {"mu": between(stream, 0.01, 1.0), "R_max": between(stream, 50e-6, 600e-6)}
     truth["R_eq"] = truth["R_max"] * float(np.exp(np.log(0.13) + 0.3 * stream.standard_normal()))
     gel = law != "newtonian"
@@ -81,24 +82,23 @@ def laboratory(
         truth["alpha"] = between(stream, 0.02, 1.0)
     density = stream.uniform(1000.0, 1060.0) if gel else stream.uniform(995.0, 1035.0)
     constants = {"rho": f"{density} kg/m^3", "p_inf": f"{101.325 * (1 + 0.01 * stream.standard_normal())} kPa"}
-    return law, truth, (world or Wrong(law)).model(truth, physics, constants)
+    return world, truth, world.model(truth, physics, constants)
 
 
 def recording(seed: int, physics: dict[str, str], world: Wrong | None = None) -> tuple[str, dict[str, float], str]:
     """Law, true values, and the file's text."""
     stream = np.random.default_rng([33, seed])
     while True:
-        law, truth, model = laboratory(stream, physics, world)
+        made, truth, model = laboratory(stream, physics, world)
         medium = model.medium
         t_c = 0.9147 * truth["R_max"] * np.sqrt(medium.rho / medium.p_inf)
         rate = between(stream, 0.1e6, 5e6)
         if not FRAMES[0] < rate * t_c < FRAMES[1]:
             continue
         times = np.linspace(0.0, 8 * t_c, CELLS)
-        radius = (world or Wrong(law)).radius(model, truth, times)
+        radius = made.radius(model, truth, times)
         if radius is not None:
-            said = world.rate if world else 1.0
-            return law, truth, _filmed(stream, times, radius, rate, t_c, said)
+            return made.fitted, truth, _filmed(stream, times, radius, rate, t_c, made.rate)
 
 
 def _filmed(stream: np.random.Generator, times: Any, radius: Any, rate: float, t_c: float, faster: float) -> str:

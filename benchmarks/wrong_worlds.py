@@ -19,7 +19,7 @@ from en4dvar_bubble.settings import BubbleSettings
 
 @dataclass(frozen=True)
 class Wrong:
-    """What differs from what is fitted: the ``truth`` has another ``law`` with parameters ``of_law`` made from its own,
+    """What differs from what is ``fitted``: there is another ``law`` with parameters ``of_law`` made from its own,
     other ``constants``, a rigid wall ``wall`` R_max away; the camera is faster than the file says by ``rate``; a shape
     mode 2 of ``shape`` (m) rings from the first collapse on along the line of sight; G is ``softened`` there.
     """
