@@ -1,4 +1,4 @@
-"""The library without the command line: the session of docs/tutorial_library.md, run block by block."""
+"""The library without the command line: the sessions of two pages, run block by block."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from doc_pages import ROOT, blocks
 import en4dvar
 
 pytestmark = pytest.mark.slow  # as the examples of the other pages
-PAGE = ROOT / "docs" / "tutorial_library.md"
+PAGES = [ROOT / "docs" / "function_and_arrays.md", ROOT / "docs" / "tutorial_library.md"]
 
 
 @pytest.fixture(scope="module")
@@ -24,9 +24,12 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], s
     names: dict[str, Any] = {}
     printed = io.StringIO()
     with contextlib.chdir(folder), contextlib.redirect_stdout(printed):
-        for block in blocks(PAGE):
-            assert block.language == "python"
-            exec(compile(block.body, f"{PAGE.name}:{block.line}", "exec"), names)
+        for page in PAGES:
+            session: dict[str, Any] = {}  # each page stands alone
+            for block in blocks(page):
+                assert block.language == "python"
+                exec(compile(block.body, f"{page.name}:{block.line}", "exec"), session)
+            names.update(session)
     return names, printed.getvalue(), folder
 
 
