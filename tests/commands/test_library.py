@@ -25,11 +25,11 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], s
     printed = io.StringIO()
     with contextlib.chdir(folder), contextlib.redirect_stdout(printed):
         for page in PAGES:
-            session: dict[str, Any] = {}  # each page stands alone
+            of_page: dict[str, Any] = {}  # each page stands alone
             for block in blocks(page):
                 assert block.language == "python"
-                exec(compile(block.body, f"{page.name}:{block.line}", "exec"), session)
-            names.update(session)
+                exec(compile(block.body, f"{page.name}:{block.line}", "exec"), of_page)
+            names.update(of_page)
     return names, printed.getvalue(), folder
 
 
