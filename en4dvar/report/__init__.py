@@ -23,6 +23,7 @@ from en4dvar.report.overview import Headline, SetSummary, overview_figures, rend
 from en4dvar.report.page import IDENTIFIERS, render_set
 from en4dvar.report.responses import ENTRY_COLUMNS, SHIFT_COLUMNS, Lines, response_lines
 from en4dvar.report.svg import svg
+from en4dvar.report.text import upper_first
 from en4dvar.report.varying import PIECE_COLUMNS, piece_lines
 from en4dvar.report.withheld import COLUMNS as WITHHELD_COLUMNS
 from en4dvar.report.withheld import withheld_lines
@@ -143,12 +144,12 @@ def _headlines(run_dir: Path) -> list[Headline]:
         stored[""] = "", load_population(run_dir / POPULATION)
     for name, (folder, of) in stored.items():
         words = f"The population of {name}" if name else "The population behind them"
-        told = [f"{name}: {line}" if name else line for line in population.sentences(of)]
+        told = [f"{name}: {line}" if name else upper_first(line) for line in population.sentences(of)]
         address = quote(f"{folder}{POPULATION_FILES[0]}")
         headlines.append(Headline(address, words, told, population.figure(of), population.caption(of)))
     if (run_dir / FILE).exists():
         shared = load_joint(run_dir / FILE)
-        lines = tuple(joint.joint_lines(shared))
+        lines = [upper_first(line) for line in joint.joint_lines(shared)]
         headlines.append(Headline(JOINT_FILES[0], "All of them together", lines, joint.figure(shared), joint.CAPTION))
     return headlines
 
@@ -163,8 +164,7 @@ def _side_by_side(run_dir: Path) -> Iterator[Headline]:
     elif of is not None:
         populations.write_tables(of, run_dir)
         drawn = svg(populations.figure(of), "populations", populations.CAPTION)
-        lines = [f"Compared: {line}" for line in groups.group_sentences(of)]  # names of parameters keep their case
-        yield Headline("differences.csv", "The differences", lines, drawn, populations.CAPTION)
+        yield Headline("differences.csv", "The differences", [*groups.group_sentences(of)], drawn, populations.CAPTION)
 
 
 def _write_page(run_dir: Path, stem: str, copies: str | None, trail: Sequence[tuple[str, str]]) -> None:

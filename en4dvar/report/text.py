@@ -26,6 +26,11 @@ _NAMES = (
 _GREEK = dict(zip(_NAMES.split(), "αβγδεζηθκλμνξρστφχψωπ∞ℓΓΔΘΛΣΦΨΩ", strict=True))
 
 
+def upper_first(words: str) -> str:
+    """A sentence with a capital to begin with; its other letters, such as those of names, stay as they are."""
+    return words[:1].upper() + words[1:]
+
+
 def pretty_unit(unit: str) -> str:
     """``"um"`` → ``"µm"``, ``"Pa s"`` → ``"Pa·s"``, ``"J/m^2"`` → ``"J/m²"``, ``"1"`` → ``""``.
 

@@ -47,6 +47,7 @@ LOWEST = (
     0.6,
     0.75,
 )  # of R_max: R^{5/2} is fitted to what lies above, to less where a thick gel lets it creep
+KNOWN = "write a configuration whose priors say what is known of it (en4dvar init --start laser, without --data)"
 BEFORE = 1.0  # of the time that is fitted to: a parabola whose top lies further before the first sample shows none
 TOLD = 0.6  # of R_max: a window that ends above does not tell the collapse time
 SOFT = 1.02  # r of a large bubble in a soft gel, whose gas and viscosity prolong its collapse a little
@@ -104,11 +105,14 @@ def lobe(times: Array, radius: Array) -> Lobe:
     if turning is None:
         top = f"its maximum, reading {np.argmax(radius) + 1} of {len(radius)}"
         if where.stop - where.start < 4 and lowest == LOWEST[0]:
-            raise DataError(f"fewer than four samples from {top}, down to its collapse; is this a radius history?")
+            raise DataError(
+                f"fewer than four samples from {top}, down to its collapse; is this a radius history? Where it is, and "
+                f"its frames are this far apart, {KNOWN}"
+            )
         raise DataError(
             f"the radius does not turn at {top}, but creeps from there as in a thick gel, where G, mu and the time of "
             "the true maximum make up for each other; give the readings before it as well, or, where there are none, "
-            "write a configuration whose priors say what is known of them (en4dvar init --start laser, without --data)"
+            f"{KNOWN}"
         )
     z, y, scale, c, b, a = turning
     middle = -b / (2 * c)

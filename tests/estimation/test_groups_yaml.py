@@ -81,7 +81,7 @@ def test_terminal_and_page_open_with_the_comparison(finished):
     answer = "k of gel 5kPa is "
     assert answer in output
     assert "broken.csv: no column" in output
-    assert page.index("<h1>") < page.index(answer) < page.index("Each data set by itself")
+    assert page.index("<h1>") < page.index(f"<li>{answer}") < page.index("Each data set by itself")  # k and not K
     assert page.index("in kPa.") < page.index('href="groups/1_gel_5kPa/population.html"')
     assert 'href="groups/2_gel_8kPa/population.html"' in page
     assert (run / "differences.csv").is_file()
