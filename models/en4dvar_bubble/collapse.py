@@ -105,10 +105,8 @@ def lobe(times: Array, radius: Array) -> Lobe:
     if turning is None:
         top = f"its maximum, reading {np.argmax(radius) + 1} of {len(radius)}"
         if where.stop - where.start < 4 and lowest == LOWEST[0]:
-            raise DataError(
-                f"fewer than four samples from {top}, down to its collapse; is this a radius history? Where it is, and "
-                f"its frames are this far apart, {KNOWN}"
-            )
+            words = f"fewer than four samples from {top}, down to its collapse; is this a radius history?"
+            raise DataError(f"{words} Where it is, {KNOWN}")
         raise DataError(
             f"the radius does not turn at {top}, but creeps from there as in a thick gel, where G, mu and the time of "
             "the true maximum make up for each other; give the readings before it as well, or, where there are none, "
