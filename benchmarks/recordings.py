@@ -40,6 +40,7 @@ import numpy as np
 from click.testing import CliRunner
 from measured_page import GROUPS, after, chi2, intervals, page, said, stated
 from records import Record, fill
+from scipy.signal import peak_widths
 from wrong_worlds import WORLDS, Wrong
 
 import en4dvar
@@ -163,8 +164,10 @@ def _withheld(stats: Any, largest: float) -> tuple[int, float, float] | None:
 def _next(result: Result) -> tuple[int, float] | None:
     """How many readings follow the window to the next minimum, and their share in the 90 % bands."""
     lines, within = withheld_lines(result), shown(result.group("observed_data")["radius"])
-    ends = minima(np.concatenate([within, [float(str(line[4])) for line in lines]]), PROMINENT)
-    count = next((int(end) + 1 - len(within) for end in ends if end > len(within)), 0)
+    series = np.concatenate([within, [float(str(line[4])) for line in lines]])
+    ends = minima(series, PROMINENT)
+    begins = peak_widths(-series, ends, rel_height=0.5)[2]  # the window ends in the middle of one
+    count = next((int(e) + 1 - len(within) for e, b in zip(ends, begins, strict=True) if b > len(within)), 0)
     return (count, float(np.mean([line[-1] == 1 for line in lines[:count]]))) if count else None
 
 

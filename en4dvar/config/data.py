@@ -38,12 +38,15 @@ def _prominence(text: Any, context: Context) -> float:
 
 
 class WindowSection(Section):
-    """First and last observation used: ``maximum``, ``minimum 2``, a time, or ``start``/``end`` of the file."""
+    """First and last observation used: ``top``, ``trough 2``, ``maximum``, ``minimum 2``, a time, or ``start``/``end``
+    of the file."""
 
     start: Annotated[Instant, Made(_instant)] = Field("start", alias="from", validate_default=True)
-    """First observation: start, maximum (for the bubble also R_max), minimum N, or a time on the file's clock."""
+    """First observation: start, top, maximum (for the bubble also R_max), trough N, minimum N, or a time on the file's
+    clock."""
     end: Annotated[Instant, Made(_instant)] = Field("end", alias="to", validate_default=True)
-    """Last observation: end, maximum, minimum N (counted from the window's start), or a time on the file's clock."""
+    """Last observation: end, top, maximum, trough N, minimum N (counted from the window's start), or a time on the
+    file's clock."""
     prominence: Annotated[float, Made(_prominence)] = Field("10 %", validate_default=True)
     """How deep a minimum must be to count, relative to the range of the series."""
 

@@ -2,6 +2,11 @@
 
 A local minimum counts when its prominence exceeds a fraction (10 % by default) of the range of the series from the
 window's start on, so that noise of a sample or two makes no minimum (``scipy.signal.find_peaks``).
+
+A window that ends with the smallest sample of several, or begins with the largest, ends or begins with an error of
+known sign: it was chosen for its value, and those beside it were left out for theirs. ``top`` and ``trough N`` say the
+same instants by what no single sample decides: the vertex of a parabola through the samples about the maximum, and the
+middle between the two crossings of half the depth of a minimum.
 """
 
 from __future__ import annotations
@@ -18,23 +23,28 @@ from en4dvar.plumbing.errors import DataError
 from en4dvar.plumbing.hints import shown
 from en4dvar.plumbing.units import UnitError, parse_quantity
 
-_MINIMUM = re.compile(r"minimum(?:\s+(\d+))?")
+_NUMBERED = re.compile(r"(minimum|trough)(?:\s+(\d+))?")
+ABOUT = 0.8  # of the maximum: the samples that are larger tell where the top is
 
 
 @dataclass(frozen=True)
 class Instant:
-    """A sample of a series: an end, an extremum (the ``number``-th minimum), or a ``time`` on the file's clock."""
+    """A sample of a series: an end, an extremum (the ``number``-th minimum), or a ``time`` on the file's clock.
 
-    kind: Literal["start", "end", "maximum", "minimum", "time"]
+    ``top`` and ``trough`` are the maximum and a minimum where several samples, and no single one, put them.
+    """
+
+    kind: Literal["start", "end", "maximum", "minimum", "top", "trough", "time"]
     number: int = 1
     time: float = 0.0
 
 
-BY_NAME: dict[str, Instant] = {kind: Instant(kind) for kind in ("start", "end", "maximum")}
+BY_NAME: dict[str, Instant] = {kind: Instant(kind) for kind in ("start", "end", "maximum", "top")}
 
 
 def parse_instant(text: str | float, time_unit: str, symbols: Collection[str] = ()) -> Instant:
-    """``start``, ``end``, ``maximum`` (or ``R_max`` for R among ``symbols``), ``minimum 2``, or a time with its unit.
+    """``start``, ``end``, ``maximum`` (or ``R_max`` for R among ``symbols``), ``top``, ``minimum 2``, ``trough 2``, or
+    a time with its unit.
 
     Raises :class:`UnitError` (a ``ValueError``) for anything else.
     """
@@ -43,13 +53,14 @@ def parse_instant(text: str | float, time_unit: str, symbols: Collection[str] = 
         return BY_NAME[word]
     if word.endswith("_max") and word.removesuffix("_max") in symbols:
         return Instant("maximum")
-    minimum = _MINIMUM.fullmatch(word)
-    if minimum and minimum[1] != "0":
-        return Instant("minimum", int(minimum[1] or 1))
+    numbered = _NUMBERED.fullmatch(word)
+    if numbered and numbered[2] != "0":
+        return Instant("minimum" if numbered[1] == "minimum" else "trough", int(numbered[2] or 1))
     if word[:1].isdigit() or word[:1] in "+-.":
         return Instant("time", time=parse_quantity(text, time_unit))
     raise UnitError(
-        f"{shown(text)} is not an instant; write start, end, maximum, 'minimum 2', or a time such as '3 us'"
+        f"{shown(text)} is not an instant; write start, end, maximum, top, 'minimum 2', 'trough 2', or a time "
+        "such as '3 us'"
     )
 
 
@@ -76,13 +87,39 @@ def _index(times: Array, values: Array, instant: Instant, first: int, prominence
         return int(np.searchsorted(times, instant.time + (rounding if last else -rounding), side)) - last
     if instant.kind == "maximum":
         return first + int(np.argmax(values[first:]))
+    if instant.kind == "top":
+        return int(np.searchsorted(times, _top(times[first:], values[first:])))
     indices = minima(values[first:], prominence)
     if instant.number > len(indices):
         raise DataError(
             f"the window asks for minimum {instant.number}, but only {len(indices)} minima with a prominence of "
             f"{prominence:.0%} of the range follow its start"
         )
-    return first + int(indices[instant.number - 1])
+    index = int(indices[instant.number - 1])
+    if instant.kind == "trough":
+        return first + int(np.searchsorted(times[first:], _middle(times[first:], values[first:], index), "right")) - 1
+    return first + index
+
+
+def _top(times: Array, values: Array) -> float:
+    """Where a parabola through the samples about the largest has its vertex; the largest where they make none."""
+    largest = int(np.argmax(values))
+    low = np.flatnonzero(values < ABOUT * values[largest])
+    near = slice(int(max(low[low < largest], default=-1)) + 1, int(min(low[low > largest], default=len(values))))
+    t, y = times[near] - times[largest], values[near]
+    if len(t) < 5:
+        return float(times[largest])
+    curvature, slope, _ = np.polyfit(t, y, 2)
+    vertex = -slope / (2 * curvature) if curvature < 0 else 0.0
+    return float(times[largest] + np.clip(vertex, t[0], t[-1]))
+
+
+def _middle(times: Array, values: Array, index: int) -> float:
+    """The middle between the crossings of half the depth (the prominence) of the minimum at ``index``."""
+    from scipy.signal import peak_widths
+
+    _, _, left, right = peak_widths(-values, [index], rel_height=0.5)
+    return float(np.mean(np.interp([left[0], right[0]], np.arange(len(times)), times)))
 
 
 def minima(values: Array, prominence: float = 0.1) -> Array:

@@ -165,7 +165,7 @@ def test_a_shallow_rebound_is_in_the_window(tmp_path: Path) -> None:
     (tmp_path / "b.csv").write_text("t,R\n" + "".join(f"{t:g},{r:g}\n" for t, r in zip(times, radius, strict=True)))
     assert call("init", "--data", "b.csv", *UNITS).exit_code == 0
     config = proposed(Path("b.yaml"))
-    assert config.document.data["data"]["window"] == {"from": "R_max", "to": "minimum 2", "prominence": "5 %"}
+    assert config.document.data["data"]["window"] == {"from": "top", "to": "trough 2", "prominence": "5 %"}
     (problem,) = build(config)
     assert problem.observations.times[-1] == pytest.approx(30e-6, abs=1e-6)
 

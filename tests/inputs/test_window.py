@@ -24,6 +24,36 @@ def test_extrema() -> None:
     assert cut(BOUNCES, "start", "end") == (0.0, 4.0)
 
 
+def test_top_and_trough() -> None:
+    triangles = np.abs((T - 0.52) % 1.0 - 0.5)  # minima at 1.02, 2.02, 3.02: between two samples
+    assert cut(triangles, "minimum 2", "trough 1") == pytest.approx((2.025, 3.0))
+    assert cut(triangles, "start", "trough 2")[1] == pytest.approx(2.0)
+    parabola = 2.0 - (T - 1.51) ** 2
+    assert cut(parabola, "top", "end")[0] == pytest.approx(1.525)
+    assert cut(parabola[::-1], "top", "end")[0] == pytest.approx(2.5)
+    few = np.where(T == 2.0, 3.0, 1.0 + 0.1 * T)
+    assert cut(few, "top", "end")[0] == 2.0  # no five samples about it: the largest
+    assert parse_instant("top", "s") == Instant("top")
+    assert parse_instant("trough 2", "s") == Instant("trough", 2)
+
+
+def test_errors_of_samples_do_not_choose_the_ends() -> None:
+    """The first and the last error of a window have the mean zero; those of the extreme samples do not."""
+    rng = np.random.default_rng(4)
+    means = {}
+    for ends in (("top", "trough 2"), ("R_max", "minimum 2")):
+        chosen = []
+        for _ in range(400):
+            errors = 0.03 * rng.standard_normal(len(T))
+            smooth = 2.0 + np.cos(2 * np.pi * T / 2.0 - 1.0) * np.exp(-0.3 * T)
+            window = select(T, smooth + errors, *(parse_instant(end, "s", ("R",)) for end in ends))
+            chosen.append((errors[window][0], errors[window][-1]))
+        means[ends[0]] = np.mean(chosen, axis=0) / 0.03
+    assert np.all(np.abs(means["top"]) < 0.25), means  # five standard errors of a mean of 400
+    assert means["R_max"][0] > 1.0, means
+    assert means["R_max"][1] < -1.0, means
+
+
 def test_noise_makes_no_minimum() -> None:
     rng = np.random.default_rng(1)
     noisy = BOUNCES + 0.02 * rng.standard_normal(len(T))
@@ -45,6 +75,6 @@ def test_refused() -> None:
     with pytest.raises(DataError, match="empty"):
         cut(BOUNCES, "5 s", "6 s")
     assert parse_instant("minimum 3", "s") == Instant("minimum", 3)
-    for text in ("R_max", "minimum 0", "minimum two", "3", "3 m", 3.0):
+    for text in ("R_max", "minimum 0", "minimum two", "trough 0", "3", "3 m", 3.0):
         with pytest.raises(UnitError):
             parse_instant(text, "s")

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from en4dvar.inputs.window import minima
+from en4dvar.inputs.window import Instant, select
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.errors import DataError
 from en4dvar.plumbing.units import convert
@@ -179,7 +179,7 @@ def starter(start: Start, law: str | None) -> Proposal:
     model, law_name = built(start, law)
     data = [Entry("error", "{radius_std: 1 % of maximum}", "how well a radius is known: put yours")]
     if start == "laser":
-        data[:0] = [Entry("window", "{from: R_max, to: minimum 2}"), Entry("time_zero", "window")]
+        data[:0] = [Entry("window", "{from: top, to: trough 2}"), Entry("time_zero", "window")]
     lines = [example(p, model) for p in model.law.parameters]
     lines += _radii(start, None)
     lines += [Entry("t_s", "{prior: normal, mean: 0 us, std: 0.5 us}", "the clock of the data against the model's")]
@@ -265,7 +265,7 @@ def _data(
     if start == "laser":
         lines = [
             _window(look, histories),
-            Entry("time_zero", "window", "the model's clock starts at R_max, t_s later or earlier"),
+            Entry("time_zero", "window", "the model's clock starts at the top, t_s later or earlier"),
         ]
     else:
         end = _text(look.descent, "s", "us", 4) if np.isfinite(look.descent) else "end"
@@ -289,22 +289,20 @@ def _data(
 
 
 def _window(look: Look, histories: Mapping[str, tuple[Array, Array]]) -> Entry:
-    """From the largest reading to the second minimum; by times where a reading that is none would be taken for it."""
-    end = f"minimum {min(look.n_minima, 2)}" if look.n_minima else "end"
+    """From the top to the second minimum; by times where a reading that is none would be taken for one of them."""
+    end = f"trough {min(look.n_minima, 2)}" if look.n_minima else "end"
     low = f", prominence: {100 * look.prominence:g} %" if look.prominence < 0.1 else ""
-    words = "what happens before R_max is not modelled"
+    words = "what happens before the top is not modelled"
     if look.drift and not look.n_minima:
         words += f"; {look.drift}: end it before that"
     if len(histories) == 1 and look.bad:
         ((times, radius),) = histories.values()
         times, radius = np.delete(times, look.bad), np.delete(radius, look.bad)
-        first = look.top.reading
-        last = len(times) - 1
-        if look.n_minima:
-            last = first + int(minima(radius[first:], look.prominence)[min(look.n_minima, 2) - 1])
-        limits = [_text(times[i], "s", "us", 8) for i in (first, last)]
-        return Entry("window", f"{{from: {limits[0]}, to: {limits[1]}}}", f"R_max to {end}; {words}")
-    return Entry("window", f"{{from: R_max, to: {end}{low}}}", words)
+        last = Instant("trough", min(look.n_minima, 2)) if look.n_minima else Instant("end")
+        within = times[select(times, radius, Instant("top"), last, look.prominence)]
+        limits = [_text(t, "s", "us", 8) for t in within[[0, -1]]]
+        return Entry("window", f"{{from: {limits[0]}, to: {limits[1]}}}", f"the top to {end}; {words}")
+    return Entry("window", f"{{from: top, to: {end}{low}}}", words)
 
 
 @dataclass(frozen=True)
@@ -323,9 +321,9 @@ def tops(looks: Mapping[str, Look], histories: Mapping[str, tuple[Array, Array]]
     shifts, heights = [], []
     for name, view in looks.items():
         times, radius = (np.delete(values, view.bad) for values in histories[name])
-        reading = view.top.reading
-        shifts.append((times[reading] - view.top.time, TOP_WIDTH * view.top.time_std, view.step))
-        largest = radius[reading]
+        first = select(times, radius, Instant("top"), Instant("end")).start
+        shifts.append((times[first] - view.top.time, TOP_WIDTH * view.top.time_std, view.step))
+        largest = float(radius[first:].max())
         heights.append((view.top.height / largest - 1, TOP_WIDTH * view.top.height_std / largest))
     shift, height = np.array(shifts), np.array(heights)
     least = LEAST_SHIFT * float(np.mean(shift[:, 2]))
