@@ -56,7 +56,8 @@ def sentences(stored: StoredPopulation) -> tuple[str, ...]:
     for centre, mean, spread in zip(centres, of["mean"], of["between"], strict=True):
         lines += [_sentence(stored, centre, mean, spread), *_parts(stored, centre), *_compared(stored, centre)]
     if "empirical" in stored.tree.children:
-        lines += [_one_by_one(stored, centre) for centre in centres if not centre.untrusted]
+        checked = [_of_sets(stored, centre) for centre in centres if not centre.untrusted]
+        lines += [f"Check without a model of the population: {words}." for words in checked]
     lines += [_together(stored, combination) for combination in stored.combinations]
     effective = float(stored.tree.attrs["effective_draws_without_hyperprior"])
     if effective < FEWEST:
@@ -132,12 +133,8 @@ def _in_parts(stored: StoredPopulation, mean: ParameterSummary, of: xr.DataArray
     )
 
 
-def _one_by_one(stored: StoredPopulation, centre: ParameterSummary) -> str:
-    """The median over the data sets, which needs no model of how they vary."""
-    return f"Check without a model of the population: {_of_sets(stored, centre)}."
-
-
 def _of_sets(stored: StoredPopulation, centre: ParameterSummary) -> str:
+    """The median over the data sets one by one, which needs no model of how they vary."""
     of = stored.group("empirical")[centre.name]
     low, middle, high = map(float, convert(of.values, str(of.attrs["units"]), centre.unit))
     std, unit = (high - low) / 3.29, f" {pretty_unit(centre.unit)}" if centre.unit != "1" else ""

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.model.state import Array
 from en4dvar.plumbing.units import convert
 from en4dvar.report.chart import PAGE, POINTS, Chart, Panel, interval, stacked
 from en4dvar.report.cycles import CERTAIN, RANKS, ranks, span_of, time_label, write_cycles_page
@@ -56,7 +55,7 @@ def write_sequence_report(run_dir: Path, files: bool = False) -> Path:
 
 def sequence_figures(data: Group) -> Iterator[Captioned]:
     """Each figure with its caption."""
-    best = _best(data)
+    best = "smoothed" if "smoothed_mean" in data else "analysis"
     held = _parameters(data)
     spread = data[f"{best}_std"].values.max(axis=0)
     uncertain = np.flatnonzero(spread > CERTAIN * np.abs(data[f"{best}_mean"].values).max(axis=0))
@@ -95,7 +94,7 @@ def innovations(data: Group) -> Chart:
     """Innovations in time over ± 2 expected std, some of the observations."""
     time = shown(data["time"])
     innovation = data["observations"].values - data["predicted_mean"].values
-    expected = _expected(data)
+    expected = np.hypot(data["predicted_std"].values, data["observation_std"].values)
     panels = []
     for i in _some(np.arange(data.sizes["observation"]), SHOWN):
         unit, display = (str(data[f"observation_{kind}"].values[i]) for kind in ("units", "display_units"))
@@ -107,15 +106,6 @@ def innovations(data: Group) -> Chart:
         panel.dots(at, convert(innovation[there, i], unit, display), "ink", 1.6, label="innovation")
         panels.append(panel)
     return stacked(panels, 2.6 * POINTS, time_label(data), PAGE)
-
-
-def _best(data: Group) -> str:
-    return "smoothed" if "smoothed_mean" in data else "analysis"
-
-
-def _expected(data: Group) -> Array:
-    """(K, p) expected standard deviations of the innovations."""
-    return np.asarray(np.hypot(data["predicted_std"].values, data["observation_std"].values))
 
 
 def _parameters(data: Group) -> npt.NDArray[np.intp]:
