@@ -141,7 +141,7 @@ def joint(folder: Path, shoot: Camera) -> None:
     for line in lines_of("joint.md", "en4dvar run configs") + lines_of("joint.md", "en4dvar joint runs/combined"):
         typed(folder, line.replace("configs/", f"{CONFIGS}/"))
     (page,) = folder.glob("runs/joint_*/joint.html")
-    shoot(str(page.relative_to(folder)), "howto_joint", 550, "figure")
+    shoot(str(page.relative_to(folder)), "howto_joint", 566, "figure")
 
 
 def population(folder: Path, shoot: Camera) -> None:
