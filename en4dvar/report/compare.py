@@ -13,19 +13,25 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from en4dvar.data.observations import Observations
+from en4dvar.diagnosis.intervals import member_quantiles
 from en4dvar.estimation.summary import ParameterSummary, estimate_cells
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, codes
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.tables import table
-from en4dvar.report.text import fixed
+from en4dvar.plumbing.units import UnitError, convert
+from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, in_columns
+from en4dvar.report.text import figure_text, fixed, with_unit
 from en4dvar.results.run_results import result_files
 from en4dvar.results.store import StoredResult, load_stored
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 T = TypeVar("T")
 MOST_WARNINGS = 12  # on the terminal
@@ -34,6 +40,7 @@ MEANINGLESS = (
 )
 UNDECIDABLE = 1.0  # difference of log-evidence
 ALL = "all data sets"
+COLOURS = ("posterior", "centre", "background", "#cc79a7", "#b58900", "muted")
 STORED = "* as the result has it: Laplace's approximation, unless its posterior was sampled"
 WITHOUT_WAIC = (
     f"p_WAIC – where it is more than {MEANINGLESS:g} times the number of parameters: members do not fit the readings, "
@@ -121,6 +128,15 @@ class Comparison:
     def datasets(self) -> tuple[str, ...]:
         """Names of the data sets; where the runs share several, :data:`ALL` comes last."""
         return tuple(dict.fromkeys(score.dataset for score in self.scores))
+
+    def plot(self) -> Figure:
+        """Posteriors of the runs over each other, a panel a parameter."""
+        from en4dvar.report.paper import on_paper  # matplotlib takes time to import
+
+        return on_paper(overlay(self))
+
+    def __str__(self) -> str:
+        return comparison_table(self)
 
     def verdict(self, dataset: str) -> str:
         """The preferred model in words, or that the data do not decide, or that evidences do not compare."""
@@ -252,6 +268,44 @@ def estimates_table(comparison: Comparison) -> str:
         why = [", ".join(e.summary.untrusted)] * doubted
         rows.append((e.summary.name, e.summary.unit, e.dataset, e.run, mean, std, low, high, *why))
     return table([header, *rows])
+
+
+def overlay(comparison: Comparison) -> Chart:
+    """Posterior members of the runs over each other, one panel a parameter, in the display unit of the first run."""
+    names = comparison.parameters
+    panels = [_panel([e for e in comparison.estimates if e.summary.name == name], comparison.runs) for name in names]
+    panels[0].legend = True
+    height = (4.0 + 0.15 * len(comparison.runs)) * POINTS
+    return in_columns(panels, height, width=COLUMN * (2 if len(names) > 1 else 1))
+
+
+def _panel(estimates: Sequence[ComparedEstimate], runs: Sequence[str]) -> Panel:
+    row = estimates[0].summary
+    panel = Panel(with_unit(row.symbol, row.unit), yticks=(), left=False, ylim=(0.0, 1.1 + 0.09 * len(runs)))
+    for i, run in enumerate(runs):
+        label = figure_text(run)
+        panel.line([], [], _colour(i), label=label)
+        values = _members([e for e in estimates if e.run == run], row.unit)
+        if values.size < 2 or np.ptp(values) == 0:
+            continue
+        panel.histogram(values, _colour(i), alpha=0.25)
+        if not any(e.summary.untrusted for e in estimates if e.run == run):
+            low, high = member_quantiles(values, (0.05, 0.95))
+            panel.line([low, high], np.full(2, 1.08 + 0.09 * i), _colour(i), 2.0)
+    return panel
+
+
+def _members(estimates: Sequence[ComparedEstimate], unit: str) -> Array:
+    """Members of all data sets of a run in ``unit``."""
+    try:
+        parts = [convert(e.members, e.summary.unit, unit) for e in estimates]
+    except UnitError as error:
+        raise OutputError(f"the runs mean different quantities by {estimates[0].summary.name}: {error}") from None
+    return np.concatenate(parts) if parts else np.empty(0)
+
+
+def _colour(i: int) -> str:
+    return COLOURS[i % len(COLOURS)]
 
 
 def named(runs: Sequence[str | Path] | Mapping[str, T]) -> Mapping[str, T | Path]:

@@ -14,10 +14,12 @@ from en4dvar.report.chart import POINTS, Chart, Panel, Row
 from en4dvar.report.drawing import Captioned, draw
 from en4dvar.report.html import render
 from en4dvar.report.page import provenance_rows
+from en4dvar.report.text import plain_number, with_unit
 from en4dvar.results.netcdf import Group
 
 Table = tuple[str, Sequence[str], Sequence[Sequence[str]], str]  # heading, columns, rows, words below it
 BINS = 10
+CERTAIN = 1e-9  # of its size: the spread of what is known
 RANKS = (
     "Rank histogram: where each observation fell among the forecast members, errors of the observations added. A "
     "reliable ensemble has flat bars, 95 % of them inside the band; a valley is too little spread, a hill too much."
@@ -30,20 +32,32 @@ def write_cycles_page(
     *,
     kind: str,
     what: str,
+    cycle: str,
+    iterations: float,
     facts: Sequence[tuple[str, str, str]],
     tables: Sequence[Table],
     figures: Iterable[Captioned],
     files: bool,
 ) -> Path:
-    """Write ``report.html``, with ``files`` also figures as PDF and PNG; returns the path of the page."""
+    """Write ``report.html``, with ``files`` also figures as PDF and PNG; returns the path of the page.
+
+    ``facts``: (quantity, value, in words) for the tiles on top, beside those of scheme, members and forward runs;
+    ``iterations``: forecasts of the window a ``cycle``, on average.
+    """
     a = data.attrs
+    members, lost = int(a["members"]), int(a["members_lost"])
     page = render(
         "cycles.html.j2",
         title=str(a["name"]),
         created=str(a.get("date_created", "")),
         kind=kind,
         what=what,
-        facts=facts,
+        facts=[
+            ("Scheme", str(a["scheme"]), f"forecasts of the window {cycle}: {plain_number(iterations, 3)}"),
+            ("Members", f"{members - lost} of {members}", "did not fail up to the end of the run"),
+            *facts,
+            ("Forward runs", str(int(a["forward_runs"])), "of one member over a window"),
+        ],
         tables=tables,
         figures=draw(figures, folder=inside(run_dir, "figures") if files else None),
         copies=files,
@@ -58,6 +72,12 @@ def write_cycles_page(
 def span_of(time: Array) -> tuple[float, float] | None:
     """Limits of an axis of time without margins."""
     return (float(time[0]), float(time[-1])) if time[-1] > time[0] else None
+
+
+def time_label(data: Group) -> str:
+    """Of an axis of time."""
+    about = data["time"].attrs
+    return with_unit("time", str(about.get("display_units", about["units"])))
 
 
 def ranks(ranked: Array, members: int) -> Chart:

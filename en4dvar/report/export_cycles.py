@@ -12,12 +12,12 @@ from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.tables import csv_text
 from en4dvar.plumbing.units import convert
+from en4dvar.report.cycles import CERTAIN
 from en4dvar.report.export import Notes, escaped, latex_unit, plus_minus, tabular
 from en4dvar.results.netcdf import Group, understood
 from en4dvar.results.series_file import read_series
 
 KINDS = ("forecast", "analysis", "smoothed")
-CERTAIN = 1e-9  # of its size: the spread of what is known
 
 
 def cycles_table(file: Path, kind: Literal["csv", "latex", "members"]) -> str:

@@ -25,7 +25,10 @@ def histograms(result: StoredResult) -> Chart:
     for row in result.rows:
         exact, posterior = _prior_density(result, row.name), result.members("posterior", row.name)
         prior = result.members("prior", row.name)
-        value, doubt = f"{estimate(row, '')} {pretty_unit(row.unit)}".rstrip(), " (?)" if row.untrusted else ""
+        value, doubt = (
+            f"{estimate(row, '')} {pretty_unit(row.unit)}".rstrip(),
+            ", not to be trusted" if row.untrusted else "",
+        )
         panel = Panel(
             with_unit(row.symbol, row.unit), title=f"{value}{doubt}", title_colour="posterior", xticks=4, yticks=(),
             left=False, xlim=_reach(prior, posterior), ylim=(-0.14, 1.2),
@@ -147,8 +150,8 @@ def all_figures(result: StoredResult) -> Iterator[Captioned]:
         yield (
             "posterior",
             "What is known after the readings (posterior, blue) and what was before (prior, grey), each scaled to its "
-            "peak. Bar: the 90 % interval; a number whose interval cannot be quoted, for a warning, has a (?) and "
-            "no bar. Ticks: the members that stand for the posterior. Dashed: the best fit.",
+            "peak. Bar: the 90 % interval; a number whose interval cannot be quoted, for a warning, has no bar "
+            "and says so. Ticks: the members that stand for the posterior. Dashed: the best fit.",
             histograms(result),
         )
     if "/fields" in result.groups:

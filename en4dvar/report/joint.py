@@ -10,6 +10,8 @@ import numpy as np
 import xarray as xr
 
 from en4dvar.diagnosis.intervals import METHOD, member_quantiles
+from en4dvar.estimation.summary import ParameterSummary, estimate_cells
+from en4dvar.model.state import Parameter
 from en4dvar.plumbing.caution import Caution, untrusted
 from en4dvar.plumbing.files import write_text
 from en4dvar.plumbing.tables import csv_text, table
@@ -17,33 +19,23 @@ from en4dvar.plumbing.units import convert
 from en4dvar.report.chart import COLUMN, PAGE, POINTS, Chart, Panel, in_columns
 from en4dvar.report.html import render
 from en4dvar.report.svg import svg
-from en4dvar.report.text import figure_text, number_like, pretty_unit, with_unit
+from en4dvar.report.text import figure_text, number_like, pretty_unit, shown, with_unit
 from en4dvar.results.joint_file import QUANTILES, StoredGroups, StoredJoint
 
 MOST_FITS = 12  # panels of the figure
+NOTHING = np.full(1, np.nan)
 CAPTION = "Median and 5–95 % of what is shared, as each data set has it alone (grey) and as all have it together."
 FITS = "Observations and 5–95 % of the joint posterior's predictions."
 
 
 @dataclass(frozen=True)
-class JointRow:
-    """One number of the joint estimate in its display unit; ``dataset`` "" for what is shared, ``without`` the names of
-    the odd data sets where they are left out.
+class JointRow(ParameterSummary):
+    """One number of the joint estimate; ``dataset`` "" for what is shared, ``without`` the names of the odd data sets
+    where they are left out.
     """
 
-    name: str
-    label: str
-    symbol: str
-    dataset: str
-    mean: float
-    std: float
-    q05: float
-    q50: float
-    q95: float
-    unit: str
-    untrusted: tuple[str, ...]
+    dataset: str = ""
     without: str = ""
-    modal: bool = False
 
 
 def estimates(joint: StoredJoint) -> tuple[JointRow, ...]:
@@ -66,13 +58,15 @@ def estimates(joint: StoredJoint) -> tuple[JointRow, ...]:
 def _estimate(
     cautions: Sequence[Caution], name: str, values: xr.DataArray, dataset: str = "", without: str = ""
 ) -> JointRow:
-    about = values.attrs
-    unit, shown = str(about["units"]), str(about["display_units"])
-    members = convert(values.values.ravel(), unit, shown)
-    q05, q50, q95 = map(float, member_quantiles(members, QUANTILES))
-    mean, std = float(members.mean()), float(members.std(ddof=1))
-    label, symbol = str(about["long_name"]), str(about["symbol"])
-    return JointRow(name, label, symbol, dataset, mean, std, q05, q50, q95, shown, untrusted(cautions, name), without)
+    row = ParameterSummary.of(parameter_of(name, values), NOTHING, shown(values).ravel(), np.nan, np.nan, cautions)
+    return JointRow(**vars(row), dataset=dataset, without=without)
+
+
+def parameter_of(name: str, values: xr.DataArray) -> Parameter:
+    """What a file says of a parameter beside its values."""
+    about = {key: str(text) for key, text in values.attrs.items()}
+    label = about.get("label") or about["long_name"]
+    return Parameter(name, about["units"], label=label, symbol=about["symbol"], display_unit=about["display_units"])
 
 
 def joint_lines(joint: StoredJoint) -> list[str]:
@@ -96,19 +90,11 @@ def figure(joint: StoredJoint) -> str:
 def joint_table(joint: StoredJoint) -> str:
     """What is shared, for the terminal."""
     rows = [
-        (_called(e), e.unit, f"{e.mean:.4g}", *(["–"] * 4 if e.untrusted else _numbers(e)))
+        (f"{e.name} without {e.without}" if e.without else e.name, e.unit, *estimate_cells(e))
         for e in estimates(joint)
         if not e.dataset
     ]
     return table([("shared", "unit", "mean", "std", "5 %", "50 %", "95 %"), *rows])
-
-
-def _called(e: JointRow) -> str:
-    return f"{e.name} without {e.without}" if e.without else e.name
-
-
-def _numbers(e: JointRow) -> list[str]:
-    return [f"{value:.4g}" for value in (e.std, e.q05, e.q50, e.q95)]
 
 
 def forest(

@@ -11,13 +11,12 @@ import xarray as xr
 from en4dvar.estimation.population.campaign import DETERMINED, Combination
 from en4dvar.estimation.population.estimate import FEWEST
 from en4dvar.estimation.summary import ParameterSummary, results_table, summary_rows
-from en4dvar.model.state import Parameter
 from en4dvar.plumbing.files import write_text
 from en4dvar.plumbing.tables import write_csv
 from en4dvar.plumbing.units import convert
 from en4dvar.report.export import Found, latex_table
 from en4dvar.report.html import render
-from en4dvar.report.joint import forest
+from en4dvar.report.joint import NOTHING, forest, parameter_of
 from en4dvar.report.svg import svg
 from en4dvar.report.text import number_like, percent, plain_number, plus_minus, pretty_unit, shown
 from en4dvar.results.population_file import StoredPopulation
@@ -34,7 +33,7 @@ def summaries(stored: StoredPopulation, group: str = "posterior") -> list[Found]
         rows.append((words, tuple(of_it), stored.cautions))
     if group != "posterior":
         return rows
-    nothing = xr.DataArray(np.full(1, np.nan))
+    nothing = xr.DataArray(NOTHING)
     for dataset in stored.datasets:
         of_set = (v.sel(dataset=dataset) for v in posterior.data_vars.values() if "dataset" in v.dims)
         rows.append((dataset, tuple(_row(stored, str(v.name), v, nothing) for v in of_set), stored.cautions))
@@ -42,15 +41,10 @@ def summaries(stored: StoredPopulation, group: str = "posterior") -> list[Found]
 
 
 def _row(stored: StoredPopulation, name: str, posterior: xr.DataArray, prior: xr.DataArray) -> ParameterSummary:
-    about = posterior.attrs
-    p = Parameter(
-        name, str(about["units"]), label=str(about["label"]), symbol=str(about["symbol"]),
-        display_unit=str(about["display_units"]),
-    )  # fmt: skip
-    draws = shown(posterior).ravel()
     before = shown(prior).ravel() if "units" in prior.attrs else prior.values
-    learned = float(about.get("learned", np.nan))
-    return ParameterSummary.of(p, before, draws, float(np.median(posterior.values)), learned, stored.cautions)
+    centre, learned = float(np.median(posterior.values)), float(posterior.attrs.get("learned", np.nan))
+    of = parameter_of(name, posterior)
+    return ParameterSummary.of(of, before, shown(posterior).ravel(), centre, learned, stored.cautions)
 
 
 def sentences(stored: StoredPopulation) -> tuple[str, ...]:
@@ -62,7 +56,8 @@ def sentences(stored: StoredPopulation) -> tuple[str, ...]:
     for centre, mean, spread in zip(centres, of["mean"], of["between"], strict=True):
         lines += [_sentence(stored, centre, mean, spread), *_parts(stored, centre), *_compared(stored, centre)]
     if "empirical" in stored.tree.children:
-        lines += [_one_by_one(stored, centre) for centre in centres if not centre.untrusted]
+        checked = [_of_sets(stored, centre) for centre in centres if not centre.untrusted]
+        lines += [f"Check without a model of the population: {words}." for words in checked]
     lines += [_together(stored, combination) for combination in stored.combinations]
     effective = float(stored.tree.attrs["effective_draws_without_hyperprior"])
     if effective < FEWEST:
@@ -138,12 +133,8 @@ def _in_parts(stored: StoredPopulation, mean: ParameterSummary, of: xr.DataArray
     )
 
 
-def _one_by_one(stored: StoredPopulation, centre: ParameterSummary) -> str:
-    """The median over the data sets, which needs no model of how they vary."""
-    return f"Check without a model of the population: {_of_sets(stored, centre)}."
-
-
 def _of_sets(stored: StoredPopulation, centre: ParameterSummary) -> str:
+    """The median over the data sets one by one, which needs no model of how they vary."""
     of = stored.group("empirical")[centre.name]
     low, middle, high = map(float, convert(of.values, str(of.attrs["units"]), centre.unit))
     std, unit = (high - low) / 3.29, f" {pretty_unit(centre.unit)}" if centre.unit != "1" else ""

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,6 +26,9 @@ from en4dvar.report.text import figure_text, number_like, plain_number, pretty_u
 from en4dvar.results.joint_file import QUANTILES
 from en4dvar.results.netcdf import understood
 from en4dvar.results.population_file import FILE, StoredPopulation, load_population
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 SURE = 0.999  # no number of draws says more
 OFF_THE_LINE = 0.05  # probability below which populations differ by more than a line says
@@ -83,6 +87,15 @@ class PopulationsCompared:
     notes: tuple[str, ...] = ()
     lines: Mapping[str, StraightLine] = field(default_factory=dict)
     logarithmic: frozenset[str] = frozenset()
+
+    def plot(self) -> Figure:
+        """The median of each population with its interval, a panel a parameter."""
+        from en4dvar.report.paper import on_paper  # matplotlib takes time to import
+
+        return on_paper(figure(self))
+
+    def __str__(self) -> str:
+        return "\n".join(sentences(self))
 
 
 def hold_populations(run_dirs: Iterable[str | Path]) -> bool:

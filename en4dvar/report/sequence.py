@@ -8,17 +8,15 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.model.state import Array
 from en4dvar.plumbing.units import convert
 from en4dvar.report.chart import PAGE, POINTS, Chart, Panel, interval, stacked
-from en4dvar.report.cycles import RANKS, ranks, span_of, write_cycles_page
+from en4dvar.report.cycles import CERTAIN, RANKS, ranks, span_of, time_label, write_cycles_page
 from en4dvar.report.drawing import Captioned
-from en4dvar.report.text import plain_number, pretty_unit, with_unit
+from en4dvar.report.text import plain_number, pretty_unit, shown, with_unit
 from en4dvar.results.netcdf import Group
 from en4dvar.results.series_file import read_series
 
 SHOWN = 5  # variables or observations in a figure
-CERTAIN = 1e-9  # of its size: the spread of what is known
 
 
 def write_sequence_report(run_dir: Path, files: bool = False) -> Path:
@@ -28,6 +26,7 @@ def write_sequence_report(run_dir: Path, files: bool = False) -> Path:
     be written.
     """
     data = read_series(run_dir / "sequence.nc")
+    readings = int(np.isfinite(data["observations"].values).sum())
     words = (
         "Of a filter or smoother that is right, normalised innovations have a root mean square of 1, and 95 % of the "
         "innovations lie within two expected standard deviations."
@@ -39,7 +38,12 @@ def write_sequence_report(run_dir: Path, files: bool = False) -> Path:
         data,
         kind="Sequential assimilation",
         what=f"the series {data.attrs['data_set']}, cycle by cycle.",
-        facts=_facts(data),
+        cycle="an observation time",
+        iterations=float(data["iterations"].values.mean()),
+        facts=[
+            ("Times", str(data.sizes["time"]), "at which there were observations"),
+            ("Readings", str(readings), f"of {data.sizes['observation']} quantities"),
+        ],
         tables=[
             ("State and parameters at the end", ["variable", "mean", "std", "unit"], _estimates(data), last),
             ("Innovations", columns, _innovations(data), words),
@@ -51,7 +55,7 @@ def write_sequence_report(run_dir: Path, files: bool = False) -> Path:
 
 def sequence_figures(data: Group) -> Iterator[Captioned]:
     """Each figure with its caption."""
-    best = _best(data)
+    best = "smoothed" if "smoothed_mean" in data else "analysis"
     held = _parameters(data)
     spread = data[f"{best}_std"].values.max(axis=0)
     uncertain = np.flatnonzero(spread > CERTAIN * np.abs(data[f"{best}_mean"].values).max(axis=0))
@@ -70,56 +74,38 @@ def sequence_figures(data: Group) -> Iterator[Captioned]:
 
 def in_time(data: Group, kind: str, chosen: npt.NDArray[np.intp]) -> Chart:
     """Mean ± 2 std of some variables of the state, one panel each, and the readings that are of them."""
-    time, read_as = _times(data), list(data["observation_state"].values)
+    time, read_as = shown(data["time"]), list(data["observation_state"].values)
     panels = []
     for i in chosen:
         name = str(data["state"].values[i])
-        unit, shown = str(data["units"].values[i]), str(data["display_units"].values[i])
-        mean, std = (convert(data[f"{kind}_{what}"].values[:, i], unit, shown) for what in ("mean", "std"))
-        panel = Panel(ylabel=with_unit(name, shown), xlim=span_of(time))
+        unit, display = str(data["units"].values[i]), str(data["display_units"].values[i])
+        mean, std = (convert(data[f"{kind}_{what}"].values[:, i], unit, display) for what in ("mean", "std"))
+        panel = Panel(ylabel=with_unit(name, display), xlim=span_of(time))
         panel.band(time, *interval(mean, std, 2, bool(data["positive"].values[i])), "posterior", 0.25, "± 2 std")
         panel.line(time, mean, "posterior", 0.9, label=kind)
         if name in read_as:
-            readings = convert(data["observations"].values[:, read_as.index(name)], unit, shown)
+            readings = convert(data["observations"].values[:, read_as.index(name)], unit, display)
             panel.dots(time, readings, "ink", 1.6, label="readings")
         panels.append(panel)
-    return stacked(panels, 2.8 * POINTS, _time_label(data), PAGE)
+    return stacked(panels, 2.8 * POINTS, time_label(data), PAGE)
 
 
 def innovations(data: Group) -> Chart:
     """Innovations in time over ± 2 expected std, some of the observations."""
-    time = _times(data)
+    time = shown(data["time"])
     innovation = data["observations"].values - data["predicted_mean"].values
-    expected = _expected(data)
+    expected = np.hypot(data["predicted_std"].values, data["observation_std"].values)
     panels = []
     for i in _some(np.arange(data.sizes["observation"]), SHOWN):
-        unit, shown = (str(data[f"observation_{kind}"].values[i]) for kind in ("units", "display_units"))
+        unit, display = (str(data[f"observation_{kind}"].values[i]) for kind in ("units", "display_units"))
         there = np.isfinite(innovation[:, i])
-        at, width = time[there], 2 * convert(expected[there, i], unit, shown)
-        panel = Panel(ylabel=with_unit(str(data["observation"].values[i]), shown), xlim=span_of(time))
+        at, width = time[there], 2 * convert(expected[there, i], unit, display)
+        panel = Panel(ylabel=with_unit(str(data["observation"].values[i]), display), xlim=span_of(time))
         panel.band(at, -width, width, "prior", 0.3, "± 2 expected std")
         panel.rule(0, size=0.5)
-        panel.dots(at, convert(innovation[there, i], unit, shown), "ink", 1.6, label="innovation")
+        panel.dots(at, convert(innovation[there, i], unit, display), "ink", 1.6, label="innovation")
         panels.append(panel)
-    return stacked(panels, 2.6 * POINTS, _time_label(data), PAGE)
-
-
-def _time_label(data: Group) -> str:
-    return with_unit("time", str(data["time"].attrs["display_units"]))
-
-
-def _best(data: Group) -> str:
-    return "smoothed" if "smoothed_mean" in data else "analysis"
-
-
-def _times(data: Group) -> Array:
-    a = data["time"].attrs
-    return np.asarray(convert(data["time"].values, str(a["units"]), str(a["display_units"])))
-
-
-def _expected(data: Group) -> Array:
-    """(K, p) expected standard deviations of the innovations."""
-    return np.asarray(np.hypot(data["predicted_std"].values, data["observation_std"].values))
+    return stacked(panels, 2.6 * POINTS, time_label(data), PAGE)
 
 
 def _parameters(data: Group) -> npt.NDArray[np.intp]:
@@ -153,18 +139,3 @@ def _innovations(data: Group) -> list[tuple[str, str, str, str]]:
         share = f"{100 * np.mean(np.abs(innovations) <= 2):.0f} %" if len(innovations) else "–"
         rows.append((str(name), str(len(innovations)), size, share))
     return rows
-
-
-def _facts(data: Group) -> list[tuple[str, str, str]]:
-    """(quantity, value, in words) for the tiles on top."""
-    a = data.attrs
-    members, lost = int(a["members"]), int(a["members_lost"])
-    iterations = plain_number(float(data["iterations"].values.mean()), 3)
-    readings = int(np.isfinite(data["observations"].values).sum())
-    return [
-        ("Scheme", str(a["scheme"]), f"forecasts of the window an observation time: {iterations}"),
-        ("Members alive", f"{members - lost} of {members}", "at the end of the run"),
-        ("Times", str(data.sizes["time"]), "at which there were observations"),
-        ("Readings", str(readings), f"of {data.sizes['observation']} quantities"),
-        ("Forward runs", str(int(a["forward_runs"])), "of one member over a window"),
-    ]

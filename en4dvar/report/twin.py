@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, Row, stacked
-from en4dvar.report.cycles import RANKS, ranks, span_of, write_cycles_page
+from en4dvar.report.cycles import RANKS, ranks, span_of, time_label, write_cycles_page
 from en4dvar.report.drawing import Captioned
 from en4dvar.report.text import plain_number, pretty_unit, with_unit
 from en4dvar.results.netcdf import Group
@@ -31,6 +31,7 @@ def write_twin_report(run_dir: Path, files: bool = False) -> Path:
     be written.
     """
     data = read_series(run_dir / "twin.nc")
+    burn_in = int(data.attrs["burn_in"])
     columns = ["estimate", with_unit("RMSE", _unit(data)), with_unit("spread", _unit(data)), "spread / RMSE"]
     words = "Averages over the cycles after the burn-in. The spread of a reliable ensemble is about its RMSE."
     return write_cycles_page(
@@ -38,7 +39,12 @@ def write_twin_report(run_dir: Path, files: bool = False) -> Path:
         data,
         kind="Twin experiment",
         what="a truth is drawn and observed, and the assimilation is judged against it.",
-        facts=_facts(data),
+        cycle="a cycle",
+        iterations=float(data["iterations"].values[burn_in:].mean()),
+        facts=[
+            ("Cycles", str(data.sizes["time"]), f"{burn_in} of them do not count in the averages"),
+            ("Observations", str(data.sizes["observation"]), "a cycle"),
+        ],
         tables=[("Scores", columns, _scores(data), words)],
         figures=twin_figures(data),
         files=files,
@@ -80,7 +86,7 @@ def scores(data: Group) -> Chart:
         panel.line(time, spread.values, "centre", 0.7, "--", label="spread")
         panel.rule(average, colour)
         panels.append(panel)
-    return stacked(panels, 3.0 * POINTS, _time_label(data))
+    return stacked(panels, 3.0 * POINTS, time_label(data))
 
 
 def errors(data: Group) -> Chart:
@@ -99,7 +105,7 @@ def errors(data: Group) -> Chart:
         panel.rule(0, size=0.5)
         panel.line(time, error[-LAST:, i], "ink", 0.8, label="analysis − truth")
         panels.append(panel)
-    return stacked(panels, 2.8 * POINTS, _time_label(data))
+    return stacked(panels, 2.8 * POINTS, time_label(data))
 
 
 def truth_ranks(data: Group) -> Chart:
@@ -136,10 +142,6 @@ def reliability(data: Group) -> Chart:
     return Chart([Row(COLUMN, [panel])])
 
 
-def _time_label(data: Group) -> str:
-    return with_unit("time", str(data["time"].attrs["units"]))
-
-
 def _counted(data: Group, values: np.ndarray) -> np.ndarray:
     """Values (K, n) that are there, after the burn-in, of the variables that scores count, as one row."""
     wanted = values[int(data.attrs["burn_in"]) :, data["dynamic"].values.astype(bool)].ravel()
@@ -168,17 +170,3 @@ def _scores(data: Group) -> list[tuple[str, str, str, str]]:
         rmse, spread = (float(data[f"{kind}_{what}"].attrs[MEAN]) for what in ("rmse", "spread"))
         rows.append((kind, plain_number(rmse, 4), plain_number(spread, 4), plain_number(spread / rmse, 3)))
     return rows
-
-
-def _facts(data: Group) -> list[tuple[str, str, str]]:
-    """(quantity, value, in words) for the tiles on top."""
-    a = data.attrs
-    cycles, burn_in, members, lost = data.sizes["time"], int(a["burn_in"]), int(a["members"]), int(a["members_lost"])
-    iterations = float(data["iterations"].values[burn_in:].mean())
-    return [
-        ("Scheme", str(a["scheme"]), f"forecasts of the window a cycle: {plain_number(iterations, 3)}"),
-        ("Members alive", f"{members - lost} of {members}", "at the end of the run"),
-        ("Cycles", str(cycles), f"{burn_in} of them do not count in the averages"),
-        ("Observations", str(data.sizes["observation"]), "a cycle"),
-        ("Forward runs", str(int(a["forward_runs"])), "of one member over a window"),
-    ]

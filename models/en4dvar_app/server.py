@@ -191,7 +191,7 @@ class Look(Guarded):
         known = {key: value for key, value in scale.items() if value > 0}
         about: dict[str, Any] = {"count": opened.count, "width": width, "height": height, "readings": None, **known}
         with suppress(En4dvarError):
-            about["readings"] = pictures.readings(below(self.root, steps.table_of(name)))
+            about["readings"] = pictures.readings(below(self.root, steps.beside(name, steps.TABLE)))
         return about
 
     def look_frame(self, arguments: dict[str, str]) -> bytes:

@@ -20,6 +20,7 @@ OF_INIT = (
     "start", "law", "medium", "time-unit", "radius-unit", "time-column", "radius-column", "time-step", "frame-rate",
     "pixel", "by", "sheet",
 )  # fmt: skip
+TABLE, CORRECTIONS = ".csv", ".corrections.txt"
 LONGEST = 1_000_000  # bytes of a text
 TRACKED = b"# en4dvar track, "  # begins a table that may be read anew
 OUTLINE = re.compile(r"(?:-?\d{1,5}(?:\.\d{1,9})?,-?\d{1,5}(?:\.\d{1,9})? ){3,}")  # of three corners at least
@@ -35,19 +36,9 @@ def words_of(root: Path, step: str, fields: Fields) -> list[str]:
     return STEPS[step](root, fields)
 
 
-def corrections_of(movie: str) -> str:
-    """The name of the text file with the corrections of a movie."""
-    return f"{movie.rpartition('.')[0] or movie}.corrections.txt"
-
-
-def table_of(movie: str) -> str:
-    """The name of the table that is read from a movie."""
-    return f"{movie.rpartition('.')[0] or movie}.csv"
-
-
-def mask_of(movie: str) -> str:
-    """The name of the picture that says which part of a movie is looked at."""
-    return f"{movie.rpartition('.')[0] or movie}.mask.png"
+def beside(movie: str, suffix: str) -> str:
+    """The name of what belongs to a movie: its table, the corrections, the picture that says what is looked at."""
+    return f"{movie.rpartition('.')[0] or movie}{suffix}"
 
 
 def existing(root: Path, fields: Fields, key: str) -> str:
@@ -69,7 +60,7 @@ def _options(fields: Fields, names: tuple[str, ...]) -> list[str]:
 
 def _track(root: Path, fields: Fields) -> list[str]:
     movie = existing(root, fields, "movie")
-    table, corrections = table_of(movie), corrections_of(movie)
+    table, corrections = beside(movie, TABLE), beside(movie, CORRECTIONS)
     words = ["track", movie, *_options(fields, OF_TRACK)]
     if fields.get("mask"):
         words.append(f"--mask={existing(root, fields, 'mask')}")
@@ -186,7 +177,7 @@ def masked(root: Path, fields: Fields, shape: tuple[int, ...]) -> None:
     ------
     FieldError: the outline is none, or the mask is no picture of that size.
     """
-    path, outline = below(root, mask_of(existing(root, fields, "movie"))), fields.get("outline", "")
+    path, outline = below(root, beside(existing(root, fields, "movie"), ".mask.png")), fields.get("outline", "")
     if not OUTLINE.fullmatch(f"{outline} "):
         raise FieldError("draw around what shall not be looked at")
     picture = open_picture(path) if path.exists() else np.full(shape, 255, dtype=np.uint8)
@@ -201,7 +192,7 @@ def masked(root: Path, fields: Fields, shape: tuple[int, ...]) -> None:
 
 
 def _text_file(root: Path, fields: Fields) -> Path:
-    name = _config(root, fields) if "config" in fields else corrections_of(existing(root, fields, "movie"))
+    name = _config(root, fields) if "config" in fields else beside(existing(root, fields, "movie"), CORRECTIONS)
     if below(root, name) != root / name:
         raise OutputError(f"{name}: is a link, which the page does not follow")
     return root / name

@@ -1,4 +1,4 @@
-"""The pages of the path and of the how-to section are short; those of the path show what the reader will see."""
+"""The pages of the path and of the how-to section are short, and show what the reader will see."""
 
 from __future__ import annotations
 
@@ -8,9 +8,12 @@ from pathlib import Path
 import pytest
 import yaml
 from doc_pages import ROOT
+from PIL import Image
 
 MOST_WORDS = 1200
 LARGEST = 120_000  # bytes of a picture
+PICTURE = r"!\[[^\]]+\]\((assets/\w+\.png)\)"
+FROM = re.compile("synthetic|simulate|measured", re.I)  # what a caption says of the data
 
 
 def section(title: str) -> list[Path]:
@@ -28,15 +31,35 @@ def test_the_path_has_six_pages() -> None:
     assert len(section("Start")) == 6
 
 
-@pytest.mark.parametrize("page", section("Start"), ids=lambda p: p.stem)
-def test_a_page_of_the_path_is_short_and_has_a_picture(page: Path) -> None:
-    assert words(page) <= MOST_WORDS
-    pictures = re.findall(r"!\[[^\]]+\]\((assets/\w+\.png)\)", page.read_text(encoding="utf-8"))
+SHORT = [*section("Start"), *section("How to")]
+
+
+@pytest.mark.parametrize("page", SHORT, ids=lambda p: p.stem)
+def test_a_page_is_short(page: Path) -> None:
+    assert words(page) <= MOST_WORDS, f"{page.name} has {words(page)} words"
+
+
+@pytest.mark.parametrize("page", SHORT, ids=lambda p: p.stem)
+def test_a_page_has_a_picture_that_exists(page: Path) -> None:
+    pictures = re.findall(PICTURE, page.read_text(encoding="utf-8"))
     assert pictures
     for picture in pictures:
+        with Image.open(page.parent / picture) as opened:
+            opened.verify()
         assert (page.parent / picture).stat().st_size < LARGEST
 
 
 @pytest.mark.parametrize("page", section("How to"), ids=lambda p: p.stem)
-def test_a_page_of_the_how_to_is_short(page: Path) -> None:
-    assert words(page) <= MOST_WORDS, f"{page.name} has {words(page)} words"
+def test_a_caption_says_where_the_data_of_a_picture_come_from(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    captions = re.findall(rf"(?:{PICTURE}\n)+\n\*(?P<caption>(?:.+\n)+?)(?=\n|$)", text)
+    below = re.split(rf"(?:{PICTURE}\n)+", text)[2::2]
+    assert len(captions) == len(below), "a picture has no caption in italics below it"
+    for _, caption in captions:
+        assert FROM.search(caption), caption
+
+
+def test_pictures_that_a_script_made_are_shown() -> None:
+    shown = {name for page in SHORT for name in re.findall(PICTURE, page.read_text(encoding="utf-8"))}
+    made = {f"assets/{p.name}" for p in (ROOT / "docs" / "assets").glob("howto_*.png")}
+    assert made <= shown

@@ -168,3 +168,9 @@ def test_page_figure_and_tables(tmp_path, monkeypatch):
     assert list(bars) == pytest.approx(list(member_quantiles(pooled, (0.05, 0.95))))
     again = CliRunner().invoke(main, ["compare", *map(str, runs), "--out", str(out), "--no-report"])
     assert "report" not in again.output
+
+
+def test_a_comparison_prints_its_table_and_plots_a_panel_a_parameter(tmp_path):
+    comparison = compare_runs([run_dir(tmp_path / "one", ("a",)), run_dir(tmp_path / "two", ("a", "b"))])
+    assert str(comparison) == comparison_table(comparison)
+    assert len(comparison.plot().axes) == len(comparison.parameters) == 2

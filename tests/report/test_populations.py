@@ -56,6 +56,8 @@ def test_how_much_stiffer_and_how_surely(gels):
     assert (logs[2] - logs[0]) / 3.29 == pytest.approx(expected, rel=0.35)  # nothing is common, and no pull is left
     assert d.greater < 0.1
     assert found.common == ()
+    assert "times that of stiff" in str(found)
+    assert len(found.plot().axes) == 1
 
 
 def test_the_command_its_page_and_tables(gels, tmp_path):

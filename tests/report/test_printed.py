@@ -169,7 +169,8 @@ def test_page_and_index_stand_in_the_same_order(tmp_path, analysis, renamed, one
     assert re.findall(r"(misfit|at bound|not informed) in 1 data set|(not informed) in 2 data sets", index) == [
         ("misfit", ""), ("at bound", ""), ("", "not informed"),
     ]  # fmt: skip
-    assert "(?)" in index
+    assert "(?)" not in index + page
+    assert ", not to be trusted" in index
     assert 'title="not to be trusted: misfit, at bound"' in index
 
 

@@ -153,7 +153,7 @@ def _may_be_robust(case: Case) -> bool:
 
 def _odd(case: Case) -> str:
     if not case.caution.words.startswith("the reading"):
-        if case.a.observations.noise.discrepant:
+        if case.absurd or case.a.observations.noise.discrepant:
             return _structure(case)
         sure = not case.a.observations.noise.time_std.any()
         first = "state how uncertain the times are (data.error.time_std)" if sure else "a larger data.error.time_std"

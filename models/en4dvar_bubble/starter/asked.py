@@ -13,15 +13,14 @@ import numpy as np
 from en4dvar.inputs.asked import Layout
 from en4dvar.inputs.contents import Contents, read_contents
 from en4dvar.plumbing.errors import ConfigError, DataError
-from en4dvar.plumbing.units import UnitError, as_unit, convert
-from en4dvar_bubble.starter.config import FRAMES, PIXELS
-from en4dvar_bubble.starter.page import TRACKED, TRACKED_COLUMNS
+from en4dvar.plumbing.units import as_unit, convert
+from en4dvar_bubble.starter.config import FRAMES, PIXELS, unit_in
+from en4dvar_bubble.starter.page import TRACKED
 
 _TIME = re.compile(r"(?i)t|time|t[ _(\[].*|time[ _(\[].*")
 _STEP = re.compile(r"(?i)delta_?t|dt|t_?step|time_?step")
 _SIZE = re.compile(r"(?i)delta_?x|dx|pixel_?size|(um|m)_?per_?(px|pixel)|px_?2_?(um|m)")
 _AS_PIXELS, _AS_FRAMES = ("px", "pixel", "pixels"), ("frame", "frames")
-_UNIT = re.compile(r"(?:[ _]*[(\[] *|[ _])(µ?[A-Za-z]{1,3}) *[)\]]?$")
 _RADIUS = re.compile(r"(?i)r|radius|radii|rnew|roft|r[ _(\[].*|radius[ _(\[].*")
 
 
@@ -42,7 +41,7 @@ class Asked:
     def tracked(self) -> bool:
         """Whether the file is a table of 'en4dvar track', which says everything itself, and nobody says otherwise."""
         options = (value for name, value in vars(self).items() if name != "contents")
-        return {*TRACKED_COLUMNS} <= self.contents.columns.keys() and not any(options)
+        return {"t_us", "R_um", *TRACKED.errors} <= self.contents.columns.keys() and not any(options)
 
     @property
     def step(self) -> str | None:
@@ -77,8 +76,8 @@ class Asked:
                     time = other[radius]
             if _only(_STEP, self.contents.scalars) is None:
                 time = time or _only(FRAMES, names)
-        times = self.time_unit or (None if self.frame_rate else _unit_in(time, "s"))
-        radii = self.radius_unit or (None if self.pixel else _unit_in(radius, "m"))
+        times = self.time_unit or (None if self.frame_rate else unit_in(time, "s"))
+        radii = self.radius_unit or (None if self.pixel else unit_in(radius, "m"))
         named = replace(self, time_column=time, radius_column=radius, time_unit=times, radius_unit=radii)
         return named._of_camera()
 
@@ -181,18 +180,6 @@ def first_with_columns(files: Sequence[Path], layout: Layout) -> tuple[Path, Con
 def _only(pattern: re.Pattern[str], names: Iterable[str]) -> str | None:
     fitting = [name for name in names if pattern.fullmatch(name.rpartition(".")[2])]
     return fitting[0] if len(fitting) == 1 else None
-
-
-def _unit_in(name: str | None, kind: str) -> str | None:
-    """The unit of such a kind that the name of a column ends in, as ``t_us``, ``R [um]``; None where it names none."""
-    ending = _UNIT.search((name or "").rpartition(".")[2])
-    if ending is None:
-        return None
-    try:
-        convert(1.0, ending[1], kind)
-    except UnitError:
-        return None
-    return ending[1]
 
 
 def _numbered(names: Sequence[str]) -> str:

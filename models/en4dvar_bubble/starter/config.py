@@ -25,7 +25,7 @@ from en4dvar_bubble.starter.look import Start
 from en4dvar_bubble.starter.page import TRACKED_COMMON, Source, quoted, yaml_text
 from en4dvar_bubble.starter.proposal import Entry, Proposal, propose, with_columns
 
-_NAMED_UNIT = re.compile(r"[_ \[(/]([a-zA-Zµμ]+)[\])]?$")
+_UNIT = re.compile(r"(?:[ _]*[(\[/] *|[ _])([µμ]?[A-Za-z]+) *[)\]]?$")
 FRAMES = re.compile(r"(?i)(frame|bild|image|index|#|n$|nr).*")
 _DIAMETER = re.compile(r"(?i)(d|diam\w*|durchmesser)([ _(\[].*)?$")
 _REST = re.compile(r"(?i)(.*\.)?r_?eq")
@@ -183,7 +183,7 @@ def _with_rest(proposal: Proposal, readings: Mapping[str, Readings], unit: str) 
 def doubts(source: Source) -> list[str]:
     """Where the name of a column says something else than its unit, or than what it is used for."""
     words = []
-    for what, column in (("times", source.time), ("radii", source.radius)):
+    for what, kind, column in (("times", "s", source.time), ("radii", "m", source.radius)):
         if column is None:
             continue
         name, unit = column
@@ -194,19 +194,19 @@ def doubts(source: Source) -> list[str]:
             words.append(f"{name!r} seems to count frames; then give, instead of a unit, --frame-rate")
         if what == "radii" and diameter and not scaled:
             words.append(f"{name!r} seems to hold diameters; then give half of their unit, --radius-unit '0.5*{unit}'")
-        named = "" if diameter and scaled else _unit_in(name)
-        if named and parse_unit(named).powers == parse_unit(unit).powers and parse_unit(named) != parse_unit(unit):
+        named = None if diameter and scaled else unit_in(name, kind)
+        if named and parse_unit(named) != parse_unit(unit):
             words.append(f"the name of column {name!r} says {named}, but its unit is given as {unit}")
     return words
 
 
-def _unit_in(name: str) -> str:
-    """The unit that a column's name ends with, as in ``R_mm`` or ``Time (µs)``; "" where there is none."""
-    match = _NAMED_UNIT.search(name)
+def unit_in(name: str | None, kind: str) -> str | None:
+    """The unit of such a kind that a column's name ends in, as ``t_us``, ``R [um]``; None where it names none."""
+    ending = _UNIT.search((name or "").rpartition(".")[2])
     try:
-        return match[1] if match and parse_unit(match[1]) else ""
+        return ending[1] if ending and convert(1.0, ending[1], kind) else None
     except UnitError:
-        return ""
+        return None
 
 
 def path_from(folder: Path, data: str) -> str:
