@@ -94,7 +94,8 @@ def reference_value(text: str, unit: str) -> tuple[float, float]:
 
 ALL = "all"
 Patterns = str | tuple[str, ...]
-Groups = dict[Name, Annotated[dict[Name, Patterns], Field(min_length=1)]]
+GroupName = Annotated[str, Field(pattern=r"^[^\s\x00-\x1f\x7f][^\x00-\x1f\x7f]*$", max_length=100)]
+Groups = dict[Name, Annotated[dict[GroupName, Patterns], Field(min_length=1)]]
 
 
 @dataclass(frozen=True)

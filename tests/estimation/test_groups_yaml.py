@@ -12,6 +12,7 @@ from toy_config import csv_text, write_toy
 
 from en4dvar.cli import main
 from en4dvar.plumbing.errors import ConfigError
+from en4dvar.report import groups
 from en4dvar.report.groups import numbers_of
 from en4dvar.report.populations import compare_populations
 from en4dvar.results.population_file import load_groups_of, load_population
@@ -82,13 +83,23 @@ def test_terminal_and_page_open_with_the_comparison(finished):
     assert answer in output
     assert "broken.csv: no column" in output
     assert page.index("<h1>") < page.index(f"<li>{answer}") < page.index("Each data set by itself")  # k and not K
-    assert page.index("in kPa.") < page.index('href="groups/1_gel_5kPa/population.html"')
+    assert page.index(f"<li>{answer}") < page.index('href="groups/1_gel_5kPa/population.html"')
+    assert "straight line" not in output + page  # a line through two says no more than their difference
     assert 'href="groups/2_gel_8kPa/population.html"' in page
     assert (run / "differences.csv").is_file()
     listed = (run / ".en4dvar-files").read_text().splitlines()
     assert "groups/2_gel_8kPa/population.nc" in listed
     write_report(run)
     assert (run / "report.html").read_text() == page
+
+
+@pytest.mark.parametrize(
+    ("names", "numbers"), [(["5 %", "8 %"], ()), (["5 %", "8 %", "10 %"], (5.0, 8.0, 10.0)), (["5 %", "8 %", "x"], ())]
+)
+def test_a_line_needs_three_groups(tmp_path, monkeypatch, names, numbers):
+    monkeypatch.setattr(groups, "load_groups_of", lambda run: {name: (run / name, None) for name in names})
+    monkeypatch.setattr(groups, "compare_populations", lambda folders, asked: asked)
+    assert groups.groups_compared(tmp_path) == numbers
 
 
 @pytest.mark.slow
