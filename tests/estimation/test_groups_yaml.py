@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -20,7 +22,7 @@ from en4dvar.runs.engine import write_report
 from en4dvar.runs.runner import run_campaign
 
 ASKED = (
-    "population: {of: [k], by: folder, mean_std: 2, spread: 0.7}\n"
+    "population: {of: [k], by: folder, mean_std: 2, spread: 0.7, known: {gel 8kPa: {k: 2.3 ± 0.02 N/m}}}\n"
     "groups: {folder: {gel 5kPa: 'gel 5kPa_*', gel 8kPa: 'gel 8kPa_*'}}\n"
 )
 SOFT, STIFF = (1.5, 1.6, 1.7), (2.2, 2.3, 2.4)
@@ -84,6 +86,9 @@ def test_terminal_and_page_open_with_the_comparison(finished):
     assert "broken.csv: no column" in output
     assert page.index("<h1>") < page.index(f"<li>{answer}") < page.index("Each data set by itself")  # k and not K
     assert page.index(f"<li>{answer}") < page.index('href="groups/1_gel_5kPa/population.html"')
+    for text in (output, page):
+        assert "k of gel 8kPa is known, 2.300 ± 0.020 N/m." in text
+        assert re.search(r"k of gel 5kPa is 1.* N/m, calibrated by gel 8kPa; without, 1.* N/m\.", text)
     assert "straight line" not in output + page  # a line through two says no more than their difference
     assert 'href="groups/2_gel_8kPa/population.html"' in page
     assert (run / "differences.csv").is_file()
@@ -129,6 +134,12 @@ def test_killed_and_resumed_to_the_same_bits(tmp_path, monkeypatch):
     ("stiff", "asked", "words"),
     [
         (STIFF, ASKED.replace("by: folder", "by: foldr"), r"population\.by: no kind of 'groups:' is called 'foldr'"),
+        (STIFF, ASKED.replace("2.3 ± 0.02 N/m", "2.3 N/m"), r"gel 8kPa\.k: '2.3 N/m': how well is it known\?"),
+        (STIFF, ASKED.replace("2.3 ± 0.02 N/m", "-2.3 ± 0.02 N/m"), r"gel 8kPa\.k: '-2.3 .*': beyond the bounds of k"),
+        (STIFF, ASKED.replace("2.3 ± 0.02 N/m", "2.3 ± 0.02 kg"), r"population\.known\.gel 8kPa\.k: .*kg"),
+        (STIFF, ASKED.replace("{k: 2.3", "{c: 2.3"), r"population\.known\.gel 8kPa\.c: 'c': not among 'of'"),
+        (STIFF, ASKED.replace("known: {gel 8", "known: {gel 9"), r"known\.gel 9kPa: no such group; did you mean"),
+        (STIFF, ASKED.replace("by: folder, ", ""), r"population\.known: of groups, which need 'by'"),
         (STIFF, ASKED.replace("'gel 8kPa_*'", "other"), r"groups\.folder: data set 'gel 8kPa_set0' is in none of them"),
         (STIFF, ASKED.replace("'gel 8kPa_*'", "'*'"), r"data set 'gel 5kPa_set0' is in several of them"),
     ],

@@ -85,9 +85,9 @@ def _by_table(files: Mapping[str, DataFile], path: Path, column: str) -> tuple[s
     if path.absolute() in [file.path.absolute() for file in files.values()]:
         raise DataError(f"{path}: lies among the data files, and would be read as one; move it out of their folder")
     names, *rows = _lines(path)
-    found = [{name: _rows_of(name, file, rows, i) for name, file in files.items()} for i in range(len(names))]
-    of_files = max(range(len(found)), key=lambda i: sum(map(bool, found[i].values())))
-    if lacking := [name for name, its in found[of_files].items() if not its]:
+    rows_in = [{name: _rows_of(name, file, rows, i) for name, file in files.items()} for i in range(len(names))]
+    of_files = max(range(len(rows_in)), key=lambda i: sum(map(bool, rows_in[i].values())))
+    if lacking := [name for name, its in rows_in[of_files].items() if not its]:
         raise DataError(
             f"{path}: no row for {listed(lacking, 5)}; a row needs, in one and the same column, the name of the data "
             f"file, as {files[lacking[0]].path.name}, and in another its group"
@@ -97,7 +97,7 @@ def _by_table(files: Mapping[str, DataFile], path: Path, column: str) -> tuple[s
         said = f"no column {column!r} of groups" if column else f"{len(others)} columns could be the groups"
         raise DataError(f"{path}: {said}; say {' or '.join(f'{path}:{name}' for name in others[:5]) or 'one more'}")
     at = names.index(column or others[0])
-    each = {name: _only({cell(row, at) for row in its}, f"{path}: {name}") for name, its in found[of_files].items()}
+    each = {name: _only({cell(row, at) for row in its}, f"{path}: {name}") for name, its in rows_in[of_files].items()}
     return names[at], each
 
 
