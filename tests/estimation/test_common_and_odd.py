@@ -11,8 +11,9 @@ from toys import Vectorised, make_problem, with_discrepancy
 
 from en4dvar.data.noise import noise_of
 from en4dvar.estimation.population import HyperPrior
-from en4dvar.estimation.population.campaign import population_of
+from en4dvar.estimation.population.campaign import _empirical, population_of
 from en4dvar.estimation.population.empirical import empirical, median_of
+from en4dvar.estimation.population.own import OwnLikelihood
 from en4dvar.model.forward import Failure
 from en4dvar.model.state import NOISE_SCALE, Parameter
 from en4dvar.plumbing.errors import ConfigError
@@ -150,6 +151,17 @@ def test_uncertain_errors_are_quantities_of_each_data_set():
 
 def timing(observations):
     return noise_of(observations.std, np.full(len(observations), 0.02))
+
+
+def test_the_median_one_by_one_of_sets_that_only_what_is_common_makes_uncertain():
+    """Their members scatter by chance less than the common quantity alone would say; what is their own is 0.01."""
+    rng, count = np.random.default_rng(1), 12
+    theta, own = rng.standard_normal((400, 1)), 0.01 * rng.standard_normal((count, 400, 1))
+    likelihoods = [OwnLikelihood(None, np.array([[0.5]]), z) for z in own]
+    sets = [0.9 * (0.5 * theta + z) for z in own]
+    (median,) = _empirical([PriorTerm.normal(A, 0.0, 1.0)], sets, likelihoods, 1)
+    assert median.common == pytest.approx(0.5, rel=1e-6)
+    assert 0.8 * 0.01 / np.sqrt(count) < median.between < 4 * 0.01 / np.sqrt(count)
 
 
 def test_data_sets_that_cannot_be_sampled_are_named():
