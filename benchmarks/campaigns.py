@@ -1,6 +1,7 @@
 """Populations of bubbles whose single posteriors are exact: are medians and spreads held, and whom does it name as odd?
 
     python benchmarks/campaigns.py synthetic [--n 200] [--seed 1] [--bubbles 3 6 12 40] [--kinds …] [--minutes 9]
+    python benchmarks/campaigns.py pairs [--n 100] [--seed 1] [--bubbles 6 12]
     python benchmarks/campaigns.py halves RUN_DIR [--splits 10]
 
 ``synthetic``: of every bubble G and μ, in units of their priors, are read with errors of their own, and with two modes
@@ -10,6 +11,9 @@ behind them is the program's. ``normal``: mean and spread from the hyperprior, a
 one of twenty bubbles from the prior. ``like``: bubbles that differ by a tenth
 of the prior, as of one gel. ``heavy``: the same by Student's t of three degrees. ``odd``: ``like`` with one bubble of
 four times the modulus.
+
+``pairs``: two gels, the second 30 % stiffer, whose readings are shifted by the same common quantity: is the difference
+held, how often is it seen, and what does the first gain where the second is known to 4 %?
 
 ``halves``: the bubbles of a finished run are sampled once, and split at random into halves with a population each.
 """
@@ -30,6 +34,7 @@ from en4dvar.data.noise import noise_of
 from en4dvar.data.observations import Observations
 from en4dvar.estimation.population import Effort, HyperPrior
 from en4dvar.estimation.population.campaign import CampaignPopulation, population_from, sampled_sets
+from en4dvar.estimation.population.contrast import Centre, drawn_together, without_pull
 from en4dvar.estimation.population.own import ENOUGH, KEPT, OwnDraws
 from en4dvar.model.function_model import FunctionModel
 from en4dvar.model.state import Array, Parameter
@@ -42,6 +47,7 @@ KINDS = ("normal", "like", "heavy", "odd")
 NAMES, COMMON = ("G", "mu"), "scale"
 LOG_STD = 2.0  # of the prior of G, so that four times as much is 0.69 of it
 LIKE, FREEDOM = 0.1, 3.0  # spread of bubbles of one gel, in units of the prior; degrees of freedom of heavy tails
+STIFFER, KNOWN = 1.3, 0.04  # of the second gel of a pair; how well its modulus is known
 ERRORS = (0.03, 0.15)  # of single bubbles: G to 6 to 30 %
 SLOPES = np.array([0.1, 0.05])  # of G and μ with the common quantity
 ALIAS = np.array([0.8, -0.8])  # of the second mode
@@ -76,10 +82,12 @@ def own_draws_of(y: Array, error: Array, aliased: bool, rng: np.random.Generator
     return OwnDraws(z[rng.integers(count, size=KEPT)], float(np.logaddexp.reduce(logs)), float(count), 0)
 
 
-def campaign(kind: str, bubbles: int, rng: np.random.Generator) -> tuple[list[OwnDraws], Array, Array, list[int]]:
-    """Draws of each bubble, and the truth: ν and τ (2,), and which are odd."""
-    hyper, theta = HyperPrior(), rng.standard_normal()
-    nu = hyper.mean_std * rng.standard_normal(2)
+def campaign(
+    kind: str, bubbles: int, rng: np.random.Generator, truth: tuple[float, Array] | None = None
+) -> tuple[list[OwnDraws], Array, Array, list[int]]:
+    """Draws of each bubble, and the truth: ν and τ (2,), and which are odd; ``truth``: θ and ν, instead of drawn."""
+    hyper = HyperPrior()
+    theta, nu = truth or (rng.standard_normal(), hyper.mean_std * rng.standard_normal(2))
     tau = hyper.spread * np.abs(rng.standard_normal(2)) if kind == "normal" else np.full(2, LIKE)
     heavy = rng.standard_t(FREEDOM, (bubbles, 2)) / np.sqrt(FREEDOM / (FREEDOM - 2))
     x = nu + tau * (heavy if kind == "heavy" else rng.standard_normal((bubbles, 2)))
@@ -120,6 +128,58 @@ def synthetic(seed: int, key: str) -> Record:
         "width": np.diff(np.quantile(result.posterior.nu[:, 0], [0.05, 0.95]))[0],
         "seconds": time.process_time() - began,
     }
+
+
+def pairs(seed: int, key: str) -> Record:
+    """Ranks of the difference of two medians and of that of the first, without and with the second known."""
+    bubbles, number = map(int, key.split("/")[1:])
+    rng = np.random.default_rng([seed, len(KINDS), bubbles, number])
+    theta, nu = rng.standard_normal(), rng.standard_normal(2)
+    apart = np.array([np.log(STIFFER) / LOG_STD, 0.0])
+    problems, results = [bubble(f"bubble{i}") for i in range(bubbles)], []
+    for gel in (nu, nu + apart):
+        results.append(found_of(campaign("like", bubbles, rng, (theta, gel))[0], problems, number))
+    error = KNOWN / LOG_STD
+    known = [(0, nu[0] + apart[0] + error * rng.standard_normal(), error)]
+
+    def centre(i: int, *told: tuple[int, float, float]) -> Centre:
+        r = results[i]
+        return without_pull(0, r.posterior.nu, r.theta, r.common, r.hyper.mean_std, r.estimate.size, number, told)
+
+    both = drawn_together([centre(0), centre(1)], number)
+    alone, told = drawn_together([centre(0)], number), drawn_together([centre(0), centre(1, *known)], number)
+    other = drawn_together([centre(1)], number + 1)
+    columns = {"difference": both[:, 1] - both[:, 0], "alone": alone[:, 0], "calibrated": told[:, 0]}
+    truth = {"difference": apart[0], "alone": nu[0], "calibrated": nu[0]}
+    return {
+        **{name: np.mean(x < truth[name]) for name, x in columns.items()},
+        **{f"{name} std": x.std() for name, x in columns.items()},
+        "apart std": (other - alone).std(),
+        "stiffer": np.mean(columns["difference"] > 0),
+    }
+
+
+def table_of_pairs(records: Sequence[Record], sizes: Sequence[int]) -> None:
+    print(
+        "| bubbles a gel | pairs | difference of ln G inside 90 % | its std (were nothing common) | stiffer with ",
+        end="",
+    )
+    print("over 95 % | ln G of the first inside 90 % | std | calibrated inside 90 % | std |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    for size in sizes:
+        of_it = [r for r in records if r["key"].startswith(f"pair/{size}/")]
+        inside, std = (
+            {name: value([r[name + suffix] for r in of_it]) for name in ("difference", "alone", "calibrated")}
+            for suffix, value in (("", lambda u: f"{100 * np.mean(np.abs(np.array(u) - 0.5) < 0.45):.0f} %"),
+                                  (" std", lambda u: f"{LOG_STD * np.median(u):.2f}"))
+        )  # fmt: skip
+        nothing_common = f"{LOG_STD * np.median([r['apart std'] for r in of_it]):.2f}"
+        cells = [
+            size, len(of_it), inside["difference"], f"{std['difference']} ({nothing_common})",
+            f"{100 * np.mean([r['stiffer'] > 0.95 for r in of_it]):.0f} %", inside["alone"], std["alone"],
+            inside["calibrated"], std["calibrated"],
+        ]  # fmt: skip
+        print(f"| {' | '.join(map(str, cells))} |")
 
 
 def table_of(records: Sequence[Record], kinds: Sequence[str], sizes: Sequence[int]) -> None:
@@ -172,7 +232,7 @@ def halves(run_dir: Path, splits: int) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("synthetic", "halves"))
+    parser.add_argument("what", choices=("synthetic", "pairs", "halves"))
     parser.add_argument("run_dir", type=Path, nargs="?")
     parser.add_argument("--n", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
@@ -185,9 +245,14 @@ def main() -> None:
     if asked.what == "halves":
         halves(asked.run_dir, asked.splits)
         return
-    keys = [f"{kind}/{size}/{i}" for i in range(asked.n) for kind in asked.kinds for size in asked.bubbles]
-    done = fill(asked.records / f"{asked.seed}.jsonl", keys, partial(synthetic, asked.seed), asked.minutes)
-    table_of(list(done.values()), asked.kinds, asked.bubbles)
+    kinds = asked.kinds if asked.what == "synthetic" else ["pair"]
+    keys = [f"{kind}/{size}/{i}" for i in range(asked.n) for kind in kinds for size in asked.bubbles]
+    run, file = synthetic if asked.what == "synthetic" else pairs, f"{asked.what}_{asked.seed}.jsonl"
+    records = list(fill(asked.records / file, keys, partial(run, asked.seed), asked.minutes).values())
+    if asked.what == "synthetic":
+        table_of(records, kinds, asked.bubbles)
+    else:
+        table_of_pairs(records, asked.bubbles)
 
 
 if __name__ == "__main__":

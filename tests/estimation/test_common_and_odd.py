@@ -76,8 +76,9 @@ def exact(problems, hyper, common=OF_D.std):
     wide = np.sqrt(0.9**2 + of_d)
     for best, variance in likely(problems).T:
         inside = norm(best, np.sqrt(variance + tau**2)).logpdf(m[:, None])
-        outside = norm(0.6, np.sqrt(variance + wide**2)).logpdf(best)
-        odd = np.log(hyper.odd) + outside if hyper.odd else -np.inf
+        outside = norm(0.6, np.sqrt(variance + wide**2)).pdf(best)
+        elsewhere = norm(best, np.sqrt(variance + tau**2 + (0.9 * hyper.spread) ** 2)).pdf(m[:, None])
+        odd = np.log(hyper.odd / 2) + np.log(outside + elsewhere) if hyper.odd else -np.inf
         log = log + np.logaddexp(np.log1p(-hyper.odd) + inside, odd)
     weights = np.exp(log - log.max()) * np.gradient(tau)
     weights /= weights.sum()
