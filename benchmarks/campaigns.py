@@ -212,9 +212,7 @@ def halves(run_dir: Path, splits: int) -> None:
     names, problems, start = config.population.of, [s.problem for s in sets], [s.white for s in sets]
     drawn, left_out = sampled_sets(problems, start, config.seed, None, lambda words: print(words, flush=True))
     rng, usable = np.random.default_rng(config.seed), sorted(drawn)
-    print(
-        f"{len(usable)} of {len(sets)} data sets; z of the difference between two halves of them, and parts in common"
-    )
+    print(f"{len(usable)} of {len(sets)} data sets; z of the difference of two halves, what is common apart")
     for split in range(splits):
         order = rng.permutation(usable)
         nu = []
