@@ -138,7 +138,7 @@ def compare_populations(
             together, own = medians[name][:, [i, j]].T, independent[:, [i, j]].T
             unit = terms[name][0].parameter.display_unit
             differences.append(Difference.of(name, a, b, unit, together, own, name in logarithmic, " ".join(doubts)))
-        notes += _calibrated(name, stored, terms[name][0].parameter, medians[name], independent)
+        notes += _calibrated(name, stored, terms[name][0].parameter, common, medians[name], independent)
         if held := [label for label, c in centres.items() if c.pulled]:
             notes.append(f"{name}: the data of {', '.join(held)} leave its median open: the hyperprior holds it")
         if numbers:
@@ -190,7 +190,12 @@ def _known(s: StoredPopulation) -> Iterator[tuple[int, float, float]]:
 
 
 def _calibrated(
-    name: str, stored: Mapping[str, StoredPopulation], parameter: Parameter, together: Array, alone: Array
+    name: str,
+    stored: Mapping[str, StoredPopulation],
+    parameter: Parameter,
+    common: Sequence[str],
+    together: Array,
+    alone: Array,
 ) -> Iterator[str]:
     """What groups that are known from elsewhere do to the median (M, K) of a parameter in the others."""
     known = [label for label, s in stored.items() if s.known]
@@ -205,7 +210,9 @@ def _calibrated(
             off = (value - float(np.median(x))) / float(np.hypot(x.std(), std))
             words = f"{name} of {label} is known, {number_like(value, std)} ± {number_like(std, std)}{unit}"
             yield words + (f"; its own data say otherwise, {abs(off):.1f} std away" if abs(off) > FAR else "")
-        elif known:
+            if not common:
+                yield "Nothing is common to the groups that this could calibrate"
+        elif known and common and label not in known:
             yield f"{name} of {label} is {now}{unit}, calibrated by {', '.join(known)}; without, {before}{unit}"
 
 

@@ -171,7 +171,7 @@ def test_subfolders_are_gels_that_are_compared(tmp_path: Path) -> None:
             write(tmp_path / "gels" / folder / f"b{n}.csv", scale=1 + n / 20)
     done = call("init", "--data", tmp_path / "gels", *UNITS)
     assert done.exit_code == 0, done.output
-    assert "the run ends with one gel a folder, and compares them: gel (3), gel_8 kPa (3)" in done.output
+    assert "the run ends with the numbers of each folder, and compares them: gel (3), gel_8 kPa (3)" in done.output
     config = proposed(Path("gels.yaml"))
     assert config.population is not None
     assert config.population.by == "folder"
@@ -214,7 +214,7 @@ def test_groups_are_a_column_of_a_table(tmp_path: Path, table: str, asked: str, 
     Path("gels.csv").write_text(table)
     done = call("init", "--data", folder, *UNITS, "--groups", asked)
     assert done.exit_code == 0, done.output
-    assert f"the run ends with one gel a {kind}, and compares them: " in done.output
+    assert f"the run ends with the numbers of each {kind}, and compares them: " in done.output
     assert groups_in("all.yaml") == expected
 
 

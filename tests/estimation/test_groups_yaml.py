@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import xarray as xr
 from click.testing import CliRunner
 from execution_models import Stops
 from run_files import assert_same_results, configuration, interrupt
@@ -13,8 +15,9 @@ from test_population_yaml import SMALL
 from toy_config import csv_text, write_toy
 
 from en4dvar.cli import main
+from en4dvar.model.state import Parameter
 from en4dvar.plumbing.errors import ConfigError
-from en4dvar.report import groups
+from en4dvar.report import groups, populations
 from en4dvar.report.groups import numbers_of
 from en4dvar.report.populations import compare_populations
 from en4dvar.results.population_file import load_groups_of, load_population
@@ -88,7 +91,7 @@ def test_terminal_and_page_open_with_the_comparison(finished):
     assert page.index(f"<li>{answer}") < page.index('href="groups/1_gel_5kPa/population.html"')
     for text in (output, page):
         assert "k of gel 8kPa is known, 2.300 ± 0.020 N/m." in text
-        assert re.search(r"k of gel 5kPa is 1.* N/m, calibrated by gel 8kPa; without, 1.* N/m\.", text)
+        assert "Nothing is common to the groups that this could calibrate." in text
     assert "straight line" not in output + page  # a line through two says no more than their difference
     assert 'href="groups/2_gel_8kPa/population.html"' in page
     assert (run / "differences.csv").is_file()
@@ -105,6 +108,21 @@ def test_a_line_needs_three_groups(tmp_path, monkeypatch, names, numbers):
     monkeypatch.setattr(groups, "load_groups_of", lambda run: {name: (run / name, None) for name in names})
     monkeypatch.setattr(groups, "compare_populations", lambda folders, asked: asked)
     assert groups.groups_compared(tmp_path) == numbers
+
+
+def test_what_a_known_group_does_to_the_others_is_told():
+    """What is known and far from the group's own data is told as such; both groups' medians without and with it."""
+    draws = xr.DataArray(np.linspace(7.9, 8.1, 101))
+    stored = {"a": SimpleNamespace(known={}), "ref": SimpleNamespace(known={"k": (9.0, 0.1)}, headline="median")}
+    stored["ref"].group = lambda of: {"k_median": draws}
+    together, alone = (np.column_stack([5 + s * np.linspace(-1, 1, 101), draws]) for s in (0.1, 0.5))
+    k = Parameter("k", "N/m")
+    told = [*populations._calibrated("k", stored, k, ["scale"], together, alone)]
+    assert re.fullmatch(
+        r"k of a is 5.00 \(4.9\d … 5.\d\d\) N/m, calibrated by ref; without, 5.0 \(4.5 … 5.5\) N/m", told[0]
+    )
+    assert re.fullmatch(r"k of ref is known, 9.00 ± 0.10 N/m; its own data say otherwise, 8.\d std away", told[1])
+    assert len(told) == 2
 
 
 @pytest.mark.slow

@@ -156,7 +156,7 @@ def _ends_with(groups: Grouped) -> str:
     if not groups.of:
         return "the run ends with what they say of one gel together"
     told = ", ".join(f"{name} ({len(names)})" for name, names in groups.of.items())
-    return f"the run ends with one gel a {groups.kind}, and compares them: {told}"
+    return f"the run ends with the numbers of each {groups.kind}, and compares them: {told}"
 
 
 def _bad_words(name: str, view: Look) -> str:
