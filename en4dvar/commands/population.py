@@ -22,7 +22,7 @@ from en4dvar.commands.common import Together, several_runs
 )  # fmt: skip
 @click.option(
     "--odd", type=click.FloatRange(min=0, max=1, max_open=True), default=0.05, show_default=True,
-    help="Probability that a data set is odd: drawn from the prior and not from the population.",
+    help="Probability that a data set is odd: of another population, in all parameters or in one.",
 )  # fmt: skip
 @several_runs("population")
 def population(runs: Together, names: tuple[str, ...], mean_std: float, spread: float, odd: float) -> None:

@@ -133,7 +133,7 @@ def _tell_what_sets_share(directory: Path, warnings: _Warnings) -> None:
 
         together = joint_file.load_joint(directory / joint_file.FILE)
         echo(f"\n{joint_table(together)}")
-        warnings.add("all together", together.cautions)
+        warnings.add("all together", together.cautions, whole=True)
     groups = population_file.load_groups_of(directory)
     if groups:
         from en4dvar.report.groups import group_lines
@@ -142,13 +142,13 @@ def _tell_what_sets_share(directory: Path, warnings: _Warnings) -> None:
         echo("\n" + "\n".join(group_lines(directory)))
         for name, (_, of) in groups.items():
             echo(f"\n{name}\n" + "\n".join(population_lines(of)))
-            warnings.add(f"population of {name}", of.cautions)
+            warnings.add(f"population of {name}", of.cautions, whole=True)
     if (directory / population_file.FILE).exists():
         from en4dvar.report.population import population_lines
 
         population = population_file.load_population(directory / population_file.FILE)
         echo("\n" + "\n".join(population_lines(population)))
-        warnings.add("population", population.cautions)
+        warnings.add("population", population.cautions, whole=True)
 
 
 class _Warnings:
@@ -158,12 +158,18 @@ class _Warnings:
         self.of: dict[str, list[tuple[float, str, Caution]]] = {}  # code → the worst: place, data set, warning
         self.counts = Counter[str]()  # of data sets
         self.sets = 0
+        self.wholes: dict[str, list[str]] = {}  # code → what is estimated of several data sets and has it
 
-    def add(self, name: str, cautions: Sequence[Caution]) -> None:
+    def add(self, name: str, cautions: Sequence[Caution], whole: bool = False) -> None:
+        """Of a data set; ``whole``: of an estimate of several of them."""
         from en4dvar.plumbing.caution import codes, gravity
 
-        self.sets += 1
-        self.counts.update(codes(cautions))
+        if whole:
+            for code in codes(cautions):
+                self.wholes.setdefault(code, []).append(name)
+        else:
+            self.sets += 1
+            self.counts.update(codes(cautions))
         for caution in cautions:
             told = [*self.of.get(caution.code, []), (caution.rank - 1e-3 * gravity(cautions), name, caution)]
             self.of[caution.code] = sorted(told, key=lambda entry: entry[0])[:MOST_TOLD]
@@ -172,13 +178,14 @@ class _Warnings:
         """One for each kind, the worst first; of a single data set one for each warning."""
         for told in sorted(self.of.values(), key=lambda entries: entries[0][2].rank):
             _, name, worst = told[0]
-            count = self.counts[worst.code]
-            if count == 1:
+            count, wholes = self.counts[worst.code], self.wholes.get(worst.code, [])
+            if count + len(wholes) == 1:
                 yield from (f"{caution.kind}: {name}: {caution}" for _, _, caution in told)
                 continue
-            named = ", ".join(list(dict.fromkeys(entry[1] for entry in told))[:MOST_NAMED])
-            which = f"{count} of {self.sets} data sets, worst {named}" if count > MOST_NAMED else named
-            yield f"{worst.kind}: {which}: {worst.code}; {worst.advice}"
+            which = [entry for entry in dict.fromkeys(entry[1] for entry in told) if entry not in wholes][:MOST_NAMED]
+            if count > MOST_NAMED:
+                which[0] = f"{count} of {self.sets} data sets, worst {which[0]}"
+            yield f"{worst.kind}: {', '.join([*which, *wholes])}: {worst.code}; {worst.advice}"
         if self.sets > 1 and self.of:
             yield "what was found in each of them: run.log and the report"
 

@@ -27,6 +27,9 @@ else:
     _HyperPrior = section_of(HyperPrior)
 
 
+GroupName = Annotated[str, Field(pattern=r"^[^\s\x00-\x1f\x7f][^\x00-\x1f\x7f]*$", max_length=100)]
+
+
 class PopulationSection(_HyperPrior):
     """Mean and spread of parameters over the data sets of the run, estimated at its end."""
 
@@ -36,6 +39,9 @@ class PopulationSection(_HyperPrior):
     """A kind of group under ``groups``: each group has a population of its own, and they are compared."""
     reference: Annotated[dict[Name, str], Field(default_factory=dict)]
     """Values of others to compare with, e.g. {G: 7.7 ± 1.1 kPa, source: indentation}; they change no number."""
+    known: Annotated[dict[GroupName, dict[Name, str]], Field(default_factory=dict)]
+    """Medians that a group is known to have, e.g. {reference gel: {G: 7.7 ± 0.2 kPa}}: they calibrate what all groups
+    have in common, such as scale and density."""
 
     @property
     def hyper(self) -> HyperPrior:
@@ -44,12 +50,15 @@ class PopulationSection(_HyperPrior):
 
 
 def check_population(
-    section: PopulationSection, entries: Sequence[Entry], groups: Mapping[str, object], document: Document
+    section: PopulationSection,
+    entries: Sequence[Entry],
+    groups: Mapping[str, Mapping[str, object]],
+    document: Document,
 ) -> None:
     """Raises :class:`ConfigError`: every parameter that is not estimated, or whose prior depends on the data set; an
     unknown kind of group.
     """
-    faults = list(_unfit(section, entries, document))
+    faults = [*_unfit(section, entries, document), *_unfit_known(section, entries, groups, document)]
     if section.by is not None and section.by not in groups:
         words = f"no kind of 'groups:' is called {shown(section.by)}{suggest(section.by, groups)}"
         faults.append(document.fault(("population", "by"), words))
@@ -76,6 +85,33 @@ def _unfit(section: PopulationSection, entries: Sequence[Entry], document: Docum
                 yield document.fault(said, str(error))
 
 
+def _unfit_known(
+    section: PopulationSection, entries: Sequence[Entry], groups: Mapping[str, Mapping[str, object]], document: Document
+) -> Iterator[Fault]:
+    terms = {e.parameter.name: e for e in entries if isinstance(e, Uncertain)}
+    of_kind = groups.get(section.by or "", {})
+    for group, values in section.known.items():
+        if section.by is None:
+            yield document.fault(("population", "known"), "of groups, which need 'by'")
+        elif section.by in groups and group not in of_kind:
+            yield document.fault(("population", "known", group), f"no such group{suggest(group, of_kind)}")
+        for name, text in values.items():
+            where = ("population", "known", group, name)
+            if name not in section.of:
+                yield document.fault(where, f"{shown(name)}: not among 'of'{suggest(name, section.of)}")
+            elif name in terms:
+                try:
+                    value, std = reference_value(text, terms[name].parameter.unit)
+                except UnitError as error:
+                    yield document.fault(where, str(error))
+                    continue
+                low, high = terms[name].parameter.bounds
+                if not std > 0:
+                    yield document.fault(where, f"{shown(text)}: how well is it known? as '7.7 ± 0.2 kPa'")
+                elif not low < value < high:
+                    yield document.fault(where, f"{shown(text)}: beyond the bounds of {name}")
+
+
 SOURCE = "source"  # of a reference: where it is from
 _REFERENCE = re.compile(r"\s*([-+.\deE]+)\s*(?:(?:±|\+/?-)\s*([.\deE+-]+))?\s*(.*)")
 
@@ -94,7 +130,7 @@ def reference_value(text: str, unit: str) -> tuple[float, float]:
 
 ALL = "all"
 Patterns = str | tuple[str, ...]
-Groups = dict[Name, Annotated[dict[Name, Patterns], Field(min_length=1)]]
+Groups = dict[Name, Annotated[dict[GroupName, Patterns], Field(min_length=1)]]
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ def columns_of(
                 if part not in _groups(table, layout.by):
                     raise DataError(f"{path}: no row belongs to {part!r} by column {layout.by!r}")
                 at = table.position(layout.by)
-                table.rows = [(line, row) for line, row in table.rows if _cell(row, at) == part]
+                table.rows = [(line, row) for line, row in table.rows if cell(row, at) == part]
             scalars = scalars_in(path) if kind == "csv" else {}
             scalars |= _constant(table) if layout.by is not None else {}
             return _of_table(table, wanted), scalars, [line for line, _ in table.rows]
@@ -80,7 +80,7 @@ def _refuse_by(path: Path, layout: Layout) -> None:
 
 def _groups(table: Table, by: str) -> tuple[str, ...]:
     """What the column ``by`` says, in the order of the rows. Raises :class:`DataError`."""
-    cells = [_cell(row, table.position(by)) for _, row in table.rows]
+    cells = [cell(row, table.position(by)) for _, row in table.rows]
     if "" in cells:
         line = table.rows[cells.index("")][0]
         raise DataError(f"{table.path}:{line}: column {by!r} does not say which data set this is")
@@ -91,13 +91,14 @@ def _constant(table: Table) -> dict[str, float]:
     """Columns of numbers that are the same in all rows of a data set: they belong to it, as a radius at rest does."""
     held: dict[str, float] = {}
     for i, name in enumerate(table.names):
-        cells = {_cell(row, i) for _, row in table.rows}
+        cells = {cell(row, i) for _, row in table.rows}
         with suppress(DataError):
             held |= {name: float(table.numbers(i, name)[0])} if len(cells) == 1 else {}
     return {name: value for name, value in held.items() if math.isfinite(value)}
 
 
-def _cell(row: Sequence[str], i: int) -> str:
+def cell(row: Sequence[str], i: int) -> str:
+    """The cell ``i`` of a row, "" where the row is shorter."""
     return row[i] if i < len(row) else ""
 
 

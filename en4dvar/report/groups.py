@@ -40,8 +40,9 @@ def groups_compared(run_dir: Path) -> PopulationsCompared | str | None:
     folders = {name: folder for name, (folder, _) in load_groups_of(run_dir).items()}
     if len(folders) < 2:
         return None
+    numbers = numbers_of([*folders])[0] if len(folders) > 2 else ()  # a line through two is their difference
     try:
-        return compare_populations(folders, numbers_of([*folders])[0])
+        return compare_populations(folders, numbers)
     except OutputError as error:
         return f"The groups are not compared: {error}."
 

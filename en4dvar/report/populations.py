@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SURE = 0.999  # no number of draws says more
+FAR = 2.5  # standard deviations between what is known and what the data say
 OFF_THE_LINE = 0.05  # probability below which populations differ by more than a line says
 CAPTION = (
     "Median and 5–95 % of the median of each population, given the data of all; what is common moves them together."
@@ -150,6 +151,7 @@ def compare_populations(
             together, own = medians[name][:, [i, j]].T, independent[:, [i, j]].T
             unit = terms[name][0].parameter.display_unit
             differences.append(Difference.of(name, a, b, unit, together, own, name in logarithmic, " ".join(doubts)))
+        notes += _calibrated(name, stored, terms[name][0].parameter, common, medians[name], independent)
         if held := [label for label, c in centres.items() if c.pulled]:
             notes.append(f"{name}: the data of {', '.join(held)} leave its median open: the hyperprior holds it")
         if numbers:
@@ -180,12 +182,51 @@ def same_readings(stored: Mapping[str, StoredPopulation]) -> str:
 
 
 def _centre(name: str, s: StoredPopulation, keys: tuple[tuple[str, str], ...], seed: int) -> Centre:
-    nu, x = np.stack([s.white(n) for n in s.names], axis=1), s.white(name)
-    theta = np.stack([s.white(n) for n in s.common], axis=1) if s.common else np.empty((len(x), 0))
+    nu = np.stack([s.white(n) for n in s.names], axis=1)
+    theta = np.stack([s.white(n) for n in s.common], axis=1) if s.common else np.empty((len(nu), 0))
     attributes = s.tree.attrs
     return without_pull(
-        x, nu, theta, keys, float(attributes["hyperprior_mean_std"]), float(attributes["effective_draws"]), seed
-    )
+        s.names.index(name), nu, theta, keys, float(attributes["hyperprior_mean_std"]),
+        float(attributes["effective_draws"]), seed, [*_known(s)],
+    )  # fmt: skip
+
+
+def _known(s: StoredPopulation) -> Iterator[tuple[int, float, float]]:
+    """Column of each centre that is known from elsewhere, its value and std in units of its prior."""
+    for name, (value, std) in s.known.items():
+        term = s.prior_of(name)
+        try:
+            x = float(term.from_physical(np.array([value]))[0])
+        except ValueError as error:
+            raise OutputError(f"{name}, known to be {value:g}: {error}") from None
+        yield s.names.index(name), (x - term.mean) / term.std, std / abs(term.slope(x)) / term.std
+
+
+def _calibrated(
+    name: str,
+    stored: Mapping[str, StoredPopulation],
+    parameter: Parameter,
+    common: Sequence[str],
+    together: Array,
+    alone: Array,
+) -> Iterator[str]:
+    """What groups that are known from elsewhere do to the median (M, K) of a parameter in the others."""
+    known = [label for label, s in stored.items() if s.known]
+    unit = f" {pretty_unit(parameter.display_unit)}" if parameter.display_unit != "1" else ""
+    for k, (label, s) in enumerate(stored.items()):
+        now, before = (_range(_three(draws[:, k]), plain=True) for draws in (together, alone))
+        if name in s.known:
+            value, std = (convert(number, parameter.unit, parameter.display_unit) for number in s.known[name])
+            x = convert(
+                s.group("posterior")[f"{name}_{s.headline}"].values.ravel(), parameter.unit, parameter.display_unit
+            )
+            off = (value - float(np.median(x))) / float(np.hypot(x.std(), std))
+            words = f"{name} of {label} is known, {number_like(value, std)} ± {number_like(std, std)}{unit}"
+            yield words + (f"; its own data say otherwise, {abs(off):.1f} std away" if abs(off) > FAR else "")
+            if not common:
+                yield "Nothing is common to the groups that this could calibrate"
+        elif known and common and label not in known:
+            yield f"{name} of {label} is {now}{unit}, calibrated by {', '.join(known)}; without, {before}{unit}"
 
 
 def _three(values: Array) -> tuple[float, float, float]:

@@ -193,7 +193,15 @@ class StoredPopulation(StoredGroups):
     @property
     def reference(self) -> dict[str, tuple[float, float]]:
         """Parameter → a value of others to compare with and its std (NaN if not stated), in the parameter's unit."""
-        lines = (line.split() for line in str(self.tree.attrs.get("reference", "")).splitlines())
+        return self._values("reference")
+
+    @property
+    def known(self) -> dict[str, tuple[float, float]]:
+        """Parameter → its median and std as known from elsewhere, in the parameter's unit."""
+        return self._values("known")
+
+    def _values(self, attribute: str) -> dict[str, tuple[float, float]]:
+        lines = (line.split() for line in str(self.tree.attrs.get(attribute, "")).splitlines())
         return {name: (float(value), float(std)) for name, value, std in lines}
 
     @property

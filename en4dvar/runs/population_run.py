@@ -90,7 +90,7 @@ class PopulationKind(TogetherKind):
         tell(f"{population.estimate.forward_runs} forward runs, {population.estimate.size:.0f} effective draws")
         used = [s for s in sets if s.name not in population.left_out]
         cautions = (*_cautions(population), *carried(used))
-        about = {**attributes, "seed": config.seed, **_reference(config, population)}
+        about = {**attributes, "seed": config.seed, **_elsewhere(config, population, str(attributes.get("group", "")))}
         save_population(path, population, [s.members for s in used], cautions, about)
 
     @classmethod
@@ -135,16 +135,19 @@ def require_population(config: Config, problem: InverseProblem, names: Collectio
         raise ConfigError([config.document.fault(("population",), str(error), at_key=True)]) from None
 
 
-def _reference(config: Config, population: CampaignPopulation) -> dict[str, str]:
-    """What the configuration says to compare with: lines of name, value and std, and its source."""
-    asked = config.population.reference if config.population else {}
-    values = [
-        (term.parameter.name, *reference_value(asked[term.parameter.name], term.parameter.unit))
-        for term in population.terms
-        if term.parameter.name in asked
-    ]
-    lines = "\n".join(f"{name} {value:.17g} {std:.17g}" for name, value, std in values)
-    return {"reference": lines, "reference_source": asked.get(SOURCE, "")} if lines else {}
+def _elsewhere(config: Config, population: CampaignPopulation, group: str) -> dict[str, str]:
+    """What the configuration says of the same numbers, to compare with and to calibrate with: lines of name, value and
+    std, and the source.
+    """
+    if (asked := config.population) is None:
+        return {}
+    said: dict[str, str] = {}
+    for key, texts in (("reference", asked.reference), ("known", asked.known.get(group, {}))):
+        of_it = {t.parameter.name: t.parameter.unit for t in population.terms if t.parameter.name in texts}
+        values = {name: reference_value(texts[name], unit) for name, unit in of_it.items()}
+        if values:
+            said[key] = "\n".join(f"{name} {value:.17g} {std:.17g}" for name, (value, std) in values.items())
+    return {**said, "reference_source": asked.reference.get(SOURCE, "")} if "reference" in said else said
 
 
 def _cautions(population: CampaignPopulation) -> Iterator[Caution]:

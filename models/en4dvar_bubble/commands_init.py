@@ -56,6 +56,12 @@ _MOVIES = (".tif", ".tiff", ".png", ".mp4", ".avi", ".mov", ".mkv", ".cine")
 @click.option("--radius-column", metavar="NAME", help="Column of radii, if its name does not tell.")
 @click.option("--time-step", metavar="TIME", help="Constant time step instead of a column, e.g. '3.7 us'.")
 @click.option("--by", metavar="NAME", help="Column that says which bubble a row belongs to.")
+@click.option(
+    "--groups",
+    metavar="NAME",
+    help="Which gel, day or concentration each bubble is of: a column of the data, or a table of files (gels.csv, or "
+    "gels.csv:COLUMN).",
+)
 @click.option("--format", type=click.Choice(["csv", "mat", "xlsx"]), help="Of the data, if their name does not tell.")
 @click.option("--sheet", metavar="SHEET", help="Sheet of a workbook or a range of it, e.g. 'Film 3!A3:D40'.")
 @click.option("--unsorted", type=click.Choice(["refuse", "sort"]), help="What to do if times do not increase.")
@@ -131,7 +137,15 @@ def init(
             columns = _columns_of(data, options, layout)
             if isinstance(columns, dict):
                 proposed = propose_config(
-                    data, **columns, start=start, law=law, medium=medium, folder=target.parent, name=name, command=words
+                    data,
+                    **columns,
+                    start=start,
+                    law=law,
+                    medium=medium,
+                    folder=target.parent,
+                    name=name,
+                    command=words,
+                    groups=options["groups"],
                 )
                 text, proposal = proposed.text, proposed.proposal
             else:

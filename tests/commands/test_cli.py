@@ -14,7 +14,7 @@ from click.testing import CliRunner, Result
 from toy_config import YAML, csv_text, write_toy
 
 from en4dvar.cli import main
-from en4dvar.commands.run import _tell
+from en4dvar.commands.run import _tell, _Warnings
 from en4dvar.config import load_config
 from en4dvar.estimation.summary import ParameterSummary
 from en4dvar.plumbing.caution import caution
@@ -271,6 +271,21 @@ def test_warnings_of_a_campaign_are_counted_by_kind(tmp_path: Path, capsys: pyte
     assert lines[3:] == ["what was found in each of them: run.log and the report"]
     _tell(Campaign(tmp_path, outcomes[:1]), with_report=False)
     assert [line.split(":")[0] for line in capsys.readouterr().err.splitlines()] == ["warning", "note"]
+
+
+def test_what_sets_have_together_is_no_data_set(tmp_path: Path) -> None:
+    """Of populations the warnings are told by name, beside the count of data sets."""
+    told = _Warnings()
+    for n in range(6):
+        told.add(f"set{n}", [caution("misfit", "χ² is large")] * (n < 4))
+    for gel in ("a", "b"):
+        told.add(f"population of {gel}", [caution("misfit", "in a"), caution("chain-not-converged", gel)], whole=True)
+    lines = "\n".join(told.lines())
+    assert "4 of 6 data sets, worst set0, set1, set2, population of a, population of b: misfit; " in lines
+    assert "population of a, population of b: chain-not-converged; " in lines
+    alone = _Warnings()
+    alone.add("population", [caution("chain-not-converged", "few draws")], whole=True)
+    assert "population: few draws" in "\n".join(alone.lines())
 
 
 def test_a_run_that_is_there_is_named_with_what_to_type(tmp_path: Path) -> None:

@@ -171,7 +171,7 @@ def test_subfolders_are_gels_that_are_compared(tmp_path: Path) -> None:
             write(tmp_path / "gels" / folder / f"b{n}.csv", scale=1 + n / 20)
     done = call("init", "--data", tmp_path / "gels", *UNITS)
     assert done.exit_code == 0, done.output
-    assert "the run ends with one gel a folder, and compares them: gel (3), gel_8 kPa (3)" in done.output
+    assert "the run ends with the numbers of each folder, and compares them: gel (3), gel_8 kPa (3)" in done.output
     config = proposed(Path("gels.yaml"))
     assert config.population is not None
     assert config.population.by == "folder"
@@ -182,6 +182,86 @@ def test_subfolders_are_gels_that_are_compared(tmp_path: Path) -> None:
     done = call("init", "--data", tmp_path / "gels", *UNITS, "--force")
     assert done.exit_code == 0, done.output
     assert "b1.csv: no column" in done.stderr
+
+
+def bubbles_of(folder: Path, names: str = "abcdef") -> Path:
+    folder.mkdir(parents=True)
+    for i, name in enumerate(names):
+        write(folder / f"{name}.csv", scale=1 + i / 20)
+    return folder
+
+
+def groups_in(path: str) -> dict[str, list[str]]:
+    config = proposed(Path(path))
+    assert config.population is not None
+    return {group.name: sorted(group.datasets) for group in groups_of(config, data_files(inverse_plan(config)))}
+
+
+@pytest.mark.parametrize(
+    ("table", "asked", "kind", "expected"),
+    [
+        ("file,gel\na.csv,soft\nb,soft\nc.csv,soft\nd.csv,9 of 12\ne.csv,9 of 12\nf.csv,9 of 12\nother.csv,none\n",
+         "gels.csv", "gel", {"soft": ["a", "b", "c"], "9 of 12": ["d", "e", "f"]}),
+        ("day;conc [%];name\n1;5;a\n1;5;b\n2;8;c\n2;8;d\n2;8;e\n1;8;f\n",
+         "gels.csv:conc [%]", "conc", {"5 %": ["a", "b"], "8 %": ["c", "d", "e", "f"]}),
+        ("day;conc [%];name\n1;5;a\n1;5;b\n2;8;c\n2;8;d\n2;8;e\n1;8;f\n",
+         "gels.csv:day", "day", {"1": ["a", "b", "f"], "2": ["c", "d", "e"]}),
+    ],
+)  # fmt: skip
+def test_groups_are_a_column_of_a_table(tmp_path: Path, table: str, asked: str, kind: str, expected: object) -> None:
+    """By file or name of the data set, in any column; a number has the unit of its column's name."""
+    folder = bubbles_of(tmp_path / "all")
+    Path("gels.csv").write_text(table)
+    done = call("init", "--data", folder, *UNITS, "--groups", asked)
+    assert done.exit_code == 0, done.output
+    assert f"the run ends with the numbers of each {kind}, and compares them: " in done.output
+    assert groups_in("all.yaml") == expected
+
+
+def test_groups_are_a_column_of_the_data(tmp_path: Path) -> None:
+    """Of one table of many bubbles, and of a file each; the same as of a table of them."""
+    lines = write(tmp_path / "one.csv").read_text().splitlines()[1:]
+    of_gel = {"x1": "A", "x2": "A", "x3": "A", "y1": "B_x", "y2": "B_x", "y3": "B_x"}
+    rows = [f"{name},{gel},{line}" for name, gel in of_gel.items() for line in lines]
+    Path("many.csv").write_text("\n".join(["bubble,gel,t_us,R_um", *rows, ""]))
+    done = call("init", "--data", "many.csv", *UNITS, "--by", "bubble", "--groups", "gel")
+    assert done.exit_code == 0, done.output
+    expected = {"A": ["many_x1", "many_x2", "many_x3"], "B_x": ["many_y1", "many_y2", "many_y3"]}
+    assert groups_in("many.yaml") == expected
+    folder = tmp_path / "each"
+    folder.mkdir()
+    for name, gel in of_gel.items():
+        (folder / f"{name}.csv").write_text("\n".join(["gel,t_us,R_um", *(f"{gel},{line}" for line in lines), ""]))
+    done = call("init", "--data", folder, *UNITS, "--time-column", "t_us", "--radius-column", "R_um", "--groups", "gel")
+    assert done.exit_code == 0, done.output
+    assert groups_in("each.yaml") == {g: [n.removeprefix("many_") for n in its] for g, its in expected.items()}
+
+
+@pytest.mark.parametrize(
+    ("table", "asked", "words"),
+    [
+        ("file,gel\na.csv,A\n", "gels.csv", "gels.csv: no row for b, c, d, e, f; a row needs"),
+        ("file,gel,day\n" + "".join(f"{x},A,1\n" for x in "abcdef"), "gels.csv",
+         "gels.csv: 2 columns could be the groups; say gels.csv:gel or gels.csv:day"),
+        ("file,gel,day\n" + "".join(f"{x},A,1\n" for x in "abcdef"), "gels.csv:gell",
+         "gels.csv: no column 'gell' of groups; say gels.csv:gel or gels.csv:day"),
+        ("file,gel\n" + "".join(f"{x},A\n" for x in "abcdef"), "gels.csv", "all data sets are of 'A'"),
+        ("file,gel\na,B\n" + "".join(f"{x},A\n" for x in "abcdef"), "gels.csv",
+         "a: one group is needed for a data set, not A, B"),
+        ("file,gel\n" + "".join(f"{x},\n" for x in "abcdef"), "gels.csv",
+         "a: one group is needed for a data set, not empty"),
+        ("", "none.csv", "none.csv: no such table of groups"),
+        ("", "all/a.csv", "all/a.csv: lies among the data files"),
+        ("", "gel", "a.csv: no column 'gel'; the columns are: t_us, R_um"),
+    ],
+)  # fmt: skip
+def test_groups_that_cannot_be_told(tmp_path: Path, table: str, asked: str, words: str) -> None:
+    folder = bubbles_of(tmp_path / "all")
+    Path("gels.csv").write_text(table)
+    done = call("init", "--data", folder, *UNITS, "--groups", asked)
+    assert done.exit_code == 2
+    assert words in done.stderr
+    assert not Path("all.yaml").exists()
 
 
 def test_one_table_of_many_bubbles(tmp_path: Path) -> None:

@@ -10,14 +10,17 @@ from scipy.stats import norm
 from toys import Vectorised, make_problem, with_discrepancy
 
 from en4dvar.data.noise import noise_of
-from en4dvar.estimation.population import HyperPrior
-from en4dvar.estimation.population.campaign import population_of
+from en4dvar.estimation.population import Effort, HyperPrior
+from en4dvar.estimation.population.campaign import _empirical, population_of, white_prior
 from en4dvar.estimation.population.empirical import empirical, median_of
+from en4dvar.estimation.population.hierarchy import Hierarchy
+from en4dvar.estimation.population.mixtures import Mixture
+from en4dvar.estimation.population.own import OwnLikelihood
 from en4dvar.model.forward import Failure
 from en4dvar.model.state import NOISE_SCALE, Parameter
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.priors.prior import Prior, PriorTerm, member_stream
-from en4dvar.runs.population_run import _cautions
+from en4dvar.runs.population_run import ODD, _cautions
 
 STD, SETS, SLOPE = 0.3, 8, 0.5
 A, B = (Parameter(name, "m") for name in "ab")
@@ -75,8 +78,9 @@ def exact(problems, hyper, common=OF_D.std):
     wide = np.sqrt(0.9**2 + of_d)
     for best, variance in likely(problems).T:
         inside = norm(best, np.sqrt(variance + tau**2)).logpdf(m[:, None])
-        outside = norm(0.6, np.sqrt(variance + wide**2)).logpdf(best)
-        odd = np.log(hyper.odd) + outside if hyper.odd else -np.inf
+        outside = norm(0.6, np.sqrt(variance + wide**2)).pdf(best)
+        elsewhere = norm(best, np.sqrt(variance + tau**2 + (0.9 * hyper.spread) ** 2)).pdf(m[:, None])
+        odd = np.log(hyper.odd / 2) + np.log(outside + elsewhere) if hyper.odd else -np.inf
         log = log + np.logaddexp(np.log1p(-hyper.odd) + inside, odd)
     weights = np.exp(log - log.max()) * np.gradient(tau)
     weights /= weights.sum()
@@ -130,6 +134,33 @@ def test_an_odd_data_set_is_named_and_moves_nothing():
     assert np.median(strict.posterior.tau) > 2 * np.median(found.posterior.tau)
 
 
+def test_one_that_is_odd_in_one_parameter_alone_is_named():
+    """Of twelve sets of two parameters, whose probabilities are those of normal distributions in closed form."""
+    rng, hyper, error = np.random.default_rng(6), HyperPrior(1.0, 0.5, odd=0.05), 0.08
+    y = np.array([0.3, -0.2]) + np.hypot(0.1, error) * rng.standard_normal((12, 2))
+    y[0] = 1.0, -0.2
+    left = 1 / (1 + error**-2)
+    likelihoods = [
+        OwnLikelihood(
+            Mixture.divided(left / error**2 * row[None], left * np.eye(2)[None], np.zeros(1), np.zeros(2), np.ones(2)),
+            np.zeros((2, 0)),
+            row + error * rng.standard_normal((400, 2)),
+        )
+        for row in y
+    ]
+    hierarchy, h = Hierarchy(likelihoods, white_prior(["a", "b"]), hyper), np.array([[0.3, -0.2, *np.log([0.1, 0.2])]])
+    variances = np.array([[0.01, 0.04], [0.01 + 0.25, 0.04], [0.01, 0.04 + 0.25]]) + error**2
+    under_prior = norm(0, np.hypot(1, error)).pdf(y).prod(axis=1)
+    exact_parts = [norm(h[0, :2], np.sqrt(v)).pdf(y).prod(axis=1) / under_prior for v in variances]
+    shares = np.array([0.95, 0.025, 0.0125, 0.0125])
+    expected = shares * np.stack([exact_parts[0], np.ones(12), *exact_parts[1:]], axis=1)
+    np.testing.assert_allclose(np.exp(hierarchy.log_parts(h)[0]), expected, rtol=1e-8)
+    np.testing.assert_allclose(hierarchy.belongs(h)[0], expected / expected.sum(axis=1, keepdims=True), rtol=1e-8)
+    belongs = hierarchy.sampled(1, Effort()).belongs
+    assert belongs[0] < 1 - ODD
+    assert belongs[1:].min() > 0.7
+
+
 def test_uncertain_errors_are_quantities_of_each_data_set():
     """A scale of the errors that is all but known changes nothing; a wide one, a timing error and a discrepancy are
     taken as they are.
@@ -150,6 +181,17 @@ def test_uncertain_errors_are_quantities_of_each_data_set():
 
 def timing(observations):
     return noise_of(observations.std, np.full(len(observations), 0.02))
+
+
+def test_the_median_one_by_one_of_sets_that_only_what_is_common_makes_uncertain():
+    """Their members scatter by chance less than the common quantity alone would say; what is their own is 0.01."""
+    rng, count = np.random.default_rng(1), 12
+    theta, own = rng.standard_normal((400, 1)), 0.01 * rng.standard_normal((count, 400, 1))
+    likelihoods = [OwnLikelihood(None, np.array([[0.5]]), z) for z in own]
+    sets = [0.9 * (0.5 * theta + z) for z in own]
+    (median,) = _empirical([PriorTerm.normal(A, 0.0, 1.0)], sets, likelihoods, 1)
+    assert median.common == pytest.approx(0.5, rel=1e-6)
+    assert 0.8 * 0.01 / np.sqrt(count) < median.between < 4 * 0.01 / np.sqrt(count)
 
 
 def test_data_sets_that_cannot_be_sampled_are_named():

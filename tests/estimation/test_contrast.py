@@ -11,7 +11,7 @@ from test_common_and_odd import HYPER, OF_A, OF_B, OF_D, STD, Shifted, likely, m
 from toys import Vectorised, make_problem
 
 from en4dvar.estimation.population.campaign import population_of
-from en4dvar.estimation.population.contrast import Centre, drawn_together, line, without_pull
+from en4dvar.estimation.population.contrast import Centre, drawn_together, knowing, line, without_pull
 from en4dvar.priors.prior import Prior
 
 DRAWS, SEEDS = 20_000, 4
@@ -80,12 +80,29 @@ def test_the_pull_of_a_hyperprior_is_taken_away_where_the_data_can():
     precision = 0.5**-2 + 0.8**-2
     x = norm(0.5**-2 / precision, precision**-0.5).rvs(DRAWS, random_state=np.random.default_rng(2))
     nothing = np.empty((DRAWS, 0))
-    freed = without_pull(x, x[:, None], nothing, (), 0.8, DRAWS, 1)
+    freed = without_pull(0, x[:, None], nothing, (), 0.8, DRAWS, 1)
     assert not freed.pulled
     assert freed.x.mean() == pytest.approx(1.0, abs=0.03)
     assert freed.x.std() == pytest.approx(0.5, rel=0.05)
     silent = 0.8 * np.random.default_rng(2).standard_normal(DRAWS)
-    assert without_pull(silent, silent[:, None], nothing, (), 0.8, 400, 1).pulled
+    assert without_pull(0, silent[:, None], nothing, (), 0.8, 400, 1).pulled
+
+
+def test_a_calibrating_gel_narrows_the_others_as_all_data_at_once_do():
+    """The first gel is known to 0.05, and what it tells of ρ and of the scale is told to the two others."""
+    systems, value, std = system(), 1.02, 0.05
+    of_known = np.zeros((1, 3 + len(SHARED)))
+    of_known[0, 0] = 1 / std
+    all_data = [*systems, (of_known, np.array([value / std]))]
+    gels = centres(systems)
+    both = knowing(np.column_stack([gels[0].x, gels[0].theta]), 0, value, std, 1)
+    x = drawn_together([Centre(both[:, 0], both[:, 1:], gels[0].common), *gels[1:]], 1)
+    mean, C = posterior(all_data, list(range(6)))
+    without = np.sqrt(np.diag(posterior(systems, list(range(6)))[1]))
+    exact = np.sqrt(np.diag(C))
+    assert np.abs((x.mean(axis=0) - mean[:3]) / exact[:3]).max() < 0.05
+    np.testing.assert_allclose(x.std(axis=0), exact[:3], rtol=0.05)
+    assert np.all(exact[:3] < 0.75 * without[:3])  # else nothing would have been calibrated
 
 
 class Steeper(Shifted):
@@ -116,35 +133,57 @@ def level(problems):
     return weights @ m, weights @ m**2 - (weights @ m) ** 2
 
 
+@pytest.fixture(scope="module")
+def gels():
+    """Two gels of one camera, whose moduli feel it by 0.5 d and by 1.5 d; of each its draws, of several seeds."""
+    rng = np.random.default_rng(8)
+    problems = [
+        gel(Shifted(), 0.5, 1.0 + 0.2 * rng.standard_normal(8), 400),
+        gel(Steeper(), 1.5, 0.4 + 0.2 * rng.standard_normal(6), 500),
+    ]
+    found = [[population_of(p, members(p), ["a"], seed, hyper=HYPER) for p in problems] for seed in range(SEEDS)]
+    return problems, found
+
+
+def medians(found, seed, known=()):
+    """Draws (M, 2) of both medians; of the first what is ``known``."""
+    each = [
+        without_pull(0, f.posterior.nu, f.theta, f.common, HYPER.mean_std, f.estimate.size, seed, of_it)
+        for f, of_it in zip(found, (known, ()), strict=True)
+    ]
+    return OF_A.mean + OF_A.std * drawn_together(each, seed)
+
+
 @pytest.mark.slow
-def test_two_gels_of_one_camera_whose_moduli_feel_it_differently():
+def test_two_gels_of_one_camera_whose_moduli_feel_it_differently(gels):
     """ν_A − ν_B = m_A − m_B − (slope_A − slope_B) d, where the data leave d to its prior.
 
     Of one seed the slopes are read from some 200 draws of each data set, whose noise tells of d what no data say.
     """
-    rng = np.random.default_rng(8)
-    gels = [
-        gel(Shifted(), 0.5, 1.0 + 0.2 * rng.standard_normal(8), 400),
-        gel(Steeper(), 1.5, 0.4 + 0.2 * rng.standard_normal(6), 500),
-    ]
-    (of_a, var_a), (of_b, var_b) = map(level, gels)
+    (of_a, var_a), (of_b, var_b) = map(level, gels[0])
     std = np.sqrt(var_a + var_b + (1.0 * OF_D.std) ** 2)
     apart = np.hypot(*(np.sqrt(v + (s * OF_D.std) ** 2) for v, s in ((var_a, 0.5), (var_b, 1.5))))
-    drawn = np.array([difference(gels, seed) for seed in range(SEEDS)])
+    drawn = np.array([x[:, 0] - x[:, 1] for x in (medians(f, seed) for seed, f in enumerate(gels[1]))])
     assert drawn.mean() == pytest.approx(of_a - of_b, abs=0.15 * std)
     assert drawn.std(axis=1).mean() == pytest.approx(std, rel=0.08)
     assert std < 0.85 * apart
 
 
-def difference(gels, seed):
-    """Draws of ν_A − ν_B."""
-    found = [population_of(problems, members(problems), ["a"], seed, hyper=HYPER) for problems in gels]
-    one_by_one = [
-        without_pull(f.posterior.nu[:, 0], f.posterior.nu, f.theta, f.common, HYPER.mean_std, f.estimate.size, seed)
-        for f in found
-    ]
-    x = drawn_together(one_by_one, seed)
-    return OF_A.std * (x[:, 0] - x[:, 1])
+@pytest.mark.slow
+def test_a_gel_of_known_modulus_calibrates_the_camera(gels):
+    """m_A = ν_A + 0.5 d tells d where ν_A is known, and ν_B = m_B − 1.5 d narrows; all in closed form but for the τ."""
+    (of_a, var_a), (of_b, var_b) = map(level, gels[0])
+    value, error = 1.0, 0.05
+    told = (var_a + error**2) / 0.5**2
+    of_d = 1 / (OF_D.std**-2 + 1 / told)
+    mean, std = of_b - 1.5 * of_d / told * (of_a - value) / 0.5, np.sqrt(var_b + 1.5**2 * of_d)
+    known = [(0, (value - OF_A.mean) / OF_A.std, error / OF_A.std)]
+    drawn = np.array([medians(f, seed, known)[:, 1] for seed, f in enumerate(gels[1])])
+    assert drawn.mean() == pytest.approx(mean, abs=0.15 * std)
+    assert drawn.std(axis=1).mean() == pytest.approx(std, rel=0.08)
+    before = np.array([medians(f, seed)[:, 1] for seed, f in enumerate(gels[1])])
+    assert before.std(axis=1).mean() == pytest.approx(np.sqrt(var_b + (1.5 * OF_D.std) ** 2), rel=0.08)
+    assert drawn.std() < 0.8 * before.std()
 
 
 def test_a_line_through_populations():

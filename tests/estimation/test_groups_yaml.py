@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import re
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+import xarray as xr
 from click.testing import CliRunner
 from execution_models import Stops
 from run_files import assert_same_results, configuration, interrupt
@@ -11,7 +15,9 @@ from test_population_yaml import SMALL
 from toy_config import csv_text, write_toy
 
 from en4dvar.cli import main
+from en4dvar.model.state import Parameter
 from en4dvar.plumbing.errors import ConfigError
+from en4dvar.report import groups, populations
 from en4dvar.report.groups import numbers_of
 from en4dvar.report.populations import compare_populations
 from en4dvar.results.population_file import load_groups_of, load_population
@@ -19,7 +25,7 @@ from en4dvar.runs.engine import write_report
 from en4dvar.runs.runner import run_campaign
 
 ASKED = (
-    "population: {of: [k], by: folder, mean_std: 2, spread: 0.7}\n"
+    "population: {of: [k], by: folder, mean_std: 2, spread: 0.7, known: {gel 8kPa: {k: 2.3 ± 0.02 N/m}}}\n"
     "groups: {folder: {gel 5kPa: 'gel 5kPa_*', gel 8kPa: 'gel 8kPa_*'}}\n"
 )
 SOFT, STIFF = (1.5, 1.6, 1.7), (2.2, 2.3, 2.4)
@@ -82,13 +88,39 @@ def test_terminal_and_page_open_with_the_comparison(finished):
     assert answer in output
     assert "broken.csv: no column" in output
     assert page.index("<h1>") < page.index(f"<li>{answer}") < page.index("Each data set by itself")  # k and not K
-    assert page.index("in kPa.") < page.index('href="groups/1_gel_5kPa/population.html"')
+    assert page.index(f"<li>{answer}") < page.index('href="groups/1_gel_5kPa/population.html"')
+    for text in (output, page):
+        assert "k of gel 8kPa is known, 2.300 ± 0.020 N/m." in text
+        assert "Nothing is common to the groups that this could calibrate." in text
+    assert "straight line" not in output + page  # a line through two says no more than their difference
     assert 'href="groups/2_gel_8kPa/population.html"' in page
     assert (run / "differences.csv").is_file()
     listed = (run / ".en4dvar-files").read_text().splitlines()
     assert "groups/2_gel_8kPa/population.nc" in listed
     write_report(run)
     assert (run / "report.html").read_text() == page
+
+
+@pytest.mark.parametrize(
+    ("names", "numbers"), [(["5 %", "8 %"], ()), (["5 %", "8 %", "10 %"], (5.0, 8.0, 10.0)), (["5 %", "8 %", "x"], ())]
+)
+def test_a_line_needs_three_groups(tmp_path, monkeypatch, names, numbers):
+    monkeypatch.setattr(groups, "load_groups_of", lambda run: {name: (run / name, None) for name in names})
+    monkeypatch.setattr(groups, "compare_populations", lambda folders, asked: asked)
+    assert groups.groups_compared(tmp_path) == numbers
+
+
+def test_what_a_known_group_does_to_the_others_is_told():
+    """What is known and far from the group's own data is told as such; both groups' medians without and with it."""
+    draws = xr.DataArray(np.linspace(7.9, 8.1, 101))
+    stored = {"a": SimpleNamespace(known={}), "ref": SimpleNamespace(known={"k": (9.0, 0.1)}, headline="median")}
+    stored["ref"].group = lambda of: {"k_median": draws}
+    together, alone = (np.column_stack([5 + s * np.linspace(-1, 1, 101), draws]) for s in (0.1, 0.5))
+    k = Parameter("k", "N/m")
+    told = [*populations._calibrated("k", stored, k, ["scale"], together, alone)]
+    assert told[0] == "k of a is 5.000 (4.909 … 5.091) N/m, calibrated by ref; without, 5.00 (4.54 … 5.46) N/m"
+    assert re.fullmatch(r"k of ref is known, 9.00 ± 0.10 N/m; its own data say otherwise, 8.\d std away", told[1])
+    assert len(told) == 2
 
 
 @pytest.mark.slow
@@ -118,6 +150,12 @@ def test_killed_and_resumed_to_the_same_bits(tmp_path, monkeypatch):
     ("stiff", "asked", "words"),
     [
         (STIFF, ASKED.replace("by: folder", "by: foldr"), r"population\.by: no kind of 'groups:' is called 'foldr'"),
+        (STIFF, ASKED.replace("2.3 ± 0.02 N/m", "2.3 N/m"), r"gel 8kPa\.k: '2.3 N/m': how well is it known\?"),
+        (STIFF, ASKED.replace("2.3 ± 0.02 N/m", "-2.3 ± 0.02 N/m"), r"gel 8kPa\.k: '-2.3 .*': beyond the bounds of k"),
+        (STIFF, ASKED.replace("2.3 ± 0.02 N/m", "2.3 ± 0.02 kg"), r"population\.known\.gel 8kPa\.k: .*kg"),
+        (STIFF, ASKED.replace("{k: 2.3", "{c: 2.3"), r"population\.known\.gel 8kPa\.c: 'c': not among 'of'"),
+        (STIFF, ASKED.replace("known: {gel 8", "known: {gel 9"), r"known\.gel 9kPa: no such group; did you mean"),
+        (STIFF, ASKED.replace("by: folder, ", ""), r"population\.known: of groups, which need 'by'"),
         (STIFF, ASKED.replace("'gel 8kPa_*'", "other"), r"groups\.folder: data set 'gel 8kPa_set0' is in none of them"),
         (STIFF, ASKED.replace("'gel 8kPa_*'", "'*'"), r"data set 'gel 5kPa_set0' is in several of them"),
     ],

@@ -213,11 +213,11 @@ def population_of(
         raise ConfigError(f"a population needs at least {FEWEST_SETS} data sets")
     require_population(problems, names)
     with one_blas_thread():
-        drawn, left_out = _sampled(problems, start, seed, executor, tell)
-        return _campaign(drawn, left_out, start, problems, names, seed, hyper or HyperPrior(), effort or Effort())
+        drawn, left_out = sampled_sets(problems, start, seed, executor, tell)
+        return population_from(drawn, left_out, start, problems, names, seed, hyper or HyperPrior(), effort or Effort())
 
 
-def _sampled(
+def sampled_sets(
     problems: Sequence[InverseProblem], start: Sequence[Array], seed: int, executor: Executor | None,
     tell: Callable[[str], None],
 ) -> tuple[dict[int, OwnDraws], dict[str, str]]:  # fmt: skip
@@ -238,7 +238,7 @@ def _sampled(
     return drawn, left_out
 
 
-def _campaign(
+def population_from(
     drawn: Mapping[int, OwnDraws], left_out: Mapping[str, str], start: Sequence[Array],
     campaign: Sequence[InverseProblem], names: Sequence[str], seed: int, scales: HyperPrior, effort: Effort,
 ) -> CampaignPopulation:  # fmt: skip
@@ -279,9 +279,9 @@ def _empirical(
 ) -> tuple[Empirical, ...]:
     """The median over data sets of each parameter, from members (N_i, p) of each."""
     middle = np.array([np.median(z, axis=0) for z in members])
-    slopes = np.array([likelihood.slopes for likelihood in likelihoods])
-    variance = np.array([z.var(axis=0, ddof=1) for z in members]) - np.sum(slopes**2, axis=2)
-    std, shared = np.sqrt(np.maximum(variance, 0.0)), np.sqrt(np.sum(slopes.mean(axis=0) ** 2, axis=1))
+    std = np.array([likelihood.adjusted.std(axis=0) for likelihood in likelihoods])  # without what all have in common
+    slopes = np.mean([likelihood.slopes for likelihood in likelihoods], axis=0)
+    shared = np.sqrt(np.sum(slopes**2, axis=1))
     return tuple(empirical(term, middle[:, j], std[:, j], float(shared[j]), seed) for j, term in enumerate(terms))
 
 

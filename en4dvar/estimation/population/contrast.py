@@ -42,17 +42,34 @@ class Centre:
 
 
 def without_pull(
-    x: Array, nu: Array, theta: Array, common: tuple[Hashable, ...], mean_std: float, draws: float, seed: int
-) -> Centre:
-    """Draws ``x`` (M,) without the hyperprior N(0, ``mean_std``²) of all centres ``nu`` (M, p) of the population, which
-    pulls populations together; with it where fewer than a hundred of the effective ``draws`` would count.
+    at: int, nu: Array, theta: Array, common: tuple[Hashable, ...], mean_std: float, draws: float, seed: int,
+    known: Sequence[tuple[int, float, float]] = (),
+) -> Centre:  # fmt: skip
+    """The centre in column ``at`` of the draws ``nu`` (M, p) without their hyperprior N(0, ``mean_std``²), which pulls
+    populations together; with it where fewer than a hundred of the effective ``draws`` would count.
+
+    ``known``: columns of ``nu`` with value and standard deviation from elsewhere, by a rheometer for instance.
     """
     logs = 0.5 * np.sum((nu / mean_std) ** 2, axis=1)
     weights = np.exp(logs - logs.max())
-    if effective_number(weights) / len(weights) * draws < FEWEST:
-        return Centre(x, theta, common, pulled=True)
-    taken = resampled(weights / weights.sum(), len(weights), member_stream(seed, "without the pull of the hyperprior"))
-    return Centre(x[taken], theta[taken], common)
+    pulled = effective_number(weights) / len(weights) * draws < FEWEST
+    both = np.hstack([nu, theta])
+    if not pulled:
+        stream = member_stream(seed, "without the pull of the hyperprior")
+        both = both[resampled(weights / weights.sum(), len(weights), stream)]
+    for column, value, std in known:
+        both = knowing(both, column, value, std, seed)
+    return Centre(both[:, at], both[:, nu.shape[1] :], common, pulled)
+
+
+def knowing(draws: Array, column: int, value: float, std: float, seed: int) -> Array:
+    """Draws (M, n) once one ``column`` is known from elsewhere to be ``value`` ± ``std``: by linear regression, with a
+    reading of its own for each draw (the update of an ensemble Kalman filter; exact for Gaussian ones).
+    """
+    apart = draws[:, column] - draws[:, column].mean()
+    reading = value + std * member_stream(seed, f"known {column}").standard_normal(len(draws))
+    gain = apart @ (draws - draws.mean(axis=0)) / len(draws) / (apart.var() + std**2)
+    return np.asarray(draws + np.outer(reading - draws[:, column], gain))
 
 
 def drawn_together(centres: Sequence[Centre], seed: int) -> Array:

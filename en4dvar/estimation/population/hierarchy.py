@@ -1,15 +1,19 @@
 r"""Mean ν and spread τ of a population from the likelihoods of its data sets, with common quantities and odd ones.
 
-    x_i ~ (1 − ε) N(ν, diag τ²) + ε π(x),     θ ~ N(0, I),     data_i ~ L_i(x_i − B_i θ)
+    x_i ~ (1 − ε) N(ν, diag τ²) + ε/2 π(x) + ε/2p Σ_j N(ν, diag τ² + σ² e_j e_jᵀ),
+    θ ~ N(0, I),     data_i ~ L_i(x_i − B_i θ)
 
-in white coordinates of the prior π. A data set is odd with probability ε: then its parameters are drawn from the prior
-as if it belonged to no population (Hogg, Bovy & Lang 2010, arXiv:1008.4686), so that one bubble of another gel moves
-the mean little and widens the spread not at all; how probably each belongs is part of the answer. θ are quantities with
-one value in all data sets, whose uncertainty therefore no number of data sets averages out.
+in white coordinates of the prior π. A data set is odd with probability ε (Hogg, Bovy & Lang 2010, arXiv:1008.4686):
+then its parameters are drawn from the prior as if it belonged to no population, or one of them alone lies elsewhere, by
+as much as populations spread a priori (σ is the scale of τ's prior), as where the gel is stiffer or the law is another
+one. So one bubble of another gel moves the mean little and widens the spread hardly; how probably each belongs is part
+of the answer. Were an odd one always odd in all parameters, one that is so in G alone would have to be improbable in
+the others, and would widen the spread instead. θ are quantities with one value in all data sets, whose uncertainty
+therefore no number of data sets averages out.
 
 With L_i in units of its evidence (:mod:`~en4dvar.estimation.population.own`) the density of h = (ν, ln τ, θ) is
 
-    p(h) Π_i [ (1 − ε) ∫ L_i(x) N(x; ν − B_i θ, τ²) dx + ε ],
+    p(h) Π_i [ (1 − ε) ∫ L_i(x) N(x; ν − B_i θ, τ²) dx + ε/2 + ε/2p Σ_j … ],
 
 every integral in closed form. Walkers find where it is, and importance weights of draws from a mixture fitted to them
 give independent draws and the evidence.
@@ -56,32 +60,38 @@ class Hierarchy:
     """The posterior density of h = (ν, ln τ, θ); ``prior`` is N(0, I) of the p parameters that vary."""
 
     def __init__(self, likelihoods: Sequence[OwnLikelihood], prior: Prior, scales: HyperPrior):
-        self.likelihoods, self.odd = likelihoods, scales.odd
+        self.likelihoods, odd = likelihoods, scales.odd
         self.p, self.c = likelihoods[0].slopes.shape
         self.hyper = Hyper(prior, list(range(self.p)), scales)
+        self.shares = np.array([1 - odd, odd / 2, *[odd / 2 / self.p] * self.p])[: None if odd else 1]
+        self.wider = scales.spread**2 * np.vstack([np.zeros((2, self.p)), np.eye(self.p)])
 
-    def log_ratios(self, h: Array) -> Array:
-        """(B, S) ln of the marginal likelihood of each data set in the population, over that under its own prior."""
+    def log_parts(self, h: Array) -> Array:
+        """(B, S, K) ln of the share and the marginal likelihood of each data set in the population, under its own prior
+        and where one parameter lies elsewhere, over that under its own prior.
+        """
         mean, variance = self.hyper.population(h[:, : 2 * self.p])
         theta = h[:, 2 * self.p :]
-        columns = [
-            log_marginal([likelihood.mixture], mean - theta @ likelihood.slopes.T, variance)
-            for likelihood in self.likelihoods
-        ]
-        return np.stack(columns, axis=1)
+        parts = np.zeros((len(h), len(self.likelihoods), len(self.shares)))
+        for s, likelihood in enumerate(self.likelihoods):
+            middle = mean - theta @ likelihood.slopes.T
+            for k in range(len(self.shares)):
+                if k != 1:
+                    parts[:, s, k] = log_marginal([likelihood.mixture], middle, variance + self.wider[k])
+        return np.asarray(parts + np.log(self.shares))
 
     def log_density(self, h: Array) -> Array:
         """(B,), of all data in units of the sets' own evidences."""
         logs: Array = self.hyper.log_density(h[:, : 2 * self.p]) - 0.5 * np.sum(h[:, 2 * self.p :] ** 2, axis=1)
         logs -= 0.5 * self.c * math.log(2 * math.pi)
         inside = np.isfinite(logs)
-        logs[inside] += self._mixed(self.log_ratios(h[inside])).sum(axis=1)
+        logs[inside] += np.logaddexp.reduce(self.log_parts(h[inside]), axis=2).sum(axis=1)
         return logs
 
     def belongs(self, h: Array) -> Array:
-        """(B, S) probabilities that each data set is of the population h."""
-        ratios = self.log_ratios(h)
-        return np.asarray(np.exp(ratios + math.log1p(-self.odd) - self._mixed(ratios)))
+        """(B, S, K) probabilities of what :meth:`log_parts` tells apart; the first: it is of the population h."""
+        parts = self.log_parts(h)
+        return np.asarray(np.exp(parts - np.logaddexp.reduce(parts, axis=2)[..., None]))
 
     def sampled(self, seed: int, effort: Effort) -> HierarchyDraws:
         """Deterministic in ``seed``. Raises :class:`ValueError`: no population that was tried explains the data."""
@@ -99,12 +109,7 @@ class Hierarchy:
         evidence = float(logs.max()) + math.log(float(weights.mean()))
         nu, tau, theta = taken[:, :p], np.exp(taken[:, p : 2 * p]), taken[:, 2 * p :]
         x = self._given(taken, belongs, stream)
-        return HierarchyDraws(nu, tau, theta, x, belongs.mean(axis=0), effective_number(weights), evidence)
-
-    def _mixed(self, ratios: Array) -> Array:
-        if not self.odd:
-            return ratios
-        return np.asarray(np.logaddexp(ratios + math.log1p(-self.odd), math.log(self.odd)))
+        return HierarchyDraws(nu, tau, theta, x, belongs[..., 0].mean(axis=0), effective_number(weights), evidence)
 
     def _walked(self, stream: np.random.Generator, effort: Effort) -> Array:
         """(D, 2p + c) positions of walkers, the first third left out."""
@@ -135,13 +140,14 @@ class Hierarchy:
         return h, logs
 
     def _given(self, h: Array, belongs: Array, stream: np.random.Generator) -> Array:
-        """Draws (M, S, p) of x_i − B_i θ given h and the data: of the population, or of the prior where it is odd."""
+        """Draws (M, S, p) of x_i − B_i θ given h and the data: of the population, or odd as ``belongs`` (M, S, K)."""
         mean, variance = self.hyper.population(h[:, : 2 * self.p])
         theta, x = h[:, 2 * self.p :], np.empty((len(h), len(self.likelihoods), self.p))
         for s, likelihood in enumerate(self.likelihoods):
-            own = stream.uniform(size=len(h)) > belongs[:, s]
-            middle = np.where(own[:, None], 0.0, mean) - theta @ likelihood.slopes.T
-            spread = np.where(own[:, None], 1.0, variance)
+            chosen = np.sum(stream.uniform(size=(len(h), 1)) > np.cumsum(belongs[:, s, :-1], axis=1), axis=1)
+            own = chosen[:, None] == 1
+            middle = np.where(own, 0.0, mean) - theta @ likelihood.slopes.T
+            spread = np.where(own, 1.0, variance + self.wider[chosen])
             numbers, uniform = stream.standard_normal((len(h), self.p)), stream.uniform(size=len(h))
             _draw(likelihood.mixture, middle, spread, numbers, uniform, x[:, s])
         return x

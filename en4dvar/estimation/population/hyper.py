@@ -36,7 +36,7 @@ class HyperPrior:
         float, Gt(0), "Hyperprior of the spread: half-normal, with so many of the prior's standard deviations."
     ] = 0.5
     odd: Annotated[
-        float, Ge(0), Lt(1), "Probability that a data set is odd: drawn from the prior and not from the population."
+        float, Ge(0), Lt(1), "Probability that a data set is odd: of another population, in all parameters or in one."
     ] = 0.05
 
 

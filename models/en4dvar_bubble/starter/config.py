@@ -17,10 +17,11 @@ from en4dvar.inputs.readers import Readings, read_series
 from en4dvar.inputs.steps import step_doubts
 from en4dvar.inputs.variables import indexed
 from en4dvar.plumbing.errors import ConfigError, DataError
-from en4dvar.plumbing.files import expanded, readable
+from en4dvar.plumbing.files import expanded
 from en4dvar.plumbing.hints import shown, suggest
 from en4dvar.plumbing.units import UnitError, convert, parse_quantity, parse_unit
 from en4dvar_bubble.starter.elsewhere import CHOICES
+from en4dvar_bubble.starter.grouped import grouped
 from en4dvar_bubble.starter.look import Start
 from en4dvar_bubble.starter.page import TRACKED_COMMON, Source, quoted, yaml_text
 from en4dvar_bubble.starter.proposal import Entry, Proposal, propose, with_columns
@@ -57,6 +58,7 @@ def propose_config(
     step_unit: str | None = None,
     rate: str | None = None,
     medium: str = "gel",
+    groups: str | None = None,
 ) -> Proposed:
     """A commented configuration for radius histories that loads and whose data can be read.
 
@@ -71,6 +73,8 @@ def propose_config(
     name: of the run, whose results go to ``runs/<name>``; default: that of the data.
     rate: of the camera's frames, e.g. ``"270 kHz"``, that the times are compared with.
     medium: one of :data:`en4dvar_bubble.starter.elsewhere.CHOICES`, for density and speed of sound.
+    groups: which gel or day each data set is of: a column of the data, or a table, as ``gels.csv`` or ``gels.csv:gel``;
+        default: its folder.
     errors: columns of the standard deviations of radii and times, in the units of ``radius`` and ``time``.
     command: told in the head of the file.
 
@@ -94,7 +98,7 @@ def propose_config(
         start,
         law,
         medium,
-        _by_folder(files, data),
+        grouped(files, data, groups, layout),
     )
     proposal = _with_rest(proposal, readings, source.radius[1])
     if errors:
@@ -106,16 +110,6 @@ def propose_config(
     for dataset in readings:
         build_one(config, dataset, files[dataset])
     return Proposed(text, proposal)
-
-
-def _by_folder(files: Mapping[str, DataFile], data: str | Path) -> dict[str, list[str]]:
-    """Subfolder of ``data`` → names of its data sets; none where there are not several."""
-    top, groups = (Path.cwd() / expanded(str(data))).absolute(), dict[str, list[str]]()
-    for name, file in files.items():
-        if file.path.absolute().parent.parent != top:
-            return {}
-        groups.setdefault(readable(file.path.parent.name), []).append(name)
-    return groups if len(groups) > 1 else {}
 
 
 def histories(files: Mapping[str, DataFile], source: Source) -> tuple[dict[str, Readings], list[str]]:

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from en4dvar.estimation.population.estimate import FEWEST_SETS
 from en4dvar.model.state import READING_SCALE
 from en4dvar_bubble.media import MEDIA, known_medium
+from en4dvar_bubble.starter.grouped import NO_GROUPS, Grouped
 
 ANY = "gel"
 CHOICES = (ANY, *MEDIA)
@@ -67,36 +68,32 @@ def wall(radius: float, slowness: float) -> tuple[str, str, str]:
     return distance, prior, source
 
 
-NO_GROUPS: Mapping[str, Sequence[str]] = {}
-
-
-def population(
-    names: Sequence[str], count: int, medium: str, groups: Mapping[str, Sequence[str]] = NO_GROUPS
-) -> tuple[str, ...]:
+def population(names: Sequence[str], count: int, medium: str, groups: Grouped = NO_GROUPS) -> tuple[str, ...]:
     """Lines for the section of the parameters ``names`` of one gel behind ``count`` bubbles; () of too few of them.
 
-    ``groups``: folder → names of its bubbles, where there are several, one gel each; () where all have too few.
+    ``groups``: of its bubbles, where there are several, one gel each; () where all have too few.
     """
-    if max(map(len, groups.values()), default=0) < FEWEST_SETS if groups else count < FEWEST_SETS:
+    if max(map(len, groups.of.values()), default=count) < FEWEST_SETS:
         return ()
     if not names:
         return ()
     common = ", ".join(quantity.key for quantity in known(medium))
+    kind = groups.kind if groups.kind.isidentifier() else json.dumps(groups.kind, ensure_ascii=False)
     return (
         "population: # of the gel behind its bubbles, at the end of the run",
         f"  of: [{', '.join(names)}] # these vary from bubble to bubble about one median",
         f"  # {common} have one value in all bubbles; the others are each bubble's own",
-        *["  by: folder # each folder has its own median and spread; they are compared"] * bool(groups),
+        *[f"  by: {kind} # each {groups.kind} has its own median and spread; they are compared"] * bool(groups.of),
         f"  # reference: {{{names[0]}: VALUE ± STD UNIT, source: NAME}} # a value to compare with, on the page",
-        *(["groups:", "  folder:"] if groups else []),
-        *(f"    {json.dumps(name, ensure_ascii=False)}: {_patterns(name, groups)}" for name in groups),
+        *(["groups:", f"  {kind}:"] if groups.of else []),
+        *(f"    {json.dumps(name, ensure_ascii=False)}: {_patterns(name, groups.of)}" for name in groups.of),
     )
 
 
-def _patterns(folder: str, groups: Mapping[str, Sequence[str]]) -> str:
-    """What the names of a folder's bubbles have in common where no other folder's have it, or else the names."""
-    start, others = f"{folder}_", [name for key, names in groups.items() if key != folder for name in names]
-    names = [glob.escape(name) for name in groups[folder]]
-    if not any(name.startswith(start) for name in others):
+def _patterns(group: str, groups: Mapping[str, Sequence[str]]) -> str:
+    """How the names of a group's bubbles begin, where all do and no other group's, or else the names."""
+    start = f"{group}_"
+    begins = {key: [name.startswith(start) for name in names] for key, names in groups.items()}
+    if all(begins.pop(group)) and not any(map(any, begins.values())):
         return json.dumps(f"{glob.escape(start)}*", ensure_ascii=False)
-    return json.dumps(names, ensure_ascii=False)
+    return json.dumps([glob.escape(name) for name in groups[group]], ensure_ascii=False)

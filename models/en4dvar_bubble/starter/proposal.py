@@ -18,6 +18,7 @@ from en4dvar_bubble.laws.loading import qualified
 from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.settings import BubbleSettings
 from en4dvar_bubble.starter import elsewhere
+from en4dvar_bubble.starter.grouped import NO_GROUPS, Grouped
 from en4dvar_bubble.starter.guess import Guess, first_guess
 from en4dvar_bubble.starter.look import Look, Start, look, typical
 
@@ -92,11 +93,11 @@ def propose(
     start: Start | None = None,
     law: str | None = None,
     medium: str = "gel",
-    groups: Mapping[str, Sequence[str]] = elsewhere.NO_GROUPS,
+    groups: Grouped = NO_GROUPS,
 ) -> Proposal:
     """A proposal for one or several data sets: name → times (K,) s, radius (K,) m.
 
-    ``medium``: one of those of :mod:`en4dvar_bubble.starter.elsewhere`. ``groups``: folder → names of its data sets.
+    ``medium``: one of those of :mod:`en4dvar_bubble.starter.elsewhere`. ``groups``: of its data sets.
 
     Raises
     ------
@@ -151,11 +152,11 @@ def propose(
     )
 
 
-def _ends_with(groups: Mapping[str, Sequence[str]]) -> str:
-    if not groups:
+def _ends_with(groups: Grouped) -> str:
+    if not groups.of:
         return "the run ends with what they say of one gel together"
-    told = ", ".join(f"{name} ({len(names)})" for name, names in groups.items())
-    return f"the run ends with one gel a folder, and compares them: {told}"
+    told = ", ".join(f"{name} ({len(names)})" for name, names in groups.of.items())
+    return f"the run ends with the numbers of each {groups.kind}, and compares them: {told}"
 
 
 def _bad_words(name: str, view: Look) -> str:

@@ -1,0 +1,147 @@
+"""Which gel, day or concentration each bubble is of: by its folder, or as a column of a table says."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from en4dvar.inputs.asked import ANY, DataFile, Layout
+from en4dvar.inputs.opened import opened
+from en4dvar.inputs.parts import cell, table_of
+from en4dvar.inputs.sheets import sheet_lines
+from en4dvar.inputs.text_table import cells_of, delimiter_of, numbered_lines
+from en4dvar.plumbing.errors import DataError
+from en4dvar.plumbing.files import expanded, readable
+from en4dvar.plumbing.hints import listed, shown
+from en4dvar.plumbing.units import UnitError, parse_unit
+
+FOLDER = "folder"
+_UNIT = re.compile(r"(.+?)[ _]*[\[( _] *([^\W\d_]+|%) *[\])]?")
+_NUMBER = re.compile(r"\d+([.,]\d+)?")
+
+
+@dataclass(frozen=True)
+class Grouped:
+    """``kind`` of group and, of each group, the names of its data sets; ``of`` is empty where there are no groups."""
+
+    kind: str = FOLDER
+    of: Mapping[str, Sequence[str]] = field(default_factory=dict)
+
+
+NO_GROUPS = Grouped()
+
+
+def grouped(files: Mapping[str, DataFile], data: str | Path, asked: str | None, layout: Layout) -> Grouped:
+    """Of the data sets ``files``: as ``asked`` says, a column of the data, or a table and perhaps one of its columns,
+    as ``gels.csv`` or ``gels.csv:gel``; without, by their folders.
+
+    Raises :class:`DataError`: no such table or column, no row or several groups for a data set, one group only.
+    """
+    if asked is None:
+        return _by_folder(files, data)
+    path, _, column = asked.rpartition(":")
+    if not path or not expanded(path).is_file():
+        path, column = asked, ""
+    if expanded(path).is_file():
+        kind, each = _by_table(files, expanded(path), column)
+    elif path.lower().endswith((".csv", ".txt", ".tsv", ".xlsx")):
+        raise DataError(f"{path}: no such table of groups")
+    else:
+        kind, each = asked, {name: _in_data(file, asked, layout) for name, file in files.items()}
+    title, unit = _unit_of(kind)
+    of: dict[str, list[str]] = {}
+    for name, group in each.items():
+        of.setdefault(f"{group} {unit}" if unit and _NUMBER.fullmatch(group) else group, []).append(name)
+    if len(of) < 2:
+        raise DataError(f"{asked}: all data sets are of {shown(next(iter(of)))}: nothing can be compared")
+    return Grouped(re.sub(r"[^\w.+ -]|^\W+", "", readable(title)) or "group", of)
+
+
+def _by_folder(files: Mapping[str, DataFile], data: str | Path) -> Grouped:
+    """Subfolders of ``data``; none where there are not several."""
+    top, groups = (Path.cwd() / expanded(str(data))).absolute(), dict[str, list[str]]()
+    for name, file in files.items():
+        if file.path.absolute().parent.parent != top:
+            return NO_GROUPS
+        groups.setdefault(readable(file.path.parent.name), []).append(name)
+    return Grouped(FOLDER, groups) if len(groups) > 1 else NO_GROUPS
+
+
+def _unit_of(column: str) -> tuple[str, str]:
+    """A column's name without the unit that it ends with, and this: of ``G [kPa]`` or ``conc_%``."""
+    if (match := _UNIT.fullmatch(column)) is None:
+        return column, ""
+    try:
+        parse_unit(match[2])
+    except UnitError:
+        return column, ""
+    return match[1], match[2]
+
+
+def _by_table(files: Mapping[str, DataFile], path: Path, column: str) -> tuple[str, dict[str, str]]:
+    """The column of groups, and data set → group."""
+    if path.absolute() in [file.path.absolute() for file in files.values()]:
+        raise DataError(f"{path}: lies among the data files, and would be read as one; move it out of their folder")
+    names, *rows = _lines(path)
+    rows_in = [{name: _rows_of(name, file, rows, i) for name, file in files.items()} for i in range(len(names))]
+    of_files = max(range(len(rows_in)), key=lambda i: sum(map(bool, rows_in[i].values())))
+    if lacking := [name for name, its in rows_in[of_files].items() if not its]:
+        raise DataError(
+            f"{path}: no row for {listed(lacking, 5)}; a row needs, in one and the same column, the name of the data "
+            f"file, as {files[lacking[0]].path.name}, and in another its group"
+        )
+    others = [name for i, name in enumerate(names) if i != of_files and name]
+    if column not in others and (column or len(others) != 1):
+        said = f"no column {column!r} of groups" if column else f"{len(others)} columns could be the groups"
+        raise DataError(f"{path}: {said}; say {' or '.join(f'{path}:{name}' for name in others[:5]) or 'one more'}")
+    at = names.index(column or others[0])
+    each = {name: _only({cell(row, at) for row in its}, f"{path}: {name}") for name, its in rows_in[of_files].items()}
+    return names[at], each
+
+
+def _lines(path: Path) -> list[list[str]]:
+    """Cells of a table whose first line names the columns. Raises :class:`DataError`."""
+    with opened(path, ANY) as kind:
+        if kind == "mat":
+            raise DataError(f"{path}: groups are read from a table (CSV, Excel)")
+        lines = sheet_lines(path, "") if kind == "xlsx" else numbered_lines(path)
+    if not lines:
+        raise DataError(f"{path}: the file holds no data")
+    first = lines[0][1]
+    delimiter = delimiter_of(first) if isinstance(first, str) else ""
+    return [cells_of(line, delimiter) if isinstance(line, str) else list(line) for _, line in lines]
+
+
+def _rows_of(name: str, file: DataFile, rows: Sequence[Sequence[str]], at: int) -> list[Sequence[str]]:
+    known = {*_words(name, file)}
+    return [row for row in rows if cell(row, at).replace("\\", "/") in known]
+
+
+def _words(name: str, file: DataFile) -> Iterator[str]:
+    """By which a table can name a data set."""
+    yield name
+    if file.part:
+        yield file.part
+    else:
+        yield from (file.path.name, file.path.stem, f"{file.path.parent.name}/{file.path.name}")
+
+
+def _in_data(file: DataFile, column: str, layout: Layout) -> str:
+    """What the column of its own table says of a data set."""
+    wanted = [column] if layout.by is None else [column, layout.by]
+    with opened(file.path, layout) as kind:
+        if kind == "mat":
+            raise DataError(f"{file.path}: the groups of elements of a .mat file are given in a table, as gels.csv")
+        table = table_of(file.path, kind, layout, wanted)
+    at, by = table.position(column), table.position(wanted[-1])
+    of_it = {cell(row, at) for _, row in table.rows if layout.by is None or cell(row, by) == file.part}
+    return _only(of_it, f"{file.path}: {file.part}" if file.part else str(file.path))
+
+
+def _only(groups: set[str], where: str) -> str:
+    if len(groups) == 1 and (group := next(iter(groups))):
+        return readable(group)
+    told = listed(sorted(groups - {""})) or "empty"
+    raise DataError(f"{where}: one group is needed for a data set, not {told}")
