@@ -29,20 +29,21 @@ def bounded_members(space: WeightSpace, linear: Linearisation, w: Array, posteri
     others = np.resize(~bounds, len(d))
     d, S = d[others], S[others]
     n_members, r = len(posterior), basis.shape[1]
-    root = np.linalg.cholesky((n_members - 1) * np.eye(r) + S.T @ S)
-    middle = np.linalg.solve(root @ root.T, S.T @ d - (n_members - 1) * basis.T @ w)
+    prior = np.sqrt(n_members - 1)
+    orthogonal, root = np.linalg.qr(np.vstack([S, prior * np.eye(r)]))
+    middle = np.linalg.solve(root, orthogonal.T @ np.concatenate([d, -prior * basis.T @ w]))
     weights = np.where(bounds, observations.weights, 0.0)
 
     def cost(z: Array) -> Array:
         """J_o (N,) of the bounds alone, at points z (N, r) that are N(0, I) but for the bounds."""
-        predicted = linear.prediction.values + (middle + np.linalg.solve(root.T, z.T).T) @ linear.anomalies
+        predicted = linear.prediction.values + (middle + np.linalg.solve(root, z.T).T) @ linear.anomalies
         return observations.noise.cost(observations.values, weights, Predicted(predicted))
 
     stream = member_stream(seed, "bounds")
-    z = np.tile(root.T @ -middle, (n_members, 1))  # at the mode
+    z = np.tile(root @ -middle, (n_members, 1))  # at the mode
     for _ in range(SWEEPS):
         z = _moved(z, cost, stream)
-    return space.control(w + (middle + np.linalg.solve(root.T, z.T).T) @ basis.T)
+    return space.control(w + (middle + np.linalg.solve(root, z.T).T) @ basis.T)
 
 
 def _moved(z: Array, cost: Callable[[Array], Array], stream: np.random.Generator) -> Array:
