@@ -202,9 +202,12 @@ class Stages:
         """The ensemble, sampled where that is asked for or there is a doubt.
 
         ``agree``: descents from different members ended in the lowest of the ``minima`` that count. ``earlier``: where
-        a chain was interrupted. ``looking``: end at a draw that lies lower than all minima.
+        a chain was interrupted. ``looking``: end at a draw that lies lower than all minima. Where members lack readings
+        nothing is sampled: draws without one would count as impossible.
         """
         space = self.space
+        if ends.run.filled:
+            return Sampled(ends, None, {})
         if self.settings.refine != "mcmc":
             cheap = samples(space)
             # with a discrepancy emulated J costs as much as true J: where that may be sampled, it tells
