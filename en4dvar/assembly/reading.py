@@ -103,13 +103,14 @@ def _doubts(data: Data, read: Readings) -> tuple[Caution, ...]:
 
 
 def _errors(data: Data) -> dict[str, Column]:
-    """The columns that hold errors of readings or times."""
+    """The columns that hold errors of readings or times, or say which readings are bounds."""
     time = data.columns.time
     clock = time if isinstance(time, Column) else time.column
     columns = {
         "std": data.error.column("std", data.columns.observable.unit),
         "time_std": data.error.column("time_std", clock.unit if clock else ""),
     }
+    columns |= {key: marked for key, marked in data.error.bounds.items() if isinstance(marked, Column)}
     return {key: column for key, column in columns.items() if column}
 
 
@@ -155,7 +156,8 @@ def errors_of(
 ) -> Noise:
     """The observation errors at ``times`` (K,); ``samples`` (K,) are the places of the observations in the series.
 
-    ``values`` are those in the window. ``stated``: ``std`` and ``time_std`` (K,) where columns of the file hold them.
+    ``values`` are those in the window. ``stated``: ``std``, ``time_std``, ``at_most`` and ``at_least`` (K,) where
+    columns of the file hold them.
 
     A covariance file holds one row an observation of the window, or one a usable sample of the whole series.
     """
@@ -185,4 +187,8 @@ def errors_of(
         std = np.hypot(std, error.model_std.absolute(float(values.max())))
     if error.correlation_time is not None:
         correlation = np.exp(-np.abs(np.subtract.outer(times, times)) / error.correlation_time)
-    return noise_of(std, time_std, correlation, error.huber, kernel)
+    upper, lower = (np.asarray(stated.get(key, on), dtype=bool) for key, on in error.bounds.items())
+    if np.any(upper & lower):
+        raise DataError("a reading is both at_most and at_least; give two readings, one of each")
+    sides = np.broadcast_to(upper.astype(float) - lower, times.shape)
+    return noise_of(std, time_std, correlation, error.huber, kernel, sides)

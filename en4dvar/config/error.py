@@ -83,6 +83,18 @@ def read_time_std(text: Any, context: Context) -> float | Column:
     return value
 
 
+class MarkColumn(Section):
+    """A column of 1 where a reading is a bound and 0 where it is none."""
+
+    column: Annotated[str, Field(min_length=1)]
+    """Header of the column (CSV) or name of the field (.mat)."""
+
+
+def _marks(written: bool | MarkColumn, context: Context) -> bool | Column:
+    return written if isinstance(written, bool) else Column(written.column, "1", "1", kind="mark")
+
+
+MARKS = Made(_marks, bool | MarkColumn)
 QUANTITY_OR_COLUMN = {"anyOf": [TEXT, ErrorColumn.model_json_schema()]}
 
 
@@ -159,6 +171,10 @@ def estimated(written: Any) -> Any:
 HUBER = 1.345  # 95 % efficiency where the errors are Gaussian after all: Huber (1981), Robust Statistics
 
 
+BOUNDS = ("at_most", "at_least")
+BESIDE = ("covariance", "correlation_time", "robust", "discrepancy", "time_std")
+
+
 def _square(context: Context) -> str:
     unit = observable_unit(context)
     return "1" if unit == "1" else f"({unit})*({unit})"
@@ -197,6 +213,10 @@ class Error(Section):
     """Robust cost: readings far off count less."""
     threshold: Annotated[float, quantity(lambda c: "1", "positive")] = HUBER
     """Threshold of the robust cost in std."""
+    at_most: Annotated[bool | Column, MARKS] = False
+    """The readings are upper bounds: true, or ``{column: NAME}`` of 1 (bound) and 0; beyond one the std counts."""
+    at_least: Annotated[bool | Column, MARKS] = False
+    """The same of lower bounds."""
     discrepancy: Annotated[
         DiscrepancySection | None,
         BeforeValidator(estimated, json_schema_input_type=Literal["estimated"] | DiscrepancySection | None),
@@ -212,6 +232,7 @@ class Error(Section):
             ("covariance", "correlation_time", "the file holds the correlations"),
             ("robust", "correlation_time", "a robust cost needs independent observation errors"),
             ("robust", "covariance", "a robust cost needs independent observation errors"),
+            *((bound, other, "bounds need independent errors of known std") for bound in BOUNDS for other in BESIDE),
         ):
             if name in keys and other in keys:
                 faults.add((name,), f"not together with {other}: {reason}", at_key=True)
@@ -226,9 +247,14 @@ class Error(Section):
         return replace(chosen, unit=chosen.unit or readings) if isinstance(chosen, Column) else None
 
     @property
+    def bounds(self) -> dict[str, bool | Column]:
+        """Which readings are upper and lower bounds."""
+        return {BOUNDS[0]: self.at_most, BOUNDS[1]: self.at_least}
+
+    @property
     def separate(self) -> bool:
-        """True if the errors of one reading say nothing of those of another."""
-        return self.covariance is None and self.correlation_time is None
+        """True if the errors of one reading say nothing of those of another, and none is a bound."""
+        return self.covariance is None and self.correlation_time is None and not any(self.bounds.values())
 
     @property
     def huber(self) -> float | None:

@@ -15,7 +15,7 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.data.noise import Linearisation, Noise, Predicted, joint_noise
+from en4dvar.data.noise import Linearisation, Noise, Predicted, joint_noise, sides_of
 from en4dvar.data.series import Part, Series
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution
@@ -176,8 +176,8 @@ class Observations:
 
     @cached_property
     def used(self) -> npt.NDArray[np.intp]:
-        """Which have a weight β > 0."""
-        return np.flatnonzero(self.weights > 0)
+        """Which have a weight β > 0 and are no bound: those whose residuals are random numbers of a known variance."""
+        return np.flatnonzero((self.weights > 0) & (sides_of(self.noise) == 0))
 
     def cost(self, predicted: Predicted) -> Array:
         """J_o (…,) of predictions (…, K); +inf where one is not finite."""
@@ -204,12 +204,14 @@ class Observations:
         return self.noise.precision_times(self.values, self.weights, at, vectors)
 
     def chi2_per_observation(self, predicted: Predicted) -> Array:
-        """(y − m)ᵀR⁻¹(y − m) per observation with β > 0 (…,), for predictions (…, K); NaN where there is none.
+        """(y − m)ᵀR⁻¹(y − m) per observation of :attr:`used` (…,), for predictions (…, K); NaN where there is none.
 
-        With a robust cost each square is v ρ'(v), whose expectation under the density of ρ is 1 as well.
+        With a robust cost each square is v ρ'(v), whose expectation under the density of ρ is 1 as well. A bound adds
+        its square where it does not hold, and is no observation otherwise; of bounds alone it is the sum.
         """
-        squares = self.noise.squares(self.values, predicted).take(self.used, axis=-1)
-        return np.asarray(np.add.reduce(squares, axis=-1) / (len(self.used) or np.nan))
+        counted = np.flatnonzero(self.weights > 0)
+        squares = self.noise.squares(self.values, predicted).take(counted, axis=-1)
+        return np.asarray(np.add.reduce(squares, axis=-1) / (len(self.used) or (1.0 if len(counted) else np.nan)))
 
     def __len__(self) -> int:
         return len(self.times)

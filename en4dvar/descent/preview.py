@@ -98,7 +98,7 @@ def expected_runs(space: WeightSpace) -> int:
 
     A scheme that runs its whole ensemble does so once for each assimilation and once at the end, with the mean. A
     search takes prior and posterior forecast, and for each iteration a tangent (of n runs, or N) and the trials of the
-    step control, ``starts`` descents side by side, and a part of one more from a far member.
+    step control, ``starts`` descents side by side, one for each shorter window, and a part of one from a far member.
     """
     n_members, scheme = len(space.members), space.scheme.minimiser
     if scheme is None:
@@ -107,5 +107,5 @@ def expected_runs(space: WeightSpace) -> int:
     tangent = 1 + (space.basis.shape[1] if economical else n_members)
     starts = scheme.starts if scheme.start == "best-member" and economical else 1
     challenger = CHALLENGER if scheme.searches and economical else 0.0
-    iterations = (starts + challenger) * min(ITERATIONS, scheme.max_iterations)
+    iterations = (starts + challenger + scheme.lengthen - 1) * min(ITERATIONS, scheme.max_iterations)
     return 2 * (n_members + 1) + round(iterations * (tangent + SEARCH))

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from en4dvar.descent.lengthen import lengthened
 from en4dvar.descent.loop import minimise
 from en4dvar.descent.minima import REACHED, Minimum, merged
 from en4dvar.descent.step_control import Move, Search
@@ -69,6 +70,15 @@ def choose_start(
     ``resume``: where the comparison was interrupted. ``keep`` is called before each round of moves with the state to
     resume from, ``tell`` after it.
     """
+    if scheme.lengthen > 1:
+
+        def of_first(short: WeightSpace) -> Descent:
+            assert short.scheme.minimiser is not None
+            return choose_start(short, short.scheme.minimiser, run, seed, None, lambda state: None, tell).descent
+
+        beyond = len(space.members) + 1
+        led = lengthened(space, scheme, of_first, tell)
+        return Start(Descent(space.start(led), members=(beyond,)), tried=(beyond,))
     warnings: tuple[Caution, ...] = ()
     begin = scheme.start
     if not isinstance(begin, str):

@@ -69,6 +69,7 @@ class WeightSpace:
 
     def __init__(self, problem: InverseProblem, settings: AssimilationSettings, seed: int, executor: Executor):
         self.problem, self.settings, self.scheme, self.executor = problem, settings, settings.own, executor
+        self.seed = seed
         self.composite = Composite(problem, executor)
         self.drawn = drawn = prior_ensemble(problem.prior, settings.members, seed, settings.sampling)
         self.members, self.mean, self.anomalies = drawn.members, drawn.mean, drawn.anomalies

@@ -55,8 +55,8 @@ class Residuals:
         ``white`` (K',) and ``sensitivity`` (K'', r) are those of the observations and, below, of what moves R.
         """
         k = len(speed)
-        hessian = prior_precision * np.eye(sensitivity.shape[1]) + sensitivity.T @ sensitivity
-        absorbed = np.linalg.solve(np.linalg.cholesky(hessian), sensitivity[:k].T).T
+        prior = math.sqrt(prior_precision) * np.eye(sensitivity.shape[1])
+        absorbed = np.linalg.qr(np.vstack([sensitivity, prior]))[0][:k]  # S R⁻¹ with RᵀR = A, which is not formed
         labels = np.zeros(k, dtype=np.intp) if series is None else series
         return cls(white[:k][which], absorbed[which], speed[which], which, labels[which])
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from en4dvar.data.noise import Predicted
+from en4dvar.data.noise import Predicted, sides_of
 from en4dvar.ensemble.members import EVERYONE, NOT_FINITE, Indices, InitialStates, Reading, out_of_bounds
 from en4dvar.ensemble.readout import Readout, batched, operators_of
 from en4dvar.ensemble.spread_rates import spread_rates
@@ -232,6 +232,8 @@ def check_problem(problem: InverseProblem) -> tuple[Parameter, ...]:
         if uncertain and problem.observations.parts:
             where = f"parameters.{parameter.name}"
             raise ConfigError("cannot be one number for several series or for readings at places", where)
+    if problem.has_noise_scale and np.any(sides_of(problem.observations.noise)):
+        raise ConfigError("bounds (at_most, at_least) tell no scale of errors; leave sigma out", "parameters.sigma")
     _operators(problem)
     return tuple(known[name] for name in problem.fixed)
 

@@ -103,11 +103,13 @@ class Hessian:
     """A = (N−1) I + SᵀS through one decomposition of the whitened anomalies S (K', N): every analysis starts here.
 
     ``rows`` (m, N), m ≤ N, are orthogonal, of lengths ``singular_values`` (m,), and SᵀS = rowsᵀ rows. Nothing below
-    divides by a singular value, so those that vanish do no harm.
+    divides by a singular value, so those that vanish do no harm. ``axes`` (m, N), where they are at hand, are the rows
+    without their lengths: with them :meth:`solve` is exact to rounding however much the observations inform.
     """
 
     singular_values: Array
     rows: Array
+    axes: Array | None = None
 
     @classmethod
     def of(cls, s: Array, basis: Array | None = None) -> Hessian:
@@ -133,9 +135,12 @@ class Hessian:
     @classmethod
     def of_each(cls, s: Array, basis: Array) -> list[Hessian]:
         """:meth:`of` every matrix of ``s`` (B, K', r) with the same ``basis``, in fewer calls."""
+        lacking = basis.shape[1] - s.shape[1]
+        if lacking > 0:  # further rows of zeros, so that every direction of the basis has an axis
+            s = np.pad(s, ((0, 0), (0, lacking), (0, 0)))
         _, sigma, right = np.linalg.svd(s, full_matrices=False)
-        rows = sigma[:, :, None] * (right @ basis.T)
-        return [cls(values, of_one) for values, of_one in zip(sigma, rows, strict=True)]
+        axes = right @ basis.T
+        return [cls(values, values[:, None] * own, own) for values, own in zip(sigma, axes, strict=True)]
 
     @property
     def prior_precision(self) -> float:
@@ -145,6 +150,11 @@ class Hessian:
     def solve(self, g: Array, damping: float = 0.0) -> Array:
         """(A + damping (N−1) I)⁻¹ g for g (N,), or for every row of g (M, N)."""
         base = self.prior_precision * (1 + damping)
+        if self.axes is not None:
+            along, rest = g @ self.axes.T, g
+            for _ in range(2):  # what rounding leaves of g along the axes would be divided by the prior's precision
+                rest = rest - (rest @ self.axes.T) @ self.axes
+            return np.asarray((along / (base + self.singular_values**2)) @ self.axes + rest / base)
         informed = (g @ self.rows.T) / (base + self.singular_values**2)
         return np.asarray((g - informed @ self.rows) / base)
 

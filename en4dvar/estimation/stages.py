@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from en4dvar.descent.bounded import bounded_members
 from en4dvar.descent.loop import minimise
 from en4dvar.descent.marginal import marginal_members
 from en4dvar.descent.minima import Minimum, merged
@@ -66,11 +67,11 @@ class Stages:
         self.problem, self.settings, self.seed = problem, settings, seed
         self.progress, self._keep = progress, keep
         self.scheme, self.minimiser = settings.own, settings.own.minimiser
-        robust = np.isfinite(problem.observations.noise.counts_within)
         estimated = any(p.name in problem.prior.names for p in problem.discrepancy)
-        if self.minimiser is None and (problem.has_noise_scale or robust or estimated):
+        plain = problem.observations.noise.quadratic and not problem.has_noise_scale
+        if self.minimiser is None and (estimated or not plain):
             raise ConfigError(
-                f"{settings.scheme} takes Gaussian errors of known covariance: neither sigma nor a robust cost nor a "
+                f"{settings.scheme} takes Gaussian errors of known covariance: no sigma, robust cost, bounds or "
                 f"discrepancy; use {' or '.join(MINIMISERS)}"
             )
         self.space = WeightSpace(problem, settings, seed, executor)
@@ -190,6 +191,8 @@ class Stages:
             return Ends(members, mode, descent.iterate.members, descent.iterate.central)
         if problem.discrepancy and descent.iterate.linear is not None:
             members = marginal_members(space, descent.iterate.linear, mode, members, self.seed)
+        if descent.iterate.linear is not None:
+            members = bounded_members(space, descent.iterate.linear, descent.weights.w, members, self.seed)
         final = space.whole(np.vstack([members, mode]), self.grid)
         return Ends(members, mode, final[:-1], final[-1:])
 
@@ -199,9 +202,12 @@ class Stages:
         """The ensemble, sampled where that is asked for or there is a doubt.
 
         ``agree``: descents from different members ended in the lowest of the ``minima`` that count. ``earlier``: where
-        a chain was interrupted. ``looking``: end at a draw that lies lower than all minima.
+        a chain was interrupted. ``looking``: end at a draw that lies lower than all minima. Where members lack readings
+        nothing is sampled: draws without one would count as impossible.
         """
         space = self.space
+        if ends.run.filled:
+            return Sampled(ends, None, {})
         if self.settings.refine != "mcmc":
             cheap = samples(space)
             # with a discrepancy emulated J costs as much as true J: where that may be sampled, it tells

@@ -28,7 +28,7 @@ class Column:
     unit: str
     target: str
     positive: bool = False
-    kind: Literal["std", "weight", "place"] = "std"
+    kind: Literal["std", "weight", "place", "mark"] = "std"
     rate: float | None = None
 
 

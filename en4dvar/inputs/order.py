@@ -48,7 +48,7 @@ def _disorder(before: int, after: int, first: int, written: Written) -> str:
         hint = "; keep one of the two readings, or their mean (data.repeated: average)"
     elif times[after] <= times[first]:
         hint = (
-            f"; if another bubble begins here, give it a file of its own or say whose each row is (data.by); or {sort}"
+            f"; if another series begins here, give it a file of its own or say whose each row is (data.by); or {sort}"
         )
     unit = "" if "*" in written.unit else f" {written.unit}"
     return f"{where}: times must increase, but {times[after]:g}{unit} follows {times[before]:g}{unit}{hint}"

@@ -96,11 +96,16 @@ def _stds(written: Array, column: Column, kept: npt.NDArray[np.intp], count: int
     if len(written) != count:
         raise DataError(f"{path}: {len(written)} values of {column.name!r} but {count} readings")
     stds = np.asarray(convert(written[kept], column.unit, column.target))
-    fits = {"std": stds > 0, "weight": stds >= 0, "place": np.isfinite(stds)}[column.kind]
+    fits, wrong_sign = {
+        "std": (stds > 0, "not positive"),
+        "weight": (stds >= 0, "negative"),
+        "place": (np.isfinite(stds), "not finite"),
+        "mark": (np.isin(stds, (0, 1)), "neither 0 nor 1"),
+    }[column.kind]
     wrong = np.flatnonzero(~(np.isfinite(stds) & fits))
     if len(wrong):
         said = written[kept[wrong[0]]]
-        sign = {"std": "not positive", "weight": "negative"}[column.kind] if np.isfinite(said) else "not finite"
+        sign = wrong_sign if np.isfinite(said) else "not finite"
         what = "is blank" if np.isnan(said) else f"is {said:g}, {sign}"
         noun = {"std": "error"}.get(column.kind, column.kind)
         raise DataError(f"{path}: the {noun} of reading {kept[wrong[0]] + 1} in column {column.name!r} {what}")

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy.sparse import csr_array
 
-from en4dvar.data.noise import noise_of_readings, noise_of_record
+from en4dvar.data.noise import SIDES, noise_of_readings, noise_of_record
 from en4dvar.data.observations import Observations
 from en4dvar.data.series import Part, Places
 from en4dvar.model.forward import Observable, Trajectory
@@ -38,7 +38,8 @@ def observations_of(
         matrix = _correlation(data, len(times)) if "correlation" in data else None
         within = [float(attributes.get(f"{p.name}_huber_threshold", math.inf)) for p in parts]
         thresholds = np.repeat(within, [p.end - p.begin for p in parts])
-        noise = noise_of_readings(each("_reading_std"), own("time_std"), matrix, thresholds)
+        sides = data[SIDES].values if SIDES in data else None
+        noise = noise_of_readings(each("_reading_std"), own("time_std"), matrix, thresholds, sides)
     else:
         held = {key.removeprefix(f"{axes[0].name}_"): value.values for key, value in data.variables.items()}
         noise = noise_of_record(times, each("_reading_std"), own("time_std"), held, attributes)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from en4dvar.data.noise import SIDES
 from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.model.state import Array
 from en4dvar.results.axes import axes_of
@@ -33,10 +34,11 @@ def _walks(a: Analysis) -> Iterator[Item]:
 
 def _matrices(a: Analysis) -> Iterator[Item]:
     several = bool(a.observations.parts)
-    square = "reading reading_column" if several else "time time_column"
+    own = "reading" if several else "time"
     for key, (matrix, words) in a.observations.noise.matrices().items():
         name = key if several else f"{a.problem.observable.name}_{key}"
-        yield Item(matrix, {"matrix": name, "pairs": square if matrix.ndim == 2 else "correlated_pair"}, words)
+        dims = f"{own} {own}_column" if matrix.ndim == 2 else own if key == SIDES else "correlated_pair"
+        yield Item(matrix, {"matrix": name, "pairs": dims}, words)
 
 
 def _fixed(a: Analysis) -> Iterator[Item]:

@@ -254,6 +254,9 @@ class Minimiser(Scheme):
     starts: Annotated[
         int, Ge(1), "How many prior members of lowest J start a descent; others follow while none explains the data."
     ] = 2
+    lengthen: Annotated[
+        int, Ge(1), "Windows, each longer than the one before, through which the start is led; for chaotic models."
+    ] = 1
     max_iterations: Annotated[int, Ge(1), "Iteration limit."] = 30
     step_tolerance: Annotated[
         float, Gt(0), "Converged where the step is shorter than this, in posterior standard deviations, √(δwᵀAδw)."
@@ -268,8 +271,9 @@ class Minimiser(Scheme):
 
     @property
     def searches(self) -> bool:
-        """Whether descents from several places are compared: not where there is one, or the start is given."""
-        return self.starts > 1 and isinstance(self.start, str)
+        """Whether descents from several places are compared: not where there is one, or the start is given or led
+        through shorter windows."""
+        return self.starts > 1 and isinstance(self.start, str) and self.lengthen == 1
 
     @property
     def regresses(self) -> bool:

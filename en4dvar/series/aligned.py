@@ -42,8 +42,8 @@ def aligned(observations: Observations, parts: Sequence[Part]) -> tuple[tuple[Ob
         a field read twice at one place and instant.
     """
     noise, where = observations.noise, observations.source or observations.name
-    if np.any(noise.time_std > 0) or noise.attributes() or np.isfinite(noise.counts_within):
-        raise DataError(f"{where}: a series takes plain Gaussian errors: no time_std, robust or discrepancy")
+    if np.any(noise.time_std > 0) or noise.attributes() or not noise.quadratic:
+        raise DataError(f"{where}: a series takes plain Gaussian errors: no time_std, robust, bounds or discrepancy")
     times, row = observations.instants
     row = np.arange(len(times)) if isinstance(row, slice) else row
     columns = np.empty(len(observations), dtype=np.intp)

@@ -66,6 +66,18 @@ def test_a_third_of_the_readings_missing_leaves_the_posterior(linearisation, ste
     assert float(found.words.split(" %")[0]) == pytest.approx(30, abs=8)
 
 
+@pytest.mark.parametrize("refine", ["auto", "mcmc"])
+def test_no_chain_is_run_to_which_a_draw_without_a_reading_is_impossible(refine):
+    """It would end where few readings are missing, and nowhere else."""
+    _, problem = patchy(Linear(NAMES), TRUTH)
+    analysis = assimilate(problem, settings(refine=refine), 1)
+    mean, cov = posterior(problem)
+    assert not analysis.refinement
+    assert np.max(np.abs(analysis.posterior.mean(axis=0) - mean) / np.sqrt(np.diag(cov))) < 1e-3
+    (found,) = [c for c in analysis.cautions if c.code == "readings-missing"]
+    assert (found.severity == "serious") == (refine == "mcmc") == ("refine: mcmc" in found.words)
+
+
 @pytest.mark.parametrize("scheme", [name for name in ON_A_WINDOW if name != "particle-filter"])
 def test_every_scheme_of_a_window_gives_what_it_gives_without_gaps(scheme):
     whole, problem = patchy(Linear(NAMES), TRUTH)

@@ -25,7 +25,9 @@ if what == "once":  # fails until its file is there
 if what == "nothing":
     sys.exit()
 if what == "garbage":
-    values[2] = "n/a"
+    values = ["n/a" for _ in values]
+if what == "gaps" and int(1e7 * given["a"]) % 4 == 0:
+    values[4] = "n/a"
 if what == "short":
     values = values[1:]
 rows = "".join(

@@ -70,6 +70,22 @@ def test_a_control_file_says_what_to_estimate_from_what(control):
     )
 
 
+def test_groups_of_inequalities_are_bounds(control):
+    """h1 = a + b + 2 is 3.5, h2 = 2 a + b + 2 at most 4.2, far below 4.5; h3 = 3 a + b + 2 at least 4.4."""
+    text = control.read_text().replace("h2 4.5 10.0 og", "h2 4.2 10.0 less_h").replace("h3 5.5 5.0 og", "h3 4.4 50 >@h")
+    control.write_text(text.replace("h1 3.5 10.0", "h1 3.5 100.0").replace("h2 4.2 10.0", "h2 4.2 100.0"))
+    found = from_pest(control, ["line.py"])
+    np.testing.assert_array_equal(found["error"]["at_most"], [0, 1, 0])
+    np.testing.assert_array_equal(found["error"]["at_least"], [0, 0, 1])
+    np.testing.assert_allclose(found["error"]["observations_std"], [0.01, 0.01, 0.02])
+    result = en4dvar.estimate(**found, progress=False, assimilation={"members": 48})
+    h1, h2, h3 = result.dataset("posterior_predictive")["observations"].values.reshape(-1, 3).T
+    assert np.abs(h1 - 3.5).mean() < 0.02
+    assert h2.max() < 4.25
+    assert h3.min() > 4.3
+    assert h2.std() > 0.03  # a in 0.45 to 0.7
+
+
 RICH = """pcf
 * control data
 restart estimation   # a comment
@@ -188,7 +204,6 @@ def test_one_observation_is_enough_and_bounds_hold(rich):
         ("++par", "++parcov(prior.cov) par", "option parcov: give correlations as prior_correlation"),
         ("++par", "++ies_par_en(prior.jcb) par", "option ies_par_en: a prior ensemble is that of prior="),
         ("++par", "++obscov(noise.cov) par", "option obscov"),
-        ("4.5 4.0 og", "4.5 4.0 less_than", "group less_than holds inequalities"),
         (
             "* observation data",
             "* observation groups\nog og.cov\n* observation data",
@@ -251,7 +266,9 @@ def test_public_control_files_are_read_or_refused_by_name():
         lines = text.split("* observation data")[1].split("* model command line")[0].splitlines()
         counted = [words for line in lines if (words := line.split()) and float(words[2]) > 0]
         assert found["model"]["outputs"]["observations"]["observations"] == [words[0] for words in counted]
-        np.testing.assert_allclose(1 / found["error"], [float(words[2]) for words in counted])
+        error = found["error"]
+        std = error["observations_std"] if isinstance(error, dict) else error
+        np.testing.assert_allclose(1 / std, [float(words[2]) for words in counted])
     assert read >= 8  # most of the others name templates that are not there
 
 

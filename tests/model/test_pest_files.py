@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import re
 
+import numpy as np
 import pytest
 
 from en4dvar.model.programs import pest
@@ -123,6 +125,11 @@ def test_what_cannot_be_read_is_told_with_its_line(instructions, words):
     with pytest.raises(ProgramError) as caught:
         pest.read(instructions, OUTPUT, "out")
     assert str(caught.value) == words
+
+
+def test_what_is_no_number_is_lost_alone():
+    found = pest.read("pif @\nl1 !a! !b!\nl1 !c! [d]8:10\n", "1.5 ****\nNaN 2.5\n", "out")
+    np.testing.assert_array_equal([found[name] for name in "abcd"], [1.5, math.nan, math.nan, math.nan])
 
 
 def test_a_program_with_files_of_pest(tmp_path):

@@ -127,6 +127,24 @@ def test_a_program_that_goes_wrong_is_a_lost_member_with_its_reason(folder):
     assert "not JSON" in failure(folder, outputs={"y": {"key": "run"}})
 
 
+@pytest.mark.parametrize("way", OUTPUTS)
+def test_a_value_that_is_missing_is_lost_alone(way, folder):
+    model = model_of(folder, "gaps", outputs={"y": OUTPUTS[way]})
+    (path,) = model.trajectories(np.array([[1.0, 0.5]]), TIMES)
+    expected = np.where(np.arange(12) == 4, np.nan, curve({"a": 1.0, "b": 0.5}, TIMES.tolist()))
+    np.testing.assert_array_equal(path["y"], expected)
+
+
+@pytest.mark.slow
+def test_members_that_lack_a_value_leave_a_linear_posterior_as_it_is(folder, monkeypatch):
+    """Some quarter of them, at random; the reading is regressed on the others."""
+    monkeypatch.chdir(folder)
+    whole, gaps = (fit(section(what), directory=what, report=False) for what in ("well", "gaps"))
+    for name in "ab":
+        np.testing.assert_allclose(gaps.posterior[name], whole.posterior[name], atol=1e-6)
+    assert "readings-missing" in [w.code for w in gaps.cautions]
+
+
 def test_a_program_past_its_time_is_ended_with_its_children(folder):
     began = time.monotonic()
     assert failure(folder, "hangs", time_limit="0.5 s") == "ProgramError: not done after 0.5 s"

@@ -209,7 +209,7 @@ def test_amplitude_and_length_must_be_given():
     plain = make_problem(Linear(("a",)), [1.0])
     with pytest.raises(ConfigError, match="not a parameter of the model"):
         assimilate(replace(plain, prior=problem.prior), AssimilationSettings(members=12), 1)
-    with pytest.raises(ConfigError, match="nor a discrepancy"):
+    with pytest.raises(ConfigError, match="no sigma, robust cost, bounds or discrepancy"):
         assimilate(problem, AssimilationSettings(scheme="es-mda"), 1)
 
 

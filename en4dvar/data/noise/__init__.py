@@ -27,6 +27,7 @@ A discrepancy of the model (:mod:`en4dvar.data.noise.discrepancy`) adds a Gaussi
 """
 
 from en4dvar.data.noise.blocks import BlockNoise
+from en4dvar.data.noise.bound import SIDES, BoundNoise, sides_of
 from en4dvar.data.noise.correlated import CorrelatedNoise, Correlation
 from en4dvar.data.noise.discrepancy import DiscrepancyNoise
 from en4dvar.data.noise.gaussian import Noise, ScaleSkewness
@@ -37,8 +38,10 @@ from en4dvar.data.noise.predicted import Linearisation, Predicted
 from en4dvar.data.noise.robust_discrepancy import RobustDiscrepancyNoise
 
 __all__ = [
+    "SIDES",
     "SMOOTHNESS",
     "BlockNoise",
+    "BoundNoise",
     "CorrelatedNoise",
     "Correlation",
     "DiscrepancyNoise",
@@ -53,4 +56,5 @@ __all__ = [
     "noise_of",
     "noise_of_readings",
     "noise_of_record",
+    "sides_of",
 ]

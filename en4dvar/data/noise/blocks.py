@@ -1,9 +1,9 @@
 r"""Errors of several series side by side: blocks of readings, each with its own kind of errors, and independent.
 
 R is block diagonal once the readings are ordered by block: readings whose errors are correlated, directly or through
-others, are one block of :class:`CorrelatedNoise`, those that share the threshold of a robust cost one of
-:class:`HuberNoise`, the rest one of :class:`Noise`. So cost, score and information are sums over blocks, and what each
-reading contributes stands at its place.
+others, are one block of :class:`CorrelatedNoise`, those that are bounds one of :class:`BoundNoise`, those that share
+the threshold of a robust cost one of :class:`HuberNoise`, the rest one of :class:`Noise`. So cost, score and
+information are sums over blocks, and what each reading contributes stands at its place.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csr_array
 
+from en4dvar.data.noise.bound import BoundNoise, record_of
 from en4dvar.data.noise.correlated import CorrelatedNoise, Correlation
 from en4dvar.data.noise.gaussian import Noise, ScaleSkewness
 from en4dvar.data.noise.huber import HuberNoise
@@ -37,11 +38,13 @@ class Block:
 @dataclass(frozen=True)
 class BlockNoise(Noise):
     """``correlation`` (K, K) of the readings, None where no two are correlated; ``thresholds`` (K,) of the robust cost,
-    inf where the errors are Gaussian.
+    inf where the errors are Gaussian; ``sides`` (K,) of :class:`BoundNoise`, 0 of readings that are no bound, None
+    where none is.
     """
 
     correlation: csr_array | None
     thresholds: Array
+    sides: Array | None = None
 
     def check(self, weights: Array) -> None:
         super().check(weights)
@@ -49,8 +52,15 @@ class BlockNoise(Noise):
             raise ValueError(f"thresholds of the robust cost have shape {self.thresholds.shape}, not {weights.shape}")
         for block in self.blocks:
             block.noise.check(weights[block.where])
-            if block.noise.matrices() and np.isfinite(self.thresholds[block.where]).any():
+            robust = np.isfinite(self.thresholds[block.where]).any()
+            if not block.noise.independent and robust:
                 raise ValueError("a robust cost needs independent observation errors")
+            if np.any(self._bounds[block.where]) and (robust or not block.noise.independent):
+                raise ValueError("bounds (at_most, at_least) need independent errors without a robust cost")
+
+    @cached_property
+    def _bounds(self) -> Array:
+        return np.zeros(len(self.std)) if self.sides is None else self.sides
 
     @cached_property
     def blocks(self) -> tuple[Block, ...]:
@@ -62,6 +72,9 @@ class BlockNoise(Noise):
         for where, matrix in self._groups():
             alone[where] = False
             yield Block(where, CorrelatedNoise(self.std[where], self.time_std[where], Correlation(matrix)))
+        if len(where := np.flatnonzero(alone & (self._bounds != 0))):
+            alone[where] = False
+            yield Block(where, BoundNoise(self.std[where], self.time_std[where], self._bounds[where]))
         for threshold in np.unique(self.thresholds[alone]):
             where = np.flatnonzero(alone & (self.thresholds == threshold))
             errors = self.std[where], self.time_std[where]
@@ -90,6 +103,10 @@ class BlockNoise(Noise):
     @property
     def counts_within(self) -> float:
         return float(self.thresholds.min())
+
+    @property
+    def quadratic(self) -> bool:
+        return all(block.noise.quadratic for block in self.blocks)
 
     def frozen(self, predicted: Predicted) -> Noise:
         return replace(self, std=self.error_std(predicted), time_std=np.zeros_like(self.std))
@@ -152,10 +169,12 @@ class BlockNoise(Noise):
         )
 
     def matrices(self) -> dict[str, tuple[Array, str]]:
+        bounds = {} if self.sides is None else record_of(self.sides)
         if self.correlation is None:
-            return {}
+            return bounds
         entries = self.correlation.tocoo()
         return {
+            **bounds,
             "correlation": (entries.data, "correlation of the errors of two readings, of those that are correlated"),
             "correlation_row": (entries.row, "which reading, counted from 0"),
             "correlation_column": (entries.col, "and which other"),

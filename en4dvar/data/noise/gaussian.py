@@ -71,6 +71,11 @@ class Noise:
         """Rate of the observable beyond which a discrepancy grows in proportion to it."""
         return math.inf
 
+    @property
+    def quadratic(self) -> bool:
+        """True if J_o is quadratic in the residual, as long as R depends on no state: no robust cost, no bound."""
+        return not math.isfinite(self.counts_within)
+
     @cached_property
     def plain(self) -> bool:
         """True if J_o is ½ Σ β (y − m)²/std² as long as no noise scale is given."""

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.sparse import block_array, csr_array, eye_array
 
 from en4dvar.data.noise.blocks import BlockNoise
+from en4dvar.data.noise.bound import SIDES, BoundNoise, sides_of
 from en4dvar.data.noise.correlated import CorrelatedNoise, Correlation
 from en4dvar.data.noise.discrepancy import DiscrepancyNoise
 from en4dvar.data.noise.gaussian import Noise
@@ -27,7 +28,8 @@ def noise_of_record(
     kernel = None
     if "discrepancy_smoothness" in held:
         kernel = Kernel(times, held["discrepancy_smoothness"], held["discrepancy_grows_beyond"])
-    return noise_of(std, time_std, matrices.get("correlation"), held.get("huber_threshold"), kernel)
+    correlation, sides = matrices.get("correlation"), matrices.get(SIDES)
+    return noise_of(std, time_std, correlation, held.get("huber_threshold"), kernel, sides)
 
 
 _NUMBERS = ("huber_threshold", "discrepancy_smoothness", "discrepancy_grows_beyond")
@@ -39,17 +41,23 @@ def noise_of(
     correlation: Array | None = None,
     huber: float | None = None,
     discrepancy: Kernel | None = None,
+    sides: Array | None = None,
 ) -> Noise:
     """Errors of the kind that is given: independent, correlated by a matrix (K, K), or robust beyond ``huber`` std.
 
     Any of them may stand beside a ``discrepancy`` of the model; its amplitude and length are then parameters
-    (:data:`~en4dvar.model.state.DISCREPANCY`).
+    (:data:`~en4dvar.model.state.DISCREPANCY`). ``sides`` (K,): readings that are upper (1) or lower (−1) bounds.
 
     Raises
     ------
-    ValueError: both a correlation and a robust cost, or a matrix that is no correlation.
+    ValueError: both a correlation and a robust cost, either or a discrepancy beside bounds, or a matrix that is no
+        correlation.
     """
     time_std = np.zeros_like(std) if time_std is None else time_std
+    if sides is not None and np.any(sides):
+        if correlation is not None or huber is not None or discrepancy is not None:
+            raise ValueError("bounds (at_most, at_least) stand beside no correlation, robust cost or discrepancy")
+        return noise_of_readings(std, time_std, sides=sides)
     if correlation is not None and huber is not None:
         raise ValueError("a robust cost needs independent observation errors")
     between = None if correlation is None else Correlation(correlation)
@@ -63,15 +71,19 @@ def noise_of(
 
 
 def noise_of_readings(
-    std: Array, time_std: Array, correlation: csr_array | None = None, thresholds: Array | None = None
+    std: Array,
+    time_std: Array,
+    correlation: csr_array | None = None,
+    thresholds: Array | None = None,
+    sides: Array | None = None,
 ) -> Noise:
     """Errors of K readings: ``std``, ``time_std`` and, where some are robust, ``thresholds`` (K,), inf where Gaussian;
-    a ``correlation`` (K, K) where some are correlated, with a unit diagonal.
+    a ``correlation`` (K, K) where some are correlated, with a unit diagonal; ``sides`` (K,) of bounds, 0 of the others.
 
     Where all are of one kind it is that kind. Raises :class:`ValueError` where the matrix is no correlation.
     """
     within = np.full(len(std), math.inf) if thresholds is None else thresholds
-    noise = BlockNoise(std, time_std, correlation, within)
+    noise = BlockNoise(std, time_std, correlation, within, sides if np.any(sides) else None)
     return noise.blocks[0].noise if len(noise.blocks) == 1 else noise
 
 
@@ -99,7 +111,8 @@ def joint_noise(times: Sequence[Array], noises: Sequence[Noise], between: Array)
     whole.eliminate_zeros()
     thresholds = np.concatenate([np.full(len(n.std), n.counts_within) for n in noises])
     std, time_std = (np.concatenate([getattr(n, key) for n in noises]) for key in ("std", "time_std"))
-    return noise_of_readings(std, time_std, whole if _correlated(whole) else None, thresholds)
+    sides = np.concatenate([sides_of(noise) for noise in noises])
+    return noise_of_readings(std, time_std, whole if _correlated(whole) else None, thresholds, sides)
 
 
 def correlation_of(noise: Noise) -> csr_array:
@@ -108,7 +121,7 @@ def correlation_of(noise: Noise) -> csr_array:
         return noise.correlation
     if isinstance(noise, CorrelatedNoise):
         return csr_array(noise.correlation.matrix)
-    if type(noise) not in (Noise, HuberNoise, BlockNoise):
+    if type(noise) not in (Noise, HuberNoise, BoundNoise, BlockNoise):
         raise ValueError("a discrepancy of the model is not possible beside other series; leave one of them out")
     return eye_array(len(noise.std), format="csr")
 

@@ -22,7 +22,7 @@ from en4dvar.problem import InverseProblem
 
 COLLAPSED = 1 / 9  # of the mean of 2 (J − J_min) per parameter: a spread below a third of what J allows
 SHORT_STEP = 0.5  # posterior standard deviations
-NO_SPREAD = 1e-8  # of the prior's: members that agree to rounding
+NO_SPREAD = 1e-14  # of the size of values: members that agree to rounding
 
 
 @dataclass(frozen=True)
@@ -179,7 +179,7 @@ def collapse(prior: Prior, control: ControlEnsembles, alive: npt.NDArray[np.bool
     alive = alive & np.isfinite(costs)
     if alive.sum() < 2:
         return
-    narrow = control.posterior[alive].std(axis=0) <= NO_SPREAD * prior.std
+    narrow = control.posterior[alive].std(axis=0) <= NO_SPREAD * (prior.std + np.abs(control.centre))
     if narrow.any():
         names = ", ".join(name for name, no_spread in zip(prior.names, narrow, strict=True) if no_spread)
         words = f"the ensemble has collapsed: all members have the same {names}"

@@ -2,8 +2,9 @@
 
 Priors are those of PEST++'s ensemble smoother: ``parval1`` in the middle and bounds four standard deviations apart
 (option ``par_sigma_range``), of the logarithm where ``partrans`` is ``log``; at the bounds they are cut off. The std of
-an observation is 1/weight; those of weight 0 are left out. Prior information counts as further observations. What would
-change the estimate and is not known here is an error that names it.
+an observation is 1/weight; those of weight 0 are left out. Prior information counts as further observations. The
+observations of groups that hold inequalities are bounds. What would change the estimate and is not known here is an
+error that names it.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from en4dvar.plumbing.errors import ConfigError
 
 RANGE = 4.0  # standard deviations between the bounds: PEST++ (White et al. 2020), option par_sigma_range
 OBSERVED = "observations"
+BOUNDS = {"at_most": ("l_", "less", "<@"), "at_least": ("g_", "greater", ">@")}  # how their groups begin: PEST++
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[edED][+-]?\d+)?"
 _TERM = re.compile(rf"\s*([+-]?)\s*({_NUMBER})\s*\*\s*(?:(log)\s*\(\s*([^\s()]+)\s*\)|([^\s()*=]+))\s*", re.IGNORECASE)
 
@@ -50,7 +52,10 @@ def from_pest(path: str | Path, files: Sequence[str] = (), *, prior_information:
     equations = _equations(control, parameters) if prior_information else []
     refuse(control, rows, observed, bool(equations))
     readings = [
-        *(_Reading(r.number("obsval"), r.number("standard_deviation", 1 / _weight(r))) for r in observed),
+        *(
+            _Reading(r.number("obsval"), r.number("standard_deviation", 1 / _weight(r)), group=r.word("obgnme"))
+            for r in observed
+        ),
         *equations,
     ]
     if not readings:
@@ -78,16 +83,25 @@ def from_pest(path: str | Path, files: Sequence[str] = (), *, prior_information:
             OBSERVED: np.array([reading.value for reading in readings]),
         },
         "priors": {name: _prior(control, row, parameters, parents) for name, row in parameters.items()},
-        "error": np.array([reading.std for reading in readings]),
+        "error": _error(readings),
     }
 
 
 class _Reading(NamedTuple):
-    """An observation, or an equation of prior information with its ``terms``."""
+    """An observation, or an equation of prior information with its ``terms``, and its group."""
 
     value: float
     std: float
     terms: Mapping[str, float] = {}
+    group: str = ""
+
+
+def _error(readings: Sequence[_Reading]) -> Any:
+    """The std of each reading and, where some are inequalities, which are bounds."""
+    std = np.array([reading.std for reading in readings])
+    marks = {key: np.array([float(r.group.startswith(begin)) for r in readings]) for key, begin in BOUNDS.items()}
+    bounds = {key: each for key, each in marks.items() if each.any()}
+    return {f"{OBSERVED}_std": std, **bounds} if bounds else std
 
 
 def _weight(row: PestRow) -> float:
@@ -152,8 +166,8 @@ def _equations(control: ControlFile, parameters: Mapping[str, PestRow]) -> list[
     """Prior information, ``label factor * name + factor * log(name) = value weight group``. Raises ConfigError."""
     lines = [(row.where, row.cells["line"].partition(" ")[2]) for row in control.lines("prior information")]
     for row in control.tables("prior information"):
-        equation, weight = row.cells.get("equation", ""), row.cells.get("weight", "")
-        lines.append((row.where, f"{equation} {weight}"))
+        equation, *further = (row.cells.get(key, "") for key in ("equation", "weight", "obgnme"))
+        lines.append((row.where, " ".join([equation, *further])))
     return [reading for where, text in lines if (reading := _equation(where, text, parameters))]
 
 
@@ -174,7 +188,8 @@ def _equation(where: str, text: str, parameters: Mapping[str, PestRow]) -> _Read
     if at < len(left.rstrip()) or not terms:
         raise ConfigError(f"{where}: {text.strip()!r} is no equation of prior information")
     weight = _weight(numbers)
-    return _Reading(numbers.number("value"), 1 / weight, terms) if weight else None
+    group = right.lower().split()[2:] or [""]
+    return _Reading(numbers.number("value"), 1 / weight, terms, group[0]) if weight else None
 
 
 def _files(control: ControlFile) -> tuple[dict[str, str], dict[str, list[str]]]:

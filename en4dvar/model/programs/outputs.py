@@ -33,7 +33,7 @@ class ProgramOutput:
     with one group, every match a value. instructions: output file → instruction files of PEST, each of the
     ``observations``, by default all, a value; ``delimiters`` separate numbers there as blanks do. With ``time``, a
     column or key of times, values are interpolated linearly at those that are asked for; without it there is one value
-    a time.
+    a time. A value that is missing or no number is NaN, a reading that the run does not give.
     """
 
     file: str
@@ -123,9 +123,9 @@ def _column(text: str, column: str | int, file: str) -> Array:
         at, first = header.index(column), 1
     else:
         raise ProgramError(f"{file}: no column {column!r}; the columns are: {listed(header)}")
-    if at >= min(len(row) for row in rows[first:] or [header]):
-        raise ProgramError(f"{file}: no column {column} in every line")
-    return _numbers([row[at] for row in rows[first:]], file)
+    if at >= max(len(row) for row in rows[first:] or [header]):
+        raise ProgramError(f"{file}: no column {column}")
+    return _numbers([row[at] if at < len(row) else "" for row in rows[first:]], file)
 
 
 def _key(text: str, key: str, file: str) -> Array:
@@ -142,10 +142,11 @@ def _key(text: str, key: str, file: str) -> Array:
 
 
 def _numbers(texts: list[Any], file: str) -> Array:
-    for value in texts:
-        if not _is_number(value):
-            raise ProgramError(f"{file}: {short(str(value))!r} is no number")
-    return np.array([float(value) for value in texts])
+    """What is no number is NaN, a reading that is missing. Raises :class:`ProgramError` where none is a number."""
+    values = np.array([float(value) if _is_number(value) else math.nan for value in texts])
+    if len(texts) and np.isnan(values).all():
+        raise ProgramError(f"{file}: {short(str(texts[0]))!r} is no number")
+    return values
 
 
 def _is_number(value: Any) -> bool:

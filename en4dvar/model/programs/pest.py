@@ -9,6 +9,7 @@ instructions are ``ln``, ``@marker@`` (primary and secondary), ``w``, ``tn``, ``
 from __future__ import annotations
 
 import functools
+import math
 import re
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -151,10 +152,11 @@ def read(
     ``where`` names that in messages, ``source`` the instructions. ``delimiters``: characters that separate numbers as
     blanks and commas do, PEST++'s ``additional_ins_delimiters``.
 
-    Raises :class:`ProgramError`.
+    What is no number is NaN. Raises :class:`ProgramError`, also where none is a number.
     """
     cursor = _Cursor(output.splitlines(), where, re.escape(delimiters))
     values: dict[str, float] = {}
+    wrong = ""
     for line in parsed(instructions, source):
         cursor.advance(line.items[0])
         k = 1
@@ -163,13 +165,16 @@ def read(
             if (name := _named(item)) or _OBSERVATION.fullmatch(item):
                 text = cursor.observed(item, _marker(following[0]) if following else "")
                 if name:
-                    values[name] = _number(text, name, cursor.place)
+                    values[name] = _number(text)
+                    wrong = wrong or f"{cursor.place}: {text.strip() or 'nothing'!r} is not a number for {name}"
             elif not cursor.moved(item):
                 if not all(_marker(each) for each in line.items[:k]):
                     raise ProgramError(f"{cursor.place}: no {_marker(item)!r} behind column {cursor.column}")
                 cursor.advance(line.items[0])  # the markers belong to a line further down
                 k = 0
             k += 1
+    if values and all(map(math.isnan, values.values())):
+        raise ProgramError(wrong)
     return values
 
 
@@ -256,8 +261,6 @@ class _Cursor:
         return text
 
 
-def _number(text: str, name: str, where: str) -> float:
+def _number(text: str) -> float:
     number = _NUMBER.fullmatch(text.strip()) or _NO_LETTER.fullmatch(text.strip())
-    if number is None:
-        raise ProgramError(f"{where}: {text.strip() or 'nothing'!r} is not a number for {name}")
-    return float(f"{number[1]}e{number[2] or 0}")
+    return math.nan if number is None else float(f"{number[1]}e{number[2] or 0}")

@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from en4dvar.model.programs.control_file import ControlFile, PestRow
 from en4dvar.plumbing.errors import ConfigError
 
-ONE_SIDED = ("l_", "less", "<@", "g_", "greater", ">@")  # how groups of inequalities begin: PEST++
 OFF = ("", "0", "false", "no")
 MATRIX = "give correlations as prior_correlation, and standard deviations in priors"
 SEARCH = "this is a search for an optimum, not an estimate"
@@ -76,9 +75,6 @@ def _rows(control: ControlFile, parameters: Sequence[PestRow], observed: Sequenc
     for row in control.rows("observation groups", ["obgnme", "covfle"]):
         if row.word("covfle"):
             yield f"group {row.word('obgnme')} has a covariance, {row.cells['covfle']}: {OPTIONS['obscov']}"
-    for row in observed:
-        if (group := row.word("obgnme")).startswith(ONE_SIDED):
-            yield f"group {group} holds inequalities, and errors have two sides here; give them the weight 0"
     for row in [*parameters, *observed]:
         for column, why in COLUMNS.items():
             if row.word(column) not in ("", "-1", "0"):

@@ -1,0 +1,76 @@
+"""Readings far more exact than the prior: the minimum and its spread are those of the closed form all the same."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from toys import Decay, Linear, make_problem
+
+from en4dvar.ensemble.linalg import Hessian
+from en4dvar.estimation.assimilate import assimilate
+from en4dvar.schemes.settings import AssimilationSettings
+
+TRUTH = np.array([1.1, 0.6])
+STDS = (1e-4, 1e-6, 1e-8, 1e-10)
+
+
+def _tangent(model, at, times):
+    """∂y/∂θ (K, n), by complex steps of the curve's own formula."""
+    if isinstance(model, Linear):
+        return np.array([[model.curve(row, t) for row in np.eye(len(at))] for t in times])
+    a, b = at
+    return np.stack([np.exp(-b * times), -a * times * np.exp(-b * times) + 0.3 * times], axis=1)
+
+
+@pytest.mark.parametrize("std", STDS)
+@pytest.mark.parametrize("model", [Linear(("a", "b")), Decay(("a", "b"))], ids=["linear", "curved"])
+@pytest.mark.parametrize("linearisation", ["bundle", "transform"])
+def test_the_minimum_is_that_of_least_squares(model, std, linearisation):
+    """From the truth a single Gauss–Newton step in closed form, exact to second order in std, the prior beside."""
+    problem = make_problem(model, TRUTH, std=std)
+    analysis = assimilate(problem, AssimilationSettings(members=20, linearisation=linearisation, refine="none"), seed=2)
+    times, y = problem.observations.times, problem.observations.values
+    slopes = _tangent(model, TRUTH, times)
+    residual = y - np.array([model.curve(TRUTH, t) for t in times])
+    covariance = std**2 * np.linalg.inv(slopes.T @ slopes)
+    expected = TRUTH + np.linalg.solve(slopes.T @ slopes, slopes.T @ residual)
+    own = np.sqrt(np.diag(covariance))
+    assert analysis.converged
+    assert np.all(np.abs(analysis.posterior.mean(axis=0) - expected) < 2e-3 * own)
+    np.testing.assert_allclose(analysis.posterior.std(axis=0, ddof=1), own, rtol=3e-3)
+    assert not [c for c in analysis.cautions if c.severity == "serious"]
+
+
+def test_a_parameter_that_no_reading_sees_keeps_its_prior():
+    """One reading a direction: c is not seen at all, a and b to 1e-9 of their prior."""
+    problem = make_problem(Linear(("a", "b", "c")), [*TRUTH, 0.4], std=1e-9)
+    data = problem.observations
+    two = replace(data, times=data.times[:2], values=data.values[:2], weights=data.weights[:2], noise=replace(
+        data.noise, std=data.std[:2], time_std=data.noise.time_std[:2]))  # fmt: skip
+    problem = replace(problem, observations=two)
+    analysis = assimilate(problem, AssimilationSettings(members=20, refine="none"), seed=2)
+    prior = np.cov(analysis.prior.T)
+    slopes = np.array([[problem.model.curve(row, t) for row in np.eye(3)] for t in two.times])
+    hidden = np.linalg.svd(slopes)[2][-1]  # the direction that is not seen
+    variance = 1 / (hidden @ np.linalg.solve(prior, hidden))
+    np.testing.assert_allclose(np.cov(analysis.posterior.T), variance * np.outer(hidden, hidden), atol=1e-6 * variance)
+    assert np.max(np.abs(analysis.posterior @ slopes.T - two.values)) < 1e-7
+
+
+@pytest.mark.parametrize("rows", [1, 2, 5])
+def test_the_inverse_hessian_is_exact_whatever_the_readings_inform(rows):
+    """A⁻¹ of an informed and an uninformed direction, in exact fractions."""
+    from fractions import Fraction
+
+    basis = np.zeros((4, 2))
+    basis[0, 0] = basis[1, 1] = 1.0
+    s = np.zeros((rows, 2))
+    s[0] = [2.0**40, 2.0**40]  # informs the sum only
+    hessian = Hessian.of(s, basis)
+    g = np.array([3.0 * 2**60, 3.0 * 2**60, 0.0, 0.0])
+    own, information = Fraction(3), Fraction(2) ** 81
+    expected = float(Fraction(3) * 2**60 / (own + information))
+    # of the sum g is 2⁶² times what the prior has, so that an error of one part in 10¹⁶ of g would be 10² of the answer
+    np.testing.assert_allclose(hessian.solve(g)[:2].sum(), 2 * expected, rtol=1e-6)
