@@ -27,7 +27,7 @@ class Failed(click.ClickException):
 
     def __init__(self, message: str, exit_code: int):
         super().__init__(message)
-        self.exit_code = exit_code  # type: ignore[misc]
+        vars(self)["exit_code"] = exit_code  # which click declares for the class
 
     def show(self, file: IO[Any] | None = None) -> None:
         try:

@@ -39,17 +39,17 @@ def resolve_any(document: Document, base: Path) -> AnyConfig:
 
 def load_twin(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> TwinConfig:
     """The counterpart of :func:`load_config` for a twin experiment. Raises :class:`ConfigError`."""
-    config = load_any(source, overrides)
-    if not isinstance(config, TwinConfig):
-        raise ConfigError([Fault("not a twin experiment: it has no twin: section", file=config.document.file)])
-    return config
+    return _of_kind(TwinConfig, load_any(source, overrides), "not a twin experiment: it has no twin: section")
 
 
 def load_sequence(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> SequenceConfig:
     """The counterpart of :func:`load_config` for a sequence. Raises :class:`ConfigError`."""
-    config = load_any(source, overrides)
-    if not isinstance(config, SequenceConfig):
-        raise ConfigError([Fault("not a sequence: it has no sequence: section", file=config.document.file)])
+    return _of_kind(SequenceConfig, load_any(source, overrides), "not a sequence: it has no sequence: section")
+
+
+def _of_kind(kind: type[Loaded], config: AnyConfig, otherwise: str) -> Loaded:
+    if not isinstance(config, kind):
+        raise ConfigError([Fault(otherwise, file=config.document.file)])
     return config
 
 

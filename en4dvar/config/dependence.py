@@ -62,10 +62,6 @@ class PriorCorrelation(Section):
             if (key in keys) != ("kernel" in keys):
                 faults.add((key,) if key in keys else (), "at and length belong to a kernel, and a kernel needs both")
 
-    def as_written(self, source: Mapping[str, Any]) -> dict[str, Any]:
-        """The section as it was written, with an absolute path."""
-        return {**super().as_written(source), **({"file": str(self.file)} if self.file else {})}
-
     def of_all(self, read: Callable[[Path], Array]) -> Array:
         """The matrix (m, m). Raises :class:`ConfigError`, :class:`DataError`."""
         if self.correlation is not None:
@@ -95,10 +91,6 @@ class PriorFile(Section):
 
     ensemble: Annotated[Path, Made(_path, Annotated[str, Field(min_length=1)], {"type": "string"})]
     """posterior.nc of an earlier run, other netCDF with a variable a parameter, or a CSV file with a column each."""
-
-    def as_written(self, source: Mapping[str, Any]) -> dict[str, Any]:
-        """The section as it was written, with an absolute path."""
-        return {**super().as_written(source), "ensemble": str(self.ensemble)}
 
 
 def joined(blocks: Sequence[tuple[tuple[str, ...], Array]]) -> tuple[Dependence, ...]:

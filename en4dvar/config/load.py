@@ -72,14 +72,6 @@ class Estimation(File):
     design: Design | None = None
     """Which experiments ``en4dvar design`` compares, and about what."""
 
-    def as_written(self, section: Mapping[str, Any]) -> dict[str, Any]:
-        """The section as it was written, with absolute paths."""
-        written = super().as_written(section)
-        if self.prior_correlation:
-            each = zip(self.prior_correlation, section["prior_correlation"], strict=True)
-            written["prior_correlation"] = [correlation.as_written(text) for correlation, text in each]
-        return written
-
 
 @dataclass(frozen=True, kw_only=True)
 class Validated:

@@ -62,7 +62,7 @@ class Section(Described):
                 return validate(section)
 
     def as_written(self, section: Mapping[str, Any]) -> dict[str, Any]:
-        """The section as it was given, what was left out filled in with defaults; plain data."""
+        """The section as it was given, paths absolute, what was left out filled in with defaults; plain data."""
         keys = {field.alias or name: (name, field) for name, field in type(self).model_fields.items()}
         if not keys.keys() >= section.keys():  # keys named after something of the model
             plain: dict[str, Any] = _plain(section)
@@ -71,8 +71,12 @@ class Section(Described):
         for key, (name, field) in keys.items():
             value = getattr(self, name)
             text = section[key] if key in section else field.get_default(call_default_factory=True)
-            if isinstance(value, Section) or hasattr(value, "as_written"):
+            if hasattr(value, "as_written"):
                 written[key] = value.as_written(text if isinstance(text, dict) else {})
+            elif isinstance(value, tuple) and isinstance(text, list) and all(isinstance(v, Section) for v in value):
+                written[key] = [v.as_written(part) for v, part in zip(value, text, strict=True)]
+            elif isinstance(value, Path) and value.is_absolute():
+                written[key] = str(value)
             elif text is not None:
                 written[key] = _plain(text)
         return written
@@ -208,10 +212,6 @@ class GivenStart(Section):
     ] = Field(alias="from")
     """Values, such as ``{G: 5 kPa}`` (the others start at the prior's mean), or a file of members such as posterior.nc
     of an earlier run, whose medians are taken."""
-
-    def as_written(self, section: Mapping[str, Any]) -> dict[str, Any]:
-        """As given, with an absolute path."""
-        return {"from": str(self.place)} if isinstance(self.place, Path) else super().as_written(section)
 
 
 class OfScheme(Section):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from en4dvar.config.context import TEXT, Context, Made, Spread, parse_spread, quantity, read_each, subject_unit
+from en4dvar.config.context import TEXT, Context, Made, parse_spread, quantity, read_each, subject_unit
 from en4dvar.config.initial_state import dynamic_fields
 from en4dvar.config.schema import OfScheme, Section, keys_of_schemes, listed
 from en4dvar.config.validate import Faults
@@ -26,20 +26,28 @@ from en4dvar.series.model_error import ModelError
 from en4dvar.series.settings import SequentialSettings
 from en4dvar.series.smoothers import EnKS, EnRTS
 
+Things = Callable[[ForwardModel], Mapping[str, Any]]  # by their names, of those that a model knows
 
-def stds(known: Callable[[ForwardModel], Mapping[str, Any]]) -> Made:
-    """Standard deviations by the name of a thing that the model knows."""
 
-    positive = quantity(subject_unit, "positive")
+def stds(known: Things) -> Made:
+    """Standard deviations by the name of a thing, at least one."""
+    return _by_name(known, quantity(subject_unit, "positive").make, 1)
 
-    def read(section: Mapping[str, Any], context: Context) -> dict[str, float]:
+
+def spreads(known: Things) -> Made:
+    """Standard deviations, some in %, by the name of a thing."""
+    return _by_name(known, lambda text, context: parse_spread(text, context.subject.unit), 0)
+
+
+def _by_name(known: Things, read_one: Callable[[Any, Context], Any], fewest: int) -> Made:
+    def read(section: Mapping[str, Any], context: Context) -> dict[str, Any]:
         things = known(context.model)
         with Faults() as faults:
-            if not section:
+            if len(section) < fewest:
                 faults.add((), f"give at least one of: {', '.join(things)}")
-            return read_each(section, things, context, faults, positive.make)
+            return read_each(section, things, context, faults, read_one)
 
-    json = {"type": "object", "minProperties": 1, "additionalProperties": TEXT}
+    json = {"type": "object", **({"minProperties": fewest} if fewest else {}), "additionalProperties": TEXT}
     return Made(read, dict[str, Any], json)
 
 
@@ -171,18 +179,6 @@ class Workers(Section):
     """Parallel workers."""
     checkpoint_every: Annotated[float, Field(ge=0)] = 2.0
     """Seconds between two checkpoints, 0: one after every cycle. Each holds the moments of all cycles done."""
-
-
-def spreads(known: Callable[[ForwardModel], Mapping[str, Any]]) -> Made:
-    """Standard deviations, some in %, by the name of a thing that the model knows."""
-
-    def read(section: Mapping[str, Any], context: Context) -> dict[str, Spread]:
-        with Faults() as faults:
-            return read_each(
-                section, known(context.model), context, faults, lambda text, at: parse_spread(text, at.subject.unit)
-            )
-
-    return Made(read, dict[str, Any], {"type": "object", "additionalProperties": TEXT})
 
 
 def error_rates(model: ForwardModel, errors: Sequence[ErrorOf], positive: Collection[str] = ()) -> Array:

@@ -23,17 +23,14 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import IO, TypeVar
 
 from en4dvar.plumbing.files import POSIX, owner, temporary_folder
 from en4dvar.plumbing.user_code import Stop
 
-try:
-    import resource
-except ImportError:  # Windows
-    resource = None  # type: ignore[assignment]
-
+resource = import_module("resource") if POSIX else None
 T = TypeVar("T")
 MARK = "EN4DVAR_STARTED_BY"
 _BORN = secrets.token_hex(8)

@@ -16,6 +16,23 @@ from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.results.netcdf import Group, read_groups, to_bytes, understood, variable
 
+COLUMNS = {  # field of an evaluation → variable, its dimensions beside that of the designs, description
+    "gain": ("gain", "", "expected information gain, nats"),
+    "error": ("gain_error", "", "Monte Carlo standard error of gain"),
+    "method": ("method", "", "method of gain"),
+    "alike": ("experiments", "", "experiments alike"),
+    "lost": ("lost", "", "share of the prior where the model fails"),
+    "beyond": ("beyond", "", "share of the prior that leaves the model's validity"),
+    "forward_runs": ("forward_runs", "", "forward runs"),
+    "std": ("std", "parameter", "expected posterior std, units of parameters"),
+    "relative": ("relative_std", "parameter", "the same relative to the value"),
+    "ratio": ("std_ratio", "parameter", "posterior over prior std"),
+    "readings": ("reading", "taken", "numbers of the readings taken"),
+    "times": ("time", "taken", "times of the readings taken"),
+    "grid": ("grid", "point", "times of the fan"),
+    "fan": ("fan", "level point", "{seen}"),
+}
+PADDED = ("taken", "point")  # of which one design has more than another
 DECISION = {  # field → variable, description
     "information": ("law_information", "mutual information of law and data, nats"),
     "information_error": ("law_information_error", "its Monte Carlo standard error"),
@@ -73,66 +90,45 @@ def save_designs(path: Path, rows: Sequence[DesignRow], asked: Asked, attributes
 
 
 def _group(rows: Sequence[DesignRow], asked: Asked, attributes: Mapping[str, Any]) -> Group:
-    worth = [row.result for row in rows]
-
-    def each(name: str) -> Array:
-        return np.array([np.nan if result is None else getattr(result, name) for result in worth], dtype=float)
-
-    def padded(name: str, length: int) -> Array:
-        table = np.full((len(rows), length), np.nan)
-        for i, result in enumerate(worth):
-            if result is not None:
-                values = getattr(result, name)
-                table[i, : len(values)] = values
-        return table
-
     def text(values: Sequence[str]) -> np.ndarray[Any, Any]:
         return np.array(values, dtype=object)
 
-    readings = max((len(result.times) for result in worth if result), default=1)
-    points = max((len(result.grid) for result in worth if result), default=1)
-    a, (time, _), (value, _) = len(asked.parameters), *asked.axes
+    (time, _), (value, _) = asked.axes
+    units = {"method": "", "std": "", "times": time, "grid": time, "fan": value}
+    fixed = {"parameter": len(asked.parameters), "level": len(FAN)}
+    worth = [row.result for row in rows]
     variables = {
         "number": variable("design", np.array([row.number for row in rows]), "1", "number of the design in the file"),
         "settings": variable("design", text([json.dumps(dict(row.settings)) for row in rows]), "", "knobs, as JSON"),
         "failure": variable("design", text([row.failure for row in rows]), "", "why a design could not be evaluated"),
         "price": variable("design", np.array([row.price for row in rows]), "1", "price"),
-        "gain": variable("design", each("gain"), "1", "expected information gain, nats"),
-        "gain_error": variable("design", each("error"), "1", "Monte Carlo standard error of gain"),
-        "method": variable("design", text([result.method if result else "" for result in worth]), "", "method of gain"),
-        "experiments": variable("design", each("alike"), "1", "experiments alike"),
-        "lost": variable("design", each("lost"), "1", "share of the prior where the model fails"),
-        "beyond": variable("design", each("beyond"), "1", "share of the prior that leaves the model's validity"),
-        "forward_runs": variable("design", each("forward_runs"), "1", "forward runs"),
-        "std": variable(("design", "parameter"), padded("std", a), "", "expected posterior std, units of parameters"),
-        "relative_std": variable(("design", "parameter"), padded("relative", a), "1", "the same relative to the value"),
-        "std_ratio": variable(("design", "parameter"), padded("ratio", a), "1", "posterior over prior std"),
-        "reading": variable(("design", "taken"), padded("readings", readings), "1", "numbers of the readings taken"),
-        "time": variable(("design", "taken"), padded("times", readings), time, "times of the readings taken"),
-        "grid": variable(("design", "point"), padded("grid", points), time, "times of the fan"),
-        "fan": variable(("design", "level", "point"), _fans(worth, points), value, asked.seen),
     }
+    for field, (name, along, label) in COLUMNS.items():
+        dims = along.split()
+        values = (
+            text([o.method if o else "" for o in worth]) if field == "method" else _padded(worth, field, dims, fixed)
+        )
+        variables[name] = variable(("design", *dims), values, units.get(field, "1"), label.format(seen=asked.seen))
     if asked.laws:
         decisions = [result.decision if result else None for result in worth]
-        variables |= {
-            name: variable("design", _of_decisions(decisions, field), "1", label)
-            for field, (name, label) in DECISION.items()
-        }
+        for field, (name, label) in DECISION.items():
+            variables[name] = variable("design", _padded(decisions, field, [], {}), "1", label)
     root = {**attributes, "asked": json.dumps(asked.__dict__)}
     return Group(variables, {"parameter": variable("parameter", text(asked.parameters), "", "asked for")}, root)
 
 
-def _of_decisions(decisions: Sequence[Decision | None], field: str) -> Array:
-    return np.array([np.nan if decision is None else getattr(decision, field) for decision in decisions], dtype=float)
-
-
-def _fans(worth: Sequence[Evaluated | None], points: int) -> Array:
-    """(designs, levels, points), NaN behind the points of a design."""
-    fans = np.full((len(worth), len(FAN), points), np.nan)
-    for i, result in enumerate(worth):
-        if result is not None:
-            fans[i, :, : len(result.grid)] = result.fan
-    return fans
+def _padded(
+    of: Sequence[Evaluated | Decision | None], field: str, dims: Sequence[str], sizes: Mapping[str, int]
+) -> Array:
+    """(designs, …) numbers along ``dims``, which have at least their ``sizes``; NaN where a design has none."""
+    each = [None if one is None else np.asarray(getattr(one, field), dtype=float) for one in of]
+    shape = [max(sizes.get(dim, 1), *(v.shape[k] for v in each if v is not None), 0) for k, dim in enumerate(dims)]
+    table = np.full((len(of), *shape), np.nan)
+    for i, values in enumerate(each):
+        if values is not None:
+            where: tuple[Any, ...] = (i, *map(slice, values.shape))
+            table[where] = values
+    return table
 
 
 def load_designs(path: Path) -> Designs:
@@ -146,33 +142,18 @@ def load_designs(path: Path) -> Designs:
 
 
 def _row(root: Group, i: int) -> DesignRow:
-    def of(name: str) -> Any:
-        return root[name].values[i]
+    def of(name: str, along: str = "") -> Any:
+        values = root[name].values[i]
+        if along in PADDED:
+            return np.asarray(values[np.isfinite(values)], dtype=float)
+        return values if along or isinstance(values, str) else float(values)
 
-    def known(name: str) -> Array:
-        values = of(name)
-        return np.asarray(values[np.isfinite(values)], dtype=float)
-
-    number, settings, price, failure = int(of("number")), json.loads(of("settings")), float(of("price")), of("failure")
+    number, settings, price, failure = int(of("number")), json.loads(of("settings")), of("price"), of("failure")
     if failure:
         return DesignRow(number, settings, None, price, failure)
-    grid = known("grid")
-    decision = {field: float(of(name)) for field, (name, _) in DECISION.items() if name in root}
-    result = Evaluated(
-        gain=float(of("gain")),
-        error=float(of("gain_error")),
-        method=of("method"),
-        std=of("std"),
-        relative=of("relative_std"),
-        ratio=of("std_ratio"),
-        lost=float(of("lost")),
-        beyond=float(of("beyond")),
-        readings=known("reading"),
-        times=known("time"),
-        grid=grid,
-        fan=of("fan")[:, : len(grid)],
-        alike=int(of("experiments")),
-        forward_runs=int(of("forward_runs")),
-        decision=Decision(**decision) if decision else None,
-    )
-    return DesignRow(number, settings, result, price)
+    held = {field: of(name, along) for field, (name, along, _) in COLUMNS.items()}
+    counts = {field: int(held[field]) for field in ("alike", "forward_runs")}
+    fan = held["fan"][:, : len(held["grid"])]
+    decision = {field: of(name) for field, (name, _) in DECISION.items() if name in root}
+    told = Decision(**decision) if decision else None
+    return DesignRow(number, settings, Evaluated(**{**held, **counts, "fan": fan, "decision": told}), price)

@@ -8,6 +8,7 @@ import socket
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from importlib import import_module
 from pathlib import Path
 
 from en4dvar.plumbing.errors import OutputError
@@ -106,12 +107,10 @@ def _is_dead(owner: str) -> bool:
 
 def _lock(file: int) -> None:
     """Lock a file that is open. Raises :class:`OSError`."""
-    try:
-        import fcntl
-    except ImportError:  # Windows
-        import msvcrt
-
-        os.lseek(file, 1 << 20, os.SEEK_SET)  # beyond the text, so that others can read it
-        msvcrt.locking(file, msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
-    else:
+    if POSIX:
+        fcntl = import_module("fcntl")
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    else:
+        msvcrt = import_module("msvcrt")
+        os.lseek(file, 1 << 20, os.SEEK_SET)  # beyond the text, so that others can read it
+        msvcrt.locking(file, msvcrt.LK_NBLCK, 1)

@@ -8,14 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import overload
 
-from en4dvar.estimation.summary import dataset_rows
 from en4dvar.plumbing.errors import OutputError
-from en4dvar.plumbing.tables import csv_text
 from en4dvar.results.codec import decode_text
 from en4dvar.results.pack import Entry, read_outcome
 from en4dvar.runs.campaign import DatasetOutcome
-
-LINES = b'"lines": '  # which outcomes of earlier versions do not have
 
 
 class Outcomes(Sequence[DatasetOutcome]):
@@ -45,24 +41,19 @@ class Outcomes(Sequence[DatasetOutcome]):
         return self._read(stems) if isinstance(stems, str) else tuple(map(self._read, stems))
 
     def lines(self) -> Iterator[str]:
-        """Those of ``summary.csv`` of each data set; the rest is looked at only where an earlier version wrote none."""
+        """Those of ``summary.csv`` of each data set; the rest of what is known of it is not looked at."""
         for stem in self._stems:
-            raw = self._raw(stem)
             try:
-                lines = str(json.loads(raw)["lines"]) if LINES in raw else ""
+                yield str(json.loads(self._raw(stem))["lines"])
             except (ValueError, LookupError, TypeError) as error:  # as below
                 raise OutputError(f"{self._record / stem}: {error}") from None
-            if LINES not in raw and not (outcome := self._read(stem)).failure:
-                lines = csv_text(dataset_rows(outcome.name, outcome.summary, outcome.warnings))
-            yield lines
 
     def _raw(self, stem: str) -> bytes:
         return read_outcome(self._record, stem, self._entries[stem])
 
     def _read(self, stem: str) -> DatasetOutcome:
-        raw = self._raw(stem)
         try:
-            outcome = decode_text(raw if LINES in raw else raw.replace(b"{", b'{"lines": "", ', 1), DatasetOutcome)
+            outcome = decode_text(self._raw(stem), DatasetOutcome)
         except ValueError as error:  # anybody can write a checksum
             raise OutputError(f"{self._record / stem}: {error}") from None
         return outcome if outcome.failure else replace(outcome, file=self._folder / self._files[stem])

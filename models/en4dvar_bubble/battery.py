@@ -117,9 +117,9 @@ def table_has_the_slope_of_the_law(law: ConstitutiveLaw) -> None:
 
     The table of a law that is too sharp for that has halved cells, and holds its stress to 1e-7.
     """
-    if is_sharp(type(law)):  # type: ignore[arg-type]  # mypy takes the class for unhashable
+    if is_sharp(type(law)):
         try:
-            refuse_inexact(type(law))  # type: ignore[arg-type]
+            refuse_inexact(type(law))
         except ValueError as refused:
             raise AssertionError(str(refused)) from refused
         return

@@ -102,7 +102,7 @@ class Dynamics:
             object.__setattr__(self, "driving", _usual_driving(self.start))
         if self.accuracy is None:
             object.__setattr__(self, "accuracy", preset("standard", self.start))
-        refuse_inexact(type(self.law))  # type: ignore[arg-type]  # mypy takes the class for unhashable
+        refuse_inexact(type(self.law))
         if self.gas != "heat" and (self.vapour == "transport" or self.medium_heat != "cold"):
             raise ValueError("vapour transport and a conducting medium need gas: heat")
         if self.vapour != "none" and self.medium.p_v:

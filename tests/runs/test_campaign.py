@@ -1,7 +1,6 @@
 """Campaigns: what fails is named and ends nothing; one file for all; names that every file system takes."""
 
 import csv
-import json
 import shutil
 
 import numpy as np
@@ -68,18 +67,6 @@ def test_an_outcome_that_was_altered_is_told(campaign, tmp_path):
     record.write_bytes(record.read_bytes().replace(b'"failure": ""', b'"failure": 12'))
     with pytest.raises(OutputError, match=r"datasets\.pack/set0: damaged or altered"):
         Outcomes(tmp_path / "run", PACK, entries, {"set0": "set0"})[0]
-
-
-def test_outcomes_of_an_earlier_version_have_no_lines_of_their_own(campaign, monkeypatch):
-    def read(*of):
-        outcome = json.loads(read_outcome(*of))
-        del outcome["lines"]
-        return json.dumps(outcome).encode()
-
-    table = list(campaign.outcomes.lines())
-    assert "".join(table) in (campaign.directory / "summary.csv").read_text()
-    monkeypatch.setattr(outcomes, "read_outcome", read)
-    assert list(campaign.outcomes.lines()) == table
 
 
 def test_one_file_for_all(campaign):

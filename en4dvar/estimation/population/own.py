@@ -15,7 +15,7 @@ leaves the likelihood of the data set, with which :mod:`~en4dvar.estimation.popu
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -109,7 +109,7 @@ def _about(start: Array) -> StudentMixture:
     )
 
 
-def _walked(sampler: Importance, cost: object, stream: np.random.Generator) -> Array:
+def _walked(sampler: Importance, cost: Callable[[Array], Array], stream: np.random.Generator) -> Array:
     """(D, n) positions of walkers on exp(−cost), which start at draws by their weights."""
     at = stream.permutation(resampled(sampler.shares, WALKERS, stream))
     offset = 0.5 * sampler.z.shape[1] * math.log(2 * math.pi)
@@ -118,7 +118,7 @@ def _walked(sampler: Importance, cost: object, stream: np.random.Generator) -> A
     kept = []
     for turn in range(WALKED):
         for i in (0, 1):
-            halves[i], costs[i] = advance(cost, halves[i], costs[i], halves[1 - i], stream, MOVES)  # type: ignore[arg-type]
+            halves[i], costs[i] = advance(cost, halves[i], costs[i], halves[1 - i], stream, MOVES)
         if turn >= WALKED // 4:
             kept += [half.copy() for half in halves]
     return np.concatenate(kept)

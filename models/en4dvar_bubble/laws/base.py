@@ -118,7 +118,7 @@ class ConstitutiveLaw:
     @property
     def sharp(self) -> bool:
         """True for a law of a user's that a uniform table does not hold: its table has halved cells."""
-        return bool(is_sharp(type(self)))  # type: ignore[arg-type]  # mypy takes the class for unhashable
+        return bool(is_sharp(type(self)))
 
     def samples(self, values: Mapping[str, Array]) -> Array | None:
         """J_e in Pa of N members at the nodes of the grid and its halo, (N, K); None of a law by W′(λ), and of a sharp

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from en4dvar_bubble.tables import evaluate
 TABLE_ERROR = 1e-6
 """Largest relative error of dJ/dλ in a uniform table; that of J is a hundredth of it."""
 _PACKAGE = f"{__package__}."
+F = TypeVar("F", bound=Callable[..., Any])
 _POINTS_IN_CELL = 8
 _STENCIL = np.array([1 / 280, -4 / 105, 1 / 5, -4 / 5, 0, 4 / 5, -1 / 5, 4 / 105, -1 / 280])
 _STEP = 5e-3
@@ -49,7 +51,12 @@ def slope_error(law: Any) -> tuple[float, float]:
     return float(error[worst]), float(stretch[worst])
 
 
-@cache
+def _once(function: F) -> F:
+    """:func:`functools.cache` for functions of a class, which mypy takes for unhashable."""
+    return cast(F, cache(function))
+
+
+@_once
 def is_sharp(kind: type[Any]) -> bool:
     """Whether a law of a user's has a uniform table that is wrong; tests hold those of the package to be right."""
     if kind.__module__.startswith(_PACKAGE):
@@ -61,10 +68,10 @@ def is_sharp(kind: type[Any]) -> bool:
         return False
 
 
-@cache
+@_once
 def refuse_inexact(kind: type[Any]) -> None:
     """Raise ValueError for a sharp law whose stress jumps, or is too rough for cells however narrow."""
-    if not is_sharp(kind):  # type: ignore[arg-type]  # mypy takes the class for unhashable
+    if not is_sharp(kind):
         return
     law = kind()
     lowest, highest = law.stretch_range
