@@ -103,6 +103,8 @@ class Dynamics:
         if self.accuracy is None:
             object.__setattr__(self, "accuracy", preset("standard", self.start))
         refuse_inexact(type(self.law))  # type: ignore[arg-type]  # mypy takes the class for unhashable
+        if self.law.released and self.start != "laser":
+            raise ValueError(f"{self.law.name} needs start: laser: only a released bubble has an R_max at time zero")
         if self.gas != "heat" and (self.vapour == "transport" or self.medium_heat != "cold"):
             raise ValueError("vapour transport and a conducting medium need gas: heat")
         if self.vapour != "none" and self.medium.p_v:
@@ -255,7 +257,9 @@ class Dynamics:
 
     def _of_law(self, values: Mapping[str, Array]) -> dict[str, Array]:
         own = {p.name: values[p.name] for p in self.law.parameters}
-        return own | {"R0": values[self.stress_free_radius]} if self.law.sized else own
+        if self.law.sized:
+            own["R0"] = values[self.stress_free_radius]
+        return own | {"R_max": values["R_max"]} if self.law.released else own
 
 
 @lru_cache(maxsize=64)  # models are made anew by each call of simulate

@@ -78,7 +78,9 @@ def some(names):
 @pytest.mark.parametrize("name", some(available()))
 def test_the_solver_integrates_the_law(name):
     law = get_law(name)
-    values = law.example_values() | ({"R0": np.array([R_EQ])} if law.sized else {})
+    radii = {"R0": np.array([R_EQ]), "R_max": np.array([R_MAX])}
+    values = law.example_values()
+    values |= {name: radii[name] for name in radii if name in values}
     model = BubbleModel(law=law, gas="polytropic", start="laser", medium=MEDIUM, accuracy=ACCURACIES["reference"])
     x = model.initial_states({**values, "R_max": np.array([R_MAX]), "R_eq": np.array([R_EQ])})
     (path,) = model.trajectories(x, TIMES)

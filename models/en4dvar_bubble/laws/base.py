@@ -66,6 +66,8 @@ class ConstitutiveLaw:
     """Stretches over which the battery tests the law at the example values."""
     sized: ClassVar[bool] = False
     """Whether the law depends on the size of the bubble: then ``p.R0`` is the stress-free radius in m."""
+    released: ClassVar[bool] = False
+    """Of a ``sized`` law: whether it is for released bubbles alone; ``p.R_max`` is their largest radius in m."""
     rest_tension: ClassVar[str] = ""
     """Name of the parameter that is the tension of the bubble's surface at rest, instead of the surface tension."""
     kinked: ClassVar[bool] = False
@@ -109,7 +111,9 @@ class ConstitutiveLaw:
             return float(np.clip(self.example.get(p.name, _EXAMPLE_BY_NAME.get(p.name, by_unit)), *p.bounds))
 
         values = {p.name: np.full(n, value(p)) for p in self.parameters}
-        return values | {"R0": np.full(n, self.example.get("R0", 1e-6))} if self.sized else values
+        radii = {"R0": 1e-6} if self.sized else {}
+        radii |= {"R_max": 5e-6} if self.released else {}
+        return values | {name: np.full(n, self.example.get(name, radius)) for name, radius in radii.items()}
 
     @property
     def closed_form(self) -> bool:
