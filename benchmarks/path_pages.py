@@ -1,4 +1,5 @@
-"""The pictures of the six pages of the documentation's path: ``python benchmarks/path_pages.py [FOLDER_OF_PICTURES]``.
+"""The pictures of the six pages of the documentation's path, and of that of coatings:
+``python benchmarks/path_pages.py [FOLDER_OF_PICTURES]``.
 
 Each shows what a reader of the page sees: pages of runs of shipped configurations and of the pages' own examples, as a
 headless Chromium draws them. All data are synthetic; the seeds are those of the configurations and of the commands.
@@ -51,15 +52,7 @@ def law(folder: Path, shoot: Camera) -> None:
     """Radii of bubbles in gels of the law that the page defines."""
     import matplotlib.pyplot as plt
 
-    files_of("own_constitutive_law.md", folder)
-    code = (folder / "simulate.py").read_text(encoding="utf-8")
-    names: dict[str, Any] = {}
-    here = Path.cwd()
-    try:
-        os.chdir(folder)
-        exec(code, names)
-    finally:
-        os.chdir(here)
+    names = executed("own_constitutive_law.md", "simulate.py", folder)
     figure, axes = plt.subplots(figsize=(6.4, 3.2), layout="constrained")
     for beta, radius in zip(names["values"]["beta"], names["bubbles"].R.values, strict=True):
         axes.plot(names["times"] * 1e6, radius * 1e6, label=f"beta {beta:g}")
@@ -67,6 +60,35 @@ def law(folder: Path, shoot: Camera) -> None:
     axes.legend()
     figure.savefig(folder / "law.png", dpi=150)
     shoot.keep(Image.open(folder / "law.png"), "path_law")
+
+
+def coatings(folder: Path, shoot: Camera) -> None:
+    """Tension and radius of coated bubbles, as the page of coatings computes them."""
+    import matplotlib.pyplot as plt
+
+    names = executed("shells.md", "coatings.py", folder)
+    figure, (left, right) = plt.subplots(1, 2, figsize=(7.6, 3.0), layout="constrained")
+    for name, style in zip(names["laws"], ("-", "--", ":"), strict=True):
+        left.plot(names["stretch"], names["tensions"][name] * 1e3, style, label=name)
+        right.plot(names["times"] * 1e6, names["radii"][name] * 1e6, style)
+    left.set(xlabel="R / R0", ylabel="tension (mN/m)", ylim=(-40, 110))
+    right.set(xlabel="time (µs)", ylabel="radius (µm)")
+    left.legend(fontsize="small", loc="lower right")
+    figure.savefig(folder / "shells.png", dpi=150)
+    shoot.keep(Image.open(folder / "shells.png"), "shells")
+
+
+def executed(page: str, script: str, folder: Path) -> dict[str, Any]:
+    """The names that a script shown on a page has when it has run."""
+    files_of(page, folder)
+    names: dict[str, Any] = {}
+    here = Path.cwd()
+    try:
+        os.chdir(folder)
+        exec((folder / script).read_text(encoding="utf-8"), names)
+    finally:
+        os.chdir(here)
+    return names
 
 
 def model(folder: Path, shoot: Camera) -> None:
@@ -78,4 +100,4 @@ def model(folder: Path, shoot: Camera) -> None:
 
 
 if __name__ == "__main__":
-    take((first_bubble, movie, table, many, law, model), sys.argv[1:])
+    take((first_bubble, movie, table, many, law, coatings, model), sys.argv[1:])

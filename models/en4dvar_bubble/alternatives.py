@@ -52,7 +52,7 @@ def _alternatives(model: Dynamics) -> Iterator[Alternative]:
         stronger = replace(driving, amplitude=PULSE * driving.amplitude)
         yield changed("pulse_amplitude", "the pulse were 5 % stronger", driving=stronger)
     for name, key, factor, words in MEDIUM:
-        if name not in model.named:
+        if name not in model.named and (name != "surface_tension" or not model.law.rest_tension):
             of = "S" if name == "surface_tension" else name
             yield changed(key, words, medium=replace(medium, **{of: factor * getattr(medium, of)}))
     if model.wall is None:

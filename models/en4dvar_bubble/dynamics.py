@@ -103,6 +103,8 @@ class Dynamics:
         if self.accuracy is None:
             object.__setattr__(self, "accuracy", preset("standard", self.start))
         refuse_inexact(type(self.law))
+        if self.law.released and self.start != "laser":
+            raise ValueError(f"{self.law.name} needs start: laser: only a released bubble has an R_max at time zero")
         if self.gas != "heat" and (self.vapour == "transport" or self.medium_heat != "cold"):
             raise ValueError("vapour transport and a conducting medium need gas: heat")
         if self.vapour != "none" and self.medium.p_v:
@@ -125,6 +127,7 @@ class Dynamics:
             memory=self.law.memory_count,
             radial=self.radial,
             shear=self.law.shear_dependent,
+            strain=self.law.strain_dependent,
             clustering=GAS_CLUSTERING[self.start],
             medium_length=MEDIUM_LENGTHS[self.start],
             image=self.wall is not None,
@@ -169,7 +172,7 @@ class Dynamics:
         acts |= {"p_v": self.vapour == "none", "T_inf": (heat or self.vapour != "none") and not self.medium.p_v}
         acts |= {"c": self.radial != "rayleigh-plesset", "kappa": self.gas != "isothermal"}
         acts |= {WALL_DISTANCE.name: self.wall is not None}
-        acts |= {P_A.name: not self.driving.silent}
+        acts |= {P_A.name: not self.driving.silent, "surface_tension": not self.law.rest_tension}
         acts |= dict.fromkeys((R_START.name, RDOT_START.name), self.start == "acoustic")
         own = {p.name for p in self.law.parameters}
         return tuple(pulse.get(p.name, p) for p in ALL if acts[p.name] and p.name not in own)
@@ -183,6 +186,8 @@ class Dynamics:
             for constant, p in OF_MEDIUM.items()
             if p.name in self.named
         }
+        if self.law.rest_tension:
+            own["S"] = values[self.law.rest_tension].reshape(-1, *[1] * axes)
         return replace(self.medium, **own) if own else self.medium
 
     def image(self, values: Mapping[str, Array]) -> float | Array:
@@ -229,7 +234,7 @@ class Dynamics:
         x = np.empty((len(rest), layout.size))
         Rdot = values.get(RDOT_START.name, 0.0)
         fields = {"R": R, "Rdot": Rdot, "p_b": gas + p_v, "T": medium.T_inf, "T_m": medium.T_inf, **values}
-        law_values = {p.name: values[p.name] for p in self.law.parameters}
+        law_values = self._of_law(values)
         relaxed = self.law.relaxed(R / rest, law_values)
         fields["Z"] = relaxed
         fields["S"] = relaxed.sum(axis=1)
@@ -248,7 +253,13 @@ class Dynamics:
 
     def law_values(self, x: Array) -> dict[str, Array]:
         """The law's parameters, name → (N,), of states (N, n_state)."""
-        return {p.name: x[:, self.layout[p.name].start] for p in self.law.parameters}
+        return self._of_law({name: x[:, where.start] for name, where in self.layout.slices.items()})
+
+    def _of_law(self, values: Mapping[str, Array]) -> dict[str, Array]:
+        own = {p.name: values[p.name] for p in self.law.parameters}
+        if self.law.sized:
+            own["R0"] = values[self.stress_free_radius]
+        return own | {"R_max": values["R_max"]} if self.law.released else own
 
 
 @lru_cache(maxsize=64)  # models are made anew by each call of simulate

@@ -19,7 +19,7 @@ from en4dvar_bubble.gas import (
     mole_fraction,
     saturated_vapour_pressure,
 )
-from en4dvar_bubble.laws.tabulate import GRID, VISCOUS_GRID
+from en4dvar_bubble.laws.tabulate import GRID
 from en4dvar_bubble.medium import Medium
 from en4dvar_bubble.numbers import P_A
 from en4dvar_bubble.solver import rows
@@ -56,9 +56,9 @@ def pack(model: Dynamics, x: Array, start: Array | float, times: Array) -> Packe
     memory = viscous = _NO_TABLE
     if system.memory:
         memory = _memory(model, values, initial, par, x, model.medium_of(own, 1).rho)
-    if system.shear:
+    if system.shear or system.strain:
         viscous = law.viscous_table(values) / model.medium_of(own, 2).rho * 1e6
-        par[:, rows.VISCOUS_TABLE] = np.arange(n_members, dtype=float) * (VISCOUS_GRID.cells * 8)
+        par[:, rows.VISCOUS_TABLE] = np.arange(n_members, dtype=float) * (viscous.shape[1] * 8)
     elif "mu" in values:
         par[:, rows.VISCOSITY] = values["mu"] / rho * 1e6
 

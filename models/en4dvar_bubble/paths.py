@@ -162,8 +162,8 @@ class Paths(Batch):
         stress = evaluate(self.model.law.table(values), GRID.span, log_stretch) / rho
         if system.memory:
             stress = stress + self.solution.states[:, :, system.first_memory : -2].sum(axis=2)
-        if system.shear:
-            nu = self.model.law.mean_viscosity(np.abs(V) * 1e6, values) / rho * 1e6
+        if system.shear or system.strain:
+            nu = self.model.law.mean_viscosity(np.abs(V) * 1e6, values, np.exp(log_stretch)) / rho * 1e6
         else:
             nu = self.par[:, None, rows.VISCOSITY]
         return np.asarray((stress - 4 * nu * V) * rho)

@@ -1,4 +1,4 @@
-"""The page "Your own constitutive law" does what it says: its files are written, checked and run."""
+"""The pages "Your own constitutive law" and of coatings do what they say: their files are written, checked and run."""
 
 from __future__ import annotations
 
@@ -16,13 +16,17 @@ from en4dvar_bubble import REGISTRY, simulate
 
 DOCS = Path(__file__).parents[2] / "docs"
 PAGE = (DOCS / "own_constitutive_law.md").read_text(encoding="utf-8")
-FILES = dict(re.findall(r"```(?:python|yaml)\n# ([\w.]+)[^\n]*\n(.*?)```", PAGE, re.S))
+FILES, COATINGS = (
+    dict(re.findall(r"```(?:python|yaml)\n# ([\w.]+)[^\n]*\n(.*?)```", page, re.S))
+    for page in (PAGE, (DOCS / "shells.md").read_text(encoding="utf-8"))
+)
 LAWS = ["yeoh.py:Yeoh", "shear_thinning_gel.py:ShearThinningGel", "relaxing_gel.py:RelaxingGel"]
+LAWS += ["stiffening.py:Stiffening"]
 
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
-    for name, text in FILES.items():
+    for name, text in (FILES | COATINGS).items():
         (tmp_path / name).write_text(text)
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -53,6 +57,16 @@ def test_the_simulation_of_the_page(capsys):
     assert printed[0] > printed[1] > printed[2] > 5
     same = simulate("neo-hookean-kelvin-voigt", {"G": 500.0, "mu": 0.1, "R0": 0.5e-6}, bubbles.time.values)
     np.testing.assert_allclose(bubbles.R[0], same.R[0], rtol=1e-5)
+
+
+def test_the_coatings_of_the_page():
+    """Three coatings of one tension at rest; the lipid contracts more than it expands, as the caption says."""
+    made = runpy.run_path("coatings.py")
+    rest = np.flatnonzero(np.isclose(made["stretch"], 1.0))
+    for name in made["laws"]:
+        np.testing.assert_allclose(made["tensions"][name][rest], 12e-3, rtol=1e-6)
+    radius = made["radii"]["marmottant-shell"] / 2.1e-6
+    assert 1 - radius.min() > radius.max() - 1 > 0.1
 
 
 def test_the_yaml_of_the_page(folder):

@@ -214,10 +214,10 @@ class TestElastic:
         assert pytest.approx(-slope / wall**2, rel=1e-6) == J
 
     def test_small_strain_modulus(self):
-        """J = −4 G ε for small strain in every solid whose parameter is the shear modulus G."""
+        """J = −4 G ε for small strain in every solid whose parameter is the shear modulus G of a medium as made."""
         for name in REGISTRY:
             law = get_law(name)
-            if "G" in law.example_values() and not law.memory(_columns(law)):
+            if "G" in law.example_values() and not law.memory(_columns(law)) and not law.released:
                 J = law.elastic_stress(np.array([[1 - 1e-5, 1 + 1e-5]]), law.example_values())[0]
                 expected = 4 * law.example_values()["G"][0]
                 assert (J[0] - J[1]) / 2e-5 == pytest.approx(expected, rel=1e-6), name

@@ -127,6 +127,29 @@ def test_a_jump_of_the_stress_is_refused_by_name():
         simulate(Jump(), {"G": 1e3, "mu": 1e-3, "R0": 1e-6}, np.linspace(0, 1e-6, 3))
 
 
+class RoughMemory(NeoHookeanKelvinVoigt):
+    title = "stiffens at once"
+
+    def memory(self, p):
+        return (MemoryVariable(1e-6, stiffness=lambda stretch: -p.G * np.maximum(stretch, 1.3)),)
+
+
+class RoughViscosity(NeoHookeanKelvinVoigt):
+    title = "thins at once"
+
+    def strained_viscosity(self, stretch, p):
+        return p.mu / (1 + np.exp((np.log(stretch) - 0.5) / 1e-3))
+
+
+@pytest.mark.parametrize(
+    ("law", "words"),
+    [(RoughMemory, "the stiffness of its memory variable 1"), (RoughViscosity, "its strained_viscosity")],
+)
+def test_what_is_not_refined_is_refused_by_name_where_it_is_rough(law, words):
+    with pytest.raises(ConfigError, match=rf"{law.name}: {words} changes too sharply near λ = 1\.[36]"):
+        simulate(law(), {"G": 1e3, "mu": 1e-3, "R0": 1e-6}, np.linspace(0, 1e-6, 3))
+
+
 @pytest.mark.parametrize("x", [-0.4, 0.2, 0.3, 0.301, 0.9])
 def test_a_kink_of_the_strain_energy_rate_by_quadrature(x):
     from scipy.integrate import quad

@@ -167,7 +167,7 @@ def test_a_shallow_rebound_is_in_the_window(tmp_path: Path) -> None:
     config = proposed(Path("b.yaml"))
     assert config.document.data["data"]["window"] == {"from": "top", "to": "trough 2", "prominence": "5 %"}
     (problem,) = build(config)
-    assert problem.observations.times[-1] == pytest.approx(28.5e-6, abs=1e-9)  # 30 of the file; the window begins at 1.5
+    assert problem.observations.times[-1] == pytest.approx(28.5e-6, abs=1e-9)  # 30 less the 1.5 it begins at
 
 
 @pytest.mark.parametrize("start", ["acoustic", "laser"])

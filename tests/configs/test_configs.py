@@ -49,6 +49,16 @@ def test_quickstart_recovers_the_synthetic_gel(tmp_path):
         assert (tmp_path / file).stat().st_size > 0
 
 
+def test_the_coating_of_a_microbubble(tmp_path):
+    result = run("shell", tmp_path, **{"output.report": False, "assimilation.what_if": False})
+    assert not any(c.spoils for c in result.cautions)
+    truth = {"chi": 0.7, "kappa_s": 6e-9, "sigma_0": 12e-3, "R0": 2.1e-6}
+    for name, value in truth.items():
+        mean, std = mean_and_std(result, name)
+        assert abs(mean - value) < 2.5 * std, name
+    assert mean_and_std(result, "kappa_s")[1] < 0.04 * truth["kappa_s"]
+
+
 @pytest.mark.slow
 def test_predator_and_prey_observed_together(tmp_path):
     """Within half of a standard deviation of Carpenter's posterior of the same data, and of spreads like his."""

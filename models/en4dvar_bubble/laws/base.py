@@ -2,9 +2,10 @@
 
 An author writes one class: its ``name``, its ``parameters`` and its elastic part, either the closed form of the stress
 integral, :meth:`ConstitutiveLaw.stress`, or W′(λ), :meth:`ConstitutiveLaw.strain_energy_rate` (a :class:`Liquid` has
-none). The viscous part is a Newtonian dashpot where ``parameters`` holds ``mu``, or the method ``viscosity``. Memory
-variables are optional. All take and return NumPy arrays that broadcast: ``p.G`` etc. are (N, 1), stretch and shear
-rate (K,). Everything is tabulated per member before the compiled integration starts, so the kernel does not change.
+none). The viscous part is a Newtonian dashpot where ``parameters`` holds ``mu``, or the method ``viscosity`` or
+``strained_viscosity``. Memory variables are optional. All take and return NumPy arrays that broadcast: ``p.G`` etc. are
+(N, 1), stretch and shear rate (K,). Everything is tabulated per member before the compiled integration starts, so the
+kernel does not change.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from en4dvar_bubble.tables import evaluate, from_values
 REGISTRY: dict[str, type[ConstitutiveLaw]] = {}
 _TOGETHER = 48  # members sampled at once: their temporary arrays fit in the cache
 _EXAMPLE_BY_NAME = {"G": 5e3, "alpha": 0.03, "mu": 0.1}
-_EXAMPLE_BY_UNIT = {"Pa": 5e3, "Pa s": 0.1, "s": 1e-6, "1": 0.5}
+_EXAMPLE_BY_UNIT = {"Pa": 5e3, "Pa s": 0.1, "s": 1e-6, "1": 0.5, "N/m": 0.02}
 
 
 Limits = tuple[tuple[type["ConstitutiveLaw"], Mapping[str, float]], ...]
@@ -48,7 +49,7 @@ class ConstitutiveLaw:
     - Elastic: for any incompressible isotropic solid dJ_e/dλ = −W′(λ)/(λ³ − 1), J_e(1) = 0, with W(λ) the strain
       energy of the equibiaxial stretch λ.
     - Viscous: μ̄ is the parameter ``mu``; or, where ``viscosity`` is defined, ∫₀¹ μ(2√3 |V| s) ds, since the flow
-      u = R²Ṙ/r² has the shear rate γ̇ = 2√3 |Ṙ| R²/r³ and s = (R/r)³.
+      u = R²Ṙ/r² has the shear rate γ̇ = 2√3 |Ṙ| R²/r³ and s = (R/r)³; or, where ``strained_viscosity`` is, μ̄(λ).
     - Memory: each variable adds s (Pa) with ds/dt = −s/θ + k V s + V a(λ) + b(λ)/θ, see :class:`MemoryVariable`.
     """
 
@@ -63,6 +64,14 @@ class ConstitutiveLaw:
     """Whether J_e falls with the stretch everywhere, so that it always opposes the strain."""
     stretch_range: ClassVar[tuple[float, float]] = (0.2, 400.0)
     """Stretches over which the battery tests the law at the example values."""
+    sized: ClassVar[bool] = False
+    """Whether the law depends on the size of the bubble: then ``p.R0`` is the stress-free radius in m."""
+    released: ClassVar[bool] = False
+    """Of a ``sized`` law: whether it is for released bubbles alone; ``p.R_max`` is their largest radius in m."""
+    rest_tension: ClassVar[str] = ""
+    """Name of the parameter that is the tension of the bubble's surface at rest, instead of the surface tension."""
+    kinked: ClassVar[bool] = False
+    """Of a law of the package: whether its table needs halved cells. That of a user's is looked at."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -86,6 +95,10 @@ class ConstitutiveLaw:
         """μ(γ̇) (N, K) in Pa s at shear rates (K,) in 1/s: a generalised Newtonian liquid, instead of the dashpot."""
         raise NotImplementedError
 
+    def strained_viscosity(self, stretch: Array, p: Values) -> Array:
+        """μ̄(λ) (N, K) in Pa s at stretches (K,) of the wall, instead of the dashpot: J has −4 μ̄ Ṙ/R."""
+        raise NotImplementedError
+
     def memory(self, p: Values) -> tuple[MemoryVariable, ...]:
         """Memory variables; none unless overridden."""
         return ()
@@ -97,7 +110,10 @@ class ConstitutiveLaw:
             by_unit = _EXAMPLE_BY_UNIT.get(p.unit, 1.0)
             return float(np.clip(self.example.get(p.name, _EXAMPLE_BY_NAME.get(p.name, by_unit)), *p.bounds))
 
-        return {p.name: np.full(n, value(p)) for p in self.parameters}
+        values = {p.name: np.full(n, value(p)) for p in self.parameters}
+        radii = {"R0": 1e-6} if self.sized else {}
+        radii |= {"R_max": 5e-6} if self.released else {}
+        return values | {name: np.full(n, self.example.get(name, radius)) for name, radius in radii.items()}
 
     @property
     def closed_form(self) -> bool:
@@ -110,6 +126,11 @@ class ConstitutiveLaw:
         return type(self).viscosity is not ConstitutiveLaw.viscosity
 
     @property
+    def strain_dependent(self) -> bool:
+        """True if the viscosity depends on the stretch."""
+        return type(self).strained_viscosity is not ConstitutiveLaw.strained_viscosity
+
+    @property
     def memory_count(self) -> int:
         """Number of memory variables."""
         has_memory = type(self).memory is not ConstitutiveLaw.memory
@@ -117,7 +138,7 @@ class ConstitutiveLaw:
 
     @property
     def sharp(self) -> bool:
-        """True for a law of a user's that a uniform table does not hold: its table has halved cells."""
+        """True for a law that a uniform table does not hold: its table has halved cells."""
         return bool(is_sharp(type(self)))
 
     def samples(self, values: Mapping[str, Array]) -> Array | None:
@@ -167,12 +188,14 @@ class ConstitutiveLaw:
             return refine(function, slope=not self.closed_form)
 
     def viscous_table(self, values: Mapping[str, Array]) -> Array:
-        """μ̄ (Pa s) against z = ln(|V| s), constant below the first node: (N, cells, 8) on :data:`VISCOUS_GRID`.
-
-        For laws that are :attr:`shear_dependent`.
+        """μ̄ (Pa s), (N, cells, 8): of laws that are :attr:`strain_dependent` against ln λ, on :data:`GRID`; of
+        those that are :attr:`shear_dependent` against z = ln(|V| s), constant below the first node, on
+        :data:`VISCOUS_GRID`.
         """
         p = columns(values)
-        with np.errstate(over="ignore"):
+        with np.errstate(all="ignore" if self.strain_dependent else None, over="ignore"):
+            if self.strain_dependent:
+                return from_function(lambda stretch: self.strained_viscosity(stretch, p), members(values))
             return from_viscosity(lambda rate: self.viscosity(rate, p), members(values))
 
     def memory_tables(self, values: Mapping[str, Array]) -> MemoryTables:
@@ -191,8 +214,11 @@ class ConstitutiveLaw:
         """J_e at ``stretch`` (N, K) for N members, Pa, from the same table the solver uses."""
         return np.asarray(evaluate(self.table(values), GRID.span, np.log(stretch)))
 
-    def mean_viscosity(self, rate: Array, values: Mapping[str, Array]) -> Array:
-        """μ̄ at |V| = ``rate`` (N, K) in 1/s for N members, Pa s, from the same table the solver uses."""
+    def mean_viscosity(self, rate: Array, values: Mapping[str, Array], stretch: float | Array = 1.0) -> Array:
+        """μ̄ at |V| = ``rate`` (N, K) in 1/s and ``stretch`` for N members, Pa s, from the table the solver uses."""
+        if self.strain_dependent:
+            x = np.log(np.broadcast_to(stretch, rate.shape))
+            return np.asarray(evaluate(self.viscous_table(values), GRID.span, x))
         if not self.shear_dependent:
             mu = np.asarray(values["mu"], dtype=float)[:, None] if "mu" in values else np.zeros((members(values), 1))
             return np.broadcast_to(mu, rate.shape).copy()

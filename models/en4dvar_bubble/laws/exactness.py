@@ -10,7 +10,7 @@ import numpy as np
 
 from en4dvar_bubble.laws.parameters import columns
 from en4dvar_bubble.laws.refined import ERROR, HALVINGS
-from en4dvar_bubble.laws.tabulate import GRID, differentiate, from_function, from_strain_energy
+from en4dvar_bubble.laws.tabulate import GRID, Function, differentiate, from_function, from_strain_energy
 from en4dvar_bubble.tables import evaluate
 
 TABLE_ERROR = 1e-6
@@ -58,9 +58,9 @@ def _once(function: F) -> F:
 
 @_once
 def is_sharp(kind: type[Any]) -> bool:
-    """Whether a law of a user's has a uniform table that is wrong; tests hold those of the package to be right."""
+    """Whether a law has a uniform table that is wrong; those of the package say so, and tests hold them to it."""
     if kind.__module__.startswith(_PACKAGE):
-        return False
+        return bool(kind.kinked)
     try:
         with np.errstate(all="ignore"):
             return slope_error(kind())[0] >= TABLE_ERROR
@@ -70,10 +70,14 @@ def is_sharp(kind: type[Any]) -> bool:
 
 @_once
 def refuse_inexact(kind: type[Any]) -> None:
-    """Raise ValueError for a sharp law whose stress jumps, or is too rough for cells however narrow."""
+    """Raise ValueError for a sharp law whose stress jumps, or is too rough for cells however narrow, and for one whose
+    other functions of the stretch, for which no cells are halved, a uniform table does not hold.
+    """
+    law = kind()
+    if law.strain_dependent or law.memory_count:
+        _refuse_rough(law)
     if not is_sharp(kind):
         return
-    law = kind()
     lowest, highest = law.stretch_range
     inexact = np.exp(law.refined(law.example_values()).x)
     inexact = inexact[(inexact > lowest) & (inexact < highest)]
@@ -84,3 +88,29 @@ def refuse_inexact(kind: type[Any]) -> None:
             "of its size. Make it continuous there (a kink does no harm), or narrow stretch_range to where it is "
             "continuous, if bubbles stay inside (en4dvar laws --check says more)"
         )
+
+
+def _refuse_rough(law: Any) -> None:
+    """Raise ValueError for a viscosity or a memory function of the stretch that a table does not hold to 1e-6 of the
+    larger of its size there and its largest between λ = 1/2 and 2.
+    """
+    p, (lowest, highest) = columns(law.example_values()), np.log(law.stretch_range)
+    x = np.arange(lowest, highest, GRID.step / _POINTS_IN_CELL)
+    functions: dict[str, Function] = {}
+    if law.strain_dependent:
+        functions["its strained_viscosity"] = lambda stretch: law.strained_viscosity(stretch, p)
+    for i, variable in enumerate(law.memory(p)):
+        functions[f"the stiffness of its memory variable {i + 1}"] = variable.stiffness_at
+        functions[f"the equilibrium of its memory variable {i + 1}"] = variable.equilibrium_at
+    for what, function in functions.items():
+        with np.errstate(all="ignore"):
+            exact = np.broadcast_to(function(np.exp(x)), (1, len(x)))[0]
+            error = np.abs(evaluate(from_function(function, 1), GRID.span, x[None])[0] - exact)
+            allowed = TABLE_ERROR * np.maximum(np.abs(exact), np.max(np.abs(exact[np.abs(x) < np.log(2)]), initial=0.0))
+        if np.any(error > allowed):
+            where = np.exp(x[np.argmax(error - allowed)])
+            raise ValueError(
+                f"{law.name}: {what} changes too sharply near λ = {where:.3g} for the table that the solver reads, "
+                f"whose cells are {GRID.step:g} wide in ln λ: make it smoother there, or narrow stretch_range to where "
+                "it is smooth, if bubbles stay inside"
+            )

@@ -56,6 +56,12 @@ def _check_elastic(kind: type[ConstitutiveLaw], name: str) -> None:
 def _check_parameters(kind: type[ConstitutiveLaw], name: str) -> None:
     if not (isinstance(kind.parameters, tuple) and all(isinstance(p, Parameter) for p in kind.parameters)):
         raise ConfigError(f"{name}: parameters must be a tuple of en4dvar.Parameter")
+    if kind.viscosity is not ConstitutiveLaw.viscosity and (
+        kind.strained_viscosity is not ConstitutiveLaw.strained_viscosity
+    ):
+        raise ConfigError(
+            f"{name}: defines both viscosity and strained_viscosity; no viscosity depends on shear rate and stretch"
+        )
     names = [p.name for p in kind.parameters]
     if not names:
         raise ConfigError(f"{name}: parameters is empty")
@@ -74,6 +80,8 @@ def _probe(law: ConstitutiveLaw, name: str) -> None:
     _call(getattr(law, elastic), (stretch, p), f"{name}: {elastic}(stretch, p)")
     if law.shear_dependent:
         _call(law.viscosity, (rate, p), f"{name}: viscosity(shear_rate, p)")
+    if law.strain_dependent:
+        _call(law.strained_viscosity, (stretch, p), f"{name}: strained_viscosity(stretch, p)")
     variables = _run(lambda: law.memory(p), f"{name}: memory(p)")
     if not (isinstance(variables, tuple) and all(isinstance(v, MemoryVariable) for v in variables)):
         raise ConfigError(f"{name}: memory(p) must return a tuple of MemoryVariable")

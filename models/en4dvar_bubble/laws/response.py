@@ -55,7 +55,7 @@ def respond(law: ConstitutiveLaw, values: Mapping[str, Array], cycle: Cycle, poi
     weight = (half * weights).ravel()
     stretch, rate = cycle.stretch(times), cycle.rate(times)
     elastic = law.elastic_stress(stretch[None], values)[0]
-    J = elastic - 4 * law.mean_viscosity(np.abs(rate)[None], values)[0] * rate
+    J = elastic - 4 * law.mean_viscosity(np.abs(rate)[None], values, stretch[None])[0] * rate
     if variables:
         theta = np.array([_scalar(v.relaxation_time) for v in variables])
         k = np.array([v.convection for v in variables])

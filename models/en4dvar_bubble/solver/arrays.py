@@ -36,7 +36,9 @@ class Members(NamedTuple):
 
 
 class Dims(NamedTuple):
-    """Numbers of unknowns, and which equations: those of the general ones by ``radial`` and ``shear``."""
+    """Numbers of unknowns, and which equations: those of the general ones by ``radial``, and by ``shear``
+    and ``strain``: what the viscosity depends on.
+    """
 
     gas: int
     vapour: int
@@ -45,6 +47,7 @@ class Dims(NamedTuple):
     memory: int
     radial: int
     shear: int
+    strain: int
 
 
 class Equations(NamedTuple):

@@ -95,9 +95,9 @@ class System:
     """Which unknowns there are, in the order of the kernel's rows, and which equations.
 
     ``gas`` temperature nodes, ``vapour`` mole-fraction nodes (0 or ``gas``), ``medium`` temperature nodes, ``memory``
-    variables; ``shear``: a viscosity that depends on the shear rate. ``clustering`` of the gas nodes at the wall, see
-    :func:`collocation.ball`. ``medium_length``: of the medium's grid map in radii; half of its nodes lie within it of
-    the wall. ``image``: whether a plane mirrors the bubble.
+    variables; ``shear``, ``strain``: a viscosity that depends on the shear rate, or on the stretch. ``clustering`` of
+    the gas nodes at the wall, see :func:`collocation.ball`. ``medium_length``: of the medium's grid map in radii; half
+    of its nodes lie within it of the wall. ``image``: whether a plane mirrors the bubble.
     """
 
     gas: int
@@ -106,6 +106,7 @@ class System:
     memory: int = 0
     radial: Radial = "keller-miksis"
     shear: bool = False
+    strain: bool = False
     clustering: float = 0.0
     medium_length: float = 0.5
     image: bool = False
@@ -118,7 +119,7 @@ class System:
     @cached_property
     def general(self) -> bool:
         """Whether the general equations are needed."""
-        options = self.vapour, self.medium, self.memory, self.shear, self.image
+        options = self.vapour, self.medium, self.memory, self.shear, self.strain, self.image
         return any(options) or RADIALS[self.radial] != rows.PRESSURE
 
     @cached_property
@@ -132,7 +133,8 @@ class System:
 
     @property
     def dims(self) -> Dims:
-        return Dims(self.gas, self.vapour, self.medium, self.wall, self.memory, RADIALS[self.radial], int(self.shear))
+        counts = self.gas, self.vapour, self.medium, self.wall, self.memory
+        return Dims(*counts, RADIALS[self.radial], int(self.shear), int(self.strain))
 
     @property
     def first_vapour(self) -> int:
@@ -265,7 +267,7 @@ class Solver:
         medium = _medium_operators(system.medium, system.medium_length)
         general: tuple[Any, Any, Any, Any] = (None,) * 4  # what nobody reads need not be compiled either
         if system.general:
-            general = medium, memory, viscous, _VISCOUS_SPAN
+            general = medium, memory, viscous, _ELASTIC_SPAN if system.strain else _VISCOUS_SPAN
         gas, reading = _gas_operators(system.gas, system.clustering), READINGS[self.reading]
         shared = gas, _REFINED_SPAN if halved else _ELASTIC_SPAN, pulse, driving.span
         where, places = self.tiles

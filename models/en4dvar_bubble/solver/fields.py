@@ -68,7 +68,7 @@ def _add_wall(value, count, matrix, work, at):
 @called
 def _sum_up(y, eq, par, work, border):
     """The interior's share in the derivatives, to ``work``, and in the sums of the border; returns θ_m' at the wall."""
-    mT, mY, mM, _, _, _, _ = eq.dims
+    mT, mY, mM = eq.dims.gas, eq.dims.vapour, eq.dims.medium
     if mT == 0:
         return splat(0.0)
     a, power = load(par, rows.SLOPE), load(par, rows.DIFFUSION_T)
@@ -96,7 +96,7 @@ def _sum_up(y, eq, par, work, border):
 @called
 def _rates(eq, par, shared, work, out):
     """Rates of the fields to ``out``; the derivatives in ``work`` are completed."""
-    mT, mY, mM, _, _, _, _ = eq.dims
+    mT, mY, mM = eq.dims.gas, eq.dims.vapour, eq.dims.medium
     gas, medium = eq.gas, eq.medium
     if mT == 0:
         return
@@ -144,7 +144,7 @@ def general_rhs(y, t, eq, loaded, w):
 @called
 def _gas_blocks(y, eq, par, w):
     """Minus the derivatives of the gas's rates and of the sums with respect to τ and Y, to ``tiles``."""
-    mT, mY, _, _, _, _, _ = eq.dims
+    mT, mY = eq.dims.gas, eq.dims.vapour
     ops, work, shared, matrix, where = eq.gas, w.work, w.shared, w.tiles, eq.where
     first_Y, _, border = begins(eq.dims)
     a, kappa, power = load(par, rows.SLOPE), load(par, rows.KAPPA), load(par, rows.DIFFUSION_T)
@@ -198,7 +198,7 @@ def _medium_block(eq, par, w):
 @called
 def _border_column(column, eq, par, change, w):
     """Minus the derivatives of the fields' rates with respect to an unknown of the border, from those of ``shared``."""
-    mT, mY, mM, _, _, _, _ = eq.dims
+    mT, mY, mM = eq.dims.gas, eq.dims.vapour, eq.dims.medium
     gas, medium, work, shared, matrix, where = eq.gas, eq.medium, w.work, w.shared, w.tiles, eq.where
     first_Y, first_M, _ = begins(eq.dims)
     kappa, power = load(par, rows.KAPPA), load(par, rows.DIFFUSION_T)

@@ -60,7 +60,7 @@ def _contents(border, V, u, outward, eq, par, shared, out):
     """Pressure and π̇; what the fields read to ``shared``, the residual of the wall to ``out``. ``outward`` is the
     interior's share in θ_m' at the wall.
     """
-    mT, mY, mM, wall, _, _, _ = eq.dims
+    mT, mY, mM, wall = eq.dims.gas, eq.dims.vapour, eq.dims.medium, eq.dims.wall
     ops, kappa, zero = eq.gas, load(par, rows.KAPPA), splat(0.0)
     if mT == 0:
         return exp(load(par, rows.LOG_GAS) - kappa * u * 3.0), kappa * V * (-3.0)
@@ -111,7 +111,8 @@ def border_rates(border, t, outward, eq, loaded, shared, out):
     """Rates of the border's unknowns to ``out``, the residual of its algebraic equation in the wall's row; what the
     fields read to ``shared``. ``outward``: see :func:`_contents`.
     """
-    _, _, _, wall, q, radial, shear = eq.dims
+    dims = eq.dims
+    wall, q, radial = dims.wall, dims.memory, dims.radial
     par, span, viscous_span, reading = loaded.par, eq.elastic_span, eq.viscous_span, eq.reading
     oS = sums(eq.dims) + wall
     V = load(border, oS + q)
@@ -134,12 +135,17 @@ def border_rates(border, t, outward, eq, loaded, shared, out):
     nu = load(par, rows.VISCOSITY)
     dashpot = nu * V * 4.0
     dashpot_V = nu * 4.0
-    if shear:
+    if dims.shear:
         z = maximum(log(maximum(absolute(V) * 1e6, 1e-300)), viscous_span[0])
         at = load(par, rows.VISCOUS_TABLE)
         nu, nu_z, _ = lookup(eq.viscous, at, viscous_span, z)
         dashpot = nu * V * 4.0
         dashpot_V = (nu + nu_z) * 4.0
+    if dims.strain:
+        nu, nu_x, _ = lookup(eq.viscous, load(par, rows.VISCOUS_TABLE), viscous_span, x)
+        dashpot = nu * V * 4.0
+        dashpot_V = nu * 4.0
+        J_rate = J_rate - nu_x * V * V * 4.0
 
     R = exp(u)
     ic = load(par, rows.INVERSE_C)
