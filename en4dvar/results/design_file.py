@@ -121,7 +121,7 @@ def _padded(
     of: Sequence[Evaluated | Decision | None], field: str, dims: Sequence[str], sizes: Mapping[str, int]
 ) -> Array:
     """(designs, …) numbers along ``dims``, which have at least their ``sizes``; NaN where a design has none."""
-    each = [None if one is None else np.asarray(getattr(one, field), dtype=float) for one in of]
+    each = [None if design is None else np.asarray(getattr(design, field), dtype=float) for design in of]
     shape = [max(sizes.get(dim, 1), *(v.shape[k] for v in each if v is not None), 0) for k, dim in enumerate(dims)]
     table = np.full((len(of), *shape), np.nan)
     for i, values in enumerate(each):

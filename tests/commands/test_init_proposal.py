@@ -18,7 +18,7 @@ from en4dvar.config import load_config, resolve
 from en4dvar.config.document import parse_document, read_document
 from en4dvar.inputs.asked import Column
 from en4dvar.inputs.readers import read_series
-from en4dvar.plumbing.errors import DataError
+from en4dvar.plumbing.errors import ConfigError, DataError
 from en4dvar.report.result import load_result
 from en4dvar_bubble.collapse import RAYLEIGH, lobe
 from en4dvar_bubble.laws import REGISTRY
@@ -174,6 +174,10 @@ def test_a_shallow_rebound_is_in_the_window(tmp_path: Path) -> None:
 @pytest.mark.parametrize("law", sorted(REGISTRY))
 def test_every_law_has_a_starter_that_validates(tmp_path: Path, start: str, law: str) -> None:
     source = Source("b.csv", ("t", "us"), None, ("R", "um"))
+    if REGISTRY[law].released and start == "acoustic":
+        with pytest.raises(ConfigError, match=f"--law {law} --start acoustic: {law} needs start: laser"):
+            starter(start, law)
+        return
     text = yaml_text("a", source, starter(start, law), "test")  # type: ignore[arg-type]
     config = resolve(parse_document(text, "a.yaml"), tmp_path)
     assert {e.parameter.name for e in config.parameters} == {*(p.name for p in config.model.parameters), "t_s"}

@@ -10,7 +10,7 @@ import numpy as np
 
 from en4dvar.inputs.window import Instant, select
 from en4dvar.model.state import Array, Parameter
-from en4dvar.plumbing.errors import DataError
+from en4dvar.plumbing.errors import ConfigError, DataError
 from en4dvar.plumbing.units import convert
 from en4dvar_bubble.collapse import Lobe, conceivable, doubt, lobe
 from en4dvar_bubble.dynamics import R0, R_EQ, R_MAX
@@ -202,10 +202,13 @@ def with_columns(proposal: Proposal, errors: Sequence[str], common: str) -> Prop
 
 
 def built(start: Start, law: str | None) -> tuple[BubbleModel, str]:
-    """The model, and how the file names its law. Raises :class:`ConfigError` where there is no such law."""
+    """The model, and how the file names its law. Raises :class:`ConfigError` where no such law starts so."""
     name = qualified(law) if law else LAWS[start]
     settings = BubbleSettings.model_validate({**MODEL[start], "start": start, "law": name})
-    return BubbleModel.from_settings(settings), name
+    try:
+        return BubbleModel.from_settings(settings), name
+    except ValueError as error:
+        raise ConfigError(f"--law {name} --start {start}: {error}") from None
 
 
 def _looks(histories: Mapping[str, tuple[Array, Array]], start: Start | None) -> dict[str, Look]:
