@@ -44,7 +44,7 @@ _SHEAR_RATE = 2 * np.sqrt(3) * np.exp(_LOG_RATE)
 
 def from_function(function: Function, n: int) -> Array:
     """Table (N, cells, 8) of ``function``: stretch (K,) → broadcastable to (N, K)."""
-    return from_values(np.ascontiguousarray(np.broadcast_to(function(STRETCH), (n, len(STRETCH))), dtype=float))
+    return from_values(np.array(np.broadcast_to(function(STRETCH), (n, len(STRETCH))), dtype=float, order="C"))
 
 
 def from_strain_energy(rate: Function, n: int) -> Array:
