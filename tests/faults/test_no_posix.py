@@ -73,7 +73,7 @@ def test_a_campaign_with_processes_killed_and_resumed(away, tmp_path):
 
 
 def test_tracking_a_movie(away, tmp_path):
-    from siege_files import movies  # which needs a folder of tests that pytest adds
+    from siege_files import movies
 
     movies(tmp_path / "movies")
     told = ran(
