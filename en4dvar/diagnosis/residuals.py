@@ -23,6 +23,7 @@ from en4dvar.model.state import Array
 
 FEWEST = 8  # readings below which nothing is said
 MOST = 500  # of them are looked at, evenly chosen blocks would tell no more
+NO_VARIANCE = 1e-12  # of the largest eigenvalue of Q; below it a direction was fitted exactly, to rounding
 FREQUENCIES = np.expm1(np.linspace(np.log1p(1e-4), np.log1p(400.0), 700))
 
 
@@ -128,14 +129,20 @@ class Residuals:
         """The reading of the largest studentised residual, its place in the data, and the probability of one so large.
 
         Of u = Q^{-1/2}e, independent normal numbers, each studentised residual is a projection, so that its square over
-        uᵀu is Beta(½, (K − 1)/2); times K for the largest of them (Bonferroni).
+        uᵀu is Beta(½, (r − 1)/2) for a covariance Q of rank r; times K for the largest of them (Bonferroni). Readings
+        far more exact than the prior leave Q no variance in the directions that the parameters fit.
         """
         from scipy.special import betainc
 
         k, worst = len(self.white), int(np.argmax(np.abs(self.studentised)))
-        total = float(self.white @ np.linalg.solve(self.expected, self.white))
+        values, vectors = np.linalg.eigh(self.expected)
+        kept = values > NO_VARIANCE * values[-1]
+        rank = int(np.count_nonzero(kept))
+        if rank < 2:  # the residuals have one shape, whose largest part says nothing
+            return int(self.which[worst]), 1.0
+        total = float(np.sum((self.white @ vectors[:, kept]) ** 2 / values[kept]))
         share = min(1.0, float(self.studentised[worst] ** 2) / total)
-        return int(self.which[worst]), min(1.0, k * float(1 - betainc(0.5, (k - 1) / 2, share)))
+        return int(self.which[worst]), min(1.0, k * float(1 - betainc(0.5, (rank - 1) / 2, share)))
 
     def _chance(self, form: Array) -> float:
         """P(xᵀFx/xᵀx ≥ eᵀFe/eᵀe) for x ~ N(0, Q)."""

@@ -85,3 +85,18 @@ def test_a_discrepancy_takes_the_structure():
 def test_an_outlier_is_named():
     words = next(c.words for c in run(spiked()).cautions if c.code == "odd-residuals")
     assert f"{run(spiked()).observations.times[12]:.4g}" in words
+
+
+def test_the_outlier_of_an_exact_fit_is_that_of_least_squares():
+    """Two parameters fitted to rounding: Q has rank K − 2, and r²/(K − 2) of a residual is Beta(½, (K − 3)/2)."""
+    from scipy.stats import beta
+
+    design = np.vander(np.linspace(-1, 1, K), 2)
+    y = np.random.default_rng(7).normal(size=K)
+    y[4] += 6
+    fit, (squares,) = np.linalg.lstsq(design, y)[:2]
+    left = y - design @ fit
+    own = 1 - np.sum(np.linalg.qr(design)[0] ** 2, axis=1)
+    chance = K * beta.sf(left[4] ** 2 / own[4] / squares, 0.5, (K - 3) / 2)
+    residuals = Residuals.of(left, 1e9 * design, 19, np.ones(K), np.arange(K))
+    assert residuals.outlier == (4, pytest.approx(chance, rel=1e-6))
