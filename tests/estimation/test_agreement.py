@@ -113,6 +113,21 @@ def test_a_trend_with_the_order_is_told():
     assert "rises with the order of the data sets" in told.words
 
 
+def test_data_sets_that_say_less_and_less_are_no_trend():
+    """Alone, they end nearer and nearer to their prior, which is 5 of its standard deviations away."""
+    found = []
+    for seed in range(5):
+        problems = campaign([4.5] * 9, seed)
+        for e, problem in enumerate(problems):
+            o = problem.observations
+            rng, more = np.random.default_rng([seed, e]), ERROR * 1.5**e
+            values = o.values + np.sqrt(more**2 - ERROR**2) * rng.standard_normal(len(o.values))
+            noise = replace(o.noise, std=o.std * more / ERROR)
+            problems[e] = replace(problem, observations=replace(o, values=values, noise=noise))
+        found += [c for c in joint(problems).cautions if c.code == "trend"]
+    assert len(found) <= 1  # of one in a hundred
+
+
 def test_trends_by_chance_are_rare():
     rng, problems = np.random.default_rng(3), campaign([0.0] * 8)
     told = [list(trends(problems, rng.standard_normal((8, 2)), ["a", "b"])) for _ in range(100)]

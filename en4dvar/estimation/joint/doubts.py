@@ -17,13 +17,16 @@ from en4dvar.plumbing.caution import Caution, caution
 
 MOST_NAMES = 6
 LEAST = 1e-16  # probability that is told in figures
+LEAST_LEARNT = 1e-6  # of the prior's variance, by which a mode would move; below it a data set says nothing
 DIFFER = 1e-3  # probability below which data sets are said not to share one value
 
 
 def doubts(
-    joint: JointProblem, chi2: Array, agreed: Agreement, kept: Collection[int], singles: Sequence[Single]
+    joint: JointProblem, border: Array, chi2: Array, agreed: Agreement, kept: Collection[int], singles: Sequence[Single]
 ) -> Iterator[Caution]:
-    """Warnings of a joint estimate about its data sets, with χ² (E,) per reading; those not ``kept`` are odd."""
+    """Warnings of a joint estimate about its data sets, with the shared values ``border`` (c,) in units of the prior
+    and χ² (E,) per reading; those not ``kept`` are odd.
+    """
     odd = [
         f"{name} (χ² {chi2[e]:.3g} per reading, {agreed.squares[e] ** 0.5:.1f} standard deviations from all others, "
         f"probability {_chance(agreed.chances[e])})"
@@ -45,7 +48,7 @@ def doubts(
             advice += f", or, where errors were stated too small, state them {agreed.scatter:.1f} times as large"
         yield replace(caution("data-sets-differ", words), advice=advice)
     yield from _misfits(joint, chi2, kept)
-    yield from _trends(joint, singles)
+    yield from _trends(joint, border, singles)
 
 
 def _misfits(joint: JointProblem, chi2: Array, kept: Collection[int]) -> Iterator[Caution]:
@@ -60,15 +63,24 @@ def _misfits(joint: JointProblem, chi2: Array, kept: Collection[int]) -> Iterato
         yield caution("misfit", words)
 
 
-def _trends(joint: JointProblem, singles: Sequence[Single]) -> Iterator[Caution]:
-    """Of the shared parameters as the data sets have them alone, in units of the prior."""
+def _trends(joint: JointProblem, border: Array, singles: Sequence[Single]) -> Iterator[Caution]:
+    """Of the shared parameters as the data sets have them alone, each held against what it should be.
+
+    Given the shared s a linear data set of posterior covariance P, in units of the prior, has its mode at (I − P)_s s
+    on average: the less its readings say, the nearer to the prior, which may well follow its size. The rest is counted in
+    its standard deviations, by the noise P − P² and the unknown quantities of its own, (I − P)_v (I − P)_vᵀ.
+    """
     names = list(dict.fromkeys(name for name, _ in joint.shared))
     values = np.full((len(singles), len(names)), np.nan)
     for e, single in enumerate(singles):
-        own = joint.experiments[e].prior.names
-        for j, name in enumerate(names):
-            if name in joint.groups[e]:
-                values[e, j] = single.mode[own.index(name)]
+        shared, own = joint.columns(e)
+        covariance = np.linalg.inv(single.precision)
+        learnt = np.eye(len(covariance)) - covariance
+        off = single.mode - learnt[:, shared] @ border[joint.of_border(e)]
+        variance = np.diag(covariance - covariance @ covariance) + np.sum(learnt[:, own] ** 2, axis=1)
+        for at in shared:
+            if variance[at] > LEAST_LEARNT:
+                values[e, names.index(joint.experiments[e].prior.names[at])] = off[at] / np.sqrt(variance[at])
     return trends(joint.experiments, values, names)
 
 

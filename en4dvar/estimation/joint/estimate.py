@@ -146,7 +146,7 @@ class _Estimate:
         names = without.rest.joint.names if without else joint.names
         kept = [e for e, name in enumerate(joint.names) if name in names]
         agreed = agreement(joint, singles, kept, 2 * np.maximum(lowest.at.own_costs - alone, 0))
-        cautions += doubts(joint, lowest.at.chi2(joint), agreed, kept, singles)
+        cautions += doubts(joint, lowest.at.place.border, lowest.at.chi2(joint), agreed, kept, singles)
         normalisation = sum(problem.observations.log_normalisation() for problem in joint.experiments)
         return JointEstimate(
             joint=joint,
