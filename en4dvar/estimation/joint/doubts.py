@@ -67,8 +67,8 @@ def _trends(joint: JointProblem, border: Array, singles: Sequence[Single]) -> It
     """Of the shared parameters as the data sets have them alone, each held against what it should be.
 
     Given the shared s a linear data set of posterior covariance P, in units of the prior, has its mode at (I − P)_s s
-    on average: the less its readings say, the nearer to the prior, which may well follow its size. The rest is counted in
-    its standard deviations, by the noise P − P² and the unknown quantities of its own, (I − P)_v (I − P)_vᵀ.
+    on average: the less its readings say, the nearer to the prior, and how much they say may well follow its size. The
+    rest is counted in its standard deviations, by the noise P − P² and its own unknown quantities, (I − P)_v (I − P)_vᵀ.
     """
     names = list(dict.fromkeys(name for name, _ in joint.shared))
     values = np.full((len(singles), len(names)), np.nan)
