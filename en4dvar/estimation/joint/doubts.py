@@ -68,7 +68,7 @@ def _trends(joint: JointProblem, border: Array, singles: Sequence[Single]) -> It
 
     Given the shared s a linear data set of posterior covariance P, in units of the prior, has its mode at (I − P)_s s
     on average: the less its readings say, the nearer to the prior, and how much they say may well follow its size. The
-    rest is counted in its standard deviations, by the noise P − P² and its own unknown quantities, (I − P)_v (I − P)_vᵀ.
+    rest is counted in its standard deviations, by the noise P − P² and by its own unknowns, (I − P)_v (I − P)_vᵀ.
     """
     names = list(dict.fromkeys(name for name, _ in joint.shared))
     values = np.full((len(singles), len(names)), np.nan)
