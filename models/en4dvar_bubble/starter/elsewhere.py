@@ -11,11 +11,13 @@ from __future__ import annotations
 import glob
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from en4dvar.estimation.population.estimate import FEWEST_SETS
 from en4dvar.model.state import READING_SCALE
+from en4dvar.plumbing.units import parse_quantity
 from en4dvar_bubble.media import MEDIA, known_medium
+from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.starter.grouped import NO_GROUPS, Grouped
 
 ANY = "gel"
@@ -54,6 +56,13 @@ def known(medium: str) -> Sequence[Known]:
             Known("c", f"{it.c:.4g} m/s", float(f"{it.c_log_std:.2g}"), f"speed of sound in {medium}"),
         )
     return (*of_medium, PRESSURE, SCALE)
+
+
+def centred(model: BubbleModel, medium: str) -> BubbleModel:
+    """The model with the medians of what is known: 3 % of density are a factor of 1.6 of a gel's modulus."""
+    medians = {quantity.key: quantity.median for quantity in known(medium)}
+    rho, c = parse_quantity(medians["rho"], "kg/m^3"), parse_quantity(medians["c"], "m/s")
+    return replace(model, medium=replace(model.medium, rho=rho, c=c, p_inf=parse_quantity(medians["p_inf"], "Pa")))
 
 
 def wall(radius: float, slowness: float) -> tuple[str, str, str]:

@@ -2,9 +2,9 @@
 
 Acoustic start: R_max and the collapse time (the driving is known, so both follow from G and μ). Laser start: the
 collapse time and the rebound's height over R_max (R_max is where the model starts). The model is run on a grid of G and
-μ, every other parameter at the centre of its prior; each node is weighted by exp(−½ Σ (ln feature − ln observed)²/s²)
-and the guess is the weighted geometric mean; of a gel the grid begins at 0.01 Pa s, for where the numbers tell little
-it decides. Collapse times of model and data are taken in the same way
+μ, every other parameter at the centre of its prior; each node is weighted by exp(−½ Σ (ln feature − ln observed)²/s²),
+of a gel also by what gels are known to be, which decides where the numbers tell little; the guess is the weighted
+geometric mean. Collapse times of model and data are taken in the same way
 (:func:`~en4dvar_bubble.collapse.lobe`).
 
 A guess is an order of magnitude to centre a wide prior on: it has seen the data that the prior is then confronted with.
@@ -27,7 +27,9 @@ from en4dvar_bubble.solver.driver import preset
 from en4dvar_bubble.starter.look import second_maximum
 
 GRID: Mapping[str, Array] = {"G": np.geomspace(50.0, 2e5, 25), "mu": np.geomspace(3e-3, 1.0, 18)}  # Pa, Pa s
-OF_GELS = np.geomspace(1e-2, 1.0, 15)  # Pa s: published of gels 0.03 (Mancia 2021) to 0.19 (Yang 2020)
+OF_GELS: Mapping[str, tuple[float, float]] = {"G": (5e3, 1.5), "mu": (0.08, 1.2)}
+"""Medians (SI) and log_std of what is known of a gel without its history, wide enough for those that bubbles were used
+on: 0.03 (Mancia 2021) to 0.19 Pa s (Yang 2020), a tenth of a kPa to some tens."""
 TOLERANCE = {"R_max": 0.05, "t_c": 0.05, "rebound": 0.15}  # s, of the logarithm
 FAR = 3.0  # in units of s: no node reproduces the observed numbers
 POINTS = 400
@@ -70,8 +72,7 @@ def first_guess(model: BubbleModel, fixed: Mapping[str, float], observed: Mappin
         return Guess({}, {}, 0.0)
     if model.start == "laser":  # whose equations are many; an order of magnitude needs no more
         model = replace(model, accuracy=preset("fast", "laser"))
-    grid = {**GRID, "mu": OF_GELS} if "G" in names else GRID
-    nodes = np.array(list(itertools.product(*(grid[name] for name in names))))
+    nodes = np.array(list(itertools.product(*(GRID[name] for name in names))))
     theta = {name: np.full(len(nodes), value) for name, value in fixed.items()}
     theta |= {name: nodes[:, i] for i, name in enumerate(names)}
     reach = (4.0 if model.start == "laser" else 5.0) * observed["t_c"]
@@ -88,9 +89,11 @@ def first_guess(model: BubbleModel, fixed: Mapping[str, float], observed: Mappin
             misfit[i] = float(np.sum(np.square(terms))) if np.all(np.isfinite(terms)) else np.inf
     if not np.any(np.isfinite(misfit)):
         return Guess({}, {}, float("inf"))
-    weights = np.exp(-0.5 * (misfit - misfit.min()))
+    logs, known = np.log(nodes), np.zeros(len(nodes))
+    if "G" in names:
+        known = sum(((logs[:, i] - np.log(OF_GELS[n][0])) / OF_GELS[n][1]) ** 2 for i, n in enumerate(names))
+    weights = np.exp(-0.5 * (misfit - misfit.min() + known))
     weights /= weights.sum()
-    logs = np.log(nodes)
     mean = weights @ logs
     spread = np.sqrt(weights @ (logs - mean) ** 2)
     told = "R_max and collapse time" if model.start == "acoustic" else "collapse time and rebound"

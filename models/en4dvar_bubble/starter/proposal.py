@@ -19,7 +19,7 @@ from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.settings import BubbleSettings
 from en4dvar_bubble.starter import elsewhere
 from en4dvar_bubble.starter.grouped import NO_GROUPS, Grouped
-from en4dvar_bubble.starter.guess import Guess, first_guess
+from en4dvar_bubble.starter.guess import OF_GELS, Guess, first_guess
 from en4dvar_bubble.starter.look import Look, Start, look, typical
 
 LAWS: Mapping[Start, str] = {"acoustic": "quadratic-kelvin-voigt", "laser": "neo-hookean-kelvin-voigt"}
@@ -43,7 +43,8 @@ USUAL_NOISE = 0.01  # of R_max: of readings too few to tell
 NOISE_LOG_STD = 0.4  # of the noise scale: a scatter is told by a dozen windows, and not alike at all radii
 TOP_WIDTH = 3.0  # standard errors of the top that the prior takes: it is not to count the readings there twice
 DISCREPANCY = "{kernel: matern-3/2, grows_beyond: 10 m/s}"
-STIFFENING = (0.12, 1.4)  # median and log_std of α: agarose 0.03 (Mancia 2021), polyacrylamide 0.48 (Yang 2020)
+STIFFENING = (0.12, 1.4)  # median and log_std of α
+SPAN = {"alpha": "agarose 0.03 (Mancia 2021), polyacrylamide 0.48 (Yang 2020)"}
 LEAST_SHIFT = 0.1  # of the step between samples: of the prior of the clock
 TIMING = 0.05  # of the step between samples
 NUCLEUS = 0.5e-6  # m: order of the stress-free radii in Mancia et al. (2021), Table 1
@@ -110,7 +111,7 @@ def propose(
     look = _typical(views)
     others = _others(model, look)
     observed = {"R_max": look.lobe.R_max, "t_c": look.lobe.t_c, "rebound": look.rebound}
-    guess = first_guess(model, others, observed)
+    guess = first_guess(elsewhere.centred(model, medium), others, observed)
     ratio = look.lobe.rayleigh_ratio(model.medium)
     told = [
         f"R_max {_text(look.lobe.R_max, 'm', 'um', 3)}, collapse {_text(look.lobe.t_c, 's', 'us', 3)} later, "
@@ -406,12 +407,15 @@ def _parameters(
 
 
 def example(p: Parameter, model: BubbleModel) -> Entry:
-    """A prior about the law's example value; of α one that spans the gels."""
-    if p.name == "alpha":
-        prior = f"{{prior: lognormal, median: {STIFFENING[0]:g}, log_std: {STIFFENING[1]:g}}}"
-        off = math.exp(BETWEEN * STIFFENING[1])
-        words = f"{p.label}: agarose 0.03 (Mancia 2021), polyacrylamide 0.48 (Yang 2020); may be off by a factor of "
-        return Entry(p.name, prior, f"{words}{off:.2g}; narrow it to what you know of your gel")
+    """A prior about the law's example value; of α, and of a gel's G and μ, one that spans the gels."""
+    gels = {"alpha": STIFFENING}
+    if any(other.name == "G" for other in model.law.parameters):
+        gels |= OF_GELS
+    if p.name in gels:
+        median, width = gels[p.name]
+        prior = f"{{prior: lognormal, median: {_text(median, p.unit, p.display_unit)}, log_std: {width:g}}}"
+        words = f"{p.label}: {SPAN.get(p.name, 'of gels')}; may be off by a factor of {math.exp(BETWEEN * width):.2g}"
+        return Entry(p.name, prior, f"{words}; narrow it to what you know of your gel")
     value = float(model.law.example_values()[p.name][0]) if p.name in model.law.example_values() else 1.0
     text = _text(value, p.unit, p.display_unit)
     words = f"{p.label}: an example value, not from the data"

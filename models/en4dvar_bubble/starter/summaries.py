@@ -24,10 +24,6 @@ RADII = (1e-6, 0.1)  # m
 STRETCHES = (1.5, 50.0)  # R_max/R_eq
 RATIOS = (0.3, 3.0)  # of the collapse time to Rayleigh's
 COLUMNS = ("bubble", "R_max_um", "R_eq_um", "collapse_us")
-PRIORS = {
-    "G": ("5 kPa", 1.5),
-    "mu": ("0.05 Pa s", 1.2),
-}  # median, log_std: they span the gels that bubbles were used on
 TIME_STD, RADIUS_STD = "20 ns", 0.005
 
 
@@ -102,9 +98,5 @@ def propose_from_times(rows: Summaries, law: str | None) -> Proposal:
 
 
 def _shared(p: Parameter, model: BubbleModel) -> Entry:
-    if p.name not in PRIORS:
-        line = example(p, model)
-        return replace(line, value=f"{line.value[:-1]}, shared: all}}")
-    median, log_std = PRIORS[p.name]
-    prior = f"{{prior: lognormal, median: {median}, log_std: {log_std}, shared: all}}"
-    return Entry(p.name, prior, f"{p.label}: wide; narrow it to what you knew before")
+    line = example(p, model)
+    return replace(line, value=f"{line.value[:-1]}, shared: all}}")
