@@ -169,8 +169,9 @@ def _on_paper(chart: Chart) -> Figure:
 
 
 def load_result(path: str | Path) -> Result:
-    """Read a result file.
+    """Read a result file, or the one in the directory of a run.
 
     Raises :class:`~en4dvar.plumbing.errors.OutputError` as :func:`~en4dvar.results.store.load_stored`.
     """
-    return Result(load_stored(path).groups)
+    file = Path(path)
+    return Result(load_stored(file / "posterior.nc" if file.is_dir() else file).groups)

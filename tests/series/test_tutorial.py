@@ -49,7 +49,7 @@ def test_every_block_is_used():
 def test_estimation_from_yaml(folder):
     for command in COMMANDS[:3]:
         call(command)
-    rows = {row.name: row for row in load_result(folder / "runs" / "duffing" / "posterior.nc").rows}
+    rows = {row.name: row for row in load_result(folder / "runs" / "duffing").rows}
     for name, value in TRUTH.items():
         assert abs(rows[name].mean - value) < 3 * rows[name].std, name
         assert rows[name].std < 0.3 * rows[name].prior_std, name
