@@ -18,6 +18,7 @@ from en4dvar.plumbing.errors import ConfigError
 from en4dvar_bubble import BubbleModel
 from en4dvar_bubble.events import events
 from en4dvar_bubble.laws.loading import get_law
+from en4dvar_bubble.starter import elsewhere
 from en4dvar_bubble.starter.summaries import summaries
 
 R_MAX, STRETCH = np.linspace(150e-6, 390e-6, 7), np.array([6.0, 8.5, 5.5, 7.0, 9.0, 6.5, 8.0])
@@ -72,7 +73,17 @@ def test_each_bubble_has_its_own_radii_and_all_have_one_gel(begun, rows):
         assert math.exp(terms["R_eq"].mean) == pytest.approx(R_max / stretch, rel=1e-8)
         assert problem.observations.values == pytest.approx([t_c], rel=1e-8)
     shared = {entry.parameter.name for entry in config.parameters if entry.spec.shared}
-    assert shared == {"G", "mu"}
+    assert shared == {"G", "mu", "rho", "c", "p_inf", "reading_scale"}
+
+
+def test_what_is_known_from_elsewhere_is_estimated_as_from_radii(rows, begun):
+    """The constants have the priors of a medium, as a configuration of radii does; a named one has its own."""
+    held = {entry.parameter.name: entry.spec for entry in load_config("pool.yaml").parameters}
+    for known in elsewhere.known("gel"):
+        assert held[known.key].log_std == known.log_std
+    assert typed("init", "--data", "pool.mat", "--medium", "agarose", "--out", "agarose.yaml").exit_code == 0
+    agarose = {entry.parameter.name: entry.spec for entry in load_config("agarose.yaml").parameters}
+    assert agarose["rho"].log_std < 0.5 * held["rho"].log_std
 
 
 def test_every_number_of_another_law_is_shared(rows, tmp_path, monkeypatch):
