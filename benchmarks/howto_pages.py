@@ -176,7 +176,7 @@ def collapse_times(folder: Path, shoot: Camera) -> None:
     table = np.column_stack([largest, stretch, read + 20e-9 * rng.standard_normal(12)])
     table[:, :2] *= np.exp(0.005 * rng.standard_normal((12, 2)))
     np.savetxt(folder / "pool.csv", table, delimiter=",", header="R_max,stretch,collapse", comments="")
-    typed(folder, "en4dvar init --data pool.csv --out pool.yaml")
+    typed(folder, "en4dvar init --data pool.csv --medium water --out pool.yaml")
     typed(folder, "en4dvar run pool.yaml")
     (page,) = folder.rglob("joint.html")
     shoot(str(page.relative_to(folder)), "howto_collapse_times", 900)

@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import numba
+from filelock import lock_descriptor
 from llvmlite.binding import get_host_cpu_features, get_host_cpu_name
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile, _CacheLocator
 from numba.core.compiler_lock import global_compiler_lock
@@ -226,13 +227,6 @@ def _held(path: Path) -> Iterator[None]:
 def _locked(file: int) -> bool:
     """Whether the file is locked for us now; where files cannot be locked, nobody is waited for."""
     try:
-        from fcntl import LOCK_EX, LOCK_NB, flock
-    except ImportError:
+        return lock_descriptor(file, blocking=False)
+    except OSError:
         return True
-    try:
-        flock(file, LOCK_EX | LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:  # of some network file systems
-        return True
-    return True

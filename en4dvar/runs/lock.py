@@ -8,8 +8,9 @@ import socket
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from importlib import import_module
 from pathlib import Path
+
+from filelock import lock_descriptor
 
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.files import POSIX, inside, own_file
@@ -53,22 +54,26 @@ def _acquire(directory: Path) -> int:
     while True:
         file = own_file(path)
         try:
-            _lock(file)
+            free = lock_descriptor(file, blocking=False)
         except OSError as error:
             if error.errno not in _UNSUPPORTED:
-                os.lseek(file, 0, os.SEEK_SET)
-                owner = os.read(file, _LONGEST).decode("utf-8", "replace").strip() or _OTHER
                 os.close(file)
-                if not _is_dead(owner) or time.monotonic() > patience:
-                    advice = "wait for it to end, or give another --out"
-                    raise OutputError(f"{directory}: in use by {owner}; {advice}") from None
-                time.sleep(0.02)
-                continue
+                raise
+            free = True
+        if not free:
+            os.lseek(file, 1, os.SEEK_SET)
+            owner = os.read(file, _LONGEST).decode("utf-8", "replace").strip() or _OTHER
+            os.close(file)
+            if not _is_dead(owner) or time.monotonic() > patience:
+                advice = "wait for it to end, or give another --out"
+                raise OutputError(f"{directory}: in use by {owner}; {advice}") from None
+            time.sleep(0.02)
+            continue
         if not _is_at(file, path):
             os.close(file)  # the run before removed the file between our opening and locking it
             continue
         try:
-            os.ftruncate(file, 0)
+            os.ftruncate(file, 1)  # Windows locks this byte, and lets others read what follows
             os.write(file, f"process {os.getpid()} on {socket.gethostname()}\n".encode())
         except OSError:
             with suppress(OSError):
@@ -103,14 +108,3 @@ def _is_dead(owner: str) -> bool:
     except OSError:
         pass
     return False
-
-
-def _lock(file: int) -> None:
-    """Lock a file that is open. Raises :class:`OSError`."""
-    if POSIX:
-        fcntl = import_module("fcntl")
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    else:
-        msvcrt = import_module("msvcrt")
-        os.lseek(file, 1 << 20, os.SEEK_SET)  # beyond the text, so that others can read it
-        msvcrt.locking(file, msvcrt.LK_NBLCK, 1)

@@ -149,7 +149,7 @@ def init(
                 )
                 text, proposal = proposed.text, proposed.proposal
             else:
-                proposal = propose_from_times(columns, law)
+                proposal = propose_from_times(columns, law, medium)
                 text = yaml_text(name, source_of(_table_beside(target, data, columns.table, force)), proposal, words)
     write_text(target, text)
     write_text(target.parent / SCHEMA_FILE, schema_text())

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import math
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,20 +20,27 @@ from en4dvar.plumbing.errors import ConfigError
 from en4dvar_bubble import BubbleModel
 from en4dvar_bubble.events import events
 from en4dvar_bubble.laws.loading import get_law
+from en4dvar_bubble.medium import Medium
+from en4dvar_bubble.starter import elsewhere
 from en4dvar_bubble.starter.summaries import summaries
 
 R_MAX, STRETCH = np.linspace(150e-6, 390e-6, 7), np.array([6.0, 8.5, 5.5, 7.0, 9.0, 6.5, 8.0])
 GEL = {"G": 8e3, "mu": 0.09}
 
 
+def collapses(
+    law: str, theta: Mapping[str, float], R_max=R_MAX, R_eq=R_MAX / STRETCH, **constants: float
+) -> np.ndarray:
+    """Collapse times (7,) s, as the law says, without noise."""
+    model = BubbleModel(law=get_law(law), start="laser", gas="polytropic", medium=replace(Medium(), **constants))
+    members = {name: np.full(len(R_max), value) for name, value in theta.items()}
+    start = model.initial_states({**members, "R_max": R_max, "R_eq": R_eq})
+    return events(model.integrate(start, np.tile([6e-5], (len(R_max), 1))))["time"][:, 1]
+
+
 def rows_of(law: str, theta: dict[str, float]) -> np.ndarray:
-    """(7, 3) of bubbles that collapse as the law says, without noise."""
-    model = BubbleModel(law=get_law(law), start="laser", gas="polytropic")
-    members = {name: np.full(len(R_MAX), value) for name, value in theta.items()}
-    paths = model.integrate(
-        model.initial_states({**members, "R_max": R_MAX, "R_eq": R_MAX / STRETCH}), np.tile([6e-5], (len(R_MAX), 1))
-    )
-    return np.column_stack([R_MAX, STRETCH, events(paths)["time"][:, 1]])
+    """(7, 3) of such bubbles."""
+    return np.column_stack([R_MAX, STRETCH, collapses(law, theta)])
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +81,17 @@ def test_each_bubble_has_its_own_radii_and_all_have_one_gel(begun, rows):
         assert math.exp(terms["R_eq"].mean) == pytest.approx(R_max / stretch, rel=1e-8)
         assert problem.observations.values == pytest.approx([t_c], rel=1e-8)
     shared = {entry.parameter.name for entry in config.parameters if entry.spec.shared}
-    assert shared == {"G", "mu"}
+    assert shared == {"G", "mu", "rho", "c", "p_inf", "reading_scale"}
+
+
+def test_what_is_known_from_elsewhere_is_estimated_as_from_radii(rows, begun):
+    """The constants have the priors of a medium, as a configuration of radii does; a named one has its own."""
+    held = {entry.parameter.name: entry.spec for entry in load_config("pool.yaml").parameters}
+    for known in elsewhere.known("gel"):
+        assert held[known.key].log_std == known.log_std
+    assert typed("init", "--data", "pool.mat", "--medium", "agarose", "--out", "agarose.yaml").exit_code == 0
+    agarose = {entry.parameter.name: entry.spec for entry in load_config("agarose.yaml").parameters}
+    assert agarose["rho"].log_std < 0.5 * held["rho"].log_std
 
 
 def test_every_number_of_another_law_is_shared(rows, tmp_path, monkeypatch):
@@ -107,31 +126,66 @@ def test_what_may_be_something_else_is_not_taken_for_it(rows):
     assert summaries({"a": a[:1], "b": b[:1], "c": c[:1]}) is None
 
 
-def estimated(law: str, rows: np.ndarray) -> tuple[dict[str, tuple[float, float]], str]:
-    """Mean and std of what is shared, SI, and what the terminal said; with errors as small as these rows have."""
+SIMULATED = {  # the rows have no errors, and were made with these constants
+    "data.error.collapse_time_std": "5 ns",
+    "parameters.R_max.log_std": "1e-4",
+    "parameters.R_eq.log_std": "1e-4",
+    "parameters.rho": "998 kg/m^3",
+    "parameters.c": "1484 m/s",
+    "parameters.p_inf": "101325 Pa",
+    "parameters.reading_scale": "1",
+}
+
+
+def estimated(law: str, rows: np.ndarray, known: Mapping[str, str]) -> tuple[dict[str, dict[str, float]], str]:
+    """What is shared, by name: mean, std and quantiles in display units; and what the terminal said."""
     savemat("pool.mat", {"pool": rows})
-    assert typed("init", "--data", "pool.mat", "--law", law, "--out", f"{law}.yaml", "--force").exit_code == 0
-    known = ["data.error.collapse_time_std=5 ns", "parameters.R_max.log_std=1e-4", "parameters.R_eq.log_std=1e-4"]
-    quicker = ["model.gas=polytropic", "model.vapour=none"]
-    words = [word for text in (*known, *quicker) for word in ("--set", text)]
+    begun = typed("init", "--data", "pool.mat", "--medium", "water", "--law", law, "--out", f"{law}.yaml", "--force")
+    assert begun.exit_code == 0
+    quicker = {"model.gas": "polytropic", "model.vapour": "none"}
+    words = [word for key, value in {**known, **quicker}.items() for word in ("--set", f"{key}={value}")]
     done = typed("run", f"{law}.yaml", *words, "--force")
     assert done.exit_code == 0, done.output
     with open(f"runs/{law}/joint.csv", encoding="utf-8") as file:
-        table = {row["name"]: row for row in csv.DictReader(file) if row["name"] in ("G", "mu")}
-    return table, done.output
+        cells = {row.pop("name"): row for row in csv.DictReader(file)}
+    numbers = ("mean", "std", "q05", "q95")
+    return {name: {key: float(row[key]) for key in numbers if row.get(key)} for name, row in cells.items()}, done.output
 
 
 @pytest.mark.slow
 def test_the_gel_comes_back_and_another_law_misfits(rows, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    table, said = estimated("neo-hookean-kelvin-voigt", rows)
-    assert "[misfit]" not in said
+    found, said = estimated("neo-hookean-kelvin-voigt", rows, SIMULATED)
+    assert "χ² per reading" not in said
     for name, scale in (("G", 1e-3), ("mu", 1.0)):
-        mean, std = float(table[name]["mean"]), float(table[name]["std"])
-        assert std < 0.05 * mean
-        assert abs(mean - GEL[name] * scale) < 4 * std
+        assert found[name]["std"] < 0.05 * found[name]["mean"]
+        assert abs(found[name]["mean"] - GEL[name] * scale) < 4 * found[name]["std"]
     other = rows_of("zener-neo-hookean", {"G": 8e3, "mu_p": 0.3, "relaxation_time": 3e-6})
-    _, said = estimated("neo-hookean-kelvin-voigt", other)
-    assert "misfit" in said
-    _, said = estimated("zener-neo-hookean", other)
-    assert "misfit" not in said
+    _, said = estimated("neo-hookean-kelvin-voigt", other, SIMULATED)
+    assert "χ² per reading" in said
+    found, said = estimated("zener-neo-hookean", other, SIMULATED)
+    assert "χ² per reading" not in said
+    assert found["G"]["q05"] < 8 < found["G"]["q95"]
+
+
+@pytest.mark.slow
+def test_the_interval_knows_that_constants_and_camera_err_alike_for_all_bubbles(rows, tmp_path, monkeypatch):
+    """Against the linear theory of ln G, ln μ and of what is known from elsewhere, by differences of collapse times."""
+    monkeypatch.chdir(tmp_path)
+    exact = {key: SIMULATED[key] for key in list(SIMULATED)[:3]}
+    found, _ = estimated("neo-hookean-kelvin-voigt", rows, exact)
+    law, h, t = "neo-hookean-kelvin-voigt", 1e-3, rows[:, 2]
+    slopes = [collapses(law, {**GEL, name: GEL[name] * math.exp(h)}) for name in GEL]
+    known = {quantity.key: quantity for quantity in elsewhere.known("water")}
+    slopes += [collapses(law, GEL, **{k: getattr(Medium(), k) * math.exp(h)}) for k in known if k != "reading_scale"]
+    J = np.column_stack([*((moved - t) / h for moved in slopes), t])
+    radii = [collapses(law, GEL, R_MAX * math.exp(h)), collapses(law, GEL, R_eq=R_MAX / STRETCH * math.exp(h))]
+    variance = 5e-9**2 + sum((1e-4 * (moved - t) / h) ** 2 for moved in radii)
+    prior = np.array([1.5, 1.2, *(quantity.log_std for quantity in known.values())])
+    posterior = np.linalg.inv(np.diag(prior**-2.0) + J.T @ (J / variance[:, None]))
+    alone = np.linalg.inv(np.diag(prior[:2] ** -2.0) + J[:, :2].T @ (J[:, :2] / variance[:, None]))
+    for i, (name, scale) in enumerate((("G", 1e-3), ("mu", 1.0))):
+        truth, std = GEL[name] * scale, GEL[name] * scale * math.sqrt(posterior[i, i])
+        assert found[name]["q05"] < truth < found[name]["q95"]
+        assert found[name]["std"] == pytest.approx(std, rel=0.25)
+    assert posterior[0, 0] > 9 * alone[0, 0]  # it is these errors that the interval is made of

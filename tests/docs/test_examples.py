@@ -29,6 +29,7 @@ def marked(page: Path) -> object:
         "own_model_further",
         "polyacrylamide",
         "collapse_times",
+        "collapse_times_measured",
     )
     return pytest.param(page, marks=pytest.mark.long) if slowest else page
 

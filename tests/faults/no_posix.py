@@ -5,9 +5,9 @@ As ``sitecustomize`` of every process of a test. ``taskkill`` is a program of Wi
 
 import os
 import signal
-import subprocess  # noqa: F401  which would take this for Windows once there is a msvcrt
 import sys
-import types
+
+import filelock  # noqa: F401  before fcntl goes: on Windows it has locks of the system's own
 
 
 def _is_open(path):
@@ -33,15 +33,6 @@ def _refusing(call, count):
     return refused
 
 
-def _msvcrt():
-    import fcntl
-
-    module = types.ModuleType("msvcrt")
-    module.LK_NBLCK = 2
-    module.locking = lambda file, mode, size: fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    return module
-
-
 def _asking_nothing(wake, unblock):
     """Windows lets the pipe of signals block."""
 
@@ -55,7 +46,7 @@ def _asking_nothing(wake, unblock):
 
 def take_away():
     signal.set_wakeup_fd = _asking_nothing(signal.set_wakeup_fd, os.set_blocking)
-    sys.modules["msvcrt"], sys.modules["fcntl"], sys.modules["resource"] = _msvcrt(), None, None
+    sys.modules["fcntl"] = sys.modules["resource"] = None
     for name in ("fork", "forkpty", "killpg", "setsid", "O_NOFOLLOW", "O_NONBLOCK", "pidfd_open", "set_blocking"):
         delattr(os, name) if hasattr(os, name) else None
     for name in ("SIGHUP", "SIGXCPU"):

@@ -203,7 +203,7 @@ def test_a_symbol_that_no_figure_can_hold_is_found_before_the_work(tmp_path: Pat
 @pytest.mark.fault("lock-number")
 def test_a_lock_of_a_process_that_cannot_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: str) -> None:
     monkeypatch.setattr("en4dvar.runs.lock.PATIENCE", 0.1)
-    (tmp_path / LOCK).write_text(f"process {number} on {os.uname().nodename}\n", encoding="utf-8")
+    (tmp_path / LOCK).write_text(f"\0process {number} on {os.uname().nodename}\n", encoding="utf-8")
     with (tmp_path / LOCK).open("a+") as held:
         fcntl.flock(held, fcntl.LOCK_EX)
         with pytest.raises(OutputError) as told, locked(tmp_path):

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import sys
+import types
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+import xarray as xr
 from toy_config import csv_text, write_toy
 
 import en4dvar
@@ -64,6 +67,17 @@ def test_arviz_shows_display_units_and_compares_chains(result: Result) -> None:
     assert float(result.to_inference_data()["posterior"]["G"].max()) == float(result.posterior["G"].max())  # SI
     with pytest.raises(ConfigError, match="too few for 40 chains"):
         result.to_inference_data(chains=40)
+
+
+def test_from_version_1_on_arviz_takes_a_tree(result: Result, monkeypatch: pytest.MonkeyPatch) -> None:
+    """ArviZ 1.x has no InferenceData; its functions take xarray's DataTree, by the same names of groups."""
+    before = result.to_inference_data(units="display", chains=4)
+    monkeypatch.setitem(sys.modules, "arviz", types.ModuleType("arviz"))
+    tree = result.to_inference_data(units="display", chains=4)
+    assert isinstance(tree, xr.DataTree)
+    assert {"posterior", "prior", "log_likelihood", "observed_data"} <= set(tree.children)
+    for name in before.groups():
+        xr.testing.assert_identical(tree[name].to_dataset(), before[name])
 
 
 def test_a_twin_experiment_and_a_sweep(tmp_path: Path) -> None:

@@ -80,6 +80,15 @@ def test_a_file_system_without_locks_refuses_no_run(tmp_path, monkeypatch, numbe
     assert_same_results(out, tmp_path / "quiet")
 
 
+def test_a_lock_that_fails_is_one_line_and_is_nobodys(tmp_path, monkeypatch):
+    def broken(*_):
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr(fcntl, "flock", broken)
+    with pytest.raises(OutputError, match=r"cannot be used as run directory: Input/output error$"):
+        RunDirectory.open(tmp_path / "run", "new").__enter__()
+
+
 @pytest.fixture
 def earlier(tmp_path):
     path = make_campaign(tmp_path, 2, "execution_models:Breaks")

@@ -399,10 +399,15 @@ def _parameters(
         *lines,
         Entry("t_s", prior, words),
         Entry("sigma", sigma, "scale of the stated errors"),
-        *(
-            Entry(k.key, f"{{prior: lognormal, median: {k.median}, log_std: {k.log_std:g}}}", k.source)
-            for k in elsewhere.known(medium)
-        ),
+        *known_elsewhere(medium),
+    )
+
+
+def known_elsewhere(medium: str, more: str = "") -> tuple[Entry, ...]:
+    """Priors of what is known from elsewhere than from the data; ``more`` is what else stands in each."""
+    return tuple(
+        Entry(k.key, f"{{prior: lognormal, median: {k.median}, log_std: {k.log_std:g}{more}}}", k.source)
+        for k in elsewhere.known(medium)
     )
 
 

@@ -1,7 +1,9 @@
 """Tables with a row a bubble, R_max, R_max/R_eq and collapse time: one gel is estimated from the times of all.
 
 The collapse time of one bubble tells G or μ, never both; those of bubbles of several sizes do. What is known of each
-bubble enters with an error of its own.
+bubble enters with an error of its own. Density, pressure and the size of a pixel err alike for all of them, so that no
+number of bubbles averages their errors out: they are estimated with the gel. Times go with radii, so that the scale of
+the readings, which are times, stands for that of the camera.
 """
 
 from __future__ import annotations
@@ -18,13 +20,14 @@ from en4dvar_bubble.collapse import RAYLEIGH
 from en4dvar_bubble.medium import Medium
 from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.starter.page import Source
-from en4dvar_bubble.starter.proposal import WHY, Entry, Proposal, built, example
+from en4dvar_bubble.starter.proposal import WHY, Entry, Proposal, built, example, known_elsewhere
 
 RADII = (1e-6, 0.1)  # m
 STRETCHES = (1.5, 50.0)  # R_max/R_eq
 RATIOS = (0.3, 3.0)  # of the collapse time to Rayleigh's
 COLUMNS = ("bubble", "R_max_um", "R_eq_um", "collapse_us")
 TIME_STD, RADIUS_STD = "20 ns", 0.005
+SHARED = ", shared: all"
 
 
 @dataclass(frozen=True)
@@ -67,14 +70,17 @@ def source_of(table: str) -> Source:
     return Source(table, time, None, time, replace(ANY, by=COLUMNS[0]), observable="collapse_time")
 
 
-def propose_from_times(rows: Summaries, law: str | None) -> Proposal:
-    """A gel common to all bubbles, and each bubble's own radii. Raises :class:`ConfigError`: unknown law."""
+def propose_from_times(rows: Summaries, law: str | None, medium: str) -> Proposal:
+    """A gel, with the constants of ``medium``, common to all bubbles, and each bubble's own radii.
+
+    Raises :class:`ConfigError`: unknown law.
+    """
     model, law_name = built("laser", law)
     told = f"{', '.join(rows.names)} are {len(rows.t_c)} rows of R_max, R_max/R_eq and collapse time in SI units"
     radii = [
         Entry(name, f"{{prior: lognormal, median: {{from_file: {column}, unit: um}}, log_std: {RADIUS_STD}}}", words)
         for name, column, words in (
-            ("R_max", COLUMNS[1], "each bubble's own, known to 0.5 %: put what you know of your camera"),
+            ("R_max", COLUMNS[1], "each bubble's own, read to 0.5 %: put what you know of your camera"),
             ("R_eq", COLUMNS[2], "the same"),
         )
     ]
@@ -86,7 +92,7 @@ def propose_from_times(rows: Summaries, law: str | None) -> Proposal:
             Entry("start", "laser", "the clock starts at R_max"),
             *(Entry(key, value, WHY[value]) for key, value in {"gas": "heat", "vapour": "transport"}.items()),
         ),
-        (*(_shared(p, model) for p in model.law.parameters), *radii),
+        (*(_shared(p, model) for p in model.law.parameters), *radii, *known_elsewhere(medium, SHARED)),
         {},
         (f"{told}, one a bubble; the gel is common to all",),
         assimilation=(
@@ -99,4 +105,4 @@ def propose_from_times(rows: Summaries, law: str | None) -> Proposal:
 
 def _shared(p: Parameter, model: BubbleModel) -> Entry:
     line = example(p, model)
-    return replace(line, value=f"{line.value[:-1]}, shared: all}}")
+    return replace(line, value=f"{line.value[:-1]}{SHARED}}}")
