@@ -16,6 +16,7 @@ from en4dvar.data.observations import Observations
 from en4dvar.descent.field_gain import gain_of
 from en4dvar.descent.start import given
 from en4dvar.ensemble.forecast import check_problem
+from en4dvar.ensemble.tangent import derivatives_of
 from en4dvar.inputs.asked import Column, DataFile
 from en4dvar.plumbing.errors import ConfigError, DataError, Fault
 from en4dvar.plumbing.units import UnitError, convert
@@ -88,6 +89,8 @@ def problem_of(config: Config, observations: Observations) -> InverseProblem:
     if minimiser and not isinstance(minimiser.start, str):
         with config.document.placing("assimilation", "start"):
             given(prior, minimiser.start)
+    with config.document.placing():
+        derivatives_of(problem, getattr(minimiser, "linearisation", ""))
     if localised:
         with config.document.placing("assimilation", "localisation"):
             gain_of(problem, asked)
