@@ -106,6 +106,7 @@ class FunctionModel(ForwardModel):
         return [Trajectory(np.array(at), path, self._path) for at, path in zip(times, states, strict=False)]
 
     def tangent(self, x: Array, directions: Array, times: Array) -> tuple[Trajectory, Array]:
+        """By the :attr:`jacobian`. Raises ValueError where the function fails."""
         assert self.jacobian is not None
         paths = self.trajectories(x[None], times)
         if isinstance(paths[0], Failure):
