@@ -119,7 +119,6 @@ def least_squares_of(folder, correlation_time: float) -> tuple[np.ndarray, np.nd
     ("seed", "changes", "times", "correlation_time"),
     [
         (7, (), np.arange(2.0, 13.0, 2.0), 1e-9),
-        (8, (), np.arange(2.0, 13.0, 2.0), 1e-9),
         (9, (CORRELATED, ("lengthen: 6", "starts: 4")), np.arange(1.0, 7.0), 3.0),
     ],
 )
