@@ -97,7 +97,7 @@ def expected_runs(space: WeightSpace) -> int:
     """Forward runs of an estimate with typical numbers of iterations and trials; without a Markov chain.
 
     A scheme that runs its whole ensemble does so once for each assimilation and once at the end, with the mean. A
-    search takes prior and posterior forecast, and for each iteration a tangent (of n runs, N, or one) and the trials of the
+    search takes prior and posterior forecast, and for each iteration a tangent (1, n or N runs) and the trials of the
     step control, ``starts`` descents side by side, one for each shorter window, and a part of one from a far member.
     """
     n_members, scheme = len(space.members), space.scheme.minimiser
