@@ -26,12 +26,15 @@ class StatePerturbation:
     """A part of the control vector that changes the initial state instead of the model's parameters.
 
     ``field`` of the model's layout (every component of it) is multiplied by the value where ``relative``, else the
-    value is added to it.
+    value is added to it. With a ``pattern`` (size,), a mode of the prior ``of`` the field, that times the value is
+    added, or is the logarithm of the factor.
     """
 
     parameter: Parameter
     field: str
     relative: bool = False
+    pattern: tuple[float, ...] = ()
+    of: FieldPrior | None = None
 
 
 @dataclass(frozen=True)

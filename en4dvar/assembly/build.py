@@ -9,13 +9,14 @@ from functools import partial
 from en4dvar.assembly.find_files import find_files, with_parts
 from en4dvar.assembly.reading import read_observations
 from en4dvar.config import Config, SequenceConfig
-from en4dvar.config.initial_state import Perturbed
+from en4dvar.config.initial_state import Perturbed, modes_of
 from en4dvar.config.parameters import Fixed, Scalar, Tied, Uncertain, inside_bounds
 from en4dvar.config.series import DataPlan, SeriesPlan
 from en4dvar.data.observations import Observations
 from en4dvar.descent.field_gain import gain_of
 from en4dvar.descent.start import given
 from en4dvar.ensemble.forecast import check_problem
+from en4dvar.ensemble.tangent import derivatives_of
 from en4dvar.inputs.asked import Column, DataFile
 from en4dvar.plumbing.errors import ConfigError, DataError, Fault
 from en4dvar.plumbing.units import UnitError, convert
@@ -64,19 +65,25 @@ def build_one(config: Config, name: str, file: DataFile) -> InverseProblem:
 def problem_of(config: Config, observations: Observations) -> InverseProblem:
     """The inverse problem of observations, wherever they come from. Raises :class:`ConfigError`."""
     terms, fixed = resolve_parameters(config, observations)
+    asked = config.assimilation
     perturbed = [start for start in config.initial_state if isinstance(start, Perturbed)]
+    fields = tuple(prior for prior in config.initial_state if isinstance(prior, FieldPrior))
+    if asked.localisation is None:
+        with config.document.placing():
+            perturbed += [mode for prior in fields for mode in modes_of(prior)]
+        fields = ()
     terms = (*terms, *(start.term for start in perturbed), *_discrepancy(config, observations))
     estimated = {term.parameter.name for term in terms}
     tied = tuple(
         Tie(e.parameter, e.to, e.factor) for e in config.parameters if isinstance(e, Tied) and e.to in estimated
     )
     perturbations = tuple(start.perturbation for start in perturbed)
-    fields = tuple(prior for prior in config.initial_state if isinstance(prior, FieldPrior))
     varying = _varying(config, observations, terms)
-    asked, count = config.assimilation, len(terms) + sum(len(change.terms) for change in varying)
-    localised = bool(fields) or asked.localisation is not None
+    count, localised = len(terms) + sum(len(change.terms) for change in varying), asked.localisation is not None
     if asked.sampling == "exact" and asked.members <= count and not localised:
-        message = f"{asked.members} are too few for {count} parameters; at least {count + 1}"
+        modes = sum(bool(effect.pattern) for effect in perturbations)
+        of_fields = f", {modes} of them modes of fields (or say how many: modes, or localisation)" if modes else ""
+        message = f"{asked.members} are too few for {count} parameters{of_fields}; at least {count + 1}"
         raise ConfigError([config.document.fault(("assimilation", "members"), message)])
     prior = Prior(terms, config.dependence)
     problem = InverseProblem(config.model, config.observable, observations, prior, fixed, perturbations, tied, fields)
@@ -88,6 +95,8 @@ def problem_of(config: Config, observations: Observations) -> InverseProblem:
     if minimiser and not isinstance(minimiser.start, str):
         with config.document.placing("assimilation", "start"):
             given(prior, minimiser.start)
+    with config.document.placing():
+        derivatives_of(problem, getattr(minimiser, "linearisation", ""))
     if localised:
         with config.document.placing("assimilation", "localisation"):
             gain_of(problem, asked)

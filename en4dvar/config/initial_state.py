@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any, NamedTuple, TypeVar
 
+from annotated_types import Ge
+
 from en4dvar.config.context import Context, Made, Spread, parse_spread, quantity, read_each
 from en4dvar.config.schema import Section
 from en4dvar.config.validate import Faults
@@ -29,6 +31,16 @@ class Perturbed(NamedTuple):
 Initial = Perturbed | FieldPrior
 
 
+def modes_of(prior: FieldPrior) -> list[Perturbed]:
+    """A field as the sum of its modes. Raises :class:`ConfigError`: it has too many cells."""
+    name, told = prior.field.name, []
+    for k, pattern in enumerate(prior.patterns(), 1):
+        parameter = Parameter(f"{name}_mode_{k}", "1", label=f"mode {k} of the initial {name}")
+        effect = StatePerturbation(parameter, name, prior.relative, tuple(pattern.tolist()), prior)
+        told.append(Perturbed(PriorTerm.normal(parameter, 0.0, 1.0), effect))
+    return told
+
+
 def perturbation(field: Field, std: str | float) -> Perturbed:
     """N(0, std²) added to the field, or, for a std in %, a factor whose logarithm is N(0, std²).
 
@@ -50,7 +62,7 @@ class InitialSpread(Section):
     """Spread of the initial value of a state field: in its unit (added), or in ``%`` (a factor).
 
     One number for all components, or, with ``kernel`` and ``length``, each component by itself, correlated by a
-    function of their distance; the scheme then has to be localised.
+    function of their distance: cell by cell where the scheme is localised, else as the sum of its largest modes.
     """
 
     std: Annotated[Spread, Made(lambda text, context: parse_spread(text, context.subject.unit))]
@@ -59,12 +71,16 @@ class InitialSpread(Section):
     """Correlation of the components as a function of their distance."""
     length: Annotated[float, quantity(lambda context: str(context.subject.coordinate_unit), "positive")] | None = None
     """Correlation length of the kernel, in the unit of the field's coordinates."""
+    modes: Annotated[int, Ge(1)] | None = None
+    """How many modes are estimated where nothing is localised; by default those with all but 1e-6 of the variance."""
 
     @classmethod
     def rules(cls, keys: Mapping[str, Any], context: Context, faults: Faults) -> None:
         for key, other in (("kernel", "length"), ("length", "kernel")):
             if key in keys and other not in keys:
                 faults.add((key,), f"kernel and length go together; give {other} as well", at_key=True)
+        if "modes" in keys and "kernel" not in keys:
+            faults.add(("modes",), "modes are those of a kernel; give kernel and length as well", at_key=True)
         if "kernel" in keys and context.subject.coordinates is None:
             name = context.subject.name
             faults.add(("kernel",), f"the model gives no coordinates for {name}, so that no distance is known")
@@ -96,7 +112,8 @@ def _perturbed(fields: Mapping[str, Any], context: Context) -> tuple[Initial, ..
         section, field = InitialSpread.model_validate(entry, context=context), context.subject
         if section.kernel is None or section.length is None:
             return perturbation(field, entry["std"])
-        return FieldPrior(field, section.std.value, section.kernel, section.length, section.std.relative)
+        std = section.std
+        return FieldPrior(field, std.value, section.kernel, section.length, std.relative, section.modes)
 
     return read_fields(fields, context, "give it a prior in parameters", read)
 

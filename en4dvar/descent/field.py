@@ -11,7 +11,8 @@ iterate x_l (a bundle), L_l = ρ_xy ∘ X0ᵀY_l/(N−1) and H_l B H_kᵀ = ρ_y
 
 the Gauss–Newton step; every iterate is x̄0 + Σ_k L_k λ_k, from which J_b and H_l(x_l − x̄0) follow without B. Where J
 does not fall, B of the step is made smaller (Levenberg–Marquardt in the metric B⁻¹). Members of the posterior are
-x + X0_i + L (H B Hᵀ + R)⁻¹ (R^{1/2} z_i − Y_i), z_i ~ N(0, I) and centred.
+x + X0_i + L (H B Hᵀ + R)⁻¹ (R^{1/2} z_i − Y_i), z_i ~ N(0, I) and centred. What has no place is not tapered: B has a
+block of its own for it, X0ᵀX0/(N−1), and a run each tells its derivatives.
 
 Sources: Courtier (1997), Q. J. R. Meteorol. Soc. 123, 2449 (dual form); Emerick & Reynolds (2013), Computers &
 Geosciences 55, 3 (ES-MDA).
@@ -32,8 +33,9 @@ from en4dvar.descent.step_control import Move, Search
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import En4dvarError
 from en4dvar.schemes.base import mda_inflations
-from en4dvar.schemes.local_gain import ByDistance, Gain, Update, parts
+from en4dvar.schemes.local_gain import ByDistance, Gain, Split, Update, parts
 
+Tangent = Array | Split
 TRIALS, SHORTER = 8, 0.3  # steps that are tried, each so much shorter than the one before
 
 
@@ -124,7 +126,7 @@ def _part_of(ensemble: Array, alive: Members, part: slice) -> Array:
 class DualSystem:
     """About an iterate: Y (N, K), H B Hᵀ (K, K), H (x − x̄0) (K,), innovation y − H(x) (K,), error variance (K,)."""
 
-    tangent: Array
+    tangent: Tangent
     covariance: Array
     moved: Array
     innovation: Array
@@ -160,7 +162,7 @@ class FieldDescent:
     centre: Array
     prediction: Array
     costs: list[float] = field(default_factory=list)
-    tangents: tuple[Array, ...] = ()
+    tangents: tuple[Tangent, ...] = ()
     duals: tuple[Array, ...] = ()
     converged: bool = False
     stop: str = ""
@@ -234,11 +236,23 @@ class FieldObjective(Objective[FieldDescent]):
 
     def _system(self, at: FieldDescent) -> DualSystem:
         """By the derivatives of the predictions along the prior anomalies."""
-        count = len(self.anomalies)
-        at.forward_runs += count
-        runs = self.data.predict(lambda some: at.centre + self.epsilon * self.anomalies[some], count)
-        tangent = (runs - at.prediction) / self.epsilon
-        tangent = tangent - tangent.mean(axis=0)
+        count, common = len(self.anomalies), self.gain.common
+
+        def beside(some: slice) -> Array:
+            x = at.centre + self.epsilon * self.anomalies[some]
+            x[:, common] = at.centre[common]
+            return x
+
+        at.forward_runs += count + len(common)
+        runs = self.data.predict(beside, count)
+        placed = (runs - at.prediction) / self.epsilon
+        tangent: Tangent = placed - placed.mean(axis=0)
+        if len(common):
+            X = self.anomalies[:, common]
+            steps = np.zeros((len(common), len(at.centre)))
+            steps[range(len(common)), common] = size = self.epsilon * X.std(axis=0)
+            runs = self.data.predict(lambda some: at.centre + steps[some], len(common))
+            tangent = Split(placed - placed.mean(axis=0), X @ ((runs - at.prediction) / size[:, None]))
         between = self.gain.between
         pairs = zip(at.tangents, at.duals, strict=True)
         moved = sum((between(tangent, Y) @ dual for Y, dual in pairs), np.zeros(len(at.prediction)))
@@ -299,12 +313,12 @@ class FieldObjective(Objective[FieldDescent]):
             self.tell(replace(here, share=move.step_length if move else 0.0))
             at.ended = bool(at.stop)
 
-    def cost(self, prediction: Array, tangents: Sequence[Array], duals: Sequence[Array]) -> float:
+    def cost(self, prediction: Array, tangents: Sequence[Tangent], duals: Sequence[Array]) -> float:
         """J of the iterate x̄0 + Σ_k L_k λ_k."""
         misfit = (self.data.values - prediction) / self.data.std
         return self.background(tangents, duals) + 0.5 * float(misfit @ misfit)
 
-    def background(self, tangents: Sequence[Array], duals: Sequence[Array]) -> float:
+    def background(self, tangents: Sequence[Tangent], duals: Sequence[Array]) -> float:
         """J_b of the iterate x̄0 + Σ_k L_k λ_k."""
         pairs = list(zip(tangents, duals, strict=True))
         return 0.5 * sum(float(a @ self.gain.between(Y, Z) @ b) for Y, a in pairs for Z, b in pairs)
@@ -320,9 +334,10 @@ class FieldObjective(Objective[FieldDescent]):
         background = self.background(at.tangents, at.duals)
         return Pass(centre, at.prediction, members, background, at.system.length, dfs=at.system.dfs)
 
-    def update(self, tangent: Array) -> Update:
+    def update(self, tangent: Tangent) -> Update:
         """What turns prior anomalies into posterior ones."""
-        return self.gain.update(tangent, self.data.std**2, self.errors - tangent)
+        whole = tangent.whole if isinstance(tangent, Split) else tangent
+        return self.gain.update(tangent, self.data.std**2, self.errors - whole)
 
     def spread(self, at: FieldDescent) -> None:
         """The posterior ensemble about the centre, in place of the anomalies."""

@@ -36,8 +36,11 @@ def gain_of(problem: InverseProblem, settings: AssimilationSettings) -> Gain:
     observed = _observed(problem, asked)
     places = _places(problem, asked, observed.shape[1])
     lost = [name for name, where in zip(problem.prior.names, places, strict=False) if np.isnan(where[0])]
-    if lost and settings.own.minimiser:
-        raise ConfigError(f"{lost[0]} has no place; give it one, 'at: {{{lost[0]}: 0}}', or use {others}")
+    if len(lost) >= settings.members - 1 and settings.own.minimiser:
+        raise ConfigError(
+            f"{len(lost)} parameters have no place, as many as {settings.members} members know directions; give them "
+            f"places, 'at: {{{lost[0]}: 0}}', or use {others}"
+        )
     return ByDistance(places, observed[problem.observations.used], asked.radius)
 
 
@@ -52,7 +55,8 @@ def _observed(problem: InverseProblem, asked: Localisation) -> Array:
             coordinates.append(np.einsum("kj,kjd->kd", part.places.shares, places_of(block)[part.places.indices]))
         else:
             raise ConfigError(
-                f"{part.name} has no place: it is no part of a field with coordinates; write 'at: {{{part.name}: 0}}'"
+                f"{part.name} has no place: it is no part of a field with coordinates; write 'at: {{{part.name}: 0}}', "
+                "or leave localisation out"
             )
     if len({where.shape[1] for where in coordinates}) > 1:
         raise ConfigError("the places of the readings have different numbers of coordinates")

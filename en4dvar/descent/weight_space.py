@@ -15,6 +15,7 @@ from en4dvar.ensemble.forecast import NO_TIMES, Composite, Forecast
 from en4dvar.ensemble.linalg import FEW, Hessian, ThinTransform, anomaly_basis, centre
 from en4dvar.ensemble.missing import filled
 from en4dvar.ensemble.repeat import check_repeats
+from en4dvar.ensemble.tangent import check_derivatives, derivatives_of
 from en4dvar.executor import Executor
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import TooFewMembersError
@@ -71,6 +72,7 @@ class WeightSpace:
         self.problem, self.settings, self.scheme, self.executor = problem, settings, settings.own, executor
         self.seed = seed
         self.composite = Composite(problem, executor)
+        self.derivatives = derivatives_of(problem, getattr(settings.own.minimiser, "linearisation", ""))
         self.drawn = drawn = prior_ensemble(problem.prior, settings.members, seed, settings.sampling)
         self.members, self.mean, self.anomalies = drawn.members, drawn.mean, drawn.anomalies
         self.prior_variance, self.basis = drawn.variance, drawn.basis
@@ -118,6 +120,25 @@ class WeightSpace:
     def whole(self, x: Array, extra_times: Array = NO_TIMES) -> Forecast:
         """The forecast of an ensemble, with the readings that some of its members lack by regression on the others."""
         return filled(self.forecast(x, extra_times), x)
+
+    def about(self, x: Array, counts: Sequence[int]) -> list[Forecast]:
+        """Of several sets of members, one after the other (B, n), so many in each with their centre the last: by the
+        model's derivatives, of which one call counts as a run, or all of them in one forecast.
+        """
+        parts = [slice(end - count, end) for end, count in zip(np.cumsum(counts).tolist(), counts, strict=True)]
+        if self.derivatives:
+            self.forward_runs += len(parts)
+            return [self.derivatives(x[part]) for part in parts]
+        whole = self.forecast(x)
+        return [whole[part] for part in parts]
+
+    def check_derivatives(self, prior_run: Forecast) -> None:
+        """At the prior mean, or at the first member of its forecast that is alive. Raises :class:`ConfigError`."""
+        alive = np.flatnonzero(np.roll(prior_run.active, 1))
+        if self.derivatives and len(alive):
+            at = np.vstack([self.mean, self.members])[alive[0]]
+            self.forward_runs += 1
+            check_derivatives(self.problem, self.derivatives, at, self.forecast)
 
     def check_repeats(self, prior_run: Forecast, extra_times: Array) -> None:
         """Run two members of the prior forecast again, at the same instants.

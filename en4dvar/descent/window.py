@@ -155,12 +155,8 @@ class DataWindow(Objective[Descent]):
         if not scheme.minimiser:
             return [self._run_ensemble(descent) for descent in going]
         rows = [[*scheme.members(d.weights, space.basis), d.weights.w] for d in going]
-        whole = space.forecast(space.control(np.array([row for each in rows for row in each])))
-        ends = np.cumsum([len(each) for each in rows]).tolist()
-        return [
-            self._arrive(descent, whole[end - len(each) : end])
-            for descent, each, end in zip(going, rows, ends, strict=True)
-        ]
+        runs = space.about(space.control(np.array([row for each in rows for row in each])), list(map(len, rows)))
+        return [self._arrive(descent, run) for descent, run in zip(going, runs, strict=True)]
 
     def whiten(self, descent: Descent, reference: Array, anomalies: Array) -> Evaluation:
         """By Fisher scoring; for a scheme that runs its whole ensemble with the R at its mean."""

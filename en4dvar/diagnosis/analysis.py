@@ -208,7 +208,7 @@ class Analysis:
     descents: Descents | None = None  # where all of them ended; None of a scheme that does not search
     withheld: Withheld | None = None  # the readings after the window, and what was expected of them
     ledger: Ledger | None = None  # what the path went through where it informed the parameters
-    fields: tuple[FieldEstimate, ...] = ()  # of the initial state, in the order of ``problem.fields``
+    fields: tuple[FieldEstimate, ...] = ()  # of the initial state
 
     def __repr__(self) -> str:
         told = []

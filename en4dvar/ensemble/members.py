@@ -96,9 +96,13 @@ class InitialStates:
         for perturbation, column in self.perturbed:
             fixed = self.problem.fixed
             value = fixed[perturbation.parameter.name] if column is None else physical[:, column, None]
+            if perturbation.pattern:
+                value = value * np.array(perturbation.pattern)
+                value = np.exp(value) if perturbation.relative else value
             where = layout[perturbation.field]
             states[:, where] = states[:, where] * value if perturbation.relative else states[:, where] + value
-            _require_inside(states[:, where], fields[perturbation.field])
+        for name in {perturbation.field for perturbation, _ in self.perturbed}:
+            _require_inside(states[:, layout[name]], fields[name])
         return states
 
 

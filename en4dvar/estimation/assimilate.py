@@ -153,6 +153,7 @@ def _concluded(
         what_if=shifts,
         withheld=withheld,
         ledger=path,
+        fields=conclusions.fields_of(problem, space.members, ends.members, ends.mode),
     )
 
 

@@ -16,11 +16,12 @@ from en4dvar.descent.variance import shares_of_variance
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.descent.window import Descent
 from en4dvar.diagnosis import diagnostics as diag
-from en4dvar.diagnosis.analysis import Analysis, Descents, Discrepancy, Mode
+from en4dvar.diagnosis.analysis import Analysis, Descents, Discrepancy, FieldEstimate, Mode
 from en4dvar.diagnosis.influence import Influence
 from en4dvar.diagnosis.residuals import Residuals
 from en4dvar.diagnosis.response.linear import LinearResponse
 from en4dvar.ensemble.forecast import Forecast
+from en4dvar.ensemble.members import InitialStates, out_of_bounds
 from en4dvar.model.state import Array
 from en4dvar.priors.prior import Prior
 from en4dvar.problem import InverseProblem
@@ -66,6 +67,26 @@ def outcome_of(
         beyond=run.beyond,
         **more,
     )
+
+
+def fields_of(problem: InverseProblem, before: Array, after: Array, centre: Array) -> tuple[FieldEstimate, ...]:
+    """Fields that were told by modes, cell by cell, of members (N, n) before and after and of the ``centre`` (n,)."""
+    initial, layout = InitialStates(problem), problem.model.layout
+
+    def states(x: Array) -> Array:
+        physical, every = problem.prior.to_physical(x), np.full((len(x), layout.size), np.nan)
+        alive, started = initial(physical, out_of_bounds(problem.prior, physical))
+        every[alive] = started
+        return every
+
+    priors = {p.of.field.name: p.of for p in problem.perturbations if p.of is not None}
+    each = [states(x) for x in (before, after, centre[None])] if priors else []
+    estimates = []
+    for name, prior in priors.items():
+        a, b, (c,) = (x[:, layout[name]] for x in each)
+        moments = [moment for x in (b, a) for moment in (np.nanmean(x, axis=0), np.nanstd(x, axis=0, ddof=1))]
+        estimates.append(FieldEstimate(prior, b, c, *moments))
+    return tuple(estimates)
 
 
 def _whole_rows(values: Array) -> Array:

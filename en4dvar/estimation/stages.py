@@ -84,6 +84,7 @@ class Stages:
         space.require_members(prior_run[:-1].failures, "prior forecast")
         if not self.settings.stochastic_model:
             space.check_repeats(prior_run, self.grid)
+        space.check_derivatives(prior_run)
         start = self.start(prior_run, resume) if resume is None or resume.descent is None else resume
         return prior_run, start, self.iterate(start, prior_run)
 

@@ -323,6 +323,20 @@ class ForwardModel(ABC):
         """
         return [self._march(x[i], np.maximum(times[i], start[i]), float(start[i])) for i in range(len(x))]
 
+    @property
+    def differentiable(self) -> bool:
+        """True if it gives derivatives of its paths: it has a :meth:`tangent`."""
+        return type(self).tangent is not ForwardModel.tangent
+
+    def tangent(self, x: Array, directions: Array, times: Array) -> tuple[Trajectory, Array]:
+        """The path of one member from its initial state ``x`` (n_state,), seen at ``times`` (K,), and the derivatives
+        (D, K, n_state) of its states along ``directions`` (D, n_state) of the initial state, parameters among them, as
+        large as the prior's standard deviations.
+
+        Optional; may raise. Gauss–Newton then takes these derivatives instead of runs beside each iterate.
+        """
+        raise NotImplementedError
+
     def share(self, x: Array, times: Array) -> Shared | None:
         """:meth:`trajectories` of states (N, n_state) as work that threads share, where the model can; else None."""
         return None

@@ -21,6 +21,8 @@ from en4dvar.priors.prior import member_stream
 
 REACH = 10.0  # correlation lengths between a grid and its image on the torus
 UNEVEN = 1e-6  # of a step: a grid whose steps differ by less is regular
+LEFT_OUT = 1e-6  # share of the variance of the modes that are not estimated
+MOST_CELLS = 2000  # of a field that is told by modes: their matrix takes 32 MB and some seconds
 
 
 @dataclass(frozen=True)
@@ -28,7 +30,8 @@ class FieldPrior:
     """The prior of the cells of ``field``: N(the model's value, std² C), C a ``kernel`` of distance/``length``.
 
     ``std`` is in the field's unit; where ``relative`` it is that of the logarithm of a factor on the model's values.
-    ``length`` is in the unit of the field's coordinates.
+    ``length`` is in the unit of the field's coordinates. ``modes``: how many of them tell the field where nothing is
+    localised, by default all but :data:`LEFT_OUT` of the variance.
 
     Raises
     ------
@@ -40,6 +43,7 @@ class FieldPrior:
     kernel: str
     length: float
     relative: bool = False
+    modes: int | None = None
 
     def __post_init__(self) -> None:
         if self.field.coordinates is None:
@@ -73,6 +77,23 @@ class FieldPrior:
     def applied(self, base: Array, drawn: Array) -> Array:
         """Fields (…, size) of the model's values ``base`` and what members add, or of their factors."""
         return np.asarray(base * np.exp(drawn) if self.relative else base + drawn)
+
+    def patterns(self) -> Array:
+        """The largest modes (m, size) of the covariance, each times its standard deviation: a field is their sum, with
+        coefficients N(0, 1) of their own (Karhunen & Loève). Raises :class:`ConfigError`: too many cells.
+        """
+        name, size = self.field.name, self.field.size
+        if size > MOST_CELLS:
+            raise ConfigError(
+                f"{name} has {size} cells; more than {MOST_CELLS} need a localised gain, e.g. {{radius: 10}}",
+                "assimilation.localisation",
+            )
+        values, vectors = np.linalg.eigh(correlation_of_places(self.kernel, self.places, self.length))
+        values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
+        left = 1 - np.cumsum(values) / values.sum()
+        count = int(np.sum(left > LEFT_OUT)) + 1 if self.modes is None else min(self.modes, size)
+        signs = np.sign(vectors[np.abs(vectors).argmax(axis=0), np.arange(size)])
+        return np.asarray(self.std * (np.sqrt(values) * vectors * signs).T[:count])
 
     @cached_property
     def _root(self) -> Array:

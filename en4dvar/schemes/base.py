@@ -239,9 +239,10 @@ class Minimiser(Scheme):
     """A scheme whose descents :mod:`en4dvar.descent` takes to the minimum of J, and the keys that these read."""
 
     linearisation: Annotated[
-        Literal["bundle", "transform"],
-        "Tangent from runs close to the iterate (bundle), or regression over the ensemble (transform).",
-    ] = "bundle"
+        Literal["auto", "tangent", "bundle", "transform"],
+        "By the derivatives that a model gives (tangent), by runs close to the iterate (bundle), or by regression over "
+        "the ensemble (transform); auto: tangent where the model gives derivatives, else bundle.",
+    ] = "auto"
     epsilon: Annotated[float, Gt(0), Le(1), "Size of the bundle, in prior standard deviations."] = 1e-3
     step_control: Annotated[
         Literal["line-search", "levenberg-marquardt", "full"],

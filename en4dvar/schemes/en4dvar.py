@@ -28,6 +28,7 @@ class En4DVar(Minimiser):
     no more runs than the anomalies have directions: where r = rank X0 < N − 1, members at w + ε' u_j, u_j the columns
     of the basis, give the same as N members at w + ε e_i, up to O(ε). A bundle that is made wider (``Weights.wider``)
     has members on both sides, at w ± ε' u_j, where these are still fewer than N: its error is O(ε²).
+    ``tangent``: the same members, of which the model's derivatives say where they are.
     ``transform``: at the rows of 1wᵀ + T, regression about the ensemble mean at posterior spread.
     """
 
@@ -39,7 +40,7 @@ class En4DVar(Minimiser):
     def economical(self, basis: Array) -> bool:
         """Whether a tangent takes fewer runs than members."""
         n_members, rank = basis.shape
-        return self.linearisation == "bundle" and 0 < rank < n_members - 1
+        return not self.regresses and 0 < rank < n_members - 1
 
     def members(self, weights: Weights, basis: Array | None = None) -> Array:
         """Rows (r or 2r, N) along directions of the basis where these are few, else those of 1wᵀ + εI or 1wᵀ + T."""

@@ -24,6 +24,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+import numpy.typing as npt
 from scipy.linalg import cho_factor, cho_solve
 
 from en4dvar.model.state import Array
@@ -33,6 +34,19 @@ PART = 1 << 18  # cells times observations that are worked on at once
 CHANCE = 3.0  # correlations below this over √N are taken for chance
 
 Update = Callable[[slice, Array], Array]  # (part of the cells, their anomalies (N, m)) → increments (M, m)
+
+
+@dataclass(frozen=True)
+class Split:
+    """Anomalies (N, K) of predictions along those of what has a place, and of what has none."""
+
+    placed: Array
+    common: Array
+
+    @property
+    def whole(self) -> Array:
+        """Their sum."""
+        return self.placed + self.common
 
 
 class Gain(Protocol):
@@ -46,7 +60,8 @@ class Gain(Protocol):
 class ByDistance:
     """``places`` (n, D) of the cells and ``observed`` (K, D) of the observations; the taper is Gaspari & Cohn's.
 
-    It falls to 5/24 at ``radius`` and to 0 at twice that. All observations act on what has no place (NaN).
+    It falls to 5/24 at ``radius`` and to 0 at twice that. All observations act on what has no place (NaN). Where the
+    predictions ``Y`` are a :class:`Split` nothing is tapered of what has none, and it is independent of the rest.
     """
 
     places: Array
@@ -67,19 +82,31 @@ class ByDistance:
         rho = gaspari_cohn(cdist(self.places[part], self.observed), self.radius)
         return np.nan_to_num(rho, copy=False, nan=1.0)
 
-    def between(self, Y: Array, Z: Array) -> Array:
+    @property
+    def common(self) -> npt.NDArray[np.intp]:
+        """Which of the cells have no place."""
+        return np.flatnonzero(np.isnan(self.places[:, 0]))
+
+    def between(self, Y: Array | Split, Z: Array | Split) -> Array:
         """ρ_yy ∘ YᵀZ/(N−1) (K, K), of anomalies of predictions about two points."""
         from scipy.spatial.distance import cdist  # not needed to import the package
 
+        if isinstance(Y, Split) and isinstance(Z, Split):
+            return np.asarray(self.between(Y.placed, Z.placed) + Y.common.T @ Z.common / (len(Y.common) - 1))
+        assert not isinstance(Y, Split)
+        assert not isinstance(Z, Split)
         rho = gaspari_cohn(cdist(self.observed, self.observed), self.radius)
         return np.asarray(rho * (Y.T @ Z) / (len(Y) - 1))
 
-    def along(self, part: slice, anomalies: Array, Y: Array, dual: Array) -> Array:
+    def along(self, part: slice, anomalies: Array, Y: Array | Split, dual: Array) -> Array:
         """(ρ_xy ∘ XᵀY/(N−1)) λ as rows (M, m), for λ (M, K)."""
-        cross = self.taper(part) * (anomalies.T @ Y) / (len(Y) - 1)
+        cross = self.taper(part) * (anomalies.T @ (Y.placed if isinstance(Y, Split) else Y)) / (len(anomalies) - 1)
+        if isinstance(Y, Split):
+            nowhere = np.isnan(self.places[part, 0])
+            cross[nowhere] = anomalies[:, nowhere].T @ Y.common / (len(anomalies) - 1)
         return np.asarray(dual @ cross.T)
 
-    def update(self, Y: Array, variance: Array, innovations: Array) -> Update:
+    def update(self, Y: Array | Split, variance: Array, innovations: Array) -> Update:
         dual = cho_solve(cho_factor(self.between(Y, Y) + np.diag(variance)), innovations.T).T
         return lambda part, anomalies: self.along(part, anomalies, Y, dual)
 

@@ -91,14 +91,15 @@ def test_a_campaign_of_fields(tmp_path: Path) -> None:
         ("radius: 300 cm", "radius: 3 m, at: {k: 1 m}", "localisation: at: 'k' is not a parameter with a prior"),
         ("radius: 300 cm", "radius: 3 m, at: {u: [1 m, 2 m]}", "localisation: u has 1 coordinates, the readings"),
         ("radius: 300 cm", "radius: 3 m, at: {offset: 1 s}", "assimilation.localisation: "),
-        ("  localisation: {radius: 300 cm}\n", "", "assimilation.localisation: a field estimated cell by cell needs"),
+        ("  localisation: {radius: 300 cm}\n", "", "assimilation.members: 12 are too few for 18 parameters, 18 of"),
         ("members: 12", "scheme: etkf", "assimilation.localisation: a scheme for data that can be localised is"),
         ("{u_std: 0.3 K}", "{u_std: 0.3 K, robust: huber}", "assimilation.localisation: takes independent Gaussian"),
         (", length: 150 cm", "", "initial_state.u.kernel: kernel and length go together; give length as well"),
         ("kernel: gaussian, ", "", "initial_state.u.length: kernel and length go together; give kernel as well"),
         ("length: 150 cm", "length: 0 m", "initial_state.u.length: must be positive, not 0"),
         ("kernel: gaussian", "kernel: cubic", "initial_state.u.kernel: 'cubic' is not one of exponential, matern-3/2"),
-        ("offset: 0", "offset: {prior: normal, mean: 0, std: 1}", "assimilation.localisation: offset has no place"),
+        (", kernel: gaussian, length: 150 cm", ", modes: 3", "initial_state.u.modes: modes are those of a kernel"),
+        ("length: 150 cm", "length: 150 cm, modes: 0", "initial_state.u.modes: "),
     ],
 )  # fmt: skip
 def test_one_located_message(tmp_path: Path, old: str, new: str, message: str) -> None:

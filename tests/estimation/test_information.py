@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 from toys import Linear, Vectorised, Wave, make_observations
 
+from en4dvar.estimation.design.evaluate import SampleSizes, evaluate
 from en4dvar.estimation.design.laplace import expected
 from en4dvar.estimation.design.nested import nested
 from en4dvar.estimation.design.planned import Planned
+from en4dvar.model.function_model import FunctionModel
+from en4dvar.model.state import Parameter
 from en4dvar.plumbing.errors import ConfigError, TooFewMembersError
 from en4dvar.priors.dependence import Dependence
 from en4dvar.priors.prior import Prior, PriorTerm
@@ -93,6 +96,39 @@ def test_what_is_not_linear():
     brute, error = np.mean(gains), np.std(gains) / np.sqrt(len(gains))
     assert abs(found.gain - brute) < 3 * np.hypot(error, found.error)
     assert _linearised(planned, planned.draws(300, 1)).gain > brute + 5 * error  # which is why there is another way
+
+
+def sine(p, t):
+    return np.sin(p["w"] * t + p["f"])
+
+
+@pytest.mark.parametrize("std", [0.5, 0.1])
+def test_what_would_be_known_where_readings_allow_several_minima(std):
+    """sin(ωt + φ), ω ± 50 %: the posterior std by quadrature over 60 000 cells, for readings of its own."""
+    t = np.array([1.0, 2.5, 4.0, 5.0])
+    model = FunctionModel(sine, [Parameter("w", "1"), Parameter("f", "1")], {"y": "1"})
+    prior = Prior(
+        tuple(PriorTerm.normal(p, m, s) for p, m, s in zip(model.parameters, (2.0, 0.0), (1.0, 0.3), strict=True))
+    )
+    data = make_observations(t, np.zeros(4), std=std)
+    problem = InverseProblem(model, model.observables[0], data, prior)
+    (found,) = evaluate(problem, ["w"], SampleSizes(draws=200, simulated=100, inner=400), "nested", 1)
+
+    w, f = np.linspace(-3.0, 7.0, 1001), np.linspace(-1.2, 1.2, 61)
+    grid = np.sin(w[:, None, None] * t + f[:, None])
+    log_prior = -0.5 * ((w - 2.0)[:, None] ** 2 + (f / 0.3) ** 2)
+    rng, stds = np.random.default_rng(0), []
+    for _ in range(150):
+        y = np.sin((2 + rng.standard_normal()) * t + 0.3 * rng.standard_normal()) + std * rng.standard_normal(4)
+        log = log_prior - 0.5 * np.sum(((y - grid) / std) ** 2, axis=2)
+        of_w = np.exp(log - log.max()).sum(axis=1)
+        of_w /= of_w.sum()
+        stds.append(np.sqrt(of_w @ (w - of_w @ w) ** 2))
+    error = np.std(stds) * np.hypot(1 / np.sqrt(150), 1 / np.sqrt(100))
+    assert found.std[0] == pytest.approx(np.mean(stds), abs=2 * error)
+    assert found.ratio[0] == pytest.approx(found.std[0], rel=1e-9)  # the prior's is 1
+    (tangent,) = evaluate(problem, ["w"], SampleSizes(), "laplace", 1)
+    assert tangent.std[0] < 0.7 * found.std[0]
 
 
 def test_experiments_alike_share_what_is_asked():

@@ -167,7 +167,7 @@ ROWS = tuple(
         ("many-sets", "10 000 data sets in a folder", "", "0", "memory flat, the first estimate within seconds"),
         ("many-rows", "a data file of 1 000 000 rows", "", "0", "read within seconds; estimated in flat memory"),
         ("many-members", "10 000 members", "", "0",
-         "time and memory in proportion to their number (En4D-Var with `linearisation: bundle`, the default)"),
+         "time and memory in proportion to their number (En4D-Var with a bundle, the default)"),
         ("mat-damaged", "a `.mat` file is damaged",
          "not a MATLAB v5 file (it is cut short, or a size in it is damaged)", "2",
          "everything; no compiled reader sees the file"),

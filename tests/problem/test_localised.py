@@ -124,13 +124,42 @@ def test_a_parameter_with_a_place_beside_a_field():
     assert found.dfs_per_parameter[0] == pytest.approx(1 - found.posterior.var(ddof=1) / found.prior.var(ddof=1))
 
 
-def test_without_a_place_all_readings_act_on_a_parameter_and_en4dvar_refuses():
+def test_without_a_place_all_readings_act_on_a_parameter():
+    """Of es-mda by an untapered covariance; of En4D-Var as a block of its own of B, written out here."""
     somewhere = Localisation(RADIUS, {"level": (0.5,)})
     problem = line(estimated=True, level=True)
     found = assimilate(problem, settings("es-mda", somewhere), SEED)
     assert found.posterior.std() < 0.8 * found.prior.std()
-    with pytest.raises(ConfigError, match="offset has no place"):
-        assimilate(problem, settings("en4dvar", somewhere), SEED)
+
+    found = assimilate(problem, settings("en4dvar", somewhere, epsilon=1.0), SEED)
+    cells, offset = prior_of(problem), problem.prior.sample(N, SEED, "exact") - 1.0
+    H = np.vstack([np.eye(30)[READ], np.tile(np.where(np.arange(30) < 3, 1 / 3, 0.0), (2, 1))])
+    of_offset, places = np.array([0.0] * 6 + [1.0] * 2), np.append(PLACES[READ], [0.5, 0.5])[:, None]
+    P = np.cov(cells.T)
+    along = gaspari_cohn(cdist(PLACES[:, None], places), RADIUS) * (P @ H.T)
+    within = gaspari_cohn(cdist(places, places), RADIUS) * (H @ P @ H.T)
+    system = within + 0.5**2 * np.outer(of_offset, of_offset) + STD**2 * np.eye(8)
+    values = np.append(VALUES, [4.0, 4.2])
+    dual = np.linalg.solve(system, values - 2.0 - of_offset)
+    (field,) = found.fields
+    assert field.centre == pytest.approx(2.0 + along @ dual, abs=1e-9)
+    assert found.centre == pytest.approx(1.0 + 0.25 * of_offset @ dual, abs=1e-9)
+    seen = errors("En4D-Var field", 8) - cells @ H.T - offset * of_offset
+    gained = np.linalg.solve(system, seen.T)
+    spread = offset[:, 0] + 0.25 * of_offset @ gained
+    assert found.posterior[:, 0] == pytest.approx(found.centre[0] + spread, abs=1e-9)
+    assert field.members == pytest.approx(field.centre + cells + (along @ gained).T, abs=1e-9)
+
+
+def test_more_parameters_without_a_place_than_members_know():
+    model = Many()
+    series = Series(
+        model.observables[0], np.ones(3), np.zeros(3), noise_of(np.ones(3)), places=Places.at_indices([0, 1, 2])
+    )
+    prior = Prior(tuple(PriorTerm.normal(p, 0.0, 1.0) for p in model.parameters))
+    problem = InverseProblem(model, model.observables[0], Observations.of_series([series]), prior)
+    with pytest.raises(ConfigError, match="2000 parameters have no place, as many as 12 members"):
+        assimilate(problem, settings("en4dvar", Localisation(RADIUS, {"k": (0.0,)})), SEED)
 
 
 def test_by_correlation_is_the_adaptive_gain_in_each_pass():

@@ -23,6 +23,24 @@ COMMANDS = re.findall(r"^\$ en4dvar (.*)$", PAGE, re.M)
 TRUTH = {"c": 0.1, "k": 4.0, "b": 3.0}
 
 
+def test_the_tangent_is_that_of_the_runs():
+    from tangent_duffing import TangentDuffing
+
+    model, times = TangentDuffing(rtol=1e-11), np.arange(0.2, 4.0, 0.2)
+    x = model.initial_state({"A": 1.0, "c": 0.1, "k": 4.0, "b": 3.0})
+    directions = np.random.default_rng(0).standard_normal((3, 5))
+    path, changes = model.tangent(x, directions, times)
+    ahead, behind = ([p.states for p in model.trajectories(x + sign * 1e-5 * directions, times)] for sign in (1, -1))
+    assert np.max(np.abs(changes - (np.array(ahead) - behind) / 2e-5)) < 1e-4 * np.max(np.abs(changes))
+    assert np.max(np.abs(path.states - model.trajectories(x[None], times)[0].states)) < 1e-8
+
+
+def test_the_function_in_jax(capsys):
+    pytest.importorskip("jax")
+    runpy.run_path("jax_cooling.py")
+    assert "T_hot" in capsys.readouterr().out
+
+
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
     for name, text in FILES.items():
@@ -41,7 +59,16 @@ def call(command):
 
 
 def test_every_block_is_used():
-    assert set(FILES) == {"duffing.py", "duffing.yaml", "fast_duffing.py", "from_python.py", "twin.yaml", "sequence.py"}
+    assert set(FILES) == {
+        "duffing.py",
+        "duffing.yaml",
+        "fast_duffing.py",
+        "from_python.py",
+        "twin.yaml",
+        "sequence.py",
+        "tangent_duffing.py",
+        "jax_cooling.py",
+    }
     assert [command.split()[0] for command in COMMANDS] == ["simulate", "validate", "run", "run", "sweep-twin"]
 
 

@@ -110,10 +110,14 @@ def evaluate(
     for n in alike:
         values = expected(planned, tangents, tried, n)
         gain, error, by = values.gain, values.error, str("laplace" if method == "nested" else method)
-        if method == "nested" and n == 1:
-            more, its_error = nested(planned, u[: sizes.simulated], sizes.inner, seed).correction
-            gain, error, by = gain + more, float(np.hypot(error, its_error)), method
         std, relative = _in_units(planned, values, tangents.u)
+        ratio = values.std.mean(axis=0)
+        if method == "nested" and n == 1:
+            simulated = nested(planned, u[: sizes.simulated], sizes.inner, seed)
+            more, its_error = simulated.correction
+            gain, error, by = gain + more, float(np.hypot(error, its_error)), method
+            std, ratio = simulated.std.mean(axis=0), simulated.ratio.mean(axis=0)
+            relative = np.median(simulated.relative, axis=0)
         designs.append(
             Evaluated(
                 gain=gain,
@@ -121,7 +125,7 @@ def evaluate(
                 method=by,
                 std=std,
                 relative=relative,
-                ratio=values.std.mean(axis=0),
+                ratio=ratio,
                 lost=values.lost,
                 beyond=float(exceeds.mean()) if len(exceeds) else 0.0,
                 readings=used.astype(float),

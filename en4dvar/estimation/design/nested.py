@@ -40,11 +40,16 @@ WIDER = 1.2  # than the Gaussian that it is made of
 @dataclass(frozen=True)
 class Nested(Gains):
     """Gains of simulated readings, less their control variate; ``linearised`` (R,) gains at the same draws,
-    ``effective`` (R,) importance draws behind each.
+    ``effective`` (R,) importance draws behind each. ``std`` (R, a) of what is asked in the posterior of each set of
+    readings, in its units, ``relative`` (R, a) to the value that they are of, and ``ratio`` (R, a) to the prior's in
+    transformed space.
     """
 
     linearised: Array
     effective: Array
+    std: Array
+    relative: Array
+    ratio: Array
 
     @property
     def correction(self) -> tuple[float, float]:
@@ -63,18 +68,35 @@ def nested(planned: Planned, u: Array, inner: int, seed: int) -> Nested:
     noise = planned.problem.observations.noise
     streams = [member_stream(seed, "design readings", int(i)) for i in truths.alive]
     values = np.stack([noise.drawn(draw.prediction, s) for draw, s in zip(truths.at, streams, strict=True)])
-    plain, effective = np.empty(len(values)), np.empty(len(values))
+    plain, effective, spread = np.empty(len(values)), np.empty(len(values)), np.empty((len(values), 2, planned.asked))
     for i, (y, stream) in enumerate(zip(values, streams, strict=True)):
         near = explaining(planned, truths, y, i)
         known, of_known = log_integral(planned, y, truths.u[i, : planned.asked], near, inner, stream)
-        log, of_all = log_integral(planned, y, truths.u[i, :0], near, inner, stream)
-        plain[i], effective[i] = known - log, min(of_known, of_all)
+        draws = explained(planned, y, truths.u[i, :0], near, inner, stream)
+        log, of_all = _log_of(draws)
+        plain[i], effective[i], spread[i] = known - log, min(of_known, of_all), _spread(planned, draws)
     alive = np.isfinite(plain)
     require_alive(int(alive.sum()), len(u))
     innovations, (_, rows) = truths.whitened(planned, values)[0], truths.whitened(planned)
     gains = plain - control_variate(innovations, rows, truths.u, planned.asked)
     linearised = 0.5 * np.linalg.slogdet(about(precision(rows), planned.asked))[1]
-    return Nested(gains[alive], linearised[alive], effective[alive])
+    prior, asked = planned.problem.prior, planned.order[: planned.asked]
+    true = prior.to_physical(planned.control(truths.u[alive]))[:, asked]
+    of_prior = np.linalg.norm(planned.root[asked], axis=1)
+    std, transformed = np.moveaxis(spread[alive], 1, 0)
+    return Nested(gains[alive], linearised[alive], effective[alive], std, std / np.abs(true), transformed / of_prior)
+
+
+def _spread(planned: Planned, draws: Importance) -> Array:
+    """Standard deviations (2, a) of what is asked, in its units and transformed, over weighted draws."""
+    if not np.isfinite(draws.log):
+        return np.full((2, planned.asked), np.nan)
+    shares = draws.shares
+    counts = shares > 0
+    x, shares, asked = planned.control(draws.z[counts]), shares[counts], planned.order[: planned.asked]
+    each = np.stack([values[:, asked] for values in (planned.problem.prior.to_physical(x), x)])
+    squares = (each - np.einsum("d,qda->qa", shares, each)[:, None]) ** 2
+    return np.asarray(np.sqrt(np.einsum("d,qda->qa", shares, squares) / max(1 - shares @ shares, 1e-9)))
 
 
 def explaining(planned: Planned, truths: Tangents, values: Array, own: int | None) -> tuple[Array, Array]:
@@ -110,9 +132,29 @@ def log_integral(
 
     In at most so many ``rounds`` of ``inner`` runs, until there are ``enough`` effective draws.
     """
-    (centres, matrices), k = near, len(known)
-    if k == len(planned.names):
+    if len(known) == len(planned.names):
         return -float(planned.cost(values, planned.run(known[None]))[0]), np.inf
+    return _log_of(explained(planned, values, known, near, inner, stream, enough, rounds))
+
+
+def _log_of(draws: Importance) -> tuple[float, float]:
+    if not np.isfinite(draws.log):
+        return -np.inf, 0.0
+    return draws.log + 0.5 * (1 / draws.effective - 1 / len(draws.z)), draws.effective
+
+
+def explained(
+    planned: Planned,
+    values: Array,
+    known: Array,
+    near: tuple[Array, Array],
+    inner: int,
+    stream: np.random.Generator,
+    enough: float = ENOUGH,
+    rounds: int = ROUNDS,
+) -> Importance:
+    """Draws of the coordinates behind the ``known`` ones, weighted by how they explain the readings."""
+    (centres, matrices), k = near, len(known)
     own = matrices[:, k:, k:]
     shift = np.linalg.solve(own, (matrices[:, k:, :k] @ (known - centres[:, :k])[..., None]))[..., 0]
     roots = WIDER * np.linalg.inv(np.linalg.cholesky(own)).transpose(0, 2, 1)
@@ -127,9 +169,7 @@ def log_integral(
         draws.add(z, -planned.cost(values, planned.run(np.hstack([np.tile(known, (inner, 1)), z]))))
         if draws.effective >= enough:
             break
-    if not np.isfinite(draws.log):
-        return -np.inf, 0.0
-    return draws.log + 0.5 * (1 / draws.effective - 1 / len(draws.z)), draws.effective
+    return draws
 
 
 def control_variate(d: Array, rows: Array, u: Array, asked: int) -> Array:
