@@ -4,7 +4,7 @@
 
 Templates and instruction files that are not there are stood in for by empty ones, as nothing is run. Prints how many
 files are read and why others are refused; and, of those that pyemu reads too, the largest difference of its parameters
-(``parval1``, std of the prior from the bounds or ``parcov``) and observations (values, std from the weights), relative.
+(``parval1``, std of the prior from the bounds or ``parcov``, behind the scale) and observations (values, std from the weights), relative.
 """
 
 from __future__ import annotations
@@ -60,10 +60,12 @@ def difference(path: Path, found: dict) -> float:
             worst.append(0.0 if isinstance(own, dict) else abs(own - row.parval1))
             continue
         middle = own.get("median", own.get("mean"))
-        std = own["log_std"] / math.log(10) if "log_std" in own else own["std"]
+        std = own["log_std"] / math.log(10) if "log_std" in own else own["std"] * abs(row.scale)
+        if "log_std" in own and row.offset:  # there pyemu takes the logarithm behind scale and offset, PEST before
+            std = spread[names[name]]
         worst += [
             abs(middle - row.parval1) / max(abs(row.parval1), 1e-300),
-            abs(std / spread[names[name]] - 1) if own.get("std") != 0 else 0.0,
+            abs(std / spread[names[name]] - 1),
         ]
     observed = pst.observation_data.loc[pst.observation_data.weight > 0]
     error = found["error"]
@@ -86,12 +88,14 @@ def main(folder: Path) -> None:
                 found, count = read(copy / path.name)
             except en4dvar.ConfigError as error:
                 text = re.sub(r"\S*/folder/\S*?:(\d+:)? ", "", str(error))
-                reasons[text] += 1
+                reasons[re.sub(r"^\S*: No such", "a table or matrix: No such", text)] += 1
                 continue
             agree += 1
             stood_in += bool(count)
             try:
-                differences.append(difference(copy / path.name, found))
+                differences.append(own := difference(copy / path.name, found))
+                if own > 1e-6:
+                    silent.append(f"{path.relative_to(folder)}: {own:.1e}")
             except ImportError:
                 continue
             except Exception as error:

@@ -29,6 +29,7 @@ import numpy as np
 from en4dvar.descent.field_data import FieldData, Members, Pass, mean_of, silent
 from en4dvar.descent.loop import Objective, minimise
 from en4dvar.descent.step_control import Move, Search
+from en4dvar.ensemble.missing import fitted
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import En4dvarError
 from en4dvar.schemes.base import mda_inflations
@@ -113,7 +114,10 @@ class Passes(Objective["Passes"]):
         self.ended = self.iteration == len(self.inflations)
 
     def _predicted(self) -> Array:
-        return self.data.predict(lambda some: self.ensemble[self.alive[some]], len(self.alive), self.fewest)
+        """(M, K) of the M members alive; what some lack is regressed on the others."""
+        predictions = np.full((len(self.ensemble), len(self.data.values)), np.nan)
+        predictions[self.alive] = self.data.runs(lambda some: self.ensemble[self.alive[some]], len(self.alive))
+        return self.data.enough(fitted(self.ensemble, predictions)[self.alive], self.fewest)
 
 
 def _part_of(ensemble: Array, alive: Members, part: slice) -> Array:
@@ -236,7 +240,8 @@ class FieldObjective(Objective[FieldDescent]):
         """By the derivatives of the predictions along the prior anomalies."""
         count = len(self.anomalies)
         at.forward_runs += count
-        runs = self.data.predict(lambda some: at.centre + self.epsilon * self.anomalies[some], count)
+        runs = self.data.runs(lambda some: at.centre + self.epsilon * self.anomalies[some], count)
+        runs = self.data.enough(fitted(self.anomalies, runs))
         tangent = (runs - at.prediction) / self.epsilon
         tangent = tangent - tangent.mean(axis=0)
         between = self.gain.between
