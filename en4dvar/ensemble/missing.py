@@ -76,10 +76,10 @@ class Beside:
         near = self.composite(self.prior.from_white(around.reshape(-1, n)), extra_times)
         self.forward_runs += len(near)
         rates = () if near.predicted.rates is None else (near.predicted.rates,)
-        found = np.hstack([near.predictions, *rates, near.path]).reshape(len(rows), len(steps), -1)
+        values_near = np.hstack([near.predictions, *rates, near.path]).reshape(len(rows), len(steps), -1)
 
         def fill(values: Array) -> Array:
-            for row, own in zip(rows.tolist(), found, strict=True):
+            for row, own in zip(rows.tolist(), values_near, strict=True):
                 values[row] = fitted(np.vstack([np.zeros(n), steps]), np.vstack([values[row], own]))[0]
             return values
 
@@ -95,8 +95,8 @@ def fitted(x: Array, values: Array, ran: Array | None = None) -> Array:
     """
     if np.isfinite(values).all():
         return values
-    ran = np.isfinite(values).any(axis=1) if ran is None else ran
-    rows = np.logical_and(ran, ~np.isinf(values).any(axis=1))
+    some = np.isfinite(values).any(axis=1) if ran is None else ran
+    rows = np.logical_and(some, np.logical_not(np.isinf(values).any(axis=1))).astype(bool)
     values, own = values.copy(), values[rows]
     values[rows] = _regressed(x[rows], own) if x.shape[1] + 1 < len(own) else _screened(x, rows, own)
     return values
