@@ -4,7 +4,8 @@
 
 Templates and instruction files that are not there are stood in for by empty ones, as nothing is run. Prints how many
 files are read and why others are refused; and, of those that pyemu reads too, the largest difference of its parameters
-(``parval1``, std of the prior from the bounds or ``parcov``, behind the scale) and observations (values, std from the weights), relative.
+(``parval1``, std of the prior from the bounds or ``parcov``, behind the scale) and observations (values, std from the
+weights), relative.
 """
 
 from __future__ import annotations
