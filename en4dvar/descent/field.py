@@ -30,6 +30,7 @@ import numpy as np
 from en4dvar.descent.field_data import FieldData, Members, Pass, mean_of, silent
 from en4dvar.descent.loop import Objective, minimise
 from en4dvar.descent.step_control import Move, Search
+from en4dvar.ensemble.missing import fitted
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import En4dvarError
 from en4dvar.schemes.base import mda_inflations
@@ -115,7 +116,10 @@ class Passes(Objective["Passes"]):
         self.ended = self.iteration == len(self.inflations)
 
     def _predicted(self) -> Array:
-        return self.data.predict(lambda some: self.ensemble[self.alive[some]], len(self.alive), self.fewest)
+        """(M, K) of the M members alive; what some lack is regressed on the others."""
+        predictions = np.full((len(self.ensemble), len(self.data.values)), np.nan)
+        predictions[self.alive] = self.data.runs(lambda some: self.ensemble[self.alive[some]], len(self.alive))
+        return self.data.enough(fitted(self.ensemble, predictions)[self.alive], self.fewest)
 
 
 def _part_of(ensemble: Array, alive: Members, part: slice) -> Array:
@@ -244,7 +248,8 @@ class FieldObjective(Objective[FieldDescent]):
             return x
 
         at.forward_runs += count + len(common)
-        runs = self.data.predict(beside, count)
+        local = np.delete(self.anomalies, common, axis=1) if len(common) else self.anomalies
+        runs = self.data.enough(fitted(local, self.data.runs(beside, count)))
         placed = (runs - at.prediction) / self.epsilon
         tangent: Tangent = placed - placed.mean(axis=0)
         if len(common):

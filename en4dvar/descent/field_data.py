@@ -33,14 +33,24 @@ class FieldData:
     at_once: int = 16
 
     def predict(self, members: Callable[[slice], Array], count: int, fewest: int | None = None) -> Array:
-        """Predictions (count, K) of members that are made a few at a time.
+        """Predictions (count, K) of members that are made a few at a time. Raises as :meth:`enough`."""
+        return self.enough(self.runs(members, count), fewest)
 
-        Raises :class:`En4dvarError` where those of fewer than ``fewest``, by default all, are finite.
-        """
+    def runs(self, members: Callable[[slice], Array], count: int) -> Array:
+        """The same, NaN where a reading is missing."""
         predictions = np.empty((count, len(self.values)))
         for first in range(0, count, self.at_once):
             some = slice(first, min(first + self.at_once, count))
             predictions[some] = np.asarray(self.forward(members(some)), dtype=float)
+        return predictions
+
+    @staticmethod
+    def enough(predictions: Array, fewest: int | None = None) -> Array:
+        """Predictions (M, K) as they are.
+
+        Raises :class:`En4dvarError` where those of fewer than ``fewest``, by default all, are finite.
+        """
+        count = len(predictions)
         lost = np.flatnonzero(~np.isfinite(predictions).all(axis=1))
         if count - len(lost) < (count if fewest is None else fewest):
             raise En4dvarError(f"{len(lost)} of {count} members have predictions that are not finite, first {lost[0]}")

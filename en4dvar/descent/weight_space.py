@@ -149,8 +149,7 @@ class WeightSpace:
         def again(members: list[int]) -> tuple[Array, tuple[str, ...]]:
             run = self.forecast(self.members[members], extra_times)
             lacks = run.partial[:, None] & np.isnan(run.predictions)
-            reasons = tuple("" if some else reason for some, reason in zip(run.partial, run.failures, strict=True))
-            return np.where(lacks, alive.predictions[members], run.predictions), reasons
+            return np.where(lacks, alive.predictions[members], run.predictions), run.lost
 
         alive = prior_run[: len(self.members)]
         check_repeats(self.problem.model, alive.predictions, alive.failures, again, self.problem.observations.name)

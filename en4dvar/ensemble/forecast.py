@@ -58,6 +58,11 @@ class Forecast:
         failed = np.array([reason == NOT_FINITE for reason in self.failures])
         return np.asarray(failed & np.isfinite(self.predictions).any(axis=1))
 
+    @property
+    def lost(self) -> tuple[str, ...]:
+        """(B,) the failures of members that have no reading at all, or failed for another reason."""
+        return tuple("" if some else reason for some, reason in zip(self.partial, self.failures, strict=True))
+
     def __len__(self) -> int:
         return len(self.failures)
 

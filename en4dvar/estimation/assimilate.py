@@ -96,11 +96,7 @@ def _through(stages: Stages, resume: LoopState | None) -> Analysis:
     cautions = (*start.warnings, *(sampled.refined.warnings if sampled.refined else ()))
     if len(outcome.tried) == 1:
         cautions = (*cautions, caution("one-descent", "one descent only: another minimum is not excluded"))
-    if share := ends.run.filled:
-        words = f"{100 * share:.2g} % of the members' readings in the posterior forecast are missing (NaN)"
-        words, asked = f"{words}; each is regressed on the members that have it", stages.settings.refine == "mcmc"
-        words += ", and no chain (refine: mcmc) is run, to which a draw without one is impossible" if asked else ""
-        cautions = (*cautions, caution("readings-missing", words, "serious" if asked else None))
+    cautions = (*cautions, *conclusions.missing_readings(ends.run.filled, stages.settings.refine == "mcmc"))
     if counting:
         weights = np.array([mode.weight for mode in analysis.modes])
         cautions = (*cautions, *mode_cautions(prior, counting, weights, agree, sampled.refined))

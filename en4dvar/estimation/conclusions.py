@@ -23,6 +23,7 @@ from en4dvar.diagnosis.response.linear import LinearResponse
 from en4dvar.ensemble.forecast import Forecast
 from en4dvar.ensemble.members import InitialStates, out_of_bounds
 from en4dvar.model.state import Array
+from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.priors.prior import Prior
 from en4dvar.problem import InverseProblem
 from en4dvar.sampling.refine import Refined
@@ -199,3 +200,11 @@ def discrepancy_of(space: WeightSpace, descent: Descent, central: Predicted) -> 
     if explained is None or linear is None:
         return None
     return Discrepancy(*explained, shares_of_variance(space, linear))
+
+
+def missing_readings(share: float, chain: bool = False) -> tuple[Caution, ...]:
+    """Told where a share of the members' readings is missing; ``chain``: whether a chain was asked for."""
+    words = f"{100 * share:.2g} % of the members' readings in the posterior forecast are missing (NaN)"
+    words += "; each is regressed on the members that have it"
+    words += ", and no chain (refine: mcmc) is run, to which a draw without one is impossible" if chain else ""
+    return (caution("readings-missing", words, "serious" if chain else None),) if share else ()

@@ -25,6 +25,7 @@ from en4dvar.diagnosis.analysis import Analysis, FieldEstimate, IterationRecord,
 from en4dvar.diagnosis.honesty import ControlEnsembles, examine
 from en4dvar.ensemble.forecast import NO_TIMES, Composite, Forecast, check_problem, plotting_times
 from en4dvar.ensemble.members import InitialStates
+from en4dvar.ensemble.missing import filled, fitted
 from en4dvar.ensemble.repeat import check_repeats
 from en4dvar.estimation import conclusions
 from en4dvar.estimation.conclusions import Ensembles
@@ -74,13 +75,17 @@ class _WithLocalisation:
         before, prior_mean = ensemble[:, :n].copy(), mean_of(ensemble, self.everyone)
         base = self._base(prior_mean[:n])
         moments = [self._moments(prior_field, columns, base) for prior_field, columns in self._fields]
-        prior_run = self.forecast(lambda some: ensemble[some], len(ensemble), self.grid)
+        raw = self.forecast(lambda some: ensemble[some], len(ensemble), self.grid)
+        prior_run = filled(raw, ensemble)
         require_members(problem, prior_run.failures, self.fewest, "prior forecast")
-        self._check_repeats(prior_run)
+        self._check_repeats(raw)
         variance = self._variance()
         centre, converged, stop, lost = self._descend(prior_run)
-        run = self.forecast(lambda some: ensemble[some], len(ensemble), self.grid)
+        run = filled(self.forecast(lambda some: ensemble[some], len(ensemble), self.grid), ensemble)
         central = self.forecast(lambda _: centre[None], 1)
+        if central.partial.any():
+            both = np.vstack([centre, ensemble]), np.vstack([central.predictions, run.predictions])
+            central = replace(central, predicted=Predicted(fitted(*both)[:1]), failures=("",))
         run = replace(run, failures=tuple(reason or lost[i] for i, reason in enumerate(run.failures)))
         require_members(problem, run.failures, self.fewest, "posterior forecast")
         self._end(run, central, centre, variance)
@@ -102,7 +107,7 @@ class _WithLocalisation:
             fields=tuple(fields),
         )  # fmt: skip
         control = ControlEnsembles(before, after, centre[:n], None, math.nan)
-        return replace(analysis, cautions=examine(analysis, control))
+        return replace(analysis, cautions=examine(analysis, control, earlier=conclusions.missing_readings(run.filled)))
 
     def forecast(self, members: Callable[[slice], Array], count: int, extra_times: Array = NO_TIMES) -> Forecast:
         """Of members that are taken a few at a time."""
@@ -240,10 +245,10 @@ class _WithLocalisation:
 
         def again(members: list[int]) -> tuple[Array, tuple[str, ...]]:
             run = self.forecast(lambda some: self.ensemble[members][some], len(members), self.grid)
-            return run.predictions, run.failures
+            return np.nan_to_num(run.predictions), run.lost
 
         name = self.problem.observations.name
-        check_repeats(self.problem.model, prior_run.predictions, prior_run.failures, again, name)
+        check_repeats(self.problem.model, np.nan_to_num(prior_run.predictions), prior_run.lost, again, name)
 
 
 def _joined(runs: Sequence[Forecast]) -> Forecast:

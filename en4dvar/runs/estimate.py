@@ -25,7 +25,7 @@ from en4dvar.report.outcomes import SequenceOutcome
 from en4dvar.report.result import Result
 from en4dvar.runs.given import Given
 from en4dvar.runs.progress import terminal_progress
-from en4dvar.runs.rundir import GIVEN, holds_run
+from en4dvar.runs.rundir import holds_run
 from en4dvar.runs.runner import run_campaign
 from en4dvar.runs.sequence_run import run_sequence
 
@@ -74,7 +74,7 @@ def estimate(
     priors: name → prior, as in a file: ``{"prior": "lognormal", "median": 4, "log_std": 0.5}``; a number fixes a
         parameter. ``t_s`` is a time shift, ``sigma`` the noise scale, ``reading_scale`` that of the predictions.
     error: std of the readings: a number, one a reading, text such as ``"1 % of maximum"``, or a dict as ``data.error``
-        of a file, in which an array is one number a reading.
+        of a file, in which an array is one number a reading, and of ``covariance`` the matrix (K, K) of all readings.
     units: of a function's parameters, values (by name) and of ``"time"``; by default none has one.
     time: name of the column, index or coordinate of times.
     observable: what the values are, by its name in the model or the column; by default the only one there is. A list:
@@ -87,7 +87,8 @@ def estimate(
     force, resume: replace or continue the run in the directory.
     progress: show it on a terminal or in a notebook; or a function that is called as that of :func:`en4dvar.run`, with
         the name of the data set and the record of each iteration.
-    sections: further sections of a file by name: ``assimilation``, ``execution``, ``initial_state``, ``model_error``.
+    sections: further sections of a file by name: ``assimilation``, ``execution``, ``initial_state``, ``model_error``;
+        ``prior={"ensemble": {"k": array}}`` may hold the members themselves.
 
     Raises
     ------
@@ -102,12 +103,13 @@ def estimate(
         "data": {**call.data(ready), **({"window": window} if window else {})},
         "parameters": priors,
         "output": {"report": report and directory is not None},
-        **sections,
+        **{key: call.prior(section) if key == "prior" else section for key, section in sections.items()},
     }
     with ExitStack() as held:
         where = Path(directory or Path(held.enter_context(temporary_folder())) / "run")
+        _keep_data(where, call.beside, resume or force)  # which the configuration reads
         config = replace(_checked(content, where, ready, resolve), directory=where)
-        _keep_data(where / GIVEN, call.csv, resume or force)
+        _keep_data(where, call.files, resume or force)
         shown = progress if callable(progress) else held.enter_context(terminal_progress()) if progress else None
         campaign = run_campaign(config, force=force, resume=resume, progress=shown, command="en4dvar.estimate")
         (result,) = campaign
@@ -164,7 +166,7 @@ def estimate_sequence(
     with ExitStack() as held:
         where = Path(directory or Path(held.enter_context(temporary_folder())) / "run")
         config = replace(_checked(content, where, ready, resolve_sequence), directory=where)
-        _keep_data(where / GIVEN, call.csv, resume or force)
+        _keep_data(where, call.files, resume or force)
         return run_sequence(config, force=force, resume=resume, command="en4dvar.estimate_sequence")
 
 
@@ -194,12 +196,12 @@ def _argument(path: str) -> str:
     return path
 
 
-def _keep_data(path: Path, text: str, replaces: bool) -> None:
-    """Write the readings into the run directory. Raises :class:`OutputError` where another file would be lost."""
-    make_folder(path.parent)
-    old = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else text
-    if old != text and not (replaces and holds_run(path.parent)):
-        raise OutputError(
-            f"{path}: holds other readings; choose another directory, or give force=True to replace a run"
-        )
-    write_text(path, text)
+def _keep_data(directory: Path, files: Mapping[str, str], replaces: bool) -> None:
+    """Write the arrays into the run directory. Raises :class:`OutputError` where another file would be lost."""
+    for path, text in ((directory / name, text) for name, text in files.items()):
+        old = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else text
+        if old != text and not (replaces and holds_run(directory)):
+            words = "holds other readings; choose another directory, or give force=True to replace a run"
+            raise OutputError(f"{path}: {words}")
+        make_folder(directory)
+        write_text(path, text)

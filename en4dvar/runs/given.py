@@ -29,7 +29,7 @@ class GivenSeries:
     """One series: its ``columns``, what they are of and their ``error``.
 
     ``name``: "" of a single one, else that in front of its columns in the data file. ``more``: what it says besides, as
-    in ``data.series``. ``used``: the columns that go to the file, by their names there.
+    in ``data.series``. ``used``: the columns that go to the file, by their names there; ``files``: others, with text.
     """
 
     name: str
@@ -38,6 +38,7 @@ class GivenSeries:
     error: Any
     more: Mapping[str, Any] = field(default_factory=dict)
     used: dict[str, Array] = field(init=False)
+    files: dict[str, str] = field(default_factory=dict, init=False)
 
     def __post_init__(self) -> None:
         self.used = {TIME: self.columns[TIME]}
@@ -100,6 +101,10 @@ class GivenSeries:
                 column = f"{self.name} error {key}".lstrip()
                 error[key] = {"column": column}
                 self.used[column] = self._one_each(np.asarray(value, dtype=float), key)
+            elif key == "covariance" and np.ndim(value) == 2:
+                file = f"data.{self.name}.covariance.csv".replace("..", ".")
+                self.files[file] = "".join(",".join(map(repr, row)) + "\n" for row in np.asarray(value, float).tolist())
+                error[key] = {"path": file, "unit": "1" if unit == "1" else f"({unit})*({unit})"}
             elif key == std and isinstance(value, int | float | np.number) and unit != "1":
                 error[key] = f"{float(value)!r} {unit}"
         return error
@@ -126,6 +131,7 @@ class Given:
         units: Mapping[str, str], priors: Mapping[str, Any], series: Mapping[str, Any], correlation: Any,
     ):  # fmt: skip
         self.units, self.priors, self.correlation = units, priors, correlation
+        self.beside: dict[str, str] = {}
         try:
             tables = tables_of(data, time, None if isinstance(observable, str) else observable)
         except DataError as problem:
@@ -150,10 +156,21 @@ class Given:
         chosen = str(more.get("observable", name))
         return GivenSeries(name, _columns(f"data: {name}", table, time, chosen), chosen, error, more)
 
+    def prior(self, section: Any) -> Any:
+        """The ``prior:`` section, with a file for an ensemble of arrays. Raises :class:`DataError`."""
+        if not (isinstance(section, Mapping) and isinstance(members := section.get("ensemble"), Mapping)):
+            return section
+        columns = {name: np.asarray(values, dtype=float) for name, values in members.items()}
+        if len({values.shape for values in columns.values()}) != 1 or next(iter(columns.values())).ndim != 1:
+            raise DataError("prior: give one number a member for each parameter, of all the same number of members")
+        self.beside["data.prior.csv"] = csv_of(columns)
+        return {**section, "ensemble": "data.prior.csv"}
+
     @property
-    def csv(self) -> str:
-        """The text of the data file."""
-        return csv_of(stacked([series.used for series in self.series]))
+    def files(self) -> dict[str, str]:
+        """Names of the data file and of those beside it, and their texts."""
+        beside = dict(item for series in self.series for item in series.files.items())
+        return {GIVEN: csv_of(stacked([series.used for series in self.series])), **beside, **self.beside}
 
     def data(self, model: ForwardModel) -> dict[str, Any]:
         """The ``data:`` section, apart from the window. Raises :class:`DataError`, :class:`ConfigError`."""

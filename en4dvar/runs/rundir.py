@@ -8,6 +8,7 @@ next run there finishes it, and commands that read say so and read nothing.
 from __future__ import annotations
 
 import itertools
+import re
 import shlex
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -38,6 +39,7 @@ from en4dvar.runs.replacement import (
 LOG = "run.log"
 OF_EVERY_RUN = ("config.yaml", "config.resolved.yaml", LOG)
 GIVEN = "data.csv"  # readings that a script handed over, written before its run begins
+BESIDE = re.compile(r"data(\..+)?\.csv")  # these, and further arrays
 Mode = Literal["new", "force", "resume", "report", "beside"]
 
 
@@ -179,7 +181,8 @@ def _prepare(path: Path, mode: Mode) -> Path:
     """The folder of a new run, to write to. Raises :class:`OutputError`."""
     finish_replacement(path)
     listed = listed_files(path)
-    others = {p.name for p in path.iterdir() if not PARTIAL.fullmatch(p.name)} - {LOCK, GIVEN}
+    others = {p.name for p in path.iterdir() if not (PARTIAL.fullmatch(p.name) or BESIDE.fullmatch(p.name))}
+    others -= {LOCK}
     if mode == "resume" and others:
         raise OutputError(f"{path}: holds no run")
     if mode == "new" and (listed or others - {LISTING}):  # an empty list is of a run that was killed before it began

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from en4dvar.ensemble.missing import fitted
 from en4dvar.executor import Executor
 from en4dvar.model.batch import Batch
 from en4dvar.model.forward import Failure, ForwardModel, Observable, Trajectory
@@ -130,8 +131,10 @@ class Flow:
         return self.times[index] - self.times[index - 1]
 
     def predict(self, states: Array, index: int) -> Array:
-        """Predictions (N, p): H acts at one instant, so members stand where it expects times."""
+        """Predictions (N, p): H acts at one instant, so members stand where it expects times.
+
+        What some members lack is regressed on the states of the others.
+        """
         physical = self.coordinates.to_physical(states)
-        return predictions(
-            self.observables, Trajectory(np.full(len(states), self.times[index]), physical, self.model.layout)
-        )
+        path = Trajectory(np.full(len(states), self.times[index]), physical, self.model.layout)
+        return fitted(states, predictions(self.observables, path), np.ones(len(states), dtype=bool))

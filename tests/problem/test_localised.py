@@ -14,7 +14,7 @@ from en4dvar.data.observations import Observations
 from en4dvar.data.series import Places, Series
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.estimation.joint.problem import sharing
-from en4dvar.model.forward import Observable
+from en4dvar.model.forward import Observable, StateField
 from en4dvar.plumbing.errors import ConfigError, TooFewMembersError
 from en4dvar.priors.field_prior import FieldPrior
 from en4dvar.priors.prior import Prior, PriorTerm, member_stream
@@ -175,27 +175,29 @@ def test_by_correlation_is_the_adaptive_gain_in_each_pass():
     assert found.fields[0].members == pytest.approx(2.0 + after[:, 1:], abs=1e-10)
 
 
+class WithoutOne(StateField):
+    """No number at one cell that is read where the first cell is more than a kelvin above what it starts with."""
+
+    def __call__(self, trajectory):
+        u = np.array(super().__call__(trajectory), dtype=float)
+        u[u[:, 0] > 3.0, READ[2]] = np.nan
+        return u
+
+
 class Gappy(Line):
-    """Gives no number at one cell that is read where its first cell is more than a kelvin above what it starts with."""
-
-    observables = (Observable("u", "K", lambda path: without_one(path["u"])), Line.observables[1])
+    observables = (Observable("u", "K", WithoutOne("u")), Line.observables[1])
 
 
-def without_one(u):
-    u = np.array(u, dtype=float)
-    u[u[:, 0] > 3.0, READ[2]] = np.nan
-    return u
-
-
-def test_a_member_that_lacks_a_reading_has_failed_where_the_gain_is_localised():
-    found = assimilate(line(Gappy()), settings("es-mda", Localisation(threshold=0.4)), SEED)
-    for failures, predictions in (
-        (found.prior_failures, found.prior_predictions), (found.posterior_failures, found.posterior_predictions),
-    ):  # fmt: skip
-        lost = np.array([bool(reason) for reason in failures])
-        assert 0 < lost.sum() < N / 2
-        assert np.isnan(predictions[lost]).all()
-        assert np.isfinite(predictions[~lost]).all()
+@pytest.mark.parametrize("scheme", ["es-mda", "en4dvar"])
+def test_what_members_lack_is_that_of_the_cell_that_is_read(scheme):
+    """The screening finds it among thirty cells, so that the analysis is that of the model without gaps."""
+    more = {"epsilon": 1.0} if scheme == "en4dvar" else {}
+    whole, gappy = (assimilate(line(model), settings(scheme, **more), SEED) for model in (Line(), Gappy()))
+    assert gappy.fields[0].members == pytest.approx(whole.fields[0].members, abs=1e-9)
+    assert gappy.posterior_predictions == pytest.approx(whole.posterior_predictions, abs=1e-9)
+    assert not any(gappy.prior_failures)
+    assert any(c.code == "readings-missing" for c in gappy.cautions) == (scheme == "es-mda")  # of the posterior
+    assert not any(c.code == "readings-missing" for c in whole.cautions)
 
 
 def test_members_that_fail_are_left_where_they_failed_and_told():

@@ -93,15 +93,31 @@ def test_failures_may_be_values():
 
 
 @pytest.mark.parametrize("scheme", [ETKF(), IEnKS(1)])
-def test_a_prediction_that_is_no_number_loses_its_member(scheme):
+def test_a_prediction_that_is_no_number_loses_the_reading_and_not_its_member(scheme):
+    """The operator is linear, so that what is regressed on the others is what it would have given."""
+
     def gap(trajectory):
         return np.where(trajectory["y"] > 0.7, np.nan, trajectory["y"])
 
     start = members()
+    assert (start[:, 1] > 0.7).sum() == 1
+    runs = []
+    for second in (gap, lambda trajectory: trajectory["y"]):
+        observed = (Forced.observables[0], Observable("gap", "1", second))
+        runs.append(run_sequential(Forced(), observed, start, series(), SequentialSettings(scheme)))
+    assert runs[0].failures == ()
+    assert runs[0].members == pytest.approx(runs[1].members, abs=1e-9)
+
+
+@pytest.mark.parametrize("scheme", [ETKF(), IEnKS(1)])
+def test_an_infinite_prediction_loses_its_member(scheme):
+    def wall(trajectory):
+        return np.where(trajectory["y"] > 0.7, np.inf, trajectory["y"])
+
+    start = members()
     lost = start[:, 1] > 0.7
-    assert lost.sum() == 1
-    observed = (Forced.observables[0], Observable("gap", "1", gap))
-    blind = series(std=1e9)  # so that no other member is moved into the gap
+    observed = (Forced.observables[0], Observable("wall", "1", wall))
+    blind = series(std=1e9)  # so that no other member is moved into it
     result = run_sequential(Forced(), observed, start, blind, SequentialSettings(scheme))
     assert result.failures == ("non-finite prediction",)
     assert result.members[:, 1] == pytest.approx(start[~lost, 1], abs=1e-9)

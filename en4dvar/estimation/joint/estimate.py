@@ -11,6 +11,7 @@ import numpy as np
 from en4dvar.descent.weight_space import require_members
 from en4dvar.ensemble.forecast import Forecast, plotting_times
 from en4dvar.estimation.assimilate import assimilate
+from en4dvar.estimation.conclusions import missing_readings
 from en4dvar.estimation.joint.agreement import AT_MOST, Agreement, agreement, is_odd, oddest
 from en4dvar.estimation.joint.challenge import challenger
 from en4dvar.estimation.joint.descent import JointDescent, Place, assembled, cost, descend
@@ -135,6 +136,7 @@ class _Estimate:
             for experiment in experiments
         )
         self._require(forecasts)
+        cautions += missing_readings(max(forecast.filled for forecast in forecasts))
         if not lowest.converged:
             cautions.append(caution("not-converged", f"the joint estimate has not converged: {lowest.stop}"))
         if _agreeing(descents) < 2:

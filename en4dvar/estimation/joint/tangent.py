@@ -8,6 +8,7 @@ import numpy as np
 
 from en4dvar.data.noise import Linearisation
 from en4dvar.ensemble.forecast import NO_TIMES, Composite, Forecast
+from en4dvar.ensemble.missing import Beside
 from en4dvar.estimation.joint.problem import JointProblem
 from en4dvar.executor import Executor
 from en4dvar.model.state import Array
@@ -29,12 +30,15 @@ class Experiment:
     def __init__(self, joint: JointProblem, e: int, epsilon: float, executor: Executor):
         self.joint, self.e, self.epsilon = joint, e, epsilon
         self.problem = joint.experiments[e]
-        self.composite = Composite(self.problem, executor)
-        self.forward_runs = 0
+        self.composite = Beside(Composite(self.problem, executor), self.problem.prior, epsilon)
+
+    @property
+    def forward_runs(self) -> int:
+        """So far."""
+        return self.composite.forward_runs
 
     def run(self, z: Array, grid: Array = NO_TIMES) -> Forecast:
         """Control vectors (B, n) in units of the prior."""
-        self.forward_runs += len(z)
         return self.composite(self.joint.control(self.e, z), grid)
 
     def costs(self, z: Array) -> Array:

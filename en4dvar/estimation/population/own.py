@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from en4dvar.ensemble.forecast import Composite
+from en4dvar.ensemble.missing import Beside
 from en4dvar.estimation.population.mixtures import Mixture
 from en4dvar.executor import Executor
 from en4dvar.model.state import Array
@@ -37,6 +38,7 @@ OF_PRIOR = 0.2  # of the first draws
 KEPT = 2000  # equally likely draws of each data set
 WALKERS, MOVES, WALKED = 80, 5, 16  # moves of half of them while the other half stands still, and turns of both
 MOST_PARTS, ROUNDS = 4, 60  # components of a mixture; rounds of expectation maximisation
+BESIDE = 1e-3  # prior standard deviations that runs for readings that one lacks are apart
 NARROWEST = 0.03  # standard deviation of what is drawn about the members, in units of the prior
 INFORMED = 0.1  # least share of the prior's variance that the data take away, for a slope to be read from draws
 
@@ -71,12 +73,11 @@ def own_draws(problem: InverseProblem, start: Array, seed: int, executor: Execut
 
     The same for a data set whatever others there are. Raises :class:`ValueError` where no run succeeds.
     """
-    composite, prior, runs = Composite(problem, executor), problem.prior, 0
+    prior = problem.prior
+    composite = Beside(Composite(problem, executor), prior, BESIDE)
     seed = own_seed(seed, problem.observations.name)
 
     def log_likelihood(z: Array) -> Array:
-        nonlocal runs
-        runs += len(z)
         return np.asarray(-problem.observations.cost(composite(prior.from_white(z)).predicted))
 
     def cost(z: Array) -> Array:
@@ -92,9 +93,11 @@ def own_draws(problem: InverseProblem, start: Array, seed: int, executor: Execut
         raise ValueError("no forward run about its members succeeded")
     stream = member_stream(seed, "population: kept draws")
     if sampler.effective >= ENOUGH:
-        return OwnDraws(sampler.z[resampled(sampler.shares, KEPT, stream)], sampler.log, sampler.effective, runs)
+        return OwnDraws(
+            sampler.z[resampled(sampler.shares, KEPT, stream)], sampler.log, sampler.effective, composite.forward_runs
+        )
     walked = _walked(sampler, cost, stream)
-    return OwnDraws(walked, sampler.log, max(sampler.effective, float(WALKERS)), runs)
+    return OwnDraws(walked, sampler.log, max(sampler.effective, float(WALKERS)), composite.forward_runs)
 
 
 def _about(start: Array) -> StudentMixture:

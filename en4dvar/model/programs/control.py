@@ -3,8 +3,8 @@
 Priors are those of PEST++'s ensemble smoother: ``parval1`` in the middle and bounds four standard deviations apart
 (option ``par_sigma_range``), of the logarithm where ``partrans`` is ``log``; at the bounds they are cut off. The std of
 an observation is 1/weight; those of weight 0 are left out. Prior information counts as further observations. The
-observations of groups that hold inequalities are bounds. What would change the estimate and is not known here is an
-error that names it.
+observations of groups that hold inequalities are bounds. Files of covariances and of a prior ensemble take the place of
+bounds and weights. What would change the estimate and is not known here is an error that names it.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import numpy as np
 from en4dvar.model.programs import pest
 from en4dvar.model.programs.control_file import OBSERVATIONS, PARAMETERS, ControlFile, PestRow, read_control, text_of
 from en4dvar.model.programs.refused import refuse
+from en4dvar.model.programs.spread import errors_in_files, priors_in_files
 from en4dvar.plumbing.errors import ConfigError
 
 RANGE = 4.0  # standard deviations between the bounds: PEST++ (White et al. 2020), option par_sigma_range
@@ -30,7 +31,7 @@ _TERM = re.compile(rf"\s*([+-]?)\s*({_NUMBER})\s*\*\s*(?:(log)\s*\(\s*([^\s()]+)
 
 
 def from_pest(path: str | Path, files: Sequence[str] = (), *, prior_information: bool = True) -> dict[str, Any]:
-    """``model``, ``data``, ``priors`` and ``error`` of a control file, for ``en4dvar.estimate(**from_pest(path))``.
+    """``model``, ``data``, ``priors``, ``error`` and what is correlated, for ``en4dvar.estimate(**from_pest(path))``.
 
     Observations, and behind them prior information, count as readings 1, 2, 3, … in the order of the control file.
     Names of parameters are in lower case, with ``_`` for what is neither letter nor digit.
@@ -50,7 +51,7 @@ def from_pest(path: str | Path, files: Sequence[str] = (), *, prior_information:
     parameters = _parameters(control, [row for row in rows if len(row.cells) > 2])
     parents = {row.word("parnme"): row.word("partrans") for row in rows if len(row.cells) == 2}
     equations = _equations(control, parameters) if prior_information else []
-    refuse(control, rows, observed, bool(equations))
+    refuse(control, rows, observed, {reading.group for reading in equations})
     readings = [
         *(
             _Reading(r.number("obsval"), r.number("standard_deviation", 1 / _weight(r)), group=r.word("obgnme"))
@@ -61,11 +62,14 @@ def from_pest(path: str | Path, files: Sequence[str] = (), *, prior_information:
     if not readings:
         raise ConfigError(f"{control.path}: no observation has a weight above 0")
     templates, instructions = _files(control)
+    scalings = {name: _scaling(row) for name, row in parameters.items()}
+    priors = {name: _prior(control, row, parameters, parents) for name, row in parameters.items()}
+    correlated = priors_in_files(control, parameters, priors, scalings)
     return {
         "model": {
             "command": control.lines("model command line")[0].cells["line"],
             "shell": True,
-            "parameters": {name: _scaling(row) for name, row in parameters.items()},
+            "parameters": scalings,
             "templates": templates,
             "files": [str(control.file(file)) for file in files],
             "outputs": {
@@ -82,8 +86,9 @@ def from_pest(path: str | Path, files: Sequence[str] = (), *, prior_information:
             "time": np.arange(1.0, len(readings) + 1),
             OBSERVED: np.array([reading.value for reading in readings]),
         },
-        "priors": {name: _prior(control, row, parameters, parents) for name, row in parameters.items()},
-        "error": _error(readings),
+        "priors": priors,
+        "error": _error(control, readings, [row.word("obsnme") for row in observed]),
+        **correlated,
     }
 
 
@@ -96,11 +101,15 @@ class _Reading(NamedTuple):
     group: str = ""
 
 
-def _error(readings: Sequence[_Reading]) -> Any:
-    """The std of each reading and, where some are inequalities, which are bounds."""
+def _error(control: ControlFile, readings: Sequence[_Reading], names: Sequence[str]) -> Any:
+    """The std of each reading, or their covariance, and where some are inequalities, which are bounds."""
     std = np.array([reading.std for reading in readings])
     marks = {key: np.array([float(r.group.startswith(begin)) for r in readings]) for key, begin in BOUNDS.items()}
     bounds = {key: each for key, each in marks.items() if each.any()}
+    values = np.array([reading.value for reading in readings])
+    full = errors_in_files(control, names, values, std, np.max([*marks.values()], axis=0))
+    if full is not None:
+        return {"covariance": full}
     return {f"{OBSERVED}_std": std, **bounds} if bounds else std
 
 

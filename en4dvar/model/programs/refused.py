@@ -5,19 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 
 from en4dvar.model.programs.control_file import ControlFile, PestRow
+from en4dvar.model.programs.spread import OFF, READ
 from en4dvar.plumbing.errors import ConfigError
 
-OFF = ("", "0", "false", "no")
-MATRIX = "give correlations as prior_correlation, and standard deviations in priors"
 SEARCH = "this is a search for an optimum, not an estimate"
 OPTIONS: Mapping[str, str] = {  # option of PEST++, or how several begin → why not
-    "parcov": MATRIX,
-    "parameter_covariance": MATRIX,
-    "obscov": "correlated errors are those of error={'covariance': …}",
-    "observation_covariance": "correlated errors are those of error={'covariance': …}",
-    "ies_par": "a prior ensemble is that of prior={'ensemble': 'members.csv'}",
-    "ies_obs": "errors are drawn here, from the weights",
-    "ies_observation_ensemble": "errors are drawn here, from the weights",
+    "ies_no_noise": "errors are drawn here, from the weights",
+    "ies_phi_factor": "weights are those of the control file",
     "ies_restart": "an estimate begins at its prior here",
     "ies_weight": "there is one weight an observation here",
     "ies_loc": "name a localisation in assimilation= instead",
@@ -43,9 +37,15 @@ COLUMNS: Mapping[str, str] = {  # of external tables
 }
 
 
-def refuse(control: ControlFile, parameters: Sequence[PestRow], observed: Sequence[PestRow], informed: bool) -> None:
-    """Raise :class:`ConfigError` with all that is refused; ``informed``: prior information counts."""
-    if reasons := [*_modes(control, informed), *_options(control), *_rows(control, parameters, observed)]:
+def refuse(
+    control: ControlFile, parameters: Sequence[PestRow], observed: Sequence[PestRow], informed: set[str]
+) -> None:
+    """Raise :class:`ConfigError` with all that is refused; ``informed``: groups of prior information that counts."""
+    if reasons := [
+        *_modes(control, bool(informed)),
+        *_options(control),
+        *_rows(control, parameters, observed, informed),
+    ]:
         raise ConfigError(f"{control.path}: " + "; ".join(dict.fromkeys(reasons)))
 
 
@@ -64,17 +64,21 @@ def _modes(control: ControlFile, informed: bool) -> Iterator[str]:
 def _options(control: ControlFile) -> Iterator[str]:
     for name, text in control.options.items():
         for begin, why in OPTIONS.items():
-            if name.startswith(begin) and text.lower() not in OFF:
+            if name.startswith(begin) and name not in READ and text.lower() not in OFF:
                 yield f"option {name}: {why}"
                 break
         if name in ("enforce_bounds", "ies_enforce_bounds") and text.lower() in OFF:
             yield f"option {name}: bounds hold here"
 
 
-def _rows(control: ControlFile, parameters: Sequence[PestRow], observed: Sequence[PestRow]) -> Iterator[str]:
+def _rows(
+    control: ControlFile, parameters: Sequence[PestRow], observed: Sequence[PestRow], informed: set[str]
+) -> Iterator[str]:
+    used = {row.word("obgnme") for row in observed} | informed
     for row in control.rows("observation groups", ["obgnme", "covfle"]):
-        if row.word("covfle"):
-            yield f"group {row.word('obgnme')} has a covariance, {row.cells['covfle']}: {OPTIONS['obscov']}"
+        if row.word("covfle") and row.word("obgnme") in used:
+            words = "correlated errors are those of option obscov"
+            yield f"group {row.word('obgnme')} has a covariance, {row.cells['covfle']}: {words}"
     for row in [*parameters, *observed]:
         for column, why in COLUMNS.items():
             if row.word(column) not in ("", "-1", "0"):
