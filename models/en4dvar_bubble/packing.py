@@ -21,7 +21,7 @@ from en4dvar_bubble.gas import (
 )
 from en4dvar_bubble.laws.tabulate import GRID
 from en4dvar_bubble.medium import Medium
-from en4dvar_bubble.numbers import P_A
+from en4dvar_bubble.numbers import ACCOMMODATION, P_A
 from en4dvar_bubble.solver import rows
 from en4dvar_bubble.solver.arrays import Members
 from en4dvar_bubble.solver.lanes import WIDTH
@@ -130,8 +130,12 @@ def _states(model: Dynamics, x: Array, own: Mapping[str, Array]) -> tuple[Array,
         outside = np.zeros(len(x))
         if system.vapour:
             gas_fraction = 1 - mole_fraction(x[:, layout["C"]], around)
-            initial[:, m : 2 * m] = gas_fraction
-            share = share * gas_fraction
+            initial[:, m : 2 * m] = gas_fraction[:, :m]
+            share = share * gas_fraction[:, :m]
+        if system.kinetic:
+            initial[:, system.first_memory - 1] = gas_fraction[:, m]
+            at_wall = at_wall * gas_fraction[:, m]
+        elif system.vapour:
             outside = saturated_vapour_pressure(wall * medium.T_inf) / medium.rho * at_wall
         par[:, rows.LOG_GAS] = np.log(gas * (share.sum(axis=1) + at_wall) - outside) + 3 * log_R
         if system.wall:
@@ -149,7 +153,9 @@ def with_gas(model: Dynamics, x: Array, factor: Array) -> Array:
     medium, around = model.medium_of(own), model.medium_of(own, 1)
     before = x[:, layout["p_b"].start]
     vapour: float | Array = medium.p_v
-    if model.system.vapour:
+    if model.system.kinetic:
+        vapour = mole_fraction(x[:, layout["C"].stop - 1], medium) * before
+    elif model.system.vapour:
         vapour = saturated_vapour_pressure(x[:, layout["T"].stop - 1] if model.system.wall else medium.T_inf)
     after = vapour + factor * (before - vapour)
     changed[:, layout["p_b"].start] = after
@@ -199,6 +205,7 @@ def _constants(model: Dynamics, medium: Medium, own: Mapping[str, Array], n_memb
     row[rows.SATURATION_T] = SATURATION_TEMPERATURE / medium.T_inf
     row[rows.IMAGE] = model.image(own) * 1e-6
     R_v = GAS_CONSTANT / medium.M_v
+    row[rows.CROSSING] = own.get(ACCOMMODATION.name, 0.0) * np.sqrt(R_v * medium.T_inf / (2 * np.pi))
     row[rows.LATENT] = medium.L_v / (R_v * medium.T_inf) * medium.D_v * medium.rho / (medium.K_inf * medium.T_inf)
     row[rows.MEDIUM_K] = medium.K_m / medium.K_inf
     row[rows.MEDIUM_D] = medium.K_m / (medium.rho * medium.c_m) * 1e6
