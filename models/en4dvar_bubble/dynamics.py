@@ -202,7 +202,8 @@ class Dynamics:
     @cached_property
     def layout(self) -> StateLayout:
         """R, Rdot, p_b, S (stress integral); T of the gas (wall last where the medium conducts), C (mass fraction of
-        vapour; at the wall last where it crosses that at a finite rate), T_m of the medium, Z (memory variables) where the model has them; the parameters.
+        vapour; wall last where it crosses that at a finite rate), T_m of the medium, Z (memory variables) where the
+        model has them; the parameters.
         """
         least = 0.0 if "p_v" in self.named else self.medium.p_v
         return _layout(self.system, tuple((p.name, p.unit) for p in self.parameters), least)

@@ -133,8 +133,8 @@ def _states(model: Dynamics, x: Array, own: Mapping[str, Array]) -> tuple[Array,
             initial[:, m : 2 * m] = gas_fraction[:, :m]
             share = share * gas_fraction[:, :m]
         if system.kinetic:
-            initial[:, system.first_memory - 1] = gas_fraction[:, m]
-            at_wall = at_wall * gas_fraction[:, m]
+            gas_wall = initial[:, system.first_memory - 1] = _gas_at_wall(model, par, column, wall, gas_fraction[:, :m])
+            at_wall = at_wall * gas_wall
         elif system.vapour:
             outside = saturated_vapour_pressure(wall * medium.T_inf) / medium.rho * at_wall
         par[:, rows.LOG_GAS] = np.log(gas * (share.sum(axis=1) + at_wall) - outside) + 3 * log_R
@@ -145,6 +145,21 @@ def _states(model: Dynamics, x: Array, own: Mapping[str, Array]) -> tuple[Array,
         par[:, rows.LOG_GAS] = np.log(gas) + 3 * model.exponent(medium) * log_R
     par[:, rows.LOG_R0] = np.log(column[model.stress_free_radius] * 1e6)
     return initial, par
+
+
+def _gas_at_wall(model: Dynamics, par: Array, column: Mapping[str, Array], theta: Array, gas_fraction: Array) -> Array:
+    """The Y_w (N,) with which the equation of a finite rate in :mod:`solver.general` holds, the positive one of its two
+    roots: a state that was changed need not hold it.
+    """
+    p, R, slope = column["p_b"], column["R"] * 1e6, model.system.ball.derivative[-1]
+    power = par[:, rows.DIFFUSION_P], par[:, rows.DIFFUSION_T]
+    rho = model.medium_of(column).rho
+    diffusion = par[:, rows.DIFFUSION] * (par[:, rows.AMBIENT] * rho / p) ** power[0] * theta ** power[1]
+    crossing = par[:, rows.CROSSING] * np.sqrt(theta) * R / diffusion
+    saturation = par[:, rows.SATURATION] * rho * np.exp(-par[:, rows.SATURATION_T] / theta)
+    half, inside = (crossing * (saturation / p - 1) + slope[-1]) / 2, gas_fraction @ slope[:-1]
+    root = np.sqrt(np.maximum(half**2 - crossing * inside, 0.0))
+    return np.asarray(np.where(half > 0, -inside / (half + root), (root - half) / np.maximum(crossing, 1e-300)))
 
 
 def with_gas(model: Dynamics, x: Array, factor: Array) -> Array:

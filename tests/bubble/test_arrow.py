@@ -13,7 +13,15 @@ from en4dvar_bubble.solver.lanes import WIDTH
 from en4dvar_bubble.solver.rodas5p import GAMMA
 from en4dvar_bubble.solver.tiles import AREA, EDGE, factorise, place, solve
 
-SYSTEMS = [System(3, 3, 2), System(3, 3, 2, True), System(5, 0, 4, memory=2), System(4), System(0, memory=2), System(7, 7), System(7, 7, kinetic=True)]
+SYSTEMS = [
+    System(3, 3, 2),
+    System(3, 3, 2, True),
+    System(5, 0, 4, memory=2),
+    System(4),
+    System(0, memory=2),
+    System(7, 7),
+    System(7, 7, kinetic=True),
+]
 
 
 @nb.njit

@@ -95,9 +95,10 @@ class System:
     """Which unknowns there are, in the order of the kernel's rows, and which equations.
 
     ``gas`` temperature nodes, ``vapour`` mole-fraction nodes (0 or ``gas``), ``medium`` temperature nodes, ``memory``
-    variables; ``kinetic``: whether vapour crosses the wall at a finite rate; ``shear``, ``strain``: a viscosity that depends on the shear rate, or on the stretch. ``clustering`` of
-    the gas nodes at the wall, see :func:`collocation.ball`. ``medium_length``: of the medium's grid map in radii; half
-    of its nodes lie within it of the wall. ``image``: whether a plane mirrors the bubble.
+    variables; ``kinetic``: whether vapour crosses the wall at a finite rate; ``shear``, ``strain``: a viscosity that
+    depends on the shear rate, or on the stretch. ``clustering`` of the gas nodes at the wall, see
+    :func:`collocation.ball`. ``medium_length``: of the medium's grid map in radii; half of its nodes lie within it of
+    the wall. ``image``: whether a plane mirrors the bubble.
     """
 
     gas: int

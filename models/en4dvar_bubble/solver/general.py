@@ -28,8 +28,8 @@ Plane at the distance h: the pressure of the image, ±ρ/(2h) d(R²Ṙ)/dt (+ ri
 R it is ±ρ R/(2h) (R²V̇ + 3Ṙ²).
 
 The unknowns of the fields τ, Y and θ_m know of each other only through a few numbers: the *border*, which is τ_w, Y_w,
-the memory, V, u, and three sums over the nodes (:data:`SUMS` at most): the interior's share in τ'_w, in ⟨Y/θ⟩ and in Y'_w.
-Here are the border's equations; those of the fields are in :mod:`fields`, and :mod:`arrow` solves both.
+the memory, V, u, and three sums over the nodes (:data:`SUMS` at most): the interior's share in τ'_w, in ⟨Y/θ⟩ and in
+Y'_w. Here are the border's equations; those of the fields are in :mod:`fields`, and :mod:`arrow` solves both.
 
 Sources: Prosperetti (1991); Estrada et al. (2018); Warnez & Johnsen (2015); Prosperetti & Lezzi (1986); Gilmore (1952).
 """

@@ -156,8 +156,8 @@ def _of_part(part, tile, _):
 @called
 def factorise(a, h, where, places, algebraic):
     """LU without pivoting, in place, of the matrix ``a`` plus 1/(hγ) on the diagonal of the unknowns but numbers
-    ``algebraic`` (first, last + 1), and 1 where no unknown is. The lower factor has tiles of unity on its diagonal; on that of the upper
-    one there are the inverses of its tiles.
+    ``algebraic`` (first, last + 1), and 1 where no unknown is. The lower factor has tiles of unity on its diagonal; on
+    that of the upper one there are the inverses of its tiles.
     """
     inverse_h = 1.0 / load(h, 0) * (1.0 / rodas5p.GAMMA)
     unknown = 0
