@@ -25,7 +25,7 @@ from en4dvar_bubble.media import known_medium
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "bubbles" / "water" / "water_1200um.csv"
 WATER = replace(WATER_25C, rho=known_medium("water").rho, c=known_medium("water").c)
 VISCOSITY = 0.89e-3  # Pa s, of water at 25 °C
-FINE = Accuracy(nodes=24, medium_nodes=32, rtol=1e-6)
+FINE = Accuracy(nodes=24, medium_nodes=32, rtol=1e-6, step_limit=200_000, time_limit=3600.0)
 DIFFUSIVITIES = {"constant": WATER, "kinetic theory": replace(WATER, D_p=1.0, D_T=1.75)}
 RATES = (None, 1.0, 0.4, 0.2, 0.1, 0.04)
 FULL = {"gas": "heat", "vapour": "transport", "medium_heat": "conducting"}
@@ -57,7 +57,7 @@ def tops(times: Array, R: Array) -> Array:
     for first, last in zip([0, *low], [*low, len(R)], strict=True):
         t, r = times[first:last], R[first:last]
         high = r > HIGH * r.max()
-        if np.argmax(r) in (0, len(r) - 1) and first > 0 or high.sum() < 3:
+        if (np.argmax(r) in (0, len(r) - 1) and first > 0) or high.sum() < 3:
             continue
         middle = t[high].mean()
         a, b, c = np.polyfit(t[high] - middle, r[high], 2)
@@ -86,16 +86,16 @@ def tops_of(times: Array, R_max: float, R_eq: Array, physics: Physics) -> Array:
 
 def matched(times: Array, observed: Array, physics: Physics) -> tuple[float, Array]:
     """R_eq that gives the second oscillation its size, and the tops (4, 2) with it."""
-    wanted, R_eq = np.log(observed[1, 1]), np.geomspace(8e-6, 250e-6, 17)
+    wanted, R_eq = np.log(observed[1, 1]), np.geomspace(20e-6, 130e-6, 8)
     for _ in range(3):
         found = tops_of(times, observed[0, 1], R_eq, physics)
         size = np.log(found[:, 1, 1])
         crossing = np.flatnonzero((size[:-1] < wanted) & (size[1:] >= wanted))
         if not len(crossing):
-            return np.nan, np.full((COUNT, 2), np.nan)
+            return np.nan, np.full((COUNT, 2), np.nan)  # always larger
         k = crossing[0]
         best = R_eq[k] * (R_eq[k + 1] / R_eq[k]) ** ((wanted - size[k]) / (size[k + 1] - size[k]))
-        R_eq = np.geomspace(R_eq[k], R_eq[k + 1], 9)
+        R_eq = np.geomspace(R_eq[k], R_eq[k + 1], 4)
     return float(best), tops_of(times, observed[0, 1], np.array([best]), physics)[0]
 
 
@@ -111,7 +111,8 @@ def main(file: Path) -> None:
         R_eq, found = matched(shifted, observed, physics)
         off = 100 * (found[2:, 1] / observed[2:, 1] - 1), 100 * (found[1:, 0] / (observed[1:, 0] - observed[0, 0]) - 1)
         cells = ["–" if np.isnan(value) else f"{value:+.1f} %" for value in np.concatenate(off)]
-        print(f"| {physics[0]} | {1e6 * R_eq:.1f} | {' | '.join(cells)} |", flush=True)
+        told = f"{1e6 * R_eq:.1f}" if R_eq > 0 else "–"
+        print(f"| {physics[0]} | {told} | {' | '.join(cells)} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import glob
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -54,6 +55,23 @@ def known(medium: str) -> Sequence[Known]:
             Known("c", f"{it.c:.4g} m/s", float(f"{it.c_log_std:.2g}"), f"speed of sound in {medium}"),
         )
     return (*of_medium, PRESSURE, SCALE)
+
+
+def of_water(radius: float) -> dict[str, tuple[str, str]]:
+    """Priors of the viscosity and of R_eq of a bubble of ``radius`` (m) in water, with words: by name. What damps a
+    collapse in water is sound, heat and vapour, so that a guess from collapse and rebound books them as viscosity.
+    """
+    off = math.exp(1.645 * 1.5)
+    return {
+        "mu": (
+            "{prior: lognormal, median: 0.002 Pa s, log_std: 1.5}",
+            f"viscosity: water has 0.0009; as a check, may be off by a factor of {off:.2g}; narrow it to what you know",
+        ),
+        "R_eq": (
+            f"{{prior: lognormal, median: {float(f'{5e4 * radius:.2g}'):g} um, log_std: 1}}",
+            "0.05 R_max, the little gas that water leaves; may be off by a factor of 5.2; narrow it to what you know",
+        ),
+    }
 
 
 def wall(radius: float, slowness: float) -> tuple[str, str, str]:
