@@ -1,4 +1,4 @@
-"""Vapour that crosses the wall at a finite rate (Hertz–Knudsen): limits, mass, an independent integration."""
+"""Vapour that crosses the wall at a finite rate (Hertz–Knudsen): limits, mass, restarts (oracle: test_full_oracle)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from oracle_full import Bubble, Constants, p_sat
+from oracle_full import p_sat
 from reference_cases import LASER, NEO_HOOKEAN
 
 from en4dvar.config import load_config
@@ -89,20 +89,6 @@ def test_gas_that_is_set_free_leaves_temperatures_and_adds_to_the_pressure():
     assert p[0] * p[1] == pytest.approx(vapour[0] * vapour[1], rel=1e-12)  # the vapour's partial pressure
     assert vapour[0] * (1 - vapour[1]) == pytest.approx(2 * p[0] * (1 - p[1]), rel=1e-12)
     assert model.integrate(after, np.array([[40e-6]]), 15e-6).whole
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("conducting", [False, True])
-def test_against_the_oracle(conducting):
-    """Less violent than in equilibrium: the error is that of the oracle's grid."""
-    errors = []
-    for nodes, cells in ((20, 60), (40, 120)):
-        constants = Constants(accommodation=0.1)
-        slow = Bubble(**LASER, vapour="transport", conducting=conducting, nodes=nodes, cells=cells, constants=constants)
-        R = path(0.1, "conducting" if conducting else "cold")
-        errors.append(np.abs(slow.solve(TIMES) - R).max() / R_MAX)
-    assert errors[1] < 2e-3
-    assert errors[1] < errors[0] / 3
 
 
 def test_of_millimetres_in_water_complete_where_equilibrium_needs_a_smeared_grid():
