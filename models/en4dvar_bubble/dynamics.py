@@ -17,7 +17,7 @@ from en4dvar_bubble.laws import ConstitutiveLaw, QuadraticKelvinVoigt
 from en4dvar_bubble.laws.exactness import refuse_inexact
 from en4dvar_bubble.laws.parameters import MANCIA, positive
 from en4dvar_bubble.medium import WATER_25C, Medium
-from en4dvar_bubble.numbers import ALL, GAS_CONTENT, OF_MEDIUM, P_A, R_START, RDOT_START, WALL_DISTANCE
+from en4dvar_bubble.numbers import ACCOMMODATION, ALL, GAS_CONTENT, OF_MEDIUM, P_A, R_START, RDOT_START, WALL_DISTANCE
 from en4dvar_bubble.solver.driver import GAS_CLUSTERING, MEDIUM_LENGTHS, Accuracy, Radial, Solver, System, preset
 
 FIRST_ORDER = "an expansion to first order in the Mach number: Prosperetti & Lezzi (1986), J. Fluid Mech. 168, 457"
@@ -69,7 +69,8 @@ class Dynamics:
 
     ``gas``: the energy equation (``heat``) or a polytropic law with exponent κ (``polytropic``, ``adiabatic``) or 1
     (``isothermal``). ``vapour="frozen"``: the saturated vapour of time zero stays in the bubble as if it were gas. With
-    ``heat``: ``vapour="transport"`` keeps it in equilibrium at the wall and lets it diffuse in the gas,
+    ``heat``: ``vapour="transport"`` keeps it in equilibrium at the wall, or with ``accommodation`` among the parameters
+    lets it condense and evaporate at the rate of Hertz and Knudsen, and lets it diffuse in the gas,
     ``medium_heat="conducting"`` solves the temperature of the medium. Equations: ``solver.equations``,
     ``solver.general``.
 
@@ -124,6 +125,7 @@ class Dynamics:
             gas=self.accuracy.nodes if heat else 0,
             vapour=self.accuracy.nodes if self.vapour == "transport" else 0,
             medium=self.accuracy.medium_nodes if self.medium_heat == "conducting" else 0,
+            kinetic=self.vapour == "transport" and ACCOMMODATION.name in self.named,
             memory=self.law.memory_count,
             radial=self.radial,
             shear=self.law.shear_dependent,
@@ -166,7 +168,7 @@ class Dynamics:
         acts = {p.name: not p.name.startswith("pulse_") for p in ALL} | dict.fromkeys(pulse, True)
         acts |= dict.fromkeys(("A", "B"), heat) | dict.fromkeys(("K_m", "c_m"), bool(self.system.wall))
         acts |= dict.fromkeys(("tait_B", "tait_n"), self.radial in ("keller-miksis-enthalpy", "gilmore"))
-        acts |= dict.fromkeys(("D_v", "D_p", "D_T"), transport)
+        acts |= dict.fromkeys(("D_v", "D_p", "D_T", ACCOMMODATION.name), transport)
         acts |= dict.fromkeys(("L_v", "M_v"), transport and bool(self.system.wall))
         # a constant vapour pressure would not follow the temperature
         acts |= {"p_v": self.vapour == "none", "T_inf": (heat or self.vapour != "none") and not self.medium.p_v}
@@ -200,7 +202,8 @@ class Dynamics:
     @cached_property
     def layout(self) -> StateLayout:
         """R, Rdot, p_b, S (stress integral); T of the gas (wall last where the medium conducts), C (mass fraction of
-        vapour), T_m of the medium, Z (memory variables) where the model has them; the parameters.
+        vapour; wall last where it crosses that at a finite rate), T_m of the medium, Z (memory variables) where the
+        model has them; the parameters.
         """
         least = 0.0 if "p_v" in self.named else self.medium.p_v
         return _layout(self.system, tuple((p.name, p.unit) for p in self.parameters), least)
@@ -274,7 +277,7 @@ def _layout(system: System, parameters: tuple[tuple[str, str], ...], least_press
     ]
     blocks = (
         Field("T", system.gas + system.wall, "K", above_zero),
-        Field("C", system.vapour, "1", (0.0, 1.0)),
+        Field("C", system.vapour + system.kinetic, "1", (0.0, 1.0)),
         Field("T_m", system.medium, "K", above_zero),
         Field("Z", system.memory, "Pa"),
     )

@@ -69,7 +69,19 @@ WALL_DISTANCE = Parameter(
     "um",
     "Rattray (1951), PhD thesis, California Institute of Technology",
 )
+ACCOMMODATION = Parameter(
+    "accommodation",
+    "1",
+    "lognormal",
+    (0.0, np.inf),
+    "part of the vapour's molecules at the wall that condense",
+    r"$\alpha_M$",
+    "",
+    "Hertz–Knudsen; water, measured 0.01 to 1: Marek & Straub (2001), Int. J. Heat Mass Transf. 44, 39",
+    True,
+)
+"""Where it is no parameter, the vapour at the wall is saturated: the limit of a large one."""
 _OF_PULSES = {p.name: p for made in PULSES.values() for _, _, p in numbers_of(made)}
 _OF_PULSES |= {number.parameter.name: number.parameter for number in OF_RECORD}
-ALL = (*OF_MEDIUM.values(), P_A, GAS_CONTENT, R_START, RDOT_START, WALL_DISTANCE, *_OF_PULSES.values())
+ALL = (*OF_MEDIUM.values(), P_A, GAS_CONTENT, R_START, RDOT_START, WALL_DISTANCE, ACCOMMODATION, *_OF_PULSES.values())
 NAMES = frozenset(p.name for p in ALL)

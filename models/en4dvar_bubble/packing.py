@@ -21,7 +21,7 @@ from en4dvar_bubble.gas import (
 )
 from en4dvar_bubble.laws.tabulate import GRID
 from en4dvar_bubble.medium import Medium
-from en4dvar_bubble.numbers import P_A
+from en4dvar_bubble.numbers import ACCOMMODATION, P_A
 from en4dvar_bubble.solver import rows
 from en4dvar_bubble.solver.arrays import Members
 from en4dvar_bubble.solver.lanes import WIDTH
@@ -130,8 +130,12 @@ def _states(model: Dynamics, x: Array, own: Mapping[str, Array]) -> tuple[Array,
         outside = np.zeros(len(x))
         if system.vapour:
             gas_fraction = 1 - mole_fraction(x[:, layout["C"]], around)
-            initial[:, m : 2 * m] = gas_fraction
-            share = share * gas_fraction
+            initial[:, m : 2 * m] = gas_fraction[:, :m]
+            share = share * gas_fraction[:, :m]
+        if system.kinetic:
+            gas_wall = initial[:, system.first_memory - 1] = _gas_at_wall(model, par, column, wall, gas_fraction[:, :m])
+            at_wall = at_wall * gas_wall
+        elif system.vapour:
             outside = saturated_vapour_pressure(wall * medium.T_inf) / medium.rho * at_wall
         par[:, rows.LOG_GAS] = np.log(gas * (share.sum(axis=1) + at_wall) - outside) + 3 * log_R
         if system.wall:
@@ -143,13 +147,30 @@ def _states(model: Dynamics, x: Array, own: Mapping[str, Array]) -> tuple[Array,
     return initial, par
 
 
+def _gas_at_wall(model: Dynamics, par: Array, column: Mapping[str, Array], theta: Array, gas_fraction: Array) -> Array:
+    """The Y_w (N,) with which the equation of a finite rate in :mod:`solver.general` holds, the positive one of its two
+    roots: a state that was changed need not hold it.
+    """
+    p, R, slope = column["p_b"], column["R"] * 1e6, model.system.ball.derivative[-1]
+    power = par[:, rows.DIFFUSION_P], par[:, rows.DIFFUSION_T]
+    rho = model.medium_of(column).rho
+    diffusion = par[:, rows.DIFFUSION] * (par[:, rows.AMBIENT] * rho / p) ** power[0] * theta ** power[1]
+    crossing = par[:, rows.CROSSING] * np.sqrt(theta) * R / diffusion
+    saturation = par[:, rows.SATURATION] * rho * np.exp(-par[:, rows.SATURATION_T] / theta)
+    half, inside = (crossing * (saturation / p - 1) + slope[-1]) / 2, gas_fraction @ slope[:-1]
+    root = np.sqrt(np.maximum(half**2 - crossing * inside, 0.0))
+    return np.asarray(np.where(half > 0, -inside / (half + root), (root - half) / np.maximum(crossing, 1e-300)))
+
+
 def with_gas(model: Dynamics, x: Array, factor: Array) -> Array:
     """States (N, n_state) with ``factor`` (N,) times the gas of ``x``, and its temperatures and pressure of vapour."""
     own, layout, changed = model.parameter_values(x), model.layout, np.array(x)
     medium, around = model.medium_of(own), model.medium_of(own, 1)
     before = x[:, layout["p_b"].start]
     vapour: float | Array = medium.p_v
-    if model.system.vapour:
+    if model.system.kinetic:
+        vapour = mole_fraction(x[:, layout["C"].stop - 1], medium) * before
+    elif model.system.vapour:
         vapour = saturated_vapour_pressure(x[:, layout["T"].stop - 1] if model.system.wall else medium.T_inf)
     after = vapour + factor * (before - vapour)
     changed[:, layout["p_b"].start] = after
@@ -199,6 +220,7 @@ def _constants(model: Dynamics, medium: Medium, own: Mapping[str, Array], n_memb
     row[rows.SATURATION_T] = SATURATION_TEMPERATURE / medium.T_inf
     row[rows.IMAGE] = model.image(own) * 1e-6
     R_v = GAS_CONSTANT / medium.M_v
+    row[rows.CROSSING] = own.get(ACCOMMODATION.name, 0.0) * np.sqrt(R_v * medium.T_inf / (2 * np.pi))
     row[rows.LATENT] = medium.L_v / (R_v * medium.T_inf) * medium.D_v * medium.rho / (medium.K_inf * medium.T_inf)
     row[rows.MEDIUM_K] = medium.K_m / medium.K_inf
     row[rows.MEDIUM_D] = medium.K_m / (medium.rho * medium.c_m) * 1e6

@@ -126,7 +126,10 @@ class Paths(Batch):
 
     def _chi(self) -> Array:
         system = self.model.system
-        return 1 - self.solution.states[:, :, system.first_vapour : system.first_medium]
+        gas = self.solution.states[:, :, system.first_vapour : system.first_medium]
+        if system.kinetic:
+            gas = np.concatenate([gas, self.solution.states[:, :, system.first_memory - 1, None]], axis=2)
+        return 1 - gas
 
     def _C(self) -> Array:
         return mass_fraction(self["chi"], self.medium(2))
@@ -150,7 +153,10 @@ class Paths(Batch):
         at_wall = weights[m] / wall
         content = np.exp(gas - 3 * log_R) * medium.rho
         if system.vapour:
-            share = share * (1 - self["chi"])
+            share = share * (1 - self["chi"][:, :, :m])
+        if system.kinetic:
+            at_wall = at_wall * (1 - self["chi"][:, :, m])
+        elif system.vapour:
             content = content + saturated_vapour_pressure(wall * medium.T_inf) * at_wall
         return np.asarray(content / (share @ weights[:m] + at_wall) + medium.p_v)
 

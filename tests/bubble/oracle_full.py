@@ -13,7 +13,8 @@ collocation). The wall temperature is solved for inside the right-hand side. sci
     K_m T_m' = K T' + L ρ D C'/(1−C)  at the wall,   ρ_m c_m ∂T_m/∂t = K_m ∂/∂η(r⁴ ∂T_m/∂η) + 12 μ R⁴Ṙ²/r⁶
 
 (Estrada et al. 2018; Prosperetti 1991), D = D_0 (p_∞/p)^D_p (T/T_∞)^D_T. ``Constants.spurious_wall_temperature`` puts
-the public code's error into the evaporation term of ṗ: divided by T_w/T_∞.
+the public code's error into the evaporation term of ṗ: divided by T_w/T_∞. With ``accommodation`` α the vapour at the
+wall is not saturated: ρ D C'/(1−C) = α (p_sat(T_w) − p_v)/√(2π R_v T_w), p_v its partial pressure.
 """
 
 from __future__ import annotations
@@ -46,6 +47,7 @@ class Constants:
     M_g: float = 28.966e-3
     M_v: float = 18.01528e-3
     spurious_wall_temperature: bool = False
+    accommodation: float = np.inf
 
 
 def p_sat(T):
@@ -87,6 +89,21 @@ class Bubble:
         k = self.k
         return k.D * (k.p_inf / p) ** k.D_p * (T / k.T_inf) ** k.D_T
 
+    def wall_fraction(self, R, p, T, C):
+        """The C_w of a wall of temperature ``T`` with C ``C[1:]`` inside (bisection: evaporation − diffusion falls)."""
+        k = self.k
+        if np.isinf(k.accommodation):
+            return self.saturated(T, p)
+        inside = self.D1[0, 1:] @ C[1:]
+        low, high = np.zeros_like(R), np.full_like(R, 1 - 1e-15)
+        for _ in range(60):
+            Cw = (low + high) / 2
+            Rmix = Cw * self.Rv + (1 - Cw) * self.Rg
+            left = k.accommodation * (p_sat(T) - p * Cw * self.Rv / Rmix) / np.sqrt(2 * np.pi * self.Rv * T)
+            flux = p / (Rmix * T) * self.diffusivity(T, p) * (self.D1[0, 0] * Cw + inside) / (1 - Cw) / R
+            low, high = np.where(left > flux, Cw, low), np.where(left > flux, high, Cw)
+        return (low + high) / 2
+
     def wall_temperature(self, R, p, T, C, T_m):
         """The T_w at which the heat fluxes balance (Newton with a differenced slope)."""
         k = self.k
@@ -97,7 +114,7 @@ class Bubble:
         def balance(w):
             inward = (k.A * w + k.B) * (self.D1[0, 0] * w + gas) / R
             if self.transport:
-                Cw = self.saturated(w, p)
+                Cw = self.wall_fraction(R, p, w, C)
                 rho = p / ((Cw * self.Rv + (1 - Cw) * self.Rg) * w)
                 inward += k.L * rho * self.diffusivity(w, p) / (1 - Cw) * (self.D1[0, 0] * Cw + vapour) / R
             return inward - k.K_m * R**2 * (weights[0] * w + weights[1] * T_m[0] + weights[2] * T_m[1])
@@ -127,7 +144,7 @@ class Bubble:
         heat = (k.kappa - 1) * K * dT
         drive = heat[0] - k.kappa * p * V
         if self.transport:
-            C[0] = self.saturated(T[0], p)
+            C[0] = self.wall_fraction(R, p, T[0], C)
             Rmix = C * self.Rv + (1 - C) * self.Rg
             dC = D1 @ C / R
             D = self.diffusivity(T, p)

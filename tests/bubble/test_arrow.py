@@ -13,7 +13,15 @@ from en4dvar_bubble.solver.lanes import WIDTH
 from en4dvar_bubble.solver.rodas5p import GAMMA
 from en4dvar_bubble.solver.tiles import AREA, EDGE, factorise, place, solve
 
-SYSTEMS = [System(3, 3, 2), System(5, 0, 4, 2), System(4), System(0, memory=2), System(7, 7)]
+SYSTEMS = [
+    System(3, 3, 2),
+    System(3, 3, 2, True),
+    System(5, 0, 4, memory=2),
+    System(4),
+    System(0, memory=2),
+    System(7, 7),
+    System(7, 7, kinetic=True),
+]
 
 
 @nb.njit
@@ -34,9 +42,9 @@ def test_solution_is_that_of_the_full_matrix(system):
     a_sum[fields : fields + kept] = True
     h = np.linspace(0.1, 0.5, WIDTH)[None]
     diagonal = np.where(a_sum[:, None], 1.0, 1 / (GAMMA * h))
-    if dims.wall:
-        diagonal[fields + kept] = 0.0
-        minus_J[fields + kept, fields + kept] = 3.0
+    for row in range(fields + kept, fields + kept + dims.wall + dims.kinetic):
+        diagonal[row] = 0.0
+        minus_J[row, row] = 3.0
     matrix = minus_J + diagonal[:, None, :] * np.eye(size)[:, :, None]
     right = rng.standard_normal((size - kept, WIDTH))
     extended = np.zeros((size, WIDTH))
@@ -49,7 +57,7 @@ def test_solution_is_that_of_the_full_matrix(system):
         kept_numbers[place.py_func(where, *places(dims)[[i, j]])] = minus_J[i, j]
     before, scratch = np.ones((2, WIDTH)), np.full((len(where) * EDGE, WIDTH), np.nan)
     stages = np.vstack([before, right])
-    algebraic = fields if dims.wall else -1
+    algebraic = fields, fields + dims.wall + dims.kinetic
     solved(kept_numbers, h, where, of_unknowns, algebraic, scratch, stages, len(before))
     np.testing.assert_array_equal(stages[:2], before)
     np.testing.assert_allclose(stages[2:], expected, rtol=0, atol=1e-12 * np.abs(expected).max())

@@ -16,15 +16,15 @@ TIMES = np.linspace(0, 60e-6, 601)  # collapse at 23 µs, maximum of the first r
 COARSE, FINE = (20, 60), (40, 120)  # nodes in the gas, cells in the medium, of the oracle
 
 
-def difference(grid, vapour, conducting, **diffusivity):
+def difference(grid, vapour, conducting, accommodation=None, **diffusivity):
     """Largest |ΔR|/R_max over collapse, rebound and second collapse."""
     nodes, cells = grid
-    slow = Bubble(
-        **LASER, vapour=vapour, conducting=conducting, nodes=nodes, cells=cells, constants=Constants(**diffusivity)
-    )
+    finite = {} if accommodation is None else {"accommodation": accommodation}
+    constants = Constants(**finite, **diffusivity)
+    slow = Bubble(**LASER, vapour=vapour, conducting=conducting, nodes=nodes, cells=cells, constants=constants)
     fast = simulate(
         NEO_HOOKEAN,
-        LASER,
+        {**LASER, **finite},
         TIMES,
         start="laser",
         vapour=vapour,
@@ -46,6 +46,17 @@ def test_vapour_transport_and_conducting_medium():
 @pytest.mark.long
 def test_diffusivity_of_kinetic_theory():
     assert difference(FINE, "transport", conducting=True, D_p=1.0, D_T=1.75) < 2e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("conducting", "coarse", "fine"),
+    [(False, (48, 0), (96, 0)), pytest.param(True, COARSE, FINE, marks=pytest.mark.long)],
+)
+def test_vapour_that_crosses_the_wall_at_a_finite_rate(conducting, coarse, fine):
+    error = difference(fine, "transport", conducting, accommodation=0.1)
+    assert error < 2e-3
+    assert error < difference(coarse, "transport", conducting, accommodation=0.1) / 3
 
 
 @pytest.mark.slow

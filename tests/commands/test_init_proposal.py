@@ -262,3 +262,16 @@ def test_zeros_before_the_bubble_are_no_readings(tmp_path: Path) -> None:
     assert "start: laser (the history begins at" in done.stdout
     (problem,) = build(load_config("film.yaml", {"data.window": {"from": "start", "to": "end"}}))
     assert problem.observations.values.min() > 0
+
+
+@pytest.mark.skipif(not (MEASURED / "bubbles" / "water").exists(), reason="../shared/data/bubbles/water is not there")
+def test_a_bubble_in_water_is_not_taken_for_one_in_a_thick_liquid(tmp_path: Path) -> None:
+    """The priors of viscosity and gas hold what is known of it: 0.9 mPa s, and 51 to 55 µm by its rebounds."""
+    data = str(MEASURED / "bubbles" / "water" / "water_1200um.csv")
+    done = call("init", "--data", data, "--medium", "water", "--law", "newtonian", "--out", "w.yaml")
+    assert done.exit_code == 0, done.output
+    (problem,) = build(load_config(Path("w.yaml")))
+    of = {term.parameter.name: term for term in problem.prior.terms}
+    for name, value in {"mu": 0.89e-3, "R_eq": 53e-6}.items():
+        assert abs(np.log(value) - of[name].mean) < of[name].std
+        assert of[name].std >= 1

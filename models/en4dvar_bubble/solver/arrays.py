@@ -37,13 +37,14 @@ class Members(NamedTuple):
 
 class Dims(NamedTuple):
     """Numbers of unknowns, and which equations: those of the general ones by ``radial``, and by ``shear``
-    and ``strain``: what the viscosity depends on.
+    and ``strain``: what the viscosity depends on. ``kinetic``: 1 where vapour crosses the wall at a finite rate.
     """
 
     gas: int
     vapour: int
     medium: int
     wall: int
+    kinetic: int
     memory: int
     radial: int
     shear: int
@@ -137,7 +138,7 @@ def scratch(
     unknowns, ``of_fields`` rows of scratch for the fields, members of so many ``parameters`` and tables of so many
     ``cells``; lanes that wait for a member have the step ``first_step``.
     """
-    n = dims.gas + dims.vapour + dims.medium + dims.wall + dims.memory + 2
+    n = dims.gas + dims.vapour + dims.medium + dims.wall + dims.kinetic + dims.memory + 2
     step = of_fields, n, matrix, 1, rodas5p.STAGES * n, n, n, 1, 3, 3 * n
     general = border, border, SHARED, border, SHARED
     lanes = n, 1, 1, parameters, 1, 1, 1, 1

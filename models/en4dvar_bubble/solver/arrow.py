@@ -29,7 +29,7 @@ def pattern(dims: Dims) -> np.ndarray:
     """(size, size): where the extended matrix and its factors may differ from zero."""
     gas, vapour = dims.gas, dims.gas + dims.vapour
     fields, kept = vapour + dims.medium, sums.py_func(dims)
-    size = fields + kept + dims.wall + dims.memory + 2
+    size = fields + kept + dims.wall + dims.kinetic + dims.memory + 2
     full = np.zeros((size, size), dtype=bool)
     full[:gas, :gas] = full[gas:vapour, :vapour] = full[vapour:fields, vapour:fields] = True
     full[:vapour, fields:] = full[vapour:fields, fields + kept :] = full[fields:, fields:] = True
@@ -43,7 +43,8 @@ def pattern(dims: Dims) -> np.ndarray:
 
 def places(dims: Dims) -> IntArray:
     """The place of each row of the :func:`pattern` among whole tiles."""
-    counts = dims.gas, dims.vapour, dims.medium, sums.py_func(dims) + dims.wall + dims.memory + 2
+    border = sums.py_func(dims) + dims.wall + dims.kinetic + dims.memory + 2
+    counts = dims.gas, dims.vapour, dims.medium, border
     first = 0, *begins.py_func(dims)
     return np.concatenate([np.arange(begin, begin + count) for begin, count in zip(first, counts, strict=True)])
 

@@ -95,14 +95,16 @@ class System:
     """Which unknowns there are, in the order of the kernel's rows, and which equations.
 
     ``gas`` temperature nodes, ``vapour`` mole-fraction nodes (0 or ``gas``), ``medium`` temperature nodes, ``memory``
-    variables; ``shear``, ``strain``: a viscosity that depends on the shear rate, or on the stretch. ``clustering`` of
-    the gas nodes at the wall, see :func:`collocation.ball`. ``medium_length``: of the medium's grid map in radii; half
-    of its nodes lie within it of the wall. ``image``: whether a plane mirrors the bubble.
+    variables; ``kinetic``: whether vapour crosses the wall at a finite rate; ``shear``, ``strain``: a viscosity that
+    depends on the shear rate, or on the stretch. ``clustering`` of the gas nodes at the wall, see
+    :func:`collocation.ball`. ``medium_length``: of the medium's grid map in radii; half of its nodes lie within it of
+    the wall. ``image``: whether a plane mirrors the bubble.
     """
 
     gas: int
     vapour: int = 0
     medium: int = 0
+    kinetic: bool = False
     memory: int = 0
     radial: Radial = "keller-miksis"
     shear: bool = False
@@ -124,7 +126,7 @@ class System:
 
     @cached_property
     def size(self) -> int:
-        return self.gas + self.vapour + self.medium + self.wall + self.memory + 2
+        return self.first_memory + self.memory + 2
 
     @property
     def ball(self) -> Ball:
@@ -133,7 +135,7 @@ class System:
 
     @property
     def dims(self) -> Dims:
-        counts = self.gas, self.vapour, self.medium, self.wall, self.memory
+        counts = self.gas, self.vapour, self.medium, self.wall, int(self.kinetic), self.memory
         return Dims(*counts, RADIALS[self.radial], int(self.shear), int(self.strain))
 
     @property
@@ -150,12 +152,13 @@ class System:
 
     @property
     def first_memory(self) -> int:
-        return self.wall_row + self.wall
+        return self.wall_row + self.wall + self.kinetic
 
     def tolerances(self, rtol: float) -> Array:
         """(2, n) absolute and relative tolerances; ln R has an absolute one, which is a relative one of R."""
         tol = np.full((2, self.size), rtol)
         tol[0, self.first_vapour : self.first_medium] = rtol * _LEAST_GAS
+        tol[0, self.wall_row + self.wall : self.first_memory] = rtol * _LEAST_GAS
         tol[0, self.first_memory : -2] = rtol * _STRESS_SCALE
         tol[0, -2] = rtol * _SLOWEST_RATE
         tol[1, -1] = 0.0

@@ -126,7 +126,7 @@ def _rates(eq, par, shared, work, out):
 
 @called
 def general_rhs(y, t, eq, loaded, w):
-    """Write dy/dt (n, 8) to ``f``; the wall's row holds the residual of its algebraic equation. ``w`` leaves what the
+    """Write dy/dt (n, 8) to ``f``; the wall's rows hold the residuals of its algebraic equations. ``w`` leaves what the
     Jacobian needs; returns θ_m' at the wall but for the wall's own share.
     """
     fields, kept = eq.dims.gas + eq.dims.vapour + eq.dims.medium, sums(eq.dims)
@@ -247,11 +247,12 @@ def general_jacobian(y, t, eq, loaded, w):
     moved, changed, now = w.moved, w.moved_f, load(t, 0)
     store(t, 0, now + _DELTA)
     late = load(t, 0)
+    gas_wall = kept + eq.dims.wall if eq.dims.kinetic else -1
     for b in range(-1, own):  # time comes first
         value = load(w.border, max(b, 0))
         inverse = 1.0 / (late - now)
         if b >= 0:
-            floor_b = 0.01 if b == own - 2 else 0.0 if b == CONTENT_SUM and kept else 1.0
+            floor_b = 0.01 if b == own - 2 else 0.0 if kept and b in (CONTENT_SUM, gas_wall) else 1.0
             store(w.border, b, value + maximum(absolute(value), floor_b) * _DELTA)
             inverse = 1.0 / (load(w.border, b) - value)
         border_rates(w.border, t, outward, eq, loaded, moved, changed)

@@ -2,7 +2,8 @@
 
 State rows: Kirchhoff temperatures τ of the gas (mT), mole fractions Y = 1 − χ of the non-condensible gas (mY),
 temperatures θ_m − 1 of the medium (mM), the wall's τ_w where the medium conducts (an algebraic unknown: RODAS5P
-integrates the index-1 system as it stands), memory variables (q), V, u. Notation and units as in :mod:`equations`.
+integrates the index-1 system as it stands), likewise Y_w where vapour crosses the wall at a finite rate, memory
+variables (q), V, u. Notation and units as in :mod:`equations`.
 
 Gas and vapour. Both have the same κ, hence the same molar heat capacity, and with the molar-average velocity u* the
 energy equation is that of a pure gas (diffusion carries no net enthalpy):
@@ -13,6 +14,9 @@ which is Prosperetti's ṗ_b with vapour transport, R_v/R_mix · dC/(1−C) bein
 density p Y/(R_a T), linear in p at the wall too, so p follows from its mass as in :mod:`equations`.
 A driven bubble becomes nearly all vapour (Y about 1e-6), hence Y and not χ as the unknown. Its growth has a solution
 that a grid can hold only with a = 1, as kinetic theory has it: at constant D, Y_w would be of order exp(−Ṙ R/D).
+Finite rate (Hertz–Knudsen): ṁ = α (p_sat(T_w) − (1−Y_w) p)/√(2π R_v T_w) per area evaporates in place of what keeps
+Y_w = 1 − p_sat/p, its limit for large α, and is what diffuses away:
+    D_w Y'_w + α √(R_v T_w/2π) R Y_w (p_sat/p − 1 + Y_w) = 0
 
 Medium (x = r/R ≥ 1, on a rational Chebyshev grid):  θ̇_m = V(x − x⁻²) θ_m' + D_m/R² ∇²θ_m + 12 ν V² x⁻⁶/(c_p T_∞)
 Wall: K_m θ_m' = K_∞ τ'_w + latent heat of the evaporating flux.
@@ -23,9 +27,9 @@ Radial: enthalpy form and Gilmore with the Tait liquid, ρ = ((p+B)/(p_∞+B))^{
 Plane at the distance h: the pressure of the image, ±ρ/(2h) d(R²Ṙ)/dt (+ rigid, − free), adds to that far away. In V and
 R it is ±ρ R/(2h) (R²V̇ + 3Ṙ²).
 
-The unknowns of the fields τ, Y and θ_m know of each other only through a few numbers: the *border*, which is τ_w, the
-memory, V, u, and three sums over the nodes (:data:`SUMS` at most): the interior's share in τ'_w, in ⟨Y/θ⟩ and in Y'_w.
-Here are the border's equations; those of the fields are in :mod:`fields`, and :mod:`arrow` solves both.
+The unknowns of the fields τ, Y and θ_m know of each other only through a few numbers: the *border*, which is τ_w, Y_w,
+the memory, V, u, and three sums over the nodes (:data:`SUMS` at most): the interior's share in τ'_w, in ⟨Y/θ⟩ and in
+Y'_w. Here are the border's equations; those of the fields are in :mod:`fields`, and :mod:`arrow` solves both.
 
 Sources: Prosperetti (1991); Estrada et al. (2018); Warnez & Johnsen (2015); Prosperetti & Lezzi (1986); Gilmore (1952).
 """
@@ -57,10 +61,10 @@ def sums(dims):
 
 @called
 def _contents(border, V, u, outward, eq, par, shared, out):
-    """Pressure and π̇; what the fields read to ``shared``, the residual of the wall to ``out``. ``outward`` is the
+    """Pressure and π̇; what the fields read to ``shared``, residuals of the wall to ``out``. ``outward`` is the
     interior's share in θ_m' at the wall.
     """
-    mT, mY, mM, wall = eq.dims.gas, eq.dims.vapour, eq.dims.medium, eq.dims.wall
+    mT, mY, mM, wall, kinetic = eq.dims.gas, eq.dims.vapour, eq.dims.medium, eq.dims.wall, eq.dims.kinetic
     ops, kappa, zero = eq.gas, load(par, rows.KAPPA), splat(0.0)
     if mT == 0:
         return exp(load(par, rows.LOG_GAS) - kappa * u * 3.0), kappa * V * (-3.0)
@@ -77,17 +81,24 @@ def _contents(border, V, u, outward, eq, par, shared, out):
     if mY:
         saturation = load(par, rows.SATURATION) * exp(-(load(par, rows.SATURATION_T) / theta_w))
     p = (content + saturation * at_wall) / (interior + at_wall)
+    gas_w = load(border, at + wall) if kinetic else zero
+    if kinetic:
+        p = content / (interior + gas_w * at_wall)
     E = load(par, rows.CONDUCTION) / p * per_area
     rate = (kappa - 1.0) * E * slope_w * 3.0 - kappa * V * 3.0
     flux = zero
     if mY:
-        # 1 − p_sat/p without the cancellation where the bubble is nearly all vapour
-        gas_w = (content - saturation * interior) / (content + saturation * at_wall)
+        if not kinetic:  # 1 − p_sat/p without the cancellation where the bubble is nearly all vapour
+            gas_w = (content - saturation * interior) / (content + saturation * at_wall)
         dilution = exp(load(par, rows.DIFFUSION_P) * log(load(par, rows.AMBIENT) / p))
         diffusion = load(par, rows.DIFFUSION) * per_area
         at_T = exp(load(par, rows.DIFFUSION_T) * log(theta_w))
         dilution = dilution + load(par, rows.SMEARED) * absolute(V) / diffusion
-        flux = -((load(border, VAPOUR_SUM) + gas_w * ops[mT, mT]) / gas_w) * dilution * at_T
+        inward = -(load(border, VAPOUR_SUM) + gas_w * ops[mT, mT]) * dilution * at_T
+        flux = inward / gas_w
+        if kinetic:
+            crossing = load(par, rows.CROSSING) * sqrt(theta_w) * exp(-u) / diffusion
+            store(out, at + wall, crossing * gas_w * (saturation / p - 1.0 + gas_w) - inward)
         rate = rate + kappa * diffusion * flux * 3.0
         store(shared, DIFFUSE, diffusion * dilution)
         store(shared, GAS_WALL, gas_w)
@@ -108,13 +119,13 @@ def _contents(border, V, u, outward, eq, par, shared, out):
 
 @called
 def border_rates(border, t, outward, eq, loaded, shared, out):
-    """Rates of the border's unknowns to ``out``, the residual of its algebraic equation in the wall's row; what the
-    fields read to ``shared``. ``outward``: see :func:`_contents`.
+    """Rates of the border's unknowns to ``out``, the residuals of its algebraic equations in the rows of τ_w and Y_w;
+    what the fields read to ``shared``. ``outward``: see :func:`_contents`.
     """
     dims = eq.dims
     wall, q, radial = dims.wall, dims.memory, dims.radial
     par, span, viscous_span, reading = loaded.par, eq.elastic_span, eq.viscous_span, eq.reading
-    oS = sums(eq.dims) + wall
+    oS = sums(eq.dims) + wall + dims.kinetic
     V = load(border, oS + q)
     u = load(border, oS + q + 1)
     p, rate = _contents(border, V, u, outward, eq, par, shared, out)

@@ -33,7 +33,8 @@ PULSE_RATE = 25
 PULSE_TABLE = 26  # offset of the member's table
 SMEARED = 27  # numerical diffusivity of the vapour over R |Ṙ|; see :mod:`integrate`
 IMAGE = 28  # ±1/(2h) of a rigid or free plane at the distance h; 0: none
-PARAMETERS = 29
+CROSSING = 29  # α √(R_v T_∞/2π), µm/µs: at which vapour crosses the wall; α is the accommodation coefficient
+PARAMETERS = 30
 # Three further rows for each memory variable: relaxation time (µs), convection, offset of its two tables.
 MEMORY = PARAMETERS
 PER_MEMORY = 3

@@ -85,18 +85,18 @@ def _dense(lanes, eq, w):
     for i in range(n):
         for j in range(n):
             store(w.tiles, place(eq.where, i, j), -load(w.jac, i * n + j))
-    factorise(w.tiles, lanes.h, eq.where, eq.places, -1)
+    factorise(w.tiles, lanes.h, eq.where, eq.places, (0, 0))
 
 
 @called
 def _general(lanes, eq, w):
     """:func:`_linearise` of the equations with every option."""
     general_jacobian(lanes.y, lanes.t, eq, lanes.loaded, w)
-    factorise(w.tiles, lanes.h, eq.where, eq.places, _algebraic_row(eq))
+    factorise(w.tiles, lanes.h, eq.where, eq.places, _algebraic_rows(eq))
 
 
 def _linearise(lanes, eq, w):
-    """dy/dt to ``f``, ∂f_V/∂t to ``dt``, and 1/(hγ) − ∂f/∂y, without 1/(hγ) in the algebraic row, as its factors to
+    """dy/dt to ``f``, ∂f_V/∂t to ``dt``, and 1/(hγ) − ∂f/∂y, without 1/(hγ) in algebraic rows, as its factors to
     ``jac`` or ``tiles``, of the equations that the compiler chooses by the type of ``eq``.
     """
 
@@ -130,15 +130,20 @@ def _choose_rhs(y, t, eq, loaded, w):
     return rhs
 
 
-def _algebraic_row(eq):
-    """The row of the wall temperature, which has an algebraic equation; −1 where there is none."""
+def _algebraic_rows(eq):
+    """First and last + 1 of the rows of the wall's temperature and gas, which have algebraic equations."""
 
 
-@overload(_algebraic_row)
-def _choose_row(eq):
-    if _is_general(eq):
-        return lambda eq: eq.dims.gas + eq.dims.vapour + eq.dims.medium if eq.dims.wall else -1
-    return lambda eq: -1
+@overload(_algebraic_rows)
+def _choose_rows(eq):
+    if not _is_general(eq):
+        return lambda eq: (0, 0)
+
+    def rows(eq):
+        first = eq.dims.gas + eq.dims.vapour + eq.dims.medium
+        return first, first + eq.dims.wall + eq.dims.kinetic
+
+    return rows
 
 
 @nb.njit(inline="always")
@@ -161,7 +166,7 @@ def _stages(lanes, eq, algebraic, w):
             _rhs(w.stage, w.t_stage, eq, lanes.loaded, w)
         for i in range(n):
             value = splat(0.0)
-            if i != algebraic:
+            if i < algebraic[0] or i >= algebraic[1]:
                 for r in range(s):
                     value = value + load(w.k, r * n + i) * _C[s, r]
             store(w.k, s * n + i, load(w.f, i) + value * inverse_h)
@@ -197,7 +202,7 @@ def judge(lanes, shear, tolerances, w):
 @nb.njit(inline="always")
 def attempt(lanes, eq, w):
     """The stages of one step of all lanes."""
-    algebraic = _algebraic_row(eq)
+    algebraic = _algebraic_rows(eq)
     _linearise(lanes, eq, w)
     _stages(lanes, eq, algebraic, w)
 

@@ -155,16 +155,16 @@ def _of_part(part, tile, _):
 
 @called
 def factorise(a, h, where, places, algebraic):
-    """LU without pivoting, in place, of the matrix ``a`` plus 1/(hγ) on the diagonal of the unknowns but number
-    ``algebraic``, and 1 where no unknown is. The lower factor has tiles of unity on its diagonal; on that of the upper
-    one there are the inverses of its tiles.
+    """LU without pivoting, in place, of the matrix ``a`` plus 1/(hγ) on the diagonal of the unknowns but numbers
+    ``algebraic`` (first, last + 1), and 1 where no unknown is. The lower factor has tiles of unity on its diagonal; on
+    that of the upper one there are the inverses of its tiles.
     """
     inverse_h = 1.0 / load(h, 0) * (1.0 / rodas5p.GAMMA)
     unknown = 0
     for i in range(len(where) * EDGE):
         added = splat(1.0)
         if unknown < len(places) and places[unknown] == i:
-            added = splat(0.0) if unknown == algebraic else inverse_h
+            added = splat(0.0) if algebraic[0] <= unknown < algebraic[1] else inverse_h
             unknown += 1
         at = place(where, i, i)
         store(a, at, load(a, at) + added)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import glob
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -63,6 +64,23 @@ def centred(model: BubbleModel, medium: str) -> BubbleModel:
     medians = {quantity.key: quantity.median for quantity in known(medium)}
     rho, c = parse_quantity(medians["rho"], "kg/m^3"), parse_quantity(medians["c"], "m/s")
     return replace(model, medium=replace(model.medium, rho=rho, c=c, p_inf=parse_quantity(medians["p_inf"], "Pa")))
+
+
+def of_water(radius: float) -> dict[str, tuple[str, str]]:
+    """Priors of the viscosity and of R_eq of a bubble of ``radius`` (m) in water, with words: by name. What damps a
+    collapse in water is sound, heat and vapour, so that a guess from collapse and rebound books them as viscosity.
+    """
+    off = math.exp(1.645 * 1.5)
+    return {
+        "mu": (
+            "{prior: lognormal, median: 0.002 Pa s, log_std: 1.5}",
+            f"viscosity: water has 0.0009; as a check, may be off by a factor of {off:.2g}; narrow it to what you know",
+        ),
+        "R_eq": (
+            f"{{prior: lognormal, median: {float(f'{5e4 * radius:.2g}'):g} um, log_std: 1}}",
+            "0.05 R_max, the little gas that water leaves; may be off by a factor of 5.2; narrow it to what you know",
+        ),
+    }
 
 
 def wall(radius: float, slowness: float) -> tuple[str, str, str]:

@@ -377,8 +377,12 @@ def _parameters(
     model: BubbleModel, start: Start, look: Look, guess: Guess, top: Tops | None, medium: str
 ) -> tuple[Entry, ...]:
     lines = []
+    liquid = medium == "water" and start == "laser" and "G" not in {p.name for p in model.law.parameters}
+    water = elsewhere.of_water(look.lobe.R_max) if liquid else {}
     for p in model.law.parameters:
-        if p.name in guess.values:
+        if p.name in water:
+            lines.append(Entry(p.name, *water[p.name]))
+        elif p.name in guess.values:
             low, high = WIDTHS[start][p.name]
             width = f"{np.clip(guess.log_std[p.name], low, high):.2g}"
             value = _text(guess.values[p.name], p.unit, p.display_unit)
@@ -388,7 +392,10 @@ def _parameters(
             lines.append(Entry(p.name, f"{{prior: lognormal, median: {value}, log_std: {width}}}", words))
         else:
             lines.append(example(p, model))
-    lines += _radii(start, look, top)
+    radii = {line.key: line for line in _radii(start, look, top)}
+    if R_EQ.name in water and not np.isfinite(look.rest):
+        radii[R_EQ.name] = Entry(R_EQ.name, *water[R_EQ.name])
+    lines += radii.values()
     mean, std = (0.0, 0.5e-6) if start == "acoustic" or top is None else top.t_s
     prior = f"{{prior: normal, mean: {_text(mean, 's', 'us', 4)}, std: {_text(std, 's', 'us')}}}"
     words = "the clock of the data against that of the pulse"
