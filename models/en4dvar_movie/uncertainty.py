@@ -40,12 +40,14 @@ THRESHOLD = 0.05  # of the contrast: what the level of the edge can be off by in
 
 @dataclass(frozen=True)
 class Errors:
-    """In pixels: the corrected ``radius``, its independent std, how far all radii move together by the edge's level."""
+    """In pixels: the corrected ``radius``, its independent std, how far all radii move together by the edge's level;
+    ``mode_std`` is the std of A_n and B_n of a mode of the shape."""
 
     radius: float
     std: float
     common: float
     words: str = ""
+    mode_std: float = float("nan")
 
 
 NOTHING = Errors(float("nan"), float("nan"), float("nan"))
@@ -107,7 +109,8 @@ def _errors(outline: Outline, ratio: float, hidden: float, turned: bool, optics:
     elif outline.seen < 0.9:
         words = f"{outline.seen:.0%} of the outline lies in the frame"
     # the edge's profile has the slope 1/(√(2π) w) at its half level
-    return Errors(radius, float(np.sqrt(variance)), float(THRESHOLD * np.sqrt(2 * np.pi) * outline.width), words)
+    common = float(THRESHOLD * np.sqrt(2 * np.pi) * outline.width)
+    return Errors(radius, float(np.sqrt(variance)), common, words, outline.mode_std * float(np.sqrt(ratio)))
 
 
 def _hidden(outlines: Sequence[Outline | None]) -> Array:
