@@ -37,6 +37,7 @@ NOISY = 0.1  # of a pixel's noise: what a contrast can be uncertain by for the n
 SHARPEST = 5  # per cent of the frames: those where the bubble moved least within the exposure
 BLOB = 120  # pixels: the smallest patch of a first frame that may be a bubble
 SPECK = 100  # pixels: the largest change that is no bubble
+HALO, STILL = 9, 0.01  # side of squares whose mean tells more than a pixel, and what it may differ by
 LEAST_CONTRAST = 0.08  # of the background's brightness
 BRIGHT = 0.25  # of the contrast: how much brighter a flash is
 STEADY = 10_000  # tiles that say how bright a frame is
@@ -151,7 +152,7 @@ def smooth_surface(frames: Sequence[Frame]) -> Array:
 
 def _lit_as(frame: Image, other: Image) -> Image:
     """A frame (H, W) in the light of another, where their lamp's brightness differs no more than it flickers."""
-    lamp = max(float(np.median(other)), 1e-6) / max(float(np.median(frame)), 1e-6)
+    lamp = float(np.median(np.maximum(other, 1e-6) / np.maximum(frame, 1e-6)))
     return frame * (lamp if abs(math.log(lamp)) < LAMP else 1.0)
 
 
@@ -174,7 +175,8 @@ def _writing(leading: Sequence[Frame], noise: float) -> npt.NDArray[np.bool_]:
     labels, _ = ndimage.label(ndimage.binary_dilation(often, np.ones((3, across))))
     for number, box in enumerate(ndimage.find_objects(labels), 1):
         rows, columns = np.nonzero(often[box] & (labels[box] == number))
-        if np.ptp(rows) + 1 > height or _one_way(frames, changes, box):
+        born_later = not changes[0][box].any()  # a bubble; a time stamp runs from the first frame on
+        if np.ptp(rows) + 1 > height or born_later or _one_way(frames, changes, box):
             continue
         top, left = box[0].start + rows.min() - down, box[1].start + columns.min() - across
         none[max(top, 0) : box[0].start + rows.max() + down + 1,
@@ -257,7 +259,8 @@ def _refined(background: Background, samples: Sequence[Frame]) -> Background:
         if not places or share_changed(tiles, background.noise) > CHANGED:
             continue
         image = background.steadied(image, tiles, places[0][0])
-        quiet = np.abs(image) < 5 * background.noise
+        near = ndimage.uniform_filter(image, HALO)  # the halo of a light is no background
+        quiet = (np.abs(image) < 5 * background.noise) & (np.abs(near) < max(5 * background.noise / HALO, STILL))
         for circle, _ in places:
             quiet &= (x - circle.x) ** 2 + (y - circle.y) ** 2 > (1.3 * circle.R + 10) ** 2
         total[quiet] += (background.level + image / background.gain)[quiet]  # at the lamp's brightness of the level
