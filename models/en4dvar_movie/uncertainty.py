@@ -36,6 +36,7 @@ STUDENT = 2.92 / 1.645  # 95 % quantiles of t with 2 degrees of freedom and of t
 FLOOR = 0.005  # pixels: what sampling by whole pixels leaves uncertain in the best of images
 SIGNIFICANT = 3.0  # std of a mode's amplitude from which it is one
 COLLAPSE = 0.15  # of the radius: blur by motion from which the bubble may have turned within the exposure
+TURNING = 0.065  # the same where nothing else explains the blur
 ONE_WAY, TURNED = 0.25, 3**0.5 / 2  # of that blur: std of the radius
 SHARP = 0.15  # of the square of a sharp edge's width, by which it varies
 BENT = 0.46  # of the exposure in steps: std of the radius in units of the blur that neighbours do not explain
@@ -74,21 +75,25 @@ def _bent(
     radii = np.array([np.nan if o is None else o.circle.R for o in outlines])
     variance = np.zeros(len(radii))
     variance[1:-1] = np.nan_to_num((exposure**2 * np.diff(radii, 2) / 24) ** 2)
-    steps = np.nan_to_num(np.abs(np.diff(radii, prepend=np.nan, append=np.nan)))
-    explained = np.maximum(steps[:-1], steps[1:]) * (exposure or 1.0) / 12**0.5
+    steps = np.abs(np.diff(radii, prepend=np.nan, append=np.nan))
+    largest = np.nan_to_num(np.fmax(steps[:-1], steps[1:]), nan=np.inf)  # a frame without neighbours says nothing
+    explained = largest * (exposure or 1.0) / 12**0.5
+    widths = [o.width for o in outlines if o is not None]
+    sharp = max(optics.width, float(np.percentile(widths or [0.0], 25)))
     for k, o in enumerate(outlines):
         if o is None:
             continue
-        moved, noise = _moved(o, optics), 8 * o.width**2 * o.variance * ratios[k]  # of the width's square
-        if moved**2 > explained[k] ** 2 + SHARP * optics.width**2 + 2 * noise**0.5:
-            turning = TURNED * moved * min(1.0, moved / (COLLAPSE * o.circle.R)) * turns[k]
+        moved, noise = _moved(o, sharp), 8 * o.width**2 * o.variance * ratios[k]  # of the width's square
+        if moved**2 > explained[k] ** 2 + SHARP * sharp**2 + 2 * noise**0.5:
+            swept = moved / o.circle.R
+            turning = TURNED * moved * min(1.0, swept / COLLAPSE) if turns[k] and swept > TURNING else 0.0
             variance[k] += max(turning, BENT * exposure * (moved - explained[k])) ** 2
     return variance
 
 
-def _moved(outline: Outline, optics: Optics) -> float:
-    """Blur beyond that of the optics, pixels."""
-    return float(np.sqrt(max(outline.width**2 - optics.width**2, 0.0)))
+def _moved(outline: Outline, sharp: float) -> float:
+    """Blur beyond the width of a sharp edge, pixels."""
+    return float(np.sqrt(max(outline.width**2 - sharp**2, 0.0)))
 
 
 def _turns(outlines: Sequence[Outline | None]) -> list[bool]:
@@ -120,7 +125,7 @@ def _errors(outline: Outline, ratio: float, hidden: float, turned: bool, optics:
     radius = outline.circle.R + 0.5 * sharp**2 / outline.circle.R
     variance = outline.variance * ratio + outline.common + hidden + outline.joined**2 + FLOOR**2
     words = ""
-    moved = _moved(outline, optics)
+    moved = _moved(outline, sharp)
     if moved > COLLAPSE * outline.circle.R:
         variance += ((TURNED if turned else ONE_WAY) * moved) ** 2
         words = f"the bubble {'turned' if turned else 'moved over much of its radius'} within the exposure"
@@ -138,7 +143,8 @@ def _hidden(outlines: Sequence[Outline | None], ratios: Array) -> Array:
     where = [k for k, o in enumerate(outlines) if o is not None and o.amplitude(2) >= 0 and o.mode_std > 0]
     known = [o for k in where if (o := outlines[k]) is not None]
     radii = np.array([o.circle.R for o in known])
-    noise = 2 * np.array([o.mode_std**2 for o in known]) * ratios[where] / radii**2  # mean and std of (a/R)² where there is no mode 2
+    noise = 2 * np.array([o.mode_std**2 for o in known]) * ratios[where]  # mean and std of a² where there is no mode 2
+    noise /= radii**2
     excess = np.array([o.amplitude(2) ** 2 for o in known]) / radii**2 - noise
     hidden = np.zeros(len(outlines))
     for n, k in enumerate(where):
