@@ -22,7 +22,7 @@ from en4dvar_app.trusted import below
 
 HERE = Path(__file__).parent
 LARGEST = 1_000_000  # bytes of a request: a configuration or corrections, never a movie
-MOVIES = (".mp4", ".avi", ".mov", ".mkv", ".tif", ".tiff", ".raw")
+MOVIES = (".mp4", ".avi", ".mov", ".mkv", ".gif", ".tif", ".tiff", ".raw")
 FRAMES, TABLES, CONFIGS = (
     (".tif", ".tiff", ".png"),
     (".csv", ".txt", ".dat", ".tsv", ".xlsx", ".mat"),

@@ -17,7 +17,7 @@ from en4dvar.plumbing.errors import DataError
 from en4dvar_movie.fitting import fit_outline
 from en4dvar_movie.frames import Frame, Movie
 from en4dvar_movie.kernels import normalise
-from en4dvar_movie.locate import TILE, locate
+from en4dvar_movie.locate import TILE, circle_through, locate, rim
 from en4dvar_movie.outline import Circle, Optics
 
 Image = npt.NDArray[Any]  # brightness (H, W), of any precision
@@ -36,7 +36,10 @@ LEAST_SPREAD = 0.002  # of the contrast
 NOISY = 0.1  # of a pixel's noise: what a contrast can be uncertain by for the noise
 SHARPEST = 5  # per cent of the frames: those where the bubble moved least within the exposure
 BLOB = 120  # pixels: the smallest patch of a first frame that may be a bubble
+ROUND = 0.5  # of a patch and the disc through its rim that both share
 SPECK = 100  # pixels: the largest change that is no bubble
+HALO, STILL = 9, 0.01  # side of squares whose mean tells more than a pixel, and what it may differ by
+SURELY = 1.4  # variances of noise beyond which the scatter in such a square is something else
 LEAST_CONTRAST = 0.08  # of the background's brightness
 BRIGHT = 0.25  # of the contrast: how much brighter a flash is
 STEADY = 10_000  # tiles that say how bright a frame is
@@ -151,7 +154,7 @@ def smooth_surface(frames: Sequence[Frame]) -> Array:
 
 def _lit_as(frame: Image, other: Image) -> Image:
     """A frame (H, W) in the light of another, where their lamp's brightness differs no more than it flickers."""
-    lamp = max(float(np.median(other)), 1e-6) / max(float(np.median(frame)), 1e-6)
+    lamp = float(np.median(np.maximum(other, 1e-6) / np.maximum(frame, 1e-6)))
     return frame * (lamp if abs(math.log(lamp)) < LAMP else 1.0)
 
 
@@ -174,7 +177,8 @@ def _writing(leading: Sequence[Frame], noise: float) -> npt.NDArray[np.bool_]:
     labels, _ = ndimage.label(ndimage.binary_dilation(often, np.ones((3, across))))
     for number, box in enumerate(ndimage.find_objects(labels), 1):
         rows, columns = np.nonzero(often[box] & (labels[box] == number))
-        if np.ptp(rows) + 1 > height or _one_way(frames, changes, box):
+        born_later = not changes[0][box].any()  # a bubble; a time stamp runs from the first frame on
+        if np.ptp(rows) + 1 > height or born_later or _one_way(frames, changes, box):
             continue
         top, left = box[0].start + rows.min() - down, box[1].start + columns.min() - across
         none[max(top, 0) : box[0].start + rows.max() + down + 1,
@@ -198,7 +202,7 @@ def _begins_with_a_bubble(first: Image, samples: Sequence[Frame], noise: float, 
     far = np.abs(ndimage.uniform_filter(first - surface, 5)) > max(4 * noise, 0.25 * float(np.median(np.abs(surface))))
     labels, _ = ndimage.label(far & ~blind)
     sizes = np.bincount(labels.ravel())
-    large = [n for n in range(1, len(sizes)) if sizes[n] > max(BLOB, 2e-4 * first.size)]
+    large = [n for n in range(1, len(sizes)) if sizes[n] > max(BLOB, 2e-4 * first.size) and _is_round(labels == n)]
     if not large:
         return False
     changed = np.array([_changed(frame.astype(np.float32), first, noise) for frame in samples])
@@ -206,8 +210,18 @@ def _begins_with_a_bubble(first: Image, samples: Sequence[Frame], noise: float, 
         return True  # nothing moves in the movie: what is there must be the bubble
     moved = changed.mean(axis=0) > OFTEN
     patches = np.isin(labels, large)
-    rim = ndimage.binary_dilation(patches, iterations=2) & ~ndimage.binary_erosion(patches, iterations=2)
-    return bool(np.mean(moved[rim]) > LIVELY)
+    edge = ndimage.binary_dilation(patches, iterations=2) & ~ndimage.binary_erosion(patches, iterations=2)
+    return bool(np.mean(moved[edge]) > LIVELY)
+
+
+def _is_round(patch: npt.NDArray[np.bool_]) -> bool:
+    """True of a disc and what the frame leaves of it, also of one with a bright centre; not of a stripe."""
+    circle = circle_through(rim(patch))
+    if circle is None:
+        return False
+    j, i = np.indices(patch.shape)
+    disc = (i - circle.x) ** 2 + (j - circle.y) ** 2 < circle.R**2
+    return bool(np.sum(patch & disc) > ROUND * np.sum(patch | disc))
 
 
 def _quiet(leading: Sequence[Frame], first: Image, noise: float, blind: npt.NDArray[np.bool_]) -> int:
@@ -247,7 +261,11 @@ def _full(samples: Sequence[Frame], level: Array) -> float:
 
 
 def _refined(background: Background, samples: Sequence[Frame]) -> Background:
-    """The background's level with the parts of later frames that lie outside the bubble: less noise."""
+    """The background's level with the parts of later frames that lie outside the bubble: less noise.
+
+    What is left of it, all frames of a bubble at rest would share: where a square of the level scatters no more than
+    its noise does, it is its mean (Lee's filter, IEEE Trans. Pattern Anal. Mach. Intell. 2, 165, 1980).
+    """
     total = background.level * background.frames
     count = np.full(total.shape, float(background.frames), dtype=np.float32)
     y, x = np.mgrid[: total.shape[0], : total.shape[1]]
@@ -257,12 +275,17 @@ def _refined(background: Background, samples: Sequence[Frame]) -> Background:
         if not places or share_changed(tiles, background.noise) > CHANGED:
             continue
         image = background.steadied(image, tiles, places[0][0])
-        quiet = np.abs(image) < 5 * background.noise
+        near = ndimage.uniform_filter(image, HALO)  # the halo of a light is no background
+        quiet = (np.abs(image) < 5 * background.noise) & (np.abs(near) < max(5 * background.noise / HALO, STILL))
         for circle, _ in places:
             quiet &= (x - circle.x) ** 2 + (y - circle.y) ** 2 > (1.3 * circle.R + 10) ** 2
         total[quiet] += (background.level + image / background.gain)[quiet]  # at the lamp's brightness of the level
         count[quiet] += 1
-    return replace(background, level=(total / count).astype(np.float32))
+    level = total / count
+    mean = ndimage.uniform_filter(level, HALO)
+    own = SURELY * np.nan_to_num(background.noise / background.gain) ** 2 / count
+    share = np.clip(1 - own / np.maximum(ndimage.uniform_filter((level - mean) ** 2, HALO), 1e-30), 0, 1)
+    return replace(background, level=(mean + share * (level - mean)).astype(np.float32))
 
 
 def share_changed(tiles: Array, noise: float) -> float:

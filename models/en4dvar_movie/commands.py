@@ -44,8 +44,8 @@ def track(
 ) -> None:  # fmt: skip
     """Read the bubble's radius and its error from every frame of a movie.
 
-    MOVIE is a TIFF stack, a folder of TIFF or PNG frames, an mp4 or avi file, or a raw file with --raw. The table is
-    read by 'en4dvar init' and 'en4dvar run' as it is; a page shows every outline and what was left out.
+    MOVIE is a TIFF stack, a folder of pictures, an mp4, avi or gif file, or a raw file with --raw. The table is read
+    by 'en4dvar init' and 'en4dvar run' as it is; a page shows every outline and what was left out.
 
     \b
     Example:

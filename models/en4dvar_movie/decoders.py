@@ -111,7 +111,8 @@ def image(path: Path) -> Iterator[Any]:
     """The frame of a single picture."""
     with library("PIL.Image").open(path) as opened:
         check_size(opened.size, path)
-        yield np.asarray(opened)
+        told = opened.mode in ("L", "F", "RGB", "RGBA") or opened.mode.startswith("I")
+        yield np.asarray(opened if told else opened.convert("RGB"))  # a palette's numbers are no brightness
 
 
 def video_count(path: Path) -> Iterator[int]:
@@ -134,7 +135,9 @@ def video_frames(path: Path) -> Iterator[Any]:
             if frame.is_corrupt:
                 yield number
             check_size((frame.height, frame.width), path)
-            yield frame.to_ndarray(format="gray" if frame.format.name.startswith("gray") else "rgb24")
+            deep = max(part.bits for part in frame.format.components) > 8
+            grey = frame.format.name.startswith("gray")
+            yield frame.to_ndarray(format=("gray16le" if deep else "gray") if grey else "rgb48le" if deep else "rgb24")
         if number + 1 < stream.frames:
             said = f"it says that it holds {stream.frames} frames, {number + 1} are there"
             yield f"{path}: the file is cut off: {said}"

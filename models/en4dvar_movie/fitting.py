@@ -22,7 +22,7 @@ REACH = 4.0  # how far from the outline pixels are used, in widths of the edge
 APART = 1.5  # widths of the edge: nested circles that are closer are not told apart
 SHARP = 1.35  # widths of the movie's sharp edges: what is no wider is blurred by nothing else
 TWO = 2.6  # their own widths by which two edges lie apart that are no blurred one
-SURE = 0.05  # share of the squares that two edges must explain and a blurred one does not
+SURE = 0.03  # share of the squares that two edges must explain and a blurred one does not
 X, Y, R, W, LEVEL, CONTRAST, GLARE, RIM = range(SHAPE)
 
 
@@ -123,7 +123,8 @@ def _known(p: Array, gaps: Array, ring: Array, noise: float, optics: Optics) -> 
     tight = 1e12 if _glare_is_far(p, gaps, ring) else 1.0
     precision[RIM] = noise**2 * tight / (0.1 * inner) ** 2
     precision[GLARE] = noise**2 * tight / optics.contrast**2
-    loose = max(0.0, p[W] / p[R] - 0.1)  # a bubble that collapses within the exposure is fainter, its halo blurred
+    moved = max(p[W] ** 2 - optics.width**2, 0.0) ** 0.5
+    loose = max(0.0, moved / p[R] - 0.1)  # a bubble that collapses within the exposure is fainter, its halo blurred
     precision[LEVEL] = noise**2 / (max(LEVEL_SPREAD, optics.spread / 3, LOOSE * loose) * optics.contrast) ** 2
     precision[CONTRAST] = noise**2 / ((optics.spread + loose) * optics.contrast) ** 2
     precision[len(p) - len(gaps) :] = noise**2 / p[R] ** 2  # of circles that cannot be told apart

@@ -22,6 +22,7 @@ DRIFT = 3.0  # pixels a frame that a bubble may travel
 LOOSE = 0.3  # of the radius: how far centres of neighbouring frames lie apart for the fit's sake
 LEAST = 3  # frames of a bubble that is followed beside the first
 SAME = 0.5  # of the best bubble's score: from which another could be meant as well
+FAINT = 0.1  # of it: below which light says nothing, such as that where dirt of the background was
 BRIEF = 4  # frames that the laser's light lasts at most
 NEAR = 3  # frames in which another bubble's outline counts as touching
 TOUCH = 5.0  # pixels between outlines that blur together
@@ -116,7 +117,7 @@ def target(
     if max(by_hand):
         return int(np.argmax(by_hand)), ""
     scores = [bubble.score for bubble in bubbles]
-    marked = _lit(bubbles, looks)
+    marked = _lit(bubbles, [n for n, score in enumerate(scores) if score > FAINT * max(scores)], looks)
     chosen = int(np.argmax(scores)) if marked is None else marked
     rivals = [b for n, b in enumerate(bubbles) if n != chosen and scores[n] > SAME * max(scores)]
     if marked is not None or not rivals:
@@ -129,8 +130,8 @@ def target(
     return chosen, words
 
 
-def _lit(bubbles: Sequence[Chain], looks: Sequence[Look]) -> int | None:
-    """The bubble that begins where the laser's light was last seen before it."""
+def _lit(bubbles: Sequence[Chain], among: Iterable[int], looks: Sequence[Look]) -> int | None:
+    """Which of some bubbles begins where the laser's light was last seen before it."""
     choices = []
     bright = {look.frame: look.spot for look in looks if look.spot is not None}
     where = np.array([spot[:2] for spot in bright.values()]).reshape(-1, 2)
@@ -139,8 +140,8 @@ def _lit(bubbles: Sequence[Chain], looks: Sequence[Look]) -> int | None:
         for frame, (x, y, light) in bright.items()
         if np.sum(np.hypot(*(where - (x, y)).T) < TOUCH) <= BRIEF
     }
-    for n, bubble in enumerate(bubbles):
-        born = bubble.candidates[0].frame
+    for n in among:
+        bubble, born = bubbles[n], bubbles[n].candidates[0].frame
         spots = [brief[frame] for frame in range(max(0, born - GAP), born + 2) if frame in brief]
         if spots:
             x, y, light = max(spots, key=lambda spot: spot[2])
@@ -175,27 +176,32 @@ def _jumps(bubble: Chain) -> dict[int, str]:
     result: dict[int, str] = {}
     for n, frame in enumerate(frames):
         before, after = circles[max(0, n - ABOUT) : n], circles[n + 1 : n + 1 + ABOUT]
-        if len(before) < 2 or len(after) < 2:
-            continue
-        a, b = np.median(before[:, :2], axis=0), np.median(after[:, :2], axis=0)
-        off = _from_segment(circles[n, :2], a, b)
-        if off > max(JUMP, JUMP_SHARE * float(np.median(np.concatenate([before, after])[:, 2]))):
+        off, far = 0.0, JUMP
+        if len(before) > 1 and len(after) > 1:
+            off = _from_segment(circles[n, :2], *(np.median(part[:, :2], axis=0) for part in (before, after)))
+            far = max(JUMP, JUMP_SHARE * float(np.median(np.concatenate([before, after])[:, 2])))
+        if off > far:
             result[int(frame)] = f"jump: the centre is {off:.0f} pixels from where the frames about it show it"
-        elif frames[n + 1] - frames[n - 1] == 2 and (words := _leap(circles[:, 2], n)):
+        elif words := _leap(frames, circles[:, 2], n):
             result[int(frame)] = words
     return result
 
 
-def _leap(radii: Array, n: int) -> str:
-    """Why a radius cannot lie between its neighbours'; "" where it can."""
-    low, high = float(min(radii[n - 1], radii[n + 1])), float(max(radii[n - 1], radii[n + 1]))
-    steps = np.abs(np.diff(radii[max(0, n - 1 - ABOUT) : n + 2 + ABOUT]))
-    here = min(n, 1 + ABOUT)  # the step from this frame on
-    speed = float(np.max(np.delete(steps, [here - 1, here])))
-    if radii[n] > high + RISE * speed + max(LEAP, LEAP_SHARE * high):
-        return f"jump: the radius is {radii[n] - high:.0f} pixels above those of the frames about it"
-    if radii[n] < low - FALL * speed - FALL_SHARE * low - LEAP:
-        return f"jump: the radius is {low - radii[n]:.0f} pixels below those of the frames about it"
+def _leap(frames: Array, radii: Array, n: int) -> str:
+    """Why a radius, or two in a row, cannot lie between their neighbours'; "" where they can."""
+    for i, j in ((n - 1, n + 1), (n - 2, n + 1), (n - 1, n + 2)):
+        if i < 0 or j >= len(radii) or frames[j] - frames[i] != j - i:
+            continue
+        low, high = sorted((float(radii[i]), float(radii[j])))
+        steps = np.abs(np.diff(radii[max(0, i - ABOUT) : j + 1 + ABOUT]))
+        first = min(i, ABOUT)  # the step from i on
+        speed = float(np.max(np.delete(steps, slice(first, first + j - i)), initial=-np.inf))
+        if speed < 0:  # three or four frames in all
+            continue
+        if radii[n] > high + RISE * speed + max(LEAP, LEAP_SHARE * high):
+            return f"jump: the radius is {radii[n] - high:.0f} pixels above those of the frames about it"
+        if j - i == 2 and radii[n] < low - FALL * speed - FALL_SHARE * low - LEAP:
+            return f"jump: the radius is {low - radii[n]:.0f} pixels below those of the frames about it"
     return ""
 
 

@@ -1,4 +1,4 @@
-"""Reading movies frame by frame: TIFF stacks, folders of TIFF or PNG frames, mp4, avi, raw files of a stated shape.
+"""Reading movies frame by frame: TIFF stacks, folders of pictures, mp4, avi, gif, raw files of a stated shape.
 
 Frames are (H, W) arrays of brightness, 8 or 16 bit. Nothing is held: a movie is a way to run through its frames.
 """
@@ -21,7 +21,9 @@ from en4dvar.plumbing.hints import no_such_file
 from en4dvar_movie.decoders import TiffAbout, check_size, image, tiff_about, tiff_frames, video_count, video_frames
 
 Frame = npt.NDArray[Any]
-TIFF, VIDEO, IMAGES = (".tif", ".tiff"), (".mp4", ".avi", ".mov", ".mkv"), (".png",)
+TIFF, VIDEO = (".tif", ".tiff"), (".mp4", ".avi", ".mov", ".mkv")
+MOVING = (*TIFF, *VIDEO, ".gif")  # which are read; a gif is not written
+IMAGES = (".png", ".bmp", ".jpg", ".jpeg")
 LEAST_SIDE = 16
 MOVIES = Allowed(seconds=20, memory=2_000_000_000, size=256_000_000_000)
 COLOUR = 0.08  # mean difference of the channels, as a share of the full scale, from which a frame is a coloured one
@@ -89,9 +91,9 @@ def open_movie(path: str | Path, raw: str | None = None) -> Movie:
     suffix = path.suffix.lower()
     if suffix in TIFF:
         return _tiff(path)
-    if suffix in VIDEO:
+    if suffix in MOVING:
         return _video(path)
-    kinds = ", ".join((*TIFF, *VIDEO))
+    kinds = ", ".join(MOVING)
     raise DataError(f"{path}: not a movie by its suffix ({kinds}, or a folder of frames); for a raw file give --raw")
 
 

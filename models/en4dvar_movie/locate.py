@@ -46,7 +46,7 @@ def _labelled(mask: Array) -> tuple[npt.NDArray[Any], npt.NDArray[np.intp]]:
     return labels, sizes
 
 
-def rim(inside: Array) -> Array:
+def rim(inside: npt.NDArray[Any]) -> Array:
     """Outermost points (K, 2), x and y, of each row and column of a patch, without those on the frame's border."""
     height, width = inside.shape
     points = []

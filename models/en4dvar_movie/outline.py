@@ -64,6 +64,11 @@ class Outline:
         return float(np.hypot(*self.modes[:, n - 2])) if n - 2 < self.modes.shape[1] else float("nan")
 
     @property
+    def angle(self) -> float:
+        """From the x axis towards the y axis to the long axis of mode 2, within ±90 degrees; NaN where not fitted."""
+        return float(np.rad2deg(np.arctan2(*self.modes[::-1, 0]) / 2)) if self.modes.shape[1] else float("nan")
+
+    @property
     def eccentricity(self) -> float:
         """That of the ellipse of mode 2; NaN where it was not fitted."""
         part = self.amplitude(2) / self.circle.R

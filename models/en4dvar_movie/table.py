@@ -12,7 +12,9 @@ import numpy as np
 
 from en4dvar_movie.tracking import Reading, Sighting
 
-COLUMNS = ("frame", "t_us", "R_um", "R_std_um", "t_std_us", "x_um", "y_um", "eccentricity", "used", "reason")
+MODES = (2, 3, 4)  # whose amplitudes are columns
+SHAPE = ("eccentricity", "angle_deg", *(f"mode_{n}_um" for n in MODES), "mode_std_um")
+COLUMNS = ("frame", "t_us", "R_um", "R_std_um", "t_std_us", "x_um", "y_um", *SHAPE, "used", "reason")
 COMMON = "R_common_um"
 STEADY = 0.1  # of the exposure: where its light may be centred
 UNKNOWN = 0.05  # of the step between frames, where no exposure is given
@@ -62,10 +64,11 @@ def _row(reading: Reading, scale: Scale) -> Iterable[str]:
     outline = reading.sighting.outline
     last = [str(int(reading.used)), reading.reason]
     if not reading.used or outline is None:
-        return [*first, *[""] * 6, *last]
+        return [*first, *[""] * (len(COLUMNS) - 4), *last]
     numbers = [
         f"{um * reading.radius:.4f}", f"{um * reading.errors.std:.4f}", f"{1e6 * scale.time_std:.4g}",
         f"{um * outline.circle.x:.3f}", f"{um * outline.circle.y:.3f}",
-        f"{outline.eccentricity:.4f}".replace("nan", ""),
     ]  # fmt: skip
-    return [*first, *numbers, *last]
+    modes = [*(um * outline.amplitude(n) for n in MODES), um * reading.errors.mode_std]
+    shape = [f"{outline.eccentricity:.4f}", f"{outline.angle:.1f}", *(f"{value:.4f}" for value in modes)]
+    return [*first, *numbers, *("" if text == "nan" or not outline.modes.size else text for text in shape), *last]

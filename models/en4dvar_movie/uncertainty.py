@@ -9,11 +9,13 @@ the amplitude of mode 2 (the mean of a degree-2 harmonic over a great circle has
 3σ²/4 = a²/2). Two numbers tell a², so that 90 % intervals take Student's t with 2 degrees of freedom. Where a frame's
 own a does not stand out of its noise, that of neighbouring frames together may.
 
-Exposure: over an exposure of length T the mean radius lies T² R̈/24 from that in its middle.
+Exposure: over an exposure of length T the mean radius lies T² R̈/24 from that in its middle, R̈ as three frames show it;
+or, where the edge is blurred more than the steps to its neighbours explain, as its speed differs from theirs over half
+a step.
 
 Turning: an edge that moves one way during the exposure has its half level where it is in the middle of it. One that
 turns there, as in a collapse, sweeps a range of √12 blurs and is at its end in the middle: √3 blurs from the half
-level.
+level. The less of the radius it sweeps, the rarer that is, unless nothing else explains the blur.
 
 Curvature: blur moves the half level of a disc inwards by w²/2R. It is given back for the blur that the movie's sharp
 frames share; what goes beyond it is the wall's motion during the exposure, which has no such shift.
@@ -34,18 +36,23 @@ STUDENT = 2.92 / 1.645  # 95 % quantiles of t with 2 degrees of freedom and of t
 FLOOR = 0.005  # pixels: what sampling by whole pixels leaves uncertain in the best of images
 SIGNIFICANT = 3.0  # std of a mode's amplitude from which it is one
 COLLAPSE = 0.15  # of the radius: blur by motion from which the bubble may have turned within the exposure
+TURNING = 0.065  # the same where nothing else explains the blur
 ONE_WAY, TURNED = 0.25, 3**0.5 / 2  # of that blur: std of the radius
+SHARP = 0.15  # of the square of a sharp edge's width, by which it varies
+BENT = 0.46  # of the exposure in steps: std of the radius in units of the blur that neighbours do not explain
 THRESHOLD = 0.05  # of the contrast: what the level of the edge can be off by in all frames alike
 
 
 @dataclass(frozen=True)
 class Errors:
-    """In pixels: the corrected ``radius``, its independent std, how far all radii move together by the edge's level."""
+    """In pixels: the corrected ``radius``, its independent std, how far all radii move together by the edge's level;
+    ``mode_std`` is the std of A_n and B_n of a mode of the shape."""
 
     radius: float
     std: float
     common: float
     words: str = ""
+    mode_std: float = float("nan")
 
 
 NOTHING = Errors(float("nan"), float("nan"), float("nan"))
@@ -53,20 +60,40 @@ NOTHING = Errors(float("nan"), float("nan"), float("nan"))
 
 def errors_of(outlines: Sequence[Outline | None], optics: Optics, exposure: float = 0.0) -> list[Errors]:
     """Errors of each frame, of which the exposure takes a share; of those without an outline :data:`NOTHING`."""
-    hidden = _hidden(outlines) + _bent(outlines, exposure)
-    turns = _turns(outlines)
+    ratios, turns = _smoothed(outlines), _turns(outlines)
+    beside = _hidden(outlines, ratios) + _bent(outlines, ratios, turns, optics, exposure)
     return [
         _errors(o, ratio, variance, turned, optics) if o is not None else NOTHING
-        for o, ratio, variance, turned in zip(outlines, _smoothed(outlines), hidden, turns, strict=True)
+        for o, ratio, variance, turned in zip(outlines, ratios, beside, turns, strict=True)
     ]
 
 
-def _bent(outlines: Sequence[Outline | None], exposure: float) -> Array:
-    """Variance of the radius (K,) for its curvature in time over the exposure, as three frames in a row show it."""
+def _bent(
+    outlines: Sequence[Outline | None], ratios: Array, turns: Sequence[bool], optics: Optics, exposure: float
+) -> Array:
+    """Variance of the radius (K,) for its curvature in time over the exposure (0: unknown, at most a step)."""
     radii = np.array([np.nan if o is None else o.circle.R for o in outlines])
     variance = np.zeros(len(radii))
     variance[1:-1] = np.nan_to_num((exposure**2 * np.diff(radii, 2) / 24) ** 2)
+    steps = np.abs(np.diff(radii, prepend=np.nan, append=np.nan))
+    largest = np.nan_to_num(np.fmax(steps[:-1], steps[1:]), nan=np.inf)  # a frame without neighbours says nothing
+    explained = largest * (exposure or 1.0) / 12**0.5
+    widths = [o.width for o in outlines if o is not None]
+    sharp = max(optics.width, float(np.percentile(widths or [0.0], 25)))
+    for k, o in enumerate(outlines):
+        if o is None:
+            continue
+        moved, noise = _moved(o, sharp), 8 * o.width**2 * o.variance * ratios[k]  # of the width's square
+        if moved**2 > explained[k] ** 2 + SHARP * sharp**2 + 2 * noise**0.5:
+            swept = moved / o.circle.R
+            turning = TURNED * moved * min(1.0, swept / COLLAPSE) if turns[k] and swept > TURNING else 0.0
+            variance[k] += max(turning, BENT * exposure * (moved - explained[k])) ** 2
     return variance
+
+
+def _moved(outline: Outline, sharp: float) -> float:
+    """Blur beyond the width of a sharp edge, pixels."""
+    return float(np.sqrt(max(outline.width**2 - sharp**2, 0.0)))
 
 
 def _turns(outlines: Sequence[Outline | None]) -> list[bool]:
@@ -98,7 +125,7 @@ def _errors(outline: Outline, ratio: float, hidden: float, turned: bool, optics:
     radius = outline.circle.R + 0.5 * sharp**2 / outline.circle.R
     variance = outline.variance * ratio + outline.common + hidden + outline.joined**2 + FLOOR**2
     words = ""
-    moved = float(np.sqrt(max(outline.width**2 - sharp**2, 0.0)))  # blur beyond that of the optics
+    moved = _moved(outline, sharp)
     if moved > COLLAPSE * outline.circle.R:
         variance += ((TURNED if turned else ONE_WAY) * moved) ** 2
         words = f"the bubble {'turned' if turned else 'moved over much of its radius'} within the exposure"
@@ -107,15 +134,17 @@ def _errors(outline: Outline, ratio: float, hidden: float, turned: bool, optics:
     elif outline.seen < 0.9:
         words = f"{outline.seen:.0%} of the outline lies in the frame"
     # the edge's profile has the slope 1/(√(2π) w) at its half level
-    return Errors(radius, float(np.sqrt(variance)), float(THRESHOLD * np.sqrt(2 * np.pi) * outline.width), words)
+    common = float(THRESHOLD * np.sqrt(2 * np.pi) * outline.width)
+    return Errors(radius, float(np.sqrt(variance)), common, words, outline.mode_std * float(np.sqrt(ratio)))
 
 
-def _hidden(outlines: Sequence[Outline | None]) -> Array:
+def _hidden(outlines: Sequence[Outline | None], ratios: Array) -> Array:
     """Variance of the radius for the extent along the line of sight (K,): of the own mode 2, or the neighbours'."""
     where = [k for k, o in enumerate(outlines) if o is not None and o.amplitude(2) >= 0 and o.mode_std > 0]
     known = [o for k in where if (o := outlines[k]) is not None]
     radii = np.array([o.circle.R for o in known])
-    noise = np.array([2 * o.mode_std**2 for o in known]) / radii**2  # mean and std of (a/R)² where there is no mode 2
+    noise = 2 * np.array([o.mode_std**2 for o in known]) * ratios[where]  # mean and std of a² where there is no mode 2
+    noise /= radii**2
     excess = np.array([o.amplitude(2) ** 2 for o in known]) / radii**2 - noise
     hidden = np.zeros(len(outlines))
     for n, k in enumerate(where):

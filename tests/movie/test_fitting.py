@@ -68,3 +68,21 @@ def test_curvature_in_time_over_the_exposure_is_an_error():
     still, moving = (errors_of(outlines, Optics(CONTRAST, 1.2, 0.002), share)[3].std for share in (0.0, T))
     sample = np.linspace(-T / 2, T / 2, 100_001)
     assert np.sqrt(moving**2 - still**2) == pytest.approx(np.mean(a * sample**2), rel=1e-3)
+
+
+def test_modes_of_the_shape_and_their_error_are_those_that_were_drawn():
+    """A_2 and B_2 of an ellipse at 30 degrees, B_3, and no mode 4; errors over their std have the std 1."""
+    rng, optics, width = np.random.default_rng(11), Optics(CONTRAST, 1.2, 0.002), 1.2
+    y, x = np.indices((64, 64)) - 31.8
+    angle = np.arctan2(y, x)
+    rho = 20 + 0.6 * np.cos(2 * (angle - np.deg2rad(30))) + 0.3 * np.sin(3 * angle)
+    shade = CONTRAST * ndtr((rho - np.hypot(x, y)) / width)
+    truth = np.array([[0.3, 0.0, 0.0], [0.6 * np.sin(np.pi / 3), 0.3, 0.0]])
+    found = [
+        fit_outline((shade + 0.05 * rng.standard_normal(x.shape)).astype(np.float32), Circle(31.5, 32, 20.3), optics)[0]
+        for _ in range(40)
+    ]
+    off = [(o.modes[:, :3] - truth) / errors_of([o], optics)[0].mode_std for o in found]
+    assert np.std(off) == pytest.approx(1.0, abs=0.2)
+    assert np.mean([o.angle for o in found]) == pytest.approx(30, abs=1)
+    assert np.mean([o.amplitude(2) for o in found]) == pytest.approx(0.6, abs=0.02)

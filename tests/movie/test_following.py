@@ -37,6 +37,22 @@ def test_the_laser_s_bubble_is_followed_beside_whatever_else_is_there(kind):
     assert not np.any((np.abs(of["wrong"]) > 2) & (np.abs(of["score"]) > 5))
 
 
+@pytest.mark.parametrize(
+    ("kind", "seed"),
+    [
+        ("stripes", 4112),  # of which the bubble covers most of the brighter half
+        ("stripes", 4119),  # whose patches change where the bubble comes
+        ("bright centre", 4105),  # low, and brighter here and darker there, as writing
+        ("drifting specks", 4103),  # a small one begins where another was in the background
+        ("shock wave", 4103),  # a ring that is read in two frames in a row
+    ],
+)
+def test_what_looks_like_a_lamp_writing_light_or_a_wall_does_not_lose_the_bubble(kind, seed):
+    of = nasty(kind, seed)
+    assert np.isfinite(of["wrong"][of["good"].astype(bool)]).mean() > 0.9
+    assert not np.any((np.abs(of["wrong"]) > 2) & (np.abs(of["score"]) > 5))
+
+
 def test_a_lamp_that_flickers_does_not_make_a_bubble_bright():
     of = nasty("flicker", 8)
     assert np.isfinite(of["wrong"][of["good"].astype(bool)]).mean() > 0.9

@@ -51,6 +51,19 @@ def test_video(tmp_path):
     assert np.abs(read(tmp_path / "m.avi").astype(int) - smooth).mean() < 3
 
 
+def test_a_video_of_sixteen_bits_keeps_them(tmp_path):
+    import av
+
+    deep = np.random.default_rng(3).integers(0, 2**16, (3, 32, 48), dtype=np.uint16)
+    with av.open(str(tmp_path / "m.mkv"), "w") as file:
+        stream = file.add_stream("ffv1", rate=25)
+        stream.height, stream.width, stream.pix_fmt = 32, 48, "gray16le"
+        for frame in deep:
+            file.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="gray16le")))
+        file.mux(stream.encode())
+    assert np.array_equal(read(tmp_path / "m.mkv"), deep)
+
+
 def test_scale_is_the_files_own_or_asked_for(tmp_path):
     tifffile.imwrite(
         tmp_path / "m.tif", FRAMES, imagej=True, resolution=(0.5, 0.5), metadata={"unit": "um", "finterval": 1e-5}

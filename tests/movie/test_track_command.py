@@ -36,8 +36,9 @@ def test_from_the_movie_to_observations(tmp_path, monkeypatch):
     lines = (tmp_path / "gel.csv").read_text().splitlines()
     comment = [line for line in lines if line.startswith("#")]
     assert "pixel: 2.5 um; frame rate: 400000 Hz" in " ".join(comment)
-    assert lines[len(comment)] == "frame,t_us,R_um,R_std_um,t_std_us,x_um,y_um,eccentricity,used,reason"
-    assert lines[len(comment) + 1].endswith(",,,,,,,0,no bubble: the frame is one of the background's")
+    shape = "eccentricity,angle_deg,mode_2_um,mode_3_um,mode_4_um,mode_std_um"
+    assert lines[len(comment)] == f"frame,t_us,R_um,R_std_um,t_std_us,x_um,y_um,{shape},used,reason"
+    assert lines[len(comment) + 1].endswith(",,,,,,,,,,,,0,no bubble: the frame is one of the background's")
     page = (tmp_path / "gel.html").read_text()
     assert page.count("<polygon") == 27
     assert CliRunner().invoke(main, ["init", "--data", "gel.csv", "--start", "laser"]).exit_code == 0
