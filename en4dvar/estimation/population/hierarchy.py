@@ -5,11 +5,11 @@ r"""Mean ν and spread τ of a population from the likelihoods of its data sets,
 
 in white coordinates of the prior π. A data set is odd with probability ε (Hogg, Bovy & Lang 2010, arXiv:1008.4686):
 then its parameters are drawn from the prior as if it belonged to no population, or one of them alone lies elsewhere, by
-as much as populations spread a priori (σ is the scale of τ's prior), as where the gel is stiffer or the law is another
-one. So one bubble of another gel moves the mean little and widens the spread hardly; how probably each belongs is part
-of the answer. Were an odd one always odd in all parameters, one that is so in G alone would have to be improbable in
-the others, and would widen the spread instead. θ are quantities with one value in all data sets, whose uncertainty
-therefore no number of data sets averages out.
+as much as medians of populations differ a priori (σ is that of ν's prior), as where the gel is stiffer or the law is
+another one. So one bubble of another gel moves the mean little and widens the spread hardly; how probably each belongs
+is part of the answer. Were an odd one always odd in all parameters, one that is so in G alone would have to be
+improbable in the others, and would widen the spread instead. θ are quantities with one value in all data sets, whose
+uncertainty therefore no number of data sets averages out.
 
 With L_i in units of its evidence (:mod:`~en4dvar.estimation.population.own`) the density of h = (ν, ln τ, θ) is
 
@@ -39,6 +39,22 @@ from en4dvar.sampling.walkers import advance
 
 MOVES = 5  # of one half of the walkers while the other stands still
 FIT = 3000  # positions that the proposal is fitted to
+RAISED, ONE_OF = 3.0, 4  # data sets are named whose odds of being odd the data raise so often, see :func:`named`
+
+
+def named(belongs: Array, odd: float) -> tuple[int, ...]:
+    """Which data sets are to be named as odd, by the probabilities (S,) to belong: those whose odds the data raise from
+    odd/(1 − odd) threefold, and by a quarter of S where that is more.
+
+    Of one that belongs they rise k-fold in at most 1/k of cases, by chance, and far more rarely where k is large, so
+    that a campaign without an odd one names one in a few per cent; one that is odd is seen as often as can be with the
+    spread unknown. Where a probability of one half is asked, half of the bubbles of four times the modulus are missed.
+    """
+    if not odd:
+        return ()
+    with np.errstate(divide="ignore"):
+        raised = (1 - belongs) / belongs * (1 - odd) / odd
+    return tuple(np.flatnonzero(raised > max(RAISED, len(belongs) / ONE_OF)).tolist())
 
 
 @dataclass(frozen=True)
@@ -64,7 +80,7 @@ class Hierarchy:
         self.p, self.c = likelihoods[0].slopes.shape
         self.hyper = Hyper(prior, list(range(self.p)), scales)
         self.shares = np.array([1 - odd, odd / 2, *[odd / 2 / self.p] * self.p])[: None if odd else 1]
-        self.wider = scales.spread**2 * np.vstack([np.zeros((2, self.p)), np.eye(self.p)])
+        self.wider = scales.mean_std**2 * np.vstack([np.zeros((2, self.p)), np.eye(self.p)])
 
     def log_parts(self, h: Array) -> Array:
         """(B, S, K) ln of the share and the marginal likelihood of each data set in the population, under its own prior
