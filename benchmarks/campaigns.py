@@ -3,6 +3,7 @@
     python benchmarks/campaigns.py synthetic [--n 200] [--seed 1] [--bubbles 3 6 12 40] [--kinds …] [--minutes 9]
     python benchmarks/campaigns.py pairs [--n 100] [--seed 1] [--bubbles 6 12]
     python benchmarks/campaigns.py odd [--n 10] [--seed 1] [--bubbles 12]
+    python benchmarks/campaigns.py power [--n 400] [--seed 1] [--bubbles 6 12 40]
     python benchmarks/campaigns.py halves RUN_DIR [--splits 10]
 
 ``synthetic``: of every bubble G and μ, in units of their priors, are read with errors of their own, and with two modes
@@ -21,6 +22,11 @@ of a linear hierarchy of known spread, and what is held where these three are ta
 ``odd``: synthetic laser bubbles of one gel (G and μ differ by 20 %, errors of 1 %, the wide priors of ``init``), whose
 posteriors are sampled by forward runs; the first as it is, of four times the modulus, of a gel that stiffens, of
 another gel, its radii or times 8 % too large.
+
+``power``: what can be seen at all? The hierarchy of G alone, what is common included in its median, by quadrature over
+median and spread, without draws: the share of odd bubbles that are named, and that would be by the best test, where the
+spread is unknown and where it is known, of errors as above and of 6 to 16 %. The best test is the ratio of the odds
+with a bound that 5 % of clean campaigns of two such parameters exceed.
 
 ``halves``: the bubbles of a finished run are sampled once, and split at random into halves with a population each.
 """
@@ -46,6 +52,7 @@ from en4dvar.ensemble.forecast import forecast
 from en4dvar.estimation.population import Effort, HyperPrior
 from en4dvar.estimation.population.campaign import CampaignPopulation, population_from, sampled_sets
 from en4dvar.estimation.population.contrast import Centre, drawn_together, without_pull
+from en4dvar.estimation.population.hierarchy import A_SET, RAISED
 from en4dvar.estimation.population.own import ENOUGH, KEPT, OwnDraws
 from en4dvar.model.function_model import FunctionModel
 from en4dvar.model.state import TIME_SHIFT, Array, Parameter
@@ -138,7 +145,8 @@ def own_draws_of(y: Array, error: Array, aliased: bool, rng: np.random.Generator
 
 
 def campaign(
-    kind: str, bubbles: int, rng: np.random.Generator, truth: tuple[Array, Array] | None = None
+    kind: str, bubbles: int, rng: np.random.Generator, truth: tuple[Array, Array] | None = None,
+    errors: tuple[float, float] = ERRORS,
 ) -> Campaign:  # fmt: skip
     """Of one kind; ``truth``: θ and ν, instead of drawn."""
     hyper = HyperPrior()
@@ -146,7 +154,7 @@ def campaign(
     tau = hyper.spread * np.abs(rng.standard_normal(2)) if kind == "normal" else np.full(2, LIKE)
     heavy = rng.standard_t(FREEDOM, (bubbles, 2)) / np.sqrt(FREEDOM / (FREEDOM - 2))
     x = nu + tau * (heavy if kind == "heavy" else rng.standard_normal((bubbles, 2)))
-    error, odd = rng.uniform(*ERRORS, (bubbles, 2)), []
+    error, odd = rng.uniform(*errors, (bubbles, 2)), []
     if kind in SHIFTS:
         shift, wider = SHIFTS[kind]
         x[0] += np.array(shift) / LOG_STD
@@ -274,6 +282,48 @@ def _share(of: Sequence[bool]) -> str:
     return f"{100 * np.mean(of):.0f} %" if len(of) else "–"
 
 
+def raised(bubbles: int, kind: str, count: int, errors: tuple[float, float], tau: Array, seed: int) -> Array:
+    """(count, S) by what factor the readings of G raise the odds of each bubble in as many campaigns; τ is one of
+    ``tau`` (T,), the first bubble of a ``kind``.
+    """
+    rng, hyper, slots = np.random.default_rng([seed, bubbles]), HyperPrior(), (..., None, None)
+    each = [campaign(kind, bubbles, rng, (np.zeros(3), np.zeros(2)), errors) for _ in range(count)]
+    nu, middle = np.linspace(-0.7, 0.7, 41), np.array([0.5, 0.25]) * hyper.odd
+    log_prior = np.log(tau) - 0.5 * (tau / hyper.spread) ** 2
+    found = []
+    for one in each:
+        y, error, aliased = one.y[:, 0][slots], one.error[:, 0][slots], one.aliased[slots]
+
+        def likely(variance: Array, y: Array = y, error: Array = error, aliased: Array = aliased) -> Array:
+            std = np.sqrt(error**2 + variance)
+            first, second = (norm.pdf(reading, nu[:, None], std) for reading in (y, y - ALIAS[0]))
+            return np.where(aliased, (first + second) / 2, first)
+
+        belongs, elsewhere = (1 - hyper.odd) * likely(tau**2), middle[1] * likely(tau**2 + hyper.mean_std**2)
+        logs = np.log(belongs + elsewhere).sum(axis=0) + log_prior
+        weights = np.exp(logs - logs.max())
+        share = np.sum(weights * elsewhere / (belongs + elsewhere), axis=(1, 2)) / weights.sum()
+        found.append(share / (1 - share) * (1 - hyper.odd) / hyper.odd)
+    return np.array(found)
+
+
+def power(seed: int, sizes: Sequence[int], count: int) -> None:
+    print("| errors of G | bubbles | the first | named | by the best test | spread known | others named |")
+    print("|---|---|---|---|---|---|---|")
+    unknown, known = np.geomspace(0.02, 2.0, 21), np.array([LIKE])
+    for errors in (ERRORS, (0.03, 0.08)):
+        for size in sizes:
+            clean = [raised(size, "like", count, errors, tau, seed).max(axis=1) for tau in (unknown, known)]
+            bounds = [np.quantile(highest, 0.975) for highest in clean]
+            limit = max(RAISED, A_SET * size)
+            false = 1 - np.mean(clean[0] < limit) ** 2  # of G or of μ
+            for kind in SHIFTS:
+                first = [raised(size, kind, count, errors, tau, seed + 1)[:, 0] for tau in (unknown, known)]
+                shares = [_share(of.tolist()) for of in (first[0] > limit, first[0] > bounds[0], first[1] > bounds[1])]
+                about = f"{100 * LOG_STD * errors[0]:.0f} to {100 * LOG_STD * errors[1]:.0f} %"
+                print(f"| {about} | {size} | {kind} | {' | '.join(shares)} | {100 * false:.0f} % |", flush=True)
+
+
 def laser_bubble(name: str, times: Array, largest: float) -> InverseProblem:
     """A bubble of the priors of ``init``, without readings."""
     about = {"G": (8e3, LOG_STD), "mu": (0.1, LOG_STD), "R_eq": (0.12 * largest, 0.4)}
@@ -377,7 +427,7 @@ def halves(run_dir: Path, splits: int) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("synthetic", "pairs", "odd", "halves"))
+    parser.add_argument("what", choices=("synthetic", "pairs", "odd", "power", "halves"))
     parser.add_argument("run_dir", type=Path, nargs="?")
     parser.add_argument("--n", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
@@ -389,6 +439,9 @@ def main() -> None:
     asked = parser.parse_args()
     if asked.what == "halves":
         halves(asked.run_dir, asked.splits)
+        return
+    if asked.what == "power":
+        power(asked.seed, asked.bubbles, asked.n)
         return
     file = asked.records / f"{asked.what}_{asked.seed}.jsonl"
     if asked.what == "odd":

@@ -161,6 +161,15 @@ def test_one_that_is_odd_in_one_parameter_alone_is_named():
     assert belongs[1:].min() > 0.7
 
 
+def test_more_data_sets_are_named_only_by_more_evidence():
+    """Of three the odds have to rise 2.5 times, of forty 16 times."""
+    for count, factor in ((3, 2.5), (12, 4.8), (40, 16.0)):
+        odds = factor * 0.05 / 0.95 * np.array([1.01, 0.99, *[0.1] * (count - 2)])
+        assert named(1 / (1 + odds), 0.05) == (0,)
+    assert named(np.array([0.0, 1.0, 1.0]), 0.05) == (0,)
+    assert named(np.array([1.0, 1.0, 1.0]), 0.0) == ()
+
+
 def test_uncertain_errors_are_quantities_of_each_data_set():
     """A scale of the errors that is all but known changes nothing; a wide one, a timing error and a discrepancy are
     taken as they are.

@@ -39,22 +39,23 @@ from en4dvar.sampling.walkers import advance
 
 MOVES = 5  # of one half of the walkers while the other stands still
 FIT = 3000  # positions that the proposal is fitted to
-RAISED, ONE_OF = 3.0, 4  # data sets are named whose odds of being odd the data raise so often, see :func:`named`
+RAISED, A_SET = 2.5, 0.4  # times more probably odd by its data, and times the number of sets: named
 
 
 def named(belongs: Array, odd: float) -> tuple[int, ...]:
-    """Which data sets are to be named as odd, by the probabilities (S,) to belong: those whose odds the data raise from
-    odd/(1 − odd) threefold, and by a quarter of S where that is more.
+    """Which data sets are to be named as odd, by the probabilities (S,) to belong: those whose odds, odd/(1 − odd),
+    the data raise by more than 0.4 S, and at least 2.5 times.
 
-    Of one that belongs they rise k-fold in at most 1/k of cases, by chance, and far more rarely where k is large, so
-    that a campaign without an odd one names one in a few per cent; one that is odd is seen as often as can be with the
-    spread unknown. Where a probability of one half is asked, half of the bubbles of four times the modulus are missed.
+    The ratio of the odds is the best test of one data set against the others (Neyman & Pearson 1933); the bound grows
+    with S as so many may be named by chance, and was set so that some 5 % of campaigns of 12 without an odd one name
+    one (``benchmarks/campaigns.py power``). Were a probability of one half asked, half of the bubbles of four times the
+    modulus would be missed, as a wider spread explains them as well.
     """
     if not odd:
         return ()
     with np.errstate(divide="ignore"):
         raised = (1 - belongs) / belongs * (1 - odd) / odd
-    return tuple(np.flatnonzero(raised > max(RAISED, len(belongs) / ONE_OF)).tolist())
+    return tuple(np.flatnonzero(raised > max(RAISED, A_SET * len(belongs))).tolist())
 
 
 @dataclass(frozen=True)
