@@ -52,7 +52,7 @@ from en4dvar.ensemble.forecast import forecast
 from en4dvar.estimation.population import Effort, HyperPrior
 from en4dvar.estimation.population.campaign import CampaignPopulation, population_from, sampled_sets
 from en4dvar.estimation.population.contrast import Centre, drawn_together, without_pull
-from en4dvar.estimation.population.hierarchy import A_SET, RAISED
+from en4dvar.estimation.population.hierarchy import A_SET, RAISED, named
 from en4dvar.estimation.population.own import ENOUGH, KEPT, OwnDraws
 from en4dvar.model.function_model import FunctionModel
 from en4dvar.model.state import TIME_SHIFT, Array, Parameter
@@ -118,15 +118,16 @@ class Campaign:
         hyper = HyperPrior()
         variance, middle = self.tau**2 + self.error**2, self.nu + SLOPES @ self.theta
         wider, wide = variance + hyper.mean_std**2, 1 + self.error**2
-        of_it, elsewhere = self._density(middle, variance), 0.0
+        of_it, elsewhere = self._density(middle, variance), np.zeros(len(self.y))
         for j in range(2):
             one = np.where(np.arange(2) == j, wider, variance)
             elsewhere = elsewhere + self._density(middle, one) / 4
-        return hyper.odd / (1 - hyper.odd) * (elsewhere + self._density(SLOPES @ self.theta, wide) / 2) / of_it
+        elsewhere = elsewhere + self._density(SLOPES @ self.theta, wide) / 2
+        return np.asarray(hyper.odd / (1 - hyper.odd) * elsewhere / of_it)
 
     def _density(self, middle: Array, variance: Array) -> Array:
         first, second = (norm(middle, np.sqrt(variance)).pdf(y).prod(axis=1) for y in (self.y, self.y - ALIAS))
-        return np.where(self.aliased, (first + second) / 2, first)
+        return np.asarray(np.where(self.aliased, (first + second) / 2, first))
 
 
 def own_draws_of(y: Array, error: Array, aliased: bool, rng: np.random.Generator, slopes: Array) -> OwnDraws:
@@ -193,7 +194,6 @@ def synthetic(seed: int, key: str) -> Record:
         "tau": np.mean(result.posterior.tau < of_it.tau, axis=0),
         "robust": (quantiles[:, 0] < of_it.nu) & (of_it.nu < quantiles[:, 2]),
         "odd": of_it.odd,
-        "named": result.odd,
         "chances": 1 - result.belongs,
         "odds": of_it.odds(),
         "size": result.estimate.size,
@@ -266,13 +266,14 @@ def table_of(records: Sequence[Record], kinds: Sequence[str], sizes: Sequence[in
                 np.array([r[key] for r in of_it], dtype=float).ravel() for key in ("nu", "tau", "robust")
             )
             clean = [max(r["odds"]) for r in records if r["key"].startswith(f"like/{size}/")]
-            odd = [(i in r["named"], r["odds"][i]) for r in of_it for i in r["odd"]]
+            seen = [named(1 - np.array(r["chances"]), HyperPrior().odd) for r in of_it]
+            odd = [(i in found, r["odds"][i]) for r, found in zip(of_it, seen, strict=True) for i in r["odd"]]
             best = [odds > np.quantile(clean, 0.95) for _, odds in odd] if clean else []
-            others = [bool(set(r["named"]) - set(r["odd"])) for r in of_it]
+            others = [bool(set(found) - set(r["odd"])) for r, found in zip(of_it, seen, strict=True)]
             cells = [
                 kind, size, len(of_it), f"{min(kstest(nu[i::2], 'uniform').pvalue for i in (0, 1)):.3f}",
                 *(f"{100 * np.mean(np.abs(u - 0.5) < 0.45):.0f} %" for u in (nu, tau)), f"{100 * robust.mean():.0f} %",
-                sum(r["size"] < 100 for r in of_it), _share([named for named, _ in odd]), _share(best), _share(others),
+                sum(r["size"] < 100 for r in of_it), _share([found for found, _ in odd]), _share(best), _share(others),
                 f"{np.median([r['seconds'] for r in of_it]):.1f}",
             ]  # fmt: skip
             print(f"| {' | '.join(map(str, cells))} |")
@@ -297,7 +298,7 @@ def raised(bubbles: int, kind: str, count: int, errors: tuple[float, float], tau
         def likely(variance: Array, y: Array = y, error: Array = error, aliased: Array = aliased) -> Array:
             std = np.sqrt(error**2 + variance)
             first, second = (norm.pdf(reading, nu[:, None], std) for reading in (y, y - ALIAS[0]))
-            return np.where(aliased, (first + second) / 2, first)
+            return np.asarray(np.where(aliased, (first + second) / 2, first))
 
         belongs, elsewhere = (1 - hyper.odd) * likely(tau**2), middle[1] * likely(tau**2 + hyper.mean_std**2)
         logs = np.log(belongs + elsewhere).sum(axis=0) + log_prior

@@ -146,7 +146,7 @@ TRIGGERS = {
     ),
     "odd-data-set": (
         "the data raise the odds that a data set is not of its population by more than a quarter of the number of data "
-        "sets, and at least twofold, or it could not be sampled; in a joint estimate, where it is serious, one "
+        "sets, and at least fivefold, or it could not be sampled; in a joint estimate, where it is serious, one "
         "disagrees with all others as once in a hundred campaigns by chance"
     ),
     "trend": (

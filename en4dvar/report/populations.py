@@ -200,7 +200,7 @@ def _centre(
     )  # fmt: skip
 
 
-def _told(stored: Mapping[str, StoredPopulation], known: Mapping[str, Mapping[str, str]]) -> dict[str, Told]:
+def _told(stored: Mapping[str, StoredPopulation], known: Mapping[str, Mapping[str, str]]) -> Mapping[str, Told]:
     """Of each population value and std of what is known from elsewhere, in the parameters' units."""
     found = {label: dict(s.known) for label, s in stored.items()}
     for label, texts in known.items():

@@ -162,8 +162,8 @@ def test_one_that_is_odd_in_one_parameter_alone_is_named():
 
 
 def test_more_data_sets_are_named_only_by_more_evidence():
-    """Of three the odds have to rise twofold, of forty tenfold."""
-    for count, factor in ((3, 2.0), (12, 3.0), (40, 10.0)):
+    """Of three the odds have to rise fivefold, of forty tenfold."""
+    for count, factor in ((3, 5.0), (12, 5.0), (40, 10.0)):
         odds = factor * 0.05 / 0.95 * np.array([1.01, 0.99, *[0.1] * (count - 2)])
         assert named(1 / (1 + odds), 0.05) == (0,)
     assert named(np.array([0.0, 1.0, 1.0]), 0.05) == (0,)

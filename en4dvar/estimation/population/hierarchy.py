@@ -39,17 +39,17 @@ from en4dvar.sampling.walkers import advance
 
 MOVES = 5  # of one half of the walkers while the other stands still
 FIT = 3000  # positions that the proposal is fitted to
-RAISED, A_SET = 2.0, 0.25  # times more probably odd by its data, and times the number of sets: named
+RAISED, A_SET = 5.0, 0.25  # times more probably odd by its data, and times the number of sets: named
 
 
 def named(belongs: Array, odd: float) -> tuple[int, ...]:
     """Which data sets are to be named as odd, by the probabilities (S,) to belong: those whose odds, odd/(1 − odd),
-    the data raise by more than S/4, and at least twofold.
+    the data raise by more than S/4, and at least fivefold.
 
     The ratio of the odds is the best test of one data set against the others (Neyman & Pearson 1933); the bound grows
-    with S as so many may be named by chance, and was set so that some 5 % of campaigns of 12 without an odd one name
-    one (``benchmarks/campaigns.py power``). Were a probability of one half asked, half of the bubbles of four times the
-    modulus would be missed, as a wider spread explains them as well.
+    with S as so many may be named by chance, and was set so that fewer than 5 % of campaigns of 12 without an odd one
+    name one (``benchmarks/campaigns.py power``). Were a probability of one half asked, half of the bubbles of four
+    times the modulus would be missed, as a wider spread explains them as well.
     """
     if not odd:
         return ()
