@@ -351,16 +351,19 @@ def read(name: str, x: Array, kind: str, rng: np.random.Generator) -> InversePro
 
 
 def members_of(problem: InverseProblem, at: Array, rng: np.random.Generator) -> Array:
-    """(50, n) about the minimum of J that is near ``at`` (n,), transformed; in white coordinates."""
+    """(50, n) about the lowest minimum of J from ``at`` (n,), transformed, and from four times more or less of G; in
+    white coordinates.
+    """
     data, prior = problem.observations, problem.prior
 
     def residuals(z: Array) -> Array:
         apart = (forecast(problem, prior.from_white(z[None])).predictions[0] - data.values) / data.std
         return np.concatenate([np.nan_to_num(apart, nan=1e3), z])
 
-    found = least_squares(residuals, (at - prior.mean) / prior.std, diff_step=1e-4, x_scale=1.0, max_nfev=15)
-    covariance = np.linalg.inv(found.jac.T @ found.jac)
-    return rng.multivariate_normal(found.x, covariance, 50)
+    starts = [(at + np.log(more) * (np.arange(len(at)) == 0) - prior.mean) / prior.std for more in (1, 4, 0.25)]
+    each = [least_squares(residuals, start, diff_step=1e-4, x_scale=1.0, max_nfev=15) for start in starts]
+    found = min(each, key=lambda one: one.cost)
+    return rng.multivariate_normal(found.x, np.linalg.inv(found.jac.T @ found.jac), 50)
 
 
 def odd(seed: int, size: int, key: str) -> Record:

@@ -15,7 +15,7 @@ from en4dvar.estimation.population.campaign import _empirical, population_of, wh
 from en4dvar.estimation.population.empirical import empirical, median_of
 from en4dvar.estimation.population.hierarchy import Hierarchy, named
 from en4dvar.estimation.population.mixtures import Mixture
-from en4dvar.estimation.population.own import OwnLikelihood
+from en4dvar.estimation.population.own import OwnLikelihood, _pooled
 from en4dvar.model.forward import Failure
 from en4dvar.model.state import NOISE_SCALE, Parameter
 from en4dvar.plumbing.errors import ConfigError
@@ -159,6 +159,20 @@ def test_one_that_is_odd_in_one_parameter_alone_is_named():
     belongs = hierarchy.sampled(1, Effort()).belongs
     assert named(belongs, hyper.odd) == (0,)
     assert belongs[1:].min() > 0.7
+
+
+def test_slopes_are_pooled_by_their_own_errors():
+    """One that is known badly takes the mean of the others; without scatter all take it, with much each keeps its own."""
+    rng = np.random.default_rng(3)
+    errors = np.array([*[0.01] * 20, 1.0])
+    alike = 0.5 + errors * rng.standard_normal(21)
+    one, others = _pooled(alike[:, None, None], errors[:, None, None] ** 2)[[20, 0], 0, 0]
+    assert one == pytest.approx(np.average(alike, weights=errors**-2.0), abs=1e-3)
+    assert others == pytest.approx(one, abs=0.01)
+    differ = alike + rng.standard_normal(21)
+    kept = _pooled(differ[:, None, None], errors[:, None, None] ** 2)[:, 0, 0]
+    np.testing.assert_allclose(kept[:20], differ[:20], atol=0.01)
+    assert abs(kept[20] - differ[20]) > 0.2 * abs(differ[20] - kept[:20].mean())
 
 
 def test_more_data_sets_are_named_only_by_more_evidence():
