@@ -162,7 +162,7 @@ def test_one_that_is_odd_in_one_parameter_alone_is_named():
 
 
 def test_slopes_are_pooled_by_their_own_errors():
-    """One that is known badly takes the mean of the others; without scatter all take it, with much each keeps its own."""
+    """One that is known badly takes the mean of the others; where they differ by more, each keeps its own."""
     rng = np.random.default_rng(3)
     errors = np.array([*[0.01] * 20, 1.0])
     alike = 0.5 + errors * rng.standard_normal(21)
