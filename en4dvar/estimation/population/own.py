@@ -161,8 +161,8 @@ def _slopes(x: Array, theta: Array, effective: float) -> tuple[Array, Array]:
 
 
 def _pooled(slopes: Sequence[Array], variances: Sequence[Array]) -> Array:
-    """(S, p, c): each slope is drawn towards the mean of all by the share of its own error in its scatter (DerSimonian &
-    Laird 1986, Control. Clin. Trials 7, 177).
+    """(S, p, c): each slope is drawn towards the mean of all by the share of its own error in its scatter
+    (DerSimonian & Laird 1986, Control. Clin. Trials 7, 177).
 
     Errors of the slopes that differ from set to set would else look like information about θ; those of a set with
     several modes are many times larger than those of the others.
