@@ -39,14 +39,14 @@ def _numbers(text: str | None) -> tuple[float, ...]:
 
 def _medians(texts: Sequence[str]) -> Known:
     """Run → parameter → value with a standard deviation, as typed. Raises :class:`click.BadParameter`."""
-    found: dict[str, dict[str, str]] = {}
+    medians: dict[str, dict[str, str]] = {}
     for text in texts:
         run, _, rest = text.rpartition(":")
         name, _, value = rest.partition("=")
         if not (run and name and value):
             raise click.BadParameter(f"{text!r} is no median such as 'gel_5:G=5.1 ± 0.2 kPa'")
-        found.setdefault(run, {})[name.strip()] = value.strip()
-    return found
+        medians.setdefault(run, {})[name.strip()] = value.strip()
+    return medians
 
 
 @click.command()

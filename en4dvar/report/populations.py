@@ -31,7 +31,7 @@ from en4dvar.results.population_file import FILE, StoredPopulation, load_populat
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Told = Mapping[str, tuple[float, float]]  # parameter → value and std
+Values = Mapping[str, tuple[float, float]]  # parameter → value and std
 SURE = 0.999  # no number of draws says more
 FAR = 2.5  # standard deviations between what is known and what the data say
 OFF_THE_LINE = 0.05  # probability below which populations differ by more than a line says
@@ -134,7 +134,7 @@ def compare_populations(
         raise OutputError(f"compare: {words}")
     if numbers and (len(numbers) != len(stored) or np.ptp(numbers) == 0 or not np.isfinite(numbers).all()):
         raise OutputError(f"compare: {len(stored)} numbers are needed, one for each run and not all the same")
-    told = _told(stored, known or {})
+    values = _known_medians(stored, known or {})
     keys = {name: _common(s, apart, name) for name, s in stored.items()}
     every = [key for of_one in keys.values() for key in of_one]
     common = tuple(dict.fromkeys(key[0] for key in every if every.count(key) > 1))
@@ -149,7 +149,7 @@ def compare_populations(
     lines: dict[str, StraightLine] = {}
     differences, notes = [], [*_other_priors(every_common, common, apart)]
     for name in names:
-        centres = {label: _centre(name, s, keys[label], seed, told[label]) for label, s in stored.items()}
+        centres = {label: _centre(name, s, keys[label], seed, values[label]) for label, s in stored.items()}
         alone = [replace(c, common=tuple((label, key) for key in c.common)) for label, c in centres.items()]
         medians[name] = _physical(drawn_together([*centres.values()], seed), terms[name])
         independent = _physical(drawn_together(alone, seed), terms[name])
@@ -158,7 +158,7 @@ def compare_populations(
             together, own = medians[name][:, [i, j]].T, independent[:, [i, j]].T
             unit = terms[name][0].parameter.display_unit
             differences.append(Difference.of(name, a, b, unit, together, own, name in logarithmic, " ".join(doubts)))
-        notes += _calibrated(name, stored, told, terms[name][0].parameter, common, medians[name], independent)
+        notes += _calibrated(name, stored, values, terms[name][0].parameter, common, medians[name], independent)
         if held := [label for label, c in centres.items() if c.pulled]:
             notes.append(f"{name}: the data of {', '.join(held)} leave its median open: the hyperprior holds it")
         if numbers:
@@ -189,20 +189,22 @@ def same_readings(stored: Mapping[str, StoredPopulation]) -> str:
 
 
 def _centre(
-    name: str, s: StoredPopulation, keys: tuple[tuple[str, str], ...], seed: int, told: Told
+    name: str, s: StoredPopulation, keys: tuple[tuple[str, str], ...], seed: int, values: Values
 ) -> Centre:  # fmt: skip
     nu = np.stack([s.white(n) for n in s.names], axis=1)
     theta = np.stack([s.white(n) for n in s.common], axis=1) if s.common else np.empty((len(nu), 0))
     attributes = s.tree.attrs
     return without_pull(
         s.names.index(name), nu, theta, keys, float(attributes["hyperprior_mean_std"]),
-        float(attributes["effective_draws"]), seed, [*_known(s, told)],
+        float(attributes["effective_draws"]), seed, [*_known(s, values)],
     )  # fmt: skip
 
 
-def _told(stored: Mapping[str, StoredPopulation], known: Mapping[str, Mapping[str, str]]) -> Mapping[str, Told]:
+def _known_medians(
+    stored: Mapping[str, StoredPopulation], known: Mapping[str, Mapping[str, str]]
+) -> Mapping[str, Values]:
     """Of each population value and std of what is known from elsewhere, in the parameters' units."""
-    found = {label: dict(s.known) for label, s in stored.items()}
+    values = {label: dict(s.known) for label, s in stored.items()}
     for label, texts in known.items():
         if label not in stored:
             raise OutputError(f"compare: {label}, of which something is known: no such run{suggest(label, stored)}")
@@ -216,13 +218,13 @@ def _told(stored: Mapping[str, StoredPopulation], known: Mapping[str, Mapping[st
                 raise OutputError(f"compare: {name} of {label}: {error}") from None
             if not std > 0:
                 raise OutputError(f"compare: {name} of {label}: say how well it is known, such as '9.8 ± 0.3 kPa'")
-            found[label][name] = value, std
-    return found
+            values[label][name] = value, std
+    return values
 
 
-def _known(s: StoredPopulation, told: Told) -> Iterator[tuple[int, float, float]]:
+def _known(s: StoredPopulation, values: Values) -> Iterator[tuple[int, float, float]]:
     """Column of each centre that is known from elsewhere, its value and std in units of its prior."""
-    for name, (value, std) in told.items():
+    for name, (value, std) in values.items():
         term = s.prior_of(name)
         try:
             x = float(term.from_physical(np.array([value]))[0])
@@ -234,19 +236,19 @@ def _known(s: StoredPopulation, told: Told) -> Iterator[tuple[int, float, float]
 def _calibrated(
     name: str,
     stored: Mapping[str, StoredPopulation],
-    told: Mapping[str, Told],
+    values: Mapping[str, Values],
     parameter: Parameter,
     common: Sequence[str],
     together: Array,
     alone: Array,
 ) -> Iterator[str]:
     """What groups that are known from elsewhere do to the median (M, K) of a parameter in the others."""
-    known = [label for label, of_it in told.items() if of_it]
+    known = [label for label, of_it in values.items() if of_it]
     unit = f" {pretty_unit(parameter.display_unit)}" if parameter.display_unit != "1" else ""
     for k, (label, s) in enumerate(stored.items()):
         now, before = (_range(_three(draws[:, k]), plain=True) for draws in (together, alone))
-        if name in told[label]:
-            value, std = (convert(number, parameter.unit, parameter.display_unit) for number in told[label][name])
+        if name in values[label]:
+            value, std = (convert(number, parameter.unit, parameter.display_unit) for number in values[label][name])
             x = convert(
                 s.group("posterior")[f"{name}_{s.headline}"].values.ravel(), parameter.unit, parameter.display_unit
             )
