@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -24,6 +25,7 @@ from en4dvar.plumbing.errors import OutputError
 if TYPE_CHECKING:
     from en4dvar.report.populations import PopulationsCompared
 
+Known = Mapping[str, Mapping[str, str]]  # run → parameter → a median known from elsewhere
 MOST_ROWS = 60  # of estimates on the terminal
 
 
@@ -33,6 +35,18 @@ def _numbers(text: str | None) -> tuple[float, ...]:
         return tuple(map(float, text.split(","))) if text else ()
     except ValueError:
         raise click.BadParameter(f"{text!r} is no list of numbers such as 5,7.5,10") from None
+
+
+def _medians(texts: Sequence[str]) -> Known:
+    """Run → parameter → value with a standard deviation, as typed. Raises :class:`click.BadParameter`."""
+    medians: dict[str, dict[str, str]] = {}
+    for text in texts:
+        run, _, rest = text.rpartition(":")
+        name, _, value = rest.partition("=")
+        if not (run and name and value):
+            raise click.BadParameter(f"{text!r} is no median such as 'gel_5:G=5.1 ± 0.2 kPa'")
+        medians.setdefault(run, {})[name.strip()] = value.strip()
+    return medians
 
 
 @click.command()
@@ -72,11 +86,16 @@ def report(run_dir: Path, datasets: tuple[str, ...], figures: bool) -> None:
     "--apart", multiple=True, metavar="NAME",
     help="A common quantity that each population has a value of its own of, e.g. rho; any number of times.",
 )  # fmt: skip
+@click.option(
+    "--known", multiple=True, metavar="RUN:NAME=VALUE", callback=lambda _, __, texts: _medians(texts),
+    help="A median that is known from elsewhere, by a rheometer for instance, e.g. 'gel_5:G=5.1 ± 0.2 kPa': it "
+    "calibrates what the populations have in common; any number of times.",
+)  # fmt: skip
 @workers_option
 @trust_option
 def compare(
     run_dirs: tuple[Path, ...], out: Path | None, no_report: bool, stored: bool, against: tuple[float, ...],
-    apart: tuple[str, ...], workers: int | None, trust: bool,
+    apart: tuple[str, ...], known: Known, workers: int | None, trust: bool,
 ) -> None:  # fmt: skip
     """Compare runs: posteriors over each other and, on the same data, evidence and model probabilities.
 
@@ -103,7 +122,7 @@ def compare(
 
         echo(sequences_table(compare_sequences(run_dirs)))
         return
-    of = _populations(run_dirs, against, apart, not any(map(has_results, run_dirs)))
+    of = _populations(run_dirs, against, apart, known, not any(map(has_results, run_dirs)))
     comparison = Comparison(()) if of else compare_runs(run_dirs)
     if not (stored or of or comparison.incomparable):
         from en4dvar.runs.evidence_run import sampled_evidences
@@ -122,7 +141,7 @@ def compare(
 
 
 def _populations(
-    run_dirs: tuple[Path, ...], against: tuple[float, ...], apart: tuple[str, ...], alone: bool
+    run_dirs: tuple[Path, ...], against: tuple[float, ...], apart: tuple[str, ...], known: Known, alone: bool
 ) -> PopulationsCompared | None:
     """The populations of the runs side by side, told on standard output; None where there are none to compare.
 
@@ -132,11 +151,11 @@ def _populations(
     from en4dvar.report.populations import compare_populations, hold_populations, medians_table, sentences
 
     held = hold_populations(run_dirs)
-    asked = (held and alone) or against or apart
+    asked = (held and alone) or against or apart or known
     if not (asked or held):
         return None
     try:
-        of = compare_populations(run_dirs, against, apart)
+        of = compare_populations(run_dirs, against, apart, known=known)
     except OutputError as error:
         if asked:
             raise

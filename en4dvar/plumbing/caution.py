@@ -145,8 +145,9 @@ TRIGGERS = {
         "three times the prior's share"
     ),
     "odd-data-set": (
-        "a data set of a population belongs to it with a probability below 0.5, or could not be sampled; in a joint "
-        "estimate, where it is serious, one disagrees with all others as once in a hundred campaigns by chance"
+        "the data raise the odds that a data set is not of its population by more than a quarter of the number of data "
+        "sets, and at least fivefold, or it could not be sampled; in a joint estimate, where it is serious, one "
+        "disagrees with all others as once in a hundred campaigns by chance"
     ),
     "trend": (
         "values of single data sets rise or fall with their order, largest reading or frame rate, as once in a hundred "

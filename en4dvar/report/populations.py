@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from en4dvar.config.sharing import reference_value
 from en4dvar.diagnosis.intervals import member_quantiles
 from en4dvar.estimation.population.contrast import Centre, StraightLine, drawn_together, line, without_pull
 from en4dvar.model.state import Array, Parameter
@@ -18,7 +19,7 @@ from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.files import write_text
 from en4dvar.plumbing.hints import suggest
 from en4dvar.plumbing.tables import csv_text, table
-from en4dvar.plumbing.units import convert
+from en4dvar.plumbing.units import UnitError, convert
 from en4dvar.priors.prior import PriorTerm
 from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, in_columns
 from en4dvar.report.compare import named
@@ -30,6 +31,7 @@ from en4dvar.results.population_file import FILE, StoredPopulation, load_populat
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+Values = Mapping[str, tuple[float, float]]  # parameter → value and std
 SURE = 0.999  # no number of draws says more
 FAR = 2.5  # standard deviations between what is known and what the data say
 OFF_THE_LINE = 0.05  # probability below which populations differ by more than a line says
@@ -109,17 +111,20 @@ def compare_populations(
     numbers: Sequence[float] = (),
     apart: Sequence[str] = (),
     seed: int = 1,
+    known: Mapping[str, Mapping[str, str]] | None = None,
 ) -> PopulationsCompared:
     """Compare the populations behind runs, e.g. of two gels; ``runs``: folders, or name → folder.
 
     Quantities that are common to the data sets of each population, of the same name and prior, have one value in all
     populations, but for those named ``apart``. ``numbers``: of each run one, e.g. a concentration, that the medians are
-    seen as a straight line of.
+    seen as a straight line of. ``known``: of a run medians that are known from elsewhere, {"G": "9.8 ± 0.3 kPa"},
+    which calibrate what is common; they go before those of its configuration.
 
     Raises
     ------
     OutputError: fewer than two, no population in a folder or one of an earlier version, no parameter of all of them,
-        data sets that two of them hold, not a number for each or all the same, a name that nothing common has.
+        data sets that two of them hold, not a number for each or all the same, a name that nothing common has; what is
+        known of no run or no parameter, or is no value with a standard deviation.
     """
     stored = {name: _stored(Path(run)) for name, run in named(runs).items()}
     names = [n for n in next(iter(stored.values())).names if all(n in s.names for s in stored.values())]
@@ -129,20 +134,22 @@ def compare_populations(
         raise OutputError(f"compare: {words}")
     if numbers and (len(numbers) != len(stored) or np.ptp(numbers) == 0 or not np.isfinite(numbers).all()):
         raise OutputError(f"compare: {len(stored)} numbers are needed, one for each run and not all the same")
+    values = _known_medians(stored, known or {})
     keys = {name: _common(s, apart, name) for name, s in stored.items()}
     every = [key for of_one in keys.values() for key in of_one]
     common = tuple(dict.fromkeys(key[0] for key in every if every.count(key) > 1))
-    known = tuple(dict.fromkeys(n for s in stored.values() for n in s.common))
+    every_common = tuple(dict.fromkeys(n for s in stored.values() for n in s.common))
     for name in apart:
-        if name not in known:
-            raise OutputError(f"compare: {name}: not common to the data sets of any population{suggest(name, known)}")
+        if name not in every_common:
+            hint = suggest(name, every_common)
+            raise OutputError(f"compare: {name}: not common to the data sets of any population{hint}")
     terms = {name: [s.prior_of(name) for s in stored.values()] for name in names}
     logarithmic = frozenset(name for name in names if all(t.transform == "lognormal" for t in terms[name]))
     medians: dict[str, Array] = {}
     lines: dict[str, StraightLine] = {}
-    differences, notes = [], [*_other_priors(known, common, apart)]
+    differences, notes = [], [*_other_priors(every_common, common, apart)]
     for name in names:
-        centres = {label: _centre(name, s, keys[label], seed) for label, s in stored.items()}
+        centres = {label: _centre(name, s, keys[label], seed, values[label]) for label, s in stored.items()}
         alone = [replace(c, common=tuple((label, key) for key in c.common)) for label, c in centres.items()]
         medians[name] = _physical(drawn_together([*centres.values()], seed), terms[name])
         independent = _physical(drawn_together(alone, seed), terms[name])
@@ -151,7 +158,7 @@ def compare_populations(
             together, own = medians[name][:, [i, j]].T, independent[:, [i, j]].T
             unit = terms[name][0].parameter.display_unit
             differences.append(Difference.of(name, a, b, unit, together, own, name in logarithmic, " ".join(doubts)))
-        notes += _calibrated(name, stored, terms[name][0].parameter, common, medians[name], independent)
+        notes += _calibrated(name, stored, values, terms[name][0].parameter, common, medians[name], independent)
         if held := [label for label, c in centres.items() if c.pulled]:
             notes.append(f"{name}: the data of {', '.join(held)} leave its median open: the hyperprior holds it")
         if numbers:
@@ -181,19 +188,43 @@ def same_readings(stored: Mapping[str, StoredPopulation]) -> str:
     return ""
 
 
-def _centre(name: str, s: StoredPopulation, keys: tuple[tuple[str, str], ...], seed: int) -> Centre:
+def _centre(
+    name: str, s: StoredPopulation, keys: tuple[tuple[str, str], ...], seed: int, values: Values
+) -> Centre:  # fmt: skip
     nu = np.stack([s.white(n) for n in s.names], axis=1)
     theta = np.stack([s.white(n) for n in s.common], axis=1) if s.common else np.empty((len(nu), 0))
     attributes = s.tree.attrs
     return without_pull(
         s.names.index(name), nu, theta, keys, float(attributes["hyperprior_mean_std"]),
-        float(attributes["effective_draws"]), seed, [*_known(s)],
+        float(attributes["effective_draws"]), seed, [*_known(s, values)],
     )  # fmt: skip
 
 
-def _known(s: StoredPopulation) -> Iterator[tuple[int, float, float]]:
+def _known_medians(
+    stored: Mapping[str, StoredPopulation], known: Mapping[str, Mapping[str, str]]
+) -> Mapping[str, Values]:
+    """Of each population value and std of what is known from elsewhere, in the parameters' units."""
+    values = {label: dict(s.known) for label, s in stored.items()}
+    for label, texts in known.items():
+        if label not in stored:
+            raise OutputError(f"compare: {label}, of which something is known: no such run{suggest(label, stored)}")
+        for name, text in texts.items():
+            if name not in stored[label].names:
+                hint = suggest(name, stored[label].names)
+                raise OutputError(f"compare: {name}: not a parameter of the population of {label}{hint}")
+            try:
+                value, std = reference_value(text, stored[label].prior_of(name).parameter.unit)
+            except UnitError as error:
+                raise OutputError(f"compare: {name} of {label}: {error}") from None
+            if not std > 0:
+                raise OutputError(f"compare: {name} of {label}: say how well it is known, such as '9.8 ± 0.3 kPa'")
+            values[label][name] = value, std
+    return values
+
+
+def _known(s: StoredPopulation, values: Values) -> Iterator[tuple[int, float, float]]:
     """Column of each centre that is known from elsewhere, its value and std in units of its prior."""
-    for name, (value, std) in s.known.items():
+    for name, (value, std) in values.items():
         term = s.prior_of(name)
         try:
             x = float(term.from_physical(np.array([value]))[0])
@@ -205,18 +236,19 @@ def _known(s: StoredPopulation) -> Iterator[tuple[int, float, float]]:
 def _calibrated(
     name: str,
     stored: Mapping[str, StoredPopulation],
+    values: Mapping[str, Values],
     parameter: Parameter,
     common: Sequence[str],
     together: Array,
     alone: Array,
 ) -> Iterator[str]:
     """What groups that are known from elsewhere do to the median (M, K) of a parameter in the others."""
-    known = [label for label, s in stored.items() if s.known]
+    known = [label for label, of_it in values.items() if of_it]
     unit = f" {pretty_unit(parameter.display_unit)}" if parameter.display_unit != "1" else ""
     for k, (label, s) in enumerate(stored.items()):
         now, before = (_range(_three(draws[:, k]), plain=True) for draws in (together, alone))
-        if name in s.known:
-            value, std = (convert(number, parameter.unit, parameter.display_unit) for number in s.known[name])
+        if name in values[label]:
+            value, std = (convert(number, parameter.unit, parameter.display_unit) for number in values[label][name])
             x = convert(
                 s.group("posterior")[f"{name}_{s.headline}"].values.ravel(), parameter.unit, parameter.display_unit
             )

@@ -27,8 +27,6 @@ from en4dvar.runs.finished import Finished, carried
 from en4dvar.runs.together import SetGroup, Tell, TogetherKind
 from en4dvar.runs.trust import Ask
 
-ODD = 0.5  # probability from which a data set is named as odd
-
 
 def population(
     run_dirs: Sequence[Path],
@@ -155,15 +153,11 @@ def _cautions(population: CampaignPopulation) -> Iterator[Caution]:
         words = f"only {population.estimate.size:.0f} effective draws stand behind the population"
         advice = "the median of the data sets one by one, which needs none, stands in the place of its numbers"
         yield replace(caution("chain-not-converged", words), advice=advice)
-    odd = [
-        f"{problem.observations.name} (with probability {share:.2g})"
-        for problem, share in zip(population.problems, 1 - population.belongs, strict=True)
-        if share > ODD
-    ]
-    if odd:
-        yield caution(
-            "odd-data-set", f"not of the population: {', '.join(odd)}; mean and spread are those of the others"
-        )
+    if population.odd:
+        names, chances = [p.observations.name for p in population.problems], 1 - population.belongs
+        odd = [f"{names[s]} (with probability {chances[s]:.2g})" for s in population.odd]
+        words = f"perhaps not of the population, where {population.hyper.odd:.2g} was expected: {', '.join(odd)}"
+        yield caution("odd-data-set", f"{words}; as far as they are not, mean and spread are those of the others")
     for name, reason in population.left_out.items():
         yield caution("odd-data-set", f"{name} is left out: {reason}")
     for name, share in zip(population.names, population.learned[0], strict=True):

@@ -13,14 +13,14 @@ from en4dvar.data.noise import noise_of
 from en4dvar.estimation.population import Effort, HyperPrior
 from en4dvar.estimation.population.campaign import _empirical, population_of, white_prior
 from en4dvar.estimation.population.empirical import empirical, median_of
-from en4dvar.estimation.population.hierarchy import Hierarchy
+from en4dvar.estimation.population.hierarchy import Hierarchy, named
 from en4dvar.estimation.population.mixtures import Mixture
-from en4dvar.estimation.population.own import OwnLikelihood
+from en4dvar.estimation.population.own import OwnLikelihood, _pooled
 from en4dvar.model.forward import Failure
 from en4dvar.model.state import NOISE_SCALE, Parameter
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.priors.prior import Prior, PriorTerm, member_stream
-from en4dvar.runs.population_run import ODD, _cautions
+from en4dvar.runs.population_run import _cautions
 
 STD, SETS, SLOPE = 0.3, 8, 0.5
 A, B = (Parameter(name, "m") for name in "ab")
@@ -79,7 +79,7 @@ def exact(problems, hyper, common=OF_D.std):
     for best, variance in likely(problems).T:
         inside = norm(best, np.sqrt(variance + tau**2)).logpdf(m[:, None])
         outside = norm(0.6, np.sqrt(variance + wide**2)).pdf(best)
-        elsewhere = norm(best, np.sqrt(variance + tau**2 + (0.9 * hyper.spread) ** 2)).pdf(m[:, None])
+        elsewhere = norm(best, np.sqrt(variance + tau**2 + (0.9 * hyper.mean_std) ** 2)).pdf(m[:, None])
         odd = np.log(hyper.odd / 2) + np.log(outside + elsewhere) if hyper.odd else -np.inf
         log = log + np.logaddexp(np.log1p(-hyper.odd) + inside, odd)
     weights = np.exp(log - log.max()) * np.gradient(tau)
@@ -149,7 +149,7 @@ def test_one_that_is_odd_in_one_parameter_alone_is_named():
         for row in y
     ]
     hierarchy, h = Hierarchy(likelihoods, white_prior(["a", "b"]), hyper), np.array([[0.3, -0.2, *np.log([0.1, 0.2])]])
-    variances = np.array([[0.01, 0.04], [0.01 + 0.25, 0.04], [0.01, 0.04 + 0.25]]) + error**2
+    variances = np.array([[0.01, 0.04], [0.01 + 1, 0.04], [0.01, 0.04 + 1]]) + error**2
     under_prior = norm(0, np.hypot(1, error)).pdf(y).prod(axis=1)
     exact_parts = [norm(h[0, :2], np.sqrt(v)).pdf(y).prod(axis=1) / under_prior for v in variances]
     shares = np.array([0.95, 0.025, 0.0125, 0.0125])
@@ -157,8 +157,31 @@ def test_one_that_is_odd_in_one_parameter_alone_is_named():
     np.testing.assert_allclose(np.exp(hierarchy.log_parts(h)[0]), expected, rtol=1e-8)
     np.testing.assert_allclose(hierarchy.belongs(h)[0], expected / expected.sum(axis=1, keepdims=True), rtol=1e-8)
     belongs = hierarchy.sampled(1, Effort()).belongs
-    assert belongs[0] < 1 - ODD
+    assert named(belongs, hyper.odd) == (0,)
     assert belongs[1:].min() > 0.7
+
+
+def test_slopes_are_pooled_by_their_own_errors():
+    """One that is known badly takes the mean of the others; where they differ by more, each keeps its own."""
+    rng = np.random.default_rng(3)
+    errors = np.array([*[0.01] * 20, 1.0])
+    alike = 0.5 + errors * rng.standard_normal(21)
+    one, others = _pooled(alike[:, None, None], errors[:, None, None] ** 2)[[20, 0], 0, 0]
+    assert one == pytest.approx(np.average(alike, weights=errors**-2.0), abs=1e-3)
+    assert others == pytest.approx(one, abs=0.01)
+    differ = alike + rng.standard_normal(21)
+    kept = _pooled(differ[:, None, None], errors[:, None, None] ** 2)[:, 0, 0]
+    np.testing.assert_allclose(kept[:20], differ[:20], atol=0.01)
+    assert abs(kept[20] - differ[20]) > 0.2 * abs(differ[20] - kept[:20].mean())
+
+
+def test_more_data_sets_are_named_only_by_more_evidence():
+    """Of three the odds have to rise fivefold, of forty tenfold."""
+    for count, factor in ((3, 5.0), (12, 5.0), (40, 10.0)):
+        odds = factor * 0.05 / 0.95 * np.array([1.01, 0.99, *[0.1] * (count - 2)])
+        assert named(1 / (1 + odds), 0.05) == (0,)
+    assert named(np.array([0.0, 1.0, 1.0]), 0.05) == (0,)
+    assert named(np.array([1.0, 1.0, 1.0]), 0.0) == ()
 
 
 def test_uncertain_errors_are_quantities_of_each_data_set():

@@ -77,6 +77,20 @@ def test_the_command_its_page_and_tables(gels, tmp_path):
     assert float(of_line["slope_q50"]) == pytest.approx(-np.log(float(row["ratio_q50"])) / 5, rel=0.02)
 
 
+def test_a_known_median_is_taken_as_it_is_and_compared_with_the_data(gels):
+    """Nothing is common, so that it tells of its own population alone: the draws of a normal reading."""
+    before = en4dvar.compare_populations(only(gels)).medians["k"]
+    value = float(np.median(before[:, 1]))
+    found = en4dvar.compare_populations(only(gels), known={"stiff_only": {"k": f"{value} ± 0.001 N/m"}})
+    assert found.medians["k"][:, 1].std() == pytest.approx(0.001, rel=0.1)
+    assert np.median(found.medians["k"][:, 1]) == pytest.approx(value, abs=0.001)
+    np.testing.assert_array_equal(found.medians["k"][:, 0], before[:, 0])
+    assert any("k of stiff_only is known" in note for note in found.notes)
+    assert "Nothing is common" in str(found)
+    far = en4dvar.compare_populations(only(gels), known={"stiff_only": {"k": f"{4 * value} ± 0.001 N/m"}})
+    assert "its own data say otherwise" in str(far)
+
+
 def test_runs_of_two_gels_are_compared_by_their_populations_and_by_nothing_else(gels, tmp_path):
     runs = [tmp_path / "soft", tmp_path / "stiff"]
     for run, gel, held in zip(runs, gels, only(gels), strict=True):
@@ -107,6 +121,11 @@ def test_runs_of_two_gels_are_compared_by_their_populations_and_by_nothing_else(
         (["--against", "5,5"], "not all the same"),
         (["--against", "5;6"], "no list of numbers"),
         (["--apart", "rho"], "rho: not common to the data sets of any population"),
+        (["--known", "stiff_only:k"], "is no median such as"),
+        (["--known", "stif_only:k=3 ± 0.1"], "stif_only, of which something is known: no such run"),
+        (["--known", "stiff_only:G=3 ± 0.1"], "G: not a parameter of the population of stiff_only"),
+        (["--known", "stiff_only:k=3 N/m"], "say how well it is known"),
+        (["--known", "stiff_only:k=3 ± 1 kPa"], "k of stiff_only: "),
     ],
 )
 def test_bad_questions(gels, tmp_path, more, words):

@@ -20,7 +20,7 @@ from en4dvar.estimation.population.effort import Effort
 from en4dvar.estimation.population.empirical import Empirical, empirical
 from en4dvar.estimation.population.estimate import FEWEST_SETS as FEWEST_SETS
 from en4dvar.estimation.population.estimate import Population, moments
-from en4dvar.estimation.population.hierarchy import Hierarchy, HierarchyDraws
+from en4dvar.estimation.population.hierarchy import Hierarchy, HierarchyDraws, named
 from en4dvar.estimation.population.hyper import HyperPrior
 from en4dvar.estimation.population.own import OwnDraws, OwnLikelihood, own_draws, own_likelihoods
 from en4dvar.executor import Executor, one_blas_thread
@@ -81,6 +81,11 @@ class CampaignPopulation:
     def terms(self) -> tuple[PriorTerm, ...]:
         """Priors of ``names``, the same in all data sets."""
         return terms_of(self.problems, self.names)
+
+    @property
+    def odd(self) -> tuple[int, ...]:
+        """Numbers of the data sets that are named as odd."""
+        return named(self.belongs, self.hyper.odd)
 
     @property
     def learned(self) -> tuple[Array, Array]:

@@ -40,6 +40,7 @@ WALKERS, MOVES, WALKED = 80, 5, 16  # moves of half of them while the other half
 MOST_PARTS, ROUNDS = 4, 60  # components of a mixture; rounds of expectation maximisation
 BESIDE = 1e-3  # prior standard deviations that runs for readings that one lacks are apart
 NARROWEST = 0.03  # standard deviation of what is drawn about the members, in units of the prior
+SMALLEST = 1e-12  # variance that every slope is taken to have
 INFORMED = 0.1  # least share of the prior's variance that the data take away, for a slope to be read from draws
 
 
@@ -163,14 +164,20 @@ def _slopes(x: Array, theta: Array, effective: float) -> tuple[Array, Array]:
 
 
 def _pooled(slopes: Sequence[Array], variances: Sequence[Array]) -> Array:
-    """(S, p, c): each slope is drawn towards the mean of all by the share of their scatter that is error of the draws.
+    """(S, p, c): each slope is drawn towards the mean of all by the share of its own error in its scatter
+    (DerSimonian & Laird 1986, Control. Clin. Trials 7, 177).
 
-    Errors of the slopes that differ from set to set would else look like information about θ.
+    Errors of the slopes that differ from set to set would else look like information about θ; those of a set with
+    several modes are many times larger than those of the others.
     """
-    each, mean = np.array(slopes), np.mean(slopes, axis=0)
-    scatter = each.var(axis=0, ddof=1)
-    kept = 1 - np.mean(variances, axis=0) / np.maximum(scatter, np.finfo(float).tiny)
-    return np.asarray(mean + np.maximum(kept, 0.0) * (each - mean))
+    each, errors = np.array(slopes), np.maximum(np.array(variances), SMALLEST)
+    weights = 1 / errors
+    apart = each - np.sum(weights * each, axis=0) / weights.sum(axis=0)
+    beyond = np.sum(weights * apart**2, axis=0) - (len(each) - 1)
+    scatter = np.maximum(beyond, 0.0) / (weights.sum(axis=0) - np.sum(weights**2, axis=0) / weights.sum(axis=0))
+    weights = 1 / (scatter + errors)
+    mean = np.sum(weights * each, axis=0) / weights.sum(axis=0)
+    return np.asarray(mean + scatter * weights * (each - mean))
 
 
 def _fitted(x: Array, effective: float, stream: np.random.Generator) -> tuple[Array, Array, Array]:
