@@ -27,10 +27,10 @@ from en4dvar.plumbing.units import convert
 MOST_REMARKS = 3
 MOST_BRIEF = 4  # parameters in one line
 INTERVAL = ("std", "q05", "q50", "q95", "dfs")  # what is not printed where it is not to be trusted
-LITTLE = "data say little"
+LITTLE, AS_WIDE = "data say little", "not narrowed by the data"
 MODAL = "of several modes: quantiles, no mean ± std"
 DFS_WORDS = (
-    (HARDLY_INFORMED, "not narrowed by the data"),
+    (HARDLY_INFORMED, AS_WIDE),
     (0.5, "weakly informed"),
     (0.9, "informed"),
     (math.inf, "determined by the data"),

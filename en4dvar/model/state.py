@@ -90,7 +90,7 @@ READING_OFFSET = Parameter(
     name="reading_offset",
     unit="1",
     label="offset of the readings",
-    symbol="$c$",
+    symbol="$d$",
     source="what all readings are too large by, in the unit of the observable; a model's own parameter goes before it",
     common=True,
 )

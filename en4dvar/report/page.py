@@ -8,6 +8,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from en4dvar.diagnosis.diagnostics import chi2_interval
+from en4dvar.diagnosis.honesty.checks import MOVED
+from en4dvar.estimation.summary import AS_WIDE, ParameterSummary
 from en4dvar.plumbing.caution import worst_first
 from en4dvar.plumbing.units import convert
 from en4dvar.report import readings
@@ -50,6 +52,8 @@ def render_set(
         configuration=str(attributes.get("configuration", "")),
         stats=judged.attrs,
         rows=result.rows,
+        stated=[row.label for row in result.rows if _as_stated(row)],
+        lead=[row for row in result.rows if not _as_stated(row)],
         dfs_words=DFS_WORDS,
         trust=trust(result),
         cautions=result.cautions,
@@ -73,6 +77,11 @@ def render_set(
         settings=_settings(result),
         provenance=provenance_rows(attributes),
     )
+
+
+def _as_stated(row: ParameterSummary) -> bool:
+    """Whether the data have neither narrowed nor moved it, and no warning says so: what was known from elsewhere."""
+    return row.informed == AS_WIDE and abs(row.mean - row.prior_mean) < MOVED * row.prior_std
 
 
 def trust(result: StoredResult) -> str:

@@ -73,10 +73,25 @@ def test_the_page_answers_in_the_order_of_the_questions(analysis):
     ]
     assert places == sorted(places)
     first = body[: body.index("<h2>More")]
-    assert first.count("90 %: ") == len(analysis.parameters)
+    assert first.count("90 %: ") == len(analysis.parameters) - 1  # of the time shift the data say nothing new
     shown = re.sub(r"<[^>]+>", " ", re.sub(r"<details.*?</details>|title=\"[^\"]*\"", "", first, flags=re.S))
     assert [word for word in JARGON if word.lower() in shown.lower()] == []
     assert 'id="d0-iterations"' in body[body.index("<details") :]
+
+
+def test_what_the_data_leave_as_stated_is_one_line_unless_they_moved_it(analysis):
+    def lead_and_rest(members):
+        page = page_of(replace(analysis, posterior=members, cautions=()))
+        return page[page.index('class="lead"') :].lower().split("</table>", 1)
+
+    label = analysis.parameters[-1].label
+    lead, rest = lead_and_rest(analysis.posterior)
+    assert label not in lead
+    assert re.search(f"as stated beforehand[^<]*: {label}.</p>", rest)
+    moved = analysis.posterior + np.eye(len(analysis.parameters))[-1] * analysis.prior[:, -1].std()
+    lead, rest = lead_and_rest(moved)
+    assert label in lead
+    assert "as stated beforehand" not in rest
 
 
 def test_warnings_stand_where_else_the_trust_is_told(analysis):
