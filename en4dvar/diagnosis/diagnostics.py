@@ -112,7 +112,7 @@ def gaussianity(members: Array, centre: Array, costs: Array) -> dict[str, float]
         return {"gaussian_fit": math.nan}
     about_mean = members - np.add.reduce(members, axis=0) / len(members)
     covariance = about_mean.T @ about_mean / (len(members) - 1)
-    squares = np.einsum("ij,ji->i", anomalies, np.linalg.solve(covariance, anomalies.T))
+    squares = np.einsum("ij,ji->i", anomalies, np.linalg.pinv(covariance, hermitian=True) @ anomalies.T)
     return {"gaussian_fit": effective_share(np.where(alive, 0.5 * squares - costs, -np.inf))}
 
 
