@@ -111,8 +111,10 @@ def gaussianity(members: Array, centre: Array, costs: Array) -> dict[str, float]
     if int(alive.sum()) < members.shape[1] + 2:
         return {"gaussian_fit": math.nan}
     about_mean = members - np.add.reduce(members, axis=0) / len(members)
-    covariance = about_mean.T @ about_mean / (len(members) - 1)
-    squares = np.einsum("ij,ji->i", anomalies, np.linalg.pinv(covariance, hermitian=True) @ anomalies.T)
+    scale = np.maximum(about_mean.std(axis=0, ddof=1), np.finfo(float).tiny)  # units differ by many powers of ten
+    about_mean, anomalies = about_mean / scale, anomalies / scale
+    correlation = about_mean.T @ about_mean / (len(members) - 1)
+    squares = np.einsum("ij,ji->i", anomalies, np.linalg.pinv(correlation, hermitian=True) @ anomalies.T)
     return {"gaussian_fit": effective_share(np.where(alive, 0.5 * squares - costs, -np.inf))}
 
 

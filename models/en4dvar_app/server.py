@@ -19,12 +19,13 @@ from tornado.netutil import bind_sockets
 from en4dvar.plumbing.errors import En4dvarError
 from en4dvar_app import job, pictures, steps
 from en4dvar_app.trusted import below
+from en4dvar_movie.frames import IMAGES, MOVING, TIFF
 
 HERE = Path(__file__).parent
 LARGEST = 1_000_000  # bytes of a request: a configuration or corrections, never a movie
-MOVIES = (".mp4", ".avi", ".mov", ".mkv", ".gif", ".tif", ".tiff", ".raw")
+MOVIES = (*MOVING, ".raw")
 FRAMES, TABLES, CONFIGS = (
-    (".tif", ".tiff", ".png"),
+    (*TIFF, *IMAGES),
     (".csv", ".txt", ".dat", ".tsv", ".xlsx", ".mat"),
     (".yaml", ".yml"),
 )

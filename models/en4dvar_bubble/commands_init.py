@@ -26,7 +26,7 @@ _OF_MOVIE = ("pixel", "frame_rate", "exposure", "flashes", "raw", "corrections",
 _OF_LAYOUT = ("by", "sheet", "unsorted", "repeated", "format")
 _OF_COLUMNS = ("time_unit", "radius_unit", "time_column", "radius_column", "time_step", "frame_rate", "pixel")
 _KEY = re.compile(rf"data\.({'|'.join(_OF_LAYOUT)})\b(?:: (\w+))?")
-_MOVIES = (".tif", ".tiff", ".png", ".gif", ".mp4", ".avi", ".mov", ".mkv", ".cine")
+_MOVIES = (".tif", ".tiff", ".png", ".bmp", ".jpg", ".jpeg", ".gif", ".mp4", ".avi", ".mov", ".mkv", ".cine")
 
 
 @click.command()

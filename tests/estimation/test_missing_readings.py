@@ -58,7 +58,7 @@ class OfRun(Gappy):
 
     def __call__(self, path):
         values = np.array(self.operator(path), dtype=float)
-        rng = np.random.default_rng(np.ascontiguousarray(path.states[0]).view(np.uint64))
+        rng = np.random.default_rng(np.round(1e6 * path.states[0]).astype(np.int64).view(np.uint64))
         values[rng.random(values.shape) < self.share] = np.nan
         return values
 
@@ -101,8 +101,7 @@ def test_a_field_keeps_its_width(localisation, operators):
     """With fewer members than cells."""
     whole, gappy = (field(operator, 28, localisation) for operator in operators)
     wide = whole.fields[0].std
-    # which readings are missing hangs on the last bits of a run: on another processor a member may lack all six
-    assert sum(map(bool, gappy.posterior_failures)) <= 1
+    assert not any(gappy.posterior_failures)
     assert np.mean(gappy.fields[0].std / wide) == pytest.approx(1.0, abs=0.05)
     assert (
         np.sqrt(np.mean(((gappy.fields[0].mean - whole.fields[0].mean) / wide) ** 2)) < 0.3

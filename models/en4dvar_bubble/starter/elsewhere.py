@@ -60,7 +60,7 @@ def known(medium: str) -> Sequence[Known]:
 
 
 def centred(model: BubbleModel, medium: str) -> BubbleModel:
-    """The model with the medians of what is known: 3 % of density are a factor of 1.6 of a gel's modulus."""
+    """The model with the medians of what is known: 1 % of density is half a kPa of a gel's modulus."""
     medians = {quantity.key: quantity.median for quantity in known(medium)}
     rho, c = parse_quantity(medians["rho"], "kg/m^3"), parse_quantity(medians["c"], "m/s")
     return replace(model, medium=replace(model.medium, rho=rho, c=c, p_inf=parse_quantity(medians["p_inf"], "Pa")))
