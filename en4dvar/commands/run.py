@@ -133,6 +133,7 @@ def _tell_what_sets_share(directory: Path, warnings: _Warnings) -> None:
 
         together = joint_file.load_joint(directory / joint_file.FILE)
         echo(f"\n{joint_table(together)}")
+        warnings.joint = True
         warnings.add("all together", together.cautions, whole=True)
     groups = population_file.load_groups_of(directory)
     if groups:
@@ -159,6 +160,7 @@ class _Warnings:
         self.counts = Counter[str]()  # of data sets
         self.sets = 0
         self.wholes: dict[str, list[str]] = {}  # code → what is estimated of several data sets and has it
+        self.joint = False  # single data sets only begin a joint estimate
 
     def add(self, name: str, cautions: Sequence[Caution], whole: bool = False) -> None:
         """Of a data set; ``whole``: of an estimate of several of them."""
@@ -175,10 +177,17 @@ class _Warnings:
             self.of[caution.code] = sorted(told, key=lambda entry: entry[0])[:MOST_TOLD]
 
     def lines(self) -> Iterator[str]:
-        """One for each kind, the worst first; of a single data set one for each warning."""
+        """One for each kind, the worst first; of a single data set one for each warning.
+
+        Where a joint estimate follows, what is less than serious in its single data sets is one line.
+        """
+        begun = []
         for told in sorted(self.of.values(), key=lambda entries: entries[0][2].rank):
             _, name, worst = told[0]
             count, wholes = self.counts[worst.code], self.wholes.get(worst.code, [])
+            if self.joint and not wholes and worst.severity != "serious":
+                begun.append(f"{worst.code} in {count}")
+                continue
             if count + len(wholes) == 1:
                 yield from (f"{caution.kind}: {name}: {caution}" for _, _, caution in told)
                 continue
@@ -186,6 +195,9 @@ class _Warnings:
             if count > MOST_NAMED:
                 which[0] = f"{count} of {self.sets} data sets, worst {which[0]}"
             yield f"{worst.kind}: {', '.join([*which, *wholes])}: {worst.code}; {worst.advice}"
+        if begun:
+            codes = ", ".join(begun)
+            yield f"note: the fits of the {self.sets} single data sets only begin the joint estimate: {codes}"
         if self.sets > 1 and self.of:
             yield "what was found in each of them: run.log and the report"
 

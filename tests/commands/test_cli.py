@@ -273,6 +273,19 @@ def test_warnings_of_a_campaign_are_counted_by_kind(tmp_path: Path, capsys: pyte
     assert [line.split(":")[0] for line in capsys.readouterr().err.splitlines()] == ["warning", "note"]
 
 
+def test_warnings_of_fits_that_only_begin_a_joint_estimate_are_one_line() -> None:
+    """What is serious in one of them is told as ever, and so is what the joint estimate has too."""
+    told = _Warnings()
+    told.joint = True
+    for n in range(6):
+        told.add(f"set{n}", [caution("non-gaussian", "bent"), caution("not-informed", "k"), caution("misfit", "χ²")])
+    told.add("all together", [caution("not-informed", "c")], whole=True)
+    serious, of_both, begun, _ = told.lines()
+    assert serious.startswith("warning: 6 of 6 data sets, worst set0, set1, set2: misfit; ")
+    assert of_both.startswith("note: 6 of 6 data sets, worst set0, set1, set2, all together: not-informed; ")
+    assert begun == "note: the fits of the 6 single data sets only begin the joint estimate: non-gaussian in 6"
+
+
 def test_what_sets_have_together_is_no_data_set(tmp_path: Path) -> None:
     """Of populations the warnings are told by name, beside the count of data sets."""
     told = _Warnings()

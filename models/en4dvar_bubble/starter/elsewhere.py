@@ -42,7 +42,7 @@ class Known:
 SCALE = Known(READING_SCALE.name, "1", 0.005, "size of a pixel: a calibration target tells it to about 0.5 %")
 PRESSURE = Known("p_inf", "101.3 kPa", 0.01, "weather moves it by 1 %, 100 m of height take 1.2 %: give yours")
 _OF_ANY = (
-    Known("rho", "1030 kg/m^3", 0.017, "density: from water, 997, to what rheometry codes take for gels, 1060 to 1064"),
+    Known("rho", "1030 kg/m^3", 0.02, "density: of 90 % from water, 997, to what rheometry codes take for gels, 1064"),
     Known("c", "1510 m/s", 0.015, "speed of sound: from water, 1497 m/s, to gels of 15 % of polymer, 1540 m/s"),
 )
 
