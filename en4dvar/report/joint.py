@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
 
+from en4dvar.diagnosis.diagnostics import HARDLY_INFORMED
+from en4dvar.diagnosis.honesty.checks import MOVED
 from en4dvar.diagnosis.intervals import METHOD, member_quantiles
 from en4dvar.estimation.summary import ParameterSummary, estimate_cells
 from en4dvar.model.state import Parameter
@@ -24,6 +26,7 @@ from en4dvar.results.joint_file import QUANTILES, StoredGroups, StoredJoint
 
 MOST_FITS = 12  # panels of the figure
 NOTHING = np.full(1, np.nan)
+NINETY = 3.2897073  # std of a normal distribution between its 5 and 95 %
 CAPTION = "Median and 5–95 % of what is shared, as each data set has it alone (grey) and as all have it together."
 FITS = "Observations and 5–95 % of the joint posterior's predictions."
 
@@ -31,11 +34,12 @@ FITS = "Observations and 5–95 % of the joint posterior's predictions."
 @dataclass(frozen=True)
 class JointRow(ParameterSummary):
     """One number of the joint estimate; ``dataset`` "" for what is shared, ``without`` the names of the odd data sets
-    where they are left out.
+    where they are left out. ``stated``: the data have neither narrowed nor moved what is shared.
     """
 
     dataset: str = ""
     without: str = ""
+    stated: bool = False
 
 
 def estimates(joint: StoredJoint) -> tuple[JointRow, ...]:
@@ -43,7 +47,8 @@ def estimates(joint: StoredJoint) -> tuple[JointRow, ...]:
     posterior, odd, rows = joint.group("posterior"), ", ".join(joint.odd), []
     for name, values in posterior.data_vars.items():
         if "dataset" not in values.dims:
-            rows.append(_estimate(joint.cautions, str(name), values))
+            row = _estimate(joint.cautions, str(name), values)
+            rows.append(replace(row, stated=not row.untrusted and _as_stated(joint, str(name))))
             continue
         for dataset in joint.datasets:
             own = values.sel(dataset=dataset)
@@ -52,7 +57,15 @@ def estimates(joint: StoredJoint) -> tuple[JointRow, ...]:
     if odd:
         rest = joint.group("without").data_vars.items()
         rows += [_estimate(joint.cautions_without, str(name), values, without=odd) for name, values in rest]
-    return tuple(sorted(rows, key=lambda row: (bool(row.dataset), not row.dataset and row.name)))
+    shared = list(joint.shared)
+    return tuple(sorted(rows, key=lambda row: (1,) if row.dataset else (0, row.stated, shared.index(row.name))))
+
+
+def _as_stated(joint: StoredJoint, name: str) -> bool:
+    """Whether the posterior of what is shared has the mean and the width of its prior."""
+    draws, (low, middle, high) = joint.group("posterior")[name].values, joint.group("prior")[name].values
+    std = (high - low) / NINETY
+    return bool(draws.std() > np.sqrt(1 - HARDLY_INFORMED) * std and abs(np.median(draws) - middle) < MOVED * std)
 
 
 def _estimate(
@@ -70,20 +83,23 @@ def parameter_of(name: str, values: xr.DataArray) -> Parameter:
 
 
 def joint_lines(joint: StoredJoint) -> list[str]:
-    """What is shared, a line each, for the page of the campaign."""
-    lines = []
-    for e in (e for e in estimates(joint) if not e.dataset):
+    """What is shared, a line each, for the page of the campaign; one line for what the data leave as it was stated."""
+    lines, shared = [], [e for e in estimates(joint) if not e.dataset]
+    for e in (e for e in shared if not e.stated):
         unit = f" {pretty_unit(e.unit)}" if e.unit != "1" else ""
         without = f" without {e.without}" if e.without else f", one value in {len(joint.datasets)} data sets"
         interval = f"5–95 %: {number_like(e.q05, e.std)} … {number_like(e.q95, e.std)}{unit}"
         doubt = f"not to be trusted: {', '.join(e.untrusted)}" if e.untrusted else interval
         lines.append(f"{e.label} {e.name} = {number_like(e.q50, e.std)}{unit} ({doubt}){without}")
+    if stated := [e.label for e in shared if e.stated]:
+        lines.append(f"left as stated beforehand, for the data say nothing new of them: {', '.join(stated)}")
     return lines
 
 
 def figure(joint: StoredJoint) -> str:
-    """All data sets over what they share, as SVG."""
-    shared = {name: joint.group("posterior")[name] for name in joint.shared}
+    """All data sets over what they share, as SVG; without what the data leave as it was stated, where there is more."""
+    names = [name for name in joint.shared if not _as_stated(joint, name)] or joint.shared
+    shared = {name: joint.group("posterior")[name] for name in names}
     return svg(forest(joint, joint.datasets, shared), "forest", CAPTION)
 
 
@@ -136,10 +152,11 @@ def forest(
     return in_columns(panels, height, width=COLUMN * (2 if len(common) > 1 else 1))
 
 
-def fits(joint: StoredJoint) -> Chart:
-    """Observations and bands of the first data sets."""
+def fits(joint: StoredJoint) -> Chart | None:
+    """Observations and bands of the first data sets that have several; no panel where a set is one number."""
     fit, panels = joint.group("fit"), []
-    for name in joint.datasets[:MOST_FITS]:
+    followed = [name for name in joint.datasets if np.isfinite(fit["time"].sel(dataset=name).values).sum() > 1]
+    for name in followed[:MOST_FITS]:
         curve = fit.sel(dataset=name)
         times, low, middle, high = curve["band"].values.T
         label = with_unit(str(curve["observable"].item()), str(curve["unit"].item()))
@@ -148,7 +165,7 @@ def fits(joint: StoredJoint) -> Chart:
         panel.line(times, middle, "posterior")
         panel.dots(curve["time"].values, curve["value"].values, "ink", 1.8)
         panels.append(panel)
-    return in_columns(panels, 3.6 * POINTS, width=PAGE)
+    return in_columns(panels, 3.6 * POINTS, width=PAGE) if panels else None
 
 
 @dataclass(frozen=True)
@@ -184,7 +201,7 @@ def write_joint(joint: StoredJoint, folder: Path) -> Path:
         own=[e for e in rows if e.dataset],
         forest=figure(joint),
         caption=CAPTION,
-        fits=svg(fits(joint), "fits", FITS),
+        fits=svg(drawn, "fits", FITS) if (drawn := fits(joint)) else "",
         fits_caption=FITS + (f" The first {MOST_FITS}." if len(joint.datasets) > MOST_FITS else ""),
         sets=_sets(joint),
         attributes=joint.tree.attrs,

@@ -9,11 +9,13 @@ import pytest
 from click.testing import CliRunner
 from execution_models import Stops
 from run_files import assert_same_results, configuration, interrupt, make_campaign
+from scipy.stats import norm
 from toy_config import csv_text
 
 from en4dvar.cli import main
 from en4dvar.config import load_config
 from en4dvar.plumbing.errors import ConfigError
+from en4dvar.report.joint import joint_lines
 from en4dvar.results.joint_file import load_joint
 from en4dvar.runs.engine import write_report
 from en4dvar.runs.joint_run import join
@@ -57,6 +59,20 @@ def test_one_value_for_each_group(finished):
     assert np.isfinite(alone["k_soft"].values[:, 1]).tolist() == [True, True, False, False]
     listed = (run / ".en4dvar-files").read_text()
     assert "joint.nc" in listed
+
+
+def test_what_the_data_leave_as_stated_comes_last_and_in_one_line(finished):
+    found = load_joint(finished[1] / "joint.nc")
+    soft, stiff = joint_lines(found)
+    low, middle, high = found.group("prior")["k_soft"].values
+    draws = found.tree["posterior"]["k_soft"].values
+    std, z = (high - low) / 3.2897, norm.ppf((np.arange(draws.size) + 0.5) / draws.size)
+    draws[:] = middle + std * (z / z.std()).reshape(draws.shape)
+    assert joint_lines(found) == [
+        stiff, "left as stated beforehand, for the data say nothing new of them: stiffness, soft"
+    ]  # fmt: skip
+    draws[:] += 0.5 * std  # the data moved it
+    assert [line.split(" = ")[0] for line in joint_lines(found)] == [line.split(" = ")[0] for line in (soft, stiff)]
 
 
 @pytest.mark.slow
