@@ -218,7 +218,7 @@ def limits(folder: Path, shoot: Camera) -> None:
         data.replace("data/agarose", f"{DATA}/agarose")
         + f"model: {{name: bubble, law: ./yeoh.py:Yeoh}}\nparameters: {{{law}}}\n"
     )
-    (folder / "theirs.yaml").write_text(f"{case}parameters: {{{law}}}\n", encoding="utf-8")
+    (folder / "theirs.yaml").write_text(case, encoding="utf-8")
     typed(folder, "en4dvar run theirs.yaml --out runs/theirs --no-report")
     shutil.rmtree(folder / ".state")  # as on another machine
     line = "en4dvar rerun runs/theirs"
