@@ -17,10 +17,7 @@ from en4dvar.plumbing.hints import natural
 
 
 def with_parts(
-    files: Mapping[str, Path],
-    value: Column,
-    layout: Layout = ANY,
-    time: str | None = None,
+    files: Mapping[str, Path], value: Column, layout: Layout = ANY, time: str | None = None
 ) -> dict[str, DataFile]:
     """Every data set that the files hold, see :func:`~en4dvar.inputs.parts.parts_of`."""
     by_name: dict[str, DataFile] = {}

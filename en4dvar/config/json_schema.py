@@ -35,7 +35,7 @@ def json_schema() -> Json:
         "parameter": {
             "description": "A prior (estimated), a quantity (fixed), or a scalar of the data file (fixed).",
             "anyOf": [dict(TEXT), *(_of(kind.model_json_schema()) for kind in (PriorSection, FromFile, TiedSection))],
-        },
+        }
     }
     definitions["series"] = _partial(_of(SeriesData.model_json_schema()))  # the rest is said for all series
     models = list(_models(definitions))

@@ -9,15 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from en4dvar.config.context import (
-    Context,
-    Made,
-    Spread,
-    parse_spread,
-    read_each,
-    subject_unit,
-    unit_of,
-)
+from en4dvar.config.context import Context, Made, Spread, parse_spread, read_each, subject_unit, unit_of
 from en4dvar.config.schema import Section
 from en4dvar.config.validate import Faults
 from en4dvar.config.varies import VariesSection

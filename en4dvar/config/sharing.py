@@ -50,10 +50,7 @@ class PopulationSection(_HyperPrior):
 
 
 def check_population(
-    section: PopulationSection,
-    entries: Sequence[Entry],
-    groups: Mapping[str, Mapping[str, object]],
-    document: Document,
+    section: PopulationSection, entries: Sequence[Entry], groups: Mapping[str, Mapping[str, object]], document: Document
 ) -> None:
     """Raises :class:`ConfigError`: every parameter that is not estimated, or whose prior depends on the data set; an
     unknown kind of group.

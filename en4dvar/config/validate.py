@@ -35,12 +35,7 @@ _MESSAGES = {
 
 
 def check(
-    schema: type[M],
-    value: Any,
-    path: Sequence[str | int],
-    document: Document,
-    faults: list[Fault],
-    context: Any = None,
+    schema: type[M], value: Any, path: Sequence[str | int], document: Document, faults: list[Fault], context: Any = None
 ) -> M | None:
     """Validate ``value``, found at ``path``; every fault is appended to ``faults`` and None returned."""
     try:

@@ -64,10 +64,7 @@ class Observations:
 
     @classmethod
     def of_series(
-        cls,
-        series: Sequence[Series],
-        correlation: Mapping[tuple[str, str], float] | None = None,
-        name: str = "data",
+        cls, series: Sequence[Series], correlation: Mapping[tuple[str, str], float] | None = None, name: str = "data"
     ) -> Self:
         """Several series as one data set, their readings one series after the other.
 

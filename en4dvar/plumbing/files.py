@@ -46,6 +46,15 @@ _CAREFUL = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr
 PATIENCE = (0.02, 0.1, 0.3, 1.0)  # s between attempts to rename a file that another program holds open
 
 
+@contextmanager
+def refused(path: str | Path, what: str) -> Iterator[None]:
+    """Within, an operating-system error becomes an :class:`OutputError`: the path, ``what`` and the reason."""
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(f"{path}: {what}: {error.strerror or error}") from None
+
+
 def inside(root: str | Path, name: str | Path) -> Path:
     """``root/name`` where that lies in ``root``; ``root`` itself may be a link, for the user has named it.
 
@@ -244,19 +253,15 @@ def write_bytes(path: str | Path, content: bytes) -> Path:
 def make_folder(path: str | Path) -> Path:
     """The folder, made where it is missing. Raises :class:`OutputError`."""
     path = Path(path)
-    try:
+    with refused(path, "cannot be created"):
         path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be created: {error.strerror}") from None
     return path
 
 
 def remove_file(path: Path) -> None:
     """Remove a file, or a link, if it is there. Raises :class:`OutputError`."""
-    try:
+    with refused(path, "cannot be removed"):
         path.unlink(missing_ok=True)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be removed: {error.strerror}") from None
 
 
 def expanded(text: str) -> Path:

@@ -11,8 +11,8 @@ from en4dvar.model.state import Array
 from en4dvar.plumbing.units import convert
 from en4dvar.report import fields, readings, varying, withheld
 from en4dvar.report.chart import COLUMN, PAGE, POINTS, Chart, Panel, Row, in_columns
-from en4dvar.report.drawing import Captioned
 from en4dvar.report.history import history
+from en4dvar.report.svg import Captioned
 from en4dvar.report.text import estimate, pretty_unit, shown, with_unit
 from en4dvar.results.store import StoredResult
 

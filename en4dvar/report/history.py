@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from en4dvar.diagnosis.intervals import member_quantiles
+from en4dvar.diagnosis.diagnostics import member_quantiles
 from en4dvar.model.state import Array
 from en4dvar.report.chart import POINTS, Chart, Panel, Row
 from en4dvar.report.text import shown, with_unit
-from en4dvar.results.axes import Axis
+from en4dvar.results.declared import Axis
 from en4dvar.results.store import StoredResult
 
 MANY = 5000  # readings: beyond, their bars are one band

@@ -14,8 +14,8 @@ import numpy as np
 from en4dvar.estimation.summary import ParameterSummary
 from en4dvar.plumbing.caution import Caution, codes, gravity, worst_first
 from en4dvar.report.chart import COLUMN, PAGE, POINTS, Chart, Panel, Row
-from en4dvar.report.drawing import Captioned, Drawing
 from en4dvar.report.html import render
+from en4dvar.report.svg import Captioned, Drawing
 from en4dvar.report.text import figure_text, number_like, pretty_unit, symbol_html, with_unit
 from en4dvar.results.store import StoredResult
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from en4dvar.data.series import Part
 from en4dvar.descent.preview import Preview
-from en4dvar.diagnosis.intervals import member_quantiles
+from en4dvar.diagnosis.diagnostics import member_quantiles
 from en4dvar.model.state import Array
 from en4dvar.plumbing.units import convert
 from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, in_columns

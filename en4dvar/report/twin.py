@@ -12,7 +12,7 @@ import numpy as np
 
 from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, Row, stacked
 from en4dvar.report.cycles import RANKS, ranks, span_of, time_label, write_cycles_page
-from en4dvar.report.drawing import Captioned
+from en4dvar.report.svg import Captioned
 from en4dvar.report.text import plain_number, pretty_unit, with_unit
 from en4dvar.results.netcdf import Group
 from en4dvar.results.series_file import MEAN, read_series

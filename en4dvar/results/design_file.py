@@ -16,6 +16,7 @@ from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.results.netcdf import Group, read_groups, to_bytes, understood, variable
 
+FILE = "design.nc"
 COLUMNS = {  # field of an evaluation → variable, its dimensions beside that of the designs, description
     "gain": ("gain", "", "expected information gain, nats"),
     "error": ("gain_error", "", "Monte Carlo standard error of gain"),

@@ -13,7 +13,7 @@ from en4dvar.data.observations import Observations
 from en4dvar.data.series import Part, Places
 from en4dvar.model.forward import Observable, Trajectory
 from en4dvar.model.state import Array
-from en4dvar.results.axes import Axis
+from en4dvar.results.declared import Axis
 from en4dvar.results.netcdf import Group
 from en4dvar.results.scalars import SCALAR
 

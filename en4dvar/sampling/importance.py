@@ -62,12 +62,7 @@ class Importance:
     """
 
     def __init__(
-        self,
-        first: Proposal,
-        stream: np.random.Generator,
-        count: int,
-        wider: float = 1.0,
-        behind_each: float = 0.0,
+        self, first: Proposal, stream: np.random.Generator, count: int, wider: float = 1.0, behind_each: float = 0.0
     ):
         n = first.dimensions
         self.stream, self.count, self.wider, self.behind_each = stream, count, wider, behind_each

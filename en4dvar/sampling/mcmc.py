@@ -185,11 +185,7 @@ def _moves(emcee: Any, emulated: Emulated | None, proposal: StudentMixture | Non
     if proposal is not None:
         far.append((emcee.moves.MHMove(_jump(proposal)), JUMPS))
     near = 1.0 - sum(share for _, share in far)
-    return [
-        (emcee.moves.DEMove(), near * DE_SHARE),
-        (emcee.moves.StretchMove(), near * (1 - DE_SHARE)),
-        *far,
-    ]
+    return [(emcee.moves.DEMove(), near * DE_SHARE), (emcee.moves.StretchMove(), near * (1 - DE_SHARE)), *far]
 
 
 @dataclass(frozen=True)

@@ -89,12 +89,7 @@ class WeightedDraws:
 
 
 def sample_modes(
-    cost: Cost,
-    prior: Prior,
-    minima: Sequence[Minimum],
-    seed: int,
-    enough: float | None = None,
-    below: float = -np.inf,
+    cost: Cost, prior: Prior, minima: Sequence[Minimum], seed: int, enough: float | None = None, below: float = -np.inf
 ) -> WeightedDraws:
     """Draws of exp(−J) until ``enough`` of them (default: :data:`ENOUGH`) are effective, by eight runs each, or more as
     long as these are :data:`TOO_FEW`, or until J of one is ``below`` a value.

@@ -75,8 +75,7 @@ class AssimilationSettings:
         "added: and let the posterior's width hold these as well (run --with-what-if).",
     ] = True
     stochastic_model: Annotated[
-        bool,
-        "true: accept a model that gives other numbers when a member is run again; by default that is an error.",
+        bool, "true: accept a model that gives other numbers when a member is run again; by default that is an error."
     ] = False
     localisation: Annotated[
         Localisation | None, "Which readings act on what: by distance, or by correlation; default: all on everything."

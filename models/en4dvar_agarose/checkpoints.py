@@ -16,7 +16,7 @@ import yaml
 
 from en4dvar.assembly.build import data_files, inverse_plan
 from en4dvar.plumbing.errors import OutputError
-from en4dvar.plumbing.files import inside, read_plain, write_text
+from en4dvar.plumbing.files import inside, read_plain, refused, write_text
 from en4dvar.results.checkpoint import FOLDER, CheckpointError, digest, read_checkpoint, write_checkpoint
 from en4dvar.results.fingerprint import Identity, identity, source_digest
 from en4dvar.runs.rundir import RunDirectory
@@ -101,7 +101,7 @@ def prepare_folder(folder: Path, key: str, mode: str) -> Path:
     ------
     OutputError: it holds another sweep, or cannot be written.
     """
-    try:
+    with refused(folder, "cannot be used"):
         folder.mkdir(parents=True, exist_ok=True)
         mark = inside(folder, "sweep.key")
         stored = read_plain(mark, 1000).decode("utf-8", "replace") if mark.exists() else ""
@@ -116,6 +116,4 @@ def prepare_folder(folder: Path, key: str, mode: str) -> Path:
         for partial in folder.glob(".*.tmp"):  # of a process that was killed
             partial.unlink()
         write_text(mark, key)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be used: {error.strerror or error}") from None
     return folder

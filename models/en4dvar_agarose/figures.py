@@ -8,7 +8,7 @@ import numpy as np
 
 from en4dvar.model.state import Array
 from en4dvar.report.chart import COLUMN, PAGE, Chart, Panel, Row, in_columns
-from en4dvar.report.drawing import Captioned
+from en4dvar.report.svg import Captioned
 from en4dvar_agarose import measured
 from en4dvar_agarose.fits import Fit, Study
 from en4dvar_agarose.paper import NAMES, QUANTITIES, Quantity, Route

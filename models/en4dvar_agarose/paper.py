@@ -12,11 +12,7 @@ Model = Literal["nh", "qs", "qlkv"]
 Route = Literal["sweep", "en4dvar"]
 
 LABELS: dict[Model, str] = {"nh": "NH", "qs": "QS QLKV", "qlkv": "Gen QLKV"}
-NAMES: dict[Model, str] = {
-    "nh": "neo-Hookean",
-    "qs": "quasi-static QLKV",
-    "qlkv": "general QLKV",
-}
+NAMES: dict[Model, str] = {"nh": "neo-Hookean", "qs": "quasi-static QLKV", "qlkv": "general QLKV"}
 ROUTES: dict[Route, str] = {"sweep": "IMR sweep", "en4dvar": "En4D-Var"}
 
 

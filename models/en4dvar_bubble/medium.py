@@ -54,11 +54,7 @@ class Medium:
     )
     c_m: float = _constant(4181.0, "J/(kg K)", f"Specific heat of the medium {_CONDUCTING}.", f"{_IMR_V2} (Cp)", gt=0)
     D_v: float = _constant(
-        24.2e-6,
-        "m^2/s",
-        f"Diffusivity of vapour in the gas at p_inf and T_inf {_VAPOUR}.",
-        f"{_IMR_V2} (D0)",
-        gt=0,
+        24.2e-6, "m^2/s", f"Diffusivity of vapour in the gas at p_inf and T_inf {_VAPOUR}.", f"{_IMR_V2} (D0)", gt=0
     )
     D_p: float = _constant(
         0.0,

@@ -106,12 +106,7 @@ _SOURCES = Field(
     description="Where replaced values come from, by constant; recorded with the result.",
 )
 _CONSTANTS: dict[str, Any] = {**{f.name: _key(f) for f in CONSTANTS}, "sources": (dict[str, str], _SOURCES)}
-ConstantsSettings = create_model(
-    "ConstantsSettings",
-    __base__=_NamedSet,
-    __doc__=_NamedSet.__doc__,
-    **_CONSTANTS,
-)
+ConstantsSettings = create_model("ConstantsSettings", __base__=_NamedSet, __doc__=_NamedSet.__doc__, **_CONSTANTS)
 
 
 class MediumSettings(Section):

@@ -41,10 +41,7 @@ class ControlEnsembles:
 
 
 def examine(
-    analysis: Analysis,
-    control: ControlEnsembles,
-    worst_loss: Sequence[str] = (),
-    earlier: tuple[Caution, ...] = (),
+    analysis: Analysis, control: ControlEnsembles, worst_loss: Sequence[str] = (), earlier: tuple[Caution, ...] = ()
 ) -> tuple[Caution, ...]:
     """Everything that should keep a reader from trusting the posterior, or that they should know, worst first.
 

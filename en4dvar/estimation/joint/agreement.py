@@ -23,8 +23,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import chdtrc, fdtrc, gammaincinv
 
-from en4dvar.estimation.joint.problem import JointProblem
-from en4dvar.estimation.joint.single import Single
+from en4dvar.estimation.joint.problem import JointProblem, Single
 from en4dvar.model.state import Array
 
 ODD = 0.01  # probability below which an experiment is odd, that any of a campaign be so by chance

@@ -13,12 +13,10 @@ from en4dvar.ensemble.forecast import Forecast, plotting_times
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.estimation.conclusions import missing_readings
 from en4dvar.estimation.joint.agreement import AT_MOST, Agreement, agreement, is_odd, oddest
-from en4dvar.estimation.joint.challenge import challenger
 from en4dvar.estimation.joint.descent import JointDescent, Place, assembled, cost, descend
 from en4dvar.estimation.joint.doubts import doubts
-from en4dvar.estimation.joint.members import JointMembers, gaussian, sampled
-from en4dvar.estimation.joint.problem import JointProblem
-from en4dvar.estimation.joint.single import Single
+from en4dvar.estimation.joint.members import JointMembers, challenger, gaussian, sampled
+from en4dvar.estimation.joint.problem import JointProblem, Single
 from en4dvar.estimation.joint.tangent import Experiment
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
 from en4dvar.model.state import Array

@@ -1,4 +1,4 @@
-"""Who shares what: inverse problems, and the quantities that have one value in several of them."""
+"""Who shares what: inverse problems, quantities that have one value in several of them, and what each says alone."""
 
 from __future__ import annotations
 
@@ -12,8 +12,23 @@ from en4dvar.ensemble.forecast import check_problem
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.hints import suggest
-from en4dvar.priors.prior import PriorTerm
+from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
+
+
+@dataclass(frozen=True)
+class Single:
+    """The estimate of one experiment by itself: mode (n,) and posterior precision (n, n), in units of the prior."""
+
+    mode: Array
+    precision: Array
+
+    @classmethod
+    def of_physical(cls, prior: Prior, members: Array, mode: Array) -> Single:
+        """From the members (N, n) alive and the mode (n,) of a posterior. Raises ValueError outside a map's range."""
+        z = (prior.from_physical(np.vstack([members, mode])) - prior.mean) / prior.std
+        return cls(z[-1], np.linalg.inv(np.atleast_2d(np.cov(z[:-1].T))))
+
 
 EVERYONE = ""  # the group of a quantity that all experiments share
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from en4dvar.model.state import Array
-from en4dvar_agarose.evidence import probability
+from en4dvar_agarose.fits import probability
 
 FOLDER = Path(__file__).parent
 POPULATION_HEAD = ["gel", "seed", "parameter", "low", "median", "high", "true_mean", "mean_of_truths", "stacked_mean"]

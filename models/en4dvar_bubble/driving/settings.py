@@ -136,9 +136,7 @@ class _AsWritten:
 
 
 DrivingSettings: Any = Annotated[
-    Union[(*PULSE_SECTIONS.values(), Tabulated)],
-    Field(discriminator="kind"),
-    _AsWritten(),
+    Union[(*PULSE_SECTIONS.values(), Tabulated)], Field(discriminator="kind"), _AsWritten()
 ]
 
 
