@@ -8,8 +8,6 @@
 Names are imported when first used, so that ``import en4dvar`` stays light.
 """
 
-from __future__ import annotations
-
 import re
 from importlib import import_module
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Data files: what paths, folders and patterns name, and which data sets are in them."""
 
-from __future__ import annotations
-
 import glob
 import itertools
 import os

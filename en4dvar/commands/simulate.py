@@ -1,7 +1,5 @@
 """``en4dvar simulate``: one forward run, or the data sets of a synthetic campaign."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 from pathlib import Path

@@ -6,8 +6,6 @@ there). What depends on packages comes from them: the settings of each registere
 further kinds of files (group ``en4dvar.schemas``: the key that marks the kind → pydantic model of the whole file).
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Iterator

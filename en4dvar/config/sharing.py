@@ -1,7 +1,5 @@
 """Parameters of several data sets: ``shared:`` of a prior with the ``groups:``, and the ``population:`` section."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence

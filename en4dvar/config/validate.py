@@ -1,7 +1,5 @@
 """Pydantic's verdicts, told as faults of the file: where, what, and what was probably meant."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager

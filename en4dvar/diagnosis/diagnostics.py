@@ -1,7 +1,5 @@
 """Diagnostics of an analysis: pure functions of arrays, and the plain words that go with them."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """One data set from its prior ensemble to the posterior and its predictions."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

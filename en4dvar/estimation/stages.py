@@ -3,8 +3,6 @@
 Where one can be interrupted, and all that it needs to go on to the same bits, is a :class:`LoopState`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 

@@ -5,8 +5,6 @@ Rows that hold NaN or a blank are dropped; every remaining number must be finite
 scalars collected. Leading zeros of a column that cannot be zero are dropped from CSV files too.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path

@@ -5,8 +5,6 @@ through :func:`inside`, which follows no link there, and what is opened in place
 what is there when they are called; a process that alters the directory at that moment has the rights to do harm anyway.
 """
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import io

@@ -1,7 +1,5 @@
 """Former names of modules: an import by one gives the module at its new place, the same object, and says so."""
 
-from __future__ import annotations
-
 import sys
 import warnings
 from importlib import import_module

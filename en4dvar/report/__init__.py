@@ -5,8 +5,6 @@ Nothing is recomputed: whatever is shown was stored by the run. One data set is 
 the worst warned of get theirs at once and the others when they are asked for by name.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from urllib.parse import quote

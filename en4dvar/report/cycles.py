@@ -1,7 +1,5 @@
 """The page of a twin experiment or a sequence, and the rank histogram that both have."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The page of compared designs: information against each knob and price, what would be known, what would be seen."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """The figures of a report: pure functions from a stored result to a chart in display units, 8.5 cm wide."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 

@@ -1,7 +1,5 @@
 """The page of a joint estimate: what the experiments share, what each says alone, and how each is fitted."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Posteriors of several runs over each other, as figure and page, from what :mod:`en4dvar.report.compare` has read."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 from pathlib import Path
 

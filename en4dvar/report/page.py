@@ -1,7 +1,5 @@
 """What the page of one data set says: a result turned into rows, sentences and figures for the template."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """The page of a population: the mean, how much the data sets vary, the next one, and each given all of them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

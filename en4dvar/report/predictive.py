@@ -1,7 +1,5 @@
 """The prior predictive over the data: what the priors expect before any assimilation (``en4dvar validate --plot``)."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator, Sequence
 

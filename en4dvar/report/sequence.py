@@ -1,7 +1,5 @@
 """Page and figures of a sequence, from ``sequence.nc`` alone: state, parameters, innovations in time, and ranks."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -4,8 +4,6 @@ The entries of a legend carry the label of their marks: with the page's script t
 says where the pointer is.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace

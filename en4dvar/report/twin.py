@@ -2,8 +2,6 @@
 ranks of the truth among the members, and whether the spread says how large the error is.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Parameters that vary in time, read from a result: bands, rows of a table, and what the evidence says of a change."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ Some groups stand beside those of ArviZ: tools take every variable of the observ
 every dimension of the predictions for one of the readings. So errors of readings and paths have groups of their own.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path

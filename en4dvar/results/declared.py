@@ -7,8 +7,6 @@ A name may hold a placeholder, as in ``{parameter}_centre``. Such a variable exi
 parameter, each series), whose names take the places of all placeholders in its name and its dimensions.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Designs and what they are worth ⇄ ``design.nc``."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -8,8 +8,6 @@ several records of a name the last one counts. What ought to be there is known e
 ``datasets.pack/<name>``.
 """
 
-from __future__ import annotations
-
 import functools
 import json
 import os

@@ -1,7 +1,5 @@
 """The observations of a result file, as they went into the estimate."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 

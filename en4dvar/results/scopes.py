@@ -1,7 +1,5 @@
 """What the placeholders of declared names stand for in the result of one data set, and units and conditions."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from typing import Any
 

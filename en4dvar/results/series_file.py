@@ -1,7 +1,5 @@
 """The result of a series: ``sequence.nc`` of data, ``twin.nc`` of a twin experiment, and their ``summary.csv``."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A stored result: what a run hands back, as its groups, without xarray; an analysis laid out in the ArviZ schema."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The kind of run that plans experiments: every design of a file evaluated, kept as it ends, and reported."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property

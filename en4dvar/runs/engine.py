@@ -1,7 +1,5 @@
 """The engine of every kind of run: directory, lock, log, resume, interrupts, result in place, page."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The data sets of finished runs, from what their result files record: for estimates of several, and for evidences."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """One data set as a unit of work: what a worker gets, what it does, what it hands back."""
 
-from __future__ import annotations
-
 import math
 import threading
 import time

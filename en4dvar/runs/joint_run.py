@@ -2,8 +2,6 @@
 or of several finished runs (``en4dvar joint``).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

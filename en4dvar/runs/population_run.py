@@ -2,8 +2,6 @@
 ``population:``, or of several finished runs (``en4dvar population``).
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """What a run tells while it runs: one line an iteration in ``run.log``, a live line on a terminal."""
 
-from __future__ import annotations
-
 import math
 import os
 import time

@@ -1,7 +1,5 @@
 """The kind of run that follows a series of readings: ``sequence.nc``, ``summary.csv``, page."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from pathlib import Path

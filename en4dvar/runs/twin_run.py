@@ -1,7 +1,5 @@
 """The kind of run that is a twin experiment: ``twin.nc``, ``summary.csv``, page."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any

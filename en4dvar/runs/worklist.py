@@ -1,7 +1,5 @@
 """The data sets of a run: which are done, what is left to do, and what came of it."""
 
-from __future__ import annotations
-
 import threading
 import traceback
 from collections.abc import Iterable, Iterator, Mapping, Sequence

@@ -13,8 +13,6 @@ of the posterior, with covariances that few draws do not make flat; what judges 
 the last proposal alone, made afresh: their mean weight is unbiased.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Protocol
 

@@ -4,8 +4,6 @@ Importance weights against J correct what the Gaussians about the minima are not
 share of the evidence, whatever its shape.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The settings of an estimate: a scheme with its own keys, and the keys of every scheme."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Annotated, Any, Literal

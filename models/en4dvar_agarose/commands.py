@@ -1,7 +1,5 @@
 """``en4dvar sweep`` and ``en4dvar study``. Heavy imports stay inside the commands."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import click

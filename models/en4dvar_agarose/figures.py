@@ -1,7 +1,5 @@
 """The figures of the paper that are computed, drawn anew from a :class:`~en4dvar_agarose.fits.Study`."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 
 import numpy as np

@@ -3,8 +3,6 @@
 Its agarose measurements are not public; nothing here enters an inference.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """One self-contained page, the tables in three formats, the figures as PDF and PNG."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

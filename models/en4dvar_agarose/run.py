@@ -1,7 +1,5 @@
 """The study: both routes on every gel and model, then population and model comparison."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """A sweep as text; tables 1 and 2 beside the paper's printed values and a twin's truth, as CSV, Markdown and LaTeX."""
 
-from __future__ import annotations
-
 import csv
 import io
 import math

@@ -25,8 +25,6 @@ published of gels that bubbles were used on; beyond it a history is doubted and 
 come as far, for a law that stiffens, or a pulse, does what no neo-Hookean spring can.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The ``model:`` section of a YAML file for the bubble."""
 
-from __future__ import annotations
-
 from dataclasses import Field as FieldOfMedium
 from dataclasses import replace
 from typing import Annotated, Any, Literal, get_args

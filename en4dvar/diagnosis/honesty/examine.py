@@ -1,7 +1,5 @@
 """The checks: what an assimilation ended with → warnings, the worst first. Nothing is run and nothing recomputed."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

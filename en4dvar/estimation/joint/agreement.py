@@ -14,8 +14,6 @@ Identification of Outliers, ch. 5). Where the others scatter by more than their 
 with the others' median by an F distribution: of data sets that all differ, none is odd.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ A value of the material that rises with the size of the bubble, with the order i
 time between readings is what a wrong scale, a wall, a drift or a wrong law leaves behind.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 

@@ -13,8 +13,6 @@ by their phase and not by their height. The others then keep what is shared abou
 (:func:`challenger`) it is enough to look at one experiment after the other.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

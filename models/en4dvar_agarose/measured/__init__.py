@@ -3,8 +3,6 @@
 ``population.csv``: python benchmarks/study_population.py; ``reliability.csv``: python benchmarks/study_reliability.py.
 """
 
-from __future__ import annotations
-
 import csv
 from dataclasses import dataclass
 from itertools import pairwise

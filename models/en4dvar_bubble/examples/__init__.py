@@ -1,7 +1,5 @@
 """Examples that come with the package, for those without a clone: each a folder with a configuration and its data."""
 
-from __future__ import annotations
-
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path

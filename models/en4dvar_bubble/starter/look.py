@@ -7,8 +7,6 @@ variance whatever a few of them hold: a bad reading, a gap, a rebound that is sh
 The collapse beside Rayleigh's: :mod:`en4dvar_bubble.collapse`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """From what the data show to what a first configuration says."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
