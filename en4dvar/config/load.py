@@ -1,7 +1,5 @@
 """From a YAML file to a frozen :class:`Config`, or every fault of the file at once."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -186,7 +184,7 @@ def _of_several_series(data: Data | DataPlan | None) -> bool:
     return isinstance(data, DataPlan) and not data.alone
 
 
-def observed_in(data: Data | DataPlan | None, read: Read[Any]) -> Observable:
+def observed_in(data: Data | DataPlan | None, read: "Read[Any]") -> Observable:
     """What the data hold; of several series that of the first."""
     if isinstance(data, DataPlan):
         return data.series[0].observable

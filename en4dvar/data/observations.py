@@ -5,8 +5,6 @@ it was measured at. With ``time_std`` the variance depends on the state through 
 ``ln s_k`` belongs to the cost and the Gauss–Newton step is Fisher scoring (see :mod:`en4dvar.data.noise`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -59,7 +57,7 @@ class Observations:
     scalars: Mapping[str, float] = field(default_factory=dict)
     doubts: tuple[Caution, ...] = ()
     parts: tuple[Part, ...] = ()
-    continued: Observations | None = None
+    continued: "Observations | None" = None
     error_unit: str = ""
 
     @classmethod

@@ -1,7 +1,5 @@
 """Warnings: a stable code, a severity, the finding in plain words, and advice."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from collections.abc import Iterable, Sequence
@@ -49,7 +47,7 @@ class Caution:
         return f"{self.severity} [{self.code}{about}] {' '.join(self.words.split())} — {self.advice}"
 
     @classmethod
-    def parse(cls, line: str) -> Caution:
+    def parse(cls, line: str) -> "Caution":
         """The inverse of :attr:`line`; a line of another form is kept as words of code ``other``."""
         match = _LINE.fullmatch(line)
         if match is None:

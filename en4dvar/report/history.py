@@ -1,7 +1,5 @@
 """Data over what was predicted, one pair of panels a series: in time, or over the places where a field was read."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,7 +46,7 @@ class SeriesShown:
     label: str
 
     @classmethod
-    def of(cls, result: StoredResult, axis: Axis) -> SeriesShown:
+    def of(cls, result: StoredResult, axis: Axis) -> "SeriesShown":
         observed, name = result.group("observed_data"), axis.name
         data, std = shown(observed[name]), shown(observed[f"{name}_std"])
         x, x_label = shown(observed[axis.time]), with_unit("time", observed[axis.time].attrs["display_units"])

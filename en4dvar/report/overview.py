@@ -1,7 +1,5 @@
 """The first page of a campaign: all data sets in one table that sorts, warnings counted, estimates side by side."""
 
-from __future__ import annotations
-
 import math
 import sys
 from collections import Counter
@@ -35,7 +33,7 @@ class SetSummary:
     about: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, result: StoredResult, stem: str) -> SetSummary:
+    def of(cls, result: StoredResult, stem: str) -> "SetSummary":
         """``stem``: name of the file without suffix."""
         stats = result.groups["/sample_stats"].attrs
         keys = ("n_observations", "chi2_per_observation", "nrmse", "dfs", "n_active", "n_members")

@@ -7,8 +7,6 @@ readings is a quantity like the parameters: it tells errors of a wrong size, whi
 (Modrák et al. 2023, Bayesian Anal., doi:10.1214/23-BA1404).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -155,7 +153,7 @@ class CalibrationKind(RunKind[Calibration]):
             self.page(run.directory.work)
         return replace(load_calibration(run.directory.work), directory=self.directory)
 
-    def _common(self) -> _Common:
+    def _common(self) -> "_Common":
         return _Common(self.config, self.made, tuple(self.data.items()))
 
     def _quantities(self) -> list[tuple[str, str]]:

@@ -5,8 +5,6 @@ works in ``.en4dvar-next`` and takes the place of the earlier files when it is c
 next run there finishes it, and commands that read say so and read nothing.
 """
 
-from __future__ import annotations
-
 import itertools
 import re
 import shlex
@@ -57,7 +55,7 @@ class RunDirectory:
 
     @classmethod
     @contextmanager
-    def open(cls, path: str | Path, mode: Mode = "new", files: Sequence[str] = ()) -> Iterator[RunDirectory]:
+    def open(cls, path: str | Path, mode: Mode = "new", files: Sequence[str] = ()) -> "Iterator[RunDirectory]":
         """Lock ``path`` for a new run, one that replaces an earlier run, the rest of one, or its report; ``beside`` for
         files that stand beside whatever is there, such as the result of an estimate of several runs.
 

@@ -16,8 +16,6 @@ is near 1 only where jumps were accepted often enough to tell the weights.
 emcee's snooker move is not used: with 48 walkers in 5 dimensions it gave standard deviations 30 % too small.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -198,7 +196,7 @@ class _Mixing:
     converged: bool
 
     @classmethod
-    def of(cls, chain: ChainState, target: float) -> _Mixing:
+    def of(cls, chain: ChainState, target: float) -> "_Mixing":
         samples = chain.samples[int(BURN_IN * chain.steps) :]
         r_hat, effective = split_r_hat(samples), effective_sample_size(samples)
         return cls(samples, r_hat, effective, bool(np.all(r_hat < MAX_R_HAT) and np.all(effective >= target)))

@@ -4,8 +4,6 @@ Kept are the chunks of the sweeps, the populations and the fits of one gel; En4D
 decides the numbers is kept with them, and a study is continued only where that agrees.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
@@ -33,7 +31,7 @@ class StudyCheckpoints:
         self.folder, self.key = folder, key
 
     @classmethod
-    def open(cls, directory: RunDirectory, plan: StudyPlan, files: Sequence[str]) -> StudyCheckpoints:
+    def open(cls, directory: RunDirectory, plan: StudyPlan, files: Sequence[str]) -> "StudyCheckpoints":
         """For a new study in ``directory``, which will write ``files``, or the one that is there.
 
         Raises

@@ -1,7 +1,5 @@
 """The fits of the study for each gel and model, their summaries, and which law they favour, or when not to decide."""
 
-from __future__ import annotations
-
 import csv
 import math
 from collections.abc import Mapping
@@ -119,7 +117,7 @@ class Study:
     plan: StudyPlan
     fits: Mapping[str, Mapping[Model, Fit]]
     populations: Mapping[str, Population]
-    comparisons: Mapping[str, Comparison]
+    comparisons: "Mapping[str, Comparison]"
     truth: Mapping[str, Mapping[str, float]]
     seconds: Mapping[str, float] = field(default_factory=dict)
     narrow: Mapping[str, Fit] = field(default_factory=dict)

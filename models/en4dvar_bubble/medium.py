@@ -1,7 +1,5 @@
 """Constants of the liquid, the gas, the vapour and their interface, each with its source; named sets of them."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
@@ -101,7 +99,7 @@ class Medium:
         }
         return json.dumps(told, ensure_ascii=False)
 
-    def with_constants(self, source: str, **values: float) -> Medium:
+    def with_constants(self, source: str, **values: float) -> "Medium":
         """The medium with some constants replaced, all from ``source``."""
         changed: dict[str, Any] = dict(values)
         return replace(self, **changed, sources={**self.sources, **dict.fromkeys(values, source)})

@@ -1,7 +1,5 @@
 """A joint estimate from single ones: where it starts, the descents, the members and what they predict."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -53,7 +51,7 @@ class JointEstimate:
     forward_runs: int
     cautions: tuple[Caution, ...]
     agreement: Agreement
-    without: JointEstimate | None = None
+    without: "JointEstimate | None" = None
 
     @property
     def odd(self) -> tuple[str, ...]:
@@ -61,7 +59,7 @@ class JointEstimate:
         return tuple(name for name in self.joint.names if name not in self.rest.joint.names)
 
     @property
-    def rest(self) -> JointEstimate:
+    def rest(self) -> "JointEstimate":
         """The estimate without any odd experiment."""
         return self.without.rest if self.without else self
 

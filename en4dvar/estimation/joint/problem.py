@@ -1,7 +1,5 @@
 """Who shares what: inverse problems, quantities that have one value in several of them, and what each says alone."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -24,7 +22,7 @@ class Single:
     precision: Array
 
     @classmethod
-    def of_physical(cls, prior: Prior, members: Array, mode: Array) -> Single:
+    def of_physical(cls, prior: Prior, members: Array, mode: Array) -> "Single":
         """From the members (N, n) alive and the mode (n,) of a posterior. Raises ValueError outside a map's range."""
         z = (prior.from_physical(np.vstack([members, mode])) - prior.mean) / prior.std
         return cls(z[-1], np.linalg.inv(np.atleast_2d(np.cov(z[:-1].T))))
@@ -82,7 +80,7 @@ class JointProblem:
         """Of the experiments."""
         return tuple(problem.observations.name for problem in self.experiments)
 
-    def of(self, kept: Sequence[int]) -> JointProblem:
+    def of(self, kept: Sequence[int]) -> "JointProblem":
         """The same of some of the experiments."""
         return JointProblem(tuple(self.experiments[e] for e in kept), tuple(self.groups[e] for e in kept))
 
