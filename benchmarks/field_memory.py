@@ -33,8 +33,8 @@ from en4dvar.model.state import Field, Parameter, StateLayout
 from en4dvar.priors.field_prior import FieldPrior
 from en4dvar.priors.prior import Prior
 from en4dvar.problem import InverseProblem
-from en4dvar.results.groups import build_groups
 from en4dvar.results.netcdf import to_bytes
+from en4dvar.results.store import build_groups
 from en4dvar.schemes.local_gain import ByDistance
 from en4dvar.schemes.settings import AssimilationSettings, Localisation
 

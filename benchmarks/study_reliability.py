@@ -27,7 +27,7 @@ from en4dvar.executor import ThreadsExecutor
 from en4dvar.problem import InverseProblem
 from en4dvar.sampling.evidence import sampled_evidence
 from en4dvar.sampling.forward_runs import ForwardRuns
-from en4dvar_agarose.evidence import probability
+from en4dvar_agarose.fits import probability
 from en4dvar_agarose.measured import FOLDER, RELIABILITY_HEAD
 
 THREADS = int(os.environ.get("THREADS", "2"))

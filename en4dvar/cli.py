@@ -4,8 +4,6 @@ Exit codes: 0 done; 1 the run failed, or some data sets of a campaign; 2 usage, 
 3 too few surviving members (in a campaign: nothing else failed); 130 interrupted, to be continued with --resume.
 """
 
-from __future__ import annotations
-
 import errno
 import io
 import os

@@ -1,7 +1,5 @@
 """What is asked of an assimilation: the inverse problem of one data set."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import accumulate
@@ -131,7 +129,7 @@ class InverseProblem:
         """The parameters that vary in time."""
         return self.model.walks if isinstance(self.model, PiecewiseModel) else ()
 
-    def varied(self, varying: Sequence[Varying]) -> InverseProblem:
+    def varied(self, varying: Sequence[Varying]) -> "InverseProblem":
         """The same with what varies; the changes join the control vector at its end."""
         changes = (term for variation in varying for term in variation.terms)
         return replace(
@@ -139,7 +137,7 @@ class InverseProblem:
         )
 
     @property
-    def constant(self) -> InverseProblem:
+    def constant(self) -> "InverseProblem":
         """The same with every parameter constant, and a model without error."""
         if not isinstance(self.model, PiecewiseModel):
             return self

@@ -1,7 +1,5 @@
 """Settings → inverse problems: reads the data files, cuts the windows, evaluates what refers to the data."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Settings of a sequence → the series to assimilate: reads the data file, and evaluates what refers to it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

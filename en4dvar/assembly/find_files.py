@@ -1,7 +1,5 @@
 """Data files: what paths, folders and patterns name, and which data sets are in them."""
 
-from __future__ import annotations
-
 import glob
 import itertools
 import os
@@ -17,10 +15,7 @@ from en4dvar.plumbing.hints import natural
 
 
 def with_parts(
-    files: Mapping[str, Path],
-    value: Column,
-    layout: Layout = ANY,
-    time: str | None = None,
+    files: Mapping[str, Path], value: Column, layout: Layout = ANY, time: str | None = None
 ) -> dict[str, DataFile]:
     """Every data set that the files hold, see :func:`~en4dvar.inputs.parts.parts_of`."""
     by_name: dict[str, DataFile] = {}

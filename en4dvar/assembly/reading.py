@@ -1,7 +1,5 @@
 """From data files to observations: readings, window, clock, errors, weights and places of each series."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``en4dvar calibrate``: are the intervals of a configuration right?"""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import click

@@ -1,7 +1,5 @@
 """Plain-text tables for the terminal: what would be estimated, and what was."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Sequence
 

@@ -1,7 +1,5 @@
 """``en4dvar design``: what experiments would tell, before they are made."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import click

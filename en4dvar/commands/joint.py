@@ -1,7 +1,5 @@
 """``en4dvar joint``: data sets of finished runs estimated together."""
 
-from __future__ import annotations
-
 import click
 
 from en4dvar.commands.common import Together, several_runs

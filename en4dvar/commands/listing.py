@@ -1,7 +1,5 @@
 """The models there are, for ``en4dvar models``."""
 
-from __future__ import annotations
-
 from importlib.metadata import entry_points
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Commands that tell what there is: ``en4dvar models`` and ``en4dvar schema``."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import click

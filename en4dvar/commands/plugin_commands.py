@@ -4,8 +4,6 @@
 its source; only invoking a command imports it.
 """
 
-from __future__ import annotations
-
 import ast
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec

@@ -1,7 +1,5 @@
 """``en4dvar population``: how much a parameter varies between the data sets of finished runs."""
 
-from __future__ import annotations
-
 import click
 
 from en4dvar.commands.common import Together, several_runs

@@ -125,7 +125,7 @@ def compare(
     of = _populations(run_dirs, against, apart, known, not any(map(has_results, run_dirs)))
     comparison = Comparison(()) if of else compare_runs(run_dirs)
     if not (stored or of or comparison.incomparable):
-        from en4dvar.runs.evidence_run import sampled_evidences
+        from en4dvar.runs.finished import sampled_evidences
 
         evidences = [sampled_evidences(run_dir, workers, trust, None, tell) for run_dir in run_dirs]
         comparison = with_evidences(comparison, evidences)

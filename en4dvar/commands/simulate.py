@@ -1,7 +1,5 @@
 """``en4dvar simulate``: one forward run, or the data sets of a synthetic campaign."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -21,13 +19,7 @@ from en4dvar.commands.forms import WithForms, asked, write_form
 @click.option("--seed", type=click.IntRange(min=0), help="Seed of the noise; default the configuration's.")
 @click.option("--force", is_flag=True, help="Replace the files.")
 def simulate(
-    source: Source,
-    out: Path | None,
-    times: str | None,
-    noise: str | None,
-    seed: int | None,
-    force: bool,
-    **forms: Any,
+    source: Source, out: Path | None, times: str | None, noise: str | None, seed: int | None, force: bool, **forms: Any
 ) -> None:
     """Run the model once and write the observable as CSV: at fixed values and prior medians.
 

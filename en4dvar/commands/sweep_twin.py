@@ -1,7 +1,5 @@
 """``en4dvar sweep-twin``: a twin experiment for several settings and seeds."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import click

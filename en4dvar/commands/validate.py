@@ -88,8 +88,8 @@ def _warn(preview: Preview) -> None:
 
 def _draw(config: Config, previews: Sequence[Preview], problems: Sequence[InverseProblem]) -> str:
     from en4dvar.plumbing.files import make_folder
-    from en4dvar.report.drawing import keep
     from en4dvar.report.predictive import prior_predictive
+    from en4dvar.report.svg import keep
 
     folder, name = make_folder(config.directory.parent), f"{config.directory.name}_prior"
     keep(prior_predictive(previews), folder, name)

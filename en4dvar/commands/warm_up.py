@@ -1,7 +1,5 @@
 """``en4dvar warm-up``."""
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """YAML → validated, frozen settings; errors as ``file:line:col: path: message``, all at once."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar

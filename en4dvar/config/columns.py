@@ -1,7 +1,5 @@
 """``data.columns``: which columns of a file hold the times and the observable, each with its unit."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Annotated, Any, Self, cast
 

@@ -4,8 +4,6 @@ What is known of the model is the validation context. Where the model's own sect
 does not know, and whatever needs that stays unread; everything else is still checked.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The ``data:`` section: which files, how they are read, which observations are used, and how well they are known."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``prior_correlation:``, which parameters are correlated in the prior, and ``prior:``, an ensemble of them."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence

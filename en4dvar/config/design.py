@@ -1,7 +1,5 @@
 """The ``design:`` section: which experiments are compared, about what, and how accurately."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import fields
 from itertools import product

@@ -4,8 +4,6 @@ Scalars follow YAML 1.2's core schema: only ``true``/``false`` are booleans (``n
 number, dates are text. Duplicate keys, aliases and tags are refused: a configuration is plain data.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import re

@@ -1,7 +1,5 @@
 """``data.error``: how well the observations are known, and what the model misses."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """The ``initial_state:`` section: fields of the model's state that join the control vector as perturbations."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any, NamedTuple, TypeVar
 

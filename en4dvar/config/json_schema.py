@@ -6,8 +6,6 @@ there). What depends on packages comes from them: the settings of each registere
 further kinds of files (group ``en4dvar.schemas``: the key that marks the kind → pydantic model of the whole file).
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Iterator
@@ -35,7 +33,7 @@ def json_schema() -> Json:
         "parameter": {
             "description": "A prior (estimated), a quantity (fixed), or a scalar of the data file (fixed).",
             "anyOf": [dict(TEXT), *(_of(kind.model_json_schema()) for kind in (PriorSection, FromFile, TiedSection))],
-        },
+        }
     }
     definitions["series"] = _partial(_of(SeriesData.model_json_schema()))  # the rest is said for all series
     models = list(_models(definitions))

@@ -1,12 +1,11 @@
 """From a YAML file to a frozen :class:`Config`, or every fault of the file at once."""
 
-from __future__ import annotations
-
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Generic, Literal, TypeVar
 
+import numpy as np
 import yaml
 
 from en4dvar.config.context import Context, Made
@@ -16,17 +15,19 @@ from en4dvar.config.design import Design
 from en4dvar.config.document import Document, document_from, override, parse_document
 from en4dvar.config.initial_state import PERTURBED, Initial, Perturbed
 from en4dvar.config.models import read_model
-from en4dvar.config.parameters import Entry, Fixed, entries
+from en4dvar.config.parameters import Entry, Fixed, Uncertain, entries
 from en4dvar.config.schema import Assimilation, Execution, File, GivenStart, Output, Section
 from en4dvar.config.series import DATA, DataPlan
 from en4dvar.config.sharing import Groups, PopulationSection, Sharing, check_population, sharing_of
-from en4dvar.config.start import values_of
 from en4dvar.config.times import Times, read_times
 from en4dvar.config.validate import check
 from en4dvar.config.varies import MODEL_ERROR, ErrorOf
+from en4dvar.inputs.members import read_members
 from en4dvar.model.forward import ForwardModel, Observable
 from en4dvar.model.state import NOISE_SCALE, Array
-from en4dvar.plumbing.errors import ConfigError, Fault
+from en4dvar.plumbing.errors import ConfigError, DataError, Fault
+from en4dvar.plumbing.hints import suggest
+from en4dvar.plumbing.units import UnitError, parse_quantity
 from en4dvar.priors.dependence import Dependence
 from en4dvar.schemes.settings import AssimilationSettings
 
@@ -183,7 +184,7 @@ def _of_several_series(data: Data | DataPlan | None) -> bool:
     return isinstance(data, DataPlan) and not data.alone
 
 
-def observed_in(data: Data | DataPlan | None, read: Read[Any]) -> Observable:
+def observed_in(data: Data | DataPlan | None, read: "Read[Any]") -> Observable:
     """What the data hold; of several series that of the first."""
     if isinstance(data, DataPlan):
         return data.series[0].observable
@@ -261,3 +262,29 @@ def context_of(document: Document, base: Path, model: ForwardModel | None) -> Co
 def in_order(faults: Iterable[Fault]) -> list[Fault]:
     """Each fault once, as the file has them."""
     return sorted(dict.fromkeys(faults), key=lambda fault: (fault.file, fault.line, fault.column))
+
+
+def values_of(start: GivenStart, entries: Sequence[Entry], document: Document) -> dict[str, float]:
+    """The value of each parameter that the start names, or of all where it is a file, in the parameters' units.
+
+    Raises :class:`ConfigError`: a parameter that is not estimated, a unit that does not fit, a file that is no result.
+    """
+    units = {e.parameter.name: e.parameter.unit for e in entries if isinstance(e, Uncertain)}
+    where = ("assimilation", "start", "from")
+    if isinstance(start.place, Path):
+        try:
+            members = read_members(start.place, {name: (unit, "") for name, unit in units.items()})
+        except DataError as error:
+            raise ConfigError([document.fault(where, str(error))]) from None
+        return {name: float(np.median(values)) for name, values in members.items()}
+    values, faults = {}, []
+    for name, text in start.place.items():
+        try:
+            if name not in units:
+                raise UnitError(f"not estimated, it has no prior{suggest(name, units)}")
+            values[name] = parse_quantity(text, units[name])
+        except UnitError as error:
+            faults.append(document.fault((*where, name), str(error)))
+    if faults:
+        raise ConfigError(faults)
+    return values

@@ -3,8 +3,6 @@
 Its labels and symbols are tried before any work: matplotlib reads them when everything else is done.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable
 from importlib.metadata import entry_points

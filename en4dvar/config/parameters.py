@@ -1,7 +1,5 @@
 """The ``parameters:`` section: what is estimated, what is fixed, and what waits for a number from the data file."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal
@@ -9,15 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from en4dvar.config.context import (
-    Context,
-    Made,
-    Spread,
-    parse_spread,
-    read_each,
-    subject_unit,
-    unit_of,
-)
+from en4dvar.config.context import Context, Made, Spread, parse_spread, read_each, subject_unit, unit_of
 from en4dvar.config.schema import Section
 from en4dvar.config.validate import Faults
 from en4dvar.config.varies import VariesSection
@@ -77,7 +67,7 @@ class Scalar:
     unit: str
 
     @classmethod
-    def of(cls, written: Any, context: Context) -> Scalar:
+    def of(cls, written: Any, context: Context) -> "Scalar":
         scalar = FromFile.model_validate(written, context=context)
         return cls(context.subject, scalar.from_file, scalar.unit)
 
@@ -155,7 +145,7 @@ class Tied:
     to: str
     factor: float
 
-    def check(self, parameters: Mapping[str, Entry], own: Sequence[str]) -> None:
+    def check(self, parameters: "Mapping[str, Entry]", own: Sequence[str]) -> None:
         """Raise :class:`ConfigError` where it cannot follow; ``own`` are the names of the model's parameters."""
         name, other = self.parameter.name, parameters.get(self.to)
         if name not in own:

@@ -1,7 +1,5 @@
 """``data.places``: where on a field the readings were taken, by index or by coordinate."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any

@@ -4,8 +4,6 @@ A key is declared once, as a field: its type, unit, bounds and default; the text
 the JSON schema and the reference of keys follow from that.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import fields

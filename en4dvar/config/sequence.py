@@ -1,7 +1,5 @@
 """A series of data that is assimilated cycle by cycle: the file has a ``sequence:`` section beside ``data:``."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path

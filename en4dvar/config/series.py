@@ -1,7 +1,5 @@
 """The ``data:`` section of several series, and what both kinds of it come to: a plan of the series of a data set."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -48,7 +46,7 @@ class DataPlan:
     correlation: Mapping[tuple[str, str], float]
 
     @classmethod
-    def of(cls, data: Data | DataPlan, observable: Observable) -> DataPlan:
+    def of(cls, data: "Data | DataPlan", observable: Observable) -> "DataPlan":
         """The plan of either kind of section; ``observable`` is that of a single series."""
         if isinstance(data, DataPlan):
             return data

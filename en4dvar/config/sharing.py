@@ -1,7 +1,5 @@
 """Parameters of several data sets: ``shared:`` of a prior with the ``groups:``, and the ``population:`` section."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -50,10 +48,7 @@ class PopulationSection(_HyperPrior):
 
 
 def check_population(
-    section: PopulationSection,
-    entries: Sequence[Entry],
-    groups: Mapping[str, Mapping[str, object]],
-    document: Document,
+    section: PopulationSection, entries: Sequence[Entry], groups: Mapping[str, Mapping[str, object]], document: Document
 ) -> None:
     """Raises :class:`ConfigError`: every parameter that is not estimated, or whose prior depends on the data set; an
     unknown kind of group.

@@ -1,7 +1,5 @@
 """A synthetic campaign from YAML: the file has a ``campaign:`` section where others have ``data:``."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass
 from pathlib import Path

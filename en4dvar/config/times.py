@@ -1,7 +1,5 @@
 """Uniform grids of instants."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import numpy as np

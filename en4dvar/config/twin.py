@@ -1,7 +1,5 @@
 """A twin experiment from YAML: the file has a ``twin:`` section where others have ``data:``."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Pydantic's verdicts, told as faults of the file: where, what, and what was probably meant."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -35,12 +33,7 @@ _MESSAGES = {
 
 
 def check(
-    schema: type[M],
-    value: Any,
-    path: Sequence[str | int],
-    document: Document,
-    faults: list[Fault],
-    context: Any = None,
+    schema: type[M], value: Any, path: Sequence[str | int], document: Document, faults: list[Fault], context: Any = None
 ) -> M | None:
     """Validate ``value``, found at ``path``; every fault is appended to ``faults`` and None returned."""
     try:

@@ -1,7 +1,5 @@
 """``varies:`` of a parameter and ``model_error:`` of the state: what changes at knots in time."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """``data.weights``: how much each observation counts, β."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path

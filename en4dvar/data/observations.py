@@ -5,8 +5,6 @@ it was measured at. With ``time_std`` the variance depends on the state through 
 ``ln s_k`` belongs to the cost and the Gauss–Newton step is Fisher scoring (see :mod:`en4dvar.data.noise`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -59,15 +57,12 @@ class Observations:
     scalars: Mapping[str, float] = field(default_factory=dict)
     doubts: tuple[Caution, ...] = ()
     parts: tuple[Part, ...] = ()
-    continued: Observations | None = None
+    continued: "Observations | None" = None
     error_unit: str = ""
 
     @classmethod
     def of_series(
-        cls,
-        series: Sequence[Series],
-        correlation: Mapping[tuple[str, str], float] | None = None,
-        name: str = "data",
+        cls, series: Sequence[Series], correlation: Mapping[tuple[str, str], float] | None = None, name: str = "data"
     ) -> Self:
         """Several series as one data set, their readings one series after the other.
 

@@ -1,7 +1,5 @@
 """Series: readings of one observable, each at its time and, of a field, at its place. A data set is a list of them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Self

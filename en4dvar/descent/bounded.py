@@ -5,8 +5,6 @@ near. With the predictions linear about it, all but the bounds is a Gaussian in 
 elliptical slice sampling (Murray, Adams & MacKay 2010, AISTATS 9, 541), which needs no run of the model.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

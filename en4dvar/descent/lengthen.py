@@ -6,8 +6,6 @@ minimum of a window lies near that of the window a little shorter: each descent 
 Tellus A 50, 369). Readings after the end of a window have the weight zero; nothing else changes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 

@@ -7,8 +7,6 @@ from which the scheme takes its step; an arrow, of what is shared and what is ow
 observations.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar

@@ -10,8 +10,6 @@ and needs no run of the model. p(h|y) is sampled by importance from Student's t 
 nested Laplace approximations: Rue, Martino & Chopin 2009, J. R. Stat. Soc. B 71, 319).
 """
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 

@@ -1,7 +1,5 @@
 """Where descents ended: minima of J, as far as a rough descent tells, and the Gaussians about them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -31,7 +29,7 @@ class Minimum:
     spread: float = 0.0
 
     @classmethod
-    def of(cls, space: WeightSpace, end: Descent) -> Minimum:
+    def of(cls, space: WeightSpace, end: Descent) -> "Minimum":
         """Where a descent has ended; the Hessian of J is known there or close by."""
         covariance = space.anomalies.T @ end.newton.hessian.solve(space.anomalies.T).T
         spread = max(0.0, end.highest - end.cost)

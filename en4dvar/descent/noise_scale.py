@@ -14,8 +14,6 @@ lies −½ C tr(C ∇³J) beyond the mode (Tierney & Kadane 1986, J. Am. Stat. A
     ½ C e_x [ g' (r_m tr MC + r_u tr UC) − 3 (g''/g') tr UC − g''' ∂_u J C_xx ].
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from en4dvar.model.state import NOISE_SCALE, Array

@@ -1,7 +1,5 @@
 """What the prior says before any assimilation: its forecast, and what an estimate will cost."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 

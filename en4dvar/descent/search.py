@@ -7,8 +7,6 @@ are run, and the lowest of them start descents. All rounds are kept as they go, 
 descent.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property

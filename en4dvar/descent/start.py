@@ -6,8 +6,6 @@ again: its iterations are the first of the assimilation. Where no other descent 
 J is higher than noise and prior explain, other members are tried, as many again while there are some left.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 

@@ -6,8 +6,6 @@ or None. So the loop can run the candidates of several descents in one call of t
 model that integrates many members at once pays for one run.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
@@ -38,7 +36,7 @@ class Settling:
     before: float = math.inf
     held: bool = False
 
-    def after(self, norm: float) -> Settling:
+    def after(self, norm: float) -> "Settling":
         """With a next step of length ``norm``.
 
         Where a share s of the steps is taken, these should shrink by s of their length; half as much is asked for. At
@@ -62,7 +60,7 @@ class Trials:
     costs: Array
     predictions: Array
 
-    def __getitem__(self, part: slice) -> Trials:
+    def __getitem__(self, part: slice) -> "Trials":
         return Trials(self.costs[part], self.predictions[part])
 
 

@@ -8,8 +8,6 @@ y − m by 𝓐⁻¹CᵀK⁻¹, so that the covariance 𝓐⁻¹ of a linear pro
 each carried to the parameters by the prior anomalies.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from en4dvar.data.noise import DiscrepancyNoise, Linearisation

@@ -1,7 +1,5 @@
 """One data set seen from weight space, x = x̄0 + X0ᵀw: its prior ensemble, forecasts and J."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

@@ -6,8 +6,6 @@ takes its steps as they are; J and its Gauss–Newton step, from a regression ov
 record only.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -104,7 +102,7 @@ class Descent:
         return self.at
 
     @property
-    def kept(self) -> Descent:
+    def kept(self) -> "Descent":
         """A copy for a checkpoint."""
         return replace(self, at=None, step=None)
 

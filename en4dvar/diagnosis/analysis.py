@@ -1,7 +1,5 @@
 """The reports of an assimilation on its way, and its outcome for one data set."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 

@@ -1,11 +1,10 @@
 """Diagnostics of an analysis: pure functions of arrays, and the plain words that go with them."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -149,3 +148,18 @@ def common_reasons(failures: Sequence[str], most: int = 3) -> str:
     """The most frequent reasons of failure with their counts."""
     counts = Counter(reason for reason in failures if reason)
     return "; ".join(f"{reason} ({count}×)" for reason, count in counts.most_common(most))
+
+
+METHOD: Literal["normal_unbiased"] = "normal_unbiased"
+
+
+def member_quantiles(values: Array, levels: Sequence[float], axis: int | None = None) -> Any:
+    """Quantiles (L, …) of what the members along ``axis`` are draws of; NaN is no member.
+
+    The p-quantile lies at the place p (N + 1/4) + 3/8 among N members in order, where a Gaussian's is on average (Blom
+    1958, *Statistical Estimates and Transformed Beta-Variables*). Interpolation between the smallest and the largest,
+    numpy's default, made 90 % intervals of 48 members that hold 86 to 88 % of truths (``en4dvar calibrate``).
+    """
+    if np.isnan(values).any():  # one instant after the other
+        return np.nanquantile(values, levels, axis=axis, method=METHOD)
+    return np.quantile(values, levels, axis=axis, method=METHOD)

@@ -14,8 +14,6 @@ Technometrics 51, 316): with N draws where k̂ < min(0.7, 1 − 1/log₁₀ N). 
 without a fit that lacks the reading.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass

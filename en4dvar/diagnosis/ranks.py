@@ -7,8 +7,6 @@ k/(N + 1). The least likely of these N numbers is the statistic, whose distribut
 Vehtari 2022, Stat. Comput. 32, 32): it sees ranks that are too low, too central or too extreme alike.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 

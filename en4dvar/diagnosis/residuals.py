@@ -10,8 +10,6 @@ known eigenvalues is positive (Imhof 1961, Biometrika 48, 419; Durbin & Watson 1
 is the leverage of each reading: the share of itself in its own prediction.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cached_property
@@ -50,7 +48,7 @@ class Residuals:
         speed: Array,
         which: npt.NDArray[np.intp],
         series: npt.NDArray[np.intp] | None = None,
-    ) -> Residuals:
+    ) -> "Residuals":
         """From whitened sensitivities S (K, r), all rows of which take part in A, and N − 1.
 
         ``white`` (K',) and ``sensitivity`` (K'', r) are those of the observations and, below, of what moves R.

@@ -12,8 +12,6 @@ maximum of the window, by normal scores in a fixed order. Nothing was fitted to 
 their bands is the one test of a real experiment that no choice of priors or errors has passed beforehand.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

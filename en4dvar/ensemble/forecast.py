@@ -1,7 +1,5 @@
 """The composite operator 𝓗: control vectors → predictions, and the cost and posterior density built on it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -66,7 +64,7 @@ class Forecast:
     def __len__(self) -> int:
         return len(self.failures)
 
-    def __getitem__(self, members: slice) -> Forecast:
+    def __getitem__(self, members: slice) -> "Forecast":
         return Forecast(
             self.predicted[members],
             self.path[members],

@@ -3,8 +3,6 @@
 Nothing here is larger than (N, n) or (K', N); no n×n matrix is ever formed.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cached_property
@@ -112,7 +110,7 @@ class Hessian:
     axes: Array | None = None
 
     @classmethod
-    def of(cls, s: Array, basis: Array | None = None) -> Hessian:
+    def of(cls, s: Array, basis: Array | None = None) -> "Hessian":
         """From the smallest matrix that tells.
 
         With ``basis`` U (N, r), orthonormal columns, S is s Uᵀ: then from the SVD of s (K', r).
@@ -133,7 +131,7 @@ class Hessian:
         return cls(sigma, sigma[:, None] * right)
 
     @classmethod
-    def of_each(cls, s: Array, basis: Array) -> list[Hessian]:
+    def of_each(cls, s: Array, basis: Array) -> "list[Hessian]":
         """:meth:`of` every matrix of ``s`` (B, K', r) with the same ``basis``, in fewer calls."""
         lacking = basis.shape[1] - s.shape[1]
         if lacking > 0:  # further rows of zeros, so that every direction of the basis has an axis

@@ -4,8 +4,6 @@ Everything is one array operation as long as all members are well. Where one is 
 in trouble get a reason, the others do not notice.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -8,8 +8,6 @@ members that have it. Sources: Little & Rubin (2019), Statistical Analysis with 
 missing responses) and § 4.2 (regression imputation); Fan & Lv (2008), J. R. Stat. Soc. B 70, 849 (screening).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -6,8 +6,6 @@ reaches rounding error with 12 to 24 terms, which are a handful of matrix produc
 Comput. 2, 60): three times faster than the eigenvectors of a matrix of 40 rows. A⁻¹ and T⁻¹ follow from T by a product.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import lru_cache
@@ -31,7 +29,7 @@ class NearPrior:
     information: Array
 
     @classmethod
-    def of(cls, s: Array) -> NearPrior | Hessian:
+    def of(cls, s: Array) -> "NearPrior | Hessian":
         """From whitened anomalies S (K', N); a :class:`~en4dvar.ensemble.linalg.Hessian` for a long series."""
         n_members = s.shape[1]
         if min(s.shape) < SMALLEST_SIDE:

@@ -1,7 +1,5 @@
 """H of every series of a data set as one function of a path: at which instants and places it is read."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -6,8 +6,6 @@ slope, and the posterior is far too sure of itself. A state that a model keeps b
 on their order, and so on the number of workers.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

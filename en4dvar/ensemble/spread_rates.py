@@ -13,8 +13,6 @@ proportion to the rate beyond v: such a discrepancy is a model that is early or 
 path is taken to stand still.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

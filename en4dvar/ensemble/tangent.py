@@ -5,8 +5,6 @@ are differences over so small a part of the members' distance from the centre th
 model is asked once for its path and its derivatives, whatever the number of members.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """One data set from its prior ensemble to the posterior and its predictions."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 
@@ -18,8 +16,7 @@ from en4dvar.ensemble.forecast import Forecast, cost, forecast, log_posterior
 from en4dvar.estimation import conclusions
 from en4dvar.estimation.conclusions import Ensembles
 from en4dvar.estimation.localised import assimilate_localised
-from en4dvar.estimation.loop_state import Keep, LoopState
-from en4dvar.estimation.stages import Sampled, Stages
+from en4dvar.estimation.stages import Keep, LoopState, Sampled, Stages
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
 from en4dvar.plumbing.caution import caution
 from en4dvar.plumbing.errors import TooFewMembersError

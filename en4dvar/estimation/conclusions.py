@@ -1,7 +1,5 @@
 """Conclusions from a descent and the posterior about it: minima, evidence, residuals, influence, discrepancy."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any

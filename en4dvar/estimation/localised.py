@@ -7,8 +7,6 @@ settings, ES-MDA ``mda_coefficients``, both ``members``, ``sampling`` (``exact``
 ``min_active_fraction``. An interrupted run begins again with this data set.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace

@@ -1,6 +1,7 @@
-"""The stages of an assimilation: prior forecast, start, iterations, search for other minima, refinement."""
+"""The stages of an assimilation: prior forecast, start, iterations, search for other minima, refinement.
 
-from __future__ import annotations
+Where one can be interrupted, and all that it needs to go on to the same bits, is a :class:`LoopState`.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,9 +20,9 @@ from en4dvar.descent.window import DataWindow, Descent
 from en4dvar.diagnosis import diagnostics as diag
 from en4dvar.diagnosis.analysis import Progress, Record
 from en4dvar.ensemble.forecast import Forecast, check_problem, plotting_times
-from en4dvar.estimation.loop_state import Keep, LoopState, Refinement
 from en4dvar.executor import Executor
 from en4dvar.model.state import Array
+from en4dvar.plumbing.caution import Caution
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.problem import InverseProblem
 from en4dvar.sampling.mcmc import ChainState
@@ -30,6 +31,43 @@ from en4dvar.sampling.shape import CLEARED, examine_shape
 from en4dvar.schemes import MINIMISERS
 from en4dvar.schemes.base import Weights
 from en4dvar.schemes.settings import AssimilationSettings
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """A Markov chain under way, and the forward runs up to there."""
+
+    chain: ChainState
+    forward_runs: int
+
+
+@dataclass(frozen=True)
+class LoopState:
+    """All that the rest of an assimilation depends on, besides the problem, the settings and the seed.
+
+    ``comparison`` is there until the start is chosen; ``descent``, the other ``minima`` that descents ended in and from
+    which members these started (``tried``) from then on; ``search`` while further descents look for another minimum,
+    ``refinement`` once the Markov chain is under way.
+    """
+
+    forward_runs: int
+    comparison: StartState | None = None
+    descent: Descent | None = None
+    minima: tuple[Minimum, ...] = ()
+    tried: tuple[int, ...] = ()
+    warnings: tuple[Caution, ...] = ()
+    search: SearchState | None = None
+    refinement: Refinement | None = None
+
+    @property
+    def reached(self) -> str:
+        """How far it has got, in words."""
+        if self.comparison is not None:
+            return f"after {self.comparison.rounds} rounds of the start"
+        return f"after {self.descent.iteration if self.descent else 0} iterations"
+
+
+Keep = Callable[[Callable[[], LoopState]], None]
 
 
 @dataclass(frozen=True)

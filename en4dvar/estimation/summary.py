@@ -15,8 +15,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 from en4dvar.diagnosis.analysis import Analysis
-from en4dvar.diagnosis.diagnostics import HARDLY_INFORMED, active_members, change_words
-from en4dvar.diagnosis.intervals import member_quantiles
+from en4dvar.diagnosis.diagnostics import HARDLY_INFORMED, active_members, change_words, member_quantiles
 from en4dvar.diagnosis.response.budget import budget_words
 from en4dvar.diagnosis.response.what_if import Shift
 from en4dvar.model.state import Array, Parameter

@@ -12,22 +12,10 @@ from en4dvar.executor.processes import ProcessesExecutor
 from en4dvar.model.forward import ForwardModel
 
 __all__ = [
-    "Executor",
-    "ExecutorError",
-    "Limits",
-    "Outcome",
-    "ProcessesExecutor",
-    "SerialExecutor",
-    "ThreadsExecutor",
-    "TimeLimitError",
-    "WorkerLostError",
-    "available_cores",
-    "choose_executor",
-    "cut",
-    "make_executor",
-    "one_blas_thread",
-    "run_chunk",
-]
+    "Executor", "ExecutorError", "Limits", "Outcome", "ProcessesExecutor", "SerialExecutor", "ThreadsExecutor",
+    "TimeLimitError", "WorkerLostError", "available_cores", "choose_executor", "cut", "make_executor",
+    "one_blas_thread", "run_chunk",
+]  # fmt: skip
 
 
 def available_cores() -> int:

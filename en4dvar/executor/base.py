@@ -1,7 +1,5 @@
 """The tasks of every executor: calls of a function as they end, and members of a forward model in order."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, Self, TypeVar

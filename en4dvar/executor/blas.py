@@ -1,7 +1,5 @@
 """BLAS in one thread: sums in one order, whatever the machine, and faster at these sizes."""
 
-from __future__ import annotations
-
 import functools
 import threading
 from collections.abc import Iterator

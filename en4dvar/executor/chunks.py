@@ -1,7 +1,5 @@
 """Members in chunks: the unit of work that is sent to a worker, and what many such units have in common."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 import pickle

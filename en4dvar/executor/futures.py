@@ -1,7 +1,5 @@
 """Common parts of executors whose calls run elsewhere and end as futures: in threads, processes, a cluster."""
 
-from __future__ import annotations
-
 import itertools
 import queue
 import threading

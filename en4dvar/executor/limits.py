@@ -8,8 +8,6 @@ raises MemoryError, or ends a process whose compiled code does not check. Either
 reason, and the run goes on. Other executors share the process of the run, which cannot be ended: they know no limits.
 """
 
-from __future__ import annotations
-
 import faulthandler
 import functools
 import os

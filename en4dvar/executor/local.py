@@ -1,7 +1,5 @@
 """Executors within this process: itself, and threads."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 

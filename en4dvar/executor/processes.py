@@ -5,8 +5,6 @@ half a message, and the pool waits for the other half for ever; a death elsewher
 unknown whose call was to blame. Here a thread waits for each worker, and starts another one where it is lost.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import pickle

@@ -3,8 +3,6 @@
 pandas and xarray objects are known by what they can do, so that neither need be installed.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Mapping, Sequence

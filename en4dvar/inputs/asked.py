@@ -1,7 +1,5 @@
 """What is asked of a data file: which columns in which units, how it is laid out, which of its parts."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,7 +47,7 @@ class DataFile:
 
     path: Path
     part: str = ""
-    others: tuple[DataFile, ...] = ()
+    others: "tuple[DataFile, ...]" = ()
 
     @property
     def paths(self) -> tuple[Path, ...]:

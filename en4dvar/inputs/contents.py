@@ -1,7 +1,5 @@
 """All that a data file holds, before anybody says what it means."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path

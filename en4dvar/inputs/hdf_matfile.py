@@ -5,8 +5,6 @@ and no filter is used but those that HDF5 brings along. Sizes are looked at befo
 MathWorks, *MAT-File Versions*; the layout is that of ``save(…, '-v7.3')``.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from pathlib import Path

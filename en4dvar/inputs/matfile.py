@@ -7,8 +7,6 @@ read. What is in a struct or a cell array has the name MATLAB has for it: ``film
 MathWorks, *MAT-File Format* (R2019b), chapter 1.
 """
 
-from __future__ import annotations
-
 import math
 import struct
 import zlib
@@ -164,7 +162,7 @@ def _name(raw: memoryview) -> str:
     return name
 
 
-def _held(elements: _Elements, order: str, kind: int, name: str, count: int, depth: int) -> Iterator[_Variable]:
+def _held(elements: "_Elements", order: str, kind: int, name: str, count: int, depth: int) -> Iterator[_Variable]:
     """What is in a struct array or a cell array of ``count`` elements, element by element."""
     if depth > DEEPEST:
         return
@@ -181,7 +179,7 @@ def _held(elements: _Elements, order: str, kind: int, name: str, count: int, dep
                 yield from _variable(content, order, within=f"{of}.{field}" if field else of, depth=depth)
 
 
-def _fields(elements: _Elements, order: str) -> list[str]:
+def _fields(elements: "_Elements", order: str) -> list[str]:
     """Names of the fields of a struct, all stored with the same length."""
     _, length = elements.next()
     if len(length) != 4:
@@ -200,7 +198,7 @@ def _shape(content: memoryview, order: str) -> tuple[int, ...]:
     return shape
 
 
-def _numbers(elements: _Elements, order: str, name: str, count: int) -> Array:
+def _numbers(elements: "_Elements", order: str, name: str, count: int) -> Array:
     """The next element as ``count`` numbers."""
     if not count:
         return np.empty(0)

@@ -1,7 +1,5 @@
 """Ensembles of parameters from files: a posterior of ours, netCDF of others, CSV. Values are read, and nothing else."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A data file that is there, of a known format, and whatever goes wrong in reading it as one kind of error."""
 
-from __future__ import annotations
-
 import csv
 import os
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The parts of a data file that each hold a data set, and the columns of one of them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress

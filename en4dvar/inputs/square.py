@@ -1,7 +1,5 @@
 """Square tables without header: covariances and correlations."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -4,8 +4,6 @@ Readings of a film lie whole frames apart, also where some frames could not be r
 that are, is a time that was written wrongly. Steps of all kinds are those of another instrument, and nothing is said.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 

@@ -4,8 +4,6 @@ Text is UTF-8, else UTF-16 with its mark or Windows' cp1252. Column names that l
 decomposed umlauts) are the same.
 """
 
-from __future__ import annotations
-
 import csv
 import fnmatch
 import re

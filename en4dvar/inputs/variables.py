@@ -4,8 +4,6 @@ What is in a struct or a cell array is ``film.R``, ``expts(2).R``, ``R{3}``; col
 and ``M(2,:)``.
 """
 
-from __future__ import annotations
-
 import fnmatch
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -57,7 +55,7 @@ class Variables:
                 yield from (f"{name}(:,{k + 1})" for k in range(matrix.shape[1]))
                 yield from (f"{name}({k + 1},:)" for k in range(matrix.shape[0]))
 
-    def of(self, part: str) -> Variables:
+    def of(self, part: str) -> "Variables":
         """What is not inside an array, and of arrays the element ``part`` under names without the index."""
         return Variables(
             _element(self.vectors, part),
@@ -66,7 +64,7 @@ class Variables:
             _element(self.others, part),
         )
 
-    def of_first(self) -> Variables:
+    def of_first(self) -> "Variables":
         """Each array by its first element, under names without the index."""
         return Variables(_first(self.vectors), _first(self.matrices), _first(self.scalars), _first(self.others))
 

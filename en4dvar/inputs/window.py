@@ -9,8 +9,6 @@ same instants by what no single sample decides: the vertex of a parabola through
 middle between the two crossings of half the depth of a minimum.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Paths of many members in one array: what a vectorised model may return instead of a list."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import overload
 

@@ -5,8 +5,6 @@ A model that can integrate many members at once overrides ``trajectories``, the 
 ``step``.
 """
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -40,7 +38,7 @@ class Trajectory:
         """
         return float(np.max(np.abs(self[name])))
 
-    def beyond(self, limit: ValidityLimit) -> float:
+    def beyond(self, limit: "ValidityLimit") -> float:
         """When the path first exceeds a limit, +inf where it does not: the first stored instant that does.
 
         Where it does between them only, or the quantity is no field, the whole path counts. A model that knows better
@@ -92,7 +90,7 @@ class Alternative:
 
     name: str
     words: str
-    model: ForwardModel | None = None
+    model: "ForwardModel | None" = None
     values: float = 1.0
     times: float = 1.0
     parameters: Mapping[str, float] = field(default_factory=dict)
@@ -244,7 +242,7 @@ class ForwardModel(ABC):
         x[:, self.layout[name]] *= np.exp(change)[:, None]
         return x
 
-    def with_parameters(self, names: Collection[str]) -> ForwardModel:
+    def with_parameters(self, names: Collection[str]) -> "ForwardModel":
         """This model with those of its ``optional_parameters`` that are in ``names`` among its ``parameters``.
 
         Models that have such parameters override it.

@@ -3,8 +3,6 @@
 The state of such a model is its parameters; the path is what the function returns, seen at the times it was asked for.
 """
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import inspect

@@ -1,7 +1,5 @@
 """Names and arrays: parameters, the layout of a state vector."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property

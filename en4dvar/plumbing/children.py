@@ -8,8 +8,6 @@ what carries the mark and removes the scratch folders; it is what is left to do 
 A thread waits for a child; :func:`end_those_of` ends the children of threads that are told to stop.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import secrets
@@ -35,7 +33,7 @@ T = TypeVar("T")
 MARK = "EN4DVAR_STARTED_BY"
 _BORN = secrets.token_hex(8)
 PATIENCE = 1.0  # s for processes to be gone that were killed
-_children: dict[int, Child] = {}  # thread → what it waits for
+_children: "dict[int, Child]" = {}  # thread → what it waits for
 _stopped: set[int] = set()  # threads that start no child any more
 _changing = threading.Lock()
 
@@ -80,7 +78,7 @@ class Child:
         finally:
             os.close(held)
 
-    def __enter__(self) -> Child:
+    def __enter__(self) -> "Child":
         thread = threading.get_ident()
         with _changing:
             _children[thread] = self

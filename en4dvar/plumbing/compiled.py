@@ -1,7 +1,5 @@
 """Kernels: functions that numba compiles once and keeps on disk (:mod:`en4dvar.plumbing.kernel_cache`)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar

@@ -6,8 +6,6 @@ does, not how long it waits, so that a busy machine or a slow disk refuses nothi
 limits (Windows), only a crash stays in the child.
 """
 
-from __future__ import annotations
-
 import atexit
 import os
 import pickle
@@ -31,7 +29,7 @@ Decoder = Callable[..., Iterator[Any]]
 DOUBT = "it is damaged, or not what it says it is"
 _SIZE = struct.Struct("<Q")
 _VALUE, _END, _FAULT = range(3)
-_idle: list[_Child] = []
+_idle: "list[_Child]" = []
 _changing = threading.Lock()
 
 

@@ -1,7 +1,5 @@
 """Sections whose keys are described by the text below each of them."""
 
-from __future__ import annotations
-
 import ast
 import sys
 from collections.abc import Iterator

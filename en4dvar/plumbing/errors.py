@@ -1,7 +1,5 @@
 """Errors a user can cause, each with the exit code of the command line."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -50,7 +48,7 @@ class DataError(En4dvarError):
         self.series = series
         super().__init__(message)
 
-    def __reduce__(self) -> tuple[type[DataError], tuple[str, str]]:
+    def __reduce__(self) -> "tuple[type[DataError], tuple[str, str]]":
         return type(self), (str(self), self.series)
 
 

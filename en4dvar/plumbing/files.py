@@ -5,8 +5,6 @@ through :func:`inside`, which follows no link there, and what is opened in place
 what is there when they are called; a process that alters the directory at that moment has the rights to do harm anyway.
 """
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import io
@@ -44,6 +42,15 @@ POSIX = hasattr(os, "killpg")  # sessions, signals and links of POSIX; not so on
 # A link is not followed and a pipe not waited for; Windows knows neither flag, but one by which bytes stay as they are.
 _CAREFUL = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 PATIENCE = (0.02, 0.1, 0.3, 1.0)  # s between attempts to rename a file that another program holds open
+
+
+@contextmanager
+def refused(path: str | Path, what: str) -> Iterator[None]:
+    """Within, an operating-system error becomes an :class:`OutputError`: the path, ``what`` and the reason."""
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(f"{path}: {what}: {error.strerror or error}") from None
 
 
 def inside(root: str | Path, name: str | Path) -> Path:
@@ -244,19 +251,15 @@ def write_bytes(path: str | Path, content: bytes) -> Path:
 def make_folder(path: str | Path) -> Path:
     """The folder, made where it is missing. Raises :class:`OutputError`."""
     path = Path(path)
-    try:
+    with refused(path, "cannot be created"):
         path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be created: {error.strerror}") from None
     return path
 
 
 def remove_file(path: Path) -> None:
     """Remove a file, or a link, if it is there. Raises :class:`OutputError`."""
-    try:
+    with refused(path, "cannot be removed"):
         path.unlink(missing_ok=True)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be removed: {error.strerror}") from None
 
 
 def expanded(text: str) -> Path:

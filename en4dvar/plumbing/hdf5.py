@@ -5,8 +5,6 @@ one of another file: whoever reads and hands on such a file hands on what it nam
 refuses, so the links and data sets are looked through first, with the HDF5 library that it has loaded.
 """
 
-from __future__ import annotations
-
 import ctypes
 import functools
 from collections.abc import Iterator

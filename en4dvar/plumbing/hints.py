@@ -1,7 +1,5 @@
 """Suggestions for misspelt names and missing files."""
 
-from __future__ import annotations
-
 import functools
 import re
 from collections.abc import Iterable, Mapping

@@ -10,8 +10,6 @@ jobs, 20 first starts) each would compile it.
 many clusters), a folder of the user's own below the system's temporary one is used, and a note says so.
 """
 
-from __future__ import annotations
-
 import gc
 import os
 import stat
@@ -124,7 +122,7 @@ class _Locator(_CacheLocator):
         self._py_file, self._lineno = file, function.__code__.co_firstlineno
 
     @classmethod
-    def from_function(cls, py_func: Any, py_file: str) -> _Locator:
+    def from_function(cls, py_func: Any, py_file: str) -> "_Locator":
         return cls(py_func, py_file)
 
     def get_cache_path(self) -> str:

@@ -1,7 +1,5 @@
 """Former names of modules: an import by one gives the module at its new place, the same object, and says so."""
 
-from __future__ import annotations
-
 import sys
 import warnings
 from importlib import import_module
@@ -17,7 +15,7 @@ HOMES = {
     "priors": "prior parameter_map dependence field_prior varying",
     "data": "observations noise",
     "diagnosis": "analysis residuals influence diagnostics response honesty",
-    "estimation": "assimilate stages localised loop_state conclusions summary joint population design",
+    "estimation": "assimilate stages localised conclusions summary joint population design",
 }
 MOVED = {f"en4dvar.{name}": f"en4dvar.{home}.{name}" for home, names in HOMES.items() for name in names.split()}
 MOVED |= {f"en4dvar.config.{n}": f"en4dvar.assembly.{n}" for n in ("build", "build_sequence", "reading", "find_files")}
@@ -26,8 +24,13 @@ MOVED |= {f"en4dvar.{old}": f"en4dvar.{new}" for new, several in {
     "config.sharing": "config.population", "config.models": "config.symbols", "data.noise.make": "data.noise.joint",
     "descent.step_control": "descent.settling", "executor.chunks": "executor.shared",
     "model.programs.process": "model.programs.adjusted", "series.moments": "series.outcome",
+    "results.store": "results.groups", "results.complete": "results.beside", "report.result": "report.notebook",
+    "report.svg": "report.words report.drawing", "runs.finished": "runs.evidence_run", "inputs.readers": "inputs.order",
+    "estimation.joint.members": "estimation.joint.challenge", "estimation.stages": "loop_state estimation.loop_state",
+    "results.declared": "results.axes",
 }.items() for old in several.split()}  # fmt: skip
 MOVED |= {"en4dvar.cycling": "en4dvar.series", "en4dvar.storage": "en4dvar.results"}
+MOVED |= {"en4dvar_agarose.summary": "en4dvar_agarose.tables", "en4dvar_agarose.evidence": "en4dvar_agarose.fits"}
 
 # names that moved by themselves, with what they are called today
 NAMES = {

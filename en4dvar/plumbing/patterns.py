@@ -1,7 +1,5 @@
 """Texts that a pattern is sought in, by a process of its own, which starts faster the less it imports."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Tables as text: aligned for the terminal, or CSV."""
 
-from __future__ import annotations
-
 import csv
 import io
 import re

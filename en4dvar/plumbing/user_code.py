@@ -5,8 +5,6 @@ Ctrl-C and the time limit of a batch are meant for the program. While such code 
 the process to itself: the working directory, warnings, numpy's errors, what Ctrl-C does.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import signal

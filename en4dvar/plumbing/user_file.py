@@ -4,8 +4,6 @@ The file becomes a module below this one, named after its path and its content. 
 by name and imported again in any other process that sees the file, as long as it is the same.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import sys

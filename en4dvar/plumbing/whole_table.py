@@ -1,7 +1,5 @@
 """Tables for Python. Imported where one is made: pandas takes long to import."""
 
-from __future__ import annotations
-
 import pandas as pd
 
 
@@ -9,7 +7,7 @@ class WholeTable(pd.DataFrame):  # type: ignore[misc]
     """A table whose text has every column, below each other where the terminal is narrow; pandas leaves some out."""
 
     @property
-    def _constructor(self) -> type[WholeTable]:
+    def _constructor(self) -> "type[WholeTable]":
         return WholeTable
 
     def __repr__(self) -> str:

@@ -6,8 +6,6 @@ C is the correlation of the values of ``normal`` parameters, of the logarithms o
 Gaussian scores of the others (a Gaussian copula): each parameter has the prior that is stated for it alone.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -100,7 +98,7 @@ class Dependence:
         """L z, of (…, m)."""
         return np.asarray(z @ self.root.T)
 
-    def among(self, names: Sequence[str]) -> Dependence | None:
+    def among(self, names: Sequence[str]) -> "Dependence | None":
         """The block of those of its parameters that are in ``names``; None where fewer than two are left."""
         kept = [i for i, name in enumerate(self.names) if name in names]
         if len(kept) == len(self.names):

@@ -5,8 +5,6 @@ diagonal in Fourier space, and a torus that is larger than the grid by ten corre
 covariances within it to 1e-4 (Dietrich & Newsam 1997, SIAM J. Sci. Comput. 18, 1088). Other places need a matrix.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cached_property

@@ -10,8 +10,6 @@ the control coordinate sees a Gaussian. Both tails are taken from their own side
 nearer bound to full relative precision. Where x says too little (below −38, Φ is no number) θ is the bound.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from typing import NamedTuple

@@ -5,8 +5,6 @@ Nothing is recomputed: whatever is shown was stored by the run. One data set is 
 the worst warned of get theirs at once and the others when they are asked for by name.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from urllib.parse import quote
@@ -17,12 +15,11 @@ from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.files import inside, make_folder, write_text
 from en4dvar.plumbing.hints import suggest
 from en4dvar.plumbing.tables import write_csv
-from en4dvar.report.drawing import draw
 from en4dvar.report.figures import all_figures
 from en4dvar.report.overview import Headline, SetSummary, overview_figures, render_overview
 from en4dvar.report.page import IDENTIFIERS, render_set
 from en4dvar.report.responses import ENTRY_COLUMNS, SHIFT_COLUMNS, Lines, response_lines
-from en4dvar.report.svg import svg
+from en4dvar.report.svg import draw, svg
 from en4dvar.report.text import upper_first
 from en4dvar.report.varying import PIECE_COLUMNS, piece_lines
 from en4dvar.report.withheld import COLUMNS as WITHHELD_COLUMNS

@@ -5,8 +5,6 @@ PDF and PNG by matplotlib, whose import and layout would take longer than the es
 :data:`~en4dvar.report.palette.LIGHT` or hexadecimal, lengths points (1/72 inch), labels text with mathtext symbols.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal

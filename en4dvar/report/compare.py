@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from en4dvar.data.observations import Observations
-from en4dvar.diagnosis.intervals import member_quantiles
+from en4dvar.diagnosis.diagnostics import member_quantiles
 from en4dvar.estimation.summary import ParameterSummary, estimate_cells
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, codes

@@ -5,8 +5,6 @@ an ensemble of enough members, as in a Kalman filter. Source: Schweppe (1965), I
 model selection by ensembles: Carrassi, Bocquet, Hannart & Ghil (2017), Q. J. R. Meteorol. Soc. 143, 866.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

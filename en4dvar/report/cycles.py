@@ -1,7 +1,5 @@
 """The page of a twin experiment or a sequence, and the rank histogram that both have."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -11,9 +9,9 @@ from scipy.stats import binom
 from en4dvar.model.state import Array
 from en4dvar.plumbing.files import inside, write_text
 from en4dvar.report.chart import POINTS, Chart, Panel, Row
-from en4dvar.report.drawing import Captioned, draw
 from en4dvar.report.html import render
 from en4dvar.report.page import provenance_rows
+from en4dvar.report.svg import Captioned, draw
 from en4dvar.report.text import plain_number, with_unit
 from en4dvar.results.netcdf import Group
 

@@ -1,7 +1,5 @@
 """The page of compared designs: information against each knob and price, what would be known, what would be seen."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Sequence
@@ -21,7 +19,7 @@ from en4dvar.report.chart import PAGE, POINTS, Chart, Panel, Row, in_columns
 from en4dvar.report.html import render
 from en4dvar.report.svg import svg
 from en4dvar.report.text import figure_text, rough_number, with_unit
-from en4dvar.results.design_file import DECISION, DesignRow, Designs
+from en4dvar.results.design_file import DECISION, FILE, DesignRow, Designs, load_designs
 
 TOLD, DRAWN = 12, 6  # designs on the terminal, in the figure of what is seen
 WIDE = 46  # letters of a line above a figure
@@ -190,8 +188,12 @@ def fans(designs: Designs) -> Chart:
     return in_columns(panels, 4.4 * POINTS, width=PAGE)
 
 
-def write_design(designs: Designs, folder: Path) -> Path:
-    """Write ``design.html`` and ``designs.csv``. Returns the path of the page. Raises :class:`OutputError`."""
+def write_design(folder: Path) -> Path:
+    """Write ``design.html`` and ``designs.csv`` from ``design.nc``; returns the path of the page.
+
+    Raises :class:`OutputError`.
+    """
+    designs = load_designs(folder / FILE)
     write_text(folder / "designs.csv", csv_text(_cells(designs)))
     rows, best = ranked(designs), {id(row) for row in front(designs)}
     drawings = [("fans", FANS, svg(fans(designs), "fans", FANS))]

@@ -3,8 +3,6 @@
 netCDF needs no export: ``posterior.nc`` follows the ArviZ schema as it is.
 """
 
-from __future__ import annotations
-
 import itertools
 import re
 import string

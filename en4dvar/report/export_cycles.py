@@ -1,7 +1,5 @@
 """Tables of runs of cycles, twin experiments and sequences, for other programs: CSV in time or of members, LaTeX."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal

@@ -1,7 +1,5 @@
 """Fields that were estimated cell by cell: maps of what they are and of how much the data narrowed them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

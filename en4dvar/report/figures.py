@@ -1,7 +1,5 @@
 """The figures of a report: pure functions from a stored result to a chart in display units, 8.5 cm wide."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 
@@ -11,8 +9,8 @@ from en4dvar.model.state import Array
 from en4dvar.plumbing.units import convert
 from en4dvar.report import fields, readings, varying, withheld
 from en4dvar.report.chart import COLUMN, PAGE, POINTS, Chart, Panel, Row, in_columns
-from en4dvar.report.drawing import Captioned
 from en4dvar.report.history import history
+from en4dvar.report.svg import Captioned
 from en4dvar.report.text import estimate, pretty_unit, shown, with_unit
 from en4dvar.results.store import StoredResult
 

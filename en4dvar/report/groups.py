@@ -1,7 +1,5 @@
 """Groups of the data sets of one run, such as two gels, each with a population: side by side."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path

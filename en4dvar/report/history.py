@@ -1,16 +1,14 @@
 """Data over what was predicted, one pair of panels a series: in time, or over the places where a field was read."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
 
-from en4dvar.diagnosis.intervals import member_quantiles
+from en4dvar.diagnosis.diagnostics import member_quantiles
 from en4dvar.model.state import Array
 from en4dvar.report.chart import POINTS, Chart, Panel, Row
 from en4dvar.report.text import shown, with_unit
-from en4dvar.results.axes import Axis
+from en4dvar.results.declared import Axis
 from en4dvar.results.store import StoredResult
 
 MANY = 5000  # readings: beyond, their bars are one band
@@ -48,7 +46,7 @@ class SeriesShown:
     label: str
 
     @classmethod
-    def of(cls, result: StoredResult, axis: Axis) -> SeriesShown:
+    def of(cls, result: StoredResult, axis: Axis) -> "SeriesShown":
         observed, name = result.group("observed_data"), axis.name
         data, std = shown(observed[name]), shown(observed[f"{name}_std"])
         x, x_label = shown(observed[axis.time]), with_unit("time", observed[axis.time].attrs["display_units"])

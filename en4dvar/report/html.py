@@ -1,7 +1,5 @@
 """HTML pages from templates: one style, one script, no address outside the file; everything given is escaped."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 from functools import cache

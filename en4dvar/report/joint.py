@@ -1,7 +1,5 @@
 """The page of a joint estimate: what the experiments share, what each says alone, and how each is fitted."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,11 +7,9 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from en4dvar.diagnosis.diagnostics import HARDLY_INFORMED
+from en4dvar.diagnosis.diagnostics import HARDLY_INFORMED, METHOD, member_quantiles
 from en4dvar.diagnosis.honesty.checks import MOVED
-from en4dvar.diagnosis.intervals import METHOD, member_quantiles
 from en4dvar.estimation.summary import ParameterSummary, estimate_cells
-from en4dvar.model.state import Parameter
 from en4dvar.plumbing.caution import Caution, untrusted
 from en4dvar.plumbing.files import write_text
 from en4dvar.plumbing.tables import csv_text, table
@@ -22,7 +18,8 @@ from en4dvar.report.chart import COLUMN, PAGE, POINTS, Chart, Panel, in_columns
 from en4dvar.report.html import render
 from en4dvar.report.svg import svg
 from en4dvar.report.text import figure_text, number_like, pretty_unit, shown, with_unit
-from en4dvar.results.joint_file import QUANTILES, StoredGroups, StoredJoint
+from en4dvar.results.declared import parameter_of
+from en4dvar.results.joint_file import FILE, QUANTILES, StoredGroups, StoredJoint, load_joint
 
 MOST_FITS = 12  # panels of the figure
 NOTHING = np.full(1, np.nan)
@@ -71,15 +68,10 @@ def _as_stated(joint: StoredJoint, name: str) -> bool:
 def _estimate(
     cautions: Sequence[Caution], name: str, values: xr.DataArray, dataset: str = "", without: str = ""
 ) -> JointRow:
-    row = ParameterSummary.of(parameter_of(name, values), NOTHING, shown(values).ravel(), np.nan, np.nan, cautions)
+    row = ParameterSummary.of(
+        parameter_of(name, values.attrs), NOTHING, shown(values).ravel(), np.nan, np.nan, cautions
+    )
     return JointRow(**vars(row), dataset=dataset, without=without)
-
-
-def parameter_of(name: str, values: xr.DataArray) -> Parameter:
-    """What a file says of a parameter beside its values."""
-    about = {key: str(text) for key, text in values.attrs.items()}
-    label = about.get("label") or about["long_name"]
-    return Parameter(name, about["units"], label=label, symbol=about["symbol"], display_unit=about["display_units"])
 
 
 def joint_lines(joint: StoredJoint) -> list[str]:
@@ -186,8 +178,12 @@ def _sets(joint: StoredJoint) -> list[SetRow]:
     return [SetRow(name, float(chi2), float(z), float(p), name in joint.odd) for name, chi2, z, p in rows]
 
 
-def write_joint(joint: StoredJoint, folder: Path) -> Path:
-    """Write ``joint.html`` and ``joint.csv``. Returns the path of the page. Raises :class:`OutputError`."""
+def write_joint(folder: Path) -> Path:
+    """Write ``joint.html`` and ``joint.csv`` from ``joint.nc``; returns the path of the page.
+
+    Raises :class:`OutputError`.
+    """
+    joint = load_joint(folder / FILE)
     rows = estimates(joint)
     columns = ("name", "dataset", "without", "mean", "std", "q05", "q50", "q95", "unit")
     cells = [[getattr(e, c) for c in columns] + [" ".join(e.untrusted)] for e in rows]

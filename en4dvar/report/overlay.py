@@ -1,7 +1,5 @@
 """Posteriors of several runs over each other, as figure and page, from what :mod:`en4dvar.report.compare` has read."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 from pathlib import Path
 
@@ -10,11 +8,10 @@ from en4dvar.plumbing.files import make_folder, write_text
 from en4dvar.plumbing.tables import csv_text
 from en4dvar.report import populations
 from en4dvar.report.compare import Comparison, ModelScore, overlay
-from en4dvar.report.drawing import keep
 from en4dvar.report.html import render
 from en4dvar.report.page import DFS_WORDS
 from en4dvar.report.populations import PopulationsCompared
-from en4dvar.report.svg import svg
+from en4dvar.report.svg import keep, svg
 
 CAPTION = (
     "Posterior of each run, scaled to its peak; bars hold 5–95 % of the members, where these are to be trusted. "

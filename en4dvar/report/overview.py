@@ -1,7 +1,5 @@
 """The first page of a campaign: all data sets in one table that sorts, warnings counted, estimates side by side."""
 
-from __future__ import annotations
-
 import math
 import sys
 from collections import Counter
@@ -14,8 +12,8 @@ import numpy as np
 from en4dvar.estimation.summary import ParameterSummary
 from en4dvar.plumbing.caution import Caution, codes, gravity, worst_first
 from en4dvar.report.chart import COLUMN, PAGE, POINTS, Chart, Panel, Row
-from en4dvar.report.drawing import Captioned, Drawing
 from en4dvar.report.html import render
+from en4dvar.report.svg import Captioned, Drawing
 from en4dvar.report.text import figure_text, number_like, pretty_unit, symbol_html, with_unit
 from en4dvar.results.store import StoredResult
 
@@ -35,7 +33,7 @@ class SetSummary:
     about: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, result: StoredResult, stem: str) -> SetSummary:
+    def of(cls, result: StoredResult, stem: str) -> "SetSummary":
         """``stem``: name of the file without suffix."""
         stats = result.groups["/sample_stats"].attrs
         keys = ("n_observations", "chi2_per_observation", "nrmse", "dfs", "n_active", "n_members")

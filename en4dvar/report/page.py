@@ -1,7 +1,5 @@
 """What the page of one data set says: a result turned into rows, sentences and figures for the template."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -13,10 +11,10 @@ from en4dvar.estimation.summary import AS_WIDE, ParameterSummary
 from en4dvar.plumbing.caution import worst_first
 from en4dvar.plumbing.units import convert
 from en4dvar.report import readings
-from en4dvar.report.drawing import Drawing
 from en4dvar.report.figures import neighbours
 from en4dvar.report.html import render
 from en4dvar.report.responses import exceeding, stored_ledger, stored_shifts
+from en4dvar.report.svg import Drawing
 from en4dvar.report.text import number_like, plain_number
 from en4dvar.report.varying import stored_walks, verdict
 from en4dvar.report.withheld import withheld_words

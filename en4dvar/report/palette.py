@@ -1,7 +1,5 @@
 """The colours of pages and figures: Okabe & Ito's (safe for colour-blind readers), on light and on dark ground."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 LIGHT = {

@@ -3,8 +3,6 @@
 Only this module draws with matplotlib, whose import takes longer than all charts of a page.
 """
 
-from __future__ import annotations
-
 import io
 import math
 from collections.abc import Sequence

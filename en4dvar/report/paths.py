@@ -4,8 +4,6 @@ One coordinate in ten of a point is kept. Lines of more points than can be seen 
 part and dots on the same spot are drawn once, so that 10⁵ readings make no page of megabytes.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

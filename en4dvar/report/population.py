@@ -1,7 +1,5 @@
 """The page of a population: the mean, how much the data sets vary, the next one, and each given all of them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,10 +14,11 @@ from en4dvar.plumbing.tables import write_csv
 from en4dvar.plumbing.units import convert
 from en4dvar.report.export import Found, latex_table
 from en4dvar.report.html import render
-from en4dvar.report.joint import NOTHING, forest, parameter_of
+from en4dvar.report.joint import NOTHING, forest
 from en4dvar.report.svg import svg
 from en4dvar.report.text import number_like, percent, plain_number, plus_minus, pretty_unit, shown
-from en4dvar.results.population_file import StoredPopulation
+from en4dvar.results.declared import parameter_of
+from en4dvar.results.population_file import FILE, StoredPopulation, load_population
 
 CAPTION = "Median and 5–95 % of each data set alone (grey) and given all (below it); band: the {} of the population{}."
 
@@ -43,7 +42,7 @@ def summaries(stored: StoredPopulation, group: str = "posterior") -> list[Found]
 def _row(stored: StoredPopulation, name: str, posterior: xr.DataArray, prior: xr.DataArray) -> ParameterSummary:
     before = shown(prior).ravel() if "units" in prior.attrs else prior.values
     centre, learned = float(np.median(posterior.values)), float(posterior.attrs.get("learned", np.nan))
-    of = parameter_of(name, posterior)
+    of = parameter_of(name, posterior.attrs)
     return ParameterSummary.of(of, before, shown(posterior).ravel(), centre, learned, stored.cautions)
 
 
@@ -179,8 +178,12 @@ def caption(stored: StoredPopulation) -> str:
     return CAPTION.format(stored.headline, "; dotted: the reference" if stored.reference else "")
 
 
-def write_population(stored: StoredPopulation, folder: Path) -> Path:
-    """Write ``population.html``, ``.csv`` and ``.tex``. Returns the path of the page. Raises :class:`OutputError`."""
+def write_population(folder: Path) -> Path:
+    """Write ``population.html``, ``.csv`` and ``.tex`` from ``population.nc``; returns the path of the page.
+
+    Raises :class:`OutputError`.
+    """
+    stored = load_population(folder / FILE)
     rows = summaries(stored)
     write_csv(folder / "population.csv", summary_rows(rows, {}))
     write_text(folder / "population.tex", latex_table(rows))

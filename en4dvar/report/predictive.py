@@ -1,7 +1,5 @@
 """The prior predictive over the data: what the priors expect before any assimilation (``en4dvar validate --plot``)."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator, Sequence
 
@@ -9,7 +7,7 @@ import numpy as np
 
 from en4dvar.data.series import Part
 from en4dvar.descent.preview import Preview
-from en4dvar.diagnosis.intervals import member_quantiles
+from en4dvar.diagnosis.diagnostics import member_quantiles
 from en4dvar.model.state import Array
 from en4dvar.plumbing.units import convert
 from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, in_columns

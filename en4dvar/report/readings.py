@@ -1,7 +1,5 @@
 """What each reading does to the posterior and how far it lies from the prior: a figure and two sentences."""
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 from markupsafe import Markup

@@ -1,7 +1,5 @@
 """How a posterior responds to its assumptions, read from a result: rows of tables, sentences of the page."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

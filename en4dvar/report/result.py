@@ -1,4 +1,4 @@
-"""The result that a session works with: what is stored as xarray shows it, and its figures."""
+"""The result that a session works with: what is stored as xarray shows it, its figures, and what a notebook shows."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from markupsafe import Markup
 
-from en4dvar.estimation.summary import frame
+from en4dvar.estimation.summary import estimate_cells, frame
 from en4dvar.plumbing.errors import ConfigError, OutputError
 from en4dvar.plumbing.files import write_text
 from en4dvar.plumbing.units import convert
 from en4dvar.report import figures
-from en4dvar.report.drawing import draw
 from en4dvar.report.history import history
-from en4dvar.report.notebook import cell_html
 from en4dvar.report.page import IDENTIFIERS, render_set
+from en4dvar.report.svg import draw
 from en4dvar.results.complete import of_members
 from en4dvar.results.netcdf import to_bytes
 from en4dvar.results.store import StoredResult, load_stored
@@ -175,3 +175,22 @@ def load_result(path: str | Path) -> Result:
     """
     file = Path(path)
     return Result(load_stored(file / "posterior.nc" if file.is_dir() else file).groups)
+
+
+HEADER = ("", "unit", "mean", "std", "5 %", "50 %", "95 %", "DFS")
+
+
+def cell_html(result: StoredResult) -> str:
+    """The result as a piece of HTML; everything in it is escaped."""
+    rows = [(row.label, row.unit, *estimate_cells(row), f"{row.dfs:.2f}") for row in result.rows]
+    head = Markup("").join(Markup("<th>{}</th>").format(cell) for cell in HEADER)
+    body = Markup("").join(
+        Markup("<tr>{}</tr>").format(Markup("").join(Markup("<td>{}</td>").format(cell) for cell in row))
+        for row in rows
+    )
+    warned = Markup("").join(Markup("<li>{}: {}</li>").format(c.kind, c.words) for c in result.cautions)
+    return str(
+        Markup("<div><b>{}</b><table><thead><tr>{}</tr></thead><tbody>{}</tbody></table><p>{}</p>{}</div>").format(
+            result.name, head, body, result.ended, Markup("<ul>{}</ul>").format(warned) if warned else ""
+        )
+    )

@@ -1,7 +1,5 @@
 """Page and figures of a sequence, from ``sequence.nc`` alone: state, parameters, innovations in time, and ranks."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,7 +9,7 @@ import numpy.typing as npt
 from en4dvar.plumbing.units import convert
 from en4dvar.report.chart import PAGE, POINTS, Chart, Panel, interval, stacked
 from en4dvar.report.cycles import CERTAIN, RANKS, ranks, span_of, time_label, write_cycles_page
-from en4dvar.report.drawing import Captioned
+from en4dvar.report.svg import Captioned
 from en4dvar.report.text import plain_number, pretty_unit, shown, with_unit
 from en4dvar.results.netcdf import Group
 from en4dvar.results.series_file import read_series

@@ -1,22 +1,23 @@
-"""A chart as an ``<svg>`` element of a page: words as words, colours as CSS variables, no addresses.
+"""A chart as an ``<svg>`` element of a page: words as words, symbols slanted, colours as CSS variables.
 
 The entries of a legend carry the label of their marks: with the page's script they are switched on and off, and a panel
 says where the pointer is.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterator
+import re
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from markupsafe import Markup, escape
 
 from en4dvar.model.state import Array
+from en4dvar.plumbing.files import make_folder
 from en4dvar.report.chart import Chart, Mark, Panel, Row
 from en4dvar.report.paths import Frame, path_of
+from en4dvar.report.text import math_pieces
 from en4dvar.report.ticks import labelled
-from en4dvar.report.words import EM, FONT, SMALL, WIDEST, width_of, written
 
 GAP = 6.0  # between panels
 
@@ -164,3 +165,76 @@ def _sample(mark: Mark) -> Mark:
         mark.kind, (middle, middle * 0, middle * 2) if mark.top.size else (middle, middle, none)
     )
     return Mark(mark.kind, x, y, top, mark.colour, mark.size, mark.alpha, mark.dash)
+
+
+FONT, SMALL = 8.0, 7.0
+EM = 0.56  # width of a character on average, of its height
+WIDEST = 0.64  # the same of digits and small letters in the widest of the usual fonts (DejaVu Sans, Verdana)
+
+
+def written(
+    text: str, x: float, y: float, anchor: str = "middle", size: float = SMALL, colour: str = "ink",
+    turned: tuple[float, float] | None = None,
+) -> str:  # fmt: skip
+    """A line of text; ``turned``: upright, about this point."""
+    if not text:
+        return ""
+    at = f'transform="translate({turned[0]:.1f} {turned[1]:.1f}) rotate(-90)"' if turned else f'x="{x:.1f}" y="{y:.1f}"'
+    ink = f' color="var(--{colour})"' if colour != "ink" else ""
+    return f'<text {at} text-anchor="{anchor}" font-size="{size:g}"{ink}>{_spans(text, size)}</text>'
+
+
+def _spans(text: str, size: float) -> str:
+    """Text with symbols: letters slanted, indices small and shifted."""
+    parts, shift = [], 0.0
+    for mark, piece in _pieces(text):
+        wanted = {"_": 0.22, "^": -0.4}.get(mark, 0.0) * size
+        dy = f' dy="{wanted - shift:.2g}"' if wanted != shift else ""
+        small = f' font-size="{0.72 * size:.3g}"' if mark in "_^" and mark else ""
+        slant = ' font-style="italic"' if mark == "i" else ""
+        parts.append(
+            f"<tspan{dy}{small}{slant}>{escape(piece)}</tspan>" if dy or small or slant else str(escape(piece))
+        )
+        shift = wanted
+    return "".join(parts)
+
+
+def _pieces(text: str) -> Iterator[tuple[str, str]]:
+    """("", words), ("i", symbol), ("_", index) or ("^", exponent), in order."""
+    for i, part in enumerate(re.split(r"(?<!\\)\$", text)):
+        if i % 2:
+            yield from ((mark or "i", piece) for mark, piece in math_pieces(part))
+        elif part:
+            yield "", part.replace(r"\$", "$")
+
+
+def width_of(text: str) -> float:
+    """Points that small text takes, about."""
+    return EM * SMALL * sum(len(piece) for _, piece in _pieces(text))
+
+
+Captioned = tuple[str, str, Chart]  # name, caption
+Drawing = tuple[str, str, Markup]  # name, caption, SVG
+
+
+def draw(
+    figures: Iterable[Captioned], identifiers: str = "", folder: Path | None = None, begin: str = ""
+) -> list[Drawing]:
+    """Each chart as an SVG element; ``identifiers`` begins the names of its elements.
+
+    ``folder``: where they are kept as PDF and PNG too, if anywhere, under names with ``begin``. Raises
+    :class:`OutputError`.
+    """
+    drawings = []
+    for name, caption, chart in figures:
+        if folder is not None:
+            keep(chart, make_folder(folder), f"{begin}{name}")
+        drawings.append((name, caption, svg(chart, f"{identifiers}{name}", caption)))
+    return drawings
+
+
+def keep(chart: Chart, folder: Path, name: str) -> None:
+    """Write ``folder/name.pdf`` and ``folder/name.png``. Raises :class:`OutputError`."""
+    from en4dvar.report.paper import save_chart  # matplotlib takes longer to import than a page to draw
+
+    save_chart(chart, folder, name)

@@ -1,7 +1,5 @@
 """Round numbers for the axes of a chart, and how they are written."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from itertools import pairwise

@@ -2,8 +2,6 @@
 ranks of the truth among the members, and whether the spread says how large the error is.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,7 +10,7 @@ import numpy as np
 
 from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, Row, stacked
 from en4dvar.report.cycles import RANKS, ranks, span_of, time_label, write_cycles_page
-from en4dvar.report.drawing import Captioned
+from en4dvar.report.svg import Captioned
 from en4dvar.report.text import plain_number, pretty_unit, with_unit
 from en4dvar.results.netcdf import Group
 from en4dvar.results.series_file import MEAN, read_series

@@ -1,14 +1,11 @@
 """Parameters that vary in time, read from a result: bands, rows of a table, and what the evidence says of a change."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from en4dvar.diagnosis.diagnostics import change_words
-from en4dvar.diagnosis.intervals import member_quantiles
+from en4dvar.diagnosis.diagnostics import change_words, member_quantiles
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import untrusted
 from en4dvar.plumbing.units import convert

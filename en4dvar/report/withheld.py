@@ -1,7 +1,5 @@
 """The readings after the window beside what the posterior expected of them, read from a result."""
 
-from __future__ import annotations
-
 from en4dvar.plumbing.units import convert
 from en4dvar.report.chart import POINTS, Chart, Panel, Row
 from en4dvar.report.text import number_like, percent, pretty_unit, shown, with_unit

@@ -1,7 +1,5 @@
 """``calibration.csv``: what came of each synthetic data set of a calibration, a line a quantity."""
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Sequence

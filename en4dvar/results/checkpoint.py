@@ -10,8 +10,6 @@ Every file starts with one line: format, version, kind, fingerprint of the run a
 rest. A file that was cut short, altered, or written by another run is named and not used.
 """
 
-from __future__ import annotations
-
 import hashlib
 import time
 from collections.abc import Callable

@@ -4,8 +4,6 @@ The layout is an ``.npz`` archive: arrays as they are, everything else in one JS
 by their name. What is read back is checked against the annotations of the dataclass.
 """
 
-from __future__ import annotations
-
 import functools
 import io
 import json

@@ -1,6 +1,8 @@
-"""The check that a file with a good seal holds what a result consists of, for anybody can seal a file."""
+"""The check that a file with a good seal holds what a result consists of, for anybody can seal a file.
 
-from __future__ import annotations
+Some groups stand beside those of ArviZ: tools take every variable of the observed data for one that is predicted, and
+every dimension of the predictions for one of the readings. So errors of readings and paths have groups of their own.
+"""
 
 from collections.abc import Iterator, Mapping
 from functools import lru_cache
@@ -9,12 +11,25 @@ from pathlib import Path
 from en4dvar.config.models import symbol_fault
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.units import UnitError, convert
-from en4dvar.results.axes import axes_of
-from en4dvar.results.beside import BESIDE, joined
-from en4dvar.results.declared import MEMBER, Declared
+from en4dvar.results.declared import MEMBER, Declared, axes_of
 from en4dvar.results.netcdf import Group, Groups, Variable
 from en4dvar.results.scalars import ATTRIBUTES
 from en4dvar.results.variables import COORDINATES, GROUPS, OPTIONAL
+
+BESIDE: Mapping[str, str] = {
+    "observed_data": "observation_errors",
+    "prior_predictive": "prior_paths",
+    "posterior_predictive": "posterior_paths",
+}
+
+
+def joined(groups: Groups, path: str) -> Group:
+    """A group with the variables of the one beside it; files of earlier versions have all in one."""
+    group, beside = groups[path], groups.get(f"/{BESIDE.get(path[1:])}")
+    if beside is None:
+        return group
+    return Group({**group.variables, **beside.variables}, {**group.coords, **beside.coords}, group.attrs)
+
 
 _OPTIONAL = OPTIONAL | {*(f"/{name}" for name in BESIDE.values())}
 

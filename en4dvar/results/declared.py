@@ -7,8 +7,6 @@ A name may hold a placeholder, as in ``{parameter}_centre``. Such a variable exi
 parameter, each series), whose names take the places of all placeholders in its name and its dimensions.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -18,7 +16,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.model.state import Parameter
+from en4dvar.model.forward import Observable, PathQuantity
+from en4dvar.model.state import Field, Parameter
 from en4dvar.results.netcdf import Group, Variable, netcdf_attributes
 
 MEMBER = "chain draw"
@@ -159,6 +158,34 @@ def text(words: Iterable[str]) -> npt.NDArray[np.object_]:
     return np.array(list(words), dtype=object)
 
 
-def shown_as(p: Parameter) -> dict[str, Any]:
-    """UnitRule and appearance of a parameter."""
+def shown_as(p: Parameter | Observable | Field | PathQuantity) -> dict[str, Any]:
+    """Unit and appearance of a parameter, an observable, a field or a quantity of the path."""
     return {"units": p.unit, "display_units": p.display_unit, "symbol": p.symbol}
+
+
+def parameter_of(name: str, about: Mapping[str, Any]) -> Parameter:
+    """The parameter of which a variable with the attributes ``about`` holds values."""
+    label, symbol = str(about.get("label") or about["long_name"]), str(about["symbol"])
+    return Parameter(name, str(about["units"]), label=label, symbol=symbol, display_unit=str(about["display_units"]))
+
+
+@dataclass(frozen=True)
+class Axis:
+    """Of the series ``name``; ``alone``: it is the only one."""
+
+    name: str
+    alone: bool = True
+
+    @property
+    def time(self) -> str:
+        """Dimension, and coordinate, of its readings."""
+        return self.own("time")
+
+    def own(self, what: str) -> str:
+        """A variable that a file of a single observable has once."""
+        return what if self.alone else f"{self.name}_{what}"
+
+
+def axes_of(names: Sequence[str]) -> tuple[Axis, ...]:
+    """Of the series of a data set."""
+    return tuple(Axis(name, len(names) == 1) for name in names)

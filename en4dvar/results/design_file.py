@@ -1,7 +1,5 @@
 """Designs and what they are worth ⇄ ``design.nc``."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,6 +14,7 @@ from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.results.netcdf import Group, read_groups, to_bytes, understood, variable
 
+FILE = "design.nc"
 COLUMNS = {  # field of an evaluation → variable, its dimensions beside that of the designs, description
     "gain": ("gain", "", "expected information gain, nats"),
     "error": ("gain_error", "", "Monte Carlo standard error of gain"),

@@ -4,8 +4,6 @@ Configuration (without ``execution`` and ``output``, which never change the numb
 packages, sources of the framework and of the model, files that the model's settings name, content of the data files.
 """
 
-from __future__ import annotations
-
 import difflib
 import functools
 import inspect
@@ -45,7 +43,7 @@ class Identity:
         """``data`` by name."""
         return dict(self.data)
 
-    def difference(self, earlier: Identity, retried: frozenset[str]) -> str:
+    def difference(self, earlier: "Identity", retried: frozenset[str]) -> str:
         """Unified diff from ``earlier`` to this, "" where they agree. Files of ``retried`` data sets may differ."""
         if self == earlier:
             return ""

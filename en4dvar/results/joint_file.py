@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from en4dvar.diagnosis.intervals import member_quantiles
+from en4dvar.diagnosis.diagnostics import member_quantiles
 from en4dvar.estimation.joint.estimate import JointEstimate
 from en4dvar.model.state import Array, Parameter
-from en4dvar.plumbing.caution import Caution, worst_first
+from en4dvar.plumbing.caution import Caution, parsed, worst_first
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.units import convert
 from en4dvar.results.netcdf import Group, Groups, Variable, read_groups, to_bytes, understood, variable
@@ -178,10 +178,6 @@ def _agreement(estimate: JointEstimate, names: Sequence[str]) -> dict[str, Varia
     }
 
 
-def _parsed(attributes: Mapping[Any, Any]) -> tuple[Caution, ...]:
-    return worst_first(map(Caution.parse, str(attributes["warnings"]).splitlines()))
-
-
 @dataclass(frozen=True)
 class StoredGroups:
     """A file about several data sets together: a thin view of ``tree``."""
@@ -191,7 +187,7 @@ class StoredGroups:
     @property
     def cautions(self) -> tuple[Caution, ...]:
         """Warnings of the estimate, the worst first."""
-        return _parsed(self.tree.attrs)
+        return parsed(self.tree.attrs["warnings"])
 
     def group(self, name: str) -> xr.Dataset:
         """The variables of a group."""
@@ -222,7 +218,7 @@ class StoredJoint(StoredGroups):
     @property
     def cautions_without(self) -> tuple[Caution, ...]:
         """Warnings of the estimate without the odd data sets."""
-        return _parsed(self.group("without").attrs)
+        return parsed(self.group("without").attrs["warnings"])
 
 
 def load_joint(path: Path) -> StoredJoint:

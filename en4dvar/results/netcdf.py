@@ -8,8 +8,6 @@ sees the same. A file is made in memory: a worker far away can do it, and a file
 :mod:`~en4dvar.results.xarrays` shows them through it.
 """
 
-from __future__ import annotations
-
 import os
 import threading
 from collections.abc import Callable, Iterator, Mapping

@@ -8,8 +8,6 @@ several records of a name the last one counts. What ought to be there is known e
 ``datasets.pack/<name>``.
 """
 
-from __future__ import annotations
-
 import functools
 import json
 import os
@@ -23,7 +21,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from en4dvar.plumbing.errors import OutputError
-from en4dvar.plumbing.files import open_plain, own_file
+from en4dvar.plumbing.files import open_plain, own_file, refused
 from en4dvar.plumbing.hints import numbered
 from en4dvar.results.checkpoint import digest
 
@@ -73,7 +71,7 @@ class Pack:
         sizes, digests = (len(outcome), len(content)), (digest(outcome), content_digest)
         words = json.dumps([name, fingerprint, *sizes, *digests]).encode("ascii")
         line = b"%s%s %08x %s\n" % (_MAGIC, VERSION.encode("ascii"), zlib.crc32(words), words)
-        try:
+        with refused(self.path, "cannot be written"):
             file = own_file(self.path)
             try:
                 _append(file, self._end, b"".join((line, outcome, content)))
@@ -82,18 +80,13 @@ class Pack:
                     self._flushed = time.monotonic()
             finally:
                 os.close(file)
-        except OSError as error:
-            raise OutputError(f"{self.path}: cannot be written: {error.strerror or error}") from None
         self.entries[name] = entry = Entry(self._end, len(line), fingerprint, *sizes, *digests)
         self._end = entry.end
 
     def flush(self) -> None:
         """What was appended also survives a loss of power. Raises :class:`OutputError`."""
-        try:
-            with self.path.open("r+b") as file:
-                os.fsync(file.fileno())
-        except OSError as error:
-            raise OutputError(f"{self.path}: cannot be written: {error.strerror or error}") from None
+        with refused(self.path, "cannot be written"), self.path.open("r+b") as file:
+            os.fsync(file.fileno())
 
     def content(self, name: str, check: bool = True) -> bytes:
         """The groups of a data set. Raises :class:`OutputError` where they are damaged, if that is to be checked."""
@@ -147,10 +140,8 @@ def read_result(address: Path) -> bytes:
 
 def known_pack(path: Path) -> Pack:
     """A pack that is read, once for all that is asked of it. Raises :class:`OutputError`."""
-    try:
+    with refused(path, "cannot be read"):
         status = path.stat()
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be read: {error.strerror or error}") from None
     return _known(path, status.st_ino, status.st_size, status.st_mtime_ns)
 
 
@@ -173,12 +164,9 @@ def _append(file: int, end: int, record: bytes) -> None:
 
 
 def _read(path: Path, name: str, begin: int, size: int, expected: str) -> bytes:
-    try:
-        with open_plain(path) as file:
-            file.seek(begin)
-            content = file.read(size)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be read: {error.strerror or error}") from None
+    with refused(path, "cannot be read"), open_plain(path) as file:
+        file.seek(begin)
+        content = file.read(size)
     if len(content) != size or (expected and digest(content) != expected):
         raise OutputError(f"{path / name}: damaged or altered since it was written (its checksum does not match)")
     return content
@@ -192,21 +180,18 @@ def _scan(path: Path) -> tuple[dict[str, Entry], int, bool]:
     entries: dict[str, Entry] = {}
     end = place = looked = 0
     whole = True
-    try:
-        with open_plain(path) as file:
-            size = os.fstat(file.fileno()).st_size
-            begin = file.read(_LONGEST)
-            while place < size:
-                file.seek(place)
-                name, entry = _entry(file.readline(1) + file.readline(_LONGEST), place)
-                if entry is None or entry.end > size:
-                    whole, place = False, _next(file, looked + 1, size)
-                    looked = place
-                else:
-                    entries[name], looked = entry, place
-                    place, end = entry.end, max(end, entry.end)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be read: {error.strerror or error}") from None
+    with refused(path, "cannot be read"), open_plain(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        begin = file.read(_LONGEST)
+        while place < size:
+            file.seek(place)
+            name, entry = _entry(file.readline(1) + file.readline(_LONGEST), place)
+            if entry is None or entry.end > size:
+                whole, place = False, _next(file, looked + 1, size)
+                looked = place
+            else:
+                entries[name], looked = entry, place
+                place, end = entry.end, max(end, entry.end)
     if not entries:
         _check_version(path, begin)
     return entries, end, whole

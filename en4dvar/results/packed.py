@@ -5,8 +5,6 @@ work. The first text says which variables there are, and is the same for most da
 understood once; the second holds what is said of the groups, and variables of text. Nothing that is read is executed.
 """
 
-from __future__ import annotations
-
 import functools
 import json
 import math

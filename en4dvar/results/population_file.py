@@ -2,8 +2,6 @@
 what each said alone.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from en4dvar.diagnosis.intervals import member_quantiles
+from en4dvar.diagnosis.diagnostics import member_quantiles
 from en4dvar.estimation.population.campaign import CampaignPopulation, Combination, Draws
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.caution import Caution, worst_first
@@ -20,6 +18,7 @@ from en4dvar.plumbing.hints import natural
 from en4dvar.priors.prior import PriorTerm
 from en4dvar.problem import InverseProblem
 from en4dvar.results.checkpoint import digest
+from en4dvar.results.declared import parameter_of
 from en4dvar.results.joint_file import QUANTILES, StoredGroups, load_groups
 from en4dvar.results.netcdf import Group, Groups, Variable, to_bytes, understood, variable
 
@@ -229,12 +228,8 @@ class StoredPopulation(StoredGroups):
 
     def prior_of(self, name: str) -> PriorTerm:
         """The prior of a parameter of the population, or of what is common."""
-        about = self.group("posterior")[name].attrs
         transform, mean, std, bounds, shape = json.loads(self.group("white")[name].attrs["prior"])
-        p = Parameter(
-            name, str(about["units"]), label=str(about["label"]), symbol=str(about["symbol"]),
-            display_unit=str(about["display_units"]),
-        )  # fmt: skip
+        p = parameter_of(name, self.group("posterior")[name].attrs)
         return PriorTerm(p, transform, mean, std, tuple(bounds), tuple(shape))
 
     @property

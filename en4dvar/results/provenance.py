@@ -1,7 +1,5 @@
 """Where a result comes from: versions, platform, commit, configuration; as attributes of the file that holds it."""
 
-from __future__ import annotations
-
 import os
 import platform
 import subprocess

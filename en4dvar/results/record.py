@@ -1,7 +1,5 @@
 """The observations of a result file, as they went into the estimate."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 
@@ -13,7 +11,7 @@ from en4dvar.data.observations import Observations
 from en4dvar.data.series import Part, Places
 from en4dvar.model.forward import Observable, Trajectory
 from en4dvar.model.state import Array
-from en4dvar.results.axes import Axis
+from en4dvar.results.declared import Axis
 from en4dvar.results.netcdf import Group
 from en4dvar.results.scalars import SCALAR
 

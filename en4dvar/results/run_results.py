@@ -4,8 +4,6 @@ What a campaign ought to hold is known from three places: the lines of its pack,
 ``checkpoints/run``, and those in ``posterior.nc``. Whichever is damaged, no data set vanishes without a word.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The group ``sample_stats`` of the result of one data set: what judges the fit, the members, the readings."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

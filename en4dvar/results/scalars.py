@@ -1,7 +1,5 @@
 """The attributes of the result of one data set, declared once, group by group."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """What the placeholders of declared names stand for in the result of one data set, and units and conditions."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -10,8 +8,7 @@ import numpy as np
 from en4dvar.data.noise import SIDES
 from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.model.state import Array
-from en4dvar.results.axes import axes_of
-from en4dvar.results.declared import Item, UnitRule, When, shown_as
+from en4dvar.results.declared import Item, UnitRule, When, axes_of, shown_as
 
 
 def _parameters(a: Analysis) -> Iterator[Item]:
@@ -22,9 +19,8 @@ def _parameters(a: Analysis) -> Iterator[Item]:
 def _series(a: Analysis) -> Iterator[Item]:
     parts = a.problem.parts
     for axis, part in zip(axes_of([part.name for part in parts]), parts, strict=True):
-        o = part.observable
-        about = {"units": o.unit, "display_units": o.display_unit, "symbol": o.symbol}
-        yield Item(part, {"series": part.name, "shared": axis.own(""), "time": axis.time}, o.label, about)
+        o, names = part.observable, {"series": part.name, "shared": axis.own(""), "time": axis.time}
+        yield Item(part, names, o.label, shown_as(o))
 
 
 def _walks(a: Analysis) -> Iterator[Item]:
@@ -57,15 +53,13 @@ def _limits(a: Analysis) -> Iterator[Item]:
 
 def _quantities(a: Analysis) -> Iterator[Item]:
     for row, q in enumerate(a.ledger.quantities if a.ledger else ()):
-        about = {"units": q.unit, "display_units": q.display_unit, "symbol": q.symbol}
-        yield Item(row, {"quantity": q.name}, q.label, about)
+        yield Item(row, {"quantity": q.name}, q.label, shown_as(q))
 
 
 def _fields(a: Analysis) -> Iterator[Item]:
     for estimate in a.fields:
         f = estimate.prior.field
-        about = {"units": f.unit, "display_units": f.display_unit, "symbol": f.symbol}
-        yield Item(estimate, {"field": f.name}, f.label, about)
+        yield Item(estimate, {"field": f.name}, f.label, shown_as(f))
 
 
 SCOPES: dict[str, Callable[[Any], Iterator[Item]]] = {

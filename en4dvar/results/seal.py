@@ -5,8 +5,6 @@ into an endless loop. The line stands behind the end of the HDF5 file, where eve
 checked before the library gets to see the file.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 from dataclasses import dataclass

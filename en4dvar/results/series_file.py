@@ -1,7 +1,5 @@
 """The result of a series: ``sequence.nc`` of data, ``twin.nc`` of a twin experiment, and their ``summary.csv``."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -11,17 +9,7 @@ import numpy as np
 from en4dvar.model.forward import ForwardModel, Observable, StateField
 from en4dvar.model.state import Array
 from en4dvar.plumbing.tables import csv_text
-from en4dvar.results.declared import (
-    Attribute,
-    Declared,
-    Item,
-    Table,
-    UnitRule,
-    When,
-    attributes_of,
-    lay_out,
-    text,
-)
+from en4dvar.results.declared import Attribute, Declared, Item, Table, UnitRule, When, attributes_of, lay_out, text
 from en4dvar.results.netcdf import Group, netcdf_attributes, read_groups
 from en4dvar.series.moments import SequentialResult
 from en4dvar.series.problem import SeriesProblem, SeriesResult, normalised_innovations
@@ -137,8 +125,7 @@ STATE_COORDINATES: Table = (
 
 
 CLOCK = UnitRule(
-    "time of the model",
-    lambda r, _: {"units": _model(r).time_unit, "display_units": _model(r).time_display_unit},
+    "time of the model", lambda r, _: {"units": _model(r).time_unit, "display_units": _model(r).time_display_unit}
 )
 MODEL_TIME = UnitRule("time of the model", lambda r, _: {"units": _model(r).time_unit})
 
@@ -243,10 +230,7 @@ TWIN_ATTRIBUTES = (
 
 TABLES = {"sequence.nc": (*SERIES, *MOMENTS, *RUN, *SEQUENCE), "twin.nc": (*TWIN, *SERIES, *RUN, *MOMENTS, *SCORES)}
 COORDINATES = {"sequence.nc": SEQUENCE_COORDINATES, "twin.nc": TWIN_COORDINATES}
-ATTRIBUTES = {
-    "sequence.nc": (*SEQUENCE_ATTRIBUTES, *RUN_ATTRIBUTES),
-    "twin.nc": (*TWIN_ATTRIBUTES, *RUN_ATTRIBUTES),
-}
+ATTRIBUTES = {"sequence.nc": (*SEQUENCE_ATTRIBUTES, *RUN_ATTRIBUTES), "twin.nc": (*TWIN_ATTRIBUTES, *RUN_ATTRIBUTES)}
 
 
 # summary.csv

@@ -1,6 +1,4 @@
-"""A stored result: what a run hands back, as its groups, without xarray."""
-
-from __future__ import annotations
+"""A stored result: what a run hands back, as its groups, without xarray; an analysis laid out in the ArviZ schema."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -15,16 +13,17 @@ from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.estimation.summary import ParameterSummary, brief, living, results_table
 from en4dvar.model.forward import Observable
 from en4dvar.model.state import Array, Parameter
-from en4dvar.plumbing.caution import Caution, worst_first
+from en4dvar.plumbing.caution import Caution, parsed
 from en4dvar.plumbing.errors import OutputError
-from en4dvar.results.axes import Axis, axes_of
-from en4dvar.results.beside import joined
-from en4dvar.results.complete import check_complete, of_members
-from en4dvar.results.groups import build_groups
+from en4dvar.results.complete import check_complete, joined, of_members
+from en4dvar.results.declared import Axis, attributes_of, axes_of, group_of, lay_out, parameter_of
 from en4dvar.results.netcdf import Group, Groups, Variable, read_groups, understood
 from en4dvar.results.pack import PACK, read_result
 from en4dvar.results.packed import unpacked
 from en4dvar.results.record import observations_of
+from en4dvar.results.scalars import ATTRIBUTES
+from en4dvar.results.scopes import SCOPES
+from en4dvar.results.variables import COORDINATES, GROUPS, OPTIONAL
 
 NEXT = ".en4dvar-next"  # in a run directory: the run that replaces its result
 COMPLETE = ".en4dvar-complete"  # in that: it is being put in place
@@ -81,7 +80,7 @@ class StoredResult:
     @property
     def cautions(self) -> tuple[Caution, ...]:
         """Why not to trust the posterior, or read it with care: code, severity, words, advice; the worst first."""
-        return worst_first(map(Caution.parse, str(self.attributes["warnings"]).splitlines()))
+        return parsed(self.attributes["warnings"])
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -159,10 +158,7 @@ class StoredResult:
         return "\n".join([*parts, *(f"{caution.kind}: {caution.words}" for caution in self.cautions)])
 
     def _parameter(self, name: str) -> Parameter:
-        about = self.groups["/posterior"][name].attrs
-        return Parameter(
-            name, about["units"], label=about["long_name"], symbol=about["symbol"], display_unit=about["display_units"]
-        )
+        return parameter_of(name, self.groups["/posterior"][name].attrs)
 
 
 def require_settled(run_dir: Path) -> None:
@@ -192,3 +188,14 @@ def load_stored(path: str | Path) -> StoredResult:
     with understood(path):
         check_complete(path, groups)
     return StoredResult(groups)
+
+
+def build_groups(a: Analysis, attributes: Mapping[str, Any]) -> dict[str, Group]:
+    """All groups of an analysis by path; ``attributes`` are added to the root's and win over the defaults."""
+    coordinates = lay_out(COORDINATES, a, SCOPES)
+    groups = {"/": group_of({}, {}, {**attributes_of(ATTRIBUTES["/"], a), **attributes})}
+    for path, table in GROUPS.items():
+        variables = lay_out(table, a, SCOPES)
+        if variables or path not in OPTIONAL:
+            groups[path] = group_of(variables, coordinates, attributes_of(ATTRIBUTES.get(path, ()), a))
+    return groups

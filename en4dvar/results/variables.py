@@ -5,8 +5,6 @@ dimension of its own, ``<name>_time``, and ``<name>_weights``. Every value is SI
 order. Whatever a report needs is stored, so that nothing downstream computes it again.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

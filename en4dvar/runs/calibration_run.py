@@ -7,8 +7,6 @@ readings is a quantity like the parameters: it tells errors of a wrong size, whi
 (Modrák et al. 2023, Bayesian Anal., doi:10.1214/23-BA1404).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -22,7 +20,7 @@ import yaml
 from en4dvar.assembly.build import build_one, data_files, inverse_plan
 from en4dvar.config import Config, load_config, resolve
 from en4dvar.config.document import document_from, override
-from en4dvar.diagnosis.intervals import member_quantiles
+from en4dvar.diagnosis.diagnostics import member_quantiles
 from en4dvar.ensemble.forecast import Composite
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.executor import Executor
@@ -34,7 +32,7 @@ from en4dvar.plumbing.units import convert
 from en4dvar.plumbing.user_code import reason_of
 from en4dvar.priors.prior import member_stream, own_seed
 from en4dvar.problem import InverseProblem
-from en4dvar.report.calibration import Calibration, load_calibration, write_calibration
+from en4dvar.report.calibration import Calibration, load_calibration
 from en4dvar.results.calibration_file import FIT, LEVELS, Judged, write_sets
 from en4dvar.results.checkpoint import FOLDER, Keeper, digest
 from en4dvar.runs.engine import conduct_run
@@ -106,6 +104,7 @@ class CalibrationKind(RunKind[Calibration]):
     result = "calibration.csv"
     files = (result, STATE)
     pages = ("calibration.html",)
+    writer = "en4dvar.report.calibration:write_calibration"
 
     config: Config
     made: Config
@@ -154,11 +153,7 @@ class CalibrationKind(RunKind[Calibration]):
             self.page(run.directory.work)
         return replace(load_calibration(run.directory.work), directory=self.directory)
 
-    @classmethod
-    def page(cls, folder: Path, datasets: Any = (), workers: int = 1, figures: bool = False) -> Path:
-        return write_calibration(folder)
-
-    def _common(self) -> _Common:
+    def _common(self) -> "_Common":
         return _Common(self.config, self.made, tuple(self.data.items()))
 
     def _quantities(self) -> list[tuple[str, str]]:

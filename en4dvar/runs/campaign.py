@@ -1,16 +1,19 @@
-"""What a run leaves behind: for each data set its file or the reason of its failure."""
+"""What a run leaves behind: for each of up to 10⁵ data sets its file or the reason of its failure, read when asked."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, overload
 
 from en4dvar.estimation.summary import ParameterSummary, frame, results_table
 from en4dvar.plumbing.caution import Caution
-from en4dvar.plumbing.errors import TooFewMembersError
+from en4dvar.plumbing.errors import OutputError, TooFewMembersError
+from en4dvar.results.codec import decode_text
+from en4dvar.results.pack import Entry, read_outcome
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -100,3 +103,48 @@ class Campaign:
             if outcome.name == name and outcome.file is not None:
                 return load_result(outcome.file)
         raise KeyError(name)
+
+
+class Outcomes(Sequence[DatasetOutcome]):
+    """Each is read when it is asked for, which raises :class:`OutputError` where it was altered.
+
+    Parameters
+    ----------
+    folder: of the run. record: the pack in it; entries: what that holds. files: name of the data set in the pack →
+        where its posterior is in the folder.
+    """
+
+    def __init__(self, folder: Path, record: str, entries: Mapping[str, Entry], files: Mapping[str, str]):
+        self._folder, self._record, self._entries = folder, folder / record, entries
+        self._files, self._stems = files, tuple(files)
+
+    def __len__(self) -> int:
+        return len(self._stems)
+
+    @overload
+    def __getitem__(self, index: int) -> DatasetOutcome: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> tuple[DatasetOutcome, ...]: ...
+
+    def __getitem__(self, index: int | slice) -> DatasetOutcome | tuple[DatasetOutcome, ...]:
+        stems = self._stems[index]
+        return self._read(stems) if isinstance(stems, str) else tuple(map(self._read, stems))
+
+    def lines(self) -> Iterator[str]:
+        """Those of ``summary.csv`` of each data set; the rest of what is known of it is not looked at."""
+        for stem in self._stems:
+            try:
+                yield str(json.loads(self._raw(stem))["lines"])
+            except (ValueError, LookupError, TypeError) as error:  # as below
+                raise OutputError(f"{self._record / stem}: {error}") from None
+
+    def _raw(self, stem: str) -> bytes:
+        return read_outcome(self._record, stem, self._entries[stem])
+
+    def _read(self, stem: str) -> DatasetOutcome:
+        try:
+            outcome = decode_text(self._raw(stem), DatasetOutcome)
+        except ValueError as error:  # anybody can write a checksum
+            raise OutputError(f"{self._record / stem}: {error}") from None
+        return outcome if outcome.failure else replace(outcome, file=self._folder / self._files[stem])

@@ -1,7 +1,5 @@
 """What can be told before a run: every fault of configuration and data at once."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path

@@ -9,7 +9,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from en4dvar.executor import Executor, make_executor
 from en4dvar.plumbing.files import write_text
@@ -30,8 +30,11 @@ class Cycles(RunKind[R]):
     """A run of cycles, one after the other; its files are called after the kind.
 
     ``on_cycle`` is called with the number of each cycle, or the index of its last observation time, from 0.
+    ``laid_out``: result, attributes → what its file holds; ``summary``: result → ``summary.csv``.
     """
 
+    laid_out: ClassVar[staticmethod[[Any, Mapping[str, Any]], Group]]
+    summary: ClassVar[staticmethod[[Any], str]]
     config: Any
     on_cycle: Callable[[int], None] | None = None
 
@@ -48,14 +51,6 @@ class Cycles(RunKind[R]):
     @abstractmethod
     def assimilated(self, executor: Executor, resume: SequentialState | None, keep: Keep | None) -> R:
         """The result, from where to ``resume`` on; ``keep`` is given the state after each cycle."""
-
-    @abstractmethod
-    def laid_out(self, result: R, attributes: Mapping[str, Any]) -> Group:
-        """What its file holds."""
-
-    @abstractmethod
-    def summary(self, result: R) -> str:
-        """``summary.csv``."""
 
     def again(self, executor: Executor) -> Group:
         """What its file holds, computed again, without attributes of the making."""

@@ -1,7 +1,5 @@
 """From a configuration to the experiments it plans: every combination of its knobs, as problems without readings."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -36,7 +34,7 @@ class Candidate:
     laws: tuple[Config, ...] = ()
 
     @classmethod
-    def of(cls, settings: Mapping[str, Value], document: Document, base: Path) -> Candidate:
+    def of(cls, settings: Mapping[str, Value], document: Document, base: Path) -> "Candidate":
         """From the document that the settings make. Raises :class:`ConfigError`."""
         config = resolve(document, base)
         laws = (resolve(override(document, keys), base) for keys in config.design.laws.values())

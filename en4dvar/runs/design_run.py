@@ -1,7 +1,5 @@
 """The kind of run that plans experiments: every design of a file evaluated, kept as it ends, and reported."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -18,8 +16,7 @@ from en4dvar.inputs.asked import DataFile
 from en4dvar.plumbing.errors import ConfigError, En4dvarError
 from en4dvar.plumbing.user_code import reason_of
 from en4dvar.results.checkpoint import FOLDER, Keeper, digest
-from en4dvar.results.design_file import Asked, DesignRow, Designs, load_designs, save_designs
-from en4dvar.results.netcdf import understood
+from en4dvar.results.design_file import FILE, Asked, DesignRow, Designs, load_designs, save_designs
 from en4dvar.runs.design_plan import Candidate, candidates, files_needed, planned_problem
 from en4dvar.runs.engine import conduct_run
 from en4dvar.runs.kind import RunKind
@@ -82,9 +79,10 @@ class DesignKind(RunKind[Designs]):
     """A configuration whose experiments are yet to be made: ``every`` design is a unit of work."""
 
     name = "design"
-    result = "design.nc"
+    result = FILE
     files = (result, STATE)
     pages = ("designs.csv", "design.html")
+    writer = "en4dvar.report.design:write_design"
 
     config: Config
     every: Sequence[Candidate]
@@ -113,13 +111,6 @@ class DesignKind(RunKind[Designs]):
         if self.config.report:
             self.page(run.directory.work)
         return load_designs(file)
-
-    @classmethod
-    def page(cls, folder: Path, datasets: Sequence[str] = (), workers: int = 1, figures: bool = False) -> Path:
-        from en4dvar.report.design import write_design  # with matplotlib
-
-        with understood(folder / cls.result):
-            return write_design(load_designs(folder / cls.result), folder)
 
 
 def _known(document: Document, base: Path, after: Path) -> dict[str, Any]:

@@ -1,7 +1,5 @@
 """The engine of every kind of run: directory, lock, log, resume, interrupts, result in place, page."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -13,8 +11,7 @@ from en4dvar.plumbing.errors import OutputError
 from en4dvar.results.fingerprint import identity
 from en4dvar.results.provenance import provenance
 from en4dvar.runs.interrupt import Interrupted, tell_interrupt, terminate_as_interrupt
-from en4dvar.runs.kind import FIGURES, RunKind
-from en4dvar.runs.kinds import kind_in
+from en4dvar.runs.kind import FIGURES, RunKind, kind_in
 from en4dvar.runs.progress import RunLog
 from en4dvar.runs.rundir import LOG, RunDirectory
 from en4dvar.runs.session import Session, directory_mode

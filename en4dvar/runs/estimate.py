@@ -4,8 +4,6 @@ The arguments become the configuration that a file would hold, and the arrays th
 directory, so that everything a configuration can say can be said here, in the same words.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace

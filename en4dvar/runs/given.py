@@ -1,7 +1,5 @@
 """What a script hands over, readings, errors and a model, as the sections of a configuration and one data file."""
 
-from __future__ import annotations
-
 import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

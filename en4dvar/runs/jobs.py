@@ -1,7 +1,5 @@
 """One data set as a unit of work: what a worker gets, what it does, what it hands back."""
 
-from __future__ import annotations
-
 import math
 import threading
 import time
@@ -23,10 +21,10 @@ from en4dvar.priors.prior import own_seed
 from en4dvar.problem import InverseProblem
 from en4dvar.results.checkpoint import Keeper, digest
 from en4dvar.results.codec import encode_text
-from en4dvar.results.groups import build_groups
 from en4dvar.results.netcdf import to_bytes
 from en4dvar.results.packed import packed
 from en4dvar.results.seal import SealedBytes
+from en4dvar.results.store import build_groups
 from en4dvar.runs.campaign import DatasetOutcome
 from en4dvar.runs.progress import describe
 from en4dvar.schemes.settings import AssimilationSettings

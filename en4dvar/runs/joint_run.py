@@ -2,8 +2,6 @@
 or of several finished runs (``en4dvar joint``).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,7 +14,6 @@ from en4dvar.executor import Executor
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.results.checkpoint import FOLDER
 from en4dvar.results.joint_file import FILE, Alone, StoredJoint, load_joint, save_joint
-from en4dvar.results.netcdf import understood
 from en4dvar.runs.finished import Finished, carried
 from en4dvar.runs.together import Tell, TogetherKind
 from en4dvar.runs.trust import Ask
@@ -60,6 +57,7 @@ class JointKind(TogetherKind):
     files = (FILE,)
     records = (f"{FOLDER}/joint",)
     pages = ("joint.html", "joint.csv")
+    writer = "en4dvar.report.joint:write_joint"
 
     names: Sequence[str] = ()
 
@@ -78,13 +76,6 @@ class JointKind(TogetherKind):
         alone = [Alone(dataset.problem.prior.names, dataset.members) for dataset in sets]
         shared = " ".join(dict.fromkeys(name for name, _ in joint.shared))
         save_joint(path, estimated, alone, {**attributes, "seed": config.seed, "shared": shared})
-
-    @classmethod
-    def page(cls, folder: Path, datasets: Sequence[str] = (), workers: int = 1, figures: bool = False) -> Path:
-        from en4dvar.report.joint import write_joint  # with matplotlib, whose import takes longer than a page
-
-        with understood(folder / FILE):
-            return write_joint(load_joint(folder / FILE), folder)
 
 
 def _with_carried(estimate: JointEstimate, sets: Sequence[Finished]) -> JointEstimate:

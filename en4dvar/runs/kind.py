@@ -1,19 +1,21 @@
 """A kind of run, declared: its files, what it is made of, how its units of work are combined, and its page.
 
 :mod:`~en4dvar.runs.engine` does the rest, the same for every kind: it claims the directory, keeps what is done,
-resumes, answers interrupts and writes the page. :mod:`~en4dvar.runs.kinds` lists the kinds.
+resumes, answers interrupts and writes the page. :data:`KINDS` lists the kinds.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 from en4dvar.executor import Executor, choose_executor
 from en4dvar.inputs.asked import DataFile
 from en4dvar.model.forward import ForwardModel
+from en4dvar.results.netcdf import understood
 
 if TYPE_CHECKING:
     from en4dvar.runs.session import Session
@@ -29,12 +31,15 @@ class Kind:
     ``files`` are those a run writes into its directory beside the ones of every run, ``pages`` those of its page, which
     can be written again: names relative to the directory, in which ``*`` stands for any text. A file of such a name
     that no run wrote is never replaced. ``result``: the one of ``files`` by which a finished run of this kind is known.
+    ``writer``: ``module:function`` that writes the page into a folder from its files, imported when it is wanted, for
+    what draws pages is slow to import; of a page with figures also told whether to keep these as files.
     """
 
     name: ClassVar[str]
     files: ClassVar[tuple[str, ...]]
     pages: ClassVar[tuple[str, ...]] = ()
     result: ClassVar[str]
+    writer: ClassVar[str] = ""
 
     @classmethod
     def page(cls, folder: Path, datasets: Sequence[str] = (), workers: int = 1, figures: bool = False) -> Path | None:
@@ -47,7 +52,12 @@ class Kind:
 
         Raises :class:`OutputError`.
         """
-        return None
+        if not cls.writer:
+            return None
+        told = (figures,) if {*FIGURES} <= {*cls.pages} else ()
+        with understood(folder / cls.result):
+            page: Path = _named(cls.writer)(folder, *told)
+        return page
 
 
 class RunKind(Kind, ABC, Generic[R]):
@@ -102,3 +112,36 @@ class RunKind(Kind, ABC, Generic[R]):
 
     def stop(self) -> None:
         """End what computes in threads of this process."""
+
+
+KINDS = {
+    "estimate": "en4dvar.runs.runner:EstimateKind",
+    "sequence": "en4dvar.runs.sequence_run:SequenceKind",
+    "twin": "en4dvar.runs.twin_run:TwinKind",
+    "design": "en4dvar.runs.design_run:DesignKind",
+    "sweep-twin": "en4dvar.runs.twin_sweep:SweepKind",
+    "calibrate": "en4dvar.runs.calibration_run:CalibrationKind",
+    "joint": "en4dvar.runs.joint_run:JointKind",
+    "population": "en4dvar.runs.population_run:PopulationKind",
+}
+
+
+def kind_named(name: str) -> type[Kind]:
+    """The declaration of a kind. Raises :class:`KeyError`."""
+    declared: type[Kind] = _named(KINDS[name])
+    return declared
+
+
+def _named(place: str) -> Any:
+    """What ``module:name`` is."""
+    module, _, name = place.partition(":")
+    return getattr(import_module(module), name)
+
+
+def kind_in(folder: Path) -> type[Kind]:
+    """The kind of the finished run in ``folder``; that of an estimate where there is no result of another kind."""
+    others = (kind_named(name) for name in KINDS if name != "estimate")
+    estimate = kind_named("estimate")
+    if (folder / estimate.result).exists():
+        return estimate
+    return next((kind for kind in others if (folder / kind.result).is_file()), estimate)

@@ -1,7 +1,5 @@
 """One process at a time in a run directory. The operating system drops the lock of a process that dies."""
 
-from __future__ import annotations
-
 import errno
 import os
 import socket

@@ -2,8 +2,6 @@
 ``population:``, or of several finished runs (``en4dvar population``).
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +19,6 @@ from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.errors import ConfigError, TooFewMembersError
 from en4dvar.problem import InverseProblem
 from en4dvar.results.checkpoint import FOLDER
-from en4dvar.results.netcdf import understood
 from en4dvar.results.population_file import FILE, GROUPS, StoredPopulation, load_population, save_population
 from en4dvar.runs.finished import Finished, carried
 from en4dvar.runs.together import SetGroup, Tell, TogetherKind
@@ -67,6 +64,7 @@ class PopulationKind(TogetherKind):
     files = (FILE,)
     records = (f"{FOLDER}/population", f"{FOLDER}/population_groups_*")
     pages = ("population.html", "population.csv", "population.tex")
+    writer = "en4dvar.report.population:write_population"
 
     names: Sequence[str] = ()
     hyper: HyperPrior | None = None
@@ -90,13 +88,6 @@ class PopulationKind(TogetherKind):
         cautions = (*_cautions(population), *carried(used))
         about = {**attributes, "seed": config.seed, **_elsewhere(config, population, str(attributes.get("group", "")))}
         save_population(path, population, [s.members for s in used], cautions, about)
-
-    @classmethod
-    def page(cls, folder: Path, datasets: Sequence[str] = (), workers: int = 1, figures: bool = False) -> Path:
-        from en4dvar.report.population import write_population  # with matplotlib
-
-        with understood(folder / FILE):
-            return write_population(load_population(folder / FILE), folder)
 
 
 def groups_of(config: Config, names: Iterable[str]) -> list[SetGroup]:

@@ -1,7 +1,5 @@
 """What a run tells while it runs: one line an iteration in ``run.log``, a live line on a terminal."""
 
-from __future__ import annotations
-
 import math
 import os
 import time
@@ -16,7 +14,7 @@ from typing import Any, Self
 from en4dvar.diagnosis.analysis import ChainRecord, Descents, IterationRecord, Record, StartRecord
 from en4dvar.plumbing.compiled import watch_compilation
 from en4dvar.plumbing.errors import OutputError
-from en4dvar.plumbing.files import own_file
+from en4dvar.plumbing.files import own_file, refused
 from en4dvar.plumbing.tables import without_control
 from en4dvar.runs.interrupt import Interrupted
 
@@ -57,22 +55,18 @@ class RunLog:
     """
 
     def __init__(self, path: Path, append: bool = False):
-        try:
+        with refused(path, "cannot be written"):
             handle = own_file(path)
             if not append:
                 os.ftruncate(handle, 0)
             self._file = os.fdopen(handle, "a", encoding="utf-8", errors="backslashreplace", buffering=1)
-        except OSError as error:
-            raise OutputError(f"{path}: cannot be written: {error.strerror}") from None
         self._path = path
 
     def write(self, message: str) -> None:
         """Append every line of ``message`` with the time of day."""
         now = datetime.now().astimezone().isoformat(timespec="milliseconds")
-        try:
+        with refused(self._path, "cannot be written"):
             self._file.write("".join(f"{now} {without_control(line)}\n" for line in message.splitlines()))
-        except OSError as error:
-            raise OutputError(f"{self._path}: cannot be written: {error.strerror}") from None
 
     def __enter__(self) -> Self:
         return self

@@ -4,8 +4,6 @@ The directory may be a stranger's: every name, of the list or of ours, goes thro
 :func:`en4dvar.plumbing.files.inside`.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

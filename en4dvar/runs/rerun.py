@@ -4,8 +4,6 @@ Configuration, seed and observations are those in the files, so that the data ne
 sequence are read again.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -5,8 +5,6 @@ works in ``.en4dvar-next`` and takes the place of the earlier files when it is c
 next run there finishes it, and commands that read say so and read nothing.
 """
 
-from __future__ import annotations
-
 import itertools
 import re
 import shlex
@@ -19,7 +17,7 @@ from typing import Literal
 
 from en4dvar.executor.processes import end_unguarded
 from en4dvar.plumbing.errors import OutputError
-from en4dvar.plumbing.files import inside, make_folder, remove_file, write_text
+from en4dvar.plumbing.files import inside, make_folder, refused, remove_file, write_text
 from en4dvar.results.store import COMPLETE, NEXT, require_settled
 from en4dvar.runs.interrupt import begun
 from en4dvar.runs.lock import LOCK, locked
@@ -57,7 +55,7 @@ class RunDirectory:
 
     @classmethod
     @contextmanager
-    def open(cls, path: str | Path, mode: Mode = "new", files: Sequence[str] = ()) -> Iterator[RunDirectory]:
+    def open(cls, path: str | Path, mode: Mode = "new", files: Sequence[str] = ()) -> "Iterator[RunDirectory]":
         """Lock ``path`` for a new run, one that replaces an earlier run, the rest of one, or its report; ``beside`` for
         files that stand beside whatever is there, such as the result of an estimate of several runs.
 
@@ -76,7 +74,7 @@ class RunDirectory:
         if mode == "report" and not path.is_dir():
             raise OutputError(f"{path}: no such run directory")
         with ExitStack() as held:
-            try:
+            with refused(path, "cannot be used as run directory"):
                 if not home.is_dir():
                     home.mkdir(parents=True)
                     held.callback(_remove_if_empty, home)
@@ -88,8 +86,6 @@ class RunDirectory:
                 elif not resumed:
                     directory._refuse_foreign((*OF_EVERY_RUN, *files))
                     write_list(directory.work, ())
-            except OSError as error:
-                raise OutputError(f"{path}: cannot be used as run directory: {error.strerror or error}") from None
             try:
                 yield directory
             except BaseException as error:
@@ -142,10 +138,8 @@ class RunDirectory:
             self.remove(LISTING)
         if self.work != self.home:
             write_text(self.at(COMPLETE), "")
-            try:
+            with refused(self.path, "cannot be replaced"):
                 replace_earlier_run(self.home)
-            except OSError as error:
-                raise OutputError(f"{self.path}: cannot be replaced: {error.strerror or error}") from None
 
     def _withdraw(self) -> None:
         """Take back what :meth:`open` made, where the run has claimed nothing."""

@@ -1,8 +1,6 @@
 """The kind of run that follows a series of readings: ``sequence.nc``, ``summary.csv``, page."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -15,7 +13,6 @@ from en4dvar.executor import Executor
 from en4dvar.inputs.asked import DataFile
 from en4dvar.report.outcomes import SequenceOutcome
 from en4dvar.results.checkpoint import FOLDER
-from en4dvar.results.netcdf import Group, understood
 from en4dvar.results.series_file import sequence_csv, sequence_group
 from en4dvar.runs.cycles import Cycles, Keep
 from en4dvar.runs.engine import conduct_run
@@ -50,6 +47,9 @@ class SequenceKind(Cycles[SeriesResult]):
     result = "sequence.nc"
     files = (result, "summary.csv", f"{FOLDER}/sequence.cycle")
     pages = (REPORT, *FIGURES)
+    writer = "en4dvar.report.sequence:write_sequence_report"
+    laid_out = staticmethod(sequence_group)
+    summary = staticmethod(sequence_csv)
 
     @cached_property
     def problem(self) -> SeriesProblem:
@@ -73,19 +73,6 @@ class SequenceKind(Cycles[SeriesResult]):
 
     def assimilated(self, executor: Executor, resume: SequentialState | None, keep: Keep | None) -> SeriesResult:
         return assimilate_series(self.problem, self.config.seed, executor, self.on_cycle, resume, keep)
-
-    def laid_out(self, result: SeriesResult, attributes: Mapping[str, Any]) -> Group:
-        return sequence_group(result, attributes)
-
-    def summary(self, result: SeriesResult) -> str:
-        return sequence_csv(result)
-
-    @classmethod
-    def page(cls, folder: Path, datasets: Sequence[str] = (), workers: int = 1, figures: bool = False) -> Path:
-        from en4dvar.report.sequence import write_sequence_report
-
-        with understood(folder / cls.result):
-            return write_sequence_report(folder, figures)
 
 
 def sequence_summary(config: SequenceConfig, problem: SeriesProblem) -> str:

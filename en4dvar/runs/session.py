@@ -1,7 +1,5 @@
 """A run at work, of any kind: its directory, its log, the identity by which it is resumed, what it kept."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeVar

@@ -1,7 +1,5 @@
 """A forward run at given parameters, seen through the observation operator: predictions, or synthetic observations."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -40,7 +38,7 @@ class Simulation:
         """(K,) of the first series."""
         return next(iter(self.series.values()))
 
-    def with_noise(self, std: float | Mapping[str, float], seed: int) -> Simulation:
+    def with_noise(self, std: float | Mapping[str, float], seed: int) -> "Simulation":
         """Independent Gaussian noise added, of a standard deviation in the observable's unit: one for all series, or
         by their names.
         """

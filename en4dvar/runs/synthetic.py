@@ -5,8 +5,6 @@ were. When a series ends is decided by its readings alone, never by the truth. N
 even one that noise puts below zero: that would bias the noise, and with it whatever such readings tell.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Mapping

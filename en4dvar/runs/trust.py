@@ -5,8 +5,6 @@ is known only if this user has run or checked a configuration that names it, wit
 (:class:`~en4dvar.plumbing.user_code.Code`).
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress

@@ -1,8 +1,6 @@
 """The kind of run that is a twin experiment: ``twin.nc``, ``summary.csv``, page."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +9,6 @@ from en4dvar.executor import Executor
 from en4dvar.model.forward import ForwardModel
 from en4dvar.report.outcomes import TwinOutcome
 from en4dvar.results.checkpoint import FOLDER
-from en4dvar.results.netcdf import Group, understood
 from en4dvar.results.series_file import twin_csv, twin_group
 from en4dvar.runs.cycles import Cycles, Keep
 from en4dvar.runs.engine import conduct_run
@@ -44,6 +41,9 @@ class TwinKind(Cycles[TwinResult]):
     result = "twin.nc"
     files = (result, "summary.csv", f"{FOLDER}/twin.cycle")
     pages = (REPORT, *FIGURES)
+    writer = "en4dvar.report.twin:write_twin_report"
+    laid_out = staticmethod(twin_group)
+    summary = staticmethod(twin_csv)
 
     @property
     def model(self) -> ForwardModel:
@@ -60,19 +60,6 @@ class TwinKind(Cycles[TwinResult]):
 
     def assimilated(self, executor: Executor, resume: SequentialState | None, keep: Keep | None) -> TwinResult:
         return conduct(self.config.experiment, self.config.seed, executor, self.on_cycle, resume, keep)
-
-    def laid_out(self, result: TwinResult, attributes: Mapping[str, Any]) -> Group:
-        return twin_group(result, attributes)
-
-    def summary(self, result: TwinResult) -> str:
-        return twin_csv(result)
-
-    @classmethod
-    def page(cls, folder: Path, datasets: Sequence[str] = (), workers: int = 1, figures: bool = False) -> Path:
-        from en4dvar.report.twin import write_twin_report
-
-        with understood(folder / cls.result):
-            return write_twin_report(folder, figures)
 
 
 def twin_summary(config: TwinConfig) -> str:

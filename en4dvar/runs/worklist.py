@@ -1,7 +1,5 @@
 """The data sets of a run: which are done, what is left to do, and what came of it."""
 
-from __future__ import annotations
-
 import threading
 import traceback
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -22,9 +20,8 @@ from en4dvar.results.checkpoint import FOLDER, Keeper, file_digest
 from en4dvar.results.codec import decode_text, encode_text
 from en4dvar.results.pack import PACK, Entry, Pack, file_names, read_outcome
 from en4dvar.results.seal import SealedBytes
-from en4dvar.runs.campaign import Campaign, DatasetOutcome
+from en4dvar.runs.campaign import Campaign, DatasetOutcome, Outcomes
 from en4dvar.runs.jobs import Common, Estimate, FileJob, Job, Told, estimate, estimate_and_tell
-from en4dvar.runs.outcomes import Outcomes
 from en4dvar.runs.progress import LiveProgress, describe
 from en4dvar.runs.session import Session
 
@@ -54,12 +51,7 @@ def datasets(files: Mapping[str, DataFile]) -> tuple[Dataset, ...]:
     """Where the results of each data set go: ``posterior.nc`` for a single one, else ``datasets.pack``."""
     stems = file_names(files)
     return tuple(
-        Dataset(
-            name,
-            file,
-            stems[name],
-            f"{PACK}/{stems[name]}" if len(files) > 1 else "posterior.nc",
-        )
+        Dataset(name, file, stems[name], f"{PACK}/{stems[name]}" if len(files) > 1 else "posterior.nc")
         for name, file in files.items()
     )
 
@@ -71,13 +63,7 @@ class Worklist:
     known of a data set stays on disk. ``stop`` ends the estimates in threads of this process.
     """
 
-    def __init__(
-        self,
-        config: Config,
-        run: Session,
-        sets: tuple[Dataset, ...],
-        progress: Progress | None,
-    ):
+    def __init__(self, config: Config, run: Session, sets: tuple[Dataset, ...], progress: Progress | None):
         self.config, self.run, self.sets, self.progress = config, run, sets, progress
         self.ended: dict[str, str] = {}
         self.stop = threading.Event()

@@ -115,12 +115,7 @@ def needed_runs(n_parameters: int) -> tuple[int, int] | None:
 
 
 def emulate(
-    run: Run,
-    prior: Prior,
-    observations: Observations,
-    ensemble: Array,
-    random: np.random.Generator,
-    fits: int = 2,
+    run: Run, prior: Prior, observations: Observations, ensemble: Array, random: np.random.Generator, fits: int = 2
 ) -> EmulatedCost | None:
     """Ĵ about a Gaussian ensemble (N, n), transformed, with draws of it.
 

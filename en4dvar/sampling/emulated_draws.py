@@ -11,8 +11,6 @@ is wrong from runs at its own draws, first hot (τ > 1), so that they reach beyo
 Source: surrogates refined where they say that the posterior is, Li & Marzouk (2014), SIAM J. Sci. Comput. 36, A1163.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -86,7 +84,7 @@ class EmulatedProposal:
     @classmethod
     def fitted(
         cls, runs: RecordedRuns, start: StudentMixture, stream: np.random.Generator, heat: float, enough: float
-    ) -> EmulatedProposal | None:
+    ) -> "EmulatedProposal | None":
         """Fitted to the runs so far, with so many effective draws; ``start`` is a mixture about them. None where runs
         are too few.
         """

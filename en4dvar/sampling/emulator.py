@@ -10,8 +10,6 @@ Sources: polynomial surrogates of posteriors, Marzouk & Xiu (2009), Commun. Comp
 surrogate says, Li & Marzouk (2014), SIAM J. Sci. Comput. 36, A1163.
 """
 
-from __future__ import annotations
-
 import itertools
 from typing import NamedTuple
 
@@ -29,7 +27,7 @@ class Coordinates(NamedTuple):
     whiten: Array
 
     @classmethod
-    def about(cls, points: Array, width: float = 1.0) -> Coordinates:
+    def about(cls, points: Array, width: float = 1.0) -> "Coordinates":
         """Those in which points (N, n) have mean zero and the standard deviation 1/``width`` in every direction."""
         root = width * np.linalg.cholesky(np.atleast_2d(np.cov(points, rowvar=False)))
         return cls(points.mean(axis=0), np.asarray(root), np.asarray(np.linalg.inv(root), dtype=float))
@@ -53,7 +51,7 @@ class Emulator(NamedTuple):
     @classmethod
     def fitted(
         cls, coordinates: Coordinates, degree: int, x: Array, outputs: Array, counts: Array, ridge: float
-    ) -> Emulator:
+    ) -> "Emulator":
         """Least squares on runs at ``x`` (B, n) that gave ``outputs`` (B, K) and count so much (B,).
 
         ``ridge`` is relative to the normal equations of scaled columns: it decides where runs leave a coefficient open.

@@ -7,8 +7,6 @@ whose radius is read near its collapse. There Laplace's approximation at the low
 end, was off by up to nine, and proposals that start about its ensemble do not find the wide mode either.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 

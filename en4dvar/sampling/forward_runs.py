@@ -1,7 +1,5 @@
 """Forward runs of many data sets in one call: control vectors of every set → its predictions."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Protocol
 

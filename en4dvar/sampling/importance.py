@@ -13,8 +13,6 @@ of the posterior, with covariances that few draws do not make flat; what judges 
 the last proposal alone, made afresh: their mean weight is unbiased.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Protocol
 
@@ -62,12 +60,7 @@ class Importance:
     """
 
     def __init__(
-        self,
-        first: Proposal,
-        stream: np.random.Generator,
-        count: int,
-        wider: float = 1.0,
-        behind_each: float = 0.0,
+        self, first: Proposal, stream: np.random.Generator, count: int, wider: float = 1.0, behind_each: float = 0.0
     ):
         n = first.dimensions
         self.stream, self.count, self.wider, self.behind_each = stream, count, wider, behind_each

@@ -16,8 +16,6 @@ is near 1 only where jumps were accepted often enough to tell the weights.
 emcee's snooker move is not used: with 48 walkers in 5 dimensions it gave standard deviations 30 % too small.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -185,11 +183,7 @@ def _moves(emcee: Any, emulated: Emulated | None, proposal: StudentMixture | Non
     if proposal is not None:
         far.append((emcee.moves.MHMove(_jump(proposal)), JUMPS))
     near = 1.0 - sum(share for _, share in far)
-    return [
-        (emcee.moves.DEMove(), near * DE_SHARE),
-        (emcee.moves.StretchMove(), near * (1 - DE_SHARE)),
-        *far,
-    ]
+    return [(emcee.moves.DEMove(), near * DE_SHARE), (emcee.moves.StretchMove(), near * (1 - DE_SHARE)), *far]
 
 
 @dataclass(frozen=True)
@@ -202,7 +196,7 @@ class _Mixing:
     converged: bool
 
     @classmethod
-    def of(cls, chain: ChainState, target: float) -> _Mixing:
+    def of(cls, chain: ChainState, target: float) -> "_Mixing":
         samples = chain.samples[int(BURN_IN * chain.steps) :]
         r_hat, effective = split_r_hat(samples), effective_sample_size(samples)
         return cls(samples, r_hat, effective, bool(np.all(r_hat < MAX_R_HAT) and np.all(effective >= target)))

@@ -1,7 +1,5 @@
 """Mixtures fitted to draws: of Gaussians by expectation maximisation, and of Student t to draw proposals from."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -24,7 +22,7 @@ class StudentMixture:
     root: Array
 
     @classmethod
-    def fitted(cls, draws: Array, stream: np.random.Generator, components: int, alike: float = 0.0) -> StudentMixture:
+    def fitted(cls, draws: Array, stream: np.random.Generator, components: int, alike: float = 0.0) -> "StudentMixture":
         """To draws (D, d); ``alike`` as of :func:`fit_gaussians`."""
         share, centre, covariance = fit_gaussians(draws, stream, components, rounds=40, alike=alike)
         return cls(share, centre, np.asarray(np.linalg.cholesky(covariance), dtype=float))

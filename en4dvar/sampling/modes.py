@@ -4,8 +4,6 @@ Importance weights against J correct what the Gaussians about the minima are not
 share of the evidence, whatever its shape.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -89,12 +87,7 @@ class WeightedDraws:
 
 
 def sample_modes(
-    cost: Cost,
-    prior: Prior,
-    minima: Sequence[Minimum],
-    seed: int,
-    enough: float | None = None,
-    below: float = -np.inf,
+    cost: Cost, prior: Prior, minima: Sequence[Minimum], seed: int, enough: float | None = None, below: float = -np.inf
 ) -> WeightedDraws:
     """Draws of exp(−J) until ``enough`` of them (default: :data:`ENOUGH`) are effective, by eight runs each, or more as
     long as these are :data:`TOO_FEW`, or until J of one is ``below`` a value.

@@ -6,8 +6,6 @@
 shift moves every index by the same number.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

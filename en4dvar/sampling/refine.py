@@ -1,7 +1,5 @@
 """When an ensemble about one minimum of J leaves a doubt, and the sampled posterior that takes its place."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -6,8 +6,6 @@ within about a tenth, and what they differ from the ensemble's is what a Markov 
 (benchmarks/gaussianity.py).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -7,8 +7,6 @@ its fit from within its own. Trajectories stream through in chunks; of each chun
 kept, on disk where a folder is given, and an interrupted sweep continues with the chunks that are missing.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -58,7 +56,7 @@ class Best:
     shift: Array
     nrmse: Array
 
-    def merged(self, other: Best) -> Best:
+    def merged(self, other: "Best") -> "Best":
         """The better of the two, set by set; this one where they are equal."""
         better = other.nrmse > self.nrmse
         x = np.where(better[:, None], other.x, self.x)
@@ -76,7 +74,7 @@ class SweepResult:
     nrmse: Array
     trajectories: int
 
-    def part(self, rows: slice) -> SweepResult:
+    def part(self, rows: slice) -> "SweepResult":
         """The same of some of the data sets."""
         return replace(
             self, names=self.names[rows], theta=self.theta[rows], shift=self.shift[rows], nrmse=self.nrmse[rows]
@@ -189,7 +187,7 @@ class _Ranges:
     std: Array
 
     @classmethod
-    def of(cls, problems: Sequence[InverseProblem], width: float) -> _Ranges:
+    def of(cls, problems: Sequence[InverseProblem], width: float) -> "_Ranges":
         """Raises :class:`ConfigError` where the data sets cannot share a design."""
         first = problems[0]
         for other in problems[1:]:

@@ -1,7 +1,5 @@
 """Moves of an ensemble of walkers about others that stand still, on a density that is cheap to evaluate."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, Protocol
 

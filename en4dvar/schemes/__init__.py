@@ -4,8 +4,6 @@ Another package brings schemes of its own by entry points of the group ``en4dvar
 subclass of :class:`Scheme`. One that cannot be loaded is left out with a warning; a name of ours is not replaced.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import fields

@@ -8,8 +8,6 @@ The weights live in the space of the prior ensemble: a member is x̄0 + X0ᵀ (w
 centre and row i of the ensemble transform T.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -45,7 +43,7 @@ class Weights:
     wider: float = 1.0
 
     @classmethod
-    def prior(cls, n_members: int) -> Weights:
+    def prior(cls, n_members: int) -> "Weights":
         """w = 0, T = I."""
         identity = _identity(n_members)
         return cls(np.zeros(n_members), identity, identity)
@@ -185,7 +183,7 @@ class Scheme:
     localised_keys: ClassVar[frozenset[str] | None] = None
 
     @property
-    def minimiser(self) -> Minimiser | None:
+    def minimiser(self) -> "Minimiser | None":
         """The scheme itself where its steps are Gauss–Newton steps of J, judged by J of the central run.
 
         Other schemes take their step as it is; their ensemble is run as a whole, and R is that at its mean.
@@ -267,7 +265,7 @@ class Minimiser(Scheme):
     ] = 1e-4
 
     @property
-    def minimiser(self) -> Minimiser:
+    def minimiser(self) -> "Minimiser":
         return self
 
     @property

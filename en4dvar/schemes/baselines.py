@@ -10,8 +10,6 @@ they are a sample of the model's climatology.
 Sources: Gandin (1963), Objective Analysis of Meteorological Fields; as baselines: Raanes (2016), thesis, Oxford.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

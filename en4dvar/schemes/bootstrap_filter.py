@@ -11,8 +11,6 @@ Sources: Gordon, Salmond & Smith (1993), IEE Proc. F 140, 107; systematic: Kitag
 1; jitter: Musso, Oudjane & Le Gland (2001), in Doucet et al., Sequential Monte Carlo Methods in Practice, ch. 12.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, cast

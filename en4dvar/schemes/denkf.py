@@ -8,8 +8,6 @@ otherwise keeps more spread, as some inflation would:
 Source: Sakov & Oke (2008), Tellus A 60, 361.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

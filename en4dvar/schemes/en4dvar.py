@@ -7,8 +7,6 @@ Sources: Sakov, Oliver & Bertino (2012), Mon. Wea. Rev. 140, 1988; Bocquet & Sak
 20, 803; projection on the prior anomalies: Raanes, Stordal & Evensen (2019), Nonlin. Processes Geophys. 26, 325.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import ClassVar

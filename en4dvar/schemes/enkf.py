@@ -8,8 +8,6 @@ gain without sampling noise, and scaled by √(N/(N−1)), so that their sample 
 Sources: Burgers, van Leeuwen & Evensen (1998), Mon. Wea. Rev. 126, 1719; Evensen (2003), Ocean Dynamics 53, 343.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import ClassVar, cast

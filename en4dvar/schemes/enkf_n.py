@@ -15,8 +15,6 @@ Sources: Bocquet (2011), Nonlin. Processes Geophys. 18, 735; dual: Bocquet & Sak
 19, 383, § 3; Bocquet, Raanes & Hannart (2015), Nonlin. Processes Geophys. 22, 645.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import ClassVar

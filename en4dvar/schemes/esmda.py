@@ -13,8 +13,6 @@ symmetric transform, and is exactly one update for a linear model.
 Sources: Emerick & Reynolds (2013), Computers & Geosciences 55, 3; square root: as the ETKF, applied to αR.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 

@@ -11,8 +11,6 @@ those of the symmetric root by a rotation.
 Source: Whitaker & Hamill (2002), Mon. Wea. Rev. 130, 1913, eqs. 10–13.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import ClassVar

@@ -8,8 +8,6 @@ Sources: Bishop, Etherton & Majumdar (2001), Mon. Wea. Rev. 129, 420; symmetric 
 Physica D 230, 112.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

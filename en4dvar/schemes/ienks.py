@@ -16,8 +16,6 @@ strongly nonlinear F keeps to one minimum. In the linear case it is the same smo
 (2013), Nonlin. Processes Geophys. 20, 803.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal

@@ -6,8 +6,6 @@
 Both act on the anomalies of the analysis and leave its mean.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -17,8 +17,6 @@ With anomalies X (N, n) of what is estimated, Y (N, K) of the predictions and in
 Gains are applied to parts of the field, so that memory beside the ensemble is of the size of a part.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Protocol

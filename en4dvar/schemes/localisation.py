@@ -5,8 +5,6 @@ beyond the support. Sources: Hunt, Kostelich & Szunyogh (2007), Physica D 230, 1
 (1999), Q. J. R. Meteorol. Soc. 125, 723, eq. 4.10 (taper).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -50,7 +48,7 @@ class BlockLocalisation:
     @classmethod
     def on_line(
         cls, state: Array, observed: Array, radius: float, period: float | None = None, block_size: int = 1
-    ) -> BlockLocalisation:
+    ) -> "BlockLocalisation":
         """Blocks of ``block_size`` neighbours of a field at positions ``state`` (n,), NaN for variables not analysed.
 
         ``observed`` (K',) are the positions of the observations; distances are measured from the middle of a block.
@@ -63,7 +61,7 @@ class BlockLocalisation:
     @classmethod
     def on_grid(
         cls, where: npt.NDArray[np.intp], shape: Sequence[int], radius: float, periodic: bool
-    ) -> BlockLocalisation:
+    ) -> "BlockLocalisation":
         """Every cell by itself of a field on a grid of ``shape``, all cells observed, in C order.
 
         ``where`` (n,) are the places of the cells in the state; distances are Euclidean, in cells, and around the ends

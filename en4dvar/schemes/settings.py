@@ -1,7 +1,5 @@
 """The settings of an estimate: a scheme with its own keys, and the keys of every scheme."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Annotated, Any, Literal
@@ -75,8 +73,7 @@ class AssimilationSettings:
         "added: and let the posterior's width hold these as well (run --with-what-if).",
     ] = True
     stochastic_model: Annotated[
-        bool,
-        "true: accept a model that gives other numbers when a member is run again; by default that is an error.",
+        bool, "true: accept a model that gives other numbers when a member is run again; by default that is an error."
     ] = False
     localisation: Annotated[
         Localisation | None, "Which readings act on what: by distance, or by correlation; default: all on everything."

@@ -3,8 +3,6 @@
 The readings of one observable, which 1.0 had under this name, are in :mod:`en4dvar.data.series`.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 

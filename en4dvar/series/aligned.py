@@ -1,7 +1,5 @@
 """From the readings of a data set to a series of cycles: what was read at each instant side by side, gaps as NaN."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -3,8 +3,6 @@
 The analysis moves members along straight lines; in these coordinates none leaves the range of a parameter.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -26,7 +24,7 @@ class EnsembleCoordinates:
     lowest: tuple[float, ...] = ()
 
     @classmethod
-    def of(cls, model: ForwardModel, prior: Prior | None, positive: Sequence[str] = ()) -> EnsembleCoordinates:
+    def of(cls, model: ForwardModel, prior: Prior | None, positive: Sequence[str] = ()) -> "EnsembleCoordinates":
         """For the parameters of ``prior`` that the state has fields of; fields named in ``positive`` by logarithms, of
         what they exceed a lower bound by, where they have one.
         """

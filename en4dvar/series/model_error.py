@@ -11,8 +11,6 @@ Gürol & Sakov (2020), SIAM/ASA J. Uncertain. Quantif. 8, 1028 (IEnKS-Q); Raanes
 Rev. 143, 3857 (square root, "Sqrt-Core").
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal

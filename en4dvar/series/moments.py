@@ -1,7 +1,5 @@
 """Ensemble moments along a sequential run, taken of many cycles at once, and the outcome that holds them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,10 +25,10 @@ class Moments:
     rank: Array
 
     @classmethod
-    def empty(cls, cycles: int, size: int, ranked: bool) -> Moments:
+    def empty(cls, cycles: int, size: int, ranked: bool) -> "Moments":
         return cls(*(np.full((cycles, width), np.nan) for width in (size, size, size if ranked else 0)))
 
-    def until(self, cycle: int) -> Moments:
+    def until(self, cycle: int) -> "Moments":
         """Copy of the rows before ``cycle``."""
         return Moments(self.mean[:cycle].copy(), self.std[:cycle].copy(), self.rank[:cycle].copy())
 

@@ -1,7 +1,5 @@
 """Members of a series on their way: from one instant to later ones, and what is observed of them there."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """A series to assimilate: what is known at time zero, what was observed, and how it is assimilated."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -41,7 +39,7 @@ class SeriesProblem:
         settings: SequentialSettings,
         members: int,
         name: str = "series",
-    ) -> SeriesProblem:
+    ) -> "SeriesProblem":
         """The problem of readings of one or several observables, each series with its own times. Raises
         :class:`DataError`.
         """
@@ -55,7 +53,7 @@ class SeriesProblem:
         data: Observations,
         settings: SequentialSettings,
         members: int,
-    ) -> SeriesProblem:
+    ) -> "SeriesProblem":
         """The problem of a data set; ``observable`` is that of one without parts. Raises :class:`DataError`."""
         whole = Part(observable.name, observable, 0, len(data))
         observables, series = aligned(data, data.parts or (whole,))

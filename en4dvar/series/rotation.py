@@ -7,8 +7,6 @@ halved. Why rotate: Sakov & Oke (2008), Mon. Wea. Rev. 136, 1042; compact form: 
 Sci. Stat. Comput. 10, 53.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from en4dvar.model.state import Array

@@ -12,8 +12,6 @@ A member that cannot be integrated is dropped and the window done again with the
 those of one ensemble; its reason is kept.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import partial
 

@@ -1,7 +1,5 @@
 """A series of observation vectors for sequential assimilation, and the whitening of its errors."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

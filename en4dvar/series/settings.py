@@ -1,7 +1,5 @@
 """How the loop over a series treats the ensemble of a scheme."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 from en4dvar.schemes.base import Scheme

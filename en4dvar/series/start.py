@@ -1,7 +1,5 @@
 """The ensemble of a series at time zero: parameters from their prior, the state around what the model says of it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 

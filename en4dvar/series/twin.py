@@ -9,8 +9,6 @@ includes such parameters. RMSE and spread are over the dynamic variables, which 
 Random numbers: one stream for the truth, one for the errors of the observations, one a member.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """One window of a series: the members at its start, and the observations in it that are assimilated."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

@@ -4,8 +4,6 @@ Kept are the chunks of the sweeps, the populations and the fits of one gel; En4D
 decides the numbers is kept with them, and a study is continued only where that agrees.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
@@ -16,7 +14,7 @@ import yaml
 
 from en4dvar.assembly.build import data_files, inverse_plan
 from en4dvar.plumbing.errors import OutputError
-from en4dvar.plumbing.files import inside, read_plain, write_text
+from en4dvar.plumbing.files import inside, read_plain, refused, write_text
 from en4dvar.results.checkpoint import FOLDER, CheckpointError, digest, read_checkpoint, write_checkpoint
 from en4dvar.results.fingerprint import Identity, identity, source_digest
 from en4dvar.runs.rundir import RunDirectory
@@ -33,7 +31,7 @@ class StudyCheckpoints:
         self.folder, self.key = folder, key
 
     @classmethod
-    def open(cls, directory: RunDirectory, plan: StudyPlan, files: Sequence[str]) -> StudyCheckpoints:
+    def open(cls, directory: RunDirectory, plan: StudyPlan, files: Sequence[str]) -> "StudyCheckpoints":
         """For a new study in ``directory``, which will write ``files``, or the one that is there.
 
         Raises
@@ -101,7 +99,7 @@ def prepare_folder(folder: Path, key: str, mode: str) -> Path:
     ------
     OutputError: it holds another sweep, or cannot be written.
     """
-    try:
+    with refused(folder, "cannot be used"):
         folder.mkdir(parents=True, exist_ok=True)
         mark = inside(folder, "sweep.key")
         stored = read_plain(mark, 1000).decode("utf-8", "replace") if mark.exists() else ""
@@ -116,6 +114,4 @@ def prepare_folder(folder: Path, key: str, mode: str) -> Path:
         for partial in folder.glob(".*.tmp"):  # of a process that was killed
             partial.unlink()
         write_text(mark, key)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be used: {error.strerror or error}") from None
     return folder

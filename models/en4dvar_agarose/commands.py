@@ -1,7 +1,5 @@
 """``en4dvar sweep`` and ``en4dvar study``. Heavy imports stay inside the commands."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import click
@@ -51,7 +49,7 @@ def sweep(
     from en4dvar.sampling.sweep import SweepSettings, run_sweep
     from en4dvar_agarose.checkpoints import prepare_folder
     from en4dvar_agarose.run import earliest_reading, one_model
-    from en4dvar_agarose.summary import sweep_csv, sweep_text
+    from en4dvar_agarose.tables import sweep_csv, sweep_text
 
     if force and resume:
         raise click.UsageError("--force and --resume exclude each other")

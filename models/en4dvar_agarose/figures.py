@@ -1,14 +1,12 @@
 """The figures of the paper that are computed, drawn anew from a :class:`~en4dvar_agarose.fits.Study`."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 
 import numpy as np
 
 from en4dvar.model.state import Array
 from en4dvar.report.chart import COLUMN, PAGE, Chart, Panel, Row, in_columns
-from en4dvar.report.drawing import Captioned
+from en4dvar.report.svg import Captioned
 from en4dvar_agarose import measured
 from en4dvar_agarose.fits import Fit, Study
 from en4dvar_agarose.paper import NAMES, QUANTITIES, Quantity, Route

@@ -1,8 +1,7 @@
-"""The fits of the study for each gel and model, and their summaries."""
-
-from __future__ import annotations
+"""The fits of the study for each gel and model, their summaries, and which law they favour, or when not to decide."""
 
 import csv
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,7 +18,6 @@ from en4dvar.priors.prior import Prior
 from en4dvar.problem import InverseProblem
 from en4dvar.sampling.evidence import Evidence
 from en4dvar.sampling.sweep import SweepResult
-from en4dvar_agarose.evidence import Comparison
 from en4dvar_agarose.paper import Model, Route
 from en4dvar_agarose.settings import StudyPlan
 
@@ -119,7 +117,7 @@ class Study:
     plan: StudyPlan
     fits: Mapping[str, Mapping[Model, Fit]]
     populations: Mapping[str, Population]
-    comparisons: Mapping[str, Comparison]
+    comparisons: "Mapping[str, Comparison]"
     truth: Mapping[str, Mapping[str, float]]
     seconds: Mapping[str, float] = field(default_factory=dict)
     narrow: Mapping[str, Fit] = field(default_factory=dict)
@@ -156,3 +154,54 @@ def read_truth(path: Path) -> dict[str, dict[str, float]]:
         }
     except (OSError, KeyError, ValueError) as error:
         raise DataError(f"{path}: not the truth of a synthetic campaign of bubbles: {error!r}") from None
+
+
+DECISIVE = 3.0  # |Δ log-evidence|: odds of 20 to 1
+MISFIT = 2.0  # χ² per reading above which a model is not one of those to choose from
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Log-evidence of the quadratic over the neo-Hookean law.
+
+    ``single`` (S,) of each data set by itself. ``population``: parameters of all bubbles about a common mean with a
+    common spread. ``shared``: of all of them in one gel, material parameters common and R0, t_s of each bubble's own.
+    ``chi2`` of one gel per reading, (neo-Hookean, quadratic): far from one where no single gel explains the readings.
+    """
+
+    single: Array
+    population: float
+    shared: float
+    chi2: tuple[float, float]
+
+    @property
+    def independent(self) -> float:
+        """Evidence of all data sets, every bubble in a gel of its own."""
+        return float(self.single.sum())
+
+    @property
+    def undecidable(self) -> int:
+        """Data sets that cannot tell the laws apart."""
+        return int(np.sum(np.abs(self.single) < DECISIVE))
+
+
+@dataclass(frozen=True)
+class OneGel:
+    """One law with one value of its parameters in all data sets of a gel."""
+
+    log_evidence: float
+    chi2_per_observation: float
+
+
+def probability(difference: Array) -> Array:
+    """Probability of the favoured-by-positive model at equal prior odds, 1/(1 + e^−Δ)."""
+    return np.asarray(0.5 * (1 + np.tanh(np.asarray(difference) / 2)))
+
+
+def verdict(difference: float, positive: str = "quadratic law", negative: str = "neo-Hookean") -> str:
+    """In words: which model, and at what odds, or that the data cannot tell."""
+    if not math.isfinite(difference):
+        return "unknown"
+    if abs(difference) < DECISIVE:
+        return "undecidable"
+    return f"{positive if difference > 0 else negative} (odds e^{abs(difference):.0f} : 1)"

@@ -3,8 +3,6 @@
 Its agarose measurements are not public; nothing here enters an inference.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,11 +10,7 @@ Model = Literal["nh", "qs", "qlkv"]
 Route = Literal["sweep", "en4dvar"]
 
 LABELS: dict[Model, str] = {"nh": "NH", "qs": "QS QLKV", "qlkv": "Gen QLKV"}
-NAMES: dict[Model, str] = {
-    "nh": "neo-Hookean",
-    "qs": "quasi-static QLKV",
-    "qlkv": "general QLKV",
-}
+NAMES: dict[Model, str] = {"nh": "neo-Hookean", "qs": "quasi-static QLKV", "qlkv": "general QLKV"}
 ROUTES: dict[Route, str] = {"sweep": "IMR sweep", "en4dvar": "En4D-Var"}
 
 

@@ -1,7 +1,5 @@
 """One self-contained page, the tables in three formats, the figures as PDF and PNG."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +10,11 @@ from markupsafe import Markup
 from en4dvar.estimation.population import HyperPrior
 from en4dvar.plumbing.files import inside, make_folder, write_text
 from en4dvar.report.chart import COLUMN
-from en4dvar.report.drawing import keep
 from en4dvar.report.palette import DARK, LIGHT, css_variables
-from en4dvar.report.svg import svg
+from en4dvar.report.svg import keep, svg
 from en4dvar_agarose import measured, paper, tables
-from en4dvar_agarose.evidence import DECISIVE, MISFIT, probability, verdict
 from en4dvar_agarose.figures import all_figures
-from en4dvar_agarose.fits import Study
+from en4dvar_agarose.fits import DECISIVE, MISFIT, Study, probability, verdict
 from en4dvar_agarose.paper import LABELS, NAMES, QUANTITIES, ROUTES, Route
 from en4dvar_agarose.store import study_netcdf
 

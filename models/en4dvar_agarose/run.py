@@ -1,7 +1,5 @@
 """The study: both routes on every gel and model, then population and model comparison."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -23,8 +21,7 @@ from en4dvar.sampling.evidence import Evidence, sampled_evidence
 from en4dvar.sampling.forward_runs import ForwardRuns
 from en4dvar.sampling.sweep import SweepResult, run_sweep
 from en4dvar_agarose.checkpoints import D, StudyCheckpoints
-from en4dvar_agarose.evidence import Comparison, OneGel
-from en4dvar_agarose.fits import Fit, Study, read_truth
+from en4dvar_agarose.fits import Comparison, Fit, OneGel, Study, read_truth
 from en4dvar_agarose.paper import TABLE_2, Model
 from en4dvar_agarose.settings import StudyPlan
 from en4dvar_bubble.model import BubbleModel

@@ -1,7 +1,5 @@
 """The study's YAML file: which configurations make it up, how large the sweep is, where a twin's truth is."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any

@@ -1,7 +1,5 @@
 """A study as one netCDF file: a group a gel and model with both routes, and a population's draws."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import Any

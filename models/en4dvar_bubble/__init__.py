@@ -24,20 +24,6 @@ from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.solver.driver import ACCURACIES, Accuracy
 
 __all__ = [
-    "ACCURACIES",
-    "REGISTRY",
-    "WATER_25C",
-    "Accuracy",
-    "BubbleModel",
-    "ConstitutiveLaw",
-    "Driving",
-    "Liquid",
-    "Medium",
-    "MemoryVariable",
-    "NeoHookeanKelvinVoigt",
-    "QuadraticKelvinVoigt",
-    "get_law",
-    "histotripsy",
-    "silence",
-    "simulate",
-]
+    "ACCURACIES", "REGISTRY", "WATER_25C", "Accuracy", "BubbleModel", "ConstitutiveLaw", "Driving", "Liquid", "Medium",
+    "MemoryVariable", "NeoHookeanKelvinVoigt", "QuadraticKelvinVoigt", "get_law", "histotripsy", "silence", "simulate",
+]  # fmt: skip

@@ -6,8 +6,6 @@ calibration target gives the scale of the picture within about 1 %; the density 
 its speed of sound that of water or 3 % more; the walls of a dish or of the holder of a gel are millimetres away.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import lru_cache

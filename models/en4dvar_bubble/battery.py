@@ -4,8 +4,6 @@ A check takes a law and raises :class:`AssertionError` with the reason, which na
 place. All run at the law's example values, over its ``stretch_range``.
 """
 
-from __future__ import annotations
-
 import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

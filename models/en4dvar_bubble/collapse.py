@@ -25,8 +25,6 @@ published of gels that bubbles were used on; beyond it a history is doubted and 
 come as far, for a law that stiffens, or a pulse, does what no neo-Hookean spring can.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -42,11 +40,7 @@ from en4dvar.plumbing.errors import DataError
 from en4dvar_bubble.medium import Medium
 
 RAYLEIGH = 0.914681  # of the empty bubble: Rayleigh (1917)
-LOWEST = (
-    0.4,
-    0.6,
-    0.75,
-)  # of R_max: R^{5/2} is fitted to what lies above, to less where a thick gel lets it creep
+LOWEST = (0.4, 0.6, 0.75)  # of R_max: R^{5/2} is fitted to what lies above, to less where a thick gel lets it creep
 KNOWN = "write a configuration whose priors say what is known of it (en4dvar init --start laser, without --data)"
 BEFORE = 1.0  # of the time that is fitted to: a parabola whose top lies further before the first sample shows none
 TOLD = 0.6  # of R_max: a window that ends above does not tell the collapse time

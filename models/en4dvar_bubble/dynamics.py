@@ -1,7 +1,5 @@
 """The physics of a bubble: what is assumed, which quantities its state has, and the state it starts from."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace

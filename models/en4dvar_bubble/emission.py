@@ -11,8 +11,6 @@ this is ρ (R² R̈ + 2 R Ṙ²), the second derivative of the volume times ρ/4
 hydrophone meets too, is not in it, nor are steepening and absorption on the way.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, ClassVar
 

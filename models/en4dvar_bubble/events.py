@@ -9,8 +9,6 @@ running the members again at instants of their own, and Ṙ is taken for linear 
 has its collapse to better than 0.1 ns (tests/bubble/test_events.py). A member that has no such event fails.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar

@@ -1,7 +1,5 @@
 """Gas and vapour in the bubble: saturation, fractions of a mixture, the variable in which heat conduction is linear."""
 
-from __future__ import annotations
-
 from typing import overload
 
 import numpy as np

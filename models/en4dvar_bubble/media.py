@@ -5,8 +5,6 @@ fraction w, c = c_w + s w. A gel made elsewhere differs from that by ``rho_error
 how much polymer there is, the usual amount and its spread count as well. At 25 °C; c_w changes by 0.18 % a kelvin.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

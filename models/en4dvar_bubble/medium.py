@@ -1,7 +1,5 @@
 """Constants of the liquid, the gas, the vapour and their interface, each with its source; named sets of them."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
@@ -54,11 +52,7 @@ class Medium:
     )
     c_m: float = _constant(4181.0, "J/(kg K)", f"Specific heat of the medium {_CONDUCTING}.", f"{_IMR_V2} (Cp)", gt=0)
     D_v: float = _constant(
-        24.2e-6,
-        "m^2/s",
-        f"Diffusivity of vapour in the gas at p_inf and T_inf {_VAPOUR}.",
-        f"{_IMR_V2} (D0)",
-        gt=0,
+        24.2e-6, "m^2/s", f"Diffusivity of vapour in the gas at p_inf and T_inf {_VAPOUR}.", f"{_IMR_V2} (D0)", gt=0
     )
     D_p: float = _constant(
         0.0,
@@ -105,7 +99,7 @@ class Medium:
         }
         return json.dumps(told, ensure_ascii=False)
 
-    def with_constants(self, source: str, **values: float) -> Medium:
+    def with_constants(self, source: str, **values: float) -> "Medium":
         """The medium with some constants replaced, all from ``source``."""
         changed: dict[str, Any] = dict(values)
         return replace(self, **changed, sources={**self.sources, **dict.fromkeys(values, source)})

@@ -1,7 +1,5 @@
 """The bubble as a forward model: state vector {R, Ṙ, p_b, S, T, C, …, parameters}, observed through its radius."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from threading import Lock
@@ -65,7 +63,7 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
     )
 
     @classmethod
-    def from_settings(cls, settings: BubbleSettings) -> BubbleModel:
+    def from_settings(cls, settings: BubbleSettings) -> "BubbleModel":
         """The model of a ``model:`` section."""
         return cls(
             law=settings.constitutive_law,
@@ -83,7 +81,7 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
             wall=None if settings.wall is None else Wall(settings.wall.distance, settings.wall.kind),
         )
 
-    def with_parameters(self, names: Collection[str]) -> BubbleModel:
+    def with_parameters(self, names: Collection[str]) -> "BubbleModel":
         """See :mod:`en4dvar_bubble.numbers`."""
         asked = NAMES.intersection(names)  # seldom any, and to know which of them the equations contain takes longer
         named = tuple(p.name for p in self.optional_parameters if p.name in asked) if asked else ()

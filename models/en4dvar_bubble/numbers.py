@@ -3,8 +3,6 @@
 Constants of the medium and the gas, amplitude, time and shape of the driving, and the state at time zero.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import Field
 from types import MappingProxyType

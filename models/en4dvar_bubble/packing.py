@@ -1,7 +1,5 @@
 """From state vectors to the arrays of the compiled solver."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Integrated members as trajectories: fields of the state vector, computed from the raw solution when asked for."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
 

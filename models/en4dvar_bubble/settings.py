@@ -1,7 +1,5 @@
 """The ``model:`` section of a YAML file for the bubble."""
 
-from __future__ import annotations
-
 from dataclasses import Field as FieldOfMedium
 from dataclasses import replace
 from typing import Annotated, Any, Literal, get_args
@@ -106,12 +104,7 @@ _SOURCES = Field(
     description="Where replaced values come from, by constant; recorded with the result.",
 )
 _CONSTANTS: dict[str, Any] = {**{f.name: _key(f) for f in CONSTANTS}, "sources": (dict[str, str], _SOURCES)}
-ConstantsSettings = create_model(
-    "ConstantsSettings",
-    __base__=_NamedSet,
-    __doc__=_NamedSet.__doc__,
-    **_CONSTANTS,
-)
+ConstantsSettings = create_model("ConstantsSettings", __base__=_NamedSet, __doc__=_NamedSet.__doc__, **_CONSTANTS)
 
 
 class MediumSettings(Section):

@@ -7,8 +7,6 @@ halved, and its halves again: the seventh number is how many times narrower a ce
 none is halved), the eighth the place of its left half, which its right half follows.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Every kind of equations of the solver, integrated once for a microsecond."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial

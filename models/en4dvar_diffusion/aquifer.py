@@ -4,8 +4,6 @@ Cells have side 1; T = exp(ln_T), a field of the state that stays as it is. Fini
 between cells, implicit Euler steps, one factorisation a member. Source: Bear (1979), Hydraulics of Groundwater, § 5-1.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated
@@ -55,7 +53,7 @@ class Aquifer(ForwardModel):
         self.layout = StateLayout((head, ln_T, Field("recharge"), Field("storage")))
 
     @classmethod
-    def from_settings(cls, settings: AquiferSettings) -> Aquifer:
+    def from_settings(cls, settings: AquiferSettings) -> "Aquifer":
         return cls(settings.shape, settings.step)
 
     def initial_state(self, theta: Mapping[str, float]) -> Array:

@@ -4,8 +4,6 @@ A field drawn from the prior of ``configs/diffusion_field.yaml``, heads at wells
 errors of 2 % of the largest head.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

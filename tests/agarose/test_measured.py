@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from en4dvar.report.drawing import keep
+from en4dvar.report.svg import keep
 from en4dvar_agarose.figures import reliability_figure
 from en4dvar_agarose.measured import bins, coverage, reliability
 

@@ -8,8 +8,7 @@ from scipy.integrate import solve_ivp
 
 from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.settings import BubbleSettings
-from en4dvar_bubble.starter.look import look
-from en4dvar_bubble.starter.scatter import bad, noise
+from en4dvar_bubble.starter.look import bad, look, noise
 from en4dvar_bubble.starter.top import Top, top
 
 _PATH = solve_ivp(

@@ -22,10 +22,9 @@ from en4dvar.plumbing.errors import ConfigError, DataError
 from en4dvar.report.result import load_result
 from en4dvar_bubble.collapse import RAYLEIGH, lobe
 from en4dvar_bubble.laws import REGISTRY
-from en4dvar_bubble.starter.look import look
+from en4dvar_bubble.starter.look import look, noise
 from en4dvar_bubble.starter.page import Source, yaml_text
 from en4dvar_bubble.starter.proposal import starter
-from en4dvar_bubble.starter.scatter import noise
 
 ROOT = Path(__file__).resolve().parents[2]
 MEASURED = ROOT.parent / "shared" / "data"

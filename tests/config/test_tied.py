@@ -14,7 +14,7 @@ from en4dvar.estimation.assimilate import assimilate
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.priors.prior import Prior
 from en4dvar.problem import Tie
-from en4dvar.results.groups import build_groups
+from en4dvar.results.store import build_groups
 from en4dvar.runs.simulation import simulate
 from en4dvar.schemes.settings import AssimilationSettings
 

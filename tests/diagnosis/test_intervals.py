@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from en4dvar.diagnosis.intervals import member_quantiles
+from en4dvar.diagnosis.diagnostics import member_quantiles
 from en4dvar.priors.prior import whiten_sample
 
 REPEATS = 4000

@@ -8,9 +8,9 @@ import pytest
 import en4dvar
 from en4dvar.config import load_config
 from en4dvar.config.context import Context
+from en4dvar.config.load import values_of
 from en4dvar.config.parameters import Uncertain
 from en4dvar.config.schema import GivenStart
-from en4dvar.config.start import values_of
 from en4dvar.model.state import Parameter
 
 TIMES = np.linspace(0.1, 2.0, 12)

@@ -10,8 +10,7 @@ from toys import Decay, Fragile, Linear, Vectorised, make_observations
 
 from en4dvar.estimation.joint import estimate
 from en4dvar.estimation.joint.arrow import Arrow
-from en4dvar.estimation.joint.problem import JointProblem, sharing
-from en4dvar.estimation.joint.single import Single
+from en4dvar.estimation.joint.problem import JointProblem, Single, sharing
 from en4dvar.model.forward import Trajectory
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.priors.dependence import Dependence

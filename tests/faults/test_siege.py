@@ -7,10 +7,10 @@ from kills import survive
 from siege import ATTACKED, KINDS, Siege, besiege
 from siege_commands import commands
 
-from en4dvar.runs import kinds
+from en4dvar.runs.kind import KINDS as KINDS_OF_RUNS
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(not hasattr(os, "fork"), reason="forks of POSIX")]
-CONTINUED = [*kinds.KINDS, "run, chain", "sweep", "study"]
+CONTINUED = [*KINDS_OF_RUNS, "run, chain", "sweep", "study"]
 
 
 @pytest.fixture(scope="module")

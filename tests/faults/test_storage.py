@@ -17,8 +17,8 @@ from run_files import assert_same_results, configuration, interrupt, make_campai
 
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.report.chart import Chart, Panel, Row
-from en4dvar.report.drawing import keep
 from en4dvar.report.result import load_result
+from en4dvar.report.svg import keep
 from en4dvar.results.netcdf import netcdf_file
 from en4dvar.results.pack import PACK, Pack, read_result, results_of
 from en4dvar.runs.runner import run_campaign

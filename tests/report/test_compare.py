@@ -11,7 +11,7 @@ from run_files import add_to_pack
 from toys import Linear, make_problem
 
 from en4dvar.cli import main
-from en4dvar.diagnosis.intervals import member_quantiles
+from en4dvar.diagnosis.diagnostics import member_quantiles
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.priors.prior import Prior, PriorTerm

@@ -13,10 +13,10 @@ from en4dvar.diagnosis.diagnostics import HARDLY_INFORMED
 from en4dvar.model.state import Parameter
 from en4dvar.plumbing.caution import caution
 from en4dvar.priors.prior import Prior, PriorTerm
-from en4dvar.report.drawing import draw
 from en4dvar.report.figures import all_figures, histograms, neighbours
 from en4dvar.report.page import render_set, trust
 from en4dvar.report.result import Result
+from en4dvar.report.svg import draw
 
 JARGON = ("whitened", "leverage", "descent", "members alive", "DFS", "NRMSE", "χ²")
 

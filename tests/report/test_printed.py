@@ -16,8 +16,8 @@ from run_files import add_to_pack
 
 from en4dvar.cli import main
 from en4dvar.commands.run import _tell
+from en4dvar.diagnosis.diagnostics import member_quantiles
 from en4dvar.diagnosis.influence import Influence
-from en4dvar.diagnosis.intervals import member_quantiles
 from en4dvar.estimation.summary import INTERVAL, results_table
 from en4dvar.plumbing.caution import caution
 from en4dvar.report import write_pages

@@ -19,19 +19,18 @@ from PIL import Image
 from run_files import add_to_pack
 
 from en4dvar import report
-from en4dvar.diagnosis.diagnostics import chi2_interval
-from en4dvar.diagnosis.intervals import member_quantiles
+from en4dvar.diagnosis.diagnostics import chi2_interval, member_quantiles
 from en4dvar.executor import SerialExecutor, WorkerLostError
 from en4dvar.plumbing.caution import Caution
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.priors.prior import Prior
 from en4dvar.report import write_pages
-from en4dvar.report.drawing import draw
 from en4dvar.report.figures import all_figures, traces
 from en4dvar.report.history import history
 from en4dvar.report.overview import LISTED, SetSummary, overview_figures, render_overview
 from en4dvar.report.page import judge_chi2
 from en4dvar.report.result import Result, load_result
+from en4dvar.report.svg import draw
 from en4dvar.results.pack import PACK
 from en4dvar.results.provenance import provenance
 

@@ -15,10 +15,9 @@ from en4dvar.plumbing.errors import DataError, OutputError, TooFewMembersError
 from en4dvar.report.result import load_result
 from en4dvar.results.campaign_file import GROUPS, save_campaign
 from en4dvar.results.pack import PACK, Pack, file_names, read_outcome, results_of
-from en4dvar.runs import outcomes
-from en4dvar.runs.campaign import Campaign, DatasetOutcome
+from en4dvar.runs import campaign as campaigns
+from en4dvar.runs.campaign import Campaign, DatasetOutcome, Outcomes
 from en4dvar.runs.engine import write_report
-from en4dvar.runs.outcomes import Outcomes
 from en4dvar.runs.runner import run_campaign
 
 
@@ -198,7 +197,7 @@ def test_the_closing_message_reads_each_outcome_once(campaign, monkeypatch, caps
         read.append(name)
         return read_outcome(path, name, entry)
 
-    monkeypatch.setattr(outcomes, "read_outcome", noted)
+    monkeypatch.setattr(campaigns, "read_outcome", noted)
     with pytest.raises(Failed, match=r"3 of 6 data sets failed:\nempty: .*\nimage: .*\nset2: "):
         _tell(campaign, with_report=False)
     assert read == ["empty", "image", "set0", "set1", "set2", "set3"]

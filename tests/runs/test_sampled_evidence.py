@@ -7,8 +7,7 @@ import pytest
 from run_files import make_campaign
 
 from en4dvar.model.forward import ForwardModel
-from en4dvar.runs.evidence_run import sampled_evidences
-from en4dvar.runs.finished import finished
+from en4dvar.runs.finished import finished, sampled_evidences
 from en4dvar.runs.runner import run_campaign
 from en4dvar.sampling.forward_runs import ForwardRuns, log_likelihood
 

@@ -38,23 +38,7 @@ from en4dvar.data.noise.predicted import Linearisation, Predicted
 from en4dvar.data.noise.robust_discrepancy import RobustDiscrepancyNoise
 
 __all__ = [
-    "SIDES",
-    "SMOOTHNESS",
-    "BlockNoise",
-    "BoundNoise",
-    "CorrelatedNoise",
-    "Correlation",
-    "DiscrepancyNoise",
-    "HuberNoise",
-    "Kernel",
-    "Linearisation",
-    "Noise",
-    "Predicted",
-    "RobustDiscrepancyNoise",
-    "ScaleSkewness",
-    "joint_noise",
-    "noise_of",
-    "noise_of_readings",
-    "noise_of_record",
-    "sides_of",
-]
+    "SIDES", "SMOOTHNESS", "BlockNoise", "BoundNoise", "CorrelatedNoise", "Correlation", "DiscrepancyNoise",
+    "HuberNoise", "Kernel", "Linearisation", "Noise", "Predicted", "RobustDiscrepancyNoise", "ScaleSkewness",
+    "joint_noise", "noise_of", "noise_of_readings", "noise_of_record", "sides_of",
+]  # fmt: skip

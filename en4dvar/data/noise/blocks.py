@@ -6,8 +6,6 @@ the threshold of a robust cost one of :class:`HuberNoise`, the rest one of :clas
 information are sums over blocks, and what each reading contributes stands at its place.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace

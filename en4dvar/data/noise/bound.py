@@ -1,7 +1,5 @@
 """Readings that are bounds: what was read is at most, or at least, what is stated."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Gaussian errors that are correlated by a given matrix."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

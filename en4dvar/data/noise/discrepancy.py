@@ -12,8 +12,6 @@ Sources: Kennedy & O'Hagan (2001), J. R. Stat. Soc. B 63, 425 (discrepancy); Mar
 135 (score and information).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -107,7 +105,7 @@ class DiscrepancyNoise(Noise):
         np.fill_diagonal(correlation, 1.0)
         return CorrelatedNoise(std, np.zeros_like(std), Correlation(0.5 * (correlation + correlation.T)))
 
-    def gaussian_at(self, values: Array, predicted: Predicted) -> DiscrepancyNoise:
+    def gaussian_at(self, values: Array, predicted: Predicted) -> "DiscrepancyNoise":
         """Gaussian errors that count each reading as these do at a prediction."""
         return self
 

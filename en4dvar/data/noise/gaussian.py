@@ -1,7 +1,5 @@
 """Gaussian errors, independent of each other: the base of every kind, which says what differs."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -96,7 +94,7 @@ class Noise:
         rest = slice(len(values), None)
         return predicted.values[rest], self.error_std(predicted)[rest]
 
-    def frozen(self, predicted: Predicted) -> Noise:
+    def frozen(self, predicted: Predicted) -> "Noise":
         """Errors whose std is that at a prediction and depends on no state any more."""
         return replace(self, std=self.error_std(predicted), time_std=np.zeros_like(self.std))
 

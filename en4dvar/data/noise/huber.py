@@ -1,7 +1,5 @@
 """Independent errors with heavy tails, the robust cost."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

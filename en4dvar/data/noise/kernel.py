@@ -1,7 +1,5 @@
 """The covariance of a model's discrepancy along time."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cached_property

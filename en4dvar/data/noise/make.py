@@ -1,7 +1,5 @@
 """From what is stated about the errors to their kind, of one series and of several together."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import cast

@@ -2,8 +2,6 @@
 change.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +23,7 @@ class Predicted:
     noise_scale: Array | None = None
     discrepancy: Array | None = None
 
-    def __getitem__(self, runs: int | slice) -> Predicted:
+    def __getitem__(self, runs: int | slice) -> "Predicted":
         """The same of some of the runs."""
         return Predicted(
             self.values[runs],
@@ -47,7 +45,7 @@ class Predicted:
                 parts.append(np.log(self.discrepancy))
         return np.hstack(parts) if len(parts) > 1 else parts[0]
 
-    def unstacked(self, columns: Array) -> Predicted:
+    def unstacked(self, columns: Array) -> "Predicted":
         """The inverse of :attr:`stacked` for columns (…, Ky) of the same make, such as those of an emulator."""
         values, rates, scale, discrepancy = self.parts(columns)
         return Predicted(
@@ -83,6 +81,6 @@ class Linearisation:
     log_discrepancy_anomalies: Array | None = None
 
     @classmethod
-    def of_stacked(cls, like: Predicted, reference: Array, anomalies: Array) -> Linearisation:
+    def of_stacked(cls, like: Predicted, reference: Array, anomalies: Array) -> "Linearisation":
         """From reference (Ky,) and anomalies (N, Ky) of what :attr:`Predicted.stacked` of ``like`` holds."""
         return cls(like.unstacked(reference), *like.parts(anomalies))

@@ -10,8 +10,6 @@ u solves a quadratic problem in the box |u| ≤ c/s, found by Newton's method on
 Kunisch 2002, SIAM J. Optim. 13, 865). Then ∂J_o/∂m = −u, and rows of d and S are those of S²/w + A, w = ρ'(v)/v.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property

@@ -12,8 +12,6 @@ Source: Hartikainen & Särkkä (2010), Proc. IEEE MLSP, 379; Särkkä & Solin (2
 Equations, § 12.3; Durbin & Koopman (2012), Time Series Analysis by State Space Methods, § 4.5.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from en4dvar.model.state import Array

@@ -4,8 +4,6 @@ The catalogue says what can be done in general. Here each advice leaves out what
 does not bring the same words back.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Single checks: pure functions, each silent where there is nothing to say."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace

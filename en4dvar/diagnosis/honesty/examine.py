@@ -1,7 +1,5 @@
 """The checks: what an assimilation ended with → warnings, the worst first. Nothing is run and nothing recomputed."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -41,10 +39,7 @@ class ControlEnsembles:
 
 
 def examine(
-    analysis: Analysis,
-    control: ControlEnsembles,
-    worst_loss: Sequence[str] = (),
-    earlier: tuple[Caution, ...] = (),
+    analysis: Analysis, control: ControlEnsembles, worst_loss: Sequence[str] = (), earlier: tuple[Caution, ...] = ()
 ) -> tuple[Caution, ...]:
     """Everything that should keep a reader from trusting the posterior, or that they should know, worst first.
 

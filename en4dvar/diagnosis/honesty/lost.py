@@ -1,7 +1,5 @@
 """Members lost in a forecast: how many, why, and where in the space of the parameters they lay."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 

@@ -9,8 +9,6 @@ and the rest of C_ii comes from the readings. Of a number that the readings hard
 correlation with it: what would go if that number were known exactly.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -14,8 +14,6 @@ differ by what the change does within one cell. The reading of an instant is thu
 should: a rebound tells of the viscosity in the collapse before it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -9,8 +9,6 @@ g' the gradient of the changed problem and g that of the problem itself (0 at it
 leave). With a constant R and the same prior this is δx = C JᵀR⁻¹ (δy − δm), C = EᵀA⁻¹E the covariance of the posterior.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

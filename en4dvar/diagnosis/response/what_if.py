@@ -5,8 +5,6 @@ where it leads, corrects it with the same tangent (a chord iteration), until wha
 parameter. An alternative that does not settle within :data:`MOST_RUNS` is beyond linear response and is fitted again.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

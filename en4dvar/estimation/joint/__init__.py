@@ -8,7 +8,6 @@ in units of the prior, which enters once for what is shared. From the bottom up:
 """
 
 from en4dvar.estimation.joint.estimate import JointEstimate, estimate_jointly
-from en4dvar.estimation.joint.problem import JointProblem, sharing
-from en4dvar.estimation.joint.single import Single
+from en4dvar.estimation.joint.problem import JointProblem, Single, sharing
 
 __all__ = ["JointEstimate", "JointProblem", "Single", "estimate_jointly", "sharing"]

@@ -14,8 +14,6 @@ Identification of Outliers, ch. 5). Where the others scatter by more than their 
 with the others' median by an F distribution: of data sets that all differ, none is odd.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
@@ -23,8 +21,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import chdtrc, fdtrc, gammaincinv
 
-from en4dvar.estimation.joint.problem import JointProblem
-from en4dvar.estimation.joint.single import Single
+from en4dvar.estimation.joint.problem import JointProblem, Single
 from en4dvar.model.state import Array
 
 ODD = 0.01  # probability below which an experiment is odd, that any of a campaign be so by chance

@@ -7,8 +7,6 @@ r"""Symmetric positive definite matrices of arrow form: a border that all blocks
 The cost grows with the number of blocks, not with its square.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,7 +1,5 @@
 """J of several data sets: each experiment is linearised in its own few directions, what is shared is solved once."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -26,7 +24,7 @@ class Place:
     border: Array
     own: tuple[Array, ...]
 
-    def moved(self, by: tuple[Array, Sequence[Array]], length: float) -> Place:
+    def moved(self, by: tuple[Array, Sequence[Array]], length: float) -> "Place":
         """The point so much of a step away."""
         own = tuple(v + length * dv for v, dv in zip(self.own, by[1], strict=True))
         return Place(self.border + length * by[0], own)
@@ -57,7 +55,7 @@ class ArrowSystem:
         of_each = zip(joint.experiments, self.forms, strict=True)
         return np.array([float(p.observations.chi2_per_observation(f.central.predicted)[0]) for p, f in of_each])
 
-    def step(self) -> ArrowStep:
+    def step(self) -> "ArrowStep":
         """That of Gauss and Newton."""
         a, b = self.slope
         x, y = self.arrow.solve(-a, [-own for own in b])

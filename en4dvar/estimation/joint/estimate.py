@@ -1,7 +1,5 @@
 """A joint estimate from single ones: where it starts, the descents, the members and what they predict."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -13,12 +11,10 @@ from en4dvar.ensemble.forecast import Forecast, plotting_times
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.estimation.conclusions import missing_readings
 from en4dvar.estimation.joint.agreement import AT_MOST, Agreement, agreement, is_odd, oddest
-from en4dvar.estimation.joint.challenge import challenger
 from en4dvar.estimation.joint.descent import JointDescent, Place, assembled, cost, descend
 from en4dvar.estimation.joint.doubts import doubts
-from en4dvar.estimation.joint.members import JointMembers, gaussian, sampled
-from en4dvar.estimation.joint.problem import JointProblem
-from en4dvar.estimation.joint.single import Single
+from en4dvar.estimation.joint.members import JointMembers, challenger, gaussian, sampled
+from en4dvar.estimation.joint.problem import JointProblem, Single
 from en4dvar.estimation.joint.tangent import Experiment
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
 from en4dvar.model.state import Array
@@ -55,7 +51,7 @@ class JointEstimate:
     forward_runs: int
     cautions: tuple[Caution, ...]
     agreement: Agreement
-    without: JointEstimate | None = None
+    without: "JointEstimate | None" = None
 
     @property
     def odd(self) -> tuple[str, ...]:
@@ -63,7 +59,7 @@ class JointEstimate:
         return tuple(name for name in self.joint.names if name not in self.rest.joint.names)
 
     @property
-    def rest(self) -> JointEstimate:
+    def rest(self) -> "JointEstimate":
         """The estimate without any odd experiment."""
         return self.without.rest if self.without else self
 

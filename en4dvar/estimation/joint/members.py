@@ -7,9 +7,11 @@ What is shared, s, is drawn from Student's t about the mode; given s each experi
 with v_k from a Gaussian about where J is low given s, widened. The estimate of L_e is unbiased, and with it the
 weights of s and the choice of one v_k for each member are those of the exact posterior (Andrieu & Roberts 2009,
 Ann. Stat. 37, 697).
-"""
 
-from __future__ import annotations
+The minimum may hold one experiment in the wrong minimum of its own quantities, as a bubble whose radii explain rebounds
+by their phase and not by their height. The others then keep what is shared about right, so that to look for a lower one
+(:func:`challenger`) it is enough to look at one experiment after the other.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import gammaln, logsumexp
 
-from en4dvar.estimation.joint.descent import ArrowSystem
+from en4dvar.estimation.joint.descent import ArrowSystem, Place
 from en4dvar.estimation.joint.problem import JointProblem
 from en4dvar.estimation.joint.tangent import Experiment
 from en4dvar.model.state import Array
@@ -142,3 +144,26 @@ def _one(own: Array, log: Array, stream: np.random.Generator) -> Array:
 
 def _numbers(seed: int, words: str, count: int, size: int) -> Array:
     return np.asarray(member_stream(seed, words).standard_normal((count, size)))
+
+
+OF_PRIOR, DEEPEST, DESCENTS = 48, 4, 8  # of the prior; of which are descended from; and with so many linearisations
+LOWER = 0.5  # of J
+
+
+def challenger(experiments: Sequence[Experiment], at: ArrowSystem, seed: int) -> Place | None:
+    """The place with the own quantities of some experiments in lower minima; None where none is found."""
+    place, lower = at.place, False
+    own = list(place.own)
+    for experiment in experiments:
+        e, n = experiment.e, len(own[experiment.e])
+        if not n:
+            continue
+        draws = member_stream(seed, f"joint challengers {e}").standard_normal((OF_PRIOR, n))
+        border = np.tile(place.border, (OF_PRIOR, 1))
+        costs = experiment.costs(experiment.joint.standard(e, border, draws)) + 0.5 * np.sum(draws**2, axis=1)
+        starts = draws[np.argsort(costs, kind="stable")[:DEEPEST]]
+        precision = np.broadcast_to(at.arrow.blocks[e], (DEEPEST, n, n))
+        places, _, ends = experiment.settled(border[:DEEPEST], starts, precision, DESCENTS)
+        if ends.min() < at.forms[e].cost + 0.5 * float(own[e] @ own[e]) - LOWER:
+            own[e], lower = places[np.argmin(ends)], True
+    return Place(place.border, tuple(own)) if lower else None

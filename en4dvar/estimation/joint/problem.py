@@ -1,6 +1,4 @@
-"""Who shares what: inverse problems, and the quantities that have one value in several of them."""
-
-from __future__ import annotations
+"""Who shares what: inverse problems, quantities that have one value in several of them, and what each says alone."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,8 +10,23 @@ from en4dvar.ensemble.forecast import check_problem
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.hints import suggest
-from en4dvar.priors.prior import PriorTerm
+from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
+
+
+@dataclass(frozen=True)
+class Single:
+    """The estimate of one experiment by itself: mode (n,) and posterior precision (n, n), in units of the prior."""
+
+    mode: Array
+    precision: Array
+
+    @classmethod
+    def of_physical(cls, prior: Prior, members: Array, mode: Array) -> "Single":
+        """From the members (N, n) alive and the mode (n,) of a posterior. Raises ValueError outside a map's range."""
+        z = (prior.from_physical(np.vstack([members, mode])) - prior.mean) / prior.std
+        return cls(z[-1], np.linalg.inv(np.atleast_2d(np.cov(z[:-1].T))))
+
 
 EVERYONE = ""  # the group of a quantity that all experiments share
 
@@ -67,7 +80,7 @@ class JointProblem:
         """Of the experiments."""
         return tuple(problem.observations.name for problem in self.experiments)
 
-    def of(self, kept: Sequence[int]) -> JointProblem:
+    def of(self, kept: Sequence[int]) -> "JointProblem":
         """The same of some of the experiments."""
         return JointProblem(tuple(self.experiments[e] for e in kept), tuple(self.groups[e] for e in kept))
 

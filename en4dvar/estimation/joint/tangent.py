@@ -1,7 +1,5 @@
 """One experiment of a joint problem: J_o of control vectors, and its linearisation by runs close to one of them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

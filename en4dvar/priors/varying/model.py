@@ -4,8 +4,6 @@ Its state at a knot goes on with the value of the next piece in the field that h
 state carries the parameter, and that can be resumed from a state, can be run like this.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

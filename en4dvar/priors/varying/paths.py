@@ -1,7 +1,5 @@
 """Paths that were run piece by piece, seen as one."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -70,7 +68,7 @@ class Walk:
             return JoinedBatch(self)
         return [self.failures.get(i) or self.path(i) for i in range(len(self.x))]
 
-    def path(self, i: int) -> JoinedTrajectory:
+    def path(self, i: int) -> "JoinedTrajectory":
         """The path of a member that has not failed."""
         parts = []
         for run in self.runs:

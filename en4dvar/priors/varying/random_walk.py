@@ -8,8 +8,6 @@ are what they are without; the values of the pieces are their sums. Where q is e
 a half-normal prior, and the c_k / q ~ N(0, 1) take the place of the c_k, so that all are still independent.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -40,7 +38,7 @@ class RandomWalk:
     @classmethod
     def of(
         cls, model: ForwardModel, first: PriorTerm, knots: Sequence[float], std: float, estimated: bool = False
-    ) -> RandomWalk:
+    ) -> "RandomWalk":
         """With changes N(0, std²) in the transformed space of ``first``. Raises :class:`ConfigError`.
 
         ``estimated``: ``std`` is that of the half-normal prior of their standard deviation.

@@ -4,8 +4,6 @@ At a knot a field of the state is multiplied by exp(c), or c is added to it, c ~
 varies, the changes are parameters of the control vector.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -31,7 +29,9 @@ class StateChanges:
     changes: tuple[PriorTerm, ...]
 
     @classmethod
-    def of(cls, model: ForwardModel, field: Field, knots: Sequence[float], std: float, relative: bool) -> StateChanges:
+    def of(
+        cls, model: ForwardModel, field: Field, knots: Sequence[float], std: float, relative: bool
+    ) -> "StateChanges":
         """Changes N(0, std²), in the field's unit or of its logarithm. Raises :class:`ConfigError`."""
         what, unit = (f"ln {field.name}", "1") if relative else (field.name, field.unit)
 

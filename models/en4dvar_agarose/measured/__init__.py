@@ -3,8 +3,6 @@
 ``population.csv``: python benchmarks/study_population.py; ``reliability.csv``: python benchmarks/study_reliability.py.
 """
 
-from __future__ import annotations
-
 import csv
 from dataclasses import dataclass
 from itertools import pairwise
@@ -13,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from en4dvar.model.state import Array
-from en4dvar_agarose.evidence import probability
+from en4dvar_agarose.fits import probability
 
 FOLDER = Path(__file__).parent
 POPULATION_HEAD = ["gel", "seed", "parameter", "low", "median", "high", "true_mean", "mean_of_truths", "stacked_mean"]

@@ -5,14 +5,6 @@ from en4dvar_bubble.driving.pulses import Envelope, gaussian, histotripsy, silen
 from en4dvar_bubble.driving.tabulated import from_file, tabulated
 
 __all__ = [
-    "Driving",
-    "Envelope",
-    "Reading",
-    "from_file",
-    "gaussian",
-    "histotripsy",
-    "silence",
-    "sine_burst",
-    "step",
+    "Driving", "Envelope", "Reading", "from_file", "gaussian", "histotripsy", "silence", "sine_burst", "step",
     "tabulated",
-]
+]  # fmt: skip

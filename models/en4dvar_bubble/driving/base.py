@@ -1,7 +1,5 @@
 """The driving of a bubble: a pressure in the far field that is zero outside a span of time."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -66,7 +64,7 @@ class Driving:
     cells: int = 512
     stops: tuple[float, ...] = ()
     numbers: tuple[PulseNumber, ...] = ()
-    remade: Callable[..., Driving] | None = field(default=None, compare=False)
+    remade: "Callable[..., Driving] | None" = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
         if not self.end > self.begin:

@@ -5,8 +5,6 @@ bounds and description, and the first line of its docstring says what it is. A k
 can be a parameter of the model.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace

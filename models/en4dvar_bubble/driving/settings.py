@@ -1,7 +1,5 @@
 """The ``driving:`` section of a YAML file for the bubble: one model per ``kind``."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from inspect import signature
 from pathlib import Path
@@ -34,7 +32,7 @@ class _Kind(Section):
         return type(self).pulse(**self.model_dump(exclude={"kind"}))
 
     @model_validator(mode="after")
-    def _can_be_built(self) -> _Kind:
+    def _can_be_built(self) -> "_Kind":
         try:
             driving = self.build()
         except En4dvarError as error:
@@ -136,9 +134,7 @@ class _AsWritten:
 
 
 DrivingSettings: Any = Annotated[
-    Union[(*PULSE_SECTIONS.values(), Tabulated)],
-    Field(discriminator="kind"),
-    _AsWritten(),
+    Union[(*PULSE_SECTIONS.values(), Tabulated)], Field(discriminator="kind"), _AsWritten()
 ]
 
 

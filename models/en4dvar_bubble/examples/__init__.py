@@ -1,13 +1,11 @@
 """Examples that come with the package, for those without a clone: each a folder with a configuration and its data."""
 
-from __future__ import annotations
-
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
 
 from en4dvar.plumbing.errors import OutputError
-from en4dvar.plumbing.files import write_text
+from en4dvar.plumbing.files import make_folder, write_text
 
 EXAMPLES = ("quickstart",)
 
@@ -24,10 +22,7 @@ def write_example(name: str, folder: Path, force: bool = False) -> Path:
         if (folder / path).exists() and not force:
             raise OutputError(f"{folder / path}: exists; give --force to replace it")
     for path, source in items.items():
-        try:
-            (folder / path).parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise OutputError(f"{(folder / path).parent}: cannot be created: {error.strerror or error}") from None
+        make_folder((folder / path).parent)
         write_text(folder / path, source.read_text(encoding="utf-8"))
     return folder / f"{name}.yaml"
 

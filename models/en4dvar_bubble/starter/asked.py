@@ -1,7 +1,5 @@
 """What ``en4dvar init`` is told about the columns of a file, what their names tell, and which options are missing."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -57,7 +55,7 @@ class Asked:
         span = f"{finite.min():g} to {finite.max():g}" if len(finite) else "none of them finite"
         return f"{name} ({len(values)} values, {span})"
 
-    def by_names(self) -> Asked:
+    def by_names(self) -> "Asked":
         """With the columns whose names tell what they are; pixels and frames as units.
 
         Raises :class:`UnitError`, and :class:`ConfigError` for options that contradict each other.
@@ -81,7 +79,7 @@ class Asked:
         named = replace(self, time_column=time, radius_column=radius, time_unit=times, radius_unit=radii)
         return named._of_camera()
 
-    def _of_camera(self) -> Asked:
+    def _of_camera(self) -> "Asked":
         asked = self
         if asked.pixel is not None:
             if asked.radius_unit not in (None, *_AS_PIXELS):

@@ -1,7 +1,5 @@
 """A starter configuration as text, from data files and what their columns mean."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Mapping

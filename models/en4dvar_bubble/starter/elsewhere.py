@@ -6,8 +6,6 @@ estimated with a prior that says how well it is known; the data hardly change it
 interval.
 """
 
-from __future__ import annotations
-
 import glob
 import json
 import math

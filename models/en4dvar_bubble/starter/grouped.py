@@ -1,7 +1,5 @@
 """Which gel, day or concentration each bubble is of: by its folder, or as a column of a table says."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field

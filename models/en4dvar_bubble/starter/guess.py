@@ -10,8 +10,6 @@ geometric mean. Collapse times of model and data are taken in the same way
 A guess is an order of magnitude to centre a wide prior on: it has seen the data that the prior is then confronted with.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -47,7 +45,7 @@ class Guess:
     misfit: float
     source: str = ""
 
-    def common(self) -> Guess:
+    def common(self) -> "Guess":
         """No stiffer or thicker than half of what common gels are at most: for a history that is doubted."""
         most = COMMON._asdict()
         values = {name: min(value, 0.5 * most.get(name, np.inf)) for name, value in self.values.items()}

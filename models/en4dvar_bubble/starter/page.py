@@ -1,7 +1,5 @@
 """A proposal as the text of a YAML file."""
 
-from __future__ import annotations
-
 import json
 import re
 import shlex

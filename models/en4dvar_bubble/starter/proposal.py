@@ -1,7 +1,5 @@
 """From what the data show to what a first configuration says."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -39,7 +37,6 @@ SIMPLER: Mapping[Start, Mapping[str, str]] = {
     "laser": {"gas": "polytropic", "vapour": "none", "medium_heat": "cold", "vapour_pressure": "saturated"},
 }
 LEAST_NOISE = 0.0005  # of R_max: no camera reads better
-USUAL_NOISE = 0.01  # of R_max: of readings too few to tell
 NOISE_LOG_STD = 0.4  # of the noise scale: a scatter is told by a dozen windows, and not alike at all radii
 TOP_WIDTH = 3.0  # standard errors of the top that the prior takes: it is not to count the readings there twice
 DISCREPANCY = "{kernel: matern-3/2, grows_beyond: 10 m/s}"

@@ -6,8 +6,6 @@ number of bubbles averages their errors out: they are estimated with the gel. Ti
 the readings, which are times, stands for that of the camera.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 

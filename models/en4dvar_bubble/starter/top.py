@@ -12,8 +12,6 @@ estimates contradicts those before it. The largest reading itself, which is no e
 and is too high by about ε √(2 ln n).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 
