@@ -28,14 +28,14 @@ class Standing:
     bands: dict[tuple[str, str], dict[int, tuple[float, float, float]]] = field(default_factory=dict)
 
 
-def standings(told: str) -> dict[str, Standing]:
+def standings(log: str) -> dict[str, Standing]:
     """Name → where the data set stands, in the order in which the log names them; what is told twice counts once."""
-    found: dict[str, Standing] = {}
-    for line in told.splitlines():
+    sets: dict[str, Standing] = {}
+    for line in log.splitlines():
         if (parts := TOLD.match(line)) is None:
             continue
         name, words, intervals = parts.groups()
-        standing = found.setdefault(name, Standing())
+        standing = sets.setdefault(name, Standing())
         kind, _, rest = words.partition(": ")
         if kind == "estimate":
             standing.estimate = rest
@@ -44,7 +44,7 @@ def standings(told: str) -> dict[str, Standing]:
         for parameter, middle, low, high, unit in BAND.findall(intervals or ""):
             band = standing.bands.setdefault((parameter, unit), {})
             band[int(words.split()[1])] = float(low), float(middle), float(high)
-    return found
+    return sets
 
 
 def bands(standing: Standing) -> Chart | None:
