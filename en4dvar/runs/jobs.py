@@ -12,7 +12,7 @@ from en4dvar.assembly.build import build_one
 from en4dvar.config import Config
 from en4dvar.diagnosis.analysis import IterationRecord, Progress, Record
 from en4dvar.estimation.assimilate import LoopState, assimilate
-from en4dvar.estimation.summary import dataset_rows, remarks, summarise
+from en4dvar.estimation.summary import brief, dataset_rows, remarks, summarise
 from en4dvar.executor import Executor
 from en4dvar.executor.chunks import CommonValue
 from en4dvar.inputs.asked import DataFile
@@ -131,7 +131,8 @@ def estimate(job: Job | FileJob, executor: Executor | None = None, progress: Pro
     converged = "converged" if analysis.converged else "not converged"
     ending = f"{converged}: {analysis.stop_reason}; {analysis.forward_runs} forward runs"
     warnings = (f"{warning.severity}: {warning}" for warning in analysis.cautions)
-    return Estimate(content, sha256, encode_text(outcome), (ending, *warnings))
+    told = (f"estimate: {brief(summary)}", ending, *warnings)
+    return Estimate(content, sha256, encode_text(outcome), told)
 
 
 def estimate_and_tell(job: Job | FileJob, tell: Callable[[tuple[Told, ...]], None]) -> Estimate:

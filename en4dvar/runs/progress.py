@@ -11,11 +11,15 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+import numpy as np
+
 from en4dvar.diagnosis.analysis import ChainRecord, Descents, IterationRecord, Record, StartRecord
+from en4dvar.model.state import Parameter
 from en4dvar.plumbing.compiled import watch_compilation
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.files import own_file, refused
 from en4dvar.plumbing.tables import without_control
+from en4dvar.plumbing.units import convert
 from en4dvar.runs.interrupt import Interrupted
 
 TYPICAL_ITERATIONS = 8.0
@@ -42,6 +46,19 @@ def describe(name: str, record: Record) -> str:
         f"{record.observation:.6g}  |dw| {record.step_norm:.2e}  step {record.step_length:.3g}  "
         f"chi2/K {record.chi2_per_observation:.3g}  DFS {record.dfs:.2f}  active {record.active}"
     )
+
+
+def intervals(name: str, record: Record, parameters: Sequence[Parameter]) -> str:
+    """A second line for an iteration: median and middle 90 % of each parameter, ``G 7.8 (4.1 to 11) kPa``; or ""."""
+    if not isinstance(record, IterationRecord) or not len(record.members):
+        return ""
+    words = []
+    for p, values in zip(parameters, record.members.T, strict=False):  # cells of fields come after the parameters
+        low, middle, high = (
+            f"{v:.4g}" for v in convert(np.nanquantile(values, (0.05, 0.5, 0.95)), p.unit, p.display_unit)
+        )
+        words.append(f"{p.name} {middle} ({low} to {high}) {p.display_unit}")
+    return f"\n{name}: iteration {record.iteration:2d}  90 %: {', '.join(words)}" if words else ""
 
 
 def _stage(record: StartRecord) -> str:

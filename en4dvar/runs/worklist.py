@@ -4,6 +4,7 @@ import threading
 import traceback
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from en4dvar.config import Config
@@ -16,13 +17,14 @@ from en4dvar.inputs.asked import DataFile
 from en4dvar.plumbing.errors import En4dvarError, OutputError
 from en4dvar.plumbing.files import atomic_path, open_plain, readable, remove_file
 from en4dvar.plumbing.tables import csv_text
+from en4dvar.problem import InverseProblem
 from en4dvar.results.checkpoint import FOLDER, Keeper, file_digest
 from en4dvar.results.codec import decode_text, encode_text
 from en4dvar.results.pack import PACK, Entry, Pack, file_names, read_outcome
 from en4dvar.results.seal import SealedBytes
 from en4dvar.runs.campaign import Campaign, DatasetOutcome, Outcomes
 from en4dvar.runs.jobs import Common, Estimate, FileJob, Job, Told, estimate, estimate_and_tell
-from en4dvar.runs.progress import LiveProgress, describe
+from en4dvar.runs.progress import LiveProgress, describe, intervals
 from en4dvar.runs.session import Session
 
 SUMMARY = "summary.csv"
@@ -196,7 +198,8 @@ class Worklist:
             stop = self.stop if isinstance(executor, ThreadsExecutor) else None
             ends = executor.map(estimate_and_tell, jobs(executor.reads, stop), self._hear)
         else:
-            ends = SerialExecutor().map(lambda job: estimate(job, executor, self._hear_one), jobs())
+            alone = SerialExecutor()
+            ends = alone.map(lambda job: estimate(job, executor, partial(self._hear_one, job.problem)), jobs())
         for i, value in ends:
             if isinstance(value, Exception):
                 self._fail(sent[i], value)
@@ -224,8 +227,8 @@ class Worklist:
     def _hear(self, _: int, records: Sequence[Told]) -> None:
         self._tell(records)
 
-    def _hear_one(self, name: str, record: Record) -> None:
-        self._tell([(name, record, describe(name, record))])
+    def _hear_one(self, problem: InverseProblem, name: str, record: Record) -> None:
+        self._tell([(name, record, describe(name, record) + intervals(name, record, problem.prior.parameters))])
 
     def _tell(self, records: Sequence[Told], *lines: str) -> None:
         """Records, and further lines of the log: all of them at once, for each time it is written to takes as long."""

@@ -83,7 +83,7 @@ function showJob(step, job) {
   box.dataset.whole = whole;
   box.className = `job ${job.state}`;
   const words = document.createElement("pre");
-  words.textContent = `$ ${job.line}\n${job.output}`;
+  words.textContent = `$ ${job.line}\n${job.output}`; words.tabIndex = 0;
   box.replaceChildren(`${job.state}; the command that repeats this step, in this folder:`, words);
   const prior = job.output.match(/^prior predictive: (.*\.png) and/m);
   if (job.state === "done" && step === "track") box.append(link(job.out.replace(/csv$/, "html"), "Open the page of all outlines"));
@@ -174,9 +174,25 @@ async function refresh() {
       say("The server does not answer. Nothing is lost: start 'en4dvar app' again and open the address that it prints.");
     } else throw error;
   }
-  const running = runs("run", "resume");
+  await showLive(state?.jobs.findLast((job) => ["run", "resume"].includes(job.step)));
+}
+
+// Of the last run, while it works and as it ended: parameters over the iterations, or where the data sets stand.
+async function showLive(job) {
+  const whole = job && `${job.number} ${job.state}`, running = job?.state === "running";
+  if (!job || (!running && $("live").dataset.whole === whole)) return;
+  const told = await fetched("live", { run: job.out.replace("runs/", "") }).catch(() => null);
+  if (!told) return;
+  $("live").dataset.whole = whole;
   $("log").hidden = !running;
-  if (running) $("log").textContent = (await fetched("log", { run: running.out.replace("runs/", "") }).catch(() => ({ text: "" }))).text;
+  $("log").textContent = told.text;
+  $("bands").innerHTML = told.bands;
+  $("sets").hidden = !told.sets.length;
+  $("sets").tBodies[0].replaceChildren(...told.sets.map((cells) => {
+    const row = document.createElement("tr");
+    for (const words of cells) row.insertCell().textContent = words;
+    return row;
+  }));
 }
 
 const freeName = (stem, names, end = "") => {

@@ -81,11 +81,11 @@ def _described(job: Path) -> dict[str, Any] | None:
     return {**whole, "state": _state(job)}
 
 
-def end_of(path: Path) -> str:
+def end_of(path: Path, most: int = LONGEST) -> str:
     """The last characters of a file; "" where there is none."""
     try:
         with path.open("rb") as file:
-            file.seek(max(0, path.stat().st_size - LONGEST))
+            file.seek(max(0, path.stat().st_size - most))
             return file.read().decode("utf-8", "replace")
     except OSError:
         return ""

@@ -17,6 +17,7 @@ from tornado.httpserver import HTTPServer
 from tornado.netutil import bind_sockets
 
 from en4dvar.plumbing.errors import En4dvarError
+from en4dvar.report.svg import svg
 from en4dvar_app import job, pictures, steps
 from en4dvar_app.trusted import below
 from en4dvar_movie.frames import IMAGES, MOVING, TIFF
@@ -24,12 +25,10 @@ from en4dvar_movie.frames import IMAGES, MOVING, TIFF
 HERE = Path(__file__).parent
 LARGEST = 1_000_000  # bytes of a request: a configuration or corrections, never a movie
 MOVIES = (*MOVING, ".raw")
-FRAMES, TABLES, CONFIGS = (
-    (*TIFF, *IMAGES),
-    (".csv", ".txt", ".dat", ".tsv", ".xlsx", ".mat"),
-    (".yaml", ".yml"),
-)
+FRAMES, CONFIGS = (*TIFF, *IMAGES), (".yaml", ".yml")
+TABLES = (".csv", ".txt", ".dat", ".tsv", ".xlsx", ".mat")
 MOST = 2000  # names of a folder
+LOG = 400_000  # bytes of a run's log, from its end
 _turn = threading.Lock()  # of two windows that write, one reads what the other wrote
 KINDS = {
     ".html": "text/html; charset=utf-8", ".css": "text/css", ".js": "text/javascript", ".png": "image/png",
@@ -206,8 +205,15 @@ class Look(Guarded):
     def look_text(self, arguments: dict[str, str]) -> dict[str, str]:
         return {"text": steps.text_of(self.root, arguments)}
 
-    def look_log(self, arguments: dict[str, str]) -> dict[str, str]:
-        return {"text": job.end_of(below(self.root, f"runs/{arguments.get('run', '')}/run.log"))}
+    def look_live(self, arguments: dict[str, str]) -> dict[str, Any]:
+        from en4dvar.report import live
+
+        told = job.end_of(below(self.root, f"runs/{arguments.get('run', '')}/run.log"), LOG)
+        standing = live.standings(told)
+        chart = live.bands(*standing.values()) if len(standing) == 1 else None
+        drawn = svg(chart, "live", "Median and middle 90 % of each parameter over the iterations") if chart else ""
+        rows = sorted((name, each.at, each.estimate) for name, each in standing.items())
+        return {"text": told[-job.LONGEST :], "bands": drawn, "sets": rows if len(rows) > 1 else []}
 
     def look_laws(self, arguments: dict[str, str]) -> dict[str, list[str]]:
         from en4dvar_bubble.laws.loading import available
@@ -258,20 +264,13 @@ async def _serve(root: Path, port: int, trust: bool, ready: Callable[[str], None
             (r"/(|plot\.js|app\.js|movie\.js|app\.css)", Own, common),
             (r"/file/(.+)", Files, common),
             (r"/state", State, common),
-            (r"/look/(movie|frame|table|text|log|laws)", Look, common),
+            (r"/look/(movie|frame|table|text|live|laws)", Look, common),
             (rf"/({'|'.join(steps.STEPS)}|cancel|keep|mask)", Step, common),
         ],
         log_function=lambda handler: None,
-        default_handler_class=Nothing,
+        default_handler_class=Guarded,
         default_handler_args=common,
     )
     HTTPServer(application, max_body_size=LARGEST, max_buffer_size=LARGEST).add_sockets(sockets)
     ready(f"http://127.0.0.1:{port}/{secret}/")
     await asyncio.Event().wait()
-
-
-class Nothing(Guarded):
-    """Whatever else is asked for."""
-
-    def get(self) -> None:
-        raise tornado.web.HTTPError(404)

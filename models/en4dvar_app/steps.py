@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Callable, Mapping
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -86,8 +87,12 @@ def _new(root: Path, fields: Fields, key: str, suffix: str) -> str:
     if not name or Path(name).name != name or name.startswith("."):
         raise FieldError(f"give the new {key} a name without '/', such as gel{suffix}")
     name = name if name.endswith(suffix) else f"{name}{suffix}"
+    return _unused(root, name, f"give the new {key} another name")
+
+
+def _unused(root: Path, name: str, otherwise: str) -> str:
     if below(root, name).exists():
-        raise FieldError(f"{name}: exists and is not replaced; give the new {key} another name")
+        raise FieldError(f"{name}: exists and is not replaced; {otherwise}")
     return name
 
 
@@ -107,9 +112,7 @@ def _run_dir(root: Path, fields: Fields, key: str = "run") -> str:
 
 
 def _run(root: Path, fields: Fields) -> list[str]:
-    out = _run_dir(root, fields)
-    if (root / out).exists():
-        raise FieldError(f"{out}: exists and is not replaced; give the new run another name, or continue that run")
+    out = _unused(root, _run_dir(root, fields), "give the new run another name, or continue that run")
     return ["run", _config(root, fields), f"--out={out}"]
 
 
@@ -121,21 +124,13 @@ def _compare(root: Path, fields: Fields) -> list[str]:
     runs = [_run_dir(root, {"run": name}) for name in fields.get("runs", "").split("\n") if name]
     if len(runs) < 2:
         raise FieldError("choose two runs or more")
-    return ["compare", *runs, "--stored", f"--out={_compared(root)}"]
-
-
-def _compared(root: Path) -> str:
-    number = 1
-    while below(root, f"comparisons/{number}").exists():
-        number += 1
-    return f"comparisons/{number}"
+    new = next(name for n in count(1) if not below(root, name := f"comparisons/{n}").exists())
+    return ["compare", *runs, "--stored", f"--out={new}"]
 
 
 def _export(root: Path, fields: Fields) -> list[str]:
     run = _run_dir(root, fields)
-    out = f"{Path(run).name}_results.csv"
-    if below(root, out).exists():
-        raise FieldError(f"{out}: exists and is not replaced; rename it first")
+    out = _unused(root, f"{Path(run).name}_results.csv", "rename it first")
     return ["export", run, f"--out={out}"]
 
 

@@ -17,8 +17,9 @@ Turning: an edge that moves one way during the exposure has its half level where
 turns there, as in a collapse, sweeps a range of √12 blurs and is at its end in the middle: √3 blurs from the half
 level. The less of the radius it sweeps, the rarer that is, unless nothing else explains the blur.
 
-Curvature: blur moves the half level of a disc inwards by w²/2R. It is given back for the blur that the movie's sharp
-frames share; what goes beyond it is the wall's motion during the exposure, which has no such shift.
+Curvature: blur moves the half level of a disc inwards by w²/2R. It is given back for a frame's own blur or, where this
+is clearly more than that of the movie's sharpest frames, for theirs: what goes beyond it is the wall's motion during
+the exposure, which has no such shift.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ COLLAPSE = 0.15  # of the radius: blur by motion from which the bubble may have 
 TURNING = 0.065  # the same where nothing else explains the blur
 ONE_WAY, TURNED = 0.25, 3**0.5 / 2  # of that blur: std of the radius
 SHARP = 0.15  # of the square of a sharp edge's width, by which it varies
+CLEARLY = 3.0  # std of noise by which a frame is blurred more than the sharpest, whose own noise made them so
 BENT = 0.46  # of the exposure in steps: std of the radius in units of the blur that neighbours do not explain
 THRESHOLD = 0.05  # of the contrast: what the level of the edge can be off by in all frames alike
 
@@ -83,12 +85,17 @@ def _bent(
     for k, o in enumerate(outlines):
         if o is None:
             continue
-        moved, noise = _moved(o, sharp), 8 * o.width**2 * o.variance * ratios[k]  # of the width's square
-        if moved**2 > explained[k] ** 2 + SHARP * sharp**2 + 2 * noise**0.5:
+        if _excess(o, sharp, ratios[k], 2.0) > explained[k] ** 2 + SHARP * sharp**2:
+            moved = _moved(o, sharp)
             swept = moved / o.circle.R
             turning = TURNED * moved * min(1.0, swept / COLLAPSE) if turns[k] and swept > TURNING else 0.0
             variance[k] += max(turning, BENT * exposure * (moved - explained[k])) ** 2
     return variance
+
+
+def _excess(outline: Outline, sharp: float, ratio: float, std: float) -> float:
+    """Square of the blur beyond a sharp edge's width and ``std`` times what noise makes of it, px²."""
+    return float(outline.width**2 - sharp**2 - std * (8 * outline.width**2 * outline.variance * ratio) ** 0.5)
 
 
 def _moved(outline: Outline, sharp: float) -> float:
@@ -122,7 +129,8 @@ def _smoothed(outlines: Sequence[Outline | None]) -> Array:
 
 def _errors(outline: Outline, ratio: float, hidden: float, turned: bool, optics: Optics) -> Errors:
     sharp = min(outline.width, optics.width)
-    radius = outline.circle.R + 0.5 * sharp**2 / outline.circle.R
+    optical = optics.width if _excess(outline, optics.width, ratio, CLEARLY) > 0 else outline.width
+    radius = outline.circle.R + 0.5 * optical**2 / outline.circle.R
     variance = outline.variance * ratio + outline.common + hidden + outline.joined**2 + FLOOR**2
     words = ""
     moved = _moved(outline, sharp)

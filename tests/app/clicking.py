@@ -70,4 +70,5 @@ def require_accessible(page):
     page.evaluate(axe.AXE_FILE_PATH.read_text(encoding="utf-8"))
     judged = page.evaluate("axe.run()")
     assert len(judged["passes"]) > 20
-    assert [(fault["id"], [node["html"] for node in fault["nodes"]]) for fault in judged["violations"]] == []
+    faults = [(fault["id"], [node["html"] for node in fault["nodes"]]) for fault in judged["violations"]]
+    assert not faults, faults

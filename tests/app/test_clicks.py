@@ -12,6 +12,8 @@ from app_page import clicks_counted, from_movie_to_interval, pull
 from clicking import LONG, at, done, point_of, proposed, repeat, require_accessible, until, words_of
 from run_files import assert_same_results
 
+from en4dvar.report.live import standings
+
 ROOT = Path(__file__).resolve().parents[2]
 MOVIE = ROOT.parent / "shared" / "data" / "PAstiff_xy002.mp4"
 LOOK = (ROOT / "tests" / "browser" / "look.js").read_text(encoding="utf-8")
@@ -56,8 +58,11 @@ def test_cancelled_and_resumed_after_the_window_and_the_server_are_gone(visit, s
     proposed(page, "messung.csv", **units)
     page.click("button[data-step=run]")
     until(page, "document.getElementById('log').innerText.includes('iteration')")
+    until(page, "document.querySelectorAll('#bands svg .read').length > 2")  # a panel a parameter
     page.click("#cancel")
     page.wait_for_selector("#job-run.stopped", timeout=LONG)
+    before = (german / "runs" / "messung" / "run.log").read_text(encoding="utf-8")
+    assert "converged" not in before
     page.fill("#run", "messung")
     page.click("button[data-step=resume]")
     page.wait_for_selector("#job-run.running", timeout=LONG)
@@ -65,6 +70,10 @@ def test_cancelled_and_resumed_after_the_window_and_the_server_are_gone(visit, s
     server.end()
     page = visit(serve(german))
     page.wait_for_selector("#job-run.done", timeout=LONG)
+    until(page, "document.getElementById('log').hidden")
+    told = standings((german / "runs" / "messung" / "run.log").read_text(encoding="utf-8"))["messung"]
+    assert page.locator("#bands svg .read").count() == len(told.bands)
+    assert "G (kPa)" in page.inner_text("#bands")
     shutil.copytree(german, tmp_path / "other", ignore=shutil.ignore_patterns("runs", ".*"))
     repeat(tmp_path / "other", ["run", "messung.yaml", "--out=runs/messung"])
     assert_same_results(german / "runs" / "messung", tmp_path / "other" / "runs" / "messung")
@@ -82,6 +91,13 @@ def test_a_campaign_compared_and_written(visit, serve, german):
     told = page.inner_text("#job-run pre")
     assert re.search(r"^a +G ", told, re.M), told
     assert re.search(r"^b +G ", told, re.M)
+    until(page, "document.querySelectorAll('#sets td').length === 6")
+    rows = [row.locator("td").all_inner_texts() for row in page.locator("#sets tbody tr").all()]
+    assert [row[:2] for row in rows] == [["a", "converged"], ["b", "converged"]]
+    for name, _, result in rows:
+        mean = re.search(rf"^{name} +G +kPa +(\S+)", told, re.M)[1]
+        assert float(re.match(r"G (\S+) ± \S+ kPa", result)[1]) == pytest.approx(float(mean), rel=0.05)
+    require_accessible(page)
     page.fill("#run", "again")
     done(page, "run")
     for box in page.query_selector_all("#runs input"):

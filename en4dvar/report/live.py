@@ -1,0 +1,61 @@
+"""What a run at work has told in ``run.log``: where each data set stands, and parameters over the iterations."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from en4dvar.report.chart import PAGE, POINTS, Chart, Panel, in_columns
+from en4dvar.report.text import figure_text, with_unit
+
+TOLD = re.compile(
+    r"\S+ (.+?): (iteration +\d+|start, round +\d+|search for another minimum, round +\d+|chain, +\d+ steps"
+    r"|continued .*|estimate: .*|failed: .*|converged|not converged)(?:  90 %: (.*))?"
+)
+BAND = re.compile(r"(\w+) (\S+) \((\S+) to (\S+)\) (.*?)(?=, \w+ \S+ \(|$)")
+
+
+@dataclass
+class Standing:
+    """Of one data set: ``at``, how far it has got; ``estimate`` in a line, "" before its end; ``bands``: parameter with
+    its unit → iteration → low, middle and high of the middle 90 %.
+    """
+
+    at: str = ""
+    estimate: str = ""
+    bands: dict[tuple[str, str], dict[int, tuple[float, float, float]]] = field(default_factory=dict)
+
+
+def standings(log: str) -> dict[str, Standing]:
+    """Name → where the data set stands, in the order in which the log names them; what is told twice counts once."""
+    sets: dict[str, Standing] = {}
+    for line in log.splitlines():
+        if (parts := TOLD.match(line)) is None:
+            continue
+        name, words, intervals = parts.groups()
+        standing = sets.setdefault(name, Standing())
+        kind, _, rest = words.partition(": ")
+        if kind == "estimate":
+            standing.estimate = rest
+        else:
+            standing.at, standing.estimate = " ".join(kind.split()), rest or standing.estimate
+        for parameter, middle, low, high, unit in BAND.findall(intervals or ""):
+            band = standing.bands.setdefault((parameter, unit), {})
+            band[int(words.split()[1])] = float(low), float(middle), float(high)
+    return sets
+
+
+def bands(standing: Standing) -> Chart | None:
+    """Median and middle 90 % of each parameter over the iterations; None before the first."""
+    panels = []
+    for (parameter, unit), band in standing.bands.items():
+        steps = sorted(band)
+        low, middle, high = np.array([band[step] for step in steps]).T
+        panel = Panel("iteration", with_unit(figure_text(parameter), unit), whole=True, xticks=4, yticks=4)
+        panel.band(steps, low, high, "posterior", 0.3)
+        panel.line(steps, middle, "posterior")
+        panel.dots(steps, middle, "posterior")
+        panels.append(panel)
+    return in_columns(panels, 3.2 * POINTS, 4, PAGE) if panels else None
