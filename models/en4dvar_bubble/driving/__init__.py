@@ -1,6 +1,6 @@
 """The far-field pressure p_f(t) that drives an acoustic bubble."""
 
-from en4dvar_bubble.driving.base import Driving, Reading
+from en4dvar_bubble.driving.base import Driving, Reading, with_knots
 from en4dvar_bubble.driving.pulses import Envelope, gaussian, histotripsy, silence, sine_burst, step
 from en4dvar_bubble.driving.tabulated import from_file, tabulated
 
@@ -15,4 +15,5 @@ __all__ = [
     "sine_burst",
     "step",
     "tabulated",
+    "with_knots",
 ]
