@@ -32,11 +32,13 @@ import sys
 import time
 import warnings
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+import yaml
 from click.testing import CliRunner
 from measured_page import GROUPS, after, chi2, intervals, page, said, stated
 from records import Record, fill
@@ -121,8 +123,17 @@ def _filmed(stream: np.random.Generator, times: Any, radius: Any, rate: float, t
     return "\n".join(["t_us,R_um", *rows]) + "\n"
 
 
-def verbatim(text: str, law: str, words: list[str], quick: bool, with_what_if: bool = False) -> Record:
-    """What ``init`` and ``run`` say of a file, from a folder of its own, beside what its head states."""
+def verbatim(
+    text: str,
+    law: str,
+    words: list[str],
+    quick: bool,
+    with_what_if: bool = False,
+    change: Callable[[dict[str, Any]], None] | None = None,
+) -> Record:
+    """What ``init`` and ``run`` say of a file, from a folder of its own, beside what its head states; with ``change``
+    of the configuration between them.
+    """
     begun = time.process_time()
     with TemporaryDirectory() as name:
         folder = Path(name)
@@ -132,6 +143,10 @@ def verbatim(text: str, law: str, words: list[str], quick: bool, with_what_if: b
         made = CliRunner().invoke(command_line, ["init", *asked, "--law", law, "--out", str(config), *words])
         if made.exit_code or not config.is_file():
             return {"reason": f"init: {made.output.strip().splitlines()[-1] if made.output else made.exception}"}
+        if change:
+            settings = yaml.safe_load(config.read_text())
+            change(settings)
+            config.write_text(yaml.safe_dump(settings, sort_keys=False))
         changes: dict[str, Any] = {"execution.workers": 1, "output.report": False}
         changes |= {"output.directory": str(folder / "run")}
         changes |= {f"model.{key}": value for key, value in QUICK.items()} if quick else {}
@@ -150,7 +165,8 @@ def verbatim(text: str, law: str, words: list[str], quick: bool, with_what_if: b
             if key in rows:
                 found[key] = _posterior(result.posterior[key].values.ravel(), rows[key])
         found["withheld"] = _withheld(result.sample_stats.attrs, found.get("R_max", {"mean": np.nan})["mean"])
-        found["next"] = _next(result)
+        found["next"] = _next(result, found.get("R_max", {"mean": np.nan})["mean"])
+        found["log_evidence"] = float(result.sample_stats.attrs.get("log_evidence", np.nan))
         return found
 
 
@@ -161,14 +177,18 @@ def _withheld(stats: Any, largest: float) -> tuple[int, float, float] | None:
     return int(stats["withheld_readings"]), float(stats["withheld_inside"]), float(stats["withheld_rms"]) / largest
 
 
-def _next(result: Result) -> tuple[int, float] | None:
-    """How many readings follow the window to the next minimum, and their share in the 90 % bands."""
+def _next(result: Result, largest: float) -> tuple[int, float, float] | None:
+    """How many readings follow the window to the next minimum, their share in the 90 % bands, and rms over R_max."""
     lines, within = withheld_lines(result), shown(result.group("observed_data")["radius"])
     series = np.concatenate([within, [float(str(line[4])) for line in lines]])
     ends = minima(series, PROMINENT)
     begins = peak_widths(-series, ends, rel_height=0.5)[2]  # the window ends in the middle of one
     count = next((int(e) + 1 - len(within) for e, b in zip(ends, begins, strict=True) if b > len(within)), 0)
-    return (count, float(np.mean([line[-1] == 1 for line in lines[:count]]))) if count else None
+    if not count:
+        return None
+    off = np.array([float(str(line[4])) - float(str(line[6])) for line in lines[:count]])
+    share = float(np.mean([line[-1] == 1 for line in lines[:count]]))
+    return count, share, float(np.sqrt(np.mean(off**2))) * 1e-6 / largest  # readings are in µm
 
 
 def _posterior(members: Any, row: dict[str, str]) -> Record:

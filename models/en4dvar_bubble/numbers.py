@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from en4dvar.model.state import Parameter
+from en4dvar_bubble.driving.base import KNOTS
 from en4dvar_bubble.driving.pulses import PULSES, numbers_of
 from en4dvar_bubble.driving.tabulated import OF_RECORD
 from en4dvar_bubble.medium import CONSTANTS
@@ -80,6 +81,6 @@ ACCOMMODATION = Parameter(
 )
 """Where it is no parameter, the vapour at the wall is saturated: the limit of a large one."""
 _OF_PULSES = {p.name: p for made in PULSES.values() for _, _, p in numbers_of(made)}
-_OF_PULSES |= {number.parameter.name: number.parameter for number in OF_RECORD}
+_OF_PULSES |= {number.parameter.name: number.parameter for number in OF_RECORD} | {p.name: p for p in KNOTS}
 ALL = (*OF_MEDIUM.values(), P_A, GAS_CONTENT, R_START, RDOT_START, WALL_DISTANCE, ACCOMMODATION, *_OF_PULSES.values())
 NAMES = frozenset(p.name for p in ALL)

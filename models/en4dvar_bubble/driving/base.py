@@ -2,8 +2,8 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import Literal, NamedTuple
+from functools import cached_property, partial
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -152,3 +152,50 @@ class Driving:
         """p_f in Pa at times (K,) in s, of any shape."""
         t = np.asarray(t, dtype=float)
         return np.where((t >= self.begin) & (t <= self.end), self.amplitude * self.shape(t), 0.0)
+
+
+MOST_KNOTS = 24
+_CELLS_PER_KNOT = 24  # a sine of the shortest wavelength to 1e-10
+KNOTS = tuple(
+    Parameter(
+        f"pulse_knot_{k}", "1", "normal", label=f"what the pulse has more at its knot {k}, of its amplitude",
+        symbol=rf"$\Delta_{{{k}}}$",
+    )
+    for k in range(1, MOST_KNOTS + 1)
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Deviating:
+    """``shape`` plus the sines that have ``values`` at equally spaced knots between the ends, where they are zero."""
+
+    shape: Callable[[Array], Array]
+    begin: float
+    end: float
+    values: tuple[float, ...]
+
+    def __call__(self, t: Array) -> Array:
+        order = np.arange(1, len(self.values) + 1)
+        sines = np.sin(np.pi / (len(order) + 1) * np.outer(order, order))  # its own inverse, but for a factor
+        heights = 2 / (len(order) + 1) * (sines @ np.array(self.values))
+        phase = np.pi * (t - self.begin) / (self.end - self.begin)
+        return np.asarray(self.shape(t) + np.sin(np.multiply.outer(phase, order)) @ heights)
+
+
+def with_knots(driving: Driving, knots: int) -> Driving:
+    """The driving as a function that is known roughly: ``pulse_knot_1``, … are further :attr:`Driving.numbers`, what
+    the shape has more at so many equally spaced instants between its ends; sines go through them. A delay, rate or
+    stretch moves them with the pulse. Raises ValueError: there is no driving.
+    """
+    if driving.silent:
+        raise ValueError("knots: there is no driving that they could change; give one, or leave them out")
+    cells = driving.cells * -(-_CELLS_PER_KNOT * (knots + 1) // driving.cells)
+    finer = replace(driving, cells=max(cells, driving.cells))
+    own = tuple(PulseNumber(of, f"knot_{k}", 0.0, "shape") for k, of in enumerate(KNOTS[:knots], 1))
+    return replace(finer, numbers=(*driving.numbers, *own), remade=partial(_deviating, driving, knots))
+
+
+def _deviating(driving: Driving, knots: int, **keys: Any) -> Driving:
+    values = tuple(float(keys.pop(f"knot_{k}", 0.0)) for k in range(1, knots + 1))
+    base = driving.remade(**keys) if keys and driving.remade else driving
+    return replace(base, shape=_Deviating(base.shape, base.begin, base.end, values), numbers=(), remade=None)

@@ -11,7 +11,7 @@ from en4dvar.inputs.asked import Format
 from en4dvar.plumbing.described import Described
 from en4dvar.plumbing.errors import En4dvarError
 from en4dvar.plumbing.units import Quantity, convert
-from en4dvar_bubble.driving.base import Driving
+from en4dvar_bubble.driving.base import MOST_KNOTS, Driving, with_knots
 from en4dvar_bubble.driving.pulses import PULSES
 from en4dvar_bubble.driving.tabulated import from_file
 
@@ -26,10 +26,16 @@ class _Kind(Section):
     model_config = ConfigDict(allow_inf_nan=False)
     pulse: ClassVar[Callable[..., Driving]]
     """The function whose arguments are the keys."""
+    knots: Annotated[int, Field(ge=0, le=MOST_KNOTS)] = 0
+    """So many numbers pulse_knot_1, … can be parameters: what the pulse has more at equally spaced instants."""
 
     def build(self) -> Driving:
         """The driving. Raises ValueError or :class:`En4dvarError`."""
-        return type(self).pulse(**self.model_dump(exclude={"kind"}))
+        return with_knots(self.known(), self.knots) if self.knots else self.known()
+
+    def known(self) -> Driving:
+        """The driving without what the knots may change. Raises as :meth:`build`."""
+        return type(self).pulse(**self.model_dump(exclude={"kind", "knots"}))
 
     @model_validator(mode="after")
     def _can_be_built(self) -> "_Kind":
@@ -112,7 +118,7 @@ class Tabulated(_Kind):
         base = (info.context or {}).get("base", Path())
         return str((Path(base) / value).resolve())
 
-    def build(self) -> Driving:
+    def known(self) -> Driving:
         time, pressure = self.columns.time, self.columns.pressure
         return from_file(
             Path(self.file), (time.name, time.unit), (pressure.name, pressure.unit), self.delay, self.scale, self.format
