@@ -32,12 +32,13 @@ from en4dvar.runs.finished import finished
 
 KINDS = ("clean", "gel", "law", "other", "scale", "clock")
 QUICK = {"gas": "polytropic", "vapour": "none", "medium_heat": "cold", "vapour_pressure": "saturated"}
+ALONE = {"refine": "none", "emulator": "off", "what_if": False}  # of each alone; the population samples them anyway
 NEO, STIFFENING = Wrong(), Wrong(law="quadratic-kelvin-voigt", of_law={"alpha": lambda truth: 0.5})
 OFF, OTHER = 1.08, {"G": 2.1 / 7.7, "mu": 0.118 / 0.101}  # soft over stiff polyacrylamide (Estrada et al. 2018)
 GEL, OF_GEL = {"G": 8e3, "mu": 0.1}, 0.3  # and how far the gels of campaigns differ, ln
 RATE, NOISE, BEFORE, CELLS = 270e3, 0.005, 4, 4000  # frames a second, of R_max, frames of the growth, of the path
 ATMOSPHERE, DENSITY, SOUND = (101.3, 0.01), (1030.0, 0.017), (1510.0, 0.015)  # as init proposes them
-PIXEL = 0.005
+PIXEL, RATIO = 0.005, (6.0, 12.0)  # std of the pixel, and R_max over R_eq
 
 
 def film(truth: dict[str, float], constants: dict[str, str], kind: str, rng: np.random.Generator) -> str:
@@ -65,7 +66,7 @@ def campaign(seed: int, number: int, size: int, spread: float, folder: Path) -> 
     for i in range(size):
         truth = {name: value * float(np.exp(spread * rng.standard_normal())) for name, value in gel.items()}
         truth["R_max"] = 4e-4 * float(np.exp(0.1 * rng.standard_normal()))
-        truth["R_eq"] = 0.12 * truth["R_max"] * float(np.exp(0.1 * rng.standard_normal()))
+        truth["R_eq"] = truth["R_max"] / rng.uniform(*RATIO)
         noise = int(rng.integers(2**32))
         for kind in KINDS if i == 0 else KINDS[:1]:
             name = f"b{i:02d}" if kind == "clean" else f"odd_{kind}"
