@@ -1,0 +1,175 @@
+"""From a folder of measured bubbles to the gel's number in two commands: what they cost, and what becomes of each file.
+
+    python benchmarks/two_commands.py ../shared/data/bubbles/stiff_polyacrylamide [FOLDER …] [--minutes 60] [--docs]
+    python benchmarks/two_commands.py … --splits 10        and random halves of each finished run against each other
+
+``init --data FOLDER`` with the law and the medium of a folder of known name (``measured_page.py``), and ``run`` of what
+it writes, on one worker and with its page. Printed are the processor time of each, the medians of the gel with their
+90 % intervals, and the files without a number, with the reason; ``--docs`` writes the table into
+``docs/howto_measured.md``.
+
+Halves: the bubbles of a finished run are sampled once and split at random into halves with a population each; z of the
+difference of the medians of ln θ, what is common apart, which is of one value in both. Three bubbles, which have no
+such halves, are held against each other: z of the difference of two draws of the population.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from measured_page import GROUPS
+from recordings import commit
+from records import Record, fill
+from scaling import ROOT
+from solver import replaced
+
+from en4dvar.estimation.population import Effort
+from en4dvar.estimation.population.campaign import CampaignPopulation, population_from, sampled_sets
+from en4dvar.estimation.population.estimate import FEWEST_SETS
+from en4dvar.model.state import Array
+from en4dvar.report.population import summaries
+from en4dvar.results.population_file import FILE, load_population
+from en4dvar.runs.finished import finished
+
+PAGE = ROOT / "docs" / "howto_measured.md"
+COMMAND = [sys.executable, "-c", "from en4dvar.cli import main; main()"]
+MORE = {"water": ["--start", "laser"]}  # init asks where its files suggest different starts
+SHOWN = {"G": ("G, kPa", 1.0), "mu": ("μ, mPa s", 1e3)}  # display units of the parameters are kPa and Pa s
+
+
+def processor_time(words: Sequence[str], log: Path) -> tuple[float, int]:
+    """Of a command and its workers, s, and its exit code."""
+    before = os.times()
+    with log.open("w") as file:
+        code = subprocess.run([*COMMAND, *words], stdout=file, stderr=subprocess.STDOUT, check=False).returncode
+    after = os.times()
+    return sum(after[2:4]) - sum(before[2:4]), code
+
+
+def two_commands(folder: Path, out: Path) -> Record:
+    """What both cost and say; ``out`` is made anew."""
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    group, config = GROUPS[folder.name], out / "gel.yaml"
+    words = ["--law", group.law, "--medium", group.medium, *MORE.get(folder.name, [])]
+    begun, code = processor_time(["init", "--data", str(folder), *words, "--out", str(config)], out / "init.log")
+    record: Record = {"commit": commit(), "init": begun, "words": " ".join(words)}
+    if code:
+        return {**record, "failed": (out / "init.log").read_text().splitlines()[-1]}
+    record["run"], code = processor_time(["run", str(config), "--out", str(out / "run")], out / "run.log")
+    if not (out / "run" / FILE).is_file():
+        return {**record, "failed": (out / "run.log").read_text().splitlines()[-1]}
+    stored = load_population(out / "run" / FILE)
+    of = dict(zip(stored.words, (rows for _, rows, _ in summaries(stored)), strict=False))
+    for row in of[stored.headline]:
+        record[row.name] = [row.q50, row.q05, row.q95]
+        record[f"{row.name} trusted"] = not row.untrusted
+    with (out / "run" / "summary.csv").open(encoding="utf-8") as file:
+        reasons = {row["dataset"]: row["failure"] for row in csv.DictReader(file)}
+    names = [file.stem for file in sorted(folder.glob("*.csv"))]
+    record["left out"] = {name: reasons.get(name, "") for name in names if name not in stored.datasets}
+    record["used"], record["code"] = list(stored.datasets), code
+    record["warnings"] = [c.line for c in stored.cautions]
+    return record
+
+
+def said(record: Record, name: str) -> str:
+    if name not in record:
+        return "–"
+    middle, low, high = (SHOWN[name][1] * x for x in record[name])
+    return f"{middle:.3g} ({low:.3g} to {high:.3g}){'' if record[f'{name} trusted'] else ', not to be trusted'}"
+
+
+def table(records: Sequence[Record]) -> str:
+    """Markdown."""
+    heads = [head for head, _ in SHOWN.values()]
+    lines = [f"| folder | files used | `init`, s | `run`, s | {' | '.join(heads)} | without a number |"]
+    lines.append("|---" * (5 + len(SHOWN)) + "|")
+    for r in records:
+        if "failed" in r:
+            cells = ["–", f"{r['init']:.0f}", f"{r['run']:.0f}" if "run" in r else "–", "–", "–", r["failed"]]
+        else:
+            left = "; ".join(f"{name}: {why}" for name, why in r["left out"].items())
+            used = f"{len(r['used'])} of {len(r['used']) + len(r['left out'])}"
+            cells = [used, f"{r['init']:.0f}", f"{r['run']:.0f}", *(said(r, name) for name in SHOWN), left or "none"]
+        lines.append(f"| {' | '.join([r['key'], *cells])} |")
+    return "\n".join(lines)
+
+
+def told(result: CampaignPopulation) -> Array:
+    """Draws (M, p) of ν, what is common apart."""
+    centred = result.theta - result.theta.mean(axis=0)
+    return np.asarray(result.posterior.nu - centred @ np.linalg.lstsq(centred, result.posterior.nu, rcond=None)[0])
+
+
+def halves(run_dir: Path, splits: int) -> None:
+    """z of the difference of the medians of two random halves, in the transformed coordinate."""
+    config, sets = finished([run_dir], True, None)
+    assert config.population is not None
+    names, problems, start = config.population.of, [s.problem for s in sets], [s.white for s in sets]
+    drawn, left_out = sampled_sets(problems, start, config.seed, None, lambda words: print(words, flush=True))
+    rng, usable, z = np.random.default_rng(config.seed), sorted(drawn), []
+
+    def of(chosen: Sequence[int]) -> CampaignPopulation:
+        some = {s: drawn[s] for s in sorted(chosen)}
+        return population_from(
+            some,
+            left_out,
+            start,
+            problems,
+            names,
+            config.seed,
+            config.population.hyper,
+            Effort(),  # type: ignore[union-attr]
+        )
+
+    if len(usable) < 2 * FEWEST_SETS:
+        result = of(usable)
+        spread = np.sqrt(np.mean(2 * result.posterior.tau**2, axis=0))
+        columns = [problems[0].prior.names.index(name) for name in names]
+        each = [drawn[s].z[:, columns] for s in usable]
+        for i, first in enumerate(each):
+            for second in each[:i]:
+                std = np.sqrt(first.var(axis=0) + second.var(axis=0) + spread**2)
+                z.append((first.mean(axis=0) - second.mean(axis=0)) / std)
+    else:
+        for _ in range(splits):
+            order = rng.permutation(usable).tolist()
+            nu = [told(of(half)) for half in (order[: len(order) // 2], order[len(order) // 2 :])]
+            z.append((nu[0].mean(axis=0) - nu[1].mean(axis=0)) / np.hypot(nu[0].std(axis=0), nu[1].std(axis=0)))
+    inside = np.sum(np.abs(z) < 2, axis=0)
+    for name, count, values in zip(names, inside, np.transpose(z), strict=True):
+        print(
+            f"{run_dir}: {name}: |z| < 2 in {count} of {len(z)}: {', '.join(f'{v:+.1f}' for v in values)}", flush=True
+        )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folders", type=Path, nargs="+")
+    parser.add_argument("--splits", type=int, default=0, help="random halves of each folder")
+    parser.add_argument("--minutes", type=float, default=60.0, help="start no folder after so long")
+    parser.add_argument("--docs", action="store_true")
+    parser.add_argument("--out", type=Path, default=Path("runs/two_commands"), help="folder of the runs and records")
+    asked = parser.parse_args()
+    of = {folder.name: folder.resolve() for folder in asked.folders}
+    records = fill(asked.out / "records.jsonl", of, lambda key: two_commands(of[key], asked.out / key), asked.minutes)
+    text = table(list(records.values()))
+    print(text)
+    if asked.docs:
+        PAGE.write_text(replaced(PAGE.read_text(encoding="utf-8"), "two commands", text), encoding="utf-8")
+    for key in records if asked.splits else ():
+        if "used" in records[key]:
+            halves(asked.out / key / "run", asked.splits)
+
+
+if __name__ == "__main__":
+    main()
