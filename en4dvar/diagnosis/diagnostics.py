@@ -19,6 +19,7 @@ GAUSSIAN_ENOUGH = 0.35  # the same of the members: the criterion where there is 
 DECISIVE = 20.0  # ratio of two evidences from which on the data are said to speak for one of the models
 UNSEEN = 0.1  # posterior standard deviations: a step that is within what so few members tell of the posterior
 HARDLY_INFORMED = 0.1  # DFS of a parameter below which its posterior is said to be its prior
+METHOD: Literal["normal_unbiased"] = "normal_unbiased"
 
 
 def background_cost(w: Array, n_members: int | None = None) -> Array:
@@ -148,9 +149,6 @@ def common_reasons(failures: Sequence[str], most: int = 3) -> str:
     """The most frequent reasons of failure with their counts."""
     counts = Counter(reason for reason in failures if reason)
     return "; ".join(f"{reason} ({count}×)" for reason, count in counts.most_common(most))
-
-
-METHOD: Literal["normal_unbiased"] = "normal_unbiased"
 
 
 def member_quantiles(values: Array, levels: Sequence[float], axis: int | None = None) -> Any:

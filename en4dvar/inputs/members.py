@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from en4dvar.inputs.contents import read_contents
 from en4dvar.inputs.opened import require_file
+from en4dvar.inputs.parts import read_contents
 from en4dvar.model.state import Array
 from en4dvar.plumbing.decoding import Allowed, DecodeError, decoded_whole
 from en4dvar.plumbing.errors import DataError

@@ -14,7 +14,7 @@ from typing import ClassVar, Protocol, Self, runtime_checkable
 
 import numpy as np
 
-from en4dvar.model.state import Array, Field, Parameter, StateLayout
+from en4dvar.model.state import Array, Field, Parameter, Shown, StateLayout
 from en4dvar.plumbing.caution import Caution
 from en4dvar.plumbing.user_code import reason_of
 
@@ -98,7 +98,7 @@ class Alternative:
 
 
 @dataclass(frozen=True)
-class PathQuantity:
+class PathQuantity(Shown):
     """A quantity that acts along a path, e.g. a strain rate: ``trajectory[name]`` (K,) in ``unit``; its size is of
     interest.
     """
@@ -108,10 +108,6 @@ class PathQuantity:
     label: str = ""
     symbol: str = ""
     display_unit: str = ""
-
-    def __post_init__(self) -> None:
-        for key, value in (("symbol", self.name), ("display_unit", self.unit), ("label", self.name)):
-            object.__setattr__(self, key, getattr(self, key) or value)
 
 
 @runtime_checkable
@@ -159,7 +155,7 @@ class StateField:
 
 
 @dataclass(frozen=True)
-class Observable:
+class Observable(Shown):
     """A quantity that can be measured: its name in YAML and netCDF, its units, and the operator H that predicts it.
 
     ``positive``: it cannot be zero, so that zeros before the first reading of a file say that there was nothing yet.
@@ -174,10 +170,6 @@ class Observable:
     label: str = ""
     positive: bool = False
     fewest: int = 3
-
-    def __post_init__(self) -> None:
-        for key, value in (("symbol", self.name), ("display_unit", self.unit), ("label", self.name)):
-            object.__setattr__(self, key, getattr(self, key) or value)
 
 
 @dataclass(frozen=True)

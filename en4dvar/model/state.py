@@ -14,8 +14,22 @@ TransformName = Literal[
 ]
 
 
+class Shown:
+    """What has a unit, and a label, a symbol and a display unit to be shown with: by default its name and its unit."""
+
+    name: str
+    unit: str
+    label: str
+    symbol: str
+    display_unit: str
+
+    def __post_init__(self) -> None:
+        for key, value in (("label", self.name), ("symbol", self.name), ("display_unit", self.unit)):
+            object.__setattr__(self, key, getattr(self, key) or value)
+
+
 @dataclass(frozen=True)
-class Parameter:
+class Parameter(Shown):
     """A quantity that can be fixed or estimated; everything downstream derives from this declaration.
 
     Attributes
@@ -45,9 +59,7 @@ class Parameter:
     def __post_init__(self) -> None:
         if not self.name.isidentifier():
             raise ValueError(f"parameter name {self.name!r} is not an identifier")
-        object.__setattr__(self, "label", self.label or self.name)
-        object.__setattr__(self, "symbol", self.symbol or self.name)
-        object.__setattr__(self, "display_unit", self.display_unit or self.unit)
+        super().__post_init__()
 
 
 TIME_SHIFT = Parameter(
@@ -121,7 +133,7 @@ DISCREPANCY = (
 
 
 @dataclass(frozen=True)
-class Field:
+class Field(Shown):
     """A named block of a state vector; a perturbed initial state must lie strictly inside its ``bounds``.
 
     ``coordinates`` (size,), or (size, D) in D dimensions, in ``coordinate_unit`` say where its components are, so that
@@ -137,10 +149,6 @@ class Field:
     label: str = ""
     symbol: str = ""
     display_unit: str = ""
-
-    def __post_init__(self) -> None:
-        for key, value in (("label", self.name), ("symbol", self.name), ("display_unit", self.unit)):
-            object.__setattr__(self, key, getattr(self, key) or value)
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 
 FEWEST_DRAWS = 4  # of a chain: ArviZ's diagnostics need as many
+HEADER = ("", "unit", "mean", "std", "5 %", "50 %", "95 %", "DFS")
 
 
 class Result(StoredResult):
@@ -175,9 +176,6 @@ def load_result(path: str | Path) -> Result:
     """
     file = Path(path)
     return Result(load_stored(file / "posterior.nc" if file.is_dir() else file).groups)
-
-
-HEADER = ("", "unit", "mean", "std", "5 %", "50 %", "95 %", "DFS")
 
 
 def cell_html(result: StoredResult) -> str:

@@ -20,6 +20,11 @@ from en4dvar.report.text import math_pieces
 from en4dvar.report.ticks import labelled
 
 GAP = 6.0  # between panels
+FONT, SMALL = 8.0, 7.0
+EM = 0.56  # width of a character on average, of its height
+WIDEST = 0.64  # the same of digits and small letters in the widest of the usual fonts (DejaVu Sans, Verdana)
+Captioned = tuple[str, str, Chart]  # name, caption
+Drawing = tuple[str, str, Markup]  # name, caption, SVG
 
 
 def svg(chart: Chart, name: str, description: str) -> Markup:
@@ -167,11 +172,6 @@ def _sample(mark: Mark) -> Mark:
     return Mark(mark.kind, x, y, top, mark.colour, mark.size, mark.alpha, mark.dash)
 
 
-FONT, SMALL = 8.0, 7.0
-EM = 0.56  # width of a character on average, of its height
-WIDEST = 0.64  # the same of digits and small letters in the widest of the usual fonts (DejaVu Sans, Verdana)
-
-
 def written(
     text: str, x: float, y: float, anchor: str = "middle", size: float = SMALL, colour: str = "ink",
     turned: tuple[float, float] | None = None,
@@ -211,10 +211,6 @@ def _pieces(text: str) -> Iterator[tuple[str, str]]:
 def width_of(text: str) -> float:
     """Points that small text takes, about."""
     return EM * SMALL * sum(len(piece) for _, piece in _pieces(text))
-
-
-Captioned = tuple[str, str, Chart]  # name, caption
-Drawing = tuple[str, str, Markup]  # name, caption, SVG
 
 
 def draw(

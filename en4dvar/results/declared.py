@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.model.forward import Observable, PathQuantity
-from en4dvar.model.state import Field, Parameter
+from en4dvar.model.state import Parameter, Shown
 from en4dvar.results.netcdf import Group, Variable, netcdf_attributes
 
 MEMBER = "chain draw"
@@ -158,7 +157,7 @@ def text(words: Iterable[str]) -> npt.NDArray[np.object_]:
     return np.array(list(words), dtype=object)
 
 
-def shown_as(p: Parameter | Observable | Field | PathQuantity) -> dict[str, Any]:
+def shown_as(p: Shown) -> dict[str, Any]:
     """Unit and appearance of a parameter, an observable, a field or a quantity of the path."""
     return {"units": p.unit, "display_units": p.display_unit, "symbol": p.symbol}
 

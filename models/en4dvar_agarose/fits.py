@@ -22,6 +22,8 @@ from en4dvar_agarose.paper import Model, Route
 from en4dvar_agarose.settings import StudyPlan
 
 _TRUTH_UNITS = {"G_kPa": ("G", 1e3), "alpha": ("alpha", 1.0), "mu_Pa_s": ("mu", 1.0), "R0_um": ("R0", 1e-6)}
+DECISIVE = 3.0  # |Δ log-evidence|: odds of 20 to 1
+MISFIT = 2.0  # χ² per reading above which a model is not one of those to choose from
 
 
 @dataclass(frozen=True)
@@ -154,10 +156,6 @@ def read_truth(path: Path) -> dict[str, dict[str, float]]:
         }
     except (OSError, KeyError, ValueError) as error:
         raise DataError(f"{path}: not the truth of a synthetic campaign of bubbles: {error!r}") from None
-
-
-DECISIVE = 3.0  # |Δ log-evidence|: odds of 20 to 1
-MISFIT = 2.0  # χ² per reading above which a model is not one of those to choose from
 
 
 @dataclass(frozen=True)

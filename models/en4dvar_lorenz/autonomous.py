@@ -1,7 +1,5 @@
 """Common parts of the models: a state of dynamic variables with the parameters appended, integrated in batches."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """An observation operator for what is positive."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, ClassVar
 

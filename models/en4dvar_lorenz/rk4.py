@@ -1,7 +1,5 @@
 """The classical Runge–Kutta method of fourth order, compiled, members one after the other."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

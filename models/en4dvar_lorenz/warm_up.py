@@ -1,7 +1,5 @@
 """The compiled test-beds, each integrated over one interval."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 

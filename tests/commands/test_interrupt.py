@@ -23,7 +23,7 @@ EARLY = tuple(f"en4dvar.runs.{step}" for step in ("runner.data_files", "runner.b
 BEGUN = (
     *(f"en4dvar.runs.engine.{step}" for step in ("identity", "provenance", "RunLog.write", "RunDirectory.publish")),
     *(f"en4dvar.runs.{step}" for step in ("session.write_checkpoint", "runner.datasets", "worklist.summary_rows")),
-    *(f"en4dvar.runs.twin_run.{step}" for step in ("twin_group", "conduct", "twin_csv")),
+    *(f"en4dvar.runs.twin_run.{step}" for step in ("TwinKind.laid_out", "conduct", "TwinKind.summary")),
 )
 pytestmark = pytest.mark.parametrize("before", ["", "--force", "--resume"])  # a first run, or one after another
 

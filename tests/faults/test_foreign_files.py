@@ -12,7 +12,7 @@ from toy_config import write_toy
 
 from en4dvar.config.document import read_document
 from en4dvar.inputs.asked import Column, Matrix
-from en4dvar.inputs.contents import read_contents
+from en4dvar.inputs.parts import read_contents
 from en4dvar.inputs.readers import read_series
 from en4dvar.inputs.square import read_covariance
 from en4dvar.plumbing.errors import ConfigError, DataError

@@ -9,7 +9,7 @@ import pytest
 from scipy.io import savemat
 
 from en4dvar.inputs.asked import Column, Layout, TimeStep
-from en4dvar.inputs.contents import read_contents
+from en4dvar.inputs.parts import read_contents
 from en4dvar.inputs.readers import Readings, read_series
 from en4dvar.plumbing.errors import DataError
 

@@ -16,10 +16,9 @@ from scipy.io import savemat
 
 from en4dvar.inputs import sheets
 from en4dvar.inputs.asked import Column, Layout
-from en4dvar.inputs.contents import read_contents
 from en4dvar.inputs.hdf_matfile import variables_of_hdf
 from en4dvar.inputs.matfile import mat_variables
-from en4dvar.inputs.parts import parts_of
+from en4dvar.inputs.parts import parts_of, read_contents
 from en4dvar.inputs.readers import Readings, read_series
 from en4dvar.inputs.steps import step_doubts
 from en4dvar.plumbing.errors import DataError

@@ -20,6 +20,8 @@ MOST_NAMES = 6
 LEAST = 1e-16  # probability that is told in figures
 LEAST_LEARNT = 1e-6  # of the prior's variance, by which a mode would move; below it a data set says nothing
 DIFFER = 1e-3  # probability below which data sets are said not to share one value
+FEWEST = 6  # data sets; of fewer no order is improbable enough
+CHANCE = 0.01  # probability below which a trend is told, that any of those looked at be there by chance
 
 
 def doubts(
@@ -92,10 +94,6 @@ def _chance(value: float) -> str:
 def _several(words: Sequence[str]) -> str:
     more = f" and {len(words) - MOST_NAMES} more" if len(words) > MOST_NAMES else ""
     return ", ".join(words[:MOST_NAMES]) + more
-
-
-FEWEST = 6  # data sets; of fewer no order is improbable enough
-CHANCE = 0.01  # probability below which a trend is told, that any of those looked at be there by chance
 
 
 def trends(problems: Sequence[InverseProblem], values: Array, names: Sequence[str]) -> Iterator[Caution]:

@@ -30,6 +30,8 @@ STEPS = 2  # linearisations that the own quantities given what is shared are sou
 FREEDOM = 7.0  # degrees of freedom of Student's t
 WIDER = 1.2  # the proposals than the Gaussian
 FEWEST = 24.0  # effective draws below which the weights say nothing
+OF_PRIOR, DEEPEST, DESCENTS = 48, 4, 8  # of the prior; of which are descended from; and with so many linearisations
+LOWER = 0.5  # of J
 
 
 @dataclass(frozen=True)
@@ -144,10 +146,6 @@ def _one(own: Array, log: Array, stream: np.random.Generator) -> Array:
 
 def _numbers(seed: int, words: str, count: int, size: int) -> Array:
     return np.asarray(member_stream(seed, words).standard_normal((count, size)))
-
-
-OF_PRIOR, DEEPEST, DESCENTS = 48, 4, 8  # of the prior; of which are descended from; and with so many linearisations
-LOWER = 0.5  # of J
 
 
 def challenger(experiments: Sequence[Experiment], at: ArrowSystem, seed: int) -> Place | None:

@@ -13,6 +13,8 @@ from en4dvar.plumbing.hints import suggest
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
 
+EVERYONE = ""  # the group of a quantity that all experiments share
+
 
 @dataclass(frozen=True)
 class Single:
@@ -26,9 +28,6 @@ class Single:
         """From the members (N, n) alive and the mode (n,) of a posterior. Raises ValueError outside a map's range."""
         z = (prior.from_physical(np.vstack([members, mode])) - prior.mean) / prior.std
         return cls(z[-1], np.linalg.inv(np.atleast_2d(np.cov(z[:-1].T))))
-
-
-EVERYONE = ""  # the group of a quantity that all experiments share
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,10 @@ DRIFTS = 0.15  # of ln R from one quarter of a history to the next
 GAS = 0.6  # of R_max: a bubble at rest is smaller
 ACOUSTIC_BEGINS = 0.1  # of R_max: one that begins below has grown from a nucleus
 CREEPS = 1.5  # collapse times after the maximum: a history that goes on for longer without a rebound is damped
+WINDOW, DEGREE = 7, 4
+STEEP = 0.5  # of the largest reading of a window: one that holds less is on its way into a collapse
+MEDIAN_OF_CHI2 = 2 * math.log(2)  # of χ²_2
+BAD = 8.0  # standard deviations from what its neighbours say
 
 
 @dataclass(frozen=True)
@@ -168,12 +172,6 @@ def typical(values: Sequence[float]) -> float:
     """Median of the finite values; NaN where there is none."""
     finite = [v for v in values if np.isfinite(v)]
     return float(np.median(finite)) if finite else float("nan")
-
-
-WINDOW, DEGREE = 7, 4
-STEEP = 0.5  # of the largest reading of a window: one that holds less is on its way into a collapse
-MEDIAN_OF_CHI2 = 2 * math.log(2)  # of χ²_2
-BAD = 8.0  # standard deviations from what its neighbours say
 
 
 def noise(times: Array, radius: Array) -> float:
