@@ -39,6 +39,11 @@ def R_max(settings: Settings) -> float:
 
 def polytropic(settings: Settings) -> None:
     settings["model"].update(SIMPLER["laser"])
+    saturated(settings)
+
+
+def saturated(settings: Settings) -> None:
+    settings["parameters"].pop("accommodation", None)
 
 
 def accommodation(settings: Settings) -> None:
@@ -73,6 +78,7 @@ PHYSICS: Mapping[str, Change] = {
     "as init proposes": lambda settings: None,
     "polytropic gas": polytropic,
     "finite condensation": accommodation,
+    "saturated vapour": saturated,
     "a wall": wall,
     "no wall": no_wall,
     "softened gel": softening,
@@ -80,6 +86,7 @@ PHYSICS: Mapping[str, Change] = {
     "scale ± 5 %, no wall": lambda settings: (scale(settings), no_wall(settings))[0],
 }
 GELS = ("as init proposes", "polytropic gas", "finite condensation", "a wall", "softened gel")
+WATER = ("as init proposes", "saturated vapour", "polytropic gas", "a wall", "scale ± 5 %")
 LIQUIDS = ("as init proposes", "no wall", "polytropic gas", "finite condensation", "a wall", "scale ± 5 %")
 HEADS = (
     "physics", "bubbles", "ln evidence", "to the next minimum", "off, %", "all after", "off, %", "G, kPa", "χ²",
@@ -89,7 +96,9 @@ HEADS = (
 
 def physics_of(group: str) -> tuple[str, ...]:
     """Names of the physics that bubbles of a group are fitted with, the first of which others are compared with."""
-    return GELS if GROUPS[group].law.startswith("neo-hookean") else LIQUIDS
+    if GROUPS[group].law.startswith("neo-hookean"):
+        return GELS
+    return WATER if GROUPS[group].medium == "water" else LIQUIDS
 
 
 def fitted(file: Path, name: str) -> Record:
