@@ -39,11 +39,6 @@ def R_max(settings: Settings) -> float:
 
 def polytropic(settings: Settings) -> None:
     settings["model"].update(SIMPLER["laser"])
-    saturated(settings)
-
-
-def saturated(settings: Settings) -> None:
-    settings["parameters"].pop("accommodation", None)
 
 
 def accommodation(settings: Settings) -> None:
@@ -78,7 +73,6 @@ PHYSICS: Mapping[str, Change] = {
     "as init proposes": lambda settings: None,
     "polytropic gas": polytropic,
     "finite condensation": accommodation,
-    "saturated vapour": saturated,
     "a wall": wall,
     "no wall": no_wall,
     "softened gel": softening,
@@ -86,7 +80,6 @@ PHYSICS: Mapping[str, Change] = {
     "scale ± 5 %, no wall": lambda settings: (scale(settings), no_wall(settings))[0],
 }
 GELS = ("as init proposes", "polytropic gas", "finite condensation", "a wall", "softened gel")
-WATER = ("as init proposes", "saturated vapour", "polytropic gas", "a wall", "scale ± 5 %")
 LIQUIDS = ("as init proposes", "no wall", "polytropic gas", "finite condensation", "a wall", "scale ± 5 %")
 HEADS = (
     "physics", "bubbles", "ln evidence", "to the next minimum", "off, %", "all after", "off, %", "G, kPa", "χ²",
@@ -96,9 +89,7 @@ HEADS = (
 
 def physics_of(group: str) -> tuple[str, ...]:
     """Names of the physics that bubbles of a group are fitted with, the first of which others are compared with."""
-    if GROUPS[group].law.startswith("neo-hookean"):
-        return GELS
-    return WATER if GROUPS[group].medium == "water" else LIQUIDS
+    return GELS if GROUPS[group].law.startswith("neo-hookean") else LIQUIDS
 
 
 def fitted(file: Path, name: str) -> Record:
@@ -109,14 +100,12 @@ def fitted(file: Path, name: str) -> Record:
 
 
 def table(group: str, bubbles: Sequence[str], records: Mapping[str, Record]) -> str:
-    """Markdown of a group, a line a physics; of the bubbles that all of its physics have records of."""
-    names = physics_of(group)
-    complete = [b for b in bubbles if all(f"{group}/{b}/{name}" in records for name in names)]
-    lines = [f"| {' | '.join(HEADS)} |", "|---" * len(HEADS) + "|"]
+    """Markdown of a group, a line a physics: of the bubbles that it and the first of the group have records of."""
+    names, lines = physics_of(group), [f"| {' | '.join(HEADS)} |", "|---" * len(HEADS) + "|"]
     for name in names:
-        mine = [records[f"{group}/{b}/{name}"] for b in complete]
-        first = [records[f"{group}/{b}/{names[0]}"] for b in complete]
-        lines.append(f"| {' | '.join([name, *_cells(mine, first)])} |")
+        both = [b for b in bubbles if {f"{group}/{b}/{name}", f"{group}/{b}/{names[0]}"} <= records.keys()]
+        mine, first = ([records[f"{group}/{b}/{of}"] for b in both] for of in (name, names[0]))
+        lines += [f"| {' | '.join([name, *_cells(mine, first)])} |"] * bool(both)
     return "\n".join(lines) + "\n"
 
 
@@ -136,7 +125,8 @@ def _cells(mine: Sequence[Record], first: Sequence[Record]) -> list[str]:
     for key, factor in (("G", 1e3), ("mu", 1.0)):
         logs = intervals(told, key)
         each = np.exp(logs[:, 0]) / factor
-        cells += [f"{each.mean():.3g} ± {each.std(ddof=1):.2g}", f"{chi2(logs):.2f}"] if len(each) > 1 else ["–", "–"]
+        spread = f" ± {each.std(ddof=1):.2g}" if len(each) > 1 else ""
+        cells += [f"{each.mean():.3g}{spread}" if len(each) else "–", f"{chi2(logs):.2f}" if len(each) > 1 else "–"]
     seconds = [r["seconds"] for r in told]
     return [*cells, f"{np.median(seconds):.0f}" if seconds else "–"]
 

@@ -19,7 +19,6 @@ from en4dvar.model.state import READING_SCALE
 from en4dvar.plumbing.units import parse_quantity
 from en4dvar_bubble.media import MEDIA, known_medium
 from en4dvar_bubble.model import BubbleModel
-from en4dvar_bubble.numbers import ACCOMMODATION
 from en4dvar_bubble.starter.grouped import NO_GROUPS, Grouped
 
 ANY = "gel"
@@ -68,9 +67,8 @@ def centred(model: BubbleModel, medium: str) -> BubbleModel:
 
 
 def of_water(radius: float) -> dict[str, tuple[str, str]]:
-    """Priors of viscosity, R_eq and accommodation of a bubble of ``radius`` (m) in water, with words: by name. What
-    damps a collapse in water is sound, heat and vapour, so that a guess from collapse and rebound books them as
-    viscosity.
+    """Priors of the viscosity and of R_eq of a bubble of ``radius`` (m) in water, with words: by name. What damps a
+    collapse in water is sound, heat and vapour, so that a guess from collapse and rebound books them as viscosity.
     """
     off = math.exp(1.645 * 1.5)
     return {
@@ -81,10 +79,6 @@ def of_water(radius: float) -> dict[str, tuple[str, str]]:
         "R_eq": (
             f"{{prior: lognormal, median: {float(f'{5e4 * radius:.2g}'):g} um, log_std: 1}}",
             "0.05 R_max, the little gas that water leaves; may be off by a factor of 5.2; narrow it to what you know",
-        ),
-        ACCOMMODATION.name: (
-            "{prior: logit, lower: 0.04, upper: 1, median: 0.4, logit_std: 1.2}",
-            "vapour crosses the wall at a finite rate (docs/physics.md); below 0.04 no gas gives measured rebounds",
         ),
     }
 

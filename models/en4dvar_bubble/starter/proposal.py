@@ -16,7 +16,6 @@ from en4dvar_bubble.collapse import Lobe, conceivable, doubt, lobe
 from en4dvar_bubble.dynamics import R0, R_EQ, R_MAX
 from en4dvar_bubble.laws.loading import qualified
 from en4dvar_bubble.model import BubbleModel
-from en4dvar_bubble.numbers import ACCOMMODATION
 from en4dvar_bubble.settings import BubbleSettings
 from en4dvar_bubble.starter import elsewhere
 from en4dvar_bubble.starter.grouped import NO_GROUPS, Grouped
@@ -142,14 +141,12 @@ def propose(
     if chosen == "laser" and ratio > elsewhere.SLOW and "G" not in {p.name for p in model.law.parameters}:
         distance, prior, source = elsewhere.wall(look.lobe.R_max, ratio)
         wall = (Entry("wall", f"{{distance: {distance}}}", source),), (Entry("wall_distance", prior, "of that plane"),)
-    parameters = _parameters(model, chosen, look, believed, tops(looks, histories), medium)
-    finite = any(line.key == ACCOMMODATION.name for line in parameters)  # which a simpler gas does not have
     together = elsewhere.population([p.name for p in model.law.parameters], len(views), medium, groups)
     return Proposal(
         _data(chosen, look, model, {**others, **guess.values}, histories),
         (*_model(law_name, chosen, look), *wall[0]),
-        (*parameters, *wall[1]),
-        {} if finite else SIMPLER[chosen],
+        (*_parameters(model, chosen, look, believed, tops(looks, histories), medium), *wall[1]),
+        SIMPLER[chosen],
         (*told, *[f"{len(views)} bubbles: {_ends_with(groups)}"] * bool(together)),
         tuple(warnings),
         together,
@@ -399,7 +396,6 @@ def _parameters(
     if R_EQ.name in water and not np.isfinite(look.rest):
         radii[R_EQ.name] = Entry(R_EQ.name, *water[R_EQ.name])
     lines += radii.values()
-    lines += [Entry(name, *water[name]) for name in (ACCOMMODATION.name,) if name in water]
     mean, std = (0.0, 0.5e-6) if start == "acoustic" or top is None else top.t_s
     prior = f"{{prior: normal, mean: {_text(mean, 's', 'us', 4)}, std: {_text(std, 's', 'us')}}}"
     words = "the clock of the data against that of the pulse"
