@@ -100,14 +100,12 @@ def fitted(file: Path, name: str) -> Record:
 
 
 def table(group: str, bubbles: Sequence[str], records: Mapping[str, Record]) -> str:
-    """Markdown of a group, a line a physics; of the bubbles that all of its physics have records of."""
-    names = physics_of(group)
-    complete = [b for b in bubbles if all(f"{group}/{b}/{name}" in records for name in names)]
-    lines = [f"| {' | '.join(HEADS)} |", "|---" * len(HEADS) + "|"]
+    """Markdown of a group, a line a physics: of the bubbles that it and the first of the group have records of."""
+    names, lines = physics_of(group), [f"| {' | '.join(HEADS)} |", "|---" * len(HEADS) + "|"]
     for name in names:
-        mine = [records[f"{group}/{b}/{name}"] for b in complete]
-        first = [records[f"{group}/{b}/{names[0]}"] for b in complete]
-        lines.append(f"| {' | '.join([name, *_cells(mine, first)])} |")
+        both = [b for b in bubbles if {f"{group}/{b}/{name}", f"{group}/{b}/{names[0]}"} <= records.keys()]
+        mine, first = ([records[f"{group}/{b}/{of}"] for b in both] for of in (name, names[0]))
+        lines += [f"| {' | '.join([name, *_cells(mine, first)])} |"] * bool(both)
     return "\n".join(lines) + "\n"
 
 
@@ -127,7 +125,8 @@ def _cells(mine: Sequence[Record], first: Sequence[Record]) -> list[str]:
     for key, factor in (("G", 1e3), ("mu", 1.0)):
         logs = intervals(told, key)
         each = np.exp(logs[:, 0]) / factor
-        cells += [f"{each.mean():.3g} ± {each.std(ddof=1):.2g}", f"{chi2(logs):.2f}"] if len(each) > 1 else ["–", "–"]
+        spread = f" ± {each.std(ddof=1):.2g}" if len(each) > 1 else ""
+        cells += [f"{each.mean():.3g}{spread}" if len(each) else "–", f"{chi2(logs):.2f}" if len(each) > 1 else "–"]
     seconds = [r["seconds"] for r in told]
     return [*cells, f"{np.median(seconds):.0f}" if seconds else "–"]
 

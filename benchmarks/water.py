@@ -2,6 +2,7 @@
 
     python benchmarks/water.py            the bubble of 1.2 mm in ../shared/data
     python benchmarks/water.py FILE.csv   another: t_us, R_um
+    python benchmarks/water.py FILE.csv gilmore equilibrium    only the rows with these words
 
 One number is not known, the amount of gas, as the equilibrium radius R_eq: it is set so that the second oscillation is
 as large as measured. The table says how far the largest radii of the third and fourth oscillation, and the instants of
@@ -12,6 +13,7 @@ parabola through what lies above 0.85 of an oscillation's largest radius. R_max 
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -99,7 +101,7 @@ def matched(times: Array, observed: Array, physics: Physics) -> tuple[float, Arr
     return float(best), tops_of(times, observed[0, 1], np.array([best]), physics)[0]
 
 
-def main(file: Path) -> None:
+def main(file: Path, words: Sequence[str] = ()) -> None:
     times, R = np.loadtxt(file, delimiter=",", comments=("#", "t"), unpack=True) * 1e-6
     observed = tops(times, R)[:COUNT]
     told = ", ".join(f"{1e6 * r:.0f} µm at {1e6 * (t - observed[0, 0]):.1f} µs" for t, r in observed)
@@ -108,6 +110,8 @@ def main(file: Path) -> None:
     heads = ["gas", "accommodation", "diffusivity", "radial", "R_eq, µm", "R 3rd", "R 4th", "t 2nd", "t 3rd", "t 4th"]
     print(f"| {' | '.join(heads)} |\n{'|---' * len(heads)}|")
     for physics in PHYSICS:
+        if not all(word in physics[0] for word in words):
+            continue
         R_eq, found = matched(shifted, observed, physics)
         off = 100 * (found[2:, 1] / observed[2:, 1] - 1), 100 * (found[1:, 0] / (observed[1:, 0] - observed[0, 0]) - 1)
         cells = ["–" if np.isnan(value) else f"{value:+.1f} %" for value in np.concatenate(off)]
@@ -116,4 +120,4 @@ def main(file: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]) if sys.argv[1:] else DATA)
+    main(Path(sys.argv[1]) if sys.argv[1:] else DATA, sys.argv[2:])

@@ -90,19 +90,17 @@ class Bubble:
         return k.D * (k.p_inf / p) ** k.D_p * (T / k.T_inf) ** k.D_T
 
     def wall_fraction(self, R, p, T, C):
-        """The C_w of a wall of temperature ``T`` with C ``C[1:]`` inside (bisection: evaporation − diffusion falls)."""
+        """The C_w of a wall of temperature ``T`` with C ``C[1:]`` inside: what diffuses is what evaporates, in which
+        C_w is of second degree.
+        """
         k = self.k
         if np.isinf(k.accommodation):
             return self.saturated(T, p)
-        inside = self.D1[0, 1:] @ C[1:]
-        low, high = np.zeros_like(R), np.full_like(R, 1 - 1e-15)
-        for _ in range(60):
-            Cw = (low + high) / 2
-            Rmix = Cw * self.Rv + (1 - Cw) * self.Rg
-            left = k.accommodation * (p_sat(T) - p * Cw * self.Rv / Rmix) / np.sqrt(2 * np.pi * self.Rv * T)
-            flux = p / (Rmix * T) * self.diffusivity(T, p) * (self.D1[0, 0] * Cw + inside) / (1 - Cw) / R
-            low, high = np.where(left > flux, Cw, low), np.where(left > flux, high, Cw)
-        return (low + high) / 2
+        rate, spread = k.accommodation / np.sqrt(2 * np.pi * self.Rv * T), p / T * self.diffusivity(T, p) / R
+        square = rate * (p_sat(T) * (self.Rv - self.Rg) - p * self.Rv)
+        none = spread * (self.D1[0, 1:] @ C[1:]) - rate * p_sat(T) * self.Rg
+        once = spread * self.D1[0, 0] + rate * p_sat(T) * self.Rg - square
+        return -2 * none / (once + np.sqrt(once**2 - 4 * square * none))
 
     def wall_temperature(self, R, p, T, C, T_m):
         """The T_w at which the heat fluxes balance (Newton with a differenced slope)."""

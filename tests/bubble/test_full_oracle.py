@@ -49,10 +49,7 @@ def test_diffusivity_of_kinetic_theory():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("conducting", "coarse", "fine"),
-    [(False, (48, 0), (96, 0)), pytest.param(True, COARSE, FINE, marks=pytest.mark.long)],
-)
+@pytest.mark.parametrize(("conducting", "coarse", "fine"), [(False, (48, 0), (96, 0)), (True, COARSE, FINE)])
 def test_vapour_that_crosses_the_wall_at_a_finite_rate(conducting, coarse, fine):
     error = difference(fine, "transport", conducting, accommodation=0.1)
     assert error < 2e-3
