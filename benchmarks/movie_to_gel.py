@@ -84,7 +84,7 @@ def experiment(key: str) -> Record:
             except En4dvarError:
                 continue
         movie = open_movie(folder / "bubble.tif")
-        found = track(movie)
+        found = track(movie, exposure=EXPOSURE)  # as the command does with --exposure
         write_text(folder / "bubble.csv", to_csv(found.readings, Scale(movie.pixel, movie.rate, EXPOSURE), "", ""))
         try:
             (problem,) = build(load_config(folder / "gel.yaml"))

@@ -53,7 +53,8 @@ def bands(standing: Standing) -> Chart | None:
     for (parameter, unit), band in standing.bands.items():
         steps = sorted(band)
         low, middle, high = np.array([band[step] for step in steps]).T
-        panel = Panel("iteration", with_unit(figure_text(parameter), unit), whole=True, xticks=4, yticks=4)
+        title = with_unit(figure_text(parameter), unit)
+        panel = Panel("iteration", title=title, whole=True, xticks=4, yticks=4)
         panel.band(steps, low, high, "posterior", 0.3)
         panel.line(steps, middle, "posterior")
         panel.dots(steps, middle, "posterior")

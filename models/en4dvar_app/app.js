@@ -184,15 +184,11 @@ async function showLive(job) {
   const told = await fetched("live", { run: job.out.replace("runs/", "") }).catch(() => null);
   if (!told) return;
   $("live").dataset.whole = whole;
-  $("log").hidden = !running;
-  $("log").textContent = told.text;
+  $("log").hidden = !running; $("log").textContent = told.text;
   $("bands").innerHTML = told.bands;
   $("sets").hidden = !told.sets.length;
-  $("sets").tBodies[0].replaceChildren(...told.sets.map((cells) => {
-    const row = document.createElement("tr");
-    for (const words of cells) row.insertCell().textContent = words;
-    return row;
-  }));
+  $("sets").tBodies[0].replaceChildren();
+  for (const cells of told.sets) { const row = $("sets").tBodies[0].insertRow(); for (const words of cells) row.insertCell().textContent = words; }
 }
 
 const freeName = (stem, names, end = "") => {

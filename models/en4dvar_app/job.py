@@ -94,6 +94,7 @@ def end_of(path: Path, most: int = LONGEST) -> str:
 def _state(job: Path) -> str:
     with suppress(OSError, ValueError):
         code = int((job / "code").read_text(encoding="utf-8"))
+        _begun.pop(job, None)  # another folder may have its name later
         cancelled = code == INTERRUPTED or (job / "cancel").exists()
         return "done" if code == 0 else "stopped" if cancelled else "failed"
     process = _begun.get(job)

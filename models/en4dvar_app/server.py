@@ -17,7 +17,6 @@ from tornado.httpserver import HTTPServer
 from tornado.netutil import bind_sockets
 
 from en4dvar.plumbing.errors import En4dvarError
-from en4dvar.report.svg import svg
 from en4dvar_app import job, pictures, steps
 from en4dvar_app.trusted import below
 from en4dvar_movie.frames import IMAGES, MOVING, TIFF
@@ -28,7 +27,6 @@ MOVIES = (*MOVING, ".raw")
 FRAMES, CONFIGS = (*TIFF, *IMAGES), (".yaml", ".yml")
 TABLES = (".csv", ".txt", ".dat", ".tsv", ".xlsx", ".mat")
 MOST = 2000  # names of a folder
-LOG = 400_000  # bytes of a run's log, from its end
 _turn = threading.Lock()  # of two windows that write, one reads what the other wrote
 KINDS = {
     ".html": "text/html; charset=utf-8", ".css": "text/css", ".js": "text/javascript", ".png": "image/png",
@@ -206,13 +204,14 @@ class Look(Guarded):
         return {"text": steps.text_of(self.root, arguments)}
 
     def look_live(self, arguments: dict[str, str]) -> dict[str, Any]:
-        from en4dvar.report import live
+        from en4dvar.report.live import bands, standings
+        from en4dvar.report.svg import svg
 
-        told = job.end_of(below(self.root, f"runs/{arguments.get('run', '')}/run.log"), LOG)
-        standing = live.standings(told)
-        chart = live.bands(*standing.values()) if len(standing) == 1 else None
+        told = job.end_of(below(self.root, f"runs/{arguments.get('run', '')}/run.log"), 20 * job.LONGEST)
+        sets = standings(told)
+        chart = bands(*sets.values()) if len(sets) == 1 else None
         drawn = svg(chart, "live", "Median and middle 90 % of each parameter over the iterations") if chart else ""
-        rows = sorted((name, each.at, each.estimate) for name, each in standing.items())
+        rows = sorted((name, each.at, each.estimate) for name, each in sets.items())
         return {"text": told[-job.LONGEST :], "bands": drawn, "sets": rows if len(rows) > 1 else []}
 
     def look_laws(self, arguments: dict[str, str]) -> dict[str, list[str]]:

@@ -24,6 +24,8 @@ Image = npt.NDArray[Any]  # brightness (H, W), of any precision
 DEAD = 0.25  # of the brightness about it: where a background shows nothing of a bubble, as writing does
 STRUCTURE = 0.1  # of that brightness: structure that a bubble darkens as it does the rest
 FLICKER = 0.2  # of the brightness: what a lamp may change from frame to frame
+TOP, MANY = 90, 0.4  # per cent of the tiles that are not the brightest; the share of tiles that tells the light
+ALIKE, CLOSE = 4.0, 0.05  # std of noise, or of the brightness, by which tiles in one light may differ
 LAMP = 0.25  # logarithm of the ratio of brightness of two frames that differ by their lamp
 LIVELY = 0.4  # share of the rim of a patch that changes in a bubble, not in what stands still
 OFTEN = 0.1  # of the frames: in how many it does
@@ -63,11 +65,18 @@ class Background:
     def normalised(self, frame: Frame) -> tuple[Array, Array]:
         """The image (H, W) and its tiles, without what the lamp flickers."""
         image, tiles = normalise(frame, self.level, self.gain, TILE)
-        change = float(np.median(tiles[:: -(-tiles.size // STEADY)])) if self.relative else 0.0
+        change = self._light(tiles[:: -(-tiles.size // STEADY)]) if self.relative else 0.0
         if abs(change) > FLICKER:  # a bubble that fills the frame, or a flash
             return image, tiles
         scale = np.float32(1 / (1 + change))
         return (image - np.float32(change)) * scale, np.where(tiles == 0, 0, (tiles - np.float32(change)) * scale)
+
+    def _light(self, tiles: Array) -> float:
+        """How much brighter than the level the background is, by the brightest tiles that are alike: of all tiles, the
+        median would be the bubble's edge where the bubble covers half of the frame.
+        """
+        alike = tiles > np.percentile(tiles, TOP) - max(ALIKE * self.noise / TILE, CLOSE)
+        return float(np.median(tiles[alike])) if np.mean(alike) > MANY else 0.0
 
     def steadied(self, image: Array, tiles: Array, bubble: Circle) -> Array:
         """The image at the background's own brightness: what the light does far from the bubble is taken out."""

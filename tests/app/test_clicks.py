@@ -160,6 +160,42 @@ def test_corrections_are_those_of_the_file_in_every_window(visit, serve, two_bub
     until(other, "corrections.value.includes('10 ok')")
 
 
+def test_a_circle_is_moved_and_resized_and_a_scale_bar_drawn(visit, serve, two_bubbles):
+    page = visit(serve(two_bubbles[0]))
+    until(page, "!!movie?.picture")
+    page.focus("#frame")
+    for x, y, radius, drag in (
+        (39.5, 49.5, 20, ((40, 50), (60, 50))),  # a new one
+        (44.5, 46.5, 20, ((42, 51), (47, 48))),  # moved from within
+        (44.5, 46.5, 30, ((65, 47), (75, 47))),  # its edge
+    ):
+        pull(page, *drag)
+        until(page, f"Math.abs(circle(at).r - {radius}) < 0.7 && Math.abs(circle(at).x - {x}) < 0.7")
+        until(page, "kept.startsWith('0 ')")
+        assert page.evaluate("circle(at).y") == pytest.approx(y, abs=0.7)
+    page.check("input[value=scale]")
+    pull(page, (10, 20), (60, 20))
+    until(page, "message.innerText.includes('Type the length')")
+    page.fill("#length", "100 um")
+    page.press("#length", "Tab")
+    value, unit = page.input_value("#pixel").split()
+    assert (float(value), unit) == (pytest.approx(2.0, rel=0.02), "um")
+
+
+def test_a_server_that_is_gone_is_told_and_nothing_is_lost(visit, serve, two_bubbles):
+    folder, _ = two_bubbles
+    server = serve(folder)
+    page = visit(server)
+    until(page, "!!movie?.picture")
+    page.focus("#frame")
+    page.keyboard.press("o")
+    until(page, "kept === '0 out\\n'")
+    server.end()
+    until(page, "message.innerText.includes('The server does not answer. Nothing is lost')")
+    page = visit(serve(folder))
+    until(page, "document.getElementById('corrections').value === '0 out\\n'")
+
+
 def test_the_public_movie_to_an_interval(visit, serve, tmp_path):
     if not MOVIE.is_file():
         pytest.skip(f"{MOVIE} is not there")

@@ -146,3 +146,13 @@ def test_the_real_movie_agrees_with_a_person():
     assert abs(np.median(off)) < 0.25
     assert np.mean(np.abs(off) < 2) > 0.97  # two frames of a collapse within the exposure are read smaller
     assert [r.sighting.frame for r in found.readings if not r.used] == [0, 1, 2]
+
+
+@pytest.mark.parametrize("noise", [2.0, 10.0])
+def test_a_bubble_that_covers_half_of_the_frame_is_no_change_of_light(noise):
+    """The median brightness of such a frame is that of the bubble's edge."""
+    radii = np.linspace(36.0, 43.0, 15)
+    found = track(movie_of(frames(Scene(shape=(96, 96), noise=noise), radii)))
+    off = np.array([r.radius for r in found.readings[3:]]) - radii
+    assert np.abs(off).max() < 0.15
+    assert np.abs(off / [r.errors.std for r in found.readings[3:]]).max() < 5
