@@ -59,6 +59,10 @@ CATALOGUE: dict[str, tuple[Severity, str]] = {
         "among the members; else find out why the model does not give them",
     ),
     "at-bound": ("caution", "widen the bound if physics allows it; else quote a limit, not mean ± std"),
+    "missed-knots": (
+        "caution",
+        "put the knots there, or several about each event: a change within a piece shifts the values beside it",
+    ),
     "odd-data-set": (
         "caution",
         "look at its data, scale and frame rate and at its residuals; say in every quotation that it is left out",

@@ -57,13 +57,13 @@ def needed(
         ratio = shared_spread(planned, information, alike, prior)[1]
         return float((np.stack(in_units(planned, planned.about, ratio, tangents.u)) * scale)[at])
 
-    found = np.empty((len(wanted), count + 1))
-    for row, (name, (value, relative)) in zip(found, wanted.items(), strict=True):
+    largest = np.empty((len(wanted), count + 1))
+    for factors, (name, (most, relative)) in zip(largest, wanted.items(), strict=True):
         at = int(relative), planned.about.index(name)
         for b, some in enumerate(np.vstack([np.eye(count), np.ones(count)])):
-            row[b] = _largest(partial(measured, some, at), value, MOST if b < count else 1.0)
+            factors[b] = _largest(partial(measured, some, at), most, MOST if b < count else 1.0)
     others = in_units(planned, planned.names[planned.asked :], np.ones((len(tangents.u), count)), tangents.u)
-    return found, np.stack(others)
+    return largest, np.stack(others)
 
 
 def _largest(measure: Callable[[float], float], wanted: float, most: float) -> float:
