@@ -148,6 +148,10 @@ TRIGGERS = {
         "at least a fifth of the posterior members lie within 5 % of the interval's width from a bound, and more than "
         "three times the prior's share"
     ),
+    "missed-knots": (
+        "the evidence speaks (ratio above 20) for all knots earlier, or later, by twice the time between readings; not "
+        "looked for with what_if: false"
+    ),
     "odd-data-set": (
         "the data raise the odds that a data set is not of its population by more than a quarter of the number of data "
         "sets, and at least fivefold, or it could not be sampled; in a joint estimate, where it is serious, one "
