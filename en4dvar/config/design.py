@@ -111,6 +111,11 @@ class Design(_SampleSizes):
 
     about: tuple[str, ...] = ()
     """Parameters that are asked for; the others stay uncertain. Default: all that have a prior."""
+    common: tuple[str, ...] = ()
+    """Others that equal experiments and the run of ``--after`` share as well: the scale of one camera, the density."""
+    wanted: dict[str, QuantityText] = Field({})
+    """Parameter asked for → what it is to be known to, one standard deviation (5 %, or in its unit): what each other
+    parameter must be known to for it is told."""
     times: Annotated[Array | None, Made(_read_rates, Rates)] = None
     """When readings are taken, on the model's clock; default: ``simulate.times``, else those of the data file."""
     knobs: dict[str, Knob] = Field({})

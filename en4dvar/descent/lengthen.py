@@ -3,7 +3,8 @@
 A chaotic model has about as many minima as its trajectories part within the window. J of its beginning has one, and the
 minimum of a window lies near that of the window a little shorter: each descent starts where the one before it ended
 (quasi-static variational assimilation: Pires, Vautard & Talagrand 1996, Tellus A 48, 96; Swanson, Vautard & Pires 1998,
-Tellus A 50, 369). Readings after the end of a window have the weight zero; nothing else changes.
+Tellus A 50, 369). Readings after the end of a window have the weight zero, and correlated errors count as independent
+on the way there, where windows only lead on; the whole window has R as it is.
 """
 
 from collections.abc import Callable, Iterator
@@ -11,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from en4dvar.data.noise import noise_of
 from en4dvar.descent.loop import minimise
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.descent.window import DataWindow, Descent
@@ -28,13 +30,16 @@ def shortened(space: WeightSpace, scheme: Minimiser) -> Iterator[WeightSpace]:
     A window that holds no more readings than the one before is left out, too.
     """
     observations, tolerance = space.problem.observations, max(ROUGH, scheme.cost_tolerance)
+    noise = observations.noise
+    if not noise.independent and not space.problem.discrepancy:
+        noise = noise_of(noise.std, noise.time_std)
     settings = replace(space.settings, own=replace(scheme, lengthen=1, cost_tolerance=tolerance))
     (begin, end), counted, of_all = observations.span, 0, int(np.sum(observations.weights > 0))
     for j in range(1, scheme.lengthen):
         inside = observations.times <= begin + (end - begin) * j / scheme.lengthen
         weights = np.where(inside, observations.weights, 0.0)
         if counted < (counted := int(np.sum(weights > 0))) < of_all:
-            problem = replace(space.problem, observations=replace(observations, weights=weights))
+            problem = replace(space.problem, observations=replace(observations, weights=weights, noise=noise))
             yield WeightSpace(problem, settings, space.seed, space.executor)
 
 

@@ -1,5 +1,6 @@
 """One data set from its prior ensemble to the posterior and its predictions."""
 
+import math
 from dataclasses import replace
 from functools import partial
 
@@ -18,13 +19,17 @@ from en4dvar.estimation.conclusions import Ensembles
 from en4dvar.estimation.localised import assimilate_localised
 from en4dvar.estimation.stages import Keep, LoopState, Sampled, Stages
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
-from en4dvar.plumbing.caution import caution
+from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.errors import TooFewMembersError
+from en4dvar.priors.varying import PiecewiseModel
+from en4dvar.priors.varying.random_walk import clock
 from en4dvar.problem import InverseProblem
 from en4dvar.sampling.refine import mode_cautions, that_count
 from en4dvar.schemes.settings import AssimilationSettings
 
 __all__ = ["LoopState", "assimilate", "cost", "forecast", "log_posterior"]
+
+INTERVALS = 2.0  # between readings, by which knots are shifted
 
 
 def assimilate(
@@ -97,7 +102,9 @@ def _through(stages: Stages, resume: LoopState | None) -> Analysis:
     if counting:
         weights = np.array([mode.weight for mode in analysis.modes])
         cautions = (*cautions, *mode_cautions(prior, counting, weights, agree, sampled.refined))
+    cautions = (*cautions, *_missed_knots(stages, analysis.log_evidence))
     analysis = replace(analysis, cautions=examine(analysis, control, outcome.descent.worst_loss, cautions))
+    analysis = replace(analysis, forward_runs=space.forward_runs)
     if stages.settings.what_if == "added":  # last, since what is examined is the posterior of the data
         widened = with_shifts(ends.members, analysis.what_if, stages.seed)
         analysis = replace(analysis, posterior=prior.to_physical(widened))
@@ -155,6 +162,7 @@ def _fitted(stages: Stages, changed: InverseProblem) -> Fit | None:
     settings = replace(stages.settings, what_if=False, refine="none", emulator="off")
     within = replace(changed.observations, continued=None)
     other = Stages(replace(changed, observations=within), settings, stages.seed, stages.space.executor, None, None)
+    other.compares = False
     try:
         end = _through(other, None)
     except TooFewMembersError:
@@ -169,13 +177,39 @@ def _log_evidence_constant(stages: Stages) -> float | None:
     changes (Savage & Dickey) would spare the runs, but extrapolates the quadratic form of J from one minimum to the
     other, which may be far away.
     """
-    if not stages.problem.varying:
-        return None
-    settings = replace(stages.settings, what_if=False)
-    other = Stages(stages.problem.constant, settings, stages.seed, stages.space.executor, None, None)
+    return _log_evidence(stages, stages.problem.constant) if stages.compares and stages.problem.varying else None
+
+
+def _log_evidence(stages: Stages, problem: InverseProblem) -> float:
+    """ln p(y) of another problem with the same readings, by an assimilation of its own; NaN where too few survive."""
+    other = Stages(problem, replace(stages.settings, what_if=False), stages.seed, stages.space.executor, None, None)
+    other.compares = False
     try:
         return _through(other, None).log_evidence
     except TooFewMembersError:
         return np.nan
     finally:
         stages.space.forward_runs += other.space.forward_runs
+
+
+def _missed_knots(stages: Stages, log_evidence: float) -> tuple[Caution, ...]:
+    """A warning where the data speak for all knots earlier, or later, by :data:`INTERVALS` between readings.
+
+    A change that lies within a piece shifts the pieces beside it by many of their standard deviations, and the linear
+    response to a knot from there does not show it: each shift is fitted anew.
+    """
+    problem, model = stages.problem, stages.problem.model
+    if not (stages.compares and stages.settings.what_if and isinstance(model, PiecewiseModel)):
+        return ()
+    by = INTERVALS * float(np.median(np.diff(np.unique(problem.observations.times[problem.observations.used]))))
+    gains = {}
+    for shift in (-by, by):
+        moved = [replace(varied, knots=tuple(t + shift for t in varied.knots)) for varied in model.varying]
+        if min(varied.knots[0] for varied in moved) > 0:
+            beside = replace(problem, model=PiecewiseModel(model.model, moved))
+            gains[shift] = _log_evidence(stages, beside) - log_evidence
+    best = max(gains, key=lambda shift: np.nan_to_num(gains[shift], nan=-np.inf), default=0.0)
+    if not gains or not gains[best] > math.log(diag.DECISIVE):
+        return ()
+    where = f"{clock(model, abs(best))} {'earlier' if best < 0 else 'later'}"
+    return (caution("missed-knots", f"the data speak for knots {where} (log evidence {gains[best]:+.1f})"),)

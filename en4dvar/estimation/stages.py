@@ -90,7 +90,12 @@ class Sampled:
 
 
 class Stages:
-    """One data set, in the order of the methods; each keeps a state to resume from as it goes on."""
+    """One data set, in the order of the methods; each keeps a state to resume from as it goes on.
+
+    ``compares``: whether what varies is compared with constant values and with knots beside its own, each fitted anew.
+    """
+
+    compares = True
 
     def __init__(
         self,

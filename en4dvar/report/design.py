@@ -70,11 +70,43 @@ def _known(designs: Designs, row: DesignRow, a: int) -> str:
     assert result is not None
     if result.ratio[a] > NOTHING:
         return f"{name} hardly at all"
-    if result.relative[a] < COARSE:
-        return f"{name} to ± {rough_number(100 * float(result.relative[a]))} %"
-    unit, shown = designs.asked.units[a]
-    value = rough_number(float(convert(np.array(result.std[a]), unit, shown)))
-    return f"{name} to ± {value}{'' if shown == '1' else f' {shown}'}"
+    return f"{name} to ± {_spread(float(result.std[a]), float(result.relative[a]), *designs.asked.units[a])}"
+
+
+def _spread(std: float, relative: float, unit: str, shown: str) -> str:
+    """In % of the value where that says something, else in the unit shown."""
+    if relative < COARSE:
+        return f"{rough_number(100 * relative)} %"
+    return f"{rough_number(float(convert(np.array(std), unit, shown)))}{'' if shown == '1' else f' {shown}'}"
+
+
+def needs(designs: Designs, row: DesignRow) -> list[str]:
+    """What the other parameters must be known to for what is wanted: "G to ± 5 % if reading_scale were known to 0.3 %",
+    a sentence for each that is wanted.
+    """
+    result = row.result
+    if result is None or result.needed is None or result.others is None:
+        return []
+    told = []
+    for (name, text), factors in zip(designs.asked.wanted.items(), result.needed, strict=True):
+        *each, every = factors.tolist()
+        met, alone = every >= 1, [f for f in each if f > 0]
+        used = each if met or alone else [every] * len(each)
+        known = [
+            f"{other} to {_spread(f * std, f * relative if relative < COARSE else math.inf, *units)}"
+            for f, (other, *units), std, relative in zip(used, designs.asked.others, *result.others, strict=True)
+            if 0 < f < math.inf
+        ]
+        if met:
+            how = f" as long as each is known: {', '.join(known)}" if known else ", however badly each other is known"
+        elif alone:
+            how = f" if one of these were known better: {', '.join(known)}"
+        elif every > 0:
+            how = f" if all others were known {rough_number(1 / every)} times better: {', '.join(known)}"
+        else:
+            how = ": not with these readings, even if all else were known"
+        told.append(f"{name} to ± {text}{how}")
+    return told
 
 
 def by(result: Evaluated) -> str:
@@ -105,7 +137,10 @@ def design_table(designs: Designs) -> str:
         for row in told
         if row.result
     ]
-    return table([head, *cells])
+    ends = list({id(row): row for row in (*rows[:1], *own)}.values())
+    alike = {id(row): f"; {_alike(row)} experiments" if several else "" for row in ends}
+    wanted = [f"{settings_text(row)}{alike[id(row)]}: {text}" for row in ends for text in needs(designs, row)]
+    return "\n".join([table([head, *cells]), *wanted])
 
 
 def remarks(designs: Designs) -> list[str]:
@@ -209,7 +244,15 @@ def write_design(folder: Path) -> Path:
         laws=designs.asked.laws,
         by=by,
         rows=[(settings_text(row), row, words(designs, row), id(row) in best) for row in rows],
-        lab=[(settings_text(row), readings_text(designs, row), row, words(designs, row)) for row in front(designs)],
+        lab=[
+            (
+                settings_text(row),
+                readings_text(designs, row),
+                row,
+                "; ".join([words(designs, row), *needs(designs, row)]),
+            )
+            for row in front(designs)
+        ],
         remarks=remarks(designs),
         drawings=drawings,
         attributes=designs.attributes,
@@ -246,8 +289,11 @@ def _cells(designs: Designs) -> list[list[Any]]:
         knobs = [row.settings.get(name, "") for name in designs.asked.knobs]
         worth = [result.alike, len(result.readings), row.price, result.gain, result.error, result.method]
         worth += [getattr(result.decision, field) for field in DECISION] if result.decision else []
-        cells.append([*knobs, *worth, *std, *map(float, result.ratio), result.lost, result.beyond])
-    return [[*head, *ratios, "lost", "beyond_validity"], *cells]
+        factors = [] if result.needed is None else result.needed.ravel().tolist()
+        cells.append([*knobs, *worth, *std, *map(float, result.ratio), result.lost, result.beyond, *factors])
+    others = [*(name for name, *_ in designs.asked.others), "all"]
+    needed = [f"{name}_needs_{other}_factor" for name in designs.asked.wanted for other in others]
+    return [[*head, *ratios, "lost", "beyond_validity", *needed], *cells]
 
 
 def _worth(row: DesignRow) -> float:

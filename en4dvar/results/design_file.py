@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,14 @@ COLUMNS = {  # field of an evaluation → variable, its dimensions beside that o
     "times": ("time", "taken", "times of the readings taken"),
     "grid": ("grid", "point", "times of the fan"),
     "fan": ("fan", "level point", "{seen}"),
+}
+NEEDED = {  # the same, where something is wanted; of the last condition all others at once
+    "needed": (
+        "needed_factor",
+        "wanted condition",
+        "largest factor of the prior std of others that allows what is wanted",
+    ),
+    "others": ("other_std", "measure other", "prior std of others, in their units and relative to the value"),
 }
 PADDED = ("taken", "point")  # of which one design has more than another
 DECISION = {  # field → variable, description
@@ -60,7 +68,7 @@ class DesignRow:
 class Asked:
     """What was asked: parameters with their ``units`` (stored, shown), symbols and labels, the knobs and the laws; the
     label and the ``axes`` of what is seen, time and observable, each with its units (stored, shown); what is
-    ``enough``, nats.
+    ``enough``, nats; what is ``wanted``, as it is written, and for it all ``others`` with their units (stored, shown).
     """
 
     parameters: tuple[str, ...]
@@ -72,6 +80,8 @@ class Asked:
     axes: tuple[tuple[str, str], tuple[str, str]]
     laws: tuple[str, ...]
     enough: float
+    wanted: Mapping[str, str] = field(default_factory=dict)
+    others: tuple[tuple[str, str, str], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -102,25 +112,23 @@ def _group(rows: Sequence[DesignRow], asked: Asked, attributes: Mapping[str, Any
         "failure": variable("design", text([row.failure for row in rows]), "", "why a design could not be evaluated"),
         "price": variable("design", np.array([row.price for row in rows]), "1", "price"),
     }
-    for field, (name, along, label) in COLUMNS.items():
+    for key, (name, along, label) in (COLUMNS | (NEEDED if asked.wanted else {})).items():
         dims = along.split()
-        values = (
-            text([o.method if o else "" for o in worth]) if field == "method" else _padded(worth, field, dims, fixed)
-        )
-        variables[name] = variable(("design", *dims), values, units.get(field, "1"), label.format(seen=asked.seen))
+        values = text([o.method if o else "" for o in worth]) if key == "method" else _padded(worth, key, dims, fixed)
+        variables[name] = variable(("design", *dims), values, units.get(key, "1"), label.format(seen=asked.seen))
     if asked.laws:
         decisions = [result.decision if result else None for result in worth]
-        for field, (name, label) in DECISION.items():
-            variables[name] = variable("design", _padded(decisions, field, [], {}), "1", label)
+        for key, (name, label) in DECISION.items():
+            variables[name] = variable("design", _padded(decisions, key, [], {}), "1", label)
     root = {**attributes, "asked": json.dumps(asked.__dict__)}
     return Group(variables, {"parameter": variable("parameter", text(asked.parameters), "", "asked for")}, root)
 
 
 def _padded(
-    of: Sequence[Evaluated | Decision | None], field: str, dims: Sequence[str], sizes: Mapping[str, int]
+    of: Sequence[Evaluated | Decision | None], key: str, dims: Sequence[str], sizes: Mapping[str, int]
 ) -> Array:
     """(designs, …) numbers along ``dims``, which have at least their ``sizes``; NaN where a design has none."""
-    each = [None if design is None else np.asarray(getattr(design, field), dtype=float) for design in of]
+    each = [None if design is None else np.asarray(getattr(design, key), dtype=float) for design in of]
     shape = [max(sizes.get(dim, 1), *(v.shape[k] for v in each if v is not None), 0) for k, dim in enumerate(dims)]
     table = np.full((len(of), *shape), np.nan)
     for i, values in enumerate(each):
@@ -150,9 +158,10 @@ def _row(root: Group, i: int) -> DesignRow:
     number, settings, price, failure = int(of("number")), json.loads(of("settings")), of("price"), of("failure")
     if failure:
         return DesignRow(number, settings, None, price, failure)
-    held = {field: of(name, along) for field, (name, along, _) in COLUMNS.items()}
-    counts = {field: int(held[field]) for field in ("alike", "forward_runs")}
+    columns = COLUMNS | (NEEDED if "needed_factor" in root else {})
+    held = {key: of(name, along) for key, (name, along, _) in columns.items()}
+    counts = {key: int(held[key]) for key in ("alike", "forward_runs")}
     fan = held["fan"][:, : len(held["grid"])]
-    decision = {field: of(name) for field, (name, _) in DECISION.items() if name in root}
+    decision = {key: of(name) for key, (name, _) in DECISION.items() if name in root}
     told = Decision(**decision) if decision else None
     return DesignRow(number, settings, Evaluated(**{**held, **counts, "fan": fan, "decision": told}), price)

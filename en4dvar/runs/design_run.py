@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from en4dvar.config import Config, resolve
+from en4dvar.config.context import parse_spread
 from en4dvar.config.document import Document, document_from, override
 from en4dvar.config.parameters import Uncertain
 from en4dvar.estimation.design.evaluate import Evaluated, Method, evaluate
@@ -14,7 +15,9 @@ from en4dvar.estimation.design.planned import Planned
 from en4dvar.executor import Executor
 from en4dvar.inputs.asked import DataFile
 from en4dvar.plumbing.errors import ConfigError, En4dvarError
+from en4dvar.plumbing.units import UnitError
 from en4dvar.plumbing.user_code import reason_of
+from en4dvar.problem import InverseProblem
 from en4dvar.results.checkpoint import FOLDER, Keeper, digest
 from en4dvar.results.design_file import FILE, Asked, DesignRow, Designs, load_designs, save_designs
 from en4dvar.runs.design_plan import Candidate, candidates, files_needed, planned_problem
@@ -117,7 +120,7 @@ def _known(document: Document, base: Path, after: Path) -> dict[str, Any]:
     """What makes the posterior of a finished run the prior of what is asked; the rest belongs to each experiment."""
     config = resolve(document, base)
     estimated = [entry.parameter.name for entry in config.parameters if isinstance(entry, Uncertain)]
-    names = config.design.about or estimated
+    names = (*(config.design.about or estimated), *config.design.common)
     file = after / "posterior.nc" if after.is_dir() else after
     return {"prior.ensemble": str(file.absolute()), **{f"parameters.{name}": {"prior": "ensemble"} for name in names}}
 
@@ -125,7 +128,10 @@ def _known(document: Document, base: Path, after: Path) -> dict[str, Any]:
 def _asked(config: Config) -> Asked:
     problem = planned_problem(config)
     terms = {term.parameter.name: term.parameter for term in problem.prior.terms}
-    about = [terms[name] for name in Planned(problem, config.design.about).about]
+    design, planned = config.design, Planned(problem, config.design.about, config.design.common)
+    about = [terms[name] for name in planned.about]
+    others = [terms[name] for name in planned.names[planned.asked :]] if design.wanted else []
+    _wanted(config, problem)
     model, seen = config.model, problem.observable
     return Asked(
         parameters=tuple(p.name for p in about),
@@ -136,8 +142,25 @@ def _asked(config: Config) -> Asked:
         laws=tuple(config.design.laws),
         enough=config.design.enough,
         seen=seen.label,
+        wanted={name: str(text) for name, text in design.wanted.items()},
+        others=tuple((p.name, p.unit, p.display_unit) for p in others),
         axes=((model.time_unit, model.time_display_unit), (seen.unit, seen.display_unit)),
     )
+
+
+def _wanted(config: Config, problem: InverseProblem) -> dict[str, tuple[float, bool]]:
+    """What is to be known to what: in its unit, or relative to the value. Raises :class:`ConfigError`."""
+    terms, wanted = {term.parameter.name: term.parameter for term in problem.prior.terms}, {}
+    for name, text in config.design.wanted.items():
+        where = ("design", "wanted", name)
+        if name not in (config.design.about or terms):
+            raise ConfigError([config.document.fault(where, f"{name}: not among what is asked about")])
+        try:
+            spread = parse_spread(text, terms[name].unit)
+        except (ConfigError, UnitError) as error:
+            raise ConfigError([config.document.fault(where, str(error))]) from None
+        wanted[name] = spread.value, spread.relative
+    return wanted
 
 
 class _Work:
@@ -216,7 +239,8 @@ def _one(candidate: Candidate, method: Method, seed: int) -> tuple[Evaluated, ..
     try:
         problem, laws = planned_problem(config), [planned_problem(law) for law in candidate.laws]
         sizes, alike = design.sizes, design.experiments
-        every = evaluate(problem, design.about, sizes, method, seed, alike, candidate.readings, laws)
+        told = design.common, _wanted(config, problem)
+        every = evaluate(problem, design.about, sizes, method, seed, alike, candidate.readings, laws, *told)
         costs = (design.price.of(planned.alike, len(planned.readings)) for planned in every)
         broken = [design.within.broken(len(o.readings), cost, o.beyond) for o, cost in zip(every, costs, strict=True)]
         kept = tuple(planned for planned, reason in zip(every, broken, strict=True) if not reason)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from chaotic import chaotic
-from toys import Linear, make_problem
+from toys import Linear, make_problem, with_noise
 
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.plumbing.errors import ConfigError
@@ -36,8 +36,12 @@ def test_nine_of_ten_reach_the_minimum_of_the_truth():
     assert reached >= 9
 
 
-def test_a_linear_problem_ends_where_it_does_without():
+@pytest.mark.parametrize("correlated", [False, True])
+def test_a_linear_problem_ends_where_it_does_without(correlated):
     problem = make_problem(Linear(("a", "b")), [1.0, -0.5])
+    if correlated:
+        apart = np.abs(np.subtract.outer(*[problem.observations.times] * 2))
+        problem = replace(problem, observations=with_noise(problem.observations, correlation=np.exp(-apart / 0.4)))
     with_and_without = [assimilate(problem, AssimilationSettings(lengthen=n), seed=2) for n in (1, 4)]
     np.testing.assert_allclose(*(a.posterior for a in with_and_without), rtol=1e-9)
     assert with_and_without[1].forward_runs > with_and_without[0].forward_runs - 60

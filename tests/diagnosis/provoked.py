@@ -7,13 +7,15 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from toys import Decay, Fragile, Toy, Vectorised, Wave, make_problem, with_discrepancy, with_noise
+from toys import Decay, Fragile, Toy, Vectorised, Wave, make_observations, make_problem, with_discrepancy, with_noise
+from varying_models import Ramp
 
 from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.model.forward import Observable, ValidityLimit
 from en4dvar.model.state import Parameter
-from en4dvar.priors.prior import PriorTerm
+from en4dvar.priors.prior import Prior, PriorTerm
+from en4dvar.priors.varying import RandomWalk
 from en4dvar.problem import InverseProblem
 from en4dvar.schemes.settings import AssimilationSettings
 
@@ -121,12 +123,23 @@ def chain_not_converged() -> Analysis:
     return run(linear(), refine="mcmc", members=12)
 
 
+def ramp(knots) -> InverseProblem:
+    """A rate that is halved at 2, with readings of high accuracy."""
+    model, times = Ramp(), np.linspace(0.25, 5.0, 20)
+    values = 1.0 + np.where(times < 2, 1.2 * times, 2.4 + 0.6 * (times - 2))
+    first = PriorTerm.normal(model.parameters[0], 1.0, 0.5)
+    data = make_observations(times, values, 0.05)
+    constant = InverseProblem(model, model.observables[0], data, Prior((first,)))
+    return constant.varied([RandomWalk.of(model, first, knots, 0.5)])
+
+
 PROVOKED: dict[str, Callable[[], Analysis]] = {
     "not-converged": lambda: run(
         make_problem(Wave(), [1.5, 1.2], scale=0.4), members=16, max_iterations=1, start="prior-mean"
     ),
     "ensemble-collapse": lambda: run(many(40), members=4, sampling="random", scheme="es-mda"),
     "rank-deficient": lambda: run(many(8), members=6, sampling="random"),
+    "missed-knots": lambda: run(ramp((2.6,))),
     "misfit": lambda: run(replace_std(linear(scale=100.0), 0.01)),
     "overstated-error": lambda: run(replace_std(linear(scale=100.0), 10.0)),
     "prior-conflict": lambda: run(linear(scale=0.02, std=0.001)),

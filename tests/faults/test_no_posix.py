@@ -124,7 +124,7 @@ def test_the_page_in_the_browser_begins_and_cancels_commands(away, tmp_path):
         assert server.post("validate", config="quickstart.yaml")[0] == 200
         assert server.last()["state"] == "done", server.last()
         assert server.post("run", config="quickstart.yaml", run="a")[0] == 200
-        while b"iteration" not in server.ask("/look/log?run=a")[1]:
+        while b"iteration" not in server.ask("/look/live?run=a")[1]:
             assert server.state()["jobs"][-1]["state"] == "running", server.last()
             time.sleep(0.05)
         assert server.post("cancel")[0] == 200

@@ -12,6 +12,7 @@ import pytest
 import en4dvar
 from en4dvar.model.programs.control import from_pest
 from en4dvar.model.programs.model import CommandModel, CommandSettings
+from en4dvar.plumbing.errors import En4dvarError
 
 PUBLIC = Path(__file__).parents[2].parent / "shared" / "reference" / "pest"
 
@@ -68,6 +69,21 @@ def test_a_control_file_says_what_to_estimate_from_what(control):
     np.testing.assert_allclose(
         result.dataset("posterior_predictive")["observations"].mean(("chain", "draw")), [3.5, 4.5, 5.5], atol=0.1
     )
+
+
+def test_several_commands_run_in_order(control):
+    """As PEST++ does: the second command turns what the first one writes; without it, or before it, nothing is read."""
+    turn = "import sys; print(open('raw.out').read().replace('x', ''), end='', file=open('line.out', 'w'))"
+    (control.parent / "turn.py").write_text(turn)
+    (control.parent / "line.py").write_text(PROGRAM.replace('"line.out"', '"raw.out"').replace('f"{c', 'f"x{c'))
+    one, two = f"{sys.executable} -S line.py\n", f"{sys.executable} -S turn.py\n"
+    text = control.read_text()
+    control.write_text(text.replace(one, one + two))
+    result = en4dvar.estimate(**from_pest(control, ["line.py", "turn.py"]), progress=False, assimilation={"members": 8})
+    assert result.posterior["a"].mean() == pytest.approx(1.0, abs=0.15)
+    control.write_text(text.replace(one, two + one))
+    with pytest.raises(En4dvarError, match=r"raw\.out"):
+        en4dvar.estimate(**from_pest(control, ["line.py", "turn.py"]), progress=False, assimilation={"members": 8})
 
 
 def test_groups_of_inequalities_are_bounds(control):
@@ -200,7 +216,7 @@ def test_one_observation_is_enough_and_bounds_hold(rich):
     [
         ("restart estimation", "restart regularisation", "prior_information=False leaves it out"),
         ("restart estimation", "restart pareto", "mode pareto is not known here"),
-        ("* model input/output", "second.bat\n* model input/output", "2 model commands"),
+        ("2.0 0.5 10.0 pg -1.0 10.0 1", "2.0 0.5 10.0 pg -1.0 10.0 2", "hk:1-a has a model command of its own"),
         ("++par", "++parcov(prior.cov) par", "option parcov: "),
         ("++par", "++ies_par_en(prior.jcb) par", "prior.jcb: No such file or directory"),
         ("++par", "++ies_no_noise(true) par", "option ies_no_noise: errors are drawn here"),

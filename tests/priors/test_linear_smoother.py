@@ -39,17 +39,17 @@ def problem(truth=(1.2, 1.2, 0.6, 0.6), seed=0, knots=KNOTS, state=0.0):
     return constant.varied(varying) if varying else constant
 
 
-def smoother(values, q, q_state=0.0):
+def smoother(values, q, q_state=0.0, knots=KNOTS):
     """Mean and covariance of (y, r) at time zero, at the knots (before the change) and at the end, and ln p(y).
 
     The state is propagated from event to event; just after a knot y and r change by N(0, q_state²) and N(0, q²).
     """
-    events = sorted({*TIMES.tolist(), *KNOTS})
+    events = sorted({*TIMES.tolist(), *knots})
     mean, covariance, log_evidence = np.array([START[0], RATE[0]]), np.diag([START[1] ** 2, RATE[1] ** 2]), 0.0
     filtered, predicted, maps, t = [(mean, covariance)], [], [], 0.0
     for event in events:
         step = np.array([[1.0, event - t], [0.0, 1.0]])
-        jump = np.diag([q_state**2, q**2]) if t in KNOTS else np.zeros((2, 2))
+        jump = np.diag([q_state**2, q**2]) if t in knots else np.zeros((2, 2))
         mean, covariance = step @ mean, step @ (covariance + jump) @ step.T
         predicted.append((mean, covariance))
         maps.append(step)
@@ -66,7 +66,7 @@ def smoother(values, q, q_state=0.0):
         gain = p @ step.T @ np.linalg.inv(p_next)
         after, spread = smooth[0]
         smooth.insert(0, (m + gain @ (after - m_next), p + gain @ (spread - p_next) @ gain.T))
-    wanted = [0, *(events.index(knot) + 1 for knot in KNOTS), len(events)]
+    wanted = [0, *(events.index(knot) + 1 for knot in knots), len(events)]
     return [smooth[i] for i in wanted], log_evidence
 
 
@@ -85,6 +85,21 @@ def test_pieces_are_those_of_the_rauch_tung_striebel_smoother(step_control):
     assert together == pytest.approx(expected[0][1], abs=1e-10)
     assert a.log_evidence == pytest.approx(log_evidence, abs=1e-8)
     assert a.log_evidence_constant == pytest.approx(smoother(p.observations.values, 0.0)[1], abs=1e-8)
+
+
+@pytest.mark.parametrize(("knot", "where"), [(2.6, "0.5 s earlier"), (1.4, "0.5 s later"), (2.0, "")])
+def test_knots_that_miss_the_change(knot, where):
+    """The rate is halved at 2 s: shifted by two readings, the evidence is that of the smoother with these knots."""
+    p = problem((1.2, 1.2, 0.5, 0.5), knots=(knot,))
+    a = assimilate(p, replace(SETTINGS, what_if=True), 1)
+    shifted = {by: smoother(p.observations.values, Q, knots=(knot + by,))[1] for by in (-0.5, 0.0, 0.5)}
+    gain = max(shifted[-0.5], shifted[0.5]) - shifted[0.0]
+    said = [str(c) for c in a.cautions if c.code == "missed-knots"]
+    assert (gain > np.log(20)) == bool(where) == bool(said)
+    assert all(f"knots {where} (log evidence {gain:+.1f})" in words for words in said)
+    quiet = assimilate(p, replace(SETTINGS, what_if=False), 1)
+    assert "missed-knots" not in {c.code for c in quiet.cautions}
+    np.testing.assert_array_equal(quiet.posterior, a.posterior)
 
 
 @pytest.mark.parametrize("walks", [True, False])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
@@ -10,8 +10,9 @@ import numpy as np
 from annotated_types import Ge
 
 from en4dvar.ensemble.forecast import plotting_times
-from en4dvar.estimation.design.laplace import Expected, expected, require_alive
+from en4dvar.estimation.design.laplace import expected, require_alive
 from en4dvar.estimation.design.laws import Decision, deciding
+from en4dvar.estimation.design.needed import in_units, needed
 from en4dvar.estimation.design.nested import nested
 from en4dvar.estimation.design.planned import Planned
 from en4dvar.estimation.design.readings import choose
@@ -41,6 +42,8 @@ class Evaluated:
     transformed space. ``lost``: share of the draws at which the model fails; ``beyond``: share that leaves what the
     model is valid for. ``readings`` (k,) are taken, at ``times`` (k,). ``fan`` (5, M) are quantiles of what will be
     seen at ``grid`` (M,). ``forward_runs`` it took. ``decision``: what it tells of which of several laws holds.
+    ``needed`` (W, B + 1): how much larger the prior std of each of the B others, or of all, may be for what is wanted;
+    ``others`` (2, B): those stds, in units and relative to the values.
     """
 
     gain: float
@@ -58,6 +61,8 @@ class Evaluated:
     alike: int = 1
     forward_runs: int = 0
     decision: Decision | None = None
+    needed: Array | None = None
+    others: Array | None = None
 
     @property
     def worth(self) -> float:
@@ -81,19 +86,23 @@ def evaluate(
     alike: Sequence[int] = (1,),
     choice: tuple[int, float] | None = None,
     laws: Sequence[InverseProblem] = (),
+    common: Sequence[str] = (),
+    wanted: Mapping[str, tuple[float, bool]] | None = None,
 ) -> tuple[Evaluated, ...]:
     """Evaluate a design, for every number of experiments ``alike``.
 
     ``choice``: how many of the readings are to be chosen, and how far apart in time. Several alike are evaluated by
     linearisation. ``laws``: the same experiment explained by each of several laws, read as ``problem`` is; which
-    of them holds is asked as well.
+    of them holds is asked as well. ``common``: parameters that experiments alike share beside those asked for.
+    ``wanted``: name → std to which it is to be known, in its unit, or relative to the value where true; what the others
+    must be known to for it is found by linearisation.
 
     Raises
     ------
     ConfigError: a name that is not estimated; a choice that is not possible. TooFewMembersError: the model fails.
     """
     problem, before = (problem, 0) if choice is None else _chosen(problem, about, sizes, seed, choice)
-    planned = Planned(problem, about)
+    planned = Planned(problem, about, common)
     u = planned.draws(sizes.draws, seed)
     grid = plotting_times(problem)
     run = planned.run(u, grid)
@@ -110,7 +119,8 @@ def evaluate(
     for n in alike:
         values = expected(planned, tangents, tried, n)
         gain, error, by = values.gain, values.error, str("laplace" if method == "nested" else method)
-        std, relative = _in_units(planned, values, tangents.u)
+        std, relative = in_units(planned, planned.about, values.std, tangents.u)
+        linearised = np.stack([std, relative])
         ratio = values.std.mean(axis=0)
         if method == "nested" and n == 1:
             simulated = nested(planned, u[: sizes.simulated], sizes.inner, seed)
@@ -118,6 +128,9 @@ def evaluate(
             gain, error, by = gain + more, float(np.hypot(error, its_error)), method
             std, ratio = simulated.std.mean(axis=0), simulated.ratio.mean(axis=0)
             relative = np.median(simulated.relative, axis=0)
+        more_than_linear = np.ones_like(linearised)
+        np.divide([std, relative], linearised, out=more_than_linear, where=np.isfinite(linearised))
+        needs = needed(planned, tangents, wanted, n, more_than_linear) if wanted else (None, None)
         designs.append(
             Evaluated(
                 gain=gain,
@@ -135,6 +148,8 @@ def evaluate(
                 alike=n,
                 forward_runs=before + planned.forward_runs,
                 decision=decision,
+                needed=needs[0],
+                others=needs[1],
             )
         )
     return tuple(designs)
@@ -147,18 +162,3 @@ def _chosen(
     planned, weights = Planned(problem, about), np.zeros(len(problem.observations))
     weights[choose(planned, planned.draws(sizes.draws, own_seed(seed, "choice of readings")), *choice)] = 1
     return replace(problem, observations=replace(problem.observations, weights=weights)), planned.forward_runs
-
-
-def _in_units(planned: Planned, values: Expected, u: Array) -> tuple[Array, Array]:
-    """Expected std (a,) of what is asked, in the units of the parameters, and relative to the value; the mean over the
-    draws ``u`` (R, n) at which ``values`` linearised, with the slope of the parameter map there.
-    """
-    prior, std, relative = planned.problem.prior, np.empty(planned.asked), np.empty(planned.asked)
-    x, physical = planned.control(u), prior.to_physical(planned.control(u))
-    for a, name in enumerate(planned.about):
-        j = prior.names.index(name)
-        slopes = np.array([prior.terms[j].slope(float(value)) for value in x[:, j]])
-        of_draws = values.std[:, a] * prior.std[j] * np.abs(slopes)
-        std[a] = of_draws.mean()
-        relative[a] = np.median(of_draws / np.abs(physical[:, j]))
-    return std, relative

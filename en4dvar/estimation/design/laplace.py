@@ -5,8 +5,9 @@ M = I + SᵀS, and what it says of what is asked is the Schur complement M_a = M
 
     I ≈ E_u[½ ln det M_a(u)],
 
-exact where F and H are linear (Long, Scavino, Tempone & Wang 2013, Comput. Methods Appl. Mech. Eng. 259, 24). Of n
-experiments alike that share what is asked, and nothing else, each adds M_a − I: I ≈ E[½ ln det(I + n (M_a − I))].
+exact where F and H are linear (Long, Scavino, Tempone & Wang 2013, Comput. Methods Appl. Mech. Eng. 259, 24). n
+experiments alike share s, what is asked and what is common to them, such as a scale: each adds M_s − I, and what is
+common is left out at the end, I ≈ E[½ ln det (I + n (M_s − I))_a].
 """
 
 from __future__ import annotations
@@ -58,12 +59,22 @@ def expected(planned: Planned, tangents: Tangents, count: int, alike: int = 1) -
     """Expected information of ``alike`` experiments, from tangents at those of ``count`` draws that can be run."""
     require_alive(len(tangents.at), count)
     _, rows = tangents.whitened(planned)
-    asked = about(precision(rows), planned.asked)
-    asked = np.eye(planned.asked) + alike * (asked - np.eye(planned.asked))
-    root = planned.root[planned.order][: planned.asked, : planned.asked]
+    asked, ratio = shared_spread(planned, np.einsum("rki,rkj->rij", rows, rows), alike)
+    return Expected(0.5 * np.linalg.slogdet(asked)[1], ratio, 1 - len(tangents.at) / count)
+
+
+def shared_spread(
+    planned: Planned, information: Array, alike: int, precision: Array | None = None
+) -> tuple[Array, Array]:
+    """What ``alike`` experiments of information SᵀS (R, n, n) each leave: the precision (R, a, a) of what is asked, and
+    its std (R, a) in transformed space, relative to the prior's; with another prior ``precision`` (n, n) than I.
+    """
+    prior = np.eye(information.shape[2])[None] if precision is None else precision[None]
+    before, after = (about(each, planned.shared) for each in (prior, prior + information))
+    asked, a = about(before + alike * (after - before), planned.asked), planned.asked
+    root = planned.root[planned.order][:a, :a]
     spread = np.sqrt(np.einsum("ij,rjk,ik->ri", root, np.linalg.inv(asked), root))
-    prior = np.sqrt(np.einsum("ij,ij->i", root, root))
-    return Expected(0.5 * np.linalg.slogdet(asked)[1], spread / prior, 1 - len(tangents.at) / count)
+    return asked, spread / np.sqrt(np.einsum("ij,ij->i", root, root))
 
 
 def precision(rows: Array) -> Array:

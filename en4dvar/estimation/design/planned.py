@@ -21,27 +21,29 @@ EPSILON = 1e-3  # size of a bundle, in prior standard deviations
 class Planned:
     """An inverse problem whose observations say when and how well it will be measured; their values mean nothing.
 
-    ``about``: names of the parameters that are asked for, all by default. Coordinates u (…, n): x = mean + W u, W Wᵀ
-    the prior covariance, W lower triangular in the order (asked, others), so that the first ``asked`` of them are those
-    of what is asked for, whatever the others are.
+    ``about``: names of the parameters that are asked for, all by default; ``common``: of others that experiments alike
+    share with each other. Coordinates u (…, n): x = mean + W u, W Wᵀ the prior covariance, W lower triangular in the
+    order (asked, common, others), so that the first ``asked`` of them are those of what is asked for, whatever the
+    others are, and the first ``shared`` those of what experiments share.
 
     Raises
     ------
     ConfigError: a name that is not estimated, or twice; weights other than 0 and 1, which are not Bayesian.
     """
 
-    def __init__(self, problem: InverseProblem, about: Sequence[str] = ()):
+    def __init__(self, problem: InverseProblem, about: Sequence[str] = (), common: Sequence[str] = ()):
         names = problem.prior.names
-        about = tuple(about) or names
-        if unknown := [name for name in about if name not in names]:
+        about, common = tuple(about) or names, tuple(common)
+        if unknown := [name for name in (*about, *common) if name not in names]:
             raise ConfigError(f"{', '.join(unknown)}: not estimated; estimated are {', '.join(names)}")
-        if len(set(about)) < len(about):
-            raise ConfigError(f"{', '.join(about)}: a name is given twice")
+        first = (*about, *common)
+        if len(set(first)) < len(first):
+            raise ConfigError(f"{', '.join(first)}: a name is given twice")
         if not np.isin(problem.observations.weights, (0, 1)).all():
             raise ConfigError("weights other than 0 and 1 are not Bayesian: there is no expected information of them")
-        self.problem, self.about, self.asked = problem, about, len(about)
+        self.problem, self.about, self.asked, self.shared = problem, about, len(about), len(first)
         self.composite = Composite(problem)
-        order = [names.index(name) for name in (*about, *(name for name in names if name not in about))]
+        order = [names.index(name) for name in (*first, *(name for name in names if name not in first))]
         half = problem.prior.from_white_change(np.eye(len(names)))
         covariance = (half.T @ half)[np.ix_(order, order)]
         self.root = np.empty((len(names), len(names)))

@@ -67,7 +67,7 @@ def from_pest(path: str | Path, files: Sequence[str] = (), *, prior_information:
     correlated = priors_in_files(control, parameters, priors, scalings)
     return {
         "model": {
-            "command": control.lines("model command line")[0].cells["line"],
+            "command": " && ".join(row.cells["line"].strip() for row in control.lines("model command line")),
             "shell": True,
             "parameters": scalings,
             "templates": templates,

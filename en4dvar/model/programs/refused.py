@@ -57,8 +57,6 @@ def _modes(control: ControlFile, informed: bool) -> Iterator[str]:
             yield "regularisation mode adapts the weights of prior information; prior_information=False leaves it out"
     elif mode != "estimation":
         yield f"mode {mode} is not known here; estimation is"
-    if len(commands := control.lines("model command line")) > 1:
-        yield f"{len(commands)} model commands, of which PEST chooses one and PEST++ runs all; put them into one script"
 
 
 def _options(control: ControlFile) -> Iterator[str]:
@@ -79,6 +77,9 @@ def _rows(
         if row.word("covfle") and row.word("obgnme") in used:
             words = "correlated errors are those of option obscov"
             yield f"group {row.word('obgnme')} has a covariance, {row.cells['covfle']}: {words}"
+    for row in parameters:
+        if row.word("dercom") not in ("", "0", "1"):
+            yield f"{row.word('parnme')} has a model command of its own for derivatives (dercom {row.word('dercom')})"
     for row in [*parameters, *observed]:
         for column, why in COLUMNS.items():
             if row.word(column) not in ("", "-1", "0"):
