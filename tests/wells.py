@@ -1,7 +1,9 @@
 """Two wells: a posterior of two modes."""
 
+from dataclasses import replace
+
 import numpy as np
-from toys import Toy, make_problem
+from toys import Toy, make_observations, make_problem
 
 from en4dvar.estimation.assimilate import log_posterior
 from en4dvar.model.forward import Trajectory
@@ -23,7 +25,7 @@ class Wells(Toy):
     def trajectories(self, x, times):
         own = np.broadcast_to(times, (len(x), np.shape(times)[-1]))
         theta = np.broadcast_to(x[:, None, 2:], (*own.shape, 2))
-        parts = self.curve(theta.transpose(2, 0, 1), own), theta[..., 1]
+        parts = self.curve(theta.transpose(2, 0, 1), own), self.rate(theta.transpose(2, 0, 1), own)
         return [
             Trajectory(t, s, self.layout)
             for t, s in zip(own, np.concatenate([np.stack(parts, axis=-1), theta], axis=-1), strict=True)
@@ -32,6 +34,16 @@ class Wells(Toy):
 
 class UnlikeWells(Wells):
     narrow = True
+
+
+class Parting(Wells):
+    """Two wells until t = 2; from then on y grows or falls by 3 a, which tells them apart."""
+
+    def curve(self, theta, t):
+        return super().curve(theta, t) + 3 * theta[0] * np.maximum(t - 2, 0)
+
+    def rate(self, theta, t):
+        return super().rate(theta, t) + 3 * theta[0] * (t > 2)
 
 
 class Hidden(Wells):
@@ -55,6 +67,16 @@ def two_wells(kind=Wells, compiled=True, mean=0.3, seed=1):
     a, b = model.parameters
     terms = (PriorTerm.normal(a, mean, 1.0), PriorTerm.normal(b, 0.0, 0.5))
     return make_problem(model, [-1.0, 0.3], std=0.2, prior=terms, seed=seed)
+
+
+def parted(kind=Parting, mean=0.3, seed=1, off=0.0, **options):
+    """Two wells whose readings after the window are of the left one, and ``off`` by so much."""
+    problem = two_wells(kind, mean=mean, seed=seed, **options)
+    y, times = problem.observations, np.linspace(2.2, 4.0, 8)
+    later = problem.model.curve(np.array([-1.0, 0.3]), times) + off
+    later = later + 0.2 * np.random.default_rng([3, seed]).standard_normal(len(times))
+    whole = make_observations(np.append(y.times, times), np.append(y.values, later), 0.2)
+    return replace(problem, observations=replace(y, continued=whole))
 
 
 def mass_of_positive(problem):

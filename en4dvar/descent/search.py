@@ -3,8 +3,9 @@
 Members of low J may all lie in the basin of a wrong minimum. A challenger starts from the member farthest from the
 minimum, chosen by the forecast of the prior ensemble that is there anyway; where it ends elsewhere, others follow.
 Where noise and prior do not explain the lowest J, no member may lie in the right basin: many more draws of the prior
-are run, and the lowest of them start descents. All rounds are kept as they go, so that an interrupted run repeats no
-descent.
+are run, and the lowest of them start descents. Where readings after the window, which nothing was fitted to, come out
+otherwise than expected, a descent starts where all readings together lead. All rounds are kept as they go, so that an
+interrupted run repeats no descent.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,6 +21,7 @@ from en4dvar.descent.start import (
     Rounds,
     StartState,
     affordable,
+    choose_start,
     descent_at,
     descent_from,
     highest_plausible,
@@ -28,6 +30,7 @@ from en4dvar.descent.start import (
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.descent.window import DataWindow, Descent
 from en4dvar.diagnosis.analysis import Record, StartRecord
+from en4dvar.diagnosis.withheld import unforeseen
 from en4dvar.ensemble.forecast import Forecast
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import TooFewMembersError
@@ -113,6 +116,35 @@ class Search:
             return outcome
         return self.round(outcome, [n_members + 1 + i for i in range(side_by_side(self.space))])
 
+    def foretold(self, outcome: Outcome, missed: Callable[[], bool]) -> Outcome:
+        """After a descent from :attr:`led`, where readings after the window ``missed`` what is expected of them."""
+        if self.last in outcome.tried or not missed():
+            return outcome
+        self.over = max(self.over, self.begun.over)
+        try:
+            return self.round(outcome, [self.last])
+        except TooFewMembersError:  # the model does not run that far
+            return outcome
+
+    @property
+    def last(self) -> int:
+        """The number of :attr:`led` in :attr:`Outcome.tried`; where it is there, the search is over."""
+        return len(self.space.members) + 1 + side_by_side(self.space)
+
+    @cached_property
+    def led(self) -> Array:
+        """Where a descent (n,) ends in which the readings after the window take part, with what is unforeseen."""
+        space, more = self.space, self.space.problem.observations.continued
+        assert more is not None
+        problem = replace(unforeseen(space.problem), observations=more)
+        whole = WeightSpace(problem, space.settings, self.seed, space.executor)
+        run = whole.whole(np.vstack([whole.members, whole.mean]))
+        scheme = replace(self.scheme, start="best-member")
+        begun = choose_start(whole, scheme, run, self.seed, None, lambda state: None, lambda record: None).descent
+        minimise(DataWindow(whole, self.seed, lambda: None, lambda record: None), [begun])
+        space.forward_runs += whole.forward_runs
+        return whole.control(begun.weights.w)[: len(space.mean)]
+
     @cached_property
     def lowest_draws(self) -> Array:
         """(B, n) of the draws that an ensemble :data:`WIDER` times as large would add, as many as go side by side."""
@@ -122,17 +154,17 @@ class Search:
         return np.asarray(draws[np.argsort(costs, kind="stable")[: side_by_side(space)]])
 
     def begin(self, number: int) -> Descent:
-        """From a member, the mean or one of :attr:`lowest_draws`, by its number in :attr:`Outcome.tried`."""
-        beyond = number - len(self.space.members) - 1
-        return (
-            descent_from(self.space, number)
-            if beyond < 0
-            else descent_at(self.space, self.lowest_draws[beyond], number)
-        )
+        """From a member, the mean, :attr:`led` or one of :attr:`lowest_draws`; numbers as in :attr:`Outcome.tried`."""
+        first = len(self.space.members) + 1
+        if number < first:
+            return descent_from(self.space, number)
+        x = self.led if number == self.last else self.lowest_draws[number - first]
+        return descent_at(self.space, x, number)
 
     def rest(self, outcome: Outcome) -> list[int]:
         """The members for which a descent can be afforded and that were not tried."""
-        return [i for i in affordable(self.space, self.scheme, self.run) if i not in outcome.tried]
+        known = (*outcome.tried, *range(self.last * (self.last in outcome.tried)))
+        return [i for i in affordable(self.space, self.scheme, self.run) if i not in known]
 
     def round(self, outcome: Outcome, members: Sequence[int]) -> Outcome:
         """After descents from these members side by side; nothing is run again of a round that is over."""

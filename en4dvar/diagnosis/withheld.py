@@ -24,6 +24,7 @@ from en4dvar.priors.varying import StateChanges
 from en4dvar.problem import InverseProblem
 
 BAND = (0.05, 0.95)
+SEEN, FEWEST = 0.6, 5  # the share in their bands, of so many readings or more, below which the estimate is doubted
 BISECTIONS = 50
 
 
@@ -47,6 +48,11 @@ class Withheld:
         return float(np.mean((self.low <= self.values) & (self.values <= self.high)))
 
     @property
+    def missed(self) -> bool:
+        """Whether so few of them lie in their bands that the estimate is in doubt."""
+        return self.inside < SEEN and len(self.values) >= FEWEST
+
+    @property
     def rms(self) -> float:
         """Root mean square of the readings less the medians, in the observable's unit."""
         return float(np.sqrt(np.mean((self.values - self.median) ** 2)))
@@ -60,7 +66,10 @@ def predict_withheld(problem: InverseProblem, members: Array, executor: Executor
     within, whole = problem.observations, problem.observations.continued
     if whole is None:
         return None
-    changed, theirs = _unforeseen(problem, members)
+    changed = unforeseen(problem)
+    count, added = len(members), changed.prior.terms[len(problem.prior.terms) :]
+    scores = np.random.default_rng(count).permutation(ndtri((np.arange(count) + 0.5) / count))
+    theirs = np.column_stack([members, *(term.std * scores for term in added)])
     run = Composite(replace(changed, observations=whole), executor)(theirs)
     begin, alive = len(within), np.flatnonzero(np.isfinite(run.predicted.values).all(axis=1))
     if len(alive) < 2:
@@ -71,20 +80,18 @@ def predict_withheld(problem: InverseProblem, members: Array, executor: Executor
     return Withheld(whole.times[begin:], whole.values[begin:], low, median, high, len(members))
 
 
-def _unforeseen(problem: InverseProblem, members: Array) -> tuple[InverseProblem, Array]:
-    """The problem with the change that its model does not foresee, and the members with theirs."""
+def unforeseen(problem: InverseProblem) -> InverseProblem:
+    """The problem with the change that its model does not foresee, the last of its control vector, if there is one."""
     model, values = problem.model, problem.observations.values
     if model.unforeseen is None:
-        return problem, members
+        return problem
     name, std = model.unforeseen
     top = len(values) - 1
     while top > 1 and max(values[top - 2 : top]) > values[top]:  # one reading that is lower is noise
         top -= 1
     field = next((field for field in model.layout.fields if field.name == name), Field(name, unit="1"))
     change = StateChanges.of(model, field, [float(problem.observations.times[top])], std, relative=True)
-    count = len(members)
-    scores = np.random.default_rng(count).permutation(ndtri((np.arange(count) + 0.5) / count))
-    return problem.varied([change]), np.insert(members, len(problem.prior.terms), std * scores, axis=1)
+    return problem.varied([change])
 
 
 def _quantile(mean: Array, std: Array, level: float) -> Array:

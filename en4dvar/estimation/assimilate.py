@@ -12,7 +12,6 @@ from en4dvar.diagnosis.analysis import Analysis, Progress
 from en4dvar.diagnosis.honesty import ControlEnsembles, examine
 from en4dvar.diagnosis.response.ledger import ledger
 from en4dvar.diagnosis.response.what_if import Fit, Shift, what_if, with_shifts
-from en4dvar.diagnosis.withheld import predict_withheld
 from en4dvar.ensemble.forecast import Forecast, cost, forecast, log_posterior
 from en4dvar.estimation import conclusions
 from en4dvar.estimation.conclusions import Ensembles
@@ -98,6 +97,7 @@ def _through(stages: Stages, resume: LoopState | None) -> Analysis:
     cautions = (*start.warnings, *(sampled.refined.warnings if sampled.refined else ()))
     if len(outcome.tried) == 1:
         cautions = (*cautions, caution("one-descent", "one descent only: another minimum is not excluded"))
+    cautions = (*cautions, *conclusions.future_missed(analysis.withheld))
     cautions = (*cautions, *conclusions.missing_readings(ends.run.filled, stages.settings.refine == "mcmc"))
     if counting:
         weights = np.array([mode.weight for mode in analysis.modes])
@@ -125,9 +125,8 @@ def _concluded(
         fitted = partial(_fitted, stages)
         shifts = what_if(problem, response, std, control.centre_cost, space.executor, fitted)
     path = ledger(problem, response, std) if stages.settings.what_if else None
-    withheld = predict_withheld(problem, ends.members, space.executor)
-    others = sum(shift.runs for shift in shifts) + (path.runs if path else 0)
-    space.forward_runs += others + (withheld.runs if withheld else 0)
+    withheld = stages.expected(ends.members)
+    space.forward_runs += sum(shift.runs for shift in shifts) + (path.runs if path else 0)
     ensembles = Ensembles(space.members, ends.members, ends.mode, prior_run[:-1], ends.run, last)
     return conclusions.outcome_of(
         problem,

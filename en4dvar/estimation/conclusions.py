@@ -18,6 +18,7 @@ from en4dvar.diagnosis.analysis import Analysis, Descents, Discrepancy, FieldEst
 from en4dvar.diagnosis.influence import Influence
 from en4dvar.diagnosis.residuals import Residuals
 from en4dvar.diagnosis.response.linear import LinearResponse
+from en4dvar.diagnosis.withheld import Withheld
 from en4dvar.ensemble.forecast import Forecast
 from en4dvar.ensemble.members import InitialStates, out_of_bounds
 from en4dvar.model.state import Array
@@ -198,6 +199,15 @@ def discrepancy_of(space: WeightSpace, descent: Descent, central: Predicted) -> 
     if explained is None or linear is None:
         return None
     return Discrepancy(*explained, shares_of_variance(space, linear))
+
+
+def future_missed(withheld: Withheld | None) -> tuple[Caution, ...]:
+    """Told where the readings after the window put the estimate in doubt."""
+    if withheld is None or not withheld.missed:
+        return ()
+    count = len(withheld.values)
+    words = f"of {count} readings after the window {withheld.inside:.0%} lie in their 90 % bands"
+    return (caution("future-missed", f"{words}: what was estimated does not go on as the data do"),)
 
 
 def missing_readings(share: float, chain: bool = False) -> tuple[Caution, ...]:

@@ -19,6 +19,7 @@ from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.descent.window import DataWindow, Descent
 from en4dvar.diagnosis import diagnostics as diag
 from en4dvar.diagnosis.analysis import Progress, Record
+from en4dvar.diagnosis.withheld import Withheld, predict_withheld
 from en4dvar.ensemble.forecast import Forecast, check_problem, plotting_times
 from en4dvar.executor import Executor
 from en4dvar.model.state import Array
@@ -119,6 +120,7 @@ class Stages:
             )
         self.space = WeightSpace(problem, settings, seed, executor)
         self.grid = plotting_times(problem)
+        self._foreseen: tuple[Array, Withheld | None] | None = None
 
     def descend(self, resume: LoopState | None = None) -> tuple[Forecast, LoopState, Descent]:
         """The prior forecast, where the iterations started, and their end."""
@@ -170,7 +172,8 @@ class Stages:
         After the first descents one from a member far from the minimum looks for another. Of a cheap model, or for a
         chain, many are tried where there is one or where J of the posterior members is not that of a Gaussian, and
         draws beyond the ensemble where the lowest J is higher than noise and prior explain; of another model some,
-        where the lowest minimum is that of one descent alone.
+        where the lowest minimum is that of one descent alone. Of any, one from where all readings lead, where those
+        after the window are not what is expected.
         """
         space, scheme, before = self.space, self.minimiser, self.latest.descent
         assert before is not None
@@ -186,17 +189,35 @@ class Stages:
             space.forward_runs = start.forward_runs
         search = Search(space, scheme, prior_run, self.seed, begun, self.keep_search, self.tell)
         outcome = search.challenged(outcome)
-        if not (self.settings.refine == "mcmc" or samples(space)):
+        sampling = self.settings.refine == "mcmc" or samples(space)
+        if not sampling:
             outcome = search.settled(outcome)
-            return outcome, self.gaussian(outcome.descent)
         ends = self.gaussian(outcome.descent)
-        if begun.over > 1 and not begun.lower:
-            space.forward_runs = start.forward_runs  # they were counted before the second round
-        fit = diag.gaussianity(ends.members, ends.mode, space.costs(ends.members, ends.run))["gaussian_fit"]
-        rest = search.rest(outcome)
-        if rest and (len(outcome.minima) > 1 or not fit >= CLEARED):
-            outcome, ends = self.rather(search.round(outcome, rest), outcome, ends)
-        return self.rather(search.widened(outcome), outcome, ends)
+        over = search.last in start.tried
+        if (over or (sampling and begun.over > 1)) and not begun.lower:
+            if over:
+                self.expected(ends.members)
+            space.forward_runs = start.forward_runs  # they were counted before the rounds that follow
+        if sampling:
+            fit = diag.gaussianity(ends.members, ends.mode, space.costs(ends.members, ends.run))["gaussian_fit"]
+            rest = search.rest(outcome)
+            if rest and (len(outcome.minima) > 1 or not fit >= CLEARED):
+                outcome, ends = self.rather(search.round(outcome, rest), outcome, ends)
+            outcome, ends = self.rather(search.widened(outcome), outcome, ends)
+        return self.rather(search.foretold(outcome, lambda: self.missed(ends.members)), outcome, ends)
+
+    def expected(self, members: Array) -> Withheld | None:
+        """What members (N, n) expect of the readings after the window, which is run once for each ensemble."""
+        if self._foreseen is None or self._foreseen[0] is not members:
+            withheld = predict_withheld(self.problem, members, self.space.executor)
+            self.space.forward_runs += withheld.runs if withheld else 0
+            self._foreseen = members, withheld
+        return self._foreseen[1]
+
+    def missed(self, members: Array) -> bool:
+        """Whether the readings after the window put the estimate in doubt."""
+        withheld = self.expected(members)
+        return withheld is not None and withheld.missed
 
     def rather(self, after: Outcome, outcome: Outcome, ends: Ends) -> tuple[Outcome, Ends]:
         """What was found ``after`` a round, and the ensemble about it: that of before where it is no lower descent."""

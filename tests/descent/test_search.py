@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from same_bits import assert_same_bits
 from toys import Decay, Wave, make_problem
-from wells import UnlikeWells, Wells, hidden_well, mass_of_positive, two_wells
+from wells import Parting, UnlikeWells, Wells, hidden_well, mass_of_positive, parted, two_wells
 
 from en4dvar.descent.search import Search
 from en4dvar.diagnosis.analysis import Descents, StartRecord
@@ -208,3 +208,65 @@ def test_where_descents_ended_in_words():
     )
     assert told.agreeing == 2
     assert np.isclose(told.spread, 0.125)
+
+
+class UnlikeParting(Parting):
+    narrow = True
+
+
+def alone(monkeypatch):
+    """Nothing looks for another minimum within the window."""
+    monkeypatch.setattr(Search, "challenged", lambda self, outcome: outcome)
+    monkeypatch.setattr(Search, "rest", lambda self, outcome: [])
+
+
+@pytest.mark.parametrize("kind", [Parting, UnlikeParting])
+def test_readings_after_the_window_lead_to_a_minimum_that_was_missed(kind, monkeypatch):
+    """The well that they are of is found; the posterior is that of the window alone, by a grid."""
+    alone(monkeypatch)
+    settings = AssimilationSettings(start="prior-mean")
+    for seed in (1, 2):
+        problem = parted(kind, seed=seed)
+        analysis = assimilate(problem, settings, seed)
+        assert sorted(round(float(mode.centre[0])) for mode in analysis.modes) == [-1, 1 if kind is Parting else 0]
+        assert analysis.withheld.inside > 0.6
+        right = sum(mode.weight for mode in analysis.modes if mode.centre[0] > 0)
+        assert right == pytest.approx(mass_of_positive(problem), abs=0.06)
+        assert "future-missed" not in {c.code for c in analysis.cautions}
+    monkeypatch.setattr(Search, "foretold", lambda self, outcome, missed: outcome)
+    lost = assimilate(problem, settings, seed)
+    assert len(lost.modes) < 2
+    assert lost.withheld.inside < 0.1
+    assert "future-missed" in {c.code for c in lost.cautions}
+
+
+def test_nothing_is_looked_for_where_the_readings_after_the_window_are_as_expected(monkeypatch):
+    monkeypatch.setattr(Search, "led", None)
+    analysis = assimilate(parted(mean=-0.9), AssimilationSettings(refine="none"), 1)
+    assert analysis.withheld.inside > 0.6
+
+
+def test_a_future_that_no_minimum_expects_is_told():
+    analysis = assimilate(parted(off=30.0), AssimilationSettings(), 1)
+    told = {c.code: c for c in analysis.cautions}["future-missed"]
+    assert "of 8 readings after the window 0% lie" in told.words
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("settings", [{}, {"refine": "none"}, {"start": "prior-mean"}])
+@pytest.mark.parametrize("off", [0.0, 30.0])
+def test_a_search_after_the_window_goes_on_from_any_state_to_the_same_bits(settings, off, monkeypatch):
+    if settings:
+        alone(monkeypatch)
+    problem, seen = parted(UnlikeParting, compiled=settings.get("refine") != "none", off=off), set()
+    whole, states = interrupted(problem, AssimilationSettings(**settings), 1)
+    led = 48 + 1 + 48 // 3
+    for state in states:
+        begun = state.search
+        if begun is not None:
+            descents = begun.comparison.descents if begun.comparison else ()
+            among = max(*state.tried, *(i for d in descents for i in d.members))
+            seen.add((among == led, begun.comparison is not None))
+        again = interrupted(problem, AssimilationSettings(**settings), 1, state)[0]
+        assert_same_bits(again, whole)
+    assert {(True, True), (True, False)} <= seen

@@ -133,12 +133,23 @@ def ramp(knots) -> InverseProblem:
     return constant.varied([RandomWalk.of(model, first, knots, 0.5)])
 
 
+def turned(window: int) -> InverseProblem:
+    """A line that turns where the window of so many readings ends."""
+    model, times = Vectorised(TWO), np.linspace(0.2, 4.0, 20)
+    problem = make_problem(model, (1.0, 0.5))
+    values = np.array([model.curve(np.array([1.0, 0.5]), t) for t in times]) + 3 * np.maximum(times - times[9], 0)
+    whole = make_observations(times, values, 0.1)
+    first = make_observations(times[:window], values[:window], 0.1)
+    return replace(problem, observations=replace(first, continued=whole if window < len(times) else None))
+
+
 PROVOKED: dict[str, Callable[[], Analysis]] = {
     "not-converged": lambda: run(
         make_problem(Wave(), [1.5, 1.2], scale=0.4), members=16, max_iterations=1, start="prior-mean"
     ),
     "ensemble-collapse": lambda: run(many(40), members=4, sampling="random", scheme="es-mda"),
     "rank-deficient": lambda: run(many(8), members=6, sampling="random"),
+    "future-missed": lambda: run(turned(10)),
     "missed-knots": lambda: run(ramp((2.6,))),
     "misfit": lambda: run(replace_std(linear(scale=100.0), 0.01)),
     "overstated-error": lambda: run(replace_std(linear(scale=100.0), 10.0)),

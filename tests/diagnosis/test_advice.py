@@ -9,7 +9,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-from diagnosis.provoked import PROVOKED, TWO, Signless, bent, chain_not_converged, linear, ramp, replace_std, run
+from diagnosis.provoked import (
+    PROVOKED,
+    TWO,
+    Signless,
+    bent,
+    chain_not_converged,
+    linear,
+    ramp,
+    replace_std,
+    run,
+    turned,
+)
 from diagnosis.provoked_by_several import OF_SEVERAL
 from estimation.test_agreement import joint
 from toys import Vectorised, make_observations, make_problem, with_discrepancy, with_noise
@@ -145,6 +156,7 @@ def narrow() -> InverseProblem:
 
 LEFT_TO_JUDGEMENT: dict[str, Callable[[], InverseProblem]] = {
     "implausible-data": linear,  # the units were wrong
+    "future-missed": lambda: turned(20),
     "missed-knots": lambda: ramp((2.0,)),
     "model-validity": linear,  # a model without that limit
     "members-lost": narrow,
