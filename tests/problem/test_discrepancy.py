@@ -376,3 +376,17 @@ def test_the_soft_gel_agrees_with_the_published_chain():
     # its prior of σ is not stated: the chain has 0.29 ± 0.10 µm, ours and emcee on this J 0.21 ± 0.10 with ln σ ± 1
     assert found["sigma"].mean() == pytest.approx(0.29e-6, abs=0.10e-6)
     assert not any(c.code == "chain-not-converged" for c in end.cautions)
+
+
+@pytest.mark.parametrize("larger", [1.0, 70.0])
+def test_the_mode_beside_heavy_tails_meets_its_conditions(larger):
+    """u = ρ'((r − δ)/s)/s and δ = A u, by A itself, where whole steps of Newton's method go round in circles, too."""
+    stream, times = np.random.default_rng(3), np.linspace(0.0, 60.0, 62)
+    s = stream.uniform(0.8, 1.2, (40, 62))
+    residual = larger * np.cumsum(stream.standard_normal((40, 62)), axis=1) + s * stream.standard_t(2, (40, 62))
+    a, length = np.full((40, 62), larger), stream.uniform(5.0, 40.0, 40)
+    u, delta = boxed(residual, s, 1e-6 * a**2, a, length, np.diff(times), 1.5, 1.345)
+    assert u == pytest.approx(np.clip((residual - delta) / s, -1.345, 1.345) / s, abs=1e-9)
+    lag = np.sqrt(3) * np.abs(np.subtract.outer(times, times)) / length[:, None, None]
+    covariance = larger**2 * ((1 + lag) * np.exp(-lag) + 1e-6 * np.eye(62))
+    assert delta == pytest.approx(np.einsum("bij,bj->bi", covariance, u), rel=1e-8, abs=1e-8 * larger)

@@ -21,8 +21,11 @@ from en4dvar.data.noise.correlated import CorrelatedNoise
 from en4dvar.data.noise.discrepancy import DiscrepancyNoise, augmented, both_sides, in_rows, whitened
 from en4dvar.data.noise.huber import HuberNoise
 from en4dvar.data.noise.predicted import Linearisation, Predicted
-from en4dvar.data.noise.state_space import NEWTON, REWEIGHTED, SETTLED, boxed, innovations
+from en4dvar.data.noise.state_space import boxed, innovations
 from en4dvar.model.state import Array
+
+NEWTON, REWEIGHTED = 30, 500  # iterations; the latter follow where the former go round in circles
+SETTLED = 1e-13  # change of a weight
 
 
 @dataclass(frozen=True)
@@ -125,6 +128,10 @@ class RobustDiscrepancyNoise(DiscrepancyNoise):
 
     def _solved(self, values: Array, predicted: Predicted) -> tuple[Array, Array]:
         """u and w (K,) at one prediction."""
+        if self.correlation is None and self.kernel.ordered:
+            u, errors, s, *_ = self._at_mode(values, predicted)
+            most = self.threshold * s
+            return u[0], np.asarray(most / np.maximum(np.abs(errors), most))[0]
         s, covariance = self.error_std(predicted), self.covariance_of_discrepancy(predicted)
         u, light = solve_boxed((values - predicted.values)[None], s[None], covariance[None], self.threshold)
         return u[0], light[0]
@@ -155,17 +162,22 @@ class RobustDiscrepancyNoise(DiscrepancyNoise):
 
         return np.asarray(self._in_parts(predicted, 1, of)[0])
 
+    def _at_mode(self, values: Array, predicted: Predicted) -> tuple[Array, ...]:
+        """u, r − δ, s, δ, r, a g (B, K) and ℓ (B,) at the mode in δ, in O(K)."""
+        runs, k = in_rows(predicted), self.kernel
+        amplitude, length = self._amplitude_and_length(runs)
+        a = amplitude[:, None] * k.growth(runs.rates)
+        residual, s, a = np.broadcast_arrays(values - runs.values, self.error_std(runs), a)
+        u, delta = boxed(residual, s, k.nugget * a**2, a, length, k.steps, k.smoothness, self.threshold)
+        return u, residual - delta, s, delta, residual, a, length
+
     def _filtered(self, values: Array, predicted: Predicted) -> Array:
         """:meth:`_terms` in O(K)."""
-        runs, c, kappa = in_rows(predicted), self.threshold, self._curvature
+        k, kappa = self.kernel, self._curvature
         with np.errstate(over="ignore", invalid="ignore"):
-            amplitude, length = self._amplitude_and_length(runs)
-            a = amplitude[:, None] * self.kernel.growth(runs.rates)
-            residual, s, a = np.broadcast_arrays(values - runs.values, self.error_std(runs), a)
-            own = self.kernel.nugget * a**2
-            u, delta = boxed(residual, s, own, a, length, self.kernel.steps, self.kernel.smoothness, c)
-            _, roots = innovations(residual, s**2 / kappa + own, a, length, self.kernel.steps, self.kernel.smoothness)
-            terms = self.huber._loss((residual - delta) / s) + 0.5 * u * delta + np.log(roots) + 0.5 * math.log(kappa)
+            u, errors, s, delta, residual, a, length = self._at_mode(values, predicted)
+            _, roots = innovations(residual, s**2 / kappa + k.nugget * a**2, a, length, k.steps, k.smoothness)
+            terms = self.huber._loss(errors / s) + 0.5 * u * delta + np.log(roots) + 0.5 * math.log(kappa)
         return np.asarray(terms).reshape(predicted.values.shape)
 
     def _residual(self, values: Array, runs: Predicted) -> tuple[Array, Array, Array]:

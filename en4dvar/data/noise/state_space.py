@@ -85,8 +85,8 @@ def boxed(
     return mode
 
 
-NEWTON, REWEIGHTED = 30, 500  # iterations; the latter follow where the former go round in circles
-SETTLED = 1e-13  # change of a weight
+SETTLED = 1e-10  # of the slope of J at the end of a step, against that at its begin
+NEWTON, SECANTS = 200, 50  # iterations, and those for the length of a step
 
 
 @kernel
@@ -101,9 +101,12 @@ def _boxed(
     c: float,
     mode: Array,
 ) -> None:
-    """``mode`` (2, B, K), run by run: Newton's method on which readings are in the tails, else reweighting."""
+    """``mode`` (2, B, K), run by run: Newton's method on which readings are in the tails, each step as long as J falls.
+
+    J is convex and quadratic in pieces, so that this ends; whole steps may go round in circles.
+    """
     count = residuals.shape[1]
-    errors, force, before = np.empty(count), np.empty(count), np.empty(count)
+    force, at, pull = np.empty(count), np.empty(count), np.empty(count)
     for run in range(residuals.shape[0]):
         r, s, nugget, a, u, delta = (
             residuals[run], std[run], own[run], amplitudes[run], mode[0, run], mode[1, run],
@@ -111,30 +114,64 @@ def _boxed(
         if not np.isfinite(np.sum(r) + np.sum(s) + np.sum(a) + rates[run]):
             mode[:, run] = np.nan
             continue
-        errors[:], force[:], settled = s * s, np.nan, False
+        at[:], pull[:] = 0.0, 0.0
+        _set_force(r, s, at, c, force)
         for _ in range(NEWTON):
-            _mode(order, r, errors, nugget, force, a, rates[run], steps, u, delta)
-            settled = True
-            for k in range(count):
-                left = r[k] - delta[k]
-                new = np.sign(left) * c / s[k] if abs(left) > c * s[k] else np.nan
-                settled = settled and (new == force[k] or (np.isnan(new) and np.isnan(force[k])))
-                force[k] = new
-            if settled:
+            _mode(order, r, s * s, nugget, force, a, rates[run], steps, u, delta)
+            if not _set_force(r, s, delta, c, force):
                 break
-        if settled:
-            continue
-        force[:], before[:] = np.nan, 0.0
-        for _ in range(REWEIGHTED):
-            _mode(order, r, errors, nugget, force, a, rates[run], steps, u, delta)
-            moved = 0.0
+            step = _step(r, s, c, at, pull, u, delta)
             for k in range(count):
-                weight = c * s[k] / max(abs(r[k] - delta[k]), c * s[k])
-                errors[k] = s[k] * s[k] / weight
-                moved = max(moved, abs(weight - before[k]))
-                before[k] = weight
-            if moved < SETTLED:
-                break
+                at[k] += step * (delta[k] - at[k])
+                pull[k] += step * (u[k] - pull[k])
+            _set_force(r, s, at, c, force)
+
+
+@called
+def _set_force(r: Array, s: Array, delta: Array, c: float, force: Array) -> bool:
+    """Set the ``force`` (K,) of the readings in the tails, NaN of the others; whether it has changed."""
+    changed = False
+    for k in range(len(r)):
+        left = r[k] - delta[k]
+        new = np.sign(left) * c / s[k] if abs(left) > c * s[k] else np.nan
+        changed = changed or not (new == force[k] or (np.isnan(new) and np.isnan(force[k])))
+        force[k] = new
+    return changed
+
+
+@called
+def _step(r: Array, s: Array, c: float, at: Array, pull: Array, u: Array, delta: Array) -> float:
+    """How far from δ = ``at`` with A⁻¹δ = ``pull`` towards ``delta`` with A⁻¹δ = ``u`` J falls, at most 1.
+
+    Its slope is linear in pieces: secants, with the value at an end that stays halved (Illinois), end in its root.
+    """
+    low, high = 0.0, 1.0
+    rising = _slope(1.0, r, s, c, at, pull, u, delta)
+    if rising <= 0.0:
+        return 1.0
+    falling = first = _slope(0.0, r, s, c, at, pull, u, delta)
+    step, side = 1.0, 0
+    for _ in range(SECANTS):
+        step = (falling * high - rising * low) / (falling - rising)
+        slope = _slope(step, r, s, c, at, pull, u, delta)
+        if abs(slope) <= SETTLED * abs(first):
+            break
+        if slope > 0.0:
+            high, rising, falling, side = step, slope, falling * (0.5 if side > 0 else 1.0), 1
+        else:
+            low, falling, rising, side = step, slope, rising * (0.5 if side < 0 else 1.0), -1
+    return step
+
+
+@called
+def _slope(step: float, r: Array, s: Array, c: float, at: Array, pull: Array, u: Array, delta: Array) -> float:
+    """Of J along the way of :func:`_step`."""
+    slope = 0.0
+    for k in range(len(r)):
+        way = delta[k] - at[k]
+        left = (r[k] - at[k] - step * way) / s[k]
+        slope += way * (pull[k] + step * (u[k] - pull[k]) - min(max(left, -c), c) / s[k])
+    return slope
 
 
 @called
