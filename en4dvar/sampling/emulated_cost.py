@@ -19,7 +19,7 @@ from en4dvar.data.noise import Predicted
 from en4dvar.data.observations import Observations
 from en4dvar.diagnosis.diagnostics import effective_share
 from en4dvar.ensemble.forecast import Forecast
-from en4dvar.model.state import Array
+from en4dvar.model.state import DISCREPANCY, NOISE_SCALE, Array
 from en4dvar.priors.prior import Prior
 from en4dvar.sampling.emulator import Coordinates, Emulator
 from en4dvar.sampling.walkers import advance
@@ -39,8 +39,33 @@ Run = Callable[[Array], Forecast]
 
 
 @dataclass(frozen=True)
+class Bend:
+    """x ↦ ln(1 + exp(x − ``about``)) of those coordinates (n,) of which ``about`` is no NaN.
+
+    They are the logarithms of what acts on the predictions: what a positive parameter does vanishes with it, and so
+    does the slope of this, while a polynomial of the logarithm grows.
+    """
+
+    about: Array
+
+    @classmethod
+    def of(cls, prior: Prior, points: Array) -> Bend:
+        """About the mean of points (B, n). Parameters of errors, whose logarithms are emulated, stay as they are."""
+        of_errors = {p.name for p in (NOISE_SCALE, *DISCREPANCY)}
+        bent = [t.transform == "lognormal" and t.parameter.name not in of_errors for t in prior.terms]
+        return cls(np.where(bent, points.mean(axis=0), np.nan))
+
+    def __call__(self, x: Array) -> Array:
+        """(B, n) of control vectors (B, n)."""
+        bent, of_it = ~np.isnan(self.about), np.array(x)
+        of_it[:, bent] = np.logaddexp(0.0, x[:, bent] - self.about[bent])
+        return of_it
+
+
+@dataclass(frozen=True)
 class EmulatedCost:
-    """Ĵ (B,) of control vectors (B, n): J of the predictions (and rates, ln σ) of ``emulator``.
+    """Ĵ (B,) of control vectors (B, n): J of the predictions (and rates, ln σ) of ``emulator``, a polynomial of what
+    ``bend`` makes of them.
 
     J_o is cut at ``ceiling``: far from its runs a polynomial says only that J is large, and a walker that true J lets
     in there must find its way out. ``share`` is the effective share of the runs that judge it, ``draws`` (S, n) are of
@@ -48,6 +73,7 @@ class EmulatedCost:
     """
 
     emulator: Emulator
+    bend: Bend
     prior: Prior
     observations: Observations
     make: Predicted
@@ -57,11 +83,8 @@ class EmulatedCost:
 
     def cost(self, x: Array) -> Array:
         """Ĵ (B,) of control vectors (B, n)."""
-        return self._cost(self.emulator.coordinates.of(x))
-
-    def _cost(self, z: Array) -> Array:
-        observed = self.observations.cost(self.make.unstacked(self.emulator.at(z)))
-        return np.minimum(observed, self.ceiling) + _prior_cost(self.prior, self.emulator.coordinates.back(z))
+        observed = self.observations.cost(self.make.unstacked(self.emulator.predictions(self.bend(x))))
+        return np.minimum(observed, self.ceiling) + _prior_cost(self.prior, x)
 
     def settled(self, random: np.random.Generator) -> EmulatedCost:
         """With draws of the walkers after :data:`LONGER` more rounds: where the posterior is bent, those of a hundred
@@ -73,12 +96,10 @@ class EmulatedCost:
 
     def walk(self, x: Array, others: Array, random: np.random.Generator, rounds: int) -> list[Array]:
         """Positions (W, n) of walkers from ``x`` after each round, sampling exp(−Ĵ); ``others`` (W', n) stand still."""
-        coordinates = self.emulator.coordinates
-        z, others = coordinates.of(x), coordinates.of(others)
-        costs, positions = self._cost(z), []
+        costs, positions = self.cost(x), []
         for _ in range(rounds):
-            z, costs = advance(self._cost, z, costs, others, random, PER_ROUND)
-            positions.append(coordinates.back(z))
+            x, costs = advance(self.cost, x, costs, others, random, PER_ROUND)
+            positions.append(x)
         return positions
 
 
@@ -132,7 +153,7 @@ def emulate(
     runs = _run(run, prior, observations, coordinates.back(random.standard_normal((count, n))))
     if len(runs.x) < ENOUGH_ALIVE * count:
         return None
-    emulated = fitted_cost(prior, observations, degree, runs, 2 * n, coordinates)
+    emulated = fitted_cost(prior, observations, degree, runs, 2 * n)
     kept, share = runs.x, math.nan
     walkers = kept[random.permutation(len(kept))[:WALKERS]]
     for _ in range(fits - 1):
@@ -143,7 +164,7 @@ def emulate(
             return None
         share = effective_share(emulated.cost(new.x) - new.costs) * len(new.x) / count  # of the fit without them
         runs = runs.joined(new)
-        emulated = fitted_cost(prior, observations, degree, runs, 2 * n, coordinates)
+        emulated = fitted_cost(prior, observations, degree, runs, 2 * n)
     settled = emulated.walk(walkers, kept, random, SETTLED)
     ceiling = float(np.min(runs.costs - _prior_cost(prior, runs.x))) + CEILING
     return replace(emulated, ceiling=ceiling, share=share, draws=np.concatenate(settled[SETTLED // 3 :]))
@@ -160,19 +181,9 @@ def _prior_cost(prior: Prior, x: Array) -> Array:
     return np.asarray(0.5 * (z * z).sum(axis=1))
 
 
-def fitted_cost(
-    prior: Prior,
-    observations: Observations,
-    degree: int,
-    runs: ModelRuns,
-    near: float,
-    coordinates: Coordinates | None = None,
-) -> EmulatedCost:
-    """Ĵ fitted to runs; one whose J exceeds the lowest by ``near`` counts half.
-
-    ``coordinates``: of the polynomials, by default those in which the runs have unit covariance.
-    """
-    excess = (runs.costs - runs.costs.min()) / near
-    about = Coordinates.about(runs.x) if coordinates is None else coordinates
-    emulator = Emulator.fitted(about, degree, runs.x, runs.outputs, 1 / (1 + excess**2), RIDGE)
-    return EmulatedCost(emulator, prior, observations, runs.make)
+def fitted_cost(prior: Prior, observations: Observations, degree: int, runs: ModelRuns, near: float) -> EmulatedCost:
+    """Ĵ fitted to runs; one whose J exceeds the lowest by ``near`` counts half."""
+    excess, bend = (runs.costs - runs.costs.min()) / near, Bend.of(prior, runs.x)
+    x = bend(runs.x)
+    emulator = Emulator.fitted(Coordinates.about(x), degree, x, runs.outputs, 1 / (1 + excess**2), RIDGE)
+    return EmulatedCost(emulator, bend, prior, observations, runs.make)

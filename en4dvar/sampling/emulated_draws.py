@@ -12,7 +12,7 @@ Source: surrogates refined where they say that the posterior is, Li & Marzouk (2
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,7 +28,8 @@ from en4dvar.sampling.walkers import advance
 NEAR = 3.0  # n τ above the lowest J: runs up to there are fitted
 COUNT, CLOSING = 2000, 5  # draws of a round, rounds that close in, on the emulator
 ROUNDS = 20  # more, at most
-OTHERS, MOVES = 1000, 30  # resampled draws are moved apart by so many moves about so many others
+WALKERS, MOVES = 600, 30  # they start from the draws, and move about where they were so many moves before,
+TURNS = 6  # so often: the tails that the mixture misses are found, and from fit to fit they go on
 LARGEST = 2000  # outputs of a run beyond which emulating them costs more than it is worth
 
 
@@ -73,20 +74,22 @@ class RecordedRuns:
 class EmulatedProposal:
     """exp(−Ĵ/τ), normalised, in the coordinates z in which the prior is N(0, 1).
 
-    ``pool``: weighted draws of it, from ``mixture``.
+    ``pool``: weighted draws of it, from ``mixture``, which tell its norm; ``walkers`` (W, n) that sample it.
     """
 
     emulated: EmulatedCost
     heat: float
     mixture: StudentMixture
     pool: FixedDraws
+    walkers: Array
 
     @classmethod
     def fitted(
-        cls, runs: RecordedRuns, start: StudentMixture, stream: np.random.Generator, heat: float, enough: float
-    ) -> "EmulatedProposal | None":
-        """Fitted to the runs so far, with so many effective draws; ``start`` is a mixture about them. None where runs
-        are too few.
+        cls, runs: RecordedRuns, start: "StudentMixture | EmulatedProposal", stream: np.random.Generator, heat: float,
+        enough: float,
+    ) -> "EmulatedProposal | None":  # fmt: skip
+        """Fitted to the runs so far, with so many effective draws; ``start`` is a mixture about them, or the proposal
+        before, whose walkers go on. None where runs are too few.
         """
         emulated = runs.emulated(heat)
         if emulated is None:
@@ -96,7 +99,7 @@ class EmulatedProposal:
             z = sampler.draw()
             sampler.add(z, 0.5 * np.sum(z**2, axis=1) - _white(emulated, z) / heat)
 
-        closing = ClosingDraws(start, stream, COUNT, wider=1.3)
+        closing = ClosingDraws(start if isinstance(start, StudentMixture) else start.mixture, stream, COUNT, wider=1.3)
         for _ in range(CLOSING):
             add(closing)
         mixture = closing.next_proposal()
@@ -105,7 +108,19 @@ class EmulatedProposal:
             add(pool)
             if pool.effective >= enough:
                 break
-        return cls(emulated, heat, mixture, pool) if np.isfinite(pool.log) else None
+        if not np.isfinite(pool.log):
+            return None
+        walkers = pool.z[resampled(pool.shares, WALKERS, stream)]
+        if not isinstance(start, StudentMixture):
+            walkers[::2] = start.walkers[::2]
+        made = cls(emulated, heat, mixture, pool, walkers)
+        for _ in range(TURNS):
+            made = replace(made, walkers=made.moved(made.walkers, stream))
+        return made
+
+    def moved(self, z: Array, stream: np.random.Generator) -> Array:
+        """Walkers (W, n) after moves about those of the proposal."""
+        return advance(self._cost, z, self._cost(z), self.walkers, stream, MOVES)[0]
 
     @property
     def dimensions(self) -> int:
@@ -114,9 +129,7 @@ class EmulatedProposal:
 
     def draw(self, count: int, stream: np.random.Generator) -> Array:
         """(count, n)."""
-        z = self.pool.z[resampled(self.pool.shares, count, stream)]
-        others = self.pool.z[resampled(self.pool.shares, OTHERS, stream)]
-        return advance(self._cost, z, self._cost(z), others, stream, MOVES)[0]
+        return self.moved(self.walkers[stream.permutation(WALKERS)[:count]], stream)
 
     def log_density(self, x: Array) -> Array:
         """(B,) at points (B, n)."""

@@ -146,7 +146,8 @@ def _guided(
     """A round of draws of the emulated posterior, after others that train the emulator, or ``mixed``, those of a
     mixture, where these keep a larger share effective; and a mixture about them. False where a draw ends them all.
     """
-    start, share = mixture, 0.0
+    start: StudentMixture | EmulatedProposal = mixture
+    share = 0.0
     for heat in (*HEATS, *(LAST_HEAT,) * TRIED):
         proposal = EmulatedProposal.fitted(runs, start, mixed.stream, heat, TRAINING)
         if proposal is None:
@@ -154,7 +155,7 @@ def _guided(
         sampler = FixedDraws(proposal, mixed.stream, DRAWS)
         if not more(sampler):
             return sampler, proposal.mixture, False
-        start, share = proposal.mixture, sampler.effective / DRAWS
+        start, share = proposal, sampler.effective / DRAWS
         if heat == LAST_HEAT and share >= GOOD:
             break
     final = EmulatedProposal.fitted(runs, start, mixed.stream, LAST_HEAT, POOL)

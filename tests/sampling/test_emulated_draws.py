@@ -1,5 +1,7 @@
 """Draws of a posterior that is a thin bent valley, whose moments and evidence one integral tells."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -69,6 +71,45 @@ class Valley:
 def weighted_quantiles(draws):
     z0, order = draws.x[:, 0], np.argsort(draws.x[:, 0])
     return np.interp([0.05, 0.5, 0.95], np.cumsum(draws.shares[order]), z0[order])
+
+
+class Fading(Valley):
+    """The same with z_0 = ln G and what vanishes with G: half of its posterior lies where G does hardly anything."""
+
+    def __init__(self):
+        super().__init__()
+        first = PriorTerm.lognormal(Parameter("G", "1"), 1.0, 2.0)
+        self.prior = Prior((first, *self.prior.terms[1:]))
+        self.observations = replace(self.observations, values=0.8 * BEND)
+
+    def run(self, z):
+        values = z[:, 1:5] + BEND * np.exp(z[:, :1])
+        return Forecast(Predicted(values), np.empty((len(z), 0)), ("",) * len(z))
+
+    def costs(self, z, outcome):
+        return 0.5 * np.sum(self.prior.white(z) ** 2, axis=1) + self.observations.cost(outcome.predicted)
+
+    @property
+    def about(self):
+        """The Gaussian about G = 1, by the tangent there."""
+        at = np.concatenate([[0.0], self.observations.values - BEND, np.zeros(3)])
+        slope = np.zeros((4, N))
+        slope[:, 1:5], slope[:, 0] = np.eye(4), BEND
+        precision = np.diag(1 / np.square([2.0] + [1.0] * (N - 1))) + slope.T @ slope / WIDTH**2
+        return Minimum(at, np.linalg.inv(precision), float(0.5 * at @ at))
+
+    @property
+    def exact(self):
+        z0 = np.linspace(-12, 6, 48001)
+        apart = self.observations.values - BEND * np.exp(z0)[:, None]
+        density = np.exp(-(z0**2) / 8 - 0.5 * np.sum(apart**2, axis=1) / (1 + WIDTH**2))
+        return np.interp([0.05, 0.5, 0.95], np.cumsum(density) / density.sum(), z0)
+
+
+def test_the_tail_of_what_vanishes_with_its_parameter_is_found():
+    fading = Fading()
+    several = [sample_modes(fading.recorded, fading.prior, [fading.about], seed, 400.0) for seed in range(4)]
+    assert np.mean([weighted_quantiles(draws) for draws in several], axis=0) == pytest.approx(fading.exact, abs=0.25)
 
 
 def test_a_thin_bent_valley_is_sampled_to_its_tails_and_its_evidence_is_known():
