@@ -2,33 +2,22 @@
 
     python benchmarks/campaigns.py synthetic [--n 200] [--seed 1] [--bubbles 3 6 12 40] [--kinds …] [--minutes 9]
     python benchmarks/campaigns.py pairs [--n 100] [--seed 1] [--bubbles 6 12]
-    python benchmarks/campaigns.py odd [--n 10] [--seed 1] [--bubbles 12]
     python benchmarks/campaigns.py power [--n 400] [--seed 1] [--bubbles 6 12 40]
-    python benchmarks/campaigns.py halves RUN_DIR [--splits 10]
 
-``synthetic``: of every bubble G and μ, in units of their priors, are read with errors of their own, and with two modes
-in every third (an alias that its likelihood knows of); all readings are shifted by scale, density and pressure, drawn
-from their stated priors. Posteriors are Gaussian mixtures in closed form; as many draws of them enter as a run has
-effective ones, and all behind them is the program's. ``normal``: mean, spread and odd bubbles as the hierarchy
-supposes. ``like``: bubbles that differ by a tenth of the prior, as of one gel. ``heavy``: the same by Student's t of
-three degrees. ``gel``, ``scale``, ``law``: ``like`` with one bubble of four times the modulus, of radii 8 % too large,
-of a gel that stiffens. Beside those named stands the best test there is: the odds of each bubble with median, spread
-and common quantities known, and a bound that 5 % of the ``like`` campaigns exceed.
+``synthetic``: campaigns of ``exact_campaigns.py``. ``normal``: mean, spread and odd bubbles as the hierarchy supposes.
+``like``: bubbles that differ by a tenth of the prior, as of one gel. ``heavy``: the same by Student's t of three
+degrees. ``gel``, ``scale``, ``law``: ``like`` with one bubble of four times the modulus, of radii 8 % too large, of a
+gel that stiffens. Beside those named stands the best test there is: the odds of each bubble with median, spread and
+common quantities known, and a bound that 5 % of the ``like`` campaigns exceed.
 
 ``pairs``: two gels, the second 30 % stiffer, whose readings are shifted by the same scale, density and pressure: is the
 difference held, how often is it seen, what does the first gain where the second is known to 4 %, beside the closed form
 of a linear hierarchy of known spread, and what is held where these three are taken to be right?
 
-``odd``: synthetic laser bubbles of one gel (G and μ differ by 20 %, errors of 1 %, the wide priors of ``init``), whose
-posteriors are sampled by forward runs; the first as it is, of four times the modulus, of a gel that stiffens, of
-another gel, its radii or times 8 % too large.
-
 ``power``: what can be seen at all? The hierarchy of G alone, what is common included in its median, by quadrature over
 median and spread, without draws: the share of odd bubbles that are named, and that would be by the best test, where the
 spread is unknown and where it is known, of errors as above and of 6 to 16 %. The best test is the ratio of the odds
 with a bound that 5 % of clean campaigns of two such parameters exceed.
-
-``halves``: the bubbles of a finished run are sampled once, and split at random into halves with a population each.
 """
 
 from __future__ import annotations
@@ -36,149 +25,20 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-from laser_twin import PARAMETERS, POLYTROPIC
+from exact_campaigns import ALIAS, COMMON, ERRORS, KINDS, LIKE, LOG_STD, SHIFTS, SLOPES, campaign, found_of
 from records import Record, fill
-from scipy.optimize import least_squares
 from scipy.stats import kstest, norm
 
-from en4dvar.data.noise import noise_of
-from en4dvar.data.observations import Observations
-from en4dvar.ensemble.forecast import forecast
-from en4dvar.estimation.population import Effort, HyperPrior
-from en4dvar.estimation.population.campaign import CampaignPopulation, population_from, sampled_sets
+from en4dvar.estimation.population import HyperPrior
 from en4dvar.estimation.population.contrast import Centre, drawn_together, without_pull
 from en4dvar.estimation.population.hierarchy import A_SET, RAISED, named
-from en4dvar.estimation.population.own import ENOUGH, KEPT, OwnDraws
-from en4dvar.model.function_model import FunctionModel
-from en4dvar.model.state import TIME_SHIFT, Array, Parameter
-from en4dvar.priors.prior import Prior, PriorTerm
-from en4dvar.problem import InverseProblem
-from en4dvar.runs.finished import finished
-from en4dvar_bubble import QuadraticKelvinVoigt
+from en4dvar.model.state import Array
 
-NAMES, COMMON = ("G", "mu"), ("scale", "rho", "p_inf")
-LOG_STD = 2.0  # of the priors of G and μ
-LIKE, FREEDOM = 0.1, 3.0  # spread of bubbles of one gel, in units of the prior; degrees of freedom of heavy tails
 STIFFER, KNOWN = 1.3, 0.04  # of the second gel of a pair; how well its modulus is known
-ERRORS = (0.03, 0.15)  # of single bubbles: G to 6 to 30 %
-ALIAS = np.array([0.8, -0.8])  # of the second mode
-# Slopes of ln G and ln μ with the logarithms of the common quantities, times their stated priors (2, 1, 1 %); how far
-# off an odd bubble is in both, and its errors over those of the others: least squares on bubbles of 400 µm and 8 kPa
-SLOPES = np.array([[14.0, -7.0, 6.5], [2.3, -0.8, 0.2]]) * [0.02, 0.01, 0.01] / LOG_STD
-SHIFTS = {
-    "gel": ((np.log(4), 0.0), (0.4, 1.0)),
-    "scale": ((0.82, 0.16), (0.6, 1.0)),
-    "law": ((1.35, 0.3), (0.35, 0.7)),
-}
-KINDS = ("normal", "like", "heavy", *SHIFTS)
-OFF, STIFFENING, OTHER = 1.08, 0.5, (2.1 / 7.7, 0.118 / 0.101)  # of the odd one; soft over stiff polyacrylamide
-REAL = ("clean", "gel", "law", "other", "scale", "clock")
-
-
-def nothing(values: dict[str, float], times: Array) -> Array:
-    return 0.0 * times
-
-
-def bubble(name: str, common: Sequence[str] = COMMON) -> InverseProblem:
-    """What a population asks of a data set beside its draws: its name and priors."""
-    parameters = [Parameter(n, "1") for n in NAMES] + [Parameter(n, "1", common=True) for n in common]
-    model = FunctionModel(nothing, parameters, {"y": "1"})
-    none = np.zeros(2)
-    data = Observations(np.array([0.0, 1.0]), none, noise_of(none + 1.0, none), none + 1.0, name=name)
-    prior = Prior(tuple(PriorTerm.normal(p, 0.0, 1.0) for p in parameters))
-    return InverseProblem(model, model.observables[0], data, prior)
-
-
-@dataclass(frozen=True)
-class Campaign:
-    """Readings ``y`` (S, 2) with errors (S, 2), ``aliased`` (S,) where there are two modes, and the truth: ν and τ
-    (2,), θ (3,), and which are ``odd``.
-    """
-
-    y: Array
-    error: Array
-    aliased: Array
-    nu: Array
-    tau: Array
-    theta: Array
-    odd: list[int]
-
-    def drawn(self, rng: np.random.Generator, slopes: Array = SLOPES) -> list[OwnDraws]:
-        """Draws of each bubble, which takes the common quantities of ``slopes`` (2, c) as uncertain."""
-        each = zip(self.y, self.error, self.aliased, strict=True)
-        return [own_draws_of(y, error, aliased, rng, slopes) for y, error, aliased in each]
-
-    def odds(self) -> Array:
-        """(S,) of being odd, with ν, τ, θ and the errors known."""
-        hyper = HyperPrior()
-        variance, middle = self.tau**2 + self.error**2, self.nu + SLOPES @ self.theta
-        wider, wide = variance + hyper.mean_std**2, 1 + self.error**2
-        of_it, elsewhere = self._density(middle, variance), np.zeros(len(self.y))
-        for j in range(2):
-            one = np.where(np.arange(2) == j, wider, variance)
-            elsewhere = elsewhere + self._density(middle, one) / 4
-        elsewhere = elsewhere + self._density(SLOPES @ self.theta, wide) / 2
-        return np.asarray(hyper.odd / (1 - hyper.odd) * elsewhere / of_it)
-
-    def _density(self, middle: Array, variance: Array) -> Array:
-        first, second = (norm(middle, np.sqrt(variance)).pdf(y).prod(axis=1) for y in (self.y, self.y - ALIAS))
-        return np.asarray(np.where(self.aliased, (first + second) / 2, first))
-
-
-def own_draws_of(y: Array, error: Array, aliased: bool, rng: np.random.Generator, slopes: Array) -> OwnDraws:
-    """Draws of (x, θ) given y = x + slopes θ + error, and perhaps the alias, x and θ being N(0, I)."""
-    H = np.column_stack([np.eye(2), slopes])
-    S = H @ H.T + np.diag(error**2)
-    gain = H.T @ np.linalg.inv(S)
-    left = np.eye(len(gain)) - gain @ H
-    readings = [y, y - ALIAS] if aliased else [y]
-    logs = np.array([-0.5 * r @ np.linalg.solve(S, r) for r in readings])
-    share = np.exp(logs - np.logaddexp.reduce(logs))
-    count = int(ENOUGH)
-    means = np.array([gain @ r for r in readings])[rng.choice(len(readings), count, p=share)]
-    z = means + rng.multivariate_normal(np.zeros(len(gain)), left, count)
-    return OwnDraws(z[rng.integers(count, size=KEPT)], float(np.logaddexp.reduce(logs)), float(count), 0)
-
-
-def campaign(
-    kind: str, bubbles: int, rng: np.random.Generator, truth: tuple[Array, Array] | None = None,
-    errors: tuple[float, float] = ERRORS,
-) -> Campaign:  # fmt: skip
-    """Of one kind; ``truth``: θ and ν, instead of drawn."""
-    hyper = HyperPrior()
-    theta, nu = truth or (rng.standard_normal(len(COMMON)), hyper.mean_std * rng.standard_normal(2))
-    tau = hyper.spread * np.abs(rng.standard_normal(2)) if kind == "normal" else np.full(2, LIKE)
-    heavy = rng.standard_t(FREEDOM, (bubbles, 2)) / np.sqrt(FREEDOM / (FREEDOM - 2))
-    x = nu + tau * (heavy if kind == "heavy" else rng.standard_normal((bubbles, 2)))
-    error, odd = rng.uniform(*errors, (bubbles, 2)), []
-    if kind in SHIFTS:
-        shift, wider = SHIFTS[kind]
-        x[0] += np.array(shift) / LOG_STD
-        error[0] *= wider
-        odd = [0]
-    if kind == "normal":
-        odd = np.flatnonzero(rng.uniform(size=bubbles) < hyper.odd).tolist()
-        for i in odd:  # as if it belonged to none, or elsewhere in one parameter
-            where = rng.choice(3, p=[0.5, 0.25, 0.25])
-            x[i] = rng.standard_normal(2) if where == 0 else x[i]
-            x[i, where - 1] += hyper.mean_std * rng.standard_normal() * (where > 0)
-    aliased = np.arange(bubbles) % 3 == 2
-    y = x + SLOPES @ theta + error * rng.standard_normal((bubbles, 2))
-    y[aliased] += ALIAS * (rng.uniform(size=(int(aliased.sum()), 1)) < 0.5)
-    return Campaign(y, error, aliased, nu, tau, theta, odd)
-
-
-def found_of(
-    drawn: Sequence[OwnDraws], seed: int, problems: Sequence[InverseProblem] = (), names: Sequence[str] = COMMON
-) -> CampaignPopulation:
-    problems = problems or [bubble(f"bubble{i}", names) for i in range(len(drawn))]
-    start = [draws.z for draws in drawn]
-    return population_from(dict(enumerate(drawn)), {}, start, problems, NAMES, seed, HyperPrior(), Effort())
 
 
 def synthetic(seed: int, key: str) -> Record:
@@ -325,133 +185,20 @@ def power(seed: int, sizes: Sequence[int], count: int) -> None:
                 print(f"| {about} | {size} | {kind} | {' | '.join(shares)} | {100 * false:.0f} % |", flush=True)
 
 
-def laser_bubble(name: str, times: Array, largest: float) -> InverseProblem:
-    """A bubble of the priors of ``init``, without readings."""
-    about = {"G": (8e3, LOG_STD), "mu": (0.1, LOG_STD), "R_eq": (0.12 * largest, 0.4)}
-    terms = [PriorTerm.lognormal(PARAMETERS[n], *values) for n, values in about.items()]
-    terms += [PriorTerm.normal(PARAMETERS["R_max"], largest, 0.01 * largest), PriorTerm.normal(TIME_SHIFT, 0.0, 5e-7)]
-    ones = np.ones(len(times))
-    data = Observations(times, ones, noise_of(0.01 * largest * ones, 0 * ones), ones, name=name)
-    return InverseProblem(POLYTROPIC, POLYTROPIC.observables[0], data, Prior(tuple(terms)))
-
-
-def read(name: str, x: Array, kind: str, rng: np.random.Generator) -> InverseProblem:
-    """The bubble of a truth (ln G, ln μ, ln R_eq, R_max, shift), read as one of a ``kind``."""
-    times, off = 3e-2 * x[3] * np.arange(1, 31), OFF if kind == "scale" else 1.0
-    x = x + np.array([*np.log({"gel": (4, 1), "other": OTHER}.get(kind, (1, 1))), 0, 0, 0])
-    problem = laser_bubble(name, times, x[3])
-    if kind == "law":
-        stiffening = replace(POLYTROPIC, law=QuadraticKelvinVoigt())
-        run = forecast(replace(problem, model=stiffening, fixed={"alpha": STIFFENING}), x[None])
-    else:
-        run = forecast(problem, x[None])
-    values = run.predictions[0] + 0.01 * x[3] * rng.standard_normal(len(times))
-    fitted = laser_bubble(name, times * (OFF if kind == "clock" else 1), off * x[3])
-    return replace(fitted, observations=replace(fitted.observations, values=off * values))
-
-
-def members_of(problem: InverseProblem, at: Array, rng: np.random.Generator) -> Array:
-    """(50, n) about the lowest minimum of J from ``at`` (n,), transformed, and from four times more or less of G; in
-    white coordinates.
-    """
-    data, prior = problem.observations, problem.prior
-
-    def residuals(z: Array) -> Array:
-        apart = (forecast(problem, prior.from_white(z[None])).predictions[0] - data.values) / data.std
-        return np.concatenate([np.nan_to_num(apart, nan=1e3), z])
-
-    starts = [(at + np.log(more) * (np.arange(len(at)) == 0) - prior.mean) / prior.std for more in (1, 4, 0.25)]
-    each = [least_squares(residuals, start, diff_step=1e-4, x_scale=1.0, max_nfev=15) for start in starts]
-    found = min(each, key=lambda one: one.cost)
-    return rng.multivariate_normal(found.x, np.linalg.inv(found.jac.T @ found.jac), 50)
-
-
-def odd(seed: int, size: int, key: str) -> Record:
-    """Who is named of the bubbles of one gel, the first of them as they are and odd in each way."""
-    rng = np.random.default_rng([seed, int(key)])
-    centre = np.array([np.log(8e3), np.log(0.1), np.log(50e-6), 4e-4, 0.0])
-    gel = centre + np.array([0.3, 0.3, 0, 0, 0]) * rng.standard_normal(5)
-    scatter = np.array([0.2, 0.2, 0.15, 2e-5, 2e-7])
-    truths = gel + scatter * rng.standard_normal((size, 5))
-    problems = [read(f"bubble{i}", x, "clean", rng) for i, x in enumerate(truths)]
-    spoilt = {kind: read("bubble0", truths[0], kind, rng) for kind in REAL[1:]}
-    start = [members_of(p, x, rng) for p, x in zip(problems, truths, strict=True)]
-    drawn = sampled_sets(problems, start, seed, None, lambda words: None)[0]
-    record: Record = {}
-    for kind in REAL:
-        first = spoilt.get(kind, problems[0])
-        if kind != "clean":
-            begun = members_of(first, truths[0], rng)
-            drawn[0] = sampled_sets([first] * 3, [begun] * 3, seed, None, lambda words: None)[0][0]
-        result = found_of([drawn[i] for i in sorted(drawn)], seed, [first, *(problems[i] for i in sorted(drawn)[1:])])
-        nu = (gel[:2] - result.problems[0].prior.mean[:2]) / LOG_STD
-        record[kind] = {
-            "named": list(result.odd),
-            "chances": 1 - result.belongs,
-            "inside": np.abs(np.mean(result.posterior.nu < nu, axis=0) - 0.5) < 0.45,
-            "std": [LOG_STD * drawn[0].z[:, j].std() for j in (0, 1)],
-        }
-    return record
-
-
-def table_of_odd(records: Sequence[Record]) -> None:
-    print("| the first bubble | campaigns | named | others named | medians inside 90 % | its own std of ln G, ln μ |")
-    print("|---|---|---|---|---|---|")
-    for kind in REAL:
-        of_it = [r[kind] for r in records]
-        others = [bool(set(r["named"]) - ({0} if kind != "clean" else set())) for r in of_it]
-        std = np.median([r["std"] for r in of_it], axis=0)
-        named = _share([0 in r["named"] for r in of_it]) if kind != "clean" else "–"
-        inside = _share(np.ravel([r["inside"] for r in of_it]).tolist())
-        print(f"| {kind} | {len(of_it)} | {named} | {_share(others)} | {inside} | {std[0]:.2f}, {std[1]:.2f} |")
-
-
-def halves(run_dir: Path, splits: int) -> None:
-    """|z| of the difference of the medians of two random halves, in the transformed coordinate."""
-    config, sets = finished([run_dir], True, None)
-    assert config.population is not None
-    names, problems, start = config.population.of, [s.problem for s in sets], [s.white for s in sets]
-    drawn, left_out = sampled_sets(problems, start, config.seed, None, lambda words: print(words, flush=True))
-    rng, usable = np.random.default_rng(config.seed), sorted(drawn)
-    print(f"{len(usable)} of {len(sets)} data sets; z of the difference of two halves, what is common apart")
-    for split in range(splits):
-        order = rng.permutation(usable)
-        nu = []
-        for half in (order[: len(order) // 2], order[len(order) // 2 :]):
-            of_half = {int(s): drawn[int(s)] for s in sorted(half)}
-            result = population_from(
-                of_half, left_out, start, problems, names, config.seed, config.population.hyper, Effort()
-            )
-            centred = result.theta - result.theta.mean(axis=0)
-            told = centred @ np.linalg.lstsq(centred, result.posterior.nu, rcond=None)[0]
-            nu.append(result.posterior.nu - told)  # what is common is of one value in both halves
-        z = (nu[0].mean(axis=0) - nu[1].mean(axis=0)) / np.hypot(nu[0].std(axis=0), nu[1].std(axis=0))
-        print(f"split {split}: " + ", ".join(f"{name} {value:+.1f}" for name, value in zip(names, z, strict=True)))
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("synthetic", "pairs", "odd", "power", "halves"))
-    parser.add_argument("run_dir", type=Path, nargs="?")
+    parser.add_argument("what", choices=("synthetic", "pairs", "power"))
     parser.add_argument("--n", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--bubbles", type=int, nargs="+", default=[3, 6, 12, 40])
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS)
-    parser.add_argument("--splits", type=int, default=10)
     parser.add_argument("--minutes", type=float, default=9.0)
     parser.add_argument("--records", type=Path, default=Path("runs/campaigns"), help="folder of the records")
     asked = parser.parse_args()
-    if asked.what == "halves":
-        halves(asked.run_dir, asked.splits)
-        return
     if asked.what == "power":
         power(asked.seed, asked.bubbles, asked.n)
         return
     file = asked.records / f"{asked.what}_{asked.seed}.jsonl"
-    if asked.what == "odd":
-        run = partial(odd, asked.seed, asked.bubbles[0])
-        table_of_odd(list(fill(file, map(str, range(asked.n)), run, asked.minutes).values()))
-        return
     kinds = asked.kinds if asked.what == "synthetic" else ["pair"]
     keys = [f"{kind}/{size}/{i}" for i in range(asked.n) for kind in kinds for size in asked.bubbles]
     of_it = synthetic if asked.what == "synthetic" else pairs

@@ -115,21 +115,13 @@ def halves(run_dir: Path, splits: int) -> None:
     config, sets = finished([run_dir], True, None)
     assert config.population is not None
     names, problems, start = config.population.of, [s.problem for s in sets], [s.white for s in sets]
+    hyper = config.population.hyper
     drawn, left_out = sampled_sets(problems, start, config.seed, None, lambda words: print(words, flush=True))
     rng, usable, z = np.random.default_rng(config.seed), sorted(drawn), []
 
     def of(chosen: Sequence[int]) -> CampaignPopulation:
         some = {s: drawn[s] for s in sorted(chosen)}
-        return population_from(
-            some,
-            left_out,
-            start,
-            problems,
-            names,
-            config.seed,
-            config.population.hyper,
-            Effort(),  # type: ignore[union-attr]
-        )
+        return population_from(some, left_out, start, problems, names, config.seed, hyper, Effort())
 
     if len(usable) < 2 * FEWEST_SETS:
         result = of(usable)
