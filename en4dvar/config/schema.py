@@ -177,6 +177,9 @@ class LocalisationSection(Section):
     """Radius of the taper, in the unit of the model's coordinates; no influence from twice this distance on."""
     at: dict[str, QuantityText | tuple[QuantityText, ...]] | None = None
     """Places of parameters, and of series that are no part of a field: ``{k_1: [0, 50], well: [10, 20]}``."""
+    velocity: QuantityText | tuple[QuantityText, ...] | None = None
+    """Of what carries the field along, in the units of the model's coordinates and of time: ``5 m/s``, or one of each
+    coordinate. What is read of a field at a time acts where that was when the model's clock began."""
     threshold: Annotated[float, Field(gt=0, lt=1)] | None = None
     """Correlations below this size are taken for chance; default 3/√N."""
 
@@ -185,16 +188,18 @@ class LocalisationSection(Section):
         by = section.get("by", "distance")
         if by == "distance" and not {"radius", "threshold"} & section.keys():
             faults.add(("radius",), "required: how far a reading acts, or write by: correlation")
-        for key in {"distance": ("threshold",), "correlation": ("radius", "at")}.get(str(by), ()):
+        for key in {"distance": ("threshold",), "correlation": ("radius", "at", "velocity")}.get(str(by), ()):
             if key in section:
                 faults.add((key,), f"not with by: {by}", at_key=True)
 
 
 def _localisation_of(section: LocalisationSection, context: Context) -> Localisation:
-    unit = _of_coordinates(context)
+    unit, moving = _of_coordinates(context), section.velocity or ()
     places = {name: where if isinstance(where, tuple) else (where,) for name, where in (section.at or {}).items()}
     at = {name: tuple(parse_quantity(text, unit) for text in where) for name, where in places.items()}
-    return Localisation(section.radius, at, section.threshold)
+    a_time = f"({unit})/({context.units.time_unit})"
+    moves = tuple(parse_quantity(text, a_time) for text in (moving if isinstance(moving, tuple) else (moving,)))
+    return Localisation(section.radius, at, moves, section.threshold)
 
 
 def _place(value: str | dict[str, QuantityText], context: Context) -> Path | dict[str, QuantityText]:

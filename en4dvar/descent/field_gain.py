@@ -45,14 +45,21 @@ def gain_of(problem: InverseProblem, settings: AssimilationSettings) -> Gain:
 
 
 def _observed(problem: InverseProblem, asked: Localisation) -> Array:
-    """Coordinates (K, D) of the readings. Raises :class:`ConfigError`."""
+    """Coordinates (K, D) of the readings, with the field carried back to the begin of the model's clock.
+
+    Raises :class:`ConfigError`.
+    """
     coordinates = []
     for part in problem.parts:
         block = field_of(problem.model, part.observable)
         if part.name in asked.at:
             coordinates.append(np.broadcast_to(asked.at[part.name], (part.end - part.begin, len(asked.at[part.name]))))
         elif part.places is not None and block is not None and block.coordinates is not None:
-            coordinates.append(np.einsum("kj,kjd->kd", part.places.shares, places_of(block)[part.places.indices]))
+            where = np.einsum("kj,kjd->kd", part.places.shares, places_of(block)[part.places.indices])
+            if len(moving := asked.velocity) not in (0, where.shape[1]):
+                raise ConfigError(f"velocity: {len(moving)} numbers, {block.name} has {where.shape[1]} coordinates")
+            since = problem.observations.times[part.begin : part.end]
+            coordinates.append(where - np.outer(since, moving) if moving else where)
         else:
             raise ConfigError(
                 f"{part.name} has no place: it is no part of a field with coordinates; write 'at: {{{part.name}: 0}}', "

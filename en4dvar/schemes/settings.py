@@ -20,11 +20,13 @@ class Localisation:
 
     By distance with a ``radius``, in the unit of the model's coordinates, where ``at`` are the coordinates of
     parameters and of series that are no part of a field; or by correlation, ``radius`` None, with a ``threshold`` or
-    its default.
+    its default. ``velocity``, in coordinates per unit of the model's time: what a field reads at time t was so much
+    times t away when the model's clock began.
     """
 
     radius: float | None = None
     at: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    velocity: tuple[float, ...] = ()
     threshold: float | None = None
 
 
