@@ -62,11 +62,11 @@ def theirs(x: np.ndarray, g: np.ndarray, y: np.ndarray, std: np.ndarray, draw: D
     return members.T, spent
 
 
-def adaptive() -> None:
-    """ES-MDA localised by correlation, both with the threshold 3/√N and the same perturbations."""
+def adaptive(n: int) -> None:
+    """ES-MDA of n parameters localised by correlation, both with the threshold 3/√N and the same perturbations."""
     from iterative_ensemble_smoother import AdaptiveESMDA
 
-    rng, (n, k, n_members) = np.random.default_rng(1), (2000, 200, 100)
+    rng, (k, n_members) = np.random.default_rng(1), (200, 100)
     x, of = rng.standard_normal((n_members, n)), rng.permutation(n)[:k]
     std, y = rng.uniform(0.5, 1.0, k), rng.standard_normal(k)
     alphas = ESMDA(COEFFICIENTS).inflations
@@ -127,7 +127,8 @@ def by_distance() -> None:
 
 
 def main() -> None:
-    adaptive()
+    adaptive(2000)
+    adaptive(100_000)
     by_distance()
     for n, k, n_members in ((20, 200, 100), (2000, 100, 100), (20_000, 500, 100), (2000, 500, 1000)):
         rng = np.random.default_rng(0)

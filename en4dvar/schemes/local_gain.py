@@ -29,6 +29,7 @@ from en4dvar.model.state import Array
 from en4dvar.schemes.localisation import gaspari_cohn
 
 PART = 1 << 18  # cells times observations that are worked on at once
+FEW = 8  # readings that act on a cell, up to which each has a system of its own, beyond it each set of readings
 CHANCE = 3.0  # correlations below this over √N are taken for chance
 
 Update = Callable[[slice, Array], Array]  # (part of the cells, their anomalies (N, m)) → increments (M, m)
@@ -126,12 +127,23 @@ class ByCorrelation:
             size = np.sqrt(np.einsum("ij,ij->j", anomalies, anomalies) / (n_members - 1))
             kept = np.abs(cross) > least * np.outer(size, spread)
             change = np.zeros((len(innovations), len(size)))
-            patterns, which = np.unique(kept, axis=0, return_inverse=True)
-            for k, near in enumerate(patterns):
-                if near.any():
-                    of = which.ravel() == k
-                    own = cho_factor(covariance[np.ix_(near, near)] + np.diag(variance[near]))
-                    change[:, of] = cho_solve(own, innovations[:, near].T).T @ cross[np.ix_(of, near)].T
+            counts = kept.sum(axis=1)
+            for count in np.unique(counts[counts > 0]).tolist():
+                of = np.flatnonzero(counts == count)
+                near = np.nonzero(kept[of])[1].reshape(-1, count)
+                sets, which = (
+                    (near, np.arange(len(of))) if count <= FEW else np.unique(near, axis=0, return_inverse=True)
+                )
+                own = covariance[sets[:, :, None], sets[:, None, :]] + variance[sets][:, :, None] * np.eye(count)
+                if count <= FEW:
+                    gain = np.linalg.solve(own, cross[of[:, None], near][:, :, None])[:, :, 0]
+                    change[:, of] = np.einsum("cm,jcm->jc", gain, innovations[:, near])
+                    continue
+                for k, (matrix, readings) in enumerate(zip(own, sets, strict=True)):
+                    cells = of[which.ravel() == k]
+                    change[:, cells] = (
+                        np.linalg.solve(matrix, innovations[:, readings].T).T @ cross[np.ix_(cells, readings)].T
+                    )
             return change
 
         return increments

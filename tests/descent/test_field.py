@@ -175,3 +175,22 @@ def test_what_cannot_be_run_leaves_the_prior(tmp_path):
         field_en4dvar(ensemble, data, ByCorrelation())
     with pytest.raises(ValueError, match=r"places \(30,\) and observed \(5, 1\) must be"):
         ByDistance(np.arange(30.0), np.zeros((5, 1)), 1.0)
+
+
+def test_by_correlation_each_cell_has_its_own_readings():
+    """The formula cell by cell, of cells on which none, few and many readings act."""
+    rng = np.random.default_rng(8)
+    common = rng.standard_normal((20, 1))
+    ensemble = rng.standard_normal((20, 40)) + np.where(np.arange(40) < 15, 3.0, 0.4) * common
+    Y = rng.standard_normal((20, 14)) + np.linspace(0, 3, 14) * common
+    X, Y = ensemble - ensemble.mean(axis=0), Y - Y.mean(axis=0)
+    variance, innovations = rng.uniform(0.2, 1.0, 14), rng.standard_normal((5, 14))
+    found, counts = ByCorrelation(0.5).update(Y, variance, innovations)(slice(0, 40), X), []
+    for j in range(40):
+        near = np.array([abs(np.corrcoef(X[:, j], Y[:, k])[0, 1]) > 0.5 for k in range(14)])
+        own = np.cov(Y[:, near].T).reshape(near.sum(), near.sum()) + np.diag(variance[near])
+        gain = np.linalg.inv(own) @ (Y[:, near].T @ X[:, j]) / 19
+        assert found[:, j] == pytest.approx(innovations[:, near] @ gain, abs=1e-12)
+        counts.append(int(near.sum()))
+    assert min(counts) == 0
+    assert 0 < sorted(set(counts))[1] <= 8 < max(counts)
