@@ -19,7 +19,7 @@ from en4dvar.report.chart import PAGE, POINTS, Chart, Panel, in_columns
 from en4dvar.report.html import render
 from en4dvar.report.svg import draw
 from en4dvar.report.text import figure_text
-from en4dvar.results.calibration_file import FIT, Judged, read_sets
+from en4dvar.results.calibration_file import ERRORS, FIT, Judged, read_sets
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -57,9 +57,9 @@ class Verdict:
         """What is wrong, in a sentence; "" where nothing is seen."""
         if not self.off:
             return ""
-        if self.quantity == FIT:
+        if self.quantity in (FIT, ERRORS):
             size = "larger" if self.mean > 0 else "smaller"
-            return f"the errors of the readings are {size} than data.error says (ranks of the fit)"
+            return f"the errors of the readings are {size} than data.error says (ranks of the {self.quantity})"
         too = [f"values are too {'low' if self.mean > 0 else 'high'}"] if abs(self.mean) > APART else []
         too += [f"intervals are too {'narrow' if self.std > 1 else 'wide'}"] if abs(self.std - 1) > WIDTH else []
         return f"{self.quantity}: {' and '.join(too) or 'the shape of the posterior is off'}"

@@ -13,7 +13,8 @@ from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.files import read_text
 from en4dvar.plumbing.tables import write_csv
 
-FIT = "fit"  # the quantity that is J_o: half the sum of squares of the readings
+FIT, ERRORS = "fit", "errors"  # J_o, half the sum of squares of the readings: at the truth, among that at members, and
+# among that of readings which are drawn at each member
 LEVELS = (0.05, 0.25, 0.75, 0.95)
 LONGEST = 1_000_000_000  # bytes of the table
 NUMBERS = ("truth", "q05", "q25", "q75", "q95", "z")

@@ -3,8 +3,9 @@
 A truth is drawn from the prior of the user's own configuration, readings from the model at that truth with the user's
 own errors, at the times of the user's own data; then the set is estimated as any other. Of a correct posterior the rank
 of each truth among the members is uniform (:mod:`~en4dvar.diagnosis.ranks`). The half sum of squares J_o of the
-readings is a quantity like the parameters: it tells errors of a wrong size, which ranks of parameters hardly see
-(Modrák et al. 2023, Bayesian Anal., doi:10.1214/23-BA1404).
+readings is a quantity like the parameters (Modrák et al. 2023, Bayesian Anal., doi:10.1214/23-BA1404). The readings
+tell most of it, so that its rank among that of other readings, one set drawn at each member, is asked too: if the
+errors are as large as stated, that of the truth has their distribution, whatever the posterior.
 """
 
 from collections.abc import Callable, Mapping
@@ -33,7 +34,7 @@ from en4dvar.plumbing.user_code import reason_of
 from en4dvar.priors.prior import member_stream, own_seed
 from en4dvar.problem import InverseProblem
 from en4dvar.report.calibration import Calibration, load_calibration
-from en4dvar.results.calibration_file import FIT, LEVELS, Judged, write_sets
+from en4dvar.results.calibration_file import ERRORS, FIT, LEVELS, Judged, write_sets
 from en4dvar.results.checkpoint import FOLDER, Keeper, digest
 from en4dvar.runs.engine import conduct_run
 from en4dvar.runs.kind import RunKind
@@ -159,7 +160,7 @@ class CalibrationKind(RunKind[Calibration]):
     def _quantities(self) -> list[tuple[str, str]]:
         name, file = next(iter(self.data.items()))
         prior = build_one(self.config, name, file).prior
-        return [*((p.name, p.display_unit or p.unit) for p in prior.parameters), (FIT, "1")]
+        return [*((p.name, p.display_unit or p.unit) for p in prior.parameters), (FIT, "1"), (ERRORS, "1")]
 
 
 _NOTHING = (np.empty(0), np.empty((4, 0)), np.empty(0), np.empty(0), 0)
@@ -209,17 +210,22 @@ def draw_set(maker: InverseProblem, seed: int) -> tuple[dict[str, float], Array]
 def _compared(
     problem: InverseProblem, config: Config, seed: int, truth: Mapping[str, float], number: int, name: str
 ) -> Judged:
-    """Ranks, quantiles and z of every parameter and of J_o."""
+    """Ranks, quantiles and z of every parameter and of J_o, as it is and among that of other readings."""
     prior, observations = problem.prior, problem.observations
     analysis = assimilate(problem, replace(config.assimilation, what_if=False), seed)
     members = prior.from_physical(analysis.posterior)
     known = np.array([truth.get(p.name, np.nan) for p in prior.parameters])
     x = np.vstack([members, prior.from_physical(known[None])])
     run = Composite(problem)(x)
-    fits = observations.cost(run.predicted)
+    fits, stream = observations.cost(run.predicted), member_stream(seed, "other readings")
+    others = [
+        float(replace(observations, values=observations.noise.drawn(at, stream)).cost(at))
+        for at in map(run.predicted.__getitem__, range(len(members)))
+    ]
+    errors = np.append(others, fits[-1])
     physical = zip(prior.to_physical(x).T, prior.parameters, strict=True)
-    shown = np.column_stack([*(convert(v, p.unit, p.display_unit or p.unit) for v, p in physical), fits])
-    draws, at = (white := np.column_stack([x, fits]))[:-1], white[-1]
+    shown = np.column_stack([*(convert(v, p.unit, p.display_unit or p.unit) for v, p in physical), fits, errors])
+    draws, at = (white := np.column_stack([x, fits, errors]))[:-1], white[-1]
     with np.errstate(invalid="ignore", divide="ignore"):
         z = (at - draws.mean(axis=0)) / draws.std(axis=0, ddof=1)
         rank = np.where(np.isfinite(at), np.sum(draws < at, axis=0), np.nan)

@@ -15,7 +15,7 @@ from en4dvar.cli import main
 from en4dvar.config import load_config
 from en4dvar.plumbing.errors import ConfigError, DataError, OutputError
 from en4dvar.report.calibration import load_calibration
-from en4dvar.results.calibration_file import FIT, Judged
+from en4dvar.results.calibration_file import ERRORS, FIT, Judged
 
 QUIET = {"output.report": False, "assimilation.members": 24}
 
@@ -31,23 +31,25 @@ def sixty(toy, out, **options):
 
 def test_a_right_configuration_passes(toy, tmp_path):
     result = sixty(toy, tmp_path / "out")
-    assert [verdict.quantity for verdict in result.verdicts] == ["A", "k", FIT]
+    assert [verdict.quantity for verdict in result.verdicts] == ["A", "k", FIT, ERRORS]
     assert not any(verdict.off for verdict in result.verdicts)
     assert result.remarks == ["60 sets show no sign that the posterior is not calibrated"]
     (position,) = np.flatnonzero([name == "A" for name, _ in result.quantities])
     truths = (result.column("truth", position) - 100) / 3  # um, drawn from the prior
     assert abs(truths.mean()) < 4 / np.sqrt(60)
     assert 0.7 < truths.std() < 1.4
-    assert result.summary().shape[0] == 3
+    assert result.summary().shape[0] == 4
 
 
 @pytest.mark.parametrize(("std", "size"), [("2.6 um", "larger"), ("1.4 um", "smaller")])
 def test_errors_of_a_wrong_size_are_seen(toy, tmp_path, std, size):
     result = sixty(toy, tmp_path / "out", sets=100, made_with={"data.error.position_std": std})
-    fit = next(verdict for verdict in result.verdicts if verdict.quantity == FIT)
+    fit, errors = (next(v for v in result.verdicts if v.quantity == quantity) for quantity in (FIT, ERRORS))
     assert fit.off
-    assert f"the errors of the readings are {size} than data.error says (ranks of the fit)" in result.remarks
-    others = [verdict for verdict in result.verdicts if verdict.quantity != FIT]
+    assert errors.off
+    assert errors.p < 1e-3
+    assert f"the errors of the readings are {size} than data.error says (ranks of the errors)" in result.remarks
+    others = [verdict for verdict in result.verdicts if verdict.quantity not in (FIT, ERRORS)]
     wide = np.mean([verdict.std for verdict in others])
     assert wide > 1.1 if size == "larger" else wide < 0.9
 
