@@ -29,7 +29,7 @@ NEAR = 3.0  # n τ above the lowest J: runs up to there are fitted
 COUNT, CLOSING = 2000, 5  # draws of a round, rounds that close in, on the emulator
 ROUNDS = 20  # more, at most
 WALKERS, MOVES = 600, 30  # they start from the draws, and move about where they were so many moves before,
-TURNS = 6  # so often: the tails that the mixture misses are found, and from fit to fit they go on
+TURNS = 3  # so often: the tails that the mixture misses are found, and from fit to fit they go on
 LARGEST = 2000  # outputs of a run beyond which emulating them costs more than it is worth
 
 
