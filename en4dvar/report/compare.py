@@ -35,26 +35,16 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 MOST_WARNINGS = 12  # on the terminal
-MEANINGLESS = (
-    2.0  # p_WAIC beyond so many times the number of parameters tells of members that do not fit, no complexity
-)
 UNDECIDABLE = 1.0  # difference of log-evidence
 ALL = "all data sets"
 COLOURS = ("posterior", "centre", "background", "#cc79a7", "#b58900", "muted")
 STORED = "* as the result has it: Laplace's approximation, unless its posterior was sampled"
-WITHOUT_WAIC = (
-    f"p_WAIC – where it is more than {MEANINGLESS:g} times the number of parameters: members do not fit the readings, "
-    "and it counts nothing"
-)
 
 
 @dataclass(frozen=True)
 class ModelScore:
     """One run on one data set (or, summed, on all): what the table of ``en4dvar compare`` shows.
 
-    ``effective_parameters`` is p_WAIC, the sum over the observations of the posterior variance of their
-    log-likelihood (Gelman, Hwang & Vehtari 2014, Stat. Comput. 24, 997), or NaN where it says nothing, see
-    :data:`MEANINGLESS`; ``dfs`` is its linear counterpart.
     ``difference`` is the log-evidence minus that of the best model; NaN, as ``probability``, where the runs used
     different data. ``stored``: the log-evidence is the result's, not sampled. ``warnings`` are the codes of its
     warnings, and ``doubted`` those for which neither its intervals nor its evidence are to be trusted.
@@ -67,7 +57,6 @@ class ModelScore:
     probability: float
     chi2_per_observation: float
     dfs: float
-    effective_parameters: float
     nrmse: float
     warnings: str = ""
     doubted: str = ""
@@ -224,7 +213,7 @@ def model_probabilities(log_evidence: Array) -> Array:
 
 def comparison_table(comparison: Comparison) -> str:
     """What the terminal shows: one row a model and data set, and the verdict on each data set."""
-    header = ("data set", "run", "log-evidence", "difference", "probability", "chi2/K", "DFS", "p_WAIC", "NRMSE")
+    header = ("data set", "run", "log-evidence", "difference", "probability", "chi2/K", "DFS", "NRMSE")
     rows = [
         (
             s.dataset,
@@ -234,7 +223,6 @@ def comparison_table(comparison: Comparison) -> str:
             fixed(s.probability, 3),
             f"{s.chi2_per_observation:.3g}",
             f"{s.dfs:.2f}",
-            f"{s.effective_parameters:.2f}",
             f"{s.nrmse:.4f}",
         )
         for s in comparison.scores
@@ -243,7 +231,6 @@ def comparison_table(comparison: Comparison) -> str:
     if comparison.incomparable:
         verdicts = [comparison.verdict("")]
     notes = [STORED] if any(s.stored for s in comparison.scores) and not comparison.incomparable else []
-    notes += [WITHOUT_WAIC] if any(np.isnan(s.effective_parameters) for s in comparison.scores) else []
     return "\n".join([table([header, *rows]), *notes, "", *verdicts, *_warned(comparison.cautions)])
 
 
@@ -353,7 +340,7 @@ def _stated(o: Observations) -> dict[str, Array]:
 
 
 def _score(run: str, dataset: str, result: StoredResult) -> ModelScore:
-    stats, likelihood = result.groups["/sample_stats"].attrs, result.log_likelihood
+    stats = result.groups["/sample_stats"].attrs
     return ModelScore(
         run,
         dataset,
@@ -362,7 +349,6 @@ def _score(run: str, dataset: str, result: StoredResult) -> ModelScore:
         probability=float("nan"),
         chi2_per_observation=float(stats["chi2_per_observation"]),
         dfs=float(stats["dfs"]),
-        effective_parameters=_effective(likelihood[result.alive], len(result.parameters)),
         nrmse=float(stats["nrmse"]),
         warnings=" ".join(codes(result.cautions)),
         doubted=" ".join(codes(c for c in result.cautions if c.spoils)),
@@ -375,21 +361,14 @@ def _resampled(score: ModelScore, sampled: Mapping[str, float]) -> ModelScore:
     return replace(score, log_evidence=sampled[score.dataset], stored=False)
 
 
-def _effective(likelihood: Array, n_parameters: int) -> float:
-    """p_WAIC from log-likelihoods (N', K) of the members."""
-    parameters = float(np.sum(np.var(likelihood, axis=0, ddof=1)))
-    return parameters if parameters <= MEANINGLESS * n_parameters else float("nan")
-
-
 def _total(scores: Sequence[ModelScore]) -> ModelScore:
-    """Of one run: sums of evidence, DFS and effective parameters; means of the measures of fit."""
+    """Of one run: sums of evidence and DFS; means of the measures of fit."""
     return replace(
         scores[0],
         dataset=ALL,
         log_evidence=sum(s.log_evidence for s in scores),
         chi2_per_observation=float(np.mean([s.chi2_per_observation for s in scores])),
         dfs=sum(s.dfs for s in scores),
-        effective_parameters=sum(s.effective_parameters for s in scores),
         nrmse=float(np.mean([s.nrmse for s in scores])),
         warnings=_joined(s.warnings for s in scores),
         doubted=_joined(s.doubted for s in scores),

@@ -92,12 +92,6 @@ class StoredResult:
         """(N,) the members that survived the posterior forecast."""
         return np.asarray(self.groups["/sample_stats"]["active"].values.ravel(), dtype=bool)
 
-    @property
-    def log_likelihood(self) -> Array:
-        """(N, K) of every member and reading, one series after the other."""
-        held = self.groups["/log_likelihood"]
-        return np.concatenate([held[axis.name].values[0] for axis in self.axes], axis=-1)
-
     def of_readings(self, group: str, name: str, shared: bool = False) -> Array:
         """(…, K) of all readings, one series after the other: the variables ``<series>_<name>``, or of a single series
         ``name`` where that is ``shared``, as ``weights`` are."""
