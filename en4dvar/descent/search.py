@@ -162,9 +162,10 @@ class Search:
         return descent_at(self.space, x, number)
 
     def rest(self, outcome: Outcome) -> list[int]:
-        """The members for which a descent can be afforded and that were not tried."""
-        known = (*outcome.tried, *range(self.last * (self.last in outcome.tried)))
-        return [i for i in affordable(self.space, self.scheme, self.run) if i not in known]
+        """The members for which a descent can be afforded and that were not tried; none once the search is over."""
+        if self.last in outcome.tried:
+            return []
+        return [i for i in affordable(self.space, self.scheme, self.run) if i not in outcome.tried]
 
     def round(self, outcome: Outcome, members: Sequence[int]) -> Outcome:
         """After descents from these members side by side; nothing is run again of a round that is over."""
