@@ -21,15 +21,14 @@ from en4dvar.ensemble.forecast import Forecast
 from en4dvar.model.state import Array
 from en4dvar.priors.prior import Prior
 from en4dvar.sampling.emulated_cost import EmulatedCost, ModelRuns, fitted_cost, needed_runs
-from en4dvar.sampling.importance import ClosingDraws, FixedDraws
-from en4dvar.sampling.mixture import StudentMixture, resampled
+from en4dvar.sampling.mixture import StudentMixture, effective_number, resampled
 from en4dvar.sampling.walkers import advance
 
 NEAR = 3.0  # n τ above the lowest J: runs up to there are fitted
-COUNT, CLOSING = 2000, 5  # draws of a round, rounds that close in, on the emulator
-ROUNDS = 20  # more, at most
-WALKERS, MOVES = 600, 30  # they start from the draws, and move about where they were so many moves before,
-TURNS = 3  # so often: the tails that the mixture misses are found, and from fit to fit they go on
+WALKERS, MOVES = 800, 25  # they are drawn by their weights, and move about where they were so many moves before;
+RENEWED, PARTS = 25, 8  # so many draws of a mixture of so many parts may then replace each of them;
+FIRST_TURNS, TURNS = 8, 2  # both so often
+HALF = 0.5  # of the walkers stay effective from a density to the next
 LARGEST = 2000  # outputs of a run beyond which emulating them costs more than it is worth
 
 
@@ -72,71 +71,94 @@ class RecordedRuns:
 
 @dataclass(frozen=True)
 class EmulatedProposal:
-    """exp(−Ĵ/τ), normalised, in the coordinates z in which the prior is N(0, 1).
+    """exp(−Ĵ/τ), normalised by exp(``log``), in the coordinates z in which the prior is N(0, 1).
 
-    ``pool``: weighted draws of it, from ``mixture``, which tell its norm; ``walkers`` (W, n) that sample it.
+    ``walkers`` (W, n) sample it. From a ``mixture`` to the first proposal, and from proposal to proposal, they are
+    drawn by the ratio of both densities, in steps that leave half of them effective, and move in each (Del Moral,
+    Doucet & Jasra 2006, J. R. Stat. Soc. B 68, 411).
     """
 
-    emulated: EmulatedCost
-    heat: float
+    cost: Callable[[Array], Array]
     mixture: StudentMixture
-    pool: FixedDraws
     walkers: Array
+    log: float
 
     @classmethod
     def fitted(
-        cls, runs: RecordedRuns, start: "StudentMixture | EmulatedProposal", stream: np.random.Generator, heat: float,
-        enough: float,
-    ) -> "EmulatedProposal | None":  # fmt: skip
-        """Fitted to the runs so far, with so many effective draws; ``start`` is a mixture about them, or the proposal
-        before, whose walkers go on. None where runs are too few.
+        cls, runs: RecordedRuns, start: "StudentMixture | EmulatedProposal", stream: np.random.Generator, heat: float
+    ) -> "EmulatedProposal | None":
+        """Fitted to the runs so far; ``start`` is a mixture about them, or the proposal before. None where runs are too
+        few.
         """
         emulated = runs.emulated(heat)
         if emulated is None:
             return None
 
-        def add(sampler: ClosingDraws | FixedDraws) -> None:
-            z = sampler.draw()
-            sampler.add(z, 0.5 * np.sum(z**2, axis=1) - _white(emulated, z) / heat)
+        def cost(z: Array) -> Array:
+            return _white(emulated, z) / heat
 
-        closing = ClosingDraws(start if isinstance(start, StudentMixture) else start.mixture, stream, COUNT, wider=1.3)
-        for _ in range(CLOSING):
-            add(closing)
-        mixture = closing.next_proposal()
-        pool = FixedDraws(mixture, stream, COUNT)
-        for _ in range(ROUNDS):
-            add(pool)
-            if pool.effective >= enough:
-                break
-        if not np.isfinite(pool.log):
-            return None
-        walkers = pool.z[resampled(pool.shares, WALKERS, stream)]
-        if not isinstance(start, StudentMixture):
-            walkers[::2] = start.walkers[::2]
-        made = cls(emulated, heat, mixture, pool, walkers)
-        for _ in range(TURNS):
-            made = replace(made, walkers=made.moved(made.walkers, stream))
+        if isinstance(start, StudentMixture):
+            made, turns = cls.of_mixture(start, stream).bridged(cost, stream), FIRST_TURNS
+        else:
+            made, turns = start.bridged(cost, stream), TURNS
+        for _ in range(turns):
+            made = made.settled(stream)
         return made
 
-    def moved(self, z: Array, stream: np.random.Generator) -> Array:
-        """Walkers (W, n) after moves about those of the proposal."""
-        return advance(self._cost, z, self._cost(z), self.walkers, stream, MOVES)[0]
+    @classmethod
+    def of_mixture(cls, mixture: StudentMixture, stream: np.random.Generator) -> "EmulatedProposal":
+        """The density of a mixture, with draws of it."""
+        return cls(lambda z: -mixture.log_density(z), mixture, mixture.draw(WALKERS, stream), 0.0)
+
+    def bridged(self, cost: Callable[[Array], Array], stream: np.random.Generator) -> "EmulatedProposal":
+        """The proposal exp(−``cost``), from this one."""
+        at, z = 0.0, self.walkers
+        while at < 1.0:
+            change = self.cost(z) - cost(z)
+            change, step = change - change.max(), 1.0 - at
+            while effective_number(np.exp(step * change)) < HALF * WALKERS and step > 1e-3:
+                step *= 0.8
+            at = at + step if at + step < 1.0 - 1e-9 else 1.0
+            shares = np.exp(step * change)
+            z = z[resampled(shares / shares.sum(), WALKERS, stream)]
+            z = _moved(cost if at == 1.0 else _between(self.cost, cost, at), z, z, stream)
+        return replace(self, cost=cost, walkers=z)
+
+    def settled(self, stream: np.random.Generator) -> "EmulatedProposal":
+        """After moves of the walkers, and with draws of a mixture about them in the place of those that their weights
+        say: small moves do not take them from end to end of a thin valley (iterated sampling importance resampling:
+        Andrieu, Lee & Vihola 2018, Bernoulli 24, 842).
+        """
+        z = _moved(self.cost, self.walkers, self.walkers, stream)
+        mixture = StudentMixture.fitted(z, stream, PARTS)
+        tried = np.concatenate([z, mixture.draw(RENEWED * WALKERS, stream)])
+        logs = (-self.cost(tried) - mixture.log_density(tried)).reshape(1 + RENEWED, WALKERS)
+        best = np.argmax(logs + stream.gumbel(size=logs.shape), axis=0)
+        log = float(np.logaddexp.reduce(logs[1:], axis=None)) - np.log(RENEWED * WALKERS)
+        walkers = tried.reshape(1 + RENEWED, WALKERS, -1)[best, np.arange(WALKERS)]
+        return replace(self, mixture=mixture, walkers=walkers, log=log)
 
     @property
     def dimensions(self) -> int:
         """n."""
-        return self.pool.z.shape[1]
+        return int(self.walkers.shape[1])
 
     def draw(self, count: int, stream: np.random.Generator) -> Array:
         """(count, n)."""
-        return self.moved(self.walkers[stream.permutation(WALKERS)[:count]], stream)
+        return _moved(self.cost, self.walkers[stream.permutation(WALKERS)[:count]], self.walkers, stream)
 
     def log_density(self, x: Array) -> Array:
         """(B,) at points (B, n)."""
-        return np.asarray(-self._cost(x) - 0.5 * x.shape[1] * np.log(2 * np.pi) - self.pool.log)
+        return np.asarray(-self.cost(x) - self.log)
 
-    def _cost(self, z: Array) -> Array:
-        return _white(self.emulated, z) / self.heat
+
+def _between(first: Callable[[Array], Array], last: Callable[[Array], Array], at: float) -> Callable[[Array], Array]:
+    return lambda z: (1 - at) * first(z) + at * last(z)
+
+
+def _moved(cost: Callable[[Array], Array], z: Array, others: Array, stream: np.random.Generator) -> Array:
+    """Walkers (B, n) after moves about ``others`` (W, n) on exp(−``cost``)."""
+    return advance(cost, z, cost(z), others, stream, MOVES)[0]
 
 
 def _white(emulated: EmulatedCost, z: Array) -> Array:

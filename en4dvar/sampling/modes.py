@@ -24,7 +24,6 @@ HEATS = (8.0, 4.0, 2.0, 1.5)  # of the rounds that train an emulator
 LAST_HEAT = 1.15  # of those that judge it: draws reach a little beyond what it says
 TRIED = 4  # such rounds, at most, and
 GOOD = 0.25  # the effective share of one that ends them
-TRAINING, POOL = 400.0, 1500.0  # effective draws of the emulated posterior behind a round that trains, and at last
 ENOUGH, MOST_RUNS = 1500.0, 8.0  # effective draws that end the rounds, and runs for each of them
 LAST_RUNS = 30.0  # for each, as long as too few are effective
 CLOSING = (2, 3, 6)  # rounds in which proposals close in, at least: two, and one for three directions, up to six
@@ -149,7 +148,7 @@ def _guided(
     start: StudentMixture | EmulatedProposal = mixture
     share = 0.0
     for heat in (*HEATS, *(LAST_HEAT,) * TRIED):
-        proposal = EmulatedProposal.fitted(runs, start, mixed.stream, heat, TRAINING)
+        proposal = EmulatedProposal.fitted(runs, start, mixed.stream, heat)
         if proposal is None:
             return mixed, mixture, True
         sampler = FixedDraws(proposal, mixed.stream, DRAWS)
@@ -158,7 +157,7 @@ def _guided(
         start, share = proposal, sampler.effective / DRAWS
         if heat == LAST_HEAT and share >= GOOD:
             break
-    final = EmulatedProposal.fitted(runs, start, mixed.stream, LAST_HEAT, POOL)
+    final = EmulatedProposal.fitted(runs, start, mixed.stream, LAST_HEAT)
     if final is None or share * len(mixed.z) < mixed.effective:
         return mixed, mixture, True
     sampler = FixedDraws(final, mixed.stream, DRAWS)

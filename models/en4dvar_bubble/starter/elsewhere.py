@@ -27,6 +27,10 @@ SLOW = 1.08
 """Of the Rayleigh time: a collapse in a liquid that takes longer may have a wall nearby."""
 
 
+WALLS = 8.0, 200.0
+"""Median of a wall's distance, in R_max, and the largest, where a collapse takes 0.1 % longer."""
+
+
 @dataclass(frozen=True)
 class Known:
     """A quantity as it stands in a configuration: its key, median with unit, std of its logarithm, and the source."""
@@ -82,13 +86,14 @@ def of_water(radius: float) -> dict[str, tuple[str, str]]:
 
 
 def wall(radius: float, slowness: float) -> tuple[str, str, str]:
-    """The distance of a plane that makes the collapse of a bubble of ``radius`` (m) take ``slowness`` times as long,
-    1 + 0.205 R_max/h (Rattray 1951), its prior, from where the bubble touches it to where nothing is seen of it, and
-    the source. Such a liquid may be viscous instead: the prior is wide.
+    """The distance of a plane beside a bubble of ``radius`` (m) whose collapse takes ``slowness`` times Rayleigh's, its
+    prior and the source. Such a liquid may be viscous instead, and the plane, which makes it 1 + 0.205 R_max/h
+    (Rattray 1951), as far as a cuvette is wide: the prior is nearly flat in ln h, from where the bubble touches the
+    plane to where nothing is seen of it.
     """
-    nearest, middle, farthest = (1e6 * radius * of_it for of_it in (1.1, max(1.5, 0.205 / (slowness - 1)), 20))
-    distance = f"{float(f'{middle:.2g}'):g} um"
-    prior = f"{{prior: logit, lower: {nearest:.4g} um, upper: {farthest:.4g} um, median: {distance}, logit_std: 1.5}}"
+    nearest, median, farthest = (1e6 * radius * of_it for of_it in (1.1, *WALLS))
+    distance = f"{float(f'{median:.2g}'):g} um"
+    prior = f"{{prior: logit, lower: {nearest:.4g} um, upper: {farthest:.4g} um, median: {distance}, logit_std: 2}}"
     source = f"the collapse takes {slowness:.2f} of the Rayleigh time, as beside a plane or in a viscous liquid"
     return distance, prior, source
 
