@@ -4,7 +4,7 @@
 
 Synthetic laser bubbles of one gel about 8 kPa and 0.1 Pa s, whose G and μ differ by ``--spread``; its density, pressure
 and pixel are off by draws of what ``init`` knows of them. Each is filmed at 270 kHz with errors of 0.5 % of R_max and
-becomes a file. What ``init`` proposes of the twelve is run as it is but for a polytropic gas, in truth and fit, which
+becomes a file. What ``init`` proposes of the twelve is run as it is but for an isothermal gas, in truth and fit, which
 costs a twentieth. The first bubble is as it is (``clean``), of four times the modulus, of a gel that stiffens (α 0.5),
 of another gel (soft polyacrylamide), its radii (``scale``) or its times (``clock``) 8 % too large. Each is estimated
 once, and the populations with each as the first of the twelve are made of them as ``run`` makes them.
@@ -31,8 +31,8 @@ from en4dvar.estimation.population.campaign import population_from, sampled_sets
 from en4dvar.runs.finished import finished
 
 KINDS = ("clean", "gel", "law", "other", "scale", "clock")
-QUICK = {"gas": "polytropic", "vapour": "none", "medium_heat": "cold", "vapour_pressure": "saturated"}
-ALONE = {"members": 24, "refine": "none", "emulator": "off", "what_if": False}  # a start; the population samples
+QUICK = {"gas": "isothermal", "vapour": "none", "medium_heat": "cold", "vapour_pressure": "saturated"}
+ALONE = {"refine": "none", "emulator": "off", "what_if": False}  # a start; the population samples
 NEO, STIFFENING = Wrong(), Wrong(law="quadratic-kelvin-voigt", of_law={"alpha": lambda truth: 0.5})
 OFF, OTHER = 1.08, {"G": 2.1 / 7.7, "mu": 0.118 / 0.101}  # soft over stiff polyacrylamide (Estrada et al. 2018)
 GEL, OF_GEL = {"G": 8e3, "mu": 0.1}, 0.3  # and how far the gels of campaigns differ, ln
