@@ -117,5 +117,7 @@ def test_a_slow_collapse_in_a_liquid_proposes_a_wall_that_may_be_near_or_far(wal
         for distance in (450, 20 * 200):  # where it is, and where nearly nothing is seen of it
             odds = logit((distance - lower) / (upper - lower)) - logit((median - lower) / (upper - lower))
             assert abs(odds) < 1.645 * prior["logit_std"]
+    viscous = path(wall, values=WATER | {"mu": 0.5}, times=3 * times)
+    assert "wall" not in {entry.key for entry in propose({"bubble": (3 * times, viscous)}, "laser", "newtonian").model}
     in_gel = propose({"bubble": (times, R)}, "laser", "neo-hookean-kelvin-voigt")
     assert "wall" not in {entry.key for entry in in_gel.model}

@@ -23,8 +23,9 @@ ANY = "gel"
 CHOICES = (ANY, *MEDIA)
 """Media that may be named; the first stands for any gel or solution that is mostly water."""
 
-SLOW = 1.08
-"""Of the Rayleigh time: a collapse in a liquid that takes longer may have a wall nearby."""
+SLOW = 1.08, 1.3
+"""Of the Rayleigh time: a collapse in a liquid that takes longer may have a wall nearby, and where it takes longer than
+the second, the liquid is viscous: a wall at 1.1 R_max makes it 1.19."""
 
 
 WALLS = 8.0, 200.0

@@ -135,7 +135,8 @@ def propose(
             + ("is the driving that of your experiment?" if chosen == "acoustic" else "are scale and frame rate right?")
         )
     wall: tuple[tuple[Entry, ...], tuple[Entry, ...]] = (), ()
-    if chosen == "laser" and ratio > elsewhere.SLOW and "G" not in {p.name for p in model.law.parameters}:
+    slow = elsewhere.SLOW[0] < ratio < elsewhere.SLOW[1]
+    if chosen == "laser" and slow and "G" not in {p.name for p in model.law.parameters}:
         distance, prior, source = elsewhere.wall(look.lobe.R_max, ratio)
         wall = (Entry("wall", f"{{distance: {distance}}}", source),), (Entry("wall_distance", prior, "of that plane"),)
     together = elsewhere.population([p.name for p in model.law.parameters], len(views), medium, groups)
