@@ -1,6 +1,5 @@
 """Draws of a posterior that is a thin bent valley, whose moments and evidence one integral tells."""
 
-
 import numpy as np
 import pytest
 
