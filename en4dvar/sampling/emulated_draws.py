@@ -25,9 +25,9 @@ from en4dvar.sampling.mixture import StudentMixture, effective_number, resampled
 from en4dvar.sampling.walkers import advance
 
 NEAR = 3.0  # n τ above the lowest J: runs up to there are fitted
-WALKERS, MOVES = 800, 25  # they are drawn by their weights, and move about where they were so many moves before;
+WALKERS, MOVES = 600, 20  # they are drawn by their weights, and move about where they were so many moves before;
 RENEWED, PARTS = 25, 8  # so many draws of a mixture of so many parts may then replace each of them;
-FIRST_TURNS, TURNS = 8, 2  # both so often
+FIRST_TURNS, TURNS = 10, 3  # both so often
 HALF = 0.5  # of the walkers stay effective from a density to the next
 LARGEST = 2000  # outputs of a run beyond which emulating them costs more than it is worth
 
