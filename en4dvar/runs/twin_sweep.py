@@ -22,6 +22,7 @@ from en4dvar.plumbing.errors import ConfigError, En4dvarError
 from en4dvar.plumbing.files import readable, write_text
 from en4dvar.plumbing.tables import csv_text, table
 from en4dvar.report.chart import POINTS, Chart, Panel, Row
+from en4dvar.report.svg import on_paper
 from en4dvar.results.checkpoint import FOLDER, digest, write_checkpoint
 from en4dvar.results.fingerprint import identity
 from en4dvar.runs.engine import conduct_run
@@ -86,8 +87,6 @@ class TwinSweep:
 
     def plot(self) -> Figure:
         """RMSE of each estimate, with its standard error, over the settings."""
-        from en4dvar.report.paper import on_paper  # matplotlib takes time to import
-
         names = [", ".join(map(_text, values)) for values in self.values]
         panel = Panel(", ".join(self.keys), "RMSE", xticks=range(len(names)), names=names, legend=True)
         for estimate, colour in zip(dict.fromkeys(row["estimate"] for row in self.rows), COLOURS, strict=False):

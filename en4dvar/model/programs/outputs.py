@@ -21,6 +21,7 @@ from en4dvar.plumbing.errors import DataError
 from en4dvar.plumbing.files import read_text
 from en4dvar.plumbing.hints import listed, short
 from en4dvar.plumbing.patterns import LONGEST, matches, text_of
+from en4dvar.plumbing.tables import is_number
 
 COMMENT = ("#", "%", "//")
 
@@ -48,24 +49,17 @@ class ProgramOutput:
     def read(self, folder: Path, times: Array, seconds: float | None = None) -> Array:
         """The values at ``times`` (K,); a pattern may take ``seconds``. Raises :class:`ProgramError`."""
         if self.pattern is not None:
-            values, text = _numbers(_found(folder, self.file, self.pattern, seconds), self.file), ""
+            values = _numbers(_found(folder, self.file, self.pattern, seconds), self.file)
+        elif self.instructions:
+            values = self._instructed(folder, self.instructions)
         else:
-            text = "" if self.instructions else _text(folder, self.file)
-            values = self._instructed(folder, self.instructions) if self.instructions else self._values(text)
-        if self.time is None:
-            if len(values) != len(times):
-                raise ProgramError(
-                    f"{self.file}: {len(values)} values for {len(times)} times; name the column of times"
-                )
-            return values
-        own = _column(text, self.time, self.file) if self.column is not None else _key(text, str(self.time), self.file)
-        return _at(times, own, values, self.file)
-
-    def _values(self, text: str) -> Array:
-        if self.column is not None:
-            return _column(text, self.column, self.file)
-        assert self.key is not None
-        return _key(text, self.key, self.file)
+            text, find = _text(folder, self.file), _key if self.column is None else _column
+            values = find(text, self.key if self.column is None else self.column, self.file)
+            if self.time is not None:
+                return _at(times, find(text, self.time, self.file), values, self.file)
+        if len(values) != len(times):
+            raise ProgramError(f"{self.file}: {len(values)} values for {len(times)} times; name the column of times")
+        return values
 
     def _instructed(self, folder: Path, instructions: Mapping[str, Sequence[Path]]) -> Array:
         values: dict[str, float] = {}
@@ -110,7 +104,7 @@ def _at(times: Array, own: Array, values: Array, file: str) -> Array:
     return np.asarray(np.interp(times, own, values))
 
 
-def _column(text: str, column: str | int, file: str) -> Array:
+def _column(text: str, column: str | int | None, file: str) -> Array:
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith(COMMENT)]
     if not lines:
         raise ProgramError(f"{file}: is empty")
@@ -118,7 +112,7 @@ def _column(text: str, column: str | int, file: str) -> Array:
     rows = list(csv.reader(lines, delimiter=delimiter)) if delimiter in lines[0] else [line.split() for line in lines]
     header = [cell.strip() for cell in rows[0]]
     if isinstance(column, int):
-        at, first = column - 1, 0 if _is_number(header[min(column, len(header)) - 1]) else 1
+        at, first = column - 1, 0 if is_number(header[min(column, len(header)) - 1]) else 1
     elif column in header:
         at, first = header.index(column), 1
     else:
@@ -128,12 +122,12 @@ def _column(text: str, column: str | int, file: str) -> Array:
     return _numbers([row[at] if at < len(row) else "" for row in rows[first:]], file)
 
 
-def _key(text: str, key: str, file: str) -> Array:
+def _key(text: str, key: str | int | None, file: str) -> Array:
     try:
         node: Any = json.loads(text)
     except ValueError as error:
         raise ProgramError(f"{file}: not JSON: {error}") from None
-    for part in key.split("."):
+    for part in str(key).split("."):
         try:
             node = node[int(part)] if isinstance(node, list) else node[part]
         except (KeyError, IndexError, ValueError, TypeError):
@@ -143,15 +137,7 @@ def _key(text: str, key: str, file: str) -> Array:
 
 def _numbers(texts: list[Any], file: str) -> Array:
     """What is no number is NaN, a reading that is missing. Raises :class:`ProgramError` where none is a number."""
-    values = np.array([float(value) if _is_number(value) else math.nan for value in texts])
+    values = np.array([float(value) if is_number(value) else math.nan for value in texts])
     if len(texts) and np.isnan(values).all():
         raise ProgramError(f"{file}: {short(str(texts[0]))!r} is no number")
     return values
-
-
-def _is_number(value: Any) -> bool:
-    try:
-        float(value)
-    except (TypeError, ValueError):
-        return False
-    return True
