@@ -63,6 +63,12 @@ class DesignRow:
     price: float
     failure: str = ""
 
+    @property
+    def evaluated(self) -> Evaluated:
+        """The result of a design without ``failure``."""
+        assert self.result is not None
+        return self.result
+
 
 @dataclass(frozen=True)
 class Asked:
