@@ -45,8 +45,7 @@ def lines_of_workbook(path: Path, asked: str) -> Iterator[Lines]:
     try:
         stored = _rows(path, name, area, formulas=False)
         rows = [(number, _texts(cells)) for number, cells in stored]
-        blank = any(None in cells for _, cells in stored)
-        if blank:
+        if any(None in cells for _, cells in stored):
             _refuse_formulas(path, stored, _rows(path, name, area, formulas=True))
     except (DataError, MemoryError):
         raise
@@ -128,8 +127,8 @@ def _sheet(book: Any, name: str, path: Path) -> ReadOnlyWorksheet:
         return sheets[name]
     used = [sheet for sheet in sheets.values() if any(map(_texts, sheet.iter_rows(values_only=True)))]
     if len(used) != 1:
-        which = f"say which (data.sheet): {listed(sheet.title for sheet in used)}" if used else "none holds anything"
-        raise DataError(f"{path}: {len(used)} sheets hold something; {which}" if used else f"{path}: {which}")
+        which = f"{len(used)} sheets hold something; say which (data.sheet): {listed(sheet.title for sheet in used)}"
+        raise DataError(f"{path}: {which if used else 'none holds anything'}")
     return used[0]
 
 

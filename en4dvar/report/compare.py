@@ -221,17 +221,11 @@ def comparison_table(comparison: Comparison) -> str:
     header = ("data set", "run", "log-evidence", "difference", "probability", "chi2/K", "DFS", "NRMSE")
     rows = [
         (
-            s.dataset,
-            s.run,
-            f"{s.log_evidence:.2f}{' *' * s.stored}",
-            fixed(s.difference, 2),
-            fixed(s.probability, 3),
-            f"{s.chi2_per_observation:.3g}",
-            f"{s.dfs:.2f}",
-            f"{s.nrmse:.4f}",
+            s.dataset, s.run, f"{s.log_evidence:.2f}{' *' * s.stored}", fixed(s.difference, 2),
+            fixed(s.probability, 3), f"{s.chi2_per_observation:.3g}", f"{s.dfs:.2f}", f"{s.nrmse:.4f}",
         )
         for s in comparison.scores
-    ]
+    ]  # fmt: skip
     verdicts = [f"{name}: {comparison.verdict(name)}" for name in comparison.datasets]
     if comparison.incomparable:
         verdicts = [comparison.verdict("")]
@@ -275,15 +269,15 @@ def _panel(estimates: Sequence[ComparedEstimate], runs: Sequence[str]) -> Panel:
     row = estimates[0].summary
     panel = Panel(with_unit(row.symbol, row.unit), yticks=(), left=False, ylim=(0.0, 1.1 + 0.09 * len(runs)))
     for i, run in enumerate(runs):
-        label = figure_text(run)
-        panel.line([], [], _colour(i), label=label)
+        colour = COLOURS[i % len(COLOURS)]
+        panel.line([], [], colour, label=figure_text(run))
         values = _members([e for e in estimates if e.run == run], row.unit)
         if values.size < 2 or np.ptp(values) == 0:
             continue
-        panel.histogram(values, _colour(i), alpha=0.25)
+        panel.histogram(values, colour, alpha=0.25)
         if not any(e.summary.untrusted for e in estimates if e.run == run):
             low, high = member_quantiles(values, (0.05, 0.95))
-            panel.line([low, high], np.full(2, 1.08 + 0.09 * i), _colour(i), 2.0)
+            panel.line([low, high], np.full(2, 1.08 + 0.09 * i), colour, 2.0)
     return panel
 
 
@@ -294,10 +288,6 @@ def _members(estimates: Sequence[ComparedEstimate], unit: str) -> Array:
     except UnitError as error:
         raise OutputError(f"the runs mean different quantities by {estimates[0].summary.name}: {error}") from None
     return np.concatenate(parts) if parts else np.empty(0)
-
-
-def _colour(i: int) -> str:
-    return COLOURS[i % len(COLOURS)]
 
 
 def named(runs: Sequence[str | Path] | Mapping[str, T]) -> Mapping[str, T | Path]:
