@@ -75,10 +75,9 @@ def _found(folder: Path, file: str, pattern: str, seconds: float | None) -> list
     """The matches, by another process: a pattern may take years, in which nothing else of this one would run."""
     allowed = Allowed(min(Allowed.seconds, math.ceil(seconds or Allowed.seconds)), size=LONGEST)
     try:
-        texts: list[str] = decoded_whole(matches, folder / file, pattern, allowed=allowed)
+        return decoded_whole(matches, folder / file, pattern, allowed=allowed)
     except (DataError, DecodeError) as error:
         raise ProgramError(str(error).replace(str(folder / file), file)) from None
-    return texts
 
 
 def _text(folder: Path, file: str) -> str:
