@@ -251,7 +251,7 @@ def _with_sign(
         for d in ((_lit_as(f, level) - level)[~blind] for f in samples)
     ]
     if float(np.median([v for v in votes if abs(v) > 4 * noise] or [-1.0])) > 0:
-        full = _full(samples, level)
+        full = max(float(np.median([np.percentile(f - level, 99.5) for f in samples])), 1.0)
         gain = np.full_like(level, -1.0 / full)
         return Background(level, np.where(blind, np.float32(np.nan), gain), noise / full, empty, relative=False)
     smooth = ndimage.gaussian_filter(level, SMOOTH)
@@ -263,10 +263,6 @@ def _with_sign(
         smooth = np.where(np.abs(sharp / smooth - 1) > STRUCTURE, np.maximum(sharp, DEAD * smooth), smooth)
     gain = np.where(blind, np.nan, 1 / smooth).astype(np.float32)
     return Background(level, gain, noise * float(np.nanmedian(gain)), empty)
-
-
-def _full(samples: Sequence[Frame], level: Array) -> float:
-    return max(float(np.median([np.percentile(f - level, 99.5) for f in samples])), 1.0)
 
 
 def _refined(background: Background, samples: Sequence[Frame]) -> Background:
