@@ -60,10 +60,7 @@ class Agreement:
 
 
 def agreement(joint: JointProblem, singles: Sequence[Single], rest: Collection[int], deviances: Array) -> Agreement:
-    """Of each experiment with those of ``rest``, by the single estimates.
-
-    ``deviances`` (E,): 2 (J_o + J_b of its own quantities) more than alone.
-    """
+    """Of each experiment with those of ``rest``; ``deviances`` (E,): 2 (J_o + J_b of its own) more than alone."""
     said = [_alone(joint, e, single) for e, single in enumerate(singles)]
     squares, freedom = _squares(said, rest)
     scatter, degrees = _scatter(said, rest)
