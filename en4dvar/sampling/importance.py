@@ -21,6 +21,7 @@ import numpy as np
 from en4dvar.model.state import Array
 from en4dvar.sampling.mixture import StudentMixture, effective_number, resampled
 
+NARROWEST = 0.03  # standard deviation of what is drawn about points, in units of the prior
 FEWEST = 60.0  # effective draws that a proposal is fitted to: with fewer, to tempered weights
 COMPONENTS = 4
 FITTED = 2000  # points that few parts are fitted to
@@ -47,6 +48,14 @@ class Proposal(Protocol):
 def standard(n: int) -> StudentMixture:
     """The prior in its own coordinates, with the tails of a proposal."""
     return StudentMixture(np.ones(1), np.zeros((1, n)), np.eye(n)[None])
+
+
+def about(points: Array, of_prior: float) -> StudentMixture:
+    """Student t about points (N, n), in no direction narrower than :data:`NARROWEST`, and a share ``of_prior``."""
+    first, n = standard(points.shape[1]), points.shape[1]
+    covariance = np.cov(points, rowvar=False).reshape(n, n) + NARROWEST**2 * np.eye(n)
+    root = np.concatenate([first.root, np.linalg.cholesky(covariance)[None]])
+    return StudentMixture(np.array([of_prior, 1 - of_prior]), np.vstack([first.centre, points.mean(axis=0)]), root)
 
 
 class Importance:

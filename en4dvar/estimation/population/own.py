@@ -27,8 +27,8 @@ from en4dvar.executor import Executor
 from en4dvar.model.state import Array
 from en4dvar.priors.prior import member_stream, own_seed
 from en4dvar.problem import InverseProblem
-from en4dvar.sampling.importance import Importance, standard
-from en4dvar.sampling.mixture import StudentMixture, fit_gaussians, resampled
+from en4dvar.sampling.importance import Importance, about
+from en4dvar.sampling.mixture import fit_gaussians, resampled
 from en4dvar.sampling.walkers import walked
 
 DRAWS, MOST_ROUNDS = 200, 48  # of a round of importance sampling, and the most rounds
@@ -39,7 +39,6 @@ KEPT = 2000  # equally likely draws of each data set
 WALKERS, WALKED = 80, 16  # and their rounds
 MOST_PARTS, ROUNDS = 4, 60  # components of a mixture; rounds of expectation maximisation
 BESIDE = 1e-3  # prior standard deviations that runs for readings that one lacks are apart
-NARROWEST = 0.03  # standard deviation of what is drawn about the members, in units of the prior
 SMALLEST = 1e-12  # variance that every slope is taken to have
 INFORMED = 0.1  # least share of the prior's variance that the data take away, for a slope to be read from draws
 
@@ -84,7 +83,9 @@ def own_draws(problem: InverseProblem, start: Array, seed: int, executor: Execut
     def cost(z: Array) -> Array:
         return np.asarray(0.5 * np.sum(z**2, axis=1) - log_likelihood(z))
 
-    sampler = Importance(_about(start), member_stream(seed, "population: own draws"), DRAWS, behind_each=BEHIND_EACH)
+    sampler = Importance(
+        about(start, OF_PRIOR), member_stream(seed, "population: own draws"), DRAWS, behind_each=BEHIND_EACH
+    )
     for _ in range(MOST_ROUNDS):
         z = sampler.draw()
         sampler.add(z, log_likelihood(z))
@@ -99,18 +100,6 @@ def own_draws(problem: InverseProblem, start: Array, seed: int, executor: Execut
         )
     walked = _walked(sampler, cost, stream)
     return OwnDraws(walked, sampler.log, max(sampler.effective, float(WALKERS)), composite.forward_runs)
-
-
-def _about(start: Array) -> StudentMixture:
-    """Student t about members (N, n) and, now and then, the prior."""
-    n = start.shape[1]
-    covariance = np.cov(start, rowvar=False).reshape(n, n) + NARROWEST**2 * np.eye(n)
-    wide = standard(n)
-    return StudentMixture(
-        np.array([OF_PRIOR, 1 - OF_PRIOR]),
-        np.vstack([wide.centre, start.mean(axis=0)]),
-        np.concatenate([wide.root, np.linalg.cholesky(covariance)[None]]),
-    )
 
 
 def _walked(sampler: Importance, cost: Callable[[Array], Array], stream: np.random.Generator) -> Array:
