@@ -126,7 +126,8 @@ def _tell(campaign: Campaign, with_report: bool) -> None:
 
 def _tell_what_sets_share(directory: Path, warnings: _Warnings) -> None:
     """The joint estimate and the population of a run on standard output, where there are; their warnings are added."""
-    from en4dvar.results import joint_file, population_file
+    from en4dvar.results import joint_file
+    from en4dvar.results.population_file import populations_of
 
     if (directory / joint_file.FILE).exists():
         from en4dvar.report.joint import joint_table
@@ -135,21 +136,14 @@ def _tell_what_sets_share(directory: Path, warnings: _Warnings) -> None:
         echo(f"\n{joint_table(together)}")
         warnings.joint = True
         warnings.add("all together", together.cautions, whole=True)
-    groups = population_file.load_groups_of(directory)
-    if groups:
+    for n, (name, (_, of)) in enumerate(populations_of(directory).items()):
         from en4dvar.report.groups import group_lines
         from en4dvar.report.population import population_lines
 
-        echo("\n" + "\n".join(group_lines(directory)))
-        for name, (_, of) in groups.items():
-            echo(f"\n{name}\n" + "\n".join(population_lines(of)))
-            warnings.add(f"population of {name}", of.cautions, whole=True)
-    if (directory / population_file.FILE).exists():
-        from en4dvar.report.population import population_lines
-
-        population = population_file.load_population(directory / population_file.FILE)
-        echo("\n" + "\n".join(population_lines(population)))
-        warnings.add("population", population.cautions, whole=True)
+        if name and n == 0:
+            echo("\n" + "\n".join(group_lines(directory)))
+        echo("\n".join(["", *[name] * bool(name), *population_lines(of)]))
+        warnings.add(f"population of {name}" if name else "population", of.cautions, whole=True)
 
 
 class _Warnings:

@@ -254,3 +254,9 @@ def load_groups_of(run_dir: Path) -> dict[str, tuple[Path, StoredPopulation]]:
     folders = sorted((file.parent for file in (run_dir / GROUPS).glob(f"*/{FILE}")), key=natural)
     stored = [(folder, load_population(folder / FILE)) for folder in folders]
     return {str(of.tree.attrs.get("group", folder.name)): (folder, of) for folder, of in stored}
+
+
+def populations_of(run_dir: Path) -> dict[str, tuple[Path, StoredPopulation]]:
+    """As :func:`load_groups_of`, and under the name "" the population of all data sets, where there is one."""
+    whole = {"": (run_dir, load_population(run_dir / FILE))} if (run_dir / FILE).exists() else {}
+    return load_groups_of(run_dir) | whole
