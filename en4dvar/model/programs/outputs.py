@@ -6,8 +6,6 @@ import csv
 import functools
 import json
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +13,7 @@ import numpy as np
 
 from en4dvar.model.programs import pest
 from en4dvar.model.programs.errors import ProgramError
+from en4dvar.model.programs.settings import OutputOf
 from en4dvar.model.state import Array
 from en4dvar.plumbing.decoding import Allowed, DecodeError, decoded_whole
 from en4dvar.plumbing.errors import DataError
@@ -26,49 +25,37 @@ from en4dvar.plumbing.tables import is_number
 COMMENT = ("#", "%", "//")
 
 
-@dataclass(frozen=True)
-class ProgramOutput:
-    """Where the values of one observable are: in ``file`` of the scratch directory, by one of the four ways.
+def read(output: OutputOf, folder: Path, times: Array, seconds: float | None = None) -> Array:
+    """The values at ``times`` (K,) of an observable, in the scratch directory; a pattern may take ``seconds``.
 
-    column: header of a column of text, or its number from 1. key: dotted path into JSON. pattern: regular expression
-    with one group, every match a value. instructions: output file → instruction files of PEST, each of the
-    ``observations``, by default all, a value; ``delimiters`` separate numbers there as blanks do. With ``time``, a
-    column or key of times, values are interpolated linearly at those that are asked for; without it there is one value
-    a time. A value that is missing or no number is NaN, a reading that the run does not give.
+    With a column or key of times, values are interpolated linearly at those that are asked for; without it there is one
+    value a time. A value that is missing or no number is NaN, a reading that the run does not give.
+
+    Raises :class:`ProgramError`.
     """
+    file = output.file
+    if output.pattern is not None:
+        values = _numbers(_found(folder, file, output.pattern, seconds), file)
+    elif output.instructions:
+        values = _instructed(output, folder)
+    else:
+        text, find = _text(folder, file), _key if output.column is None else _column
+        values = find(text, output.key if output.column is None else output.column, file)
+        if output.time is not None:
+            return _at(times, find(text, output.time, file), values, file)
+    if len(values) != len(times):
+        raise ProgramError(f"{file}: {len(values)} values for {len(times)} times; name the column of times")
+    return values
 
-    file: str
-    column: str | int | None = None
-    key: str | None = None
-    pattern: str | None = None
-    instructions: Mapping[str, Sequence[Path]] | None = None
-    time: str | int | None = None
-    observations: tuple[str, ...] | None = None
-    delimiters: str = ""
 
-    def read(self, folder: Path, times: Array, seconds: float | None = None) -> Array:
-        """The values at ``times`` (K,); a pattern may take ``seconds``. Raises :class:`ProgramError`."""
-        if self.pattern is not None:
-            values = _numbers(_found(folder, self.file, self.pattern, seconds), self.file)
-        elif self.instructions:
-            values = self._instructed(folder, self.instructions)
-        else:
-            text, find = _text(folder, self.file), _key if self.column is None else _column
-            values = find(text, self.key if self.column is None else self.column, self.file)
-            if self.time is not None:
-                return _at(times, find(text, self.time, self.file), values, self.file)
-        if len(values) != len(times):
-            raise ProgramError(f"{self.file}: {len(values)} values for {len(times)} times; name the column of times")
-        return values
-
-    def _instructed(self, folder: Path, instructions: Mapping[str, Sequence[Path]]) -> Array:
-        values: dict[str, float] = {}
-        for file, paths in instructions.items():
-            text = _text(folder, file)
-            for path in paths:
-                values |= pest.read(_instructions(path), text, file, path.name, self.delimiters)
-        names = list(values) if self.observations is None else [name.lower() for name in self.observations]
-        return np.array([values[name] for name in names])
+def _instructed(output: OutputOf, folder: Path) -> Array:
+    values: dict[str, float] = {}
+    for file, paths in output.instruction_files.items():
+        text = _text(folder, file)
+        for path in paths:
+            values |= pest.read(_instructions(path), text, file, path.name, output.delimiters)
+    names = list(values) if output.observations is None else [name.lower() for name in output.observations]
+    return np.array([values[name] for name in names])
 
 
 def _found(folder: Path, file: str, pattern: str, seconds: float | None) -> list[str]:
