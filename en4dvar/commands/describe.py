@@ -24,8 +24,10 @@ def problem_summary(config: Config, problems: Sequence[InverseProblem]) -> str:
     """The lines that ``validate`` prints: data sets, priors (centre and 5–95 %), fixed values, scheme."""
     first = problems[0]
     settings, rows = config.assimilation, [row for problem in problems for row in _data_rows(problem)]
+    cells = sum(prior.field.size for prior in first.fields)
+    and_cells = f" and {cells} cells of fields" if cells else ""
     parts = [
-        f"{config.name}: {len(first.prior.names)} parameters{_and_cells(first)} from {len(problems)} data set(s) with "
+        f"{config.name}: {len(first.prior.names)} parameters{and_cells} from {len(problems)} data set(s) with "
         f"{settings.scheme}, {settings.members} members, weights {config.weights}, seed {config.seed}",
         table([("data set", "observations", "window", "maximum", "error std"), *rows]),
     ]
@@ -70,11 +72,6 @@ def _field_row(prior: FieldPrior) -> tuple[str, ...]:
     std = f"{100 * prior.std:g} %" if prior.relative else f"{prior.std:g} {prior.field.unit}"
     kernel = f"{prior.kernel}, length {prior.length:g} {prior.field.coordinate_unit}"
     return prior.field.name, str(prior.field.size), std, kernel
-
-
-def _and_cells(problem: InverseProblem) -> str:
-    cells = sum(prior.field.size for prior in problem.fields)
-    return f" and {cells} cells of fields" if cells else ""
 
 
 def cost_summary(config: Config, preview: Preview, count: int) -> str:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from en4dvar.commands.common import parted
 from en4dvar.commands.plugin_commands import first_sentence
 from en4dvar.plumbing.errors import En4dvarError
 
@@ -54,15 +55,8 @@ def asked(options: Mapping[str, Any]) -> dict[str, tuple[Path, dict[str, str]]]:
         if texts and out is None:
             raise click.UsageError(f"--{name}-set needs --{name} FILE")
         if out is not None:
-            answers[name] = out, dict(_setting(name, text) for text in texts)
+            answers[name] = out, {key: value.strip() for key, value in parted(texts, f"--{name}-set").items()}
     return answers
-
-
-def _setting(name: str, text: str) -> tuple[str, str]:
-    key, equals, value = text.partition("=")
-    if not equals:
-        raise click.BadParameter(f"{text!r} is not KEY=VALUE", param_hint=f"--{name}-set")
-    return key.strip(), value.strip()
 
 
 def write_form(

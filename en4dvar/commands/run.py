@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import chdir
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from en4dvar.config import Config, SequenceConfig, TwinConfig
     from en4dvar.plumbing.caution import Caution
     from en4dvar.runs.campaign import Campaign
-    from en4dvar.series.problem import SeriesResult
-    from en4dvar.series.twin import TwinResult
 
 MOST_TOLD = 30  # data sets and failures on the terminal; all of them are in the run directory
 MOST_NAMED = 3  # data sets of a warning
@@ -56,7 +54,7 @@ def run(
     Example:
       en4dvar run configs/quickstart.yaml --out runs/first --set assimilation.members=96
     """
-    from en4dvar.config import Config, TwinConfig, load_any
+    from en4dvar.config import Config, load_any
 
     special = {
         "output.directory": str(out) if out else None,
@@ -74,8 +72,6 @@ def run(
         raise click.UsageError(
             "--scheduler cannot be used for a series: its cycles are too short to be sent to other machines"
         )
-    elif isinstance(config, TwinConfig):
-        _conduct(config, force, resume)
     else:
         _follow(config, force, resume)
 
@@ -126,7 +122,8 @@ def _tell(campaign: Campaign, with_report: bool) -> None:
 
 def _tell_what_sets_share(directory: Path, warnings: _Warnings) -> None:
     """The joint estimate and the population of a run on standard output, where there are; their warnings are added."""
-    from en4dvar.results import joint_file, population_file
+    from en4dvar.results import joint_file
+    from en4dvar.results.population_file import populations_of
 
     if (directory / joint_file.FILE).exists():
         from en4dvar.report.joint import joint_table
@@ -135,21 +132,14 @@ def _tell_what_sets_share(directory: Path, warnings: _Warnings) -> None:
         echo(f"\n{joint_table(together)}")
         warnings.joint = True
         warnings.add("all together", together.cautions, whole=True)
-    groups = population_file.load_groups_of(directory)
-    if groups:
+    for n, (name, (_, of)) in enumerate(populations_of(directory).items()):
         from en4dvar.report.groups import group_lines
         from en4dvar.report.population import population_lines
 
-        echo("\n" + "\n".join(group_lines(directory)))
-        for name, (_, of) in groups.items():
-            echo(f"\n{name}\n" + "\n".join(population_lines(of)))
-            warnings.add(f"population of {name}", of.cautions, whole=True)
-    if (directory / population_file.FILE).exists():
-        from en4dvar.report.population import population_lines
-
-        population = population_file.load_population(directory / population_file.FILE)
-        echo("\n" + "\n".join(population_lines(population)))
-        warnings.add("population", population.cautions, whole=True)
+        if name and n == 0:
+            echo("\n" + "\n".join(group_lines(directory)))
+        echo("\n".join(["", *[name] * bool(name), *population_lines(of)]))
+        warnings.add(f"population of {name}" if name else "population", of.cautions, whole=True)
 
 
 class _Warnings:
@@ -202,38 +192,27 @@ class _Warnings:
             yield "what was found in each of them: run.log and the report"
 
 
-def _conduct(config: TwinConfig, force: bool, resume: bool) -> None:
-    from en4dvar.report.outcomes import scores_table
+def _follow(config: TwinConfig | SequenceConfig, force: bool, resume: bool) -> None:
+    """Cycles, their table on standard output, warnings on standard error, and where the files are."""
+    from en4dvar.config import TwinConfig
+    from en4dvar.report.outcomes import estimates_table, scores_table
     from en4dvar.runs.progress import cycle_progress
-    from en4dvar.runs.twin_run import run_twin
+    from en4dvar.runs.sequence_run import SequenceKind, run_sequence
+    from en4dvar.runs.twin_run import TwinKind, run_twin
 
-    with continuable(), cycle_progress(config.experiment.cycles) as on_cycle:
-        result = run_twin(config, force=force, resume=resume, on_cycle=on_cycle, command=command_line())
-    echo(scores_table(result))
-    _tell_series(config, "twin.nc", config.experiment.members, result)
-
-
-def _follow(config: SequenceConfig, force: bool, resume: bool) -> None:
-    from en4dvar.assembly.build_sequence import build_sequence
-    from en4dvar.report.outcomes import estimates_table
-    from en4dvar.runs.progress import cycle_progress
-    from en4dvar.runs.sequence_run import run_sequence
-
-    with continuable(), cycle_progress(len(build_sequence(config).series.times)) as on_cycle:
-        result = run_sequence(config, force=force, resume=resume, on_cycle=on_cycle, command=command_line())
-    echo(estimates_table(result))
-    _tell_series(config, "sequence.nc", config.assimilation.members, result)
-
-
-def _tell_series(
-    config: TwinConfig | SequenceConfig, file: str, members: int, result: TwinResult | SeriesResult
-) -> None:
-    """Warnings on standard error, and where the files are."""
+    if isinstance(config, TwinConfig):
+        own: Any = TwinKind(config), run_twin, scores_table, config.experiment.members
+    else:
+        own = SequenceKind(config), run_sequence, estimates_table, config.assimilation.members
+    kind, conduct, table, members = own
+    with continuable(), cycle_progress(kind.cycles) as on_cycle:
+        result = conduct(config, force=force, resume=resume, on_cycle=on_cycle, command=command_line())
+    echo(table(result))
     if result.run.failures:
         lost = f"{len(result.run.failures)} of {members} members lost"
         echo(f"warning: {config.name}: {lost}, the last: {result.run.failures[-1]}", err=True)
     for warning in result.warnings:
         echo(f"warning: {config.name}: {warning}", err=True)
-    echo(f"result: {config.directory / file}")
+    echo(f"result: {config.directory / kind.result}")
     if config.report:
         echo(f"report: {config.directory / 'report.html'}")

@@ -54,7 +54,11 @@ def validate(source: Source, plot: bool) -> None:
 
     problems = build(loaded)
     echo(problem_summary(loaded, problems))
-    chosen = problems[: _panels()] if plot else problems[:1]
+    chosen = problems[:1]
+    if plot:
+        from en4dvar.report.predictive import PANELS
+
+        chosen = problems[:PANELS]
     seeds = [own_seed(loaded.seed, problem.observations.name) for problem in chosen]
     previews = [preview(p, loaded.assimilation, seed, whole=plot) for p, seed in zip(chosen, seeds, strict=True)]
     echo(cost_summary(loaded, previews[0], len(problems)))
@@ -62,12 +66,6 @@ def validate(source: Source, plot: bool) -> None:
         _warn(shown)
     if plot:
         echo(f"prior predictive: {_draw(loaded, previews, problems)}")
-
-
-def _panels() -> int:
-    from en4dvar.report.predictive import PANELS
-
-    return PANELS
 
 
 def _warn(preview: Preview) -> None:

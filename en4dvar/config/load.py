@@ -157,6 +157,7 @@ def resolve(document: Document, base: Path, model: ForwardModel | None = None) -
     parameters, blocks = resolved(file.parameters, file.prior, file.prior_correlation or (), others, apart, document)
     if file.population is not None:
         check_population(file.population, parameters, file.groups or {}, document)
+    several = isinstance(file.data, DataPlan) and not file.data.alone
     settings = file.assimilation.settings
     minimiser = settings.own.minimiser
     if minimiser and isinstance(minimiser.start, GivenStart):
@@ -171,17 +172,13 @@ def resolve(document: Document, base: Path, model: ForwardModel | None = None) -
         weights=file.assimilation.weights,
         execution=file.execution,
         simulate_times=file.simulate.times if file.simulate else None,
-        sharing=sharing_of(parameters, file.groups or {}, bool(blocks), _of_several_series(file.data), document),
+        sharing=sharing_of(parameters, file.groups or {}, bool(blocks), several, document),
         initial_state=file.initial_state or (),
         model_error=file.model_error or (),
         dependence=blocks,
         design=file.design or Design(),
         population=file.population,
     )
-
-
-def _of_several_series(data: Data | DataPlan | None) -> bool:
-    return isinstance(data, DataPlan) and not data.alone
 
 
 def observed_in(data: Data | DataPlan | None, read: "Read[Any]") -> Observable:

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from en4dvar.data.noise import DiscrepancyNoise, Linearisation, Predicted
 from en4dvar.descent.weight_space import WeightSpace
+from en4dvar.ensemble.linalg import with_moments
 from en4dvar.model.state import NOISE_SCALE, Array
 from en4dvar.priors.prior import member_stream
 
@@ -130,6 +131,4 @@ def _with_moments(
     mean = weights @ centres
     target = (weights[:, None] * (centres - mean)).T @ (centres - mean)
     target[np.ix_(~of_errors, ~of_errors)] += np.einsum("d,dij->ij", weights, covariances)
-    anomalies = members - members.mean(axis=0)
-    own = np.linalg.cholesky(np.atleast_2d(np.cov(members.T)))
-    return np.asarray(mean + np.linalg.solve(own, anomalies.T).T @ np.linalg.cholesky(target).T)
+    return with_moments(members, mean, target)

@@ -43,8 +43,7 @@ def spread(members: Array, prior_variance: Array) -> Array:
     n_members, n = members.shape[-2:]
     anomalies = members - np.add.reduce(members, axis=-2, keepdims=True) / n_members
     variance = np.einsum("...ij,...ij->...j", anomalies, anomalies) / n_members
-    ratio: Array = np.sqrt(np.add.reduce(variance / prior_variance, axis=-1) / n)
-    return ratio
+    return np.asarray(np.sqrt(np.add.reduce(variance / prior_variance, axis=-1) / n))
 
 
 def nrmse(values: Array, predictions: Array) -> float:

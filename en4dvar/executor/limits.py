@@ -19,8 +19,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from en4dvar.plumbing.children import ThreadAlarm, limit_memory
 from en4dvar.plumbing.children import TimeLimitError as TimeLimitError
+from en4dvar.plumbing.children import limit_memory, within
 
 T = TypeVar("T")
 _UNITS = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9, "T": 10**12, "Ki": 2**10, "Mi": 2**20, "Gi": 2**30, "Ti": 2**40}
@@ -82,26 +82,17 @@ def has_time_limit() -> bool:
 
 
 def within_time_limit(batch: Callable[[], T]) -> T:
-    """What ``batch()`` returns. Raises :class:`TimeLimitError` past the limit; past twice the time the process ends.
-
-    No context manager: an exception may come at any moment, in the manager's own ``__exit__`` too.
-    """
+    """What ``batch()`` returns. Raises :class:`TimeLimitError` past the limit; past twice the time the process ends."""
     seconds = _limits.seconds
     if seconds is None:
         return batch()
     by_signal = hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread()
-    alarm = _Signal() if by_signal else ThreadAlarm()
     _watch(_end_of(seconds))
     try:
-        try:
-            alarm.start(seconds)
-            return batch()
-        finally:
-            alarm.stop()
+        return within(seconds, batch, _Signal() if by_signal else None)
     except TimeLimitError:
         raise TimeLimitError(f"not done after {seconds:g} s") from None
     finally:
-        alarm.stop()  # again, for the exception may have come while it was stopped; it comes once
         _watch(None)
 
 

@@ -28,8 +28,7 @@ Found = Iterator[tuple[str, Array | str]]
 
 def hdf_variables(path: Path) -> Variables:
     """What a ``.mat`` file of version 7.3 holds. Raises :class:`DataError`."""
-    variables: Variables = decoded_whole(variables_of_hdf, path, allowed=HDF)
-    return variables
+    return decoded_whole(variables_of_hdf, path, allowed=HDF)
 
 
 def variables_of_hdf(path: Path) -> Iterator[Variables]:

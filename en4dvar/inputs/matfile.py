@@ -98,9 +98,7 @@ def _variables(raw: memoryview, order: str) -> list[_Variable]:
 def _unpacked(packed: memoryview, order: str) -> list[_Variable]:
     """A compressed variable; what holds no vector is not unpacked to its end, where its checksum is."""
     head, _ = _inflated(packed, HEAD)
-    if len(head) < 8:
-        raise _Damaged("a compressed variable is damaged")
-    kind, size = struct.unpack_from(f"{order}II", head)
+    kind, size = struct.unpack_from(f"{order}II", head) if len(head) >= 8 else (0, 0)
     if kind != MATRIX:
         raise _Damaged("a compressed variable is damaged")
     variable, *_ = _variable(memoryview(head)[8:], order, data=False)
@@ -139,8 +137,8 @@ def _variable(content: memoryview, order: str, data: bool = True, within: str = 
     if kind not in CLASSES and kind not in NUMERIC:
         raise _Damaged(f"a variable of class {kind}")
     shape = () if kind == OPAQUE else _shape(elements.next()[1], order)
-    name = _name(elements.next()[1])
-    name = within or name
+    own = _name(elements.next()[1])
+    name = within or own
     if kind in (CELL, STRUCT):
         container = _Variable(name, words=CLASSES[kind], holds=True)
         return [container, *(_held(elements, order, kind, name, math.prod(shape), depth + 1) if data else ())]
@@ -233,8 +231,7 @@ class _Elements:
         if size > 4:
             raise _Damaged(f"a small element of {size} bytes")
         if size:
-            content = self._take(4)[:size]
-            return kind, content
+            return kind, self._take(4)[:size]
         (size,) = self._words(4)
         content = self._take(size)
         self.at = min(self.at + -size % 8, len(self.content))

@@ -70,10 +70,9 @@ def _of_netcdf(path: Path, names: Mapping[str, Any]) -> dict[str, tuple[Array, s
     """As a process of its own reads it."""
     allowed = Allowed(60, 4_000_000_000, LARGEST)
     try:
-        members: dict[str, tuple[Array, str]] = decoded_whole(netcdf_members, path, list(names), allowed=allowed)
+        return decoded_whole(netcdf_members, path, list(names), allowed=allowed)
     except DecodeError as error:
         raise DataError(f"{path}: cannot be read as netCDF: {error}") from None
-    return members
 
 
 def netcdf_members(path: Path, names: Sequence[str]) -> Iterator[dict[str, tuple[Array, str]]]:

@@ -67,9 +67,7 @@ def parts_of(path: Path, value: Column, layout: Layout = ANY, time: str | None =
 
 
 def table_of(path: Path, kind: Format, layout: Layout, wanted: Sequence[str] = ()) -> Table:
-    if kind == "csv":
-        return Table(path, layout.decimal, wanted)
-    return Table(path, layout.decimal, wanted, sheet_lines(path, layout.sheet))
+    return Table(path, layout.decimal, wanted, None if kind == "csv" else sheet_lines(path, layout.sheet))
 
 
 def _refuse_by(path: Path, layout: Layout) -> None:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 LARGEST = 1 << 28  # bytes that the parts of a workbook unpack to
 MOST_PARTS = 2_000
+DECLARATION = [bytes("<!D", c) for c in ("utf-8", "utf-16-le", "utf-16-be")]  # of entities, in XML
 MOST_CELLS = 10_000_000
 WORKBOOK = Allowed(seconds=60, memory=4_000_000_000, size=LARGEST)
 MOST_ROWS = 1 << 20  # of a sheet: what Excel itself allows
@@ -34,8 +35,7 @@ def sheet_lines(path: Path, asked: str) -> Lines:
 
     Raises :class:`DataError`.
     """
-    lines: Lines = decoded_whole(lines_of_workbook, path, asked, allowed=WORKBOOK)
-    return lines
+    return decoded_whole(lines_of_workbook, path, asked, allowed=WORKBOOK)
 
 
 def lines_of_workbook(path: Path, asked: str) -> Iterator[Lines]:
@@ -45,8 +45,7 @@ def lines_of_workbook(path: Path, asked: str) -> Iterator[Lines]:
     try:
         stored = _rows(path, name, area, formulas=False)
         rows = [(number, _texts(cells)) for number, cells in stored]
-        blank = any(None in cells for _, cells in stored)
-        if blank:
+        if any(None in cells for _, cells in stored):
             _refuse_formulas(path, stored, _rows(path, name, area, formulas=True))
     except (DataError, MemoryError):
         raise
@@ -72,16 +71,13 @@ def _check(path: Path) -> None:
             if size > LARGEST or len(parts) > MOST_PARTS:
                 raise DataError(f"{path}: {len(parts)} parts that unpack to {size / 2**20:.0f} MiB; save it as CSV")
             for part in parts:
-                if part.filename.endswith((".xml", ".rels")) and _declares(archive.read(part)):
+                xml = archive.read(part) if part.filename.endswith((".xml", ".rels")) else b""
+                if any(sign in xml for sign in DECLARATION):
                     raise DataError(f"{path}: {part.filename} declares entities, as no workbook does")
     except DataError:
         raise
     except Exception as error:  # BadZipFile, zlib.error and whatever else a damaged archive gives
         raise DataError(f"{path}: not an Excel workbook ({error})") from None
-
-
-def _declares(xml: bytes) -> bool:
-    return b"<!D" in xml or any("<!D".encode(coding) in xml for coding in ("utf-16-le", "utf-16-be"))
 
 
 def _rows(path: Path, name: str, area: str, formulas: bool) -> list[tuple[int, tuple[Any, ...]]]:
@@ -128,8 +124,8 @@ def _sheet(book: Any, name: str, path: Path) -> ReadOnlyWorksheet:
         return sheets[name]
     used = [sheet for sheet in sheets.values() if any(map(_texts, sheet.iter_rows(values_only=True)))]
     if len(used) != 1:
-        which = f"say which (data.sheet): {listed(sheet.title for sheet in used)}" if used else "none holds anything"
-        raise DataError(f"{path}: {len(used)} sheets hold something; {which}" if used else f"{path}: {which}")
+        which = f"{len(used)} sheets hold something; say which (data.sheet): {listed(sheet.title for sheet in used)}"
+        raise DataError(f"{path}: {which if used else 'none holds anything'}")
     return used[0]
 
 

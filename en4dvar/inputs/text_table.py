@@ -18,7 +18,8 @@ from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import DataError
 from en4dvar.plumbing.files import read_plain
 from en4dvar.plumbing.hints import listed, short
-from en4dvar.plumbing.units import UnitError, parse_unit
+from en4dvar.plumbing.tables import is_number
+from en4dvar.plumbing.units import is_unit
 
 Lines = Sequence[tuple[int, str | Sequence[str]]]
 Decimal = Literal[".", ","]
@@ -40,7 +41,7 @@ def numbered_lines(path: Path) -> list[tuple[int, str]]:
 def scalars_in(path: Path) -> dict[str, float]:
     """What comments such as ``# Req = 21.79`` say, by name."""
     said = filter(None, (_SCALAR.fullmatch(line.strip()) for line in _text(path).splitlines()))
-    return {match[1]: float(match[2]) for match in said if _is_number(match[2])}
+    return {match[1]: float(match[2]) for match in said if is_number(match[2])}
 
 
 def _text(path: Path) -> str:
@@ -151,7 +152,12 @@ def _names_and_numbers(head: Sequence[Sequence[str]], wanted: Sequence[str]) -> 
     if _holds_number(head[first]) and (first == 0 or (wanted and all(map(_NAMELESS.fullmatch, wanted)))):
         return None, first
     top = max(first - 1, 0)
-    if top and _words(head[top - 1]) and len(head[top - 1]) == len(head[top]) and all(map(_is_unit, head[top])):
+    if (
+        top
+        and _words(head[top - 1])
+        and len(head[top - 1]) == len(head[top])
+        and all(is_unit(cell.strip("[]()")) for cell in head[top])
+    ):
         top -= 1
     if len(head[top]) == 1 < len(head[first]):
         return None, first
@@ -165,16 +171,8 @@ def _delimiter(line: str | Sequence[str], numbers: bool) -> str:
     return next((sign for sign in (";", "\t") if numbers and sign in line), delimiter_of(line))
 
 
-def _is_unit(cell: str) -> bool:
-    try:
-        parse_unit(cell.strip("[]()"))
-    except UnitError:
-        return False
-    return True
-
-
 def _holds_number(cells: Sequence[str]) -> bool:
-    return any(cell.lower() not in BLANK and _is_number(cell.replace(",", ".")) for cell in cells)
+    return any(cell.lower() not in BLANK and is_number(cell.replace(",", ".")) for cell in cells)
 
 
 def _words(cells: Sequence[str]) -> bool:
@@ -185,21 +183,13 @@ def _same(a: str, b: str) -> bool:
     return unicodedata.normalize("NFKC", a) == unicodedata.normalize("NFKC", b)
 
 
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
 def number_in(cell: str, name: str, path: Path, line: int, decimal: Decimal | None) -> float:
     """A cell as a number, NaN where it is blank; ``decimal`` None: a point, without a word on the setting."""
     if cell.lower() in BLANK:
         return float("nan")
     text = cell.replace(",", ".") if decimal == "," and "." not in cell else cell
-    if not _is_number(text):
-        comma = decimal != "," and "," in cell and _is_number(cell.replace(",", "."))
+    if not is_number(text):
+        comma = decimal != "," and "," in cell and is_number(cell.replace(",", "."))
         hint = "; write a decimal point" + (", or data.decimal: ','" if decimal else "") if comma else ""
         raise DataError(f"{path}:{line}: {short(cell)!r} in column {short(name)!r} is not a number{hint}")
     return float(text)

@@ -23,7 +23,7 @@ from contextlib import contextmanager, suppress
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import IO, TypeVar
+from typing import IO, Any, TypeVar
 
 from en4dvar.plumbing.files import POSIX, owner, temporary_folder
 from en4dvar.plumbing.user_code import Stop
@@ -219,12 +219,13 @@ class ThreadAlarm:
         raise_in(self.thread, None)  # set, but not raised yet
 
 
-def within(seconds: float, call: Callable[[], T]) -> T:
+def within(seconds: float, call: Callable[[], T], alarm: Any = None) -> T:
     """What ``call()`` returns. Raises :class:`TimeLimitError` past the time, where that is spent in Python.
 
-    No context manager: an exception may come at any moment, in the manager's own ``__exit__`` too.
+    ``alarm`` raises it, by default a :class:`ThreadAlarm`. No context manager: an exception may come at any moment, in
+    the manager's own ``__exit__`` too.
     """
-    alarm = ThreadAlarm()
+    alarm = alarm or ThreadAlarm()
     try:
         try:
             alarm.start(seconds)

@@ -19,12 +19,13 @@ from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeVar
 
 from en4dvar.plumbing.children import Child, limit_memory, limit_time
 from en4dvar.plumbing.errors import DataError, En4dvarError
 from en4dvar.plumbing.files import here, in_bytes, open_plain
 
+T = TypeVar("T")
 Decoder = Callable[..., Iterator[Any]]
 DOUBT = "it is damaged, or not what it says it is"
 _SIZE = struct.Struct("<Q")
@@ -89,8 +90,9 @@ def decoded(decoder: Decoder, path: Path, *arguments: Any, allowed: Allowed = Al
             child.kept = done
 
 
-def decoded_whole(decoder: Decoder, path: Path, *arguments: Any, allowed: Allowed = Allowed()) -> Any:
+def decoded_whole(decoder: Callable[..., Iterator[T]], path: Path, *arguments: Any, allowed: Allowed = Allowed()) -> T:
     """The only value of a decoder. Raises as :func:`decoded`."""
+    value: T
     (value,) = decoded(decoder, path, *arguments, allowed=allowed)
     return value
 

@@ -5,7 +5,7 @@ import io
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 from en4dvar.plumbing.files import atomic_path
 
@@ -60,8 +60,13 @@ def _plain(cell: str) -> str:
     cell = without_control(cell.replace("\r", " "))  # csv does not quote it, and a new line begins there
     if not (cell[:1] in ("\t", "\n") or cell.lstrip()[:1] in _FORMULA):
         return cell
+    return cell if is_number(cell) else f"'{cell}"
+
+
+def is_number(cell: Any) -> bool:
+    """Whether ``float`` takes it."""
     try:
         float(cell)
-    except ValueError:
-        return f"'{cell}"
-    return cell
+    except (TypeError, ValueError):
+        return False
+    return True

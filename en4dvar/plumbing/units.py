@@ -136,6 +136,14 @@ def parse_unit(text: str) -> Unit:
     return unit
 
 
+def is_unit(text: str) -> bool:
+    """Whether :func:`parse_unit` reads it."""
+    try:
+        return bool(parse_unit(text))
+    except UnitError:
+        return False
+
+
 def as_unit(quantity: str, unit: str) -> str:
     """A positive quantity in whatever has the dimension of ``unit``, as a unit itself. Raises :class:`UnitError`.
 

@@ -27,8 +27,7 @@ from en4dvar.report.withheld import withheld_lines
 from en4dvar.results.campaign_file import failed_datasets
 from en4dvar.results.joint_file import FILE, load_joint
 from en4dvar.results.pack import PACK
-from en4dvar.results.population_file import FILE as POPULATION
-from en4dvar.results.population_file import load_groups_of, load_population
+from en4dvar.results.population_file import populations_of
 from en4dvar.results.run_results import RunResults
 from en4dvar.results.store import StoredResult, load_stored
 
@@ -133,16 +132,10 @@ def _headlines(run_dir: Path) -> list[Headline]:
     from en4dvar.report import joint, population  # with the estimates themselves, which other pages do not need
 
     headlines = [*_side_by_side(run_dir)]
-    stored = {
-        name: (f"{folder.relative_to(run_dir).as_posix()}/", of)
-        for name, (folder, of) in load_groups_of(run_dir).items()
-    }
-    if (run_dir / POPULATION).exists():
-        stored[""] = "", load_population(run_dir / POPULATION)
-    for name, (folder, of) in stored.items():
+    for name, (folder, of) in populations_of(run_dir).items():
         words = f"The population of {name}" if name else "The population behind them"
         told = [f"{name}: {line}" if name else upper_first(line) for line in population.sentences(of)]
-        address = quote(f"{folder}{POPULATION_FILES[0]}")
+        address = quote((folder / POPULATION_FILES[0]).relative_to(run_dir).as_posix())
         headlines.append(Headline(address, words, told, population.figure(of), population.caption(of)))
     if (run_dir / FILE).exists():
         shared = load_joint(run_dir / FILE)

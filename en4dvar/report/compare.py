@@ -26,6 +26,7 @@ from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.tables import table
 from en4dvar.plumbing.units import UnitError, convert
 from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, in_columns
+from en4dvar.report.svg import on_paper
 from en4dvar.report.text import figure_text, fixed, with_unit
 from en4dvar.results.run_results import result_files
 from en4dvar.results.store import StoredResult, load_stored
@@ -120,8 +121,6 @@ class Comparison:
 
     def plot(self) -> Figure:
         """Posteriors of the runs over each other, a panel a parameter."""
-        from en4dvar.report.paper import on_paper  # matplotlib takes time to import
-
         return on_paper(overlay(self))
 
     def __str__(self) -> str:
@@ -167,7 +166,13 @@ def compare_runs(runs: Sequence[str | Path] | Mapping[str, str | Path | StoredRe
 def with_evidences(comparison: Comparison, sampled: Sequence[Mapping[str, float]]) -> Comparison:
     """The same with other evidences. ``sampled``: of each run data set → log-evidence in place of the result's."""
     better = dict(zip(comparison.runs, sampled, strict=True))
-    scores = [_resampled(score, better[score.run]) for score in comparison.scores if score.dataset != ALL]
+    scores = [
+        replace(score, log_evidence=better[score.run][score.dataset], stored=False)
+        if score.dataset in better[score.run]
+        else score
+        for score in comparison.scores
+        if score.dataset != ALL
+    ]
     return replace(comparison, scores=_judged(scores, [name for name in comparison.datasets if name != ALL]))
 
 
@@ -216,17 +221,11 @@ def comparison_table(comparison: Comparison) -> str:
     header = ("data set", "run", "log-evidence", "difference", "probability", "chi2/K", "DFS", "NRMSE")
     rows = [
         (
-            s.dataset,
-            s.run,
-            f"{s.log_evidence:.2f}{' *' * s.stored}",
-            fixed(s.difference, 2),
-            fixed(s.probability, 3),
-            f"{s.chi2_per_observation:.3g}",
-            f"{s.dfs:.2f}",
-            f"{s.nrmse:.4f}",
+            s.dataset, s.run, f"{s.log_evidence:.2f}{' *' * s.stored}", fixed(s.difference, 2),
+            fixed(s.probability, 3), f"{s.chi2_per_observation:.3g}", f"{s.dfs:.2f}", f"{s.nrmse:.4f}",
         )
         for s in comparison.scores
-    ]
+    ]  # fmt: skip
     verdicts = [f"{name}: {comparison.verdict(name)}" for name in comparison.datasets]
     if comparison.incomparable:
         verdicts = [comparison.verdict("")]
@@ -270,15 +269,15 @@ def _panel(estimates: Sequence[ComparedEstimate], runs: Sequence[str]) -> Panel:
     row = estimates[0].summary
     panel = Panel(with_unit(row.symbol, row.unit), yticks=(), left=False, ylim=(0.0, 1.1 + 0.09 * len(runs)))
     for i, run in enumerate(runs):
-        label = figure_text(run)
-        panel.line([], [], _colour(i), label=label)
+        colour = COLOURS[i % len(COLOURS)]
+        panel.line([], [], colour, label=figure_text(run))
         values = _members([e for e in estimates if e.run == run], row.unit)
         if values.size < 2 or np.ptp(values) == 0:
             continue
-        panel.histogram(values, _colour(i), alpha=0.25)
+        panel.histogram(values, colour, alpha=0.25)
         if not any(e.summary.untrusted for e in estimates if e.run == run):
             low, high = member_quantiles(values, (0.05, 0.95))
-            panel.line([low, high], np.full(2, 1.08 + 0.09 * i), _colour(i), 2.0)
+            panel.line([low, high], np.full(2, 1.08 + 0.09 * i), colour, 2.0)
     return panel
 
 
@@ -289,10 +288,6 @@ def _members(estimates: Sequence[ComparedEstimate], unit: str) -> Array:
     except UnitError as error:
         raise OutputError(f"the runs mean different quantities by {estimates[0].summary.name}: {error}") from None
     return np.concatenate(parts) if parts else np.empty(0)
-
-
-def _colour(i: int) -> str:
-    return COLOURS[i % len(COLOURS)]
 
 
 def named(runs: Sequence[str | Path] | Mapping[str, T]) -> Mapping[str, T | Path]:
@@ -341,24 +336,9 @@ def _stated(o: Observations) -> dict[str, Array]:
 
 def _score(run: str, dataset: str, result: StoredResult) -> ModelScore:
     stats = result.groups["/sample_stats"].attrs
-    return ModelScore(
-        run,
-        dataset,
-        log_evidence=float(stats["log_evidence"]),
-        difference=float("nan"),
-        probability=float("nan"),
-        chi2_per_observation=float(stats["chi2_per_observation"]),
-        dfs=float(stats["dfs"]),
-        nrmse=float(stats["nrmse"]),
-        warnings=" ".join(codes(result.cautions)),
-        doubted=" ".join(codes(c for c in result.cautions if c.spoils)),
-    )
-
-
-def _resampled(score: ModelScore, sampled: Mapping[str, float]) -> ModelScore:
-    if score.dataset not in sampled:
-        return score
-    return replace(score, log_evidence=sampled[score.dataset], stored=False)
+    log, *fit = (float(stats[key]) for key in ("log_evidence", "chi2_per_observation", "dfs", "nrmse"))
+    warned, doubted = (" ".join(codes(c)) for c in (result.cautions, [c for c in result.cautions if c.spoils]))
+    return ModelScore(run, dataset, log, np.nan, np.nan, fit[0], fit[1], fit[2], warned, doubted)
 
 
 def _total(scores: Sequence[ModelScore]) -> ModelScore:

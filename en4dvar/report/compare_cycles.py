@@ -5,7 +5,7 @@ an ensemble of enough members, as in a Kalman filter. Source: Schweppe (1965), I
 model selection by ensembles: Carrassi, Bocquet, Hannart & Ghil (2017), Q. J. R. Meteorol. Soc. 143, 866.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,7 +40,10 @@ def compare_sequences(run_dirs: Sequence[Path]) -> tuple[SequenceScore, ...]:
     OutputError: fewer than two, one of them no sequence, without an evidence, or of other readings.
     """
     runs = {name: _sequence(run_dir) for name, run_dir in named(run_dirs).items()}
-    _require_same_readings(runs)
+    (first, reference), *others = runs.items()
+    for name, other in others:
+        if not all(_same(reference, other, key) for key in READINGS):
+            raise OutputError(f"{name} and {first} hold other readings or errors: their evidences cannot be compared")
     evidence = np.array([float(data.attrs["log_evidence"]) for data in runs.values()])
     each = zip(runs.items(), evidence, model_probabilities(evidence), strict=True)
     return tuple(
@@ -74,13 +77,6 @@ def _sequence(run_dir: Path) -> Group:
     if not np.isfinite(data.attrs["log_evidence"]):
         raise OutputError(f"{run_dir}: has no evidence to compare: its ensemble has lost the readings")
     return data
-
-
-def _require_same_readings(runs: Mapping[str, Group]) -> None:
-    (first, reference), *others = runs.items()
-    for name, other in others:
-        if not all(_same(reference, other, key) for key in READINGS):
-            raise OutputError(f"{name} and {first} hold other readings or errors: their evidences cannot be compared")
 
 
 def _same(first: Group, other: Group, key: str) -> bool:

@@ -35,14 +35,14 @@ FANS = "What would be seen: median, 50 % and 90 % of the prior; marks below: the
 
 def ranked(designs: Designs) -> list[DesignRow]:
     """Those that could be evaluated, the most informative first."""
-    return sorted((row for row in designs.rows if row.result), key=lambda row: -_worth(row))
+    return sorted((row for row in designs.rows if row.result), key=lambda row: -row.evaluated.worth)
 
 
 def front(designs: Designs) -> list[DesignRow]:
     """The designs that no other beats in both price and information (Pareto), the cheapest first."""
     kept: list[DesignRow] = []
-    for row in sorted(ranked(designs), key=lambda row: (row.price, -_worth(row))):
-        if not kept or _worth(row) > _worth(kept[-1]):
+    for row in sorted(ranked(designs), key=lambda row: (row.price, -row.evaluated.worth)):
+        if not kept or row.evaluated.worth > kept[-1].evaluated.worth:
             kept.append(row)
     return kept
 
@@ -54,8 +54,8 @@ def settings_text(row: DesignRow) -> str:
 
 def words(designs: Designs, row: DesignRow) -> str:
     """What would be known: "G to ± 12 %, alpha hardly at all"."""
-    known = [_known(designs, row, a) for a in range(len(designs.asked.parameters))]
-    return ", ".join([*([_law(row.result.decision)] if row.result and row.result.decision else []), *known])
+    decision, known = row.evaluated.decision, [_known(designs, row, a) for a in range(len(designs.asked.parameters))]
+    return ", ".join([*([_law(decision)] if decision else []), *known])
 
 
 def _law(decision: Decision) -> str:
@@ -66,8 +66,7 @@ def _law(decision: Decision) -> str:
 
 
 def _known(designs: Designs, row: DesignRow, a: int) -> str:
-    name, result = designs.asked.parameters[a], row.result
-    assert result is not None
+    name, result = designs.asked.parameters[a], row.evaluated
     if result.ratio[a] > NOTHING:
         return f"{name} hardly at all"
     return f"{name} to ± {_spread(float(result.std[a]), float(result.relative[a]), *designs.asked.units[a])}"
@@ -84,8 +83,8 @@ def needs(designs: Designs, row: DesignRow) -> list[str]:
     """What the other parameters must be known to for what is wanted: "G to ± 5 % if reading_scale were known to 0.3 %",
     a sentence for each that is wanted.
     """
-    result = row.result
-    if result is None or result.needed is None or result.others is None:
+    result = row.evaluated
+    if result.needed is None or result.others is None:
         return []
     told = []
     for (name, text), factors in zip(designs.asked.wanted.items(), result.needed, strict=True):
@@ -114,31 +113,22 @@ def by(result: Evaluated) -> str:
     return "nested" if result.decision else result.method
 
 
-def _gain(designs: Designs) -> str:
-    return "law [nats]" if designs.asked.laws else "gain [nats]"
-
-
 def design_table(designs: Designs) -> str:
     """The best designs and the file's own, for the terminal."""
     rows, own = ranked(designs), [row for row in designs.rows if not row.settings and row.result]
     told = list({id(row): row for row in (*rows[:TOLD], *own)}.values())
-    several = any(row.result.alike > 1 for row in rows if row.result)
-    head = ("design", *(["experiments"] if several else []), "readings", "price", _gain(designs), "by", "what is known")
+    several = any(row.evaluated.alike > 1 for row in rows)
+    gain = "law [nats]" if designs.asked.laws else "gain [nats]"
+    head = ("design", *["experiments"] * several, "readings", "price", gain, "by", "what is known")
     cells = [
         (
-            settings_text(row),
-            *([str(row.result.alike)] if several else []),
-            str(len(row.result.readings)),
-            f"{row.price:g}",
-            f"{row.result.worth:.2f} ± {row.result.worth_error:.2f}",
-            by(row.result),
-            words(designs, row),
+            settings_text(row), *[str(it.alike)] * several, str(len(it.readings)), f"{row.price:g}",
+            f"{it.worth:.2f} ± {it.worth_error:.2f}", by(it), words(designs, row),
         )
-        for row in told
-        if row.result
-    ]
+        for row, it in ((row, row.evaluated) for row in told)
+    ]  # fmt: skip
     ends = list({id(row): row for row in (*rows[:1], *own)}.values())
-    alike = {id(row): f"; {_alike(row)} experiments" if several else "" for row in ends}
+    alike = {id(row): f"; {row.evaluated.alike} experiments" if several else "" for row in ends}
     wanted = [f"{settings_text(row)}{alike[id(row)]}: {text}" for row in ends for text in needs(designs, row)]
     return "\n".join([table([head, *cells]), *wanted])
 
@@ -146,37 +136,36 @@ def design_table(designs: Designs) -> str:
 def remarks(designs: Designs) -> list[str]:
     """What to know of the designs beside their worth."""
     failed = [row for row in designs.rows if row.failure]
-    beyond = [row for row in ranked(designs)[:TOLD] if row.result and row.result.beyond > 0.1]
-    told = []
-    if (rows := ranked(designs)) and _worth(rows[0]) < designs.asked.enough:
+    rows, told = ranked(designs), []
+    if rows and rows[0].evaluated.worth < designs.asked.enough:
         told.append(
-            f"the best design is expected to tell {_worth(rows[0]):.2f} nats, less than design.enough = "
+            f"the best design is expected to tell {rows[0].evaluated.worth:.2f} nats, less than design.enough = "
             f"{designs.asked.enough:g}: no experiment among these is worth making"
         )
     for reason in dict.fromkeys(row.failure for row in failed):
         names = [settings_text(row) for row in failed if row.failure == reason]
         more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
         told.append(f"{'; '.join(names[:NAMED])}{more}: {reason}")
-    thin = sum(bool(row.result and row.result.decision and row.result.decision.thin > THIN) for row in designs.rows)
+    thin = sum(decision is not None and decision.thin > THIN for decision in (row.evaluated.decision for row in rows))
     told += [f"of {thin} designs the evidences of many readings are rough; raise design.inner"] if thin else []
     told += [
-        f"{settings_text(row)}: {100 * row.result.beyond:.0f} % of the prior leaves what the model is valid for"
-        for row in beyond
-        if row.result
+        f"{settings_text(row)}: {100 * row.evaluated.beyond:.0f} % of the prior leaves what the model is valid for"
+        for row in rows[:TOLD]
+        if row.evaluated.beyond > 0.1
     ]
     return told
 
 
 def gains(designs: Designs) -> Chart:
     """Information against each knob."""
-    names = [*designs.asked.knobs, *(["experiments"] if len({_alike(row) for row in ranked(designs)}) > 1 else [])]
+    names = [*designs.asked.knobs, *["experiments"] * (len({row.evaluated.alike for row in ranked(designs)}) > 1)]
     panels = []
     for name in names:
         rows = [row for row in ranked(designs) if name in row.settings or name == "experiments"]
-        values = [row.settings.get(name, _alike(row)) for row in rows]
+        values = [row.settings.get(name, row.evaluated.alike) for row in rows]
         x, labels = _positions(values)
-        worth = np.array([_worth(row) for row in rows])
-        errors = np.array([row.result.worth_error for row in rows if row.result])
+        worth = np.array([row.evaluated.worth for row in rows])
+        errors = np.array([row.evaluated.worth_error for row in rows])
         panel = Panel(figure_text(name) + ("" if labels else _unit_of(values)), "information [nats]", names=labels)
         if labels:
             panel.xticks = range(len(labels))
@@ -189,29 +178,31 @@ def gains(designs: Designs) -> Chart:
 
 def prices(designs: Designs) -> Chart:
     """Information against price, with the front."""
-    rows, best = ranked(designs), front(designs)
     panel = Panel("price", "information [nats]")
-    panel.dots([row.price for row in rows], [_worth(row) for row in rows], "prior", 3.0)
-    panel.line([row.price for row in best], [_worth(row) for row in best], "posterior")
-    panel.dots([row.price for row in best], [_worth(row) for row in best], "posterior", 4.0)
+    (x, y), (u, v) = (
+        ([row.price for row in rows], [row.evaluated.worth for row in rows])
+        for rows in (ranked(designs), front(designs))
+    )
+    panel.dots(x, y, "prior", 3.0)
+    panel.line(u, v, "posterior")
+    panel.dots(u, v, "posterior", 4.0)
     return Chart([Row(5.6 * POINTS, [panel])], PAGE)
 
 
 def fans(designs: Designs) -> Chart:
     """What would be seen with the best designs, and the file's own."""
     rows = {
-        row.number: row for row in reversed([*ranked(designs)[:DRAWN], *(r for r in designs.rows if r.number == 0)])
+        row.number: row
+        for row in reversed([*ranked(designs)[:DRAWN], *(r for r in designs.rows if r.number == 0 and r.result)])
     }
     time, value = designs.asked.axes
     panels = []
     for row in reversed(list(rows.values())):
-        result = row.result
-        if result is None:
-            continue
+        result = row.evaluated
         t, taken = convert(result.grid, *time), convert(result.times, *time)
         low, lower, middle, upper, high = convert(result.fan, *value)
         settings = ", ".join(figure_text(f"{name} {value}") for name, value in row.settings.items()) or "as in the file"
-        title = fill(f"{settings}: {_worth(row):.2f} nats", WIDE)
+        title = fill(f"{settings}: {result.worth:.2f} nats", WIDE)
         panel = Panel(with_unit("time", time[1]), with_unit(designs.asked.seen, value[1]), title=title)
         panel.band(t, low, high, "posterior", 0.18)
         panel.band(t, lower, upper, "posterior", 0.3)
@@ -234,7 +225,7 @@ def write_design(folder: Path) -> Path:
     drawings = [("fans", FANS, svg(fans(designs), "fans", FANS))]
     if len({row.price for row in rows}) > 1:
         drawings.insert(0, ("prices", FRONT, svg(prices(designs), "prices", FRONT)))
-    if designs.asked.knobs or len({_alike(row) for row in rows}) > 1:
+    if designs.asked.knobs or len({row.evaluated.alike for row in rows}) > 1:
         drawings.insert(0, ("gains", GAINS, svg(gains(designs), "gains", GAINS)))
     page = render(
         "design.html.j2",
@@ -262,9 +253,8 @@ def write_design(folder: Path) -> Path:
 
 def readings_text(designs: Designs, row: DesignRow) -> str:
     """When readings are taken: "43 from 0.7 to 59.5 µs, every 1.4 µs", or each where they are not evenly spaced."""
-    assert row.result is not None
     stored, shown = designs.asked.axes[0]
-    t, unit = convert(row.result.times, stored, shown), "" if shown == "1" else f" {shown}"
+    t, unit = convert(row.evaluated.times, stored, shown), "" if shown == "1" else f" {shown}"
     gaps = np.diff(t)
     if len(t) > 2 and np.ptp(gaps) < 1e-6 * gaps.mean():
         return f"{len(t)} from {t[0]:.4g} to {t[-1]:.4g}{unit}, every {gaps.mean():.4g}{unit}"
@@ -282,10 +272,8 @@ def _cells(designs: Designs) -> list[list[Any]]:
     ratios = [f"{name}_std_ratio" for name in designs.asked.parameters]
     cells = []
     for row in ranked(designs):
-        result = row.result
-        assert result is not None
-        units = zip(result.std, designs.asked.units, strict=True)
-        std = [float(convert(np.array(value), *unit)) for value, unit in units]
+        result = row.evaluated
+        std = [float(convert(x, *unit)) for x, unit in zip(result.std.tolist(), designs.asked.units, strict=True)]
         knobs = [row.settings.get(name, "") for name in designs.asked.knobs]
         worth = [result.alike, len(result.readings), row.price, result.gain, result.error, result.method]
         worth += [getattr(result.decision, field) for field in DECISION] if result.decision else []
@@ -294,14 +282,6 @@ def _cells(designs: Designs) -> list[list[Any]]:
     others = [*(name for name, *_ in designs.asked.others), "all"]
     needed = [f"{name}_needs_{other}_factor" for name in designs.asked.wanted for other in others]
     return [[*head, *ratios, "lost", "beyond_validity", *needed], *cells]
-
-
-def _worth(row: DesignRow) -> float:
-    return row.result.worth if row.result else math.nan
-
-
-def _alike(row: DesignRow) -> int:
-    return row.result.alike if row.result else 1
 
 
 def _positions(values: Sequence[Any]) -> tuple[Array, list[str]]:

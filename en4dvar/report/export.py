@@ -17,6 +17,7 @@ from en4dvar.estimation.summary import LITTLE, MODAL, ParameterSummary, summary_
 from en4dvar.plumbing.caution import Caution, codes
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.tables import csv_text
+from en4dvar.report.text import GREEK as LETTERS
 from en4dvar.report.text import number_like, plain_number, untrusted_words
 from en4dvar.results.run_results import RunResults
 from en4dvar.results.store import StoredResult, require_settled
@@ -28,15 +29,11 @@ _COMMANDS = (
 )
 Kind = Literal["csv", "latex", "members"]
 _ESCAPES = {c: f"\\{c}" for c in "#$%&_{}"} | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\^{}"}
-_GREEK = dict(zip("αβγδεθκλμνπρστχωΓΔΘΛΣΩ", (
-    "alpha", "beta", "gamma", "delta", "epsilon", "theta", "kappa", "lambda", "mu", "nu", "pi", "rho", "sigma", "tau",
-    "chi", "omega", "Gamma", "Delta", "Theta", "Lambda", "Sigma", "Omega",
-), strict=True))  # fmt: skip
 _SIGNS = {
     "²": "^2", "³": "^3", "±": r"\pm", "×": r"\times", "−": "-", "→": r"\to", "≤": r"\le", "≥": r"\ge", "≈": r"\approx",
     "√": r"\surd", "°": r"^\circ", "µ": r"\mu", "Ṙ": r"\dot R",
 }  # fmt: skip
-_ESCAPES |= {c: f"$\\{name}$" for c, name in _GREEK.items()} | {c: f"${sign}$" for c, sign in _SIGNS.items()}
+_ESCAPES |= {c: f"$\\{name}$" for name, c in LETTERS.items()} | {c: f"${sign}$" for c, sign in _SIGNS.items()}
 _ESCAPES |= {"–": "--", "—": "---", "…": r"\dots{}"}
 
 
@@ -112,9 +109,10 @@ def latex_table(sets: Sequence[Found]) -> str:
     """Mean ± std for a paper (package booktabs): a row a parameter, or of several ``sets`` a row each."""
     header = "% en4dvar export: posterior mean and standard deviation; needs \\usepackage{booktabs}"
     warned = [f"% {c.severity}: {name}: {c}" for name, _, cautions in sets for c in cautions if c.kind == "note"]
+    comments = ["".join(c if c.isprintable() else " " for c in line) for line in warned]  # which end where they should
     notes = Notes()
     table = _one_set(sets[0], notes) if len(sets) == 1 else _many_sets(sets, notes)
-    return "\n".join([header, *(_one_line(line) for line in warned), *table]) + "\n"
+    return "\n".join([header, *comments, *table]) + "\n"
 
 
 class Notes:
@@ -153,15 +151,8 @@ def _one_set(dataset: Found, notes: Notes) -> list[str]:
     _, rows, cautions = dataset
     head = f"parameter & unit & prior & posterior{notes.warn(cautions)} & 5--95\\,\\%"
     lines = [
-        " & ".join(
-            (
-                latex_symbol(row),
-                latex_unit(row.unit) or "--",
-                plus_minus(row.prior_mean, row.prior_std),
-                _estimate(row, cautions, notes),
-                _interval(row),
-            )
-        )
+        f"{latex_symbol(row)} & {latex_unit(row.unit) or '--'} & {plus_minus(row.prior_mean, row.prior_std)} & "
+        f"{_estimate(row, cautions, notes)} & {_interval(row)}"
         for row in rows
     ]
     return tabular("llrrr", head, lines, notes)
@@ -218,11 +209,6 @@ def _interval(row: ParameterSummary) -> str:
     if row.untrusted:
         return "--"
     return f"${_tex(number_like(row.q05, row.std))}$ to ${_tex(number_like(row.q95, row.std))}$"
-
-
-def _one_line(comment: str) -> str:
-    """A comment of LaTeX that ends where it should."""
-    return "".join(c if c.isprintable() else " " for c in comment)
 
 
 def plus_minus(mean: float, std: float) -> str:

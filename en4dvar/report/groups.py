@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from en4dvar.plumbing.errors import OutputError
-from en4dvar.plumbing.units import UnitError, parse_unit
+from en4dvar.plumbing.units import is_unit
 from en4dvar.report.populations import PopulationsCompared, compare_populations, medians_table, sentences
 from en4dvar.results.population_file import load_groups_of
 
@@ -16,19 +16,12 @@ def numbers_of(names: Sequence[str]) -> tuple[tuple[float, ...], str]:
     """The number in each of the names and their unit, as of ``gel_5kPa`` and ``gel_8kPa``; nothing where a name has
     none or several, units differ, or all numbers are the same.
     """
-    of_names = [[(number, unit) for number, unit in _NUMBER.findall(name) if _is_unit(unit)] for name in names]
+    of_names = [[(number, unit) for number, unit in _NUMBER.findall(name) if is_unit(unit)] for name in names]
     units = {unit for of_name in of_names for _, unit in of_name}
     if any(len(of_name) != 1 for of_name in of_names) or len(units) != 1:
         return (), ""
     numbers = tuple(float(of_name[0][0]) for of_name in of_names)
     return (numbers, units.pop()) if len(set(numbers)) > 1 else ((), "")
-
-
-def _is_unit(text: str) -> bool:
-    try:
-        return bool(parse_unit(text))
-    except UnitError:
-        return False
 
 
 def groups_compared(run_dir: Path) -> PopulationsCompared | str | None:

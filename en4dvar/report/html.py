@@ -41,15 +41,12 @@ def _environment() -> Environment:
     script = _text("table.js") + _text("chart.js")
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     policy = f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"
-    environment.globals |= {"policy": policy, "style": _style(), "script": Markup(script)}
-    environment.globals |= {write.__name__: write for write in WRITERS}
-    return environment
-
-
-def _style() -> Markup:
     light, dark = css_variables(LIGHT), css_variables(DARK)
     palette = f":root {{ {light} }}\n@media screen and (prefers-color-scheme: dark) {{ :root {{ {dark} }} }}\n"
-    return Markup(palette + _text("style.css"))
+    style = Markup(palette + _text("style.css"))
+    environment.globals |= {"policy": policy, "style": style, "script": Markup(script)}
+    environment.globals |= {write.__name__: write for write in WRITERS}
+    return environment
 
 
 def _text(name: str) -> str:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -160,22 +161,13 @@ def fits(joint: StoredJoint) -> Chart | None:
     return in_columns(panels, 3.6 * POINTS, width=PAGE) if panels else None
 
 
-@dataclass(frozen=True)
-class SetRow:
-    """One data set under the shared values: misfit per reading, and how far it is from all others alone."""
-
-    name: str
-    chi2: float
-    distance: float
-    chance: float
-    odd: bool
-
-
-def _sets(joint: StoredJoint) -> list[SetRow]:
+def _sets(joint: StoredJoint) -> list[dict[str, Any]]:
+    """Each data set under the shared values: misfit per reading, and how far it is from all others alone."""
     fit, absent = joint.group("fit"), np.full(len(joint.datasets), np.nan)
     columns = [fit[c].values if c in fit else absent for c in ("chi2_per_observation", "distance", "chance")]
-    rows = zip(joint.datasets, *columns, strict=True)
-    return [SetRow(name, float(chi2), float(z), float(p), name in joint.odd) for name, chi2, z, p in rows]
+    keys = ("name", "odd", "chi2", "distance", "chance")
+    odd = [name in joint.odd for name in joint.datasets]
+    return [dict(zip(keys, row, strict=True)) for row in zip(joint.datasets, odd, *columns, strict=True)]
 
 
 def write_joint(folder: Path) -> Path:

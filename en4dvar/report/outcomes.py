@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from en4dvar.plumbing.tables import table
 from en4dvar.report.sequence import sequence_figures
+from en4dvar.report.svg import on_paper
 from en4dvar.report.twin import scores as scores_in_time
 from en4dvar.results.series_file import estimates, sequence_group, twin_group
 from en4dvar.series.problem import SeriesResult
@@ -36,8 +37,6 @@ class TwinOutcome(TwinResult):
 
     def plot(self) -> Figure:
         """RMSE and spread in time."""
-        from en4dvar.report.paper import on_paper  # matplotlib takes time to import
-
         return on_paper(scores_in_time(twin_group(self, {})))
 
 
@@ -61,8 +60,6 @@ class SequenceOutcome(SeriesResult):
 
     def plot(self) -> Figure:
         """The state in time, or the parameters where it is known."""
-        from en4dvar.report.paper import on_paper
-
         _, _, chart = next(sequence_figures(sequence_group(self, {})))
         return on_paper(chart)
 

@@ -40,8 +40,12 @@ def write_comparison(comparison: Comparison, out: str | Path, of: PopulationsCom
     else:
         chart = overlay(comparison)
         keep(chart, out, "posteriors")
-        write_text(out / "estimates.csv", _estimates_csv(comparison))
-        write_text(out / "evidence.csv", _evidence_csv(comparison))
+        warned = {(s.run, s.dataset): s.warnings for s in comparison.scores}
+        rows = ([e.run, e.dataset, *csv_cells(e.summary), warned[e.run, e.dataset]] for e in comparison.by_parameter)
+        write_text(out / "estimates.csv", csv_text([["run", "dataset", *CSV_COLUMNS, "warnings"], *rows]))
+        columns = [f.name for f in fields(ModelScore)]
+        evidence = ([getattr(s, c) for c in columns] for s in comparison.scores)
+        write_text(out / "evidence.csv", csv_text([columns, *evidence]))
         content |= {"figure": svg(chart, "posteriors", CAPTION)}
     page = render(
         "compare.html.j2",
@@ -56,14 +60,3 @@ def write_comparison(comparison: Comparison, out: str | Path, of: PopulationsCom
         **content,
     )
     return write_text(out / "compare.html", page)
-
-
-def _estimates_csv(comparison: Comparison) -> str:
-    warned = {(s.run, s.dataset): s.warnings for s in comparison.scores}
-    rows = [[e.run, e.dataset, *csv_cells(e.summary), warned[e.run, e.dataset]] for e in comparison.by_parameter]
-    return csv_text([["run", "dataset", *CSV_COLUMNS, "warnings"], *rows])
-
-
-def _evidence_csv(comparison: Comparison) -> str:
-    columns = [f.name for f in fields(ModelScore)]
-    return csv_text([columns, *([getattr(s, c) for c in columns] for s in comparison.scores)])

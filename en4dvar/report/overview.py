@@ -155,17 +155,11 @@ def _parameters(sets: Sequence[SetSummary]) -> list[str]:
 def _parameter(name: str, sets: Sequence[SetSummary]) -> dict[str, Any]:
     rows = [dataset.rows[name] for dataset in sets if name in dataset.rows]
     means = np.array([row.mean for row in rows if math.isfinite(row.mean)])
-    low, median, high = np.quantile(means, (0.25, 0.5, 0.75)) if means.size else (math.nan,) * 3
+    quartiles = np.quantile(means, (0.25, 0.5, 0.75)).tolist() if means.size else (math.nan,) * 3
     precision = float(np.nanmedian([row.std for row in rows])) if means.size else math.nan
-    return {
-        "name": name,
-        "label": rows[0].label,
-        "symbol": symbol_html(rows[0].symbol),
-        "unit": pretty_unit(rows[0].unit),
-        "median": number_like(float(median), precision),
-        "low": number_like(float(low), precision),
-        "high": number_like(float(high), precision),
-    }
+    numbers = {key: number_like(x, precision) for key, x in zip(("low", "median", "high"), quartiles, strict=True)}
+    symbol, unit = symbol_html(rows[0].symbol), pretty_unit(rows[0].unit)
+    return {"name": name, "label": rows[0].label, "symbol": symbol, "unit": unit, **numbers}
 
 
 def _tally(sets: Sequence[SetSummary]) -> list[dict[str, Any]]:
@@ -177,12 +171,7 @@ def _tally(sets: Sequence[SetSummary]) -> list[dict[str, Any]]:
         for c in dataset.cautions:
             first.setdefault((c.severity, c.code), (c, dataset.name))
     return [
-        {
-            "severity": c.severity,
-            "code": c.code,
-            "count": count[c.severity, c.code],
-            "example": f"e.g. {first[c.severity, c.code][1]}: {c.words}",
-            "advice": c.advice,
-        }
+        {"severity": c.severity, "code": c.code, "count": count[c.severity, c.code], "advice": c.advice,
+         "example": f"e.g. {first[c.severity, c.code][1]}: {c.words}"}
         for c in worst_first(tuple(c for c, _ in first.values()))
-    ]
+    ]  # fmt: skip

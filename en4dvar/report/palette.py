@@ -2,28 +2,17 @@
 
 from collections.abc import Sequence
 
-LIGHT = {
-    "paper": "#ffffff",
-    "ink": "#1b1b1f",
-    "muted": "#63636c",
-    "grid": "#dcdce2",
-    "prior": "#85858f",
-    "posterior": "#0072b2",
-    "centre": "#d55e00",
-    "background": "#009e73",
+_BOTH = {  # on light, on dark ground
+    "paper": ("#ffffff", "#16161a"),
+    "ink": ("#1b1b1f", "#ececf0"),
+    "muted": ("#63636c", "#a9a9b4"),
+    "grid": ("#dcdce2", "#3b3b44"),
+    "prior": ("#85858f", "#9c9ca8"),
+    "posterior": ("#0072b2", "#56b4e9"),
+    "centre": ("#d55e00", "#ff9f5a"),
+    "background": ("#009e73", "#2fd0a2"),
 }
-DARK = {
-    "paper": "#16161a",
-    "ink": "#ececf0",
-    "muted": "#a9a9b4",
-    "grid": "#3b3b44",
-    "prior": "#9c9ca8",
-    "posterior": "#56b4e9",
-    "centre": "#ff9f5a",
-    "background": "#2fd0a2",
-}
-
-
+LIGHT, DARK = ({name: colours[k] for name, colours in _BOTH.items()} for k in (0, 1))
 VIRIDIS = ("#440154", "#3b528b", "#21918c", "#5ec962", "#fde725")
 GREYS = ("#ffffff", "#bdbdbd", "#636363", "#000000")
 

@@ -73,15 +73,12 @@ def path_of(mark: Mark, place: Frame) -> str:
         edges = _each(*_spots(x, y, mark))
     if not edges:
         return ""
+    ends = {"": "", "--": ' stroke-dasharray="3.7 1.6"', ":": ' stroke-dasharray="1 1.6"'}[mark.dash]
+    ends += ' stroke-linecap="round"' if mark.kind == "dots" else ""
     label = f' data-label="{escape(mark.label)}"' if mark.label else ""
-    how = f'fill="{colour}"' if filled else f'stroke="{colour}" stroke-width="{mark.stroke:g}"{_ends(mark)}'
+    how = f'fill="{colour}"' if filled else f'stroke="{colour}" stroke-width="{mark.stroke:g}"{ends}'
     crisp = ' shape-rendering="crispEdges"' if mark.kind == "tiles" else ""
     return f'<path d="{edges}" {how}{alpha}{label}{crisp}/>'
-
-
-def _ends(mark: Mark) -> str:
-    dash = {"": "", "--": ' stroke-dasharray="3.7 1.6"', ":": ' stroke-dasharray="1 1.6"'}[mark.dash]
-    return dash + (' stroke-linecap="round"' if mark.kind == "dots" else "")
 
 
 def _spots(x: Array, y: Array, mark: Mark) -> tuple[Array, Array, list[str]]:

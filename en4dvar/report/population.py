@@ -53,7 +53,11 @@ def sentences(stored: StoredPopulation) -> tuple[str, ...]:
     centres, free_centres, free_spreads = of[stored.headline], free_of[stored.headline], free_of["between"]
     lines = []
     for centre, mean, spread in zip(centres, of["mean"], of["between"], strict=True):
-        lines += [_sentence(stored, centre, mean, spread), *_parts(stored, centre), *_compared(stored, centre)]
+        lines.append(_sentence(stored, centre, mean, spread))
+        if stored.common and not centre.untrusted:
+            of_it = stored.group("posterior")[f"{centre.name}_{stored.headline}"]
+            lines.append(_in_parts(stored, centre, of_it, centre.std))
+        lines += _compared(stored, centre)
     if "empirical" in stored.tree.children:
         checked = [_of_sets(stored, centre) for centre in centres if not centre.untrusted]
         lines += [f"Check without a model of the population: {words}." for words in checked]
@@ -113,13 +117,8 @@ def _compared(stored: StoredPopulation, centre: ParameterSummary) -> Iterator[st
     yield f"{words}; the estimate lies {side} it with probability {chance:.2f}."
 
 
-def _parts(stored: StoredPopulation, mean: ParameterSummary) -> Iterator[str]:
-    """What the interval is made of, where data sets have anything in common."""
-    if stored.common and not mean.untrusted:
-        yield _in_parts(stored, mean, stored.group("posterior")[f"{mean.name}_{stored.headline}"], mean.std)
-
-
 def _in_parts(stored: StoredPopulation, mean: ParameterSummary, of: xr.DataArray, std: float) -> str:
+    """What the interval is made of, where data sets have anything in common."""
     about = of.attrs
     between, common = (
         float(convert(about[key], str(about["units"]), mean.unit)) for key in ("std_between", "std_common")

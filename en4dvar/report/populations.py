@@ -23,6 +23,7 @@ from en4dvar.plumbing.units import UnitError, convert
 from en4dvar.priors.prior import PriorTerm
 from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, in_columns
 from en4dvar.report.compare import named
+from en4dvar.report.svg import on_paper
 from en4dvar.report.text import figure_text, number_like, plain_number, pretty_unit, with_unit
 from en4dvar.results.joint_file import QUANTILES
 from en4dvar.results.netcdf import understood
@@ -93,8 +94,6 @@ class PopulationsCompared:
 
     def plot(self) -> Figure:
         """The median of each population with its interval, a panel a parameter."""
-        from en4dvar.report.paper import on_paper  # matplotlib takes time to import
-
         return on_paper(figure(self))
 
     def __str__(self) -> str:

@@ -49,7 +49,8 @@ def _panel(preview: Preview, part: Part, path: Array | None) -> Panel:
     paths, data, std = (convert(v, unit, shown_unit) for v in (members, y.values[own], y.std[own]))
     label = observable.label
     if label != observable.symbol:
-        label = f"{label} {_math(observable.symbol)}"
+        symbol = observable.symbol
+        label = f"{label} {symbol}" if "$" in symbol or len(symbol) > 1 else f"{label} ${symbol}$"
     panel = Panel(with_unit("time", model.time_display_unit), with_unit(label, shown_unit))
     if len(paths) > 1:
         for levels, alpha, words in (((0.05, 0.95), 0.3, "prior 90 %"), ((0.25, 0.75), 0.45, "50 %")):
@@ -68,7 +69,3 @@ def _panel(preview: Preview, part: Part, path: Array | None) -> Panel:
     bottom = min(float(data.min()), float(np.quantile(paths, 0.05)) if len(paths) else 0.0)
     panel.ylim = bottom - 0.05 * (top - bottom), top + 0.08 * (top - bottom)
     return panel
-
-
-def _math(symbol: str) -> str:
-    return symbol if "$" in symbol or len(symbol) > 1 else f"${symbol}$"

@@ -88,7 +88,9 @@ def _stems(panel: Panel, result: StoredResult, values: Array, alone: str) -> Non
 
 def reading_words(result: StoredResult) -> list[Markup]:
     """The reading that moves a parameter most, the one farthest from the prior; or why that is not told."""
-    sentences = [_most_moving(result) if has_influence(result) else _why_not(result), _farthest(result)]
+    reason = str(result.group("sample_stats").attrs.get("influence_reason", ""))
+    not_told = Markup("What leaving out a reading would change is not told: {}.").format(reason) if reason else Markup()
+    sentences = [_most_moving(result) if has_influence(result) else not_told, _farthest(result)]
     return [words for words in sentences if words]
 
 
@@ -120,11 +122,6 @@ def _farthest(result: StoredResult) -> Markup:
     return Markup("{} more than {} standard deviations from what the prior predicts; the farthest, at {}, {}.").format(
         count, plain_number(FAR), _time(result, k), signed(float(distance[k]))
     )
-
-
-def _why_not(result: StoredResult) -> Markup:
-    reason = str(result.group("sample_stats").attrs.get("influence_reason", ""))
-    return Markup("What leaving out a reading would change is not told: {}.").format(reason) if reason else Markup("")
 
 
 def _time(result: StoredResult, k: int) -> str:

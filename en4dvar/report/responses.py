@@ -98,25 +98,16 @@ def stored_shifts(result: StoredResult) -> tuple[tuple[StoredShift, ...], ...]:
     )
     parameters, alternatives = result.parameters, stats.coords["alternative"].values
 
-    def row(i: int, alternative: str) -> tuple[StoredShift, ...]:
-        common = float(of["cost_change"][i]), str(of["reason"][i])
-        return tuple(
-            StoredShift(
-                alternative,
-                str(of["words"][i]),
-                name,
-                about["symbol"],
-                about["display_units"],
-                convert(float(change[i, j]), about["units"], about["display_units"]),
-                float(relative[i, j]),
-                float(in_std[i, j]),
-                *common,
-            )
-            for j, (name, about) in enumerate((name, v.attrs) for name, v in parameters.items())
-        )
+    def shift(i: int, j: int, name: str) -> StoredShift:
+        about = parameters[name].attrs
+        value = convert(float(change[i, j]), about["units"], about["display_units"])
+        numbers = value, float(relative[i, j]), float(in_std[i, j]), float(of["cost_change"][i])
+        known = str(alternatives[i]), str(of["words"][i]), name, about["symbol"], about["display_units"]
+        return StoredShift(*known, *numbers, str(of["reason"][i]))
 
     largest = np.where(of["reason"] == "", np.abs(in_std).max(axis=1), 1.0)
-    return tuple(row(i, str(alternatives[i])) for i in np.argsort(-largest, kind="stable"))
+    order = np.argsort(-largest, kind="stable").tolist()
+    return tuple(tuple(shift(i, j, name) for j, name in enumerate(parameters)) for i in order)
 
 
 def shift_text(shift: StoredShift) -> str:

@@ -16,7 +16,7 @@ from en4dvar.plumbing.units import convert
 from en4dvar.report import figures
 from en4dvar.report.history import history
 from en4dvar.report.page import IDENTIFIERS, render_set
-from en4dvar.report.svg import draw
+from en4dvar.report.svg import draw, on_paper
 from en4dvar.results.complete import of_members
 from en4dvar.results.netcdf import to_bytes
 from en4dvar.results.store import StoredResult, load_stored
@@ -26,9 +26,6 @@ if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
     from matplotlib.figure import Figure
-
-    from en4dvar.report.chart import Chart
-
 
 FEWEST_DRAWS = 4  # of a chain: ArviZ's diagnostics need as many
 HEADER = ("", "unit", "mean", "std", "5 %", "50 %", "95 %", "DFS")
@@ -89,15 +86,15 @@ class Result(StoredResult):
 
     def plot_histograms(self) -> Figure:
         """Posterior over prior, one panel a parameter."""
-        return _on_paper(figures.histograms(self))
+        return on_paper(figures.histograms(self))
 
     def plot_history(self) -> Figure:
         """Data, prior and posterior predictive bands and the residuals of the centre."""
-        return _on_paper(history(self))
+        return on_paper(history(self))
 
     def plot_pairs(self) -> Figure:
         """Posterior members of every pair of parameters with their correlation."""
-        return _on_paper(figures.pairs(self))
+        return on_paper(figures.pairs(self))
 
     def save(self, path: str | Path) -> Path:
         """Write one netCDF file, which :func:`load_result` reads again. Raises :class:`OutputError`."""
@@ -161,12 +158,6 @@ def _in_display_units(group: xr.Dataset) -> xr.Dataset:
             shown[name] = variable.copy(data=convert(variable.values, unit, display))
             shown[name].attrs["units"] = display
     return group.assign(shown)
-
-
-def _on_paper(chart: Chart) -> Figure:
-    from en4dvar.report.paper import on_paper  # matplotlib takes time to import
-
-    return on_paper(chart)
 
 
 def load_result(path: str | Path) -> Result:

@@ -54,7 +54,8 @@ def write_sequence_report(run_dir: Path, files: bool = False) -> Path:
 def sequence_figures(data: Group) -> Iterator[Captioned]:
     """Each figure with its caption."""
     best = "smoothed" if "smoothed_mean" in data else "analysis"
-    held = _parameters(data)
+    parameters, state = str(data.attrs["parameters"]).split(", "), list(map(str, data["state"].values))
+    held = np.array([state.index(name) for name in parameters if name in state], dtype=np.intp)
     spread = data[f"{best}_std"].values.max(axis=0)
     uncertain = np.flatnonzero(spread > CERTAIN * np.abs(data[f"{best}_mean"].values).max(axis=0))
     dynamic = np.array([i for i in uncertain if i not in held], dtype=np.intp)
@@ -104,12 +105,6 @@ def innovations(data: Group) -> Chart:
         panel.dots(at, convert(innovation[there, i], unit, display), "ink", 1.6, label="innovation")
         panels.append(panel)
     return stacked(panels, 2.6 * POINTS, time_label(data), PAGE)
-
-
-def _parameters(data: Group) -> npt.NDArray[np.intp]:
-    """Where the estimated parameters stand in the state."""
-    names, state = str(data.attrs["parameters"]).split(", "), [str(name) for name in data["state"].values]
-    return np.array([state.index(name) for name in names if name in state], dtype=np.intp)
 
 
 def _some(places: npt.NDArray[np.intp], most: int) -> npt.NDArray[np.intp]:

@@ -4,10 +4,13 @@ The entries of a legend carry the label of their marks: with the page's script t
 says where the pointer is.
 """
 
+from __future__ import annotations
+
 import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from markupsafe import Markup, escape
@@ -18,6 +21,9 @@ from en4dvar.report.chart import Chart, Mark, Panel, Row
 from en4dvar.report.paths import Frame, path_of
 from en4dvar.report.text import math_pieces
 from en4dvar.report.ticks import labelled
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 GAP = 6.0  # between panels
 FONT, SMALL = 8.0, 7.0
@@ -234,3 +240,10 @@ def keep(chart: Chart, folder: Path, name: str) -> None:
     from en4dvar.report.paper import save_chart  # matplotlib takes longer to import than a page to draw
 
     save_chart(chart, folder, name)
+
+
+def on_paper(chart: Chart) -> Figure:
+    """The figure of matplotlib, in the same size and colours as in the page."""
+    from en4dvar.report import paper
+
+    return paper.on_paper(chart)

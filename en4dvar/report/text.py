@@ -23,7 +23,7 @@ _NAMES = (
     "alpha beta gamma delta epsilon zeta eta theta kappa lambda mu nu xi rho sigma tau phi chi psi omega pi infty ell "
     "Gamma Delta Theta Lambda Sigma Phi Psi Omega"
 )
-_GREEK = dict(zip(_NAMES.split(), "αβγδεζηθκλμνξρστφχψωπ∞ℓΓΔΘΛΣΦΨΩ", strict=True))
+GREEK = dict(zip(_NAMES.split(), "αβγδεζηθκλμνξρστφχψωπ∞ℓΓΔΘΛΣΦΨΩ", strict=True))
 
 
 def upper_first(words: str) -> str:
@@ -166,6 +166,6 @@ def math_pieces(body: str) -> list[tuple[str, str]]:
     """
     body = re.sub(r"(?<![_^])\\(?:mathrm|text|mathit)\s*\{([^{}]*)\}", r"\1", body)
     body = re.sub(r"\\(?:mathrm|text|rm|mathit)\b\s*", "", body)
-    body = re.sub(r"\\([A-Za-z]+)\s?", lambda m: _GREEK.get(m[1], m[1]), body)
+    body = re.sub(r"\\([A-Za-z]+)\s?", lambda m: GREEK.get(m[1], m[1]), body)
     pieces = re.findall(r"([_^])(\{[^{}]*\}|.)|([^_^]+)", body)
     return [(mark, (index or base).strip("{}")) for mark, index, base in pieces]

@@ -12,6 +12,7 @@ from en4dvar.estimation.design.evaluate import FAN, Evaluated
 from en4dvar.estimation.design.laws import Decision
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import OutputError
+from en4dvar.results.declared import text
 from en4dvar.results.netcdf import Group, read_groups, to_bytes, understood, variable
 
 FILE = "design.nc"
@@ -63,6 +64,12 @@ class DesignRow:
     price: float
     failure: str = ""
 
+    @property
+    def evaluated(self) -> Evaluated:
+        """The result of a design without ``failure``."""
+        assert self.result is not None
+        return self.result
+
 
 @dataclass(frozen=True)
 class Asked:
@@ -99,9 +106,6 @@ def save_designs(path: Path, rows: Sequence[DesignRow], asked: Asked, attributes
 
 
 def _group(rows: Sequence[DesignRow], asked: Asked, attributes: Mapping[str, Any]) -> Group:
-    def text(values: Sequence[str]) -> np.ndarray[Any, Any]:
-        return np.array(values, dtype=object)
-
     (time, _), (value, _) = asked.axes
     units = {"method": "", "std": "", "times": time, "grid": time, "fan": value}
     fixed = {"parameter": len(asked.parameters), "level": len(FAN)}

@@ -17,6 +17,7 @@ from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.caution import Caution, parsed, worst_first
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.units import convert
+from en4dvar.results.declared import text
 from en4dvar.results.netcdf import Group, Groups, Variable, read_groups, to_bytes, understood, variable
 from en4dvar.results.xarrays import tree_of
 
@@ -44,7 +45,7 @@ def save_joint(path: Path, estimate: JointEstimate, alone: Sequence[Alone], attr
 def joint_groups(estimate: JointEstimate, alone: Sequence[Alone], attributes: Mapping[str, Any]) -> Groups:
     """All of the file."""
     names = [experiment.observations.name for experiment in estimate.joint.experiments]
-    datasets = {"dataset": variable("dataset", np.array(names, dtype=object), "", "data set")}
+    datasets = {"dataset": variable("dataset", text(names), "", "data set")}
     root = {
         **attributes,
         "converged": int(estimate.converged),
@@ -150,15 +151,14 @@ def _fit(estimate: JointEstimate) -> dict[str, Variable]:
         bands[e, : len(grid), 0] = convert(grid, *to_time)
         alive = run.path[:-1][run.active[:-1]]
         bands[e, : len(grid), 1:] = convert(member_quantiles(alive, QUANTILES, axis=0).T, *to_value)
-    labels = np.array([experiment.observable.label for experiment in experiments], dtype=object)
-    units = np.array([experiment.observable.display_unit for experiment in experiments], dtype=object)
-    time_units = np.array([experiment.model.time_display_unit for experiment in experiments], dtype=object)
+    observables = [experiment.observable for experiment in experiments]
+    time_units = text(experiment.model.time_display_unit for experiment in experiments)
     alive_counts = np.array([int(run.active[:-1].sum()) for run in estimate.forecasts])
     return {
         "chi2_per_observation": variable("dataset", estimate.chi2, "1", "misfit per observation at the mode"),
         "alive": variable("dataset", alive_counts, "1", "members that ran"),
-        "observable": variable("dataset", labels, "", "what was observed"),
-        "unit": variable("dataset", units, "", "unit of values and bands"),
+        "observable": variable("dataset", text(o.label for o in observables), "", "what was observed"),
+        "unit": variable("dataset", text(o.display_unit for o in observables), "", "unit of values and bands"),
         "time_unit": variable("dataset", time_units, "", "unit of times"),
         "time": variable(("dataset", "observation"), times, "1", "times of the observations"),
         "value": variable(("dataset", "observation"), values, "1", "observations"),
@@ -185,6 +185,11 @@ class StoredGroups:
     tree: xr.DataTree
 
     @property
+    def datasets(self) -> tuple[str, ...]:
+        """Names of the data sets."""
+        return tuple(map(str, self.group("alone")["dataset"].values))
+
+    @property
     def cautions(self) -> tuple[Caution, ...]:
         """Warnings of the estimate, the worst first."""
         return parsed(self.tree.attrs["warnings"])
@@ -197,11 +202,6 @@ class StoredGroups:
 @dataclass(frozen=True)
 class StoredJoint(StoredGroups):
     """A file of :func:`save_joint`: groups posterior, prior, alone, fit, and, without odd data sets, without."""
-
-    @property
-    def datasets(self) -> tuple[str, ...]:
-        """Names of the data sets."""
-        return tuple(map(str, self.group("fit")["dataset"].values))
 
     @property
     def shared(self) -> tuple[str, ...]:

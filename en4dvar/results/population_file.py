@@ -18,7 +18,7 @@ from en4dvar.plumbing.hints import natural
 from en4dvar.priors.prior import PriorTerm
 from en4dvar.problem import InverseProblem
 from en4dvar.results.checkpoint import digest
-from en4dvar.results.declared import parameter_of
+from en4dvar.results.declared import parameter_of, text
 from en4dvar.results.joint_file import QUANTILES, StoredGroups, load_groups
 from en4dvar.results.netcdf import Group, Groups, Variable, to_bytes, understood, variable
 
@@ -49,7 +49,7 @@ def population_groups(
     population: CampaignPopulation, alone: Sequence[Array], cautions: Sequence[Caution], attributes: Mapping[str, Any]
 ) -> Groups:
     """All of the file."""
-    names = np.array([problem.observations.name for problem in population.problems], dtype=object)
+    names = text(problem.observations.name for problem in population.problems)
     datasets = {"dataset": variable("dataset", names, "", "data set")}
     free, effective = population.without_hyperprior(int(attributes["seed"]))
     root = {
@@ -121,9 +121,8 @@ def _prior_line(term: PriorTerm) -> str:
 
 def _readings(problems: Sequence[InverseProblem]) -> dict[str, Variable]:
     """(dataset,) which tells whether two populations hold the same readings."""
-    each = [digest(p.observations.times.tobytes() + p.observations.values.tobytes()) for p in problems]
-    words = "SHA-256 of times and values of the readings"
-    return {"readings": variable("dataset", np.array(each, dtype=object), "", words)}
+    each = text(digest(p.observations.times.tobytes() + p.observations.values.tobytes()) for p in problems)
+    return {"readings": variable("dataset", each, "", "SHA-256 of times and values of the readings")}
 
 
 def _belongs(population: CampaignPopulation) -> dict[str, Variable]:
@@ -168,11 +167,6 @@ def _alone(population: CampaignPopulation, alone: Sequence[Array]) -> dict[str, 
 @dataclass(frozen=True)
 class StoredPopulation(StoredGroups):
     """A file of :func:`save_population`: a thin view of ``tree``."""
-
-    @property
-    def datasets(self) -> tuple[str, ...]:
-        """Names of the data sets."""
-        return tuple(map(str, self.group("alone")["dataset"].values))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -260,3 +254,9 @@ def load_groups_of(run_dir: Path) -> dict[str, tuple[Path, StoredPopulation]]:
     folders = sorted((file.parent for file in (run_dir / GROUPS).glob(f"*/{FILE}")), key=natural)
     stored = [(folder, load_population(folder / FILE)) for folder in folders]
     return {str(of.tree.attrs.get("group", folder.name)): (folder, of) for folder, of in stored}
+
+
+def populations_of(run_dir: Path) -> dict[str, tuple[Path, StoredPopulation]]:
+    """As :func:`load_groups_of`, and under the name "" the population of all data sets, where there is one."""
+    whole = {"": (run_dir, load_population(run_dir / FILE))} if (run_dir / FILE).exists() else {}
+    return load_groups_of(run_dir) | whole

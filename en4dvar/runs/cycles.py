@@ -6,8 +6,7 @@ After a kill they go on from the latest checkpoint.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar
 
@@ -63,9 +62,21 @@ class Cycles(RunKind[R]):
         return f"the cycles up to the last checkpoint are kept in {self.directory}"
 
     def conduct(self, run: Session, executor: Executor) -> R:
-        state, every = f"{FOLDER}/{self.name}.cycle", self.config.execution.checkpoint_every
-        with kept_cycles(run, state, every, self.cycles) as (before, keep):
-            result = self.assimilated(executor, before, keep)
+        file = f"{FOLDER}/{self.name}.cycle"
+        fingerprint = digest("\n".join([run.identity.settings, *map(str, run.identity.data)]).encode())
+        before = run.restore(file, fingerprint, SequentialState, "it is assimilated from the start")
+        if before is not None:
+            run.log.write(f"continued after {before.cycle} of {self.cycles} cycles")
+        keeper = Keeper(run.directory.at(file), fingerprint, self.config.execution.checkpoint_every)
+        latest: list[Callable[[], SequentialState]] = []
+
+        def keep(state: Callable[[], SequentialState]) -> None:
+            latest[:] = [state]
+            keeper.keep(state)
+
+        result = self.assimilated(executor, before, keep)
+        for state in latest:  # what it ends with is kept, too, so that it is never repeated
+            keeper.write(state())
         run.log.write("\n".join(f"member lost: {reason}" for reason in result.run.failures))
         own = {"identity": run.identity.settings, "name": self.config.name, "scheme": self.scheme}
         to_bytes({"/": self.laid_out(result, {**run.attributes, **own})}).write(run.directory.at(self.result))
@@ -73,27 +84,3 @@ class Cycles(RunKind[R]):
         if self.config.report:
             self.page(run.directory.work, figures=self.config.figures)
         return result
-
-
-@contextmanager
-def kept_cycles(run: Session, file: str, every: float, cycles: int) -> Iterator[tuple[SequentialState | None, Keep]]:
-    """Where to resume from and what keeps the state after each cycle, in the checkpoint ``file``.
-
-    What the block ends with is kept, too, so that it is never repeated.
-    """
-    fingerprint = digest("\n".join([run.identity.settings, *map(str, run.identity.data)]).encode())
-    resume = None
-    if run.resumed:
-        resume = run.restore(file, fingerprint, SequentialState, "it is assimilated from the start")
-    if resume is not None:
-        run.log.write(f"continued after {resume.cycle} of {cycles} cycles")
-    keeper = Keeper(run.directory.at(file), fingerprint, every)
-    latest: list[Callable[[], SequentialState]] = []
-
-    def keep(state: Callable[[], SequentialState]) -> None:
-        latest[:] = [state]
-        keeper.keep(state)
-
-    yield resume, keep
-    for state in latest:
-        keeper.write(state())

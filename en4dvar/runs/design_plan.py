@@ -12,7 +12,7 @@ from en4dvar.config import Config, resolve
 from en4dvar.config.design import Value
 from en4dvar.config.document import Document, override
 from en4dvar.config.series import SeriesPlan
-from en4dvar.data.noise import Noise, noise_of
+from en4dvar.data.noise import noise_of
 from en4dvar.data.observations import Observations
 from en4dvar.data.series import Series
 from en4dvar.ensemble.forecast import forecast
@@ -79,7 +79,8 @@ def planned_problem(config: Config) -> InverseProblem:
     assert times is not None
     for series in plan.series:
         _require_plannable(series)
-    blank = _observations(config, [np.full(len(times), _scale(measured))] * len(plan.series), times, measured)
+    scale = 1.0 if measured is None else float(measured.values.max())  # for priors that refer to the largest reading
+    blank = _observations(config, [np.full(len(times), scale)] * len(plan.series), times, measured)
     problem = problem_of(config, blank)
     run = forecast(problem, problem.prior.mean[None])
     if run.failures[0]:
@@ -102,11 +103,6 @@ def files_needed(config: Config) -> dict[str, DataFile]:
     return dict([next(iter(data_files(inverse_plan(config)).items()))])
 
 
-def _scale(measured: Observations | None) -> float:
-    """The largest reading, for priors that refer to it."""
-    return 1.0 if measured is None else float(measured.values.max())
-
-
 def _observations(
     config: Config, values: list[Array], times: Array, measured: Observations | None, stated: bool = False
 ) -> Observations:
@@ -117,7 +113,9 @@ def _observations(
             observable=planned.observable,
             times=times,
             values=own,
-            noise=_noise(planned, times, own) if stated else noise_of(np.ones(len(times)), np.zeros(len(times))),
+            noise=errors_of(planned.data, times, own, np.arange(len(times)), {})
+            if stated
+            else noise_of(np.ones(len(times)), np.zeros(len(times))),
             name=planned.name,
             group=planned.group,
             scalars=measured.scalars if measured else {},
@@ -126,10 +124,6 @@ def _observations(
         for planned, own in zip(plan.series, values, strict=True)
     ]
     return Observations.of_series(series, plan.correlation if stated else {}, config.name)
-
-
-def _noise(series: SeriesPlan, times: Array, values: Array) -> Noise:
-    return errors_of(series.data, times, values, np.arange(len(times)), {})
 
 
 def _require_plannable(series: SeriesPlan) -> None:

@@ -109,8 +109,7 @@ def estimate(
         config = replace(_checked(content, where, ready, resolve), directory=where)
         _keep_data(where, call.files, resume or force)
         shown = progress if callable(progress) else held.enter_context(terminal_progress()) if progress else None
-        campaign = run_campaign(config, force=force, resume=resume, progress=shown, command="en4dvar.estimate")
-        (result,) = campaign
+        (result,) = run_campaign(config, force=force, resume=resume, progress=shown, command="en4dvar.estimate")
     if directory is None:
         for path in ("/", "/observed_data"):
             result = result.with_attributes(path, data_source=ARRAYS)

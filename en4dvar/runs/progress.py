@@ -225,7 +225,7 @@ def counted(what: str) -> Iterator[Callable[[int, int], None] | None]:
         return
     with shown(Bar(console=console, transient=True)) as bar:
         task = bar.add_task(what, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
+        yield lambda done, total: bar.update(task, completed=done, total=total or None)
 
 
 def _short(name: str, record: Record) -> str:

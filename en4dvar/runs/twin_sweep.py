@@ -22,6 +22,7 @@ from en4dvar.plumbing.errors import ConfigError, En4dvarError
 from en4dvar.plumbing.files import readable, write_text
 from en4dvar.plumbing.tables import csv_text, table
 from en4dvar.report.chart import POINTS, Chart, Panel, Row
+from en4dvar.report.svg import on_paper
 from en4dvar.results.checkpoint import FOLDER, digest, write_checkpoint
 from en4dvar.results.fingerprint import identity
 from en4dvar.runs.engine import conduct_run
@@ -86,8 +87,6 @@ class TwinSweep:
 
     def plot(self) -> Figure:
         """RMSE of each estimate, with its standard error, over the settings."""
-        from en4dvar.report.paper import on_paper  # matplotlib takes time to import
-
         names = [", ".join(map(_text, values)) for values in self.values]
         panel = Panel(", ".join(self.keys), "RMSE", xticks=range(len(names)), names=names, legend=True)
         for estimate, colour in zip(dict.fromkeys(row["estimate"] for row in self.rows), COLOURS, strict=False):
@@ -196,54 +195,31 @@ class SweepKind(RunKind[TwinSweep]):
         return f"the finished runs are kept in {self.directory}"
 
     def conduct(self, run: Session, executor: Executor) -> TwinSweep:
-        done = _Runs(run, self.configs, self.seeds, self.progress).all(executor)
-        sweep = TwinSweep(self.keys, self.values, self.seeds, done, self.directory)
+        runs, n = self._runs(run, executor), len(self.seeds)
+        of_settings = tuple(tuple(runs[i : i + n]) for i in range(0, len(runs), n))
+        sweep = TwinSweep(self.keys, self.values, self.seeds, of_settings, self.directory)
         write_text(run.directory.at("sweep.csv"), sweep_csv(sweep))
         write_text(run.directory.at("runs.csv"), runs_csv(sweep))
         return sweep
 
-
-class _Runs:
-    """The runs of a sweep, those that are there taken over."""
-
-    def __init__(
-        self,
-        session: Session,
-        configs: Sequence[TwinConfig],
-        seeds: tuple[int, ...],
-        progress: Callable[[int, int], None] | None,
-    ):
-        self.session, self.progress = session, progress
-        prints = [identity(c.resolved, c.experiment.model, {}).settings for c in configs]
-        self.jobs = [
-            (c.experiment, seed, digest(f"{text}\nseed of the run: {seed}".encode()))
-            for c, text in zip(configs, prints, strict=True)
-            for seed in seeds
-        ]
-        self.seeds = len(seeds)
-
-    def all(self, executor: Executor) -> tuple[tuple[TwinRun, ...], ...]:
-        done = {i: run for i, job in enumerate(self.jobs) if (run := self._restored(job[2])) is not None}
-        left = [i for i in range(len(self.jobs)) if i not in done]
-        self._tell(len(done))
-        for n, value in executor.map(_one, (self.jobs[i][:2] for i in left)):
+    def _runs(self, session: Session, executor: Executor) -> list[TwinRun]:
+        """One a seed, setting by setting; those that are there are taken over."""
+        settings = [(c.experiment, identity(c.resolved, c.experiment.model, {}).settings) for c in self.configs]
+        jobs = [(experiment, seed) for experiment, _ in settings for seed in self.seeds]
+        marks = [digest(f"{text}\nseed of the run: {seed}".encode()) for _, text in settings for seed in self.seeds]
+        files = [f"{FOLDER}/{mark[:24]}.run" for mark in marks]
+        again, tell = "its run is conducted again", self.progress or (lambda done, total: None)
+        kept = (session.restore(file, mark, TwinRun, again) for file, mark in zip(files, marks, strict=True))
+        done = {i: run for i, run in enumerate(kept) if run is not None}
+        left = [i for i in range(len(jobs)) if i not in done]
+        tell(len(done), len(jobs))
+        for n, value in executor.map(_one, (jobs[i] for i in left)):
             if isinstance(value, Exception):
                 raise value
-            done[left[n]], fingerprint = value, self.jobs[left[n]][2]
-            write_checkpoint(self.session.directory.at(self._file(fingerprint)), fingerprint, value)
-            self._tell(len(done))
-        runs = [done[i] for i in range(len(self.jobs))]
-        return tuple(tuple(runs[i : i + self.seeds]) for i in range(0, len(runs), self.seeds))
-
-    def _restored(self, fingerprint: str) -> TwinRun | None:
-        return self.session.restore(self._file(fingerprint), fingerprint, TwinRun, "its run is conducted again")
-
-    def _file(self, fingerprint: str) -> str:
-        return f"{FOLDER}/{fingerprint[:24]}.run"
-
-    def _tell(self, done: int) -> None:
-        if self.progress is not None:
-            self.progress(done, len(self.jobs))
+            done[left[n]] = value
+            write_checkpoint(session.directory.at(files[left[n]]), marks[left[n]], value)
+            tell(len(done), len(jobs))
+        return [done[i] for i in range(len(jobs))]
 
 
 def _one(experiment: TwinExperiment, seed: int) -> TwinRun:

@@ -43,8 +43,7 @@ class Predictor:
         if len(states):
             outcomes = self.executor.trajectories(self.problem.model, states, times[alive])
             observed[alive] = self._reading.observe(outcomes, times.shape[1])[0][0]
-        read: Array = as_read(self.problem, physical, observed[None])[0]
-        return read
+        return np.asarray(as_read(self.problem, physical, observed[None])[0])
 
     def time_shifts(self, x: Array) -> Array:
         """t_s (B,) of control vectors (B, n)."""

@@ -21,6 +21,7 @@ import numpy as np
 from en4dvar.model.state import Array
 from en4dvar.sampling.mixture import StudentMixture, effective_number, resampled
 
+NARROWEST = 0.03  # standard deviation of what is drawn about points, in units of the prior
 FEWEST = 60.0  # effective draws that a proposal is fitted to: with fewer, to tempered weights
 COMPONENTS = 4
 FITTED = 2000  # points that few parts are fitted to
@@ -47,6 +48,14 @@ class Proposal(Protocol):
 def standard(n: int) -> StudentMixture:
     """The prior in its own coordinates, with the tails of a proposal."""
     return StudentMixture(np.ones(1), np.zeros((1, n)), np.eye(n)[None])
+
+
+def about(points: Array, of_prior: float) -> StudentMixture:
+    """Student t about points (N, n), in no direction narrower than :data:`NARROWEST`, and a share ``of_prior``."""
+    first, n = standard(points.shape[1]), points.shape[1]
+    covariance = np.cov(points, rowvar=False).reshape(n, n) + NARROWEST**2 * np.eye(n)
+    root = np.concatenate([first.root, np.linalg.cholesky(covariance)[None]])
+    return StudentMixture(np.array([of_prior, 1 - of_prior]), np.vstack([first.centre, points.mean(axis=0)]), root)
 
 
 class Importance:
@@ -89,17 +98,21 @@ class Importance:
         """Draws (M, n) and what came of them (M,); weights and evidence of all draws follow."""
         n = z.shape[1]
         target = log_likelihood - 0.5 * np.sum(z**2, axis=1) - 0.5 * n * np.log(2 * np.pi)
-        if len(self.z):
-            self.mixture = np.logaddexp(self.mixture, self.proposals[-1].log_density(self.z))
-        here = np.logaddexp.reduce([q.log_density(z) for q in self.proposals], axis=0)
+        self.mixture = self._mixed(z)
         self.z, self.target = np.concatenate([self.z, z]), np.concatenate([self.target, target])
-        self.mixture = np.concatenate([self.mixture, here])
         self.log_weights = self.target - self.mixture + np.log(len(self.proposals))
         top = float(self.log_weights.max())
         if np.isfinite(top):
             weights = np.exp(self.log_weights - top)
             self.log = top + float(np.log(weights.mean()))
             self.effective = effective_number(weights)
+
+    def _mixed(self, z: Array) -> Array:
+        """ln Σ_t q_t of the draws so far, and of ``z``."""
+        before = self.mixture
+        if len(self.z):
+            before = np.logaddexp(before, self.proposals[-1].log_density(self.z))
+        return np.concatenate([before, np.logaddexp.reduce([q.log_density(z) for q in self.proposals], axis=0)])
 
     def next_proposal(self) -> Proposal:
         """Fitted to the draws so far; the first one while hardly any of them has a weight."""
@@ -164,12 +177,10 @@ class FixedDraws(Importance):
         return self.proposals[0].draw(self.count, self.stream)
 
     def add(self, z: Array, log_likelihood: Array) -> None:
-        target = log_likelihood - 0.5 * np.sum(z**2, axis=1) - 0.5 * z.shape[1] * np.log(2 * np.pi)
-        self.z, self.target = np.concatenate([self.z, z]), np.concatenate([self.target, target])
-        self.mixture = np.concatenate([self.mixture, self.proposals[0].log_density(z)])
-        self.log_weights = self.target - self.mixture
-        top = float(self.log_weights.max())
-        if np.isfinite(top):
-            self.log = top + float(np.log(np.exp(self.log_weights - top).mean()))
+        super().add(z, log_likelihood)
+        if np.isfinite(self.log):
             self.log_weights = np.minimum(self.log_weights, self.log + np.log(MOST * np.sqrt(len(self.z))))
             self.effective = effective_number(np.exp(self.log_weights - self.log_weights.max()))
+
+    def _mixed(self, z: Array) -> Array:
+        return np.concatenate([self.mixture, self.proposals[0].log_density(z)])

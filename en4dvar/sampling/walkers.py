@@ -10,6 +10,7 @@ from en4dvar.model.state import Array
 STRETCHES = 0.3  # share of the moves, the others are differential evolution
 LEAPS = 0.1  # share of the latter of length 1, which takes walkers from one mode to another
 JITTER = 2e-5  # of the spread, the most
+MOVES = 5  # of one half of the walkers while the other stands still
 
 
 class Emulated(Protocol):
@@ -55,3 +56,19 @@ def advance(
         np.copyto(x, proposed, where=accepted)
         np.copyto(costs, new, where=accepted)
     return np.ascontiguousarray(x.T), costs
+
+
+def walked(
+    cost: Callable[[Array], Array], start: Array, random: Any, rounds: int, left_out: int, costs: Array | None = None
+) -> Array:
+    """Positions (D, n) on exp(−cost) of walkers from ``start`` (W, n), two halves that move in turn.
+
+    Those of the first ``left_out`` rounds are left out. ``costs`` (W,): of the start, where they are known.
+    """
+    halves, kept = list(start.reshape(2, len(start) // 2, -1)), list[Array]()
+    of_each = [cost(part) for part in halves] if costs is None else list(costs.reshape(2, -1))
+    for number in range(rounds):
+        for i in (0, 1):
+            halves[i], of_each[i] = advance(cost, halves[i], of_each[i], halves[1 - i], random, MOVES)
+        kept += halves if number >= left_out else []
+    return np.concatenate(kept)

@@ -157,31 +157,6 @@ def log_evidence(gaps: Array, std: Array, correlation: Correlation | None) -> Ar
 
 
 @dataclass(frozen=True)
-class SequentialState:
-    """All that the rest of a run depends on, besides its arguments, and what it has found so far.
-
-    ``cycle`` observation times are done; ``ensemble`` (N', n_state + changes) stands at ``start`` (0: time zero, k:
-    observation time k). Random numbers are drawn by cycle, so that no generator has a state.
-    """
-
-    cycle: int
-    start: int
-    ensemble: Array
-    forecast: Moments
-    analysis: Moments
-    smoothed: Moments
-    predicted: Moments
-    ranks: Array
-    evidence: Array
-    iterations: Array
-    effective: Array
-    kept: tuple[tuple[int, Array], ...]
-    forward_runs: int
-    failures: tuple[str, ...] = ()
-    trail: tuple[Array, ...] = ()
-
-
-@dataclass(frozen=True)
 class SequentialResult:
     """The result of a run: moments of forecast, analysis (by y_1…y_k) and smoothed ensemble (by y_1…y_{k+L}).
 
@@ -206,3 +181,21 @@ class SequentialResult:
     kept: tuple[tuple[int, Array], ...] = ()
     failures: tuple[str, ...] = ()
     forward_runs: int = 0
+
+
+@dataclass(frozen=True)
+class SequentialState(SequentialResult):
+    """What a run has found so far, with all that the rest of it depends on, besides its arguments.
+
+    ``cycle`` observation times are done; ``ensemble`` (N', n_state + changes) stands at ``start`` (0: time zero, k:
+    observation time k). Random numbers are drawn by cycle, so that no generator has a state.
+    """
+
+    cycle: int = 0
+    start: int = 0
+    trail: tuple[Array, ...] = ()
+
+    @property
+    def ensemble(self) -> Array:
+        """The members, with the changes of what varies."""
+        return self.members

@@ -135,9 +135,9 @@ class _Run:
         after, smooth = (recorder.moments().until(done) for recorder in (self.after, self.smooth))
         ranks, evidence = (numbers[: done + 1].copy() for numbers in (self.predicted.ranks, self.predicted.evidence))
         return SequentialState(
-            done, self.start, self.ensemble, before, after, smooth, predicted, ranks, evidence,
-            self.iterations[:done].copy(), self.effective[:done].copy(), tuple(self.kept), self.flow.runs,
-            tuple(self.failures), tuple(self.trail),
+            before, after, smooth, predicted, ranks, evidence, self.iterations[:done].copy(),
+            self.effective[:done].copy(), self.ensemble, tuple(self.kept), tuple(self.failures), self.flow.runs, done,
+            self.start, tuple(self.trail),
         )  # fmt: skip
 
     def result(self) -> SequentialResult:

@@ -53,8 +53,7 @@ class InitialEnsemble:
             assert x is not None
             origin[:, column] = x[:, prior.names.index(term.parameter.name)]
         states = self.coordinates.from_physical(self._initial(x, n)[:, None], origin)[:, 0]
-        disturbed: Array = states + std * of_state
-        return disturbed
+        return np.asarray(states + std * of_state)
 
     def _initial(self, x: Array | None, n_members: int) -> Array:
         """The model's states (N, n_state) for control vectors (N, n) of the prior."""

@@ -102,8 +102,7 @@ class Fit:
         """(S·N,) posterior members of all sets, SI; failed ones left out."""
         j = self.prior.names.index(name)
         stacked = np.concatenate([a.posterior[:, j] for a in self.analyses])
-        finite: Array = stacked[np.isfinite(stacked)]
-        return finite
+        return np.asarray(stacked[np.isfinite(stacked)])
 
     def prior_members(self, name: str) -> Array:
         """(N,) members of the prior, SI."""

@@ -116,12 +116,11 @@ def columns(path: Path, sheet: str = "") -> dict[str, Any]:
     with suppress(En4dvarError):
         asked = asked.by_names()
     step = max(1, max((len(v) for v in contents.columns.values()), default=0) // PLOTTED)
-    shown = {name: [_finite(v) for v in values[::step]] for name, values in contents.columns.items()}
+    shown = {
+        name: [float(v) if np.isfinite(v) else None for v in values[::step]]
+        for name, values in contents.columns.items()
+    }
     return {
         "file": first.name, "files": len(files), "columns": shown, "words": [*contents.others],
         "decimal": layout.decimal, "tracked": asked.tracked, "time": asked.time_column, "radius": asked.radius_column,
     }  # fmt: skip
-
-
-def _finite(value: Any) -> float | None:
-    return float(value) if np.isfinite(value) else None

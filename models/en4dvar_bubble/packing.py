@@ -193,8 +193,7 @@ def _memory(
         par[:, at], par[:, at + 1] = memory.relaxation_time[:, j] * 1e6, memory.convection[j]
         par[:, at + 2] = (member * system.memory + j) * (2 * GRID.cells * 8)
     tables = np.stack([memory.stiffness, memory.equilibrium], axis=2)
-    packed: Array = (tables / np.reshape(rho, (-1, 1, 1, 1, 1))).reshape(-1, 1, 8)
-    return packed
+    return np.asarray((tables / np.reshape(rho, (-1, 1, 1, 1, 1))).reshape(-1, 1, 8))
 
 
 def _constants(model: Dynamics, medium: Medium, own: Mapping[str, Array], n_members: int) -> Array:

@@ -64,8 +64,7 @@ class Paths(Batch):
     def largest(self, name: str) -> Array:
         """(N,) wall Mach numbers over all steps of the solver; with Rayleigh–Plesset over the stored instants."""
         if name != "wall_mach":
-            largest: Array = np.abs(self[name]).max(axis=1)
-            return largest
+            return np.asarray(np.abs(self[name]).max(axis=1))
         if self.model.radial == "rayleigh-plesset":  # its equations know no speed of sound
             return np.asarray(np.abs(self["Rdot"] / self.medium(1).c).max(axis=1))
         return self.solution.record[:, MAX_MACH]

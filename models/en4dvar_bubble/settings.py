@@ -1,7 +1,7 @@
 """The ``model:`` section of a YAML file for the bubble."""
 
 from dataclasses import Field as FieldOfMedium
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Annotated, Any, Literal, get_args
 
 from pydantic import (
@@ -249,12 +249,6 @@ class BubbleSettings(Section):
 
     @property
     def solver_accuracy(self) -> Accuracy:
-        base = preset(self.accuracy, self.start)
-        return Accuracy(
-            nodes=base.nodes if self.nodes is None else self.nodes,
-            rtol=base.rtol if self.rtol is None else self.rtol,
-            medium_nodes=base.medium_nodes if self.medium_nodes is None else self.medium_nodes,
-            step_limit=self.step_limit,
-            time_limit=self.time_limit,
-            mach_limit=self.mach_limit,
-        )
+        said = {f.name: getattr(self, f.name) for f in fields(Accuracy)}
+        own = {name: value for name, value in said.items() if value is not None}
+        return replace(preset(self.accuracy, self.start), **own)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -157,8 +157,7 @@ def smooth_surface(frames: Sequence[Frame]) -> Array:
         fitted = np.linalg.solve(chosen @ terms.T, chosen @ values)  # of terms within ±1, so that squares lose little
         off = values - fitted @ terms
         kept = np.abs(off) <= 3 * max(1.4826 * float(np.median(np.abs(off[kept]))), 0.5)
-    surface: Array = (fitted @ terms).reshape(typical.shape).astype(np.float32)
-    return surface
+    return np.asarray((fitted @ terms).reshape(typical.shape).astype(np.float32))
 
 
 def _lit_as(frame: Image, other: Image) -> Image:
@@ -251,7 +250,7 @@ def _with_sign(
         for d in ((_lit_as(f, level) - level)[~blind] for f in samples)
     ]
     if float(np.median([v for v in votes if abs(v) > 4 * noise] or [-1.0])) > 0:
-        full = _full(samples, level)
+        full = max(float(np.median([np.percentile(f - level, 99.5) for f in samples])), 1.0)
         gain = np.full_like(level, -1.0 / full)
         return Background(level, np.where(blind, np.float32(np.nan), gain), noise / full, empty, relative=False)
     smooth = ndimage.gaussian_filter(level, SMOOTH)
@@ -265,10 +264,6 @@ def _with_sign(
     return Background(level, gain, noise * float(np.nanmedian(gain)), empty)
 
 
-def _full(samples: Sequence[Frame], level: Array) -> float:
-    return max(float(np.median([np.percentile(f - level, 99.5) for f in samples])), 1.0)
-
-
 def _refined(background: Background, samples: Sequence[Frame]) -> Background:
     """The background's level with the parts of later frames that lie outside the bubble: less noise.
 
@@ -278,12 +273,7 @@ def _refined(background: Background, samples: Sequence[Frame]) -> Background:
     total = background.level * background.frames
     count = np.full(total.shape, float(background.frames), dtype=np.float32)
     y, x = np.mgrid[: total.shape[0], : total.shape[1]]
-    for frame in samples:
-        image, tiles = background.normalised(frame)
-        places = locate(tiles, background.noise / TILE, LEAST_CONTRAST)
-        if not places or share_changed(tiles, background.noise) > CHANGED:
-            continue
-        image = background.steadied(image, tiles, places[0][0])
+    for image, places in _steadied(background, samples):
         near = ndimage.uniform_filter(image, HALO)  # the halo of a light is no background
         quiet = (np.abs(image) < 5 * background.noise) & (np.abs(near) < max(5 * background.noise / HALO, STILL))
         for circle, _ in places:
@@ -297,6 +287,15 @@ def _refined(background: Background, samples: Sequence[Frame]) -> Background:
     return replace(background, level=(mean + share * (level - mean)).astype(np.float32))
 
 
+def _steadied(background: Background, samples: Sequence[Frame]) -> Iterator[tuple[Array, list[tuple[Circle, float]]]]:
+    """Of frames that show a circle, and no flash, the image in the light of the level, and the circles."""
+    for frame in samples:
+        image, tiles = background.normalised(frame)
+        places = locate(tiles, background.noise / TILE, LEAST_CONTRAST)
+        if places and share_changed(tiles, background.noise) <= CHANGED:
+            yield background.steadied(image, tiles, places[0][0]), places
+
+
 def share_changed(tiles: Array, noise: float) -> float:
     """The share of tiles much brighter than the background, as those of a flash."""
     return float(np.mean(tiles > max(4 * noise, BRIGHT)))
@@ -305,13 +304,8 @@ def share_changed(tiles: Array, noise: float) -> float:
 def _optics(background: Background, samples: Sequence[Frame], movie: Movie, circles: int) -> Optics:
     """Contrast and sharpness that the sampled frames share. Raises :class:`DataError` where none shows a bubble."""
     optics = []
-    for frame in samples:
-        image, tiles = background.normalised(frame)
-        places = locate(tiles, background.noise / TILE, LEAST_CONTRAST)
-        if not places or share_changed(tiles, background.noise) > CHANGED:
-            continue
-        place, contrast = places[0]
-        outlines = fit_outline(background.steadied(image, tiles, place), place, Optics(-contrast), circles)
+    for image, ((place, contrast), *_) in _steadied(background, samples):
+        outlines = fit_outline(image, place, Optics(-contrast), circles)
         if outlines is not None and outlines[0].seen > 0.15 and outlines[0].contrast < 0:
             optics.append(outlines[0])
     if not optics:

@@ -70,7 +70,8 @@ def look_at(
         outlines = fit_outline(steady, place, optics, circles)
         if outlines is None or any(_same(outlines[0].circle, c.circle) for c in candidates):
             continue
-        candidate = Candidate(number, tuple(outlines), _fault(outlines, optics, background.noise))
+        fault = next((words for o in outlines if (words := _fault_of(o, optics, background.noise))), "")
+        candidate = Candidate(number, tuple(outlines), fault)
         doubt = "" if candidate.fault else _doubt(steady, outlines[0], optics, circles)
         candidates.append(replace(candidate, doubt=doubt))
     return Look(number, tuple(candidates), "" if candidates else "no circle fits the outline", spot)
@@ -87,11 +88,6 @@ def _spot(tiles: Array, noise: float) -> tuple[float, float, float] | None:
         return None
     y, x = np.nonzero(tiles > 0.7 * most)
     return float(TILE * np.median(x) + 0.5), float(TILE * np.median(y) + 0.5), most
-
-
-def _fault(outlines: list[Outline], optics: Optics, noise: float) -> str:
-    """Why outlines are none of a bubble; "" where they are."""
-    return next((fault for o in outlines if (fault := _fault_of(o, optics, noise))), "")
 
 
 def _fault_of(outline: Outline, optics: Optics, noise: float) -> str:

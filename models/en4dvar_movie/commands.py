@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -55,6 +53,7 @@ def track(
     from en4dvar.commands.common import command_line, refuse_to_replace
     from en4dvar.executor import available_cores
     from en4dvar.plumbing.files import write_text
+    from en4dvar.runs.progress import counted
     from en4dvar_movie.choice import place, watched
     from en4dvar_movie.corrections import read_corrections
     from en4dvar_movie.following import MOST
@@ -77,7 +76,8 @@ def track(
     fixed = read_corrections(corrections) if corrections else {}
     point = place(choice["bubble"])
     part = watched(opened, choice["region"], choice["mask"])
-    with _bar(opened.count) as progress:
+    with counted("frames") as tell:
+        progress = (lambda done: tell(done, opened.count)) if tell else (lambda done: None)
         shutter = scale.exposure if scale.exposure > 0 else 0.0
         track = track_movie(opened, workers or available_cores(), fixed, progress, scale.flashes, point, part, shutter)
     for note in (*opened.notes, *track.notes):
@@ -124,18 +124,3 @@ def _scaled(
     if instants[-1] - instants[0] >= 1 / movie.rate:
         raise click.UsageError(f"--flashes {flashes}: more than {between}")
     return movie, Scale(movie.pixel, movie.rate, float("nan") if shutter is None else shutter, instants)
-
-
-@contextmanager
-def _bar(total: int) -> Iterator[Callable[[int], None]]:
-    """Progress on a terminal."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield lambda done: None
-        return
-    with Progress(console=console, transient=True) as bar:
-        task = bar.add_task("frames", total=total or None)
-        yield lambda done: bar.update(task, completed=done)

@@ -74,8 +74,7 @@ def film(config: Config, times: Array | None, out: Path, settings: Mapping[str, 
 def exposures(times: Array, camera: Camera) -> Array:
     """Instants (K, S) at which each frame is exposed: all of a flash or of the exposure, in equal parts."""
     within = camera.exposure * np.linspace(-0.5, 0.5, INSTANTS) if camera.exposure else np.zeros(1)
-    instants: Array = times[:, None] + np.add.outer(np.array(camera.flashes), within).ravel()
-    return instants
+    return np.asarray(times[:, None] + np.add.outer(np.array(camera.flashes), within).ravel())
 
 
 def parse_settings(settings: Mapping[str, str]) -> tuple[Camera, Scene]:

@@ -18,7 +18,7 @@ from en4dvar.plumbing.decoding import Allowed, DecodeError, decoded, decoded_who
 from en4dvar.plumbing.errors import DataError, En4dvarError
 from en4dvar.plumbing.files import open_plain
 from en4dvar.plumbing.hints import no_such_file
-from en4dvar_movie.decoders import TiffAbout, check_size, image, tiff_about, tiff_frames, video_count, video_frames
+from en4dvar_movie.decoders import check_size, image, tiff_about, tiff_frames, video_count, video_frames
 
 Frame = npt.NDArray[Any]
 TIFF, VIDEO = (".tif", ".tiff"), (".mp4", ".avi", ".mov", ".mkv")
@@ -130,7 +130,7 @@ def _size(shape: tuple[int, ...]) -> str:
 
 
 def _tiff(path: Path) -> Movie:
-    about: TiffAbout = decoded_whole(tiff_about, path, allowed=MOVIES)
+    about = decoded_whole(tiff_about, path, allowed=MOVIES)
     start, count, shape = about.start, about.count, about.shape
     check_size(shape, path)
     if about.pages == 1 < count and about.plain and path.stat().st_size >= start + count * about.frame:

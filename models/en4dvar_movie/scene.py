@@ -114,8 +114,7 @@ def _cover(r: Array, radii: Array) -> Array:
     """Mean over radii (S,) of how much of a sub-pixel at r the disc covers: linear between its edges."""
     edges = np.sort(np.concatenate([radii - 0.5 / FINE, radii + 0.5 / FINE]))
     values = np.clip((radii[:, None] - edges) * FINE + 0.5, 0, 1).mean(axis=0)
-    profile: Array = np.interp(r, edges, values)
-    return profile
+    return np.asarray(np.interp(r, edges, values))
 
 
 def _exposed(light: Array, scene: Scene, rng: np.random.Generator) -> Frame:

@@ -112,8 +112,7 @@ class DiscrepancyNoise(Noise):
     def drawn(self, predicted: Predicted, stream: np.random.Generator) -> Array:
         root = np.linalg.cholesky(self.covariance_of_discrepancy(predicted))
         missed = np.einsum("...ij,...j->...i", root, stream.standard_normal(predicted.values.shape))
-        drawn: Array = super().drawn(predicted, stream) + missed
-        return drawn
+        return np.asarray(super().drawn(predicted, stream) + missed)
 
     def explained(self, values: Array, predicted: Predicted) -> tuple[Array, Array]:
         """Mean and std (K,) of δ given the residual at one prediction."""
@@ -163,8 +162,7 @@ class DiscrepancyNoise(Noise):
             own = np.diagonal(precision, axis1=1, axis2=2)
             return (0.5 * (np.log(own) - scaled**2 / own) - self._log_norm(),)
 
-        log_conditional: Array = self._in_parts(predicted, 1, conditional)[0]
-        return log_conditional
+        return np.asarray(self._in_parts(predicted, 1, conditional)[0])
 
     def log_normalisation(self, weights: Array) -> float:
         return float(np.sum(weights * (np.log(self.std) + self._log_norm())))

@@ -68,7 +68,8 @@ def examine(
         *_validity(a, alive),
         *checks.gaussian(prior, members, a.shape),
     )
-    silent = {name for name in prior.names if untrusted(warnings, name)} | _changes(a) | _beside(a)
+    silent = {name for name in prior.names if untrusted(warnings, name)} | _beside(a)
+    silent |= {term.parameter.name for change in a.problem.varying for term in change.terms}  # data may say little
     little = checks.information(prior, control.posterior[alive], a.dfs_per_parameter, silent)
     return advised(a, worst_first((*warnings, *little)))
 
@@ -78,11 +79,6 @@ def _whole(prior: Prior, control: ControlEnsembles, alive: npt.NDArray[np.bool_]
     if control.costs is not None:
         yield from checks.rank(prior, control.prior, control.posterior[alive])
         yield from collapse(prior, control, alive)
-
-
-def _changes(a: Analysis) -> set[str]:
-    """Names of the changes of parameters that vary, of which data may say little."""
-    return {term.parameter.name for change in a.problem.varying for term in change.terms}
 
 
 def _beside(a: Analysis) -> set[str]:

@@ -55,8 +55,7 @@ class Ledger:
         """(P, M), the share of each cell; rows sum to one, NaN where nothing on the path informs the parameter."""
         size = np.abs(self.kernel)
         total = size.sum(axis=1, keepdims=True)
-        shares: Array = np.divide(size, total, out=np.full_like(size, np.nan), where=total > 0)
-        return shares
+        return np.asarray(np.divide(size, total, out=np.full_like(size, np.nan), where=total > 0))
 
     @property
     def quantiles(self) -> Array:

@@ -47,22 +47,20 @@ class Agreement:
     """``squares`` z² (E,) of each experiment against others, along ``freedom`` (E,) directions, and ``chances`` (E,)
     that it be as large if they share one value; NaN where there is nothing to compare.
 
-    ``deviances`` (E,): 2 (J_o + J_b of its own quantities) more than alone; ``chance``: that those of all be so large
-    if they share one value. ``scatter`` of the others in units of their errors, known with so many ``degrees``, 0 where
-    the errors explain it.
+    ``chance``: that the deviances of all be so large if they share one value. ``scatter`` of the others in units of
+    their errors, known with so many ``degrees``, 0 where the errors explain it.
     """
 
     squares: Array
     freedom: Array
     chances: Array
-    deviances: Array
     chance: float
     scatter: float
     degrees: float
 
 
 def agreement(joint: JointProblem, singles: Sequence[Single], rest: Collection[int], deviances: Array) -> Agreement:
-    """Of each experiment with those of ``rest``, by the single estimates."""
+    """Of each experiment with those of ``rest``; ``deviances`` (E,): 2 (J_o + J_b of its own) more than alone."""
     said = [_alone(joint, e, single) for e, single in enumerate(singles)]
     squares, freedom = _squares(said, rest)
     scatter, degrees = _scatter(said, rest)
@@ -70,7 +68,7 @@ def agreement(joint: JointProblem, singles: Sequence[Single], rest: Collection[i
     shared = len({j for e in rest for j in joint.of_border(e)})
     more = max(1, sum(len(joint.of_border(e)) for e in rest) - shared)
     together = float(chdtrc(more, deviances[list(rest)].sum()))
-    return Agreement(squares, freedom, chances, deviances, together, float(np.sqrt(scatter)), degrees)
+    return Agreement(squares, freedom, chances, together, float(np.sqrt(scatter)), degrees)
 
 
 def oddest(joint: JointProblem, singles: Sequence[Single]) -> int | None:

@@ -127,9 +127,5 @@ def _covariates(problems: Sequence[InverseProblem]) -> Iterator[tuple[str, Array
     """What values are held against, and it (S,)."""
     yield "the order of the data sets", np.arange(len(problems), dtype=float)
     yield "the largest reading", np.array([float(p.observations.values.max()) for p in problems])
-    yield "the time between readings", np.array([_step(p) for p in problems])
-
-
-def _step(problem: InverseProblem) -> float:
-    step = float(np.median(np.diff(problem.observations.instants[0])))
-    return float(f"{step:.4g}")  # of one camera they differ by rounding alone
+    steps = [np.median(np.diff(p.observations.instants[0])) for p in problems]
+    yield "the time between readings", np.array([float(f"{x:.4g}") for x in steps])  # of one camera they are the same

@@ -35,9 +35,8 @@ from en4dvar.model.state import Array
 from en4dvar.plumbing.compiled import kernel
 from en4dvar.priors.prior import Prior, member_stream
 from en4dvar.sampling.mixture import StudentMixture, effective_number, resampled
-from en4dvar.sampling.walkers import advance
+from en4dvar.sampling.walkers import walked
 
-MOVES = 5  # of one half of the walkers while the other stands still
 FIT = 3000  # positions that the proposal is fitted to
 RAISED, A_SET = 5.0, 0.25  # times more probably odd by its data, and times the number of sets: named
 
@@ -137,14 +136,7 @@ class Hierarchy:
 
         walkers = effort.hyper_walkers
         start = np.hstack([self.hyper.scattered(walkers, stream), stream.standard_normal((walkers, self.c))])
-        halves = list(start.reshape(2, walkers // 2, -1))
-        costs, kept = [cost(part) for part in halves], []
-        for number in range(effort.hyper_rounds):
-            for i in (0, 1):
-                halves[i], costs[i] = advance(cost, halves[i], costs[i], halves[1 - i], stream, MOVES)
-            if number >= effort.hyper_rounds // 3:
-                kept += halves
-        return np.concatenate(kept)
+        return walked(cost, start, stream, effort.hyper_rounds, effort.hyper_rounds // 3)
 
     def _weighed(self, at: Array, stream: np.random.Generator, effort: Effort) -> tuple[Array, Array]:
         """Draws h (B, 2p + c) of a mixture fitted to positions, and logs of their weights."""

@@ -19,10 +19,9 @@ from annotated_types import Ge, Gt, Lt
 from en4dvar.estimation.population.mixtures import Mixture, log_marginal
 from en4dvar.model.state import Array
 from en4dvar.priors.prior import Prior
-from en4dvar.sampling.walkers import advance
+from en4dvar.sampling.walkers import walked
 
 SPREADS = (1e-3, 10.0)  # of τ; smaller ones are indistinguishable, and lost to rounding in the marginals
-MOVES = 5  # of one half of the walkers while the other stands still
 
 
 @dataclass(frozen=True)
@@ -81,12 +80,4 @@ def walk(hyper: Hyper, mixtures: Sequence[Mixture], stream: np.random.Generator,
         logs[inside] += log_marginal(mixtures, *hyper.population(h[inside]))
         return np.where(np.isnan(logs), np.inf, -logs)
 
-    halves = list(hyper.scattered(walkers, stream).reshape(2, walkers // 2, -1))
-    costs = [cost(part) for part in halves]
-    kept = []
-    for number in range(rounds):
-        for i in (0, 1):
-            halves[i], costs[i] = advance(cost, halves[i], costs[i], halves[1 - i], stream, MOVES)
-        if number >= rounds // 3:
-            kept += halves
-    return np.concatenate(kept)
+    return walked(cost, hyper.scattered(walkers, stream), stream, rounds, rounds // 3)

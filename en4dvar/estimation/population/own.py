@@ -27,19 +27,18 @@ from en4dvar.executor import Executor
 from en4dvar.model.state import Array
 from en4dvar.priors.prior import member_stream, own_seed
 from en4dvar.problem import InverseProblem
-from en4dvar.sampling.importance import Importance, standard
-from en4dvar.sampling.mixture import StudentMixture, fit_gaussians, resampled
-from en4dvar.sampling.walkers import advance
+from en4dvar.sampling.importance import Importance, about
+from en4dvar.sampling.mixture import fit_gaussians, resampled
+from en4dvar.sampling.walkers import walked
 
 DRAWS, MOST_ROUNDS = 200, 48  # of a round of importance sampling, and the most rounds
 ENOUGH = 200.0  # effective draws that end the rounds: they know a mean to 7 % of its std
 BEHIND_EACH = 8.0  # effective draws a dimension behind each part of a proposal
 OF_PRIOR = 0.2  # of the first draws
 KEPT = 2000  # equally likely draws of each data set
-WALKERS, MOVES, WALKED = 80, 5, 16  # moves of half of them while the other half stands still, and turns of both
+WALKERS, WALKED = 80, 16  # and their rounds
 MOST_PARTS, ROUNDS = 4, 60  # components of a mixture; rounds of expectation maximisation
 BESIDE = 1e-3  # prior standard deviations that runs for readings that one lacks are apart
-NARROWEST = 0.03  # standard deviation of what is drawn about the members, in units of the prior
 SMALLEST = 1e-12  # variance that every slope is taken to have
 INFORMED = 0.1  # least share of the prior's variance that the data take away, for a slope to be read from draws
 
@@ -84,7 +83,9 @@ def own_draws(problem: InverseProblem, start: Array, seed: int, executor: Execut
     def cost(z: Array) -> Array:
         return np.asarray(0.5 * np.sum(z**2, axis=1) - log_likelihood(z))
 
-    sampler = Importance(_about(start), member_stream(seed, "population: own draws"), DRAWS, behind_each=BEHIND_EACH)
+    sampler = Importance(
+        about(start, OF_PRIOR), member_stream(seed, "population: own draws"), DRAWS, behind_each=BEHIND_EACH
+    )
     for _ in range(MOST_ROUNDS):
         z = sampler.draw()
         sampler.add(z, log_likelihood(z))
@@ -101,31 +102,11 @@ def own_draws(problem: InverseProblem, start: Array, seed: int, executor: Execut
     return OwnDraws(walked, sampler.log, max(sampler.effective, float(WALKERS)), composite.forward_runs)
 
 
-def _about(start: Array) -> StudentMixture:
-    """Student t about members (N, n) and, now and then, the prior."""
-    n = start.shape[1]
-    covariance = np.cov(start, rowvar=False).reshape(n, n) + NARROWEST**2 * np.eye(n)
-    wide = standard(n)
-    return StudentMixture(
-        np.array([OF_PRIOR, 1 - OF_PRIOR]),
-        np.vstack([wide.centre, start.mean(axis=0)]),
-        np.concatenate([wide.root, np.linalg.cholesky(covariance)[None]]),
-    )
-
-
 def _walked(sampler: Importance, cost: Callable[[Array], Array], stream: np.random.Generator) -> Array:
     """(D, n) positions of walkers on exp(−cost), which start at draws by their weights."""
     at = stream.permutation(resampled(sampler.shares, WALKERS, stream))
     offset = 0.5 * sampler.z.shape[1] * math.log(2 * math.pi)
-    halves = list(sampler.z[at].reshape(2, WALKERS // 2, -1))
-    costs = list((-sampler.target[at] - offset).reshape(2, -1))
-    kept = []
-    for turn in range(WALKED):
-        for i in (0, 1):
-            halves[i], costs[i] = advance(cost, halves[i], costs[i], halves[1 - i], stream, MOVES)
-        if turn >= WALKED // 4:
-            kept += [half.copy() for half in halves]
-    return np.concatenate(kept)
+    return walked(cost, sampler.z[at], stream, WALKED, WALKED // 4, -sampler.target[at] - offset)
 
 
 def own_likelihoods(

@@ -13,11 +13,10 @@ from en4dvar.model.state import Array
 from en4dvar.priors.prior import member_stream
 from en4dvar.sampling.evidence import sample_sets
 from en4dvar.sampling.forward_runs import CampaignRuns, Sets, log_likelihood
-from en4dvar.sampling.importance import Importance, standard
-from en4dvar.sampling.mixture import StudentMixture, resampled
+from en4dvar.sampling.importance import Importance, about
+from en4dvar.sampling.mixture import resampled
 
 DRAWS = 400  # of a round of the search for all modes
-NARROWEST = 0.03  # standard deviation of what is drawn about the start, in units of the interim prior
 SETTLING = 6  # the walkers' positions are kept after this part of their rounds
 
 
@@ -68,9 +67,7 @@ class Training:
     ) -> tuple[Array, Array]:
         """(W, S, n) where the walkers start, and their log-densities (W, S)."""
         started = {
-            s: Importance(
-                _about(standard(len(mean)), (entry - mean) / std), member_stream(self.seed, "start", s), DRAWS
-            )
+            s: Importance(about((entry - mean) / std, 0.5), member_stream(self.seed, "start", s), DRAWS)
             for s, entry in enumerate(start)
         }
         sample_sets(self.runs, lambda z: mean + std * z, started)
@@ -125,13 +122,3 @@ class Training:
 
 def _log_gauss(x: Array, mean: Array, std: Array) -> Array:
     return np.asarray(-0.5 * np.sum(((x - mean) / std) ** 2, axis=-1))
-
-
-def _about(first: StudentMixture, z: Array) -> StudentMixture:
-    """``first`` and, as often, draws about points (N, n)."""
-    covariance = np.cov(z, rowvar=False).reshape(first.root.shape[1:]) + NARROWEST**2 * np.eye(z.shape[1])
-    return StudentMixture(
-        np.append(first.share, 1.0) / 2,
-        np.vstack([first.centre, z.mean(axis=0)]),
-        np.concatenate([first.root, np.linalg.cholesky(covariance)[None]]),
-    )

@@ -7,28 +7,26 @@ from __future__ import annotations
 
 import math
 import os
-import shlex
 import shutil
 import signal
 import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 
 from en4dvar.model.programs.errors import ProgramError
-from en4dvar.model.programs.outputs import ProgramOutput
+from en4dvar.model.programs.outputs import read
+from en4dvar.model.programs.settings import LOGARITHM, OUTPUT, STDOUT, CommandSettings, fill
 from en4dvar.model.programs.template import filled
 from en4dvar.model.state import Array
 from en4dvar.plumbing.children import Child, TimeLimitError, require_going_on, scratch, within
 from en4dvar.plumbing.files import POSIX
 
-OUTPUT = "output"  # the file that {output} names
-STDOUT = "stdout"  # what the program prints, as a file
 LAST_WORDS = 300  # characters of the standard error in a reason
 LONGEST_ERRORS = 10_000  # bytes of it that are looked at
 T = TypeVar("T")
@@ -39,91 +37,63 @@ class Program:
     """A command as a function of parameters and times; the same numbers for the same arguments, wherever it runs.
 
     ``words``: program and arguments, in which ``{input}``, ``{output}`` and ``{NAME}`` of a parameter are filled in; a
-    single one with ``shell``, which then runs it. ``templates``: input file → template, the first is ``{input}``.
-    ``files`` are copied into the scratch directory, whose parent is ``scratch``. It runs again ``retries`` times where
-    it fails.
+    single one where a shell runs it. The first of the templates is ``{input}``.
     """
 
     words: tuple[str, ...]
-    templates: Mapping[str, Path]
-    outputs: Mapping[str, ProgramOutput]
-    files: tuple[Path, ...] = ()
-    environment: Mapping[str, str] = field(default_factory=dict)
-    time_limit: float | None = None
-    retries: int = 0
-    shell: bool = False
-    scratch: Path | None = None
+    settings: CommandSettings
 
     def __call__(self, parameters: Mapping[str, float], times: Array) -> dict[str, Array]:
         """Observable → values (K,). Raises :class:`ProgramError`: the last attempt failed, with its reason."""
-        for attempt in range(self.retries + 1):
+        for attempt in range(self.settings.retries + 1):
             try:
                 return self._attempt(parameters, times)
             except ProgramError:
-                if attempt == self.retries:
+                if attempt == self.settings.retries:
                     raise
         raise AssertionError
 
     def _attempt(self, parameters: Mapping[str, float], times: Array) -> dict[str, Array]:
         """One run. What this process does for it, and what the program does, are together within the time limit."""
         require_going_on()
-        end = None if self.time_limit is None else time.monotonic() + self.time_limit
+        end = None if self.settings.time_limit is None else time.monotonic() + self.settings.time_limit
 
         def within_limit(call: Callable[[], T]) -> T:
             return call() if end is None else within(end - time.monotonic(), call)
 
         try:
-            with scratch(self.scratch) as folder:
+            with scratch(self.settings.scratch) as folder:
                 within_limit(lambda: self._fill(folder, parameters, times))
                 self._run(folder, parameters, end)
-                outputs = self.outputs.items()
-                return within_limit(lambda: {n: output.read(folder, times, self.time_limit) for n, output in outputs})
+                outputs, limit = self.settings.outputs.items(), self.settings.time_limit
+                return within_limit(lambda: {n: read(output, folder, times, limit) for n, output in outputs})
         except OSError as error:
             raise ProgramError(f"{error.filename or 'scratch folder'}: {error.strerror}") from None
         except (TimeLimitError, subprocess.TimeoutExpired):
-            raise ProgramError(f"not done after {self.time_limit:g} s") from None
+            raise ProgramError(f"not done after {self.settings.time_limit:g} s") from None
 
     def _fill(self, folder: Path, parameters: Mapping[str, float], times: Array) -> None:
-        for file in self.files:
+        for file in self.settings.files:
             shutil.copy(file, folder)
-        for name, template in self.templates.items():
+        for name, template in self.settings.templates.items():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_text(filled(template, parameters, times), encoding="utf-8", newline="")
 
     def _run(self, folder: Path, parameters: Mapping[str, float], end: float | None) -> None:
         values = {name: repr(float(value)) for name, value in parameters.items()}
-        values |= {"input": next(iter(self.templates), ""), "output": OUTPUT}
+        values |= {"input": next(iter(self.settings.templates), ""), "output": OUTPUT}
         words = [fill(word, values) for word in self.words]
-        if self.shell:  # which takes its line as it is
+        if self.settings.shell:  # which takes its line as it is
             line: list[str] | str = ["/bin/sh", "-c", *words] if POSIX else f'cmd /d /s /c "{words[0]}"'
         else:
             line = words
         with (folder / STDOUT).open("wb") as printed, tempfile.TemporaryFile(dir=folder) as said:
-            with Child(line, folder, self.environment, printed, said) as child:
+            with Child(line, folder, self.settings.environment, printed, said) as child:
                 status = child.wait(None if end is None else end - time.monotonic())
             if status:
                 said.seek(max(0, said.seek(0, os.SEEK_END) - LONGEST_ERRORS))
-                advice = " (now and then? retries: 2 runs it again)" if status < 0 and not self.retries else ""
+                advice = " (now and then? retries: 2 runs it again)" if status < 0 and not self.settings.retries else ""
                 raise ProgramError(_why(status, said.read()) + advice)
-
-
-def fill(word: str, values: Mapping[str, str]) -> str:
-    """A word of a command with ``{name}`` replaced by what is known; other braces stay."""
-    for name, value in values.items():
-        word = word.replace(f"{{{name}}}", value)
-    return word
-
-
-def split(command: str, shell: bool) -> tuple[str, ...]:
-    """The words of a command. Raises ValueError where quotes are left open or there is none."""
-    lexer = shlex.shlex(command, posix=True, punctuation_chars=False)
-    lexer.whitespace_split, lexer.commenters = True, ""
-    if not POSIX:  # a backslash separates folders
-        lexer.escape = ""
-    words = (command,) if shell else tuple(lexer)
-    if not words or not words[0].strip():
-        raise ValueError("write the program and its arguments")
-    return words
 
 
 def _why(status: int, errors: bytes) -> str:
@@ -136,9 +106,6 @@ def _why(status: int, errors: bytes) -> str:
             name = str(-status)
         return f"the program was ended by signal {name}{said}"
     return f"the program ended with exit status {status}{said}"
-
-
-LOGARITHM = "log10("  # how a term log10(name) of a combination begins
 
 
 @dataclass(frozen=True)

@@ -150,13 +150,11 @@ class JoinedBatch(Batch):
 
     def largest(self, name: str) -> Array:
         """(N,) the largest of all pieces."""
-        largest: Array = np.max([batch.largest(name) for batch in self._batches()], axis=0)
-        return largest
+        return np.asarray(np.max([batch.largest(name) for batch in self._batches()], axis=0))
 
     def beyond(self, limit: ValidityLimit) -> Array:
         """(N,) the earliest of all pieces."""
-        earliest: Array = np.min([batch.beyond(limit) for batch in self._batches()], axis=0)
-        return earliest
+        return np.asarray(np.min([batch.beyond(limit) for batch in self._batches()], axis=0))
 
     @property
     def states(self) -> Array:  # type: ignore[override]

@@ -13,7 +13,7 @@ from en4dvar.inputs.text_table import cells_of, delimiter_of, numbered_lines
 from en4dvar.plumbing.errors import DataError
 from en4dvar.plumbing.files import expanded, readable
 from en4dvar.plumbing.hints import listed, shown
-from en4dvar.plumbing.units import UnitError, parse_unit
+from en4dvar.plumbing.units import is_unit
 
 FOLDER = "folder"
 _UNIT = re.compile(r"(.+?)[ _]*[\[( _] *([^\W\d_]+|%) *[\])]?")
@@ -69,13 +69,8 @@ def _by_folder(files: Mapping[str, DataFile], data: str | Path) -> Grouped:
 
 def _unit_of(column: str) -> tuple[str, str]:
     """A column's name without the unit that it ends with, and this: of ``G [kPa]`` or ``conc_%``."""
-    if (match := _UNIT.fullmatch(column)) is None:
-        return column, ""
-    try:
-        parse_unit(match[2])
-    except UnitError:
-        return column, ""
-    return match[1], match[2]
+    match = _UNIT.fullmatch(column)
+    return (match[1], match[2]) if match and is_unit(match[2]) else (column, "")
 
 
 def _by_table(files: Mapping[str, DataFile], path: Path, column: str) -> tuple[str, dict[str, str]]:
