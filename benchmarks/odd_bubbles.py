@@ -154,6 +154,11 @@ def table(records: Sequence[Record]) -> None:
         print(
             f"| {kind} | {len(of_it)} | {named} | {share(others)} | {' | '.join(inside)} | {std[0]:.2f}, {std[1]:.2f} |"
         )
+    clean = [r for r in records if "clean" in r]
+    off = np.array([np.median(r["clean"]["own mean"], axis=0) - r["medians"] for r in clean])
+    for name, of_it in zip(GEL, off.T, strict=True):
+        error = of_it.std() / np.sqrt(len(of_it))
+        print(f"clean: medians of single means lie {of_it.mean():+.3f} ± {error:.3f} from the gel's, in ln {name}")
     for r in records:
         if "failed" in r:
             print(f"{r['key']}: {r['failed']}")

@@ -12,7 +12,7 @@ Synthetic: one bubble a recording, released in a gel of 0.1 to 100 kPa and 0.01 
 the bubble is small, sometimes a bad reading. Density, pressure and scale are those of a laboratory and not of the
 program: drawn within what is known of them, and the file does not hold them. Printed are the share of 90 % and 50 %
 intervals that hold the truth, the standard deviation of z in ln θ, which sets have no interval and why, and those that
-are more than 3.5 standard deviations off without a word.
+are more than 3.5 standard deviations off, with a warning or without a word.
 
 Measured: a folder of files with columns t_us, R_um of bubbles in one material; printed are the intervals, how many
 readings after the window lie in their 90 % bands, and how far the bubbles agree, χ² of ln θ about their weighted mean
@@ -59,7 +59,7 @@ QUICK = {"gas": "isothermal", "vapour": "none", "medium_heat": "cold", "vapour_p
 FRAMES = (6.0, 80.0)  # of a collapse, between which a camera is set
 CELLS = 4000  # instants of the model's path that readings are interpolated from
 INSIDE = {90: (0.05, 0.95), 50: (0.25, 0.75)}
-SILENT = 3.5
+FAR = 3.5
 PROMINENT = 0.03  # of the range of readings: a minimum after the window
 NUMBERS = ("G", "mu")
 
@@ -208,8 +208,11 @@ def table(records: list[Record]) -> None:
     """Coverage, z, and what has no interval."""
     seconds = [r["seconds"] for r in records if "seconds" in r]
     print(f"{len(records)} recordings; processor seconds of a set: median {np.median(seconds or [np.nan]):.1f}")
-    print("| | sets | with interval | 90 % hold | 50 % hold | std of z | mean of z | silent > 3.5 std |")
-    print("|---|---|---|---|---|---|---|---|")
+    print(
+        "| | sets | with interval | 90 % hold | 50 % hold "
+        "| truth below, above | std of z | mean of z | beyond 3.5 std |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|")
     for key in NUMBERS:
         sets = [r for r in records if key in r["truth"]]
         told = [r for r in sets if key in r and not r[key]["untrusted"]]
@@ -218,8 +221,11 @@ def table(records: list[Record]) -> None:
             sum(r[key][str(low)] <= r["truth"][key] <= r[key][str(high)] for r in told) / max(1, len(told))
             for low, high in INSIDE.values()
         ]
-        off = [r["key"] for r in told if abs(z_of(r, key)) > SILENT]
-        shares = " | ".join(f"{share:.0%}" for share in held)
+        beside = [
+            sum(r["truth"][key] < r[key]["0.05"] for r in told), sum(r["truth"][key] > r[key]["0.95"] for r in told)
+        ]  # fmt: skip
+        off = [r["key"] + " (warned)" * bool(r["warnings"]) for r in told if abs(z_of(r, key)) > FAR]
+        shares = " | ".join([*(f"{share:.0%}" for share in held), f"{beside[0]}, {beside[1]}"])
         moments = f"{z.std():.2f} | {z.mean():+.2f}" if len(z) else "– | –"
         print(f"| {key} | {len(sets)} | {len(told)} | {shares} | {moments} | {', '.join(off) or 'none'} |")
     reasons = Counter(why(r) for r in records)

@@ -95,7 +95,7 @@ class EmulatedProposal:
             return None
 
         def cost(z: Array) -> Array:
-            return _white(emulated, z) / heat
+            return emulated.cost(runs.prior.from_white(z)) / heat
 
         if isinstance(start, StudentMixture):
             made, turns = cls.of_mixture(start, stream).bridged(cost, stream), FIRST_TURNS
@@ -159,8 +159,3 @@ def _between(first: Callable[[Array], Array], last: Callable[[Array], Array], at
 def _moved(cost: Callable[[Array], Array], z: Array, others: Array, stream: np.random.Generator) -> Array:
     """Walkers (B, n) after moves about ``others`` (W, n) on exp(−``cost``)."""
     return advance(cost, z, cost(z), others, stream, MOVES)[0]
-
-
-def _white(emulated: EmulatedCost, z: Array) -> Array:
-    """Ĵ (B,) at white coordinates (B, n)."""
-    return emulated.cost(emulated.prior.from_white(z))

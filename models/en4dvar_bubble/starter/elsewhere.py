@@ -27,7 +27,6 @@ SLOW = 1.08, 1.3
 """Of the Rayleigh time: a collapse in a liquid that takes longer may have a wall nearby, and where it takes longer than
 the second, the liquid is viscous: a wall at 1.1 R_max makes it 1.19."""
 
-
 WALLS = 8.0, 200.0
 """Median of a wall's distance, in R_max, and the largest, where a collapse takes 0.1 % longer."""
 
