@@ -15,7 +15,7 @@ from en4dvar.estimation.population.campaign import _empirical, population_of, wh
 from en4dvar.estimation.population.empirical import empirical, median_of
 from en4dvar.estimation.population.hierarchy import Hierarchy, named
 from en4dvar.estimation.population.mixtures import Mixture
-from en4dvar.estimation.population.own import OwnLikelihood, _pooled
+from en4dvar.estimation.population.own import OwnDraws, OwnLikelihood, own_likelihoods, pooled_slopes
 from en4dvar.model.forward import Failure
 from en4dvar.model.state import NOISE_SCALE, Parameter
 from en4dvar.plumbing.errors import ConfigError
@@ -161,18 +161,52 @@ def test_one_that_is_odd_in_one_parameter_alone_is_named():
     assert belongs[1:].min() > 0.7
 
 
-def test_slopes_are_pooled_by_their_own_errors():
-    """One that is known badly takes the mean of the others; where they differ by more, each keeps its own."""
+def test_a_slope_that_is_known_badly_counts_little():
     rng = np.random.default_rng(3)
     errors = np.array([*[0.01] * 20, 1.0])
     alike = 0.5 + errors * rng.standard_normal(21)
-    one, others = _pooled(alike[:, None, None], errors[:, None, None] ** 2)[[20, 0], 0, 0]
-    assert one == pytest.approx(np.average(alike, weights=errors**-2.0), abs=1e-3)
-    assert others == pytest.approx(one, abs=0.01)
+    of_all = pooled_slopes(alike[:, None, None], errors[:, None, None] ** 2)[0, 0]
+    assert of_all == pytest.approx(np.average(alike, weights=errors**-2.0), abs=1e-3)
     differ = alike + rng.standard_normal(21)
-    kept = _pooled(differ[:, None, None], errors[:, None, None] ** 2)[:, 0, 0]
-    np.testing.assert_allclose(kept[:20], differ[:20], atol=0.01)
-    assert abs(kept[20] - differ[20]) > 0.2 * abs(differ[20] - kept[:20].mean())
+    assert pooled_slopes(differ[:, None, None], errors[:, None, None] ** 2)[0, 0] == pytest.approx(
+        differ.mean(), abs=0.1
+    )
+
+
+def test_slopes_that_differ_with_what_varies_tell_nothing_of_what_is_common():
+    """Of y = exp(x) + θ b + e, slopes of x with θ are steeper where x is small; exact by quadrature."""
+    rng, b, error, count = np.random.default_rng(11), 0.15, 0.08, 12
+    z, u = np.meshgrid(np.linspace(-1.5, 1.5, 301), np.linspace(-4, 4, 81), indexing="ij")
+    far = []
+    for trial in range(8):
+        x = 0.25 * rng.standard_normal(count)
+        y = np.exp(x) + b * rng.standard_normal() + error * rng.standard_normal(count)
+        likely = [norm(np.exp(z) + b * u, error).pdf(reading) for reading in y]
+        sets = []
+        for like in likely:
+            shares = (like * norm.pdf(z) * norm.pdf(u)).ravel()
+            taken = rng.choice(z.size, size=2000, p=shares / shares.sum())
+            jitter = np.array([0.01, 0.1]) * rng.uniform(-0.5, 0.5, (2000, 2))
+            sets.append(OwnDraws(np.stack([z.ravel()[taken], u.ravel()[taken]], axis=1) + jitter, 0.0, 2000.0, 0))
+        hyper = HyperPrior(1.0, 0.5, odd=0.0)
+        likelihoods = own_likelihoods(sets, [0], [1], trial, [f"set{s}" for s in range(count)])
+        found = Hierarchy(likelihoods, white_prior(["a"]), hyper).sampled(trial, Effort())
+        mean, std = by_quadrature(np.array(likely), z, hyper)
+        far.append((found.nu.mean() - mean) / std)
+        assert found.nu.std() == pytest.approx(std, rel=0.25)
+    assert abs(np.mean(far)) < 0.25
+
+
+def by_quadrature(likely, z, hyper):
+    """Mean and std of ν where likelihoods (S, x, θ) are of x at ``z`` and of θ, a priori N(0, 1)."""
+    nu, tau, u = np.linspace(-1.2, 1.2, 97), np.geomspace(0.02, 1.5, 40), np.linspace(-4, 4, likely.shape[2])
+    log = -0.5 * (nu[:, None, None] / hyper.mean_std) ** 2 - 0.5 * (tau[:, None] / hyper.spread) ** 2 - 0.5 * u**2
+    within = norm(nu[:, None, None], tau[:, None]).pdf(z[:, 0])  # (ν, τ, x)
+    for like in likely:
+        log = log + np.log(within @ like + 1e-300)
+    weights = (np.exp(log - log.max()) * np.gradient(tau)[:, None]).sum(axis=(1, 2))
+    mean = np.average(nu, weights=weights)
+    return mean, np.sqrt(np.average((nu - mean) ** 2, weights=weights))
 
 
 def test_more_data_sets_are_named_only_by_more_evidence():

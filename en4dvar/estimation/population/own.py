@@ -7,9 +7,12 @@ Where too few draws are effective, walkers go on from them (:mod:`en4dvar.sampli
 
 Of the coordinates x that vary and the quantities θ that all data sets have in common (a density, a scale) the draws
 tell how x moves with θ, to first order: the likelihood is one of x − Bθ, which gives the regression of x on θ in the
-posterior the slopes (I − C) B, where C is the covariance of x given θ and the prior of x is N(0, I). What the data tell
-of θ itself is left aside: it keeps its prior. A Gaussian mixture describes x − Bθ; dividing by the prior N(0, I + BBᵀ)
-leaves the likelihood of the data set, with which :mod:`~en4dvar.estimation.population.hierarchy` works.
+posterior the slopes (I − C) B, where C is the covariance of x given θ and the prior of x is N(0, I). A Gaussian mixture
+describes x − Bθ; dividing by the prior N(0, I + BBᵀ) leaves the likelihood of the data set, with which
+:mod:`~en4dvar.estimation.population.hierarchy` works. What the data tell of θ itself is left aside: it keeps its prior,
+and therefore all data sets of a population have the same B. Slopes of their own would tell of θ, and falsely: where a
+pressure adds as many pascals to every modulus, soft gels have the steeper slopes in ln G, and a θ that makes all of
+them stiffer would make them more alike.
 """
 
 from __future__ import annotations
@@ -116,12 +119,13 @@ def own_likelihoods(
     name the streams.
     """
     each = [(draws.z[:, list(varying)], draws.z[:, list(common)]) for draws in drawn]
-    slopes = _pooled(
+    slopes = pooled_slopes(
         *zip(*(_slopes(*both, draws.effective) for both, draws in zip(each, drawn, strict=True)), strict=True)
     )
+    streams = (member_stream(own_seed(seed, name), "population: mixture") for name in names)
     return [
-        _likelihood(x - theta @ b.T, b, draws.effective, member_stream(own_seed(seed, name), "population: mixture"))
-        for (x, theta), b, draws, name in zip(each, slopes, drawn, names, strict=True)
+        _likelihood(x - theta @ slopes.T, slopes, draws.effective, stream)
+        for (x, theta), draws, stream in zip(each, drawn, streams, strict=True)
     ]
 
 
@@ -144,21 +148,17 @@ def _slopes(x: Array, theta: Array, effective: float) -> tuple[Array, Array]:
     return np.asarray(undone @ of_posterior), variance
 
 
-def _pooled(slopes: Sequence[Array], variances: Sequence[Array]) -> Array:
-    """(S, p, c): each slope is drawn towards the mean of all by the share of its own error in its scatter
-    (DerSimonian & Laird 1986, Control. Clin. Trials 7, 177).
-
-    Errors of the slopes that differ from set to set would else look like information about θ; those of a set with
-    several modes are many times larger than those of the others.
+def pooled_slopes(slopes: Sequence[Array], variances: Sequence[Array]) -> Array:
+    """(p, c): the mean of all (S, p, c), each counted by the inverse of its own error and of their scatter together
+    (DerSimonian & Laird 1986, Control. Clin. Trials 7, 177). Slopes of a set with several modes are many times less
+    certain than those of the others.
     """
     each, errors = np.array(slopes), np.maximum(np.array(variances), SMALLEST)
     weights = 1 / errors
     apart = each - np.sum(weights * each, axis=0) / weights.sum(axis=0)
     beyond = np.sum(weights * apart**2, axis=0) - (len(each) - 1)
     scatter = np.maximum(beyond, 0.0) / (weights.sum(axis=0) - np.sum(weights**2, axis=0) / weights.sum(axis=0))
-    weights = 1 / (scatter + errors)
-    mean = np.sum(weights * each, axis=0) / weights.sum(axis=0)
-    return np.asarray(mean + scatter * weights * (each - mean))
+    return np.asarray(np.average(each, axis=0, weights=1 / (scatter + errors)))
 
 
 def _fitted(x: Array, effective: float, stream: np.random.Generator) -> tuple[Array, Array, Array]:
