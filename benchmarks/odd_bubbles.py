@@ -32,7 +32,6 @@ from en4dvar.runs.finished import finished
 
 KINDS = ("clean", "gel", "law", "other", "scale", "clock")
 QUICK = {"gas": "isothermal", "vapour": "none", "medium_heat": "cold", "vapour_pressure": "saturated"}
-ALONE = {"refine": "none", "emulator": "off", "what_if": False}  # a start; the population samples
 NEO, STIFFENING = Wrong(), Wrong(law="quadratic-kelvin-voigt", of_law={"alpha": lambda truth: 0.5})
 OFF, OTHER = 1.08, {"G": 2.1 / 7.7, "mu": 0.118 / 0.101}  # soft over stiff polyacrylamide (Estrada et al. 2018)
 GEL, OF_GEL = {"G": 8e3, "mu": 0.1}, 0.3  # and how far the gels of campaigns differ, ln
@@ -99,7 +98,7 @@ def odd(seed: int, size: int, spread: float, key: str) -> Record:
             file.write_text(text)
         changes = {f"model.{part}": value for part, value in QUICK.items()} | {"execution.workers": 1}
         changes |= {"output.report": False, "output.directory": str(Path(name) / "run"), "population": None}
-        changes |= {f"assimilation.{key}": value for key, value in ALONE.items()}
+        changes |= {"assimilation.what_if": False}
         en4dvar.run_campaign(config, overrides=changes)
         return populations(Path(name) / "run", gel, spread, seed)
 
