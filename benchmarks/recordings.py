@@ -47,6 +47,7 @@ from wrong_worlds import WORLDS, Wrong
 
 import en4dvar
 from en4dvar.cli import main as command_line
+from en4dvar.diagnosis.diagnostics import member_quantiles
 from en4dvar.inputs.window import minima
 from en4dvar.report.result import Result
 from en4dvar.report.text import shown
@@ -194,7 +195,8 @@ def _next(result: Result, largest: float) -> tuple[int, float, float] | None:
 def _posterior(members: Any, row: dict[str, str]) -> Record:
     members = members[np.isfinite(members)]
     logs = np.log(np.maximum(members, 1e-300))
-    said = {str(p): float(np.quantile(members, p)) for p in (0.05, 0.25, 0.5, 0.75, 0.95)}
+    levels = (0.05, 0.25, 0.5, 0.75, 0.95)
+    said = {str(p): float(q) for p, q in zip(levels, member_quantiles(members, levels), strict=True)}
     moments = {"mean": float(members.mean()), "std": float(members.std(ddof=1))}
     return {**said, **moments, "ln": (float(logs.mean()), float(logs.std(ddof=1))), "untrusted": row["untrusted"]}
 
