@@ -14,7 +14,7 @@ import numpy as np
 
 from en4dvar.data.noise import Linearisation, Predicted
 from en4dvar.descent.loop import EnsembleSystem, Objective
-from en4dvar.descent.step_control import NEAR, STEP_CONTROLS, Move, Point, Search, Settling, Tangent, Trials
+from en4dvar.descent.step_control import NEAR, STEP_CONTROLS, Move, Point, Search, Settling, Tangent, Trials, each_once
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.diagnosis import diagnostics as diag
 from en4dvar.diagnosis.analysis import IterationRecord, Record
@@ -196,7 +196,9 @@ class DataWindow(Objective[Descent]):
 
     def searched(self, descent: Descent) -> Search:
         """By the configured step control."""
-        return STEP_CONTROLS[self.minimiser.step_control](self._point(descent))
+        point = self._point(descent)
+        search = STEP_CONTROLS[self.minimiser.step_control](point)
+        return each_once(search) if point.sparing else search
 
     def move(self, going: Sequence[Descent], moves: Sequence[Move | None]) -> None:
         for descent, move in zip(going, moves, strict=True):
@@ -363,7 +365,7 @@ class DataWindow(Objective[Descent]):
                 return self.observations.precision_times(linear.prediction, vectors)
 
             tangent = Tangent(linear.prediction.values, linear.anomalies, precision_times, self.space.basis)
-        return Point(descent.weights.w, at.cost, descent.newton, tangent)
+        return Point(descent.weights.w, at.cost, descent.newton, tangent, self.space.derivatives is not None)
 
     def _same_members(self, a: Weights, b: Weights) -> bool:
         """Whether the scheme would run the same members again, to the step tolerance."""
