@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from en4dvar.data.noise import Linearisation, Predicted
-from en4dvar.descent.loop import EnsembleSystem, Objective
+from en4dvar.descent.loop import Objective
 from en4dvar.descent.step_control import NEAR, STEP_CONTROLS, Move, Point, Search, Settling, Tangent, Trials, each_once
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.diagnosis import diagnostics as diag
@@ -136,16 +136,16 @@ class DataWindow(Objective[Descent]):
     def keep(self, going: Sequence[Descent]) -> None:
         self.save()
 
-    def linearise(self, going: Sequence[Descent]) -> list[EnsembleSystem | None]:
+    def linearise(self, going: Sequence[Descent]) -> list[Step | GaussNewtonStep | None]:
         self.tangents = []
         each = zip(going, self.run(going), strict=True)
-        return [None if runs is None else self._system(descent, runs) for descent, runs in each]
+        return [None if runs is None else self._advanced(descent, runs) for descent, runs in each]
 
-    def _system(self, descent: Descent, runs: Runs) -> EnsembleSystem:
+    def _advanced(self, descent: Descent, runs: Runs) -> Step | GaussNewtonStep:
         reference, anomalies = self.scheme.linearise(descent.weights, runs)
         self.tangents.append((descent.weights.w, reference, anomalies))
         evaluation = self.whiten(descent, reference, anomalies)
-        return EnsembleSystem(self.scheme, descent.weights, evaluation, descent.iteration, self.draw)
+        return self.scheme.advance(descent.weights, evaluation, descent.iteration, self.draw)
 
     def run(self, going: Sequence[Descent]) -> list[Runs | None]:
         """The members of the scheme through F and H, all descents in one call; None where too few of them survive."""
