@@ -20,7 +20,7 @@ from en4dvar.diagnosis import diagnostics as diag
 from en4dvar.diagnosis.analysis import IterationRecord, Record
 from en4dvar.diagnosis.diagnostics import UNSEEN
 from en4dvar.ensemble.forecast import NO_TIMES, Forecast
-from en4dvar.ensemble.linalg import ThinTransform
+from en4dvar.ensemble.linalg import LowRank
 from en4dvar.ensemble.missing import filled
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import TooFewMembersError
@@ -208,7 +208,7 @@ class DataWindow(Objective[Descent]):
                 self._take(descent)
             self.tell(descent.records[-1])
 
-    def record(self, descent: Descent, transform: Array | ThinTransform, step_length: float) -> None:
+    def record(self, descent: Descent, transform: Array | LowRank, step_length: float) -> None:
         """Add the record of an iterate: the ensemble of ``transform`` (N, N) there, and how far it is left."""
         space, at, step = self.space, descent.iterate, descent.newton
         ensemble = space.ensemble(descent.weights.w, transform)

@@ -40,6 +40,12 @@ class Judged:
     cautions: tuple[str, ...] = ()
     failure: str = ""
 
+    @classmethod
+    def failed(cls, number: int, data_set: str, failure: str) -> "Judged":
+        """One without a posterior."""
+        nothing = np.empty(0)
+        return cls(number, data_set, nothing, np.empty((4, 0)), nothing, nothing, 0, failure=failure)
+
 
 def write_sets(path: Path, quantities: Sequence[tuple[str, str]], sets: Sequence[Judged]) -> Path:
     """Write the table of quantities (name, unit). Raises :class:`OutputError`."""
@@ -77,8 +83,7 @@ def read_sets(path: Path) -> tuple[tuple[tuple[str, str], ...], tuple[Judged, ..
 def _set(number: int, lines: Sequence[dict[str, str]]) -> Judged:
     first = lines[0]
     if first["failure"]:
-        nothing = np.empty(0)
-        return Judged(number, first["data_set"], nothing, np.empty((4, 0)), nothing, nothing, 0, (), first["failure"])
+        return Judged.failed(number, first["data_set"], first["failure"])
     truth, *quantiles, z = (np.array([float(line[name]) for line in lines]) for name in NUMBERS)
     rank, codes = np.array([float(line["rank"]) for line in lines]), tuple(first["cautions"].split())
     return Judged(number, first["data_set"], truth, np.array(quantiles), z, rank, int(first["members"]), codes)
