@@ -142,7 +142,7 @@ class CalibrationKind(RunKind[Calibration]):
         common = CommonValue((self.config, self.made, list(self.data.items())))
         for i, judged in executor.map(_judged, ((common, number) for number in left)):
             if isinstance(judged, Exception):
-                judged = Judged.failed(left[i], "", reason_of(judged))
+                judged = Judged(left[i], "", failure=reason_of(judged))
             done.append(judged)
             run.log.write(f"set {judged.number}: {judged.failure or 'estimated'}")
             keeper.keep(lambda: CalibrationState(tuple(done)))
@@ -172,7 +172,7 @@ def _judged(common: CommonValue[tuple[Config, Config, list[tuple[str, DataFile]]
         observed = replace(problem.observations, values=readings, continued=None, name=f"{name}_{number}")
         return _compared(replace(problem, observations=observed), config, seed, truth, number, name)
     except En4dvarError as error:
-        return Judged.failed(number, name, str(error))
+        return Judged(number, name, failure=str(error))
 
 
 def draw_set(maker: InverseProblem, seed: int) -> tuple[dict[str, float], Array]:
@@ -216,5 +216,5 @@ def _compared(
         z = (at - draws.mean(axis=0)) / draws.std(axis=0, ddof=1)
         rank = np.where(np.isfinite(at), np.sum(draws < at, axis=0), np.nan)
     serious = tuple(dict.fromkeys(c.code for c in analysis.cautions if c.severity == "serious"))
-    quantiles = member_quantiles(shown[:-1], LEVELS, axis=0)
-    return Judged(number, name, shown[-1], quantiles, z, rank, len(members), serious)
+    numbers = np.vstack([shown[-1], member_quantiles(shown[:-1], LEVELS, axis=0), z, rank]).T
+    return Judged(number, name, numbers, len(members), serious)
