@@ -171,6 +171,5 @@ def visit(space, w):
     """The descent at weights ``w`` of a space: J there and the Gauss–Newton step."""
     descent = Descent(Weights(w, np.eye(len(space.members))))
     window = DataWindow(space, 0, lambda: None, lambda record: None)
-    (system,) = window.linearise([descent])
-    descent.step = system.step()
+    (descent.step,) = window.linearise([descent])
     return descent

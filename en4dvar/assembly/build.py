@@ -92,7 +92,7 @@ def problem_of(config: Config, observations: Observations) -> InverseProblem:
     minimiser = asked.own.minimiser
     if minimiser and not isinstance(minimiser.start, str):
         with config.document.placing("assimilation", "start"):
-            given(prior, minimiser.start)
+            given(problem, minimiser.start)
     with config.document.placing():
         derivatives_of(problem, getattr(minimiser, "linearisation", ""))
     if localised:

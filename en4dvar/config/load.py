@@ -22,7 +22,7 @@ from en4dvar.config.sharing import Groups, PopulationSection, Sharing, check_pop
 from en4dvar.config.times import Times, read_times
 from en4dvar.config.validate import check
 from en4dvar.config.varies import MODEL_ERROR, ErrorOf
-from en4dvar.inputs.members import read_members
+from en4dvar.inputs.members import read_centres, read_members
 from en4dvar.model.forward import ForwardModel, Observable
 from en4dvar.model.state import NOISE_SCALE, Array
 from en4dvar.plumbing.errors import ConfigError, DataError, Fault
@@ -261,8 +261,11 @@ def in_order(faults: Iterable[Fault]) -> list[Fault]:
     return sorted(dict.fromkeys(faults), key=lambda fault: (fault.file, fault.line, fault.column))
 
 
-def values_of(start: GivenStart, entries: Sequence[Entry], document: Document) -> dict[str, float]:
-    """The value of each parameter that the start names, or of all where it is a file, in the parameters' units.
+def values_of(
+    start: GivenStart, entries: Sequence[Entry], document: Document
+) -> Mapping[str, float | Mapping[str, float]]:
+    """The value of each parameter that the start names, or of all where it is a file, in the parameters' units; of a
+    summary of data sets, by their names.
 
     Raises :class:`ConfigError`: a parameter that is not estimated, a unit that does not fit, a file that is no result.
     """
@@ -270,6 +273,8 @@ def values_of(start: GivenStart, entries: Sequence[Entry], document: Document) -
     where = ("assimilation", "start", "from")
     if isinstance(start.place, Path):
         try:
+            if of_sets := read_centres(start.place, units):
+                return of_sets
             members = read_members(start.place, {name: (unit, "") for name, unit in units.items()})
         except DataError as error:
             raise ConfigError([document.fault(where, str(error))]) from None

@@ -213,8 +213,9 @@ class GivenStart(Section):
         Path | dict[str, QuantityText],
         Made(_place, Annotated[str, Field(min_length=1)] | Annotated[dict[str, QuantityText], Field(min_length=1)]),
     ] = Field(alias="from")
-    """Values, such as ``{G: 5 kPa}`` (the others start at the prior's mean), or a file of members such as posterior.nc
-    of an earlier run, whose medians are taken."""
+    """Values, such as ``{G: 5 kPa}`` (the others start at the prior's mean), a file of members such as posterior.nc
+    of an earlier run, whose medians are taken, or summary.csv of an earlier campaign: each data set starts at the
+    centre of the one of its name, or of that before it."""
 
 
 class OfScheme(Section):

@@ -70,21 +70,6 @@ def field_passes(
     return passes.alive
 
 
-@dataclass(frozen=True)
-class GainSystem:
-    """The predictions of members, and the covariances with them: what the gain makes of it is the step."""
-
-    gain: Gain
-    predictions: Array
-    variance: Array
-    values: Array  # with a draw of their errors for each member
-
-    def step(self) -> Update:
-        """What changes a part of the ensemble."""
-        anomalies = self.predictions - self.predictions.mean(axis=0)
-        return self.gain.update(anomalies, self.variance, self.values - self.predictions)
-
-
 class Passes(Objective["Passes"]):
     """The passes of ES-MDA over an ensemble, which is their only descent."""
 
@@ -98,7 +83,7 @@ class Passes(Objective["Passes"]):
         self.iteration, self.stop, self.ended = 0, "", False
         self.step: Any = None
 
-    def linearise(self, going: Sequence[Passes]) -> list[GainSystem]:
+    def linearise(self, going: Sequence[Passes]) -> list[Update]:
         a, alpha, first = self.iteration, self.inflations[self.iteration], self.first
         predictions = self._predicted() if a or first is None else first
         finite = np.isfinite(predictions).all(axis=1)
@@ -106,7 +91,8 @@ class Passes(Objective["Passes"]):
         errors = np.sqrt(alpha) * self.data.perturbations(self.seed, f"ES-MDA {a}", self.alive)
         here = partial(_part_of, self.ensemble, self.alive)
         self.tell(Pass(mean_of(self.ensemble, self.alive), predictions.mean(axis=0), here))
-        return [GainSystem(self.gain, predictions, alpha * self.data.std**2, self.data.values + errors)]
+        anomalies, innovations = predictions - predictions.mean(axis=0), self.data.values + errors - predictions
+        return [self.gain.update(anomalies, alpha * self.data.std**2, innovations)]
 
     def move(self, going: Sequence[Passes], moves: Sequence[Move | None]) -> None:
         for part in parts(self.ensemble.shape[1], self.data.width(len(self.ensemble))):
@@ -135,10 +121,6 @@ class DualSystem:
     moved: Array
     innovation: Array
     variance: Array
-
-    def step(self) -> DualSystem:
-        """The steps from there, of any length: see :meth:`dual`."""
-        return self
 
     def dual(self, a: float = 1.0) -> Array:
         """λ (K,) of the step x̄0 + (1 − a)(x − x̄0) + a L λ, which minimises J plus (1/a − 1)/2 δxᵀB⁻¹δx, linearised."""

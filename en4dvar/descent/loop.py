@@ -2,24 +2,14 @@
 
 What is minimised is an *objective*: J of one data set (:mod:`en4dvar.descent.window`), of one cycle of a series
 (:mod:`en4dvar.series.window`), of several data sets that share parameters (:mod:`en4dvar.estimation.joint.descent`), or
-of whole fields (:mod:`en4dvar.descent.field`). It makes a linear *system* of the runs at each iterate: an ensemble,
-from which the scheme takes its step; an arrow, of what is shared and what is own; or a dual one, in the space of the
-observations.
+of whole fields (:mod:`en4dvar.descent.field`). It makes a *step* of the runs at each iterate, linearised: that of a
+scheme, of an ensemble; one of what is shared and what is own; or a dual one, in the space of the observations.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
 from en4dvar.descent.step_control import Move, Search, run_searches
-from en4dvar.schemes.base import Draw, Evaluation, GaussNewtonStep, Scheme, Step, Weights
-
-
-class System(Protocol):
-    """What the runs at an iterate say, linearised."""
-
-    def step(self) -> Any:
-        """The step from there."""
 
 
 class Descends(Protocol):
@@ -39,8 +29,8 @@ class Objective(Generic[D]):
     def keep(self, going: Sequence[D]) -> None:
         """Keep what an interrupted run needs to go on from here."""
 
-    def linearise(self, going: Sequence[D]) -> Sequence[System | None]:
-        """Run the members, of all descents in one call; None where too few of them survive."""
+    def linearise(self, going: Sequence[D]) -> Sequence[Any]:
+        """Run the members, of all descents in one call, and make a step of each; None where too few survive."""
         raise NotImplementedError
 
     def judge(self, going: Sequence[D]) -> None:
@@ -61,24 +51,9 @@ def minimise(objective: Objective[D], descents: Sequence[D]) -> None:
     """Iterate descents side by side, usually one, until each has ended."""
     while going := [descent for descent in descents if not descent.ended]:
         objective.keep(going)
-        for descent, system in zip(going, objective.linearise(going), strict=True):
-            descent.step = None if system is None else system.step()
+        for descent, step in zip(going, objective.linearise(going), strict=True):
+            descent.step = step
         objective.judge(going)
         going = [descent for descent in going if not descent.ended]
         searches = [None if descent.stop else objective.search(descent) for descent in going]
         objective.move(going, run_searches(searches, objective.try_out))
-
-
-@dataclass(frozen=True)
-class EnsembleSystem:
-    """A linearisation in weight space, of which a scheme makes a step."""
-
-    scheme: Scheme
-    weights: Weights
-    evaluation: Evaluation
-    iteration: int
-    draw: Draw
-
-    def step(self) -> Step | GaussNewtonStep:
-        """The step of the scheme."""
-        return self.scheme.advance(self.weights, self.evaluation, self.iteration, self.draw)

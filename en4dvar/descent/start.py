@@ -23,7 +23,8 @@ from en4dvar.ensemble.forecast import Forecast
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.errors import ConfigError, Fault
-from en4dvar.priors.prior import Prior
+from en4dvar.plumbing.hints import nearest
+from en4dvar.problem import InverseProblem
 from en4dvar.schemes.base import Minimiser
 
 ROUGH = 1e-2  # relative decrease of J at which a descent stops that only has to tell basins apart
@@ -81,7 +82,7 @@ def choose_start(
     begin = scheme.start
     if not isinstance(begin, str):
         beyond = len(space.members) + 1
-        return Start(descent_at(space, given(space.problem.prior, begin), beyond), tried=(beyond,))
+        return Start(descent_at(space, given(space.problem, begin), beyond), tried=(beyond,))
     if begin == "prior-mean":
         if np.isfinite(space.observation_cost(run)[-1]):
             mean = len(space.members)
@@ -116,13 +117,17 @@ def descent_at(space: WeightSpace, x: Array, number: int) -> Descent:
     return Descent(space.start(space.weights_of(x)), members=(number,))
 
 
-def given(prior: Prior, values: Mapping[str, float]) -> Array:
-    """The control vector (n,) of ``values`` of parameters, in their units; the others are at the prior's mean.
+def given(problem: InverseProblem, start: Mapping[str, float | Mapping[str, float]]) -> Array:
+    """The control vector (n,) of values of parameters, in their units; the others are at the prior's mean.
 
-    Raises :class:`ConfigError`: a parameter that is not estimated, or a value where the prior has none.
+    ``start`` holds them, or those of data sets by name, of which the nearest by name is taken. Raises
+    :class:`ConfigError`: a parameter that is not estimated, or a value where the prior has none.
     """
+    prior, own = problem.prior, start
+    if of_sets := {name: values for name, values in start.items() if isinstance(values, Mapping)}:
+        own = of_sets[nearest(problem.observations.name, of_sets)]
     x, faults = np.array(prior.mean, dtype=float), []
-    for name, value in values.items():
+    for name, value in own.items():
         try:
             j = prior.names.index(name)
             x[j] = prior.terms[j].from_physical(np.array(value))

@@ -51,6 +51,7 @@ SUFFICIENT = 1e-4  # Armijo's constant: the fraction of the predicted decrease t
 LENGTHS = np.array([1.0, 0.5, 0.25, 0.125])
 MOST_BENT = 2.0  # the acceleration is cut to this multiple of the direction
 BATCH = len(LENGTHS)  # trials per call of the model
+KEPT = 0.75  # of the predicted decrease: what half of a step promises
 
 
 @dataclass(frozen=True)
@@ -80,12 +81,16 @@ class Tangent:
 
 @dataclass(frozen=True)
 class Point:
-    """Where a search starts: weights ``w`` (N,), J there, the undamped step, and the tangent where there is one."""
+    """Where a search starts: weights ``w`` (N,), J there, the undamped step, and the tangent where there is one.
+
+    ``sparing``: derivatives cost a run, so that trials decide how many there are; the whole step is tried alone first.
+    """
 
     w: Array
     cost: float
     step: GaussNewtonStep
     tangent: Tangent | None = None
+    sparing: bool = False
 
 
 @dataclass(frozen=True)
@@ -110,13 +115,16 @@ def full_step(at: Point) -> Search:
 def line_search(at: Point) -> Search:
     """Backtracking: the lowest J among 1, ½, ¼, ⅛ of the step that satisfies Armijo's condition, then shorter ones.
 
-    Where the full step is not the best of the first four, the predictions along the step tell how the model curves,
+    A ``sparing`` point tries the others only where the whole step lowers J by less than half of it promised. Where the
+    full step is not the best of the first four, the predictions along the step tell how the model curves,
     and four points of the parabola a δw + ½ a² δ²w are tried as well: the second-order correction of the step,
     without which a descent creeps along a curved valley. Returns None when none of 12 halvings lowers J.
     Sources: Nocedal & Wright (2006), Numerical Optimization, § 3.1; geodesic acceleration: Transtrum & Sethna (2012),
     arXiv:1201.5885.
     """
     direction = at.step.direction
+    if at.sparing and (move := (yield from _whole_step(at))):
+        return move
     for first in range(3):
         lengths = LENGTHS * 0.5 ** (BATCH * first)
         straight = lengths[:, None] * direction
@@ -131,6 +139,37 @@ def line_search(at: Point) -> Search:
         if move is not None:
             return move
     return None
+
+
+def _whole_step(at: Point) -> Search:
+    """Straight, else bent by the shortest trial: the first that lowers J by as much as half of it promised."""
+    step, direction = at.step, at.step.direction
+    enough = at.cost - KEPT * step.predicted_decrease
+    trials = yield at.w + LENGTHS[:1, None] * direction
+    if trials.costs[0] > enough and at.tangent is not None:
+        trials = yield at.w + LENGTHS[-1:, None] * direction
+        bend = acceleration(step, at.tangent, LENGTHS[-1:], trials.predictions)
+        direction = direction + 0.5 * LENGTHS[0] ** 2 * bend
+        trials = yield at.w + LENGTHS[:1, None] * direction
+    return Move(at.w + direction, float(trials.costs[0]), 1.0) if trials.costs[0] <= enough else None
+
+
+def each_once(search: Search) -> Search:
+    """The same search; a candidate that it had before is not tried again."""
+    known: dict[bytes, tuple[float, Array]] = {}
+    candidates = next(search)
+    while True:
+        own = [candidate.tobytes() for candidate in candidates]
+        new = [i for i, key in enumerate(own) if key not in known]
+        if new:
+            trials = yield candidates[new]
+            known |= {own[i]: (cost, row) for i, cost, row in zip(new, trials.costs, trials.predictions, strict=True)}
+        costs, predictions = zip(*(known[key] for key in own), strict=True)
+        try:
+            candidates = search.send(Trials(np.array(costs), np.array(predictions)))
+        except StopIteration as end:
+            move: Move | None = end.value
+            return move
 
 
 def acceleration(step: GaussNewtonStep, tangent: Tangent, lengths: Array, predictions: Array) -> Array:

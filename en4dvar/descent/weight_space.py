@@ -10,7 +10,7 @@ import numpy as np
 from en4dvar.descent.step_control import Trials
 from en4dvar.diagnosis import diagnostics as diag
 from en4dvar.ensemble.forecast import NO_TIMES, Composite, Forecast
-from en4dvar.ensemble.linalg import FEW, Hessian, ThinTransform, anomaly_basis, centre
+from en4dvar.ensemble.linalg import FEW, Hessian, LowRank, anomaly_basis, centre
 from en4dvar.ensemble.missing import filled
 from en4dvar.ensemble.repeat import check_repeats
 from en4dvar.ensemble.tangent import check_derivatives, derivatives_of
@@ -91,9 +91,9 @@ class WeightSpace:
         scale = np.sqrt(self.prior_variance)
         return np.asarray(np.linalg.lstsq((self.anomalies / scale).T, (x - self.mean) / scale, rcond=None)[0])
 
-    def ensemble(self, w: Array, transform: Array | ThinTransform) -> Array:
+    def ensemble(self, w: Array, transform: Array | LowRank) -> Array:
         """Control vectors (N + 1, n) of the members w + T_i of a transform T and, last, of w (N,)."""
-        if isinstance(transform, ThinTransform):
+        if isinstance(transform, LowRank):
             middle = self.control(w)
             return np.vstack([middle + transform @ self.anomalies, middle])
         return self.control(np.vstack([w + transform, w]))

@@ -13,14 +13,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from en4dvar.data.noise import Linearisation, Predicted
-from en4dvar.descent.loop import EnsembleSystem, Objective
-from en4dvar.descent.step_control import NEAR, STEP_CONTROLS, Move, Point, Search, Settling, Tangent, Trials
+from en4dvar.descent.loop import Objective
+from en4dvar.descent.step_control import NEAR, STEP_CONTROLS, Move, Point, Search, Settling, Tangent, Trials, each_once
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.diagnosis import diagnostics as diag
 from en4dvar.diagnosis.analysis import IterationRecord, Record
 from en4dvar.diagnosis.diagnostics import UNSEEN
 from en4dvar.ensemble.forecast import NO_TIMES, Forecast
-from en4dvar.ensemble.linalg import ThinTransform
+from en4dvar.ensemble.linalg import LowRank
 from en4dvar.ensemble.missing import filled
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import TooFewMembersError
@@ -136,16 +136,16 @@ class DataWindow(Objective[Descent]):
     def keep(self, going: Sequence[Descent]) -> None:
         self.save()
 
-    def linearise(self, going: Sequence[Descent]) -> list[EnsembleSystem | None]:
+    def linearise(self, going: Sequence[Descent]) -> list[Step | GaussNewtonStep | None]:
         self.tangents = []
         each = zip(going, self.run(going), strict=True)
-        return [None if runs is None else self._system(descent, runs) for descent, runs in each]
+        return [None if runs is None else self._advanced(descent, runs) for descent, runs in each]
 
-    def _system(self, descent: Descent, runs: Runs) -> EnsembleSystem:
+    def _advanced(self, descent: Descent, runs: Runs) -> Step | GaussNewtonStep:
         reference, anomalies = self.scheme.linearise(descent.weights, runs)
         self.tangents.append((descent.weights.w, reference, anomalies))
         evaluation = self.whiten(descent, reference, anomalies)
-        return EnsembleSystem(self.scheme, descent.weights, evaluation, descent.iteration, self.draw)
+        return self.scheme.advance(descent.weights, evaluation, descent.iteration, self.draw)
 
     def run(self, going: Sequence[Descent]) -> list[Runs | None]:
         """The members of the scheme through F and H, all descents in one call; None where too few of them survive."""
@@ -196,7 +196,9 @@ class DataWindow(Objective[Descent]):
 
     def searched(self, descent: Descent) -> Search:
         """By the configured step control."""
-        return STEP_CONTROLS[self.minimiser.step_control](self._point(descent))
+        point = self._point(descent)
+        search = STEP_CONTROLS[self.minimiser.step_control](point)
+        return each_once(search) if point.sparing else search
 
     def move(self, going: Sequence[Descent], moves: Sequence[Move | None]) -> None:
         for descent, move in zip(going, moves, strict=True):
@@ -206,7 +208,7 @@ class DataWindow(Objective[Descent]):
                 self._take(descent)
             self.tell(descent.records[-1])
 
-    def record(self, descent: Descent, transform: Array | ThinTransform, step_length: float) -> None:
+    def record(self, descent: Descent, transform: Array | LowRank, step_length: float) -> None:
         """Add the record of an iterate: the ensemble of ``transform`` (N, N) there, and how far it is left."""
         space, at, step = self.space, descent.iterate, descent.newton
         ensemble = space.ensemble(descent.weights.w, transform)
@@ -363,7 +365,7 @@ class DataWindow(Objective[Descent]):
                 return self.observations.precision_times(linear.prediction, vectors)
 
             tangent = Tangent(linear.prediction.values, linear.anomalies, precision_times, self.space.basis)
-        return Point(descent.weights.w, at.cost, descent.newton, tangent)
+        return Point(descent.weights.w, at.cost, descent.newton, tangent, self.space.derivatives is not None)
 
     def _same_members(self, a: Weights, b: Weights) -> bool:
         """Whether the scheme would run the same members again, to the step tolerance."""

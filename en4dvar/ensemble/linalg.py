@@ -64,30 +64,14 @@ def with_moments(members: Array, mean: Array, covariance: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class ThinTransform:
-    """T = I − Rᵀ diag(shrink) R of many members, without the matrix (N, N): ``rows`` R (m, N), ``shrink`` (m,)."""
-
-    rows: Array
-    shrink: Array
-
-    def __matmul__(self, columns: Array) -> Array:
-        """T applied to (N, n)."""
-        return np.asarray(columns - self.rows.T @ (self.shrink[:, None] * (self.rows @ columns)))
-
-    @property
-    def dense(self) -> Array:
-        """T (N, N)."""
-        return np.asarray(np.eye(self.rows.shape[1]) - (self.rows.T * self.shrink) @ self.rows)
-
-
-@dataclass(frozen=True)
 class LowRank:
-    """I + ``left`` ``right`` (N, N), of (N, k) and (k, N): as :class:`ThinTransform`, without a matrix of N rows."""
+    """I + ``left`` ``right``, of (N, k) and (k, N): a transform of many members, without the matrix (N, N)."""
 
     left: Array
     right: Array
 
     def __matmul__(self, columns: Array) -> Array:
+        """Applied to (N, n)."""
         return np.asarray(columns + self.left @ (self.right @ columns))
 
     @property
@@ -167,15 +151,15 @@ class Hessian:
         return self._thin.dense
 
     @property
-    def economical_transform(self) -> Array | ThinTransform:
+    def economical_transform(self) -> Array | LowRank:
         """T as a matrix where members are few."""
         return self.transform if self.rows.shape[1] <= FEW else self._thin
 
     @property
-    def _thin(self) -> ThinTransform:
+    def _thin(self) -> LowRank:
         # 1/√(1+x) − 1 = −x / (√(1+x) (1 + √(1+x))), x = σ²/(N−1)
         root = np.sqrt(1 + self.singular_values**2 / self.prior_precision)
-        return ThinTransform(self.rows, 1 / (self.prior_precision * root * (1 + root)))
+        return LowRank(-self.rows.T * (1 / (self.prior_precision * root * (1 + root))), self.rows)
 
     @property
     def inverse_transform(self) -> Array:

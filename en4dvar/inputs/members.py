@@ -1,5 +1,6 @@
 """Ensembles of parameters from files: a posterior of ours, netCDF of others, CSV. Values are read, and nothing else."""
 
+import csv
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -8,11 +9,13 @@ import numpy as np
 
 from en4dvar.inputs.opened import require_file
 from en4dvar.inputs.parts import read_contents
+from en4dvar.inputs.text_table import numbered_lines
 from en4dvar.model.state import Array
 from en4dvar.plumbing.decoding import Allowed, DecodeError, decoded_whole
 from en4dvar.plumbing.errors import DataError
 from en4dvar.plumbing.hdf5 import ForeignDataError, require_whole
 from en4dvar.plumbing.hints import listed, suggest
+from en4dvar.plumbing.tables import is_number
 from en4dvar.plumbing.units import UnitError, convert
 
 NETCDF = (".nc", ".nc4", ".cdf")
@@ -45,6 +48,30 @@ def read_members(path: Path, units: Mapping[str, tuple[str, str]]) -> dict[str, 
             )
         members[name] = _converted(path, name, values, unit, units[name])
     return members
+
+
+def read_centres(path: Path, units: Mapping[str, str]) -> dict[str, dict[str, float]]:
+    """Of a ``summary.csv`` of a run, data set → parameter → centre, in ``units``; nothing of another file.
+
+    Raises :class:`DataError`: no data set has any of the parameters, or a number is none.
+    """
+    if path.suffix.lower() != ".csv":
+        return {}
+    require_file(path)
+    rows = csv.DictReader(line for _, line in numbered_lines(path))
+    if not {"dataset", "name", "unit", "centre"} <= {*(rows.fieldnames or ())}:
+        return {}
+    sets: dict[str, dict[str, float]] = {}
+    for row in rows:
+        if (name := row["name"]) in units:
+            centre = np.array([float(row["centre"] if is_number(row["centre"]) else "nan")])
+            if not np.isfinite(centre).all():
+                raise DataError(f"{path}: the centre of {name} of {row['dataset']} is no finite number")
+            own = _converted(path, name, centre, row["unit"], (units[name], ""))
+            sets.setdefault(row["dataset"], {})[name] = own.item()
+    if not sets:
+        raise DataError(f"{path}: no data set has {listed(units)}")
+    return sets
 
 
 def _converted(path: Path, name: str, values: Array, unit: str, units: tuple[str, str]) -> Array:

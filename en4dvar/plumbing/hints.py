@@ -2,7 +2,7 @@
 
 import functools
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from difflib import get_close_matches
 from pathlib import Path
 from reprlib import Repr
@@ -77,6 +77,15 @@ def numbered(name: str) -> list[str | int]:
     ['bubble2', 'bubble10']
     """
     return [int(s) if i % 2 else s for i, s in enumerate(re.split(r"([0-9]{1,40})", name))]
+
+
+def nearest(name: str, others: Collection[str]) -> str:
+    """The same name, else the one before it in the order of :func:`numbered`, else the first.
+
+    >>> nearest("bubble12", ["bubble2", "bubble10", "bubble30"])
+    'bubble10'
+    """
+    return max((n for n in others if numbered(n) <= numbered(name)), key=numbered, default=min(others, key=numbered))
 
 
 def short(text: str, most: int = 60) -> str:

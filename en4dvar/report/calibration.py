@@ -19,7 +19,7 @@ from en4dvar.report.chart import PAGE, POINTS, Chart, Panel, in_columns
 from en4dvar.report.html import render
 from en4dvar.report.svg import draw, on_paper
 from en4dvar.report.text import figure_text
-from en4dvar.results.calibration_file import ERRORS, FIT, Judged, read_sets
+from en4dvar.results.calibration_file import ERRORS, FIT, NUMBERS, Judged, read_sets
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -82,7 +82,7 @@ class Calibration:
     @cached_property
     def verdicts(self) -> tuple[Verdict, ...]:
         """One a quantity that has a truth."""
-        known = [j for j in range(len(self.quantities)) if np.isfinite(self.good[0].rank[j])] if self.good else []
+        known = np.flatnonzero(np.isfinite(self.good[0].numbers[:, -1])).tolist() if self.good else []
         p = {j: self.uniform.p_value(self.column("rank", j)) for j in known}
         off: set[int] = set()
         for left, j in zip(range(len(known), 0, -1), sorted(known, key=p.__getitem__), strict=True):
@@ -108,8 +108,8 @@ class Calibration:
         return told
 
     def column(self, what: str, j: int) -> np.ndarray:
-        """``truth``, ``z`` or ``rank`` (S,) of a quantity over the good sets."""
-        return np.array([getattr(judged, what)[j] for judged in self.good])
+        """``truth``, ``z`` or another of the numbers (S,) of a quantity over the good sets."""
+        return np.array([judged.numbers[j, NUMBERS.index(what)] for judged in self.good])
 
     def rows(self) -> list[tuple[str, ...]]:
         """The table, without its head."""
@@ -140,8 +140,7 @@ class Calibration:
         return uniform_ranks(len(self.good), self.good[0].members)
 
     def _verdict(self, j: int, p: float, off: bool) -> Verdict:
-        z, truth = self.column("z", j), self.column("truth", j)
-        low, lower, upper, high = np.array([judged.quantiles[:, j] for judged in self.good]).T
+        truth, low, lower, upper, high, z, _ = np.array([judged.numbers[j] for judged in self.good]).T
         half, most = int(np.sum((lower <= truth) & (truth <= upper))), int(np.sum((low <= truth) & (truth <= high)))
         std = float(z.std(ddof=1)) if len(z) > 1 else float("nan")
         return Verdict(*self.quantities[j], len(z), p, float(z.mean()), std, half, most, off)

@@ -3,7 +3,7 @@
 import csv
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -17,26 +17,23 @@ FIT, ERRORS = "fit", "errors"  # J_o, half the sum of squares of the readings: a
 # among that of readings which are drawn at each member
 LEVELS = (0.05, 0.25, 0.75, 0.95)
 LONGEST = 1_000_000_000  # bytes of the table
-NUMBERS = ("truth", "q05", "q25", "q75", "q95", "z")
-COLUMNS = ("set", "data_set", "quantity", "unit", *NUMBERS, "rank", "members", "cautions", "failure")
+NUMBERS = ("truth", "q05", "q25", "q75", "q95", "z", "rank")
+COLUMNS = ("set", "data_set", "quantity", "unit", *NUMBERS, "members", "cautions", "failure")
 
 
 @dataclass(frozen=True)
 class Judged:
-    """What came of one set, of Q quantities: the parameters, and the fit of the readings.
+    """What came of one set: of Q quantities, the parameters and the fit of the readings, ``numbers`` (Q, 7).
 
-    ``truth`` (Q,) and ``quantiles`` (4, Q) of :data:`LEVELS` in display units; ``z`` (Q,) distance of the truth from
-    the mean in standard deviations, in the prior's own transform; ``rank`` (Q,) of the truth among the ``members``, all
+    A row holds :data:`NUMBERS`: truth and quantiles of :data:`LEVELS` in display units; the distance z of the truth
+    from the mean in standard deviations, in the prior's own transform; its rank among the ``members``. All are
     NaN where there is no truth. ``cautions``: codes of the serious ones. ``failure``: why there is no posterior.
     """
 
     number: int
     data_set: str
-    truth: Array
-    quantiles: Array
-    z: Array
-    rank: Array
-    members: int
+    numbers: Array = field(default_factory=lambda: np.empty((0, len(NUMBERS))))
+    members: int = 0
     cautions: tuple[str, ...] = ()
     failure: str = ""
 
@@ -45,27 +42,24 @@ def write_sets(path: Path, quantities: Sequence[tuple[str, str]], sets: Sequence
     """Write the table of quantities (name, unit). Raises :class:`OutputError`."""
     lines: list[Sequence[object]] = [COLUMNS]
     for judged in sets:
+        head, tail = (judged.number, judged.data_set), (judged.members, " ".join(judged.cautions), "")
         if judged.failure:
-            lines.append([judged.number, judged.data_set, "", "", *[""] * len(NUMBERS), "", "", "", judged.failure])
-            continue
-        for j, (name, unit) in enumerate(quantities):
-            numbers = (judged.truth[j], *judged.quantiles[:, j], judged.z[j], judged.rank[j])
-            codes = " ".join(judged.cautions)
-            lines.append([judged.number, judged.data_set, name, unit, *numbers, judged.members, codes, ""])
+            lines.append([*head, *[""] * (len(COLUMNS) - 3), judged.failure])
+        of_each = zip(quantities, judged.numbers.tolist(), strict=not judged.failure)
+        lines += [[*head, *quantity, *numbers, *tail] for quantity, numbers in of_each]
     return write_csv(path, lines)
 
 
 def read_sets(path: Path) -> tuple[tuple[tuple[str, str], ...], tuple[Judged, ...]]:
     """The quantities (name, unit) and the sets of a table. Raises :class:`OutputError` where it is none."""
     try:
-        text = read_text(path, LONGEST)
         by_set: dict[int, list[dict[str, str]]] = {}
-        for line in csv.DictReader(io.StringIO(text)):
+        for line in csv.DictReader(io.StringIO(read_text(path, LONGEST))):
             by_set.setdefault(int(line["set"]), []).append(line)
         sets = tuple(_set(number, lines) for number, lines in by_set.items())
         known = next((lines for lines in by_set.values() if not lines[0]["failure"]), [])
         quantities = tuple((line["quantity"], line["unit"]) for line in known)
-        if not sets or any(not s.failure and len(s.truth) != len(quantities) for s in sets):
+        if not sets or any(not s.failure and len(s.numbers) != len(quantities) for s in sets):
             raise ValueError
     except OSError as error:
         raise OutputError(f"{path}: cannot be read: {error.strerror}") from None
@@ -77,8 +71,6 @@ def read_sets(path: Path) -> tuple[tuple[tuple[str, str], ...], tuple[Judged, ..
 def _set(number: int, lines: Sequence[dict[str, str]]) -> Judged:
     first = lines[0]
     if first["failure"]:
-        nothing = np.empty(0)
-        return Judged(number, first["data_set"], nothing, np.empty((4, 0)), nothing, nothing, 0, (), first["failure"])
-    truth, *quantiles, z = (np.array([float(line[name]) for line in lines]) for name in NUMBERS)
-    rank, codes = np.array([float(line["rank"]) for line in lines]), tuple(first["cautions"].split())
-    return Judged(number, first["data_set"], truth, np.array(quantiles), z, rank, int(first["members"]), codes)
+        return Judged(number, first["data_set"], failure=first["failure"])
+    numbers = np.array([[float(line[name]) for name in NUMBERS] for line in lines])
+    return Judged(number, first["data_set"], numbers, int(first["members"]), tuple(first["cautions"].split()))

@@ -138,10 +138,11 @@ class CalibrationKind(RunKind[Calibration]):
         keeper = Keeper(run.directory.at(STATE), fingerprint, self.config.execution.checkpoint_every)
         done = list(state.done)
         known = {judged.number for judged in done}
-        left, common = [i for i in range(1, self.sets + 1) if i not in known], CommonValue(self._common())
+        left = [i for i in range(1, self.sets + 1) if i not in known]
+        common = CommonValue((self.config, self.made, list(self.data.items())))
         for i, judged in executor.map(_judged, ((common, number) for number in left)):
             if isinstance(judged, Exception):
-                judged = Judged(left[i], "", *_NOTHING, failure=reason_of(judged))
+                judged = Judged(left[i], "", failure=reason_of(judged))
             done.append(judged)
             run.log.write(f"set {judged.number}: {judged.failure or 'estimated'}")
             keeper.keep(lambda: CalibrationState(tuple(done)))
@@ -154,39 +155,24 @@ class CalibrationKind(RunKind[Calibration]):
             self.page(run.directory.work)
         return replace(load_calibration(run.directory.work), directory=self.directory)
 
-    def _common(self) -> "_Common":
-        return _Common(self.config, self.made, tuple(self.data.items()))
-
     def _quantities(self) -> list[tuple[str, str]]:
         name, file = next(iter(self.data.items()))
         prior = build_one(self.config, name, file).prior
         return [*((p.name, p.display_unit or p.unit) for p in prior.parameters), (FIT, "1"), (ERRORS, "1")]
 
 
-_NOTHING = (np.empty(0), np.empty((4, 0)), np.empty(0), np.empty(0), 0)
-
-
-@dataclass(frozen=True)
-class _Common:
-    """What all sets need; pickled once."""
-
-    config: Config
-    made: Config
-    files: tuple[tuple[str, DataFile], ...]
-
-
-def _judged(common: CommonValue[_Common], number: int) -> Judged:
+def _judged(common: CommonValue[tuple[Config, Config, list[tuple[str, DataFile]]]], number: int) -> Judged:
     """Draw set ``number``, estimate it, and compare with its truth; text says why it cannot be."""
-    held = common.value
-    name, file = held.files[(number - 1) % len(held.files)]
-    seed = own_seed(held.config.seed, f"calibration {number}")
-    problem, maker = build_one(held.config, name, file), build_one(held.made, name, file)
+    config, made, files = common.value
+    name, file = files[(number - 1) % len(files)]
+    seed = own_seed(config.seed, f"calibration {number}")
+    problem, maker = build_one(config, name, file), build_one(made, name, file)
     try:
         truth, readings = draw_set(maker, seed)
         observed = replace(problem.observations, values=readings, continued=None, name=f"{name}_{number}")
-        return _compared(replace(problem, observations=observed), held.config, seed, truth, number, name)
+        return _compared(replace(problem, observations=observed), config, seed, truth, number, name)
     except En4dvarError as error:
-        return Judged(number, name, *_NOTHING, failure=str(error))
+        return Judged(number, name, failure=str(error))
 
 
 def draw_set(maker: InverseProblem, seed: int) -> tuple[dict[str, float], Array]:
@@ -230,5 +216,5 @@ def _compared(
         z = (at - draws.mean(axis=0)) / draws.std(axis=0, ddof=1)
         rank = np.where(np.isfinite(at), np.sum(draws < at, axis=0), np.nan)
     serious = tuple(dict.fromkeys(c.code for c in analysis.cautions if c.severity == "serious"))
-    quantiles = member_quantiles(shown[:-1], LEVELS, axis=0)
-    return Judged(number, name, shown[-1], quantiles, z, rank, len(members), serious)
+    numbers = np.vstack([shown[-1], member_quantiles(shown[:-1], LEVELS, axis=0), z, rank]).T
+    return Judged(number, name, numbers, len(members), serious)

@@ -247,8 +247,9 @@ class Minimiser(Scheme):
         "What keeps J from rising along the iterations; full takes the whole step or, where that raises J, none.",
     ] = "line-search"
     start: Annotated[
-        Literal["best-member", "prior-mean"] | Mapping[str, float],
-        "Where the iterations start: the prior members of lowest J, the prior mean, or values of parameters.",
+        Literal["best-member", "prior-mean"] | Mapping[str, float | Mapping[str, float]],
+        "Where the iterations start: the prior members of lowest J, the prior mean, or values of parameters, also of "
+        "each data set by name.",
     ] = "best-member"
     starts: Annotated[
         int, Ge(1), "How many prior members of lowest J start a descent; others follow while none explains the data."

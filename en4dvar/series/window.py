@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from en4dvar.descent.loop import EnsembleSystem, Objective
+from en4dvar.descent.loop import Objective
 from en4dvar.descent.step_control import Move
 from en4dvar.ensemble.linalg import centre
 from en4dvar.model.state import Array
@@ -66,13 +66,13 @@ class CycleWindow(Objective[CycleDescent]):
         self.runs: Runs | None = None
         self.ahead: list[Ahead] = []
 
-    def linearise(self, going: Sequence[CycleDescent]) -> list[EnsembleSystem | None]:
+    def linearise(self, going: Sequence[CycleDescent]) -> list[Step | GaussNewtonStep]:
         (descent,), scheme = going, self.scheme
         self.runs = self.run(descent)
         evaluation = self.whiten(*scheme.linearise(descent.weights, self.runs))
         if self.localisation is not None and self.local is None:
             self.localised = self.localisation.analysis(scheme, self.members, evaluation, self.draw)
-        return [EnsembleSystem(scheme, descent.weights, evaluation, descent.iteration, self.draw)]
+        return [scheme.advance(descent.weights, evaluation, descent.iteration, self.draw)]
 
     def run(self, descent: CycleDescent) -> Runs:
         """The members of the scheme through the window. Raises :class:`MembersLost`."""

@@ -203,7 +203,7 @@ def test_many_members_are_treated_as_few_but_for_rounding(monkeypatch, change):
     if not change:
         eye = np.eye
         monkeypatch.setattr(np, "eye", lambda n, *rest, **named: eye(n, *rest, **named) if n < 24 else 1 / 0)
-        monkeypatch.setattr("en4dvar.ensemble.linalg.ThinTransform.dense", property(lambda thin: 1 / 0))
+        monkeypatch.setattr("en4dvar.ensemble.linalg.LowRank.dense", property(lambda thin: 1 / 0))
     many = assimilate(problem, settings, 1)
     assert len(many.iterations) == len(few.iterations) > 2
     assert many.posterior == pytest.approx(few.posterior, rel=1e-9)

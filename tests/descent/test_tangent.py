@@ -95,14 +95,15 @@ class Counted:
         return slopes(p, t)
 
 
-def test_descents_take_less_than_half_the_runs_and_all_are_counted():
+def test_half_the_runs_are_spared_and_all_are_counted():
     counted = Counted()
     by_tangent = estimate(ten(counted.jacobian, counted.function))
     by_runs = estimate(ten(counted.jacobian), linearisation="bundle")
     assert by_tangent.forward_runs == counted.runs
     around = 2 * 49 + 2  # prior and posterior, and the members that are run twice
     check = 10
-    assert by_runs.forward_runs - around > 2.4 * (by_tangent.forward_runs - around - check)
+    assert by_runs.forward_runs > 2 * by_tangent.forward_runs
+    assert by_runs.forward_runs - around > 4 * (by_tangent.forward_runs - around - check)
     assert counted.tangents < 40
     mean, std = by_runs.posterior.mean(axis=0), by_runs.posterior.std(axis=0)
     assert np.max(np.abs(by_tangent.posterior.mean(axis=0) - mean) / std) < 0.01

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from run_files import configuration, make_campaign
 
 import en4dvar
 from en4dvar.config import load_config
@@ -12,6 +13,7 @@ from en4dvar.config.load import values_of
 from en4dvar.config.parameters import Uncertain
 from en4dvar.config.schema import GivenStart
 from en4dvar.model.state import Parameter
+from en4dvar.runs.runner import run_campaign
 
 TIMES = np.linspace(0.1, 2.0, 12)
 PRIORS = {"a": {"prior": "normal", "mean": 0.3, "std": 1.5}, "b": {"prior": "lognormal", "median": 1.0, "log_std": 0.5}}
@@ -71,6 +73,26 @@ def test_from_an_earlier_result(tmp_path):
     foreign = tmp_path / "foreign.csv"
     foreign.write_text("c,d\n1,2\n3,4\n")
     told(foreign, "no column 'a'")
+
+
+def test_a_campaign_starts_from_its_neighbours(tmp_path):
+    """From where those of the same name ended before, or of the name before it; the minima are the same."""
+    path = make_campaign(tmp_path, 3)
+    before = run_campaign(configuration(path, tmp_path / "before"))
+    rows = (tmp_path / "before" / "summary.csv").read_text(encoding="utf-8").splitlines(keepends=True)
+    summary = tmp_path / "summary.csv"
+    summary.write_text("".join(row for row in rows if not row.startswith("set1")), encoding="utf-8")
+    again = {"assimilation.start": {"from": str(summary)}, "output.directory": str(tmp_path / "again")}
+    again["output.report"] = False
+    assert load_config(path, again).assimilation.start.keys() == {"set0", "set2"}
+    for earlier, later in zip(before, run_campaign(load_config(path, again)), strict=True):
+        assert later.sample_stats.attrs["forward_runs"] < earlier.sample_stats.attrs["forward_runs"]
+        near, far = (result.summary()["centre"].to_numpy() for result in (later, earlier))
+        assert near == pytest.approx(far, rel=1e-3)
+    whole = summary.read_text(encoding="utf-8")
+    summary.write_text(whole.replace(",A,", ",B,").replace(",k,", ",K,"), encoding="utf-8")
+    with pytest.raises(en4dvar.ConfigError, match=r"start.from: .*: no data set has A, k"):
+        load_config(path, again)
 
 
 def told(start, words):

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 
 import en4dvar
 from en4dvar.model.programs.control import from_pest
@@ -287,6 +288,63 @@ def test_public_control_files_are_read_or_refused_by_name():
         std = error["observations_std"] if isinstance(error, dict) else error
         np.testing.assert_allclose(1 / std, [float(words[2]) for words in counted])
     assert read >= 8  # most of the others name templates that are not there
+
+
+HOSAKI = """\
+import math
+x, y = (float(line.split(",")[1]) for line in open("par.csv").readlines()[1:])
+value = (1 - 8 * x + 7 * x**2 - 7 / 3 * x**3 + x**4 / 4) * y**2 * math.exp(-y)
+open("sim.csv", "w").write(f"obsnme,simval\\nsim,{value!r}\\n")
+"""  # Hosaki's function, whose minimum of -2.3458 is at (4, 2)
+CHEN_OLIVER = """\
+x = float(open("par.dat").read())
+open("obs.dat", "w").write(f"y {7 / 12 * x**3 - 7 / 2 * x**2 + 8 * x!r}\\n")
+"""  # Chen and Oliver (2012), Mathematical Geosciences 44, 1-26, section 4.1
+
+
+def public(folder, name, script, program):
+    """The estimate of the public control file ``name``, with ``program`` as the script that it calls."""
+    folder.mkdir()
+    for file in (PUBLIC / "pyemu" / "autotest" / name).parent.glob("*.*"):
+        (folder / file.name).write_bytes(file.read_bytes())
+    path = folder / Path(name).name
+    path.write_text(path.read_text().replace("\npython ", f"\n{sys.executable} -S "))
+    (folder / script).write_text(program)
+    settings = {"members": 12, "what_if": False}
+    return en4dvar.estimate(**from_pest(path, files=[script]), progress=False, assimilation=settings).summary()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not PUBLIC.is_dir(), reason=f"no {PUBLIC}")
+def test_hosaki_ends_at_its_minimum(tmp_path):
+    """One reading that is a bound, and two parameters: J is least where the bound and the prior balance."""
+
+    def cost(at):
+        x, y = at
+        value = (1 - 8 * x + 7 * x**2 - 7 / 3 * x**3 + x**4 / 4) * y**2 * math.exp(-y)
+        return 0.5 * np.sum(((at - 2.5) / 1.25) ** 2) + 0.5 * max(0.0, (value + 2.3458115761) / 0.01) ** 2
+
+    least = minimize(cost, [4.0, 2.0], method="Nelder-Mead", options={"xatol": 1e-6, "fatol": 1e-9})
+    found = public(tmp_path / "hosaki", "utils/hosaki_template/pest.pst", "forward_run.py", HOSAKI)
+    assert least.x == pytest.approx([4, 2], abs=0.1)
+    assert cost(found["centre"].to_numpy()) == pytest.approx(least.fun, abs=0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not PUBLIC.is_dir(), reason=f"no {PUBLIC}")
+def test_chen_and_oliver_have_the_posterior_of_quadrature(tmp_path):
+    """One reading and one parameter: within its bounds in one of the two files, beyond them in the other."""
+    name = "smoother/chenoliver/{}chenoliver.pst"
+    beyond = public(tmp_path / "beyond", name.format("template/"), "chenoliver.py", CHEN_OLIVER).loc["par"]
+    assert beyond["centre"] == pytest.approx(-1, abs=0.001)
+    assert "misfit" in beyond["untrusted"].split()
+    within = public(tmp_path / "within", name.format(""), "chenoliver.py", CHEN_OLIVER).loc["par"]
+    x = np.linspace(5, 7, 20_001)
+    weight = np.exp(-0.5 * ((x + 2) / 3.25) ** 2 - 0.5 * (48 - (7 / 12 * x**3 - 7 / 2 * x**2 + 8 * x)) ** 2)
+    mean = np.average(x, weights=weight)
+    std = np.sqrt(np.average((x - mean) ** 2, weights=weight))
+    assert within["centre"] == pytest.approx(mean, abs=0.1 * std)
+    assert within["std"] == pytest.approx(std, rel=0.05)
 
 
 @pytest.mark.parametrize(

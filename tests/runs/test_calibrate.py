@@ -80,7 +80,7 @@ def test_more_sets_leave_the_first_as_they_were_for_any_workers(toy, tmp_path):
 
 def test_sets_without_a_posterior_are_told(toy, tmp_path):
     result = sixty(toy, tmp_path / "out", sets=3)
-    failed = replace(result, sets=(*result.sets, Judged(4, "toy", *[np.empty(0)] * 4, 0, (), "lost")))
+    failed = replace(result, sets=(*result.sets, Judged(4, "toy", failure="lost")))
     assert "1 of 4 sets have no posterior: lost" in failed.remarks
     assert len(failed.good) == 3
 

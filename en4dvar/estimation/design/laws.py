@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from en4dvar.estimation.design.laplace import require_alive, standard_error
-from en4dvar.estimation.design.nested import explaining, log_integral
+from en4dvar.estimation.design.nested import explained, explaining, log_integral
 from en4dvar.estimation.design.planned import Planned
 from en4dvar.model.state import Array
 from en4dvar.priors.prior import member_stream, own_seed
@@ -86,7 +86,8 @@ def deciding(laws: Sequence[Planned], count: int, inner: int, seed: int) -> Deci
             for j, law in enumerate(laws):
                 near = explaining(law, tangents[j], values, i if j == k else None)
                 stream = member_stream(seed, f"design evidence {k}", int(number))
-                evidences[i, j], effective = log_integral(law, values, np.empty(0), near, inner, stream, ENOUGH, ROUNDS)
+                draws = explained(law, values, np.empty(0), near, inner, stream, ENOUGH, ROUNDS)
+                evidences[i, j], effective = log_integral(draws)
                 behind.append(effective)
         alive = np.isfinite(evidences[:, k])
         require_alive(int(alive.sum()), count)

@@ -71,18 +71,22 @@ def nested(planned: Planned, u: Array, inner: int, seed: int) -> Nested:
     plain, effective, spread = np.empty(len(values)), np.empty(len(values)), np.empty((len(values), 2, planned.asked))
     for i, (y, stream) in enumerate(zip(values, streams, strict=True)):
         near = explaining(planned, truths, y, i)
-        known, of_known = log_integral(planned, y, truths.u[i, : planned.asked], near, inner, stream)
+        asked = truths.u[i, : planned.asked]
+        if len(asked) == len(planned.names):  # nothing else is unknown
+            known, of_known = -float(planned.cost(y, planned.run(asked[None]))[0]), np.inf
+        else:
+            known, of_known = log_integral(explained(planned, y, asked, near, inner, stream))
         draws = explained(planned, y, truths.u[i, :0], near, inner, stream)
-        log, of_all = _log_of(draws)
+        log, of_all = log_integral(draws)
         plain[i], effective[i], spread[i] = known - log, min(of_known, of_all), _spread(planned, draws)
     alive = np.isfinite(plain)
     require_alive(int(alive.sum()), len(u))
     innovations, (_, rows) = truths.whitened(planned, values)[0], truths.whitened(planned)
     gains = plain - control_variate(innovations, rows, truths.u, planned.asked)
     linearised = 0.5 * np.linalg.slogdet(about(precision(rows), planned.asked))[1]
-    prior, asked = planned.problem.prior, planned.order[: planned.asked]
-    true = prior.to_physical(planned.control(truths.u[alive]))[:, asked]
-    of_prior = np.linalg.norm(planned.root[asked], axis=1)
+    order = planned.order[: planned.asked]
+    true = planned.problem.prior.to_physical(planned.control(truths.u[alive]))[:, order]
+    of_prior = np.linalg.norm(planned.root[order], axis=1)
     std, transformed = np.moveaxis(spread[alive], 1, 0)
     return Nested(gains[alive], linearised[alive], effective[alive], std, std / np.abs(true), transformed / of_prior)
 
@@ -118,26 +122,8 @@ def explaining(planned: Planned, truths: Tangents, values: Array, own: int | Non
     return (explained.u + step)[plausible], matrices[plausible]
 
 
-def log_integral(
-    planned: Planned,
-    values: Array,
-    known: Array,
-    near: tuple[Array, Array],
-    inner: int,
-    stream: np.random.Generator,
-    enough: float = ENOUGH,
-    rounds: int = ROUNDS,
-) -> tuple[float, float]:
-    """ln ∫ e^{−J_o} N(·; 0, I) over the coordinates behind the ``known`` ones, and the effective draws behind it.
-
-    In at most so many ``rounds`` of ``inner`` runs, until there are ``enough`` effective draws.
-    """
-    if len(known) == len(planned.names):
-        return -float(planned.cost(values, planned.run(known[None]))[0]), np.inf
-    return _log_of(explained(planned, values, known, near, inner, stream, enough, rounds))
-
-
-def _log_of(draws: Importance) -> tuple[float, float]:
+def log_integral(draws: Importance) -> tuple[float, float]:
+    """ln ∫ e^{−J_o} N(·; 0, I) over the coordinates of :func:`explained`, and the effective draws behind it."""
     if not np.isfinite(draws.log):
         return -np.inf, 0.0
     return draws.log + 0.5 * (1 / draws.effective - 1 / len(draws.z)), draws.effective
@@ -153,7 +139,10 @@ def explained(
     enough: float = ENOUGH,
     rounds: int = ROUNDS,
 ) -> Importance:
-    """Draws of the coordinates behind the ``known`` ones, weighted by how they explain the readings."""
+    """Draws of the coordinates behind the ``known`` ones, weighted by how they explain the readings.
+
+    In at most so many ``rounds`` of ``inner`` runs, until there are ``enough`` effective draws.
+    """
     (centres, matrices), k = near, len(known)
     own = matrices[:, k:, k:]
     shift = np.linalg.solve(own, (matrices[:, k:, :k] @ (known - centres[:, :k])[..., None]))[..., 0]

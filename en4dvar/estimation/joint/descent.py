@@ -119,11 +119,11 @@ class JointObjective(Objective[JointDescent]):
     def __init__(self, joint: JointProblem, experiments: Sequence[Experiment], scheme: Minimiser):
         self.joint, self.experiments, self.scheme = joint, experiments, scheme
 
-    def linearise(self, going: Sequence[JointDescent]) -> list[ArrowSystem | None]:
+    def linearise(self, going: Sequence[JointDescent]) -> list[ArrowStep | None]:
         systems = [self._system(descent.place, descent.wider) for descent in going]
         for descent, system in zip(going, systems, strict=True):
             descent.system = system or descent.system
-        return systems
+        return [None if system is None else system.step() for system in systems]
 
     def _system(self, place: Place, wider: float) -> ArrowSystem | None:
         """None where an experiment cannot be run there."""

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from en4dvar.model.programs.control_file import text_of
 from en4dvar.model.state import Array
@@ -142,10 +143,7 @@ def _uncertainty(path: Path) -> Read:
             blocks.append(factor * part.covariance(part.rows))
         else:
             raise ValueError(f"block {kind} with {', '.join(said)}")
-    values, ends = np.zeros((len(names), len(names))), np.cumsum([len(block) for block in blocks])
-    for block, end in zip(blocks, ends.tolist(), strict=True):
-        values[end - len(block) : end, end - len(block) : end] = block
-    return names, names, values
+    return names, names, block_diag(*blocks)
 
 
 def _blocks(path: Path) -> Iterator[tuple[str, list[list[str]]]]:

@@ -24,18 +24,13 @@ _NO_LETTER = re.compile(r"([+-]?(?:\d+\.\d*|\.\d+))([+-]\d{3})")  # Fortran leav
 
 
 def is_template(text: str) -> bool:
-    """Whether the first line says that this is a template of PEST."""
-    return _begins(text, ("ptf ", "jtf "))
+    """Whether the first line says that this is a template of PEST, with a sign, which delimits what follows."""
+    return re.match(r"[pj]tf \S", text, re.IGNORECASE) is not None
 
 
 def is_instructions(text: str) -> bool:
-    """Whether the first line says that these are instructions of PEST."""
-    return _begins(text, ("pif ", "jif "))
-
-
-def _begins(text: str, words: tuple[str, ...]) -> bool:
-    """With one of the words and a sign, which delimits what follows."""
-    return text[:4].lower() in words and not text[4:5].isspace() and text[4:5] != ""
+    """Whether the first line says that these are instructions of PEST, with a sign likewise."""
+    return re.match(r"[pj]if \S", text, re.IGNORECASE) is not None
 
 
 def identifier(name: str) -> str:
