@@ -8,7 +8,8 @@ Each file goes through ``init`` with the law and medium of its folder; a physics
 else. Per group and physics are printed: the evidence, readings up to the next minimum after the window in their 90 %
 bands and off their medians, all that follow the window likewise, G and μ over the bubbles with χ² of their logarithms
 about the weighted mean, and processor time. Evidences are of the same readings, so that their differences count; that
-of a pair of physics is over the bubbles that both have. Records are kept as JSON lines, a line a bubble and physics.
+of a pair of physics is over the bubbles that both have. What changes nothing of a bubble, as no wall where ``init``
+proposes none, counts as the first row. Records are kept as JSON lines, a line a bubble and physics.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import argparse
 import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -28,8 +30,13 @@ from records import Record, fill
 
 from en4dvar_bubble.starter.proposal import SIMPLER
 
+COMMIT = commit()  # when this began
 Settings = dict[str, Any]
 Change = Callable[[Settings], None]
+
+
+class _AsFirstError(Exception):
+    """A physics changes nothing of what init proposes for a bubble."""
 
 
 def R_max(settings: Settings) -> float:
@@ -69,6 +76,20 @@ def scale(settings: Settings) -> None:
     settings["parameters"]["reading_scale"]["log_std"] = 0.05
 
 
+def gilmore(settings: Settings) -> None:
+    settings["model"]["radial"] = "gilmore"
+
+
+def relaxing(settings: Settings) -> None:
+    settings["model"]["law"] = "oldroyd-b"
+    settings["parameters"]["mu_p"] = dict(settings["parameters"]["mu"])
+    settings["parameters"]["relaxation_time"] = {"prior": "lognormal", "median": "1 us", "log_std": 1.5}
+
+
+def both(one: Change, other: Change) -> Change:
+    return lambda settings: (one(settings), other(settings))[0]
+
+
 PHYSICS: Mapping[str, Change] = {
     "as init proposes": lambda settings: None,
     "polytropic gas": polytropic,
@@ -77,10 +98,24 @@ PHYSICS: Mapping[str, Change] = {
     "no wall": no_wall,
     "softened gel": softening,
     "scale ± 5 %": scale,
-    "scale ± 5 %, no wall": lambda settings: (scale(settings), no_wall(settings))[0],
+    "relaxing liquid": relaxing,
+    "Gilmore, polytropic gas": both(gilmore, polytropic),
+    "Gilmore, finite condensation": both(gilmore, accommodation),
 }
 GELS = ("as init proposes", "polytropic gas", "finite condensation", "a wall", "softened gel")
-LIQUIDS = ("as init proposes", "no wall", "polytropic gas", "finite condensation", "a wall", "scale ± 5 %")
+PEG = (
+    "as init proposes",
+    "a wall",
+    "no wall",
+    "polytropic gas",
+    "relaxing liquid",
+    "scale ± 5 %",
+    "finite condensation",
+)
+WATER = (
+    "as init proposes", "polytropic gas", "finite condensation", "a wall", "Gilmore, polytropic gas",
+    "Gilmore, finite condensation",
+)  # fmt: skip
 HEADS = (
     "physics", "bubbles", "ln evidence", "to the next minimum", "off, %", "all after", "off, %", "G, kPa", "χ²",
     "μ, Pa s", "χ²", "s",
@@ -89,14 +124,24 @@ HEADS = (
 
 def physics_of(group: str) -> tuple[str, ...]:
     """Names of the physics that bubbles of a group are fitted with, the first of which others are compared with."""
-    return GELS if GROUPS[group].law.startswith("neo-hookean") else LIQUIDS
+    return GELS if GROUPS[group].law.startswith("neo-hookean") else WATER if group == "water" else PEG
 
 
 def fitted(file: Path, name: str) -> Record:
     """What ``init``, the change of physics, and ``run`` say of a bubble."""
     group = GROUPS[file.parent.name]
     words = ["--medium", group.medium]
-    return {"commit": commit(), **verbatim(file.read_text(), group.law, words, quick=False, change=PHYSICS[name])}
+
+    def change(settings: Settings) -> None:
+        before = deepcopy(settings)
+        PHYSICS[name](settings)
+        if settings == before and name != physics_of(file.parent.name)[0]:
+            raise _AsFirstError
+
+    try:
+        return {"commit": COMMIT, **verbatim(file.read_text(), group.law, words, quick=False, change=change)}
+    except _AsFirstError:
+        return {"commit": COMMIT, "as": "first"}
 
 
 def table(group: str, bubbles: Sequence[str], records: Mapping[str, Record]) -> str:
@@ -105,6 +150,7 @@ def table(group: str, bubbles: Sequence[str], records: Mapping[str, Record]) -> 
     for name in names:
         both = [b for b in bubbles if {f"{group}/{b}/{name}", f"{group}/{b}/{names[0]}"} <= records.keys()]
         mine, first = ([records[f"{group}/{b}/{of}"] for b in both] for of in (name, names[0]))
+        mine = [b if "as" in a else a for a, b in zip(mine, first, strict=True)]
         lines += [f"| {' | '.join([name, *_cells(mine, first)])} |"] * bool(both)
     return "\n".join(lines) + "\n"
 

@@ -40,7 +40,7 @@ from typing import Any
 import numpy as np
 import yaml
 from click.testing import CliRunner
-from measured_page import GROUPS, after, chi2, intervals, page, said, stated
+from measured_page import GROUPS, after, chi2, intervals, page, said, started, stated
 from records import Record, fill
 from scipy.signal import peak_widths
 from wrong_worlds import WORLDS, Wrong
@@ -141,7 +141,9 @@ def verbatim(
         (folder / "bubble.csv").write_text(text)
         config = folder / "bubble.yaml"
         asked = ["--data", str(folder / "bubble.csv"), "--time-unit", "us", "--radius-unit", "um"]
-        made = CliRunner().invoke(command_line, ["init", *asked, "--law", law, "--out", str(config), *words])
+        made = CliRunner().invoke(
+            command_line, ["init", *asked, "--law", law, "--out", str(config), *words, *started(text)]
+        )
         if made.exit_code or not config.is_file():
             return {"reason": f"init: {made.output.strip().splitlines()[-1] if made.output else made.exception}"}
         if change:
