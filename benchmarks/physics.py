@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from measured_page import GROUPS, after, chi2, intervals
 from recordings import commit, verbatim
-from records import Record, fill
+from records import Record, fill, load
 
 from en4dvar_bubble.starter.proposal import SIMPLER
 
@@ -67,6 +67,13 @@ def no_wall(settings: Settings) -> None:
     settings["parameters"].pop("wall_distance", None)
 
 
+def slit(settings: Settings) -> None:
+    near, middle, far = (f"{ratio * R_max(settings):.4g} um" for ratio in (1.1, 8, 200))
+    settings["model"]["wall"] = {"distance": middle, "kind": "slit"}
+    prior = {"prior": "logit", "lower": near, "upper": far, "median": middle, "logit_std": 2}
+    settings["parameters"]["wall_distance"] = prior
+
+
 def softening(settings: Settings) -> None:
     settings["model"]["law"] = "softening-kelvin-voigt"
     settings["parameters"]["damage"] = {"prior": "logit", "lower": 0, "upper": 1, "median": 0.3, "logit_std": 1.5}
@@ -96,6 +103,7 @@ PHYSICS: Mapping[str, Change] = {
     "finite condensation": accommodation,
     "a wall": wall,
     "no wall": no_wall,
+    "a slit": slit,
     "softened gel": softening,
     "scale ± 5 %": scale,
     "relaxing liquid": relaxing,
@@ -104,14 +112,9 @@ PHYSICS: Mapping[str, Change] = {
 }
 GELS = ("as init proposes", "polytropic gas", "finite condensation", "a wall", "softened gel")
 PEG = (
-    "as init proposes",
-    "a wall",
-    "no wall",
-    "polytropic gas",
-    "relaxing liquid",
-    "scale ± 5 %",
+    "as init proposes", "a slit", "no wall", "a wall", "polytropic gas", "relaxing liquid", "scale ± 5 %",
     "finite condensation",
-)
+)  # fmt: skip
 WATER = (
     "as init proposes", "polytropic gas", "finite condensation", "a wall", "Gilmore, polytropic gas",
     "Gilmore, finite condensation",
@@ -181,6 +184,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", type=Path, nargs="+", help="of measured bubbles, of known names")
     parser.add_argument("--first", type=int, help="bubbles of each folder, in the order of their names")
+    parser.add_argument("--only", action="append", default=[], metavar="PHYSICS", help="run these alone, any number")
     parser.add_argument("--minutes", type=float, default=np.inf, help="start no bubble after so long")
     parser.add_argument("--records", type=Path, default=Path("runs/physics.jsonl"), help="file of the records")
     parser.add_argument("--page", type=Path, help="write the tables between their marks in this page")
@@ -193,7 +197,9 @@ def main() -> None:
         if file is not None
         for name in physics_of(file.parent.name)
     }
-    records = fill(o.records, jobs, lambda key: fitted(*jobs[key]), o.minutes)
+    wanted = [key for key, (_, name) in jobs.items() if not o.only or name in o.only]
+    fill(o.records, wanted, lambda key: fitted(*jobs[key]), o.minutes)
+    records = {key: record for key, record in load(o.records).items() if key in jobs}
     tables = {group: table(group, [file.stem for file in of], records) for group, of in files.items()}
     for group, text in tables.items():
         print(f"{GROUPS[group].title}\n\n{text}")
