@@ -164,7 +164,7 @@ def verbatim(
         with (folder / "run" / "summary.csv").open() as file:
             rows = {row["name"]: row for row in csv.DictReader(file)}
         found: Record = {"seconds": time.process_time() - begun, "warnings": next(iter(rows.values()))["warnings"]}
-        for key in (*NUMBERS, "alpha", "R_eq", "R_max", "t_s"):
+        for key in (*NUMBERS, "alpha", "R_eq", "R_max", "t_s", "wall_distance", "damage", "accommodation", "mu_p"):
             if key in rows:
                 found[key] = _posterior(result.posterior[key].values.ravel(), rows[key])
         found["withheld"] = _withheld(result.sample_stats.attrs, found.get("R_max", {"mean": np.nan})["mean"])
