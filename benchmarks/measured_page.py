@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from records import Record
 
+from en4dvar_bubble.medium import WATER_25C
+
 HEAD = """# Measured bubbles, gel by gel
 
 This page is written by one command from folders of measured radius histories, `t_us,R_um`: each file goes through
@@ -75,11 +77,28 @@ GROUPS: Mapping[str, Group] = {
 
 
 def stated(text: str) -> dict[str, Any]:
-    """What the head of a file says of its experiment: keys of the configuration."""
+    """What the head of a file says of its experiment: keys of the configuration. Water under pressure is denser (Tait's
+    equation) and its sound faster (1.6 m/s a MPa at 25 °C).
+    """
     match = PRESSURE.search(text.splitlines()[0])
     if match is None or float(match[1]) == ATMOSPHERE:
         return {}
-    return {"parameters.p_inf": {"prior": "lognormal", "median": f"{match[1]} MPa", "log_std": 0.01}}
+    p = float(match[1])
+    rho = WATER_25C.rho * (1 + 1e6 * p / WATER_25C.tait_B) ** (1 / WATER_25C.tait_n)
+    known = {
+        "p_inf": (f"{p} MPa", 0.01),
+        "rho": (f"{rho:.2f} kg/m^3", 0.001),
+        "c": (f"{1497 + 1.6 * p:.1f} m/s", 0.005),
+    }
+    return {
+        f"parameters.{name}": {"prior": "lognormal", "median": median, "log_std": width}
+        for name, (median, width) in known.items()
+    }
+
+
+def started(text: str) -> list[str]:
+    """What the head of a file says for ``init``: a bubble that a laser makes begins at R_max, however it grew."""
+    return ["--start", "laser"] * ("laser" in text.splitlines()[0])
 
 
 def page(groups: Mapping[str, Sequence[Record]], command: str) -> str:

@@ -40,7 +40,7 @@ from typing import Any
 import numpy as np
 import yaml
 from click.testing import CliRunner
-from measured_page import GROUPS, after, chi2, intervals, page, said, stated
+from measured_page import GROUPS, after, chi2, intervals, page, said, started, stated
 from records import Record, fill
 from scipy.signal import peak_widths
 from wrong_worlds import WORLDS, Wrong
@@ -141,7 +141,9 @@ def verbatim(
         (folder / "bubble.csv").write_text(text)
         config = folder / "bubble.yaml"
         asked = ["--data", str(folder / "bubble.csv"), "--time-unit", "us", "--radius-unit", "um"]
-        made = CliRunner().invoke(command_line, ["init", *asked, "--law", law, "--out", str(config), *words])
+        made = CliRunner().invoke(
+            command_line, ["init", *asked, "--law", law, "--out", str(config), *words, *started(text)]
+        )
         if made.exit_code or not config.is_file():
             return {"reason": f"init: {made.output.strip().splitlines()[-1] if made.output else made.exception}"}
         if change:
@@ -162,7 +164,7 @@ def verbatim(
         with (folder / "run" / "summary.csv").open() as file:
             rows = {row["name"]: row for row in csv.DictReader(file)}
         found: Record = {"seconds": time.process_time() - begun, "warnings": next(iter(rows.values()))["warnings"]}
-        for key in (*NUMBERS, "alpha", "R_eq", "R_max", "t_s"):
+        for key in (*NUMBERS, "alpha", "R_eq", "R_max", "t_s", "wall_distance", "damage", "accommodation", "mu_p"):
             if key in rows:
                 found[key] = _posterior(result.posterior[key].values.ravel(), rows[key])
         found["withheld"] = _withheld(result.sample_stats.attrs, found.get("R_max", {"mean": np.nan})["mean"])

@@ -7,8 +7,10 @@ from functools import cache, cached_property, lru_cache
 from typing import Any, Literal
 
 import numpy as np
+from scipy.special import digamma
 
 from en4dvar.model.state import Array, Field, Parameter, StateLayout
+from en4dvar_bubble.collapse import RAYLEIGH
 from en4dvar_bubble.driving import Driving, Reading, histotripsy, silence
 from en4dvar_bubble.gas import CRITICAL_TEMPERATURE, kirchhoff, mass_fraction, saturated_vapour_pressure
 from en4dvar_bubble.laws import ConstitutiveLaw, QuadraticKelvinVoigt
@@ -34,10 +36,12 @@ Heat = Literal["cold", "conducting"]
 
 @dataclass(frozen=True)
 class Wall:
-    """A plane at ``distance`` (m) from the centre of the bubble: ``rigid``, or the ``free`` surface of the medium."""
+    """A plane at ``distance`` (m) from the centre of the bubble: ``rigid``, or the ``free`` surface of the medium; a
+    ``slit`` has a rigid one on either side.
+    """
 
     distance: float
-    kind: Literal["rigid", "free"] = "rigid"
+    kind: Literal["rigid", "free", "slit"] = "rigid"
 
 
 R0 = positive("R0", "m", "stress-free radius", "$R_0$", MANCIA, "um")
@@ -104,6 +108,8 @@ class Dynamics:
         refuse_inexact(type(self.law))
         if self.law.released and self.start != "laser":
             raise ValueError(f"{self.law.name} needs start: laser: only a released bubble has an R_max at time zero")
+        if self.wall and self.wall.kind == "slit" and self.start != "laser":
+            raise ValueError("a slit needs start: laser: how many of its images are heard follows from R_max")
         if self.gas != "heat" and (self.vapour == "transport" or self.medium_heat != "cold"):
             raise ValueError("vapour transport and a conducting medium need gas: heat")
         if self.vapour != "none" and self.medium.p_v:
@@ -191,11 +197,17 @@ class Dynamics:
         return replace(self.medium, **own) if own else self.medium
 
     def image(self, values: Mapping[str, Array]) -> float | Array:
-        """±1/(2h) in 1/m for members with parameters name → (N,): + a rigid plane at the distance h, − a free one."""
+        """±1/(2h) in 1/m for members with parameters name → (N,): + a rigid plane at the distance h, − a free one. In
+        a slit 1/h (1 + 1/2 + … + 1/n), of the images whose sound arrives within growth and collapse: n = c t_c/h.
+        """
         if self.wall is None:
             return 0.0
-        sign = 1.0 if self.wall.kind == "rigid" else -1.0
-        return sign / (2 * values.get(WALL_DISTANCE.name, np.float64(self.wall.distance)))
+        h = values.get(WALL_DISTANCE.name, np.float64(self.wall.distance))
+        if self.wall.kind == "slit":
+            medium = self.medium_of(values)
+            heard = medium.c * RAYLEIGH * values["R_max"] * np.sqrt(medium.rho / medium.p_inf) / h
+            return np.asarray((digamma(1 + heard) + np.euler_gamma) / h)
+        return (0.5 if self.wall.kind == "rigid" else -0.5) / h
 
     @cached_property
     def layout(self) -> StateLayout:

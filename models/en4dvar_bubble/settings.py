@@ -135,8 +135,8 @@ class WallSettings(Section):
 
     distance: Annotated[float, Quantity("m"), Field(gt=0)]
     """From the centre of the bubble."""
-    kind: Literal["rigid", "free"] = "rigid"
-    """A rigid wall, or the free surface of the medium."""
+    kind: Literal["rigid", "free", "slit"] = "rigid"
+    """A rigid wall, the free surface of the medium, or a rigid wall on either side."""
 
 
 class BubbleSettings(Section):
