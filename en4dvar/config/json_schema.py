@@ -95,7 +95,8 @@ def _partial(node: Any) -> Any:
         return [_partial(item) for item in node]
     if not isinstance(node, dict):
         return node
-    return {k: _partial(v) for k, v in node.items() if k != "required" or not isinstance(v, list)}
+    parts = {k: _partial(v) for k, v in node.items() if k != "required" or not isinstance(v, list)}
+    return {k: v for k, v in parts.items() if k != "oneOf" or {} not in v}  # alternatives that only required are none
 
 
 def _tidy(node: Any) -> Any:
