@@ -285,8 +285,7 @@ def _empirical(
     """The median over data sets of each parameter, from members (N_i, p) of each."""
     middle = np.array([np.median(z, axis=0) for z in members])
     std = np.array([likelihood.adjusted.std(axis=0) for likelihood in likelihoods])  # without what all have in common
-    slopes = np.mean([likelihood.slopes for likelihood in likelihoods], axis=0)
-    shared = np.sqrt(np.sum(slopes**2, axis=1))
+    shared = np.sqrt(np.sum(likelihoods[0].slopes ** 2, axis=1))
     return tuple(empirical(term, middle[:, j], std[:, j], float(shared[j]), seed) for j, term in enumerate(terms))
 
 

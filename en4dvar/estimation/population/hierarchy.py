@@ -1,7 +1,7 @@
 r"""Mean ν and spread τ of a population from the likelihoods of its data sets, with common quantities and odd ones.
 
     x_i ~ (1 − ε) N(ν, diag τ²) + ε/2 π(x) + ε/2p Σ_j N(ν, diag τ² + σ² e_j e_jᵀ),
-    θ ~ N(0, I),     data_i ~ L_i(x_i − B_i θ)
+    θ ~ N(0, I),     data_i ~ L_i(x_i − B θ)
 
 in white coordinates of the prior π. A data set is odd with probability ε (Hogg, Bovy & Lang 2010, arXiv:1008.4686):
 then its parameters are drawn from the prior as if it belonged to no population, or one of them alone lies elsewhere, by
@@ -13,7 +13,7 @@ uncertainty therefore no number of data sets averages out.
 
 With L_i in units of its evidence (:mod:`~en4dvar.estimation.population.own`) the density of h = (ν, ln τ, θ) is
 
-    p(h) Π_i [ (1 − ε) ∫ L_i(x) N(x; ν − B_i θ, τ²) dx + ε/2 + ε/2p Σ_j … ],
+    p(h) Π_i [ (1 − ε) ∫ L_i(x) N(x; ν − B θ, τ²) dx + ε/2 + ε/2p Σ_j … ],
 
 every integral in closed form. Walkers find where it is, and importance weights of draws from a mixture fitted to them
 give independent draws and the evidence.
@@ -59,7 +59,7 @@ def named(belongs: Array, odd: float) -> tuple[int, ...]:
 
 @dataclass(frozen=True)
 class HierarchyDraws:
-    """Draws of ν and τ (M, p), θ (M, c), and of x_i − B_i θ (M, S, p) given them; ``belongs`` (S,) the probabilities
+    """Draws of ν and τ (M, p), θ (M, c), and of x_i − B θ (M, S, p) given them; ``belongs`` (S,) the probabilities
     that the data sets are of the population; ``effective`` draws and ``log_evidence`` in units of the sets' own.
     """
 
@@ -149,7 +149,7 @@ class Hierarchy:
         return h, logs
 
     def _given(self, h: Array, belongs: Array, stream: np.random.Generator) -> Array:
-        """Draws (M, S, p) of x_i − B_i θ given h and the data: of the population, or odd as ``belongs`` (M, S, K)."""
+        """Draws (M, S, p) of x_i − B θ given h and the data: of the population, or odd as ``belongs`` (M, S, K)."""
         mean, variance = self.hyper.population(h[:, : 2 * self.p])
         theta, x = h[:, 2 * self.p :], np.empty((len(h), len(self.likelihoods), self.p))
         for s, likelihood in enumerate(self.likelihoods):

@@ -63,7 +63,7 @@ class OwnDraws:
 class OwnLikelihood:
     """The likelihood of one data set in p coordinates x given c common quantities θ, in units of its evidence.
 
-    ``mixture``: of x − ``slopes`` θ, with slopes (p, c); ``adjusted`` (D, p): the draws of x − Bθ.
+    ``mixture``: of x − ``slopes`` θ, with slopes (p, c), the same in all; ``adjusted`` (D, p): the draws of x − Bθ.
     """
 
     mixture: Mixture
