@@ -107,7 +107,7 @@ def populations(run_dir: Path, gel: dict[str, float], spread: float, seed: int) 
     """Of each kind: who is named, and whether the interval of the gel's medians holds the truth."""
     _, sets = finished([run_dir], True, None)
     problems, start = [s.problem for s in sets], [s.white for s in sets]
-    drawn, left_out = sampled_sets(problems, start, seed, None, lambda words: None)
+    drawn, left_out = sampled_sets(problems, start, seed, None, lambda words: None, [s.drawn for s in sets])
     of = {s.name: i for i, s in enumerate(sets)}
     names = list(gel)
     record: Record = {"left out": left_out, "medians": [np.log(value) for value in gel.values()]}

@@ -116,7 +116,8 @@ def halves(run_dir: Path, splits: int) -> None:
     assert config.population is not None
     names, problems, start = config.population.of, [s.problem for s in sets], [s.white for s in sets]
     hyper = config.population.hyper
-    drawn, left_out = sampled_sets(problems, start, config.seed, None, lambda words: print(words, flush=True))
+    kept = [s.drawn for s in sets]
+    drawn, left_out = sampled_sets(problems, start, config.seed, None, lambda words: print(words, flush=True), kept)
     rng, usable, z = np.random.default_rng(config.seed), sorted(drawn), []
 
     def of(chosen: Sequence[int]) -> CampaignPopulation:

@@ -207,6 +207,7 @@ class Analysis:
     withheld: Withheld | None = None  # the readings after the window, and what was expected of them
     ledger: Ledger | None = None  # what the path went through where it informed the parameters
     fields: tuple[FieldEstimate, ...] = ()  # of the initial state
+    draws: Array = field(default_factory=lambda: np.empty((0, 0)))  # (D, n) of a posterior that was sampled, beside
 
     def __repr__(self) -> str:
         told = []

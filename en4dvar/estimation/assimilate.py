@@ -93,6 +93,7 @@ def _through(stages: Stages, resume: LoopState | None) -> Analysis:
         _concluded(stages, prior_run, outcome.descent, sampled, control),
         modes=conclusions.modes_of(prior, counting, sampled.refined),
         descents=descents,
+        draws=prior.to_physical(sampled.refined.draws) if sampled.refined else np.empty((0, 0)),
     )
     cautions = (*start.warnings, *(sampled.refined.warnings if sampled.refined else ()))
     if len(outcome.tried) == 1:

@@ -94,6 +94,7 @@ DISCREPANT_FIRST = When(DISCREPANT.words, lambda a, item: a.discrepancy is not N
 SEARCHED = When("a scheme that searches", lambda a, _: bool(a.modes) and a.descents is not None)
 RESPONSE = When("a model with alternatives", lambda a, _: bool(a.what_if))
 WITHHELD = When("readings after the window", lambda a, _: a.withheld is not None)
+SAMPLED = When("a posterior that was sampled by weighted draws", lambda a, _: a.draws.size > 0)
 LEDGER = When("a model with quantities of its path", lambda a, _: a.ledger is not None)
 
 

@@ -16,7 +16,19 @@ from en4dvar.diagnosis.response.ledger import QUANTILES
 from en4dvar.model.state import Array
 from en4dvar.results.declared import MEMBER, OWN, Declared, Item, Table, text
 from en4dvar.results.sample_stats import SAMPLE_STATS, SCORES, shifts
-from en4dvar.results.scopes import AT, FIXED, PATH, PIECE_TIME, PLACE, PLACED, ROBUST, TIME, WITHHELD, of_series
+from en4dvar.results.scopes import (
+    AT,
+    FIXED,
+    PATH,
+    PIECE_TIME,
+    PLACE,
+    PLACED,
+    ROBUST,
+    SAMPLED,
+    TIME,
+    WITHHELD,
+    of_series,
+)
 
 
 def _parameters(members: Callable[[Analysis], Array]) -> Table:
@@ -121,6 +133,12 @@ FIELDS = (
 )  # fmt: skip
 
 
+DRAWS = (
+    Declared("{parameter}", "posterior_draw", "{label}, equally likely draws beside the members",
+             lambda a, i: a.draws[:, i.held], OWN, SAMPLED),
+)  # fmt: skip
+
+
 def _expected(name: str, meaning: str, key: str) -> Declared:
     return Declared(name, "withheld_time", meaning, lambda a, _: getattr(a.withheld, key), OWN, WITHHELD)
 
@@ -182,6 +200,7 @@ GROUPS: dict[str, Table] = {
     "/iterations": ITERATIONS,
     "/fields": FIELDS,
     "/withheld": WITHHELD_READINGS,
+    "/posterior_draws": DRAWS,
 }
-OPTIONAL = frozenset({"/fields", "/withheld"})
+OPTIONAL = frozenset({"/fields", "/withheld", "/posterior_draws"})
 """Groups that a file may lack."""

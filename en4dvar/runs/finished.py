@@ -10,6 +10,7 @@ from en4dvar.assembly.build import problem_of
 from en4dvar.config import Config
 from en4dvar.config.load import recorded, resolve
 from en4dvar.estimation.population.campaign import white_prior
+from en4dvar.estimation.population.own import OwnDraws
 from en4dvar.executor import choose_executor, one_blas_thread
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, Severity, caution
@@ -30,7 +31,8 @@ MOST_NAMES = 4
 class Finished:
     """One data set: its problem, physical members (N, n) of its posterior that are alive, its centre (n,), warnings.
 
-    ``white``: the members in white coordinates of the prior; ``groups``: what its configuration shares, and with whom.
+    ``white``: the members in white coordinates of the prior; ``groups``: what its configuration shares, and with whom;
+    ``drawn``: draws of its posterior, where it was sampled.
     Data sets of one name in several runs get a number.
     """
 
@@ -40,6 +42,7 @@ class Finished:
     centre: Array
     cautions: tuple[Caution, ...]
     groups: Mapping[str, str]
+    drawn: OwnDraws | None
 
     @property
     def name(self) -> str:
@@ -106,10 +109,25 @@ def finished_set(config: Config, result: StoredResult, run_dir: Path) -> Finishe
     centre = result.centres(names)
     try:
         white = prior.white(prior.from_physical(np.vstack([members, centre])))
+        drawn = _kept_draws(problem, result)
     except ValueError as error:
         raise OutputError(f"{result.name}: {error}") from None
     groups = config.sharing.of_dataset(result.name)
-    return Finished(problem, members, white[:-1], centre, result.cautions, groups)
+    return Finished(problem, members, white[:-1], centre, result.cautions, groups, drawn)
+
+
+def _kept_draws(problem: InverseProblem, result: StoredResult) -> OwnDraws | None:
+    """The draws of a posterior that was sampled. Raises :class:`ValueError` for what no estimate keeps."""
+    if (held := result.groups.get("/posterior_draws")) is None:
+        return None
+    stats = result.groups["/sample_stats"].attrs
+    effective, log_evidence = (
+        float(stats.get(key, np.nan)) for key in ("importance_effective_sample_size", "log_evidence")
+    )
+    draws = np.column_stack([np.asarray(held[name].values, dtype=float) for name in problem.prior.names])
+    if not (effective > 0 and np.isfinite(log_evidence) and np.isfinite(draws).all()):
+        raise ValueError("its draws are not finite, or nothing is said of them")
+    return OwnDraws.kept(problem, draws, effective, log_evidence)
 
 
 def _named_apart(sets: Sequence[Finished]) -> Iterator[Finished]:

@@ -78,8 +78,8 @@ class PopulationKind(TogetherKind):
         problems, white = [s.problem for s in sets], [s.white for s in sets]
         try:
             population = population_of(
-                problems, white, self.names, config.seed, hyper=self.hyper, effort=self.effort, executor=executor,
-                tell=tell,
+                problems, white, self.names, config.seed, kept=[s.drawn for s in sets], hyper=self.hyper,
+                effort=self.effort, executor=executor, tell=tell,
             )  # fmt: skip
         except ValueError as error:  # of forward runs that failed
             raise TooFewMembersError(f"no population: {error}") from None

@@ -18,6 +18,7 @@ from en4dvar.problem import InverseProblem
 from en4dvar.sampling import mcmc
 from en4dvar.sampling.emulated_cost import needed_runs
 from en4dvar.sampling.emulated_draws import RecordedRuns
+from en4dvar.sampling.mixture import resampled
 from en4dvar.sampling.modes import TOO_FEW, WeightedDraws, nearest, sample_modes
 from en4dvar.sampling.shape import doubtful, guide
 from en4dvar.schemes.settings import AssimilationSettings
@@ -27,6 +28,7 @@ COUNTS = math.log(1e-3)  # evidence of a minimum relative to that of the lowest,
 MISSED = 0.5  # of J, by which a draw must be lower than all minima: another one is looked for there, or it is told
 APART = 2.0  # standard deviations between modes of a parameter from which mean ± std describe none of them
 SEEN = 0.02  # weight of a mode that is told
+KEPT = 500  # draws of the posterior beside the members
 OVERLAP = "no action is needed: mean ± std describe the members"
 
 
@@ -35,7 +37,8 @@ class Refined:
     """Members (N, n), transformed, that take the ensemble's place, and what judges them.
 
     ``weights`` (M,) of the modes; ``log_evidence`` ln ∫ exp(−J_o) N(x; prior) dx, NaN where it is not known;
-    ``lowest`` J that was met. ``lower`` (n,) is a draw that lies lower than all minima; then nothing else was sampled.
+    ``lowest`` J that was met. ``draws`` (:data:`KEPT`, n) are equally likely; there are none of a chain. ``lower`` (n,)
+    is a draw that lies lower than all minima; then nothing else was sampled.
     """
 
     members: Array
@@ -43,6 +46,7 @@ class Refined:
     weights: Array = field(default_factory=lambda: np.ones(1))
     log_evidence: float = math.nan
     lowest: float = math.inf
+    draws: Array = field(default_factory=lambda: np.empty((0, 0)))
     lower: Array | None = None
     warnings: tuple[Caution, ...] = ()
 
@@ -146,7 +150,8 @@ def refined(
     if draws is not None and not chain and draws.effective >= TOO_FEW:
         members = draws.members(len(posterior), member_stream(seed, "members of the modes"), exact)
         summary = _summary(draws, posterior)
-        return Refined(members, summary, draws.weights(len(minima)), draws.log_evidence, draws.lowest)
+        kept = draws.x[resampled(draws.shares, KEPT, member_stream(seed, "kept draws"))]
+        return Refined(members, summary, draws.weights(len(minima)), draws.log_evidence, draws.lowest, kept)
     several = draws is not None and len(minima) > 1
     start = _in_all(minima, len(posterior), seed) if several else posterior
     emulated = None if several else guide(space, posterior, seed)

@@ -197,6 +197,7 @@ def population_of(
     names: Sequence[str],
     seed: int,
     *,
+    kept: Sequence[OwnDraws | None] = (),
     executor: Executor | None = None,
     hyper: HyperPrior | None = None,
     effort: Effort | None = None,
@@ -207,6 +208,7 @@ def population_of(
     Parameters
     ----------
     start: of each data set control vectors (N_i, n) near its posterior, in white coordinates of its prior.
+    kept: of each data set draws of its posterior, None where there are none; it is then sampled.
     hyper: in units of the prior's standard deviations. tell: called with a line about each data set.
 
     Raises
@@ -218,21 +220,22 @@ def population_of(
         raise ConfigError(f"a population needs at least {FEWEST_SETS} data sets")
     require_population(problems, names)
     with one_blas_thread():
-        drawn, left_out = sampled_sets(problems, start, seed, executor, tell)
+        drawn, left_out = sampled_sets(problems, start, seed, executor, tell, kept)
         return population_from(drawn, left_out, start, problems, names, seed, hyper or HyperPrior(), effort or Effort())
 
 
 def sampled_sets(
     problems: Sequence[InverseProblem], start: Sequence[Array], seed: int, executor: Executor | None,
-    tell: Callable[[str], None],
+    tell: Callable[[str], None], kept: Sequence[OwnDraws | None] = (),
 ) -> tuple[dict[int, OwnDraws], dict[str, str]]:  # fmt: skip
-    """Draws of each data set by its number, and why others have none."""
+    """Draws of each data set by its number, those that are ``kept`` or its own, and why others have none."""
     drawn: dict[int, OwnDraws] = {}
     left_out: dict[str, str] = {}
-    for s, (problem, members) in enumerate(zip(problems, start, strict=True)):
+    each = zip(problems, start, kept or [None] * len(problems), strict=True)
+    for s, (problem, members, own) in enumerate(each):
         name = problem.observations.name
         try:
-            drawn[s] = own_draws(problem, members, seed, executor)
+            drawn[s] = own or own_draws(problem, members, seed, executor)
         except ValueError as error:
             left_out[name] = str(error)
             tell(f"{name}: left out, {error}")

@@ -58,6 +58,14 @@ class OwnDraws:
     effective: float
     forward_runs: int
 
+    @classmethod
+    def kept(cls, problem: InverseProblem, draws: Array, effective: float, log_evidence: float) -> OwnDraws:
+        """What the estimate of a data set has kept: ``draws`` (D, n), physical, taken from others that are worth
+        ``effective`` of them, and ln p(y). Raises :class:`ValueError` for a draw that the prior excludes.
+        """
+        z, log = problem.prior.white(problem.prior.from_physical(draws)), problem.observations.log_normalisation()
+        return cls(z, log_evidence + log, 1 / (1 / effective + 1 / len(draws)), 0)
+
 
 @dataclass(frozen=True)
 class OwnLikelihood:
