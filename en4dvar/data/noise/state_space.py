@@ -103,10 +103,15 @@ def _boxed(
 ) -> None:
     """``mode`` (2, B, K), run by run: Newton's method on which readings are in the tails, each step as long as J falls.
 
-    J is convex and quadratic in pieces, so that this ends; whole steps may go round in circles.
+    The first step is to the mode of Gaussian errors. J is convex and quadratic in pieces, so that this ends; whole
+    steps may go round in circles.
     """
     count = residuals.shape[1]
     force, at, pull = np.empty(count), np.empty(count), np.empty(count)
+    moves, towards = np.empty((count - 1, order, order)), np.empty((count, order))
+    expected, precision = np.empty(count), np.empty(count)
+    stationary, apart, half = _stationary(order), np.empty((order, order)), np.empty((order, order))
+    mean, column = np.empty(order), np.empty(order)
     for run in range(residuals.shape[0]):
         r, s, nugget, a, u, delta = (
             residuals[run], std[run], own[run], amplitudes[run], mode[0, run], mode[1, run],
@@ -114,10 +119,14 @@ def _boxed(
         if not np.isfinite(np.sum(r) + np.sum(s) + np.sum(a) + rates[run]):
             mode[:, run] = np.nan
             continue
-        at[:], pull[:] = 0.0, 0.0
-        _set_force(r, s, at, c, force)
+        for k in range(count - 1):
+            _set_transition(order, rates[run] * steps[k], moves[k])
+        at[:], pull[:], force[:] = 0.0, 0.0, np.nan
         for _ in range(NEWTON):
-            _mode(order, r, s * s, nugget, force, a, rates[run], steps, u, delta)
+            _ahead(
+                r, s, nugget, force, a, moves, stationary, u, expected, towards, precision, mean, apart, column, half
+            )
+            _back(nugget, a, moves, u, delta, expected, towards, precision, mean, column)
             if not _set_force(r, s, delta, c, force):
                 break
             step = _step(r, s, c, at, pull, u, delta)
@@ -175,57 +184,53 @@ def _slope(step: float, r: Array, s: Array, c: float, at: Array, pull: Array, u:
 
 
 @called
-def _mode(
-    order: int, r: Array, errors: Array, own: Array, force: Array, a: Array, rate: float, steps: Array, u: Array,
-    delta: Array,
+def _ahead(
+    r: Array, s: Array, own: Array, force: Array, a: Array, moves: Array, stationary: Array, u: Array, expected: Array,
+    towards: Array, precision: Array, mean: Array, apart: Array, column: Array, half: Array,
 ) -> None:  # fmt: skip
-    """u and δ of one run for Gaussian errors of variance ``errors``, or for a constant u where ``force`` is no NaN."""
-    count, move, column = len(r), np.empty((order, order)), np.empty(order)
-    expected, towards, variance = np.empty(count), np.empty((count, order)), np.empty(count)
-    _ahead(r, errors + own, force, a, rate, steps, u, expected, towards, variance)
-    adjoint = np.zeros(order)  # of the state before reading k, once that is reached
-    for k in range(count - 1, -1, -1):
-        if k < count - 1:
-            _set_transition(order, rate * steps[k], move)
+    """The filter, for Gaussian errors of standard deviation ``s`` or a constant ``force``, where that is no NaN: a f as
+    ``expected`` (K,) of each reading, what moves the state ``towards`` it (K, order), and ``u``, what is new in it,
+    times its ``precision`` (K,), none of a constant force. The last four are room to work in.
+    """
+    order = len(mean)
+    mean[:], apart[:] = 0.0, 0.0
+    for k in range(len(r)):
+        if k > 0:
+            _advance(moves[k - 1], mean, apart, column, half)
+        expected[k] = a[k] * mean[0]
+        for i in range(order):
+            towards[k, i] = a[k] * (stationary[i, 0] + apart[i, 0])
+        precision[k], u[k] = 0.0, force[k]
+        if np.isnan(force[k]):
+            precision[k] = 1.0 / (a[k] * towards[k, 0] + s[k] * s[k] + own[k])
+            u[k] = (r[k] - expected[k]) * precision[k]
+        for i in range(order):
+            mean[i] += towards[k, i] * u[k]
+            for j in range(order):
+                apart[i, j] -= towards[k, i] * towards[k, j] * precision[k]
+
+
+@called
+def _back(
+    own: Array, a: Array, moves: Array, u: Array, delta: Array, expected: Array, towards: Array, precision: Array,
+    adjoint: Array, column: Array,
+) -> None:  # fmt: skip
+    """The smoother behind :func:`_ahead`: u and δ of the mode. ``adjoint`` and ``column`` are room to work in."""
+    order = len(adjoint)
+    adjoint[:] = 0.0  # of the state before reading k, once that is reached
+    for k in range(len(u) - 1, -1, -1):
+        if k < len(u) - 1:
             column[:] = adjoint
             for i in range(order):
                 adjoint[i] = 0.0
                 for j in range(order):
-                    adjoint[i] += move[j, i] * column[j]
+                    adjoint[i] += moves[k, j, i] * column[j]
         for i in range(order):
-            u[k] -= towards[k, i] * adjoint[i] / variance[k]
+            u[k] -= towards[k, i] * adjoint[i] * precision[k]
         adjoint[0] += a[k] * u[k]
         delta[k] = expected[k] + own[k] * u[k]
         for i in range(order):
             delta[k] += towards[k, i] * adjoint[i]
-
-
-@called
-def _ahead(
-    r: Array, errors: Array, force: Array, a: Array, rate: float, steps: Array, u: Array, expected: Array,
-    towards: Array, variance: Array,
-) -> None:  # fmt: skip
-    """The filter: a f as ``expected`` (K,) of each reading, what moves the state ``towards`` it (K, order), and what is
-    new in it, over its ``variance`` (K,), infinite of a constant force.
-    """
-    order = towards.shape[1]
-    stationary, move, half = _stationary(order), np.empty((order, order)), np.empty((order, order))
-    mean, apart, column = np.zeros(order), np.zeros((order, order)), np.empty(order)
-    for k in range(len(r)):
-        if k > 0:
-            _set_transition(order, rate * steps[k - 1], move)
-            _advance(move, mean, apart, column, half)
-        expected[k] = a[k] * mean[0]
-        for i in range(order):
-            towards[k, i] = a[k] * (stationary[i, 0] + apart[i, 0])
-        variance[k], u[k] = np.inf, force[k]
-        if np.isnan(force[k]):
-            variance[k] = a[k] * towards[k, 0] + errors[k]
-            u[k] = (r[k] - expected[k]) / variance[k]
-        for i in range(order):
-            mean[i] += towards[k, i] * u[k]
-            for j in range(order):
-                apart[i, j] -= towards[k, i] * towards[k, j] / variance[k]
 
 
 @called
