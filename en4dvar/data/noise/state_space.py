@@ -110,8 +110,7 @@ def _boxed(
     force, at, pull = np.empty(count), np.empty(count), np.empty(count)
     moves, towards = np.empty((count - 1, order, order)), np.empty((count, order))
     expected, precision = np.empty(count), np.empty(count)
-    stationary, apart, half = _stationary(order), np.empty((order, order)), np.empty((order, order))
-    mean, column = np.empty(order), np.empty(order)
+    room = np.empty((2 * order + 2, order))
     for run in range(residuals.shape[0]):
         r, s, nugget, a, u, delta = (
             residuals[run], std[run], own[run], amplitudes[run], mode[0, run], mode[1, run],
@@ -123,10 +122,8 @@ def _boxed(
             _set_transition(order, rates[run] * steps[k], moves[k])
         at[:], pull[:], force[:] = 0.0, 0.0, np.nan
         for _ in range(NEWTON):
-            _ahead(
-                r, s, nugget, force, a, moves, stationary, u, expected, towards, precision, mean, apart, column, half
-            )
-            _back(nugget, a, moves, u, delta, expected, towards, precision, mean, column)
+            _ahead(r, s, nugget, force, a, moves, u, expected, towards, precision, room)
+            _back(nugget, a, moves, u, delta, expected, towards, precision, room)
             if not _set_force(r, s, delta, c, force):
                 break
             step = _step(r, s, c, at, pull, u, delta)
@@ -185,14 +182,16 @@ def _slope(step: float, r: Array, s: Array, c: float, at: Array, pull: Array, u:
 
 @called
 def _ahead(
-    r: Array, s: Array, own: Array, force: Array, a: Array, moves: Array, stationary: Array, u: Array, expected: Array,
-    towards: Array, precision: Array, mean: Array, apart: Array, column: Array, half: Array,
+    r: Array, s: Array, own: Array, force: Array, a: Array, moves: Array, u: Array, expected: Array, towards: Array,
+    precision: Array, room: Array,
 ) -> None:  # fmt: skip
     """The filter, for Gaussian errors of standard deviation ``s`` or a constant ``force``, where that is no NaN: a f as
     ``expected`` (K,) of each reading, what moves the state ``towards`` it (K, order), and ``u``, what is new in it,
-    times its ``precision`` (K,), none of a constant force. The last four are room to work in.
+    times its ``precision`` (K,), none of a constant force. ``room`` (2 order + 2, order) to work in.
     """
-    order = len(mean)
+    order = room.shape[1]
+    mean, column, apart, half = room[0], room[1], room[2 : 2 + order], room[2 + order :]
+    stationary = _stationary(order)
     mean[:], apart[:] = 0.0, 0.0
     for k in range(len(r)):
         if k > 0:
@@ -213,10 +212,10 @@ def _ahead(
 @called
 def _back(
     own: Array, a: Array, moves: Array, u: Array, delta: Array, expected: Array, towards: Array, precision: Array,
-    adjoint: Array, column: Array,
+    room: Array,
 ) -> None:  # fmt: skip
-    """The smoother behind :func:`_ahead`: u and δ of the mode. ``adjoint`` and ``column`` are room to work in."""
-    order = len(adjoint)
+    """The smoother behind :func:`_ahead`: u and δ of the mode."""
+    order, adjoint, column = room.shape[1], room[0], room[1]
     adjoint[:] = 0.0  # of the state before reading k, once that is reached
     for k in range(len(u) - 1, -1, -1):
         if k < len(u) - 1:
