@@ -57,7 +57,7 @@ def test_the_page_names_nothing_that_is_not_there(result, page):
     groups: list[str] = []
     for head, names, dims in rows:
         groups = re.findall(r"`/(\w+)`", head) or groups
-        for group in (g for g in groups if g not in ("fields", "withheld")):
+        for group in (g for g in groups if g not in ("fields", "withheld", "posterior_draws")):
             there = {named(result, v): set(map(str, d.dims)) for v, d in result.dataset(group).data_vars.items()}
             for name in set(re.findall(r"`(\w+)`", names)) - sometimes:
                 if name.startswith(("what_if_", "ledger_", "influence_", "ln_T")):  # where they can be told
