@@ -40,8 +40,8 @@ class WindowSection(Section):
     of the file."""
 
     start: Annotated[Instant, Made(_instant)] = Field("start", alias="from", validate_default=True)
-    """First observation: start, top, maximum (for the bubble also R_max), trough N, minimum N, or a time on the file's
-    clock."""
+    """First observation: start, top, maximum (also written x_max), trough N, minimum N, or a time on the
+    file's clock."""
     end: Annotated[Instant, Made(_instant)] = Field("end", alias="to", validate_default=True)
     """Last observation: end, top, maximum, trough N, minimum N (counted from the window's start), or a time on the
     file's clock."""

@@ -30,13 +30,13 @@ class Observations:
 
     Attributes
     ----------
-    times: (K,) in the model's time unit (seconds for the bubble), from the model's time zero; strictly increasing
+    times: (K,) in the model's time unit, from the model's time zero; strictly increasing
         within a series, of a field not decreasing.
     values: (K,) finite, in the observable's unit.
     noise: the observation errors (:func:`en4dvar.data.noise.noise_of` makes them of std, timing error and correlation).
     weights: (K,) β_k ≥ 0; 1 counts an observation fully (``weights: sum``), 1/K is ``weights: mean``.
     name: of the data set. source: where it was read from (for the record).
-    scalars: further numbers found beside the series (e.g. an equilibrium radius), as read, no units applied.
+    scalars: further numbers found beside the series (e.g. a size at rest), as read, no units applied.
     doubts: what makes the times of the file implausible.
     parts: which readings belong to which series, see :meth:`of_series`; () where all are of one observable, which has
         one value at a time.

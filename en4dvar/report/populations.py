@@ -1,4 +1,4 @@
-"""Populations side by side: is one gel stiffer than another, by how much, how surely, and how it goes with a number."""
+"""Populations side by side: is one median larger than another, by how much, how surely, and its trend."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def compare_populations(
     seed: int = 1,
     known: Mapping[str, Mapping[str, str]] | None = None,
 ) -> PopulationsCompared:
-    """Compare the populations behind runs, e.g. of two gels; ``runs``: folders, or name → folder.
+    """Compare the populations behind runs, e.g. of two materials; ``runs``: folders, or name → folder.
 
     Quantities that are common to the data sets of each population, of the same name and prior, have one value in all
     populations, but for those named ``apart``. ``numbers``: of each run one, e.g. a concentration, that the medians are

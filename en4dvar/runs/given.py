@@ -19,7 +19,7 @@ from en4dvar.plumbing.hints import listed, suggest
 from en4dvar.results.checkpoint import digest
 from en4dvar.runs.rundir import GIVEN
 
-MODELS = "give f(parameters, times), a ForwardModel, or a dict such as {'name': 'bubble'}"
+MODELS = "give f(parameters, times), a ForwardModel, or a dict such as {'name': 'lorenz63'}"
 
 
 @dataclass
