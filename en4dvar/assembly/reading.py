@@ -21,7 +21,7 @@ from en4dvar.inputs.steps import step_doubts
 from en4dvar.inputs.window import select
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution
-from en4dvar.plumbing.errors import ConfigError, DataError
+from en4dvar.plumbing.errors import ConfigError, DataError, retold
 from en4dvar.plumbing.files import readable
 from en4dvar.plumbing.units import convert
 
@@ -31,10 +31,8 @@ def read_observations(plan: DataPlan, file: DataFile, name: str, weights: str = 
     files = (file, *file.others)
     series = []
     for series_plan, where in zip(plan.series, files, strict=True):
-        try:
+        with retold(DataError, DataError, "", series_plan.name):
             series.append(read_one(series_plan, where, fewest=series_plan.observable.fewest if plan.alone else 1))
-        except DataError as error:
-            raise DataError(str(error), series_plan.name) from None
     observations = Observations.of_series(series, plan.correlation, name)
     return observations if weights == "sum" else weighted(observations, weights)
 

@@ -14,7 +14,7 @@ from en4dvar.inputs.arrays import TIME, VALUE, columns_of, csv_of, require_colum
 from en4dvar.model.forward import ForwardModel, Observable
 from en4dvar.model.function_model import FunctionModel, digest_of, name_of
 from en4dvar.model.state import OF_READINGS, Array, Parameter
-from en4dvar.plumbing.errors import ConfigError, DataError, Fault
+from en4dvar.plumbing.errors import ConfigError, DataError, Fault, retold
 from en4dvar.plumbing.hints import listed, suggest
 from en4dvar.results.checkpoint import digest
 from en4dvar.runs.rundir import GIVEN
@@ -77,10 +77,8 @@ class GivenSeries:
 
     def _kept(self, column: str) -> str:
         """What a column is called in the data file, which it goes to. Raises :class:`DataError`."""
-        try:
+        with retold(DataError, DataError, f"data: {self._of()}"):
             require_columns(self.columns, [column])
-        except DataError as problem:
-            raise DataError(f"data: {self._of()}{problem}") from None
         name = column if self.name in ("", column) else f"{self.name} {column}"
         self.used[name] = self.columns[column]
         return name
@@ -138,10 +136,8 @@ class Given:
     ):  # fmt: skip
         self.units, self.priors, self.correlation = units, priors, correlation
         self.beside: dict[str, str] = {}
-        try:
+        with retold(DataError, DataError, "data: "):
             tables = tables_of(data, time, None if isinstance(observable, str) else observable)
-        except DataError as problem:
-            raise DataError(f"data: {problem}") from None
         self.alone = tables is None
         if tables is not None:
             if isinstance(observable, str):
@@ -232,10 +228,8 @@ def _check_keys(argument: str, keys: Any, series: Mapping[str, Any], whole: bool
 
 
 def _columns(where: str, table: Any, time: str, value: str) -> dict[str, Array]:
-    try:
+    with retold(DataError, DataError, f"{where}: "):
         return columns_of(table, time, value)
-    except DataError as problem:
-        raise DataError(f"{where}: {problem}") from None
 
 
 def _columns_in(sections: Any) -> list[str]:
