@@ -67,10 +67,10 @@ class TooFewMembersError(En4dvarError):
 
 @contextmanager
 def retold(
-    caught: type[Exception] | tuple[type[Exception], ...], told: type[Exception], words: str = "", *more: str
+    caught: type[Exception] | tuple[type[Exception], ...], kind: type[Exception], words: str = "", *more: str
 ) -> Iterator[None]:
-    """Raise what is ``caught`` in the block as ``told(words + message, *more)``, of system errors the reason alone."""
+    """Raise what is ``caught`` in the block as ``kind(words + message, *more)``, of system errors the reason alone."""
     try:
         yield
     except caught as error:
-        raise told(f"{words}{getattr(error, 'strerror', None) or error}", *more) from None
+        raise kind(f"{words}{getattr(error, 'strerror', None) or error}", *more) from None
