@@ -16,7 +16,7 @@ from en4dvar.descent.start import given
 from en4dvar.ensemble.forecast import check_problem
 from en4dvar.ensemble.tangent import derivatives_of
 from en4dvar.inputs.asked import Column, DataFile
-from en4dvar.plumbing.errors import ConfigError, DataError, Fault
+from en4dvar.plumbing.errors import ConfigError, DataError, Fault, retold
 from en4dvar.plumbing.units import UnitError, convert
 from en4dvar.priors.field_prior import FieldPrior
 from en4dvar.priors.prior import Prior, PriorTerm
@@ -166,10 +166,8 @@ def data_files(plan: DataPlan) -> dict[str, DataFile]:
 
 def _files_of(series: SeriesPlan) -> dict[str, DataFile]:
     data = series.data
-    try:
+    with retold(DataError, DataError, "", series.name):
         files = find_files(data.path.base, data.path.texts)
-    except DataError as error:
-        raise DataError(str(error), series.name) from None
     time = data.columns.time
     return with_parts(files, data.columns.observable, data.layout, time.name if isinstance(time, Column) else None)
 

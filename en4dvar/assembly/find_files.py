@@ -9,7 +9,7 @@ from pathlib import Path
 
 from en4dvar.inputs.asked import ANY, SUFFIXES, Column, DataFile, Layout
 from en4dvar.inputs.parts import parts_of
-from en4dvar.plumbing.errors import DataError
+from en4dvar.plumbing.errors import DataError, retold
 from en4dvar.plumbing.files import PathError, expanded, readable
 from en4dvar.plumbing.hints import natural
 
@@ -36,10 +36,8 @@ def find_files(base: Path, texts: Sequence[str]) -> dict[str, Path]:
     paths: list[Path] = []
     grouped: set[Path] = set()
     for text in texts:
-        try:
+        with retold(PathError, DataError):
             path = base / expanded(text)
-        except PathError as error:
-            raise DataError(str(error)) from None
         if glob.has_magic(text) and not os.path.exists(path):
             matches = sorted(map(Path, glob.glob(str(path), recursive=True)), key=natural)
             if not matches:
@@ -63,10 +61,8 @@ def find_files(base: Path, texts: Sequence[str]) -> dict[str, Path]:
 
 
 def _beside(folder: Path) -> list[Path]:
-    try:
+    with retold(OSError, DataError, f"{folder}: cannot be read: "):
         return list(folder.iterdir())
-    except OSError as error:
-        raise DataError(f"{folder}: cannot be read: {error.strerror}") from None
 
 
 def _data_files(folder: Path) -> list[Path]:

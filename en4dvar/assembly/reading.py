@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -10,7 +11,7 @@ import numpy.typing as npt
 from en4dvar.config.context import Spread
 from en4dvar.config.data import Data
 from en4dvar.config.series import DataPlan, SeriesPlan
-from en4dvar.data.noise import Noise, noise_of
+from en4dvar.data.noise import Noise, SharedErrors, noise_of
 from en4dvar.data.observations import Observations
 from en4dvar.data.series import Series, balanced
 from en4dvar.inputs.asked import Column, DataFile
@@ -20,7 +21,7 @@ from en4dvar.inputs.steps import step_doubts
 from en4dvar.inputs.window import select
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution
-from en4dvar.plumbing.errors import ConfigError, DataError
+from en4dvar.plumbing.errors import ConfigError, DataError, retold
 from en4dvar.plumbing.files import readable
 from en4dvar.plumbing.units import convert
 
@@ -30,10 +31,8 @@ def read_observations(plan: DataPlan, file: DataFile, name: str, weights: str = 
     files = (file, *file.others)
     series = []
     for series_plan, where in zip(plan.series, files, strict=True):
-        try:
+        with retold(DataError, DataError, "", series_plan.name):
             series.append(read_one(series_plan, where, fewest=series_plan.observable.fewest if plan.alone else 1))
-        except DataError as error:
-            raise DataError(str(error), series_plan.name) from None
     observations = Observations.of_series(series, plan.correlation, name)
     return observations if weights == "sum" else weighted(observations, weights)
 
@@ -104,12 +103,8 @@ def _errors(data: Data) -> dict[str, Column]:
     """The columns that hold errors of readings or times, or say which readings are bounds."""
     time = data.columns.time
     clock = time if isinstance(time, Column) else time.column
-    columns = {
-        "std": data.error.column("std", data.columns.observable.unit),
-        "time_std": data.error.column("time_std", clock.unit if clock else ""),
-    }
-    columns |= {key: marked for key, marked in data.error.bounds.items() if isinstance(marked, Column)}
-    return {key: column for key, column in columns.items() if column}
+    columns = data.error.columns(data.columns.observable.unit, clock.unit if clock else "")
+    return columns | {key: marked for key, marked in data.error.bounds.items() if isinstance(marked, Column)}
 
 
 def _readings(data: Data, file: DataFile, fewest: int) -> Readings:
@@ -150,16 +145,17 @@ def _span(times: Array, data: Data) -> str:
 
 
 def errors_of(
-    data: Data, times: Array, values: Array, samples: npt.NDArray[np.intp], stated: Mapping[str, Array | None]
+    data: Data, times: Array, values: Array, samples: npt.NDArray[np.intp], stated: Mapping[str, Array]
 ) -> Noise:
     """The observation errors at ``times`` (K,); ``samples`` (K,) are the places of the observations in the series.
 
-    ``values`` are those in the window. ``stated``: ``std``, ``time_std``, ``at_most`` and ``at_least`` (K,) where
-    columns of the file hold them.
+    ``values`` are those in the window. ``stated``: ``std``, ``time_std``, ``shared 0`` and so on, ``at_most`` and
+    ``at_least`` (K,) where columns of the file hold them.
 
     A covariance file holds one row an observation of the window, or one a usable sample of the whole series.
     """
-    error, correlation = data.error, None
+    error, correlation = data.error, cast(Array | SharedErrors | None, None)
+    largest = float(values.max())
     kernel = error.discrepancy.kernel_at(times) if error.discrepancy else None
     timing = stated.get("time_std")
     time_std = np.full(len(times), error.time_std) if timing is None else timing
@@ -175,14 +171,16 @@ def errors_of(
         return noise_of(std, time_std, correlation, discrepancy=kernel)
     if error.std is None:
         raise ConfigError("data.error: neither a std nor a covariance")
-    if isinstance(error.std, Spread):
-        std = np.full(len(times), error.std.absolute(float(values.max())))
-    else:
-        read = stated["std"]
-        assert read is not None
-        std = read
+
+    def of(part: Spread | Column, key: str) -> Array:
+        return np.full(len(times), part.absolute(largest)) if isinstance(part, Spread) else stated[key]
+
+    std = of(error.std, "std")
     if error.model_std is not None:
-        std = np.hypot(std, error.model_std.absolute(float(values.max())))
+        std = np.hypot(std, error.model_std.absolute(largest))
+    if error.shared:
+        columns = [of(part, f"shared {i}") for i, part in enumerate(error.shared)]
+        std, correlation = SharedErrors.beside(std, np.stack(columns, axis=1))
     if error.correlation_time is not None:
         correlation = np.exp(-np.abs(np.subtract.outer(times, times)) / error.correlation_time)
     upper, lower = (np.asarray(stated.get(key, on), dtype=bool) for key, on in error.bounds.items())

@@ -15,7 +15,7 @@ import click
 
 from en4dvar.commands.common import parted
 from en4dvar.commands.plugin_commands import first_sentence
-from en4dvar.plumbing.errors import En4dvarError
+from en4dvar.plumbing.errors import En4dvarError, retold
 
 if TYPE_CHECKING:
     from en4dvar.config import Config
@@ -66,8 +66,6 @@ def write_form(
     refuses.
     """
     entry = forms()[name]
-    try:
+    with retold((ImportError, AttributeError), En4dvarError, f"--{name} ({entry.value}) cannot be loaded: "):
         function = entry.load()
-    except (ImportError, AttributeError) as error:
-        raise En4dvarError(f"--{name} ({entry.value}) cannot be loaded: {error}") from error
     return str(function(config, times, out, settings, seed))

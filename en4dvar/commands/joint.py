@@ -12,11 +12,10 @@ from en4dvar.commands.common import Together, several_runs
 )  # fmt: skip
 @several_runs("joint")
 def joint(runs: Together, names: tuple[str, ...]) -> None:
-    """Estimate data sets together that share parameters: the bubbles of one gel, the experiments of one pulse.
+    """Estimate data sets together that share parameters: samples of one material, records of one instrument.
 
-    Takes finished runs, any of which may be a campaign; their models, windows and errors may differ (laser and
-    acoustic bubbles of one gel). Each data set has its own values of what is not shared. Writes joint.nc, joint.csv and
-    a page.
+    Takes finished runs, any of which may be a campaign; their models, windows and errors may differ.
+    Each data set has its own values of what is not shared. Writes joint.nc, joint.csv and a page.
 
     \b
     Example:

@@ -12,7 +12,7 @@ from typing import Any
 
 import click
 
-from en4dvar.plumbing.errors import En4dvarError
+from en4dvar.plumbing.errors import En4dvarError, retold
 
 GROUP = "en4dvar.commands"
 
@@ -28,10 +28,9 @@ class PluginCommand(click.Command):
         self, info_name: str | None, args: list[str], parent: click.Context | None = None, **extra: Any
     ) -> click.Context:
         """Import the command and let it take over. Raises :class:`En4dvarError` where that fails."""
-        try:
+        words = f"command {self.name!r} ({self.entry.value}) cannot be loaded: "
+        with retold((ImportError, AttributeError), En4dvarError, words):
             command = self.entry.load()
-        except (ImportError, AttributeError) as error:
-            raise En4dvarError(f"command {self.name!r} ({self.entry.value}) cannot be loaded: {error}") from error
         if not isinstance(command, click.Command):
             raise En4dvarError(f"command {self.name!r}: {self.entry.value} is not a click command")
         return command.make_context(info_name, args, parent, **extra)

@@ -24,7 +24,7 @@ from en4dvar.commands.common import Together, several_runs
 )  # fmt: skip
 @several_runs("population")
 def population(runs: Together, names: tuple[str, ...], mean_std: float, spread: float, odd: float) -> None:
-    """Estimate the mean of parameters over data sets and how much they vary: the gel behind its bubbles.
+    """Estimate the mean of parameters over data sets and how much they vary: a material behind its samples.
 
     Takes finished runs of the same parameters, with at least three data sets together, whatever their errors. Unlike
     stacked posteriors it counts the prior once. Constants of the medium and of the camera that are estimated have one

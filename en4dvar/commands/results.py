@@ -105,8 +105,8 @@ def compare(
     Evidences are sampled with forward runs if the model is cheap. Code outside the current folder and installed
     packages is run only with --trust.
 
-    The runs may be laws on the same data or different gels. Writes compare.html, a figure (PNG, PDF) and CSV tables.
-    For sequences, a table of their evidences is printed.
+    The runs may be models on the same data or different materials. Writes compare.html, a figure (PNG, PDF) and CSV
+    tables. For sequences, a table of their evidences is printed.
 
     \b
     Example:

@@ -35,11 +35,10 @@ def warm_up() -> None:
 
 def examples() -> Iterator[tuple[str, Callable[[], object]]]:
     """Names of kernels, each with a call that compiles it. Raises :class:`En4dvarError`: a package is at fault."""
-    from en4dvar.plumbing.errors import En4dvarError
+    from en4dvar.plumbing.errors import En4dvarError, retold
 
     for entry in sorted(entry_points(group=GROUP)):
-        try:
+        words = f"warm-up of {entry.name!r} ({entry.value}) cannot be loaded: "
+        with retold((ImportError, AttributeError), En4dvarError, words):
             examples_of_package = entry.load()()
-        except (ImportError, AttributeError) as error:
-            raise En4dvarError(f"warm-up of {entry.name!r} ({entry.value}) cannot be loaded: {error}") from error
         yield from examples_of_package.items()

@@ -9,7 +9,7 @@ from en4dvar.config.context import PLACEHOLDER, Context, Made, observable_unit, 
 from en4dvar.config.schema import QuantityText, Section
 from en4dvar.config.validate import Faults
 from en4dvar.inputs.asked import Column, TimeStep
-from en4dvar.plumbing.errors import ConfigError
+from en4dvar.plumbing.errors import ConfigError, retold
 from en4dvar.plumbing.units import UnitError, as_unit, parse_quantity
 
 
@@ -72,18 +72,14 @@ def _times(section: TimeColumn, context: Context) -> Column | TimeStep:
     if section.unit is not None:
         named = Column(str(section.name or section.step), section.unit, unit, rate=rate)
         return named if section.name else TimeStep(named)
-    try:
+    with retold(UnitError, ConfigError, "", "step"):
         return TimeStep(value=parse_quantity(section.step or 0, unit))
-    except UnitError as error:
-        raise ConfigError(str(error), "step") from None
 
 
 def _rate(text: Any, unit: str) -> float:
-    try:
+    with retold(ValueError, ConfigError, "", "rate"):
         value = parse_quantity(text, f"1/({unit})")
         require_sign(value, "positive", text)
-    except ValueError as error:
-        raise ConfigError(str(error), "rate") from None
     return value
 
 

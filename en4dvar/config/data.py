@@ -18,6 +18,7 @@ from en4dvar.inputs.asked import Disorder, Format, Layout, Repeated
 from en4dvar.inputs.text_table import Decimal
 from en4dvar.inputs.window import Instant, parse_instant
 from en4dvar.model.forward import field_of
+from en4dvar.plumbing.errors import retold
 from en4dvar.plumbing.hints import shown, suggest
 from en4dvar.plumbing.units import UnitError, parse_quantity
 
@@ -40,8 +41,8 @@ class WindowSection(Section):
     of the file."""
 
     start: Annotated[Instant, Made(_instant)] = Field("start", alias="from", validate_default=True)
-    """First observation: start, top, maximum (for the bubble also R_max), trough N, minimum N, or a time on the file's
-    clock."""
+    """First observation: start, top, maximum (also written x_max), trough N, minimum N, or a time on the
+    file's clock."""
     end: Annotated[Instant, Made(_instant)] = Field("end", alias="to", validate_default=True)
     """Last observation: end, top, maximum, trough N, minimum N (counted from the window's start), or a time on the
     file's clock."""
@@ -52,10 +53,8 @@ class WindowSection(Section):
 def read_time_zero(text: Any, context: Context) -> Literal["file", "window"] | float:
     if text in ("file", "window"):
         return "file" if text == "file" else "window"
-    try:
+    with retold(UnitError, UnitError, "write file, window or a time: "):
         return parse_quantity(text, time_unit(context))
-    except UnitError as error:
-        raise UnitError(f"write file, window or a time: {error}") from None
 
 
 @dataclass(frozen=True)

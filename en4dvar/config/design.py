@@ -84,7 +84,7 @@ class Within(Section):
     price: Annotated[float, Field(ge=0)] | None = None
     """Largest price of a design."""
     beyond: Annotated[float, Field(ge=0, le=1)] | None = None
-    """Largest share of the prior for which the model may leave its validity (for a bubble: its wall Mach number)."""
+    """Largest share of the prior for which the model may leave a limit of its validity."""
 
     def broken(self, readings: int, price: float, beyond: float) -> str:
         """The limits that a design exceeds, in words; empty where it keeps to all."""
@@ -123,7 +123,7 @@ class Design(_SampleSizes):
     choose: Choice | None = None
     """Take only the most informative readings."""
     experiments: Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(min_length=1)] = (1,)
-    """How many equal experiments are made, e.g. bubbles of one gel; they share the parameters asked for."""
+    """How many equal experiments are made, of one sample; they share the parameters asked for."""
     price: Price = Price()
     """What an experiment costs: information is compared with it."""
     within: Within = Within()

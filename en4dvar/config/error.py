@@ -88,6 +88,11 @@ class MarkColumn(Section):
     """Header of the column (CSV) or name of the field (.mat)."""
 
 
+def _shared(written: Any, context: Context) -> tuple[Spread | Column, ...]:
+    parts = [read_error_std(part, context) for part in (written if isinstance(written, list) else [written])]
+    return tuple(replace(part, kind="shared") if isinstance(part, Column) else part for part in parts)
+
+
 def _marks(written: bool | MarkColumn, context: Context) -> bool | Column:
     return written if isinstance(written, bool) else Column(written.column, "1", "1", kind="mark")
 
@@ -170,7 +175,7 @@ HUBER = 1.345  # 95 % efficiency where the errors are Gaussian after all: Huber 
 
 
 BOUNDS = ("at_most", "at_least")
-BESIDE = ("covariance", "correlation_time", "robust", "discrepancy", "time_std")
+BESIDE = ("covariance", "correlation_time", "shared", "robust", "discrepancy", "time_std")
 
 
 def _square(context: Context) -> str:
@@ -205,6 +210,11 @@ class Error(Section):
     """Std of what the model misses from reading to reading, e.g. '1 % of maximum'; its square is added."""
     correlation_time: Annotated[float | None, quantity(time_unit, "positive")] = None
     """Errors are correlated as exp(−|Δt|/τ)."""
+    shared: Annotated[
+        tuple[Spread | Column, ...], Made(_shared, json={"type": "array", "items": QUANTITY_OR_COLUMN})
+    ] = ()
+    """Errors that all readings share, independent of each other, each a std for all or ``{column: NAME}`` of a std with
+    a sign for each reading: R is the diagonal plus the sum of their products."""
     covariance: Annotated[Matrix | None, Made(_matrix, CovarianceFile)] = None
     """File of the whole R."""
     robust: Literal["huber"] | None = None
@@ -228,6 +238,9 @@ class Error(Section):
             ("covariance", std, "the file holds the variances"),
             ("covariance", "model_std", "the file holds the variances"),
             ("covariance", "correlation_time", "the file holds the correlations"),
+            ("covariance", "shared", "the file holds the correlations"),
+            ("shared", "correlation_time", "give R as a file, covariance: {path: …}"),
+            ("robust", "shared", "a robust cost needs independent observation errors"),
             ("robust", "correlation_time", "a robust cost needs independent observation errors"),
             ("robust", "covariance", "a robust cost needs independent observation errors"),
             *((bound, other, "bounds need independent errors of known std") for bound in BOUNDS for other in BESIDE),
@@ -239,10 +252,11 @@ class Error(Section):
         if context.observed and not keys.keys() & {std, "covariance"}:
             faults.add((std,), "required: the standard deviation of the observation error")
 
-    def column(self, which: Literal["std", "time_std"], readings: str) -> Column | None:
-        """The column of errors, in the unit ``readings`` where it has none of its own; None: no column."""
-        chosen = getattr(self, which)
-        return replace(chosen, unit=chosen.unit or readings) if isinstance(chosen, Column) else None
+    def columns(self, readings: str, times: str) -> dict[str, Column]:
+        """The columns of errors, in the units of ``readings`` and ``times`` where they have none of their own."""
+        shared = {f"shared {i}": (part, readings) for i, part in enumerate(self.shared)}
+        every = {"std": (self.std, readings), "time_std": (self.time_std, times), **shared}
+        return {key: replace(c, unit=c.unit or unit) for key, (c, unit) in every.items() if isinstance(c, Column)}
 
     @property
     def bounds(self) -> dict[str, bool | Column]:
@@ -252,7 +266,8 @@ class Error(Section):
     @property
     def separate(self) -> bool:
         """True if the errors of one reading say nothing of those of another, and none is a bound."""
-        return self.covariance is None and self.correlation_time is None and not any(self.bounds.values())
+        correlated = self.covariance is not None or self.correlation_time is not None or self.shared
+        return not correlated and not any(self.bounds.values())
 
     @property
     def huber(self) -> float | None:

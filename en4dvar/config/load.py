@@ -49,7 +49,7 @@ class Estimation(File):
     parameters: Annotated[tuple[Entry, ...], entries()]
     """For each parameter a prior (estimated), a quantity (fixed), or a scalar of the data file (fixed)."""
     groups: Groups | None = None
-    """What data sets have in common, e.g. ``gel: {soft: 'a_*', stiff: [b_*, c_01]}``: under each kind of group the
+    """What data sets have in common, e.g. ``batch: {first: 'a_*', second: [b_*, c_01]}``: under each kind of group the
     groups, with patterns of the names of their data sets."""
     population: PopulationSection | None = None
     """Mean and spread of parameters over the data sets, estimated at the end of the run."""

@@ -142,7 +142,7 @@ def read_model(
         return None  # told with the other keys of the file
     name = raw.get("name", COMMAND if COMMAND in raw else None)
     if not isinstance(name, str):
-        faults.append(document.fault(("model", "name"), "name the model, e.g. name: bubble"))
+        faults.append(document.fault(("model", "name"), "name the model, e.g. name: ./my_model.py:MyModel"))
         return None
     if name == HANDED:
         words = f"{shown(raw.get('object'))} was handed over by a Python script; run that script again"

@@ -124,7 +124,7 @@ class PriorSection(Section):
     """The parameter varies in time; the prior is that of its first piece."""
     shared: Annotated[str | None, Field(min_length=1)] = None
     """The data sets have one value of it, estimated together after each by itself: ``all`` of them, or those of one
-    group of a kind in ``groups:``, e.g. gel."""
+    group of a kind in ``groups:``, e.g. batch."""
 
 
 class TiedSection(Section):

@@ -14,7 +14,7 @@ from en4dvar.inputs.asked import Column
 from en4dvar.model.forward import field_of
 from en4dvar.model.state import Array
 from en4dvar.model.state import Field as StateBlock
-from en4dvar.plumbing.errors import ConfigError, DataError
+from en4dvar.plumbing.errors import ConfigError, DataError, retold
 from en4dvar.plumbing.units import UnitError, convert, parse_quantity
 
 
@@ -63,10 +63,8 @@ def placing(written: Any, context: Context) -> Placing:
         if written.unit is None:
             return Placing(Column(written.column, "1", "1", kind="place"), size=size)
         target = _coordinates(block, "unit")
-        try:
+        with retold(UnitError, ConfigError, "", "unit"):
             convert(1.0, written.unit, target.coordinate_unit)
-        except UnitError as error:
-            raise ConfigError(str(error), "unit") from None
         return Placing(Column(written.column, written.unit, target.coordinate_unit, kind="place"), of=target)
     entries = written if isinstance(written, list) else [written]
     if all(isinstance(entry, int) for entry in entries):

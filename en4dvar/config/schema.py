@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, cast, get_type_hints
 
 from pydantic import (
     AfterValidator,
@@ -26,8 +26,11 @@ from pydantic_core import from_json, to_json
 from en4dvar.config.context import Context, Made, Unknown, quantity
 from en4dvar.config.validate import Faults
 from en4dvar.executor.limits import Limits, parse_bytes
+from en4dvar.plumbing import user_file
 from en4dvar.plumbing.described import Described
+from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.files import expanded
+from en4dvar.plumbing.hints import shown
 from en4dvar.plumbing.units import Quantity, parse_quantity
 from en4dvar.schemes import DEFAULT, ON_A_WINDOW, keys_of, unread
 from en4dvar.schemes.base import Scheme
@@ -221,7 +224,22 @@ class GivenStart(Section):
 class OfScheme(Section):
     """A section that names a scheme. Its keys are its own and those of the scheme; those of others are errors."""
 
-    kinds: ClassVar[Mapping[str, type[Scheme]]]
+    kinds: ClassVar[dict[str, type[Scheme]]]
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _in_a_file(cls, section: Any, validate: ModelWrapValidatorHandler[Self], info: Any) -> Self:
+        """With ``scheme: ./file.py:Class``, the section of that scheme's keys, under its absolute reference."""
+        name = section.get("scheme") if isinstance(section, dict) else None
+        known = cls.model_fields["scheme"].annotation is str
+        if known or not (isinstance(name, str) and user_file.is_file_reference(name)):
+            return validate(section)
+        reference = user_file.absolute(name, info.context.base)
+        with Faults() as faults, faults.at("scheme"):
+            cls.kinds[reference] = _scheme_in(reference)
+        own = cast(Any, create_model(cls.__name__, __base__=section_of(cls.kinds[reference], base=cls), scheme=str))
+        made: Self = own.model_validate({**section, "scheme": reference}, context=info.context)
+        return made
 
     @classmethod
     def rules(cls, section: Mapping[str, Any], context: Context, faults: Faults) -> None:
@@ -242,16 +260,24 @@ class OfScheme(Section):
 
     def as_written(self, section: Mapping[str, Any]) -> dict[str, Any]:
         """As given, without what the scheme does not read."""
-        written = super().as_written(section)
+        written = {**super().as_written(section), "scheme": getattr(self, "scheme")}  # noqa: B009
         return {key: value for key, value in written.items() if key not in type(self).unread(written)}
+
+
+def _scheme_in(reference: str) -> type[Scheme]:
+    """The scheme that a file holds. Raises :class:`ConfigError`."""
+    kind = user_file.load(reference, f"scheme {shown(reference)}")
+    if not (isinstance(kind, type) and issubclass(kind, Scheme)):
+        raise ConfigError(f"{shown(reference)} is not a subclass of en4dvar.schemes.Scheme")
+    return kind
 
 
 def listed(kinds: Mapping[str, type[Scheme]]) -> str:
     """The schemes, with what each is."""
-    return f"The scheme: {', '.join(f'{name} ({kind.words})' for name, kind in kinds.items())}."
+    return f"The scheme: {', '.join(f'{n} ({kind.words})' for n, kind in kinds.items())}, or ./file.py:Class."
 
 
-def keys_of_schemes(of: Mapping[str, type[Scheme]], *others: Any, base: type[OfScheme] = OfScheme) -> Any:
+def keys_of_schemes(of: dict[str, type[Scheme]], *others: Any, base: type[OfScheme] = OfScheme) -> Any:
     """``base`` with the keys of the schemes ``of`` a kind, which are told, and with those of other dataclasses."""
     section = section_of(*others, *of.values(), base=base)
     for name, field in section.model_fields.items():
@@ -260,6 +286,11 @@ def keys_of_schemes(of: Mapping[str, type[Scheme]], *others: Any, base: type[OfS
             field.description = f"{field.description} ({', '.join(readers)})"
     section.kinds = of
     return section
+
+
+def or_in_a_file(schema: dict[str, Any]) -> None:
+    """In the JSON schema: the name of a scheme, or ``./file.py:Class``."""
+    schema["anyOf"] = [{"enum": schema.pop("enum")}, {"pattern": r"\.py:\w+$"}]
 
 
 if TYPE_CHECKING:
@@ -273,7 +304,9 @@ else:
 class Assimilation(_Settings):
     """The settings of the scheme, declared at :class:`AssimilationSettings`, and how observations count."""
 
-    scheme: Annotated[OnAWindow, Field(description=listed(ON_A_WINDOW))] = AssimilationSettings.scheme
+    scheme: Annotated[OnAWindow, Field(description=listed(ON_A_WINDOW), json_schema_extra=or_in_a_file)] = (
+        AssimilationSettings.scheme
+    )
     weights: Literal["sum", "mean", "balanced"] = "sum"
     """sum: every observation counts (the Bayesian posterior); mean: β = 1/K, as in the published code; balanced: every
     series, or group of series, counts as if it had as many readings as the others. The latter two are not Bayesian."""

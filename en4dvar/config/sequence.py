@@ -22,7 +22,7 @@ from en4dvar.model.forward import ForwardModel, Observable
 from en4dvar.plumbing.errors import ConfigError, Fault
 from en4dvar.plumbing.hints import shown, suggest
 
-APART = ("time_std", "correlation_time", "covariance", "robust", "discrepancy")  # keys of data.error
+APART = ("time_std", "correlation_time", "shared", "covariance", "robust", "discrepancy")  # keys of data.error
 
 
 def _known_fields(names: tuple[str, ...], context: Context) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 
 from en4dvar.config.context import TEXT, Context, Made, parse_spread, quantity, read_each, subject_unit
 from en4dvar.config.initial_state import dynamic_fields
-from en4dvar.config.schema import OfScheme, Section, keys_of_schemes, listed
+from en4dvar.config.schema import OfScheme, Section, keys_of_schemes, listed, or_in_a_file
 from en4dvar.config.validate import Faults
 from en4dvar.config.varies import ErrorOf, Knots
 from en4dvar.model.forward import ForwardModel
@@ -105,7 +105,7 @@ else:
 
 
 class _Scheme(OfScheme):
-    scheme: Annotated[OnASeries, Field(description=listed(ON_A_SERIES))]
+    scheme: Annotated[OnASeries, Field(description=listed(ON_A_SERIES), json_schema_extra=or_in_a_file)]
     members: Annotated[int, Field(ge=3)]
     """Ensemble size N."""
 

@@ -32,13 +32,13 @@ class PopulationSection(_HyperPrior):
     """Mean and spread of parameters over the data sets of the run, estimated at its end."""
 
     of: Annotated[tuple[str, ...], Field(min_length=1)]
-    """Parameters that vary from data set to data set about a common median, e.g. [G, mu]."""
+    """Parameters that vary from data set to data set about a common median, e.g. [k, c]."""
     by: Name | None = None
     """A kind of group under ``groups``: each group has a population of its own, and they are compared."""
     reference: Annotated[dict[Name, str], Field(default_factory=dict)]
-    """Values of others to compare with, e.g. {G: 7.7 ± 1.1 kPa, source: indentation}; they change no number."""
+    """Values of others to compare with, e.g. {k: 7.7 ± 1.1 N/m, source: data sheet}; they change no number."""
     known: Annotated[dict[GroupName, dict[Name, str]], Field(default_factory=dict)]
-    """Medians that a group is known to have, e.g. {reference gel: {G: 7.7 ± 0.2 kPa}}: they calibrate what all groups
+    """Medians that a group is known to have, e.g. {standard: {k: 7.7 ± 0.2 N/m}}: they calibrate what all groups
     have in common, such as scale and density."""
 
     @property

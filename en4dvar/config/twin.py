@@ -20,7 +20,7 @@ from en4dvar.data.noise import Correlation
 from en4dvar.inputs.asked import Matrix
 from en4dvar.inputs.square import read_covariance
 from en4dvar.model.forward import ForwardModel, Observable
-from en4dvar.plumbing.errors import ConfigError, DataError
+from en4dvar.plumbing.errors import ConfigError, DataError, retold
 from en4dvar.plumbing.files import expanded
 from en4dvar.priors.prior import Prior
 from en4dvar.series.coordinates import EnsembleCoordinates
@@ -33,11 +33,9 @@ def _errors(model: ForwardModel) -> dict[str, Observable]:
 
 def _correlation(path: str, context: Context) -> tuple[str, Correlation]:
     """The absolute path and the matrix."""
-    try:
+    with retold((DataError, ValueError), ConfigError):
         file = (context.base / expanded(path)).absolute()
         return str(file), Correlation(read_covariance(Matrix(file, "1", "1")))
-    except (DataError, ValueError) as error:
-        raise ConfigError(str(error)) from None
 
 
 class Twin(Section):

@@ -14,7 +14,7 @@ from en4dvar.inputs.asked import Column
 from en4dvar.inputs.window import minima
 from en4dvar.model.state import Array
 from en4dvar.plumbing import user_file
-from en4dvar.plumbing.errors import ConfigError, DataError
+from en4dvar.plumbing.errors import ConfigError, DataError, retold
 from en4dvar.plumbing.files import PathError
 from en4dvar.plumbing.hints import shown
 from en4dvar.plumbing.user_code import loading, reason_of
@@ -106,12 +106,10 @@ def away_from_minima(times: Array, values: Array, reach: float, prominence: floa
 def _of_function(name: str, base: Path) -> Weighing:
     if not user_file.is_file_reference(name):
         raise ConfigError(f"{shown(name)} is not a function in a file; write ./weights.py:name", "function")
-    try:
+    with retold((ConfigError, PathError, ValueError), ConfigError, "", "function"):
         reference = user_file.absolute(name, base)
         with loading(f"{shown(name)} cannot be loaded"):
             function = user_file.load(reference, f"function {shown(name)}")
-    except (ConfigError, PathError, ValueError) as error:
-        raise ConfigError(str(error), "function") from None
     if not callable(function):
         raise ConfigError(f"{shown(name)} is not a function", "function")
 

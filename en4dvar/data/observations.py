@@ -17,7 +17,7 @@ from en4dvar.data.noise import Linearisation, Noise, Predicted, joint_noise, sid
 from en4dvar.data.series import Part, Series
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution
-from en4dvar.plumbing.errors import DataError
+from en4dvar.plumbing.errors import DataError, retold
 from en4dvar.priors.prior import LARGEST
 
 SEVERAL = ", "  # between the names of several sources
@@ -30,13 +30,13 @@ class Observations:
 
     Attributes
     ----------
-    times: (K,) in the model's time unit (seconds for the bubble), from the model's time zero; strictly increasing
+    times: (K,) in the model's time unit, from the model's time zero; strictly increasing
         within a series, of a field not decreasing.
     values: (K,) finite, in the observable's unit.
     noise: the observation errors (:func:`en4dvar.data.noise.noise_of` makes them of std, timing error and correlation).
     weights: (K,) β_k ≥ 0; 1 counts an observation fully (``weights: sum``), 1/K is ``weights: mean``.
     name: of the data set. source: where it was read from (for the record).
-    scalars: further numbers found beside the series (e.g. an equilibrium radius), as read, no units applied.
+    scalars: further numbers found beside the series (e.g. a size at rest), as read, no units applied.
     doubts: what makes the times of the file implausible.
     parts: which readings belong to which series, see :meth:`of_series`; () where all are of one observable, which has
         one value at a time.
@@ -87,14 +87,12 @@ class Observations:
             between[i, j] = between[j, i] = value
         times = [readings.times for readings in series]
         times = _same_instants(times) if len(times) > 1 else times
-        try:
+        with retold(ValueError, DataError, f"{name}: "):
             noise = (
                 joint_noise(times, [readings.noise for readings in series], between)
                 if len(series) > 1
                 else series[0].noise
             )
-        except ValueError as error:
-            raise DataError(f"{name}: {error}") from None
         more = series[0].continued if len(series) == 1 else None
         ends = np.cumsum([len(t) for t in times]).tolist()
         parts = tuple(
@@ -130,10 +128,8 @@ class Observations:
         self._check_order(where)
         if not np.all(self.weights >= 0):
             raise DataError(f"{where}: weights must not be negative")
-        try:
+        with retold(ValueError, DataError, f"{where}: "):
             self.noise.check(self.weights)
-        except ValueError as error:
-            raise DataError(f"{where}: {error}") from None
         smallest, std = float(self.std.min()), float(self.std.max())
         if not (std < LARGEST and largest < LARGEST * smallest and smallest * LARGEST > 1):
             raise DataError(

@@ -25,8 +25,8 @@ def gain_of(problem: InverseProblem, settings: AssimilationSettings) -> Gain:
         raise ConfigError(f"a scheme for data that can be localised is {' or '.join(LOCALISED)}")
     if not problem.observations.noise.plain or problem.has_noise_scale:
         raise ConfigError(
-            "takes independent Gaussian errors of known std: no covariance, correlation time, timing error, robust "
-            "cost, discrepancy or sigma"
+            "takes independent Gaussian errors of known std: no covariance, correlation time, shared or timing error, "
+            "robust cost, discrepancy or sigma"
         )
     others = f"scheme: {' or '.join(name for name in LOCALISED if name not in MINIMISERS)}"
     if asked.radius is None:

@@ -21,6 +21,7 @@ from en4dvar.model.state import Array
 
 FEWEST = 8  # readings below which nothing is said
 MOST = 500  # of them are looked at, evenly chosen blocks would tell no more
+ROUNDING = 1e-3  # standard deviations: residuals of which none is larger are those of arithmetic, not of readings
 NO_VARIANCE = 1e-12  # of the largest eigenvalue of Q; below it a direction was fitted exactly, to rounding
 FREQUENCIES = np.expm1(np.linspace(np.log1p(1e-4), np.log1p(400.0), 700))
 
@@ -77,7 +78,8 @@ class Residuals:
     @property
     def enough(self) -> bool:
         """True if there is anything to be said."""
-        return FEWEST <= len(self.white) <= MOST and bool(np.all(np.isfinite(self.white)) and np.any(self.white))
+        size = float(np.max(np.abs(self.white), initial=0.0))
+        return FEWEST <= len(self.white) <= MOST and ROUNDING < size < math.inf
 
     @cached_property
     def follows(self) -> npt.NDArray[np.bool_]:

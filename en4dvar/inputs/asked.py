@@ -26,7 +26,7 @@ class Column:
     unit: str
     target: str
     positive: bool = False
-    kind: Literal["std", "weight", "place", "mark"] = "std"
+    kind: Literal["std", "shared", "weight", "place", "mark"] = "std"
     rate: float | None = None
 
 

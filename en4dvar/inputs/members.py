@@ -12,7 +12,7 @@ from en4dvar.inputs.parts import read_contents
 from en4dvar.inputs.text_table import numbered_lines
 from en4dvar.model.state import Array
 from en4dvar.plumbing.decoding import Allowed, DecodeError, decoded_whole
-from en4dvar.plumbing.errors import DataError
+from en4dvar.plumbing.errors import DataError, retold
 from en4dvar.plumbing.hdf5 import ForeignDataError, require_whole
 from en4dvar.plumbing.hints import listed, suggest
 from en4dvar.plumbing.tables import is_number
@@ -79,10 +79,8 @@ def _converted(path: Path, name: str, values: Array, unit: str, units: tuple[str
     unit = stated or unit
     if not unit and target != "1":
         raise DataError(f"{path}: {name} has no unit there; write e.g. '{name}: {{prior: ensemble, unit: {target}}}'")
-    try:
+    with retold(UnitError, DataError, f"{path}: {name}: "):
         return np.asarray(convert(values, unit or "1", target), dtype=float)
-    except UnitError as error:
-        raise DataError(f"{path}: {name}: {error}") from None
 
 
 def _of_table(path: Path, names: Mapping[str, Any]) -> dict[str, tuple[Array, str]]:
@@ -96,17 +94,15 @@ def _of_table(path: Path, names: Mapping[str, Any]) -> dict[str, tuple[Array, st
 def _of_netcdf(path: Path, names: Mapping[str, Any]) -> dict[str, tuple[Array, str]]:
     """As a process of its own reads it."""
     allowed = Allowed(60, 4_000_000_000, LARGEST)
-    try:
+    with retold(DecodeError, DataError, f"{path}: cannot be read as netCDF: "):
         return decoded_whole(netcdf_members, path, list(names), allowed=allowed)
-    except DecodeError as error:
-        raise DataError(f"{path}: cannot be read as netCDF: {error}") from None
 
 
 def netcdf_members(path: Path, names: Sequence[str]) -> Iterator[dict[str, tuple[Array, str]]]:
     """The numbers of each name, with their unit. Raises :class:`DataError`."""
     import netCDF4  # a tenth of a second that other files do not need
 
-    try:
+    with retold((OSError, RuntimeError, ForeignDataError), DataError, f"{path}: cannot be read as netCDF: "):
         require_whole(path)
         with netCDF4.Dataset(path) as file:
             group = file.groups.get("posterior", file)
@@ -123,8 +119,6 @@ def netcdf_members(path: Path, names: Sequence[str]) -> Iterator[dict[str, tuple
                 values = values[alive] if alive is not None and len(alive) == len(values) else values
                 members[name] = values, str(getattr(variable, "units", ""))
             yield members
-    except (OSError, RuntimeError, ForeignDataError) as error:
-        raise DataError(f"{path}: cannot be read as netCDF: {error}") from None
 
 
 def _numbers(path: Path, variable: Any) -> Array:

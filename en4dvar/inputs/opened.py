@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import get_args
 
 from en4dvar.inputs.asked import SUFFIXES, Format, Layout
-from en4dvar.plumbing.errors import DataError
+from en4dvar.plumbing.errors import DataError, retold
 from en4dvar.plumbing.files import kind_of
 from en4dvar.plumbing.hints import no_such_file
 
@@ -39,10 +39,8 @@ def format_of(path: Path, layout: Layout) -> Format | None:
 @contextmanager
 def readable(path: Path) -> Iterator[None]:
     """Whatever goes wrong in the system or in the csv module as :class:`DataError`."""
-    try:
+    with retold((OSError, csv.Error), DataError, f"{path}: "):
         yield
-    except (OSError, csv.Error) as error:
-        raise DataError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
 
 
 def require_file(path: Path) -> None:

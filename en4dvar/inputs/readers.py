@@ -95,6 +95,7 @@ def _stds(written: Array, column: Column, kept: npt.NDArray[np.intp], count: int
     stds = np.asarray(convert(written[kept], column.unit, column.target))
     fits, wrong_sign = {
         "std": (stds > 0, "not positive"),
+        "shared": (np.isfinite(stds), "not finite"),
         "weight": (stds >= 0, "negative"),
         "place": (np.isfinite(stds), "not finite"),
         "mark": (np.isin(stds, (0, 1)), "neither 0 nor 1"),
@@ -104,7 +105,7 @@ def _stds(written: Array, column: Column, kept: npt.NDArray[np.intp], count: int
         said = written[kept[wrong[0]]]
         sign = wrong_sign if np.isfinite(said) else "not finite"
         what = "is blank" if np.isnan(said) else f"is {said:g}, {sign}"
-        noun = {"std": "error"}.get(column.kind, column.kind)
+        noun = {"std": "error", "shared": "shared error"}.get(column.kind, column.kind)
         raise DataError(f"{path}: the {noun} of reading {kept[wrong[0]] + 1} in column {column.name!r} {what}")
     return stds
 

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import IO, Any, TypeVar
 
 from en4dvar.plumbing.children import Child, limit_memory, limit_time
-from en4dvar.plumbing.errors import DataError, En4dvarError
+from en4dvar.plumbing.errors import DataError, En4dvarError, retold
 from en4dvar.plumbing.files import here, in_bytes, open_plain
 
 T = TypeVar("T")
@@ -51,11 +51,8 @@ class DecodeError(Exception):
 
 def require_plain(path: Path, size: int) -> None:
     """Raises :class:`DataError` where a file is none that can be read to its end: a pipe, a device, too large."""
-    try:
-        with open_plain(path) as file:
-            length = os.fstat(file.fileno()).st_size
-    except OSError as error:
-        raise DataError(f"{path}: {error.strerror or error}") from None
+    with retold(OSError, DataError, f"{path}: "), open_plain(path) as file:
+        length = os.fstat(file.fileno()).st_size
     if length > size:
         raise DataError(f"{path}: {in_bytes(length)}; at most {in_bytes(size)} are read")
 

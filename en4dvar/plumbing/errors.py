@@ -1,6 +1,7 @@
 """Errors a user can cause, each with the exit code of the command line."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 
@@ -62,3 +63,14 @@ class TooFewMembersError(En4dvarError):
     """Too few members survived a forecast for the ensemble statistics to mean anything."""
 
     exit_code = 3
+
+
+@contextmanager
+def retold(
+    caught: type[Exception] | tuple[type[Exception], ...], kind: type[Exception], words: str = "", *more: str
+) -> Iterator[None]:
+    """Raise what is ``caught`` in the block as ``kind(words + message, *more)``, of system errors the reason alone."""
+    try:
+        yield
+    except caught as error:
+        raise kind(f"{words}{getattr(error, 'strerror', None) or error}", *more) from None

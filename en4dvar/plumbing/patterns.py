@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from en4dvar.plumbing.errors import DataError
+from en4dvar.plumbing.errors import DataError, retold
 from en4dvar.plumbing.files import read_plain
 
 LONGEST = 256_000_000  # bytes of a text
@@ -23,7 +23,5 @@ def text_of(path: Path) -> str:
 
     Raises :class:`DataError` where it cannot be read, or is longer than :data:`LONGEST`.
     """
-    try:
+    with retold(OSError, DataError, f"no output file {path}: "):
         return read_plain(path, LONGEST).decode("utf-8", errors="replace").replace("\r\n", "\n")
-    except OSError as error:
-        raise DataError(f"no output file {path}: {error.strerror}") from None

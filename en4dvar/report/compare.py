@@ -139,7 +139,7 @@ class Comparison:
 
 
 def compare_runs(runs: Sequence[str | Path] | Mapping[str, str | Path | StoredResult]) -> Comparison:
-    """Compare runs: laws on the same data, or gels.
+    """Compare runs: models on the same data, or different data.
 
     ``runs``: run directories or result files (``.nc``); or name → one of these, or a result at hand.
 

@@ -1,4 +1,4 @@
-"""Groups of the data sets of one run, such as two gels, each with a population: side by side."""
+"""Groups of the data sets of one run, such as two materials, each with a population: side by side."""
 
 import re
 from collections.abc import Iterator, Sequence

@@ -1,4 +1,4 @@
-"""Populations side by side: is one gel stiffer than another, by how much, how surely, and how it goes with a number."""
+"""Populations side by side: is one median larger than another, by how much, how surely, and its trend."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from en4dvar.diagnosis.diagnostics import member_quantiles
 from en4dvar.estimation.population.contrast import Centre, StraightLine, drawn_together, line, without_pull
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.caution import untrusted
-from en4dvar.plumbing.errors import OutputError
+from en4dvar.plumbing.errors import OutputError, retold
 from en4dvar.plumbing.files import write_text
 from en4dvar.plumbing.hints import suggest
 from en4dvar.plumbing.tables import csv_text, table
@@ -112,7 +112,7 @@ def compare_populations(
     seed: int = 1,
     known: Mapping[str, Mapping[str, str]] | None = None,
 ) -> PopulationsCompared:
-    """Compare the populations behind runs, e.g. of two gels; ``runs``: folders, or name → folder.
+    """Compare the populations behind runs, e.g. of two materials; ``runs``: folders, or name → folder.
 
     Quantities that are common to the data sets of each population, of the same name and prior, have one value in all
     populations, but for those named ``apart``. ``numbers``: of each run one, e.g. a concentration, that the medians are
@@ -211,10 +211,8 @@ def _known_medians(
             if name not in stored[label].names:
                 hint = suggest(name, stored[label].names)
                 raise OutputError(f"compare: {name}: not a parameter of the population of {label}{hint}")
-            try:
+            with retold(UnitError, OutputError, f"compare: {name} of {label}: "):
                 value, std = reference_value(text, stored[label].prior_of(name).parameter.unit)
-            except UnitError as error:
-                raise OutputError(f"compare: {name} of {label}: {error}") from None
             if not std > 0:
                 raise OutputError(f"compare: {name} of {label}: say how well it is known, such as '9.8 ± 0.3 kPa'")
             values[label][name] = value, std
@@ -225,10 +223,8 @@ def _known(s: StoredPopulation, values: Values) -> Iterator[tuple[int, float, fl
     """Column of each centre that is known from elsewhere, its value and std in units of its prior."""
     for name, (value, std) in values.items():
         term = s.prior_of(name)
-        try:
+        with retold(ValueError, OutputError, f"{name}, known to be {value:g}: "):
             x = float(term.from_physical(np.array([value]))[0])
-        except ValueError as error:
-            raise OutputError(f"{name}, known to be {value:g}: {error}") from None
         yield s.names.index(name), (x - term.mean) / term.std, std / abs(term.slope(x)) / term.std
 
 

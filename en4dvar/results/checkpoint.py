@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, TypeVar
 
-from en4dvar.plumbing.errors import OutputError
+from en4dvar.plumbing.errors import OutputError, retold
 from en4dvar.plumbing.files import atomic_path, open_plain, read_at_most
 from en4dvar.results.codec import decode, encode
 
@@ -101,10 +101,8 @@ def read_checkpoint(path: Path, fingerprint: str, kind: type[D]) -> D | None:
         raise CheckpointError(f"{path}: belongs to another run (other configuration, data or model)")
     if words[2] != kind.__name__:
         raise CheckpointError(f"{path}: holds a {words[2]}, not a {kind.__name__}")
-    try:
+    with retold(ValueError, CheckpointError, f"{path}: "):
         return decode(payload, kind)
-    except ValueError as error:
-        raise CheckpointError(f"{path}: {error}") from None
 
 
 def digest(content: bytes) -> str:

@@ -16,6 +16,8 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from en4dvar.plumbing.errors import retold
+
 D = TypeVar("D")
 _TEXT = "content"
 
@@ -36,21 +38,17 @@ def encode_text(value: Any) -> bytes:
 
 def decode_text(content: bytes, kind: type[D]) -> D:
     """The dataclass of :func:`encode_text`. Raises :class:`ValueError` where the bytes are not one of ``kind``."""
-    try:
+    with retold((KeyError, TypeError, ValueError), ValueError, f"not a {kind.__name__}: "):
         value: D = _reader(typing.cast(Any, kind))(json.loads(content), {})
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"not a {kind.__name__}: {error}") from error
     return value
 
 
 def decode(content: bytes, kind: type[D]) -> D:
     """The dataclass of :func:`encode`. Raises :class:`ValueError` where the bytes are not one of ``kind``."""
-    try:
+    with retold((OSError, KeyError, TypeError, ValueError, EOFError), ValueError, f"not a {kind.__name__}: "):
         with np.load(io.BytesIO(content), allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
         value: D = _reader(typing.cast(Any, kind))(json.loads(str(arrays.pop(_TEXT))), arrays)
-    except (OSError, KeyError, TypeError, ValueError, EOFError) as error:
-        raise ValueError(f"not a {kind.__name__}: {error}") from error
     return value
 
 

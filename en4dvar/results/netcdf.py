@@ -20,7 +20,7 @@ import netCDF4
 import numpy as np
 
 from en4dvar.plumbing.decoding import Allowed, DecodeError, decoded
-from en4dvar.plumbing.errors import DataError, OutputError
+from en4dvar.plumbing.errors import DataError, OutputError, retold
 from en4dvar.plumbing.files import atomic_path
 from en4dvar.plumbing.hdf5 import require_whole
 from en4dvar.results.seal import SealedBytes, check_seal, seal_file
@@ -204,14 +204,12 @@ def read_sealed(reader: Callable[..., Iterator[Any]], path: Path, *arguments: An
 @contextmanager
 def opened_netcdf(path: Path) -> Iterator[netCDF4.Dataset]:
     """A file that is all there. Raises :class:`OutputError`."""
-    try:
-        with understood(path), _LOCK:
-            require_whole(path)
-            with netCDF4.Dataset(path) as file:
-                file.set_auto_maskandscale(False)
-                yield file
-    except (RuntimeError, OSError) as error:
-        raise OutputError(f"{path}: not a readable netCDF file: {getattr(error, 'strerror', '') or error}") from None
+    unreadable = retold((RuntimeError, OSError), OutputError, f"{path}: not a readable netCDF file: ")
+    with unreadable, understood(path), _LOCK:
+        require_whole(path)
+        with netCDF4.Dataset(path) as file:
+            file.set_auto_maskandscale(False)
+            yield file
 
 
 def groups_in(path: Path) -> Iterator[tuple[str, Group]]:

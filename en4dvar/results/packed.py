@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from en4dvar.plumbing.errors import retold
 from en4dvar.results.netcdf import Group, Groups, Variable
 
 _SIZES = struct.Struct("<QQ")  # of the texts
@@ -113,10 +114,10 @@ def unpacked_together(contents: Sequence[Content], wanted: Collection[str]) -> l
 
 @contextmanager
 def _understanding() -> Iterator[None]:
-    try:
+    with retold(
+        (struct.error, ValueError, KeyError, TypeError, AttributeError, IndexError), ValueError, "no packed groups: "
+    ):
         yield
-    except (struct.error, ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
-        raise ValueError(f"no packed groups: {error}") from None
 
 
 @functools.lru_cache(maxsize=64)

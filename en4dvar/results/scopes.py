@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from en4dvar.data.noise import SIDES
+from en4dvar.data.noise import SHARED, SIDES
 from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.model.state import Array
 from en4dvar.results.declared import Item, UnitRule, When, axes_of, shown_as
@@ -33,7 +33,8 @@ def _matrices(a: Analysis) -> Iterator[Item]:
     own = "reading" if several else "time"
     for key, (matrix, words) in a.observations.noise.matrices().items():
         name = key if several else f"{a.problem.observable.name}_{key}"
-        dims = f"{own} {own}_column" if matrix.ndim == 2 else own if key == SIDES else "correlated_pair"
+        dims = {SHARED: f"{own} shared_error", SIDES: own}.get(key, "correlated_pair")
+        dims = f"{own} {own}_column" if matrix.ndim == 2 and key != SHARED else dims
         yield Item(matrix, {"matrix": name, "pairs": dims}, words)
 
 

@@ -14,7 +14,7 @@ from en4dvar.estimation.summary import ParameterSummary, brief, living, results_
 from en4dvar.model.forward import Observable
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.caution import Caution, parsed
-from en4dvar.plumbing.errors import OutputError
+from en4dvar.plumbing.errors import OutputError, retold
 from en4dvar.results.complete import check_complete, joined, of_members
 from en4dvar.results.declared import Axis, attributes_of, axes_of, group_of, lay_out, parameter_of
 from en4dvar.results.netcdf import Group, Groups, Variable, read_groups, understood
@@ -172,13 +172,11 @@ def load_stored(path: str | Path) -> StoredResult:
     OutputError: it is no result, of another version, cut short or altered (see :mod:`en4dvar.results.seal`).
     """
     path = Path(path)
-    try:
+    with retold(ValueError, OutputError, f"{path}: not a result of en4dvar: "):  # anybody can write a checksum
         groups = unpacked(read_result(path)) if path.parent.name == PACK else read_groups(path)
         for path_in_file, group in groups.items():
             group.check()
             joined(groups, path_in_file).check()
-    except ValueError as error:  # anybody can write a checksum
-        raise OutputError(f"{path}: not a result of en4dvar: {error}") from None
     with understood(path):
         check_complete(path, groups)
     return StoredResult(groups)

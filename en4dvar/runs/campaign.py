@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, overload
 
 from en4dvar.estimation.summary import ParameterSummary, frame, results_table
 from en4dvar.plumbing.caution import Caution
-from en4dvar.plumbing.errors import OutputError, TooFewMembersError
+from en4dvar.plumbing.errors import OutputError, TooFewMembersError, retold
 from en4dvar.results.codec import decode_text
 from en4dvar.results.pack import Entry, read_outcome
 
@@ -134,17 +134,13 @@ class Outcomes(Sequence[DatasetOutcome]):
     def lines(self) -> Iterator[str]:
         """Those of ``summary.csv`` of each data set; the rest of what is known of it is not looked at."""
         for stem in self._stems:
-            try:
+            with retold((ValueError, LookupError, TypeError), OutputError, f"{self._record / stem}: "):
                 yield str(json.loads(self._raw(stem))["lines"])
-            except (ValueError, LookupError, TypeError) as error:  # as below
-                raise OutputError(f"{self._record / stem}: {error}") from None
 
     def _raw(self, stem: str) -> bytes:
         return read_outcome(self._record, stem, self._entries[stem])
 
     def _read(self, stem: str) -> DatasetOutcome:
-        try:
+        with retold(ValueError, OutputError, f"{self._record / stem}: "):  # anybody can write a checksum
             outcome = decode_text(self._raw(stem), DatasetOutcome)
-        except ValueError as error:  # anybody can write a checksum
-            raise OutputError(f"{self._record / stem}: {error}") from None
         return outcome if outcome.failure else replace(outcome, file=self._folder / self._files[stem])

@@ -129,9 +129,8 @@ def _observations(
 def _require_plannable(series: SeriesPlan) -> None:
     """Raise :class:`ConfigError` for what a planned series cannot have."""
     error = series.data.error
-    in_columns = error.column("std", ""), error.column("time_std", "")
     for present, what in (
-        (any(in_columns), "errors in a column of the file"),
+        (bool(error.columns("", "")), "errors in a column of the file"),
         (error.covariance is not None, "a covariance of readings"),
         (series.data.weights is not None, "weights of readings"),
         (series.data.places is not None, "places on a field"),

@@ -14,7 +14,7 @@ from en4dvar.estimation.population.own import OwnDraws
 from en4dvar.executor import choose_executor, one_blas_thread
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, Severity, caution
-from en4dvar.plumbing.errors import ConfigError, OutputError
+from en4dvar.plumbing.errors import ConfigError, OutputError, retold
 from en4dvar.plumbing.user_code import RefusedError
 from en4dvar.problem import InverseProblem
 from en4dvar.results.run_results import result_files
@@ -107,11 +107,9 @@ def finished_set(config: Config, result: StoredResult, run_dir: Path) -> Finishe
     members = np.column_stack(columns)
     members = members[result.alive & np.isfinite(members).all(axis=1)]
     centre = result.centres(names)
-    try:
+    with retold(ValueError, OutputError, f"{result.name}: "):
         white = prior.white(prior.from_physical(np.vstack([members, centre])))
         drawn = _kept_draws(problem, result)
-    except ValueError as error:
-        raise OutputError(f"{result.name}: {error}") from None
     groups = config.sharing.of_dataset(result.name)
     return Finished(problem, members, white[:-1], centre, result.cautions, groups, drawn)
 

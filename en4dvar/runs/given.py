@@ -14,12 +14,12 @@ from en4dvar.inputs.arrays import TIME, VALUE, columns_of, csv_of, require_colum
 from en4dvar.model.forward import ForwardModel, Observable
 from en4dvar.model.function_model import FunctionModel, digest_of, name_of
 from en4dvar.model.state import OF_READINGS, Array, Parameter
-from en4dvar.plumbing.errors import ConfigError, DataError, Fault
+from en4dvar.plumbing.errors import ConfigError, DataError, Fault, retold
 from en4dvar.plumbing.hints import listed, suggest
 from en4dvar.results.checkpoint import digest
 from en4dvar.runs.rundir import GIVEN
 
-MODELS = "give f(parameters, times), a ForwardModel, or a dict such as {'name': 'bubble'}"
+MODELS = "give f(parameters, times), a ForwardModel, or a dict such as {'name': 'lorenz63'}"
 
 
 @dataclass
@@ -77,16 +77,16 @@ class GivenSeries:
 
     def _kept(self, column: str) -> str:
         """What a column is called in the data file, which it goes to. Raises :class:`DataError`."""
-        try:
+        with retold(DataError, DataError, f"data: {self._of()}"):
             require_columns(self.columns, [column])
-        except DataError as problem:
-            raise DataError(f"data: {self._of()}{problem}") from None
         name = column if self.name in ("", column) else f"{self.name} {column}"
         self.used[name] = self.columns[column]
         return name
 
     def _placed(self, value: Any) -> Any:
-        """The same, with the file's name of a column."""
+        """The same, with the file's names of columns."""
+        if isinstance(value, list):
+            return [self._placed(part) for part in value]
         named = isinstance(value, Mapping) and "column" in value and value["column"] not in self.used
         return {**value, "column": self._kept(str(value["column"]))} if named else value
 
@@ -95,23 +95,29 @@ class GivenSeries:
         std, unit = f"{observable.name}_std", observable.unit
         error = dict(self.error) if isinstance(self.error, Mapping) else {std: self.error}
         for key, value in error.items():
-            if np.ndim(value) == 1 and not isinstance(value, str | Mapping):
-                column = f"{self.name} error {key}".lstrip()
-                error[key] = {"column": column}
-                self.used[column] = self._one_each(np.asarray(value, dtype=float), key)
+            if key == "shared":
+                parts = np.asarray(value).T if hasattr(value, "shape") else value
+                error[key] = [self._stated(part, f"shared {i}", unit) for i, part in enumerate(parts, 1)]
             elif key == "covariance" and np.ndim(value) == 2:
                 file = f"data.{self.name}.covariance.csv".replace("..", ".")
                 self.files[file] = "".join(",".join(map(repr, row)) + "\n" for row in np.asarray(value, float).tolist())
                 error[key] = {"path": file, "unit": "1" if unit == "1" else f"({unit})*({unit})"}
-            elif key == std and isinstance(value, int | float | np.number) and unit != "1":
-                error[key] = f"{float(value)!r} {unit}"
+            else:
+                error[key] = self._stated(value, key, unit if key == std else "1")
         return error
 
-    def _one_each(self, values: Array, key: str) -> Array:
-        if len(values) != len(self.columns[TIME]):
-            counts = f"{len(values)} numbers for {len(self.columns[TIME])} readings"
+    def _stated(self, value: Any, key: str, unit: str) -> Any:
+        """A number in ``unit``; numbers of each reading as a column of the data file."""
+        if isinstance(value, int | float | np.number) and not isinstance(value, bool) and unit != "1":
+            return f"{float(value)!r} {unit}"
+        if np.ndim(value) != 1:
+            return value
+        if len(value) != len(self.columns[TIME]):
+            counts = f"{len(value)} numbers for {len(self.columns[TIME])} readings"
             raise DataError(f"error: {self._of()}{key} has {counts}")
-        return values
+        column = f"{self.name} error {key}".lstrip()
+        self.used[column] = np.asarray(value, dtype=float)
+        return {"column": column}
 
     def _of(self) -> str:
         return f"{self.name}: " if self.name else ""
@@ -130,10 +136,8 @@ class Given:
     ):  # fmt: skip
         self.units, self.priors, self.correlation = units, priors, correlation
         self.beside: dict[str, str] = {}
-        try:
+        with retold(DataError, DataError, "data: "):
             tables = tables_of(data, time, None if isinstance(observable, str) else observable)
-        except DataError as problem:
-            raise DataError(f"data: {problem}") from None
         self.alone = tables is None
         if tables is not None:
             if isinstance(observable, str):
@@ -224,15 +228,14 @@ def _check_keys(argument: str, keys: Any, series: Mapping[str, Any], whole: bool
 
 
 def _columns(where: str, table: Any, time: str, value: str) -> dict[str, Array]:
-    try:
+    with retold(DataError, DataError, f"{where}: "):
         return columns_of(table, time, value)
-    except DataError as problem:
-        raise DataError(f"{where}: {problem}") from None
 
 
 def _columns_in(sections: Any) -> list[str]:
     """The columns that ``error``, or what a series says besides, names."""
-    values = sections.values() if isinstance(sections, Mapping) else ()
+    values = list(sections.values()) if isinstance(sections, Mapping) else []
+    values += [part for value in values if isinstance(value, list) for part in value]
     return [str(value["column"]) for value in values if isinstance(value, Mapping) and "column" in value]
 
 

@@ -16,7 +16,7 @@ from en4dvar.estimation.population import campaign as of_campaign
 from en4dvar.estimation.population.campaign import FEWEST_SETS, CampaignPopulation, population_of
 from en4dvar.executor import Executor
 from en4dvar.plumbing.caution import Caution, caution
-from en4dvar.plumbing.errors import ConfigError, TooFewMembersError
+from en4dvar.plumbing.errors import ConfigError, TooFewMembersError, retold
 from en4dvar.problem import InverseProblem
 from en4dvar.results.checkpoint import FOLDER
 from en4dvar.results.population_file import FILE, GROUPS, StoredPopulation, load_population, save_population
@@ -76,13 +76,11 @@ class PopulationKind(TogetherKind):
     ) -> None:  # fmt: skip
         tell(f"population of {', '.join(self.names)} behind {len(sets)} data sets")
         problems, white = [s.problem for s in sets], [s.white for s in sets]
-        try:
+        with retold(ValueError, TooFewMembersError, "no population: "):  # of forward runs that failed
             population = population_of(
                 problems, white, self.names, config.seed, kept=[s.drawn for s in sets], hyper=self.hyper,
                 effort=self.effort, executor=executor, tell=tell,
             )  # fmt: skip
-        except ValueError as error:  # of forward runs that failed
-            raise TooFewMembersError(f"no population: {error}") from None
         tell(f"{population.estimate.forward_runs} forward runs, {population.estimate.size:.0f} effective draws")
         used = [s for s in sets if s.name not in population.left_out]
         cautions = (*_cautions(population), *carried(used))

@@ -18,7 +18,7 @@ import numpy as np
 
 from en4dvar.executor import Executor, SerialExecutor
 from en4dvar.model.state import TIME_SHIFT, Array, Parameter
-from en4dvar.plumbing.errors import ConfigError, DataError
+from en4dvar.plumbing.errors import ConfigError, DataError, retold
 from en4dvar.plumbing.files import atomic_path, inside, open_plain
 from en4dvar.priors.prior import member_stream
 from en4dvar.problem import InverseProblem
@@ -117,10 +117,8 @@ def run_sweep(
     """
     executor = executor or SerialExecutor()
     ranges = _Ranges.of(problems, settings.width)
-    try:
+    with retold(ValueError, DataError):
         aims = targets([p.observations for p in problems], settings.shift, settings.step, earliest)
-    except ValueError as error:
-        raise DataError(str(error)) from None
     score = _Score(_without_shift(problems[0]), ranges, aims)
     low, high = ranges.low.min(axis=0), ranges.high.max(axis=0)
     design = sobol_box((low + high) / 2, (high - low) / 2, settings.trajectories, seed)

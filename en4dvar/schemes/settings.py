@@ -8,6 +8,7 @@ from annotated_types import Ge, Gt, Le
 
 from en4dvar.plumbing.errors import ConfigError, Fault
 from en4dvar.plumbing.hints import suggest
+from en4dvar.plumbing.user_file import is_file_reference
 from en4dvar.schemes import DEFAULT, ON_A_WINDOW, keys_of, unread
 from en4dvar.schemes.base import Scheme
 
@@ -83,10 +84,12 @@ class AssimilationSettings:
     own: Scheme = field(default_factory=ON_A_WINDOW[DEFAULT])
 
     def __init__(self, scheme: str = DEFAULT, **keys: Any) -> None:
+        before = keys.pop("own", None)  # of settings that are changed by dataclasses.replace
+        if before is not None and is_file_reference(scheme):  # which a worker has not read
+            ON_A_WINDOW.setdefault(scheme, type(before))
         if scheme not in ON_A_WINDOW:
             raise ConfigError(f"{scheme!r} is not a scheme for the data of one set{suggest(scheme, list(ON_A_WINDOW))}")
         kind, common = ON_A_WINDOW[scheme], {f.name: f.default for f in fields(self) if f.name not in ("scheme", "own")}
-        before = keys.pop("own", None)  # of settings that are changed by dataclasses.replace
         changed = {key: keys.pop(key) for key in keys.keys() & keys_of(kind)}
         own = replace(before, **changed) if type(before) is kind else kind(**changed)
         faults = unread(scheme, ON_A_WINDOW, keys)

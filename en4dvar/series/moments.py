@@ -145,8 +145,8 @@ def log_evidence(gaps: Array, std: Array, correlation: Correlation | None) -> Ar
     if correlation is not None:
         for k, among in enumerate(there):
             part = Correlation(correlation.matrix[np.ix_(among, among)])
-            d[k, among], s[k][:, among] = part.decorrelated(d[k, among]), part.decorrelated(s[k][:, among].T).T
-            log_norm[k] += np.sum(np.log(np.diag(part.root)))
+            d[k, among], s[k][:, among] = part.decorrelated(d[k, among]), part.decorrelated(s[k][:, among])
+            log_norm[k] += np.sum(part.log_root)
     if p <= n_members:
         v, roots = whitened(d, np.eye(p) + np.swapaxes(s, 1, 2) @ s)
         square = np.sum(v**2, axis=1)

@@ -49,13 +49,13 @@ class CycleSeries:
         there = self._there[k]
         if there.all():
             return (d, s) if self.correlation is None else (
-                self.correlation.decorrelated(d), self.correlation.decorrelated(s)
+                self.correlation.decorrelated(d), self.correlation.decorrelated(s.T).T
             )  # fmt: skip
         whitened = np.zeros_like(d), np.zeros_like(s)
         if there.any():
             among = None if self.correlation is None else Correlation(self.correlation.matrix[np.ix_(there, there)])
             for whole, part in zip(whitened, (d[there], s[there]), strict=True):
-                whole[there] = part if among is None else among.decorrelated(part)
+                whole[there] = part if among is None else among.decorrelated(part.T).T
         return whitened
 
     @cached_property

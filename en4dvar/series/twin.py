@@ -18,7 +18,7 @@ from en4dvar.data.noise import Correlation
 from en4dvar.executor import Executor, SerialExecutor
 from en4dvar.model.forward import ForwardModel, Observable, Trajectory
 from en4dvar.model.state import Array
-from en4dvar.plumbing.errors import ConfigError, En4dvarError
+from en4dvar.plumbing.errors import ConfigError, En4dvarError, retold
 from en4dvar.priors.prior import Prior, member_stream
 from en4dvar.series.moments import Moments, SequentialResult, SequentialState
 from en4dvar.series.moving import Flow, MembersLost, predictions
@@ -154,10 +154,8 @@ def observe_truth(experiment: TwinExperiment, seed: int) -> tuple[Array, CycleSe
     std = np.repeat([experiment.error_std[o.name] for o in experiment.observables], widths)
     noise = member_stream(seed, "observation error").standard_normal(exact.shape)
     if experiment.error_correlation is not None:
-        try:
+        with retold(ValueError, ConfigError, "twin.error_correlation: "):
             experiment.error_correlation.check_size(len(std))
-        except ValueError as error:
-            raise ConfigError(f"twin.error_correlation: {error}") from None
         noise = experiment.error_correlation.correlated(noise)
     return states, CycleSeries(times, exact + std * noise, std, experiment.error_correlation)
 

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict
 from pydantic import Field as Setting
 
 from en4dvar import Field
-from en4dvar_lorenz.autonomous import Autonomous, dimensionless
+from en4dvar_lorenz.autonomous import Analytic, dimensionless
 from en4dvar_lorenz.rk4 import kept, rk4
 
 SOURCE = "Lorenz (1963)"
@@ -43,7 +43,7 @@ def integrate(start: np.ndarray, times: np.ndarray, longest: float) -> np.ndarra
     return rk4(tendency, start, times, longest)
 
 
-class Lorenz63(Autonomous):
+class Lorenz63(Analytic):
     """Three variables, chaotic at the default parameters."""
 
     Settings = Lorenz63Settings

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict
 from pydantic import Field as Setting
 
 from en4dvar import Field, Observable, Parameter, StateField, StateLayout
-from en4dvar_lorenz.autonomous import Autonomous
+from en4dvar_lorenz.autonomous import Analytic
 from en4dvar_lorenz.logarithm import Logarithm
 from en4dvar_lorenz.rk4 import kept, rk4
 
@@ -46,7 +46,7 @@ def _positive(name: str, label: str, symbol: str) -> Parameter:
     return Parameter(name, "1", "lognormal", (0.0, np.inf), label, symbol, source=SOURCE)
 
 
-class LotkaVolterra(Autonomous):
+class LotkaVolterra(Analytic):
     """Prey and predators, in units of your own (of number and of time), and the logarithms of both."""
 
     Settings = LotkaVolterraSettings

@@ -26,9 +26,9 @@ def rk4(
     ``tendency(x, dx)``, an njit function, writes dx/dt of one state into ``dx``. Every interval is cut into equal steps
     no longer than ``longest``.
     """
-    n = start.shape[1]
-    paths = np.empty((start.shape[0], times.shape[1], n))
-    x, at, slope, total = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    n, kind = start.shape[1], start.dtype  # complex for derivatives
+    paths = np.empty((start.shape[0], times.shape[1], n), kind)
+    x, at, slope, total = np.empty(n, kind), np.empty(n, kind), np.empty(n, kind), np.empty(n, kind)
     for i in range(start.shape[0]):
         for j in range(n):
             x[j] = start[i, j]

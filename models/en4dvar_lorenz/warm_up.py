@@ -13,4 +13,8 @@ MODULES = {"Lorenz-63": lorenz63, "Lorenz-96": lorenz96, "Lotka–Volterra": lot
 def examples() -> dict[str, Callable[[], object]]:
     """Name of each kernel, in words, and a call that compiles it; for ``en4dvar warm-up``."""
     start, times = np.ones((1, 6)), np.array([[0.01]])
-    return {f"test-bed, {name}": partial(module.integrate, start, times, 0.01) for name, module in MODULES.items()}
+    return {
+        f"test-bed, {name}{of}": partial(module.integrate, kind(start), times, 0.01)
+        for name, module in MODULES.items()
+        for of, kind in (("", np.real), (": derivatives", np.complex128))
+    }

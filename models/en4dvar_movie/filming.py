@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import numpy as np
 
 from en4dvar.model.state import Array
-from en4dvar.plumbing.errors import ConfigError
+from en4dvar.plumbing.errors import ConfigError, retold
 from en4dvar.plumbing.hints import suggest
 from en4dvar.plumbing.units import UnitError, parse_quantity
 from en4dvar_movie.flashes import parse_flashes
@@ -87,10 +87,8 @@ def parse_settings(settings: Mapping[str, str]) -> tuple[Camera, Scene]:
         else:
             known = [f.name for kind in (Camera, Scene) for f in fields(kind)]
             raise ConfigError(f"movie: no setting {key!r}{suggest(key, known)}; there are:\n" + "\n".join(described()))
-        try:
+        with retold((ValueError, UnitError), ConfigError, f"movie: {key}={text}: "):
             changed = {key: _read(key, text, target)}
-        except (ValueError, UnitError) as error:
-            raise ConfigError(f"movie: {key}={text}: {error}") from None
         camera = replace(camera, **changed) if target is camera else camera
         scene = replace(scene, **changed) if target is scene else scene
     return camera, _checked(scene)

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from en4dvar.plumbing.decoding import Allowed, DecodeError, decoded, decoded_whole, require_plain
-from en4dvar.plumbing.errors import DataError, En4dvarError
+from en4dvar.plumbing.errors import DataError, En4dvarError, retold
 from en4dvar.plumbing.files import open_plain
 from en4dvar.plumbing.hints import no_such_file
 from en4dvar_movie.decoders import check_size, image, tiff_about, tiff_frames, video_count, video_frames
@@ -146,10 +146,8 @@ def open_picture(path: Path) -> Any:
     if path.suffix.lower() not in (*TIFF, *IMAGES):
         raise DataError(f"{path}: not a picture by its suffix ({', '.join((*IMAGES, *TIFF))})")
     read = _tiff(path).open() if path.suffix.lower() in TIFF else decoded(image, path, allowed=MOVIES)
-    try:
+    with retold((DecodeError, En4dvarError), DataError, f"{path}: cannot be read as a picture: "):
         return next(iter(read))
-    except (DecodeError, En4dvarError) as error:
-        raise DataError(f"{path}: cannot be read as a picture: {error}") from None
 
 
 def _folder(path: Path) -> Movie:
@@ -178,10 +176,8 @@ def _video(path: Path) -> Movie:
             else:
                 yield value
 
-    try:
+    with retold(DecodeError, DataError, f"{path}: cannot be read as a movie: "):
         count = decoded_whole(video_count, path, allowed=MOVIES)
-    except DecodeError as error:
-        raise DataError(f"{path}: cannot be read as a movie: {error}") from None
     return Movie(path, read, count, notes=notes, damaged=damaged)
 
 

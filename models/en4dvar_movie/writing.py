@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from itertools import chain
 from pathlib import Path
 
-from en4dvar.plumbing.errors import DataError
+from en4dvar.plumbing.errors import DataError, retold
 from en4dvar_movie.decoders import library
 from en4dvar_movie.frames import TIFF, VIDEO, Frame
 
@@ -31,15 +31,13 @@ def write_movie(path: Path, frames: Iterable[Frame], count: int, pixel: float, r
     require_suffix(path)
     stream = iter(frames)
     first = next(stream)
-    try:
+    with retold((OSError, ValueError), DataError, f"{path}: cannot be written: "):
         if path.suffix.lower() in TIFF:
             _write_tiff(path, first, stream, count, pixel, rate)
         elif first.dtype.itemsize > 1:
             raise DataError(f"{path}: a video holds 8 bits; write more as .tif")
         else:
             _write_video(path, first, stream)
-    except (OSError, ValueError) as error:
-        raise DataError(f"{path}: cannot be written: {error}") from None
 
 
 def _write_tiff(path: Path, first: Frame, others: Iterator[Frame], count: int, pixel: float, rate: float) -> None:

@@ -74,3 +74,15 @@ def test_the_inverse_hessian_is_exact_whatever_the_readings_inform(rows):
     expected = float(Fraction(3) * 2**60 / (own + information))
     # of the sum g is 2⁶² times what the prior has, so that an error of one part in 10¹⁶ of g would be 10² of the answer
     np.testing.assert_allclose(hessian.solve(g)[:2].sum(), 2 * expected, rtol=1e-6)
+
+
+def test_residuals_of_rounding_are_no_finding():
+    """Readings without any error, fitted to rounding: nothing is said of how the remainders lie."""
+    model = Decay(("a", "b"))
+    problem = make_problem(model, TRUTH, std=1e-8, k=31)
+    data = problem.observations
+    exact = np.array([model.curve(TRUTH, t) for t in data.times])
+    analysis = assimilate(
+        replace(problem, observations=replace(data, values=exact)), AssimilationSettings(members=20), seed=2
+    )
+    assert [caution.code for caution in analysis.cautions] == ["overstated-error"]

@@ -72,6 +72,24 @@ def test_against_scipy_with_the_order_of_the_method(model, by_hand, x, step):
     assert np.log2(errors[1] / errors[2]) == pytest.approx(4, abs=0.4)
 
 
+def test_derivatives_are_those_of_the_variational_equations():
+    """Lorenz-63 by scipy: the path, and how it changes with the start in x and with ρ."""
+
+    def slope(t, v):
+        (x, y, z), changes = v[:3], v[3:].reshape(2, 3).T
+        jacobian = np.array([[-10, 10, 0], [28 - z, -1, -x], [y, x, -8 / 3]])
+        of_rho = np.outer([0, x, 0], [0, 1])
+        return np.concatenate([lorenz63_by_hand(t, v[:3]), (jacobian @ changes + of_rho).T.ravel()])
+
+    times, x = np.array([0.3, 1.0]), np.array([1.5, -1.5, 25.0])
+    start = np.concatenate([x, [1, 0, 0], [0, 0, 0]])
+    exact = solve_ivp(slope, (0, 1), start, "DOP853", times, rtol=1e-13, atol=1e-13).y.T
+    model = lorenz63(step=0.0005)
+    path, changes = model.tangent(state(model, x), np.eye(6)[[0, 4]], times)
+    np.testing.assert_allclose(path.states[:, :3], exact[:, :3], rtol=1e-8)
+    np.testing.assert_allclose(changes[..., :3], exact[:, 3:].reshape(2, 2, 3).swapaxes(0, 1), rtol=1e-7, atol=1e-9)
+
+
 def test_lorenz63_fixed_points_symmetry_and_contraction():
     model = lorenz63()
     r = np.sqrt(8 / 3 * 27)

@@ -69,3 +69,39 @@ def test_one_that_cannot_be_loaded_is_told_and_left_out(package, tmp_path):
     assert done.returncode == 0, done.stderr
     assert "scheme 'lost' (nowhere:Lost) cannot be loaded: ModuleNotFoundError" in done.stderr
     assert "scheme 'number' (math:pi) cannot be loaded: TypeError: it is not a subclass" in done.stderr
+
+
+def test_a_file_serves_as_well(package, tmp_path):
+    """``scheme: ./file.py:Class``, of the data of one set, in other processes, and of a series."""
+
+    def cli(*words):
+        return called("-m", "en4dvar.cli", *words, environment=dict(os.environ), folder=tmp_path)
+
+    own = (tmp_path / "own.yaml").read_text().replace("scheme: patient", "scheme: ./patient.py:Patient")
+    for old, new, words in (
+        ("patience: 4", "patience: -1", "assimilation.patience: should be greater than or equal to 0"),
+        ("patience: 4", "patienc: 4", "unknown key 'patienc'; did you mean 'patience'?"),
+        (":Patient", ":Patien", "no class 'Patien'; did you mean 'Patient'?"),
+        (":Patient", ":Ge", "is not a subclass of en4dvar.schemes.Scheme"),
+    ):
+        (tmp_path / "file.yaml").write_text(own.replace(old, new))
+        refused = cli("validate", "file.yaml")
+        assert refused.returncode == 2
+        assert words in refused.stderr
+    (tmp_path / "file.yaml").write_text(own)
+    workers = ["--set", "execution.executor=processes", "--set", "execution.workers=2", "--out", "out"]
+    for verb in (["calibrate", "file.yaml", "--sets", "2", *workers], ["run", "file.yaml"]):
+        done = cli(*verb)
+        assert done.returncode == 0, done.stderr
+        assert "no posterior" not in done.stderr
+    resolved = yaml.safe_load((tmp_path / "runs" / "quickstart" / "config.resolved.yaml").read_text())
+    assert resolved["assimilation"]["scheme"] == f"{tmp_path / 'patient.py'}:Patient"
+    assert resolved["assimilation"]["patience"] == 4
+    (tmp_path / "slow.py").write_text("from en4dvar.schemes import ETKF\nclass Slow(ETKF):\n    words = 'slow'\n")
+    errors, spread = {f"{name}_std": 1.0 for name in "xyz"}, dict.fromkeys("xyz", 1.0)
+    twin = {"error": errors, "initial_std": spread, "interval": 0.1, "cycles": 20, "burn_in": 5}
+    config = {"name": "twin", "model": {"name": "lorenz63"}, "twin": twin}
+    config["assimilation"] = {"scheme": "./slow.py:Slow", "members": 8}
+    (tmp_path / "twin.yaml").write_text(yaml.safe_dump(config))
+    done = cli("run", "twin.yaml")
+    assert done.returncode == 0, done.stderr

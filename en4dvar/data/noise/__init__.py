@@ -22,13 +22,14 @@ the gradient is exact, SᵀS bounds the Hessian of the part of m from above.
 
 A kind of errors is one class of this folder: :class:`Noise` is Gaussian and independent, the others say what differs.
 Several series are blocks (:mod:`en4dvar.data.noise.blocks`), joined where they are correlated
-(:mod:`en4dvar.data.noise.make`).
+(:mod:`en4dvar.data.noise.make`). What readings share makes C a diagonal plus low rank, whitened without any matrix
+(:class:`SharedErrors`).
 A discrepancy of the model (:mod:`en4dvar.data.noise.discrepancy`) adds a Gaussian process to any of them.
 """
 
 from en4dvar.data.noise.blocks import BlockNoise
 from en4dvar.data.noise.bound import SIDES, BoundNoise, sides_of
-from en4dvar.data.noise.correlated import CorrelatedNoise, Correlation
+from en4dvar.data.noise.correlated import SHARED, CorrelatedNoise, Correlation, SharedErrors
 from en4dvar.data.noise.discrepancy import DiscrepancyNoise
 from en4dvar.data.noise.gaussian import Noise, ScaleSkewness
 from en4dvar.data.noise.huber import HuberNoise
@@ -38,7 +39,7 @@ from en4dvar.data.noise.predicted import Linearisation, Predicted
 from en4dvar.data.noise.robust_discrepancy import RobustDiscrepancyNoise
 
 __all__ = [
-    "SIDES", "SMOOTHNESS", "BlockNoise", "BoundNoise", "CorrelatedNoise", "Correlation", "DiscrepancyNoise",
+    "SHARED", "SIDES", "SMOOTHNESS", "BlockNoise", "BoundNoise", "CorrelatedNoise", "Correlation", "DiscrepancyNoise",
     "HuberNoise", "Kernel", "Linearisation", "Noise", "Predicted", "RobustDiscrepancyNoise", "ScaleSkewness",
-    "joint_noise", "noise_of", "noise_of_readings", "noise_of_record", "sides_of",
+    "SharedErrors", "joint_noise", "noise_of", "noise_of_readings", "noise_of_record", "sides_of",
 ]  # fmt: skip

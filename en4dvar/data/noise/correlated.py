@@ -1,7 +1,8 @@
-"""Gaussian errors that are correlated by a given matrix."""
+"""Gaussian errors that are correlated: by a given matrix, or because they have parts in common."""
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 
@@ -42,26 +43,153 @@ class Correlation:
         """L⁻¹ (K, K), lower triangular."""
         return np.asarray(np.tril(np.linalg.solve(self.root, np.eye(len(self.root)))))
 
-    def decorrelated(self, columns: Array) -> Array:
-        """L⁻¹ applied to columns (K,) or (K, N)."""
-        return np.asarray(self.whitening @ columns)
+    @cached_property
+    def precision(self) -> Array:
+        """C⁻¹ (K, K)."""
+        return np.asarray(self.whitening.T @ self.whitening)
+
+    @property
+    def precision_diagonal(self) -> Array:
+        """The diagonal of C⁻¹ (K,)."""
+        return np.diag(self.precision)
+
+    @property
+    def log_root(self) -> Array:
+        """ln L_kk (K,)."""
+        return np.asarray(np.log(np.diag(self.root)))
+
+    def decorrelated(self, rows: Array) -> Array:
+        """L⁻¹ applied to rows (…, K)."""
+        return np.asarray(rows @ self.whitening.T)
 
     def correlated(self, rows: Array) -> Array:
-        """Independent numbers (M, K) made to have this correlation."""
+        """Independent numbers (…, K) made to have this correlation."""
         return np.asarray(rows @ self.root.T)
+
+    def solved(self, rows: Array) -> Array:
+        """C⁻¹ applied to rows (…, K)."""
+        return np.asarray(rows @ self.precision)
 
     @cached_property
     def scale_root(self) -> Array:
         """B (K, K), lower triangular, with B Bᵀ = I + C∘C⁻¹, the Fisher information of ln s."""
-        precision = self.whitening.T @ self.whitening
-        return np.asarray(np.linalg.cholesky(np.eye(len(self.root)) + self.matrix * precision))
+        return np.asarray(np.linalg.cholesky(np.eye(len(self.root)) + self.matrix * self.precision))
+
+    def record(self) -> dict[str, tuple[Array, str]]:
+        """What a file holds of it: name → values and what they are."""
+        return {"correlation": (self.matrix, "correlation of the observation errors")}
+
+
+@dataclass(frozen=True)
+class SharedErrors:
+    """C = Δ + WWᵀ (K, K) of errors that share k independent parts: ``columns`` W (K, k), and Δ = 1 − Σ_c W_kc² of the
+    part of each reading alone, so that C has a unit diagonal. No matrix (K, K) is formed unless errors of the times
+    need it: time and memory are those of K k numbers.
+
+    With a_j = w_j/√Δ_j and z_j an error over √Δ_j, the shared parts x ~ N(0, I) are known from the errors before j as
+    a Kalman filter knows them: with the covariance P_j = (I + Σ_{i<j} a_i a_iᵀ)⁻¹ and the mean P_j Σ_{i<j} a_i z_i. So
+    h_j = P_j a_j and d_j² = 1 + a_jᵀh_j are all of the Cholesky factor, and P_{K+1} that of Woodbury's identity.
+
+    Raises :class:`ValueError` for columns that are not finite, or where a reading has hardly an error of its own.
+    """
+
+    columns: Array
+
+    def __post_init__(self) -> None:
+        if self.columns.ndim != 2 or not np.all(np.isfinite(self.columns)):
+            raise ValueError(f"shared errors must be finite columns (K, k), not {self.columns.shape}")
+        if not np.all(self._own > 1e-8):
+            raise ValueError("shared errors must be below 10⁴ times the error of each reading alone")
+
+    @classmethod
+    def beside(cls, std: Array, columns: Array) -> tuple[Array, Self]:
+        """From stds (K,) of each reading alone and of what is shared (K, k): the total std (K,) and the correlation."""
+        total = np.sqrt(std**2 + np.sum(columns**2, axis=1))
+        return total, cls(columns / total[:, None])
+
+    def check_size(self, size: int) -> None:
+        """Raise :class:`ValueError` unless it is that of so many errors."""
+        if len(self.columns) != size:
+            raise ValueError(f"shared errors {self.columns.shape} do not match {size} observations")
+
+    @property
+    def matrix(self) -> Array:
+        """C (K, K)."""
+        matrix = self.columns @ self.columns.T
+        np.fill_diagonal(matrix, 1.0)
+        return np.asarray(0.5 * (matrix + matrix.T))
+
+    @cached_property
+    def _own(self) -> Array:
+        """Δ (K,)."""
+        return np.asarray(1 - np.sum(self.columns**2, axis=1))
+
+    @cached_property
+    def _a(self) -> Array:
+        return np.asarray(self.columns / np.sqrt(self._own)[:, None])
+
+    @cached_property
+    def _filter(self) -> tuple[Array, Array, Array]:
+        """h (K, k), d (K,) and the last P (k, k)."""
+        h, d, P = np.empty_like(self._a), np.empty(len(self._a)), np.eye(self._a.shape[1])
+        for j, a in enumerate(self._a):
+            h[j] = P @ a
+            d[j] = np.sqrt(1 + a @ h[j])
+            P -= np.outer(h[j] / d[j], h[j] / d[j])
+        return h, d, P
+
+    @property
+    def precision_diagonal(self) -> Array:
+        """The diagonal of C⁻¹ (K,)."""
+        return np.asarray((1 - np.sum((self._a @ self._filter[2]) * self._a, axis=1)) / self._own)
+
+    @property
+    def log_root(self) -> Array:
+        """ln L_kk (K,)."""
+        return np.asarray(np.log(self._filter[1]) + 0.5 * np.log(self._own))
+
+    def decorrelated(self, rows: Array) -> Array:
+        """L⁻¹ applied to rows (…, K)."""
+        (h, d, _), z = self._filter, rows / np.sqrt(self._own)
+        return np.asarray((z - _from_before(h, self._a, z)) / d)
+
+    def correlated(self, rows: Array) -> Array:
+        """Independent numbers (…, K) made to have this correlation."""
+        h, d, _ = self._filter
+        return np.asarray((d * rows + _from_before(self._a, h, rows / d)) * np.sqrt(self._own))
+
+    def solved(self, rows: Array) -> Array:
+        """C⁻¹ applied to rows (…, K)."""
+        z = rows / np.sqrt(self._own)
+        return np.asarray((z - z @ self._a @ self._filter[2] @ self._a.T) / np.sqrt(self._own))
+
+    @property
+    def scale_root(self) -> Array:
+        """As of :class:`Correlation`."""
+        return Correlation(self.matrix).scale_root
+
+    def record(self) -> dict[str, tuple[Array, str]]:
+        """What a file holds of it: name → values and what they are."""
+        return {SHARED: (self.columns, "what observation errors share, each column in total standard deviations")}
+
+
+SHARED = "shared_errors"  # in the record
+
+
+def _from_before(to: Array, of: Array, rows: Array) -> Array:
+    """Σ_{i<j} to_j·of_i rows_i for each j, of rows (…, K); ``to`` and ``of`` (K, k)."""
+    total = np.zeros_like(rows)
+    for outer, inner in zip(to.T, of.T, strict=True):
+        part = inner * rows
+        total += outer * (np.cumsum(part, axis=-1) - part)
+    return total
 
 
 @dataclass(frozen=True)
 class CorrelatedNoise(Noise):
     """Gaussian errors R = D C D."""
 
-    correlation: Correlation
+    correlation: Correlation | SharedErrors
 
     @property
     def words(self) -> str:
@@ -78,32 +206,33 @@ class CorrelatedNoise(Noise):
             raise ValueError("correlated observation errors need one weight for all observations")
 
     def precision_times(self, values: Array, weights: Array, at: Predicted, vectors: Array) -> Array:
-        s, whitening = self.error_std(at), self.correlation.whitening
-        return np.asarray(weights * ((vectors / s) @ whitening.T @ whitening) / s)
+        s = self.error_std(at)
+        return np.asarray(weights * self.correlation.solved(vectors / s) / s)
 
     def log_conditional(self, values: Array, predicted: Predicted) -> Array:
         """With the precision P = C⁻¹ it is N((Pz)_k/P_kk, 1/P_kk) of what is new in z_k beside all others."""
-        s, whitening = self.error_std(predicted), self.correlation.whitening
-        scaled = ((values - predicted.values) / s) @ whitening.T @ whitening
-        precision = np.sum(whitening**2, axis=0)
+        s, precision = self.error_std(predicted), self.correlation.precision_diagonal
+        scaled = self.correlation.solved((values - predicted.values) / s)
         return np.asarray(-0.5 * scaled**2 / precision + 0.5 * np.log(precision) - np.log(s) - self._log_norm())
 
     def matrices(self) -> dict[str, tuple[Array, str]]:
-        return {"correlation": (self.correlation.matrix, "correlation of the observation errors")}
+        return self.correlation.record()
 
     def _correlated(self, v: Array) -> Array:
         return self.correlation.correlated(v)
 
     def _decorrelated(self, z: Array) -> Array:
-        return np.asarray(z @ self.correlation.whitening.T)
+        return self.correlation.decorrelated(z)
 
     def _whitened_anomalies(self, row: Array, s: Array, anomalies: Array) -> Array:
-        return np.asarray(row[:, None] * (self.correlation.whitening @ (anomalies / s).T))
+        return np.asarray(row[:, None] * self.correlation.decorrelated(anomalies / s).T)
 
     def _scale_rows(self, root_weight: Array, z: Array, v: Array, log_s: Array) -> tuple[Array, Array]:
+        if not self.timed:  # all stds grow alike: the score is vᵀv − K, the information 2K
+            return super()._scale_rows(root_weight, v, v, log_s)
         root = self.correlation.scale_root
-        of_scale = root_weight * np.linalg.solve(root, z * (self.correlation.whitening.T @ v) - 1)
+        of_scale = root_weight * np.linalg.solve(root, z * self.correlation.solved(z) - 1)
         return of_scale, root_weight[:, None] * (root.T @ log_s.T)
 
     def _log_root(self) -> Array:
-        return np.asarray(-np.log(np.diag(self.correlation.whitening)))
+        return self.correlation.log_root

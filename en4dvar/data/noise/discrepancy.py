@@ -19,7 +19,7 @@ from typing import ClassVar
 import numpy as np
 from scipy.linalg import cho_solve, solve_triangular
 
-from en4dvar.data.noise.correlated import CorrelatedNoise, Correlation
+from en4dvar.data.noise.correlated import CorrelatedNoise, Correlation, SharedErrors
 from en4dvar.data.noise.gaussian import Noise
 from en4dvar.data.noise.kernel import Kernel
 from en4dvar.data.noise.predicted import Linearisation, Predicted
@@ -45,7 +45,7 @@ class DiscrepancyNoise(Noise):
     """Gaussian errors, correlated where there is a ``correlation``, beside a discrepancy with a ``kernel``."""
 
     kernel: Kernel
-    correlation: Correlation | None = None
+    correlation: Correlation | SharedErrors | None = None
 
     discrepant: ClassVar[bool] = True
 
@@ -78,9 +78,7 @@ class DiscrepancyNoise(Noise):
         return {"discrepancy_smoothness": self.kernel.smoothness, "discrepancy_grows_beyond": self.grows_beyond}
 
     def matrices(self) -> dict[str, tuple[Array, str]]:
-        if self.correlation is None:
-            return {}
-        return {"correlation": (self.correlation.matrix, "correlation of the observation errors")}
+        return {} if self.correlation is None else self.correlation.record()
 
     def covariance_of_errors(self, predicted: Predicted) -> Array:
         """R (…, K, K)."""

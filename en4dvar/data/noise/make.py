@@ -9,7 +9,7 @@ from scipy.sparse import block_array, csr_array, eye_array
 
 from en4dvar.data.noise.blocks import BlockNoise
 from en4dvar.data.noise.bound import SIDES, BoundNoise, sides_of
-from en4dvar.data.noise.correlated import CorrelatedNoise, Correlation
+from en4dvar.data.noise.correlated import SHARED, CorrelatedNoise, Correlation, SharedErrors
 from en4dvar.data.noise.discrepancy import DiscrepancyNoise
 from en4dvar.data.noise.gaussian import Noise
 from en4dvar.data.noise.huber import HuberNoise
@@ -26,7 +26,10 @@ def noise_of_record(
     kernel = None
     if "discrepancy_smoothness" in held:
         kernel = Kernel(times, held["discrepancy_smoothness"], held["discrepancy_grows_beyond"])
-    correlation, sides = matrices.get("correlation"), matrices.get(SIDES)
+    correlation: Array | SharedErrors | None = matrices.get("correlation")
+    sides = matrices.get(SIDES)
+    if SHARED in matrices:
+        correlation = SharedErrors(matrices[SHARED])
     return noise_of(std, time_std, correlation, held.get("huber_threshold"), kernel, sides)
 
 
@@ -36,12 +39,13 @@ _NUMBERS = ("huber_threshold", "discrepancy_smoothness", "discrepancy_grows_beyo
 def noise_of(
     std: Array,
     time_std: Array | None = None,
-    correlation: Array | None = None,
+    correlation: Array | SharedErrors | None = None,
     huber: float | None = None,
     discrepancy: Kernel | None = None,
     sides: Array | None = None,
 ) -> Noise:
-    """Errors of the kind that is given: independent, correlated by a matrix (K, K), or robust beyond ``huber`` std.
+    """Errors of the kind that is given: independent, correlated by a matrix (K, K) or by what they share, or robust
+    beyond ``huber`` std.
 
     Any of them may stand beside a ``discrepancy`` of the model; its amplitude and length are then parameters
     (:data:`~en4dvar.model.state.DISCREPANCY`). ``sides`` (K,): readings that are upper (1) or lower (−1) bounds.
@@ -58,7 +62,7 @@ def noise_of(
         return noise_of_readings(std, time_std, sides=sides)
     if correlation is not None and huber is not None:
         raise ValueError("a robust cost needs independent observation errors")
-    between = None if correlation is None else Correlation(correlation)
+    between = Correlation(correlation) if isinstance(correlation, np.ndarray) else correlation
     if discrepancy is not None and huber is not None:
         return RobustDiscrepancyNoise(std, time_std, discrepancy, None, huber)
     if discrepancy is not None:

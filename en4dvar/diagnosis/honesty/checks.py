@@ -184,7 +184,7 @@ def validity(limits: Sequence[ValidityLimit], extremes: Array, since: Array, tim
     """Posterior members (N, V) whose path leaves what the model's equations assume, ``since`` (N, V) when.
 
     Serious where readings that lie beyond inform: ``leverage`` (K,) at ``times`` (K,) is the share of each in its own
-    prediction, and sums to the DFS of the data. A bubble at rest after its collapse, say, tells nothing.
+    prediction, and sums to the DFS of the data. A system at rest, say, tells nothing.
     """
     for v, limit in enumerate(limits if extremes.size else ()):
         reached = extremes[:, v]

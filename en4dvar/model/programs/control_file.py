@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-from en4dvar.plumbing.errors import ConfigError
+from en4dvar.plumbing.errors import ConfigError, retold
 from en4dvar.plumbing.files import read_text
 
 PARAMETERS = ["parnme", "partrans", "parchglim", "parval1", "parlbnd", "parubnd", "pargp", "scale", "offset", "dercom"]
@@ -128,7 +128,5 @@ def read_control(path: Path) -> ControlFile:
 
 def text_of(path: Path) -> str:
     """The text of a file. Raises :class:`ConfigError`."""
-    try:
+    with retold(OSError, ConfigError, f"{path}: "):
         return read_text(path)
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}") from None

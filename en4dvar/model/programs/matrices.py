@@ -17,7 +17,7 @@ from scipy.linalg import block_diag
 
 from en4dvar.model.programs.control_file import text_of
 from en4dvar.model.state import Array
-from en4dvar.plumbing.errors import ConfigError
+from en4dvar.plumbing.errors import ConfigError, retold
 from en4dvar.plumbing.files import read_plain
 
 BINARY = (".jcb", ".jco", ".bin")
@@ -57,12 +57,9 @@ def read_matrix(path: Path) -> NamedMatrix:
     """The matrix in a file. Raises :class:`ConfigError`: unreadable, not finite, a name twice."""
     kind = path.suffix.lower()
     read = _binary if kind in BINARY else {".csv": _table, ".unc": _uncertainty}.get(kind, _text)
-    try:
+    not_read = retold((ValueError, IndexError), ConfigError, f"{path}: is no matrix of PEST: ")
+    with retold(OSError, ConfigError, f"{path}: "), not_read:
         rows, columns, values = read(path)
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}") from None
-    except (ValueError, IndexError) as error:
-        raise ConfigError(f"{path}: is no matrix of PEST: {error}") from None
     own, across = (tuple(name.strip().lower() for name in names) for names in (rows, columns))
     matrix = NamedMatrix(path, own, across, values)
     if values.shape != (len(matrix.rows), len(matrix.columns)) or not np.isfinite(values).all():

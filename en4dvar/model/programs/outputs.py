@@ -16,7 +16,7 @@ from en4dvar.model.programs.errors import ProgramError
 from en4dvar.model.programs.settings import OutputOf
 from en4dvar.model.state import Array
 from en4dvar.plumbing.decoding import Allowed, DecodeError, decoded_whole
-from en4dvar.plumbing.errors import DataError
+from en4dvar.plumbing.errors import DataError, retold
 from en4dvar.plumbing.files import read_text
 from en4dvar.plumbing.hints import listed, short
 from en4dvar.plumbing.patterns import LONGEST, matches, text_of
@@ -109,10 +109,8 @@ def _column(text: str, column: str | int | None, file: str) -> Array:
 
 
 def _key(text: str, key: str | int | None, file: str) -> Array:
-    try:
+    with retold(ValueError, ProgramError, f"{file}: not JSON: "):
         node: Any = json.loads(text)
-    except ValueError as error:
-        raise ProgramError(f"{file}: not JSON: {error}") from None
     for part in str(key).split("."):
         try:
             node = node[int(part)] if isinstance(node, list) else node[part]

@@ -28,6 +28,7 @@ from en4dvar.model.programs import pest
 from en4dvar.model.programs.errors import ProgramError
 from en4dvar.model.programs.template import TIMES, check_template, input_name
 from en4dvar.plumbing.described import Described
+from en4dvar.plumbing.errors import retold
 from en4dvar.plumbing.files import POSIX, expanded, read_text
 from en4dvar.plumbing.hints import no_such_file, suggest
 from en4dvar.plumbing.units import Quantity, parse_unit
@@ -46,10 +47,8 @@ def _unit(text: str) -> str:
 
 
 def _pattern(text: str) -> str:
-    try:
+    with retold(re.error, ValueError, "is not a regular expression: "):
         groups = re.compile(text).groups
-    except re.error as error:
-        raise ValueError(f"is not a regular expression: {error}") from None
     if groups != 1:
         raise ValueError(f"has {groups} groups; put the number, and nothing else, in parentheses")
     return text
@@ -177,16 +176,12 @@ class OutputOf(_Section):
         """Raise ValueError at what is no instruction, and where an observation is read by none, or twice."""
         names: list[str] = []
         for path in itertools.chain.from_iterable(self.instruction_files.values()):
-            try:
+            with retold(OSError, ValueError, f"{path}: "):
                 text = read_text(path)
-            except OSError as error:
-                raise ValueError(f"{path}: {error.strerror}") from None
             if not pest.is_instructions(text):
                 raise ValueError(f"{path}: the first line of PEST's instructions is pif and a sign, e.g. pif @")
-            try:
+            with retold(ProgramError, ValueError):
                 names += pest.observations_of(text, str(path))
-            except ProgramError as error:
-                raise ValueError(str(error)) from None
         if double := [name for name, count in Counter(names).items() if count > 1]:
             raise ValueError(f"two of the instructions read {double[0]!r}")
         known = set(names)

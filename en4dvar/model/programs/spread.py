@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from en4dvar.model.programs.control_file import ControlFile, PestRow
 from en4dvar.model.programs.matrices import NamedMatrix, read_matrix
 from en4dvar.model.state import Array
-from en4dvar.plumbing.errors import ConfigError
+from en4dvar.plumbing.errors import ConfigError, retold
 
 OFF = ("", "0", "false", "no")
 PARCOV = ("parcov", "parameter_covariance", "parcov_filename")
@@ -100,8 +100,6 @@ def _file(control: ControlFile, options: Sequence[str]) -> NamedMatrix | None:
     """The matrix that one of the options names."""
     for name in options:
         if (text := control.options.get(name, "")).lower() not in OFF:
-            try:
+            with retold(ConfigError, ConfigError, f"{control.path}: option {name}: "):
                 return read_matrix(control.file(text))
-            except ConfigError as error:
-                raise ConfigError(f"{control.path}: option {name}: {error}") from None
     return None

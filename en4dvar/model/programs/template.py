@@ -18,6 +18,7 @@ from jinja2.sandbox import ImmutableSandboxedEnvironment
 from en4dvar.model.programs import pest
 from en4dvar.model.programs.errors import ProgramError
 from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import retold
 from en4dvar.plumbing.files import in_bytes, read_text
 from en4dvar.plumbing.hints import suggest
 
@@ -36,10 +37,8 @@ def check_template(template: Path, names: Collection[str]) -> None:
     text = _text(template)
     if pest.is_template(text):
         names = {pest.identifier(name) for name in names}
-        try:
+        with retold(ProgramError, ValueError, f"{template}: "):
             wanted: Collection[str] = pest.parameters_of(text)
-        except ProgramError as error:
-            raise ValueError(f"{template}: {error}") from None
     else:
         try:
             wanted = find_undeclared_variables(_environment().parse(text))
@@ -67,10 +66,8 @@ def filled(template: Path, parameters: Mapping[str, float], times: Array) -> str
 
 @functools.cache
 def _text(template: Path) -> str:
-    try:
+    with retold(OSError, ValueError, f"{template}: "):
         return read_text(template)
-    except OSError as error:
-        raise ValueError(f"{template}: {error.strerror}") from None
 
 
 @functools.cache

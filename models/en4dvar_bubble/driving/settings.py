@@ -9,7 +9,7 @@ from pydantic import ConfigDict, Field, ValidationInfo, create_model, field_vali
 
 from en4dvar.inputs.asked import Format
 from en4dvar.plumbing.described import Described
-from en4dvar.plumbing.errors import En4dvarError
+from en4dvar.plumbing.errors import En4dvarError, retold
 from en4dvar.plumbing.units import Quantity, convert
 from en4dvar_bubble.driving.base import MOST_KNOTS, Driving, with_knots
 from en4dvar_bubble.driving.pulses import PULSES
@@ -39,10 +39,8 @@ class _Kind(Section):
 
     @model_validator(mode="after")
     def _can_be_built(self) -> "_Kind":
-        try:
+        with retold(En4dvarError, ValueError):
             driving = self.build()
-        except En4dvarError as error:
-            raise ValueError(str(error)) from None
         if driving.end <= 0:
             raise ValueError(f"the driving has ended by time zero, at {driving.end:g} s")
         return self

@@ -11,6 +11,7 @@ import numpy as np
 from en4dvar.inputs.asked import Column, Format, Layout
 from en4dvar.inputs.readers import read_series
 from en4dvar.model.state import Array, Parameter
+from en4dvar.plumbing.errors import retold
 from en4dvar_bubble.driving.base import Driving, PulseNumber
 
 if TYPE_CHECKING:
@@ -104,7 +105,5 @@ def from_file(
     Raises :class:`~en4dvar.plumbing.errors.DataError` for a file that cannot be read, ValueError as :func:`tabulated`.
     """
     series = read_series(path, Column(*time, "s"), Column(*pressure, "Pa"), Layout(format))
-    try:
+    with retold(ValueError, ValueError, f"{path}: "):
         return tabulated(series.times, series.values, delay, scale)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None

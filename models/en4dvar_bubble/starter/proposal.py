@@ -8,7 +8,7 @@ import numpy as np
 
 from en4dvar.inputs.window import Instant, select
 from en4dvar.model.state import Array, Parameter
-from en4dvar.plumbing.errors import ConfigError, DataError
+from en4dvar.plumbing.errors import ConfigError, DataError, retold
 from en4dvar.plumbing.units import convert
 from en4dvar_bubble.collapse import Lobe, conceivable, doubt, lobe
 from en4dvar_bubble.dynamics import R0, R_EQ, R_MAX
@@ -204,19 +204,15 @@ def built(start: Start, law: str | None) -> tuple[BubbleModel, str]:
     """The model, and how the file names its law. Raises :class:`ConfigError` where no such law starts so."""
     name = qualified(law) if law else LAWS[start]
     settings = BubbleSettings.model_validate({**MODEL[start], "start": start, "law": name})
-    try:
+    with retold(ValueError, ConfigError, f"--law {name} --start {start}: "):
         return BubbleModel.from_settings(settings), name
-    except ValueError as error:
-        raise ConfigError(f"--law {name} --start {start}: {error}") from None
 
 
 def _looks(histories: Mapping[str, tuple[Array, Array]], start: Start | None) -> dict[str, Look]:
     looks: dict[str, Look] = {}
     for name, (times, radius) in histories.items():
-        try:
+        with retold(DataError, DataError, f"{name}: "):
             looks[name] = look(times, radius, start)
-        except DataError as error:
-            raise DataError(f"{name}: {error}") from None
     if len({view.start for view in looks.values()}) > 1:
         kinds = {kind: [n for n, view in looks.items() if view.start == kind] for kind in ("acoustic", "laser")}
         told = "; ".join(f"{kind}: {', '.join(names[:3])}" for kind, names in kinds.items())
