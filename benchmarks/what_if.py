@@ -3,9 +3,9 @@
     python benchmarks/what_if.py --seed 401 --n 15 --measured ../shared/data/bubbles/stiff_polyacrylamide/pa_0[1-9].csv
 
 Synthetic recordings as recordings.py makes them, and measured bubbles, each through ``init``; then every assumption of
-the table is put in and J is minimised again, descents from several members of the prior, as a run does. A shift of G or
-μ agrees if it has the sign of the fit's and lies within 0.3 posterior standard deviations of it or a quarter; of fits
-that end elsewhere, the one with the lower J counts, and the row is listed.
+the table is put in and J is minimised again, descents from several members of the prior, as a run does before it
+samples. A shift of G or μ agrees if it has the sign of the fit's and lies within 0.3 posterior standard deviations of
+it or a quarter; where both end in different minima, the one with the lower J counts, and the row is listed.
 """
 
 from __future__ import annotations
@@ -50,8 +50,10 @@ def problem_of(text: str, words: list[str]) -> InverseProblem:
 
 
 def compared(problem: InverseProblem, name: str) -> list[str]:
-    """What became of each row: "agrees", "apart", "elsewhere" (the fit's minimum is lower), or "not told"."""
-    fit, ends = assimilate(problem, SETTINGS, 1), []
+    """What became of each row: "agrees", "apart", "elsewhere" (the fit's minimum is lower), "above" (the row's is), or
+    "not told".
+    """
+    fit, ends = assimilate(problem, AssimilationSettings(), 1), []
     for alternative in problem.alternatives:
         (row,) = [shift for shift in fit.what_if if shift.name == alternative.name] or [None]
         if row is None:
@@ -80,7 +82,7 @@ def _beside(
     if signed and np.all((off <= NEAR) | (off <= SHARE * np.abs(shift[at]))):
         return "agrees"
     lower = gained - (again.iterations[-1].cost - fit.iterations[-1].cost)
-    end = "elsewhere" if lower > LOWER else "apart"
+    end = "elsewhere" if lower > LOWER else "above" if lower < -LOWER else "apart"
     both = f"row {np.round(in_std[at], 2)}, fit {np.round(shift[at], 2)} std"
     print(f"{words}: {end}; {both}, J {lower:+.2f} below the row's")
     return end
