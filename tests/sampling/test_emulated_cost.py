@@ -74,6 +74,24 @@ def test_emulator_of_an_estimated_noise_scale():
     assert_emulated(emulator, problem, np.concatenate([x, emulator.draws[::50]]))
 
 
+def test_walkers_stay_where_data_narrow_a_lot():
+    """Six parameters of a linear model; against the posterior in closed form. The prior has e^41 times its volume."""
+    std, problem = 0.002, make_problem(Linear(tuple("abcdef")), [1.0, 0.5, 0.2, 0.9, 0.4, 0.7], std=0.002, k=40)
+    prior, readings = problem.prior, problem.observations.values
+    at = forecast(problem, np.vstack([prior.mean, prior.mean + np.eye(6)])).predictions
+    H = (at[1:] - at[0]).T
+    covariance = np.linalg.inv(np.diag(prior.std**-2) + H.T @ H / std**2)
+    mean, stds = prior.mean + covariance @ H.T @ (readings - at[0]) / std**2, np.sqrt(np.diag(covariance))
+    assert np.sum(np.log(prior.std)) - 0.5 * np.linalg.slogdet(covariance)[1] > 40
+    random = np.random.default_rng(2)
+    ensemble = mean + random.standard_normal((48, 6)) @ np.linalg.cholesky(covariance).T
+    made = emulate(lambda x: forecast(problem, x), prior, problem.observations, ensemble, random)
+    apart = (made.settled(np.random.default_rng(5)).draws - mean) / stds
+    assert np.abs(apart).max() < 6
+    assert apart.mean(axis=0) == pytest.approx(np.zeros(6), abs=0.15)
+    assert apart.std(axis=0) == pytest.approx(np.ones(6), abs=0.1)
+
+
 def test_no_emulator_of_many_parameters_or_few_survivors():
     assert needed_runs(5) == (3, 224)
     assert needed_runs(1) == (3, 96)
