@@ -28,7 +28,7 @@ from en4dvar.plumbing.errors import ConfigError
 from en4dvar.problem import InverseProblem
 from en4dvar.sampling.mcmc import ChainState
 from en4dvar.sampling.refine import Refined, in_doubt, refined, samples
-from en4dvar.sampling.shape import CLEARED, PLAIN, examine_shape, examine_tails
+from en4dvar.sampling.shape import CLEARED, examine_shape, examine_tails
 from en4dvar.schemes import MINIMISERS
 from en4dvar.schemes.base import Weights
 from en4dvar.schemes.settings import AssimilationSettings
@@ -280,7 +280,7 @@ class Stages:
             costs = space.costs(ends.members, ends.run)
             shape = examine_shape(space, ends.members, ends.mode, costs, self.seed, settle)
             settles = cheap and bool(minima)
-            if settles and shape["gaussian_fit"] < PLAIN and not in_doubt(minima, agree, shape):
+            if settles and not in_doubt(minima, agree, shape):
                 shape |= examine_tails(space, ends.members, costs)
             if not (settles and in_doubt(minima, agree, shape)):
                 return Sampled(ends, None, shape)

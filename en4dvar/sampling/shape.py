@@ -20,7 +20,7 @@ from en4dvar.sampling.emulator import Coordinates
 
 CHAIN_FITS = 4  # of an emulator that has to guide a chain into the tails; two tell mean and spread
 SHIFT, SPREAD = 0.25, 0.15  # of the ensemble, by the emulator, that leave a doubt: half of what is warned of
-FAR, PLAIN = 2.0, 0.97  # times as far out as members; their effective share from which tails are those of a Gaussian
+FAR = 2.0  # times as far out as the members
 CLEARED = 0.85  # effective share of the members above which no run was found that was off (docs: calibration)
 
 
