@@ -17,7 +17,7 @@ from en4dvar.model.state import NOISE_SCALE
 from en4dvar.priors.prior import PriorTerm
 from en4dvar.sampling import mcmc
 from en4dvar.sampling.emulated_cost import emulate, needed_runs
-from en4dvar.sampling.shape import guide
+from en4dvar.sampling.shape import CLEARED, guide
 from en4dvar.sampling.walkers import advance
 from en4dvar.schemes.settings import AssimilationSettings
 
@@ -187,11 +187,45 @@ def test_the_emulator_is_for_cheap_models_unless_asked_for(nothing_cleared):
     assert "mean_shift" not in assimilate(fast, replace(settings, emulator="off"), 1).shape
 
 
-def test_a_gaussian_posterior_costs_no_more_runs():
+def test_a_gaussian_posterior_costs_no_more_runs_than_it_has_members():
     problem = make_problem(Linear(("a", "b"), compiled=True), [1.0, 0.5])
     analysis = assimilate(problem, AssimilationSettings(), 1)
-    assert set(analysis.shape) == {"gaussian_fit", "non_gaussian"}
+    assert set(analysis.shape) == {"gaussian_fit", "non_gaussian", "tail_shift", "tail_ratio"}
     assert not analysis.shape["non_gaussian"]
+    assert analysis.shape["tail_shift"] == pytest.approx(0, abs=1e-6)
+    assert analysis.shape["tail_ratio"] == pytest.approx(1, abs=1e-6)
+    assert analysis.forward_runs == assimilate(problem, AssimilationSettings(refine="none"), 1).forward_runs + 48
+
+
+class Kinked(Toy):
+    """y = a + g t with g = b above zero and b/5 below."""
+
+    def curve(self, theta, t):
+        return float(theta[0] + self.rate(theta, t) * t)
+
+    def rate(self, theta, t):
+        return float(max(theta[1], 0.2 * theta[1]))
+
+
+def test_a_tail_beyond_a_kink_that_no_member_has_reached():
+    """Against the posterior on a grid: two standard deviations from the mode J rises a fifth as steeply."""
+    problem = make_problem(Kinked(("a", "b"), compiled=True), [1.0, 0.15], std=0.15, seed=3)
+    prior, observations = problem.prior, problem.observations
+    axes = [m + s * np.linspace(-6, 6, 801) for m, s in zip(prior.mean, prior.std, strict=True)]
+    a, b = (axis.ravel() for axis in np.meshgrid(*axes))
+    residuals = [
+        y - a - np.where(b > 0, b, b / 5) * t for t, y in zip(observations.times, observations.values, strict=True)
+    ]
+    z = np.stack([(x - m) / s for x, m, s in zip((a, b), prior.mean, prior.std, strict=True)])
+    J = 0.5 * np.sum(np.square(residuals), axis=0) / 0.15**2 + 0.5 * np.sum(z**2, axis=0)
+    p = np.exp(J.min() - J)
+    mean, std = np.average(b, weights=p), np.sqrt(np.cov(b, aweights=p))
+    for refine, right in (("none", False), ("auto", True)):
+        found = assimilate(problem, AssimilationSettings(refine=refine), 1)
+        members = prior.from_physical(found.posterior)[:, 1]
+        assert (abs(members.std(ddof=1) / std - 1) < 0.1) == right
+        assert (abs(members.mean() - mean) < 0.1 * std) == right
+        assert refine == "auto" or found.shape["gaussian_fit"] > CLEARED
 
 
 def test_shape_has_the_same_bits_for_any_workers():
