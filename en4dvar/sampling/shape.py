@@ -49,39 +49,32 @@ def examine_shape(
 
 
 def examine_tails(space: WeightSpace, ensemble: Array, costs: Array) -> dict[str, float]:
-    """``tail_shift`` and ``tail_ratio``, in the sense of ``mean_shift`` and ``spread_ratio``, by the ensemble (N, n) of
-    J ``costs`` (N,) and as many runs :data:`FAR` times as far out, weighted with the density that these are all drawn
-    from: of a Gaussian posterior 0 and 1, whatever the members are.
+    """``tail_ratio``, the least standard deviation of the ensemble (N, n) over the posterior's, by members of J
+    ``costs`` (N,) and as many runs :data:`FAR` times as far out, weighted with the density that these are all drawn
+    from: of a Gaussian posterior 1, whatever the members are.
     """
-    mean, scale = ensemble.mean(axis=0), ensemble.std(axis=0, ddof=1)
-    x = np.concatenate([ensemble, mean + FAR * (ensemble - mean)])
-    far = x[len(ensemble) :]
+    mean = ensemble.mean(axis=0)
+    far = mean + FAR * (ensemble - mean)
+    x = np.concatenate([ensemble, far])
     squares = np.sum(Coordinates.about(ensemble).of(x) ** 2, axis=1)
     drawn = np.logaddexp(-0.5 * squares, -0.5 * squares / FAR**2 - x.shape[1] * np.log(FAR))
-    of_posterior = _moments(x, -np.append(costs, space.costs(far, space.forecast(far))) - drawn)
-    of_gaussian = _moments(x, -0.5 * squares - drawn)
-    ratio = of_gaussian[1] / of_posterior[1]
-    return {
-        "tail_shift": float(np.max(np.abs(of_posterior[0] - of_gaussian[0]) / scale)),
-        "tail_ratio": float(ratio[np.argmax(np.abs(np.log(ratio)))]),
-    }
+    posterior = _spread(x, -np.append(costs, space.costs(far, space.forecast(far))) - drawn)
+    return {"tail_ratio": float(np.min(_spread(x, -0.5 * squares - drawn) / posterior))}
 
 
-def _moments(x: Array, logs: Array) -> tuple[Array, Array]:
-    """Mean and standard deviations (n,) of points (B, n) of log weights (B,)."""
+def _spread(x: Array, logs: Array) -> Array:
+    """Standard deviations (n,) of points (B, n) of log weights (B,)."""
     shares = np.exp(logs - logs.max())
     shares /= shares.sum()
-    mean = shares @ x
-    return mean, np.sqrt(shares @ (x - mean) ** 2)
+    return np.sqrt(shares @ (x - shares @ x) ** 2)
 
 
 def doubtful(shape: Mapping[str, float]) -> bool:
-    """True if mean or spread of the ensemble are off, by the emulator or by runs in the tails, by half of what is
-    warned of.
+    """True if mean or spread of the ensemble are off, by the emulator, by half of what is warned of, or the spread is
+    too small by as much in view of the tails.
     """
-    shifts = shape.get("mean_shift", 0.0), shape.get("tail_shift", 0.0)
-    ratios = shape.get("spread_ratio", 1.0), shape.get("tail_ratio", 1.0)
-    return max(shifts) > SHIFT or any(abs(ratio - 1) > SPREAD for ratio in ratios)
+    off = shape.get("mean_shift", 0.0) > SHIFT or abs(shape.get("spread_ratio", 1.0) - 1) > SPREAD
+    return off or 1 - shape.get("tail_ratio", 1.0) > SPREAD
 
 
 def _off(emulator: EmulatedCost, ensemble: Array) -> dict[str, float]:
