@@ -66,7 +66,7 @@ def _spread(x: Array, logs: Array) -> Array:
     """Standard deviations (n,) of points (B, n) of log weights (B,)."""
     shares = np.exp(logs - logs.max())
     shares /= shares.sum()
-    return np.sqrt(shares @ (x - shares @ x) ** 2)
+    return np.asarray(np.sqrt(shares @ (x - shares @ x) ** 2))
 
 
 def doubtful(shape: Mapping[str, float]) -> bool:
