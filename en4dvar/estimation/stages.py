@@ -28,7 +28,7 @@ from en4dvar.plumbing.errors import ConfigError
 from en4dvar.problem import InverseProblem
 from en4dvar.sampling.mcmc import ChainState
 from en4dvar.sampling.refine import Refined, in_doubt, refined, samples
-from en4dvar.sampling.shape import CLEARED, examine_shape
+from en4dvar.sampling.shape import CLEARED, examine_shape, examine_tails
 from en4dvar.schemes import MINIMISERS
 from en4dvar.schemes.base import Weights
 from en4dvar.schemes.settings import AssimilationSettings
@@ -279,7 +279,10 @@ class Stages:
             settle = not (cheap and self.problem.discrepancy)
             costs = space.costs(ends.members, ends.run)
             shape = examine_shape(space, ends.members, ends.mode, costs, self.seed, settle)
-            if not (cheap and minima and in_doubt(minima, agree, shape)):
+            settles = cheap and bool(minima)
+            if settles and not in_doubt(minima, agree, shape):
+                shape |= examine_tails(space, ends.members, costs)
+            if not (settles and in_doubt(minima, agree, shape)):
                 return Sampled(ends, None, shape)
         sampled = self.refine(ends.members, minima, earlier, looking)
         if sampled.lower is not None:

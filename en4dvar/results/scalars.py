@@ -159,8 +159,10 @@ SAMPLE_STATS = (
     _withheld("withheld_inside", "share of them in the 90 % bands of what was expected", lambda w: w.inside),
     _withheld("withheld_rms", "root mean square of these readings less the medians, SI", lambda w: w.rms),
     Attribute("discrepancy_share", "share of the squared residuals that the discrepancy takes", _discrepancy_share),
-    Attribute("gaussian_fit, non_gaussian, mean_shift, spread_ratio, emulator_fit, emulated_mean_G, emulated_std_G",
-              "shape of the posterior, the latter five where an emulator was needed", lambda a: a.shape),
+    Attribute("gaussian_fit, non_gaussian, tail_ratio, mean_shift, spread_ratio, emulator_fit, "
+              "emulated_mean_G, emulated_std_G",
+              "shape of the posterior; the third of a cheap model, the latter five where an emulator was needed",
+              lambda a: a.shape),
     Attribute("importance_draws, importance_effective_sample_size, importance_largest_shift, "
               "importance_largest_spread_ratio, mcmc_r_hat, mcmc_effective_sample_size, …",
               "of a posterior that was sampled", lambda a: a.refinement),

@@ -28,7 +28,7 @@ DEGREES = (3, 2)  # tried in this order
 RUNS_PER_TERM = 4
 FEWEST_RUNS, MOST_RUNS = 96, 512  # of one fit
 ENOUGH_ALIVE = 0.75  # share of the first runs that must succeed
-CEILING = 20.0  # above the lowest J_o of the runs
+CEILING = 20.0  # above the lowest J_o of the runs, and ln of the prior's volume over the posterior's more
 RIDGE = 1e-9
 WALKERS = 300
 SCATTERED, SETTLED = 6, 10  # rounds of the walkers before the second fit, after it
@@ -68,8 +68,9 @@ class EmulatedCost:
     ``bend`` makes of them.
 
     J_o is cut at ``ceiling``: far from its runs a polynomial says only that J is large, and a walker that true J lets
-    in there must find its way out. ``share`` is the effective share of the runs that judge it, ``draws`` (S, n) are of
-    exp(−Ĵ). Outputs are stacked as those of ``make``.
+    in there must find its way out. All of the prior at that J_o has about e^−20 of the posterior's probability.
+    ``share`` is the effective share of the runs that judge it, ``draws`` (S, n) are of exp(−Ĵ). Outputs are stacked as
+    those of ``make``.
     """
 
     emulator: Emulator
@@ -166,7 +167,8 @@ def emulate(
         runs = runs.joined(new)
         emulated = fitted_cost(prior, observations, degree, runs, 2 * n)
     settled = emulated.walk(walkers, kept, random, SETTLED)
-    ceiling = float(np.min(runs.costs - _prior_cost(prior, runs.x))) + CEILING
+    narrowed = prior.log_det_root - np.linalg.slogdet(coordinates.root)[1]
+    ceiling = float(np.min(runs.costs - _prior_cost(prior, runs.x)) + CEILING + max(0.0, narrowed))
     return replace(emulated, ceiling=ceiling, share=share, draws=np.concatenate(settled[SETTLED // 3 :]))
 
 

@@ -155,7 +155,7 @@ def _gas_at_wall(model: Dynamics, par: Array, column: Mapping[str, Array], theta
     diffusion = par[:, rows.DIFFUSION] * (par[:, rows.AMBIENT] * rho / p) ** power[0] * theta ** power[1]
     crossing = par[:, rows.CROSSING] * np.sqrt(theta) * R / diffusion
     saturation = par[:, rows.SATURATION] * rho * np.exp(-par[:, rows.SATURATION_T] / theta)
-    half, inside = (crossing * (saturation / p - 1) + slope[-1]) / 2, gas_fraction @ slope[:-1]
+    half, inside = (crossing * (saturation / p - 1) + slope[-1]) / 2, (gas_fraction * slope[:-1]).sum(axis=1)
     root = np.sqrt(np.maximum(half**2 - crossing * inside, 0.0))
     return np.asarray(np.where(half > 0, -inside / (half + root), (root - half) / np.maximum(crossing, 1e-300)))
 

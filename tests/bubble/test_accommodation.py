@@ -10,6 +10,8 @@ from oracle_full import p_sat
 from reference_cases import LASER, NEO_HOOKEAN
 
 from en4dvar.config import load_config
+from en4dvar.plumbing.errors import ConfigError
+from en4dvar.runs.runner import run
 from en4dvar_bubble import WATER_25C, Accuracy, BubbleModel, get_law, simulate
 from en4dvar_bubble.gas import GAS_CONSTANT, mole_fraction
 from en4dvar_bubble.solver.collocation import ball
@@ -123,3 +125,67 @@ def test_from_yaml_fixed_or_estimated(tmp_path, value):
     assert "accommodation" in [p.name for p in model.parameters]
     assert model.system.kinetic
     assert not replace(model, vapour="frozen").system.kinetic
+
+
+WATER = """\
+name: water
+seed: 1
+data:
+  path: radii.csv
+  columns: {time: {name: t, unit: us}, radius: {name: R, unit: um}}
+  error: {radius_std: 2 % of maximum}
+model:
+  name: "MODEL"
+  law: newtonian
+  start: laser
+  vapour: transport
+  medium_heat: conducting
+  radial: gilmore
+parameters:
+  mu: {prior: lognormal, median: 2 mPa s, log_std: 0.5}
+  R_eq: {prior: lognormal, median: 60 um, log_std: 0.3}
+  R_max: {prior: normal, mean: 1200 um, std: 1 %}
+  accommodation: {prior: lognormal, median: 0.2, log_std: 0.5}
+assimilation: {members: 24, max_iterations: 1, emulator: "off", refine: none, what_if: false}
+output: {report: false}
+"""
+
+
+class Unsure(BubbleModel):
+    """A bubble whose radii of the start are wrong by 1e-6, otherwise each time."""
+
+    def prepared(self, x, times, t0=0.0):
+        return super().prepared(x * (1 + 1e-6 * np.random.default_rng().standard_normal((len(x), 1))), times, t0)
+
+
+@pytest.mark.parametrize("radial", ["keller-miksis", "gilmore"])
+def test_members_do_not_influence_each_other(radial):
+    """The collapse of a bubble in water makes 1e-6 of R_max of the last digit of Y_w at time zero."""
+    law, random = get_law("newtonian"), np.random.default_rng(1)
+    options = {"start": "laser", "vapour": "transport", "medium_heat": "conducting", "radial": radial}
+    model = BubbleModel(law=law, **options).with_parameters(["accommodation"])
+    spread = {"mu": (2e-3, 0.5), "R_eq": (60e-6, 0.3), "R_max": (1.2e-3, 0.01), "accommodation": (0.2, 0.5)}
+    x = model.initial_states({k: a * np.exp(b * random.standard_normal(16)) for k, (a, b) in spread.items()})
+    times = np.broadcast_to(np.linspace(0, 300e-6, 61), (16, 61))
+    together = model.integrate(x, times)
+    for i in range(16):
+        alone = model.integrate(x[i : i + 1], times[:1])
+        for name in ("R", "p_b", "C", "T_m"):
+            np.testing.assert_array_equal(alone[name][0], together[name][i], name)
+
+
+@pytest.mark.parametrize("sure", [True, False])
+def test_run_accepts_what_is_not_random(tmp_path, sure):
+    times = np.linspace(0, 300, 31)
+    radii = simulate(
+        "newtonian", {"mu": 2e-3, "R_eq": 60e-6, "R_max": 1.2e-3}, times * 1e-6, start="laser", gas="polytropic"
+    ).R.values[0]
+    rows = [f"{t:.6g},{R * 1e6:.6g}" for t, R in zip(times, radii, strict=True)]
+    (tmp_path / "radii.csv").write_text("\n".join(["t,R", *rows, ""]))
+    (tmp_path / "water.yaml").write_text(WATER.replace("MODEL", "bubble" if sure else "test_accommodation:Unsure"))
+    config = load_config(tmp_path / "water.yaml", {"output.directory": str(tmp_path / "run")})
+    if sure:
+        assert np.isfinite(run(config).posterior["mu"]).all()
+    else:
+        with pytest.raises(ConfigError, match="the model gives other numbers when a member is run again"):
+            run(config)

@@ -17,7 +17,7 @@ from en4dvar.model.state import NOISE_SCALE
 from en4dvar.priors.prior import PriorTerm
 from en4dvar.sampling import mcmc
 from en4dvar.sampling.emulated_cost import emulate, needed_runs
-from en4dvar.sampling.shape import guide
+from en4dvar.sampling.shape import CLEARED, guide
 from en4dvar.sampling.walkers import advance
 from en4dvar.schemes.settings import AssimilationSettings
 
@@ -72,6 +72,24 @@ def test_emulator_of_an_estimated_noise_scale():
     emulator = emulated(problem)
     x = prior.mean + 0.3 * prior.std * np.random.default_rng(5).standard_normal((50, 3))
     assert_emulated(emulator, problem, np.concatenate([x, emulator.draws[::50]]))
+
+
+def test_walkers_stay_where_data_narrow_a_lot():
+    """Six parameters of a linear model; against the posterior in closed form. The prior has e^41 times its volume."""
+    std, problem = 0.002, make_problem(Linear(tuple("abcdef")), [1.0, 0.5, 0.2, 0.9, 0.4, 0.7], std=0.002, k=40)
+    prior, readings = problem.prior, problem.observations.values
+    at = forecast(problem, np.vstack([prior.mean, prior.mean + np.eye(6)])).predictions
+    H = (at[1:] - at[0]).T
+    covariance = np.linalg.inv(np.diag(prior.std**-2) + H.T @ H / std**2)
+    mean, stds = prior.mean + covariance @ H.T @ (readings - at[0]) / std**2, np.sqrt(np.diag(covariance))
+    assert np.sum(np.log(prior.std)) - 0.5 * np.linalg.slogdet(covariance)[1] > 40
+    random = np.random.default_rng(2)
+    ensemble = mean + random.standard_normal((48, 6)) @ np.linalg.cholesky(covariance).T
+    made = emulate(lambda x: forecast(problem, x), prior, problem.observations, ensemble, random)
+    apart = (made.settled(np.random.default_rng(5)).draws - mean) / stds
+    assert np.abs(apart).max() < 6
+    assert apart.mean(axis=0) == pytest.approx(np.zeros(6), abs=0.15)
+    assert apart.std(axis=0) == pytest.approx(np.ones(6), abs=0.1)
 
 
 def test_no_emulator_of_many_parameters_or_few_survivors():
@@ -169,11 +187,44 @@ def test_the_emulator_is_for_cheap_models_unless_asked_for(nothing_cleared):
     assert "mean_shift" not in assimilate(fast, replace(settings, emulator="off"), 1).shape
 
 
-def test_a_gaussian_posterior_costs_no_more_runs():
+def test_a_gaussian_posterior_costs_no_more_runs_than_it_has_members():
     problem = make_problem(Linear(("a", "b"), compiled=True), [1.0, 0.5])
     analysis = assimilate(problem, AssimilationSettings(), 1)
-    assert set(analysis.shape) == {"gaussian_fit", "non_gaussian"}
+    assert set(analysis.shape) == {"gaussian_fit", "non_gaussian", "tail_ratio"}
     assert not analysis.shape["non_gaussian"]
+    assert analysis.shape["tail_ratio"] == pytest.approx(1, abs=1e-6)
+    assert analysis.forward_runs == assimilate(problem, AssimilationSettings(refine="none"), 1).forward_runs + 48
+
+
+class Kinked(Toy):
+    """y = a + g t with g = b above zero and b/5 below."""
+
+    def curve(self, theta, t):
+        return float(theta[0] + self.rate(theta, t) * t)
+
+    def rate(self, theta, t):
+        return float(max(theta[1], 0.2 * theta[1]))
+
+
+def test_a_tail_beyond_a_kink_that_no_member_has_reached():
+    """Against the posterior on a grid: two standard deviations from the mode J rises a fifth as steeply."""
+    problem = make_problem(Kinked(("a", "b"), compiled=True), [1.0, 0.15], std=0.15, seed=3)
+    prior, observations = problem.prior, problem.observations
+    axes = [m + s * np.linspace(-6, 6, 801) for m, s in zip(prior.mean, prior.std, strict=True)]
+    a, b = (axis.ravel() for axis in np.meshgrid(*axes))
+    residuals = [
+        y - a - np.where(b > 0, b, b / 5) * t for t, y in zip(observations.times, observations.values, strict=True)
+    ]
+    z = np.stack([(x - m) / s for x, m, s in zip((a, b), prior.mean, prior.std, strict=True)])
+    J = 0.5 * np.sum(np.square(residuals), axis=0) / 0.15**2 + 0.5 * np.sum(z**2, axis=0)
+    p = np.exp(J.min() - J)
+    mean, std = np.average(b, weights=p), np.sqrt(np.cov(b, aweights=p))
+    for refine, right in (("none", False), ("auto", True)):
+        found = assimilate(problem, AssimilationSettings(refine=refine), 1)
+        members = prior.from_physical(found.posterior)[:, 1]
+        assert (abs(members.std(ddof=1) / std - 1) < 0.1) == right
+        assert (abs(members.mean() - mean) < 0.1 * std) == right
+        assert refine == "auto" or found.shape["gaussian_fit"] > CLEARED
 
 
 def test_shape_has_the_same_bits_for_any_workers():

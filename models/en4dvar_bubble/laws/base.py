@@ -11,6 +11,7 @@ kernel does not change.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any, ClassVar
 
 import numpy as np
@@ -164,11 +165,7 @@ class ConstitutiveLaw:
         if samples is not None:
             return from_values(samples)
         if self.sharp:
-            tables = [
-                self.refined({name: v[i : i + 1] for name, v in values.items()}).table for i in range(members(values))
-            ]
-            most = max(map(len, tables))
-            return np.stack([np.pad(table, ((0, most - len(table)), (0, 0))) for table in tables])
+            return _kept(self, tuple(values), np.stack([*values.values()], dtype=float).tobytes()).copy()
         p = columns(values)
         with np.errstate(all="ignore"):
             return from_strain_energy(lambda stretch: self.strain_energy_rate(stretch, p), members(values))
@@ -238,6 +235,17 @@ class Liquid(ConstitutiveLaw):
 
     def stress(self, stretch: Array, p: Values) -> Array:
         return np.zeros_like(stretch)
+
+
+@lru_cache(maxsize=2)  # who reads the stress of a path, or runs it again, asks for the same
+def _kept(law: ConstitutiveLaw, names: tuple[str, ...], numbers: bytes) -> Array:
+    """The table of a sharp law for parameters ``names`` (n,) and the ``numbers`` (n, N) of members."""
+    tables = [
+        law.refined(dict(zip(names, member[:, None], strict=True))).table
+        for member in np.frombuffer(numbers).reshape(len(names), -1).T
+    ]
+    most = max(map(len, tables))
+    return np.stack([np.pad(table, ((0, most - len(table)), (0, 0))) for table in tables])
 
 
 def members(values: Mapping[str, Array]) -> int:

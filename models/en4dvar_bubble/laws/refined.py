@@ -40,16 +40,16 @@ def refine(function: Callable[[Array], Array], slope: bool) -> Refined:
     """
     points = _GAUSS if slope else _SPREAD
     fit = np.linalg.inv(points[:, None] ** _POWERS[: len(points)])
+    asked, to_checked = np.append(points, _CHECKED), (_CHECKED[:, None] ** _POWERS[: len(points)]).T
     left = GRID.origin + GRID.step * np.arange(GRID.cells)
     places, records, inexact = np.arange(GRID.cells), np.zeros((GRID.cells, 8)), []
     central = floor = 0.0
     for level in range(HALVINGS + 1):
         width = GRID.step * 0.5**level
-        values, exact = (
-            np.reshape(function((left[:, None] + width * at).ravel()), (len(left), -1)) for at in (points, _CHECKED)
-        )
+        both = np.reshape(function((left[:, None] + width * asked).ravel()), (len(left), -1))
+        values, exact = both[:, : len(points)], both[:, len(points) :]
         made = values @ fit.T
-        difference = made @ (_CHECKED[:, None] ** _POWERS[: len(points)]).T - exact
+        difference = made @ to_checked - exact
         error, size = np.abs(difference).max(axis=1), np.abs(exact).max(axis=1)
         if level == 0:
             central = _largest(size[np.abs(left) < np.log(2)])
