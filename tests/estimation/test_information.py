@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from toys import Linear, Vectorised, Wave, make_observations
 
+from en4dvar.assembly.build import build
+from en4dvar.config import load_config
+from en4dvar.ensemble.forecast import Composite
 from en4dvar.estimation.design.evaluate import SampleSizes, evaluate
 from en4dvar.estimation.design.laplace import expected
 from en4dvar.estimation.design.nested import nested
@@ -17,6 +22,7 @@ from en4dvar.priors.dependence import Dependence
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
 
+CONFIGS = Path(__file__).parents[2] / "configs"
 MEAN, STD = (0.5, -0.5, 0.2), (0.8, 1.2, 0.9)
 CORRELATION = np.array([[1, 0.6, 0], [0.6, 1, -0.3], [0, -0.3, 1]])
 CASES = [(5.0, (), False), (0.5, (), False), (0.03, (), True), (0.5, ("b",), False), (0.05, ("c", "a"), True)]
@@ -98,37 +104,83 @@ def test_what_is_not_linear():
     assert _linearised(planned, planned.draws(300, 1)).gain > brute + 5 * error  # which is why there is another way
 
 
+def by_quadrature(values, log_prior, grid, truths, predicted, std):
+    """Mean and standard deviation of the posterior's std of w and of the gain about it, over readings of ``truths``
+    (R,) of w that are ``predicted`` (R, K): ``values`` (A,) of w, log masses (A, B) and predictions (A, B, K).
+    """
+    rng, numbers, of_prior = np.random.default_rng(0), [], np.logaddexp.reduce(log_prior, axis=1)
+    for own, at in zip(truths, predicted, strict=True):
+        y = at + std * rng.standard_normal(len(at))
+        of_w = np.logaddexp.reduce(log_prior - 0.5 * np.sum(((y - grid) / std) ** 2, axis=2), axis=1)
+        log = np.logaddexp.reduce(of_w)
+        shares = np.exp(of_w - log)
+        gain = np.interp(own, values, of_w - of_prior) - log
+        numbers.append((np.sqrt(shares @ (values - shares @ values) ** 2), gain))
+    return np.mean(numbers, axis=0), np.std(numbers, axis=0)
+
+
+def masses(*axes):
+    """Log masses (A, B) of N(0, 1) of two coordinates."""
+    logs = -0.5 * np.square(axes[0])[:, None] - 0.5 * np.square(axes[1])
+    return logs - np.logaddexp.reduce(logs, axis=None)
+
+
 def sine(p, t):
     return np.sin(p["w"] * t + p["f"])
 
 
-@pytest.mark.parametrize("std", [0.5, 0.1])
-def test_what_would_be_known_where_readings_allow_several_minima(std):
-    """sin(ωt + φ), ω ± 50 %: the posterior std by quadrature over 60 000 cells, for readings of its own."""
+def decay(p, t):
+    return p["f"] * np.exp(-p["w"] * t)
+
+
+@pytest.mark.parametrize(
+    ("curve", "mean", "prior_std", "std"),
+    [(sine, (2.0, 0.0), (1.0, 0.3), 0.5), (sine, (2.0, 0.0), (1.0, 0.3), 0.1), (decay, (1.0, 1.0), (0.4, 1.0), 0.2)],
+)
+def test_what_would_be_known_where_readings_allow_several_minima(curve, mean, prior_std, std):
+    """sin(ωt + φ), ω ± 50 %, and a decay whose size may be of either sign: by quadrature over 60 000 cells."""
     t = np.array([1.0, 2.5, 4.0, 5.0])
-    model = FunctionModel(sine, [Parameter("w", "1"), Parameter("f", "1")], {"y": "1"})
-    prior = Prior(
-        tuple(PriorTerm.normal(p, m, s) for p, m, s in zip(model.parameters, (2.0, 0.0), (1.0, 0.3), strict=True))
-    )
+    model = FunctionModel(curve, [Parameter("w", "1"), Parameter("f", "1")], {"y": "1"})
+    prior = Prior(tuple(PriorTerm.normal(p, m, s) for p, m, s in zip(model.parameters, mean, prior_std, strict=True)))
     data = make_observations(t, np.zeros(4), std=std)
     problem = InverseProblem(model, model.observables[0], data, prior)
     (found,) = evaluate(problem, ["w"], SampleSizes(draws=200, simulated=100, inner=400), "nested", 1)
 
-    w, f = np.linspace(-3.0, 7.0, 1001), np.linspace(-1.2, 1.2, 61)
-    grid = np.sin(w[:, None, None] * t + f[:, None])
-    log_prior = -0.5 * ((w - 2.0)[:, None] ** 2 + (f / 0.3) ** 2)
-    rng, stds = np.random.default_rng(0), []
-    for _ in range(150):
-        y = np.sin((2 + rng.standard_normal()) * t + 0.3 * rng.standard_normal()) + std * rng.standard_normal(4)
-        log = log_prior - 0.5 * np.sum(((y - grid) / std) ** 2, axis=2)
-        of_w = np.exp(log - log.max()).sum(axis=1)
-        of_w /= of_w.sum()
-        stds.append(np.sqrt(of_w @ (w - of_w @ w) ** 2))
-    error = np.std(stds) * np.hypot(1 / np.sqrt(150), 1 / np.sqrt(100))
-    assert found.std[0] == pytest.approx(np.mean(stds), abs=2 * error)
-    assert found.ratio[0] == pytest.approx(found.std[0], rel=1e-9)  # the prior's is 1
-    (tangent,) = evaluate(problem, ["w"], SampleSizes(), "laplace", 1)
-    assert tangent.std[0] < 0.7 * found.std[0]
+    z = np.linspace(-5.0, 5.0, 1001), np.linspace(-4.0, 4.0, 61)
+    w, f = (m + s * of for m, s, of in zip(mean, prior_std, z, strict=True))
+    grid = curve({"w": w[:, None, None], "f": f[:, None]}, t)
+    own = np.array(mean) + np.array(prior_std) * np.random.default_rng(1).standard_normal((150, 2))
+    predicted = curve({"w": own[:, :1], "f": own[:, 1:]}, t)
+    expected, apart = by_quadrature(w, masses(*z), grid, own[:, 0], predicted, std)
+    error = apart * np.hypot(1 / np.sqrt(150), 1 / np.sqrt(100))
+    assert found.std[0] == pytest.approx(expected[0], abs=2 * error[0])
+    assert found.gain == pytest.approx(expected[1], abs=2 * np.hypot(apart[1] / np.sqrt(150), found.error))
+    assert found.ratio[0] == pytest.approx(found.std[0] / prior_std[0], rel=1e-9)
+    if curve is sine:
+        (tangent,) = evaluate(problem, ["w"], SampleSizes(), "laplace", 1)
+        assert tangent.std[0] < 0.7 * found.std[0]
+
+
+@pytest.mark.slow
+def test_what_would_be_known_of_a_bubble():
+    """G of a polytropic bubble with μ unknown, by quadrature over 201 × 201 runs and 600 sets of readings."""
+    parameters = {
+        "G": {"prior": "lognormal", "median": "2 kPa", "log_std": 0.8},
+        "mu": {"prior": "lognormal", "median": "0.1 Pa s", "log_std": 0.5}, "R0": "0.5 um",
+    }  # fmt: skip
+    asked = {"model.law": "neo-hookean-kelvin-voigt", "model.gas": "polytropic", "data.error.radius_std": "6 um"}
+    (problem,) = build(load_config(CONFIGS / "quickstart.yaml", {"parameters": parameters, **asked}))
+    (found,) = evaluate(problem, ["G"], SampleSizes(draws=200, simulated=100, inner=200), "nested", 1)
+    z = np.linspace(-4.0, 4.0, 201)
+    cells = np.stack(np.meshgrid(z, z, indexing="ij"), axis=-1).reshape(-1, 2)
+    x = problem.prior.from_white(np.vstack([cells, np.random.default_rng(1).standard_normal((600, 2))]))
+    values, g = Composite(problem)(x).predictions, problem.prior.to_physical(x)[:, 0]
+    grid, own = values[: len(cells)].reshape(201, 201, -1), slice(len(cells), None)
+    expected, apart = by_quadrature(
+        g[: len(cells) : 201], masses(z, z), grid, g[own], values[own], problem.observations.std
+    )
+    assert found.std[0] == pytest.approx(expected[0], abs=2 * apart[0] * np.hypot(1 / np.sqrt(600), 1 / np.sqrt(100)))
+    assert found.gain == pytest.approx(expected[1], abs=2 * np.hypot(apart[1] / np.sqrt(600), found.error))
 
 
 def test_experiments_alike_share_what_is_asked():
