@@ -8,7 +8,7 @@
     python benchmarks/calibration.py proposed          the same, gas of ``init``: heat, vapour, conducting medium
     python benchmarks/calibration.py b --minutes 4     a piece of it: records are kept and the next call goes on
 
-Over ``--n`` experiments: rank histograms of every parameter uniform (chi-squared, p > 0.01), central 50 and 90 %
+Over ``--n`` experiments: ranks of every parameter uniform (as `en4dvar calibrate` tests them, p > 0.01), central 50 and 90 %
 intervals cover within binomial error (p > 0.01), standard deviation of the z-scores in [0.9, 1.1]. Intervals are those
 between members that hold 25 and 45 of the 49 ranks. The records of b are also those of case c
 (benchmarks/gaussianity.py).
@@ -23,10 +23,11 @@ import numpy as np
 from acoustic_twin import NARROW, WIDE, make_twin, prior, through_the_collapse
 from laser_twin import PROPOSED, laser_prior, make_laser_twin, stiff_gel
 from records import Record, fill
-from scipy.stats import binomtest, chisquare
+from scipy.stats import binomtest
 from worlds import Twin
 
 from en4dvar.descent.weight_space import WeightSpace
+from en4dvar.diagnosis.ranks import uniform_ranks
 from en4dvar.ensemble.forecast import log_posterior
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.executor import SerialExecutor
@@ -35,7 +36,6 @@ from en4dvar.sampling import mcmc
 from en4dvar.sampling.shape import guide
 from en4dvar.schemes.settings import AssimilationSettings
 
-BINS = 7  # of 49 ranks
 CENTRAL = (25, 45)  # of 49 ranks: the central intervals nearest to 50 and 90 %
 CHAINS = 20  # runs of case a that are compared with a chain
 CLOSE = (0.3, 0.15)  # mean by standard deviations of the chain, std by a fraction
@@ -133,10 +133,10 @@ def table(records: list[Record], names: tuple[str, ...]) -> None:
     # between two members lies a whole number of the 49 ranks: 25 of them make 51.0 %, 45 of them 91.8 %
     within = {ranks / (members + 1): 2 * np.abs(rank - members / 2) < ranks for ranks in CENTRAL}
     heads = " | ".join(f"inside {share:.1%}" for share in within)
-    print(f"| parameter | rank histogram p | std of z | mean of z | {heads} | |")
+    print(f"| parameter | p of uniform ranks | std of z | mean of z | {heads} | |")
     print("|---|---|---|---|---|---|---|")
     for j, name in enumerate(names):
-        p = chisquare(np.histogram(rank[:, j], bins=BINS, range=(-0.5, members + 0.5))[0]).pvalue
+        p = uniform_ranks(len(good), members).p_value(rank[:, j])
         spread = z[:, j].std(ddof=1)
         inside = [int(np.sum(each[:, j])) for each in within.values()]
         passed = p > LEVEL and 0.9 <= spread <= 1.1
