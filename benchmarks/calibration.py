@@ -8,9 +8,9 @@
     python benchmarks/calibration.py proposed          the same, gas of ``init``: heat, vapour, conducting medium
     python benchmarks/calibration.py b --minutes 4     a piece of it: records are kept and the next call goes on
 
-Over ``--n`` experiments: ranks of every parameter uniform (as `en4dvar calibrate` tests them, p > 0.01), central 50 and 90 %
-intervals cover within binomial error (p > 0.01), standard deviation of the z-scores in [0.9, 1.1]. Intervals are those
-between members that hold 25 and 45 of the 49 ranks. The records of b are also those of case c
+Over ``--n`` experiments: ranks of every parameter uniform (as ``en4dvar calibrate`` tests them, p > 0.01), central 50
+and 90 % intervals cover within binomial error (p > 0.01), standard deviation of the z-scores in [0.9, 1.1]. Intervals
+are those between members that hold 25 and 45 of the 49 ranks. The records of b are also those of case c
 (benchmarks/gaussianity.py).
 """
 
