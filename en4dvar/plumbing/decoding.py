@@ -10,7 +10,6 @@ import atexit
 import os
 import pickle
 import signal
-import struct
 import subprocess
 import sys
 import threading
@@ -28,7 +27,6 @@ from en4dvar.plumbing.files import here, in_bytes, open_plain
 T = TypeVar("T")
 Decoder = Callable[..., Iterator[Any]]
 DOUBT = "it is damaged, or not what it says it is"
-_SIZE = struct.Struct("<Q")
 _VALUE, _END, _FAULT = range(3)
 _idle: "list[_Child]" = []
 _changing = threading.Lock()
@@ -127,8 +125,8 @@ class _Child(Child):
         """The next message. Raises :class:`DataError` where the child is gone."""
         assert self.process.stdout is not None
         try:
-            return _read(self.process.stdout)
-        except (EOFError, OSError):
+            return pickle.load(self.process.stdout)
+        except (EOFError, OSError, pickle.UnpicklingError):  # the latter where it ended within an answer
             status = self.wait(None)
         if hasattr(signal, "SIGXCPU") and status == -signal.SIGXCPU:
             words = f"takes more than {allowed.seconds} s of processor time to be read"
@@ -153,22 +151,8 @@ def _named(status: int) -> str:
 
 
 def _write(pipe: IO[bytes], message: Any) -> None:
-    content = pickle.dumps(message, protocol=5)
-    pipe.write(_SIZE.pack(len(content)))
-    pipe.write(content)
+    pipe.write(pickle.dumps(message, protocol=5))  # all of it or, where it cannot be pickled, nothing
     pipe.flush()
-
-
-def _read(pipe: IO[bytes]) -> Any:
-    """Raises EOFError."""
-    head = pipe.read(_SIZE.size)
-    if len(head) < _SIZE.size:
-        raise EOFError
-    (size,) = _SIZE.unpack(head)
-    content = pipe.read(size)
-    if len(content) < size:
-        raise EOFError
-    return pickle.loads(content)
 
 
 def serve() -> None:
@@ -177,9 +161,9 @@ def serve() -> None:
     requests, answers = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
     nowhere = os.open(os.devnull, os.O_RDWR)
     os.dup2(nowhere, 1)  # what a library prints is no answer
-    with suppress(EOFError, OSError):
+    with suppress(EOFError, OSError, pickle.UnpicklingError):
         while True:
-            name, arguments, allowed, folder = _read(requests)
+            name, arguments, allowed, folder = pickle.load(requests)
             with suppress(OSError):  # names of files mean what they mean there
                 os.chdir(folder)
             _write(answers, _served(name, arguments, allowed, answers))

@@ -22,20 +22,12 @@ class Described(BaseModel):
     def __get_pydantic_json_schema__(cls, core_schema: Any, handler: Any) -> dict[str, Any]:
         schema: dict[str, Any] = handler(core_schema)
         keys = handler.resolve_ref_schema(schema)["properties"]
-        for name, text in _texts(cls).items():
-            field = cls.model_fields.get(name)
-            if field and field.description is None:
-                keys[field.alias or name]["description"] = text
+        for kind in reversed([kind for kind in cls.__mro__ if issubclass(kind, Described)]):
+            for name, text in _texts_of(kind.__module__).get(kind.__qualname__, {}).items():
+                field = cls.model_fields.get(name)
+                if field and field.description is None:
+                    keys[field.alias or name]["description"] = text
         return schema
-
-
-def _texts(section: type) -> dict[str, str]:
-    """Key → text below it, in the class or the nearest of those that it inherits from."""
-    texts: dict[str, str] = {}
-    for kind in reversed(section.__mro__):
-        if issubclass(kind, Described):
-            texts |= _texts_of(kind.__module__).get(kind.__qualname__, {})
-    return texts
 
 
 @cache
@@ -50,7 +42,6 @@ def _texts_of(module: str) -> dict[str, dict[str, str]]:
 
 def _below(kind: ast.ClassDef) -> Iterator[tuple[str, str]]:
     for key, text in pairwise(kind.body):
-        if isinstance(key, ast.AnnAssign) and isinstance(key.target, ast.Name) and isinstance(text, ast.Expr):
-            words = text.value.value if isinstance(text.value, ast.Constant) else None
-            if isinstance(words, str):
-                yield key.target.id, cleandoc(words)
+        match key, text:
+            case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(words))):
+                yield name, cleandoc(words)

@@ -15,16 +15,15 @@ import os
 import stat
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import numba
-from filelock import lock_descriptor
+from filelock import FileLock
 from llvmlite.binding import get_host_cpu_features, get_host_cpu_name
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile, _CacheLocator
 from numba.core.compiler_lock import global_compiler_lock
@@ -34,7 +33,6 @@ from en4dvar.plumbing.errors import OutputError
 
 CACHE = "NUMBA_CACHE_DIR"
 PATIENCE = 120.0  # s that a process waits for another one's compilation, which may have been stopped
-LOOKS = 0.05  # s between two looks
 
 
 class SignatureFiles(IndexDataCacheFile):
@@ -205,26 +203,9 @@ def _without_collection() -> Iterator[None]:
 
 @contextmanager
 def _held(path: Path) -> Iterator[None]:
-    """Within, no other process is; without such a file, or after :data:`PATIENCE`, another one may be."""
-    with suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        file = os.open(path, os.O_WRONLY | os.O_CREAT, 0o600)
-    except OSError:  # a folder of somebody else's
+    """Within, no other process is; where files cannot be locked, or after :data:`PATIENCE`, another one may be."""
+    with ExitStack() as stack:
+        with suppress(OSError):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            stack.enter_context(FileLock(path, timeout=PATIENCE, mode=0o600))
         yield
-        return
-    try:
-        end = time.monotonic() + PATIENCE
-        while not _locked(file) and time.monotonic() < end:
-            time.sleep(LOOKS)
-        yield
-    finally:
-        os.close(file)  # the lock with it, as at the death of the process
-
-
-def _locked(file: int) -> bool:
-    """Whether the file is locked for us now; where files cannot be locked, nobody is waited for."""
-    try:
-        return lock_descriptor(file, blocking=False)
-    except OSError:
-        return True

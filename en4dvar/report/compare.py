@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
+from scipy.special import softmax
 
 from en4dvar.data.observations import Observations
 from en4dvar.diagnosis.diagnostics import member_quantiles
@@ -210,12 +211,6 @@ def preferred(best: str, second: str, by: float) -> str:
     return f"{best} is preferred: log-evidence {by:.2f} above {second}"
 
 
-def model_probabilities(log_evidence: Array) -> Array:
-    """Posterior probabilities (M,) of models with log-evidences (M,) and equal prior probabilities."""
-    weights = np.exp(log_evidence - np.max(log_evidence))
-    return np.asarray(weights / weights.sum())
-
-
 def comparison_table(comparison: Comparison) -> str:
     """What the terminal shows: one row a model and data set, and the verdict on each data set."""
     header = ("data set", "run", "log-evidence", "difference", "probability", "chi2/K", "DFS", "NRMSE")
@@ -365,5 +360,5 @@ def _ranked(scores: Sequence[ModelScore]) -> list[ModelScore]:
     evidence = np.array([s.log_evidence for s in scores])
     return [
         replace(s, difference=float(s.log_evidence - evidence.max()), probability=float(p))
-        for s, p in zip(scores, model_probabilities(evidence), strict=True)
+        for s, p in zip(scores, softmax(evidence), strict=True)  # the models are equally probable before the data
     ]

@@ -10,10 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.special import softmax
 
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.tables import table
-from en4dvar.report.compare import model_probabilities, named, preferred
+from en4dvar.report.compare import named, preferred
 from en4dvar.results.netcdf import Group
 from en4dvar.results.series_file import read_series, series_file
 
@@ -45,7 +46,7 @@ def compare_sequences(run_dirs: Sequence[Path]) -> tuple[SequenceScore, ...]:
         if not all(_same(reference, other, key) for key in READINGS):
             raise OutputError(f"{name} and {first} hold other readings or errors: their evidences cannot be compared")
     evidence = np.array([float(data.attrs["log_evidence"]) for data in runs.values()])
-    each = zip(runs.items(), evidence, model_probabilities(evidence), strict=True)
+    each = zip(runs.items(), evidence, softmax(evidence), strict=True)
     return tuple(
         SequenceScore(run, str(data.attrs["scheme"]), float(log), float(log - evidence.max()), float(p), _size(data))
         for (run, data), log, p in each

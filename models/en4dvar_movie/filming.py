@@ -6,16 +6,18 @@ The settings are the fields of :class:`Camera` and of :class:`Scene`, which hold
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, get_type_hints
 
 import numpy as np
+from annotated_types import Ge, Gt
+from pydantic import BeforeValidator, TypeAdapter, ValidationError
 
 from en4dvar.model.state import Array
-from en4dvar.plumbing.errors import ConfigError, retold
+from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.hints import suggest
-from en4dvar.plumbing.units import UnitError, parse_quantity
+from en4dvar.plumbing.units import Quantity
 from en4dvar_movie.flashes import parse_flashes
 from en4dvar_movie.scene import Scene, render
 from en4dvar_movie.writing import require_suffix, write_movie
@@ -24,16 +26,17 @@ if TYPE_CHECKING:
     from en4dvar.config import Config
 
 INSTANTS = 9  # of an exposure
+Instants = Annotated[tuple[float, ...], BeforeValidator(parse_flashes)]
 
 
 @dataclass(frozen=True)
 class Camera:
     """The camera, which turns metres and seconds into pixels and frames."""
 
-    pixel: Annotated[float, "m", "size of a pixel"] = 2e-6
-    exposure: Annotated[float, "s", "how long light falls on a frame, or how long a flash is"] = 0.0
-    jitter: Annotated[float, "s", "std of the error of each frame's instant"] = 0.0
-    flashes: Annotated[tuple[float, ...], "flashes of a frame after its instant, such as 0 us, 2 us"] = (0.0,)
+    pixel: Annotated[float, "size of a pixel", Quantity("m"), Gt(0)] = 2e-6
+    exposure: Annotated[float, "how long light falls on a frame, or how long a flash is", Quantity("s"), Ge(0)] = 0.0
+    jitter: Annotated[float, "std of the error of each frame's instant", Quantity("s"), Ge(0)] = 0.0
+    flashes: Annotated[Instants, "flashes of a frame after its instant, such as 0 us, 2 us"] = (0.0,)
 
 
 def film(config: Config, times: Array | None, out: Path, settings: Mapping[str, str], seed: int) -> str:
@@ -79,19 +82,17 @@ def exposures(times: Array, camera: Camera) -> Array:
 
 def parse_settings(settings: Mapping[str, str]) -> tuple[Camera, Scene]:
     """Camera and scene of text values. Raises :class:`ConfigError` that says what there is."""
-    camera, scene = Camera(), Scene()
-    for key, text in settings.items():
-        for target in (camera, scene):
-            if key in {f.name for f in fields(target)}:
-                break
-        else:
-            known = [f.name for kind in (Camera, Scene) for f in fields(kind)]
-            raise ConfigError(f"movie: no setting {key!r}{suggest(key, known)}; there are:\n" + "\n".join(described()))
-        with retold((ValueError, UnitError), ConfigError, f"movie: {key}={text}: "):
-            changed = {key: _read(key, text, target)}
-        camera = replace(camera, **changed) if target is camera else camera
-        scene = replace(scene, **changed) if target is scene else scene
-    return camera, _checked(scene)
+    kinds = {f.name: kind for kind in (Camera, Scene) for f in fields(kind)}
+    for key in settings:
+        if key not in kinds:
+            raise ConfigError(f"movie: no setting {key!r}{suggest(key, kinds)}; there are:\n" + "\n".join(described()))
+    of_camera, of_scene = ({k: v for k, v in settings.items() if kinds[k] is kind} for kind in (Camera, Scene))
+    try:
+        return TypeAdapter(Camera).validate_python(of_camera), TypeAdapter(Scene).validate_python(of_scene)
+    except ValidationError as error:
+        fault = error.errors()[0]
+        key, words = str(fault["loc"][0]), fault["msg"].removeprefix("Value error, ")
+        raise ConfigError(f"movie: {key}={settings[key]} cannot be filmed: {words}") from None
 
 
 def described() -> Iterator[str]:
@@ -100,42 +101,7 @@ def described() -> Iterator[str]:
         hints = get_type_hints(kind, include_extras=True)
         for f in fields(kind):
             default = "x".join(map(str, f.default)) if isinstance(f.default, tuple) else f.default
-            unit = {"m": " m", "s": " s"}.get(hints[f.name].__metadata__[0], "")
-            yield f"  {f.name}: {hints[f.name].__metadata__[-1]} (default {default}{unit})"
-
-
-def _read(key: str, text: str, target: Any) -> Any:
-    """A value of a field from text. Raises ValueError, UnitError."""
-    hint = get_type_hints(type(target), include_extras=True)[key]
-    if len(hint.__metadata__) == 2:  # a quantity
-        value = parse_quantity(text, hint.__metadata__[0])
-        if not value >= 0 or (key == "pixel" and not value > 0):
-            raise ValueError("must be positive")
-        return value
-    if key == "flashes":
-        return parse_flashes(text)
-    if key in ("shape", "bubble"):
-        kind, sign = (int, "x") if key == "shape" else (float, ",")
-        parts = tuple(kind(part) for part in text.split(sign))
-        if len(parts) != 2:
-            raise ValueError(f"two numbers with {sign!r} between them")
-        return parts[::-1] if key == "shape" else parts  # WIDTHxHEIGHT, as --raw
-    return hint.__origin__(text)
-
-
-def _checked(scene: Scene) -> Scene:
-    """The scene, where it can be filmed. Raises :class:`ConfigError`."""
-    faults = {
-        "shape": min(scene.shape) < 16 or max(scene.shape) > 8192,
-        "bits": scene.bits not in (8, 16),
-        "contrast": not 0 < scene.contrast <= 1,
-        "centre": not 0 <= scene.centre < 1,
-        "shot": not 0 <= scene.shot <= 1,
-        "level": not 0 < scene.level < 2**16,
-        **{name: not 0 <= getattr(scene, name) < 1e3 for name in ("blur", "noise", "uneven", "drift", "ellipticity")},
-        **{name: not 0 <= getattr(scene, name) < 100_000 for name in ("dirt", "before")},
-    }
-    wrong = [name for name, fault in faults.items() if fault]
-    if wrong:
-        raise ConfigError(f"movie: {wrong[0]}={getattr(scene, wrong[0])} cannot be filmed")
-    return scene
+            about = hints[f.name].__metadata__
+            words = next(part for part in about if isinstance(part, str))
+            unit = next((f" {part.unit}" for part in about if isinstance(part, Quantity)), "")
+            yield f"  {f.name}: {words} (default {default}{unit})"

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from en4dvar.plumbing.decoding import Allowed, DecodeError, decoded, decoded_whole, require_plain
 from en4dvar.plumbing.errors import DataError, En4dvarError, retold
 from en4dvar.plumbing.files import open_plain
-from en4dvar.plumbing.hints import no_such_file
+from en4dvar.plumbing.hints import natural, no_such_file
 from en4dvar_movie.decoders import check_size, image, tiff_about, tiff_frames, video_count, video_frames
 
 Frame = npt.NDArray[Any]
@@ -154,7 +154,7 @@ def _folder(path: Path) -> Movie:
     files = [p for p in path.iterdir() if p.suffix.lower() in (*TIFF, *IMAGES) and not p.name.startswith(".")]
     if not files:
         raise DataError(f"{path}: the folder holds no frame ({', '.join((*TIFF, *IMAGES))})")
-    files.sort(key=lambda p: [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", p.name)])
+    files.sort(key=natural)
 
     def read() -> Iterator[Frame]:
         for file in files:

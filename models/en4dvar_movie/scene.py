@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
+from annotated_types import Interval, MultipleOf
+from pydantic import BeforeValidator
 from scipy import ndimage
 
 from en4dvar.model.state import Array
@@ -22,24 +24,40 @@ GLARE = 0.7  # how much of a bubble's shade its bright centre lacks
 TRUNCATE = 5.0  # std of the blur
 
 
+SHARE, PART = Interval(ge=0, le=1), Interval(ge=0, lt=1)
+SIZE, COUNT = Interval(ge=0, lt=1e3), Interval(ge=0, lt=100_000)
+
+
+def split(text: str, sign: str = ",") -> list[str]:
+    """The two numbers of ``4.5,3``. Raises :class:`ValueError`."""
+    if text.count(sign) != 1:
+        raise ValueError(f"two numbers with {sign!r} between them")
+    return text.split(sign)
+
+
+Side = Annotated[int, Interval(ge=16, le=8192)]
+Shape = Annotated[tuple[Side, Side], BeforeValidator(lambda text: split(text, "x")[::-1])]  # WIDTHxHEIGHT, as --raw
+Place = Annotated[tuple[float, float], BeforeValidator(split)]
+
+
 @dataclass(frozen=True)
 class Scene:
     """The scene that is filmed, and the camera; lengths in pixels. Each field's annotation says what it is."""
 
-    shape: Annotated[tuple[int, int], "WIDTHxHEIGHT of a frame"] = (128, 128)
-    level: Annotated[float, "grey level of the background"] = 150.0
-    contrast: Annotated[float, "share of the light that the bubble takes"] = 0.5
-    blur: Annotated[float, "std of the blur by the optics"] = 1.2
-    noise: Annotated[float, "std of the noise where the background is, in grey levels"] = 3.0
-    shot: Annotated[float, "share of the noise's variance that is shot noise, growing with the light"] = 0.5
-    uneven: Annotated[float, "share by which the background's light varies over a frame"] = 0.1
-    centre: Annotated[float, "radius of the bright centre over that of the bubble; 0: none"] = 0.0
-    drift: Annotated[float, "distance the bubble's centre moves from frame to frame"] = 0.0
-    ellipticity: Annotated[float, "std of a random ellipsoid's surface over its radius"] = 0.0
-    dirt: Annotated[int, "number of specks, a quarter of which moves from frame to frame"] = 0
-    bubble: Annotated[tuple[float, float] | None, "x and y of the bubble's centre; default the frame's middle"] = None
-    before: Annotated[int, "empty frames before the bubble"] = 3
-    bits: Annotated[int, "of a grey level: 8 or 16"] = 8
+    shape: Annotated[Shape, "WIDTHxHEIGHT of a frame"] = (128, 128)
+    level: Annotated[float, "grey level of the background", Interval(gt=0, lt=2**16)] = 150.0
+    contrast: Annotated[float, "share of the light that the bubble takes", Interval(gt=0, le=1)] = 0.5
+    blur: Annotated[float, "std of the blur by the optics", SIZE] = 1.2
+    noise: Annotated[float, "std of the noise where the background is, in grey levels", SIZE] = 3.0
+    shot: Annotated[float, "share of the noise's variance that is shot noise, growing with the light", SHARE] = 0.5
+    uneven: Annotated[float, "share by which the background's light varies over a frame", SIZE] = 0.1
+    centre: Annotated[float, "radius of the bright centre over that of the bubble; 0: none", PART] = 0.0
+    drift: Annotated[float, "distance the bubble's centre moves from frame to frame", SIZE] = 0.0
+    ellipticity: Annotated[float, "std of a random ellipsoid's surface over its radius", SIZE] = 0.0
+    dirt: Annotated[int, "number of specks, a quarter of which moves from frame to frame", COUNT] = 0
+    bubble: Annotated[Place | None, "x and y of the bubble's centre; default the frame's middle"] = None
+    before: Annotated[int, "empty frames before the bubble", COUNT] = 3
+    bits: Annotated[int, "of a grey level: 8 or 16", Interval(ge=8, le=16), MultipleOf(8)] = 8
 
 
 def render(radii: Array, scene: Scene, rng: np.random.Generator) -> Iterator[Frame]:

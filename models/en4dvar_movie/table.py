@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 
 import numpy as np
 
+from en4dvar.plumbing.tables import csv_text
 from en4dvar_movie.tracking import Reading, Sighting
 
 MODES = (2, 3, 4)  # whose amplitudes are columns
@@ -50,15 +49,11 @@ def to_csv(readings: Sequence[Reading], scale: Scale, movie: str, command: str) 
         "R_std_um is independent from frame to frame; a pixel's size moves all radii together, the edge's level by",
         *[f"{COMMON} = {1e6 * scale.pixel * float(np.median(common or [0])):.2g}"] * bool(common),
     ]
-    out = io.StringIO()
-    out.writelines(f"# {' '.join(line.split())}\n" for line in head)
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    writer.writerows(_row(reading, scale) for reading in readings)
-    return out.getvalue()
+    comment = "".join(f"# {' '.join(line.split())}\n" for line in head)
+    return comment + csv_text([COLUMNS, *(_row(reading, scale) for reading in readings)])
 
 
-def _row(reading: Reading, scale: Scale) -> Iterable[str]:
+def _row(reading: Reading, scale: Scale) -> Sequence[str]:
     um = 1e6 * scale.pixel
     first = [str(reading.sighting.frame), f"{1e6 * scale.time(reading.sighting):.9g}"]
     outline = reading.sighting.outline

@@ -1,8 +1,9 @@
-"""The reader of MATLAB files against scipy's, on files that nothing has damaged."""
+"""Names and words for what files hold that nothing has damaged."""
 
 from __future__ import annotations
 
 import re
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -85,3 +86,27 @@ def test_every_kind_of_variable_in_both_byte_orders(tmp_path, number):
     vectors, scalars = found.vectors, found.scalars
     assert len(vectors["R"]) == len(RADIUS)
     assert "dt" in scalars
+
+
+def element(kind: int, content: bytes = b"") -> bytes:
+    return struct.pack("<II", kind, len(content)) + content + bytes(-len(content) % 8)
+
+
+def variable(kind: int, name: bytes, count: int, *content: bytes) -> bytes:
+    head = element(6, struct.pack("<II", kind, 0)) + element(5, struct.pack("<ii", 1, count)) + element(1, name)
+    return element(14, head + b"".join(content))
+
+
+def table(name: bytes) -> bytes:
+    head = element(6, struct.pack("<II", 17, 0)) + element(1, name) + element(1, b"MCOS") + element(1, b"table")
+    return element(14, head + variable(13, b"", 1, element(6, struct.pack("<I", 7))))
+
+
+def test_what_scipy_does_not_write(tmp_path):
+    """Tables, text of two bytes a letter that is no UTF-8, and an element of a cell array that never had a value."""
+    cells = (variable(6, b"", 2, element(9, struct.pack("<dd", 1, 2))), variable(4, b"", 2, element(4, b"\xb5\0m\0")))
+    content = variable(1, b"C", 3, *cells, element(14)) + table(b"T") + table(b"notes")
+    (tmp_path / "a.mat").write_bytes(seeds()[0] + content)
+    found = mat_variables(tmp_path / "a.mat")
+    assert found.vectors.keys() == {"R", "dt", "C{1}"}
+    assert found.others == {"C": "a cell array", "C{2}": "text", "T": "an object", "notes": "an object"}

@@ -16,8 +16,7 @@ from scipy.io import savemat
 
 from en4dvar.inputs import sheets
 from en4dvar.inputs.asked import Column, Layout
-from en4dvar.inputs.hdf_matfile import variables_of_hdf
-from en4dvar.inputs.matfile import mat_variables
+from en4dvar.inputs.matfile import mat_variables, variables_of
 from en4dvar.inputs.parts import parts_of, read_contents
 from en4dvar.inputs.readers import Readings, read_series
 from en4dvar.inputs.steps import step_doubts
@@ -260,7 +259,7 @@ def test_a_missing_package_is_named(tmp_path, monkeypatch, module, file):
     path = book(tmp_path / file, film=ROWS) if file == "a.xlsx" else hdf(tmp_path / file, laboratory)
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(DataError, match=rf"{file}: .*pip install {module}"):
-        list(sheets.lines_of_workbook(path, "") if module == "openpyxl" else variables_of_hdf(path))
+        list(sheets.lines_of_workbook(path, "") if module == "openpyxl" else variables_of(path))
 
 
 def test_columns_and_rows_of_matrices(tmp_path):

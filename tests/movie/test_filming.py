@@ -91,6 +91,8 @@ def test_instants_of_flashes_and_exposures():
 def test_every_setting_is_described_and_read():
     names = {f.name for kind in (Camera, Scene) for f in fields(kind)}
     assert {line.split(":")[0].strip() for line in described()} == names
+    assert "  pixel: size of a pixel (default 2e-06 m)" in described()
+    assert "  shape: WIDTHxHEIGHT of a frame (default 128x128)" in described()
     camera, scene = parse_settings(
         {"pixel": "3 um", "flashes": "0 us, 2 us", "shape": "96x64", "bubble": "4.5,3", "dirt": "7", "blur": "2"}
     )
@@ -103,7 +105,7 @@ def test_every_setting_is_described_and_read():
     [
         ("blurr", "2", "did you mean 'blur'"),
         ("blur", "wide", "blur=wide"),
-        ("pixel", "0 um", "positive"),
+        ("pixel", "0 um", "greater than 0"),
         ("pixel", "2", "unit"),
         ("shape", "9x9", "cannot be filmed"),
         ("shape", "128", "two numbers"),

@@ -37,6 +37,12 @@ def test_sixteen_bits(tmp_path):
     assert np.array_equal(read(tmp_path / "m.raw", "48x32x12"), deep)
 
 
+def test_frames_of_a_folder_come_in_the_order_of_their_numbers(tmp_path):
+    for k in (1, 2, 10):
+        Image.fromarray(FRAMES[0] * 0 + k).save(tmp_path / f"²{k}.png")
+    assert read(tmp_path)[:, 0, 0].tolist() == [1, 2, 10]
+
+
 @pytest.mark.slow
 def test_video(tmp_path):
     import av

@@ -20,7 +20,6 @@ from en4dvar.report.compare import (
     ALL,
     compare_runs,
     comparison_table,
-    model_probabilities,
     with_evidences,
 )
 from en4dvar.report.overlay import overlay
@@ -91,10 +90,6 @@ def test_equal_models_are_undecidable_on_the_command_line(tmp_path):
     assert "do not record a configuration" in done.stderr
     assert "* as the result has it" in done.stdout
     assert comparison_table(compare_runs(runs)) in done.output
-
-
-def test_probabilities_do_not_overflow():
-    assert model_probabilities(np.array([-1e5, -1e5 + np.log(3), -2e5])) == pytest.approx([0.25, 0.75, 0])
 
 
 def test_evidences_of_different_data_are_not_compared(tmp_path):
