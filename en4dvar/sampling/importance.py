@@ -24,7 +24,6 @@ from en4dvar.sampling.mixture import StudentMixture, effective_number, resampled
 NARROWEST = 0.03  # standard deviation of what is drawn about points, in units of the prior
 FEWEST = 60.0  # effective draws that a proposal is fitted to: with fewer, to tempered weights
 COMPONENTS = 4
-FITTED = 2000  # points that few parts are fitted to
 SETTLED, PARTS = 150.0, 8  # the same of proposals to a power of the posterior,
 MOST_FITTED = 1000  # and points that these are fitted to
 EACH = 4  # effective draws for each coordinate of a component: fitted to fewer it is flat in some direction
@@ -62,17 +61,14 @@ class Importance:
     """The draws and proposals of one data set, ``count`` in a round, the first of them from ``first``.
 
     Proposals are ``wider`` by that factor than what they are fitted to, so that thin tails are found as well.
-    ``behind_each``: effective draws, times n, that stand behind each part of a proposal; 0: as many as allowed.
 
     ``z`` (D, n) are all draws, ``log_weights`` (D,) their weights, ``log`` is ln ∫ L N dz and ``effective`` the number
     of draws behind it.
     """
 
-    def __init__(
-        self, first: Proposal, stream: np.random.Generator, count: int, wider: float = 1.0, behind_each: float = 0.0
-    ):
+    def __init__(self, first: Proposal, stream: np.random.Generator, count: int, wider: float = 1.0):
         n = first.dimensions
-        self.stream, self.count, self.wider, self.behind_each = stream, count, wider, behind_each
+        self.stream, self.count, self.wider = stream, count, wider
         self.proposals: list[Proposal] = [first]
         self.z, self.target, self.mixture = np.empty((0, n)), np.empty(0), np.empty(0)  # mixture: ln Σ_t q_t
         self.log_weights, self.log, self.effective = np.empty(0), -np.inf, 0.0
@@ -124,12 +120,8 @@ class Importance:
         while (effective := effective_number(weights)) < singular or (effective < FEWEST and power > 1e-4):
             power *= 0.8
             weights = np.exp(power * logs)
-        parts, count = COMPONENTS, self.count
-        if self.behind_each:  # a covariance of n quantities from a few draws misses most of the next ones
-            parts = int(np.clip(effective / (self.behind_each * self.z.shape[1]), 1, COMPONENTS))
-            count = max(count, FITTED)
-        where = resampled(weights / weights.sum(), count, self.stream)
-        fitted = StudentMixture.fitted(self.z[where], self.stream, parts)
+        where = resampled(weights / weights.sum(), self.count, self.stream)
+        fitted = StudentMixture.fitted(self.z[where], self.stream, COMPONENTS)
         return replace(fitted, root=self.wider * fitted.root)
 
 

@@ -1,9 +1,9 @@
 r"""What each data set says by itself about the parameters of a population: draws of its own posterior, as a likelihood.
 
-The draws follow p(y|x) π(x) with the data set's own prior π, by adaptive importance sampling with forward runs from its
-members and from the prior (:mod:`en4dvar.sampling.importance`), so that all modes count by their weight and any kind of
-observation errors is taken as it is: the scale of the errors and a discrepancy are further parameters of the data set.
-Where too few draws are effective, walkers go on from them (:mod:`en4dvar.sampling.walkers`).
+The draws follow p(y|x) π(x) with the data set's own prior π, weighted forward runs from its members and from the prior
+(:mod:`en4dvar.sampling.modes`), so that all modes count by their weight and any kind of observation errors is taken as
+it is: the scale of the errors and a discrepancy are further parameters of the data set. Where its posterior was sampled
+by its own estimate, the draws are those that this has kept.
 
 Of the coordinates x that vary and the quantities θ that all data sets have in common (a density, a scale) the draws
 tell how x moves with θ, to first order: the likelihood is one of x − Bθ, which gives the regression of x on θ in the
@@ -18,28 +18,26 @@ them stiffer would make them more alike.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from en4dvar.ensemble.forecast import Composite
+from en4dvar.descent.minima import Minimum
+from en4dvar.ensemble.forecast import Composite, Forecast
 from en4dvar.ensemble.missing import Beside
 from en4dvar.estimation.population.mixtures import Mixture
 from en4dvar.executor import Executor
 from en4dvar.model.state import Array
 from en4dvar.priors.prior import member_stream, own_seed
 from en4dvar.problem import InverseProblem
-from en4dvar.sampling.importance import Importance, about
+from en4dvar.sampling.emulated_draws import RecordedRuns
 from en4dvar.sampling.mixture import fit_gaussians, resampled
-from en4dvar.sampling.walkers import walked
+from en4dvar.sampling.modes import sample_modes
 
-DRAWS, MOST_ROUNDS = 200, 48  # of a round of importance sampling, and the most rounds
-ENOUGH = 200.0  # effective draws that end the rounds: they know a mean to 7 % of its std
-BEHIND_EACH = 8.0  # effective draws a dimension behind each part of a proposal
-OF_PRIOR = 0.2  # of the first draws
+ENOUGH = 200.0  # effective draws that are asked for: they know a mean to 7 % of its std
+NARROWEST = 0.03  # standard deviation of the first draws about members, in units of the prior's
 KEPT = 2000  # equally likely draws of each data set
-WALKERS, WALKED = 80, 16  # and their rounds
 MOST_PARTS, ROUNDS = 4, 60  # components of a mixture; rounds of expectation maximisation
 BESIDE = 1e-3  # prior standard deviations that runs for readings that one lacks are apart
 SMALLEST = 1e-12  # variance that every slope is taken to have
@@ -80,44 +78,25 @@ class OwnLikelihood:
 
 
 def own_draws(problem: InverseProblem, start: Array, seed: int, executor: Executor | None = None) -> OwnDraws:
-    """Draws of one posterior, from members (N, n) of it in white coordinates.
+    """Draws of one posterior, from members (N, n) near it in white coordinates.
 
     The same for a data set whatever others there are. Raises :class:`ValueError` where no run succeeds.
     """
-    prior = problem.prior
+    prior, observations = problem.prior, problem.observations
     composite = Beside(Composite(problem, executor), prior, BESIDE)
-    seed = own_seed(seed, problem.observations.name)
+    seed = own_seed(seed, observations.name)
 
-    def log_likelihood(z: Array) -> Array:
-        return np.asarray(-problem.observations.cost(composite(prior.from_white(z)).predicted))
+    def costs(x: Array, run: Forecast) -> Array:
+        observed = observations.cost(run.predicted)
+        return np.where(run.active, 0.5 * np.sum(prior.white(x) ** 2, axis=1) + observed, np.inf)
 
-    def cost(z: Array) -> Array:
-        return np.asarray(0.5 * np.sum(z**2, axis=1) - log_likelihood(z))
-
-    sampler = Importance(
-        about(start, OF_PRIOR), member_stream(seed, "population: own draws"), DRAWS, behind_each=BEHIND_EACH
-    )
-    for _ in range(MOST_ROUNDS):
-        z = sampler.draw()
-        sampler.add(z, log_likelihood(z))
-        if sampler.effective >= ENOUGH:
-            break
-    if not math.isfinite(sampler.log):
-        raise ValueError("no forward run about its members succeeded")
-    stream = member_stream(seed, "population: kept draws")
-    if sampler.effective >= ENOUGH:
-        return OwnDraws(
-            sampler.z[resampled(sampler.shares, KEPT, stream)], sampler.log, sampler.effective, composite.forward_runs
-        )
-    walked = _walked(sampler, cost, stream)
-    return OwnDraws(walked, sampler.log, max(sampler.effective, float(WALKERS)), composite.forward_runs)
-
-
-def _walked(sampler: Importance, cost: Callable[[Array], Array], stream: np.random.Generator) -> Array:
-    """(D, n) positions of walkers on exp(−cost), which start at draws by their weights."""
-    at = stream.permutation(resampled(sampler.shares, WALKERS, stream))
-    offset = 0.5 * sampler.z.shape[1] * math.log(2 * math.pi)
-    return walked(cost, sampler.z[at], stream, WALKED, WALKED // 4, -sampler.target[at] - offset)
+    x = prior.from_white(start)
+    covariance = np.atleast_2d(np.cov(x, rowvar=False)) + np.diag((NARROWEST * prior.std) ** 2)
+    about = Minimum(x.mean(axis=0), covariance, 0.0)  # of one alone, J does not matter
+    draws = sample_modes(RecordedRuns(composite, costs, prior, observations), prior, [about], seed, ENOUGH)
+    taken = resampled(draws.shares, KEPT, member_stream(seed, "population: kept draws"))
+    effective = 1 / (1 / draws.effective + 1 / KEPT)
+    return OwnDraws(prior.white(draws.x[taken]), draws.log_evidence, effective, composite.forward_runs)
 
 
 def own_likelihoods(
