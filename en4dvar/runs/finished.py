@@ -9,8 +9,7 @@ import numpy as np
 from en4dvar.assembly.build import problem_of
 from en4dvar.config import Config
 from en4dvar.config.load import recorded, resolve
-from en4dvar.estimation.population.campaign import white_prior
-from en4dvar.estimation.population.own import OwnDraws
+from en4dvar.estimation.population.own import OwnDraws, own_draws
 from en4dvar.executor import choose_executor, one_blas_thread
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, Severity, caution
@@ -20,8 +19,7 @@ from en4dvar.problem import InverseProblem
 from en4dvar.results.run_results import result_files
 from en4dvar.results.store import StoredResult, load_stored
 from en4dvar.runs.trust import Ask, of_strangers
-from en4dvar.sampling.evidence import TOO_FEW, sampled_evidence
-from en4dvar.sampling.forward_runs import ForwardRuns
+from en4dvar.sampling.modes import TOO_FEW
 
 CARRIED = ("implausible-data", "misfit", "residual-structure", "model-validity")
 MOST_NAMES = 4
@@ -142,20 +140,21 @@ def _named_apart(sets: Sequence[Finished]) -> Iterator[Finished]:
 def sampled_evidences(
     run_dir: Path, workers: int | None, trust: bool, ask: Ask | None, tell: Callable[[str], None]
 ) -> Mapping[str, float]:
-    """Data set → log-evidence, of those that enough draws stand behind.
+    """Data set → log-evidence, by the draws that its estimate has kept or by its own, where enough are effective.
 
-    ``tell`` gets a line where there are none: a model that is not cheap, errors or priors that
-    :class:`~en4dvar.sampling.forward_runs.ForwardRuns` cannot take, code that is not run unasked.
+    ``tell`` gets a line where there are none: a model that is not cheap, draws that fail, code that is not run unasked.
     """
     try:
         config, sets = finished([run_dir], trust, ask)
         if not all(s.problem.model.cheap for s in sets):
             raise ConfigError("its model is not cheap")
         with choose_executor(config.model, None, workers) as executor, one_blas_thread():
-            runs = ForwardRuns([s.problem for s in sets], executor, white=True)
-            evidence = sampled_evidence(runs, white_prior(sets[0].problem.prior.names), config.seed)
-    except (ConfigError, OutputError, RefusedError) as error:
+            drawn = [s.drawn or own_draws(s.problem, s.white, config.seed, executor) for s in sets]
+    except (ConfigError, OutputError, RefusedError, ValueError) as error:
         tell(f"{run_dir}: evidence by Laplace's approximation, as stored: {error}")
         return {}
-    logs = evidence.log - [s.problem.observations.log_normalisation() for s in sets]
-    return {s.name: float(log) for s, log, n in zip(sets, logs, evidence.effective, strict=True) if n >= TOO_FEW}
+    return {
+        s.name: draws.log_evidence - s.problem.observations.log_normalisation()
+        for s, draws in zip(sets, drawn, strict=True)
+        if draws.effective >= TOO_FEW
+    }

@@ -54,8 +54,6 @@ class ForwardRuns:
     """:class:`CampaignRuns` of data sets with one prior; those that share model and fixed values are run together.
 
     A set with fewer observations than another is padded with its last instant: a model has to bear one twice.
-    ``white``: control vectors are white coordinates of each set's own prior (:meth:`Prior.white`), so that priors of
-    the same parameters may differ.
 
     Raises
     ------
@@ -63,13 +61,13 @@ class ForwardRuns:
         that vary in time.
     """
 
-    def __init__(self, problems: Sequence[InverseProblem], executor: Executor | None = None, white: bool = False):
+    def __init__(self, problems: Sequence[InverseProblem], executor: Executor | None = None):
         shape = len(problems), max(len(p.observations) for p in problems)
         self.times, self.values, self.weight = np.zeros(shape), np.zeros(shape), np.zeros(shape)
         alike: dict[object, list[int]] = {}
         for s, p in enumerate(problems):
             o, k = p.observations, len(p.observations)
-            if p.prior.names != problems[0].prior.names or not (white or p.prior == problems[0].prior):
+            if p.prior != problems[0].prior:
                 raise ConfigError(f"{o.name}: a population needs one prior")
             if p.varying:
                 raise ConfigError(f"{o.name}: a population needs parameters that do not vary in time")
@@ -79,10 +77,8 @@ class ForwardRuns:
                 raise ConfigError(f"{o.name}: a population needs independent Gaussian errors of known std")
             self.times[s] = o.times[-1]
             self.times[s, :k], self.values[s, :k], self.weight[s, :k] = o.times, o.values, o.weights / o.std**2
-            terms = (p.prior.terms, *map(id, p.prior.blocks)) if white else ()
-            key = id(p.model), id(p.observable), tuple(sorted(p.fixed.items())), p.perturbations, p.tied, terms
+            key = id(p.model), id(p.observable), tuple(sorted(p.fixed.items())), p.perturbations, p.tied
             alike.setdefault(key, []).append(s)
-        self.white = white
         self.groups = [(Predictor(problems[sets[0]], executor), sets) for sets in alike.values()]
 
     def predictions(self, x: Array, sets: Sets = None) -> Array:
@@ -93,8 +89,6 @@ class ForwardRuns:
             here = np.flatnonzero(np.isin(chosen, members))
             if len(here):
                 flat = x[:, here].reshape(-1, x.shape[2])
-                if self.white:
-                    flat = predictor.problem.prior.from_white(flat)
                 times = np.tile(self.times[chosen[here]], (len(x), 1)) + predictor.time_shifts(flat)[:, None]
                 out[:, here] = predictor.at(flat, times).reshape(len(x), len(here), -1)
         return out
