@@ -50,7 +50,7 @@ def _filter(
         for k in range(residuals.shape[1]):
             if k > 0:
                 _set_transition(order, rates[run] * steps[k - 1], move)
-                _advance(move, mean, apart, column, half)
+                _advance(order, move, mean, apart, column, half)
             a = amplitudes[run, k]
             variance = a * a * (stationary[0, 0] + apart[0, 0]) + errors[run, k]
             if not variance > 0.0:
@@ -81,17 +81,18 @@ def boxed(
     r, s, nuggets, a, rates, steps = (
         np.ascontiguousarray(part, dtype=float) for part in (residuals, std, own, amplitudes, rates, steps)
     )
-    _boxed(int(nu + 0.5), r, s, nuggets, a, rates, steps, c, mode)
+    _boxed((0.0,) * int(nu + 0.5), r, s, nuggets, a, rates, steps, c, mode)
     return mode
 
 
+States = tuple[float, ...]  # one number for each state of the process: the compiler knows how many
 SETTLED = 1e-10  # of the slope of J at the end of a step, against that at its begin
 NEWTON, SECANTS = 200, 50  # iterations, and those for the length of a step
 
 
 @kernel
 def _boxed(
-    order: int,
+    states: States,
     residuals: Array,
     std: Array,
     own: Array,
@@ -106,6 +107,7 @@ def _boxed(
     The first step is to the mode of Gaussian errors. J is convex and quadratic in pieces, so that this ends; whole
     steps may go round in circles.
     """
+    order = len(states)
     count = residuals.shape[1]
     force, at, pull = np.empty(count), np.empty(count), np.empty(count)
     moves, towards = np.empty((count - 1, order, order)), np.empty((count, order))
@@ -122,8 +124,8 @@ def _boxed(
             _set_transition(order, rates[run] * steps[k], moves[k])
         at[:], pull[:], force[:] = 0.0, 0.0, np.nan
         for _ in range(NEWTON):
-            _ahead(r, s, nugget, force, a, moves, u, expected, towards, precision, room)
-            _back(nugget, a, moves, u, delta, expected, towards, precision, room)
+            _ahead(states, r, s, nugget, force, a, moves, u, expected, towards, precision, room)
+            _back(states, nugget, a, moves, u, delta, expected, towards, precision, room)
             if not _set_force(r, s, delta, c, force):
                 break
             step = _step(r, s, c, at, pull, u, delta)
@@ -182,20 +184,20 @@ def _slope(step: float, r: Array, s: Array, c: float, at: Array, pull: Array, u:
 
 @called
 def _ahead(
-    r: Array, s: Array, own: Array, force: Array, a: Array, moves: Array, u: Array, expected: Array, towards: Array,
-    precision: Array, room: Array,
+    states: States, r: Array, s: Array, own: Array, force: Array, a: Array, moves: Array, u: Array, expected: Array,
+    towards: Array, precision: Array, room: Array,
 ) -> None:  # fmt: skip
     """The filter, for Gaussian errors of standard deviation ``s`` or a constant ``force``, where that is no NaN: a f as
     ``expected`` (K,) of each reading, what moves the state ``towards`` it (K, order), and ``u``, what is new in it,
     times its ``precision`` (K,), none of a constant force. ``room`` (2 order + 2, order) to work in.
     """
-    order = room.shape[1]
+    order = len(states)
     mean, column, apart, half = room[0], room[1], room[2 : 2 + order], room[2 + order :]
     stationary = _stationary(order)
     mean[:], apart[:] = 0.0, 0.0
     for k in range(len(r)):
         if k > 0:
-            _advance(moves[k - 1], mean, apart, column, half)
+            _advance(len(states), moves[k - 1], mean, apart, column, half)
         expected[k] = a[k] * mean[0]
         for i in range(order):
             towards[k, i] = a[k] * (stationary[i, 0] + apart[i, 0])
@@ -211,11 +213,11 @@ def _ahead(
 
 @called
 def _back(
-    own: Array, a: Array, moves: Array, u: Array, delta: Array, expected: Array, towards: Array, precision: Array,
-    room: Array,
+    states: States, own: Array, a: Array, moves: Array, u: Array, delta: Array, expected: Array, towards: Array,
+    precision: Array, room: Array,
 ) -> None:  # fmt: skip
     """The smoother behind :func:`_ahead`: u and δ of the mode."""
-    order, adjoint, column = room.shape[1], room[0], room[1]
+    order, adjoint, column = len(states), room[0], room[1]
     adjoint[:] = 0.0  # of the state before reading k, once that is reached
     for k in range(len(u) - 1, -1, -1):
         if k < len(u) - 1:
@@ -259,9 +261,8 @@ def _set_transition(order: int, d: float, move: Array) -> None:
 
 
 @called
-def _advance(move: Array, mean: Array, apart: Array, column: Array, half: Array) -> None:
+def _advance(order: int, move: Array, mean: Array, apart: Array, column: Array, half: Array) -> None:
     """Mean and covariance of the state over a step; ``column`` and ``half`` are room to work in."""
-    order = len(mean)
     for i in range(order):
         column[i] = 0.0
         for j in range(order):
