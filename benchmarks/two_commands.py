@@ -1,12 +1,11 @@
 """From a folder of measured bubbles to the gel's number in two commands: what they cost, and what becomes of each file.
 
-    python benchmarks/two_commands.py ../shared/data/bubbles/stiff_polyacrylamide [FOLDER …] [--minutes 60] [--docs]
+    python benchmarks/two_commands.py ../shared/data/bubbles/stiff_polyacrylamide [FOLDER …] [--minutes 60]
     python benchmarks/two_commands.py … --splits 10        and random halves of each finished run against each other
 
 ``init --data FOLDER`` with the law and the medium of a folder of known name (``measured_page.py``), and ``run`` of what
 it writes, on one worker and with its page. Printed are the processor time of each, the medians of the gel with their
-90 % intervals, and the files without a number, with the reason; ``--docs`` writes the table into
-``docs/howto_measured.md``.
+90 % intervals, and the files without a number, with the reason.
 
 Halves: the bubbles of a finished run are sampled once and split at random into halves with a population each; z of the
 difference of the medians of ln θ, what is common apart, which is of one value in both. Three bubbles, which have no
@@ -28,8 +27,6 @@ import numpy as np
 from measured_page import GROUPS
 from recordings import commit
 from records import Record, fill
-from scaling import ROOT
-from solver import replaced
 
 from en4dvar.estimation.population import Effort
 from en4dvar.estimation.population.campaign import CampaignPopulation, population_from, sampled_sets
@@ -39,7 +36,6 @@ from en4dvar.report.population import summaries
 from en4dvar.results.population_file import FILE, load_population
 from en4dvar.runs.finished import finished
 
-PAGE = ROOT / "docs" / "howto_measured.md"
 COMMAND = [sys.executable, "-c", "from en4dvar.cli import main; main()"]
 MORE = {"water": ["--start", "laser"]}  # init asks where its files suggest different starts
 SHOWN = {"G": ("G, kPa", 1.0), "mu": ("μ, mPa s", 1e3)}  # display units of the parameters are kPa and Pa s
@@ -150,15 +146,11 @@ def main() -> None:
     parser.add_argument("folders", type=Path, nargs="+")
     parser.add_argument("--splits", type=int, default=0, help="random halves of each folder")
     parser.add_argument("--minutes", type=float, default=60.0, help="start no folder after so long")
-    parser.add_argument("--docs", action="store_true")
     parser.add_argument("--out", type=Path, default=Path("runs/two_commands"), help="folder of the runs and records")
     asked = parser.parse_args()
     of = {folder.name: folder.resolve() for folder in asked.folders}
     records = fill(asked.out / "records.jsonl", of, lambda key: two_commands(of[key], asked.out / key), asked.minutes)
-    text = table(list(records.values()))
-    print(text)
-    if asked.docs:
-        PAGE.write_text(replaced(PAGE.read_text(encoding="utf-8"), "two commands", text), encoding="utf-8")
+    print(table(list(records.values())))
     for key in records if asked.splits else ():
         if "used" in records[key]:
             halves(asked.out / key / "run", asked.splits)

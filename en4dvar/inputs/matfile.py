@@ -21,9 +21,7 @@ from en4dvar.plumbing.errors import DataError
 from en4dvar.plumbing.files import open_plain
 
 MAT = Allowed(seconds=60, memory=8_000_000_000, size=256_000_000_000)
-LONGEST = (
-    4_000_000_000  # bytes of a file of version 5, which is read whole; MATLAB writes variables of at most half of it
-)
+LONGEST = 4_000_000_000  # bytes of a file of version 5, which is read whole
 HEADER = 128  # bytes
 DEEPEST = 4  # structs inside structs
 MOST_OBJECTS = 100_000

@@ -62,7 +62,7 @@ class OwnDraws:
         ``effective`` of them, and ln p(y). Raises :class:`ValueError` for a draw that the prior excludes.
         """
         z, log = problem.prior.white(problem.prior.from_physical(draws)), problem.observations.log_normalisation()
-        return cls(z, log_evidence + log, 1 / (1 / effective + 1 / len(draws)), 0)
+        return cls(z, log_evidence + log, _worth(len(draws), effective), 0)
 
 
 @dataclass(frozen=True)
@@ -95,8 +95,13 @@ def own_draws(problem: InverseProblem, start: Array, seed: int, executor: Execut
     about = Minimum(x.mean(axis=0), covariance, 0.0)  # of one alone, J does not matter
     draws = sample_modes(RecordedRuns(composite, costs, prior, observations), prior, [about], seed, ENOUGH)
     taken = resampled(draws.shares, KEPT, member_stream(seed, "population: kept draws"))
-    effective = 1 / (1 / draws.effective + 1 / KEPT)
+    effective = _worth(KEPT, draws.effective)
     return OwnDraws(prior.white(draws.x[taken]), draws.log_evidence, effective, composite.forward_runs)
+
+
+def _worth(count: int, effective: float) -> float:
+    """How many independent draws so many are worth that were taken from others, worth ``effective`` of them."""
+    return 1 / (1 / effective + 1 / count)
 
 
 def own_likelihoods(
