@@ -6,8 +6,9 @@ As ``sitecustomize`` of every process of a test. ``taskkill`` is a program of Wi
 import os
 import signal
 import sys
+import types
 
-import filelock  # noqa: F401  before fcntl goes: on Windows it has locks of the system's own
+import filelock  # before fcntl goes: on Windows it has locks of the system's own
 
 
 def _is_open(path):
@@ -44,7 +45,17 @@ def _asking_nothing(wake, unblock):
     return set_wakeup_fd
 
 
+def _leave_all_to_filelock():
+    """The modules of filelock for POSIX, which no Windows loads, keep a module ``os`` in which nothing is missing."""
+    whole = types.ModuleType("os")
+    vars(whole).update(vars(os))
+    for name, module in list(sys.modules.items()):
+        if name.split(".")[0] == filelock.__name__ and getattr(module, "os", None) is os:
+            module.os = whole
+
+
 def take_away():
+    _leave_all_to_filelock()
     signal.set_wakeup_fd = _asking_nothing(signal.set_wakeup_fd, os.set_blocking)
     sys.modules["fcntl"] = sys.modules["resource"] = None
     for name in ("fork", "forkpty", "killpg", "setsid", "O_NOFOLLOW", "O_NONBLOCK", "pidfd_open", "set_blocking"):
