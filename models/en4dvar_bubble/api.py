@@ -189,7 +189,7 @@ def _dataset(model: BubbleModel, theta: Mapping[str, Array], t: Array, out: _Out
         "radial": model.radial,
         "vapour": model.vapour,
         "medium_heat": model.medium_heat,
-        "wall": f"{model.wall.kind}, {model.wall.distance:.6g} m" if model.wall else "none",
+        "wall": str(model.wall) if model.wall else "none",
         "constants": medium.json,
     }
     return xr.Dataset(data, coords=coordinates, attrs=attributes)

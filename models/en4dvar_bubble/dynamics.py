@@ -36,12 +36,21 @@ Heat = Literal["cold", "conducting"]
 
 @dataclass(frozen=True)
 class Wall:
-    """A plane at ``distance`` (m) from the centre of the bubble: ``rigid``, or the ``free`` surface of the medium; a
-    ``slit`` has a rigid one on either side.
+    """A plane at ``distance`` (m; of R_max if ``relative``) from the centre of the bubble: ``rigid``, or the ``free``
+    surface of the medium; a ``slit`` has a rigid one on either side.
     """
 
     distance: float
     kind: Literal["rigid", "free", "slit"] = "rigid"
+    relative: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.kind}, {self.distance:.6g} {'R_max' if self.relative else 'm'}"
+
+    def away(self, values: Mapping[str, Array]) -> Array:
+        """The distance in m for members with parameters name → (N,)."""
+        unit = values["R_max"] if self.relative else 1.0
+        return np.asarray(values.get(WALL_DISTANCE.name, self.distance * unit))
 
 
 R0 = positive("R0", "m", "stress-free radius", "$R_0$", MANCIA, "um")
@@ -202,7 +211,7 @@ class Dynamics:
         """
         if self.wall is None:
             return 0.0
-        h = values.get(WALL_DISTANCE.name, np.float64(self.wall.distance))
+        h = self.wall.away(values)
         if self.wall.kind == "slit":
             medium = self.medium_of(values)
             heard = medium.c * RAYLEIGH * values["R_max"] * np.sqrt(medium.rho / medium.p_inf) / h
@@ -235,7 +244,7 @@ class Dynamics:
         R = values.get(R_START.name, rest) if self.start == "acoustic" else values["R_max"]
         if np.any(rest <= 0) or np.any(R <= 0):
             raise ValueError("radii must be positive")
-        if self.wall is not None and np.all(values.get(WALL_DISTANCE.name, self.wall.distance) <= R):
+        if self.wall is not None and np.all(self.wall.away(values) <= R):
             raise ValueError("the bubble reaches the wall: R at time zero must be less than the distance of the wall")
         medium, layout, system = self.medium_of(values), self.layout, self.system
         p_v = medium.p_v if self.vapour == "none" else saturated_vapour_pressure(medium.T_inf)

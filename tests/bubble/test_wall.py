@@ -149,6 +149,10 @@ def test_the_distance_may_be_a_parameter():
     for i, h in enumerate(values["wall_distance"]):
         fixed = simulate("newtonian", WATER, TIMES, start="laser", gas="polytropic", wall=Wall(h))
         assert np.array_equal(R[i], fixed.R[0])
+    far = simulate(
+        "newtonian", WATER, TIMES, start="laser", gas="polytropic", wall=Wall(h / WATER["R_max"], relative=True)
+    )
+    np.testing.assert_allclose(far["R"], fixed["R"], rtol=1e-9)
     assert "wall_distance" not in [p.name for p in replace(model, wall=None, named=()).optional_parameters]
     with pytest.raises(ValueError, match="reaches the wall"):
         model.initial_states(values | {"wall_distance": np.full(2, 150e-6)})
