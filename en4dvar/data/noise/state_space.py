@@ -13,6 +13,7 @@ Equations, § 12.3; Durbin & Koopman (2012), Time Series Analysis by State Space
 """
 
 import numpy as np
+import numpy.typing as npt
 
 from en4dvar.model.state import Array
 from en4dvar.plumbing.compiled import called, kernel
@@ -26,43 +27,85 @@ def innovations(residuals: Array, errors: Array, amplitudes: Array, lengths: Arr
     residuals: (B, K) y − m. errors: (B, K) variances of ε. amplitudes: (B, K) a g.
     lengths: (B,) ℓ. steps: (K − 1,) > 0 between readings. nu: ½, 3/2 or 5/2.
     """
-    order = int(nu + 0.5)
-    white = np.empty((2, *residuals.shape))
     with np.errstate(all="ignore"):
         rates = np.sqrt(2 * nu) / lengths
-    arrays = [np.ascontiguousarray(a, dtype=float) for a in (residuals, errors, amplitudes, rates, steps)]
-    _filter(order, arrays[0], arrays[1], arrays[2], arrays[3], arrays[4], white)
-    return white
+        least = steps.min(initial=np.inf)  # those of a camera are equal but for rounding
+        different, which = np.unique(np.round(steps / least, 12), return_inverse=True)
+        d = np.outer(different * least, rates)
+        shrink = np.exp(-d)
+    r, e, a = (np.ascontiguousarray(part.T, dtype=float) for part in (residuals, errors, amplitudes))
+    white = np.empty((2, *r.shape))
+    _filter(int(nu + 0.5), r, e, a, d, shrink, which, white)
+    return np.ascontiguousarray(white.transpose(0, 2, 1))
+
+
+ABREAST = 128  # runs that are filtered side by side: the inner loops are over runs, as the vector units like them
 
 
 @kernel
 def _filter(
-    order: int, residuals: Array, errors: Array, amplitudes: Array, rates: Array, steps: Array, white: Array
+    order: int,
+    residuals: Array,
+    errors: Array,
+    amplitudes: Array,
+    d: Array,
+    shrink: Array,
+    which: npt.NDArray[np.intp],
+    white: Array,
 ) -> None:
-    """``white`` (2, B, K), run by run."""
+    """``white`` (2, K, B). Runs are last in all arrays; d = λΔ and e^{−d} (U, B) are of each different step, ``which``
+    (K − 1,) says of which each is.
+    """
     stationary = _stationary(order)
-    move, half = np.empty((order, order)), np.empty((order, order))
-    apart = np.empty((order, order))  # P − P_∞
-    mean, column = np.empty(order), np.empty(order)
-    for run in range(residuals.shape[0]):
-        mean[:] = 0.0
-        apart[:] = 0.0
-        for k in range(residuals.shape[1]):
+    move, half = np.empty((order, order, ABREAST)), np.empty((order, order, ABREAST))
+    apart = np.empty((order, order, ABREAST))  # P − P_∞
+    mean, column = np.empty((order, ABREAST)), np.empty((order, ABREAST))
+    count, runs = residuals.shape
+    for first in range(0, runs, ABREAST):
+        n = min(ABREAST, runs - first)
+        some = slice(first, first + n)
+        mean[:], apart[:] = 0.0, 0.0
+        for k in range(count):
             if k > 0:
-                _set_transition(order, rates[run] * steps[k - 1], move)
-                _advance(order, move, mean, apart, column, half)
-            a = amplitudes[run, k]
-            variance = a * a * (stationary[0, 0] + apart[0, 0]) + errors[run, k]
-            if not variance > 0.0:
-                variance = np.nan
-            missed = residuals[run, k] - a * mean[0]
-            white[0, run, k], white[1, run, k] = missed / np.sqrt(variance), np.sqrt(variance)
+                if k == 1 or which[k - 1] != which[k - 2]:
+                    _set_transitions(order, d[which[k - 1], some], shrink[which[k - 1], some], move)
+                _advance_abreast(order, n, move, mean, apart, column, half)
+            r, e, a = residuals[k, some], errors[k, some], amplitudes[k, some]
+            new, root = white[0, k, some], white[1, k, some]
+            for run in range(n):
+                variance = a[run] * a[run] * (stationary[0, 0] + apart[0, 0, run]) + e[run]
+                root[run] = np.sqrt(variance if variance > 0.0 else np.nan)
+                new[run] = (r[run] - a[run] * mean[0, run]) / root[run]
             for i in range(order):
-                column[i] = a * (stationary[i, 0] + apart[i, 0])
+                for run in range(n):
+                    column[i, run] = a[run] * (stationary[i, 0] + apart[i, 0, run]) / root[run]
             for i in range(order):
-                mean[i] += column[i] * missed / variance
+                for run in range(n):
+                    mean[i, run] += column[i, run] * new[run]
                 for j in range(order):
-                    apart[i, j] -= column[i] * column[j] / variance
+                    for run in range(n):
+                        apart[i, j, run] -= column[i, run] * column[j, run]
+
+
+@called
+def _advance_abreast(order: int, n: int, move: Array, mean: Array, apart: Array, column: Array, half: Array) -> None:
+    """:func:`_advance` of the first n runs, each by its own ``move``."""
+    for i in range(order):
+        column[i] = 0.0
+        for j in range(order):
+            half[i, j] = 0.0
+            for run in range(n):
+                column[i, run] += move[i, j, run] * mean[j, run]
+            for m in range(order):
+                for run in range(n):
+                    half[i, j, run] += move[i, m, run] * apart[m, j, run]
+    mean[:] = column
+    for i in range(order):
+        for j in range(order):
+            apart[i, j] = 0.0
+            for m in range(order):
+                for run in range(n):
+                    apart[i, j, run] += half[i, m, run] * move[j, m, run]
 
 
 def boxed(
@@ -120,8 +163,7 @@ def _boxed(
         if not np.isfinite(np.sum(r) + np.sum(s) + np.sum(a) + rates[run]):
             mode[:, run] = np.nan
             continue
-        for k in range(count - 1):
-            _set_transition(order, rates[run] * steps[k], moves[k])
+        _set_transitions(order, rates[run] * steps, np.exp(-rates[run] * steps), moves.transpose((1, 2, 0)))
         at[:], pull[:], force[:] = 0.0, 0.0, np.nan
         for _ in range(NEWTON):
             _ahead(states, r, s, nugget, force, a, moves, u, expected, towards, precision, room)
@@ -245,19 +287,19 @@ def _stationary(order: int) -> Array:
 
 
 @called
-def _set_transition(order: int, d: float, move: Array) -> None:
-    """Of the state over a step d = λΔ."""
-    shrink, q = np.exp(-d), 0.5 * d * d
-    if order == 1:
-        move[0, 0] = shrink
-    elif order == 2:
-        move[0, 0], move[0, 1] = shrink * (1 + d), shrink * d
-        move[1, 0], move[1, 1] = -shrink * d, shrink * (1 - d)
-    else:
-        move[0, 0], move[0, 1], move[0, 2] = shrink * (1 + d + q), shrink * (d + 2 * q), shrink * q
-        move[1, 0], move[1, 1], move[1, 2] = -shrink * q, shrink * (1 + d - 2 * q), shrink * (d - q)
-        move[2, 0], move[2, 1] = shrink * (q - d), shrink * (2 * q - 3 * d)
-        move[2, 2] = shrink * (1 - 2 * d + q)
+def _set_transitions(order: int, d: Array, shrink: Array, moves: Array) -> None:
+    """``moves`` (order, order, ≥ D) of the state over steps d = λΔ (D,), with e^{−d}."""
+    for i in range(len(d)):
+        x, e, q = d[i], shrink[i], 0.5 * d[i] * d[i]
+        if order == 1:
+            moves[0, 0, i] = e
+        elif order == 2:
+            moves[0, 0, i], moves[0, 1, i] = e * (1 + x), e * x
+            moves[1, 0, i], moves[1, 1, i] = -e * x, e * (1 - x)
+        else:
+            moves[0, 0, i], moves[0, 1, i], moves[0, 2, i] = e * (1 + x + q), e * (x + 2 * q), e * q
+            moves[1, 0, i], moves[1, 1, i], moves[1, 2, i] = -e * q, e * (1 + x - 2 * q), e * (x - q)
+            moves[2, 0, i], moves[2, 1, i], moves[2, 2, i] = e * (q - x), e * (2 * q - 3 * x), e * (1 - 2 * x + q)
 
 
 @called
