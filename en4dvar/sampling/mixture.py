@@ -42,7 +42,7 @@ class StudentMixture:
     def log_density(self, x: Array) -> Array:
         """(B,) at points (B, d)."""
         d = x.shape[1]
-        z = np.linalg.solve(self.root, (x - self.centre[:, None]).transpose(0, 2, 1))
+        z = np.linalg.inv(self.root) @ (x - self.centre[:, None]).transpose(0, 2, 1)
         logs = -0.5 * (DEGREES + d) * np.log1p(np.sum(z**2, axis=1) / DEGREES)
         logs += (np.log(self.share) - np.log(np.einsum("mii->mi", self.root)).sum(axis=1))[:, None]
         constant = math.lgamma((DEGREES + d) / 2) - math.lgamma(DEGREES / 2) - d / 2 * math.log(DEGREES * math.pi)

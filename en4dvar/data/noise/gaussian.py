@@ -82,7 +82,7 @@ class Noise:
     def error_std(self, predicted: Predicted) -> Array:
         """Total observation-error std s (…, K)."""
         rates, scale = predicted.rates, predicted.noise_scale
-        s = self.std if rates is None else np.asarray(np.hypot(self.std, rates * self.time_std))
+        s = self.std if rates is None else np.sqrt(self.std**2 + (rates * self.time_std) ** 2)
         return s if scale is None else np.asarray(s * np.asarray(scale)[..., None])
 
     def total_std(self, predicted: Predicted) -> Array:
