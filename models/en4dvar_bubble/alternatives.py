@@ -4,7 +4,7 @@ Sizes: a hydrophone states the amplitude within 5 to 10 %; weather moves the amb
 1000 m of height by 11 %; the rheometry codes take 0.056 to 0.072 N/m for the surface tension of water in a gel; a
 calibration target gives the scale of the picture within about 1 %; the density of a gel is water's or up to 6 % more,
 its speed of sound that of water or 3 % more; the walls of a dish or of the holder of a gel are millimetres away, and
-one that is five times the largest radius away, which makes a collapse 4 % longer, is commonly neglected.
+one three times the largest radius away, which makes a collapse 7 % longer, is not seen as such in a recording.
 """
 
 from collections.abc import Iterator
@@ -18,7 +18,7 @@ from en4dvar_bubble.gas import saturated_vapour_pressure
 from en4dvar_bubble.numbers import WALL_DISTANCE
 
 PULSE, REST, SCALE, CLOCK = 1.05, 1.1, 1.01, 1.01
-NEARBY = Wall(5.0, relative=True), "five times R_max"
+NEARBY = Wall(3.0, relative=True), "three times R_max"
 NEARBY_DRIVEN = Wall(3e-3), "3 mm"
 MEDIUM = (  # parameter, unless it is one that is named; alternative, factor, words
     ("p_inf", "ambient_pressure", 1.02, "the ambient pressure were 2 % higher"),
