@@ -27,7 +27,8 @@ with each group.
 How to read it. *G*, *μ*: mean ± standard deviation; a number in brackets has no interval, for the reason that follows
 it. *After the window*: how many of the readings that were not fitted lie in the 90 % bands of what was expected of
 them, and their distance from the medians in per cent of R_max (root mean square); the window ends at the second
-minimum, if there are two. χ² per degree of freedom: of ln G or ln μ about their weighted mean, 1 if bubbles of one gel
+minimum, if there are two. In brackets: 90 % of such shares of as many bubbles drawn with replacement, since the readings
+of one bubble are missed together. χ² per degree of freedom: of ln G or ln μ about their weighted mean, 1 if bubbles of one gel
 differ by no more than their intervals say, and far above 1 if intervals are too narrow or the bubbles' gels differ; the
 readings after the window go on to the end of the record, through oscillations of which none was fitted. Density,
 scale and pressure are common to the bubbles of a folder and make χ² smaller. Where χ² is far above 1, the stated
@@ -124,14 +125,23 @@ def _overview(groups: Mapping[str, Sequence[Record]]) -> str:
             cells += [str(len(logs)) if some else "–", f"{chi2(logs):.2f}" if len(logs) > 1 and title != "all" else "–"]
         for part in ("next", "withheld"):
             count, inside = after(records, part)
-            cells += [str(count), f"{inside:.0%}" if count else "–"]
+            low, high = np.quantile(_redrawn(records, part), (0.05, 0.95))
+            cells += [str(count), f"{inside:.0%} ({low:.0%} to {high:.0%})" if count else "–"]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
 
 def _group(about: Group, records: Sequence[Record]) -> str:
     solid = any("G" in record for record in records)
-    head = ["bubble", *["G, kPa"] * solid, "μ, Pa s", "after the window", "rms, % of R_max", "warnings"]
+    head = [
+        "bubble",
+        *["G, kPa"] * solid,
+        "μ, Pa s",
+        "to the next minimum",
+        "after the window",
+        "rms, % of R_max",
+        "warnings",
+    ]
     lines = [f"## {about.title}", "", about.words + f" Law: `{about.law}`, medium: `{about.medium}`.", ""]
     lines += [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
     for record in records:
@@ -141,6 +151,8 @@ def _group(about: Group, records: Sequence[Record]) -> str:
         numbers = [said(record.get("G"), 1e-3)] * solid + [said(record.get("mu"), 1.0)]
         count, share, rms = record["withheld"] or (0, 0.0, 0.0)
         later = [f"{share * count:.0f} of {count}", f"{100 * rms:.1f}"] if count else ["–", "–"]
+        first, inside, _ = record["next"] or (0, 0.0, 0.0)
+        later = [f"{inside * first:.0f} of {first}" if first else "–", *later]
         lines.append(f"| {' | '.join([record['key'], *numbers, *later, record['warnings']])} |")
     for key, symbol, factor in (("G", "G", 1e-3), ("mu", "μ", 1.0)):
         logs = intervals(records, key)
@@ -176,6 +188,13 @@ def after(records: Sequence[Record], key: str = "withheld") -> tuple[int, float]
     told = [record[key] for record in records if record.get(key)]
     count = sum(int(each[0]) for each in told)
     return count, sum(each[0] * each[1] for each in told) / max(1, count)
+
+
+def _redrawn(records: Sequence[Record], key: str) -> np.ndarray:
+    """The share of :func:`after` of as many bubbles, drawn with replacement a thousand times."""
+    stream = np.random.default_rng(0)
+    samples = stream.integers(len(records), size=(1000, len(records)))
+    return np.array([after([records[i] for i in some], key)[1] for some in samples])
 
 
 def said(number: Record | None, factor: float) -> str:
