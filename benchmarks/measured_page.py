@@ -26,13 +26,13 @@ with each group.
 
 How to read it. *G*, *μ*: mean ± standard deviation; a number in brackets has no interval, for the reason that follows
 it. *After the window*: how many of the readings that were not fitted lie in the 90 % bands of what was expected of
-them, and their distance from the medians in per cent of R_max (root mean square); the window ends at the second
-minimum, if there are two. In brackets: 90 % of such shares of as many bubbles drawn with replacement, since the readings
-of one bubble are missed together. χ² per degree of freedom: of ln G or ln μ about their weighted mean, 1 if bubbles of one gel
-differ by no more than their intervals say, and far above 1 if intervals are too narrow or the bubbles' gels differ; the
-readings after the window go on to the end of the record, through oscillations of which none was fitted. Density,
-scale and pressure are common to the bubbles of a folder and make χ² smaller. Where χ² is far above 1, the stated
-intervals are too narrow. The bands allow for gas that a collapse takes or sets free (`gas_change`, see
+them, and their distance from the medians in per cent of R_max (rms, root mean square); the window ends at the second
+minimum, if there are two. In brackets: 90 % of such shares of as many bubbles drawn with replacement, since the
+readings of one bubble are missed together. χ² per degree of freedom: of ln G or ln μ about their weighted mean, 1 if
+bubbles of one gel differ by no more than their intervals say, and far above 1 if intervals are too narrow or the
+bubbles' gels differ; the readings after the window go on to the end of the record, through oscillations of which none
+was fitted. Density, scale and pressure are common to the bubbles of a folder and make χ² smaller. Where χ² is far above
+1, the stated intervals are too narrow. The bands allow for gas that a collapse takes or sets free (`gas_change`, see
 [physics](physics.md#vapour-and-a-warm-medium)); where far more than 90 % lie in them, it allows for too much, and where
 far fewer do, something else happens to the bubble.
 """
