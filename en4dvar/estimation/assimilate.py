@@ -1,6 +1,7 @@
 """One data set from its prior ensemble to the posterior and its predictions."""
 
 import math
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 
@@ -18,6 +19,7 @@ from en4dvar.estimation.conclusions import Ensembles
 from en4dvar.estimation.localised import assimilate_localised
 from en4dvar.estimation.stages import Keep, LoopState, Sampled, Stages
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
+from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.errors import TooFewMembersError
 from en4dvar.priors.varying import PiecewiseModel
@@ -28,6 +30,7 @@ from en4dvar.schemes.settings import AssimilationSettings
 
 __all__ = ["LoopState", "assimilate", "cost", "forecast", "log_posterior"]
 
+AS_GOOD = 3.0  # of J above that of the problem itself: the data allow the change as well
 INTERVALS = 2.0  # between readings, by which knots are shifted
 
 
@@ -123,7 +126,7 @@ def _concluded(
     std = ends.members.std(axis=0, ddof=1)
     shifts: tuple[Shift, ...] = ()
     if stages.settings.what_if:
-        fitted = partial(_fitted, stages)
+        fitted = partial(_fitted, stages, response.at, control.centre_cost)
         shifts = what_if(problem, response, std, control.centre_cost, space.executor, fitted)
     path = ledger(problem, response, std) if stages.settings.what_if else None
     withheld = stages.expected(ends.members)
@@ -157,17 +160,28 @@ def _concluded(
     )
 
 
-def _fitted(stages: Stages, changed: InverseProblem) -> Fit | None:
-    """The mode of a changed problem, searched like that of the problem itself; None where too few members survive."""
+def _fitted(stages: Stages, at: Array, cost: float, changed: InverseProblem) -> Fit | None:
+    """The mode of a changed problem: where a descent from ``at`` (n,), the mode of the problem itself, leads and, where
+    J there is higher than ``cost`` by more than :data:`AS_GOOD`, the lower one of that and what a search like that of
+    the problem itself finds. None where too few members survive.
+    """
     settings = replace(stages.settings, what_if=False, refine="none", emulator="off")
-    within = replace(changed.observations, continued=None)
-    other = Stages(replace(changed, observations=within), settings, stages.seed, stages.space.executor, None, None)
-    other.compares = False
-    try:
-        end = _through(other, None)
-    except TooFewMembersError:
-        return None
-    return Fit(changed.prior.from_physical(end.centre), end.iterations[-1].cost, other.space.forward_runs)
+    ways, fits = [settings], list[Fit]()
+    if stages.minimiser:
+        place = dict(zip(changed.prior.names, changed.prior.to_physical(at).tolist(), strict=True))
+        ways.insert(0, replace(settings, own=replace(stages.minimiser, start=place)))
+    for way in ways:
+        within = replace(changed.observations, continued=None)
+        other = Stages(replace(changed, observations=within), way, stages.seed, stages.space.executor, None, None)
+        other.compares = False
+        with suppress(TooFewMembersError):
+            end = _through(other, None)
+            centre = changed.prior.from_physical(end.centre)
+            fits.append(Fit(centre, end.iterations[-1].cost, other.space.forward_runs))
+        if fits and fits[0].cost < cost + AS_GOOD:
+            break
+    best = min(fits, key=lambda fit: fit.cost, default=None)
+    return best and replace(best, runs=sum(fit.runs for fit in fits))
 
 
 def _log_evidence_constant(stages: Stages) -> float | None:
