@@ -69,19 +69,16 @@ class PriorCorrelation(Section):
         if self.file is not None:
             return read(self.file)
         if self.kernel is not None:
-            return self._of_distance()
+            places = [np.atleast_1d(np.asarray(place, dtype=float)) for place in self.at or ()]
+            if len(places) != len(self.between) or len({len(place) for place in places}) != 1:
+                raise ConfigError(
+                    f"at: give {len(self.between)} places, one per parameter, all with the same number of coordinates"
+                )
+            return correlation_of_places(self.kernel or "", np.stack(places), self.length or 1.0)
         rows = self.matrix or ()
         if len({len(row) for row in rows}) != 1:
             raise ConfigError("the rows of the matrix have different lengths")
         return np.array(rows)
-
-    def _of_distance(self) -> Array:
-        places = [np.atleast_1d(np.asarray(place, dtype=float)) for place in self.at or ()]
-        if len(places) != len(self.between) or len({len(place) for place in places}) != 1:
-            raise ConfigError(
-                f"at: give {len(self.between)} places, one per parameter, all with the same number of coordinates"
-            )
-        return correlation_of_places(self.kernel or "", np.stack(places), self.length or 1.0)
 
 
 class PriorFile(Section):
@@ -156,7 +153,11 @@ def resolved(
     for k, section in enumerate(correlations):
         place = ("prior_correlation", k)
         try:
-            _check_names(section.between, estimated, alone)
+            for name in section.between:
+                if name in alone:
+                    raise ConfigError(f"{name} cannot be correlated: {alone[name]}")
+                if name not in estimated:
+                    raise ConfigError(f"{name!r} is not a parameter with a prior{suggest(name, estimated)}")
             parts.append((section.between, section.of_all(read_square)))
             Dependence(*parts[-1])
         except (ConfigError, DataError) as error:
@@ -167,14 +168,6 @@ def resolved(
         except ConfigError as error:
             faults.append(document.fault(("prior_correlation",), str(error)))
     raise ConfigError(faults)
-
-
-def _check_names(names: Sequence[str], estimated: Sequence[str], apart: Mapping[str, str]) -> None:
-    for name in names:
-        if name in apart:
-            raise ConfigError(f"{name} cannot be correlated: {apart[name]}")
-        if name not in estimated:
-            raise ConfigError(f"{name!r} is not a parameter with a prior{suggest(name, estimated)}")
 
 
 def _of_ensemble(

@@ -236,7 +236,11 @@ class OfScheme(Section):
             return validate(section)
         reference = user_file.absolute(name, info.context.base)
         with Faults() as faults, faults.at("scheme"):
-            cls.kinds[reference] = _scheme_in(reference)
+            # The scheme that a file holds
+            kind = user_file.load(reference, f"scheme {shown(reference)}")
+            if not (isinstance(kind, type) and issubclass(kind, Scheme)):
+                raise ConfigError(f"{shown(reference)} is not a subclass of en4dvar.schemes.Scheme")
+            cls.kinds[reference] = kind
         own = cast(Any, create_model(cls.__name__, __base__=section_of(cls.kinds[reference], base=cls), scheme=str))
         made: Self = own.model_validate({**section, "scheme": reference}, context=info.context)
         return made
@@ -262,14 +266,6 @@ class OfScheme(Section):
         """As given, without what the scheme does not read."""
         written = {**super().as_written(section), "scheme": getattr(self, "scheme")}  # noqa: B009
         return {key: value for key, value in written.items() if key not in type(self).unread(written)}
-
-
-def _scheme_in(reference: str) -> type[Scheme]:
-    """The scheme that a file holds. Raises :class:`ConfigError`."""
-    kind = user_file.load(reference, f"scheme {shown(reference)}")
-    if not (isinstance(kind, type) and issubclass(kind, Scheme)):
-        raise ConfigError(f"{shown(reference)} is not a subclass of en4dvar.schemes.Scheme")
-    return kind
 
 
 def listed(kinds: Mapping[str, type[Scheme]]) -> str:

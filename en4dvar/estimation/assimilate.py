@@ -118,7 +118,13 @@ def _concluded(
     """The outcome without its minima and cautions."""
     space, problem, ends = stages.space, stages.problem, sampled.ends
     observations, last = problem.observations, ends.central
-    log_evidence_constant = _log_evidence_constant(stages)
+    # ln p(y) with constant parameters, NaN where these lose the ensemble; None where none varies. It is that of an
+    # assimilation of its own, searched and, in doubt, sampled like this one. The posterior at zero changes (Savage &
+    # Dickey) would spare the runs, but extrapolates the quadratic form of J from one minimum to the other, which may
+    # be far away.
+    log_evidence_constant = (
+        _log_evidence(stages, stages.problem.constant) if stages.compares and stages.problem.varying else None
+    )
     response = conclusions.response_of(space, descent, ends.mode, last)
     std = ends.members.std(axis=0, ddof=1)
     shifts: tuple[Shift, ...] = ()
@@ -168,16 +174,6 @@ def _fitted(stages: Stages, changed: InverseProblem) -> Fit | None:
     except TooFewMembersError:
         return None
     return Fit(changed.prior.from_physical(end.centre), end.iterations[-1].cost, other.space.forward_runs)
-
-
-def _log_evidence_constant(stages: Stages) -> float | None:
-    """ln p(y) with constant parameters, NaN where these lose the ensemble; None where none varies.
-
-    It is that of an assimilation of its own, searched and, in doubt, sampled like this one. The posterior at zero
-    changes (Savage & Dickey) would spare the runs, but extrapolates the quadratic form of J from one minimum to the
-    other, which may be far away.
-    """
-    return _log_evidence(stages, stages.problem.constant) if stages.compares and stages.problem.varying else None
 
 
 def _log_evidence(stages: Stages, problem: InverseProblem) -> float:
