@@ -69,19 +69,18 @@ def choose_start(
     ``resume``: where the comparison was interrupted. ``keep`` is called before each round of moves with the state to
     resume from, ``tell`` after it.
     """
+    beyond = len(space.members) + 1  # the number of what is no member
     if scheme.lengthen > 1:
 
         def of_first(short: WeightSpace) -> Descent:
             assert short.scheme.minimiser is not None
             return choose_start(short, short.scheme.minimiser, run, seed, None, lambda state: None, tell).descent
 
-        beyond = len(space.members) + 1
         led = lengthened(space, scheme, of_first, tell)
         return Start(Descent(space.start(led), members=(beyond,)), tried=(beyond,))
     warnings: tuple[Caution, ...] = ()
     begin = scheme.start
     if not isinstance(begin, str):
-        beyond = len(space.members) + 1
         return Start(descent_at(space, given(space.problem, begin), beyond), tried=(beyond,))
     if begin == "prior-mean":
         if np.isfinite(space.observation_cost(run)[-1]):

@@ -15,7 +15,7 @@ from en4dvar.diagnosis.response.what_if import Fit, Shift, what_if, with_shifts
 from en4dvar.ensemble.forecast import Forecast, cost, forecast, log_posterior
 from en4dvar.estimation import conclusions
 from en4dvar.estimation.conclusions import Ensembles
-from en4dvar.estimation.localised import assimilate_localised
+from en4dvar.estimation.localised import Localised
 from en4dvar.estimation.stages import Keep, LoopState, Sampled, Stages
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
 from en4dvar.plumbing.caution import Caution, caution
@@ -59,7 +59,7 @@ def assimilate(
     """
     with one_blas_thread():
         if settings.localisation is not None or problem.fields:
-            return assimilate_localised(problem, settings, seed, executor or SerialExecutor(), progress)
+            return Localised(problem, settings, seed, executor or SerialExecutor(), progress).run()
         return _through(Stages(problem, settings, seed, executor or SerialExecutor(), progress, keep), resume)
 
 

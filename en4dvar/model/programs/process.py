@@ -8,11 +8,11 @@ from __future__ import annotations
 import math
 import os
 import shutil
-import signal
 import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -24,7 +24,7 @@ from en4dvar.model.programs.outputs import read
 from en4dvar.model.programs.settings import LOGARITHM, OUTPUT, STDOUT, CommandSettings, fill
 from en4dvar.model.programs.template import filled
 from en4dvar.model.state import Array
-from en4dvar.plumbing.children import Child, TimeLimitError, require_going_on, scratch, within
+from en4dvar.plumbing.children import Child, TimeLimitError, require_going_on, scratch, status_named, within
 from en4dvar.plumbing.files import POSIX
 
 LAST_WORDS = 300  # characters of the standard error in a reason
@@ -45,13 +45,10 @@ class Program:
 
     def __call__(self, parameters: Mapping[str, float], times: Array) -> dict[str, Array]:
         """Observable → values (K,). Raises :class:`ProgramError`: the last attempt failed, with its reason."""
-        for attempt in range(self.settings.retries + 1):
-            try:
+        for _ in range(self.settings.retries):
+            with suppress(ProgramError):
                 return self._attempt(parameters, times)
-            except ProgramError:
-                if attempt == self.settings.retries:
-                    raise
-        raise AssertionError
+        return self._attempt(parameters, times)
 
     def _attempt(self, parameters: Mapping[str, float], times: Array) -> dict[str, Array]:
         """One run. What this process does for it, and what the program does, are together within the time limit."""
@@ -99,13 +96,7 @@ class Program:
 def _why(status: int, errors: bytes) -> str:
     lines = [line.strip() for line in errors.decode("utf-8", "replace").splitlines() if line.strip()]
     said = f": {lines[-1][-LAST_WORDS:]}" if lines else ""
-    if status < 0:
-        try:
-            name = signal.Signals(-status).name
-        except ValueError:
-            name = str(-status)
-        return f"the program was ended by signal {name}{said}"
-    return f"the program ended with exit status {status}{said}"
+    return f"the program {'was ended by' if status < 0 else 'ended with'} {status_named(status)}{said}"
 
 
 @dataclass(frozen=True)
