@@ -61,9 +61,7 @@ class Knots(Section):
 
 
 def _change_std(text: Any, context: Context) -> Spread:
-    if text == "estimated":
-        return Estimated(0.5, relative=True)
-    return parse_spread(text, subject_unit(context))
+    return Estimated(0.5, relative=True) if text == "estimated" else parse_spread(text, subject_unit(context))
 
 
 class VariesSection(Knots):

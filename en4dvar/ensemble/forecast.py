@@ -134,9 +134,7 @@ class Composite:
 
     def _rates(self, observed: Array, at: Indices, nodes: Indices) -> Array:
         rates: Array = observed[1][:, at]
-        if self._spread is None:
-            return rates
-        return self._spread.rates(np.moveaxis(observed[0][:, nodes], 1, 0), rates)
+        return rates if self._spread is None else self._spread.rates(np.moveaxis(observed[0][:, nodes], 1, 0), rates)
 
     def _reading(self, extra_times: Array) -> tuple[Array, Reading, int, Indices, Indices, Indices]:
         """The instants; what is read there and how many numbers that are; which of them are observations, and curves,

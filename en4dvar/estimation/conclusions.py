@@ -191,9 +191,7 @@ def discrepancy_of(space: WeightSpace, descent: Descent, central: Predicted) -> 
     """Discrepancy of the model, where the observations allow for one."""
     observations, linear = space.problem.observations, descent.iterate.linear
     explained = observations.noise.explained(observations.values, central)
-    if explained is None or linear is None:
-        return None
-    return Discrepancy(*explained, shares_of_variance(space, linear))
+    return None if explained is None or linear is None else Discrepancy(*explained, shares_of_variance(space, linear))
 
 
 def future_missed(withheld: Withheld | None) -> tuple[Caution, ...]:

@@ -14,7 +14,7 @@ from en4dvar.estimation.design.evaluate import Evaluated, Method, evaluate
 from en4dvar.estimation.design.planned import Planned
 from en4dvar.executor import Executor
 from en4dvar.inputs.asked import DataFile
-from en4dvar.plumbing.errors import ConfigError, En4dvarError
+from en4dvar.plumbing.errors import ConfigError, En4dvarError, retold
 from en4dvar.plumbing.units import UnitError
 from en4dvar.plumbing.user_code import reason_of
 from en4dvar.problem import InverseProblem
@@ -152,13 +152,10 @@ def _wanted(config: Config, problem: InverseProblem) -> dict[str, tuple[float, b
     """What is to be known to what: in its unit, or relative to the value. Raises :class:`ConfigError`."""
     terms, wanted = {term.parameter.name: term.parameter for term in problem.prior.terms}, {}
     for name, text in config.design.wanted.items():
-        where = ("design", "wanted", name)
-        if name not in (config.design.about or terms):
-            raise ConfigError([config.document.fault(where, f"{name}: not among what is asked about")])
-        try:
+        with config.document.placing("design", "wanted", name), retold(UnitError, ConfigError):
+            if name not in (config.design.about or terms):
+                raise ConfigError(f"{name}: not among what is asked about")
             spread = parse_spread(text, terms[name].unit)
-        except (ConfigError, UnitError) as error:
-            raise ConfigError([config.document.fault(where, str(error))]) from None
         wanted[name] = spread.value, spread.relative
     return wanted
 
