@@ -215,25 +215,22 @@ class Rounds(DataWindow):
 
     def move(self, going: Sequence[Descent], moves: Sequence[Move | None]) -> None:
         for descent, move in zip(going, moves, strict=True):
-            self._follow(descent, move)
+            step, before = descent.newton, descent.cost
+            if move is not None:
+                self.record(descent, step.hessian.economical_transform, move.step_length)
+                descent.weights, descent.cost = self.space.onwards(move.w, step.hessian), move.cost
+                rough = max(before - move.cost, step.predicted_decrease) <= ROUGH * max(1.0, move.cost)
+                descent.ended = rough or descent.iteration == self.minimiser.max_iterations
+            else:
+                descent.ended = True
+            if descent.ended:
+                self.end_here(descent)
         self.rounds += 1
         costs = tuple(descent.cost for descent in self.descents)
         self.tell(StartRecord(self.rounds, costs, sum(not descent.ended for descent in self.descents)))
         others = (self.lowest.cost, *(minimum.cost for minimum in self.known))
         if len(going) == 1 and going[0].cost <= min(*costs, *others, self.plausible):
             going[0].ended = True  # it can only go lower: the comparison is decided
-
-    def _follow(self, descent: Descent, move: Move | None) -> None:
-        step, before = descent.newton, descent.cost
-        if move is not None:
-            self.record(descent, step.hessian.economical_transform, move.step_length)
-            descent.weights, descent.cost = self.space.onwards(move.w, step.hessian), move.cost
-            rough = max(before - move.cost, step.predicted_decrease) <= ROUGH * max(1.0, move.cost)
-            descent.ended = rough or descent.iteration == self.minimiser.max_iterations
-        else:
-            descent.ended = True
-        if descent.ended:
-            self.end_here(descent)
 
     def end_here(self, descent: Descent) -> None:
         """A minimum, which takes over the members."""
