@@ -185,12 +185,9 @@ class _Work:
         best = sorted(gains, key=lambda number: -gains[number])[:CHECKED]
         checked = [number for number in dict.fromkeys([0, *best]) if number in gains]
         self._evaluate(executor, checked, "nested")
-        if self._off(gains, checked):
-            self._evaluate(executor, list(gains), "nested")
-
-    def _off(self, gains: Mapping[int, float], checked: Sequence[int]) -> bool:
         exact = {d.number: d.results[0] for d in self._latest() if d.method == "nested" and d.results}
-        return any(abs(exact[n].gain - gains[n]) > AGREE + 2 * exact[n].error for n in checked if n in exact)
+        if any(abs(exact[n].gain - gains[n]) > AGREE + 2 * exact[n].error for n in checked if n in exact):
+            self._evaluate(executor, list(gains), "nested")
 
     def rows(self) -> list[DesignRow]:
         """Every candidate, or number of experiments alike, in the order of the file."""
@@ -213,12 +210,8 @@ class _Work:
         left = [n for n in numbers if n not in done]
         calls = ((self.every[n], method, self.config.seed) for n in left)
         for i, outcome in executor.map(_one, calls):
-            if isinstance(outcome, Exception):
-                ended = Done(left[i], method, (), reason_of(outcome))
-            else:
-                ended = (
-                    Done(left[i], method, outcome) if isinstance(outcome, tuple) else Done(left[i], method, (), outcome)
-                )
+            results, failure = ((), reason_of(outcome)) if isinstance(outcome, Exception) else outcome
+            ended = Done(left[i], method, results, failure)
             self.state = DesignState((*self.state.done, ended))
             self.run.log.write(_line(ended))
             self.keeper.keep(lambda: self.state)
@@ -229,8 +222,8 @@ class _Work:
             raise ConfigError(f"none of the designs can be evaluated: {self.state.done[0].failure}")
 
 
-def _one(candidate: Candidate, method: Method, seed: int) -> tuple[Evaluated, ...] | str:
-    """Evaluate a candidate in a worker; text says why it cannot be."""
+def _one(candidate: Candidate, method: Method, seed: int) -> tuple[tuple[Evaluated, ...], str]:
+    """Evaluate a candidate in a worker; the text says why it cannot be."""
     config = candidate.config
     design = config.design
     try:
@@ -241,9 +234,9 @@ def _one(candidate: Candidate, method: Method, seed: int) -> tuple[Evaluated, ..
         costs = (design.price.of(planned.alike, len(planned.readings)) for planned in every)
         broken = [design.within.broken(len(o.readings), cost, o.beyond) for o, cost in zip(every, costs, strict=True)]
         kept = tuple(planned for planned, reason in zip(every, broken, strict=True) if not reason)
-        return kept or broken[0]
+        return kept, "" if kept else broken[0]
     except En4dvarError as error:
-        return str(error)
+        return (), str(error)
 
 
 def _line(done: Done) -> str:
