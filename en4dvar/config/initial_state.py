@@ -40,9 +40,14 @@ def modes_of(prior: FieldPrior) -> list[Perturbed]:
     return told
 
 
-def perturbation(field: Field, spread: Spread) -> Perturbed:
-    """N(0, std²) added to the field, or, for a std in %, a factor whose logarithm is N(0, std²)."""
-    name = f"initial_{field.name}"
+def perturbation(field: Field, std: str | float | Spread) -> Perturbed:
+    """N(0, std²) added to the field, or, for a std in %, a factor whose logarithm is N(0, std²).
+
+    Raises
+    ------
+    UnitError: a unit that is not the field's. ConfigError: a std that is not positive.
+    """
+    name, spread = f"initial_{field.name}", std if isinstance(std, Spread) else parse_spread(std, field.unit)
     if spread.relative:
         label = f"initial {field.name} relative to the model's"
         parameter = Parameter(name, "1", "lognormal", (0.0, float("inf")), label)

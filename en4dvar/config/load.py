@@ -25,7 +25,7 @@ from en4dvar.config.varies import MODEL_ERROR, ErrorOf
 from en4dvar.inputs.members import read_centres, read_members
 from en4dvar.model.forward import ForwardModel, Observable
 from en4dvar.model.state import NOISE_SCALE, Array
-from en4dvar.plumbing.errors import ConfigError, DataError, Fault, retold
+from en4dvar.plumbing.errors import ConfigError, DataError, Fault
 from en4dvar.plumbing.hints import suggest
 from en4dvar.plumbing.units import UnitError, parse_quantity
 from en4dvar.priors.dependence import Dependence
@@ -272,10 +272,12 @@ def values_of(
     units = {e.parameter.name: e.parameter.unit for e in entries if isinstance(e, Uncertain)}
     where = ("assimilation", "start", "from")
     if isinstance(start.place, Path):
-        with document.placing(*where), retold(DataError, ConfigError):
+        try:
             if of_sets := read_centres(start.place, units):
                 return of_sets
             members = read_members(start.place, {name: (unit, "") for name, unit in units.items()})
+        except DataError as error:
+            raise ConfigError([document.fault(where, str(error))]) from None
         return {name: float(np.median(values)) for name, values in members.items()}
     values, faults = {}, []
     for name, text in start.place.items():

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from en4dvar.config.context import parse_spread
 from en4dvar.config.initial_state import perturbation
 from en4dvar.data.noise import noise_of
 from en4dvar.data.observations import Observations
@@ -26,10 +25,7 @@ def laser(values=None):
     settings = BubbleSettings(law="neo-hookean-kelvin-voigt", start="laser", gas="polytropic")
     model = BubbleModel.from_settings(settings)
     fields = {f.name: f for f in model.layout}
-    pairs = [
-        perturbation(fields["Rdot"], parse_spread("4 m/s", "m/s")),
-        perturbation(fields["p_b"], parse_spread("5 %", "Pa")),
-    ]
+    pairs = [perturbation(fields["Rdot"], "4 m/s"), perturbation(fields["p_b"], "5 %")]
     G = next(p for p in model.parameters if p.name == "G")
     prior = Prior((PriorTerm.lognormal(G, 3000.0, 0.4), *(term for term, _ in pairs)))
     ones = np.ones(len(TIMES))
@@ -56,8 +52,7 @@ def test_velocity_and_gas_pressure_change_the_run():
 def test_a_member_without_gas_fails_alone():
     problem = laser()
     fields = {f.name: f for f in problem.model.layout}
-    pressure, by = perturbation(fields["p_b"], parse_spread("1 kPa", "Pa"))
-    radius, size = perturbation(fields["R"], parse_spread("10 um", "m"))
+    (pressure, by), (radius, size) = perturbation(fields["p_b"], "1 kPa"), perturbation(fields["R"], "10 um")
     problem = replace(problem, prior=Prior((problem.prior.terms[0], pressure, radius)), perturbations=(by, size))
     run = forecast(problem, np.array([[8.0, 0.0, 0.0], [8.0, -1e4, 0.0], [8.0, 0.0, -3e-4], [8.0, 1e3, 1e-6]]))
     assert run.active.tolist() == [True, False, False, True]
