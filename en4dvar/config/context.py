@@ -10,11 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import AfterValidator, GetCoreSchemaHandler, GetJsonSchemaHandler
+from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import CoreSchema, core_schema
 
 from en4dvar.config.validate import Faults
 from en4dvar.model.forward import ForwardModel, Observable
+from en4dvar.plumbing.described import text_for
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.hints import brief, shown, suggest
 from en4dvar.plumbing.units import convert, parse_quantity, parse_unit
@@ -149,15 +150,11 @@ def parse_spread(text: Any, unit: str) -> Spread:
 def unit_of(target: Unit) -> Made:
     """The text of a unit that can be converted to ``target``."""
 
-    def known(unit: str) -> str:
-        parse_unit(unit)
-        return unit
-
     def fits(unit: str, context: Context) -> str:
         convert(1.0, unit, target(context))
         return unit
 
-    return Made(fits, Annotated[str, AfterValidator(known)])
+    return Made(fits, Annotated[str, text_for(parse_unit)])
 
 
 def read_each(

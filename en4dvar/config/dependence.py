@@ -18,7 +18,7 @@ from en4dvar.config.validate import Faults
 from en4dvar.inputs.members import read_members
 from en4dvar.inputs.square import read_square
 from en4dvar.model.state import Array, Parameter, TransformName
-from en4dvar.plumbing.errors import ConfigError, DataError, Fault
+from en4dvar.plumbing.errors import ConfigError, DataError, Fault, retold
 from en4dvar.plumbing.files import expanded
 from en4dvar.plumbing.hints import suggest
 from en4dvar.priors.dependence import Dependence, KernelName, correlation_of_places
@@ -69,19 +69,16 @@ class PriorCorrelation(Section):
         if self.file is not None:
             return read(self.file)
         if self.kernel is not None:
-            return self._of_distance()
+            places = [np.atleast_1d(np.asarray(place, dtype=float)) for place in self.at or ()]
+            if len(places) != len(self.between) or len({len(place) for place in places}) != 1:
+                raise ConfigError(
+                    f"at: give {len(self.between)} places, one per parameter, all with the same number of coordinates"
+                )
+            return correlation_of_places(self.kernel or "", np.stack(places), self.length or 1.0)
         rows = self.matrix or ()
         if len({len(row) for row in rows}) != 1:
             raise ConfigError("the rows of the matrix have different lengths")
         return np.array(rows)
-
-    def _of_distance(self) -> Array:
-        places = [np.atleast_1d(np.asarray(place, dtype=float)) for place in self.at or ()]
-        if len(places) != len(self.between) or len({len(place) for place in places}) != 1:
-            raise ConfigError(
-                f"at: give {len(self.between)} places, one per parameter, all with the same number of coordinates"
-            )
-        return correlation_of_places(self.kernel or "", np.stack(places), self.length or 1.0)
 
 
 class PriorFile(Section):
@@ -156,7 +153,11 @@ def resolved(
     for k, section in enumerate(correlations):
         place = ("prior_correlation", k)
         try:
-            _check_names(section.between, estimated, alone)
+            for name in section.between:
+                if name in alone:
+                    raise ConfigError(f"{name} cannot be correlated: {alone[name]}")
+                if name not in estimated:
+                    raise ConfigError(f"{name!r} is not a parameter with a prior{suggest(name, estimated)}")
             parts.append((section.between, section.of_all(read_square)))
             Dependence(*parts[-1])
         except (ConfigError, DataError) as error:
@@ -169,34 +170,26 @@ def resolved(
     raise ConfigError(faults)
 
 
-def _check_names(names: Sequence[str], estimated: Sequence[str], apart: Mapping[str, str]) -> None:
-    for name in names:
-        if name in apart:
-            raise ConfigError(f"{name} cannot be correlated: {apart[name]}")
-        if name not in estimated:
-            raise ConfigError(f"{name!r} is not a parameter with a prior{suggest(name, estimated)}")
-
-
 def _of_ensemble(
     asking: Sequence[Uncertain], ensemble: PriorFile | None, apart: Mapping[str, str]
 ) -> tuple[tuple[Dependence, ...], dict[str, Entry]]:
     """The Gaussian of the members' mean and covariance in transformed space. Raises :class:`ConfigError` with paths."""
     if ensemble is None:
-        raise _at(f"parameters.{asking[0].parameter.name}", "no ensemble is given; write 'prior: {ensemble: FILE}'")
+        raise ConfigError(
+            "no ensemble is given; write 'prior: {ensemble: FILE}'", f"parameters.{asking[0].parameter.name}"
+        )
     if not asking:
-        raise _at("prior", "no parameter takes its prior from it; write e.g. 'G: {prior: ensemble}'")
+        raise ConfigError("no parameter takes its prior from it; write e.g. 'G: {prior: ensemble}'", "prior")
     for entry in asking:
         if reason := apart.get(entry.parameter.name):
-            raise _at(f"parameters.{entry.parameter.name}", f"cannot be part of an ensemble: {reason}")
+            raise ConfigError(f"cannot be part of an ensemble: {reason}", f"parameters.{entry.parameter.name}")
     units = {e.parameter.name: (e.parameter.unit, e.spec.unit or "") for e in asking}
-    try:
+    with retold(DataError, ConfigError, "", "prior.ensemble"):
         members = read_members(ensemble.ensemble, units)
-    except DataError as error:
-        raise _at("prior.ensemble", str(error)) from None
     count, n = len(next(iter(members.values()))), len(asking)
     if count < n + 2:
         words = f"{count} members are too few for {n} parameters; at least {n + 2}"
-        raise _at("prior.ensemble", f"{ensemble.ensemble}: {words}")
+        raise ConfigError(f"{ensemble.ensemble}: {words}", "prior.ensemble")
     made: dict[str, Entry] = {}
     columns = []
     for entry in asking:
@@ -204,16 +197,14 @@ def _of_ensemble(
         try:
             term, scores = term_of_members(entry.parameter, members[name], entry.spec.map)
         except ConfigError as error:
-            raise _at(f"parameters.{name}", str(error).removeprefix(f"prior of {name}: ")) from None
+            raise ConfigError(str(error).removeprefix(f"prior of {name}: "), f"parameters.{name}") from None
         made[name] = replace(entry, of_members=term)
         columns.append(scores)
     y = np.stack(columns, axis=1)
     matrix = np.atleast_2d(np.corrcoef(y.T))
     np.fill_diagonal(matrix, 1.0)
-    try:
+    with retold(ConfigError, ConfigError, f"{ensemble.ensemble}: ", "prior.ensemble"):
         return (Dependence(tuple(made), matrix, y),), made
-    except ConfigError as error:
-        raise _at("prior.ensemble", f"{ensemble.ensemble}: {error}") from None
 
 
 def term_of_members(parameter: Parameter, values: Array, kind: str | None) -> tuple[PriorTerm, Array]:
@@ -237,7 +228,3 @@ def term_of_members(parameter: Parameter, values: Array, kind: str | None) -> tu
         raise ConfigError(f"{error}, as map: {kind} has it") from None
     term = replace(shape, mean=float(x.mean()), std=float(x.std(ddof=1)))
     return term, np.asarray((x - term.mean) / term.std)
-
-
-def _at(path: str, message: str) -> ConfigError:
-    return ConfigError(message, path)

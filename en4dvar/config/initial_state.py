@@ -16,6 +16,7 @@ from en4dvar.priors.field_prior import FieldPrior
 from en4dvar.priors.prior import PriorTerm
 from en4dvar.problem import StatePerturbation
 
+S = TypeVar("S", bound=Section)
 T = TypeVar("T")
 
 
@@ -39,14 +40,14 @@ def modes_of(prior: FieldPrior) -> list[Perturbed]:
     return told
 
 
-def perturbation(field: Field, std: str | float) -> Perturbed:
+def perturbation(field: Field, std: str | float | Spread) -> Perturbed:
     """N(0, std²) added to the field, or, for a std in %, a factor whose logarithm is N(0, std²).
 
     Raises
     ------
     UnitError: a unit that is not the field's. ConfigError: a std that is not positive.
     """
-    name, spread = f"initial_{field.name}", parse_spread(std, field.unit)
+    name, spread = f"initial_{field.name}", std if isinstance(std, Spread) else parse_spread(std, field.unit)
     if spread.relative:
         label = f"initial {field.name} relative to the model's"
         parameter = Parameter(name, "1", "lognormal", (0.0, float("inf")), label)
@@ -90,32 +91,33 @@ def dynamic_fields(model: ForwardModel) -> dict[str, Field]:
     return {f.name: f for f in model.layout if f.name not in constant}
 
 
-def read_fields(
-    section: Mapping[str, Any], context: Context, instead: str, read: Callable[[Any, Context], T]
-) -> tuple[T, ...]:
-    """The entries about fields of the state, in the order of the file; ``instead`` is what to do for a parameter."""
-    fields = dynamic_fields(context.model)
+def of_fields(kind: type[S], instead: str, make: Callable[[S, Field], T]) -> Made:
+    """What ``make`` makes of sections of a ``kind`` about fields of the state, in the order of the file; ``instead`` is
+    what to do for a parameter.
+    """
 
-    def unknown(name: str) -> str:
-        if name in {p.name for p in context.model.parameters}:
-            return f"{name} is a parameter: {instead}"
-        return f"unknown field {shown(name)} of the state{suggest(name, fields)}"
+    def read(sections: Mapping[str, Any], context: Context) -> tuple[T, ...]:
+        fields = dynamic_fields(context.model)
 
-    with Faults() as faults:
-        return tuple(read_each(section, fields, context, faults, read, unknown).values())
+        def one(entry: Any, context: Context) -> T:
+            return make(kind.model_validate(entry, context=context), context.subject)
 
+        def unknown(name: str) -> str:
+            if name in {p.name for p in context.model.parameters}:
+                return f"{name} is a parameter: {instead}"
+            return f"unknown field {shown(name)} of the state{suggest(name, fields)}"
 
-def _perturbed(fields: Mapping[str, Any], context: Context) -> tuple[Initial, ...]:
-    def read(entry: Any, context: Context) -> Initial:
-        section, field = InitialSpread.model_validate(entry, context=context), context.subject
-        if section.kernel is None or section.length is None:
-            return perturbation(field, entry["std"])
-        std = section.std
-        return FieldPrior(field, std.value, section.kernel, section.length, std.relative, section.modes)
+        with Faults() as faults:
+            return tuple(read_each(sections, fields, context, faults, one, unknown).values())
 
-    return read_fields(fields, context, "give it a prior in parameters", read)
+    return Made(read, dict[str, Any], {"type": "object", "additionalProperties": kind.model_json_schema()})
 
 
-PERTURBED = Made(
-    _perturbed, dict[str, Any], {"type": "object", "additionalProperties": InitialSpread.model_json_schema()}
-)
+def _initial(section: InitialSpread, field: Field) -> Initial:
+    std = section.std
+    if section.kernel is None or section.length is None:
+        return perturbation(field, std)
+    return FieldPrior(field, std.value, section.kernel, section.length, std.relative, section.modes)
+
+
+PERTURBED = of_fields(InitialSpread, "give it a prior in parameters", _initial)

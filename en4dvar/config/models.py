@@ -4,7 +4,6 @@ Its labels and symbols are tried before any work: matplotlib reads them when eve
 """
 
 import re
-from collections.abc import Iterable
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
@@ -13,8 +12,7 @@ from pydantic import BaseModel, ConfigDict
 
 from en4dvar.config.document import Document
 from en4dvar.config.validate import check
-from en4dvar.model.forward import ForwardModel, Observable, StateField
-from en4dvar.model.state import Parameter
+from en4dvar.model.forward import ForwardModel, StateField
 from en4dvar.plumbing import user_file
 from en4dvar.plumbing.errors import ConfigError, En4dvarError, Fault
 from en4dvar.plumbing.files import PathError
@@ -33,14 +31,6 @@ _BESIDE = rf"[_^](?:{_LETTER}|{_ROMAN}|{_GROUP})"
 _ATOM = rf"(?:{_LETTER}(?:{_BESIDE})?|\\dot\{{[A-Za-z]\}}|\\(?:{FUNCTIONS})(?![A-Za-z])|[|/()+=,-])"
 FORMULA = rf"\$(?:{_ATOM} ?)+\$"
 _SIMPLE = re.compile(rf"[^$\\]*|{FORMULA}", re.ASCII)
-
-
-def check_symbols(things: Iterable[Parameter | Observable]) -> None:
-    """Raises :class:`ConfigError`: a label or symbol that cannot be written in a figure."""
-    for thing in things:
-        for what, text in (("symbol", thing.symbol), ("label", thing.label)):
-            if reason := symbol_fault(text):
-                raise ConfigError(f"the {what} {shown(text)} of {thing.name} cannot be written in a figure: {reason}")
 
 
 def symbol_fault(text: str) -> str:
@@ -119,7 +109,10 @@ def build_model(kind: type[ForwardModel], settings: BaseModel) -> ForwardModel:
                 raise
             raise ConfigError(f"{error}; a class that takes arguments needs Settings and from_settings") from error
         observables = model.observables
-    check_symbols((*model.parameters, *observables))
+    for thing in (*model.parameters, *observables):
+        for what, text in (("symbol", thing.symbol), ("label", thing.label)):
+            if reason := symbol_fault(text):
+                raise ConfigError(f"the {what} {shown(text)} of {thing.name} cannot be written in a figure: {reason}")
     for observable in observables:
         if isinstance(observable.operator, StateField):
             for field in (observable.operator.name, observable.operator.rate_of):

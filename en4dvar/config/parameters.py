@@ -203,7 +203,7 @@ class Uncertain:
             raise ConfigError([replace(f, message=f.message.removeprefix(own)) for f in error.problems]) from None
 
     def _term(self, mean: float, median: float) -> PriorTerm:
-        spec, p, bounds = self.spec, self.parameter, self._bounds
+        spec, p, bounds = self.spec, self.parameter, (self.spec.lower or 0.0, self.spec.upper or 0.0)
         if self.of_members is not None:
             return self.of_members
         log_std, logit_std = spec.log_std or 0.0, spec.logit_std or 0.0  # each is there where it is read
@@ -241,10 +241,6 @@ class Uncertain:
             self.term()
         elif self.spec.prior != "logit":
             self.term(lambda where: 1.0)  # the other values do not wait for the data
-
-    @property
-    def _bounds(self) -> tuple[float, float]:
-        return self.spec.lower or 0.0, self.spec.upper or 0.0
 
     def walk(self, model: ForwardModel, term: PriorTerm, times: Array) -> RandomWalk | None:
         """How it varies over a window of observations at ``times`` (K,); None where it does not.

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, cast, get_type_hints
 
 from pydantic import (
-    AfterValidator,
     ConfigDict,
     Discriminator,
     Field,
@@ -27,7 +26,7 @@ from en4dvar.config.context import Context, Made, Unknown, quantity
 from en4dvar.config.validate import Faults
 from en4dvar.executor.limits import Limits, parse_bytes
 from en4dvar.plumbing import user_file
-from en4dvar.plumbing.described import Described
+from en4dvar.plumbing.described import Described, text_for
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.files import expanded
 from en4dvar.plumbing.hints import shown
@@ -101,11 +100,6 @@ def section_of(*kinds: Any, base: type[Section] = Section) -> Any:
     return create_model(f"{base.__name__}Of", __base__=base, **declared)
 
 
-def _size(text: str) -> str:
-    parse_bytes(text)
-    return text
-
-
 class Output(Section):
     """Where results go."""
 
@@ -145,7 +139,7 @@ class Execution(Section):
     time_limit: Annotated[float, Quantity("s"), Field(gt=0)] | None = None
     """Longest that one batch of members (one member, unless the model batches) may take, e.g. 60 s; past it they have
     failed. Needs executor processes (then the default) or dask."""
-    memory_limit: Annotated[str, AfterValidator(_size)] | None = None
+    memory_limit: Annotated[str, text_for(parse_bytes)] | None = None
     """Most that a worker process may allocate, e.g. 4 GB; members that need more have failed. Linux; needs executor
     processes (then the default) or dask."""
 
@@ -236,7 +230,11 @@ class OfScheme(Section):
             return validate(section)
         reference = user_file.absolute(name, info.context.base)
         with Faults() as faults, faults.at("scheme"):
-            cls.kinds[reference] = _scheme_in(reference)
+            # The scheme that a file holds
+            kind = user_file.load(reference, f"scheme {shown(reference)}")
+            if not (isinstance(kind, type) and issubclass(kind, Scheme)):
+                raise ConfigError(f"{shown(reference)} is not a subclass of en4dvar.schemes.Scheme")
+            cls.kinds[reference] = kind
         own = cast(Any, create_model(cls.__name__, __base__=section_of(cls.kinds[reference], base=cls), scheme=str))
         made: Self = own.model_validate({**section, "scheme": reference}, context=info.context)
         return made
@@ -262,14 +260,6 @@ class OfScheme(Section):
         """As given, without what the scheme does not read."""
         written = {**super().as_written(section), "scheme": getattr(self, "scheme")}  # noqa: B009
         return {key: value for key, value in written.items() if key not in type(self).unread(written)}
-
-
-def _scheme_in(reference: str) -> type[Scheme]:
-    """The scheme that a file holds. Raises :class:`ConfigError`."""
-    kind = user_file.load(reference, f"scheme {shown(reference)}")
-    if not (isinstance(kind, type) and issubclass(kind, Scheme)):
-        raise ConfigError(f"{shown(reference)} is not a subclass of en4dvar.schemes.Scheme")
-    return kind
 
 
 def listed(kinds: Mapping[str, type[Scheme]]) -> str:

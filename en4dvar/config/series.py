@@ -48,9 +48,7 @@ class DataPlan:
     @classmethod
     def of(cls, data: "Data | DataPlan", observable: Observable) -> "DataPlan":
         """The plan of either kind of section; ``observable`` is that of a single series."""
-        if isinstance(data, DataPlan):
-            return data
-        return cls((SeriesPlan(observable.name, observable, data),), {})
+        return data if isinstance(data, DataPlan) else cls((SeriesPlan(observable.name, observable, data),), {})
 
     @property
     def alone(self) -> bool:

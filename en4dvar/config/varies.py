@@ -8,7 +8,7 @@ from typing import Annotated, Any, Self
 from pydantic import model_validator
 
 from en4dvar.config.context import Context, Made, Spread, parse_spread, quantity, subject_unit, time_unit
-from en4dvar.config.initial_state import read_fields
+from en4dvar.config.initial_state import of_fields
 from en4dvar.config.schema import Section
 from en4dvar.config.validate import Faults
 from en4dvar.model.forward import ForwardModel
@@ -61,9 +61,7 @@ class Knots(Section):
 
 
 def _change_std(text: Any, context: Context) -> Spread:
-    if text == "estimated":
-        return Estimated(0.5, relative=True)
-    return parse_spread(text, subject_unit(context))
+    return Estimated(0.5, relative=True) if text == "estimated" else parse_spread(text, subject_unit(context))
 
 
 class VariesSection(Knots):
@@ -99,13 +97,6 @@ class ErrorOf:
         return StateChanges.of(model, self.field, self.spec.knots(times), std.value, std.relative)
 
 
-def _model_error(section: Mapping[str, Any], context: Context) -> tuple[ErrorOf, ...]:
-    def read(entry: Any, context: Context) -> ErrorOf:
-        return ErrorOf(context.subject, ModelErrorSection.model_validate(entry, context=context))
-
-    return read_fields(section, context, "write varies behind its prior", read)
-
-
-MODEL_ERROR = Made(
-    _model_error, dict[str, Any], {"type": "object", "additionalProperties": ModelErrorSection.model_json_schema()}
+MODEL_ERROR = of_fields(
+    ModelErrorSection, "write varies behind its prior", lambda section, field: ErrorOf(field, section)
 )

@@ -125,7 +125,12 @@ class Observations:
         largest = float(np.max(np.abs([self.times, self.values])))
         if not largest < LARGEST:
             raise DataError(f"{where}: {largest:g} among the observations; is the unit right? (less than {LARGEST:g})")
-        self._check_order(where)
+        for begin, end, field_ in [(p.begin, p.end, p.places) for p in self.parts] or [(0, len(self), None)]:
+            step = np.diff(self.times[begin:end])
+            wrong = np.flatnonzero(step <= 0 if field_ is None else step < 0)
+            if len(wrong):
+                a, b = self.times[begin:end][wrong[0] : wrong[0] + 2]
+                raise DataError(f"{where}: times must increase; {a:g} is followed by {b:g}")
         if not np.all(self.weights >= 0):
             raise DataError(f"{where}: weights must not be negative")
         with retold(ValueError, DataError, f"{where}: "):
@@ -136,15 +141,6 @@ class Observations:
                 f"{where}: an error std of {smallest if std < LARGEST else std:g} beside observations up to "
                 f"{largest:g}: their ratio is too large; is the unit right?"
             )
-
-    def _check_order(self, where: str) -> None:
-        """Raise :class:`DataError` where the times of a series do not increase."""
-        for begin, end, field_ in [(p.begin, p.end, p.places) for p in self.parts] or [(0, len(self), None)]:
-            step = np.diff(self.times[begin:end])
-            wrong = np.flatnonzero(step <= 0 if field_ is None else step < 0)
-            if len(wrong):
-                a, b = self.times[begin:end][wrong[0] : wrong[0] + 2]
-                raise DataError(f"{where}: times must increase; {a:g} is followed by {b:g}")
 
     @cached_property
     def instants(self) -> tuple[Array, npt.NDArray[np.intp] | slice]:

@@ -22,7 +22,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -89,8 +88,8 @@ class Passes(Objective["Passes"]):
         finite = np.isfinite(predictions).all(axis=1)
         self.alive, predictions = self.alive[finite], predictions[finite]
         errors = np.sqrt(alpha) * self.data.perturbations(self.seed, f"ES-MDA {a}", self.alive)
-        here = partial(_part_of, self.ensemble, self.alive)
-        self.tell(Pass(mean_of(self.ensemble, self.alive), predictions.mean(axis=0), here))
+        ensemble, alive = self.ensemble, self.alive
+        self.tell(Pass(mean_of(ensemble, alive), predictions.mean(axis=0), lambda part: ensemble[alive, part]))
         anomalies, innovations = predictions - predictions.mean(axis=0), self.data.values + errors - predictions
         return [self.gain.update(anomalies, alpha * self.data.std**2, innovations)]
 
@@ -106,10 +105,6 @@ class Passes(Objective["Passes"]):
         predictions = np.full((len(self.ensemble), len(self.data.values)), np.nan)
         predictions[self.alive] = self.data.runs(lambda some: self.ensemble[self.alive[some]], len(self.alive))
         return self.data.enough(fitted(self.ensemble, predictions)[self.alive], self.fewest)
-
-
-def _part_of(ensemble: Array, alive: Members, part: slice) -> Array:
-    return np.asarray(ensemble[alive, part])
 
 
 @dataclass(frozen=True)

@@ -32,9 +32,9 @@ class FieldData:
     forward: Forward
     at_once: int = 16
 
-    def predict(self, members: Callable[[slice], Array], count: int, fewest: int | None = None) -> Array:
+    def predict(self, members: Callable[[slice], Array], count: int) -> Array:
         """Predictions (count, K) of members that are made a few at a time. Raises as :meth:`enough`."""
-        return self.enough(self.runs(members, count), fewest)
+        return self.enough(self.runs(members, count))
 
     def runs(self, members: Callable[[slice], Array], count: int) -> Array:
         """The same, NaN where a reading is missing."""

@@ -48,7 +48,13 @@ def marginal_members(space: WeightSpace, linear: Linearisation, mode: Array, pos
         return posterior
     members = _drawn(weights, draws, means, covariances, of_errors, len(posterior), stream)
     if space.settings.sampling == "exact":
-        members = _with_moments(members, weights, draws, means, covariances, of_errors)
+        # The members mapped linearly so that mean and covariance are those of the whole mixture
+        centres = np.empty((len(draws), len(of_errors)))
+        centres[:, of_errors], centres[:, ~of_errors] = draws, means
+        mean = weights @ centres
+        target = (weights[:, None] * (centres - mean)).T @ (centres - mean)
+        target[np.ix_(~of_errors, ~of_errors)] += np.einsum("d,dij->ij", weights, covariances)
+        members = with_moments(members, mean, target)
     return prior.from_white(members)
 
 
@@ -120,15 +126,3 @@ def _drawn(
         "dij,dj->di", roots, stream.standard_normal((count, means.shape[1]))
     )
     return members
-
-
-def _with_moments(
-    members: Array, weights: Array, draws: Array, means: Array, covariances: Array, of_errors: Mask
-) -> Array:
-    """The members mapped linearly so that mean and covariance are those of the whole mixture."""
-    centres = np.empty((len(draws), len(of_errors)))
-    centres[:, of_errors], centres[:, ~of_errors] = draws, means
-    mean = weights @ centres
-    target = (weights[:, None] * (centres - mean)).T @ (centres - mean)
-    target[np.ix_(~of_errors, ~of_errors)] += np.einsum("d,dij->ij", weights, covariances)
-    return with_moments(members, mean, target)

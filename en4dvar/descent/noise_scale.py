@@ -54,7 +54,11 @@ def log_derivatives(term: PriorTerm, x: float) -> tuple[float, float, float]:
     if term.transform == "lognormal":
         return 1.0, 0.0, 0.0
     if term.transform in QUANTILE_MAPS:
-        return _differences(term, x)
+        # The same by central differences over seven points
+        h, u = STENCIL, np.log(term.to_physical(x + STENCIL * np.arange(-3.0, 4.0)))
+        first = np.dot([-1, 9, -45, 0, 45, -9, 1], u) / (60 * h)
+        second = np.dot([2, -27, 270, -490, 270, -27, 2], u) / (180 * h**2)
+        return float(first), float(second), float(np.dot([1, -8, 13, 0, -13, 8, -1], u) / (8 * h**3))
     sigma = float(term.to_physical(np.array(x)))
     slopes = 1.0, 0.0, 0.0
     if term.transform == "logit":
@@ -64,11 +68,3 @@ def log_derivatives(term: PriorTerm, x: float) -> tuple[float, float, float]:
         slopes = slope, slope * (1 - 2 * share), slope * (1 - 6 * share + 6 * share**2)
     a, b, c = (slope / sigma for slope in slopes)
     return a, b - a**2, c - 3 * a * b + 2 * a**3
-
-
-def _differences(term: PriorTerm, x: float) -> tuple[float, float, float]:
-    """The same by central differences over seven points."""
-    h, u = STENCIL, np.log(term.to_physical(x + STENCIL * np.arange(-3.0, 4.0)))
-    first = np.dot([-1, 9, -45, 0, 45, -9, 1], u) / (60 * h)
-    second = np.dot([2, -27, 270, -490, 270, -27, 2], u) / (180 * h**2)
-    return float(first), float(second), float(np.dot([1, -8, 13, 0, -13, 8, -1], u) / (8 * h**3))

@@ -69,19 +69,18 @@ def choose_start(
     ``resume``: where the comparison was interrupted. ``keep`` is called before each round of moves with the state to
     resume from, ``tell`` after it.
     """
+    beyond = len(space.members) + 1  # the number of what is no member
     if scheme.lengthen > 1:
 
         def of_first(short: WeightSpace) -> Descent:
             assert short.scheme.minimiser is not None
             return choose_start(short, short.scheme.minimiser, run, seed, None, lambda state: None, tell).descent
 
-        beyond = len(space.members) + 1
         led = lengthened(space, scheme, of_first, tell)
         return Start(Descent(space.start(led), members=(beyond,)), tried=(beyond,))
     warnings: tuple[Caution, ...] = ()
     begin = scheme.start
     if not isinstance(begin, str):
-        beyond = len(space.members) + 1
         return Start(descent_at(space, given(space.problem, begin), beyond), tried=(beyond,))
     if begin == "prior-mean":
         if np.isfinite(space.observation_cost(run)[-1]):
@@ -216,25 +215,22 @@ class Rounds(DataWindow):
 
     def move(self, going: Sequence[Descent], moves: Sequence[Move | None]) -> None:
         for descent, move in zip(going, moves, strict=True):
-            self._follow(descent, move)
+            step, before = descent.newton, descent.cost
+            if move is not None:
+                self.record(descent, step.hessian.economical_transform, move.step_length)
+                descent.weights, descent.cost = self.space.onwards(move.w, step.hessian), move.cost
+                rough = max(before - move.cost, step.predicted_decrease) <= ROUGH * max(1.0, move.cost)
+                descent.ended = rough or descent.iteration == self.minimiser.max_iterations
+            else:
+                descent.ended = True
+            if descent.ended:
+                self.end_here(descent)
         self.rounds += 1
         costs = tuple(descent.cost for descent in self.descents)
         self.tell(StartRecord(self.rounds, costs, sum(not descent.ended for descent in self.descents)))
         others = (self.lowest.cost, *(minimum.cost for minimum in self.known))
         if len(going) == 1 and going[0].cost <= min(*costs, *others, self.plausible):
             going[0].ended = True  # it can only go lower: the comparison is decided
-
-    def _follow(self, descent: Descent, move: Move | None) -> None:
-        step, before = descent.newton, descent.cost
-        if move is not None:
-            self.record(descent, step.hessian.economical_transform, move.step_length)
-            descent.weights, descent.cost = self.space.onwards(move.w, step.hessian), move.cost
-            rough = max(before - move.cost, step.predicted_decrease) <= ROUGH * max(1.0, move.cost)
-            descent.ended = rough or descent.iteration == self.minimiser.max_iterations
-        else:
-            descent.ended = True
-        if descent.ended:
-            self.end_here(descent)
 
     def end_here(self, descent: Descent) -> None:
         """A minimum, which takes over the members."""

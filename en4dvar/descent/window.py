@@ -294,7 +294,12 @@ class DataWindow(Objective[Descent]):
 
     def _take(self, descent: Descent) -> None:
         """The whole step; the iterate after the last one is recorded, too."""
-        taken, descent.step = descent.step, self._regression(descent)
+        # The Gauss–Newton step of J that an ensemble that was run as a whole tells
+        at = descent.iterate
+        runs = Runs(at.members.predicted.stacked, at.central.predicted.stacked[0], at.members.active)
+        reference, anomalies = self._regressed(descent.weights, runs)
+        linear = Linearisation.of_stacked(at.central.predicted[0], reference, anomalies)
+        taken, descent.step = descent.step, gauss_newton(descent.weights.w, self._evaluation(descent, linear))
         self.record(descent, descent.weights.T, 0.0 if descent.stop else 1.0)
         descent.ended = bool(descent.stop)
         if descent.ended:
@@ -345,14 +350,6 @@ class DataWindow(Objective[Descent]):
     def _evaluation(self, descent: Descent, linear: Linearisation) -> Evaluation:
         descent.at = replace(descent.iterate, linear=linear)
         return Evaluation(*self.observations.whiten(linear), self.space.basis)
-
-    def _regression(self, descent: Descent) -> GaussNewtonStep:
-        """The Gauss–Newton step of J that an ensemble that was run as a whole tells."""
-        at = descent.iterate
-        runs = Runs(at.members.predicted.stacked, at.central.predicted.stacked[0], at.members.active)
-        reference, anomalies = self._regressed(descent.weights, runs)
-        linear = Linearisation.of_stacked(at.central.predicted[0], reference, anomalies)
-        return gauss_newton(descent.weights.w, self._evaluation(descent, linear))
 
     def _regressed(self, weights: Weights, runs: Runs) -> tuple[Array, Array]:
         return regression((weights.rows - weights.w) @ self.space.basis, runs)

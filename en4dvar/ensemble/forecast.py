@@ -6,6 +6,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from en4dvar.data.noise import Predicted, sides_of
 from en4dvar.ensemble.members import EVERYONE, NOT_FINITE, Indices, InitialStates, Reading, out_of_bounds
@@ -134,9 +135,7 @@ class Composite:
 
     def _rates(self, observed: Array, at: Indices, nodes: Indices) -> Array:
         rates: Array = observed[1][:, at]
-        if self._spread is None:
-            return rates
-        return self._spread.rates(np.moveaxis(observed[0][:, nodes], 1, 0), rates)
+        return rates if self._spread is None else self._spread.rates(np.moveaxis(observed[0][:, nodes], 1, 0), rates)
 
     def _reading(self, extra_times: Array) -> tuple[Array, Reading, int, Indices, Indices, Indices]:
         """The instants; what is read there and how many numbers that are; which of them are observations, and curves,
@@ -148,11 +147,12 @@ class Composite:
         limits = tuple(self.problem.model.validity) if len(extra_times) else ()
         spread = self._spread
         instants, rows = observations.instants if spread is None else (spread.instants, spread.at)
-        times, at_instants, at_extra = _union(instants, extra_times)
         nodes: Indices = slice(0, 0) if spread is None else spread.nodes
-        if not isinstance(at_instants, slice):
-            rows = at_instants[rows]
-            nodes = at_instants[nodes]
+        at_extra: Indices = slice(0, 0)
+        times = instants
+        if len(extra_times):
+            times, at_instants, at_extra = _union(instants.tobytes(), extra_times.tobytes())
+            rows, nodes = at_instants[rows], at_instants[nodes]
         if not observations.parts:
             quantities = tuple(of_parts[0] for of_parts in self._operators)
             return times, Reading(quantities, limits, self._batched), len(times), rows, at_extra, nodes
@@ -277,16 +277,12 @@ def _of_framework(problem: InverseProblem, physical: Array, parameter: Parameter
     return np.full(len(physical), problem.fixed.get(parameter.name, default))
 
 
-def _union(times: Array, extra: Array) -> tuple[Array, Indices, Indices]:
-    """Increasing union of the times and where the observations and the extra times stand in it."""
-    if not len(extra):
-        return times, slice(None), slice(0, 0)
-    return _union_of_both(times.tobytes(), extra.tobytes())
-
-
 @lru_cache(maxsize=1)  # arrays as long as the data
-def _union_of_both(times_: bytes, extra_: bytes) -> tuple[Array, Indices, Indices]:
-    """Kept, because the forecasts of prior and posterior of a data set ask for the same."""
+def _union(times_: bytes, extra_: bytes) -> tuple[Array, npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    """Increasing union of the times and where the observations and the extra times stand in it.
+
+    Kept, because the forecasts of prior and posterior of a data set ask for the same.
+    """
     times, extra = np.frombuffer(times_), np.frombuffer(extra_)
     nearest = times[np.searchsorted(0.5 * (times[1:] + times[:-1]), extra)]
     extra = np.where(np.abs(extra - nearest) <= SAME_INSTANT * (times[-1] - times[0]), nearest, extra)

@@ -16,7 +16,7 @@ from en4dvar.diagnosis.response.what_if import Fit, Shift, what_if, with_shifts
 from en4dvar.ensemble.forecast import Forecast, cost, forecast, log_posterior
 from en4dvar.estimation import conclusions
 from en4dvar.estimation.conclusions import Ensembles
-from en4dvar.estimation.localised import assimilate_localised
+from en4dvar.estimation.localised import Localised
 from en4dvar.estimation.stages import Keep, LoopState, Sampled, Stages
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
 from en4dvar.model.state import Array
@@ -62,7 +62,7 @@ def assimilate(
     """
     with one_blas_thread():
         if settings.localisation is not None or problem.fields:
-            return assimilate_localised(problem, settings, seed, executor or SerialExecutor(), progress)
+            return Localised(problem, settings, seed, executor or SerialExecutor(), progress).run()
         return _through(Stages(problem, settings, seed, executor or SerialExecutor(), progress, keep), resume)
 
 
@@ -121,7 +121,13 @@ def _concluded(
     """The outcome without its minima and cautions."""
     space, problem, ends = stages.space, stages.problem, sampled.ends
     observations, last = problem.observations, ends.central
-    log_evidence_constant = _log_evidence_constant(stages)
+    # ln p(y) with constant parameters, NaN where these lose the ensemble; None where none varies. It is that of an
+    # assimilation of its own, searched and, in doubt, sampled like this one. The posterior at zero changes (Savage &
+    # Dickey) would spare the runs, but extrapolates the quadratic form of J from one minimum to the other, which may
+    # be far away.
+    log_evidence_constant = (
+        _log_evidence(stages, stages.problem.constant) if stages.compares and stages.problem.varying else None
+    )
     response = conclusions.response_of(space, descent, ends.mode, last)
     std = ends.members.std(axis=0, ddof=1)
     shifts: tuple[Shift, ...] = ()
@@ -182,16 +188,6 @@ def _fitted(stages: Stages, at: Array, cost: float, changed: InverseProblem) -> 
             break
     best = min(fits, key=lambda fit: fit.cost, default=None)
     return best and replace(best, runs=sum(fit.runs for fit in fits))
-
-
-def _log_evidence_constant(stages: Stages) -> float | None:
-    """ln p(y) with constant parameters, NaN where these lose the ensemble; None where none varies.
-
-    It is that of an assimilation of its own, searched and, in doubt, sampled like this one. The posterior at zero
-    changes (Savage & Dickey) would spare the runs, but extrapolates the quadratic form of J from one minimum to the
-    other, which may be far away.
-    """
-    return _log_evidence(stages, stages.problem.constant) if stages.compares and stages.problem.varying else None
 
 
 def _log_evidence(stages: Stages, problem: InverseProblem) -> float:

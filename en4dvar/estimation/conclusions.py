@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from en4dvar.data.noise import Predicted
 from en4dvar.descent.minima import Minimum
@@ -148,16 +147,12 @@ def residuals_of(space: WeightSpace, descent: Descent) -> Residuals | None:
     if observations.parts:
         speed = speed / observations.std
     precision = len(space.members) - 1
-    return Residuals.of(white, sensitivity, precision, speed, observations.used, _in_a_row(space.problem))
-
-
-def _in_a_row(problem: InverseProblem) -> npt.NDArray[np.intp]:
-    """(K,) a label for each series; for each reading, where it has several places."""
-    labels = np.arange(len(problem.observations))
-    for part in problem.parts:
+    # (K,) a label for each series; for each reading, where it has several places
+    labels = np.arange(len(space.problem.observations))
+    for part in space.problem.parts:
         if part.has_path:
             labels[part.where] = part.begin
-    return labels
+    return Residuals.of(white, sensitivity, precision, speed, observations.used, labels)
 
 
 def _rates(problem: InverseProblem, at: Predicted) -> Array:
@@ -196,9 +191,7 @@ def discrepancy_of(space: WeightSpace, descent: Descent, central: Predicted) -> 
     """Discrepancy of the model, where the observations allow for one."""
     observations, linear = space.problem.observations, descent.iterate.linear
     explained = observations.noise.explained(observations.values, central)
-    if explained is None or linear is None:
-        return None
-    return Discrepancy(*explained, shares_of_variance(space, linear))
+    return None if explained is None or linear is None else Discrepancy(*explained, shares_of_variance(space, linear))
 
 
 def future_missed(withheld: Withheld | None) -> tuple[Caution, ...]:

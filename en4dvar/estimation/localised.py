@@ -38,22 +38,13 @@ from en4dvar.schemes.settings import AssimilationSettings
 PATHS = 1 << 23  # numbers of the paths that are held at a time, unless a quarter of the ensemble has more
 
 
-def assimilate_localised(
-    problem: InverseProblem, settings: AssimilationSettings, seed: int, executor: Executor, progress: Progress | None
-) -> Analysis:
-    """As :func:`en4dvar.estimation.assimilate.assimilate`. Raises :class:`ConfigError`, :class:`TooFewMembersError`."""
-    return _WithLocalisation(problem, settings, seed, executor, progress).run()
+class Localised:
+    """:meth:`run` is :func:`en4dvar.estimation.assimilate.assimilate`. Raises as that does."""
 
-
-class _WithLocalisation:
     def __init__(
-        self,
-        problem: InverseProblem,
-        settings: AssimilationSettings,
-        seed: int,
-        executor: Executor,
+        self, problem: InverseProblem, settings: AssimilationSettings, seed: int, executor: Executor,
         progress: Progress | None,
-    ):
+    ):  # fmt: skip
         self.fixed_parameters = check_problem(problem)
         self.gain = gain_of(problem, settings)
         self.problem, self.settings, self.seed, self.progress = problem, settings, seed, progress
@@ -172,9 +163,6 @@ class _WithLocalisation:
             members=prior.to_physical(named),
             centre=prior.to_physical(at.centre[: self.named]),
         )
-        self._tell(record)
-
-    def _tell(self, record: IterationRecord) -> None:
         self.records.append(record)
         if self.progress is not None:
             self.progress(self.problem.observations.name, record)

@@ -170,6 +170,13 @@ def require_going_on() -> None:
         raise HaltedError("stopped")
 
 
+def status_named(status: int) -> str:
+    """What ended a process, by its status."""
+    if status >= 0:
+        return f"exit status {status}"
+    return f"signal {signal.Signals(-status).name if -status in set(signal.Signals) else -status}"
+
+
 def limit_memory(size: int) -> None:
     """From now on, an allocation in this process beyond ``size`` bytes more than it has raises MemoryError (Linux).
 

@@ -20,7 +20,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import IO, Any, TypeVar
 
-from en4dvar.plumbing.children import Child, limit_memory, limit_time
+from en4dvar.plumbing.children import Child, limit_memory, limit_time, status_named
 from en4dvar.plumbing.errors import DataError, En4dvarError, retold
 from en4dvar.plumbing.files import here, in_bytes, open_plain
 
@@ -131,7 +131,7 @@ class _Child(Child):
         if hasattr(signal, "SIGXCPU") and status == -signal.SIGXCPU:
             words = f"takes more than {allowed.seconds} s of processor time to be read"
         else:
-            words = f"ends the process that reads it ({_named(status)})"
+            words = f"ends the process that reads it ({status_named(status)})"
         raise DataError(f"{path}: {words}; {DOUBT}")
 
 
@@ -141,13 +141,6 @@ def _end_idle() -> None:
     while _idle:
         with _idle.pop():
             pass
-
-
-def _named(status: int) -> str:
-    with suppress(ValueError):
-        if status < 0:
-            return f"signal {signal.Signals(-status).name}"
-    return f"exit status {status}"
 
 
 def _write(pipe: IO[bytes], message: Any) -> None:

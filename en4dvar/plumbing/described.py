@@ -1,14 +1,24 @@
-"""Sections whose keys are described by the text below each of them."""
+"""Sections whose keys are described by the text below each of them, and texts among their values."""
 
 import ast
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cache
 from inspect import cleandoc, getsource
 from itertools import pairwise
 from typing import Any
 
-from pydantic import BaseModel
+from pydantic import AfterValidator, BaseModel
+
+
+def text_for(parse: Callable[[str], object]) -> AfterValidator:
+    """Of a text that ``parse`` takes without a ValueError, and that stays as it is."""
+
+    def checked(text: str) -> str:
+        parse(text)
+        return text
+
+    return AfterValidator(checked)
 
 
 class Described(BaseModel):

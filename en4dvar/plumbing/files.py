@@ -17,11 +17,11 @@ import stat
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import cache
 from pathlib import Path
 
-from en4dvar.plumbing.errors import En4dvarError, OutputError
+from en4dvar.plumbing.errors import En4dvarError, OutputError, retold
 
 
 class PathError(En4dvarError, ValueError):
@@ -44,13 +44,9 @@ _CAREFUL = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr
 PATIENCE = (0.02, 0.1, 0.3, 1.0)  # s between attempts to rename a file that another program holds open
 
 
-@contextmanager
-def refused(path: str | Path, what: str) -> Iterator[None]:
+def refused(path: str | Path, what: str) -> AbstractContextManager[None]:
     """Within, an operating-system error becomes an :class:`OutputError`: the path, ``what`` and the reason."""
-    try:
-        yield
-    except OSError as error:
-        raise OutputError(f"{path}: {what}: {error.strerror or error}") from None
+    return retold(OSError, OutputError, f"{path}: {what}: ")
 
 
 def inside(root: str | Path, name: str | Path) -> Path:

@@ -107,6 +107,4 @@ def no_such_file(path: Path) -> str:
     except OSError:
         return brief(f"{path}: no such file; the folder {path.parent} cannot be read")
     close = get_close_matches(path.name, beside, 3, 0.6) or [b for b in beside if Path(b).suffix == path.suffix][:5]
-    if not close:
-        return brief(f"{path}: no such file")
-    return f"{path}: no such file; the folder holds {', '.join(close)}"
+    return f"{path}: no such file; the folder holds {', '.join(close)}" if close else brief(f"{path}: no such file")

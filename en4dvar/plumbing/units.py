@@ -13,7 +13,7 @@ from fractions import Fraction
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, overload
 
-from en4dvar.plumbing.errors import En4dvarError
+from en4dvar.plumbing.errors import En4dvarError, retold
 from en4dvar.plumbing.hints import shown
 
 if TYPE_CHECKING:
@@ -235,10 +235,8 @@ def parse_quantity(value: str | float, unit: str) -> float:
         raise UnitError(f"{shown(value)}: a number of {len(number)} characters")
     if not symbol and parse_unit(unit).powers != ONE.powers:
         raise UnitError(f"{text} has no unit; write e.g. '{text} {unit}'")
-    try:
+    with retold(UnitError, UnitError, f"{shown(text)}: "):
         factor = _factor(symbol or "1", unit)
-    except UnitError as error:
-        raise UnitError(f"{shown(text)}: {error}") from None
     try:
         return float(Fraction(number) * factor)
     except OverflowError:

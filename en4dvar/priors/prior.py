@@ -63,15 +63,7 @@ class PriorTerm:
         self._require(
             math.isfinite(self.std) and self.std > 0, f"the standard deviation must be positive, not {self.std:g}"
         )
-        self._require_digits()
-        if self.transform == "logit":
-            low, high = self.bounds
-            self._require(
-                -math.inf < low < high < math.inf, f"logit needs finite bounds, low < high, not {self.bounds}"
-            )
-
-    def _require_digits(self) -> None:
-        """The ensemble must spread by more than rounding, its squares and physical values must be numbers."""
+        # The ensemble must spread by more than rounding, its squares and physical values must be numbers
         around = abs(self.mean) if self.transform == "normal" else max(1.0, abs(self.mean))
         self._require(
             self.std > max(1 / LARGEST, RESOLVED * around),
@@ -80,6 +72,11 @@ class PriorTerm:
         largest = LARGEST if self.transform == "normal" else LARGEST_LOG
         self._require(self.std < largest, f"the standard deviation {self.std:g} is too large; less than {largest:g}")
         self._require(abs(self.mean) < LARGEST, f"{self.mean:g} is too large; less than {LARGEST:g}")
+        if self.transform == "logit":
+            low, high = self.bounds
+            self._require(
+                -math.inf < low < high < math.inf, f"logit needs finite bounds, low < high, not {self.bounds}"
+            )
 
     def _require(self, condition: bool, message: str) -> None:
         if not condition:

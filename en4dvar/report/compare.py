@@ -23,7 +23,7 @@ from en4dvar.diagnosis.diagnostics import member_quantiles
 from en4dvar.estimation.summary import ParameterSummary, estimate_cells
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, codes
-from en4dvar.plumbing.errors import OutputError
+from en4dvar.plumbing.errors import OutputError, retold
 from en4dvar.plumbing.tables import table
 from en4dvar.plumbing.units import UnitError, convert
 from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, in_columns
@@ -278,10 +278,9 @@ def _panel(estimates: Sequence[ComparedEstimate], runs: Sequence[str]) -> Panel:
 
 def _members(estimates: Sequence[ComparedEstimate], unit: str) -> Array:
     """Members of all data sets of a run in ``unit``."""
-    try:
+    words = f"the runs mean different quantities by {estimates[0].summary.name}: " if estimates else ""
+    with retold(UnitError, OutputError, words):
         parts = [convert(e.members, e.summary.unit, unit) for e in estimates]
-    except UnitError as error:
-        raise OutputError(f"the runs mean different quantities by {estimates[0].summary.name}: {error}") from None
     return np.concatenate(parts) if parts else np.empty(0)
 
 

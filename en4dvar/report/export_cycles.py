@@ -37,9 +37,7 @@ def cycles_table(file: Path, kind: Literal["csv", "latex", "members"]) -> str:
             f"{file}: a twin experiment keeps no members; --csv has mean and std of each variable in time"
         )
     with understood(file):
-        if kind == "latex":
-            return _latex(data)
-        return csv_text(_members(data) if kind == "members" else _in_time(data))
+        return _latex(data) if kind == "latex" else csv_text(_members(data) if kind == "members" else _in_time(data))
 
 
 def _shown(data: Group) -> tuple[list[str], list[str], Array]:

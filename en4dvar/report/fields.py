@@ -36,7 +36,8 @@ def maps(result: StoredResult) -> Chart:
             continue
         mean = shown(data[f"{name}_mean"])
         share = data[f"{name}_std"].values / data[f"{name}_prior_std"].values
-        of_mean = _map(at, mean, _around(mean), VIRIDIS, _label(data, name))
+        low, high = float(mean.min()), float(mean.max())
+        of_mean = _map(at, mean, (low, high if high > low else low + 1.0), VIRIDIS, _label(data, name))
         of_share = _map(at, share, (0.0, 1.0), GREYS, "posterior / prior std")
         tall = float(np.ptp(at[:, 0]) / np.ptp(at[:, 1])) if np.ptp(at[:, 1]) > 0 else 1.0
         rows.append(Row(min(max(tall, 0.3), 2.0) * 0.4 * COLUMN + 0.7 * POINTS, [of_mean[0], of_share[0]]))
@@ -58,11 +59,6 @@ def _line(data: Group, name: str, at: Array) -> Panel:
         panel.band(at[order], *interval(mean, std, 1, positive), colour, 0.3)
         panel.line(at[order], mean, colour)
     return panel
-
-
-def _around(values: Array) -> tuple[float, float]:
-    low, high = float(values.min()), float(values.max())
-    return low, high if high > low else low + 1.0
 
 
 def _map(

@@ -61,7 +61,11 @@ def path_of(mark: Mark, place: Frame) -> str:
     elif mark.kind == "span":
         edges = f"M{place.x:.1f} {y[0]:.1f}H{far:.1f}V{top[0]:.1f}H{place.x:.1f}z"
     elif mark.kind == "tiles":
-        edges = _tiles(x, y, mark, place)
+        # Rectangles, a little larger than they are, so that no line shows between them
+        width = place.width * mark.top[0] / abs(place.xlim[1] - place.xlim[0]) + 0.1
+        height = place.height * mark.top[1] / abs(place.ylim[1] - place.ylim[0]) + 0.1
+        stroke = f"h{width:.2f}v{height:.2f}h-{width:.2f}z"
+        edges = _each(x - width / 2, y - height / 2, [stroke] * len(x))
     elif mark.kind == "bars":
         seen = np.isfinite(x) & np.isfinite(y) & np.isfinite(top)
         edges = _each(x[seen], y[seen], [f"V{t:.1f}" for t in top[seen]])
@@ -91,14 +95,6 @@ def _spots(x: Array, y: Array, mark: Mark) -> tuple[Array, Array, list[str]]:
         mark.kind, f"m-{r:g} 0{arc} {mark.size:g} 0{arc}-{mark.size:g} 0"
     )
     return spots[:, 0], spots[:, 1], [stroke] * len(spots)
-
-
-def _tiles(x: Array, y: Array, mark: Mark, place: Frame) -> str:
-    """Rectangles, a little larger than they are, so that no line shows between them."""
-    width = place.width * mark.top[0] / abs(place.xlim[1] - place.xlim[0]) + 0.1
-    height = place.height * mark.top[1] / abs(place.ylim[1] - place.ylim[0]) + 0.1
-    stroke = f"h{width:.2f}v{height:.2f}h-{width:.2f}z"
-    return _each(x - width / 2, y - height / 2, [stroke] * len(x))
 
 
 def _each(x: Array, y: Array, strokes: Sequence[str]) -> str:

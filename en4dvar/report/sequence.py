@@ -31,6 +31,13 @@ def write_sequence_report(run_dir: Path, files: bool = False) -> Path:
     )
     columns = ["observed", "readings", "root mean square of normalised innovations", "within 2 std"]
     last = "The analysis at the last observation time, given all observations."
+    rows = []
+    for i, name in enumerate(data["observation"].values[:40]):
+        innovations = data["normalised_innovation"].values[:, i]
+        innovations = innovations[np.isfinite(innovations)]
+        size = plain_number(float(np.sqrt(np.mean(innovations**2))), 3) if len(innovations) else "–"
+        share = f"{100 * np.mean(np.abs(innovations) <= 2):.0f} %" if len(innovations) else "–"
+        rows.append((str(name), str(len(innovations)), size, share))
     return write_cycles_page(
         run_dir,
         data,
@@ -44,7 +51,7 @@ def write_sequence_report(run_dir: Path, files: bool = False) -> Path:
         ],
         tables=[
             ("State and parameters at the end", ["variable", "mean", "std", "unit"], _estimates(data), last),
-            ("Innovations", columns, _innovations(data), words),
+            ("Innovations", columns, rows, words),
         ],
         figures=sequence_figures(data),
         files=files,
@@ -120,15 +127,4 @@ def _estimates(data: Group) -> list[tuple[str, str, str, str]]:
         mean, std = (float(convert(float(values[i]), unit, shown)) for values in last.values())
         if std > CERTAIN * abs(mean) and len(rows) < 40:
             rows.append((str(name), plain_number(mean, 4), plain_number(std, 2), pretty_unit(shown)))
-    return rows
-
-
-def _innovations(data: Group) -> list[tuple[str, str, str, str]]:
-    rows = []
-    for i, name in enumerate(data["observation"].values[:40]):
-        innovations = data["normalised_innovation"].values[:, i]
-        innovations = innovations[np.isfinite(innovations)]
-        size = plain_number(float(np.sqrt(np.mean(innovations**2))), 3) if len(innovations) else "–"
-        share = f"{100 * np.mean(np.abs(innovations) <= 2):.0f} %" if len(innovations) else "–"
-        rows.append((str(name), str(len(innovations)), size, share))
     return rows

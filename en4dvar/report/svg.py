@@ -155,7 +155,7 @@ def _legend(panel: Panel, x: float, top: float, width: float) -> tuple[list[str]
     parts, at, line = [], x, top
     for label in panel.entries():
         marks = [m for m in panel.marks if m.label == label]
-        length = 15 + width_of(label)
+        length = 15 + EM * SMALL * sum(len(piece) for _, piece in _pieces(label))  # the text takes this, about
         if at > x and at + length > x + width:
             at, line = x, line + SMALL + 4
         sample = Frame(at, line + 2, 11, SMALL, (0, 1), (0, 1))
@@ -212,11 +212,6 @@ def _pieces(text: str) -> Iterator[tuple[str, str]]:
             yield from ((mark or "i", piece) for mark, piece in math_pieces(part))
         elif part:
             yield "", part.replace(r"\$", "$")
-
-
-def width_of(text: str) -> float:
-    """Points that small text takes, about."""
-    return EM * SMALL * sum(len(piece) for _, piece in _pieces(text))
 
 
 def draw(

@@ -32,6 +32,11 @@ def write_twin_report(run_dir: Path, files: bool = False) -> Path:
     burn_in = int(data.attrs["burn_in"])
     columns = ["estimate", with_unit("RMSE", _unit(data)), with_unit("spread", _unit(data)), "spread / RMSE"]
     words = "Averages over the cycles after the burn-in. The spread of a reliable ensemble is about its RMSE."
+    # (estimate, RMSE, spread, spread over RMSE) after the burn-in
+    rows = []
+    for kind, _ in _kinds(data):
+        rmse, spread = (float(data[f"{kind}_{what}"].attrs[MEAN]) for what in ("rmse", "spread"))
+        rows.append((kind, plain_number(rmse, 4), plain_number(spread, 4), plain_number(spread / rmse, 3)))
     return write_cycles_page(
         run_dir,
         data,
@@ -43,7 +48,7 @@ def write_twin_report(run_dir: Path, files: bool = False) -> Path:
             ("Cycles", str(data.sizes["time"]), f"{burn_in} of them do not count in the averages"),
             ("Observations", str(data.sizes["observation"]), "a cycle"),
         ],
-        tables=[("Scores", columns, _scores(data), words)],
+        tables=[("Scores", columns, rows, words)],
         figures=twin_figures(data),
         files=files,
     )
@@ -159,12 +164,3 @@ def _upper(*series: Any) -> float:
     """A limit that one bad beginning does not set: twice the 98 % quantile, no more than the maximum."""
     values = np.concatenate([s[np.isfinite(s)] for s in series])
     return float(min(1.05 * values.max(), 2 * np.quantile(values, 0.98))) if len(values) else 1.0
-
-
-def _scores(data: Group) -> list[tuple[str, str, str, str]]:
-    """(estimate, RMSE, spread, spread over RMSE) after the burn-in."""
-    rows = []
-    for kind, _ in _kinds(data):
-        rmse, spread = (float(data[f"{kind}_{what}"].attrs[MEAN]) for what in ("rmse", "spread"))
-        rows.append((kind, plain_number(rmse, 4), plain_number(spread, 4), plain_number(spread / rmse, 3)))
-    return rows

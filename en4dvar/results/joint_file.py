@@ -55,11 +55,22 @@ def joint_groups(estimate: JointEstimate, alone: Sequence[Alone], attributes: Ma
         "effective_draws": estimate.members.effective,
         "warnings": _lines(estimate),
     }
+    # Quantiles (dataset, quantile) of each shared parameter as each data set has it by itself
+    each_alone = {}
+    for j, key in enumerate(estimate.joint.shared):
+        rows = np.full((len(alone), len(QUANTILES)), np.nan)
+        for e, single in enumerate(alone):
+            if estimate.joint.groups[e].get(key[0]) == key[1]:
+                values = single.members[:, single.names.index(key[0])]
+                rows[e] = member_quantiles(values, QUANTILES)
+        unit = estimate.joint.terms[j].parameter.unit
+        words = "5, 50 and 95 % of a data set alone"
+        each_alone[shared_name(key)] = variable(("dataset", "quantile"), rows, unit, words)
     groups = {
         "/": Group(attrs=root),
         "/posterior": Group(_shared(estimate) | _own(estimate, names), datasets),
         "/prior": Group(_prior(estimate)),
-        "/alone": Group(_alone(estimate, alone), datasets),
+        "/alone": Group(each_alone, datasets),
         "/fit": Group(_fit(estimate) | _agreement(estimate, names), datasets),
     }
     if estimate.without:
@@ -120,20 +131,6 @@ def _prior(estimate: JointEstimate) -> dict[str, Variable]:
         shared_name(key): variable("quantile", term.to_physical(term.mean + term.std * z), term.parameter.unit, "prior")
         for key, term in zip(estimate.joint.shared, estimate.joint.terms, strict=True)
     }
-
-
-def _alone(estimate: JointEstimate, alone: Sequence[Alone]) -> dict[str, Variable]:
-    """Quantiles (dataset, quantile) of each shared parameter as each data set has it by itself."""
-    result = {}
-    for j, key in enumerate(estimate.joint.shared):
-        rows = np.full((len(alone), len(QUANTILES)), np.nan)
-        for e, single in enumerate(alone):
-            if estimate.joint.groups[e].get(key[0]) == key[1]:
-                values = single.members[:, single.names.index(key[0])]
-                rows[e] = member_quantiles(values, QUANTILES)
-        unit = estimate.joint.terms[j].parameter.unit
-        result[shared_name(key)] = variable(("dataset", "quantile"), rows, unit, "5, 50 and 95 % of a data set alone")
-    return result
 
 
 def _fit(estimate: JointEstimate) -> dict[str, Variable]:

@@ -262,17 +262,13 @@ def netcdf_file(path: Path) -> Iterator[Path]:
         try:
             yield partial
         except (RuntimeError, OSError) as error:  # of the operating system's reason the library tells "HDF error"
-            _write_more(partial)
+            # Fail as the library did, with the operating system's reason: disk or quota full, a device that is broken
+            with partial.open("ab") as file:
+                file.write(bytes(_MORE))
+                file.flush()
+                os.fsync(file.fileno())
             raise OutputError(f"{path}: cannot be written: {error}") from None
         seal_file(partial)
-
-
-def _write_more(partial: Path) -> None:
-    """Fail as the library did, with the operating system's reason: disk or quota full, a device that is broken."""
-    with partial.open("ab") as file:
-        file.write(bytes(_MORE))
-        file.flush()
-        os.fsync(file.fileno())
 
 
 def attributes_of(variable: Variable) -> dict[str, Any]:

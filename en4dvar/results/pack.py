@@ -193,14 +193,10 @@ def _scan(path: Path) -> tuple[dict[str, Entry], int, bool]:
                 entries[name], looked = entry, place
                 place, end = entry.end, max(end, entry.end)
     if not entries:
-        _check_version(path, begin)
+        version = begin.removeprefix(_MAGIC).split(b" ", 1)[0].decode("ascii", "replace")
+        if begin.startswith(_MAGIC) and version != VERSION:
+            raise OutputError(f"{path}: result format {version}; this version of en4dvar reads {VERSION}")
     return entries, end, whole
-
-
-def _check_version(path: Path, begin: bytes) -> None:
-    version = begin.removeprefix(_MAGIC).split(b" ", 1)[0].decode("ascii", "replace")
-    if begin.startswith(_MAGIC) and version != VERSION:
-        raise OutputError(f"{path}: result format {version}; this version of en4dvar reads {VERSION}")
 
 
 def _entry(line: bytes, begin: int) -> tuple[str, Entry | None]:

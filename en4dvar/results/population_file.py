@@ -108,15 +108,12 @@ def _white(population: CampaignPopulation) -> dict[str, Variable]:
     """(chain, draw) of the centres and of what is common in units of their priors, as the draws of ``posterior``."""
     first, draws = population.problems[0].prior, (population.posterior.nu, population.theta)
     columns = np.hstack([part for part in draws if part.size])
-    return {
-        name: variable(_DRAWS, columns[None, :, j], "1", f"{name} in units of its prior", prior=_prior_line(term))
-        for j, name in enumerate((*population.names, *population.common))
-        for term in (first.terms[first.names.index(name)],)
-    }
-
-
-def _prior_line(term: PriorTerm) -> str:
-    return json.dumps([term.transform, term.mean, term.std, [*term.bounds], [*term.shape]])
+    white = {}
+    for j, name in enumerate((*population.names, *population.common)):
+        term = first.terms[first.names.index(name)]
+        prior = json.dumps([term.transform, term.mean, term.std, [*term.bounds], [*term.shape]])
+        white[name] = variable(_DRAWS, columns[None, :, j], "1", f"{name} in units of its prior", prior=prior)
+    return white
 
 
 def _readings(problems: Sequence[InverseProblem]) -> dict[str, Variable]:

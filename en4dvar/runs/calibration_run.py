@@ -150,15 +150,13 @@ class CalibrationKind(RunKind[Calibration]):
                 self.progress(len(done), self.sets)
         keeper.write(CalibrationState(tuple(done)))
         told = sorted((judged for judged in done if judged.number <= self.sets), key=lambda judged: judged.number)
-        write_sets(run.directory.at(self.result), self._quantities(), told)
+        name, file = next(iter(self.data.items()))
+        estimated = build_one(self.config, name, file).prior.parameters
+        quantities = [*((p.name, p.display_unit or p.unit) for p in estimated), (FIT, "1"), (ERRORS, "1")]
+        write_sets(run.directory.at(self.result), quantities, told)
         if self.config.report:
             self.page(run.directory.work)
         return replace(load_calibration(run.directory.work), directory=self.directory)
-
-    def _quantities(self) -> list[tuple[str, str]]:
-        name, file = next(iter(self.data.items()))
-        prior = build_one(self.config, name, file).prior
-        return [*((p.name, p.display_unit or p.unit) for p in prior.parameters), (FIT, "1"), (ERRORS, "1")]
 
 
 def _judged(common: CommonValue[tuple[Config, Config, list[tuple[str, DataFile]]]], number: int) -> Judged:

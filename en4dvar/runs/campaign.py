@@ -63,9 +63,7 @@ class Campaign:
     def exit_code(self) -> int:
         """0: every data set has a posterior; 3: all failures are lost ensembles; 1: others failed."""
         codes = {o.exit_code for o in self.failures}
-        if codes <= {TooFewMembersError.exit_code}:
-            return max(codes, default=0)
-        return 1
+        return max(codes, default=0) if codes <= {TooFewMembersError.exit_code} else 1
 
     def __repr__(self) -> str:
         failed = f", {len(self.failures)} without a posterior" if self.failures else ""

@@ -11,7 +11,6 @@ from en4dvar.assembly.reading import errors_of, read_observations
 from en4dvar.config import Config, resolve
 from en4dvar.config.design import Value
 from en4dvar.config.document import Document, override
-from en4dvar.config.series import SeriesPlan
 from en4dvar.data.noise import noise_of
 from en4dvar.data.observations import Observations
 from en4dvar.data.series import Series
@@ -78,7 +77,17 @@ def planned_problem(config: Config) -> InverseProblem:
         return problem_of(config, measured)
     assert times is not None
     for series in plan.series:
-        _require_plannable(series)
+        error = series.data.error
+        for present, what in (
+            (bool(error.columns("", "")), "errors in a column of the file"),
+            (error.covariance is not None, "a covariance of readings"),
+            (series.data.weights is not None, "weights of readings"),
+            (series.data.places is not None, "places on a field"),
+        ):
+            if present:
+                raise ConfigError(
+                    f"data: {what} cannot be planned at design.times; leave design.times out, or state a std"
+                )
     scale = 1.0 if measured is None else float(measured.values.max())  # for priors that refer to the largest reading
     blank = _observations(config, [np.full(len(times), scale)] * len(plan.series), times, measured)
     problem = problem_of(config, blank)
@@ -124,16 +133,3 @@ def _observations(
         for planned, own in zip(plan.series, values, strict=True)
     ]
     return Observations.of_series(series, plan.correlation if stated else {}, config.name)
-
-
-def _require_plannable(series: SeriesPlan) -> None:
-    """Raise :class:`ConfigError` for what a planned series cannot have."""
-    error = series.data.error
-    for present, what in (
-        (bool(error.columns("", "")), "errors in a column of the file"),
-        (error.covariance is not None, "a covariance of readings"),
-        (series.data.weights is not None, "weights of readings"),
-        (series.data.places is not None, "places on a field"),
-    ):
-        if present:
-            raise ConfigError(f"data: {what} cannot be planned at design.times; leave design.times out, or state a std")

@@ -14,7 +14,7 @@ from en4dvar.estimation.design.evaluate import Evaluated, Method, evaluate
 from en4dvar.estimation.design.planned import Planned
 from en4dvar.executor import Executor
 from en4dvar.inputs.asked import DataFile
-from en4dvar.plumbing.errors import ConfigError, En4dvarError
+from en4dvar.plumbing.errors import ConfigError, En4dvarError, retold
 from en4dvar.plumbing.units import UnitError
 from en4dvar.plumbing.user_code import reason_of
 from en4dvar.problem import InverseProblem
@@ -152,13 +152,10 @@ def _wanted(config: Config, problem: InverseProblem) -> dict[str, tuple[float, b
     """What is to be known to what: in its unit, or relative to the value. Raises :class:`ConfigError`."""
     terms, wanted = {term.parameter.name: term.parameter for term in problem.prior.terms}, {}
     for name, text in config.design.wanted.items():
-        where = ("design", "wanted", name)
-        if name not in (config.design.about or terms):
-            raise ConfigError([config.document.fault(where, f"{name}: not among what is asked about")])
-        try:
+        with config.document.placing("design", "wanted", name), retold(UnitError, ConfigError):
+            if name not in (config.design.about or terms):
+                raise ConfigError(f"{name}: not among what is asked about")
             spread = parse_spread(text, terms[name].unit)
-        except (ConfigError, UnitError) as error:
-            raise ConfigError([config.document.fault(where, str(error))]) from None
         wanted[name] = spread.value, spread.relative
     return wanted
 
@@ -188,12 +185,9 @@ class _Work:
         best = sorted(gains, key=lambda number: -gains[number])[:CHECKED]
         checked = [number for number in dict.fromkeys([0, *best]) if number in gains]
         self._evaluate(executor, checked, "nested")
-        if self._off(gains, checked):
-            self._evaluate(executor, list(gains), "nested")
-
-    def _off(self, gains: Mapping[int, float], checked: Sequence[int]) -> bool:
         exact = {d.number: d.results[0] for d in self._latest() if d.method == "nested" and d.results}
-        return any(abs(exact[n].gain - gains[n]) > AGREE + 2 * exact[n].error for n in checked if n in exact)
+        if any(abs(exact[n].gain - gains[n]) > AGREE + 2 * exact[n].error for n in checked if n in exact):
+            self._evaluate(executor, list(gains), "nested")
 
     def rows(self) -> list[DesignRow]:
         """Every candidate, or number of experiments alike, in the order of the file."""
@@ -216,12 +210,8 @@ class _Work:
         left = [n for n in numbers if n not in done]
         calls = ((self.every[n], method, self.config.seed) for n in left)
         for i, outcome in executor.map(_one, calls):
-            if isinstance(outcome, Exception):
-                ended = Done(left[i], method, (), reason_of(outcome))
-            else:
-                ended = (
-                    Done(left[i], method, outcome) if isinstance(outcome, tuple) else Done(left[i], method, (), outcome)
-                )
+            results, failure = ((), reason_of(outcome)) if isinstance(outcome, Exception) else outcome
+            ended = Done(left[i], method, results, failure)
             self.state = DesignState((*self.state.done, ended))
             self.run.log.write(_line(ended))
             self.keeper.keep(lambda: self.state)
@@ -232,8 +222,8 @@ class _Work:
             raise ConfigError(f"none of the designs can be evaluated: {self.state.done[0].failure}")
 
 
-def _one(candidate: Candidate, method: Method, seed: int) -> tuple[Evaluated, ...] | str:
-    """Evaluate a candidate in a worker; text says why it cannot be."""
+def _one(candidate: Candidate, method: Method, seed: int) -> tuple[tuple[Evaluated, ...], str]:
+    """Evaluate a candidate in a worker; the text says why it cannot be."""
     config = candidate.config
     design = config.design
     try:
@@ -244,9 +234,9 @@ def _one(candidate: Candidate, method: Method, seed: int) -> tuple[Evaluated, ..
         costs = (design.price.of(planned.alike, len(planned.readings)) for planned in every)
         broken = [design.within.broken(len(o.readings), cost, o.beyond) for o, cost in zip(every, costs, strict=True)]
         kept = tuple(planned for planned, reason in zip(every, broken, strict=True) if not reason)
-        return kept or broken[0]
+        return kept, "" if kept else broken[0]
     except En4dvarError as error:
-        return str(error)
+        return (), str(error)
 
 
 def _line(done: Done) -> str:

@@ -286,16 +286,12 @@ def augmented(
     weights: Array, white: Array, directions: Sequence[Direction], changes: Sequence[Array], score: Array
 ) -> tuple[Array, Array]:
     """d and S of the whitened residual and anomalies (K, 1 + N), with the rows of what moves the covariance below."""
-    rows, side = _information_rows(changes, score)
-    moved = rows @ np.stack([direction.coordinates for direction in directions])
-    d, sensitivity = np.concatenate([white[:, 0], side]), np.concatenate([white[:, 1:], moved])
-    return np.sqrt(weights[0]) * d, np.sqrt(weights[0]) * sensitivity
-
-
-def _information_rows(changes: Sequence[Array], score: Array) -> tuple[Array, Array]:
-    """Rows (r, D) and their right-hand side (r,): rowsᵀrows is the information of D directions, rowsᵀside the score."""
+    # Rows (r, D) and their right-hand side (r,): rowsᵀrows is the information of D directions, rowsᵀside the score
     flat = np.array([change.ravel() for change in changes])
     values, vectors = np.linalg.eigh(0.5 * flat @ flat.T)
     kept = values > SAME * values[-1]
     root = np.sqrt(values[kept])
-    return root[:, None] * vectors[:, kept].T, (score @ vectors[:, kept]) / root
+    rows, side = root[:, None] * vectors[:, kept].T, (score @ vectors[:, kept]) / root
+    moved = rows @ np.stack([direction.coordinates for direction in directions])
+    d, sensitivity = np.concatenate([white[:, 0], side]), np.concatenate([white[:, 1:], moved])
+    return np.sqrt(weights[0]) * d, np.sqrt(weights[0]) * sensitivity

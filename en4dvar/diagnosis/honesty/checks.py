@@ -40,7 +40,8 @@ Findings = Iterator[Caution]
 def rank(prior: Prior, members: Array, posterior: Array) -> Findings:
     """Ensembles (N, n), (N', n) whose anomalies span fewer directions than there are parameters."""
     n = members.shape[1]
-    spanned = _rank((members - members.mean(axis=0)) / prior.std)
+    values = np.linalg.svd((members - members.mean(axis=0)) / prior.std, compute_uv=False)
+    spanned = int(np.sum(values > SAME_DIRECTION * values[0])) if values.size and values[0] > 0 else 0
     if spanned < n:
         words = f"the {len(members)} prior members span {spanned} of {n} directions"
         yield caution(
@@ -276,8 +277,3 @@ def weighted(analysis: Analysis) -> Findings:
         span = f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
         words = f"{len(odd)} of {len(weights)} observations count with weights of {span}"
         yield caution("not-bayesian", f"{words}: the intervals are not those of the Bayesian posterior")
-
-
-def _rank(anomalies: Array) -> int:
-    values = np.linalg.svd(anomalies, compute_uv=False)
-    return int(np.sum(values > SAME_DIRECTION * values[0])) if values.size and values[0] > 0 else 0

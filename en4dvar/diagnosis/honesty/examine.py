@@ -49,6 +49,7 @@ def examine(
     a, prior = analysis, analysis.problem.prior
     alive = active_members(a.posterior_failures)
     members = a.posterior[alive]
+    last, n_used = a.iterations[-1], len(a.problem.observations.used)
     warnings = (
         *earlier,
         *a.problem.observations.doubts,
@@ -60,7 +61,7 @@ def examine(
         *loss("prior forecast", a.prior_failures, prior, control.prior),
         *loss("iterations", worst_loss, prior),
         *loss("posterior forecast", a.posterior_failures, prior, control.posterior),
-        *_fit(a),
+        *checks.fit(last.chi2_per_observation * n_used, n_used, last.dfs),
         *_structure(a),
         *checks.missed(a),
         *(checks.conflict(prior, control.centre) if control.costs is not None else ()),
@@ -131,11 +132,6 @@ def _validity(a: Analysis, alive: npt.NDArray[np.bool_]) -> checks.Findings:
     if limits:
         beyond = checks.validity(limits, a.extremes[alive], a.beyond[alive], observations.times[which], leverage)
         yield from map(_allowed, beyond) if a.discrepancy else beyond
-
-
-def _fit(a: Analysis) -> checks.Findings:
-    last, n_used = a.iterations[-1], len(a.problem.observations.used)
-    return checks.fit(last.chi2_per_observation * n_used, n_used, last.dfs)
 
 
 def unfinished(analysis: Analysis) -> checks.Findings:

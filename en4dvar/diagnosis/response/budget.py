@@ -67,6 +67,4 @@ def budget_words(a: Analysis, name: str) -> str:
         return ""
     line = f"variance of {name}: {', '.join(named)}"
     first = next(iter(sources))
-    if first in a.problem.prior.names:
-        return f"{line}; know {first} better first"
-    return line
+    return f"{line}; know {first} better first" if first in a.problem.prior.names else line

@@ -119,7 +119,13 @@ def _path(problem: InverseProblem, start: Array, end: float) -> tuple[Array, Arr
     (first,) = model.trajectories(start, even)
     if isinstance(first, Failure):
         return None
-    edges = _edges(even, np.stack([first[q.name] for q in model.path_quantities]))
+    # Edges (M + 1,) of cells with equal shares of the time and of the variation of each quantity (V, T)
+    variation = np.abs(np.diff(np.stack([first[q.name] for q in model.path_quantities]), axis=1))
+    total = variation.sum(axis=1, keepdims=True)
+    variation = np.divide(variation, total, out=np.zeros_like(variation), where=total > 0)
+    density = np.diff(even) / (even[-1] - even[0]) + variation.mean(axis=0)
+    spent = np.concatenate([[0.0], np.cumsum(density)])
+    edges = np.asarray(np.interp(np.linspace(0, spent[-1], CELLS + 1), spent, even))
     share = np.arange(CELLS * FINE) / FINE
     fine = np.append(np.interp(share, np.arange(CELLS + 1), edges), edges[-1])
     (path,) = model.trajectories(start, fine)
@@ -128,16 +134,6 @@ def _path(problem: InverseProblem, start: Array, end: float) -> tuple[Array, Arr
     sizes = np.abs(np.stack([path[q.name] for q in model.path_quantities]))
     means = 0.5 * (sizes[:, 1:] + sizes[:, :-1])
     return edges, path.states[::FINE], means.reshape(len(means), CELLS, FINE).mean(axis=2)
-
-
-def _edges(times: Array, values: Array) -> Array:
-    """Edges (M + 1,) of cells with equal shares of the time and of the variation of each quantity (V, T)."""
-    variation = np.abs(np.diff(values, axis=1))
-    total = variation.sum(axis=1, keepdims=True)
-    variation = np.divide(variation, total, out=np.zeros_like(variation), where=total > 0)
-    density = np.diff(times) / (times[-1] - times[0]) + variation.mean(axis=0)
-    spent = np.concatenate([[0.0], np.cumsum(density)])
-    return np.asarray(np.interp(np.linspace(0, spent[-1], CELLS + 1), spent, times))
 
 
 def _localised(

@@ -44,7 +44,8 @@ class Arrow:
     def solve(self, a: Array, b: Sequence[Array]) -> tuple[Array, list[Array]]:
         """x (c,) and y_e (n_e,) for the right-hand side a (c,), b_e (n_e,)."""
         passed = (edge @ self._solve(e, b[e]) for e, edge in enumerate(self.edges))
-        x = self._of_border(a - sum(passed, start=np.zeros_like(a)))
+        a = a - sum(passed, start=np.zeros_like(a))
+        x = np.asarray(np.linalg.solve(self.schur, a)) if len(a) else a
         return x, [self._solve(e, b[e] - edge.T @ x) for e, edge in enumerate(self.edges)]
 
     def sample(self, border: Array, own: Callable[[int], Array]) -> tuple[Array, list[Array]]:
@@ -61,8 +62,9 @@ class Arrow:
         ------
         ValueError: N is not larger than c + n_e.
         """
-        standard = whiten_sample(border)
-        x = self._from_standard(standard)
+        x = whiten_sample(border)
+        if x.shape[1]:
+            x = solve_triangular(np.linalg.cholesky(self.schur).T, x.T).T
         return x, [self._own(e, edge, x, border, own(e)) for e, edge in enumerate(self.edges)]
 
     def _own(self, e: int, edge: Array, x: Array, border: Array, numbers: Array) -> Array:
@@ -73,14 +75,6 @@ class Arrow:
         standard = whiten_sample(np.hstack([border, numbers]))[:, edge.shape[0] :]  # orthogonal to the border's
         factor = self._factors[e][0]
         return np.asarray(solve_triangular(factor, standard.T).T - self._solve(e, edge.T @ x.T).T)
-
-    def _from_standard(self, standard: Array) -> Array:
-        if not standard.shape[1]:
-            return standard
-        return np.asarray(solve_triangular(np.linalg.cholesky(self.schur).T, standard.T).T)
-
-    def _of_border(self, a: Array) -> Array:
-        return np.asarray(np.linalg.solve(self.schur, a)) if len(a) else a
 
     def _solve(self, e: int, right: Array) -> Array:
         return np.asarray(cho_solve(self._factors[e], right)) if len(right) else right

@@ -131,7 +131,9 @@ class _Estimate:
             experiment.run(_points(joint, members, lowest.at.place, experiment.e), grids[experiment.e])
             for experiment in experiments
         )
-        self._require(forecasts)
+        for problem, run in zip(joint.experiments, forecasts, strict=True):
+            needed = math.ceil(self.settings.min_active_fraction * (len(run) - 1))
+            require_members(problem, run.failures[:-1], needed, "forecast of the joint posterior")
         cautions += missing_readings(max(forecast.filled for forecast in forecasts))
         if not lowest.converged:
             cautions.append(caution("not-converged", f"the joint estimate has not converged: {lowest.stop}"))
@@ -246,11 +248,6 @@ class _Estimate:
             return members, []
         words = "the joint posterior is far from Gaussian, and importance sampling did not reach it"
         return laplace, [caution("non-gaussian", words)]
-
-    def _require(self, forecasts: Sequence[Forecast]) -> None:
-        for problem, run in zip(self.joint.experiments, forecasts, strict=True):
-            needed = math.ceil(self.settings.min_active_fraction * (len(run) - 1))
-            require_members(problem, run.failures[:-1], needed, "forecast of the joint posterior")
 
 
 def _agreeing(descents: Sequence[JointDescent]) -> int:

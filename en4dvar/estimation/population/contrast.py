@@ -79,7 +79,9 @@ def drawn_together(centres: Sequence[Centre], seed: int) -> Array:
     for centre in centres:
         if centre.common:
             where = [known.index(name) for name in centre.common]
-            mean, told = centre.theta.mean(axis=0), _precision(centre.theta)
+            # S⁻¹ of draws, not below that of the prior: data only add information, and the rest is noise of the draws
+            values, vectors = np.linalg.eigh(np.atleast_2d(np.cov(centre.theta.T)))
+            mean, told = centre.theta.mean(axis=0), (vectors / np.minimum(values, 1.0)) @ vectors.T
             precision[np.ix_(where, where)] += told - np.eye(len(where))
             information[where] += told @ mean
     stream, count = member_stream(seed, "populations together"), len(centres[0].x)
@@ -92,12 +94,6 @@ def drawn_together(centres: Sequence[Centre], seed: int) -> Array:
         rest = (centre.x - centred @ slope)[stream.integers(len(centre.x), size=count)]
         columns.append(rest + (theta[:, [known.index(name) for name in centre.common]] - mean) @ slope)
     return np.stack(columns, axis=1)
-
-
-def _precision(theta: Array) -> Array:
-    """S⁻¹ of draws, not below that of the prior: data only add information, and the rest is noise of the draws."""
-    values, vectors = np.linalg.eigh(np.atleast_2d(np.cov(theta.T)))
-    return np.asarray((vectors / np.minimum(values, 1.0)) @ vectors.T)
 
 
 @dataclass(frozen=True)

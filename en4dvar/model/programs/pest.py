@@ -160,7 +160,8 @@ def read(
             if (name := _named(item)) or _OBSERVATION.fullmatch(item):
                 text = cursor.observed(item, _marker(following[0]) if following else "")
                 if name:
-                    values[name] = _number(text)
+                    number = _NUMBER.fullmatch(text.strip()) or _NO_LETTER.fullmatch(text.strip())
+                    values[name] = math.nan if number is None else float(f"{number[1]}e{number[2] or 0}")
                     wrong = wrong or f"{cursor.place}: {text.strip() or 'nothing'!r} is not a number for {name}"
             elif not cursor.moved(item):
                 if not all(_marker(each) for each in line.items[:k]):
@@ -254,8 +255,3 @@ class _Cursor:
                 text, end = (token[0], token.end()) if token is not None and inside else ("", end)
         self.column = end
         return text
-
-
-def _number(text: str) -> float:
-    number = _NUMBER.fullmatch(text.strip()) or _NO_LETTER.fullmatch(text.strip())
-    return math.nan if number is None else float(f"{number[1]}e{number[2] or 0}")

@@ -1,18 +1,15 @@
-"""One run of a program: a scratch directory of its own, its input files, the process, what it leaves.
-
-Between the estimated parameters and the program stand scale and offset, and sums that need no program.
-"""
+"""One run of a program: a scratch directory of its own, its input files, the process, what it leaves."""
 
 from __future__ import annotations
 
 import math
 import os
 import shutil
-import signal
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -24,7 +21,7 @@ from en4dvar.model.programs.outputs import read
 from en4dvar.model.programs.settings import LOGARITHM, OUTPUT, STDOUT, CommandSettings, fill
 from en4dvar.model.programs.template import filled
 from en4dvar.model.state import Array
-from en4dvar.plumbing.children import Child, TimeLimitError, require_going_on, scratch, within
+from en4dvar.plumbing.children import Child, TimeLimitError, require_going_on, scratch, status_named, within
 from en4dvar.plumbing.files import POSIX
 
 LAST_WORDS = 300  # characters of the standard error in a reason
@@ -45,17 +42,26 @@ class Program:
 
     def __call__(self, parameters: Mapping[str, float], times: Array) -> dict[str, Array]:
         """Observable → values (K,). Raises :class:`ProgramError`: the last attempt failed, with its reason."""
-        for attempt in range(self.settings.retries + 1):
-            try:
+        for _ in range(self.settings.retries):
+            with suppress(ProgramError):
                 return self._attempt(parameters, times)
-            except ProgramError:
-                if attempt == self.settings.retries:
-                    raise
-        raise AssertionError
+        return self._attempt(parameters, times)
 
     def _attempt(self, parameters: Mapping[str, float], times: Array) -> dict[str, Array]:
-        """One run. What this process does for it, and what the program does, are together within the time limit."""
+        """One run. What this process does for it, and what the program does, are together within the time limit.
+
+        The program gets scale · value + offset of each parameter. The values of linear combinations of the parameters
+        as they are estimated, name or log10(name) → factor, stand behind those that the program gives.
+        """
         require_going_on()
+        inputs = {
+            name: entry.scale * parameters[name] + entry.offset for name, entry in self.settings.parameters.items()
+        }
+        more = {
+            name: np.array([sum(factor * _term(key, parameters) for key, factor in terms.items()) for terms in several])
+            for name, several in ((name, output.combinations) for name, output in self.settings.outputs.items())
+        }
+        times = times[: max(len(times) - max(map(len, more.values())), 0)]
         end = None if self.settings.time_limit is None else time.monotonic() + self.settings.time_limit
 
         def within_limit(call: Callable[[], T]) -> T:
@@ -63,10 +69,11 @@ class Program:
 
         try:
             with scratch(self.settings.scratch) as folder:
-                within_limit(lambda: self._fill(folder, parameters, times))
-                self._run(folder, parameters, end)
+                within_limit(lambda: self._fill(folder, inputs, times))
+                self._run(folder, inputs, end)
                 outputs, limit = self.settings.outputs.items(), self.settings.time_limit
-                return within_limit(lambda: {n: read(output, folder, times, limit) for n, output in outputs})
+                values = within_limit(lambda: {n: read(output, folder, times, limit) for n, output in outputs})
+                return {name: np.concatenate([values[name], more[name]]) for name in values}
         except OSError as error:
             raise ProgramError(f"{error.filename or 'scratch folder'}: {error.strerror}") from None
         except (TimeLimitError, subprocess.TimeoutExpired):
@@ -99,38 +106,7 @@ class Program:
 def _why(status: int, errors: bytes) -> str:
     lines = [line.strip() for line in errors.decode("utf-8", "replace").splitlines() if line.strip()]
     said = f": {lines[-1][-LAST_WORDS:]}" if lines else ""
-    if status < 0:
-        try:
-            name = signal.Signals(-status).name
-        except ValueError:
-            name = str(-status)
-        return f"the program was ended by signal {name}{said}"
-    return f"the program ended with exit status {status}{said}"
-
-
-@dataclass(frozen=True)
-class Adjusted:
-    """``program`` gets scale · value + offset of the parameters in ``scaled``.
-
-    ``combinations``: observable → linear combinations of the parameters as they are estimated, name or log10(name) →
-    factor, whose values stand behind those that the program gives.
-    """
-
-    program: Program
-    scaled: Mapping[str, tuple[float, float]]
-    combinations: Mapping[str, Sequence[Mapping[str, float]]]
-
-    def __call__(self, parameters: Mapping[str, float], times: Array) -> dict[str, Array]:
-        """Observable → values (K,). Raises :class:`ProgramError`."""
-        same = (1.0, 0.0)
-        inputs = {n: self.scaled.get(n, same)[0] * v + self.scaled.get(n, same)[1] for n, v in parameters.items()}
-        more = {
-            name: np.array([sum(factor * _term(key, parameters) for key, factor in terms.items()) for terms in several])
-            for name, several in self.combinations.items()
-        }
-        count = len(times) - max((len(values) for values in more.values()), default=0)
-        returned = self.program(inputs, times[: max(count, 0)])
-        return {name: np.concatenate([values, more.get(name, [])]) for name, values in returned.items()}
+    return f"the program {'was ended by' if status < 0 else 'ended with'} {status_named(status)}{said}"
 
 
 def _term(key: str, parameters: Mapping[str, float]) -> float:

@@ -27,7 +27,7 @@ from pydantic import (
 from en4dvar.model.programs import pest
 from en4dvar.model.programs.errors import ProgramError
 from en4dvar.model.programs.template import TIMES, check_template, input_name
-from en4dvar.plumbing.described import Described
+from en4dvar.plumbing.described import Described, text_for
 from en4dvar.plumbing.errors import retold
 from en4dvar.plumbing.files import POSIX, expanded, read_text
 from en4dvar.plumbing.hints import no_such_file, suggest
@@ -39,11 +39,6 @@ LOGARITHM = "log10("  # how a term log10(name) of a combination begins
 OWN_NAMES = ("input", "output", "here", "python", TIMES)
 _NAME = re.compile(r"\{([A-Za-z_]\w*)\}")
 WAYS = ("column", "key", "pattern", "instructions")
-
-
-def _unit(text: str) -> str:
-    parse_unit(text)
-    return text
 
 
 def _pattern(text: str) -> str:
@@ -76,7 +71,7 @@ def _file(text: Any, info: ValidationInfo) -> Any:
     return path.absolute()
 
 
-Unit = Annotated[str, AfterValidator(_unit)]
+Unit = Annotated[str, text_for(parse_unit)]
 File = Annotated[Path, BeforeValidator(_file, json_schema_input_type=str)]
 
 
