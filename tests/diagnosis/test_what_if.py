@@ -7,13 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.optimize import minimize
-from toys import Decay, Linear, make_problem, with_noise
+from toys import Decay, Linear, Wave, make_problem, with_noise
 
 from en4dvar.diagnosis.response.budget import ASSUMED, budget
 from en4dvar.diagnosis.response.what_if import MOST_RUNS, NOWHERE, changed_problem
 from en4dvar.ensemble.forecast import cost
-from en4dvar.estimation.assimilate import assimilate
+from en4dvar.estimation.assimilate import _fitted, assimilate
+from en4dvar.estimation.stages import Stages
 from en4dvar.estimation.summary import remarks
+from en4dvar.executor import SerialExecutor
 from en4dvar.model.forward import Alternative, Failure
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.schemes.settings import AssimilationSettings
@@ -144,6 +146,17 @@ def test_what_is_beyond_linear_response_is_fitted_again(alternative):
     std = problem.prior.from_physical(analysis.posterior).std(axis=0, ddof=1)
     np.testing.assert_allclose(start + shift.in_std * std, done.x, rtol=0, atol=0.05 * std.max())
     assert np.abs(shift.in_std).max() > 3
+
+
+def test_it_is_fitted_again_from_the_mode_where_a_search_from_the_prior_ends_elsewhere():
+    prior = tuple(PriorTerm.normal(p, mean, 1.0) for p, mean in zip(Wave().parameters, (1.0, 0.5), strict=True))
+    problem = make_problem(Wave(), [1.0, 3.0], std=0.02, k=25, prior=prior)
+    settings = AssimilationSettings(members=12, start="prior-mean", starts=1, refine="none")
+    missed = assimilate(problem, replace(settings, what_if=False), 1).iterations[-1].cost
+    at = problem.prior.from_physical(np.array([1.0, 3.0]))
+    found = _fitted(Stages(problem, settings, 1, SerialExecutor(), None, None), at, 50.0, problem)
+    assert found.cost < cost(problem, at[None])[0] < missed - 50
+    np.testing.assert_allclose(problem.prior.to_physical(found.centre), [1.0, 3.0], rtol=0.02)
 
 
 def test_relative_changes_are_of_what_cannot_be_negative():
