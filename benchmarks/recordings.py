@@ -205,12 +205,15 @@ def _posterior(members: Any, row: dict[str, str]) -> Record:
 
 
 def later(text: str, trough: int) -> str:
-    """The file of a recording that begins at so many troughs after the top, as if nobody had seen what was before."""
+    """The file of a recording from so many troughs after the top on, as if nobody had seen what was before; without a
+    reading where it has fewer.
+    """
     lines = text.splitlines()
     first = next(i for i, line in enumerate(lines) if line[:1].isdigit())
     radii = np.array([float(line.split(",")[1] or "nan") for line in lines[first:]])
     read = np.flatnonzero(np.isfinite(radii))
-    begins = read[minima(radii[read], PROMINENT)[trough - 1]]
+    troughs = read[minima(radii[read], PROMINENT)]
+    begins = troughs[trough - 1] if trough <= len(troughs) else len(radii)
     return "\n".join([*lines[:first], *lines[first + begins :]]) + "\n"
 
 

@@ -171,14 +171,14 @@ def _fitted(stages: Stages, at: Array, cost: float, changed: InverseProblem) -> 
     J there is higher than ``cost`` by more than :data:`AS_GOOD`, the lower one of that and what a search like that of
     the problem itself finds. None where too few members survive.
     """
+    within = replace(changed, observations=replace(changed.observations, continued=None))
     settings = replace(stages.settings, what_if=False, refine="none", emulator="off")
     ways, fits = [settings], list[Fit]()
     if stages.minimiser:
         place = dict(zip(changed.prior.names, changed.prior.to_physical(at).tolist(), strict=True))
         ways.insert(0, replace(settings, own=replace(stages.minimiser, start=place)))
     for way in ways:
-        within = replace(changed.observations, continued=None)
-        other = Stages(replace(changed, observations=within), way, stages.seed, stages.space.executor, None, None)
+        other = Stages(within, way, stages.seed, stages.space.executor, None, None)
         other.compares = False
         with suppress(TooFewMembersError):
             end = _through(other, None)

@@ -4,7 +4,7 @@ Sizes: a hydrophone states the amplitude within 5 to 10 %; weather moves the amb
 1000 m of height by 11 %; the rheometry codes take 0.056 to 0.072 N/m for the surface tension of water in a gel; a
 calibration target gives the scale of the picture within about 1 %; the density of a gel is water's or up to 6 % more,
 its speed of sound that of water or 3 % more; the walls of a dish or of the holder of a gel are millimetres away, and
-one three times the largest radius away, which makes a collapse 7 % longer, is not seen as such in a recording.
+one three times the largest radius away makes a collapse 7 % longer (Rattray: 0.205 R_max/h).
 """
 
 from collections.abc import Iterator

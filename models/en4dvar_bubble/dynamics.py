@@ -117,8 +117,11 @@ class Dynamics:
         refuse_inexact(type(self.law))
         if self.law.released and self.start != "laser":
             raise ValueError(f"{self.law.name} needs start: laser: only a released bubble has an R_max at time zero")
-        if self.wall and self.wall.kind == "slit" and self.start != "laser":
-            raise ValueError("a slit needs start: laser: how many of its images are heard follows from R_max")
+        if self.wall and self.start != "laser":
+            if self.wall.kind == "slit":
+                raise ValueError("a slit needs start: laser: how many of its images are heard follows from R_max")
+            if self.wall.relative:
+                raise ValueError("a distance of a wall in R_max needs start: laser: no other bubble has an R_max")
         if self.gas != "heat" and (self.vapour == "transport" or self.medium_heat != "cold"):
             raise ValueError("vapour transport and a conducting medium need gas: heat")
         if self.vapour != "none" and self.medium.p_v:

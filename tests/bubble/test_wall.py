@@ -131,9 +131,10 @@ def test_the_delay_of_the_sound_from_one_plane_is_short():
     assert found == pytest.approx(delayed(0.8e-3, 1) / alone - 1, rel=0.08)
 
 
-def test_a_slit_needs_a_released_bubble():
+@pytest.mark.parametrize("wall", [Wall(1e-3, "slit"), Wall(3.0, relative=True)])
+def test_what_refers_to_the_largest_radius_needs_a_released_bubble(wall):
     with pytest.raises(ValueError, match="start: laser"):
-        BubbleModel(get_law("newtonian"), wall=Wall(1e-3, "slit"))
+        BubbleModel(get_law("newtonian"), wall=wall)
 
 
 @pytest.mark.parametrize("gas", ["polytropic", "heat"])

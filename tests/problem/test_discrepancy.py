@@ -13,9 +13,10 @@ from toys import Linear, Vectorised, Wave, make_problem, with_discrepancy
 from en4dvar.assembly.build import build
 from en4dvar.config import load_config
 from en4dvar.data.noise import Kernel, Linearisation, Predicted, RobustDiscrepancyNoise, noise_of
+from en4dvar.data.noise.discrepancy import whitened
 from en4dvar.data.noise.kernel import NUGGET
 from en4dvar.data.noise.robust_discrepancy import _reweighted, solve_boxed
-from en4dvar.data.noise.state_space import boxed
+from en4dvar.data.noise.state_space import ABREAST, boxed, innovations
 from en4dvar.diagnosis.response.linear import LinearResponse
 from en4dvar.diagnosis.response.what_if import NOWHERE, what_if
 from en4dvar.estimation.assimilate import assimilate, forecast, log_posterior
@@ -39,6 +40,26 @@ def matern(lag, length, nu):
 
 
 CORRELATION = np.exp(-np.abs(np.subtract.outer(TIMES, TIMES)) / 0.3)
+
+
+@pytest.mark.parametrize("nu", NU)
+def test_the_filter_is_the_factor_of_the_covariance_for_any_steps_and_any_number_of_runs(nu):
+    """Each run has its own length, amplitudes and errors; steps of a camera, with gaps, and of no clock at all."""
+    stream, runs = np.random.default_rng(3), 2 * ABREAST + 5
+    times = np.cumsum([0.1, 0.1, 0.1, 0.3, 0.1, 0.1, 0.2, 0.07, 0.11, 0.1])
+    r, errors, a = (
+        stream.standard_normal((runs, 10)),
+        stream.uniform(0.1, 1, (runs, 10)),
+        stream.uniform(1, 2, (runs, 10)),
+    )
+    lengths = stream.uniform(0.1, 1.0, runs)
+    lag = np.abs(np.subtract.outer(times, times))
+    process = [
+        np.outer(each, each) * (matern(lag, ell, nu) - (NUGGET if nu > 0.5 else 0.0) * np.eye(10))
+        for each, ell in zip(a, lengths, strict=True)
+    ]
+    exact = whitened(r, np.array([p + np.diag(e) for p, e in zip(process, errors, strict=True)]))
+    np.testing.assert_allclose(innovations(r, errors, a, lengths, np.diff(times), nu), exact, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("nu", NU)
