@@ -170,24 +170,36 @@ def _fitted(stages: Stages, at: Array, cost: float, changed: InverseProblem) -> 
     """The mode of a changed problem: where a descent from ``at`` (n,), the mode of the problem itself, leads and, where
     J there is higher than ``cost`` by more than :data:`AS_GOOD`, the lower one of that and what a search like that of
     the problem itself finds. None where too few members survive.
+
+    The descent first holds the parameters of R, since a large discrepancy would excuse whatever is missed at ``at``.
     """
-    within = replace(changed, observations=replace(changed.observations, continued=None))
+    changed = replace(changed, observations=replace(changed.observations, continued=None))
     settings = replace(stages.settings, what_if=False, refine="none", emulator="off")
-    ways, fits = [settings], list[Fit]()
-    if stages.minimiser:
-        place = dict(zip(changed.prior.names, changed.prior.to_physical(at).tolist(), strict=True))
-        ways.insert(0, replace(settings, own=replace(stages.minimiser, start=place)))
-    for way in ways:
-        other = Stages(within, way, stages.seed, stages.space.executor, None, None)
+    prior, place, fits, runs = changed.prior, dict[str, float](), list[Fit](), 0
+
+    def descend(problem: InverseProblem, settings: AssimilationSettings) -> None:
+        nonlocal runs
+        other = Stages(problem, settings, stages.seed, stages.space.executor, None, None)
         other.compares = False
         with suppress(TooFewMembersError):
             end = _through(other, None)
-            centre = changed.prior.from_physical(end.centre)
-            fits.append(Fit(centre, end.iterations[-1].cost, other.space.forward_runs))
-        if fits and fits[0].cost < cost + AS_GOOD:
-            break
+            place.update(zip(problem.prior.names, end.centre.tolist(), strict=True))
+            if problem is changed:
+                fits.append(Fit(prior.from_physical(end.centre), end.iterations[-1].cost, runs))
+        runs += other.space.forward_runs
+
+    if stages.minimiser:
+        place.update(zip(prior.names, prior.to_physical(at).tolist(), strict=True))
+        if errors := {name: place[name] for name in prior.names if name in changed.of_errors}:
+            others = prior.of(tuple(term for term in prior.terms if term.parameter.name not in errors))
+            held = replace(changed, prior=others, fixed={**changed.fixed, **errors})
+            start = {name: place[name] for name in others.names}
+            descend(held, replace(settings, own=replace(stages.minimiser, start=start)))
+        descend(changed, replace(settings, own=replace(stages.minimiser, start=dict(place))))
+    if not fits or fits[0].cost > cost + AS_GOOD:
+        descend(changed, settings)
     best = min(fits, key=lambda fit: fit.cost, default=None)
-    return best and replace(best, runs=sum(fit.runs for fit in fits))
+    return best and replace(best, runs=runs)
 
 
 def _log_evidence(stages: Stages, problem: InverseProblem) -> float:

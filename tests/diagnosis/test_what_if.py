@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.optimize import minimize
-from toys import Decay, Linear, Wave, make_problem, with_noise
+from toys import Decay, Linear, Wave, make_problem, with_discrepancy, with_noise
 
 from en4dvar.diagnosis.response.budget import ASSUMED, budget
 from en4dvar.diagnosis.response.what_if import MOST_RUNS, NOWHERE, changed_problem
@@ -157,6 +157,19 @@ def test_it_is_fitted_again_from_the_mode_where_a_search_from_the_prior_ends_els
     found = _fitted(Stages(problem, settings, 1, SerialExecutor(), None, None), at, 50.0, problem)
     assert found.cost < cost(problem, at[None])[0] < missed - 50
     np.testing.assert_allclose(problem.prior.to_physical(found.centre), [1.0, 3.0], rtol=0.02)
+
+
+@pytest.mark.parametrize("off", [0.06, 0.1, 0.3])
+def test_a_large_discrepancy_is_no_excuse_for_what_is_missed_at_the_mode(off):
+    """A descent of all parameters from there ends with an amplitude above 0.5; the readings' errors are 0.01."""
+    prior = tuple(PriorTerm.normal(p, mean, 1.0) for p, mean in zip(Wave().parameters, (1.0, 2.0), strict=True))
+    problem = make_problem(Wave(), [1.0, 3.0], std=0.01, k=60, prior=prior)
+    problem = with_discrepancy(problem, amplitude=(0.02, 2.0), length=(0.2, 0.7))
+    true, beside = (problem.prior.from_physical(np.array([1.0, b, 0.001, 0.2])) for b in (3.0, 3.0 + off))
+    settings = AssimilationSettings(members=12, start="prior-mean", starts=1, refine="none")
+    found = _fitted(Stages(problem, settings, 1, SerialExecutor(), None, None), beside, 1e9, problem)
+    assert found.cost < cost(problem, true[None])[0] < cost(problem, beside[None])[0] - 1000
+    np.testing.assert_allclose(problem.prior.to_physical(found.centre)[:2], [1.0, 3.0], rtol=0.01)
 
 
 def test_relative_changes_are_of_what_cannot_be_negative():
