@@ -175,29 +175,31 @@ def _fitted(stages: Stages, at: Array, cost: float, changed: InverseProblem) -> 
     """
     changed = replace(changed, observations=replace(changed.observations, continued=None))
     settings = replace(stages.settings, what_if=False, refine="none", emulator="off")
-    prior, place, fits, runs = changed.prior, dict[str, float](), list[Fit](), 0
+    prior, fits, runs = changed.prior, list[Fit](), 0
 
-    def descend(problem: InverseProblem, settings: AssimilationSettings) -> None:
+    def descend(problem: InverseProblem, start: dict[str, float] | None) -> dict[str, float]:
+        """Where that leads, in physical values; {} where too few members survive."""
         nonlocal runs
-        other = Stages(problem, settings, stages.seed, stages.space.executor, None, None)
-        other.compares = False
+        way = replace(settings, own=replace(stages.minimiser, start=start)) if stages.minimiser and start else settings
+        other = Stages(problem, way, stages.seed, stages.space.executor, None, None)
+        other.compares, end = False, None
         with suppress(TooFewMembersError):
             end = _through(other, None)
-            place.update(zip(problem.prior.names, end.centre.tolist(), strict=True))
-            if problem is changed:
-                fits.append(Fit(prior.from_physical(end.centre), end.iterations[-1].cost, runs))
         runs += other.space.forward_runs
+        if end and problem is changed:
+            fits.append(Fit(prior.from_physical(end.centre), end.iterations[-1].cost, runs))
+        return dict(zip(problem.prior.names, end.centre.tolist(), strict=True)) if end else {}
 
     if stages.minimiser:
-        place.update(zip(prior.names, prior.to_physical(at).tolist(), strict=True))
-        if errors := {name: place[name] for name in prior.names if name in changed.of_errors}:
-            others = prior.of(tuple(term for term in prior.terms if term.parameter.name not in errors))
+        place = dict(zip(prior.names, prior.to_physical(at).tolist(), strict=True))
+        errors = {name: x for name, x in place.items() if name in changed.of_errors}
+        others = prior.of(tuple(term for term in prior.terms if term.parameter.name not in errors))
+        if errors and others.terms:
             held = replace(changed, prior=others, fixed={**changed.fixed, **errors})
-            start = {name: place[name] for name in others.names}
-            descend(held, replace(settings, own=replace(stages.minimiser, start=start)))
-        descend(changed, replace(settings, own=replace(stages.minimiser, start=dict(place))))
-    if not fits or fits[0].cost > cost + AS_GOOD:
-        descend(changed, settings)
+            place |= descend(held, {name: place[name] for name in others.names})
+        descend(changed, place)
+    if not fits or not fits[0].cost < cost + AS_GOOD:
+        descend(changed, None)
     best = min(fits, key=lambda fit: fit.cost, default=None)
     return best and replace(best, runs=runs)
 

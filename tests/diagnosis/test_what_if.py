@@ -172,6 +172,16 @@ def test_a_large_discrepancy_is_no_excuse_for_what_is_missed_at_the_mode(off):
     np.testing.assert_allclose(problem.prior.to_physical(found.centre)[:2], [1.0, 3.0], rtol=0.01)
 
 
+def test_parameters_of_errors_alone_are_fitted_again_without_being_held():
+    problem = with_discrepancy(make_problem(Linear(("a",)), [1.0]))
+    a, *errors = problem.prior.terms
+    problem = replace(problem, prior=Prior(tuple(errors)), fixed={a.parameter.name: 1.0})
+    settings = AssimilationSettings(members=12, refine="none")
+    found = _fitted(Stages(problem, settings, 1, SerialExecutor(), None, None), problem.prior.mean, 1e9, problem)
+    assert np.isfinite(found.cost)
+    assert found.cost < cost(problem, problem.prior.mean[None])[0]
+
+
 def test_relative_changes_are_of_what_cannot_be_negative():
     problem = make_problem(Linear(("a", "b")), [1.0, 0.5])
     a = replace(problem.prior.parameters[0], bounds=(0.0, np.inf))
