@@ -114,6 +114,11 @@ class InverseProblem:
         return discrepancy_parameters(self.model, self.observable)
 
     @property
+    def estimates_discrepancy(self) -> bool:
+        """Whether its amplitude or length is estimated."""
+        return any(parameter.name in self.prior.names for parameter in self.discrepancy)
+
+    @property
     def of_errors(self) -> frozenset[str]:
         """Names of the parameters of R: its scale, amplitude and length of a discrepancy."""
         scale = (NOISE_SCALE,) if self.has_noise_scale else ()

@@ -97,13 +97,15 @@ def expected_runs(space: WeightSpace) -> int:
     A scheme that runs its whole ensemble does so once for each assimilation and once at the end, with the mean. A
     search takes prior and posterior forecast, and for each iteration a tangent (1, n or N runs) and the trials of the
     step control, ``starts`` descents side by side, one for each shorter window, and a part of one from a far member.
+    Where a discrepancy is estimated and nothing is sampled, it takes another search, and one descent from there.
     """
-    n_members, scheme = len(space.members), space.scheme.minimiser
+    n_members, scheme, problem = len(space.members), space.scheme.minimiser, space.problem
     if scheme is None:
         return (space.scheme.passes + 1) * (n_members + 1)
     economical = scheme.economical(space.basis)
     tangent = 1 if space.derivatives else 1 + (space.basis.shape[1] if economical else n_members)
     starts = scheme.starts if scheme.start == "best-member" and economical else 1
     challenger = CHALLENGER if scheme.searches and economical else 0.0
-    iterations = (starts + challenger + scheme.lengthen - 1) * min(ITERATIONS, scheme.max_iterations)
+    held = 1 + starts + challenger if challenger and problem.estimates_discrepancy and not problem.model.cheap else 0.0
+    iterations = (starts + challenger + held + scheme.lengthen - 1) * min(ITERATIONS, scheme.max_iterations)
     return 2 * (n_members + 1) + round(iterations * (tangent + SEARCH))

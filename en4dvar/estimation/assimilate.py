@@ -1,6 +1,7 @@
 """One data set from its prior ensemble to the posterior and its predictions."""
 
 import math
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -22,6 +23,7 @@ from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.errors import TooFewMembersError
+from en4dvar.priors.prior import Prior
 from en4dvar.priors.varying import PiecewiseModel
 from en4dvar.priors.varying.random_walk import clock
 from en4dvar.problem import InverseProblem
@@ -71,7 +73,7 @@ def _through(stages: Stages, resume: LoopState | None) -> Analysis:
     space, prior = stages.space, stages.problem.prior
     prior_run, start, descent = stages.descend(resume)
     outcome, ends = stages.searched(start, descent, prior_run)
-    looking = True
+    looking, excused = True, True
     while True:
         counting = that_count(outcome.minima, prior)
         agree = len(outcome.tried) < 2 or outcome.agreed
@@ -79,10 +81,16 @@ def _through(stages: Stages, resume: LoopState | None) -> Analysis:
         if descents and looking:  # else they are those that were told
             stages.tell(descents)
         sampled = stages.sampled(ends, counting, agree, start.refinement, looking)
-        if sampled.refined is None or sampled.refined.lower is None:
+        if sampled.refined is None and excused:
+            lower, excused = _without_excuse(stages), False
+        else:
+            lower = sampled.refined.lower if sampled.refined else None
+        if lower is None:
             break
-        after, ends = stages.searched_from(outcome, ends, sampled.refined.lower)
-        looking, outcome = after is not outcome, after
+        after, beside = stages.searched_from(outcome, ends, lower)
+        if sampled.refined is None and after is outcome:
+            break
+        looking, outcome, ends = after is not outcome, after, beside
     ends = sampled.ends
     space.require_members(ends.run.failures, "posterior forecast")
     control = ControlEnsembles(
@@ -166,6 +174,21 @@ def _concluded(
     )
 
 
+def _without_excuse(stages: Stages) -> Array | None:
+    """Where (n,) a search leads that holds the parameters of R at the prior's mean; None where no discrepancy is
+    estimated, no other minimum is looked for or too few members survive.
+
+    Far from a minimum a free discrepancy grows until it excuses whatever is missed, and a descent may end there.
+    """
+    problem, scheme = stages.problem, stages.minimiser
+    searched = scheme and scheme.searches and scheme.economical(stages.space.basis)
+    if not (searched and problem.estimates_discrepancy):
+        return None
+    place, runs = _errors_held(stages, problem, problem.prior.mean, told=False)
+    stages.space.forward_runs += runs
+    return place
+
+
 def _fitted(stages: Stages, at: Array, cost: float, changed: InverseProblem) -> Fit | None:
     """The mode of a changed problem: where a descent from ``at`` (n,), the mode of the problem itself, leads and, where
     J there is higher than ``cost`` by more than :data:`AS_GOOD`, the lower one of that and what a search like that of
@@ -173,35 +196,59 @@ def _fitted(stages: Stages, at: Array, cost: float, changed: InverseProblem) -> 
 
     The descent first holds the parameters of R, since a large discrepancy would excuse whatever is missed at ``at``.
     """
-    changed = replace(changed, observations=replace(changed.observations, continued=None))
-    settings = replace(stages.settings, what_if=False, refine="none", emulator="off")
     prior, fits, runs = changed.prior, list[Fit](), 0
 
-    def descend(problem: InverseProblem, start: dict[str, float] | None) -> dict[str, float]:
-        """Where that leads, in physical values; {} where too few members survive."""
+    def descend(start: Mapping[str, float] | None) -> None:
         nonlocal runs
-        way = replace(settings, own=replace(stages.minimiser, start=start)) if stages.minimiser and start else settings
-        other = Stages(problem, way, stages.seed, stages.space.executor, None, None)
-        other.compares, end = False, None
-        with suppress(TooFewMembersError):
-            end = _through(other, None)
-        runs += other.space.forward_runs
-        if end and problem is changed:
+        end, taken = _alone(stages, changed, start)
+        runs += taken
+        if end:
             fits.append(Fit(prior.from_physical(end.centre), end.iterations[-1].cost, runs))
-        return dict(zip(problem.prior.names, end.centre.tolist(), strict=True)) if end else {}
 
     if stages.minimiser:
-        place = dict(zip(prior.names, prior.to_physical(at).tolist(), strict=True))
-        errors = {name: x for name, x in place.items() if name in changed.of_errors}
-        others = prior.of(tuple(term for term in prior.terms if term.parameter.name not in errors))
-        if errors and others.terms:
-            held = replace(changed, prior=others, fixed={**changed.fixed, **errors})
-            place |= descend(held, {name: place[name] for name in others.names})
-        descend(changed, place)
+        place, runs = _errors_held(stages, changed, at, told=True)
+        descend(_named(prior, at if place is None else place))
     if not fits or not fits[0].cost < cost + AS_GOOD:
-        descend(changed, None)
+        descend(None)
     best = min(fits, key=lambda fit: fit.cost, default=None)
     return best and replace(best, runs=runs)
+
+
+def _errors_held(stages: Stages, problem: InverseProblem, at: Array, told: bool) -> tuple[Array | None, int]:
+    """Where (n,) descents lead that hold the parameters of R as in ``at`` (n,), and start there if they are ``told``
+    to; None where there is nothing to hold or to descend in, or too few members survive. And forward runs.
+    """
+    prior, values = problem.prior, _named(problem.prior, at)
+    errors = {name: x for name, x in values.items() if name in problem.of_errors}
+    others = prior.of(tuple(term for term in prior.terms if term.parameter.name not in errors))
+    if not (errors and others.terms):
+        return None, 0
+    held = replace(problem, prior=others, fixed={**problem.fixed, **errors})
+    end, runs = _alone(stages, held, {name: values[name] for name in others.names} if told else None)
+    if end is None:
+        return None, runs
+    values |= dict(zip(others.names, end.centre.tolist(), strict=True))
+    return prior.from_physical(np.array([values[name] for name in prior.names])), runs
+
+
+def _named(prior: Prior, x: Array) -> dict[str, float]:
+    """Physical values, by name, of a control vector (n,)."""
+    return dict(zip(prior.names, prior.to_physical(x).tolist(), strict=True))
+
+
+def _alone(stages: Stages, problem: InverseProblem, start: Mapping[str, float] | None) -> tuple[Analysis | None, int]:
+    """The mode of another problem, from a ``start`` or by a search, without what is after it; None where too few
+    members survive. And forward runs.
+    """
+    problem = replace(problem, observations=replace(problem.observations, continued=None))
+    settings = replace(stages.settings, what_if=False, refine="none", emulator="off")
+    if stages.minimiser and start:
+        settings = replace(settings, own=replace(stages.minimiser, start=start))
+    other = Stages(problem, settings, stages.seed, stages.space.executor, None, None)
+    other.compares, end = False, None
+    with suppress(TooFewMembersError):
+        end = _through(other, None)
+    return end, other.space.forward_runs
 
 
 def _log_evidence(stages: Stages, problem: InverseProblem) -> float:

@@ -111,9 +111,8 @@ class Stages:
         self.problem, self.settings, self.seed = problem, settings, seed
         self.progress, self._keep = progress, keep
         self.scheme, self.minimiser = settings.own, settings.own.minimiser
-        estimated = any(p.name in problem.prior.names for p in problem.discrepancy)
         plain = problem.observations.noise.quadratic and not problem.has_noise_scale
-        if self.minimiser is None and (estimated or not plain):
+        if self.minimiser is None and (problem.estimates_discrepancy or not plain):
             raise ConfigError(
                 f"{settings.scheme} takes Gaussian errors of known covariance: no sigma, robust cost, bounds or "
                 f"discrepancy; use {' or '.join(MINIMISERS)}"

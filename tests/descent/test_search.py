@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from same_bits import assert_same_bits
-from toys import Decay, Wave, make_problem
+from toys import Decay, Wave, make_problem, with_discrepancy
 from wells import Parting, UnlikeWells, Wells, hidden_well, mass_of_positive, parted, two_wells
 
 from en4dvar.descent.search import Search
@@ -198,6 +198,30 @@ def test_a_chain_behind_a_descent_from_a_draw_goes_on_to_the_same_bits(monkeypat
     of_chain = [state for state in states if state.refinement is not None]
     assert_same_bits(interrupted(problem, settings, 1, of_chain[-1])[0], whole)
     assert_same_bits(interrupted(problem, settings, 1, states[0])[0], whole)
+
+
+def excused(truth):
+    """A wave that the prior expects far away, and a discrepancy that may be large."""
+    prior = tuple(PriorTerm.normal(p, mean, 1.0) for p, mean in zip(Wave().parameters, (1.0, 0.5), strict=True))
+    problem = make_problem(Wave(), [1.0, truth], std=0.01, k=60, prior=prior)
+    return with_discrepancy(problem, amplitude=(0.02, 2.0), length=(0.2, 0.7))
+
+
+@pytest.mark.parametrize("seed", [4, 5, 6])
+@pytest.mark.parametrize("truth", [2.0, 3.0])
+def test_no_minimum_is_missed_because_a_discrepancy_excuses_whatever_is_missed(truth, seed):
+    """Descents of all parameters end with an amplitude above 0.5 in most of these; the readings' errors are 0.01."""
+    problem = excused(truth)
+    found = assimilate(problem, AssimilationSettings(members=12, refine="none", what_if=False), seed)
+    np.testing.assert_allclose(np.abs(found.centre[:2]), [1.0, truth], rtol=0.01)
+    assert found.centre[2] < 0.01
+
+
+def test_what_follows_a_search_with_errors_held_goes_on_from_any_state_to_the_same_bits():
+    problem, settings = excused(3.0), AssimilationSettings(members=12, refine="none", what_if=False)
+    whole, states = interrupted(problem, settings, 4)
+    for state in states[:: len(states) // 4]:
+        assert_same_bits(interrupted(problem, settings, 4, state)[0], whole)
 
 
 def test_where_descents_ended_in_words():

@@ -223,6 +223,16 @@ def test_singular_and_failed_runs_cost_infinity():
         assert not np.isnan(costs[3])
 
 
+@pytest.mark.parametrize("huber", [None, 1.345])
+def test_a_descent_does_not_go_where_the_covariance_has_no_factor(huber):
+    """There J falls with the length as with the amplitude of a discrepancy that excuses all that is missed."""
+    prior = tuple(PriorTerm.normal(p, mean, 1.0) for p, mean in zip(Wave().parameters, (1.0, 2.0), strict=True))
+    problem = make_problem(Wave(), [1.0, 2.7], std=0.01, k=60, prior=prior)
+    problem = with_discrepancy(problem, huber=huber, amplitude=(0.02, 2.0), length=(0.2, 0.7))
+    found = assimilate(problem, AssimilationSettings(members=24, refine="none", what_if=False), 1)
+    np.testing.assert_allclose(found.centre[:2], [1.0, 2.7], rtol=0.01)
+
+
 def test_amplitude_and_length_must_be_given():
     problem = with_discrepancy(make_problem(Linear(("a",)), [1.0]))
     with pytest.raises(ConfigError, match="discrepancy_amplitude, discrepancy_length: neither fixed nor estimated"):

@@ -20,7 +20,7 @@ from en4dvar.plumbing.compiled import called, kernel
 
 
 def innovations(residuals: Array, errors: Array, amplitudes: Array, lengths: Array, steps: Array, nu: float) -> Array:
-    """v and the diagonal of L (2, B, K) of B runs.
+    """v and the diagonal of L (2, B, K) of B runs; NaN where R + A is singular to rounding, as a dense factor would be.
 
     Parameters
     ----------
@@ -36,6 +36,9 @@ def innovations(residuals: Array, errors: Array, amplitudes: Array, lengths: Arr
     r, e, a = (np.ascontiguousarray(part.T, dtype=float) for part in (residuals, errors, amplitudes))
     white = np.empty((2, *r.shape))
     _filter(int(nu + 0.5), r, e, a, d, shrink, which, white)
+    with np.errstate(all="ignore"):
+        singular = np.square(white[1]).min(axis=0) < len(r) * np.finfo(float).eps * np.square(a).max(axis=0)
+    white[:, :, singular] = np.nan
     return np.ascontiguousarray(white.transpose(0, 2, 1))
 
 
@@ -197,9 +200,9 @@ def _step(r: Array, s: Array, c: float, at: Array, pull: Array, u: Array, delta:
     """
     low, high = 0.0, 1.0
     rising = _slope(1.0, r, s, c, at, pull, u, delta)
-    if rising <= 0.0:
-        return 1.0
     falling = first = _slope(0.0, r, s, c, at, pull, u, delta)
+    if rising <= 0.0 or falling >= rising:  # the latter by rounding
+        return 1.0
     step, side = 1.0, 0
     for _ in range(SECANTS):
         step = (falling * high - rising * low) / (falling - rising)
@@ -245,7 +248,7 @@ def _ahead(
             towards[k, i] = a[k] * (stationary[i, 0] + apart[i, 0])
         precision[k], u[k] = 0.0, force[k]
         if np.isnan(force[k]):
-            precision[k] = 1.0 / (a[k] * towards[k, 0] + s[k] * s[k] + own[k])
+            precision[k] = 1.0 / (max(a[k] * towards[k, 0], 0.0) + s[k] * s[k] + own[k])
             u[k] = (r[k] - expected[k]) * precision[k]
         for i in range(order):
             mean[i] += towards[k, i] * u[k]
