@@ -2,6 +2,7 @@
 
     python benchmarks/recordings.py                          24 synthetic recordings of seed 1, and a table
     python benchmarks/recordings.py --seed 7 --start 24 --n 24 --minutes 5    a piece; the next call goes on
+    python benchmarks/recordings.py --movie --n 40           movies of bubbles, tracked
     python benchmarks/recordings.py --world wall-3 --with-what-if --n 50    readings the fit cannot make
     python benchmarks/recordings.py --measured ../shared/data/bubbles/stiff_polyacrylamide
     python benchmarks/recordings.py --measured ../shared/data/bubbles/peg_water --law newtonian --medium water
@@ -14,6 +15,8 @@ the bubble is small, sometimes a bad reading. Density, pressure and scale are th
 program: drawn within what is known of them, and the file does not hold them. Printed are the share of 90 % and 50 %
 intervals that hold the truth, the standard deviation of z in ln θ, which sets have no interval and why, and those that
 are more than 3.5 standard deviations off, with a warning or without a word.
+
+Movies: the same bubbles, 12 to 40 pixels large, rendered with noise, dirt and sometimes a bright centre, and tracked.
 
 Measured: a folder of files with columns t_us, R_um of bubbles in one material; printed are the intervals, how many
 readings after the window lie in their 90 % bands, and how far the bubbles agree, χ² of ln θ about their weighted mean
@@ -34,6 +37,7 @@ import time
 import warnings
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -50,10 +54,14 @@ import en4dvar
 from en4dvar.cli import main as command_line
 from en4dvar.diagnosis.diagnostics import member_quantiles
 from en4dvar.inputs.window import minima
+from en4dvar.model.state import Array
 from en4dvar.report.result import Result
 from en4dvar.report.text import shown
 from en4dvar.report.withheld import withheld_lines
 from en4dvar_bubble.model import BubbleModel
+from en4dvar_movie.filming import Camera, exposures
+from en4dvar_movie.scene import Scene, render
+from en4dvar_movie.writing import write_movie
 
 LAWS = {"neo-hookean-kelvin-voigt": 0.5, "quadratic-kelvin-voigt": 0.3, "newtonian": 0.2}  # and how often
 FULL = {"gas": "heat", "vapour": "transport", "medium_heat": "conducting"}
@@ -90,8 +98,35 @@ def laboratory(
     return world, truth, world.model(truth, physics, constants)
 
 
-def recording(seed: int, physics: dict[str, str], world: Wrong | None = None) -> tuple[str, dict[str, float], str]:
-    """Law, true values, and the file's text."""
+@dataclass(frozen=True)
+class Bubble:
+    """One that is filmed: its ``radius`` (m) at ``times`` (s) from R_max on, by a camera of that ``rate`` (1/s), which
+    is ``faster`` than the file says; ``t_c`` (s), a collapse without elasticity; ``stream`` draws what is left.
+    """
+
+    law: str
+    truth: dict[str, float]
+    times: Array
+    radius: Array
+    rate: float
+    faster: float
+    t_c: float
+    stream: np.random.Generator
+
+    def instants(self) -> Array:
+        """Of its frames, from the growth on."""
+        stream, t_c, rate = self.stream, self.t_c, self.rate
+        grown = stream.uniform(0.2, 0.9) if stream.random() < 0.7 else 0.0  # of the collapse time, seen before R_max
+        last = min(stream.uniform(3.0, 7.5) * t_c, 256 / rate)
+        return np.asarray(np.arange(-np.floor(grown * t_c * rate) + stream.random(), last * rate) / rate)
+
+    def model_time(self, t: Array, skew: float) -> Array:
+        """Growth is no mirror image of the collapse, which has the same R and R̈ at the top."""
+        return np.where(t < 0, -t * (1 - skew * t / self.t_c), t)
+
+
+def bubble(seed: int, physics: dict[str, str], world: Wrong | None = None) -> Bubble:
+    """One that can be filmed with so many frames of a collapse as :data:`FRAMES`."""
     stream = np.random.default_rng([33, seed])
     while True:
         made, truth, model = laboratory(stream, physics, world)
@@ -103,17 +138,17 @@ def recording(seed: int, physics: dict[str, str], world: Wrong | None = None) ->
         times = np.linspace(0.0, 8 * t_c, CELLS)
         radius = made.radius(model, truth, times)
         if radius is not None:
-            return made.fitted, truth, _filmed(stream, times, radius, rate, t_c, made.rate)
+            return Bubble(made.fitted, truth, times, radius, rate, made.rate, t_c, stream)
 
 
-def _filmed(stream: np.random.Generator, times: Any, radius: Any, rate: float, t_c: float, faster: float) -> str:
+def recording(seed: int, physics: dict[str, str], world: Wrong | None = None) -> tuple[str, dict[str, float], str]:
+    """Law, true values, and the text of a file of radii."""
+    filmed = bubble(seed, physics, world)
+    stream, times, radius = filmed.stream, filmed.times, filmed.radius
     noise = between(stream, 0.002, 0.03) * radius[0]
-    grown = stream.uniform(0.2, 0.9) if stream.random() < 0.7 else 0.0  # of the collapse time, seen before R_max
-    last = min(stream.uniform(3.0, 7.5) * t_c, 256 / rate)
-    t = np.arange(-np.floor(grown * t_c * rate) + stream.random(), last * rate) / rate
-    skew = stream.uniform(-0.1, 0.3)  # growth is no mirror image of the collapse, which has the same R and R̈ at the top
-    fast = np.where(t < 0, -t * (1 - skew * t / t_c), t)
-    at = fast + 0.02 / rate * stream.standard_normal(len(t))
+    t = filmed.instants()
+    fast = filmed.model_time(t, stream.uniform(-0.1, 0.3))
+    at = fast + 0.02 / filmed.rate * stream.standard_normal(len(t))
     read = np.interp(np.abs(at), times, radius) + noise * stream.standard_normal(len(t))
     small = np.interp(fast, times, radius) < 0.06 * radius[0]
     gap = (stream.random(len(t)) < 0.01) | (small & (stream.random(len(t)) < 0.5))
@@ -121,8 +156,31 @@ def _filmed(stream: np.random.Generator, times: Any, radius: Any, rate: float, t
         read[stream.integers(len(t))] += stream.choice([-1, 1]) * stream.uniform(6, 15) * noise
     scale = 1 + 0.005 * stream.standard_normal()
     kept = ~gap & (read > 0.005 * radius[0])
-    rows = [f"{faster * 1e6 * (a - t[0]):.6g},{1e6 * scale * b:.6g}" for a, b in zip(t[kept], read[kept], strict=True)]
-    return "\n".join(["t_us,R_um", *rows]) + "\n"
+    fast = filmed.faster * 1e6 * (t[kept] - t[0])
+    rows = [f"{a:.6g},{1e6 * scale * b:.6g}" for a, b in zip(fast, read[kept], strict=True)]
+    return filmed.law, filmed.truth, "\n".join(["t_us,R_um", *rows]) + "\n"
+
+
+def movie(seed: int, physics: dict[str, str]) -> tuple[str, dict[str, float], str]:
+    """Law, true values, and the table that ``track`` reads from a movie, whose scale is off as that of a recording."""
+    filmed = bubble(seed, physics)
+    stream, across = filmed.stream, between(filmed.stream, 12.0, 40.0)  # pixels of R_max
+    t, skew = filmed.instants(), filmed.stream.uniform(-0.1, 0.3)
+    camera = Camera(filmed.radius[0] / across, exposure := between(stream, 0.02, 0.2) / filmed.rate, 0.1 * exposure)
+    exposed = exposures(t + camera.jitter * stream.standard_normal(len(t)), camera)
+    at = np.abs(filmed.model_time(exposed, skew))
+    radii = np.interp(at, filmed.times, filmed.radius).reshape(len(t), -1) / camera.pixel
+    side = max(48, round(2.8 * across))
+    noise, middle = 75 / between(stream, 5.0, 25.0), 0.5 * side + stream.uniform(-1.0, 1.0, 2)
+    scene = Scene((side, side), noise=noise, dirt=8, centre=float(stream.choice([0.0, 0.4])), drift=0.02,
+                  bubble=tuple(middle))  # fmt: skip
+    with TemporaryDirectory() as name:
+        tif, table = Path(name) / "bubble.tif", Path(name) / "bubble.csv"
+        pixel = camera.pixel * (1 + 0.005 * stream.standard_normal())
+        write_movie(tif, render(radii, scene, stream), scene.before + len(t), pixel, filmed.rate)
+        asked = ["track", str(tif), "--exposure", f"{1e9 * exposure} ns", "--out", str(table), "--workers", "1"]
+        made = CliRunner().invoke(command_line, asked)
+        return filmed.law, filmed.truth, table.read_text() if table.is_file() else f"# {made.output}"
 
 
 def verbatim(
@@ -141,10 +199,8 @@ def verbatim(
         folder = Path(name)
         (folder / "bubble.csv").write_text(text)
         config = folder / "bubble.yaml"
-        asked = ["--data", str(folder / "bubble.csv"), "--time-unit", "us", "--radius-unit", "um"]
-        made = CliRunner().invoke(
-            command_line, ["init", *asked, "--law", law, "--out", str(config), *words, *started(text)]
-        )
+        asked = ["--data", str(folder / "bubble.csv"), "--law", law, "--out", str(config), *words, *started(text)]
+        made = CliRunner().invoke(command_line, ["init", *asked])
         if made.exit_code or not config.is_file():
             return {"reason": f"init: {made.output.strip().splitlines()[-1] if made.output else made.exception}"}
         if change:
@@ -218,7 +274,8 @@ def later(text: str, trough: int) -> str:
 
 
 def synthetic(seed: int, o: argparse.Namespace) -> Record:
-    law, truth, text = recording(seed, QUICK if o.quick else FULL, WORLDS.get(o.world))
+    physics = QUICK if o.quick else FULL
+    law, truth, text = movie(seed, physics) if o.movie else recording(seed, physics, WORLDS.get(o.world))
     return {"law": law, "truth": truth, **verbatim(text, law, [], o.quick, o.with_what_if)}
 
 
@@ -305,6 +362,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=np.inf, help="start no set after so long")
     parser.add_argument("--quick", action="store_true", help="isothermal gas in truth and fit")
     parser.add_argument("--world", default="", choices=["", *WORLDS], help="what the fit does not know of")
+    parser.add_argument("--movie", action="store_true", help="render a movie of each bubble, and track it")
     parser.add_argument("--with-what-if", action="store_true", help="as of run")
     parser.add_argument("--measured", type=Path, nargs="*", default=[], help="folders of measured bubbles instead")
     parser.add_argument(
@@ -319,7 +377,8 @@ def main() -> None:
     o = parser.parse_args()
     if not o.measured:
         keys = [str(1000 * o.seed + i) for i in range(o.start, o.start + o.n)]
-        kind = f"{'quick' if o.quick else 'full'}{o.world and '_' + o.world}{'_what_if' * o.with_what_if}"
+        marks = [o.world, "movie" * o.movie, "what_if" * o.with_what_if]
+        kind = "_".join(["quick" if o.quick else "full", *filter(None, marks)])
         table(list(fill(o.records / f"{kind}.jsonl", keys, lambda key: synthetic(int(key), o), o.minutes).values()))
     groups = {}
     for folder in o.measured:
