@@ -184,7 +184,7 @@ def _without_excuse(stages: Stages) -> Array | None:
     searched = scheme and scheme.searches and scheme.economical(stages.space.basis)
     if not (searched and problem.estimates_discrepancy):
         return None
-    place, runs = _errors_held(stages, problem, problem.prior.mean, told=False)
+    place, runs = _errors_held(stages, problem, problem.prior.mean, from_there=False)
     stages.space.forward_runs += runs
     return place
 
@@ -206,7 +206,7 @@ def _fitted(stages: Stages, at: Array, cost: float, changed: InverseProblem) -> 
             fits.append(Fit(prior.from_physical(end.centre), end.iterations[-1].cost, runs))
 
     if stages.minimiser:
-        place, runs = _errors_held(stages, changed, at, told=True)
+        place, runs = _errors_held(stages, changed, at, from_there=True)
         descend(_named(prior, at if place is None else place))
     if not fits or not fits[0].cost < cost + AS_GOOD:
         descend(None)
@@ -214,9 +214,9 @@ def _fitted(stages: Stages, at: Array, cost: float, changed: InverseProblem) -> 
     return best and replace(best, runs=runs)
 
 
-def _errors_held(stages: Stages, problem: InverseProblem, at: Array, told: bool) -> tuple[Array | None, int]:
-    """Where (n,) descents lead that hold the parameters of R as in ``at`` (n,), and start there if they are ``told``
-    to; None where there is nothing to hold or to descend in, or too few members survive. And forward runs.
+def _errors_held(stages: Stages, problem: InverseProblem, at: Array, from_there: bool) -> tuple[Array | None, int]:
+    """Where (n,) descents lead that hold the parameters of R as in ``at`` (n,), and start there or look from the prior;
+    None where there is nothing to hold or to descend in, or too few members survive. And forward runs.
     """
     prior, values = problem.prior, _named(problem.prior, at)
     errors = {name: x for name, x in values.items() if name in problem.of_errors}
@@ -224,7 +224,7 @@ def _errors_held(stages: Stages, problem: InverseProblem, at: Array, told: bool)
     if not (errors and others.terms):
         return None, 0
     held = replace(problem, prior=others, fixed={**problem.fixed, **errors})
-    end, runs = _alone(stages, held, {name: values[name] for name in others.names} if told else None)
+    end, runs = _alone(stages, held, {name: values[name] for name in others.names} if from_there else None)
     if end is None:
         return None, runs
     values |= dict(zip(others.names, end.centre.tolist(), strict=True))
