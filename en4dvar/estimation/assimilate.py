@@ -191,25 +191,27 @@ def _without_excuse(stages: Stages) -> Array | None:
 
 def _fitted(stages: Stages, at: Array, cost: float, changed: InverseProblem) -> Fit | None:
     """The mode of a changed problem: where a descent from ``at`` (n,), the mode of the problem itself, leads and, where
-    J there is higher than ``cost`` by more than :data:`AS_GOOD`, the lower one of that and what a search like that of
-    the problem itself finds. None where too few members survive.
+    J there is higher than ``cost`` by more than :data:`AS_GOOD`, the lower one of that and what a search from the prior
+    finds. None where too few members survive.
 
-    The descent first holds the parameters of R, since a large discrepancy would excuse whatever is missed at ``at``.
+    Both first hold the parameters of R, since a large discrepancy would excuse whatever is missed.
     """
     prior, fits, runs = changed.prior, list[Fit](), 0
 
-    def descend(start: Mapping[str, float] | None) -> None:
+    def descend(place: Array | None) -> None:
         nonlocal runs
-        end, taken = _alone(stages, changed, start)
+        end, taken = _alone(stages, changed, None if place is None else _named(prior, place))
         runs += taken
         if end:
             fits.append(Fit(prior.from_physical(end.centre), end.iterations[-1].cost, runs))
 
     if stages.minimiser:
         place, runs = _errors_held(stages, changed, at, from_there=True)
-        descend(_named(prior, at if place is None else place))
+        descend(at if place is None else place)
     if not fits or not fits[0].cost < cost + AS_GOOD:
-        descend(None)
+        place, taken = _errors_held(stages, changed, at, from_there=False)
+        runs += taken
+        descend(place)
     best = min(fits, key=lambda fit: fit.cost, default=None)
     return best and replace(best, runs=runs)
 
