@@ -56,21 +56,13 @@ def field_esmda(
 
     Raises :class:`En4dvarError`: predictions that are not finite.
     """
-    return field_passes(ensemble, data, gain, mda_inflations(coefficients), seed, fewest, first, tell)
-
-
-def field_passes(
-    ensemble: Array, data: FieldData, gain: Gain, inflations: Array, seed: int, fewest: int | None = None,
-    first: Array | None = None, tell: Callable[[Pass], None] = silent,
-) -> Members:  # fmt: skip
-    """The same, R multiplied by each of the ``inflations``, whose inverses sum to one."""
-    passes = Passes(ensemble, data, gain, inflations, seed, fewest, first, tell)
+    passes = Passes(ensemble, data, gain, mda_inflations(coefficients), seed, fewest, first, tell)
     minimise(passes, [passes])
     return passes.alive
 
 
 class Passes(Objective["Passes"]):
-    """The passes of ES-MDA over an ensemble, which is their only descent."""
+    """The passes of ES-MDA over an ensemble, which is their only descent, with R times each of the ``inflations``."""
 
     def __init__(
         self, ensemble: Array, data: FieldData, gain: Gain, inflations: Array, seed: int, fewest: int | None,

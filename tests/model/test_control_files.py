@@ -89,7 +89,7 @@ def test_several_commands_run_in_order(control):
 
 def test_groups_of_inequalities_are_bounds(control):
     """h1 = a + b + 2 is 3.5, h2 = 2 a + b + 2 at most 4.2, far below 4.5; h3 = 3 a + b + 2 at least 4.4."""
-    text = control.read_text().replace("h2 4.5 10.0 og", "h2 4.2 10.0 less_h").replace("h3 5.5 5.0 og", "h3 4.4 50 >@h")
+    text = control.read_text().replace("h2 4.5 10.0 og", "h2 4.2 10.0 less_h").replace("h3 5.5 5.0 og", "h3 4.4 50 <@h")
     control.write_text(text.replace("h1 3.5 10.0", "h1 3.5 100.0").replace("h2 4.2 10.0", "h2 4.2 100.0"))
     found = from_pest(control, ["line.py"])
     np.testing.assert_array_equal(found["error"]["at_most"], [0, 1, 0])
@@ -101,6 +101,38 @@ def test_groups_of_inequalities_are_bounds(control):
     assert h2.max() < 4.25
     assert h3.min() > 4.3
     assert h2.std() > 0.03  # a in 0.45 to 0.7
+
+
+def test_the_signs_of_a_group_are_those_of_pestpp_and_pyemu(control):
+    """What is penalised stands first: ``>@`` what is greater, an upper bound, and ``<@`` what is less."""
+    control.write_text(control.read_text().replace("h2 4.5 10.0 og", "h2 4.5 10.0 >@h"))
+    assert list(from_pest(control)["error"]) == ["observations_std", "at_most"]
+    control.write_text(control.read_text().replace(">@h", "<@h"))
+    assert list(from_pest(control)["error"]) == ["observations_std", "at_least"]
+
+
+def test_a_range_is_two_bounds(control):
+    """h1 = a + b + 2 is 3.5; h2 = 2 a + b + 2 lies in 3.9 to 4.2, so that a lies in 0.4 to 0.7."""
+    table = (
+        "obsnme,obsval,weight,obgnme,greater_than,less_than\nh1,3.5,500,og,,\nh2,4,500,og,3.9,4.2\nh3,5.5,500,og,,9\n"
+    )
+    own = control.with_name("range.pst")
+    begin, end = CONTROL.split("* observation data\n")
+    end = end[end.index("* model command line") :]
+    own.write_text(f"{begin}* observation data external\nobs.csv\n{end}")
+    control.with_name("obs.csv").write_text(table)
+    found = from_pest(own, ["line.py"])
+    assert found["model"]["outputs"]["observations"]["observations"] == ["h1", "h2", "h2", "h3"]
+    np.testing.assert_array_equal(found["data"]["observations"], [3.5, 4.2, 3.9, 9.0])
+    np.testing.assert_array_equal(found["error"]["at_most"], [0, 1, 0, 1])
+    np.testing.assert_array_equal(found["error"]["at_least"], [0, 0, 1, 0])
+    result = en4dvar.estimate(**found, progress=False, assimilation={"members": 48})
+    a = result.posterior["a"].values
+    assert 0.38 < a.min() < 0.5
+    assert 0.6 < a.max() < 0.72
+    control.with_name("obs.csv").write_text(table.replace("4.2", "3.8"))
+    with pytest.raises(en4dvar.ConfigError, match=r"obs.csv:3: greater_than of h2 is not below its less_than"):
+        from_pest(own)
 
 
 RICH = """pcf

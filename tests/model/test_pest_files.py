@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from en4dvar.model.programs import pest
 from en4dvar.model.programs.errors import ProgramError
 from en4dvar.model.programs.model import CommandModel, CommandSettings
 
+PUBLIC = Path(__file__).parents[2].parent / "shared" / "reference" / "pest" / "pestpp" / "benchmarks"
 TEMPLATE = "ptf ~\nmodel input\n~   K1        ~ ~  s~\nlast ~k1~\n"
 
 
@@ -79,6 +81,34 @@ def test_instructions_read_what_they_say(instructions, expected):
 )  # fmt: skip
 def test_instructions_as_the_manual_of_pestpp_has_them(instructions, output, expected):
     assert pest.read(instructions, output, "out", delimiters="|") == {"a": expected}
+
+
+@pytest.mark.skipif(not PUBLIC.is_dir(), reason=f"no {PUBLIC}")
+def test_instructions_of_pestpps_benchmarks():
+    """An output in the layout of ``tplins_test_1``, with the values that stand in its archive, ``out1.dat.obf``."""
+    expected = {"h02_09": 7.92106, "h01_10": 1.234567, "h01_09": 9.876543, "h01_01": 1.0, "h01_02": 1.2, "h01_03": 1.4}
+    expected |= {"h01_04": 1.6, "h01_05": 1.8, "h01_06": 2.0, "h01_07": 2.2, "h01_08": 2.4, "h02_01": 1236.567}
+    expected |= {"h02_02": 8495.123, "h02_03": -900.999, "h02_04": 2.2, "h02_05": 2.6, "h02_06": 3.0, "h02_07": 3.4}
+    expected |= {"h02_08": 3.8, "h02_10": 4.123, "dummy_obs": 5.5}
+    lines = [
+        ",".join("abcdefgh") + ",7.92106,9", "primary", "", " primary  1.234567 a   secondary  ".ljust(44) + "9.876543",
+        "", "", "", " 1.0 and nan of secondary 1.2 1.4 1.6 1.8 2.0 2.2".ljust(106) + "2.400 # 9.9",
+        "1236.5678495.123-900.999 2.2 2.6 3.0 3.4 3.8 4.0", "4.123x", "dummy_obs 5.5",
+    ]  # fmt: skip
+    instructions = (PUBLIC / "tplins_test_1" / "template" / "out1.dat.ins").read_text()
+    assert pest.read(instructions, "\n".join(lines) + "\n", "out1.dat") == expected
+
+
+@pytest.mark.skipif(not PUBLIC.is_dir(), reason=f"no {PUBLIC}")
+@pytest.mark.parametrize(("name", "between"), [("out1.dat.ins", ", "), ("out2.dat.ins", ","), ("out3.dat.ins", "|")])
+def test_secondary_markers_of_pestpps_benchmarks(name, between):
+    """Lines that hold the first of the markers alone, or some of them, are passed over."""
+    rows = [["1.0", "2.0", "3.0", "4.0"], ["32.0", "5.0", "6.0", "7.0"]]
+    head = "time, of\n\ntime,SEEPAGE_FLUX1, of\n\ntime,SEEPAGE_FLUX1,SEEPAGE_FLUX2, of\n\n" if name[3] == "1" else ""
+    text = head + "time,SEEPAGE_FLUX1,SEEPAGE_FLUX2,SEEPAGE_FLUX3\n" + "\n".join(between.join(row) for row in rows)
+    found = pest.read((PUBLIC / "secondary_marker_test" / "template" / name).read_text(), text, name, delimiters="|")
+    first = 0 if name[3] == "3" else 1  # the instructions of the third begin with the time
+    assert found == {f"obs{i + 1}_{j + 1}": float(rows[j][first + i]) for i in range(3) for j in range(2)}
 
 
 @pytest.mark.parametrize(

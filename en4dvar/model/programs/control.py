@@ -25,7 +25,8 @@ from en4dvar.plumbing.errors import ConfigError
 
 RANGE = 4.0  # standard deviations between the bounds: PEST++ (White et al. 2020), option par_sigma_range
 OBSERVED = "observations"
-BOUNDS = {"at_most": ("l_", "less", "<@"), "at_least": ("g_", "greater", ">@")}  # how their groups begin: PEST++
+BOUNDS = {"at_most": ("l_", "less", ">@"), "at_least": ("g_", "greater", "<@")}  # how their groups begin: PEST++
+RANGES = {"at_most": "less_than", "at_least": "greater_than"}  # columns of external tables, where the group is none
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[edED][+-]?\d+)?"
 _TERM = re.compile(rf"\s*([+-]?)\s*({_NUMBER})\s*\*\s*(?:(log)\s*\(\s*([^\s()]+)\s*\)|([^\s()*=]+))\s*", re.IGNORECASE)
 
@@ -52,13 +53,8 @@ def from_pest(path: str | Path, files: Sequence[str] = (), *, prior_information:
     parents = {row.word("parnme"): row.word("partrans") for row in rows if len(row.cells) == 2}
     equations = _equations(control, parameters) if prior_information else []
     refuse(control, rows, observed, {reading.group for reading in equations})
-    readings = [
-        *(
-            _Reading(r.number("obsval"), r.number("standard_deviation", 1 / _weight(r)), group=r.word("obgnme"))
-            for r in observed
-        ),
-        *equations,
-    ]
+    observations = [reading for row in observed for reading in _observations(row)]
+    readings, names = [*observations, *equations], [reading.name for reading in observations]
     if not readings:
         raise ConfigError(f"{control.path}: no observation has a weight above 0")
     templates, instructions = _files(control)
@@ -76,7 +72,7 @@ def from_pest(path: str | Path, files: Sequence[str] = (), *, prior_information:
                 OBSERVED: {
                     "instructions": instructions,
                     "delimiters": control.options.get("additional_ins_delimiters", ""),
-                    OBSERVED: [row.word("obsnme") for row in observed],
+                    OBSERVED: names,
                     "combinations": [reading.terms for reading in equations],
                 }
             },
@@ -87,24 +83,41 @@ def from_pest(path: str | Path, files: Sequence[str] = (), *, prior_information:
             OBSERVED: np.array([reading.value for reading in readings]),
         },
         "priors": priors,
-        "error": _error(control, readings, [row.word("obsnme") for row in observed]),
+        "error": _error(control, readings, names),
         **correlated,
     }
 
 
 class _Reading(NamedTuple):
-    """An observation, or an equation of prior information with its ``terms``, and its group."""
+    """An observation, or an equation of prior information with its ``terms``; its group, and which bound it is."""
 
     value: float
     std: float
     terms: Mapping[str, float] = {}
+    name: str = ""
     group: str = ""
+    bound: str = ""
+
+
+def _observations(row: PestRow) -> list[_Reading]:
+    """The one reading of an observation, or the two bounds of a range. Raises :class:`ConfigError`."""
+    std, group = row.number("standard_deviation", 1 / _weight(row)), row.word("obgnme")
+    own = _Reading(row.number("obsval"), std, name=row.word("obsnme"), group=group, bound=_bound(group))
+    values = {} if own.bound else {key: row.number(column) for key, column in RANGES.items() if column in row.cells}
+    if len(values) == 2 and not values["at_least"] < values["at_most"]:
+        raise ConfigError(f"{row.where}: greater_than of {own.name} is not below its less_than")
+    return [own._replace(value=value, bound=key) for key, value in values.items()] or [own]
+
+
+def _bound(group: str) -> str:
+    """Which bound the readings of a group are, "" if none."""
+    return next((key for key, begin in BOUNDS.items() if group.startswith(begin)), "")
 
 
 def _error(control: ControlFile, readings: Sequence[_Reading], names: Sequence[str]) -> Any:
     """The std of each reading, or their covariance, and where some are inequalities, which are bounds."""
     std = np.array([reading.std for reading in readings])
-    marks = {key: np.array([float(r.group.startswith(begin)) for r in readings]) for key, begin in BOUNDS.items()}
+    marks = {key: np.array([float(reading.bound == key) for reading in readings]) for key in BOUNDS}
     bounds = {key: each for key, each in marks.items() if each.any()}
     values = np.array([reading.value for reading in readings])
     full = errors_in_files(control, names, values, std, np.max([*marks.values()], axis=0))
@@ -197,8 +210,8 @@ def _equation(where: str, text: str, parameters: Mapping[str, PestRow]) -> _Read
     if at < len(left.rstrip()) or not terms:
         raise ConfigError(f"{where}: {text.strip()!r} is no equation of prior information")
     weight = _weight(numbers)
-    group = right.lower().split()[2:] or [""]
-    return _Reading(numbers.number("value"), 1 / weight, terms, group[0]) if weight else None
+    group = " ".join(right.lower().split()[2:3])
+    return _Reading(numbers.number("value"), 1 / weight, terms, "", group, _bound(group)) if weight else None
 
 
 def _files(control: ControlFile) -> tuple[dict[str, str], dict[str, list[str]]]:
