@@ -40,6 +40,7 @@ COLLAPSE = 0.15  # of the radius: blur by motion from which the bubble may have 
 TURNING = 0.065  # the same where nothing else explains the blur
 ONE_WAY, TURNED = 0.25, 3**0.5 / 2  # of that blur: std of the radius
 SHARP = 0.15  # of the square of a sharp edge's width, by which it varies
+LIKELY = 2.0  # std of noise beyond which a frame is blurred by motion rather than by chance
 CLEARLY = 3.0  # std of noise by which a frame is blurred more than the sharpest, whose own noise made them so
 BENT = 0.46  # of the exposure in steps: std of the radius in units of the blur that neighbours do not explain
 THRESHOLD = 0.05  # of the contrast: what the level of the edge can be off by in all frames alike
@@ -85,7 +86,7 @@ def _bent(
     for k, o in enumerate(outlines):
         if o is None:
             continue
-        if _excess(o, sharp, ratios[k], 2.0) > explained[k] ** 2 + SHARP * sharp**2:
+        if _excess(o, sharp, ratios[k], LIKELY) > explained[k] ** 2 + SHARP * sharp**2:
             moved = _moved(o, sharp)
             swept = moved / o.circle.R
             turning = TURNED * moved * min(1.0, swept / COLLAPSE) if turns[k] and swept > TURNING else 0.0
@@ -134,7 +135,7 @@ def _errors(outline: Outline, ratio: float, hidden: float, turned: bool, optics:
     variance = outline.variance * ratio + outline.common + hidden + outline.joined**2 + FLOOR**2
     words = ""
     moved = _moved(outline, sharp)
-    if moved > COLLAPSE * outline.circle.R:
+    if moved > COLLAPSE * outline.circle.R and _excess(outline, sharp, ratio, LIKELY) > 0:
         variance += ((TURNED if turned else ONE_WAY) * moved) ** 2
         words = f"the bubble {'turned' if turned else 'moved over much of its radius'} within the exposure"
     elif outline.joined:
