@@ -1,6 +1,7 @@
 """Discrepancies of the model: likelihood, gradient, information against closed forms, differences, quadrature."""
 
 import functools
+import itertools
 from dataclasses import replace
 from pathlib import Path
 
@@ -223,9 +224,25 @@ def test_singular_and_failed_runs_cost_infinity():
         assert not np.isnan(costs[3])
 
 
+@pytest.mark.parametrize("k", [9, 60])
+def test_where_a_dense_covariance_has_no_factor_the_filter_has_none(k):
+    o = with_discrepancy(make_problem(Wave(), [1.0, 1.3], k=k)).observations
+    failed = 0
+    for hyper in itertools.product(np.logspace(4, 16, 13), np.logspace(-1, 16, 18)):
+        covariance = o.noise.covariance(Predicted(o.values, None, None, np.array(hyper)))
+        cost = o.cost(Predicted(o.values[None], None, None, np.array([hyper])))[0]
+        try:
+            np.linalg.cholesky(covariance)
+        except np.linalg.LinAlgError:
+            failed += 1
+            assert np.isinf(cost)
+        assert np.isfinite(cost) or hyper[0] > 1e5
+    assert failed > 5
+
+
 @pytest.mark.parametrize("huber", [None, 1.345])
 def test_a_descent_does_not_go_where_the_covariance_has_no_factor(huber):
-    """There J falls with the length as with the amplitude of a discrepancy that excuses all that is missed."""
+    """From far away a descent raises amplitude and length further and further, since both excuse what is missed."""
     prior = tuple(PriorTerm.normal(p, mean, 1.0) for p, mean in zip(Wave().parameters, (1.0, 2.0), strict=True))
     problem = make_problem(Wave(), [1.0, 2.7], std=0.01, k=60, prior=prior)
     problem = with_discrepancy(problem, huber=huber, amplitude=(0.02, 2.0), length=(0.2, 0.7))

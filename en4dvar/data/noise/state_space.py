@@ -37,7 +37,8 @@ def innovations(residuals: Array, errors: Array, amplitudes: Array, lengths: Arr
     white = np.empty((2, *r.shape))
     _filter(int(nu + 0.5), r, e, a, d, shrink, which, white)
     with np.errstate(all="ignore"):
-        singular = np.square(white[1]).min(axis=0) < len(r) * np.finfo(float).eps * np.square(a).max(axis=0)
+        rounding = 4 * len(r) * np.finfo(float).eps * np.square(a).max(axis=0)
+        singular = np.square(white[1]).min(axis=0) < rounding
     white[:, :, singular] = np.nan
     return np.ascontiguousarray(white.transpose(0, 2, 1))
 
