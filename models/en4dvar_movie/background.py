@@ -37,6 +37,7 @@ SMOOTH = 12.0  # pixels: the brightness that contrasts are relative to varies sl
 LEAST_SPREAD = 0.002  # of the contrast
 NOISY = 0.1  # of a pixel's noise: what a contrast can be uncertain by for the noise
 SHARPEST = 5  # per cent of the frames: those where the bubble moved least within the exposure
+CLEAR = 4.0  # times the least variance of an edge's width: up to which noise does not make it a sharp one
 BLOB = 120  # pixels: the smallest patch of a first frame that may be a bubble
 ROUND = 0.5  # of a patch and the disc through its rim that both share
 SPECK = 100  # pixels: the largest change that is no bubble
@@ -314,6 +315,7 @@ def _optics(background: Background, samples: Sequence[Frame], movie: Movie, circ
     contrasts = np.array([o.contrast for o in large])
     contrast = float(np.median(contrasts))
     scatter = 1.2533 * float(np.std(contrasts)) / max(len(large) - 1, 1) ** 0.5  # of a median
-    width = float(np.percentile([o.width for o in optics], SHARPEST))
+    clearest = CLEAR * min(o.variance * o.ratio for o in optics)
+    width = float(np.percentile([o.width for o in optics if o.variance * o.ratio <= clearest], SHARPEST))
     scatter = min(scatter, NOISY * background.noise)  # more is not noise: bubbles differ in how bright their centre is
     return Optics(contrast, width, max(scatter / -contrast, LEAST_SPREAD))

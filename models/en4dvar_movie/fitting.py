@@ -123,7 +123,8 @@ def _known(p: Array, gaps: Array, ring: Array, noise: float, optics: Optics) -> 
     tight = 1e12 if _glare_is_far(p, gaps, ring) else 1.0
     precision[RIM] = noise**2 * tight / (0.1 * inner) ** 2
     precision[GLARE] = noise**2 * tight / optics.contrast**2
-    moved = max(p[W] ** 2 - optics.width**2, 0.0) ** 0.5
+    chance = 2 * (8 / np.pi**0.5 * p[W] / p[R]) ** 0.5 * p[W] * noise / abs(p[CONTRAST])  # 2 std of the width's square
+    moved = max(p[W] ** 2 - optics.width**2 - chance, 0.0) ** 0.5
     loose = max(0.0, moved / p[R] - 0.1)  # a bubble that collapses within the exposure is fainter, its halo blurred
     precision[LEVEL] = noise**2 / (max(LEVEL_SPREAD, optics.spread / 3, LOOSE * loose) * optics.contrast) ** 2
     precision[CONTRAST] = noise**2 / ((optics.spread + loose) * optics.contrast) ** 2

@@ -7,7 +7,8 @@ Shape: a bubble's extent along the line of sight is not seen. Were its outline a
 the mean radius over the sphere would differ from that over the outline by a normal error of variance a²/6, where a is
 the amplitude of mode 2 (the mean of a degree-2 harmonic over a great circle has variance σ²/4, mode 2 itself the rest,
 3σ²/4 = a²/2). Two numbers tell a², so that 90 % intervals take Student's t with 2 degrees of freedom. Where a frame's
-own a does not stand out of its noise, that of neighbouring frames together may.
+own a does not stand out of its noise, that of neighbouring frames together may, of which one that does (a speck of
+dirt at its edge, say) counts no more than the least that would.
 
 Exposure: over an exposure of length T the mean radius lies T² R̈/24 from that in its middle, R̈ as three frames show it;
 or, where the edge is blurred more than the steps to its neighbours explain, as its speed differs from theirs over half
@@ -17,7 +18,8 @@ Turning: an edge that moves one way during the exposure has its half level where
 turns there, as in a collapse, sweeps a range of √12 blurs and is at its end in the middle: √3 blurs from the half
 level. The less of the radius it sweeps, the rarer that is, unless nothing else explains the blur.
 
-Curvature: blur moves the half level of a disc inwards by w²/2R. It is given back for a frame's own blur or, where this
+Curvature: blur moves the edge fitted to a disc inwards by w²/2R, and by w⁴/2R³ less than that to the next order (found
+from discs without noise, tests/movie/test_fitting.py). It is given back for a frame's own blur or, where this
 is clearly more than that of the movie's sharpest frames, for theirs: what goes beyond it is the wall's motion during
 the exposure, which has no such shift.
 """
@@ -132,6 +134,7 @@ def _errors(outline: Outline, ratio: float, hidden: float, turned: bool, optics:
     sharp = min(outline.width, optics.width)
     optical = optics.width if _excess(outline, optics.width, ratio, CLEARLY) > 0 else outline.width
     radius = outline.circle.R + 0.5 * optical**2 / outline.circle.R
+    radius -= 0.5 * optical**4 / radius**3
     variance = outline.variance * ratio + outline.common + hidden + outline.joined**2 + FLOOR**2
     words = ""
     moved = _moved(outline, sharp)
@@ -156,11 +159,12 @@ def _hidden(outlines: Sequence[Outline | None], ratios: Array) -> Array:
     noise /= radii**2
     excess = np.array([o.amplitude(2) ** 2 for o in known]) / radii**2 - noise
     hidden = np.zeros(len(outlines))
+    bar = (SIGNIFICANT**2 / 2 - 1) * noise
     for n, k in enumerate(where):
         near = slice(max(0, n - NEIGHBOURS), n + NEIGHBOURS + 1)
         weights = 1 / noise[near] ** 2
-        together = float(np.average(excess[near], weights=weights))
-        if excess[n] > (SIGNIFICANT**2 / 2 - 1) * noise[n]:
+        together = float(np.average(np.minimum(excess, bar)[near], weights=weights))
+        if excess[n] > bar[n]:
             hidden[k] = excess[n]
         elif together > SIGNIFICANT / np.sqrt(weights.sum()):
             hidden[k] = together

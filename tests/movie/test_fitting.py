@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.special import ndtr
+from scipy.stats import ncx2
 
 from en4dvar_movie.fitting import fit_outline
 from en4dvar_movie.outline import Circle, Optics, Outline
@@ -39,6 +40,19 @@ def test_the_error_is_that_of_repeated_images(R, width):
     stated = np.sqrt(np.mean([o.variance for o in found]))
     assert off.std() / stated == pytest.approx(1.0, abs=0.3)
     assert abs(off.mean()) < 3 * stated / np.sqrt(len(off)) + 0.005
+
+
+@pytest.mark.parametrize(("R", "width"), [(2.5, 1.2), (2.9, 1.2), (4.5, 1.2), (6.0, 2.0), (9.0, 3.0)])
+def test_what_blur_takes_from_a_disc_is_given_back(R, width):
+    """The disc of which light is moved by a normal distance shows at r what a noncentral χ² says."""
+    y, x = np.indices((48, 48)) - 23.2
+    shade = ncx2.cdf((R / width) ** 2, 2, (x**2 + y**2) / width**2)
+    optics = Optics(CONTRAST, width, 0.002)
+    noise = 1e-4 * np.random.default_rng(5).standard_normal(shade.shape)
+    disc = fit_outline((CONTRAST * shade + noise).astype(np.float32), Circle(23.0, 23.0, R), optics)[0]
+    assert errors_of([disc], optics)[0].radius == pytest.approx(R, abs=0.02)
+    inwards = R - disc.circle.R
+    assert inwards > 0.4 * width**2 / R
 
 
 def test_nested_circles_and_their_errors():

@@ -86,6 +86,18 @@ def test_noise_at_the_edge_of_a_small_bubble_is_no_motion():
     assert np.mean(moved) < 0.1
 
 
+def test_stated_errors_of_a_small_bubble_are_at_most_twice_the_real_ones():
+    """A collapse, and a rest of 2.9 pixels that is most of the movie, beside specks of dirt."""
+    true = np.concatenate([np.linspace(17.0, 3.0, 15), np.full(45, 2.9)])
+    scores = []
+    for seed in range(21, 29):
+        shown = render(true[:, None], Scene(noise=8.0, drift=0.02, dirt=8), np.random.default_rng(seed))
+        small = track(movie_of(list(shown))).readings[18:]
+        scores += [(r.radius - 2.9) / r.errors.std for r in small if np.isfinite(r.radius)]
+    assert len(scores) > 320
+    assert 0.5 < np.median(np.abs(scores)) / 0.674 < 1.3
+
+
 def test_a_bubble_that_turns_within_the_exposure_has_an_error_to_match():
     """The largest disc of the exposure casts some shade, the smallest is where the bubble is at its middle."""
     still = np.array([34.0, 27.0, 21.0, 0.0, 21.0, 27.0, 34.0])
