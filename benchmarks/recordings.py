@@ -138,7 +138,8 @@ def bubble(seed: int, physics: dict[str, str], world: Wrong | None = None) -> Bu
         times = np.linspace(0.0, 8 * t_c, CELLS)
         radius = made.radius(model, truth, times)
         if radius is not None:
-            return Bubble(made.fitted, truth, times, radius, rate, made.rate, t_c, stream)
+            values = made.as_fitted(truth, times, radius)
+            return Bubble(made.fitted, values, times, radius, rate, made.rate, t_c, stream)
 
 
 def recording(seed: int, physics: dict[str, str], world: Wrong | None = None) -> tuple[str, dict[str, float], str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from en4dvar.model.state import Array
 from en4dvar.priors.prior import PriorTerm
 from en4dvar.priors.varying import PiecewiseModel, RandomWalk
 from en4dvar_bubble.laws.parameters import G
+from en4dvar_bubble.laws.viscous import Carreau
 from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.settings import BubbleSettings
 
@@ -63,6 +65,17 @@ class Wrong:
             ringing = np.arange(len(times)) >= first
             radius = radius + ringing * self.shape * np.sin(phase - phase[first])
         return radius
+
+    def as_fitted(self, truth: Mapping[str, float], times: Array, radius: Array) -> dict[str, float]:
+        """True values of the fitted law's parameters: of a liquid that thins μ is the mean of its viscosity, by what
+        it dissipates, R Ṙ² ∫ μ(2√3 |Ṙ/R| s) ds, for it has no other.
+        """
+        if self.law != Carreau.name:
+            return dict(truth)
+        speed, shares = np.gradient(radius, times), (np.arange(50) + 0.5) / 50
+        rates = 12**0.5 * np.abs(speed / radius)[:, None] * shares
+        viscosity = Carreau().viscosity(rates, SimpleNamespace(**self.values(truth))).mean(axis=1)
+        return {**truth, "mu": float(np.average(viscosity, weights=radius * speed**2))}
 
 
 def _path(model: ForwardModel, theta: Mapping[str, Array], times: Array) -> Array | None:
