@@ -65,7 +65,7 @@ def read_one(plan: SeriesPlan, file: DataFile, fewest: int = 3) -> Series:
         return errors_of(data, read.times[part] - float(zero), values, np.arange(len(read.times))[part], stated)
 
     try:
-        noise, whole = errors(window), slice(window.start, None)
+        noise, whole = errors(window), slice(window.start, max(window.stop, _window(data, read, path, until=True).stop))
         weights, places = data.weights, data.places
         if len(times) < fewest:
             raise DataError(f"{len(times)} usable observations in the window; at least {fewest} are needed")
@@ -82,7 +82,7 @@ def read_one(plan: SeriesPlan, file: DataFile, fewest: int = 3) -> Series:
             scalars=read.scalars,
             doubts=_doubts(data, read),
             continued=(read.times[whole] - float(zero), read.values[whole], errors(whole))
-            if window.stop < len(read.times) and data.error.separate and not places
+            if window.stop < whole.stop and data.error.separate and not places
             else None,
             error_unit=data.error.std.unit if data.error.std else "",
         )
@@ -123,11 +123,11 @@ def _readings(data: Data, file: DataFile, fewest: int) -> Readings:
     )
 
 
-def _window(data: Data, read: Readings, path: Path) -> slice:
-    """Which of the readings are used. Raises :class:`DataError` where none is."""
+def _window(data: Data, read: Readings, path: Path, until: bool = False) -> slice:
+    """Which of the readings are used, or these and those predicted. Raises :class:`DataError` where none is."""
     asked = data.window
     try:
-        window = select(read.times, read.values, asked.start, asked.end, asked.prominence)
+        window = select(read.times, read.values, asked.start, asked.until if until else asked.end, asked.prominence)
     except DataError as error:
         raise DataError(f"{path}: {error}{_span(read.times, data)}") from None
     if not len(read.times[window]):

@@ -46,6 +46,8 @@ class WindowSection(Section):
     end: Annotated[Instant, Made(_instant)] = Field("end", alias="to", validate_default=True)
     """Last observation: end, top, maximum, trough N, minimum N (counted from the window's start), or a time on the
     file's clock."""
+    until: Annotated[Instant, Made(_instant)] = Field("end", validate_default=True)
+    """Last reading after the window that is predicted; later ones are no longer of the same system."""
     prominence: Annotated[float, Made(_prominence)] = Field("10 %", validate_default=True)
     """How deep a minimum must be to count, relative to the range of the series."""
 

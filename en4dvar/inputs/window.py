@@ -6,7 +6,7 @@ window's start on, so that noise of a sample or two makes no minimum (``scipy.si
 A window that ends with the smallest sample of several, or begins with the largest, ends or begins with an error of
 known sign: it was chosen for its value, and those beside it were left out for theirs. ``top`` and ``trough N`` say the
 same instants by what no single sample decides: the vertex of a parabola through the samples about the maximum, and the
-middle between the two crossings of half the depth of a minimum.
+middle between the two crossings of half the depth of a minimum, seen between the minima beside it.
 """
 
 import re
@@ -95,7 +95,10 @@ def _index(times: Array, values: Array, instant: Instant, first: int, prominence
         )
     index = int(indices[instant.number - 1])
     if instant.kind == "trough":
-        return first + int(np.searchsorted(times[first:], _middle(times[first:], values[first:], index), "right")) - 1
+        begin, _, end = np.concatenate([[0], indices, [len(values) - first - 1]])[instant.number - 1 :][:3]
+        between = slice(first + begin, first + end + 1)
+        middle = _middle(times[between], values[between], index - begin)
+        return int(np.searchsorted(times, middle, "right")) - 1
     return first + index
 
 

@@ -169,6 +169,28 @@ def test_a_shallow_rebound_is_in_the_window(tmp_path: Path) -> None:
     assert problem.observations.times[-1] == pytest.approx(28.5e-6, abs=1e-9)  # 30 less the 1.5 it begins at
 
 
+@pytest.mark.parametrize("dirt", [False, True])
+def test_a_cloud_of_fragments_is_not_predicted(tmp_path: Path, dirt: bool) -> None:
+    """The top at 25 µs, collapses at 51, 76 and 99 µs, and growth from 40 to 90 µm after the last."""
+    times = np.arange(250) * 1.0
+    lobe = 240 * np.clip(1 - (times / 25 - 1) ** 2, 0, 1) ** 0.4
+    rebounds = 130 * np.abs(np.sin((times - 51) / 8)) * np.exp(-(times - 50) / 40)
+    radius = np.maximum(np.maximum(lobe, np.where((times > 51) & (times < 102), rebounds, 0)), 20)
+    radius[102:] = np.linspace(40, 90, 148)
+    if dirt:
+        radius[200] += 30
+    (tmp_path / "b.csv").write_text(
+        "t,R\n" + "".join(f"{t:g},{r:g}\n" for t, r in zip(times[15:], radius[15:], strict=True))
+    )
+    assert call("init", "--data", "b.csv", *UNITS).exit_code == 0
+    config = proposed(Path("b.yaml"))
+    window = config.document.data["data"]["window"]
+    assert window["to"] == ("76 us" if dirt else "trough 2")
+    (problem,) = build(config)
+    assert problem.observations.times[-1] == pytest.approx(51e-6, abs=1.1e-6)
+    assert problem.observations.continued.times[-1] == pytest.approx(73e-6, abs=2e-6)
+
+
 @pytest.mark.parametrize("start", ["acoustic", "laser"])
 @pytest.mark.parametrize("law", sorted(REGISTRY))
 def test_every_law_has_a_starter_that_validates(tmp_path: Path, start: str, law: str) -> None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from en4dvar.inputs.window import Instant, select
+from en4dvar.inputs.window import Instant, parse_instant, select
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.errors import ConfigError, DataError, retold
 from en4dvar.plumbing.units import convert
@@ -292,16 +292,19 @@ def _window(look: Look, histories: Mapping[str, tuple[Array, Array]]) -> Entry:
     end = f"trough {min(look.n_minima, 2)}" if look.n_minima else "end"
     low = f", prominence: {100 * look.prominence:g} %" if look.prominence < 0.1 else ""
     words = "what happens before the top is not modelled"
-    if look.drift and not look.n_minima:
-        words += f"; {look.drift}: end it before that"
+    ends = bool(look.drift and look.n_minima and len(histories) == 1)  # with its last minimum
+    if ends or (look.drift and not look.n_minima):
+        words += f"; {look.drift}: " + ("no bubble after its last minimum" if ends else "end it before that")
+    limits = ["top", end, *[f"trough {look.n_minima}"] * ends]
     if len(histories) == 1 and look.bad:
         ((times, radius),) = histories.values()
         times, radius = np.delete(times, look.bad), np.delete(radius, look.bad)
-        last = Instant("trough", min(look.n_minima, 2)) if look.n_minima else Instant("end")
-        within = times[select(times, radius, Instant("top"), last, look.prominence)]
-        limits = [_text(t, "s", "us", 8) for t in within[[0, -1]]]
-        return Entry("window", f"{{from: {limits[0]}, to: {limits[1]}}}", f"the top to {end}; {words}")
-    return Entry("window", f"{{from: top, to: {end}{low}}}", words)
+        first, *last = (parse_instant(limit, "us") for limit in limits)
+        within = [times[select(times, radius, first, instant, look.prominence)] for instant in last]
+        limits = [_text(t, "s", "us", 8) for t in (within[0][0], *(part[-1] for part in within))]
+        low, words = "", f"the top to {end}; {words}"
+    until = f", until: {limits[2]}" if len(limits) > 2 else ""
+    return Entry("window", f"{{from: {limits[0]}, to: {limits[1]}{until}{low}}}", words)
 
 
 @dataclass(frozen=True)
