@@ -51,6 +51,7 @@ SUFFICIENT = 1e-4  # Armijo's constant: the fraction of the predicted decrease t
 LENGTHS = np.array([1.0, 0.5, 0.25, 0.125])
 MOST_BENT = 2.0  # the acceleration is cut to this multiple of the direction
 BATCH = len(LENGTHS)  # trials per call of the model
+LONGEST = 6.0  # norm of a step in the coordinates of the tangent: 40 prior standard deviations of an ensemble of 48
 KEPT = 0.75  # of the predicted decrease: what half of a step promises
 
 
@@ -115,6 +116,8 @@ def full_step(at: Point) -> Search:
 def line_search(at: Point) -> Search:
     """Backtracking: the lowest J among 1, ½, ¼, ⅛ of the step that satisfies Armijo's condition, then shorter ones.
 
+    Of a step longer than :data:`LONGEST` these are shares of one that long: readings whose errors are small beside their
+    misfit ask for hundreds of prior standard deviations, where a model is absurd and a run of it slow.
     A ``sparing`` point tries the others only where the whole step lowers J by less than half of it promised. Where the
     full step is not the best of the first four, the predictions along the step tell how the model curves,
     and four points of the parabola a δw + ½ a² δ²w are tried as well: the second-order correction of the step,
@@ -123,17 +126,19 @@ def line_search(at: Point) -> Search:
     arXiv:1201.5885.
     """
     direction = at.step.direction
-    if at.sparing and (move := (yield from _whole_step(at))):
+    far = float(np.linalg.norm(direction @ at.tangent.basis)) if at.tangent else 0.0
+    most = LENGTHS * min(1.0, LONGEST / max(far, LONGEST))
+    if at.sparing and most[0] == 1 and (move := (yield from _whole_step(at))):
         return move
     for first in range(3):
-        lengths = LENGTHS * 0.5 ** (BATCH * first)
+        lengths = most * 0.5 ** (BATCH * first)
         straight = lengths[:, None] * direction
         trials = yield at.w + straight
         move = _lowest(at, straight, lengths, trials)
-        if first == 0 and at.tangent is not None and (move is None or move.step_length < 1):
+        if first == 0 and at.tangent is not None and (move is None or move.step_length < most[0]):
             bend = acceleration(at.step, at.tangent, lengths, trials.predictions)
-            bent = straight + 0.5 * LENGTHS[:, None] ** 2 * bend
-            curved = _lowest(at, bent, LENGTHS, (yield at.w + bent))
+            bent = straight + 0.5 * lengths[:, None] ** 2 * bend
+            curved = _lowest(at, bent, lengths, (yield at.w + bent))
             if curved is not None and (move is None or curved.cost < move.cost):
                 move = curved
         if move is not None:

@@ -39,6 +39,17 @@ def test_the_top_lies_where_its_errors_say(per_collapse: float, noise_std: float
         assert np.median([one.time_std for one in tops]) < 0.5 * largest
 
 
+@pytest.mark.parametrize("grown", [0.5, 0.8])
+@pytest.mark.parametrize("per_collapse", [9, 20, 60])
+def test_where_readings_are_exact_the_top_is_off_by_what_growth_differs(per_collapse: float, grown: float) -> None:
+    stream = np.random.default_rng(4)
+    for _ in range(10):
+        t, r = history(stream, per_collapse, 1e-4, grown)
+        seen = top(t, r, 1e-4)
+        assert abs(seen.time) < 2.5 * seen.time_std
+        assert seen.time_std < 0.02
+
+
 @pytest.mark.parametrize("per_collapse", [9, 20, 60])
 def test_scatter_is_told_whatever_the_bubble_does(per_collapse: float) -> None:
     stream = np.random.default_rng(5)
@@ -59,6 +70,15 @@ def test_a_reading_that_is_none_is_told_and_not_taken_for_the_top() -> None:
     seen = look(t, 1e-4 * r)
     assert seen.bad == (where,)
     assert seen.top.height == pytest.approx(1e-4, rel=0.02)
+
+
+def test_a_bubble_that_is_large_when_first_seen_is_no_nucleus() -> None:
+    """Seen from 72 % of R_max to 36 %, growth from small would have been seen before."""
+    t, r = history(np.random.default_rng(8), 24, 0.003, 0.65)
+    kept = r > 0.36
+    seen = look(24e-6 / 0.9147 * t[kept], 243e-6 * r[kept])
+    assert 0.6 < r[0] < 0.8
+    assert (seen.start, seen.clear) == ("laser", False)
 
 
 def test_fragments_are_no_bubble_at_rest() -> None:

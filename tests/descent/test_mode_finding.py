@@ -151,18 +151,25 @@ class Ridge(Toy):
         return float(theta[0] + 2 * np.sin(3 * theta[0]))
 
 
-@pytest.mark.parametrize("seed", [1, 11, 12, 13])
-def test_where_no_start_explains_the_data_others_are_tried(seed, monkeypatch):
+def test_where_no_start_explains_the_data_others_are_tried(monkeypatch):
+    """Of thirty seeds a third find the truth from two starts, two thirds from others beside them; the rest ends at the
+    maximum of the factor, 4.77, or beyond the next one.
+    """
     prior = (PriorTerm.normal(Parameter("a", "m"), 4.8, 0.6),)
-    problem = make_problem(Ridge(("a",)), [6.42], std=0.02, seed=seed, prior=prior)
-    settings = AssimilationSettings(members=16)
-    more = assimilate(problem, settings, seed)
-    assert more.converged
-    assert more.iterations[-1].centre == pytest.approx([6.42], abs=0.003)
-    monkeypatch.setattr("en4dvar.descent.start.highest_plausible", lambda space: np.inf)
-    two = assimilate(problem, settings, seed)
-    assert two.iterations[-1].centre == pytest.approx([4.77], abs=0.01)  # the maximum of the factor
-    assert two.forward_runs < more.forward_runs
+    found, runs = {}, {}
+    for starts in ("more", "two"):
+        ends = []
+        for seed in range(1, 31):
+            problem = make_problem(Ridge(("a",)), [6.42], std=0.02, seed=seed, prior=prior)
+            ends.append(assimilate(problem, AssimilationSettings(members=16), seed))
+        found[starts] = sum(abs(end.iterations[-1].centre[0] - 6.42) < 0.01 for end in ends)
+        runs[starts] = sum(end.forward_runs for end in ends)
+        if starts == "more":
+            assert sum(end.converged for end in ends) > 25
+        monkeypatch.setattr("en4dvar.descent.start.highest_plausible", lambda space: np.inf)
+    assert found["more"] >= 15
+    assert found["more"] >= found["two"] + 5
+    assert runs["two"] < runs["more"]
 
 
 class Remembering(Decay):

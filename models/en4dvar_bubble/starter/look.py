@@ -28,6 +28,7 @@ UNKNOWN = 0.01  # of R_max: errors where the scatter cannot be told
 DRIFTS = 0.15  # of ln R from one quarter of a history to the next
 GAS = 0.6  # of R_max: a bubble at rest is smaller
 ACOUSTIC_BEGINS = 0.1  # of R_max: one that begins below has grown from a nucleus
+EMERGES = 0.5  # of R_max: a nucleus that grows is seen before it is as large
 CREEPS = 1.5  # collapse times after the maximum: a history that goes on for longer without a rebound is damped
 WINDOW, DEGREE = 7, 4
 STEEP = 0.5  # of the largest reading of a window: one that holds less is on its way into a collapse
@@ -163,6 +164,8 @@ def _start(first: float, rebounds: bool, creeps: bool) -> tuple[Start, str, bool
         return "acoustic", f"{begins}: it grows from small", True
     if rebounds:
         return "laser", f"{begins}, but goes on through a rebound, as gas made by a laser does", False
+    if first >= EMERGES:
+        return "laser", f"{begins}: one that grows from a nucleus is seen before", False
     if creeps:
         return "laser", f"{begins}, but goes on after the collapse, which a thick gel damps", False
     return "acoustic", f"{begins}, grows and ends with the first collapse", False

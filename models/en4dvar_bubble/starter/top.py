@@ -5,7 +5,8 @@ collapse differ by, a term t³. With n readings of relative error ε within ± T
 
     σ_t = ε t_c² √(3/n) / (0.84 T),
 
-so that a wide window is the better one as long as it is not biased; a cubic takes away what that term does, and has
+so that a wide window is the better one as long as it is not biased; beside readings that are exact, its bias is its
+error. A cubic takes away what that term does, and has
 2.5 times the error. The width is chosen by intersecting confidence
 intervals (Goldenshluger & Nemirovski 1997, Math. Methods Statist. 6, 135): from narrow to wide, until one of the
 estimates contradicts those before it. The largest reading itself, which is no estimate, lies up to √(ε/0.42) t_c off
@@ -25,7 +26,7 @@ WINDOWS = (0.15, 0.2, 0.27, 0.35, 0.45, 0.55, 0.65, 0.75, 0.85)  # half widths i
 LOWEST = 0.45  # of R_max: what lies lower belongs to the end of the collapse, or to the beginning of the growth
 FEWEST, CUBIC = 5, 8  # readings through which a parabola and a cubic are laid
 AGREE = 2.0  # standard deviations
-FORM = 0.002  # of the height: what R^{5/2} is not a parabola by
+FORM = 0.002  # of the height: what R^{5/2} is not a polynomial by
 CHOSEN, ONE_SIDED = 1.3, 2.5  # errors of a window that the readings chose themselves are larger by these factors
 
 
@@ -83,7 +84,8 @@ def _vertex(t: Array, r: Array, scatter: float, t_c: float) -> tuple[Array, Arra
     """Top of the parabola or cubic R^{5/2} through readings, and its std; None where there is none.
 
     Of a cubic where the readings lie to both sides, which growth that is slower than the collapse does not move. The
-    std holds the errors of the readings to first order.
+    std holds the errors of the readings to first order, and :data:`FORM`, which as a tilt over half of the readings
+    moves the top by 5/2 of it over the slope there.
     """
     middle, scale, largest = 0.5 * (t[0] + t[-1]), 0.5 * float(np.ptp(t)), float(r.max())
     z, y = (t - middle) / scale, np.clip(r / largest, 0.05, None)
@@ -99,10 +101,8 @@ def _vertex(t: Array, r: Array, scatter: float, t_c: float) -> tuple[Array, Arra
             (at, height), variance = there, of_cubic
         else:  # from the way down alone a cubic tells how far off a parabola may be, and no more
             variance = variance + (there - parabola[0]) ** 2
-    std = np.sqrt(variance)
-    return np.array([middle + scale * at, largest * height]), np.array(
-        [scale * std[0], largest * np.hypot(std[1], FORM)]
-    )
+    std = np.hypot(np.sqrt(variance), FORM * np.array([1.25 * (t_c / scale) ** 2, 1.0]))
+    return np.array([middle + scale * at, largest * height]), np.array([scale, largest]) * std
 
 
 def _fit(z: Array, y: Array, weight: Array, error: float, degree: int, curvature: float) -> tuple[Array, Array] | None:
