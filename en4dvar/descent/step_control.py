@@ -116,8 +116,8 @@ def full_step(at: Point) -> Search:
 def line_search(at: Point) -> Search:
     """Backtracking: the lowest J among 1, ½, ¼, ⅛ of the step that satisfies Armijo's condition, then shorter ones.
 
-    Of a step longer than :data:`LONGEST` these are shares of one that long: readings whose errors are small beside their
-    misfit ask for hundreds of prior standard deviations, where a model is absurd and a run of it slow.
+    Of a step longer than :data:`LONGEST` these are shares of one that long: readings whose errors are small beside
+    their misfit ask for hundreds of prior standard deviations, where a model is absurd and a run of it slow.
     A ``sparing`` point tries the others only where the whole step lowers J by less than half of it promised. Where the
     full step is not the best of the first four, the predictions along the step tell how the model curves,
     and four points of the parabola a δw + ½ a² δ²w are tried as well: the second-order correction of the step,
