@@ -191,18 +191,22 @@ class PriorTerm:
         return theta if self.transform == "lognormal" else 1.0
 
     def to_physical(self, x: Array) -> Array:
-        """θ for transformed values ``x`` of any shape; overflow gives inf, which no model accepts as a value."""
+        """θ for transformed values ``x`` of any shape; overflow gives inf, which no model accepts as a value.
+
+        Between bounds: what would be rounded to one of them stays on this side of it.
+        """
         x = np.asarray(x, dtype=float)
         if self.transform == "normal":
             return x
         if self.transform == "lognormal":
             with np.errstate(over="ignore"):
                 return np.asarray(np.exp(x))
-        if self.transform in QUANTILE_MAPS:
-            return parameter_map.value(self.transform, x, self.bounds, self.shape)
         low, high = self.bounds
-        # from the nearer bound, so that values close to it keep their relative precision
-        return np.where(x < 0, low + (high - low) * _sigmoid(x), high - (high - low) * _sigmoid(-x))
+        if self.transform in QUANTILE_MAPS:
+            theta = parameter_map.value(self.transform, x, self.bounds, self.shape)
+        else:  # from the nearer bound, so that values close to it keep their relative precision
+            theta = np.where(x < 0, low + (high - low) * _sigmoid(x), high - (high - low) * _sigmoid(-x))
+        return np.clip(theta, np.nextafter(low, high), np.nextafter(high, low) if high < math.inf else high)
 
     def from_physical(self, theta: Array) -> Array:
         """x for physical values ``theta`` of any shape.

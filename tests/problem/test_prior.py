@@ -33,6 +33,14 @@ def test_logit_round_trip_and_range(x, low, width):
         assert abs(float(term.from_physical(np.array(theta))) - x) < 2 * tolerance
 
 
+@given(st.floats(-300.0, 300.0), st.floats(-100.0, 100.0), st.floats(1e-3, 1e3))
+def test_what_is_far_out_lies_within_the_bounds_and_can_be_gone_back_to(x, low, width):
+    term = PriorTerm.logit(A, (low, low + width), low + width / 2, 1.0)
+    theta = term.to_physical(np.array(x))
+    assert low < theta < low + width
+    assert np.isfinite(term.from_physical(theta))
+
+
 def test_logit_keeps_precision_at_a_zero_bound():
     term = PriorTerm.logit(A, (0.0, 2.0), 1.0, 1.0)
     assert float(term.to_physical(np.array(-40.0))) == pytest.approx(2 * math.exp(-40.0), rel=1e-13)
