@@ -90,11 +90,11 @@ def test_stated_errors_of_a_small_bubble_are_at_most_twice_the_real_ones():
     """A collapse, and a rest of 2.9 pixels that is most of the movie, beside specks of dirt."""
     true = np.concatenate([np.linspace(17.0, 3.0, 15), np.full(45, 2.9)])
     scores = []
-    for seed in range(21, 29):
+    for seed in range(21, 25):
         shown = render(true[:, None], Scene(noise=8.0, drift=0.02, dirt=8), np.random.default_rng(seed))
         small = track(movie_of(list(shown))).readings[18:]
         scores += [(r.radius - 2.9) / r.errors.std for r in small if np.isfinite(r.radius)]
-    assert len(scores) > 320
+    assert len(scores) > 160
     assert 0.5 < np.median(np.abs(scores)) / 0.674 < 1.3
 
 
