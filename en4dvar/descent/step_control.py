@@ -127,7 +127,7 @@ def line_search(at: Point) -> Search:
     """
     direction = at.step.direction
     far = float(np.linalg.norm(direction @ at.tangent.basis)) if at.tangent else 0.0
-    most = LENGTHS * min(1.0, LONGEST / max(far, LONGEST))
+    most = LENGTHS * (LONGEST / max(far, LONGEST))
     if at.sparing and most[0] == 1 and (move := (yield from _whole_step(at))):
         return move
     for first in range(3):

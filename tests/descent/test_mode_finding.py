@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from toys import Decay, Toy, Wave, make_problem, visit
 
-from en4dvar.descent.step_control import Point, Tangent, Trials, acceleration, line_search, run_searches
+from en4dvar.descent.step_control import LONGEST, Point, Tangent, Trials, acceleration, line_search, run_searches
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.diagnosis.analysis import IterationRecord
 from en4dvar.ensemble.linalg import Hessian
@@ -125,6 +125,24 @@ def test_searches_side_by_side_find_what_each_finds_alone():
         assert np.array_equal(a.w, b.w)
         assert a.cost == b.cost < point.cost
     assert len({m.step_length for m in together if m}) > 1
+
+
+@pytest.mark.parametrize("far", [3.0, 500.0])
+def test_no_trial_is_farther_than_an_ensemble_knows(far):
+    """Of J = ½ |w|² the whole step ends in the minimum, at ``far``; of a longer one the longest allowed is taken."""
+    w, tried = np.array([far, 0.0]), []
+
+    def try_out(candidates):
+        tried.extend(candidates)
+        return Trials(0.5 * np.sum(candidates**2, axis=1), candidates)
+
+    step = GaussNewtonStep(w, w, Hessian.of(np.zeros((2, 2))), -w)
+    tangent = Tangent(w, np.eye(2), lambda vector: vector, np.eye(2))
+    (move,) = run_searches([line_search(Point(w, 0.5 * far**2, step, tangent))], try_out)
+    assert move is not None
+    assert np.linalg.norm(move.w - w) == pytest.approx(min(far, LONGEST))
+    assert move.step_length == pytest.approx(min(1.0, LONGEST / far))
+    assert max(np.linalg.norm(np.array(tried) - w, axis=1)) < 1.001 * LONGEST
 
 
 @pytest.mark.parametrize("seed", range(6))

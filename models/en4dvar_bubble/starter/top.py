@@ -6,11 +6,10 @@ collapse differ by, a term t³. With n readings of relative error ε within ± T
     σ_t = ε t_c² √(3/n) / (0.84 T),
 
 so that a wide window is the better one as long as it is not biased; beside readings that are exact, its bias is its
-error. A cubic takes away what that term does, and has
-2.5 times the error. The width is chosen by intersecting confidence
-intervals (Goldenshluger & Nemirovski 1997, Math. Methods Statist. 6, 135): from narrow to wide, until one of the
-estimates contradicts those before it. The largest reading itself, which is no estimate, lies up to √(ε/0.42) t_c off
-and is too high by about ε √(2 ln n).
+error. A cubic takes away what that term does, and has 2.5 times the error. The width is chosen by intersecting
+confidence intervals (Goldenshluger & Nemirovski 1997, Math. Methods Statist. 6, 135): from narrow to wide, until one
+of the estimates contradicts those before it. The largest reading itself, which is no estimate, lies up to √(ε/0.42) t_c
+off and is too high by about ε √(2 ln n).
 """
 
 from collections.abc import Iterator
@@ -84,8 +83,8 @@ def _vertex(t: Array, r: Array, scatter: float, t_c: float) -> tuple[Array, Arra
     """Top of the parabola or cubic R^{5/2} through readings, and its std; None where there is none.
 
     Of a cubic where the readings lie to both sides, which growth that is slower than the collapse does not move. The
-    std holds the errors of the readings to first order, and :data:`FORM`, which as a tilt over half of the readings
-    moves the top by 5/2 of it over the slope there.
+    std holds the errors of the readings to first order, and :data:`FORM`, which as a tilt of half of the readings
+    moves the top by 5/2 of it over the parabola's curvature.
     """
     middle, scale, largest = 0.5 * (t[0] + t[-1]), 0.5 * float(np.ptp(t)), float(r.max())
     z, y = (t - middle) / scale, np.clip(r / largest, 0.05, None)
