@@ -35,12 +35,16 @@ LEADING = 40  # frames looked at for the background
 SAMPLES = 24  # frames looked at for what they share
 SMOOTH = 12.0  # pixels: the brightness that contrasts are relative to varies slowly
 LEAST_SPREAD = 0.002  # of the contrast
+FULL = 2  # power of its radius over its edge's width with which a bubble tells the contrast: small ones show less of it
+LARGE = 95  # per cent of the frames: from which on bubbles count alike
 NOISY = 0.1  # of a pixel's noise: what a contrast can be uncertain by for the noise
 SHARPEST = 5  # per cent of the frames: those where the bubble moved least within the exposure
 CLEAR = 4.0  # times the least variance of an edge's width: up to which noise does not make it a sharp one
 BLOB = 120  # pixels: the smallest patch of a first frame that may be a bubble
 ROUND = 0.5  # of a patch and the disc through its rim that both share
+DRIFTS = 1.0  # noise of a pixel: means over 3 × 3 pixels that differ by more from frame to frame are dirt that drifts
 SPECK = 100  # pixels: the largest change that is no bubble
+BEGUN, SURE = 0.25, 2.0  # of the shade in a bubble's middle, and of a pixel's noise: what tells that it was there
 HALO, STILL = 9, 0.01  # side of squares whose mean tells more than a pixel, and what it may differ by
 SURELY = 1.4  # variances of noise beyond which the scatter in such a square is something else
 LEAST_CONTRAST = 0.08  # of the background's brightness
@@ -110,7 +114,7 @@ def find_background(
     if watched is not None:
         blind |= ~watched
     empty = 0 if _begins_with_a_bubble(first, samples, noise, blind) else _quiet(leading, first, noise, blind)
-    level = np.mean(np.array(leading[:empty], dtype=np.float32), axis=0) if empty else smooth_surface(samples)
+    level = _without_specks(leading[:empty], noise) if empty else smooth_surface(samples)
     if empty > 2:
         noise = pixel_noise(np.array([f - level for f in leading[:empty]])) * float(np.sqrt(empty / (empty - 1)))
     background = _with_sign(level, samples, noise, empty, blind)
@@ -234,12 +238,29 @@ def _is_round(patch: npt.NDArray[np.bool_]) -> bool:
 
 
 def _quiet(leading: Sequence[Frame], first: Image, noise: float, blind: npt.NDArray[np.bool_]) -> int:
-    """How many leading frames look like the first."""
+    """How many leading frames look like the first: before a bubble is large enough to be told from dirt, most of them
+    show the shade in its middle.
+    """
     for number, frame in enumerate(leading):
         labels, count = ndimage.label(_changed(frame.astype(np.float32), first, noise) & ~blind)
-        if count and np.bincount(labels.ravel())[1:].max() > SPECK:  # larger than dirt that drifts
-            return number
+        sizes = np.bincount(labels.ravel())[1:]
+        if count and sizes.max() > SPECK:  # larger than dirt that drifts
+            y, x = np.mean(np.nonzero(labels == 1 + np.argmax(sizes)), axis=1).round().astype(int)
+            middle = np.s_[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2]
+            frames = (_lit_as(f.astype(np.float32), first) for f in leading[: number + 1])
+            shade = np.array([float(np.mean((f - first)[middle])) for f in frames])
+            begun = shade * np.sign(shade[-1]) > max(BEGUN * abs(shade[-1]), SURE * noise)
+            mostly = [n for n in range(1, number) if begun[n] and np.mean(begun[n:number]) > 0.5]
+            return min(mostly, default=number)
     return len(leading)
+
+
+def _without_specks(empty: Sequence[Frame], noise: float) -> Array:
+    """Mean (H, W) of empty frames, without what is seen in few of them, such as dirt that drifts."""
+    frames = np.array(empty, dtype=np.float32)
+    off = frames - np.median(frames, axis=0)
+    kept = np.abs(ndimage.uniform_filter(off, (0, 3, 3))) < DRIFTS * noise
+    return np.asarray(np.mean(frames, axis=0, where=kept | ~kept.any(axis=0)), dtype=np.float32)
 
 
 def _with_sign(
@@ -254,7 +275,7 @@ def _with_sign(
         full = max(float(np.median([np.percentile(f - level, 99.5) for f in samples])), 1.0)
         gain = np.full_like(level, -1.0 / full)
         return Background(level, np.where(blind, np.float32(np.nan), gain), noise / full, empty, relative=False)
-    smooth = ndimage.gaussian_filter(level, SMOOTH)
+    smooth = ndimage.gaussian_filter(ndimage.median_filter(level, HALO), SMOOTH)  # the light itself, without dirt
     smooth = np.maximum(smooth, max(float(np.median(smooth)) * 0.05, 1.0))
     if empty:  # what stands still is in the level, and a bubble takes its share of that light
         sharp = ndimage.gaussian_filter(level, 1.0)
@@ -311,10 +332,14 @@ def _optics(background: Background, samples: Sequence[Frame], movie: Movie, circ
             optics.append(outlines[0])
     if not optics:
         raise DataError(f"{movie.path}: no frame shows a bubble that differs from the background")
-    large = sorted(optics, key=lambda o: o.circle.R / o.width)[3 * len(optics) // 4 :]  # they show the full contrast
-    contrasts = np.array([o.contrast for o in large])
-    contrast = float(np.median(contrasts))
-    scatter = 1.2533 * float(np.std(contrasts)) / max(len(large) - 1, 1) ** 0.5  # of a median
+    contrasts = np.array([o.contrast for o in optics])
+    clear = np.array([o.circle.R / o.width for o in optics])
+    weights = np.minimum(clear, np.percentile(clear, LARGE)) ** FULL
+    weights /= weights.sum()
+    order = np.argsort(contrasts)
+    contrast = float(contrasts[order][np.searchsorted(np.cumsum(weights[order]), 0.5)])
+    spread = float(np.sqrt(weights @ (contrasts - contrast) ** 2))
+    scatter = 1.2533 * spread / max(1 / float(weights @ weights) - 1, 1) ** 0.5  # of a median
     clearest = CLEAR * min(o.variance * o.ratio for o in optics)
     width = float(np.percentile([o.width for o in optics if o.variance * o.ratio <= clearest], SHARPEST))
     scatter = min(scatter, NOISY * background.noise)  # more is not noise: bubbles differ in how bright their centre is

@@ -29,6 +29,31 @@ def test_radii_of_every_class_of_frame_are_the_true_ones(kind):
     assert np.sqrt(np.mean(scores**2)) < 3
 
 
+def test_dirt_that_drifts_in_the_empty_frames_moves_no_radius():
+    """It would be a part of the background, and so at the same place in all frames."""
+    true, off = np.linspace(9.0, 13.0, 15), []
+    for seed in range(31, 39):
+        found = track(movie_of(frames(Scene((48, 48), noise=4.0, dirt=8, centre=0.4), true, seed)))
+        off.append(np.nanmean(np.array([r.radius for r in found.readings[3:]]) - true))
+    assert np.sqrt(np.mean(np.square(off))) < 0.03
+
+
+def test_the_frames_of_a_bubble_that_begins_small_are_no_background():
+    true = np.array([3.4, 3.1, 2.8, 2.6, 3.0, 4.0, 5.5, 7.0, 9.0, 11.0, 12.0, 12.0, 11.0, 9.0, 7.0, 5.0, *[4.0] * 8])
+    for seed in range(51, 55):
+        found = track(movie_of(frames(Scene((64, 64), noise=8.0), true, seed)))
+        assert found.background.frames == 3
+        assert abs(np.mean([r.radius for r in found.readings[-8:]]) - 4) < 0.15
+
+
+def test_a_few_large_bubbles_tell_the_contrast_of_many_small_ones():
+    """Of the light in a small bubble's centre, some is blurred to its edge."""
+    true = np.concatenate([np.linspace(24.0, 4.0, 8), np.full(40, 3.8)])
+    for seed in range(41, 45):
+        found = track(movie_of(frames(Scene((70, 70), noise=7.5, centre=0.4), true, seed)))
+        assert abs(found.optics.contrast + 0.5) < 0.02
+
+
 @pytest.mark.slow
 @pytest.mark.long
 @pytest.mark.parametrize("kind", CLASSES)
