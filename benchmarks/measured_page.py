@@ -33,8 +33,9 @@ bubbles of one gel differ by no more than their intervals say, and far above 1 i
 bubbles' gels differ; the readings after the window go on to the end of the record, through oscillations of which none
 was fitted. Density, scale and pressure are common to the bubbles of a folder and make χ² smaller. Where χ² is far above
 1, the stated intervals are too narrow. The bands allow for gas that a collapse takes or sets free (`gas_change`, see
-[physics](physics.md#vapour-and-a-warm-medium)); where far more than 90 % lie in them, it allows for too much, and where
-far fewer do, something else happens to the bubble.
+[physics](physics.md#vapour-and-a-warm-medium)) and, in liquids, for damping that is no viscosity (`viscosity_change`);
+where far more than 90 % lie in them, they allow for too much, and where far fewer do, something else happens to the
+bubble.
 """
 PRESSURE = re.compile(r"ambient pressure of ([\d.]+) ?MPa")
 ATMOSPHERE = 0.1  # MPa, which init takes for granted

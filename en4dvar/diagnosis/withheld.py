@@ -7,9 +7,10 @@ residuals in the window say of the discrepancy there and of the errors
     F(y) = (1/N) Σ_i Φ((y − m_i − δ_i)/s_i),
 
 whose 5 and 95 % quantiles are a band that a reading lies in with a chance of 90 %, if model, errors and posterior are
-right. A quantity that the model calls :attr:`~en4dvar.model.forward.ForwardModel.unforeseen` changes at the last
-maximum of the window, by normal scores in a fixed order. Nothing was fitted to these readings: how many of them lie in
-their bands is the one test of a real experiment that no choice of priors or errors has passed beforehand.
+right. Quantities that the model calls :attr:`~en4dvar.model.forward.ForwardModel.unforeseen` change at the last
+maximum of the window, each by normal scores in a fixed order of its own. Nothing was fitted to these readings: how many
+of them lie in their bands is the one test of a real experiment that no choice of priors or errors has passed
+beforehand.
 """
 
 from dataclasses import dataclass, replace
@@ -68,8 +69,8 @@ def predict_withheld(problem: InverseProblem, members: Array, executor: Executor
         return None
     changed = unforeseen(problem)
     count, added = len(members), changed.prior.terms[len(problem.prior.terms) :]
-    scores = np.random.default_rng(count).permutation(ndtri((np.arange(count) + 0.5) / count))
-    theirs = np.column_stack([members, *(term.std * scores for term in added)])
+    scores, stream = ndtri((np.arange(count) + 0.5) / count), np.random.default_rng(count)
+    theirs = np.column_stack([members, *(term.std * stream.permutation(scores) for term in added)])
     run = Composite(replace(changed, observations=whole), executor)(theirs)
     begin, alive = len(within), np.flatnonzero(np.isfinite(run.predicted.values).all(axis=1))
     if len(alive) < 2:
@@ -81,17 +82,20 @@ def predict_withheld(problem: InverseProblem, members: Array, executor: Executor
 
 
 def unforeseen(problem: InverseProblem) -> InverseProblem:
-    """The problem with the change that its model does not foresee, the last of its control vector, if there is one."""
+    """The problem with the changes that its model does not foresee, at the end of its control vector."""
     model, values = problem.model, problem.observations.values
-    if model.unforeseen is None:
+    if not model.unforeseen:
         return problem
-    name, std = model.unforeseen
     top = len(values) - 1
     while top > 1 and max(values[top - 2 : top]) > values[top]:  # one reading that is lower is noise
         top -= 1
-    field = next((field for field in model.layout.fields if field.name == name), Field(name, unit="1"))
-    change = StateChanges.of(model, field, [float(problem.observations.times[top])], std, relative=True)
-    return problem.varied([change])
+    fields, knots = {field.name: field for field in model.layout.fields}, [float(problem.observations.times[top])]
+    return problem.varied(
+        [
+            StateChanges.of(model, fields.get(name, Field(name, unit="1")), knots, std, relative=True)
+            for name, std in model.unforeseen.items()
+        ]
+    )
 
 
 def _quantile(mean: Array, std: Array, level: float) -> Array:

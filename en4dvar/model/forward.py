@@ -200,9 +200,9 @@ class ForwardModel(ABC):
 
     ``defaults`` are values (SI) of parameters that ``parameters:`` need not name.
 
-    ``unforeseen`` is a quantity that may change on the way by what no model foresees, and the standard deviation of the
-    change of its logarithm; what is expected of readings after the window allows for one such change. If it is no field
-    of the state, :meth:`changed` says what its change is.
+    ``unforeseen`` are quantities that may change on the way by what no model foresees, by the standard deviation of
+    the change of their logarithm; what is expected of readings after the window allows for one such change of each. If
+    one is no field of the state, :meth:`changed` says what its change is.
 
     A model that has settings in YAML also has ``Settings`` (a pydantic model of its ``model:`` section) and
     ``from_settings``; without them the class is called without arguments. In a sequence, parameters that the state
@@ -223,7 +223,7 @@ class ForwardModel(ABC):
     path_quantities: tuple[PathQuantity, ...] = ()
     path_parameters: tuple[str, ...] = ()
     optional_parameters: tuple[Parameter, ...] = ()
-    unforeseen: tuple[str, float] | None = None
+    unforeseen: Mapping[str, float] = MappingProxyType({})
 
     def changed(self, name: str, x: Array, change: Array) -> Array:
         """States (N, n_state) in which the quantity ``name`` is exp(``change``) (N,) times what it is in ``x``.

@@ -106,6 +106,8 @@ class Dynamics:
     """A plane whose image of the bubble, taken to move at the same instant, adds its pressure."""
     gas_change: float = 0.0
     """Standard deviation of ln of what the amount of gas is multiplied by at a collapse, by what no equation says."""
+    viscosity_change: float = 0.0
+    """The same of the viscosity."""
     named: tuple[str, ...] = ()
     """Those of the :attr:`optional_parameters` that are parameters."""
 

@@ -78,6 +78,7 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
             medium_heat=settings.medium_heat,
             hydrophone=settings.hydrophone,
             gas_change=settings.gas_change,
+            viscosity_change=settings.viscosity_change,
             wall=None if settings.wall is None else Wall(settings.wall.distance, settings.wall.kind),
         )
 
@@ -104,12 +105,20 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
         return alternatives(self)
 
     @property
-    def unforeseen(self) -> tuple[str, float] | None:  # type: ignore[override]
-        """The amount of gas, vapour apart: a bubble breaks up, gas dissolves, or is set free."""
-        return ("gas", self.gas_change) if self.gas_change else None
+    def unforeseen(self) -> Mapping[str, float]:  # type: ignore[override]
+        """The amount of gas, vapour apart: a bubble breaks up, gas dissolves, or is set free. The viscosity: what takes
+        the energy of the first collapses beside it is booked as viscosity, and acts no more.
+        """
+        return {name: std for name, std in (("gas", self.gas_change), ("viscosity", self.viscosity_change)) if std}
 
     def changed(self, name: str, x: Array, change: Array) -> Array:
-        """See :meth:`ForwardModel.changed`; ``gas`` changes at the temperature and the vapour pressure that it has."""
+        """See :meth:`ForwardModel.changed`; ``gas`` changes at the temperature and the vapour pressure that it has,
+        ``viscosity`` is every viscosity of the law.
+        """
+        if name == "viscosity":
+            for p in self.law.parameters:
+                x = super().changed(p.name, x, change) if p.unit == "Pa s" else x
+            return x
         return with_gas(self, x, np.exp(change)) if name == "gas" else super().changed(name, x, change)
 
     def doubts(

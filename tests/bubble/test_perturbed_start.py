@@ -108,5 +108,15 @@ def test_gas_that_changes_on_the_way_is_that_of_the_radius_at_rest(physics, fact
         return (medium.p_inf + 2 * medium.S / R - vapour) * R**3
 
     assert amount(rest) == pytest.approx(factor * amount(30e-6), rel=0.01)
-    other = model.changed("mu", path.states[:, 0], np.log([factor]))
-    assert other[0, model.layout["mu"]] == pytest.approx(0.08 * factor)
+
+
+def test_a_change_of_viscosity_is_that_of_all_viscosities_of_the_law():
+    settings = {"start": "laser", "law": "carreau", "driving": {"kind": "none"}, "viscosity_change": 0.7}
+    model = BubbleModel.from_settings(BubbleSettings.model_validate(settings))
+    theta = {"R_eq": 30e-6, "R_max": 150e-6} | {p.name: 0.5 for p in model.law.parameters}
+    x = model.initial_states({name: np.array([value]) for name, value in theta.items()})
+    (name,) = model.unforeseen
+    expected = x.copy()
+    for viscosity in ("mu_0", "mu_inf"):
+        expected[:, model.layout[viscosity]] *= 3
+    np.testing.assert_allclose(model.changed(name, x, np.log([3.0])), expected, rtol=1e-12)

@@ -296,3 +296,12 @@ def test_a_bubble_in_water_is_not_taken_for_one_in_a_thick_liquid(tmp_path: Path
     for name, value in {"mu": 0.89e-3, "R_eq": 53e-6}.items():
         assert abs(np.log(value) - of[name].mean) < of[name].std
         assert of[name].std >= 1
+
+
+def test_what_is_expected_after_the_window_allows_for_less_damping_in_a_liquid_alone(tmp_path: Path) -> None:
+    data = simulate("laser", "0 us:70 us:0.63 us", "1 um", tmp_path / "bubble.csv")
+    for law, changing in (("newtonian", {"gas", "viscosity"}), ("neo-hookean-kelvin-voigt", {"gas"})):
+        done = call("init", "--data", data, *UNITS, "--law", law, "--out", f"{law}.yaml")
+        assert done.exit_code == 0, done.output
+        (problem,) = build(load_config(Path(f"{law}.yaml")))
+        assert set(problem.model.unforeseen) == changing

@@ -80,10 +80,17 @@ def test_bands_are_those_of_a_linear_model():
     assert a.withheld.high - a.withheld.low == pytest.approx(2 * 1.645 * std, rel=0.02)
 
 
-def test_bands_allow_for_a_change_that_the_model_does_not_foresee():
+class Twice(Ramp):
+    """Also told to change by "twice", which makes y so much larger two times."""
+
+    def changed(self, name, x, change):
+        return super().changed("y", x, 2 * change if name == "twice" else change)
+
+
+def test_bands_allow_for_changes_that_the_model_does_not_foresee():
     """y' = r, and y is e^z times larger from the last maximum of the window on: quantiles of a lognormal."""
-    model = Ramp()
-    model.unforeseen = ("y", 0.5)
+    model = Twice()
+    model.unforeseen = {"y": 0.5}
     times, later = np.array([1.0, 2.0, 3.0]), np.array([4.0, 6.0])
     observed = make_observations(times, np.array([0.5, 1.0, 0.9]), 1e-6)
     whole = make_observations(np.append(times, later), np.array([0.5, 1.0, 0.9, 1.0, 1.0]), 1e-6)
@@ -93,7 +100,10 @@ def test_bands_allow_for_a_change_that_the_model_does_not_foresee():
     at_top, since = 1 + 0.2 * 2.0, 0.2 * (later - 2.0)
     for level, values in ((-1.645, found.low), (0.0, found.median), (1.645, found.high)):
         assert values == pytest.approx(at_top * np.exp(0.5 * level) + since, rel=0.01)
-    model.unforeseen = None
+    model.unforeseen = {"y": 0.3, "twice": 0.2}  # independent: 0.3 and 2 × 0.2 make 0.5
+    found = predict_withheld(problem, np.full((401, 1), 0.2), SerialExecutor())
+    assert found.high == pytest.approx(at_top * np.exp(0.5 * 1.645) + since, rel=0.03)
+    model.unforeseen = {}
     found = predict_withheld(problem, np.full((401, 1), 0.2), SerialExecutor())
     assert found.high == pytest.approx(1 + 0.2 * later, rel=1e-4)
 

@@ -29,6 +29,7 @@ WHY = {
     "heat": "the gas gives heat to the wall",
     "transport": "near R_max there is more vapour than gas; it condenses at the wall, through the gas",
     "1": "std of ln of what collapses multiply the gas by, for what is expected after the window (docs/physics.md)",
+    "viscosity_change": "the same of the viscosity: in a liquid, what damps the first collapses is not it alone",
     "conducting": "the wall warms; with a cold one R_eq comes out wrong (docs/calibration.md)",
 }
 # The quicker gas that a laser-induced bubble can be compared with; benchmarks/laser_gas.py has what it costs.
@@ -136,13 +137,13 @@ def propose(
         )
     wall: tuple[tuple[Entry, ...], tuple[Entry, ...]] = (), ()
     slow = elsewhere.SLOW[0] < ratio < elsewhere.SLOW[1]
-    if chosen == "laser" and slow and "G" not in {p.name for p in model.law.parameters}:
+    if slow and _in_a_liquid(model):
         distance, prior, source = elsewhere.wall(look.lobe.R_max, ratio)
         wall = (Entry("wall", f"{{distance: {distance}}}", source),), (Entry("wall_distance", prior, "of that plane"),)
     together = elsewhere.population([p.name for p in model.law.parameters], len(views), medium, groups)
     return Proposal(
         _data(chosen, look, model, {**others, **guess.values}, histories),
-        (*_model(law_name, chosen, look), *wall[0]),
+        (*_model(law_name, model, look), *wall[0]),
         (*_parameters(model, chosen, look, believed, tops(looks, histories), medium), *wall[1]),
         SIMPLER[chosen],
         (*told, *[f"{len(views)} bubbles: {_ends_with(groups)}"] * bool(together)),
@@ -183,7 +184,7 @@ def starter(start: Start, law: str | None) -> Proposal:
     lines = [example(p, model) for p in model.law.parameters]
     lines += _radii(start, None)
     lines += [Entry("t_s", "{prior: normal, mean: 0 us, std: 0.5 us}", "the clock of the data against the model's")]
-    return Proposal(tuple(data), _model(law_name, start, None), tuple(lines), SIMPLER[start])
+    return Proposal(tuple(data), _model(law_name, model, None), tuple(lines), SIMPLER[start])
 
 
 def with_columns(proposal: Proposal, errors: Sequence[str], common: str) -> Proposal:
@@ -357,12 +358,19 @@ def _clock(look: Look, model: BubbleModel, theta: Mapping[str, float]) -> Entry:
     )
 
 
-def _model(law: str, start: Start, look: Look | None) -> tuple[Entry, ...]:
+def _in_a_liquid(model: BubbleModel) -> bool:
+    """True of a laser's bubble that no elasticity holds together."""
+    return model.start == "laser" and "G" not in {p.name for p in model.law.parameters}
+
+
+def _model(law: str, model: BubbleModel, look: Look | None) -> tuple[Entry, ...]:
+    start = model.start
     lines = [
         Entry("name", "bubble"),
         Entry("law", law, "others: en4dvar laws"),
         Entry("start", start, look.reason if look else "or " + ("laser" if start == "acoustic" else "acoustic")),
         *(Entry(key, value, WHY[value]) for key, value in MODEL[start].items()),
+        *[Entry("viscosity_change", "1", WHY["viscosity_change"])] * _in_a_liquid(model),
     ]
     if start == "acoustic":
         pulse = "{kind: histotripsy, amplitude: -24 MPa, frequency: 1 MHz, exponent: 3.7, delay: 5 us}"
@@ -374,8 +382,7 @@ def _parameters(
     model: BubbleModel, start: Start, look: Look, guess: Guess, top: Tops | None, medium: str
 ) -> tuple[Entry, ...]:
     lines = []
-    liquid = medium == "water" and start == "laser" and "G" not in {p.name for p in model.law.parameters}
-    water = elsewhere.of_water(look.lobe.R_max) if liquid else {}
+    water = elsewhere.of_water(look.lobe.R_max) if medium == "water" and _in_a_liquid(model) else {}
     for p in model.law.parameters:
         if p.name in water:
             lines.append(Entry(p.name, *water[p.name]))
