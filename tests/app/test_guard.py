@@ -140,7 +140,9 @@ def test_a_configuration_reads_nothing_outside_of_the_folder(server, path):
     assert "outside of the folder" in job["output"]
 
 
-LAW = "open('ran', 'w').close()\nfrom en4dvar_bubble.laws.kelvin_voigt import *\n"
+LAW = (
+    "import pathlib\npathlib.Path(__file__).with_name('ran').touch()\nfrom en4dvar_bubble.laws.kelvin_voigt import *\n"
+)
 NAMED = {
     "law": "model: {name: bubble, law: evil.py:Law}",
     "model": "model: {name: evil.py:Model}",
