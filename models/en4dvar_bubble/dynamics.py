@@ -107,7 +107,7 @@ class Dynamics:
     gas_change: float = 0.0
     """Standard deviation of ln of what the amount of gas is multiplied by at a collapse, by what no equation says."""
     viscosity_change: float = 0.0
-    """The same of the viscosity."""
+    """Standard deviation of ln of what the viscosity is multiplied by at a collapse: it is not all that damps one."""
     named: tuple[str, ...] = ()
     """Those of the :attr:`optional_parameters` that are parameters."""
 

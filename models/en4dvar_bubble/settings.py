@@ -169,7 +169,7 @@ class BubbleSettings(Section):
     gas_change: Annotated[float, Field(ge=0, le=3)] = 0.0
     """How far the amount of gas may change unforeseen, std of its ln: for what is expected after the window."""
     viscosity_change: Annotated[float, Field(ge=0, le=3)] = 0.0
-    """The same of the viscosity, which takes more of the first collapses of a bubble in a liquid than of later ones."""
+    """How far the viscosity may change unforeseen, std of its ln: it is not all that damps the first collapses."""
     hydrophone: Annotated[float, Quantity("m"), Field(gt=0)] = 1.0
     """How far from the bubble acoustic_pressure is read."""
     accuracy: AccuracyName = "standard"

@@ -257,8 +257,8 @@ def _quiet(leading: Sequence[Frame], first: Image, noise: float, blind: npt.NDAr
 
 def _without_specks(empty: Sequence[Frame], noise: float) -> Array:
     """Mean (H, W) of empty frames, in their mean light, without what few of them show, such as dirt that drifts."""
-    frames = np.array(empty, dtype=np.float32)
-    frames = np.array([_lit_as(frame, np.mean(frames, axis=0)) for frame in frames])
+    mean = np.mean(np.array(empty, dtype=np.float32), axis=0)
+    frames = np.array([_lit_as(frame.astype(np.float32), mean) for frame in empty])
     off = frames - np.median(frames, axis=0)
     kept = np.abs(ndimage.uniform_filter(off, (0, 3, 3))) < DRIFTS * noise
     return np.asarray(np.mean(frames, axis=0, where=kept | ~kept.any(axis=0)), dtype=np.float32)

@@ -108,6 +108,8 @@ def test_gas_that_changes_on_the_way_is_that_of_the_radius_at_rest(physics, fact
         return (medium.p_inf + 2 * medium.S / R - vapour) * R**3
 
     assert amount(rest) == pytest.approx(factor * amount(30e-6), rel=0.01)
+    other = model.changed("mu", path.states[:, 0], np.log([factor]))
+    assert other[0, model.layout["mu"]] == pytest.approx(0.08 * factor)
 
 
 def test_a_change_of_viscosity_is_that_of_all_viscosities_of_the_law():

@@ -38,6 +38,15 @@ def test_dirt_that_drifts_in_the_empty_frames_moves_no_radius():
     assert np.sqrt(np.mean(np.square(off))) < 0.03
 
 
+def test_a_lamp_that_flickers_leaves_no_pattern_in_the_mean_of_empty_frames():
+    """Pixels that leave out one of them, which is brighter, would be darker than the others."""
+    scene, lamp = Scene((64, 64), noise=6.0, before=6), np.array([1.0, 1.04, 0.97, 1.06, 0.95, 1.02])
+    shown = frames(scene, RADII[:2])
+    shown[:6] = [np.rint(frame * part).astype(np.uint8) for frame, part in zip(shown, lamp, strict=False)]
+    ratio = find_background(movie_of(shown))[0].level / frames(replace(scene, noise=0.0), RADII[:2])[0]
+    assert np.std(ratio / np.median(ratio)) * scene.level < 0.7
+
+
 def test_the_frames_of_a_bubble_that_begins_small_are_no_background():
     true = np.array([3.4, 3.1, 2.8, 2.6, 3.0, 4.0, 5.5, 7.0, 9.0, 11.0, 12.0, 12.0, 11.0, 9.0, 7.0, 5.0, *[4.0] * 8])
     for seed in range(51, 55):

@@ -29,7 +29,7 @@ WHY = {
     "heat": "the gas gives heat to the wall",
     "transport": "near R_max there is more vapour than gas; it condenses at the wall, through the gas",
     "1": "std of ln of what collapses multiply the gas by, for what is expected after the window (docs/physics.md)",
-    "viscosity_change": "the same of the viscosity: in a liquid, what damps the first collapses is not it alone",
+    "viscosity_change": "std of ln of its change after the window: viscosity is not all that damps the first collapses",
     "conducting": "the wall warms; with a cold one R_eq comes out wrong (docs/calibration.md)",
 }
 # The quicker gas that a laser-induced bubble can be compared with; benchmarks/laser_gas.py has what it costs.
