@@ -12,6 +12,8 @@ import numpy as np
 from en4dvar.model.state import Array
 
 GRAM_LIMIT = 100.0
+NARROW = 0.05  # posterior standard deviations: along a longer step of a bundle a model may bend
+LEAST = 1e-3  # of ε: a shorter step is lost in rounding
 FEW = 512  # members up to which a transform is a matrix (2 MB); beyond, time and memory grow with N, not N²
 
 
@@ -53,6 +55,17 @@ def anomaly_basis(anomalies: Array) -> Array:
 def min_norm_fit(design: Array, values: Array) -> Array:
     """Minimum-norm least-squares solution C of ``design @ C = values``; (m, r), (m, k) → (r, k)."""
     return np.asarray(np.linalg.lstsq(design, values, rcond=None)[0])
+
+
+def bundle_steps(spread: Array, axes: Array, epsilon: float) -> Array:
+    """Steps of a bundle as rows (r, r), in units of ε prior standard deviations.
+
+    ``spread`` (r,) are standard deviations of an ensemble, relative to the prior's, along its ``axes`` (r, r), the
+    columns. The steps go along these and are at most :data:`NARROW` of them: where readings are exact, ε prior standard
+    deviations are many posterior ones. They are the identity where none needs to be shorter.
+    """
+    shares = NARROW * spread / epsilon
+    return np.eye(len(axes)) if np.all(shares >= 1) else np.clip(shares, LEAST, 1)[:, None] * axes.T
 
 
 def with_moments(members: Array, mean: Array, covariance: Array) -> Array:

@@ -13,9 +13,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from en4dvar.ensemble.linalg import min_norm_fit
+from en4dvar.ensemble.linalg import bundle_steps, min_norm_fit
 from en4dvar.model.state import Array
-from en4dvar.schemes.base import Minimiser, Runs, Weights, regression
+from en4dvar.schemes.base import Minimiser, Runs, Weights, dense, regression
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,10 @@ class En4DVar(Minimiser):
 
     ``bundle``: ε away from w, for finite differences about the central prediction (a tangent linearisation). It needs
     no more runs than the anomalies have directions: where r = rank X0 < N − 1, members at w + ε' u_j, u_j the columns
-    of the basis, give the same as N members at w + ε e_i, up to O(ε). A bundle that is made wider (``Weights.wider``)
-    has members on both sides, at w ± ε' u_j, where these are still fewer than N: its error is O(ε²).
+    of the basis, give the same as N members at w + ε e_i, up to O(ε). Where the ensemble of the iterate before is much
+    narrower than the prior's, the u_j are its axes, with steps that it tells (:func:`bundle_steps`). A bundle that is
+    made wider (``Weights.wider``) has members on both sides, at w ± ε' u_j, where these are still fewer than N: its
+    error is O(ε²).
     ``tangent``: the same members, of which the model's derivatives say where they are.
     ``transform``: at the rows of 1wᵀ + T, regression about the ensemble mean at posterior spread.
     """
@@ -43,7 +45,7 @@ class En4DVar(Minimiser):
     def members(self, weights: Weights, basis: Array | None = None) -> Array:
         """Rows (r or 2r, N) along directions of the basis where these are few, else those of 1wᵀ + εI or 1wᵀ + T."""
         if basis is not None and self.economical(basis):
-            rows = self._short(weights) * basis.T
+            rows = self._short(weights) * self._steps(weights, basis) @ basis.T
             return np.asarray(weights.w + (np.vstack([rows, -rows]) if self._on_both_sides(weights, basis) else rows))
         if self.regresses:
             return weights.rows
@@ -63,12 +65,20 @@ class En4DVar(Minimiser):
         if len(runs.predictions) < len(weights.w):
             if self._on_both_sides(weights, basis):
                 ahead, behind = np.split(runs.predictions, 2)
-                return central, (ahead - behind) / (2 * self._short(weights))
-            return central, (runs.predictions - central) / self._short(weights)
+                change = (ahead - behind) / 2
+            else:
+                change = runs.predictions - central
+            return central, np.asarray(np.linalg.solve(self._steps(weights, basis), change / self._short(weights)))
         coordinates = (self.members(weights) - weights.w) @ basis
         if self.regresses:
             return regression(coordinates, runs)
         return central, min_norm_fit(coordinates[active], runs.predictions[active] - central)
+
+    def _steps(self, weights: Weights, basis: Array) -> Array:
+        """Of the bundle (r, r) in coordinates of the basis, as shares of ε prior standard deviations."""
+        if not len(weights.T):
+            return np.eye(basis.shape[1])
+        return bundle_steps(*np.linalg.eigh(basis.T @ dense(weights.T) @ basis), self.epsilon)
 
     def _on_both_sides(self, weights: Weights, basis: Array) -> bool:
         return weights.wider > 1 and 2 * basis.shape[1] < len(basis)

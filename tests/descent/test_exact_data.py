@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from toys import Decay, Linear, make_problem
+from scipy.optimize import least_squares
+from toys import Decay, Linear, Wave, make_problem
 
 from en4dvar.ensemble.linalg import Hessian
 from en4dvar.estimation.assimilate import assimilate
@@ -41,6 +42,27 @@ def test_the_minimum_is_that_of_least_squares(model, std, linearisation):
     assert np.all(np.abs(analysis.posterior.mean(axis=0) - expected) < 2e-3 * own)
     np.testing.assert_allclose(analysis.posterior.std(axis=0, ddof=1), own, rtol=3e-3)
     assert not [c for c in analysis.cautions if c.severity == "serious"]
+
+
+@pytest.mark.parametrize("std", [1e-3, 1e-4])
+def test_the_minimum_is_found_where_the_model_misses_exact_readings(std):
+    """A large misfit weighs what is wrong in the tangent: the members lie within the posterior, not beside it."""
+    model, truth = Wave(), np.array([1.5, 1.2])
+    problem = make_problem(model, truth, std=std)
+    times = problem.observations.times
+    y = problem.observations.values + 0.3 * np.cos(7 * times)
+    problem = replace(problem, observations=replace(problem.observations, values=y))
+
+    def residuals(x):
+        curve = np.array([model.curve(x, t) for t in times])
+        return np.concatenate([(curve - y) / std, problem.prior.white(x[None])[0]])
+
+    best = least_squares(residuals, truth, xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    own = np.sqrt(np.diag(np.linalg.inv(best.jac.T @ best.jac)))
+    settings = AssimilationSettings(members=20, refine="none", what_if=False, cost_tolerance=1e-14)
+    analysis = assimilate(problem, settings, seed=2)
+    assert analysis.converged
+    assert np.all(np.abs(analysis.centre - best.x) < 0.02 * own)
 
 
 def test_a_parameter_that_no_reading_sees_keeps_its_prior():

@@ -120,16 +120,18 @@ class JointObjective(Objective[JointDescent]):
         self.joint, self.experiments, self.scheme = joint, experiments, scheme
 
     def linearise(self, going: Sequence[JointDescent]) -> list[ArrowStep | None]:
-        systems = [self._system(descent.place, descent.wider) for descent in going]
+        systems = [self._system(descent) for descent in going]
         for descent, system in zip(going, systems, strict=True):
             descent.system = system or descent.system
         return [None if system is None else system.step() for system in systems]
 
-    def _system(self, place: Place, wider: float) -> ArrowSystem | None:
+    def _system(self, descent: JointDescent) -> ArrowSystem | None:
         """None where an experiment cannot be run there."""
-        forms = []
+        place, before, forms = descent.place, descent.system, list[Linearised]()
         for e, experiment in enumerate(self.experiments):
-            form = experiment.linearise(self.joint.standard(e, place.border, place.own[e]), wider)
+            hessian = before.forms[e].hessian if before else None
+            z = self.joint.standard(e, place.border, place.own[e])
+            form = experiment.linearise(z, descent.wider, hessian)
             if form is None:
                 return None
             forms.append(form)

@@ -6,6 +6,7 @@ import numpy as np
 
 from en4dvar.data.noise import Linearisation
 from en4dvar.ensemble.forecast import NO_TIMES, Composite, Forecast
+from en4dvar.ensemble.linalg import bundle_steps
 from en4dvar.ensemble.missing import Beside
 from en4dvar.estimation.joint.problem import JointProblem
 from en4dvar.executor import Executor
@@ -43,13 +44,17 @@ class Experiment:
         """J_o (B,) of control vectors (B, n) in units of the prior; +inf where the model fails."""
         return self.problem.observations.cost(self.run(z).predicted)
 
-    def linearise(self, z: Array, wider: float = 1.0) -> Linearised | None:
+    def linearise(self, z: Array, wider: float = 1.0, hessian: Array | None = None) -> Linearised | None:
         """At z (n,), by n runs beside it; None where it or too many of them fail.
 
-        A run that fails is replaced by the one on the other side. A bundle that is ``wider`` has runs on both sides.
+        A run that fails is replaced by the one on the other side. A bundle that is ``wider`` has runs on both sides. The
+        ``hessian`` (n, n) of J_o at the place before tells its steps (:func:`bundle_steps`).
         """
-        size = self.epsilon * wider
-        observations, step = self.problem.observations, size * np.eye(len(z))
+        size, steps = self.epsilon * wider, np.eye(len(z))
+        if hessian is not None:
+            precision, axes = np.linalg.eigh(steps + hessian)
+            steps = bundle_steps(1 / np.sqrt(np.maximum(precision, 1)), axes, self.epsilon)
+        observations, step = self.problem.observations, size * steps
         run = self.run(np.vstack([z, z + step]))
         stacked = run.predicted.stacked
         change = (stacked[1:] - stacked[0]) / size
@@ -62,7 +67,8 @@ class Experiment:
         cost = float(observations.cost(run.predicted)[0])
         if not (np.isfinite(cost) and np.isfinite(change).all()):
             return None
-        d, S = observations.whiten(Linearisation.of_stacked(run.predicted[0], stacked[0], change))
+        tangent = np.linalg.solve(steps, change)
+        d, S = observations.whiten(Linearisation.of_stacked(run.predicted[0], stacked[0], tangent))
         return Linearised(cost, -S.T @ d, S.T @ S, run[:1])
 
     def linearise_own(self, z: Array, columns: list[int]) -> tuple[Array, Array, Array]:
