@@ -234,6 +234,10 @@ class DataWindow(Objective[Descent]):
         """A decrease of J that counts as none; below J = 1 it is absolute, for there J has no more to tell."""
         return self.minimiser.cost_tolerance * max(cost, 1.0)
 
+    @property
+    def _flat(self) -> str:
+        return f"relative decrease of J below {self.minimiser.cost_tolerance:g}"
+
     def _go_on(self, descent: Descent, move: Move | None) -> None:
         at, step, again = descent.iterate, descent.newton, None
         if move is None and not descent.stop and not self._settles(descent):
@@ -250,18 +254,16 @@ class DataWindow(Objective[Descent]):
         if move is None:
             return
         if at.cost - move.cost <= self.small(at.cost) and step.predicted_decrease <= self.small(at.cost):
-            # one more forecast, to linearise at the end point
-            words = f"relative decrease of J below {self.minimiser.cost_tolerance:g}"
-            descent.stop, descent.converged = words, True
+            descent.stop, descent.converged = self._flat, True  # after one more forecast, to linearise at the end point
         descent.weights = self._onwards(descent, move.w)
 
     def _no_decrease(self, descent: Descent) -> None:
         """The search by J has ended; a regression goes on to settle."""
         if self.minimiser.regresses:
             return
-        descent.stop = "no decrease possible along the step"
-        least = max(self.small(descent.iterate.cost), 0.5 * UNSEEN**2)
-        descent.converged = descent.newton.predicted_decrease <= least
+        promised, small = descent.newton.predicted_decrease, self.small(descent.iterate.cost)
+        descent.stop = self._flat if promised <= small else "no decrease possible along the step"
+        descent.converged = promised <= max(small, 0.5 * UNSEEN**2)
 
     def _settles(self, descent: Descent) -> bool:
         near = descent.settling is not None or descent.newton.norm <= NEAR

@@ -68,7 +68,7 @@ def test_descents_go_on_until_two_agree():
     """Of many minima the lowest found is that of one descent alone: others follow until a second one ends there."""
     rounds = []
     for seed in range(6):
-        analysis = assimilate(make_problem(Wave(), [1.5, 3.0], scale=2.5, seed=seed), AssimilationSettings(), seed)
+        analysis = assimilate(make_problem(Wave(), [1.5, 3.0], scale=4.0, seed=seed), AssimilationSettings(), seed)
         agree = analysis.descents.agreeing >= 2
         assert agree or "starts-disagree" in {c.code for c in analysis.cautions}
         assert agree or len(analysis.descents.members) > 8  # all that the budget allows
