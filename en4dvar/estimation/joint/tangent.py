@@ -47,8 +47,8 @@ class Experiment:
     def linearise(self, z: Array, wider: float = 1.0, hessian: Array | None = None) -> Linearised | None:
         """At z (n,), by n runs beside it; None where it or too many of them fail.
 
-        A run that fails is replaced by the one on the other side. A bundle that is ``wider`` has runs on both sides. The
-        ``hessian`` (n, n) of J_o at the place before tells its steps (:func:`bundle_steps`).
+        A run that fails is replaced by the one on the other side. A bundle that is ``wider`` has runs on both sides.
+        The ``hessian`` (n, n) of J_o at the place before tells its steps (:func:`bundle_steps`).
         """
         size, steps = self.epsilon * wider, np.eye(len(z))
         if hessian is not None:
