@@ -32,7 +32,7 @@ from en4dvar.schemes.settings import AssimilationSettings
 
 __all__ = ["LoopState", "assimilate", "cost", "forecast", "log_posterior"]
 
-AS_GOOD = 1.0  # of J above that of the problem itself: the data allow the change as well
+AS_GOOD = 0.5  # of J above that of the problem itself: the data allow the change as well
 INTERVALS = 2.0  # between readings, by which knots are shifted
 
 
