@@ -6,11 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from toys import Decay, Fragile, Linear, Vectorised, make_observations
+from toys import Decay, Fragile, Linear, Vectorised, Wave, make_observations
 
 from en4dvar.estimation.joint import estimate
 from en4dvar.estimation.joint.arrow import Arrow
 from en4dvar.estimation.joint.problem import JointProblem, Single, sharing
+from en4dvar.estimation.joint.tangent import Experiment
+from en4dvar.executor import SerialExecutor
 from en4dvar.model.forward import Trajectory
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.priors.dependence import Dependence
@@ -245,6 +247,28 @@ def test_the_arrow_is_the_dense_matrix():
     x, y = arrow.solve(right[:2], [right[s] for s in own])
     np.testing.assert_allclose(np.concatenate([x, *y]), np.linalg.solve(dense, right), rtol=1e-11)
     assert arrow.log_determinant == pytest.approx(np.linalg.slogdet(dense)[1], rel=1e-12)
+
+
+def test_the_gradient_is_right_where_readings_are_exact():
+    """Steps that are many posterior standard deviations long feel a bent model; the Hessian tells shorter ones."""
+    model, times = Wave(), np.linspace(0.1, 2.0, 9)
+    curve = np.array([model.curve([1.5, 1.2], t) for t in times])
+    data = make_observations(times, curve + 0.3 * np.cos(7 * times), std=1e-4)
+    terms = tuple(PriorTerm.normal(p, 1.3, 0.5) for p in model.parameters)
+    joint = JointProblem(
+        (InverseProblem(model, model.observables[0], data, Prior(terms)),), ({terms[0].parameter.name: ""},)
+    )
+    experiment, z = Experiment(joint, 0, 1e-3, SerialExecutor()), np.array([0.4, -0.2])
+    first = experiment.linearise(z)
+    again = experiment.linearise(z, hessian=first.hessian)
+    h = 1e-6 * np.eye(2)
+    exact = (experiment.costs(z + h) - experiment.costs(z - h)) / 2e-6
+
+    def off(form):  # in posterior standard deviations
+        wrong = form.gradient - exact
+        return np.sqrt(wrong @ np.linalg.solve(first.hessian, wrong))
+
+    assert off(again) < 0.05 * off(first)
 
 
 def correlated(problem):
