@@ -241,9 +241,7 @@ class Minimiser(Scheme):
         "By the derivatives that a model gives (tangent), by runs close to the iterate (bundle), or by regression over "
         "the ensemble (transform); auto: tangent where the model gives derivatives, else bundle.",
     ] = "auto"
-    epsilon: Annotated[
-        float, Gt(0), Le(1), "Size of the bundle, in prior standard deviations; at most 0.05 posterior ones."
-    ] = 1e-3
+    epsilon: Annotated[float, Gt(0), Le(1), "Largest size of the bundle, in prior standard deviations."] = 1e-3
     step_control: Annotated[
         Literal["line-search", "levenberg-marquardt", "full"],
         "What keeps J from rising along the iterations; full takes the whole step or, where that raises J, none.",

@@ -24,10 +24,10 @@ class En4DVar(Minimiser):
 
     ``bundle``: ε away from w, for finite differences about the central prediction (a tangent linearisation). It needs
     no more runs than the anomalies have directions: where r = rank X0 < N − 1, members at w + ε' u_j, u_j the columns
-    of the basis, give the same as N members at w + ε e_i, up to O(ε). Where the ensemble of the iterate before is much
-    narrower than the prior's, the u_j are its axes, with steps that it tells (:func:`bundle_steps`). A bundle that is
-    made wider (``Weights.wider``) has members on both sides, at w ± ε' u_j, where these are still fewer than N: its
-    error is O(ε²).
+    of the basis, give the same as N members at w + ε e_i, up to O(ε). Where the transform of the iterate before is at
+    hand, of an ensemble much narrower than the prior's, the u_j are its axes, with the steps of :func:`bundle_steps`.
+    A bundle that is made wider (``Weights.wider``) has members on both sides, at w ± ε' u_j, where these are still
+    fewer than N: its error is O(ε²).
     ``tangent``: the same members, of which the model's derivatives say where they are.
     ``transform``: at the rows of 1wᵀ + T, regression about the ensemble mean at posterior spread.
     """

@@ -53,7 +53,7 @@ class Experiment:
         size, steps = self.epsilon * wider, np.eye(len(z))
         if hessian is not None:
             precision, axes = np.linalg.eigh(steps + hessian)
-            steps = bundle_steps(1 / np.sqrt(np.maximum(precision, 1)), axes, self.epsilon)
+            steps = bundle_steps(1 / np.sqrt(precision), axes, self.epsilon)
         observations, step = self.problem.observations, size * steps
         run = self.run(np.vstack([z, z + step]))
         stacked = run.predicted.stacked
