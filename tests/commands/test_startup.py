@@ -40,7 +40,7 @@ def test_units_and_errors_need_no_pydantic() -> None:
 
 def test_a_run_imports_nothing_that_takes_long(tmp_path: Path) -> None:
     """A second of every start, and of every worker's; its page is drawn and its files are read without, too."""
-    slow = {"matplotlib", "xarray", "pandas", "dask", "scipy.fft"}
+    slow = {"matplotlib", "xarray", "pandas", "dask", "scipy.fft", "scipy.spatial"}
     words = ["run", str(write_toy(tmp_path)), "--out", str(tmp_path / "run")]
     without, page = (
         loaded(f"from en4dvar.cli import main; main({words + more}, standalone_mode=False)")

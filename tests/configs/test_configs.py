@@ -49,6 +49,7 @@ def test_quickstart_recovers_the_synthetic_gel(tmp_path):
         assert (tmp_path / file).stat().st_size > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["shell", "shell_heard"])
 def test_the_coating_of_a_microbubble(name, tmp_path):
     """Filmed, or heard by a hydrophone of which neither sensitivity nor distance are known."""
@@ -114,6 +115,7 @@ def test_laser_bubbles_calibrate_the_pulse_of_driven_ones(tmp_path):
     assert amplitude.std() < 0.7 * alone.std()  # the laser bubbles tell
 
 
+@pytest.mark.slow
 def test_laser_with_a_viscosity_that_is_halved(tmp_path):
     result = run("laser_varying", tmp_path, **{"output.report": False})
     assert result.sample_stats.attrs["n_active"] == 48

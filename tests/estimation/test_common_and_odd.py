@@ -173,6 +173,7 @@ def test_a_slope_that_is_known_badly_counts_little():
     )
 
 
+@pytest.mark.slow
 def test_slopes_that_differ_with_what_varies_tell_nothing_of_what_is_common():
     """Of y = exp(x) + θ b + e, slopes of x with θ are steeper where x is small; exact by quadrature."""
     rng, b, error, count = np.random.default_rng(11), 0.15, 0.08, 12
@@ -218,6 +219,7 @@ def test_more_data_sets_are_named_only_by_more_evidence():
     assert named(np.array([1.0, 1.0, 1.0]), 0.0) == ()
 
 
+@pytest.mark.slow
 def test_uncertain_errors_are_quantities_of_each_data_set():
     """A scale of the errors that is all but known changes nothing; a wide one, a timing error and a discrepancy are
     taken as they are.
@@ -268,6 +270,7 @@ def test_parameters_must_be_the_same_in_all():
         population_of(problems, members(problems), ["a"], 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [3, 6, 20])
 def test_the_median_of_data_sets_holds_the_truth_as_often_as_it_says(count):
     """Sets of std 0.5 ± 0.3 about 0, with a common error of std 0.4."""

@@ -133,6 +133,7 @@ def decay(p, t):
     return p["f"] * np.exp(-p["w"] * t)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("curve", "mean", "prior_std", "std"),
     [(sine, (2.0, 0.0), (1.0, 0.3), 0.5), (sine, (2.0, 0.0), (1.0, 0.3), 0.1), (decay, (1.0, 1.0), (0.4, 1.0), 0.2)],

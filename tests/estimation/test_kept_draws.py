@@ -69,6 +69,7 @@ def valley(p, t):
     return each[np.rint(np.asarray(t) - 1).astype(int)]
 
 
+@pytest.mark.slow
 def test_a_thin_bent_posterior_is_as_wide_as_its_integral_says():
     """b_k = y_k − bend_k(a) within 0.03, so that p(a|y) is N(y; bend(a), 1 + 0.03²) N(a): 5, 50 and 95 %, evidence."""
     std, names = 0.03, ["a", "b1", "b2", "b3", "b4"]

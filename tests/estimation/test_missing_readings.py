@@ -203,6 +203,7 @@ def test_a_joint_estimate_with_gaps_has_the_same_bits_for_any_worker_count():
         np.testing.assert_array_equal(joint(True, executor).members.border, alone.members.border)
 
 
+@pytest.mark.slow
 def test_a_likelihood_of_a_population_is_that_without_gaps():
     ((whole,), (gappy,)) = (experiments(gaps, 1) for gaps in (False, True))
     h = np.array([[whole.model.curve(row, t) for row in np.eye(3)] for t in whole.observations.times])

@@ -108,6 +108,7 @@ def test_what_has_no_population_is_told_before_anything_is_computed(tmp_path, n,
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_errors_of_any_kind(tmp_path):
     """A discrepancy whose amplitude and length are quantities of each data set."""
     path = springs(tmp_path)

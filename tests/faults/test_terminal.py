@@ -127,6 +127,7 @@ def test_ctrl_c_at_a_terminal(quiet, tmp_path, kind, presses):
     assert_same_results(out, quiet)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 @pytest.mark.fault("interrupt")
 def test_compiled_code_that_answers_no_signal(tmp_path, number):

@@ -125,6 +125,7 @@ def test_what_cannot_be_read_is_told_in_one_message(tmp_path, kind, words):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 def test_a_scribbled_stack_is_read_or_refused_in_one_message(tmp_path):
     tifffile.imwrite(tmp_path / "whole.tif", FRAMES[:4], imagej=True, metadata={"unit": "um", "finterval": 1e-6})
     whole = np.frombuffer((tmp_path / "whole.tif").read_bytes(), np.uint8)

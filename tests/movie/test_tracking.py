@@ -120,6 +120,7 @@ def test_noise_at_the_edge_of_a_small_bubble_is_no_motion():
     assert np.mean(moved) < 0.1
 
 
+@pytest.mark.slow
 def test_stated_errors_of_a_small_bubble_are_at_most_twice_the_real_ones():
     """A collapse, and a rest of 2.9 pixels that is most of the movie, beside specks of dirt."""
     true = np.concatenate([np.linspace(17.0, 3.0, 15), np.full(45, 2.9)])

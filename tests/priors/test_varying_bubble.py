@@ -102,6 +102,7 @@ def halved():
     return assimilate(problem, AssimilationSettings(emulator="off"), 1)
 
 
+@pytest.mark.slow
 def test_bands_cover_a_viscosity_that_is_halved_at_the_collapse(halved):
     pieces = halved.pieces(halved.problem.varying[0], halved.posterior)
     truth = np.array([0.06, 0.06, 0.03, 0.03])

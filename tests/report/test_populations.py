@@ -44,6 +44,7 @@ def only(gels):
     return [gels[0] / "soft_only", gels[1] / "stiff_only"]
 
 
+@pytest.mark.slow
 def test_how_much_stiffer_and_how_surely(gels):
     found = en4dvar.compare_populations({"soft": only(gels)[0], "stiff": only(gels)[1]})
     (d,) = found.differences

@@ -41,6 +41,7 @@ def test_a_right_configuration_passes(toy, tmp_path):
     assert result.summary().shape[0] == 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("std", "size"), [("2.6 um", "larger"), ("1.4 um", "smaller")])
 def test_errors_of_a_wrong_size_are_seen(toy, tmp_path, std, size):
     result = sixty(toy, tmp_path / "out", sets=100, made_with={"data.error.position_std": std})
@@ -54,6 +55,7 @@ def test_errors_of_a_wrong_size_are_seen(toy, tmp_path, std, size):
     assert wide > 1.1 if size == "larger" else wide < 0.9
 
 
+@pytest.mark.slow
 def test_a_value_that_is_wrong_is_seen(toy, tmp_path):
     """A damping that the readings have and the estimate has not moves k."""
     result = sixty(toy, tmp_path / "out", sets=40, made_with={"parameters.c": "0.03 N s/m"})
@@ -63,6 +65,7 @@ def test_a_value_that_is_wrong_is_seen(toy, tmp_path):
     assert yaml.safe_load(load_config(kept).resolved) == yaml.safe_load(kept.read_text())
 
 
+@pytest.mark.slow
 def test_more_sets_leave_the_first_as_they_were_for_any_workers(toy, tmp_path):
     whole = sixty(toy, tmp_path / "whole", sets=9)
     sixty(toy, tmp_path / "parts", sets=4)

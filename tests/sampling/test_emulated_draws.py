@@ -105,6 +105,7 @@ class Fading(Valley):
         return np.interp([0.05, 0.5, 0.95], np.cumsum(density) / density.sum(), z0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [WIDTH, 0.01])
 def test_the_tail_of_what_vanishes_with_its_parameter_is_found(width):
     fading = Fading(width)
@@ -112,6 +113,7 @@ def test_the_tail_of_what_vanishes_with_its_parameter_is_found(width):
     assert np.mean([weighted_quantiles(draws) for draws in several], axis=0) == pytest.approx(fading.exact, abs=0.25)
 
 
+@pytest.mark.slow
 def test_a_thin_bent_valley_is_sampled_to_its_tails_and_its_evidence_is_known():
     valley = Valley()
     expected, evidence = valley.exact

@@ -71,6 +71,7 @@ def test_one_that_cannot_be_loaded_is_told_and_left_out(package, tmp_path):
     assert "scheme 'number' (math:pi) cannot be loaded: TypeError: it is not a subclass" in done.stderr
 
 
+@pytest.mark.slow
 def test_a_file_serves_as_well(package, tmp_path):
     """``scheme: ./file.py:Class``, of the data of one set, in other processes, and of a series."""
 

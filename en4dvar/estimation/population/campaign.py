@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from en4dvar.ensemble.forecast import check_problem
 from en4dvar.estimation.population.effort import Effort
@@ -299,6 +298,8 @@ def _sets(
     """Control vectors (M, S, n) of each data set given all, white: what is neither of the population nor common is as
     in one of the data set's own draws whose x − Bθ is nearest.
     """
+    from scipy.spatial import cKDTree  # here: a twentieth of what every command imports
+
     z = np.empty((*estimated.x.shape[:2], drawn[0].z.shape[1]))
     for s, (draws, likelihood) in enumerate(zip(drawn, likelihoods, strict=True)):
         scale = likelihood.adjusted.std(axis=0)
