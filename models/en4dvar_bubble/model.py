@@ -181,7 +181,7 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
             solution = solved
             if order is not None:
                 back = np.argsort(order, axis=1)
-                states = np.take_along_axis(solution.states, back[:, :, None], axis=1)
+                states = solution.states[np.arange(len(x))[:, None], back]
                 states[:, :, -2] *= np.where(times < 0, -1.0, 1.0)
                 solution = Solution(states, solution.status, solution.record)
             return Paths(self, x, times, solution, packed.members.parameters, t0)
