@@ -8,6 +8,7 @@ import pytest
 from en4dvar_app import pictures
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_frames_are_the_same_in_any_order_with_little_room(tmp_path, monkeypatch, dtype):
     tifffile = pytest.importorskip("tifffile")

@@ -91,6 +91,7 @@ def test_the_shell_of_another_program():
     assert np.abs(found - R[1:] * 1e-6).max() <= 1e-6 * R0
 
 
+@pytest.mark.slow
 def test_another_pulse_by_scipy():
     """Members whose tables are halved at different places, side by side."""
     times, chi, buckling = np.linspace(0, 2.4e-6, 121), (1.0, 0.5, 2.0), (1.0, 0.987, 0.9915)

@@ -94,6 +94,7 @@ def test_the_shell_of_another_program():
     assert np.abs(found.R.values - R[1:] * 1e-6).max() <= 1e-7 * R0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "amplitude"), list(zip(SHELLS, (80e3, 80e3, 200e3, 400e3), strict=True)))
 def test_another_pulse_by_scipy(name, amplitude):
     times = np.linspace(0, 2.4e-6, 121)

@@ -27,6 +27,7 @@ def test_units_that_cannot_be_right_are_noticed(tmp_path: Path) -> None:
     assert "no bubble has such a radius; are the units of both columns right?" in done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("header", "options", "told"),
     [

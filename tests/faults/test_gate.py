@@ -134,6 +134,7 @@ def _metadata(path: Path) -> None:
     tifffile.imwrite(path, np.zeros((2, 32, 32), np.uint8), photometric="minisblack", description=words)
 
 
+@pytest.mark.slow
 @pytest.mark.fault("decoding")
 @pytest.mark.parametrize("make", [_self_pointing, _large_page, _metadata])
 def test_a_tiff_that_does_not_end(tmp_path: Path, make) -> None:
@@ -211,6 +212,7 @@ def misbehave(path: Path, how: str):
     yield how
 
 
+@pytest.mark.slow
 @pytest.mark.fault("decoding")
 @pytest.mark.parametrize(
     ("how", "told"),
@@ -295,6 +297,7 @@ def test_a_series_with_a_good_seal_that_lacks_something(twin: Path, tmp_path: Pa
     assert "not a result of en4dvar" in done.output
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["crash", "time"])
 @pytest.mark.fault("decoding")
 def test_a_sealed_file_that_takes_its_library_down(twin: Path, tmp_path: Path, monkeypatch, how: str) -> None:

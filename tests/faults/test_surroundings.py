@@ -149,6 +149,7 @@ def test_an_environment_that_cannot_be_worked_in(tmp_path, name, value):
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-"])
 def test_standard_output_that_is_closed(tmp_path, closed):
     words = shlex.join(command("run", write_toy(tmp_path), "--out", tmp_path / "run", "--no-report"))

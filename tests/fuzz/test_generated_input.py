@@ -77,6 +77,7 @@ def test_odd_values_in_every_place(folder, step):
     _one_place(folder, itertools.islice(mutations.one_changed(yaml.safe_load(seeds.FULL)), 0, None, step))
 
 
+@pytest.mark.slow
 @given(st.binary(max_size=200) | st.text(max_size=200).map(lambda s: s.encode("utf-8", "surrogatepass")))
 @settings(FEW, max_examples=150)
 @pytest.mark.parametrize("target", sorted(TARGETS))
@@ -84,6 +85,7 @@ def test_any_bytes(folder, target, content):
     TARGETS[target](content, folder)
 
 
+@pytest.mark.slow
 @given(st.data())
 @settings(FEW, max_examples=150)
 @pytest.mark.parametrize("target", ["csv", "covariance", "mat", "mat 7.3", "workbook", "quantity"])

@@ -111,6 +111,7 @@ def test_the_signs_of_a_group_are_those_of_pestpp_and_pyemu(control):
     assert list(from_pest(control)["error"]) == ["observations_std", "at_least"]
 
 
+@pytest.mark.slow
 def test_a_range_is_two_bounds(control):
     """h1 = a + b + 2 is 3.5; h2 = 2 a + b + 2 lies in 3.9 to 4.2, so that a lies in 0.4 to 0.7."""
     table = (

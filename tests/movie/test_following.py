@@ -29,6 +29,7 @@ def read(filmed, **options):
     return np.array([r.radius if r.used else np.nan for r in result.readings]), result
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["second bubble", "second enters", "time stamp", "stripes", "scale bar", "needle"])
 def test_the_laser_s_bubble_is_followed_beside_whatever_else_is_there(kind):
     of = nasty(kind, 1)
@@ -37,6 +38,7 @@ def test_the_laser_s_bubble_is_followed_beside_whatever_else_is_there(kind):
     assert not np.any((np.abs(of["wrong"]) > 2) & (np.abs(of["score"]) > 5))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "seed"),
     [

@@ -83,6 +83,7 @@ KINDS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", KINDS)
 def test_radii_are_read_from_movies_of_every_kind(tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)

@@ -60,6 +60,7 @@ print(compilations())
 """
 
 
+@pytest.mark.slow
 def test_of_processes_that_start_at_once_one_compiles(tmp_path):
     (tmp_path / "first_use.py").write_text(FIRST_USE)
     started = [

@@ -69,6 +69,7 @@ def assert_same(a, b):
             assert left == right, field.name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scheme", "smoother"),
     [
