@@ -124,11 +124,12 @@ def least_squares_of(folder, correlation_time: float) -> tuple[np.ndarray, np.nd
 )
 def test_the_ring_from_a_file_is_4d_var(tmp_path, seed, changes, correlation_time):
     """128 cells, a parameter, readings of no place, a chaotic window, also with correlated errors; least squares
-    started at the truth.
+    started at the truth. A descent that ends by the default tolerance may have √(2·10⁻⁴ J) = 0.13 std to go.
     """
     path, truth = write_ring(tmp_path, *changes, seed=seed)
     np.save(tmp_path / "truth.npy", truth)
-    (result,) = run_campaign(path, overrides={"output.directory": str(tmp_path / "run")})
+    overrides = {"output.directory": str(tmp_path / "run"), "assimilation.cost_tolerance": 1e-7}
+    (result,) = run_campaign(path, overrides=overrides)
     mean, std = least_squares_of(tmp_path, correlation_time)
     fields, nu = result.dataset("fields"), result.posterior["nu"].values.ravel()
     assert nu.mean() == pytest.approx(mean[0], abs=0.02 * std[0])
