@@ -7,7 +7,7 @@ import numpy as np
 from en4dvar.model.batch import Batch
 from en4dvar.model.forward import ForwardModel, Observable, StateField
 from en4dvar.model.state import Field, Parameter, StateLayout
-from en4dvar.priors.field_prior import FieldPrior
+from en4dvar.priors.dependence import correlation_of_places
 
 CELLS, LENGTH, STEP = 128, 100.0, 0.25
 PLACES = np.arange(CELLS) * LENGTH / CELLS
@@ -104,8 +104,9 @@ def write_ring(folder, *changes, seed=7, times=TIMES):
         assert old in text, old
         text = text.replace(old, new, 1)
     truth = model.initial_state({"nu": NU})
-    patterns = FieldPrior(model.layout.fields[0], 0.4, "gaussian", 5.0).patterns()
-    truth[:CELLS] += rng.standard_normal(len(patterns)) @ patterns
+    C = correlation_of_places("gaussian", model.layout.fields[0].coordinates[:, None], 5.0)
+    root = np.linalg.cholesky(C + 1e-8 * np.eye(CELLS))  # eigenvectors would be others on another processor
+    truth[:CELLS] += 0.4 * root @ rng.standard_normal(CELLS)
     (path,) = model.trajectories(truth[None], times)
     energy = np.mean(path["u"] ** 2, axis=1) + 0.05 * rng.standard_normal(len(times))
     rows = [

@@ -116,17 +116,17 @@ def least_squares_of(folder, correlation_time: float) -> tuple[np.ndarray, np.nd
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("seed", "changes", "correlation_time"),
+    ("changes", "correlation_time"),
     [
-        (8, (), 1e-9),
-        (1, (CORRELATED,), 3.0),
+        ((), 1e-9),
+        ((CORRELATED,), 3.0),
     ],
 )
-def test_the_ring_from_a_file_is_4d_var(tmp_path, seed, changes, correlation_time):
+def test_the_ring_from_a_file_is_4d_var(tmp_path, changes, correlation_time):
     """128 cells, a parameter, readings of no place, a chaotic window, also with correlated errors; least squares
     started at the truth. A descent that ends by the default tolerance may have √(2·10⁻⁴ J) = 0.13 std to go.
     """
-    path, truth = write_ring(tmp_path, *changes, seed=seed)
+    path, truth = write_ring(tmp_path, *changes, seed=1)
     np.save(tmp_path / "truth.npy", truth)
     overrides = {"output.directory": str(tmp_path / "run"), "assimilation.cost_tolerance": 1e-7}
     (result,) = run_campaign(path, overrides=overrides)
