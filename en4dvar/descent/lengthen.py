@@ -21,7 +21,7 @@ from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.schemes.base import Minimiser
 
-ROUGH = 1e-3  # relative decrease of J at which the descent of a window that will be lengthened ends
+ROUGH = 1e-2  # relative decrease of J at which the descent of a window that will be lengthened ends
 
 
 def shortened(space: WeightSpace, scheme: Minimiser) -> Iterator[WeightSpace]:

@@ -124,7 +124,7 @@ def least_squares_of(folder, correlation_time: float) -> tuple[np.ndarray, np.nd
 )
 def test_the_ring_from_a_file_is_4d_var(tmp_path, changes, correlation_time):
     """128 cells, a parameter, readings of no place, a chaotic window, also with correlated errors; least squares
-    started at the truth. A descent that ends by the default tolerance may have √(2·10⁻⁴ J) = 0.13 std to go.
+    started at the truth. A descent that ends by the default tolerance may have √(2·10⁻⁴ J) = 0.13 std to go, J = 80.
     """
     path, truth = write_ring(tmp_path, *changes, seed=1)
     np.save(tmp_path / "truth.npy", truth)

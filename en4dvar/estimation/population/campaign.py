@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 
 import numpy as np
+import scipy  # its trees where they are used: a twentieth of what every command imports
 
 from en4dvar.ensemble.forecast import check_problem
 from en4dvar.estimation.population.effort import Effort
@@ -298,12 +299,10 @@ def _sets(
     """Control vectors (M, S, n) of each data set given all, white: what is neither of the population nor common is as
     in one of the data set's own draws whose x − Bθ is nearest.
     """
-    from scipy.spatial import cKDTree  # here: a twentieth of what every command imports
-
     z = np.empty((*estimated.x.shape[:2], drawn[0].z.shape[1]))
     for s, (draws, likelihood) in enumerate(zip(drawn, likelihoods, strict=True)):
         scale = likelihood.adjusted.std(axis=0)
-        _, near = cKDTree(likelihood.adjusted / scale).query(estimated.x[:, s] / scale, k=NEAR)
+        _, near = scipy.spatial.cKDTree(likelihood.adjusted / scale).query(estimated.x[:, s] / scale, k=NEAR)
         chosen = near[np.arange(len(near)), stream.integers(NEAR, size=len(near))]
         z[:, s] = draws.z[chosen]
         z[:, s, list(varying)] = estimated.x[:, s] + estimated.theta @ likelihood.slopes.T
