@@ -56,7 +56,7 @@ def synthetic(seed: int, key: str) -> Record:
         "odd": of_it.odd,
         "chances": 1 - result.belongs,
         "odds": of_it.odds(),
-        "size": result.estimate.size,
+        "size": result.size,
         "width": np.diff(np.quantile(result.posterior.nu[:, 0], [0.05, 0.95]))[0],
         "seconds": time.process_time() - began,
     }
@@ -76,7 +76,7 @@ def pairs(seed: int, key: str) -> Record:
 
     def centre(i: int, *told: tuple[int, float, float]) -> Centre:
         r = results[i]
-        return without_pull(0, r.posterior.nu, r.theta, r.common, r.hyper.mean_std, r.estimate.size, number, told)
+        return without_pull(0, r.posterior.nu, r.theta, r.common, r.hyper.mean_std, r.size, number, told)
 
     both = drawn_together([centre(0), centre(1)], number)
     alone, told = drawn_together([centre(0)], number), drawn_together([centre(0), centre(1, *known)], number)

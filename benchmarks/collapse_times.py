@@ -27,7 +27,6 @@ from en4dvar.estimation.joint.estimate import Single
 from en4dvar.model.state import Array
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
-from en4dvar.sampling.forward_runs import ForwardRuns
 from en4dvar.schemes.settings import AssimilationSettings
 from en4dvar_bubble import BubbleModel, NeoHookeanKelvinVoigt
 from en4dvar_bubble.medium import WATER_25C
@@ -84,12 +83,12 @@ def one_gel(
 def least_squares_of(campaign: Array, gas: str) -> tuple[float, float, float]:
     """G (Pa), μ (Pa s) that meet the collapse times best with the radii as they stand, and the root mean square (s)."""
     problems = problems_of(campaign, 1.0, 1.0, model_of(gas))
-    runs, own = ForwardRuns(problems, white=True), np.zeros((1, len(problems), 4))
-    prior = problems[0].prior
+    own = np.stack([problem.prior.mean for problem in problems])
 
     def left(theta: Array) -> Array:
-        own[..., :2] = (theta - prior.mean[:2]) / prior.std[:2]
-        return (runs.predictions(own)[0, :, 0] - campaign[:, 2]) / 1e-9
+        own[:, :2] = theta
+        times = [forecast(problem, x[None]).predictions[0, 0] for problem, x in zip(problems, own, strict=True)]
+        return (np.array(times) - campaign[:, 2]) / 1e-9
 
     best = least_squares(left, np.log([1e4, 0.1]), diff_step=1e-4)
     return *map(float, np.exp(best.x)), float(1e-9 * np.sqrt(np.mean(best.fun**2)))

@@ -17,7 +17,7 @@ from scipy.stats import norm
 from en4dvar.data.noise import noise_of
 from en4dvar.data.observations import Observations
 from en4dvar.estimation.population import Effort, HyperPrior
-from en4dvar.estimation.population.campaign import CampaignPopulation, population_from
+from en4dvar.estimation.population.campaign import Population, population_from
 from en4dvar.estimation.population.own import ENOUGH, KEPT, OwnDraws
 from en4dvar.model.function_model import FunctionModel
 from en4dvar.model.state import Array, Parameter
@@ -135,7 +135,7 @@ def campaign(
 
 def found_of(
     drawn: Sequence[OwnDraws], seed: int, problems: Sequence[InverseProblem] = (), names: Sequence[str] = COMMON
-) -> CampaignPopulation:
+) -> Population:
     problems = problems or [bubble(f"bubble{i}", names) for i in range(len(drawn))]
     start = [draws.z for draws in drawn]
     return population_from(dict(enumerate(drawn)), {}, start, problems, NAMES, seed, HyperPrior(), Effort())

@@ -24,7 +24,7 @@ from scipy.stats import kstest
 from en4dvar.ensemble.forecast import forecast
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.estimation.population import population_of
-from en4dvar.estimation.population.estimate import moments
+from en4dvar.estimation.population.campaign import moments
 from en4dvar.model.state import Array
 from en4dvar.priors.prior import own_seed
 from en4dvar.problem import InverseProblem
@@ -97,7 +97,7 @@ def ranks(law: str, seed: int, bubbles: int) -> Record:
         for what in truth
         for j, name in enumerate(names)
     }
-    size = result.estimate.size
+    size = result.size
     return {"ranks": found_ranks, "size": size, "seconds": time.process_time() - began}
 
 

@@ -24,11 +24,11 @@ from en4dvar.config.synthetic import resolve_campaign
 from en4dvar.data.noise import noise_of
 from en4dvar.data.observations import Observations
 from en4dvar.estimation.assimilate import assimilate
-from en4dvar.estimation.population import estimate_population
+from en4dvar.estimation.population import population_of
 from en4dvar.executor import ThreadsExecutor
 from en4dvar.priors.prior import own_seed
 from en4dvar.runs.synthetic import draw_campaign
-from en4dvar.sampling.forward_runs import ForwardRuns
+from en4dvar_agarose.fits import HYPER, LEVELS
 from en4dvar_agarose.measured import FOLDER, POPULATION_HEAD
 from en4dvar_agarose.run import POPULATION
 
@@ -54,18 +54,17 @@ def campaign(key: str, seed: int) -> list[list[object]]:
     with ThreadsExecutor(THREADS) as executor:
         seeds = [own_seed(config.seed, s.name) for s in sets]
         analyses = [assimilate(p, config.assimilation, s, executor) for p, s in zip(problems, seeds, strict=True)]
-        start = np.stack([base.prior.from_physical(a.posterior) for a in analyses])
-        runs = ForwardRuns(problems, executor)
-        found = estimate_population(runs, start, base.prior, POPULATION, seed, workers=THREADS)
-    low, high = found.interval()
+        start = [base.prior.white(base.prior.from_physical(a.posterior)) for a in analyses]
+        found = population_of(problems, start, POPULATION, seed, executor=executor, hyper=HYPER)
+    low, median, high = np.quantile(found.posterior.mean, LEVELS, axis=0)
     terms = {t.parameter.name: t for t in group.terms}
     rows: list[list[object]] = []
     for j, name in enumerate(POPULATION):
         term = terms[name]
         true, drawn = np.exp(term.mean + term.std**2 / 2), np.mean([s.truth[name] for s in sets])
         stacked = np.mean(np.concatenate([a.posterior[:, base.prior.names.index(name)] for a in analyses]))
-        numbers = [low[j], np.median(found.mean[:, j]), high[j], true, drawn, stacked]
-        judged = [*found.weighed, found.size]
+        numbers = [low[j], median[j], high[j], true, drawn, stacked]
+        judged = [*found.effective, found.size]
         rows.append([GELS[key], seed, name, *(f"{v:.6g}" for v in numbers), *(f"{v:.4g}" for v in judged)])
     return rows
 
@@ -85,7 +84,7 @@ def main() -> None:
             writer = csv.writer(stream, lineterminator="\n")
             writer.writerows([*([] if file.stat().st_size else [POPULATION_HEAD]), *rows])
         told = ", ".join(f"{r[2]} {float(r[3]) / float(r[6]):.2f}–{float(r[5]) / float(r[6]):.2f}" for r in rows)
-        judged = f"effective {rows[0][11]} (weights {rows[0][9]} and {rows[0][10]})"
+        judged = f"effective {rows[0][11]} (hierarchy {rows[0][9]}, data sets {rows[0][10]})"
         print(f"{seed}: interval / truth: {told}; {judged} ({time.perf_counter() - start:.1f} s)", flush=True)
 
 

@@ -23,10 +23,11 @@ from en4dvar.config import load_config
 from en4dvar.data.noise import noise_of
 from en4dvar.data.observations import Observations
 from en4dvar.ensemble.forecast import forecast
+from en4dvar.estimation.assimilate import assimilate
+from en4dvar.estimation.population.own import own_draws
 from en4dvar.executor import ThreadsExecutor
 from en4dvar.problem import InverseProblem
-from en4dvar.sampling.evidence import sampled_evidence
-from en4dvar.sampling.forward_runs import ForwardRuns
+from en4dvar.schemes.settings import AssimilationSettings
 from en4dvar_agarose.fits import probability
 from en4dvar_agarose.measured import FOLDER, RELIABILITY_HEAD
 
@@ -88,8 +89,12 @@ def compare(bases: dict[str, InverseProblem], experiment: Experiment, number: in
     law = "qlkv" if number % 2 else "nh"
     observed = draw(bases[law], experiment, np.random.default_rng([11, number]))
     with ThreadsExecutor(THREADS) as executor:
-        runs = {name: ForwardRuns([replace(base, observations=observed)], executor) for name, base in bases.items()}
-        log = {name: float(sampled_evidence(runs[name], bases[name].prior, number).log[0]) for name in bases}
+        log = {}
+        for name, base in bases.items():
+            problem = replace(base, observations=observed)
+            members = assimilate(problem, AssimilationSettings(what_if=False), number, executor).posterior
+            start = base.prior.white(base.prior.from_physical(members))
+            log[name] = own_draws(problem, start, number, executor).log_evidence
     return law, log["qlkv"] - log["nh"]
 
 

@@ -29,8 +29,7 @@ from recordings import commit
 from records import Record, fill
 
 from en4dvar.estimation.population import Effort
-from en4dvar.estimation.population.campaign import CampaignPopulation, population_from, sampled_sets
-from en4dvar.estimation.population.estimate import FEWEST_SETS
+from en4dvar.estimation.population.campaign import FEWEST_SETS, Population, population_from, sampled_sets
 from en4dvar.model.state import Array
 from en4dvar.report.population import summaries
 from en4dvar.results.population_file import FILE, load_population
@@ -100,7 +99,7 @@ def table(records: Sequence[Record]) -> str:
     return "\n".join(lines)
 
 
-def told(result: CampaignPopulation) -> Array:
+def told(result: Population) -> Array:
     """Draws (M, p) of ν, what is common apart."""
     centred = result.theta - result.theta.mean(axis=0)
     return np.asarray(result.posterior.nu - centred @ np.linalg.lstsq(centred, result.posterior.nu, rcond=None)[0])
@@ -116,7 +115,7 @@ def halves(run_dir: Path, splits: int) -> None:
     drawn, left_out = sampled_sets(problems, start, config.seed, None, lambda words: print(words, flush=True), kept)
     rng, usable, z = np.random.default_rng(config.seed), sorted(drawn), []
 
-    def of(chosen: Sequence[int]) -> CampaignPopulation:
+    def of(chosen: Sequence[int]) -> Population:
         some = {s: drawn[s] for s in sorted(chosen)}
         return population_from(some, left_out, start, problems, names, config.seed, hyper, Effort())
 

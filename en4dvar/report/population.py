@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from en4dvar.estimation.population.campaign import DETERMINED, Combination
-from en4dvar.estimation.population.estimate import FEWEST
+from en4dvar.estimation.population.campaign import DETERMINED, FEWEST, Combination
 from en4dvar.estimation.summary import ParameterSummary, results_table, summary_rows
 from en4dvar.plumbing.files import write_text
 from en4dvar.plumbing.tables import write_csv

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from en4dvar.diagnosis.diagnostics import member_quantiles
-from en4dvar.estimation.population.campaign import CampaignPopulation, Combination, Draws
+from en4dvar.estimation.population.campaign import Combination, Draws, Population
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.caution import Caution, worst_first
 from en4dvar.plumbing.hints import natural
@@ -35,7 +35,7 @@ _DRAWS = ("chain", "draw")
 
 
 def save_population(
-    path: Path, population: CampaignPopulation, alone: Sequence[Array], cautions: Sequence[Caution],
+    path: Path, population: Population, alone: Sequence[Array], cautions: Sequence[Caution],
     attributes: Mapping[str, Any],
 ) -> Path:  # fmt: skip
     """Write the file; it appears complete or not at all. ``alone``: physical members (N_i, n) of each data set.
@@ -46,7 +46,7 @@ def save_population(
 
 
 def population_groups(
-    population: CampaignPopulation, alone: Sequence[Array], cautions: Sequence[Caution], attributes: Mapping[str, Any]
+    population: Population, alone: Sequence[Array], cautions: Sequence[Caution], attributes: Mapping[str, Any]
 ) -> Groups:
     """All of the file."""
     names = text(problem.observations.name for problem in population.problems)
@@ -59,11 +59,10 @@ def population_groups(
         "hyperprior_spread": population.hyper.spread,
         "hyperprior_odd": population.hyper.odd,
         "common": " ".join(population.common),
-        "effective_draws": population.estimate.size,
+        "effective_draws": population.size,
         "effective_draws_without_hyperprior": effective,
-        "log_evidence": population.estimate.log_evidence
-        - sum(p.observations.log_normalisation() for p in population.problems),
-        "forward_runs": population.estimate.forward_runs,
+        "log_evidence": population.log_evidence - sum(p.observations.log_normalisation() for p in population.problems),
+        "forward_runs": population.forward_runs,
         "combinations": "\n".join(map(combination_line, population.combinations())),
         "warnings": "\n".join(c.line for c in worst_first(cautions)),
     }
@@ -87,7 +86,7 @@ def _about(p: Parameter) -> dict[str, Any]:
     return {"symbol": p.symbol, "display_units": p.display_unit, "label": p.label}
 
 
-def _draws(population: CampaignPopulation, draws: Draws) -> dict[str, Variable]:
+def _draws(population: Population, draws: Draws) -> dict[str, Variable]:
     of_centre, of_spread = population.learned
     learned = {"median": of_centre, "mean": of_centre, "between": of_spread}
     result = {}
@@ -104,7 +103,7 @@ def _draws(population: CampaignPopulation, draws: Draws) -> dict[str, Variable]:
     return result
 
 
-def _white(population: CampaignPopulation) -> dict[str, Variable]:
+def _white(population: Population) -> dict[str, Variable]:
     """(chain, draw) of the centres and of what is common in units of their priors, as the draws of ``posterior``."""
     first, draws = population.problems[0].prior, (population.posterior.nu, population.theta)
     columns = np.hstack([part for part in draws if part.size])
@@ -122,13 +121,13 @@ def _readings(problems: Sequence[InverseProblem]) -> dict[str, Variable]:
     return {"readings": variable("dataset", each, "", "SHA-256 of times and values of the readings")}
 
 
-def _belongs(population: CampaignPopulation) -> dict[str, Variable]:
+def _belongs(population: Population) -> dict[str, Variable]:
     """(dataset,) how probably each data set is of the population."""
     words = "probability that the data set is of the population"
     return {"belongs": variable("dataset", population.belongs, "1", words)} if len(population.belongs) else {}
 
 
-def _empirical(population: CampaignPopulation) -> dict[str, Variable]:
+def _empirical(population: Population) -> dict[str, Variable]:
     """(quantile,) of the median over the data sets one by one."""
     result = {}
     for term, median in zip(population.terms, population.empirical, strict=True):
@@ -139,7 +138,7 @@ def _empirical(population: CampaignPopulation) -> dict[str, Variable]:
     return result
 
 
-def _sets(population: CampaignPopulation) -> dict[str, Variable]:
+def _sets(population: Population) -> dict[str, Variable]:
     """(chain, draw, dataset) of every parameter, given all data."""
     terms: tuple[PriorTerm, ...] = population.problems[0].prior.terms
     return {
@@ -148,7 +147,7 @@ def _sets(population: CampaignPopulation) -> dict[str, Variable]:
     }
 
 
-def _alone(population: CampaignPopulation, alone: Sequence[Array]) -> dict[str, Variable]:
+def _alone(population: Population, alone: Sequence[Array]) -> dict[str, Variable]:
     """Quantiles (dataset, quantile) of the parameters of the population as each data set has them by itself."""
     result = {}
     for term in population.terms:

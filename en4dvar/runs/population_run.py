@@ -13,7 +13,7 @@ from en4dvar.config.sharing import SOURCE, reference_value
 from en4dvar.diagnosis.diagnostics import HARDLY_INFORMED
 from en4dvar.estimation.population import Effort, HyperPrior
 from en4dvar.estimation.population import campaign as of_campaign
-from en4dvar.estimation.population.campaign import FEWEST_SETS, CampaignPopulation, population_of
+from en4dvar.estimation.population.campaign import FEWEST_SETS, Population, population_of
 from en4dvar.executor import Executor
 from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.errors import ConfigError, TooFewMembersError, retold
@@ -81,7 +81,7 @@ class PopulationKind(TogetherKind):
                 problems, white, self.names, config.seed, kept=[s.drawn for s in sets], hyper=self.hyper,
                 effort=self.effort, executor=executor, tell=tell,
             )  # fmt: skip
-        tell(f"{population.estimate.forward_runs} forward runs, {population.estimate.size:.0f} effective draws")
+        tell(f"{population.forward_runs} forward runs, {population.size:.0f} effective draws")
         used = [s for s in sets if s.name not in population.left_out]
         cautions = (*_cautions(population), *carried(used))
         about = {**attributes, "seed": config.seed, **_elsewhere(config, population, str(attributes.get("group", "")))}
@@ -122,7 +122,7 @@ def require_population(config: Config, problem: InverseProblem, names: Collectio
         raise ConfigError([config.document.fault(("population",), str(error), at_key=True)]) from None
 
 
-def _elsewhere(config: Config, population: CampaignPopulation, group: str) -> dict[str, str]:
+def _elsewhere(config: Config, population: Population, group: str) -> dict[str, str]:
     """What the configuration says of the same numbers, to compare with and to calibrate with: lines of name, value and
     std, and the source.
     """
@@ -137,9 +137,9 @@ def _elsewhere(config: Config, population: CampaignPopulation, group: str) -> di
     return {**said, "reference_source": asked.reference.get(SOURCE, "")} if "reference" in said else said
 
 
-def _cautions(population: CampaignPopulation) -> Iterator[Caution]:
-    if not population.estimate.converged:
-        words = f"only {population.estimate.size:.0f} effective draws stand behind the population"
+def _cautions(population: Population) -> Iterator[Caution]:
+    if not population.converged:
+        words = f"only {population.size:.0f} effective draws stand behind the population"
         advice = "the median of the data sets one by one, which needs none, stands in the place of its numbers"
         yield replace(caution("chain-not-converged", words), advice=advice)
     if population.odd:

@@ -16,13 +16,15 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+from en4dvar.data.noise import noise_of
+from en4dvar.data.observations import Observations
+from en4dvar.ensemble.forecast import forecast
 from en4dvar.executor import Executor, SerialExecutor
 from en4dvar.model.state import TIME_SHIFT, Array, Parameter
 from en4dvar.plumbing.errors import ConfigError, DataError, retold
 from en4dvar.plumbing.files import atomic_path, inside, open_plain
 from en4dvar.priors.prior import member_stream
 from en4dvar.problem import InverseProblem
-from en4dvar.sampling.forward_runs import Predictor
 from en4dvar.sampling.nearest import Targets, best_over_shifts, targets
 
 BATCH = 128  # trajectories whose full solution is in memory at once, a worker
@@ -119,7 +121,9 @@ def run_sweep(
     ranges = _Ranges.of(problems, settings.width)
     with retold(ValueError, DataError):
         aims = targets([p.observations for p in problems], settings.shift, settings.step, earliest)
-    score = _Score(_without_shift(problems[0]), ranges, aims)
+    ones = np.ones(len(aims.grid))
+    traced = Observations(aims.grid, ones, noise_of(ones, 0 * ones), ones)
+    score = _Score(replace(_without_shift(problems[0]), observations=traced), ranges, aims)
     low, high = ranges.low.min(axis=0), ranges.high.max(axis=0)
     design = sobol_box((low + high) / 2, (high - low) / 2, settings.trajectories, seed)
     parts = [design[i : i + settings.chunk] for i in range(0, len(design), settings.chunk)]
@@ -203,7 +207,7 @@ class _Ranges:
 class _Score:
     """The data that all chunks share; it can be sent to workers of any kind."""
 
-    problem: InverseProblem
+    problem: InverseProblem  # its observations are those of a trace, on the time grid
     ranges: _Ranges
     aims: Targets
 
@@ -230,8 +234,7 @@ class _Score:
 
     def of(self, x: Array) -> tuple[Array, Array]:
         """NRMSE and shift (B, S) of coordinates (B, n)."""
-        times = np.broadcast_to(self.aims.grid, (len(x), len(self.aims.grid)))
-        return best_over_shifts(Predictor(self.problem).at(x, times), self.aims)
+        return best_over_shifts(forecast(self.problem, x).predictions, self.aims)
 
 
 def _refined(

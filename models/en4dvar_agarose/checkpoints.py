@@ -1,6 +1,7 @@
 """The results that a study has computed so far, on disk, so that one that was killed continues to the same bits.
 
-Kept are the chunks of the sweeps, the populations and the fits of one gel; En4D-Var is quick and computed again. What
+Kept are the chunks of the sweeps, the draws of each data set and the fits of one gel; what is quick, En4D-Var and the
+populations, is computed again. What
 decides the numbers is kept with them, and a study is continued only where that agrees.
 """
 
@@ -71,7 +72,7 @@ def identity_of(plan: StudyPlan) -> Identity:
     """The inputs that decide the numbers of a study: its effort and seed, its configurations, readings, software and
     sources.
     """
-    settings: dict[str, Any] = {"seed": plan.seed, "sweep": asdict(plan.sweep), "population": asdict(plan.population)}
+    settings: dict[str, Any] = {"seed": plan.seed, "sweep": asdict(plan.sweep)}
     common: dict[str, Any] = {"software": {}, "sources": {"en4dvar_agarose": source_digest("en4dvar_agarose")}}
     gels: dict[str, dict[str, Any]] = {}
     data: list[tuple[str, str]] = []

@@ -8,7 +8,7 @@ from en4dvar.model.state import Array
 from en4dvar.report.chart import COLUMN, PAGE, Chart, Panel, Row, in_columns
 from en4dvar.report.svg import Captioned
 from en4dvar_agarose import measured
-from en4dvar_agarose.fits import Fit, Study
+from en4dvar_agarose.fits import LEVELS, Fit, Study
 from en4dvar_agarose.paper import NAMES, QUANTITIES, Quantity, Route
 from en4dvar_bubble.model import BubbleModel
 
@@ -227,9 +227,8 @@ def population(study: Study) -> Chart:
         panel.yticks, panel.y_names = range(len(gels)), gels if not panels else [""] * len(gels)
         for row, (gel, distribution) in enumerate(study.populations.items()):
             j, fit = distribution.names.index(q.name), study.fits[gel]["qlkv"]
-            low, high = distribution.interval()[:, j] * q.factor
+            low, middle, high = np.quantile(distribution.posterior.mean[:, j], LEVELS) * q.factor
             panel.intervals([low], [high], [row], "posterior", 1.5)
-            middle = float(np.median(distribution.mean[:, j])) * q.factor
             panel.dots([middle], [row], "posterior", 4.0, label="hierarchical")
             panel.dots([fit.members(q.name).mean() * q.factor], [row + 0.18], "prior", 4.0, label="stacked")
             truth = study.true_values(gel, q.name) * q.factor

@@ -10,19 +10,21 @@ import numpy as np
 
 from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.diagnosis.diagnostics import nrmse
-from en4dvar.estimation.population import Population
+from en4dvar.estimation.population import HyperPrior, Population
+from en4dvar.estimation.population.own import OwnDraws
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import DataError
 from en4dvar.plumbing.files import read_text
 from en4dvar.priors.prior import Prior
 from en4dvar.problem import InverseProblem
-from en4dvar.sampling.evidence import Evidence
 from en4dvar.sampling.sweep import SweepResult
 from en4dvar_agarose.paper import Model, Route
 from en4dvar_agarose.settings import StudyPlan
 
 _TRUTH_UNITS = {"G_kPa": ("G", 1e3), "alpha": ("alpha", 1.0), "mu_Pa_s": ("mu", 1.0), "R0_um": ("R0", 1e-6)}
 DECISIVE = 3.0  # |Δ log-evidence|: odds of 20 to 1
+HYPER = HyperPrior(spread=1.0)  # R0 of the softer gel varies by more than what is known of it beforehand
+LEVELS = (0.025, 0.5, 0.975)  # of the interval of a population, and its middle
 MISFIT = 2.0  # χ² per reading above which a model is not one of those to choose from
 
 
@@ -35,15 +37,15 @@ class Fit:
     problems: tuple[InverseProblem, ...]
     sweep: SweepResult
     analyses: tuple[Analysis, ...]
-    evidence: Evidence | None = None
+    sampled: tuple[OwnDraws, ...] = ()
 
     @property
     def log_evidence(self) -> Array:
-        """(S,) ln p(y); by Laplace's approximation where it was not computed."""
-        if self.evidence is None:
+        """(S,) ln p(y); by Laplace's approximation where it was not sampled."""
+        if not self.sampled:
             return self.laplace_evidence
-        constants: Array = np.array([p.observations.log_normalisation() for p in self.problems])
-        return self.evidence.log - constants
+        each = zip(self.sampled, self.problems, strict=True)
+        return np.array([draws.log_evidence - p.observations.log_normalisation() for draws, p in each])
 
     @property
     def laplace_evidence(self) -> Array:
@@ -61,9 +63,9 @@ class Fit:
 
     @property
     def starts(self) -> Array:
-        """(S, N, n) posterior members in transformed space; one that failed is replaced by the centre."""
+        """(S, N, n) posterior members in white coordinates; one that failed is replaced by the centre."""
         members = [np.where(np.isfinite(a.posterior), a.posterior, a.centre) for a in self.analyses]
-        return np.stack([self.prior.from_physical(m) for m in members])
+        return np.stack([self.prior.white(self.prior.from_physical(m)) for m in members])
 
     def values(self, route: Route, name: str) -> Array:
         """(S,) estimates of a parameter, SI: best fits of the sweep, or means of the posterior ensembles."""
@@ -180,6 +182,13 @@ class Comparison:
     def undecidable(self) -> int:
         """Data sets that cannot tell the laws apart."""
         return int(np.sum(np.abs(self.single) < DECISIVE))
+
+
+@dataclass(frozen=True)
+class OneByOne:
+    """Draws of the posterior of each data set."""
+
+    sampled: tuple[OwnDraws, ...]
 
 
 @dataclass(frozen=True)

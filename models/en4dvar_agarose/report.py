@@ -7,14 +7,13 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from en4dvar.estimation.population import HyperPrior
 from en4dvar.plumbing.files import inside, make_folder, write_text
 from en4dvar.report.chart import COLUMN
 from en4dvar.report.palette import DARK, LIGHT, css_variables
 from en4dvar.report.svg import keep, svg
 from en4dvar_agarose import measured, paper, tables
 from en4dvar_agarose.figures import all_figures
-from en4dvar_agarose.fits import DECISIVE, MISFIT, Study, probability, verdict
+from en4dvar_agarose.fits import DECISIVE, HYPER, LEVELS, MISFIT, Study, probability, verdict
 from en4dvar_agarose.paper import LABELS, NAMES, QUANTITIES, ROUTES, Route
 from en4dvar_agarose.store import study_netcdf
 
@@ -55,7 +54,7 @@ def _page(study: Study, figures: list[dict[str, Any]]) -> str:
         plan=study.plan,
         sweep=study.plan.sweep,
         seconds=study.seconds,
-        hyper=HyperPrior(),
+        hyper=HYPER,
         decisive=DECISIVE,
         gels=len(study.fits),
         members=fits[0].analyses[0].settings.members,
@@ -187,12 +186,11 @@ def _population(study: Study) -> Rows:
     rows = []
     for gel, distribution in study.populations.items():
         fit = study.fits[gel]["qlkv"]
-        interval = distribution.interval()
         for q in QUANTITIES:
             j = distribution.names.index(q.name)
             stacked, truth = fit.members(q.name) * q.factor, study.true_values(gel, q.name) * q.factor
-            mean, std = (np.median(values[:, j]) * q.factor for values in (distribution.mean, distribution.std))
-            low, high = interval[:, j] * q.factor
+            low, mean, high = np.quantile(distribution.posterior.mean[:, j], LEVELS) * q.factor
+            std = np.median(distribution.posterior.between[:, j]) * q.factor
             known = tables.plus_minus((truth.mean(), truth.std(ddof=1))) if len(truth) > 1 else "–"
             cells = [f"{mean:.3g} [{low:.3g}, {high:.3g}]", f"{std:.2g}"]
             rows.append(
@@ -204,8 +202,8 @@ def _population(study: Study) -> Rows:
 def _effective(study: Study) -> str:
     """How many draws stand behind each population."""
     return "; ".join(
-        f"{gel}: {f.size:.0f} effective draws (weights with emulators {f.weighed[0]:.0f}, with forward runs "
-        f"{f.weighed[1]:.0f})" + ("" if f.converged else ", NOT CONVERGED: do not use")
+        f"{gel}: {f.size:.0f} effective draws (of the hierarchy {f.effective[0]:.0f}, of its data sets "
+        f"{f.effective[1]:.0f})" + ("" if f.converged else ", NOT CONVERGED: do not use")
         for gel, f in study.populations.items()
     )
 
@@ -238,7 +236,7 @@ def _judged(study: Study) -> dict[str, Any]:
     """Reliability of the evidences of single sets, and how many of them decide."""
     fits = [study.fits[gel][model] for gel in study.comparisons for model in ("nh", "qlkv")]
     return {
-        "fewest": min((float(fit.evidence.effective.min()) for fit in fits if fit.evidence is not None), default=0.0),
+        "fewest": min((draws.effective for fit in fits for draws in fit.sampled), default=0.0),
         "laplace": max((float(np.max(np.abs(fit.laplace_evidence - fit.log_evidence))) for fit in fits), default=0.0),
         "undecided": sum(c.undecidable for c in study.comparisons.values()),
         "total": sum(len(c.single) for c in study.comparisons.values()),

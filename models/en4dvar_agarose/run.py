@@ -12,16 +12,17 @@ import numpy as np
 from en4dvar.assembly.build import build
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.estimation.joint import Single, estimate_jointly, sharing
-from en4dvar.estimation.population import Population, estimate_population
-from en4dvar.executor import Executor, make_executor
+from en4dvar.estimation.population import Population, population_of
+from en4dvar.estimation.population.campaign import FEWEST_SETS
+from en4dvar.estimation.population.own import OwnDraws, own_draws
+from en4dvar.executor import Executor, make_executor, one_blas_thread
 from en4dvar.model.forward import ForwardModel
+from en4dvar.plumbing.errors import TooFewMembersError, retold
 from en4dvar.priors.prior import Prior, own_seed
 from en4dvar.problem import InverseProblem
-from en4dvar.sampling.evidence import Evidence, sampled_evidence
-from en4dvar.sampling.forward_runs import ForwardRuns
 from en4dvar.sampling.sweep import SweepResult, run_sweep
 from en4dvar_agarose.checkpoints import D, StudyCheckpoints
-from en4dvar_agarose.fits import Comparison, Fit, OneGel, Study, read_truth
+from en4dvar_agarose.fits import HYPER, Comparison, Fit, OneByOne, OneGel, Study, read_truth
 from en4dvar_agarose.paper import TABLE_2, Model
 from en4dvar_agarose.settings import StudyPlan
 from en4dvar_bubble.model import BubbleModel
@@ -30,7 +31,6 @@ Say = Callable[[str], None]
 SHARED = ("G", "alpha", "mu")  # properties of the gel; R0 and t_s belong to the bubble
 POPULATION = ("G", "alpha", "mu", "R0")
 COMPARED: tuple[Model, Model] = ("nh", "qlkv")
-FEWEST_SETS = 3  # of a population
 
 
 def run_study(plan: StudyPlan, workers: int = 1, say: Say | None = None, keep: StudyCheckpoints | None = None) -> Study:
@@ -136,7 +136,7 @@ class _Parts:
         populations, comparisons = {}, {}
         for gel, models in fits.items():
             for m, fit in models.items():
-                models[m] = replace(fit, evidence=self.kept(Evidence, partial(self._evidence, fit), fit))
+                models[m] = replace(fit, sampled=self._sampled(fit))
             estimates = {m: self._population(models[m]) for m in COMPARED if m in models}
             if (general := estimates.get("qlkv")) is not None:
                 populations[gel] = general
@@ -144,25 +144,20 @@ class _Parts:
                 comparisons[gel] = self._comparison(models, estimates)
         return populations, comparisons
 
-    def _runs(self, fit: Fit) -> ForwardRuns:
-        return ForwardRuns(fit.problems, self.executor)
+    def _sampled(self, fit: Fit) -> tuple[OwnDraws, ...]:
+        def compute() -> OneByOne:
+            each = zip(fit.problems, fit.starts, strict=True)
+            with one_blas_thread(), retold(ValueError, TooFewMembersError, "no evidence: "):
+                return OneByOne(tuple(own_draws(p, start, self.plan.seed, self.executor) for p, start in each))
 
-    def _evidence(self, fit: Fit) -> Evidence:
-        return sampled_evidence(self._runs(fit), fit.prior, self.plan.seed)
+        return self.kept(OneByOne, compute, fit).sampled
 
     def _population(self, fit: Fit) -> Population | None:
         """None with fewer than 3 data sets."""
         if len(fit.problems) < FEWEST_SETS:
             return None
         names = [name for name in POPULATION if fit.estimated(name)]
-
-        def compute() -> Population:
-            return estimate_population(
-                self._runs(fit), fit.starts, fit.prior, names, self.plan.seed, effort=self.plan.population,
-                workers=self.workers,
-            )  # fmt: skip
-
-        return self.kept(Population, compute, fit)
+        return population_of(fit.problems, list(fit.starts), names, self.plan.seed, kept=fit.sampled, hyper=HYPER)
 
     def _comparison(self, models: Mapping[Model, Fit], populations: Mapping[Model, Population | None]) -> Comparison:
         nh, general = (models[m] for m in COMPARED)

@@ -10,7 +10,6 @@ from en4dvar.config import Config, load_config
 from en4dvar.config.document import Document, override, read_document
 from en4dvar.config.schema import Name, QuantityText, Section
 from en4dvar.config.validate import check
-from en4dvar.estimation.population import Effort
 from en4dvar.plumbing.errors import ConfigError, Fault
 from en4dvar.plumbing.units import UnitError, parse_quantity
 from en4dvar.sampling.sweep import SweepSettings
@@ -43,25 +42,6 @@ class Sweep(Section):
         return SweepSettings(self.trajectories, shift, step, self.width, rounds=self.rounds, local=self.local)
 
 
-class PopulationSection(Section):
-    """How much the population estimate computes; see :mod:`en4dvar.estimation.population`."""
-
-    rounds: Annotated[int, Field(ge=30)] = Effort.rounds
-    """Rounds of the walkers over each data set, from which its emulator is learnt."""
-    components: Annotated[int, Field(ge=1, le=100)] = Effort.components
-    """Gaussians in the mixture that stands for a data set's posterior."""
-    passes: Annotated[int, Field(ge=1)] = Effort.passes
-    """How often, at most, an interim prior is tried; it ends when there are enough effective draws."""
-    draws: Annotated[int, Field(ge=100)] = Effort.draws
-    """Draws of means and spreads that receive importance weights with emulators."""
-    exact: Annotated[int, Field(ge=50)] = Effort.exact
-    """Of them, those weighed by forward runs as well."""
-
-    def built(self) -> Effort:
-        """The rest as by default."""
-        return Effort(**self.model_dump())
-
-
 class StudySchema(Section):
     """The whole file of ``en4dvar study``."""
 
@@ -75,8 +55,8 @@ class StudySchema(Section):
     """CSV file of the twin's true parameters, read for the report only; relative to this file's folder."""
     sweep: Sweep = Sweep()
     """Size of the sweep of each model and gel."""
-    population: PopulationSection = PopulationSection()
-    """How much the population estimate computes."""
+    population: Annotated[dict[str, Any], Field(default_factory=dict)]
+    """How much an estimator of populations computed that is no more; read by no one since 1.1."""
     gels: Annotated[dict[str, dict[str, str]], Field(min_length=1)]
     """Label of the gel → model (nh, qs, qlkv) → configuration file, relative to this file's folder."""
 
@@ -90,7 +70,6 @@ class StudyPlan:
     synthetic: bool
     truth: Path | None
     sweep: SweepSettings
-    population: Effort
     configs: dict[str, dict[Model, Config]]
     text: str
 
@@ -117,7 +96,7 @@ def load_study(path: str | Path, overrides: dict[str, Any] | None = None) -> Stu
         faults.append(document.fault(("truth",), f"{truth}: no such file"))
     if faults or sweep is None:
         raise ConfigError(faults)
-    return StudyPlan(top.name, top.seed, top.synthetic, truth, sweep, top.population.built(), configs, document.text)
+    return StudyPlan(top.name, top.seed, top.synthetic, truth, sweep, configs, document.text)
 
 
 def _configs(

@@ -55,23 +55,23 @@ def _fit(study: Study, fit: Fit) -> Group:
     for route, words in of_routes.items():
         variables[f"nrmse_{route}"] = _plain(fit.nrmse(route), f"NRMSE, {words}")
     variables["log_evidence"] = _plain(fit.log_evidence, "log-evidence, adaptive importance sampling")
-    if fit.evidence is not None:
-        variables["evidence_draws"] = _plain(fit.evidence.effective, "effective number of draws of the log-evidence")
+    if fit.sampled:
+        effective = np.array([draws.effective for draws in fit.sampled])
+        variables["evidence_draws"] = _plain(effective, "effective number of draws of the log-evidence")
     coords = {"dataset": Variable(("dataset",), np.array(fit.names, dtype=object), {"long_name": "data set"})}
     return Group(variables, coords)
 
 
 def _population(population: Population) -> Group:
-    terms = {t.parameter.name: t.parameter for t in population.prior.terms}
     variables: dict[str, Variable] = {}
-    for j, name in enumerate(population.names):
-        about = _words(terms[name])
-        variables[f"mean_{name}"] = Variable(("draw",), population.mean[:, j], about)
-        variables[f"spread_{name}"] = Variable(("draw",), population.std[:, j], about)
+    for j, term in enumerate(population.terms):
+        name, about = term.parameter.name, _words(term.parameter)
+        variables[f"mean_{name}"] = Variable(("draw",), population.posterior.mean[:, j], about)
+        variables[f"spread_{name}"] = Variable(("draw",), population.posterior.between[:, j], about)
     judged = {
         "effective_draws": population.size,
-        "effective_draws_emulators": population.weighed[0],
-        "effective_draws_forward_runs": population.weighed[1],
+        "effective_draws_hierarchy": population.effective[0],
+        "effective_draws_data_sets": population.effective[1],
         "log_evidence": population.log_evidence,
         "forward_runs": population.forward_runs,
     }

@@ -10,9 +10,9 @@ import pytest
 
 from en4dvar.assembly.build import build
 from en4dvar.config import load_config
+from en4dvar.ensemble.forecast import forecast
 from en4dvar.estimation.joint import estimate_jointly, sharing
 from en4dvar.priors.prior import member_stream
-from en4dvar.sampling.forward_runs import ForwardRuns
 from en4dvar.schemes.settings import AssimilationSettings
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
@@ -24,11 +24,11 @@ def test_bubbles_of_one_gel_are_recognised_and_those_of_several_are_not():
     prior, stream = base[0].prior, member_stream(3, "one gel")
     truth = np.tile(prior.mean, (4, 1))
     truth[:, 3:] += 0.5 * prior.std[3:] * stream.standard_normal((4, 2))
-    exact = ForwardRuns(base).predictions(truth[None])[0]
+    exact = [forecast(problem, x[None]).predictions[0] for problem, x in zip(base, truth, strict=True)]
     problems = []
     for s, problem in enumerate(base):
         o = problem.observations
-        values = exact[s, : len(o)] + o.std * stream.standard_normal(len(o))
+        values = exact[s] + o.std * stream.standard_normal(len(o))
         problems.append(replace(problem, observations=replace(o, values=values)))
     names, settings = ["G", "alpha", "mu"], AssimilationSettings(refine="none", what_if=False)
     one = estimate_jointly(sharing(problems, names), settings, 1)

@@ -50,9 +50,7 @@ def small(tmp_path_factory):
     folder = tmp_path_factory.mktemp("study")
     file = write_study(folder, "0[1-3]")
     call = [str(file), "--set", "sweep.trajectories=128", "--set", "sweep.rounds=1"]
-    call += ["--set", "sweep.step=0.1 us", "--out", str(folder / "out"), "--set", "population.rounds=30"]
-    call += ["--set", "population.passes=1", "--set", "population.draws=200", "--set", "population.exact=50"]
-    call += ["--set", "population.components=3"]
+    call += ["--set", "sweep.step=0.1 us", "--out", str(folder / "out")]
     result = CliRunner().invoke(study_command, call)
     assert result.exit_code == 0, (result.output, result.exception)
     return folder / "out", result.output, call
@@ -112,9 +110,9 @@ def test_an_earlier_study_is_kept(small):
 def test_a_changed_study_is_not_continued(small):
     out, _, call = small
     before = sorted((file, file.stat().st_mtime_ns) for file in out.rglob("*"))
-    error = CliRunner().invoke(study_command, [*call, "--set", "population.draws=250", "--resume"]).exception
+    error = CliRunner().invoke(study_command, [*call, "--set", "sweep.rounds=2", "--resume"]).exception
     assert isinstance(error, OutputError)
-    assert "-  draws: 200\n+  draws: 250" in str(error)
+    assert "-  rounds: 1\n+  rounds: 2" in str(error)
     assert "give --force" in str(error)
     assert sorted((file, file.stat().st_mtime_ns) for file in out.rglob("*")) == before
 
@@ -162,9 +160,7 @@ def test_a_study_killed_at_random_moments_and_resumed_has_the_same_bits(tmp_path
             text.replace("data/agarose_twin/agarose_03_*.csv", str(data / "agarose_03_0[1-4].csv"))
         )
     settings = "name: s\nseed: 1\nsynthetic: false\nsweep: {trajectories: 9000, step: 0.2 us, rounds: 1}\n"
-    settings += (
-        "population: {rounds: 60, passes: 1, draws: 200, exact: 50}\ngels:\n  a: {nh: nh.yaml, qlkv: qlkv.yaml}\n"
-    )
+    settings += "gels:\n  a: {nh: nh.yaml, qlkv: qlkv.yaml}\n"
     (tmp_path / "study.yaml").write_text(settings)
     whole, pieces = tmp_path / "whole", tmp_path / "pieces"
     done = run_cli("study", tmp_path / "study.yaml", "--out", whole)
@@ -217,8 +213,8 @@ def test_results_as_netcdf(small):
 def test_a_study_that_lost_some_results_is_resumed_to_the_same_tables(small):
     out, _, call = small
     before = {file.name: file.read_bytes() for file in [*out.glob("*.csv"), *out.glob("table*.md")]}
-    lost = out / "checkpoints" / "population_1_qlkv"
-    kept = out / "checkpoints" / "population_0_3_qlkv"
+    lost = out / "checkpoints" / "onebyone_1_qlkv"
+    kept = out / "checkpoints" / "onebyone_0_3_qlkv"
     stamp = kept.stat().st_mtime_ns
     lost.unlink()
     next((out / "checkpoints").glob("sweep_0_3_qlkv/*.npz")).unlink()
@@ -266,8 +262,8 @@ def twin(tmp_path_factory):
     """
     file = write_study(tmp_path_factory.mktemp("twin"), "*[02468]")
     with pytest.MonkeyPatch.context() as patch:
-        sampled = _Parts._evidence
-        patch.setattr(_Parts, "_evidence", lambda parts, fit: sampled(parts, fit) if fit.model in COMPARED else None)
+        sampled = _Parts._sampled
+        patch.setattr(_Parts, "_sampled", lambda parts, fit: sampled(parts, fit) if fit.model in COMPARED else ())
         patch.setattr(_Parts, "_population", lambda *_: None)
         patch.setattr(_Parts, "_one_gel", lambda *_: OneGel(np.nan, np.nan))
         return run_study(load_study(file, {"sweep.trajectories": 8192}), workers=2)

@@ -1,4 +1,4 @@
-"""Population, evidence and sweep on a campaign that is no bubble: linear, Gaussian, all is known."""
+"""Evidence and sweep on a campaign that is no bubble: linear, Gaussian, all is known."""
 
 from __future__ import annotations
 
@@ -6,22 +6,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import halfnorm, multivariate_normal, norm
-from toys import Fragile, Vectorised, make_problem, with_noise
+from scipy.stats import multivariate_normal, norm
+from toys import Vectorised, make_problem
 
-from en4dvar.estimation.population import Effort, HyperPrior, estimate_population
+from en4dvar.data.noise import noise_of
+from en4dvar.data.observations import Observations
+from en4dvar.estimation.population.own import own_draws
 from en4dvar.executor import ProcessesExecutor
-from en4dvar.model.state import NOISE_SCALE, TIME_SHIFT
-from en4dvar.plumbing.errors import ConfigError
+from en4dvar.model.forward import Trajectory
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
-from en4dvar.sampling.evidence import sampled_evidence
-from en4dvar.sampling.forward_runs import ForwardRuns
 from en4dvar.sampling.sweep import SweepSettings, run_sweep
 
 STD, SETS = 0.3, 6
-SMALL = Effort(rounds=36, refits=1, degree=1, components=2, hyper_walkers=32, draws=1500, exact=200)
-HYPER = HyperPrior(mean_std=0.8, spread=0.5)
 
 
 @pytest.fixture(scope="module")
@@ -48,30 +45,41 @@ def log_marginal(problem: InverseProblem, mean: np.ndarray, variance: np.ndarray
     return density.logpdf(problem.observations.values - mean @ H.T) + k * np.log(STD * np.sqrt(2 * np.pi))
 
 
-@pytest.mark.slow
-def test_population_of_a_linear_hierarchy(campaign):
-    prior, runs = campaign[0].prior, ForwardRuns(campaign)
-    start = prior.mean + 0.3 * np.random.default_rng(0).standard_normal((SETS, 20, 2))
-    found = estimate_population(runs, start, prior, ["a"], 2, HYPER, SMALL)
-    nu, tau = np.linspace(-2, 3, 81), np.geomspace(5e-3, 3, 41)
-    means = np.stack([nu, np.full(81, 0.2)], axis=1)
-    log = np.stack([sum(log_marginal(p, means, np.array([t**2, 0.25])) for p in campaign) for t in tau], axis=1)
-    log += norm(0.6, HYPER.mean_std).logpdf(nu)[:, None] + halfnorm(scale=HYPER.spread).logpdf(tau)
-    weights = np.exp(log - log.max()) * (nu[1] - nu[0]) * np.gradient(tau)
-    assert found.converged
-    assert found.log_evidence == pytest.approx(log.max() + np.log(weights.sum()), abs=0.1)
-    weights /= weights.sum()
-    mean, spread = weights.sum(axis=1) @ nu, weights.sum(axis=0) @ tau
-    error = np.sqrt(weights.sum(axis=1) @ (nu - mean) ** 2 / found.size)
-    assert found.mean.mean() == pytest.approx(mean, abs=4 * error)
-    assert found.std.mean() == pytest.approx(spread, rel=0.15)
-
-
 def test_evidence_of_each_set(campaign):
-    prior = campaign[0].prior
-    found = sampled_evidence(ForwardRuns(campaign[:2]), prior, seed=1)
-    exact = [float(log_marginal(p, prior.mean[None], prior.std**2)) for p in campaign[:2]]
-    assert found.log == pytest.approx(exact, abs=0.25)
+    start = 0.3 * np.random.default_rng(0).standard_normal((20, 2))
+    for problem in campaign[:2]:
+        exact = float(log_marginal(problem, problem.prior.mean, problem.prior.std**2))
+        assert own_draws(problem, start, 1).log_evidence == pytest.approx(exact, abs=0.15)
+
+
+class Spiked(Vectorised):
+    """L = exp(−½|x − 1|²/0.01²) + 0.6 exp(−½|x + 1|²/0.4²): J is lowest in the first, the probability in the second."""
+
+    parts = ((1.0, 1.0, 0.01), (0.6, -1.0, 0.4))
+
+    def trajectories(self, x, times):
+        theta = x[:, 2:]
+        logs = [np.log(a) - 0.5 * np.sum((theta - c) ** 2, axis=1) / w**2 for a, c, w in self.parts]
+        y = np.sqrt(np.maximum(-2 * np.logaddexp(*logs), 0.0))
+        own = np.broadcast_to(times, (len(x), np.shape(times)[-1]))
+        states = np.stack([np.stack([y, 0 * y, *theta.T], axis=1)] * own.shape[1], axis=1)
+        return [Trajectory(t, s, self.layout) for t, s in zip(own, states, strict=True)]
+
+    def exact(self):
+        return sum(a * (np.sqrt(2 * np.pi) * w * norm(c, np.hypot(1, w)).pdf(0.0)) ** 2 for a, c, w in self.parts)
+
+
+def test_the_wide_mode_counts_not_the_lowest_spike():
+    model = Spiked()
+    ones = np.ones(1)
+    observed = Observations(ones, 0 * ones, noise_of(ones, 0 * ones), ones)
+    prior = Prior(tuple(PriorTerm.normal(p, 0.0, 1.0) for p in model.parameters))
+    problem = replace(make_problem(Vectorised(), [0.0, 0.0]), model=model, observations=observed, prior=prior)
+    about_the_spike = 1.0 + 0.01 * np.random.default_rng(0).standard_normal((20, 2))
+    told = [own_draws(problem, about_the_spike, seed).log_evidence for seed in range(5)]
+    assert told == pytest.approx([np.log(model.exact())] * 5, abs=0.2)
+    laplace = np.log(2 * np.pi * 0.01**2) + norm.logpdf(1.0) * 2  # at the lowest J
+    assert laplace < min(told) - 5
 
 
 def test_a_sweep_finds_the_time_shift():
@@ -95,27 +103,3 @@ def test_a_sweep_has_the_same_bits_in_processes(campaign):
         found = run_sweep(sets, settings, 1, executor)
     np.testing.assert_array_equal(found.theta, alone.theta)
     np.testing.assert_array_equal(found.nrmse, alone.nrmse)
-
-
-def test_members_that_cannot_be_run_and_time_shifts():
-    problem = make_problem(Fragile(limit=2.0), [1.0, 0.5])
-    term = PriorTerm.normal(TIME_SHIFT, 0.0, 0.1)
-    problem = replace(problem, prior=replace(problem.prior, terms=(*problem.prior.terms, term)))
-    runs = ForwardRuns([problem])
-    x = np.array([[[1.0, 0.5, 0.05]], [[3.0, 0.5, 0.05]]])
-    predictions = runs.predictions(x)
-    t = problem.observations.times + 0.05
-    assert predictions[0, 0] == pytest.approx(1.0 + 0.5 * np.cos(t + 1 / 3))
-    assert np.isnan(predictions[1]).all()
-
-
-def test_errors_that_it_cannot_take(campaign):
-    prior = campaign[0].prior
-    other = replace(campaign[1], prior=replace(prior, terms=prior.terms[::-1]))
-    with pytest.raises(ConfigError, match="one prior"):
-        ForwardRuns([campaign[0], other])
-    scaled = replace(prior, terms=(*prior.terms, PriorTerm.lognormal(NOISE_SCALE, 1.0, 0.2)))
-    robust = replace(campaign[0], observations=with_noise(campaign[0].observations, huber=1.5))
-    for problem in (replace(campaign[0], prior=scaled), robust):
-        with pytest.raises(ConfigError, match="independent Gaussian errors"):
-            ForwardRuns([problem])

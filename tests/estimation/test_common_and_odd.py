@@ -11,7 +11,7 @@ from toys import Vectorised, make_problem, with_discrepancy
 
 from en4dvar.data.noise import noise_of
 from en4dvar.estimation.population import Effort, HyperPrior
-from en4dvar.estimation.population.campaign import _empirical, population_of, white_prior
+from en4dvar.estimation.population.campaign import _empirical, population_of
 from en4dvar.estimation.population.empirical import empirical, median_of
 from en4dvar.estimation.population.hierarchy import Hierarchy, named
 from en4dvar.estimation.population.mixtures import Mixture
@@ -142,13 +142,13 @@ def test_one_that_is_odd_in_one_parameter_alone_is_named():
     left = 1 / (1 + error**-2)
     likelihoods = [
         OwnLikelihood(
-            Mixture.divided(left / error**2 * row[None], left * np.eye(2)[None], np.zeros(1), np.zeros(2), np.ones(2)),
+            Mixture.divided(left / error**2 * row[None], left * np.eye(2)[None], np.zeros(1), np.ones(2)),
             np.zeros((2, 0)),
             row + error * rng.standard_normal((400, 2)),
         )
         for row in y
     ]
-    hierarchy, h = Hierarchy(likelihoods, white_prior(["a", "b"]), hyper), np.array([[0.3, -0.2, *np.log([0.1, 0.2])]])
+    hierarchy, h = Hierarchy(likelihoods, hyper), np.array([[0.3, -0.2, *np.log([0.1, 0.2])]])
     variances = np.array([[0.01, 0.04], [0.01 + 1, 0.04], [0.01, 0.04 + 1]]) + error**2
     under_prior = norm(0, np.hypot(1, error)).pdf(y).prod(axis=1)
     exact_parts = [norm(h[0, :2], np.sqrt(v)).pdf(y).prod(axis=1) / under_prior for v in variances]
@@ -191,7 +191,7 @@ def test_slopes_that_differ_with_what_varies_tell_nothing_of_what_is_common():
             sets.append(OwnDraws(np.stack([z.ravel()[taken], u.ravel()[taken]], axis=1) + jitter, 0.0, 2000.0, 0))
         hyper = HyperPrior(1.0, 0.5, odd=0.0)
         likelihoods = own_likelihoods(sets, [0], [1], trial, [f"set{s}" for s in range(count)])
-        found = Hierarchy(likelihoods, white_prior(["a"]), hyper).sampled(trial, Effort())
+        found = Hierarchy(likelihoods, hyper).sampled(trial, Effort())
         mean, std = by_quadrature(np.array(likely), z, hyper)
         far.append((found.nu.mean() - mean) / std)
         assert found.nu.std() == pytest.approx(std, rel=0.25)

@@ -148,7 +148,7 @@ def gels():
 def medians(found, seed, known=()):
     """Draws (M, 2) of both medians; of the first what is ``known``."""
     each = [
-        without_pull(0, f.posterior.nu, f.theta, f.common, HYPER.mean_std, f.estimate.size, seed, of_it)
+        without_pull(0, f.posterior.nu, f.theta, f.common, HYPER.mean_std, f.size, seed, of_it)
         for f, of_it in zip(found, (known, ()), strict=True)
     ]
     return OF_A.mean + OF_A.std * drawn_together(each, seed)

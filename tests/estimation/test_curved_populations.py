@@ -12,7 +12,7 @@ from toys import Toy, Vectorised, make_problem
 
 from en4dvar.data.noise import noise_of
 from en4dvar.data.observations import Observations
-from en4dvar.estimation.population import CampaignPopulation, HyperPrior, population_of
+from en4dvar.estimation.population import HyperPrior, Population, population_of
 from en4dvar.model.forward import Trajectory
 from en4dvar.priors.prior import Prior, PriorTerm
 
@@ -71,7 +71,7 @@ class Case:
         exact = np.stack(self.pair(*truth.T), axis=1)
         return truth, exact + ERRORS * rng.standard_normal(exact.shape)
 
-    def estimated(self, seed) -> CampaignPopulation:
+    def estimated(self, seed) -> Population:
         truth, values = self.drawn()
         base, model = make_problem(Vectorised(), [0.0, 0.0]), TwoReadings(self.pair)
         prior = Prior(tuple(PriorTerm.normal(p, 0.0, s) for p, s in zip(model.parameters, STD, strict=True)))
@@ -122,11 +122,11 @@ def test_a_population_of_such_likelihoods_against_quadrature(case):
     quantiles, std, spread, evidence = by_quadrature(case)
     found = case.estimated(3)
     nu = STD[0] * found.posterior.nu[:, 0]
-    assert found.estimate.converged
+    assert found.converged
     assert nu.mean() == pytest.approx(quantiles[1], abs=0.45 * std)
     assert nu.std() == pytest.approx(std, rel=0.15)
     assert STD[0] * found.posterior.tau.mean() == pytest.approx(spread, rel=0.15)
-    assert found.estimate.log_evidence == pytest.approx(evidence, abs=0.75)
+    assert found.log_evidence == pytest.approx(evidence, abs=0.75)
 
 
 @pytest.mark.slow
@@ -136,4 +136,4 @@ def test_repeated_estimates_have_no_bias(case):
     several = [case.estimated(seed) for seed in range(8)]
     below = np.mean([[np.mean(STD[0] * f.posterior.nu[:, 0] < value) for value in quantiles] for f in several], axis=0)
     assert below == pytest.approx(LEVELS, abs=0.07)
-    assert np.mean([found.estimate.log_evidence for found in several]) == pytest.approx(evidence, abs=0.3)
+    assert np.mean([found.log_evidence for found in several]) == pytest.approx(evidence, abs=0.3)

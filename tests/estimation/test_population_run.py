@@ -13,8 +13,7 @@ from toys import Vectorised, make_problem
 
 from en4dvar.cli import main
 from en4dvar.estimation.population import Effort, HyperPrior
-from en4dvar.estimation.population.campaign import CampaignPopulation, Draws, population_of
-from en4dvar.estimation.population.estimate import Population
+from en4dvar.estimation.population.campaign import Draws, Population, population_of
 from en4dvar.plumbing.caution import caution
 from en4dvar.plumbing.errors import ConfigError, OutputError
 from en4dvar.priors.prior import Prior, PriorTerm
@@ -24,7 +23,7 @@ from en4dvar.runs.population_run import population
 from en4dvar.runs.runner import run_campaign
 
 STD, SETS = 0.3, 6
-SMALL = Effort(rounds=36, refits=1, degree=2, components=2, hyper_walkers=32, draws=1500, exact=400)
+SMALL = Effort(hyper_walkers=32, draws=1500)
 
 
 @pytest.fixture(scope="module")
@@ -153,8 +152,7 @@ def test_what_is_determined_together_only():
     nu = np.stack([(free + 0.01 * sharp) / np.sqrt(2), (-free + 0.01 * sharp) / np.sqrt(2)], axis=1)
     tau = np.abs(0.5 * rng.standard_normal(nu.shape))
     draws = Draws(nu, nu, tau, nu, nu, tau)
-    estimate = Population(("a", "b"), prior, nu, tau, nu[:, None], (400.0, 400.0), 0.0, 0)
-    found = CampaignPopulation(problems, HyperPrior(), estimate, draws, draws, nu[:, None])
+    found = Population(("a", "b"), problems, HyperPrior(), draws, draws, nu[:, None], (400.0, 400.0), 0.0, 0)
     (one,) = found.combinations()
     exponents = dict(one.parts)
     assert exponents["a"] / exponents["b"] == pytest.approx(2.0, rel=0.02)
@@ -170,9 +168,9 @@ def test_what_is_determined_together_only():
 def test_a_linear_hierarchy_with_priors_of_their_own():
     problems, hyper = linear(), HyperPrior(1.0, 0.5)
     start = [0.3 * np.random.default_rng(s).standard_normal((20, 2)) for s in range(SETS)]
-    found = population_of(problems, start, ["a"], 2, hyper=hyper, effort=replace(SMALL, degree=1, exact=1500))
+    found = population_of(problems, start, ["a"], 2, hyper=hyper, effort=SMALL)
     weights, nu, tau, means, variances = exact(problems, hyper)
-    size = np.sqrt(found.estimate.size)
+    size = np.sqrt(found.size)
     mean = weights.sum(axis=1) @ nu
     std = np.sqrt(weights.sum(axis=1) @ nu**2 - mean**2)
     assert found.posterior.mean.mean() == pytest.approx(mean, abs=4 * std / size)

@@ -18,9 +18,7 @@ from en4dvar.runs.engine import write_report
 from en4dvar.runs.population_run import population
 from en4dvar.runs.runner import run_campaign
 
-SMALL = Effort(
-    rounds=30, refits=1, degree=2, components=2, hyper_walkers=16, hyper_rounds=30, draws=400, exact=100, passes=1
-)
+SMALL = Effort(hyper_walkers=16, hyper_rounds=30, hyper_components=2, draws=400)
 ASKED = "population: {of: [k], mean_std: 2, spread: 0.7, reference: {k: 1.9 ± 0.1 N/m, source: balance}}\n"
 
 

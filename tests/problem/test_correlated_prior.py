@@ -10,7 +10,6 @@ from toys import Vectorised, make_problem
 
 from en4dvar.config.dependence import term_of_members
 from en4dvar.estimation.assimilate import assimilate, log_posterior
-from en4dvar.estimation.population import estimate_population
 from en4dvar.model.state import Parameter
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.priors.dependence import Dependence
@@ -147,8 +146,6 @@ def test_blocks_that_do_not_suit_the_prior_are_refused():
         Prior(terms, (BLOCK, Dependence(("a", "b"), pair)))
     with pytest.raises(ConfigError, match="e is correlated, but not estimated"):
         Prior(terms, (Dependence(("a", "e"), pair),))
-    with pytest.raises(ValueError, match="independent parameters"):
-        estimate_population(None, np.zeros((3, 5, 4)), Prior(terms, (BLOCK,)), ("a",), 1)
 
 
 @pytest.mark.parametrize("members", [12, 30])

@@ -22,7 +22,6 @@ from en4dvar.plumbing.errors import ConfigError
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
 from en4dvar.report.result import load_result
-from en4dvar.sampling.forward_runs import ForwardRuns
 from en4dvar.schemes.settings import AssimilationSettings
 
 SETTINGS = AssimilationSettings(members=12)
@@ -54,8 +53,7 @@ def test_it_multiplies_predictions_and_rates_of_every_kind_of_run():
     for values in (of[0].values, of[0].rates, of[1]):
         np.testing.assert_allclose(values[1], 1.1 * values[0], rtol=1e-14)
     plain = scaled(make_problem(Linear(("a", "b")), [1.0, 0.5]))
-    alone = ForwardRuns([plain]).predictions(x[:, None])
-    np.testing.assert_allclose(alone[:, 0], of[0].values, rtol=1e-14)
+    np.testing.assert_allclose(forecast(plain, x).predictions, of[0].values, rtol=1e-14)
 
 
 def test_a_parameter_of_that_name_of_the_model_goes_before_it():

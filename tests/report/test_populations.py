@@ -22,7 +22,7 @@ from en4dvar.runs.population_run import population
 from en4dvar.runs.runner import run_campaign
 
 STIFFER = 1.3
-SMALL = Effort(rounds=36, refits=1, degree=2, components=2, hyper_walkers=32, draws=1500, exact=400)
+SMALL = Effort(hyper_walkers=32, draws=1500)
 
 
 @pytest.fixture(scope="module")

@@ -18,22 +18,23 @@ import scipy  # its trees where they are used: a twentieth of what every command
 from en4dvar.ensemble.forecast import check_problem
 from en4dvar.estimation.population.effort import Effort
 from en4dvar.estimation.population.empirical import Empirical, empirical
-from en4dvar.estimation.population.estimate import FEWEST_SETS as FEWEST_SETS
-from en4dvar.estimation.population.estimate import Population, moments
 from en4dvar.estimation.population.hierarchy import Hierarchy, HierarchyDraws, named
 from en4dvar.estimation.population.hyper import HyperPrior
 from en4dvar.estimation.population.own import OwnDraws, OwnLikelihood, own_draws, own_likelihoods
 from en4dvar.executor import Executor, one_blas_thread
-from en4dvar.model.state import Array, Parameter
+from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.hints import suggest
-from en4dvar.priors.prior import Prior, PriorTerm, member_stream
+from en4dvar.priors.prior import PriorTerm, member_stream
 from en4dvar.problem import InverseProblem
 from en4dvar.sampling.mixture import effective_number, resampled
 
 DETERMINED = 0.9  # of the hyperprior's variance, taken away by the data
 IN_IT = 0.2  # of the largest exponent: a parameter that is part of a combination
 HALF_NORMAL_VARIANCE = 1 - 2 / np.pi
+FEWEST_SETS = 3  # with fewer nothing is known of a spread
+FEWEST = 100.0  # effective draws of a result that can be trusted
+NODES = 24  # of the quadrature
 NEAR = 5  # draws of a data set among which one is chosen for what is its own
 
 
@@ -52,21 +53,26 @@ class Draws:
 
 
 @dataclass(frozen=True)
-class CampaignPopulation:
+class Population:
     """The population of ``names`` in ``problems``: ``posterior`` and ``prior`` draws; ``sets`` (M, S, n) physical, each
-    data set given all of them; ``estimate`` in units of the prior.
+    data set given all of them.
 
+    ``effective``: numbers of independent draws that stand behind the hierarchy and, together, behind the data sets;
+    ``log_evidence``: of all data, hyperpriors included, without Σ ln(std √2π); ``forward_runs`` that were made.
     ``common``: names of the quantities with one value in all data sets, ``theta`` (M, c) their draws in units of the
     prior. ``belongs`` (S,): probability that each data set is of the population. ``empirical``: for each of ``names``
     the median of the data sets one by one. ``left_out``: data sets that could not be sampled, and why.
     """
 
+    names: tuple[str, ...]
     problems: tuple[InverseProblem, ...]
     hyper: HyperPrior
-    estimate: Population
     posterior: Draws
     prior: Draws
     sets: Array
+    effective: tuple[float, float]
+    log_evidence: float
+    forward_runs: int
     common: tuple[str, ...] = ()
     theta: Array = field(default_factory=lambda: np.empty((0, 0)))
     belongs: Array = field(default_factory=lambda: np.empty(0))
@@ -74,8 +80,14 @@ class CampaignPopulation:
     left_out: Mapping[str, str] = field(default_factory=dict)
 
     @property
-    def names(self) -> tuple[str, ...]:
-        return self.estimate.names
+    def size(self) -> float:
+        """Number of independent draws behind the result: the variances that both leave add up."""
+        return 1 / (1 / self.effective[0] + 1 / self.effective[1])
+
+    @property
+    def converged(self) -> bool:
+        """True if the result can be trusted: at least 100 effective draws."""
+        return self.size >= FEWEST
 
     @property
     def terms(self) -> tuple[PriorTerm, ...]:
@@ -112,14 +124,14 @@ class CampaignPopulation:
         """Draws as they are where ν and τ are equally likely everywhere, and how many of them count.
 
         From the posterior's draws, weighed; fewer than
-        :data:`~en4dvar.estimation.population.estimate.FEWEST` say that the hyperprior decides.
+        :data:`FEWEST` say that the hyperprior decides.
         """
         d, h = self.posterior, self.hyper
         logs = 0.5 * np.sum((d.nu / h.mean_std) ** 2 + (d.tau / h.spread) ** 2, axis=1)
         weights = np.exp(logs - logs.max())
         taken = resampled(weights / weights.sum(), len(weights), member_stream(seed, "without hyperprior"))
         kept = Draws(*(getattr(d, field.name)[taken] for field in fields(Draws)))
-        return kept, effective_number(weights) / len(weights) * self.estimate.size
+        return kept, effective_number(weights) / len(weights) * self.size
 
     def combinations(self) -> tuple[Combination, ...]:
         """Combinations of the means that the data determine where they do not determine each mean by itself."""
@@ -202,7 +214,7 @@ def population_of(
     hyper: HyperPrior | None = None,
     effort: Effort | None = None,
     tell: Callable[[str], None] = lambda words: None,
-) -> CampaignPopulation:
+) -> Population:
     """The population of ``names`` behind data sets of the same parameters.
 
     Parameters
@@ -249,7 +261,7 @@ def sampled_sets(
 def population_from(
     drawn: Mapping[int, OwnDraws], left_out: Mapping[str, str], start: Sequence[Array],
     campaign: Sequence[InverseProblem], names: Sequence[str], seed: int, scales: HyperPrior, effort: Effort,
-) -> CampaignPopulation:  # fmt: skip
+) -> Population:  # fmt: skip
     """The population of the data sets that could be sampled."""
     problems = tuple(campaign[s] for s in drawn)
     terms, columns = terms_of(problems, names), problems[0].prior.names
@@ -257,23 +269,21 @@ def population_from(
     varying, shared = [columns.index(name) for name in names], [columns.index(name) for name in common]
     sets = [problem.observations.name for problem in problems]
     likelihoods = own_likelihoods(list(drawn.values()), varying, shared, seed, sets)
-    white = white_prior(names)
-    estimated = Hierarchy(likelihoods, white, scales).sampled(seed, effort)
+    estimated = Hierarchy(likelihoods, scales).sampled(seed, effort)
     stream = member_stream(seed, "hyperprior")
     nu, tau = stream.standard_normal(estimated.nu.shape), np.abs(stream.standard_normal(estimated.nu.shape))
     z = _sets(estimated, list(drawn.values()), likelihoods, varying, shared, member_stream(seed, "sets given all"))
-    evidence = estimated.log_evidence + sum(draws.log_evidence for draws in drawn.values())
-    runs = sum(draws.forward_runs for draws in drawn.values())
-    sizes = estimated.effective, float(sum(draws.effective for draws in drawn.values()))
-    estimate = Population(tuple(names), white, estimated.nu, estimated.tau, z, sizes, evidence, runs)
     physical = [entry.prior.to_physical(entry.prior.from_white(z[:, s])) for s, entry in enumerate(problems)]
-    return CampaignPopulation(
+    return Population(
+        names=tuple(names),
         problems=problems,
         hyper=scales,
-        estimate=estimate,
         posterior=_draws(terms, estimated.nu, estimated.tau, member_stream(seed, "next")),
         prior=_draws(terms, scales.mean_std * nu, scales.spread * tau, stream),
         sets=np.stack(physical, axis=1),
+        effective=(estimated.effective, float(sum(draws.effective for draws in drawn.values()))),
+        log_evidence=estimated.log_evidence + sum(draws.log_evidence for draws in drawn.values()),
+        forward_runs=sum(draws.forward_runs for draws in drawn.values()),
         common=common,
         theta=estimated.theta,
         belongs=estimated.belongs,
@@ -310,9 +320,23 @@ def _sets(
     return z
 
 
-def white_prior(names: Sequence[str]) -> Prior:
-    """N(0, I) of parameters with these names."""
-    return Prior(tuple(PriorTerm.normal(Parameter(name, "1"), 0.0, 1.0) for name in names))
+def moments(terms: Sequence[PriorTerm], nu: Array, tau: Array) -> tuple[Array, Array]:
+    """Physical mean and standard deviation (M, p) of parameters whose coordinates are N(ν, τ²), (M, p) each.
+
+    In closed form for normal and lognormal ones, else by Gauss–Hermite quadrature.
+    """
+    mean, std = nu.copy(), tau.copy()
+    nodes, weights = np.polynomial.hermite_e.hermegauss(NODES)
+    weights = weights / weights.sum()
+    for j, term in enumerate(terms):
+        if term.transform == "lognormal":
+            mean[:, j] = np.exp(nu[:, j] + tau[:, j] ** 2 / 2)
+            std[:, j] = mean[:, j] * np.sqrt(np.expm1(tau[:, j] ** 2))
+        elif term.transform != "normal":
+            values = term.to_physical(nu[:, j, None] + tau[:, j, None] * nodes)
+            mean[:, j] = values @ weights
+            std[:, j] = np.sqrt((values - mean[:, j, None]) ** 2 @ weights)
+    return mean, std
 
 
 def _draws(terms: Sequence[PriorTerm], nu: Array, tau: Array, stream: np.random.Generator) -> Draws:

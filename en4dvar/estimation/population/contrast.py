@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
-from en4dvar.estimation.population.estimate import FEWEST
+from en4dvar.estimation.population.campaign import FEWEST
 from en4dvar.model.state import Array
 from en4dvar.priors.prior import member_stream
 from en4dvar.sampling.mixture import effective_number, resampled

@@ -33,7 +33,7 @@ from en4dvar.estimation.population.mixtures import Mixture, condition, draw_cond
 from en4dvar.estimation.population.own import OwnLikelihood
 from en4dvar.model.state import Array
 from en4dvar.plumbing.compiled import kernel
-from en4dvar.priors.prior import Prior, member_stream
+from en4dvar.priors.prior import member_stream
 from en4dvar.sampling.mixture import StudentMixture, effective_number, resampled
 from en4dvar.sampling.walkers import walked
 
@@ -73,12 +73,12 @@ class HierarchyDraws:
 
 
 class Hierarchy:
-    """The posterior density of h = (ν, ln τ, θ); ``prior`` is N(0, I) of the p parameters that vary."""
+    """The posterior density of h = (ν, ln τ, θ)."""
 
-    def __init__(self, likelihoods: Sequence[OwnLikelihood], prior: Prior, scales: HyperPrior):
+    def __init__(self, likelihoods: Sequence[OwnLikelihood], scales: HyperPrior):
         self.likelihoods, odd = likelihoods, scales.odd
         self.p, self.c = likelihoods[0].slopes.shape
-        self.hyper = Hyper(prior, list(range(self.p)), scales)
+        self.hyper = Hyper(self.p, scales)
         self.shares = np.array([1 - odd, odd / 2, *[odd / 2 / self.p] * self.p])[: None if odd else 1]
         self.wider = scales.mean_std**2 * np.vstack([np.zeros((2, self.p)), np.eye(self.p)])
 
@@ -93,7 +93,7 @@ class Hierarchy:
             middle = mean - theta @ likelihood.slopes.T
             for k in range(len(self.shares)):
                 if k != 1:
-                    parts[:, s, k] = log_marginal([likelihood.mixture], middle, variance + self.wider[k])
+                    parts[:, s, k] = log_marginal(likelihood.mixture, middle, variance + self.wider[k])
         return np.asarray(parts + np.log(self.shares))
 
     def log_density(self, h: Array) -> Array:

@@ -9,17 +9,13 @@ weights know what it is worth.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 from annotated_types import Ge, Gt, Lt
 
-from en4dvar.estimation.population.mixtures import Mixture, log_marginal
 from en4dvar.model.state import Array
-from en4dvar.priors.prior import Prior
-from en4dvar.sampling.walkers import walked
 
 SPREADS = (1e-3, 10.0)  # of τ; smaller ones are indistinguishable, and lost to rounding in the marginals
 
@@ -40,44 +36,26 @@ class HyperPrior:
 
 
 class Hyper:
-    """The hyperprior over h = (ν, ln τ) of the coordinates ``where``; the others keep their prior."""
+    """The hyperprior over h = (ν, ln τ) of p coordinates."""
 
-    def __init__(self, prior: Prior, where: list[int], scales: HyperPrior):
-        self.prior, self.where, self.scales = prior, where, scales
-        self.start, p = prior.mean[where], len(where)
+    def __init__(self, p: int, scales: HyperPrior):
+        self.p, self.scales = p, scales
         self.constant = -p * (0.5 * math.log(2 * math.pi) + math.log(scales.mean_std))
         self.constant += p * (0.5 * math.log(2 / math.pi) - math.log(scales.spread))
 
     def population(self, h: Array) -> tuple[Array, Array]:
-        """Mean and variance (B, n) of x given h (B, 2p)."""
-        p = len(self.where)
-        mean = np.tile(self.prior.mean, (len(h), 1))
-        variance = np.tile(self.prior.std**2, (len(h), 1))
-        mean[:, self.where], variance[:, self.where] = h[:, :p], np.exp(2 * h[:, p:])
-        return mean, variance
+        """Mean and variance (B, p) of x given h (B, 2p)."""
+        return h[:, : self.p], np.exp(2 * h[:, self.p :])
 
     def log_density(self, h: Array) -> Array:
         """(B,), normalised; −inf where a spread is out of bounds."""
-        p = len(self.where)
-        logs = -0.5 * np.sum(((h[:, :p] - self.start) / self.scales.mean_std) ** 2, axis=1)
-        logs += np.sum(h[:, p:] - 0.5 * np.exp(2 * h[:, p:]) / self.scales.spread**2, axis=1)
-        inside = np.all((h[:, p:] > math.log(SPREADS[0])) & (h[:, p:] < math.log(SPREADS[1])), axis=1)
+        nu, log_tau = h[:, : self.p], h[:, self.p :]
+        logs = -0.5 * np.sum((nu / self.scales.mean_std) ** 2, axis=1)
+        logs += np.sum(log_tau - 0.5 * np.exp(2 * log_tau) / self.scales.spread**2, axis=1)
+        inside = np.all((log_tau > math.log(SPREADS[0])) & (log_tau < math.log(SPREADS[1])), axis=1)
         return np.where(inside, logs + self.constant, -np.inf)
 
     def scattered(self, count: int, stream: np.random.Generator) -> Array:
         """(count, 2p) somewhere in the bulk of the hyperprior."""
-        p = len(self.where)
-        nu = self.start + 0.5 * self.scales.mean_std * stream.standard_normal((count, p))
-        return np.hstack([nu, math.log(0.6 * self.scales.spread) + 0.5 * stream.standard_normal((count, p))])
-
-
-def walk(hyper: Hyper, mixtures: Sequence[Mixture], stream: np.random.Generator, walkers: int, rounds: int) -> Array:
-    """(D, 2p) positions of walkers on p(h | mixtures), the first third left out."""
-
-    def cost(h: Array) -> Array:
-        logs = hyper.log_density(h)
-        inside = np.isfinite(logs)
-        logs[inside] += log_marginal(mixtures, *hyper.population(h[inside]))
-        return np.where(np.isnan(logs), np.inf, -logs)
-
-    return walked(cost, hyper.scattered(walkers, stream), stream, rounds, rounds // 3)
+        nu = 0.5 * self.scales.mean_std * stream.standard_normal((count, self.p))
+        return np.hstack([nu, math.log(0.6 * self.scales.spread) + 0.5 * stream.standard_normal((count, self.p))])

@@ -35,7 +35,7 @@ from en4dvar.sampling.emulated_draws import RecordedRuns
 from en4dvar.sampling.mixture import fit_gaussians, resampled
 from en4dvar.sampling.modes import sample_modes
 
-ENOUGH = 200.0  # effective draws that are asked for: they know a mean to 7 % of its std
+ENOUGH = 500.0  # effective draws that are asked for: they know a mean to 4 % of its std
 NARROWEST = 0.03  # standard deviation of the first draws about members, in units of the prior's
 KEPT = 2000  # equally likely draws of each data set
 MOST_PARTS, ROUNDS = 4, 60  # components of a mixture; rounds of expectation maximisation
@@ -124,7 +124,7 @@ def own_likelihoods(
 def _likelihood(adjusted: Array, slopes: Array, effective: float, stream: np.random.Generator) -> OwnLikelihood:
     share, centre, covariance = _fitted(adjusted, effective, stream)
     std = np.sqrt(1 + np.sum(slopes**2, axis=1))
-    return OwnLikelihood(Mixture.divided(centre, covariance, np.log(share), np.zeros(len(std)), std), slopes, adjusted)
+    return OwnLikelihood(Mixture.divided(centre, covariance, np.log(share), std), slopes, adjusted)
 
 
 def _slopes(x: Array, theta: Array, effective: float) -> tuple[Array, Array]:

@@ -15,7 +15,7 @@ from en4dvar_agarose.fits import probability
 
 FOLDER = Path(__file__).parent
 POPULATION_HEAD = ["gel", "seed", "parameter", "low", "median", "high", "true_mean", "mean_of_truths", "stacked_mean"]
-POPULATION_HEAD += ["weighed_emulators", "weighed_runs", "effective"]
+POPULATION_HEAD += ["effective_hierarchy", "effective_sets", "effective"]
 RELIABILITY_HEAD = ["experiment", "number", "generated_by", "delta_log_evidence"]
 
 LEVEL, FIRST = 0.95, 20  # of the intervals; campaigns that the criterion asks for

@@ -12,7 +12,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from en4dvar.estimation.population.estimate import FEWEST_SETS
+from en4dvar.estimation.population.campaign import FEWEST_SETS
 from en4dvar.model.state import READING_SCALE
 from en4dvar.plumbing.units import parse_quantity
 from en4dvar_bubble.media import MEDIA, known_medium
