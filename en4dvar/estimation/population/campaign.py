@@ -9,8 +9,9 @@ population enters the hierarchy (:mod:`~en4dvar.estimation.population.hierarchy`
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 import scipy  # its trees where they are used: a twentieth of what every command imports
@@ -34,6 +35,7 @@ IN_IT = 0.2  # of the largest exponent: a parameter that is part of a combinatio
 HALF_NORMAL_VARIANCE = 1 - 2 / np.pi
 FEWEST_SETS = 3  # with fewer nothing is known of a spread
 FEWEST = 100.0  # effective draws of a result that can be trusted
+REACH = 1.5  # prior standard deviations: a hyperprior of mean and spread that reaches further needs draws that do
 NODES = 24  # of the quadrature
 NEAR = 5  # draws of a data set among which one is chosen for what is its own
 
@@ -221,7 +223,9 @@ def population_of(
     ----------
     start: of each data set control vectors (N_i, n) near its posterior, in white coordinates of its prior.
     kept: of each data set draws of its posterior, None where there are none; it is then sampled.
-    hyper: in units of the prior's standard deviations. tell: called with a line about each data set.
+    hyper: in units of the prior's standard deviations. One that is much wider than the prior reaches where draws of
+        the posterior do not: data sets are then sampled anew, with a prior as wide.
+    tell: called with a line about each data set.
 
     Raises
     ------
@@ -231,9 +235,27 @@ def population_of(
     if len(problems) < FEWEST_SETS:
         raise ConfigError(f"a population needs at least {FEWEST_SETS} data sets")
     require_population(problems, names)
+    hyper, effort = hyper or HyperPrior(), effort or Effort()
+    if (factor := math.hypot(hyper.mean_std, hyper.spread)) > REACH:
+        tell(f"data sets are sampled with a prior {factor:.2g} times as wide, which is what the hyperprior allows")
+        wide = [_wider(problem, names, factor) for problem in problems]
+        at = [w.prior.white(p.prior.from_white(z)) for w, p, z in zip(wide, problems, start, strict=True)]
+        scaled = replace(hyper, mean_std=hyper.mean_std / factor, spread=hyper.spread / factor)
+        result = population_of(wide, at, names, seed, executor=executor, hyper=scaled, effort=effort, tell=tell)
+        sampled = tuple(p for p in problems if p.observations.name not in result.left_out)
+        posterior, prior = (
+            replace(draws, nu=factor * draws.nu, tau=factor * draws.tau) for draws in (result.posterior, result.prior)
+        )
+        return replace(result, problems=sampled, hyper=hyper, posterior=posterior, prior=prior)
     with one_blas_thread():
         drawn, left_out = sampled_sets(problems, start, seed, executor, tell, kept)
-        return population_from(drawn, left_out, start, problems, names, seed, hyper or HyperPrior(), effort or Effort())
+        return population_from(drawn, left_out, start, problems, names, seed, hyper, effort)
+
+
+def _wider(problem: InverseProblem, names: Sequence[str], factor: float) -> InverseProblem:
+    """With so many times the standard deviation of the transformed parameters ``names``."""
+    terms = (replace(t, std=factor * t.std) if t.parameter.name in names else t for t in problem.prior.terms)
+    return replace(problem, prior=problem.prior.of(tuple(terms)))
 
 
 def sampled_sets(
