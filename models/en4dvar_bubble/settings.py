@@ -180,8 +180,8 @@ class BubbleSettings(Section):
     """Nodes in the conducting medium; default: those of ``accuracy``."""
     rtol: Annotated[float, Field(ge=1e-11, le=1e-2)] | None = None
     """Relative tolerance of a time step; default: that of ``accuracy``."""
-    step_limit: Annotated[int, Field(ge=100)] = Accuracy.step_limit
-    """A member that needs more time steps has failed."""
+    step_limit: Annotated[int, Field(ge=100)] | None = None
+    """A member that needs more time steps, or three tenths of them for a hundredth of the span, has failed."""
     time_limit: Annotated[float, Quantity("s"), Field(gt=0)] = Accuracy.time_limit
     """A member that computes for longer has failed."""
     mach_limit: Annotated[float, Field(gt=0)] = Accuracy.mach_limit

@@ -9,7 +9,7 @@ import pytest
 
 from en4dvar_bubble import BubbleModel, get_law
 from en4dvar_bubble.solver.driver import preset
-from en4dvar_bubble.solver.integrate import SMEAR
+from en4dvar_bubble.solver.integrate import REJECTED, SMEAR, STEPS
 
 R_MAX = 1.2e-3
 TIMES = np.linspace(1e-6, 480e-6, 240)  # four oscillations
@@ -23,12 +23,12 @@ def water(n=48):
     return {"mu": mu, "R_eq": np.minimum(R_eq, R_MAX / 2), "R_max": np.full(n, R_MAX)}
 
 
-def paths(theta, accuracy=STANDARD):
+def paths(theta, accuracy=STANDARD, times=TIMES):
     model = BubbleModel(
         law=get_law("newtonian"), start="laser", vapour="transport", medium_heat="conducting", accuracy=accuracy
     )
     x = model.initial_states(theta)
-    return model.integrate(x, np.broadcast_to(TIMES, (len(x), len(TIMES))))
+    return model.integrate(x, np.broadcast_to(times, (len(x), len(times))))
 
 
 @pytest.fixture(scope="module")
@@ -71,3 +71,11 @@ def test_no_gas_is_lost(all_physics):
     end = paths(thick)
     assert end.solution.record[0, SMEAR] > 0
     np.testing.assert_allclose(end["R"][0, -1], 12e-6, rtol=0.05)
+
+
+def test_a_member_that_stalls_in_a_collapse_is_let_go():
+    """Its gas at rest would fill 0.3 % of R_max: in its first collapse it takes steps without end."""
+    theta = {"mu": np.array([0.127]), "R_eq": np.array([0.936e-6]), "R_max": np.array([277e-6])}
+    lost = paths(theta, times=TIMES[TIMES < 60e-6]).solution
+    assert lost.reason(0).startswith("step limit reached")
+    assert lost.record[0, STEPS] + lost.record[0, REJECTED] < STANDARD.step_limit / 2

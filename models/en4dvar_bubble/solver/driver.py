@@ -56,8 +56,9 @@ _STRESS_SCALE = 10.0  # µm²/µs², about 0.1 bar: errors of a memory variable 
 class Accuracy:
     """Nodes in the gas (temperature, vapour) and in the medium, relative tolerance of the time steps, and limits.
 
-    ``step_limit`` and ``time_limit`` (seconds of wall clock, and up to 2 more; not those in which the process is
-    suspended) bound the work per member; ``mach_limit`` ends a member whose wall Mach number exceeds it.
+    ``step_limit`` (three tenths of it for a hundredth of the span) and ``time_limit`` (seconds of wall clock, and up to
+    2 more; not those in which the process is suspended) bound the work per member; ``mach_limit`` ends a member whose
+    wall Mach number exceeds it.
     """
 
     nodes: int = 4
@@ -71,7 +72,7 @@ class Accuracy:
 ACCURACIES: dict[AccuracyName, Accuracy] = {
     "fast": Accuracy(nodes=4, rtol=1e-4, medium_nodes=16),
     "standard": Accuracy(nodes=4, rtol=1e-5, medium_nodes=24),
-    "reference": Accuracy(nodes=24, rtol=1e-8, medium_nodes=48),
+    "reference": Accuracy(nodes=24, rtol=1e-8, medium_nodes=48, step_limit=80_000),
 }
 # A released bubble is full of gas that is hot in its core when it bounces, under a thin layer at the wall; the acoustic
 # one has hardly any.

@@ -23,14 +23,16 @@ from en4dvar_bubble.tables import fill_one
 # Status of a member; the reasons users read are made by ``driver.reason``.
 OK, STEP_LIMIT, NON_FINITE, STEP_UNDERFLOW, MACH_LIMIT, TIME_LIMIT, WALL_LIMIT = 0, 1, 2, 3, 4, 5, 6
 # Columns of the per-member record.
-STEPS, REJECTED, MAX_MACH, MAX_THETA, MIN_LOG_R, END_TIME, BEYOND, SMEAR = 0, 1, 2, 3, 4, 5, 6, 7
-RECORD = 8
+STEPS, REJECTED, MAX_MACH, MAX_THETA, MIN_LOG_R, END_TIME, BEYOND, SMEAR, MARK, TO_MARK = 0, 1, 2, 3, 4, 5, 6, 7, 8, 9
+RECORD = 10
 
 _SAFETY, _SHRINK, _GROW = 0.9, 0.15, 6.0
 _LEAST_ROOT = 1e-2 ** (1.0 / rodas5p.ORDER)
 # µs. A bounce may need steps below the spacing of doubles near t: the equations know no other time by then, and the
 # step limit bounds the work.
 _SHORTEST = 1e-18
+# Of the step limit, what a hundredth of the span may take: a member that has stalled in a collapse will not leave it.
+_STALLED, _HUNDREDTH = 0.3, 0.01
 _LEAST_SMEARED, _MOST_SMEARED = 0.001, 0.5  # each time four times the last
 _TURNS_PER_LOOK = 64  # attempted steps between looks at the clock
 # Of ``turn``: how many so far, lanes with a member, whether all are taken, seconds so far, whether the interpolant is
@@ -62,7 +64,7 @@ def _begin(i, lane, shared, lanes):
     for column in range(RECORD):
         out.record[i, column] = 0.0
     out.record[i, MIN_LOG_R] = members.initial[i, n - 1]
-    out.record[i, END_TIME] = start
+    out.record[i, END_TIME] = out.record[i, MARK] = start
     out.record[i, BEYOND] = math.inf
     out.status[i] = OK
     done = 0
@@ -172,6 +174,9 @@ def _accept(lane, shared, lanes, w):
     record = out.record
     record[i, STEPS] += 1
     record[i, END_TIME] = end
+    times = shared.members.times
+    if end - record[i, MARK] > _HUNDREDTH * (times[i, times.shape[1] - 1] - shared.members.start[i]):
+        record[i, MARK], record[i, TO_MARK] = end, record[i, STEPS] + record[i, REJECTED]
     record[i, MAX_MACH] = max(record[i, MAX_MACH], w.norm[2, lane])
     if w.norm[2, lane] > control.valid_mach:
         record[i, BEYOND] = min(record[i, BEYOND], now)
@@ -202,7 +207,8 @@ def _failure(lane, shared, lanes, w):
     if lanes.rejected[lane] == 0.0 and w.norm[2, lane] > control.mach_limit:
         failure = MACH_LIMIT
     record, i = out.record, lanes.member[lane]
-    if record[i, STEPS] + record[i, REJECTED] >= control.step_limit:
+    taken = record[i, STEPS] + record[i, REJECTED]
+    if taken >= control.step_limit or taken - record[i, TO_MARK] >= _STALLED * control.step_limit:
         failure = STEP_LIMIT
     if clock - lanes.began[lane] > control.seconds + 1.0:  # the clock ticks in seconds
         failure = TIME_LIMIT
@@ -244,7 +250,7 @@ def _end_step(shared, lanes, w):
         else:
             _reject(lane, shared, lanes, w)
         failure = _failure(lane, shared, lanes, w)
-        if failure in (NON_FINITE, STEP_UNDERFLOW, STEP_LIMIT) and _again(lane, shared, lanes):
+        if failure in (NON_FINITE, STEP_UNDERFLOW) and _again(lane, shared, lanes):
             continue
         if failure != OK or lanes.observed[lane] == members.times.shape[1]:
             shared.out.status[i] = failure
