@@ -18,13 +18,14 @@ from en4dvar.data.noise import noise_of
 from en4dvar.data.observations import Observations
 from en4dvar.estimation.population import Effort, HyperPrior
 from en4dvar.estimation.population.campaign import Population, population_from
-from en4dvar.estimation.population.own import ENOUGH, KEPT, OwnDraws
+from en4dvar.estimation.population.own import KEPT, OwnDraws
 from en4dvar.model.function_model import FunctionModel
 from en4dvar.model.state import Array, Parameter
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
 
 NAMES, COMMON = ("G", "mu"), ("scale", "rho", "p_inf")
+EFFECTIVE = 200  # independent draws that the posterior of a single run stands for
 LOG_STD = 2.0  # of the priors of G and μ
 LIKE, FREEDOM = 0.1, 3.0  # spread of bubbles of one gel, in units of the prior; degrees of freedom of heavy tails
 ERRORS = (0.03, 0.15)  # of single bubbles: G to 6 to 30 %
@@ -99,7 +100,7 @@ def own_draws_of(y: Array, error: Array, aliased: bool, rng: np.random.Generator
     readings = [y, y - ALIAS] if aliased else [y]
     logs = np.array([-0.5 * r @ np.linalg.solve(S, r) for r in readings])
     share = np.exp(logs - np.logaddexp.reduce(logs))
-    count = int(ENOUGH)
+    count = EFFECTIVE
     means = np.array([gain @ r for r in readings])[rng.choice(len(readings), count, p=share)]
     z = means + rng.multivariate_normal(np.zeros(len(gain)), left, count)
     return OwnDraws(z[rng.integers(count, size=KEPT)], float(np.logaddexp.reduce(logs)), float(count), 0)
