@@ -1,8 +1,8 @@
 """The results that a study has computed so far, on disk, so that one that was killed continues to the same bits.
 
 Kept are the chunks of the sweeps, the draws of each data set and the fits of one gel; what is quick, En4D-Var and the
-populations, is computed again. What
-decides the numbers is kept with them, and a study is continued only where that agrees.
+populations, is computed again. What decides the numbers is kept with them, and a study is continued only where that
+agrees.
 """
 
 import re

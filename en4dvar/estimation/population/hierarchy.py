@@ -15,8 +15,10 @@ With L_i in units of its evidence (:mod:`~en4dvar.estimation.population.own`) th
 
     p(h) Π_i [ (1 − ε) ∫ L_i(x) N(x; ν − B θ, τ²) dx + ε/2 + ε/2p Σ_j … ],
 
-every integral in closed form. Walkers find where it is, and importance weights of draws from a mixture fitted to them
-give independent draws and the evidence.
+every integral in closed form. Walkers find where it is; a mixture of Student t distributions fitted to them is the
+proposal, whose weighted draws are independent and give the evidence (adaptive importance sampling: Cappé et al. 2008,
+Stat. Comput. 18, 447). A walker left behind in a secondary mode moves the proposal a little; the weights know what it
+is worth.
 """
 
 from __future__ import annotations

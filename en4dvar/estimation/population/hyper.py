@@ -1,10 +1,4 @@
-r"""Mean ν and spread τ of a population: what the sets' mixtures say of them, and draws for importance sampling.
-
-h = (ν, ln τ). Walkers on the density with all sets integrated out over their mixtures find where it is; a mixture of
-Student t distributions fitted to them is the proposal q, from which draws are independent (adaptive importance
-sampling: Cappé et al. 2008, Stat. Comput. 18, 447). A walker left behind in a secondary mode moves q a little; the
-weights know what it is worth.
-"""
+"""The hyperprior: what is known beforehand of the mean ν and the spread τ of a population, h = (ν, ln τ)."""
 
 from __future__ import annotations
 
