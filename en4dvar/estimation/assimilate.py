@@ -8,6 +8,7 @@ from functools import partial
 
 import numpy as np
 
+from en4dvar.descent.search import SAME_COST
 from en4dvar.descent.window import Descent
 from en4dvar.diagnosis import diagnostics as diag
 from en4dvar.diagnosis.analysis import Analysis, Progress
@@ -184,9 +185,9 @@ def _without_excuse(stages: Stages) -> Array | None:
     searched = scheme and scheme.searches and scheme.economical(stages.space.basis)
     if not (searched and problem.estimates_discrepancy):
         return None
-    place, runs = _errors_held(stages, problem, problem.prior.mean, from_there=False)
+    held, runs = _errors_held(stages, problem, problem.prior.mean, from_there=False)
     stages.space.forward_runs += runs
-    return place
+    return held.centre if held else None
 
 
 def _fitted(stages: Stages, at: Array, cost: float, changed: InverseProblem) -> Fit | None:
@@ -194,9 +195,11 @@ def _fitted(stages: Stages, at: Array, cost: float, changed: InverseProblem) -> 
     J there is higher than ``cost`` by more than :data:`AS_GOOD`, the lower one of that and what a search from the prior
     finds. None where too few members survive.
 
-    Both first hold the parameters of R, since a large discrepancy would excuse whatever is missed.
+    Both first hold the parameters of R, since a large discrepancy would excuse whatever is missed. Where that leads
+    both to one place, the second is a descent from ``at`` that holds nothing.
     """
     prior, fits, runs = changed.prior, list[Fit](), 0
+    held: Fit | None = None
 
     def descend(place: Array | None) -> None:
         nonlocal runs
@@ -206,19 +209,20 @@ def _fitted(stages: Stages, at: Array, cost: float, changed: InverseProblem) -> 
             fits.append(Fit(prior.from_physical(end.centre), end.iterations[-1].cost, runs))
 
     if stages.minimiser:
-        place, runs = _errors_held(stages, changed, at, from_there=True)
-        descend(at if place is None else place)
+        held, runs = _errors_held(stages, changed, at, from_there=True)
+        descend(held.centre if held else at)
     if not fits or not fits[0].cost < cost + AS_GOOD:
-        place, taken = _errors_held(stages, changed, at, from_there=False)
+        wider, taken = _errors_held(stages, changed, at, from_there=False)
         runs += taken
-        descend(place)
+        again = held is not None and wider is not None and abs(wider.cost - held.cost) < SAME_COST
+        descend(at if again else wider.centre if wider else None)
     best = min(fits, key=lambda fit: fit.cost, default=None)
     return best and replace(best, runs=runs)
 
 
-def _errors_held(stages: Stages, problem: InverseProblem, at: Array, from_there: bool) -> tuple[Array | None, int]:
-    """Where (n,) descents lead that hold the parameters of R as in ``at`` (n,), and start there or look from the prior;
-    None where there is nothing to hold or to descend in, or too few members survive. And forward runs.
+def _errors_held(stages: Stages, problem: InverseProblem, at: Array, from_there: bool) -> tuple[Fit | None, int]:
+    """Where descents lead that hold the parameters of R as in ``at`` (n,), and start there or look from the prior; None
+    where there is nothing to hold or to descend in, or too few members survive. And forward runs.
     """
     prior, values = problem.prior, _named(problem.prior, at)
     errors = {name: x for name, x in values.items() if name in problem.of_errors}
@@ -230,7 +234,8 @@ def _errors_held(stages: Stages, problem: InverseProblem, at: Array, from_there:
     if end is None:
         return None, runs
     values |= dict(zip(others.names, end.centre.tolist(), strict=True))
-    return prior.from_physical(np.array([values[name] for name in prior.names])), runs
+    centre = prior.from_physical(np.array([values[name] for name in prior.names]))
+    return Fit(centre, end.iterations[-1].cost, runs), runs
 
 
 def _named(prior: Prior, x: Array) -> dict[str, float]:

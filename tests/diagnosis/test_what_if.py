@@ -172,6 +172,29 @@ def test_a_large_discrepancy_is_no_excuse_for_what_is_missed_at_the_mode(off):
     np.testing.assert_allclose(problem.prior.to_physical(found.centre)[:2], [1.0, 3.0], rtol=0.01)
 
 
+class Torn(Linear):
+    """A smooth part that vanishes at a = 0, and a rough one that vanishes at a = 1."""
+
+    def curve(self, theta, t):
+        return float(theta[0] * np.cos(2 * t) + 0.15 * (theta[0] - 1) * np.sin(40 * t))
+
+
+def test_where_held_errors_lead_to_one_place_a_descent_that_holds_nothing_starts_at_the_mode():
+    """A discrepancy of the size that is held cannot excuse the smooth part, a larger one does."""
+    problem = make_problem(
+        Torn(("a",)), [1.0], std=0.1, k=60, prior=(PriorTerm.normal(Torn(("a",)).parameters[0], 0.5, 1.0),)
+    )
+    o = problem.observations
+    problem = replace(problem, observations=replace(o, values=o.values - np.cos(2 * o.times)))
+    problem = with_discrepancy(problem, amplitude=(0.02, 2.0), length=(0.6, 0.4))
+    at = problem.prior.from_physical(np.array([1.0, 0.02, 0.6]))
+    settings = AssimilationSettings(members=12, start="prior-mean", starts=1, refine="none")
+    found = _fitted(Stages(problem, settings, 1, SerialExecutor(), None, None), at, 0.0, problem)
+    done = minimize(lambda x: cost(problem, x[None])[0], problem.prior.from_physical(np.array([1.0, 1.0, 0.6])))
+    assert found.cost == pytest.approx(done.fun, abs=0.01)
+    np.testing.assert_allclose(found.centre[0], done.x[0], rtol=0, atol=0.02)
+
+
 def test_parameters_of_errors_alone_are_fitted_again_without_being_held():
     problem = with_discrepancy(make_problem(Linear(("a",)), [1.0]))
     a, *errors = problem.prior.terms
