@@ -5,7 +5,9 @@
 Synthetic recordings as recordings.py makes them, and measured bubbles, each through ``init``; then every assumption of
 the table is put in and J is minimised again, descents from several members of the prior, as a run does before it
 samples. A shift of G or μ agrees if it has the sign of the fit's and lies within 0.3 posterior standard deviations of
-it or a quarter; where both end in different minima, the one with the lower J counts, and the row is listed.
+it or a quarter; where both end in different minima, the one with the lower J counts, and the row is listed. Where
+neither is lower than the other by half a unit of J, a descent from the row's place tells whether the row is of a
+minimum, "one of two"; else it is "apart".
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ import argparse
 import warnings
 from collections import Counter
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -33,25 +36,25 @@ from en4dvar.schemes.settings import AssimilationSettings
 
 NUMBERS = ("G", "mu")
 NEAR, SHARE = 0.3, 0.25  # posterior standard deviations, and of the shift
-SETTINGS = AssimilationSettings(refine="none")  # rows are of modes
+SETTINGS = AssimilationSettings(refine="none", what_if=False)  # rows are of modes
 LOWER = 0.5  # of J, by which one of two minima is the other's better
 
 
-def problem_of(text: str, words: list[str]) -> InverseProblem:
-    """What ``init`` proposes for a file."""
+def problem_of(text: str, words: list[str]) -> InverseProblem | None:
+    """What ``init`` proposes for a file; None where it refuses."""
     with TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "bubble.csv").write_text(text)
         asked = ["--data", str(folder / "bubble.csv"), "--time-unit", "us", "--radius-unit", "um", *words]
         made = CliRunner().invoke(command_line, ["init", *asked, "--out", str(folder / "bubble.yaml")])
         if made.exit_code:
-            raise SystemExit(made.output)
+            return None
         return build(load_config(folder / "bubble.yaml"))[0]
 
 
 def compared(problem: InverseProblem, name: str) -> list[str]:
-    """What became of each row: "agrees", "apart", "elsewhere" (the fit's minimum is lower), "above" (the row's is), or
-    "not told".
+    """What became of each row: "agrees", "one of two", "apart", "elsewhere" (the fit's minimum is lower), "above" (the
+    row's is), or "not told".
     """
     fit, ends = assimilate(problem, AssimilationSettings(), 1), []
     for alternative in problem.alternatives:
@@ -65,8 +68,14 @@ def compared(problem: InverseProblem, name: str) -> list[str]:
         changed = changed_problem(problem, alternative)
         moved = prior_shift(problem, tuple(alternative.parameters.items()))
         terms = tuple(replace(t, mean=t.mean + by) for t, by in zip(changed.prior.terms, moved, strict=True))
-        again = assimilate(replace(changed, prior=Prior(terms)), replace(SETTINGS, what_if=False), 1)
-        ends.append(_beside(problem, fit, again, row.in_std, row.cost_change, f"{name} {row.name}"))
+        changed, beside = replace(changed, prior=Prior(terms)), partial(_beside, problem, fit)
+        again = assimilate(changed, SETTINGS, 1)
+        end = beside(again, row.in_std, row.cost_change, words := f"{name} {row.name}")
+        if end == "apart":
+            start = dict(zip(problem.prior.names, fit.centre + row.change, strict=True))
+            there = assimilate(changed, AssimilationSettings(refine="none", what_if=False, start=start), 1)
+            end = "one of two" if beside(there, row.in_std, row.cost_change, f"{words} from there") == "agrees" else end
+        ends.append(end)
     return ends
 
 
@@ -101,7 +110,8 @@ def main() -> None:
     sets |= {path.stem: (path.read_text(), ["--medium", o.medium]) for path in o.measured}
     counts: Counter[str] = Counter()
     for name, (text, words) in sets.items():
-        counts.update(compared(problem_of(text, words), name))
+        problem = problem_of(text, words)
+        counts.update(compared(problem, name) if problem else ["set refused by init"])
         print(f"{name}: so far {dict(counts)}", flush=True)
 
 

@@ -17,7 +17,7 @@ from en4dvar.data.noise import Kernel, Linearisation, Predicted, RobustDiscrepan
 from en4dvar.data.noise.discrepancy import whitened
 from en4dvar.data.noise.kernel import NUGGET
 from en4dvar.data.noise.robust_discrepancy import _reweighted, solve_boxed
-from en4dvar.data.noise.state_space import ABREAST, boxed, innovations
+from en4dvar.data.noise.state_space import boxed, innovations
 from en4dvar.diagnosis.response.linear import LinearResponse
 from en4dvar.diagnosis.response.what_if import NOWHERE, what_if
 from en4dvar.estimation.assimilate import assimilate, forecast, log_posterior
@@ -46,7 +46,7 @@ CORRELATION = np.exp(-np.abs(np.subtract.outer(TIMES, TIMES)) / 0.3)
 @pytest.mark.parametrize("nu", NU)
 def test_the_filter_is_the_factor_of_the_covariance_for_any_steps_and_any_number_of_runs(nu):
     """Each run has its own length, amplitudes and errors; steps of a camera, with gaps, and of no clock at all."""
-    stream, runs = np.random.default_rng(3), 2 * ABREAST + 5
+    stream, runs = np.random.default_rng(3), 13
     times = np.cumsum([0.1, 0.1, 0.1, 0.3, 0.1, 0.1, 0.2, 0.07, 0.11, 0.1])
     r, errors, a = (
         stream.standard_normal((runs, 10)),

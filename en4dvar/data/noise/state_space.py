@@ -18,6 +18,8 @@ import numpy.typing as npt
 from en4dvar.model.state import Array
 from en4dvar.plumbing.compiled import called, kernel
 
+Indices = npt.NDArray[np.intp]
+
 
 def innovations(residuals: Array, errors: Array, amplitudes: Array, lengths: Array, steps: Array, nu: float) -> Array:
     """v and the diagonal of L (2, B, K) of B runs; NaN where R + A is singular to rounding, as a dense factor would be.
@@ -27,89 +29,42 @@ def innovations(residuals: Array, errors: Array, amplitudes: Array, lengths: Arr
     residuals: (B, K) y − m. errors: (B, K) variances of ε. amplitudes: (B, K) a g.
     lengths: (B,) ℓ. steps: (K − 1,) > 0 between readings. nu: ½, 3/2 or 5/2.
     """
+    d, shrink, which = _different(lengths, steps, nu)
+    r, e, a = (np.ascontiguousarray(part, dtype=float) for part in (residuals, errors, amplitudes))
+    white = np.empty((2, *r.shape))
+    _whiten(int(nu + 0.5), r, e, a, d, shrink, which, white)
+    with np.errstate(all="ignore"):
+        rounding = 4 * r.shape[1] * np.finfo(float).eps * np.square(a).max(axis=1)
+        singular = np.square(white[1]).min(axis=1) < rounding
+    white[:, singular] = np.nan
+    return white
+
+
+def _different(lengths: Array, steps: Array, nu: float) -> tuple[Array, Array, Indices]:
+    """λΔ and e^{−λΔ} (B, U) of each different step, and which of them each step (K − 1,) is."""
     with np.errstate(all="ignore"):
         rates = np.sqrt(2 * nu) / lengths
         least = steps.min(initial=np.inf)  # those of a camera are equal but for rounding
         different, which = np.unique(np.round(steps / least, 12), return_inverse=True)
-        d = np.outer(different * least, rates)
-        shrink = np.exp(-d)
-    r, e, a = (np.ascontiguousarray(part.T, dtype=float) for part in (residuals, errors, amplitudes))
-    white = np.empty((2, *r.shape))
-    _filter(int(nu + 0.5), r, e, a, d, shrink, which, white)
-    with np.errstate(all="ignore"):
-        rounding = 4 * len(r) * np.finfo(float).eps * np.square(a).max(axis=0)
-        singular = np.square(white[1]).min(axis=0) < rounding
-    white[:, :, singular] = np.nan
-    return np.ascontiguousarray(white.transpose(0, 2, 1))
-
-
-ABREAST = 128  # runs that are filtered side by side: the inner loops are over runs, as the vector units like them
+        d = np.outer(rates, different * least)
+        return d, np.exp(-d), which
 
 
 @kernel
-def _filter(
-    order: int,
-    residuals: Array,
-    errors: Array,
-    amplitudes: Array,
-    d: Array,
-    shrink: Array,
-    which: npt.NDArray[np.intp],
+def _whiten(
+    order: int, residuals: Array, errors: Array, amplitudes: Array, d: Array, shrink: Array, which: Indices,
     white: Array,
-) -> None:
-    """``white`` (2, K, B). Runs are last in all arrays; d = λΔ and e^{−d} (U, B) are of each different step, ``which``
-    (K − 1,) says of which each is.
-    """
-    stationary = _stationary(order)
-    move, half = np.empty((order, order, ABREAST)), np.empty((order, order, ABREAST))
-    apart = np.empty((order, order, ABREAST))  # P − P_∞
-    mean, column = np.empty((order, ABREAST)), np.empty((order, ABREAST))
-    count, runs = residuals.shape
-    for first in range(0, runs, ABREAST):
-        n = min(ABREAST, runs - first)
-        some = slice(first, first + n)
-        mean[:], apart[:] = 0.0, 0.0
+) -> None:  # fmt: skip
+    """``white`` (2, B, K) of :func:`innovations`, run by run."""
+    count = residuals.shape[1]
+    force, room, moves = np.full(count, np.nan), np.empty((count, 5)), np.empty((d.shape[1], 9))
+    for run in range(len(residuals)):
+        new, root = white[0, run], white[1, run]
+        _set_transitions(order, d[run], shrink[run], moves)
+        _ahead(order, residuals[run], errors[run], force, amplitudes[run], moves, which, room, new)
         for k in range(count):
-            if k > 0:
-                if k == 1 or which[k - 1] != which[k - 2]:
-                    _set_transitions(order, d[which[k - 1], some], shrink[which[k - 1], some], move)
-                _advance_abreast(order, n, move, mean, apart, column, half)
-            r, e, a = residuals[k, some], errors[k, some], amplitudes[k, some]
-            new, root = white[0, k, some], white[1, k, some]
-            for run in range(n):
-                variance = a[run] * a[run] * (stationary[0, 0] + apart[0, 0, run]) + e[run]
-                root[run] = np.sqrt(variance if variance > 0.0 else np.nan)
-                new[run] = (r[run] - a[run] * mean[0, run]) / root[run]
-            for i in range(order):
-                for run in range(n):
-                    column[i, run] = a[run] * (stationary[i, 0] + apart[i, 0, run]) / root[run]
-            for i in range(order):
-                for run in range(n):
-                    mean[i, run] += column[i, run] * new[run]
-                for j in range(order):
-                    for run in range(n):
-                        apart[i, j, run] -= column[i, run] * column[j, run]
-
-
-@called
-def _advance_abreast(order: int, n: int, move: Array, mean: Array, apart: Array, column: Array, half: Array) -> None:
-    """:func:`_advance` of the first n runs, each by its own ``move``."""
-    for i in range(order):
-        column[i] = 0.0
-        for j in range(order):
-            half[i, j] = 0.0
-            for run in range(n):
-                column[i, run] += move[i, j, run] * mean[j, run]
-            for m in range(order):
-                for run in range(n):
-                    half[i, j, run] += move[i, m, run] * apart[m, j, run]
-    mean[:] = column
-    for i in range(order):
-        for j in range(order):
-            apart[i, j] = 0.0
-            for m in range(order):
-                for run in range(n):
-                    apart[i, j, run] += half[i, m, run] * move[j, m, run]
+            root[k] = 1.0 / np.sqrt(room[k, 4])
+            new[k] *= root[k]
 
 
 def boxed(
@@ -123,55 +78,42 @@ def boxed(
     amplitudes: (B, K) a g. lengths: (B,) ℓ. steps: (K − 1,) > 0 between readings. nu: ½, 3/2 or 5/2. c: threshold.
     """
     mode = np.empty((2, *residuals.shape))
-    with np.errstate(all="ignore"):
-        rates = np.sqrt(2 * nu) / lengths
-    r, s, nuggets, a, rates, steps = (
-        np.ascontiguousarray(part, dtype=float) for part in (residuals, std, own, amplitudes, rates, steps)
-    )
-    _boxed((0.0,) * int(nu + 0.5), r, s, nuggets, a, rates, steps, c, mode)
+    r, s, nuggets, a = (np.ascontiguousarray(part, dtype=float) for part in (residuals, std, own, amplitudes))
+    _boxed(int(nu + 0.5), r, s, nuggets, a, *_different(lengths, steps, nu), c, mode)
     return mode
 
 
-States = tuple[float, ...]  # one number for each state of the process: the compiler knows how many
 SETTLED = 1e-10  # of the slope of J at the end of a step, against that at its begin
 NEWTON, SECANTS = 200, 50  # iterations, and those for the length of a step
 
 
 @kernel
 def _boxed(
-    states: States,
-    residuals: Array,
-    std: Array,
-    own: Array,
-    amplitudes: Array,
-    rates: Array,
-    steps: Array,
-    c: float,
-    mode: Array,
-) -> None:
+    order: int, residuals: Array, std: Array, own: Array, amplitudes: Array, d: Array, shrink: Array, which: Indices,
+    c: float, mode: Array,
+) -> None:  # fmt: skip
     """``mode`` (2, B, K), run by run: Newton's method on which readings are in the tails, each step as long as J falls.
 
     The first step is to the mode of Gaussian errors. J is convex and quadratic in pieces, so that this ends; whole
     steps may go round in circles.
     """
-    order = len(states)
     count = residuals.shape[1]
-    force, at, pull = np.empty(count), np.empty(count), np.empty(count)
-    moves, towards = np.empty((count - 1, order, order)), np.empty((count, order))
-    expected, precision = np.empty(count), np.empty(count)
-    room = np.empty((2 * order + 2, order))
-    for run in range(residuals.shape[0]):
+    force, at, pull, errors = np.empty(count), np.empty(count), np.empty(count), np.empty(count)
+    room, moves = np.empty((count, 5)), np.empty((d.shape[1], 9))
+    for run in range(len(residuals)):
         r, s, nugget, a, u, delta = (
             residuals[run], std[run], own[run], amplitudes[run], mode[0, run], mode[1, run],
         )  # fmt: skip
-        if not np.isfinite(np.sum(r) + np.sum(s) + np.sum(a) + rates[run]):
+        if not np.isfinite(np.sum(r) + np.sum(s) + np.sum(a) + np.sum(d[run])):
             mode[:, run] = np.nan
             continue
-        _set_transitions(order, rates[run] * steps, np.exp(-rates[run] * steps), moves.transpose((1, 2, 0)))
+        _set_transitions(order, d[run], shrink[run], moves)
+        for k in range(count):
+            errors[k] = s[k] * s[k] + nugget[k]
         at[:], pull[:], force[:] = 0.0, 0.0, np.nan
         for _ in range(NEWTON):
-            _ahead(states, r, s, nugget, force, a, moves, u, expected, towards, precision, room)
-            _back(states, nugget, a, moves, u, delta, expected, towards, precision, room)
+            _ahead(order, r, errors, force, a, moves, which, room, u)
+            _back(nugget, a, moves, which, room, u, delta)
             if not _set_force(r, s, delta, c, force):
                 break
             step = _step(r, s, c, at, pull, u, delta)
@@ -230,95 +172,87 @@ def _slope(step: float, r: Array, s: Array, c: float, at: Array, pull: Array, u:
 
 @called
 def _ahead(
-    states: States, r: Array, s: Array, own: Array, force: Array, a: Array, moves: Array, u: Array, expected: Array,
-    towards: Array, precision: Array, room: Array,
+    order: int, r: Array, errors: Array, force: Array, a: Array, moves: Array, which: Indices, room: Array, u: Array
 ) -> None:  # fmt: skip
-    """The filter, for Gaussian errors of standard deviation ``s`` or a constant ``force``, where that is no NaN: a f as
-    ``expected`` (K,) of each reading, what moves the state ``towards`` it (K, order), and ``u``, what is new in it,
-    times its ``precision`` (K,), none of a constant force. ``room`` (2 order + 2, order) to work in.
+    """The filter, for Gaussian errors of variance ``errors`` (K,) or a constant ``force`` (K,), where that is no NaN.
+
+    ``room`` (K, 5) holds of each reading what moves the states towards it, a f as expected of it, and the precision of
+    what is new in it, none of a constant force; ``u`` (K,) is what is new times that. States that a process of lower
+    order does not have stay zero.
     """
-    order = len(states)
-    mean, column, apart, half = room[0], room[1], room[2 : 2 + order], room[2 + order :]
-    stationary = _stationary(order)
-    mean[:], apart[:] = 0.0, 0.0
+    joint = -1.0 / 3.0 if order == 3 else 0.0  # of the first and the third state in P_∞, which is 1 of the first
+    m0 = m1 = m2 = 0.0
+    p00 = p01 = p02 = p11 = p12 = p22 = 0.0  # P − P_∞
     for k in range(len(r)):
         if k > 0:
-            _advance(len(states), moves[k - 1], mean, apart, column, half)
-        expected[k] = a[k] * mean[0]
-        for i in range(order):
-            towards[k, i] = a[k] * (stationary[i, 0] + apart[i, 0])
-        precision[k], u[k] = 0.0, force[k]
-        if np.isnan(force[k]):
-            precision[k] = 1.0 / (max(a[k] * towards[k, 0], 0.0) + s[k] * s[k] + own[k])
-            u[k] = (r[k] - expected[k]) * precision[k]
-        for i in range(order):
-            mean[i] += towards[k, i] * u[k]
-            for j in range(order):
-                apart[i, j] -= towards[k, i] * towards[k, j] * precision[k]
+            f = moves[which[k - 1]]
+            f00, f01, f02, f10, f11, f12, f20, f21, f22 = f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8]
+            m0, m1, m2 = (
+                f00 * m0 + f01 * m1 + f02 * m2, f10 * m0 + f11 * m1 + f12 * m2, f20 * m0 + f21 * m1 + f22 * m2,
+            )  # fmt: skip
+            a0, a1, a2 = (
+                f00 * p00 + f01 * p01 + f02 * p02,
+                f00 * p01 + f01 * p11 + f02 * p12,
+                f00 * p02 + f01 * p12 + f02 * p22,
+            )
+            b0, b1, b2 = (
+                f10 * p00 + f11 * p01 + f12 * p02,
+                f10 * p01 + f11 * p11 + f12 * p12,
+                f10 * p02 + f11 * p12 + f12 * p22,
+            )
+            c0, c1, c2 = (
+                f20 * p00 + f21 * p01 + f22 * p02,
+                f20 * p01 + f21 * p11 + f22 * p12,
+                f20 * p02 + f21 * p12 + f22 * p22,
+            )
+            p00, p01, p02 = (
+                a0 * f00 + a1 * f01 + a2 * f02,
+                a0 * f10 + a1 * f11 + a2 * f12,
+                a0 * f20 + a1 * f21 + a2 * f22,
+            )
+            p11, p12 = b0 * f10 + b1 * f11 + b2 * f12, b0 * f20 + b1 * f21 + b2 * f22
+            p22 = c0 * f20 + c1 * f21 + c2 * f22
+        t0, t1, t2 = a[k] * (1.0 + p00), a[k] * p01, a[k] * (joint + p02)
+        expected, precision, new = a[k] * m0, 0.0, force[k]
+        if np.isnan(new):
+            variance = max(a[k] * t0, 0.0) + errors[k]
+            precision = 1.0 / variance if variance > 0.0 else np.nan
+            new = (r[k] - expected) * precision
+        room[k, 0], room[k, 1], room[k, 2], room[k, 3], room[k, 4], u[k] = t0, t1, t2, expected, precision, new
+        m0, m1, m2 = m0 + t0 * new, m1 + t1 * new, m2 + t2 * new
+        t0, t1, t2, x0, x1, x2 = t0 * precision, t1 * precision, t2 * precision, t0, t1, t2
+        p00, p01, p02 = p00 - t0 * x0, p01 - t0 * x1, p02 - t0 * x2
+        p11, p12, p22 = p11 - t1 * x1, p12 - t1 * x2, p22 - t2 * x2
 
 
 @called
-def _back(
-    states: States, own: Array, a: Array, moves: Array, u: Array, delta: Array, expected: Array, towards: Array,
-    precision: Array, room: Array,
-) -> None:  # fmt: skip
+def _back(own: Array, a: Array, moves: Array, which: Indices, room: Array, u: Array, delta: Array) -> None:
     """The smoother behind :func:`_ahead`: u and δ of the mode."""
-    order, adjoint, column = len(states), room[0], room[1]
-    adjoint[:] = 0.0  # of the state before reading k, once that is reached
+    m0 = m1 = m2 = 0.0  # the adjoint of the state before reading k, once that is reached
     for k in range(len(u) - 1, -1, -1):
         if k < len(u) - 1:
-            column[:] = adjoint
-            for i in range(order):
-                adjoint[i] = 0.0
-                for j in range(order):
-                    adjoint[i] += moves[k, j, i] * column[j]
-        for i in range(order):
-            u[k] -= towards[k, i] * adjoint[i] * precision[k]
-        adjoint[0] += a[k] * u[k]
-        delta[k] = expected[k] + own[k] * u[k]
-        for i in range(order):
-            delta[k] += towards[k, i] * adjoint[i]
-
-
-@called
-def _stationary(order: int) -> Array:
-    """P_∞ of a process of unit variance."""
-    stationary = np.eye(order)
-    if order == 3:
-        stationary[1, 1] = 1.0 / 3.0
-        stationary[0, 2] = stationary[2, 0] = -1.0 / 3.0
-    return stationary
+            f = moves[which[k]]
+            m0, m1, m2 = (
+                f[0] * m0 + f[3] * m1 + f[6] * m2, f[1] * m0 + f[4] * m1 + f[7] * m2, f[2] * m0 + f[5] * m1 + f[8] * m2,
+            )  # fmt: skip
+        t0, t1, t2 = room[k, 0], room[k, 1], room[k, 2]
+        u[k] -= (t0 * m0 + t1 * m1 + t2 * m2) * room[k, 4]
+        m0 += a[k] * u[k]
+        delta[k] = room[k, 3] + own[k] * u[k] + t0 * m0 + t1 * m1 + t2 * m2
 
 
 @called
 def _set_transitions(order: int, d: Array, shrink: Array, moves: Array) -> None:
-    """``moves`` (order, order, ≥ D) of the state over steps d = λΔ (D,), with e^{−d}."""
+    """``moves`` (U, 9), row by row, of the states over steps d = λΔ (U,), with e^{−d}."""
     for i in range(len(d)):
-        x, e, q = d[i], shrink[i], 0.5 * d[i] * d[i]
+        x, e, q, f = d[i], shrink[i], 0.5 * d[i] * d[i], moves[i]
+        f[:] = 0.0
         if order == 1:
-            moves[0, 0, i] = e
+            f[0] = e
         elif order == 2:
-            moves[0, 0, i], moves[0, 1, i] = e * (1 + x), e * x
-            moves[1, 0, i], moves[1, 1, i] = -e * x, e * (1 - x)
+            f[0], f[1] = e * (1 + x), e * x
+            f[3], f[4] = -e * x, e * (1 - x)
         else:
-            moves[0, 0, i], moves[0, 1, i], moves[0, 2, i] = e * (1 + x + q), e * (x + 2 * q), e * q
-            moves[1, 0, i], moves[1, 1, i], moves[1, 2, i] = -e * q, e * (1 + x - 2 * q), e * (x - q)
-            moves[2, 0, i], moves[2, 1, i], moves[2, 2, i] = e * (q - x), e * (2 * q - 3 * x), e * (1 - 2 * x + q)
-
-
-@called
-def _advance(order: int, move: Array, mean: Array, apart: Array, column: Array, half: Array) -> None:
-    """Mean and covariance of the state over a step; ``column`` and ``half`` are room to work in."""
-    for i in range(order):
-        column[i] = 0.0
-        for j in range(order):
-            column[i] += move[i, j] * mean[j]
-            half[i, j] = 0.0
-            for m in range(order):
-                half[i, j] += move[i, m] * apart[m, j]
-    for i in range(order):
-        mean[i] = column[i]
-        for j in range(order):
-            apart[i, j] = 0.0
-            for m in range(order):
-                apart[i, j] += half[i, m] * move[j, m]
+            f[0], f[1], f[2] = e * (1 + x + q), e * (x + 2 * q), e * q
+            f[3], f[4], f[5] = -e * q, e * (1 + x - 2 * q), e * (x - q)
+            f[6], f[7], f[8] = e * (q - x), e * (2 * q - 3 * x), e * (1 - 2 * x + q)
