@@ -1,11 +1,12 @@
 """How far collapses change the gas of measured bubbles: bands of the readings after the window, by ``gas_change``.
 
-    python benchmarks/gas_change.py ../shared/data/bubbles/{stiff_polyacrylamide,paam_alginate,polyacrylamide_1mhz,peg_water}
+    python benchmarks/gas_change.py ../shared/data/bubbles/stiff_polyacrylamide [FOLDER …]    of known names
 
-Each bubble is estimated once, as ``init`` proposes, and its members are run on with each value of ``gas_change``, which
-does not change the estimate. Printed are, of a folder and of all, the share of the readings that lie in their 90 % bands
-and the mean interval score of these bands in per cent of R_max, low where they are narrow and hold the readings: width +
-20 times the distance of a reading from its band (Gneiting & Raftery 2007, J. Am. Stat. Assoc. 102, 359, eq. 43).
+Each bubble is estimated once, as ``init`` proposes, and its members are run on with each value of ``gas_change``,
+which does not change the estimate. Printed are, of each folder and of all, the share of the readings that lie in
+their 90 % bands, and the mean interval score of these in per cent of R_max, low where they are narrow and hold the
+readings: width + 20 times the distance of a reading from its band (Gneiting & Raftery 2007, J. Am. Stat. Assoc. 102,
+359, eq. 43).
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ def bubble(path: Path) -> Callable[[str], Record]:
 
 
 def of_part(withheld: Withheld, count: int | None, largest: float) -> list[float]:
-    """Number of the first ``count`` readings, how many lie in their bands, and the sum of interval scores over R_max."""
+    """Number of the first ``count`` readings, how many are in their bands, and the sum of interval scores over R_max."""
     low, high, y = withheld.low[:count], withheld.high[:count], withheld.values[:count]
     score = high - low + BEYOND * (np.maximum(low - y, 0.0) + np.maximum(y - high, 0.0))
     return [len(y), float(np.sum((low <= y) & (y <= high))), float(np.sum(score)) / largest]
