@@ -62,7 +62,7 @@ def bubble(path: Path) -> Callable[[str], Record]:
 
 
 def of_part(withheld: Withheld, count: int | None, largest: float) -> list[float]:
-    """Number of the first ``count`` readings, how many are in their bands, and the sum of interval scores over R_max."""
+    """Number of the first ``count`` readings, how many are in their bands, and the sum of their scores over R_max."""
     low, high, y = withheld.low[:count], withheld.high[:count], withheld.values[:count]
     score = high - low + BEYOND * (np.maximum(low - y, 0.0) + np.maximum(y - high, 0.0))
     return [len(y), float(np.sum((low <= y) & (y <= high))), float(np.sum(score)) / largest]
