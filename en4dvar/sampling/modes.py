@@ -23,7 +23,8 @@ DRAWS = 400  # of a round
 HEATS = (8.0, 4.0, 2.0, 1.5)  # of the rounds that train an emulator
 LAST_HEAT = 1.15  # of those that judge it: draws reach a little beyond what it says
 TRIED = 4  # such rounds, at most, and
-GOOD = 0.25  # the effective share of one that ends them
+GOOD = 0.25  # the effective share of one that ends them,
+HOPELESS = 0.25  # and that, times the share of the mixture, below which none that follows is good enough
 ENOUGH, MOST_RUNS = 1500.0, 8.0  # effective draws that end the rounds, and runs for each of them
 LAST_RUNS = 30.0  # for each, as long as too few are effective
 CLOSING = (2, 3, 6)  # rounds in which proposals close in, at least: two, and one for three directions, up to six
@@ -146,7 +147,7 @@ def _guided(
     mixture, where these keep a larger share effective; and a mixture about them. False where a draw ends them all.
     """
     start: StudentMixture | EmulatedProposal = mixture
-    share = 0.0
+    share, of_mixture = 0.0, mixed.effective / len(mixed.z)
     for heat in (*HEATS, *(LAST_HEAT,) * TRIED):
         proposal = EmulatedProposal.fitted(runs, start, mixed.stream, heat)
         if proposal is None:
@@ -155,10 +156,10 @@ def _guided(
         if not more(sampler):
             return sampler, proposal.mixture, False
         start, share = proposal, sampler.effective / DRAWS
-        if heat == LAST_HEAT and share >= GOOD:
+        if heat == LAST_HEAT and not HOPELESS * of_mixture <= share < GOOD:
             break
-    final = EmulatedProposal.fitted(runs, start, mixed.stream, LAST_HEAT)
-    if final is None or share * len(mixed.z) < mixed.effective:
+    final = EmulatedProposal.fitted(runs, start, mixed.stream, LAST_HEAT) if share >= of_mixture else None
+    if final is None:
         return mixed, mixture, True
     sampler = FixedDraws(final, mixed.stream, DRAWS)
     return sampler, final.mixture, more(sampler)

@@ -23,12 +23,12 @@ from en4dvar_bubble.starter.look import Look, Start, look, typical
 LAWS: Mapping[Start, str] = {"acoustic": "quadratic-kelvin-voigt", "laser": "neo-hookean-kelvin-voigt"}
 MODEL: Mapping[Start, Mapping[str, str]] = {
     "acoustic": {"gas": "heat"},
-    "laser": {"gas": "heat", "vapour": "transport", "medium_heat": "conducting", "gas_change": "1"},
+    "laser": {"gas": "heat", "vapour": "transport", "medium_heat": "conducting", "gas_change": "0.7"},
 }
 WHY = {
     "heat": "the gas gives heat to the wall",
     "transport": "near R_max there is more vapour than gas; it condenses at the wall, through the gas",
-    "1": "std of ln of what collapses multiply the gas by, for what is expected after the window (docs/physics.md)",
+    "0.7": "std of ln of what collapses multiply the gas by, for what is expected after the window (docs/physics.md)",
     "viscosity_change": "std of ln of its change after the window: viscosity is not all that damps the first collapses",
     "conducting": "the wall warms; with a cold one R_eq comes out wrong (docs/calibration.md)",
 }
