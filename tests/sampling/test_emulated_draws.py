@@ -1,5 +1,7 @@
 """Draws of a posterior that is a thin bent valley, whose moments and evidence one integral tells."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,8 +11,8 @@ from en4dvar.descent.minima import Minimum
 from en4dvar.ensemble.forecast import Forecast
 from en4dvar.model.state import Parameter
 from en4dvar.priors.prior import Prior, PriorTerm
-from en4dvar.sampling.emulated_draws import RecordedRuns
-from en4dvar.sampling.modes import sample_modes
+from en4dvar.sampling.emulated_draws import EmulatedProposal, RecordedRuns
+from en4dvar.sampling.modes import HEATS, LAST_HEAT, TOO_FEW, sample_modes
 
 N, WIDTH = 8, 0.03
 BEND = np.array([0.6, -0.5, 0.4, 0.3])  # of the readings of z_1 to z_4
@@ -103,6 +105,34 @@ class Fading(Valley):
         apart = self.observations.values - BEND * np.exp(z0)[:, None]
         density = np.exp(-(z0**2) / 8 - 0.5 * np.sum(apart**2, axis=1) / (1 + self.width**2))
         return np.interp([0.05, 0.5, 0.95], np.cumsum(density) / density.sum(), z0)
+
+
+class Flipping(Valley):
+    """The same J, of readings less what is predicted that change their signs all the time: no polynomial follows."""
+
+    def __init__(self):
+        super().__init__()
+        self.aim = self.observations.values
+        self.observations = Observations(np.arange(4) + 1.0, np.zeros(4), noise_of(np.full(4, WIDTH)), np.ones(4))
+
+    def run(self, z):
+        outcome = super().run(z)
+        signs = np.sign(np.sin(1000 * z[:, :1]))
+        return replace(outcome, predicted=Predicted(signs * (outcome.predicted.values - self.aim)))
+
+
+def test_an_emulator_that_is_far_behind_the_mixture_is_given_up(monkeypatch):
+    flipping, fitted = Flipping(), []
+    made = EmulatedProposal.fitted
+
+    def counted(*arguments):
+        fitted.append(arguments[-1])
+        return made(*arguments)
+
+    monkeypatch.setattr(EmulatedProposal, "fitted", counted)
+    draws = sample_modes(flipping.recorded, flipping.prior, [Valley().about], 1, 400.0)
+    assert fitted == [*HEATS, LAST_HEAT]
+    assert draws.effective > TOO_FEW
 
 
 @pytest.mark.slow
