@@ -19,15 +19,13 @@ from pathlib import Path
 
 import numpy as np
 from measured_page import GROUPS
-from recordings import PROMINENT, commit
+from recordings import commit, to_the_next_minimum
 from records import Record, fill
-from scipy.signal import peak_widths
 from what_if import problem_of
 
 from en4dvar.diagnosis.withheld import Withheld, predict_withheld
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.executor import SerialExecutor
-from en4dvar.inputs.window import minima
 from en4dvar.schemes.settings import AssimilationSettings
 
 VALUES = (0.0, 0.25, 0.5, 0.6, 0.7, 0.8, 1.0)
@@ -51,11 +49,8 @@ def bubble(path: Path) -> Callable[[str], Record]:
             withheld = predict_withheld(changed, members, SerialExecutor())
             if withheld is None:
                 return {"reason": "too few members can be run so far"}
-            series = np.concatenate([within, withheld.values])
-            ends = minima(series, PROMINENT)
-            begins = peak_widths(-series, ends, rel_height=0.5)[2]
-            after = [int(e) + 1 - len(within) for e, b in zip(ends, begins, strict=True) if b > len(within)]
-            found[str(value)] = [of_part(withheld, count, max(within)) for count in (after[0] if after else 0, None)]
+            count = to_the_next_minimum(within, withheld.values)
+            found[str(value)] = [of_part(withheld, part, max(within)) for part in (count, None)]
         return found
 
     return of

@@ -241,15 +241,20 @@ def _withheld(stats: Any, largest: float) -> tuple[int, float, float] | None:
 def _next(result: Result, largest: float) -> tuple[int, float, float] | None:
     """How many readings follow the window to the next minimum, their share in the 90 % bands, and rms over R_max."""
     lines, within = withheld_lines(result), shown(result.group("observed_data")["radius"])
-    series = np.concatenate([within, [float(str(line[4])) for line in lines]])
-    ends = minima(series, PROMINENT)
-    begins = peak_widths(-series, ends, rel_height=0.5)[2]  # the window ends in the middle of one
-    count = next((int(e) + 1 - len(within) for e, b in zip(ends, begins, strict=True) if b > len(within)), 0)
+    count = to_the_next_minimum(within, np.array([float(str(line[4])) for line in lines]))
     if not count:
         return None
     off = np.array([float(str(line[4])) - float(str(line[6])) for line in lines[:count]])
     share = float(np.mean([line[-1] == 1 for line in lines[:count]]))
     return count, share, float(np.sqrt(np.mean(off**2))) * 1e-6 / largest  # readings are in µm
+
+
+def to_the_next_minimum(within: Array, later: Array) -> int:
+    """How many of the readings after the window there are up to the next minimum; 0 without one."""
+    series = np.concatenate([within, later])
+    ends = minima(series, PROMINENT)
+    begins = peak_widths(-series, ends, rel_height=0.5)[2]  # the window ends in the middle of one
+    return next((int(e) + 1 - len(within) for e, b in zip(ends, begins, strict=True) if b > len(within)), 0)
 
 
 def _posterior(members: Any, row: dict[str, str]) -> Record:

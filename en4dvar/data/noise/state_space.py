@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from en4dvar.model.state import Array
-from en4dvar.plumbing.compiled import called, kernel
+from en4dvar.plumbing.compiled import called, inlined, kernel
 
 Indices = npt.NDArray[np.intp]
 
@@ -170,6 +170,11 @@ def _slope(step: float, r: Array, s: Array, c: float, at: Array, pull: Array, u:
     return slope
 
 
+@inlined
+def _dot(a: tuple[float, float, float], b: tuple[float, float, float]) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
 @called
 def _ahead(
     order: int, r: Array, errors: Array, force: Array, a: Array, moves: Array, which: Indices, room: Array, u: Array
@@ -186,32 +191,14 @@ def _ahead(
     for k in range(len(r)):
         if k > 0:
             f = moves[which[k - 1]]
-            f00, f01, f02, f10, f11, f12, f20, f21, f22 = f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8]
-            m0, m1, m2 = (
-                f00 * m0 + f01 * m1 + f02 * m2, f10 * m0 + f11 * m1 + f12 * m2, f20 * m0 + f21 * m1 + f22 * m2,
-            )  # fmt: skip
-            a0, a1, a2 = (
-                f00 * p00 + f01 * p01 + f02 * p02,
-                f00 * p01 + f01 * p11 + f02 * p12,
-                f00 * p02 + f01 * p12 + f02 * p22,
-            )
-            b0, b1, b2 = (
-                f10 * p00 + f11 * p01 + f12 * p02,
-                f10 * p01 + f11 * p11 + f12 * p12,
-                f10 * p02 + f11 * p12 + f12 * p22,
-            )
-            c0, c1, c2 = (
-                f20 * p00 + f21 * p01 + f22 * p02,
-                f20 * p01 + f21 * p11 + f22 * p12,
-                f20 * p02 + f21 * p12 + f22 * p22,
-            )
-            p00, p01, p02 = (
-                a0 * f00 + a1 * f01 + a2 * f02,
-                a0 * f10 + a1 * f11 + a2 * f12,
-                a0 * f20 + a1 * f21 + a2 * f22,
-            )
-            p11, p12 = b0 * f10 + b1 * f11 + b2 * f12, b0 * f20 + b1 * f21 + b2 * f22
-            p22 = c0 * f20 + c1 * f21 + c2 * f22
+            f0, f1, f2 = (f[0], f[1], f[2]), (f[3], f[4], f[5]), (f[6], f[7], f[8])
+            mean, p0, p1, p2 = (m0, m1, m2), (p00, p01, p02), (p01, p11, p12), (p02, p12, p22)
+            m0, m1, m2 = _dot(f0, mean), _dot(f1, mean), _dot(f2, mean)
+            a0 = _dot(f0, p0), _dot(f0, p1), _dot(f0, p2)
+            a1 = _dot(f1, p0), _dot(f1, p1), _dot(f1, p2)
+            a2 = _dot(f2, p0), _dot(f2, p1), _dot(f2, p2)
+            p00, p01, p02 = _dot(a0, f0), _dot(a0, f1), _dot(a0, f2)
+            p11, p12, p22 = _dot(a1, f1), _dot(a1, f2), _dot(a2, f2)
         t0, t1, t2 = a[k] * (1.0 + p00), a[k] * p01, a[k] * (joint + p02)
         expected, precision, new = a[k] * m0, 0.0, force[k]
         if np.isnan(new):
