@@ -7,7 +7,7 @@
     python benchmarks/joint.py laser --minutes 4    a piece of it: records are kept and the next call goes on
 
 Campaign ``i`` has seed ``i``: shared truths from the prior, and for every bubble its own. Ranks of what is shared and
-of the first bubble's own among the 48 members, as in benchmarks/calibration.py.
+of the first bubble's own among the 48 members, as benchmarks/worlds.py has them.
 """
 
 from __future__ import annotations
@@ -22,10 +22,9 @@ from pathlib import Path
 import numpy as np
 from acoustic_twin import MODEL as DRIVEN
 from acoustic_twin import WIDE, make_twin, prior, read_twin
-from calibration import CENTRAL, experiment, table
 from laser_twin import MODEL, STD, TIMES, laser_prior
 from records import Record, fill
-from worlds import Twin, World
+from worlds import CENTRAL, Twin, World, experiment, table
 
 from en4dvar.data.noise import noise_of
 from en4dvar.data.observations import Observations

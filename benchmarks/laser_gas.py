@@ -24,11 +24,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from calibration import CENTRAL, experiment
 from laser_twin import make_laser_twin, stiff_gel
 from movies import SHARED
 from records import Record, fill
-from worlds import Twin, World
+from worlds import CENTRAL, Twin, World, experiment
 
 import en4dvar
 from en4dvar.ensemble.forecast import forecast

@@ -27,10 +27,9 @@ from typing import Any
 
 import numpy as np
 from acoustic_twin import MODEL, WIDE, make_twin, prior
-from calibration import CENTRAL, experiment
 from laser_twin import make_laser_twin
 from records import Record, fill
-from worlds import Twin, World
+from worlds import CENTRAL, Twin, World, experiment
 
 from en4dvar.config.context import Context
 from en4dvar.config.error import DiscrepancySection

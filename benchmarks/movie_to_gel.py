@@ -6,8 +6,7 @@
 Each experiment goes through files as a user's does: ``film`` writes a TIFF, ``track`` its table, whose columns are the
 errors of the estimate; nothing is told that the movie does not show. Frames of 96 × 96 pixels of 6 µm, an exposure of
 200 ns whose instant is off by a tenth of it and an edge whose level is off in all frames alike, as the table supposes,
-contrast over noise 5 to 25, half of the bubbles with a bright centre, uneven light, dirt. Tables as those of
-calibration.py.
+contrast over noise 5 to 25, half of the bubbles with a bright centre, uneven light, dirt.
 """
 
 from __future__ import annotations
@@ -18,8 +17,8 @@ from collections import Counter
 from pathlib import Path
 
 import numpy as np
-from calibration import table
 from records import Record, fill
+from worlds import table
 
 from en4dvar.assembly.build import build
 from en4dvar.config import load_config
