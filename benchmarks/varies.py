@@ -2,12 +2,13 @@
 
     python benchmarks/varies.py                  60 twins of each kind of truth, about four minutes on one core
     python benchmarks/varies.py --minutes 2      a piece of it: records are kept, the next call goes on
+    python benchmarks/varies.py --knots          one knot, 1.9 µs late or in time: how often does the warning come?
     python benchmarks/varies.py --example PATH   readings of one bubble whose viscosity is halved, as a CSV file
 
 A laser bubble in a neo-Hookean solid with rebounds: truths are drawn from the priors of G, μ, R_eq and R_max, the
 readings have an error of 1.5 µm, the knots lie at ½, 1, 1½ and 2 times the time of the first collapse. The viscosity
 of the truth is drawn from the random walk that the fit assumes (``drawn``), halved at the collapse (``halved``), or
-constant.
+constant. With ``--knots`` it is halved at the collapse, readings have an error of 0.5 µm, and the fit has one knot.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +25,7 @@ from records import Record, fill
 
 from en4dvar.data.noise import noise_of
 from en4dvar.data.observations import Observations
+from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.diagnosis.diagnostics import DECISIVE
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.priors.varying import PiecewiseModel, RandomWalk
@@ -38,6 +41,7 @@ NOISE, STD = 1.5e-6, 0.4  # m; of ln μ, of each change
 KNOTS = np.array([0.5, 1.0, 1.5, 2.0])  # times that of the first collapse
 FINE = np.arange(15e-6, 32e-6, 0.02e-6)
 TRUTHS = ("drawn", "halved", "constant")
+KNOT_AT, EXACT, OFF = {"1.9 us late": 1.9e-6, "in time": 0.0}, 0.5e-6, 2.0  # s after the collapse; m; of z
 SETTINGS = AssimilationSettings(emulator="off", what_if=False)
 
 
@@ -55,22 +59,34 @@ def readings(theta: Mapping[str, np.ndarray], walk: RandomWalk, noise: float, rn
     return path["R"] + noise * rng.standard_normal(len(TIMES))
 
 
+def bubble_of(rng: np.random.Generator) -> tuple[dict[str, np.ndarray], float]:
+    """Parameters (1,) drawn from their priors, and the time of the first collapse."""
+    values = PRIOR.to_physical(PRIOR.mean + PRIOR.std * rng.standard_normal(len(PRIOR.terms)))
+    theta = {name: values[[j]] for j, name in enumerate(PRIOR.names)}
+    (path,) = MODEL.trajectories(MODEL.initial_states(theta), FINE)
+    return theta, float(FINE[np.argmin(path["R"])])
+
+
+def fitted(walk: RandomWalk, y: np.ndarray, error: float, what_if: bool, seed: int) -> tuple[Analysis, np.ndarray]:
+    """The analysis, and ln μ of its members, a column a piece."""
+    observations = Observations(
+        TIMES, y, noise_of(np.full(len(TIMES), error), np.zeros(len(TIMES))), np.ones(len(TIMES))
+    )
+    problem = InverseProblem(MODEL, MODEL.observables[0], observations, PRIOR).varied([walk])
+    a = assimilate(problem, replace(SETTINGS, what_if=what_if), seed)
+    return a, np.log(a.pieces(walk, a.posterior))
+
+
 def experiment(key: str) -> Record:
     """Which pieces the bands cover, z-scores of ln μ, and ln of the Bayes factor of a change; of one twin."""
     truth, seed = key.split()
     rng = np.random.default_rng([int(seed), TRUTHS.index(truth)])
-    values = PRIOR.to_physical(PRIOR.mean + PRIOR.std * rng.standard_normal(len(PRIOR.terms)))
-    theta = {name: values[[j]] for j, name in enumerate(PRIOR.names)}
-    (path,) = MODEL.trajectories(MODEL.initial_states(theta), FINE)
-    collapse = float(FINE[np.argmin(path["R"])])
+    theta, collapse = bubble_of(rng)
     walk = RandomWalk.of(MODEL, PRIOR.terms[1], tuple(collapse * KNOTS), STD)
     changes = changes_of(truth, rng)
     theta |= {f"mu_change_{k}": np.array([change]) for k, change in enumerate(changes, 1)}
-    noise = noise_of(np.full(len(TIMES), NOISE), np.zeros(len(TIMES)))
-    observations = Observations(TIMES, readings(theta, walk, NOISE, rng), noise, np.ones(len(TIMES)))
-    problem = InverseProblem(MODEL, MODEL.observables[0], observations, PRIOR).varied([walk])
-    a = assimilate(problem, SETTINGS, int(seed))
-    true, pieces = np.log(walk.pieces(theta)[0]), np.log(a.pieces(walk, a.posterior))
+    a, pieces = fitted(walk, readings(theta, walk, NOISE, rng), NOISE, False, int(seed))
+    true = np.log(walk.pieces(theta)[0])
     low, high = np.quantile(pieces, (0.05, 0.95), axis=0)
     return {
         "covered": ((low <= true) & (true <= high)).tolist(),
@@ -80,6 +96,29 @@ def experiment(key: str) -> Record:
         "warned": bool(a.cautions),
         "runs": a.forward_runs,
     }
+
+
+def with_one_knot(key: str) -> Record:
+    """How far ln μ of the pieces is from its truth, in standard deviations, and what is warned of; of one twin."""
+    late, seed = key.rsplit(" ", 1)
+    rng = np.random.default_rng([int(seed), 77])
+    theta, collapse = bubble_of(rng)
+    theta |= {"mu_change_1": np.array([-math.log(2)])}
+    true = RandomWalk.of(MODEL, PRIOR.terms[1], (collapse,), STD)
+    walk = RandomWalk.of(MODEL, PRIOR.terms[1], (collapse + KNOT_AT[late],), STD)
+    a, pieces = fitted(walk, readings(theta, true, EXACT, rng), EXACT, True, int(seed))
+    z = (pieces.mean(axis=0) - np.log(true.pieces(theta)[0])) / pieces.std(axis=0, ddof=1)
+    return {"z": z.tolist(), "warned": [c.code for c in a.cautions]}
+
+
+def knots_table(found: Mapping[str, Record]) -> None:
+    """Print, for knots late and in time, how many twins are off, and who of them is warned of missed knots."""
+    print(f"| the knot | twins | off by {OFF:g} std and more | missed-knots, of these | of the others |\n{'|---' * 5}|")
+    for late in KNOT_AT:
+        records = [record for key, record in found.items() if key.startswith(late)]
+        off = np.array([np.max(np.abs(r["z"])) >= OFF for r in records])
+        told = np.array(["missed-knots" in r["warned"] for r in records])
+        print(f"| {late} | {len(off)} | {off.sum()} | {(told & off).sum()} | {(told & ~off).sum()} of {(~off).sum()} |")
 
 
 def write_example(path: Path) -> None:
@@ -103,11 +142,18 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=np.inf, help="start no twin after so long")
     parser.add_argument("--records", type=Path, default=Path("runs/varies"), help="folder of the records")
     parser.add_argument("--example", type=Path, help="write readings of one twin to this file, and nothing else")
+    parser.add_argument("--knots", action="store_true", help="one knot, late or in time")
+    parser.add_argument("--start", type=int, default=0, help="first twin")
     options = parser.parse_args()
     if options.example:
         write_example(options.example)
         return
-    keys = [f"{truth} {seed}" for seed in range(options.n) for truth in TRUTHS]
+    seeds = range(options.start, options.start + options.n)
+    if options.knots:
+        keys = [f"{late} {seed}" for seed in seeds for late in KNOT_AT]
+        knots_table(fill(options.records / "knots.jsonl", keys, with_one_knot, options.minutes))
+        return
+    keys = [f"{truth} {seed}" for seed in seeds for truth in TRUTHS]
     found = fill(options.records / "twins.jsonl", keys, experiment, options.minutes)
     print("| truth | twins | pieces covered by 5–95 % | by piece | z mean, std | change reported | constant reported |")
     print("|---|---|---|---|---|---|---|")

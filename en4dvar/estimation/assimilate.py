@@ -35,6 +35,7 @@ __all__ = ["LoopState", "assimilate", "cost", "forecast", "log_posterior"]
 
 AS_GOOD = 0.5  # of J above that of the problem itself: the data allow the change as well
 INTERVALS = 2.0  # between readings, by which knots are shifted
+HINT, FAR = 3.0, 2.0  # ratio of evidences, and standard deviations that a parameter moves: knots that seem to be missed
 
 
 def assimilate(
@@ -115,7 +116,7 @@ def _through(stages: Stages, resume: LoopState | None) -> Analysis:
     if counting:
         weights = np.array([mode.weight for mode in analysis.modes])
         cautions = (*cautions, *mode_cautions(prior, counting, weights, agree, sampled.refined))
-    cautions = (*cautions, *_missed_knots(stages, analysis.log_evidence))
+    cautions = (*cautions, *_missed_knots(stages, analysis))
     analysis = replace(analysis, cautions=examine(analysis, control, outcome.descent.worst_loss, cautions))
     analysis = replace(analysis, forward_runs=space.forward_runs)
     if stages.settings.what_if == "added":  # last, since what is examined is the posterior of the data
@@ -270,24 +271,30 @@ def _alone(stages: Stages, problem: InverseProblem, settings: AssimilationSettin
     return end, other.space.forward_runs
 
 
-def _missed_knots(stages: Stages, log_evidence: float) -> tuple[Caution, ...]:
+def _missed_knots(stages: Stages, analysis: Analysis) -> tuple[Caution, ...]:
     """A warning where the data speak for all knots earlier, or later, by :data:`INTERVALS` between readings.
 
     A change that lies within a piece shifts the pieces beside it by many of their standard deviations, and the linear
-    response to a knot from there does not show it: each shift is fitted anew.
+    response to a knot from there does not show it: each shift is fitted anew. Where it leads :data:`FAR` away, a hint
+    is enough for the warning.
     """
-    problem, model = stages.problem, stages.problem.model
+    problem, model, prior = stages.problem, stages.problem.model, stages.problem.prior
     if not (stages.compares and stages.settings.what_if and isinstance(model, PiecewiseModel)):
         return ()
     by = INTERVALS * float(np.median(np.diff(np.unique(problem.observations.times[problem.observations.used]))))
-    gains = {}
+    here, said = prior.from_physical(analysis.posterior), []
     for shift in (-by, by):
         moved = [replace(varied, knots=tuple(t + shift for t in varied.knots)) for varied in model.varying]
-        if min(varied.knots[0] for varied in moved) > 0:
-            beside = replace(problem, model=PiecewiseModel(model.model, moved))
-            gains[shift] = _log_evidence(stages, beside) - log_evidence
-    best = max(gains, key=lambda shift: np.nan_to_num(gains[shift], nan=-np.inf), default=0.0)
-    if not gains or not gains[best] > math.log(diag.DECISIVE):
-        return ()
-    where = f"{clock(model, abs(best))} {'earlier' if best < 0 else 'later'}"
-    return (caution("missed-knots", f"the data speak for knots {where} (log evidence {gains[best]:+.1f})"),)
+        if min(varied.knots[0] for varied in moved) <= 0:
+            continue
+        there, runs = _alone(stages, replace(problem, model=PiecewiseModel(model.model, moved)), stages.settings)
+        stages.space.forward_runs += runs
+        if there is None:
+            continue
+        gain = there.log_evidence - analysis.log_evidence
+        way = np.abs(prior.from_physical(there.posterior).mean(axis=0) - here.mean(axis=0)) / here.std(axis=0, ddof=1)
+        if gain > math.log(diag.DECISIVE) or (gain > math.log(HINT) and np.max(way) > FAR):
+            where = f"{clock(model, by)} {'earlier' if shift < 0 else 'later'} (log evidence {gain:+.1f})"
+            name = prior.parameters[int(np.argmax(way))].name
+            said.append((gain, f"{where}, where {name} is {np.max(way):.1f} standard deviations from here"))
+    return (caution("missed-knots", f"the data speak for knots {max(said)[1]}"),) if said else ()

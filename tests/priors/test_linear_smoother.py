@@ -102,6 +102,18 @@ def test_knots_that_miss_the_change(knot, where):
     np.testing.assert_array_equal(quiet.posterior, a.posterior)
 
 
+def test_a_hint_is_enough_where_knots_elsewhere_change_the_answer():
+    """The rate is halved at 1 s: half a second earlier it is three standard deviations from that of a knot at 1.6 s,
+    though the ratio of evidences is seven.
+    """
+    p = problem((1.2, 0.6, 0.6, 0.6), knots=(1.6,))
+    a = assimilate(p, replace(SETTINGS, what_if=True), 1)
+    (mean, *_), (there, *_) = ([m[1] for m, _ in smoother(p.observations.values, Q, knots=(k,))[0]] for k in (1.6, 1.1))
+    far = abs(there - mean) / a.posterior[:, 0].std(ddof=1)
+    (said,) = (str(c) for c in a.cautions if c.code == "missed-knots")
+    assert f"0.5 s earlier (log evidence +2.0), where r is {far:.1f} standard deviations" in said
+
+
 @pytest.mark.parametrize("walks", [True, False])
 def test_the_state_may_change_as_well(walks):
     """Weak constraint: a model error of y at the knots, with and without a rate that walks."""
