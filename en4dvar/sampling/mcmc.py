@@ -23,9 +23,9 @@ from typing import Any
 import numpy as np
 
 from en4dvar.diagnosis.analysis import ChainRecord
-from en4dvar.ensemble.linalg import with_moments
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import En4dvarError
+from en4dvar.sampling.alike import LEAST, POOL, standing_for
 from en4dvar.sampling.mixture import StudentMixture
 from en4dvar.sampling.walkers import Emulated, advance
 
@@ -66,14 +66,16 @@ class Chain:
     def thin(self, n_members: int, exact: bool = False) -> Array:
         """(N, n) draws, evenly spaced over the chain, walkers in turn.
 
-        ``exact``: mapped linearly so that their mean and covariance are those of the whole chain.
+        ``exact``: nearly of the moments and quantiles of the whole chain, see :mod:`~en4dvar.sampling.alike`.
         """
-        steps, walkers, n = self.samples.shape
-        index = np.arange(n_members)
-        draws = self.samples[steps - 1 - (index * steps) // n_members, index % walkers]
-        if not exact or n_members <= n:
-            return np.asarray(draws)
-        return with_moments(draws, self.flat.mean(axis=0), np.cov(self.flat.T))
+        steps, walkers, _ = self.samples.shape
+        count = max(POOL * n_members, LEAST) if exact else n_members
+        index = np.arange(count)
+        draws = np.asarray(self.samples[steps - 1 - (index * steps) // count, index % walkers])
+        if not exact:
+            return draws
+        alike, every = np.zeros(count, dtype=np.intp), np.arange(n_members) * count // n_members
+        return standing_for(draws, alike, every, self.flat.mean(axis=0), np.cov(self.flat.T))
 
     def warning(self) -> str:
         """Words for a chain that has not mixed."""

@@ -12,9 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from en4dvar.descent.minima import Minimum
-from en4dvar.ensemble.linalg import with_moments
 from en4dvar.model.state import Array
 from en4dvar.priors.prior import Prior, member_stream
+from en4dvar.sampling.alike import LEAST, POOL, standing_for
 from en4dvar.sampling.emulated_draws import EmulatedProposal, RecordedRuns
 from en4dvar.sampling.importance import ClosingDraws, FixedDraws, Importance
 from en4dvar.sampling.mixture import StudentMixture, effective_number, resampled
@@ -76,14 +76,15 @@ class WeightedDraws:
     def members(self, count: int, stream: np.random.Generator, exact: bool) -> Array:
         """(N, n) equally likely ones, of every mode as many as its weight says, to one.
 
-        ``exact``: mapped linearly so that their mean and covariance are those of all draws.
+        ``exact``: nearly of the moments and quantiles of all draws, see :mod:`~en4dvar.sampling.alike`.
         """
-        values, vectors = np.linalg.eigh(self.covariance)
+        vectors = np.linalg.eigh(self.covariance)[1]
         order = np.lexsort(((self.x - self.mean) @ vectors[:, -1], self.mode))
-        chosen = self.x[order[resampled(self.shares[order], count, stream)]]
-        if not exact or count <= self.x.shape[1] or np.linalg.matrix_rank(chosen - chosen.mean(axis=0)) < len(values):
-            return np.asarray(chosen)
-        return with_moments(chosen, self.mean, self.covariance)
+        if not exact:
+            return np.asarray(self.x[order[resampled(self.shares[order], count, stream)]])
+        pool = order[resampled(self.shares[order], max(POOL * count, LEAST), stream)]
+        every = ((np.arange(count) + 0.5) * len(pool) / count).astype(np.intp)
+        return standing_for(self.x[pool], self.mode[pool], every, self.mean, self.covariance)
 
 
 def sample_modes(

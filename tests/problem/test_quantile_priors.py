@@ -117,7 +117,7 @@ def test_posterior_and_evidence_of_a_linear_observation(name):
 
     evidence, first, second = (quad(lambda t, p=p: t**p * joint(t), low, high, limit=200)[0] for p in range(3))
     mean = first / evidence
-    found = assimilate(problem, AssimilationSettings(members=400, refine="mcmc"), 1)
+    found = assimilate(problem, AssimilationSettings(members=400, refine="mcmc", draws=4000), 1)
     assert found.refinement["mcmc_converged"]
     spread = math.sqrt(second / evidence - mean**2)
     assert found.posterior[:, 0].mean() == pytest.approx(mean, abs=0.06 * spread)

@@ -56,11 +56,11 @@ def test_chain_of_a_gaussian_and_its_thinning():
     assert np.all(chain.moved < -0.5)
     assert np.all(chain.widened > 1.5)
     draws = chain.thin(48, exact=True)
-    assert draws.mean(axis=0) == pytest.approx(chain.flat.mean(axis=0), abs=1e-12)
-    assert np.cov(draws.T) == pytest.approx(np.cov(chain.flat.T), abs=1e-12)
+    assert draws.mean(axis=0) == pytest.approx(chain.flat.mean(axis=0), abs=0.01)
+    assert np.cov(draws.T) == pytest.approx(np.cov(chain.flat.T), abs=0.03)
     plain = chain.thin(48)
     assert len(np.unique(plain[:, 0])) > 40
-    assert {tuple(row) for row in plain} <= {tuple(row) for row in chain.flat}
+    assert {tuple(row) for row in (*plain, *draws)} <= {tuple(row) for row in chain.flat}
 
 
 def test_an_interrupt_in_the_density_passes_in_silence(capfd):

@@ -1,0 +1,63 @@
+"""Few draws that stand for many: on the posterior, with its moments and its quantiles."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from en4dvar.sampling.alike import standing_for
+
+WIDTH = 0.05
+
+
+def bent(count, seed):
+    """Draws about a parabola, of this width across it."""
+    stream = np.random.default_rng(seed)
+    along = stream.standard_normal(count)
+    return np.column_stack([along, along**2 + WIDTH * stream.standard_normal(count), stream.standard_normal(count)])
+
+
+def across(x):
+    """How far draws lie from the parabola, on average, in squares of its width; 1 of all draws."""
+    return float(np.mean((x[:, 1] - x[:, 0] ** 2) ** 2) / WIDTH**2)
+
+
+def moments(x):
+    return x.mean(axis=0), np.cov(x.T)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_members_of_a_bent_posterior_stay_on_it(seed):
+    x = bent(1000, seed)
+    mean, covariance = moments(x)
+    every = np.arange(0, 1000, 20)
+    members = standing_for(x, np.zeros(1000, dtype=np.intp), every, mean, covariance)
+    std = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(members.mean(axis=0) / std, mean / std, atol=0.02)
+    np.testing.assert_allclose(np.cov(members.T), covariance, atol=0.1 * np.max(std) ** 2)
+    assert across(x) == pytest.approx(1, abs=0.2)
+    assert across(members) < 1.7
+    assert all(any(np.array_equal(member, draw) for draw in x) for member in members)
+
+
+def test_as_many_members_lie_below_a_quantile_as_draws():
+    x = bent(1000, 7)
+    members = standing_for(x, np.zeros(1000, dtype=np.intp), np.arange(0, 1000, 20), *moments(x))
+    for level in (0.05, 0.25, 0.75, 0.95):
+        share = np.mean(members < np.quantile(x, level, axis=0), axis=0)
+        assert share == pytest.approx(np.full(3, level), abs=0.031)  # one and a half of 50
+
+
+def test_each_mode_keeps_its_share():
+    """Two modes, of 30 and 20 members: only draws of the same mode are exchanged."""
+    x = np.vstack([bent(600, 1), bent(400, 2) + 20.0])
+    kind = np.repeat([0, 1], [600, 400])
+    members = standing_for(x, kind, np.arange(0, 1000, 20), *moments(x))
+    assert np.count_nonzero(members[:, 0] < 10) == 30
+
+
+def test_too_few_members_are_the_chosen_draws():
+    x = bent(100, 3)
+    np.testing.assert_array_equal(
+        standing_for(x, np.zeros(100, dtype=np.intp), np.array([4, 7]), *moments(x)), x[[4, 7]]
+    )
