@@ -2,6 +2,7 @@
 
     python benchmarks/two_commands.py ../shared/data/bubbles/stiff_polyacrylamide [FOLDER …] [--minutes 60]
     python benchmarks/two_commands.py … --splits 10        and random halves of each finished run against each other
+    python benchmarks/two_commands.py … --set KEY=VALUE    the second command with another value, any number of times
 
 ``init --data FOLDER`` with the law and the medium of a folder of known name (``measured_page.py``), and ``run`` of what
 it writes, on one worker and with its page. Printed are the processor time of each, the medians of the gel with their
@@ -49,8 +50,8 @@ def processor_time(words: Sequence[str], log: Path) -> tuple[float, int]:
     return sum(after[2:4]) - sum(before[2:4]), code
 
 
-def two_commands(folder: Path, out: Path) -> Record:
-    """What both cost and say; ``out`` is made anew."""
+def two_commands(folder: Path, out: Path, changed: Sequence[str]) -> Record:
+    """What both cost and say; ``out`` is made anew. ``changed``: values of the second, as KEY=VALUE."""
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
     group, config = GROUPS[folder.name], out / "gel.yaml"
@@ -59,7 +60,10 @@ def two_commands(folder: Path, out: Path) -> Record:
     record: Record = {"commit": commit(), "init": begun, "words": " ".join(words)}
     if code:
         return {**record, "failed": (out / "init.log").read_text().splitlines()[-1]}
-    record["run"], code = processor_time(["run", str(config), "--out", str(out / "run")], out / "run.log")
+    record["run"], code = processor_time(
+        ["run", str(config), *(word for value in changed for word in ("--set", value)), "--out", str(out / "run")],
+        out / "run.log",
+    )
     if not (out / "run" / FILE).is_file():
         return {**record, "failed": (out / "run.log").read_text().splitlines()[-1]}
     stored = load_population(out / "run" / FILE)
@@ -146,9 +150,12 @@ def main() -> None:
     parser.add_argument("--splits", type=int, default=0, help="random halves of each folder")
     parser.add_argument("--minutes", type=float, default=60.0, help="start no folder after so long")
     parser.add_argument("--out", type=Path, default=Path("runs/two_commands"), help="folder of the runs and records")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="of the second command")
     asked = parser.parse_args()
     of = {folder.name: folder.resolve() for folder in asked.folders}
-    records = fill(asked.out / "records.jsonl", of, lambda key: two_commands(of[key], asked.out / key), asked.minutes)
+    records = fill(
+        asked.out / "records.jsonl", of, lambda key: two_commands(of[key], asked.out / key, asked.set), asked.minutes
+    )
     print(table(list(records.values())))
     for key in records if asked.splits else ():
         if "used" in records[key]:

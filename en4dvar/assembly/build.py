@@ -105,15 +105,13 @@ def _varying(config: Config, observations: Observations, terms: Sequence[PriorTe
     """Parameters and model errors that vary in time. Raises :class:`ConfigError`: knots that do not suit the
     observations.
     """
-    model, times, by_name = config.model, observations.times, {term.parameter.name: term for term in terms}
+    model, by_name = config.model, {term.parameter.name: term for term in terms}
     asked: list[tuple[tuple[str, ...], Callable[[], Varying | None]]] = [
-        (("parameters", e.parameter.name), partial(e.walk, model, by_name[e.parameter.name], times))
+        (("parameters", e.parameter.name), partial(e.walk, model, by_name[e.parameter.name], observations))
         for e in config.parameters
         if isinstance(e, Uncertain)
     ]
-    asked += [
-        (("model_error", process.field.name), partial(process.changes, model, times)) for process in config.model_error
-    ]
+    asked += [(("model_error", e.field.name), partial(e.changes, model, observations)) for e in config.model_error]
     varying: list[Varying] = []
     for path, make in asked:
         with config.document.placing(*path):

@@ -91,13 +91,15 @@ def dynamic_fields(model: ForwardModel) -> dict[str, Field]:
     return {f.name: f for f in model.layout if f.name not in constant}
 
 
-def of_fields(kind: type[S], instead: str, make: Callable[[S, Field], T]) -> Made:
+def of_fields(kind: type[S], instead: str, make: Callable[[S, Field], T], changes: bool = False) -> Made:
     """What ``make`` makes of sections of a ``kind`` about fields of the state, in the order of the file; ``instead`` is
-    what to do for a parameter.
+    what to do for a parameter. ``changes``: also about what may change unforeseen.
     """
 
     def read(sections: Mapping[str, Any], context: Context) -> tuple[T, ...]:
         fields = dynamic_fields(context.model)
+        if changes:
+            fields |= {name: Field(name) for name in context.model.unforeseen}
 
         def one(entry: Any, context: Context) -> T:
             return make(kind.model_validate(entry, context=context), context.subject)

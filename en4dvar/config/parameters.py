@@ -11,8 +11,9 @@ from en4dvar.config.context import Context, Made, Spread, parse_spread, read_eac
 from en4dvar.config.schema import Section
 from en4dvar.config.validate import Faults
 from en4dvar.config.varies import VariesSection
+from en4dvar.data.observations import Observations
 from en4dvar.model.forward import ForwardModel
-from en4dvar.model.state import OF_READINGS, READING_OFFSET, TIME_SHIFT, Array, Parameter
+from en4dvar.model.state import OF_READINGS, READING_OFFSET, TIME_SHIFT, Parameter
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.hints import brief, shown, suggest
 from en4dvar.plumbing.units import parse_quantity
@@ -242,8 +243,8 @@ class Uncertain:
         elif self.spec.prior != "logit":
             self.term(lambda where: 1.0)  # the other values do not wait for the data
 
-    def walk(self, model: ForwardModel, term: PriorTerm, times: Array) -> RandomWalk | None:
-        """How it varies over a window of observations at ``times`` (K,); None where it does not.
+    def walk(self, model: ForwardModel, term: PriorTerm, observations: Observations) -> RandomWalk | None:
+        """How it varies over a window of observations; None where it does not.
 
         Raises :class:`ConfigError`, its path the faulty key.
         """
@@ -256,7 +257,7 @@ class Uncertain:
             raise ConfigError(message, "varies.std")
         try:
             std = varies.std.absolute(centre) / term.slope(term.mean)
-            return RandomWalk.of(model, term, varies.knots(times), std, varies.estimated)
+            return RandomWalk.of(model, term, varies.knots(observations), std, varies.estimated)
         except ConfigError as error:
             raise ConfigError(
                 [replace(f, path=f"varies.{f.path}" if f.path else "varies") for f in error.problems]

@@ -3,7 +3,7 @@
 import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import model_validator
 
@@ -11,8 +11,10 @@ from en4dvar.config.context import Context, Made, Spread, parse_spread, quantity
 from en4dvar.config.initial_state import of_fields
 from en4dvar.config.schema import Section
 from en4dvar.config.validate import Faults
+from en4dvar.data.observations import Observations
+from en4dvar.inputs.window import maxima
 from en4dvar.model.forward import ForwardModel
-from en4dvar.model.state import Array, Field
+from en4dvar.model.state import Field
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.priors.varying import StateChanges
 
@@ -28,8 +30,9 @@ class Knots(Section):
 
     every: Annotated[float | None, quantity(time_unit, "positive")] = None
     """Length of a piece, e.g. 5 us: knots at its multiples, from the model's time zero to the last observation."""
-    at: tuple[Annotated[float, quantity(time_unit, "positive")], ...] | None = None
-    """The knots, in increasing order, from the model's time zero; instead of ``every``."""
+    at: Literal["maxima"] | tuple[Annotated[float, quantity(time_unit, "positive")], ...] | None = None
+    """The knots, in increasing order, from the model's time zero; instead of ``every``. Or maxima: the highest reading
+    between each two minima in the window."""
 
     @classmethod
     def rules(cls, keys: Mapping[str, Any], context: Context, faults: Faults) -> None:
@@ -38,15 +41,19 @@ class Knots(Section):
 
     @model_validator(mode="after")
     def _increasing(self) -> Self:
-        at = self.at if self.at is None or None not in self.at else None
+        at = None if self.at == "maxima" or self.at is None or None in self.at else self.at
         with Faults() as faults:
             if at is not None and (not at or any(b <= a for a, b in itertools.pairwise(at))):
                 faults.add(("at",), "give at least one knot, and each later than the one before it")
         return self
 
-    def knots(self, times: Array) -> tuple[float, ...]:
-        """Those for a window of observations at ``times`` (K,). Raises :class:`ConfigError`: none is of use."""
-        last = float(times[-1])
+    def knots(self, observations: Observations) -> tuple[float, ...]:
+        """Those for a window of observations. Raises :class:`ConfigError`: none is of use."""
+        times, last = observations.times, float(observations.times[-1])
+        if self.at == "maxima":
+            if observations.parts or not len(tops := maxima(observations.values)):
+                raise ConfigError("there is no maximum between two minima of one series in the window", "at")
+            return tuple(times[tops].tolist())
         if self.at is not None:
             if not self.at[0] < last:
                 raise ConfigError("all knots lie after the last observation", "at")
@@ -91,12 +98,14 @@ class ErrorOf:
     field: Field
     spec: ModelErrorSection
 
-    def changes(self, model: ForwardModel, times: Array) -> StateChanges:
-        """Over a window of observations at ``times`` (K,). Raises :class:`ConfigError`, its path the faulty key."""
+    def changes(self, model: ForwardModel, observations: Observations) -> StateChanges:
+        """Over a window of observations. Raises :class:`ConfigError`, its path the faulty key."""
         std = self.spec.std
-        return StateChanges.of(model, self.field, self.spec.knots(times), std.value, std.relative)
+        if self.field.name not in model.layout.names and not std.relative:
+            raise ConfigError("it is multiplied at each knot: give the std in %", "std")
+        return StateChanges.of(model, self.field, self.spec.knots(observations), std.value, std.relative)
 
 
 MODEL_ERROR = of_fields(
-    ModelErrorSection, "write varies behind its prior", lambda section, field: ErrorOf(field, section)
+    ModelErrorSection, "write varies behind its prior", lambda section, field: ErrorOf(field, section), changes=True
 )

@@ -68,9 +68,12 @@ def predict_withheld(problem: InverseProblem, members: Array, executor: Executor
     if whole is None:
         return None
     changed = unforeseen(problem)
-    count, added = len(members), changed.prior.terms[len(problem.prior.terms) :]
+    count, estimated = len(members), _last_changes(problem)
     scores, stream = ndtri((np.arange(count) + 0.5) / count), np.random.default_rng(count)
-    theirs = np.column_stack([members, *(term.std * stream.permutation(scores) for term in added)])
+    theirs = np.column_stack([members, np.zeros((count, len(changed.prior.names) - members.shape[1]))])
+    for name, spread in problem.model.unforeseen.items():
+        own = estimated.get(name, changed.prior.names.index(f"{name}_change_1"))
+        theirs[:, own] += spread * stream.permutation(scores)
     run = Composite(replace(changed, observations=whole), executor)(theirs)
     begin, alive = len(within), np.flatnonzero(np.isfinite(run.predicted.values).all(axis=1))
     if len(alive) < 2:
@@ -83,8 +86,8 @@ def predict_withheld(problem: InverseProblem, members: Array, executor: Executor
 
 def unforeseen(problem: InverseProblem) -> InverseProblem:
     """The problem with the changes that its model does not foresee, at the end of its control vector."""
-    model, values = problem.model, problem.observations.values
-    if not model.unforeseen:
+    model, values, estimated = problem.model, problem.observations.values, _last_changes(problem)
+    if not model.unforeseen.keys() - estimated.keys():
         return problem
     top = len(values) - 1
     while top > 1 and max(values[top - 2 : top]) > values[top]:  # one reading that is lower is noise
@@ -94,8 +97,16 @@ def unforeseen(problem: InverseProblem) -> InverseProblem:
         [
             StateChanges.of(model, fields.get(name, Field(name, unit="1")), knots, std, relative=True)
             for name, std in model.unforeseen.items()
+            if name not in estimated
         ]
     )
+
+
+def _last_changes(problem: InverseProblem) -> dict[str, int]:
+    """Of what may change unforeseen and is estimated within the window, the place of the last change in x."""
+    names = [term.parameter.name for term in problem.prior.terms]
+    last = {varied.name: varied.terms[-1] for varied in problem.varying if varied.name in problem.model.unforeseen}
+    return {name: names.index(term.parameter.name) for name, term in last.items()}
 
 
 def _quantile(mean: Array, std: Array, level: float) -> Array:

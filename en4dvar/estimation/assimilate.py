@@ -279,7 +279,7 @@ def _missed_knots(stages: Stages, analysis: Analysis) -> tuple[Caution, ...]:
     is enough for the warning.
     """
     problem, model, prior = stages.problem, stages.problem.model, stages.problem.prior
-    if not (stages.compares and stages.settings.what_if and isinstance(model, PiecewiseModel)):
+    if not (stages.compares and stages.settings.what_if and isinstance(model, PiecewiseModel) and model.walks):
         return ()
     by = INTERVALS * float(np.median(np.diff(np.unique(problem.observations.times[problem.observations.used]))))
     here, said = prior.from_physical(analysis.posterior), []

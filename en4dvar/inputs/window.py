@@ -123,6 +123,13 @@ def _middle(times: Array, values: Array, index: int) -> float:
     return float(np.mean(np.interp([left[0], right[0]], np.arange(len(times)), times)))
 
 
+def maxima(values: Array, prominence: float = 0.1) -> Array:
+    """Indices of the local maxima of ``values`` (K,) behind their first minimum, of such a prominence."""
+    first = minima(values, prominence)[:1]
+    tops = minima(-values, prominence)
+    return tops[tops > first] if len(first) else first
+
+
 def minima(values: Array, prominence: float = 0.1) -> Array:
     """Indices of the local minima of ``values`` (K,) with at least ``prominence`` times its range."""
     from scipy.signal import find_peaks

@@ -140,7 +140,7 @@ def _empirical(population: Population) -> dict[str, Variable]:
 
 def _sets(population: Population) -> dict[str, Variable]:
     """(chain, draw, dataset) of every parameter, given all data."""
-    terms: tuple[PriorTerm, ...] = population.problems[0].prior.terms
+    terms: tuple[PriorTerm, ...] = population.problems[0].constant.prior.terms
     return {
         p.name: variable((*_DRAWS, "dataset"), population.sets[None, :, :, j], p.unit, p.label, **_about(p))
         for j, p in enumerate(term.parameter for term in terms)

@@ -98,7 +98,7 @@ def finished_set(config: Config, result: StoredResult, run_dir: Path) -> Finishe
     if len(result.axes) > 1:  # files and pages of such estimates know one series a data set
         raise ConfigError(f"{run_dir}: {result.name} has several series; it cannot be estimated with others")
     problem = problem_of(config, result.observations())
-    if problem.varying:
+    if problem.walks:
         raise ConfigError(f"{run_dir}: parameters that vary in time cannot be estimated with other data sets")
     names, prior = problem.prior.names, problem.prior
     columns = [np.asarray(result.parameters[name].values, dtype=float).ravel() for name in names]

@@ -103,8 +103,8 @@ def samples(space: WeightSpace) -> bool:
 
 
 def may_sample(problem: InverseProblem, settings: AssimilationSettings) -> bool:
-    """True if there is ``refine: auto`` with a cheap model of few parameters, constant or on an estimated walk."""
-    gaussian = problem.varying and not any(walk.spread for walk in problem.walks)
+    """True if there is ``refine: auto`` with a cheap model of few parameters, all walks of which are estimated."""
+    gaussian = problem.walks and not any(walk.spread for walk in problem.walks)
     few = needed_runs(len(problem.prior.names)) is not None and not gaussian
     return settings.refine == "auto" and problem.model.cheap and few and not settings.stochastic_model
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from en4dvar.inputs.window import Instant, minima, parse_instant, select
+from en4dvar.inputs.window import Instant, maxima, minima, parse_instant, select
 from en4dvar.plumbing.errors import DataError
 from en4dvar.plumbing.units import UnitError
 
@@ -35,6 +35,12 @@ def test_top_and_trough() -> None:
     assert cut(few, "top", "end")[0] == 2.0  # no five samples about it: the largest
     assert parse_instant("top", "s") == Instant("top")
     assert parse_instant("trough 2", "s") == Instant("trough", 2)
+
+
+def test_maxima_lie_behind_the_first_minimum() -> None:
+    tops = T[maxima(BOUNCES)]
+    assert tops == pytest.approx([1.5, 2.5, 3.5], abs=0.06)  # a little earlier, since they decay; not that at 0.5
+    assert len(maxima(BOUNCES[: np.argmax(T >= 1.0)])) == 0
 
 
 def test_errors_of_samples_do_not_choose_the_ends() -> None:

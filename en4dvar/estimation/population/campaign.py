@@ -182,9 +182,9 @@ def require_population(problems: Sequence[InverseProblem], names: Sequence[str])
     for problem in problems:
         name = problem.observations.name
         check_problem(problem)
-        if problem.prior.names != problems[0].prior.names:
+        if problem.constant.prior.names != problems[0].constant.prior.names:
             raise ConfigError(f"{name}: a population needs the same parameters in all data sets")
-        if problem.varying or problem.fields:
+        if problem.walks or problem.fields:
             raise ConfigError(f"{name}: a population needs parameters that do not vary in time or space")
         if correlated := [n for block in problem.prior.blocks for n in block.names if n in names]:
             raise ConfigError(f"{name}: {correlated[0]}: a population needs a prior that is not correlated")
@@ -286,7 +286,7 @@ def population_from(
 ) -> Population:  # fmt: skip
     """The population of the data sets that could be sampled."""
     problems = tuple(campaign[s] for s in drawn)
-    terms, columns = terms_of(problems, names), problems[0].prior.names
+    terms, columns = terms_of(problems, names), problems[0].constant.prior.names  # changes stand behind them
     common = common_to(problems, names)
     varying, shared = [columns.index(name) for name in names], [columns.index(name) for name in common]
     sets = [problem.observations.name for problem in problems]
@@ -295,7 +295,8 @@ def population_from(
     stream = member_stream(seed, "hyperprior")
     nu, tau = stream.standard_normal(estimated.nu.shape), np.abs(stream.standard_normal(estimated.nu.shape))
     z = _sets(estimated, list(drawn.values()), likelihoods, varying, shared, member_stream(seed, "sets given all"))
-    physical = [entry.prior.to_physical(entry.prior.from_white(z[:, s])) for s, entry in enumerate(problems)]
+    sets_of = ((entry.prior, own) for entry, own in zip(problems, z, strict=True))
+    physical = [prior.to_physical(prior.from_white(own))[:, : len(columns)] for prior, own in sets_of]
     return Population(
         names=tuple(names),
         problems=problems,
@@ -327,18 +328,19 @@ def _empirical(
 def _sets(
     estimated: HierarchyDraws, drawn: Sequence[OwnDraws], likelihoods: Sequence[OwnLikelihood], varying: Sequence[int],
     shared: Sequence[int], stream: np.random.Generator,
-) -> Array:  # fmt: skip
-    """Control vectors (M, S, n) of each data set given all, white: what is neither of the population nor common is as
+) -> list[Array]:  # fmt: skip
+    """Control vectors (M, n) of each data set given all, white: what is neither of the population nor common is as
     in one of the data set's own draws whose x − Bθ is nearest.
     """
-    z = np.empty((*estimated.x.shape[:2], drawn[0].z.shape[1]))
+    z = []
     for s, (draws, likelihood) in enumerate(zip(drawn, likelihoods, strict=True)):
         scale = likelihood.adjusted.std(axis=0)
         _, near = scipy.spatial.cKDTree(likelihood.adjusted / scale).query(estimated.x[:, s] / scale, k=NEAR)
         chosen = near[np.arange(len(near)), stream.integers(NEAR, size=len(near))]
-        z[:, s] = draws.z[chosen]
-        z[:, s, list(varying)] = estimated.x[:, s] + estimated.theta @ likelihood.slopes.T
-        z[:, s, list(shared)] = estimated.theta
+        own = draws.z[chosen]
+        own[:, list(varying)] = estimated.x[:, s] + estimated.theta @ likelihood.slopes.T
+        own[:, list(shared)] = estimated.theta
+        z.append(own)
     return z
 
 

@@ -57,6 +57,11 @@ class PiecewiseModel(ForwardModel):
         return self.model.dense
 
     @property
+    def unforeseen(self) -> Mapping[str, float]:  # type: ignore[override]
+        """The same as of the model."""
+        return self.model.unforeseen
+
+    @property
     def alternatives(self) -> tuple[Alternative, ...]:  # type: ignore[override]
         """Those of the model, with the same parameters varying."""
         return tuple(
@@ -75,6 +80,11 @@ class PiecewiseModel(ForwardModel):
         """
         inner = self.model.initial_states({p.name: theta[p.name] for p in self.model.parameters})
         return np.hstack([inner, *(change.values(theta) for change in self.varying)])
+
+    def changed(self, name: str, x: Array, change: Array) -> Array:
+        """As of the model."""
+        inner = self.model.layout.size
+        return np.hstack([self.model.changed(name, x[:, :inner], change), x[:, inner:]])
 
     def doubts(
         self, observable: str, times: Array, values: Array, predicted: Array, members: Mapping[str, Array]

@@ -92,6 +92,7 @@ def yaml_text(name: str, source: Source, proposal: Proposal, command: str) -> st
         "model:",
         *_section(proposal.model),
         *_comparison(name, proposal.simpler),
+        *_longer(name) * proposal.longer,
         "parameters: # a prior is estimated, a quantity such as 'mu: 0.1 Pa s' is fixed",
         *_section(proposal.parameters),
         *proposal.population,
@@ -111,6 +112,15 @@ def _comparison(name: str, simpler: Mapping[str, str]) -> list[str]:
         f"  # A {simpler['gas']} gas is quicker, but makes R_eq and mu wrong, often without a warning. To compare:",
         f"  #   en4dvar run THIS_FILE {options} --out {there}",
         f"  #   en4dvar compare {here} {there}",
+    ]
+
+
+def _longer(name: str) -> list[str]:
+    """How to fit one oscillation more."""
+    options = "--set data.window.to='trough 3' --set model_error.gas='{at: maxima, std: 70 %}'"
+    return [
+        "  # The gas may change within the window, too. One oscillation more often tells mu several times better:",
+        f"  #   en4dvar run THIS_FILE {options} --out {shlex.quote(f'runs/{name}_gas')}",
     ]
 
 

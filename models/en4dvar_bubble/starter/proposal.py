@@ -72,6 +72,7 @@ class Proposal:
 
     ``simpler``: keys of the model, and their values, of quicker physics to compare with; empty where there is none.
     ``population``: what varies from bubble to bubble of one gel, line by line; empty where there are too few of them.
+    ``longer``: the window may end a minimum later in all histories.
     """
 
     data: tuple[Entry, ...]
@@ -81,6 +82,7 @@ class Proposal:
     remarks: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     population: tuple[str, ...] = ()
+    longer: bool = False
     assimilation: tuple[Entry, ...] = (
         Entry("members", "48"),
         Entry("draws", "400", "effective ones where the posterior is sampled: its mean is known to 5 % of its std"),
@@ -149,6 +151,7 @@ def propose(
         (*told, *[f"{len(views)} bubbles: {_ends_with(groups)}"] * bool(together)),
         tuple(warnings),
         together,
+        chosen == "laser" and look.n_minima > 2,
     )
 
 
