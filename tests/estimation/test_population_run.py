@@ -9,14 +9,19 @@ import pytest
 from click.testing import CliRunner
 from run_files import make_campaign
 from scipy.stats import norm
-from toys import Vectorised, make_problem
+from toys import Vectorised, make_observations, make_problem
+from varying_models import KNOTS, Batched
 
 from en4dvar.cli import main
+from en4dvar.data.noise import noise_of
+from en4dvar.data.noise.correlated import SharedErrors
 from en4dvar.estimation.population import Effort, HyperPrior
 from en4dvar.estimation.population.campaign import Draws, Population, population_of
 from en4dvar.plumbing.caution import caution
 from en4dvar.plumbing.errors import ConfigError, OutputError
 from en4dvar.priors.prior import Prior, PriorTerm
+from en4dvar.priors.varying import RandomWalk, StateChanges
+from en4dvar.problem import InverseProblem
 from en4dvar.report.population import sentences
 from en4dvar.results.population_file import load_population
 from en4dvar.runs.population_run import population
@@ -182,3 +187,53 @@ def test_a_linear_hierarchy_with_priors_of_their_own():
         assert found.sets[:, s, 0].std() == pytest.approx(spread, rel=0.15)
     following = np.sqrt(np.sum(weights * (nu[:, None] ** 2 + tau**2)) - mean**2)
     assert found.posterior.next.std() == pytest.approx(following, rel=0.15)
+
+
+@pytest.mark.slow
+def test_changes_of_the_state_are_each_bubbles_own():
+    """y' = r, and y changes at one knot or at two: as if later readings shared an error, which is another way to it."""
+    times, steps = np.linspace(0.25, 3.0, 12), (0.4, 0.6)
+    with_changes, shared = [], []
+    for seed in range(SETS):
+        rng, knots = np.random.default_rng([5, seed]), KNOTS[: 1 + seed % 2]
+        after = np.stack([q * (times > knot) for q, knot in zip(steps, knots, strict=False)], axis=1)
+        values = 1 + (0.5 + 0.3 * rng.standard_normal()) * times + after @ rng.standard_normal(len(knots))
+        observed = make_observations(times, values + 0.05 * rng.standard_normal(12), 0.05, name=f"set{seed}")
+        model = Batched()
+        model.compiled = True  # sampled, as cheap models are
+        prior = Prior((PriorTerm.normal(model.parameters[0], 0.0, 1.0),))
+        plain = InverseProblem(model, model.observables[0], observed, prior)
+        changes = [
+            StateChanges.of(model, model.layout.fields[0], [knot], q, relative=False)
+            for q, knot in zip(steps, knots, strict=False)
+        ]
+        merged = replace(changes[0], knots=knots, changes=tuple(_numbered(changes)))
+        with_changes.append(plain.varied([merged]))
+        std, common = SharedErrors.beside(observed.noise.std, after)
+        shared.append(replace(plain, observations=replace(observed, noise=noise_of(std, correlation=common))))
+    found, other = (
+        population_of(problems, [np.zeros((20, len(p.prior.names))) for p in problems], ["r"], 2, effort=SMALL)
+        for problems in (with_changes, shared)
+    )
+    assert found.sets.shape == other.sets.shape
+    std = other.posterior.mean.std()
+    assert found.posterior.mean.mean() == pytest.approx(other.posterior.mean.mean(), abs=0.2 * std)
+    assert found.posterior.mean.std() == pytest.approx(std, rel=0.15)
+    assert found.sets.mean(axis=0) == pytest.approx(other.sets.mean(axis=0), abs=0.05)
+
+
+def _numbered(changes):
+    """The terms of several changes of one field, in order."""
+    for k, change in enumerate(changes, 1):
+        (term,) = change.changes
+        yield replace(term, parameter=replace(term.parameter, name=f"y_change_{k}"))
+
+
+def test_parameters_that_walk_have_no_population():
+    model = Batched()
+    first = PriorTerm.normal(model.parameters[0], 0.0, 1.0)
+    observed = make_observations(np.arange(1.0, 5.0), np.ones(4), 0.1)
+    problem = InverseProblem(model, model.observables[0], observed, Prior((first,)))
+    walking = problem.varied([RandomWalk.of(model, first, (2.0,), 0.3)])
+    with pytest.raises(ConfigError, match="do not vary in time"):
+        population_of([walking] * 3, [np.zeros((20, 2))] * 3, ["r"], 2)
