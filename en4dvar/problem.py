@@ -134,6 +134,11 @@ class InverseProblem:
         """The parameters that vary in time."""
         return self.model.walks if isinstance(self.model, PiecewiseModel) else ()
 
+    @property
+    def in_question(self) -> bool:
+        """Whether the data are asked if something varies: not of what the model says may change unforeseen."""
+        return any(change.name not in self.model.unforeseen for change in self.varying)
+
     def varied(self, varying: Sequence[Varying]) -> "InverseProblem":
         """The same with what varies; the changes join the control vector at its end."""
         changes = (term for variation in varying for term in variation.terms)

@@ -61,7 +61,7 @@ def preview(problem: InverseProblem, settings: AssimilationSettings, seed: int, 
         else:
             space = WeightSpace(problem, settings, seed, executor)
             every, runs = space.members, expected_runs(space)
-        if problem.varying and not settings.localisation:  # its evidence takes a second fit
+        if problem.in_question and not settings.localisation:  # its evidence takes a second fit
             runs += expected_runs(WeightSpace(problem.constant, settings, seed, executor))
         forecast(problem, every[:1], executor, grid)
         seconds, count = _seconds_per_run(problem, every, executor)

@@ -131,13 +131,12 @@ def _concluded(
     """The outcome without its minima and cautions."""
     space, problem, ends = stages.space, stages.problem, sampled.ends
     observations, last = problem.observations, ends.central
-    # ln p(y) with constant parameters, NaN where these lose the ensemble; None where none varies. It is that of an
+    # ln p(y) with constant parameters, NaN where these lose the ensemble; None where nobody asks. It is that of an
     # assimilation of its own, searched and, in doubt, sampled like this one. The posterior at zero changes (Savage &
     # Dickey) would spare the runs, but extrapolates the quadratic form of J from one minimum to the other, which may
     # be far away.
-    log_evidence_constant = (
-        _log_evidence(stages, stages.problem.constant) if stages.compares and stages.problem.varying else None
-    )
+    asked = stages.compares and problem.in_question
+    log_evidence_constant = _log_evidence(stages, problem.constant) if asked else None
     response = conclusions.response_of(space, descent, ends.mode, last)
     std = ends.members.std(axis=0, ddof=1)
     shifts: tuple[Shift, ...] = ()
