@@ -103,7 +103,7 @@ def test_a_laser_bubble_gets_the_whole_physics_and_what_to_compare_it_with() -> 
     text = Path("film.yaml").read_text(encoding="utf-8")
     model = load_config(Path("film.yaml")).model
     assert (model.gas, model.vapour, model.medium_heat) == ("heat", "transport", "conducting")
-    (line,) = (line for line in text.splitlines() if line.startswith("  #   en4dvar run THIS_FILE --set"))
+    line, *_ = (line for line in text.splitlines() if line.startswith("  #   en4dvar run THIS_FILE --set model"))
     words = shlex.split(line.replace("THIS_FILE", "film.yaml").removeprefix("  #   en4dvar run "))
     assert words[-2:] == ["--out", "runs/film_polytropic"]
     assert call("validate", *words[:-2]).exit_code == 0
@@ -112,6 +112,36 @@ def test_a_laser_bubble_gets_the_whole_physics_and_what_to_compare_it_with() -> 
     assert (simpler.gas, simpler.vapour, simpler.medium_heat) == ("polytropic", "none", "cold")
     assert simpler.medium.p_v == pytest.approx(3.1e3, rel=0.05)
     assert "  #   en4dvar compare runs/film runs/film_polytropic\n" in text
+
+
+def bouncing(path: Path, lobes: int) -> Path:
+    """Half a lobe of Rayleigh's shape about, and so many more, each 0.7 times as high and as long."""
+    rows, begin, half = [], -22.8, 22.8
+    for k in range(1 + lobes):
+        R, times = 250 * 0.7**k, np.arange(0.0 if k == 0 else begin, begin + 2 * half, 0.63)
+        rows += [f"{t:.3f},{R * (1 - ((t - begin) / half - 1) ** 2) ** 0.4 + 12:.3f}" for t in times]
+        begin, half = begin + 2 * half, 0.7 * half
+    path.write_text("\n".join(["t_us,R_um", *rows]) + "\n")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("law", "lobes", "said"),
+    [("neo-hookean-kelvin-voigt", 3, 1), ("neo-hookean-kelvin-voigt", 2, 0), ("newtonian", 3, 0)],
+)
+def test_a_third_oscillation_in_a_gel_gets_its_command(tmp_path: Path, law: str, lobes: int, said: int) -> None:
+    """Its options end the window a minimum later, and let the gas change at the maxima."""
+    data = bouncing(tmp_path / "bubble.csv", lobes)
+    done = call("init", "--data", data, *UNITS, "--law", law, "--out", "b.yaml")
+    assert done.exit_code == 0, done.output
+    lines = [line for line in Path("b.yaml").read_text(encoding="utf-8").splitlines() if "model_error.gas" in line]
+    assert len(lines) == said
+    for line in lines:
+        words = shlex.split(line.replace("THIS_FILE", "b.yaml").removeprefix("  #   en4dvar run "))
+        changes = dict(word.split("=", 1) for word in words if "=" in word)
+        (problem,), (shorter,) = (build(load_config(Path("b.yaml"), given)) for given in (changes, {}))
+        assert [name for name in problem.prior.names if "change" in name][:1] == ["gas_change_1"]
+        assert len(problem.observations) > len(shorter.observations)
 
 
 def test_an_acoustic_bubble_gets_no_comparison() -> None:

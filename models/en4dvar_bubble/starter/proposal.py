@@ -72,7 +72,7 @@ class Proposal:
 
     ``simpler``: keys of the model, and their values, of quicker physics to compare with; empty where there is none.
     ``population``: what varies from bubble to bubble of one gel, line by line; empty where there are too few of them.
-    ``longer``: the window may end a minimum later in all histories.
+    ``longer``: in a gel, and most histories have a third minimum, at which the window may end.
     """
 
     data: tuple[Entry, ...]
@@ -151,7 +151,7 @@ def propose(
         (*told, *[f"{len(views)} bubbles: {_ends_with(groups)}"] * bool(together)),
         tuple(warnings),
         together,
-        chosen == "laser" and look.n_minima > 2,
+        chosen == "laser" and not _in_a_liquid(model) and float(np.median([v.n_minima for v in views])) > 2,
     )
 
 
