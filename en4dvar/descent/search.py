@@ -143,7 +143,8 @@ class Search:
         begun = choose_start(whole, scheme, run, self.seed, None, lambda state: None, lambda record: None).descent
         minimise(DataWindow(whole, self.seed, lambda: None, lambda record: None), [begun])
         space.forward_runs += whole.forward_runs
-        return whole.control(begun.weights.w)[: len(space.mean)]
+        named = dict(zip(problem.prior.names, whole.control(begun.weights.w), strict=True))
+        return np.array([named[name] for name in space.problem.prior.names])
 
     @cached_property
     def lowest_draws(self) -> Array:

@@ -67,13 +67,13 @@ def predict_withheld(problem: InverseProblem, members: Array, executor: Executor
     within, whole = problem.observations, problem.observations.continued
     if whole is None:
         return None
-    changed = unforeseen(problem)
-    count, estimated = len(members), _last_changes(problem)
-    scores, stream = ndtri((np.arange(count) + 0.5) / count), np.random.default_rng(count)
-    theirs = np.column_stack([members, np.zeros((count, len(changed.prior.names) - members.shape[1]))])
-    for name, spread in problem.model.unforeseen.items():
-        own = estimated.get(name, changed.prior.names.index(f"{name}_change_1"))
-        theirs[:, own] += spread * stream.permutation(scores)
+    changed, count = unforeseen(problem), len(members)
+    names, scores, stream = changed.prior.names, ndtri((np.arange(count) + 0.5) / count), np.random.default_rng(count)
+    theirs = np.zeros((count, len(names)))
+    theirs[:, [names.index(name) for name in problem.prior.names]] = members
+    for quantity, spread in problem.model.unforeseen.items():
+        last = max(j for j, name in enumerate(names) if name.startswith(f"{quantity}_change_"))
+        theirs[:, last] += spread * stream.permutation(scores)
     run = Composite(replace(changed, observations=whole), executor)(theirs)
     begin, alive = len(within), np.flatnonzero(np.isfinite(run.predicted.values).all(axis=1))
     if len(alive) < 2:
@@ -85,28 +85,23 @@ def predict_withheld(problem: InverseProblem, members: Array, executor: Executor
 
 
 def unforeseen(problem: InverseProblem) -> InverseProblem:
-    """The problem with the changes that its model does not foresee, at the end of its control vector."""
-    model, values, estimated = problem.model, problem.observations.values, _last_changes(problem)
-    if not model.unforeseen.keys() - estimated.keys():
-        return problem
+    """The problem with a change, at the last maximum of the window, of each quantity that its model does not foresee; a
+    change that is estimated there, or later, is that one.
+    """
+    within, values = problem.constant, problem.observations.values
     top = len(values) - 1
     while top > 1 and max(values[top - 2 : top]) > values[top]:  # one reading that is lower is noise
         top -= 1
-    fields, knots = {field.name: field for field in model.layout.fields}, [float(problem.observations.times[top])]
-    return problem.varied(
-        [
-            StateChanges.of(model, fields.get(name, Field(name, unit="1")), knots, std, relative=True)
-            for name, std in model.unforeseen.items()
-            if name not in estimated
-        ]
-    )
-
-
-def _last_changes(problem: InverseProblem) -> dict[str, int]:
-    """Of what may change unforeseen and is estimated within the window, the place of the last change in x."""
-    names = [term.parameter.name for term in problem.prior.terms]
-    last = {varied.name: varied.terms[-1] for varied in problem.varying if varied.name in problem.model.unforeseen}
-    return {name: names.index(term.parameter.name) for name, term in last.items()}
+    fields, knot = {field.name: field for field in within.model.layout.fields}, float(problem.observations.times[top])
+    varying = {change.name: change for change in problem.varying}
+    for name, std in within.model.unforeseen.items():
+        before = varying.get(name)
+        knots, changes = (before.knots, before.changes) if before else ((), ())
+        if not knots or knots[-1] < knot:
+            field = fields.get(name, Field(name, unit="1"))
+            more = StateChanges.of(within.model, field, [*knots, knot], std, relative=True)
+            varying[name] = replace(more, changes=(*changes, more.changes[-1]))
+    return within.varied([*varying.values()]) if varying else problem
 
 
 def _quantile(mean: Array, std: Array, level: float) -> Array:
