@@ -18,15 +18,17 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+import acoustic_twin
 import laser_twin
 import numpy as np
 
 from en4dvar import calibrate
 from en4dvar.model.state import Array
+from en4dvar_bubble.starter.proposal import MODEL, SIMPLER
 
 Settings = dict[str, Any]
 QUICKSTART = Path(__file__).parents[1] / "configs" / "quickstart.yaml"
-WIDE = {f"parameters.{k}.log_std": s for k, s in {"G": 1.0, "alpha": 1.0, "mu": 0.7, "R0": 0.7}.items()}
+WIDE = {f"parameters.{name}.log_std": std for name, std in acoustic_twin.WIDE.items()}
 COLUMNS = {"time": {"name": "t_us", "unit": "us"}, "radius": {"name": "R_um", "unit": "um"}}
 TIMES: dict[str, Array] = {
     "rebound": np.linspace(4e-6, 60e-6, 30),
@@ -36,8 +38,8 @@ TIMES: dict[str, Array] = {
 }
 
 
-def lognormal(median: str, log_std: float) -> Settings:
-    return {"prior": "lognormal", "median": median, "log_std": log_std}
+def lognormal(name: str, median: float, log_std: float) -> Settings:
+    return {"prior": "lognormal", "median": f"{median} {laser_twin.PARAMETERS[name].unit}", "log_std": log_std}
 
 
 def normal(mean: str, std: str) -> Settings:
@@ -54,23 +56,22 @@ def released(error: str, parameters: Settings, **physics: str) -> Settings:
     }
 
 
-POLYTROPIC = {"gas": "polytropic", "vapour_pressure": "saturated"}
-PROPOSED = {"gas": "heat", "vapour": "transport", "medium_heat": "conducting"}  # by ``en4dvar init``
 SOFT_GEL = {
-    "G": lognormal("4 kPa", 0.5), "mu": lognormal("0.06 Pa s", 0.5), "R_eq": lognormal("35 um", 0.2),
+    **{name: lognormal(name, median, laser_twin.LOG_STD[name]) for name, median in laser_twin.MEDIANS.items()},
     "R_max": normal("250 um", "5 um"),
-}  # fmt: skip
+}
 STIFF_GEL = {
-    "G": lognormal("8 kPa", 1.0), "mu": lognormal("0.1 Pa s", 0.7), "R_eq": lognormal("48 um", 0.4),
-    "R_max": normal("400 um", "4 um"), "t_s": normal("0 us", "0.5 us"),
-}  # fmt: skip
+    **{name: lognormal(name, *about) for name, about in laser_twin.STIFF.items()},
+    "R_max": normal("400 um", "4 um"),
+    "t_s": normal("0 us", "0.5 us"),
+}
 CASES: dict[str, tuple[Settings | Path, Settings]] = {
     "a": (QUICKSTART, {"assimilation.refine": "none"}),
     "b": (QUICKSTART, {"assimilation.refine": "mcmc", **WIDE}),
     "rebound": (QUICKSTART, WIDE),
     "laser": (released("1.5 um", SOFT_GEL, gas="polytropic"), {}),
-    "stiff": (released("4 um", STIFF_GEL, **POLYTROPIC), {}),
-    "proposed": (released("4 um", STIFF_GEL, **PROPOSED), {}),
+    "stiff": (released("4 um", STIFF_GEL, **SIMPLER["laser"]), {}),
+    "proposed": (released("4 um", STIFF_GEL, **MODEL["laser"]), {}),
 }
 
 
