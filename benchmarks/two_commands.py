@@ -3,6 +3,7 @@
     python benchmarks/two_commands.py ../shared/data/bubbles/stiff_polyacrylamide [FOLDER …] [--minutes 60]
     python benchmarks/two_commands.py … --splits 10        and random halves of each finished run against each other
     python benchmarks/two_commands.py … --set KEY=VALUE    the second command with another value, any number of times
+    python benchmarks/two_commands.py … --medium 'polyacrylamide 8 %'    the first with another medium than the page has
 
 ``init --data FOLDER`` with the law and the medium of a folder of known name (``measured_page.py``), and ``run`` of what
 it writes, on one worker and with its page. Printed are the processor time of each, the medians of the gel with their
@@ -18,10 +19,12 @@ from __future__ import annotations
 import argparse
 import csv
 import os
+import shlex
 import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -50,14 +53,16 @@ def processor_time(words: Sequence[str], log: Path) -> tuple[float, int]:
     return sum(after[2:4]) - sum(before[2:4]), code
 
 
-def two_commands(folder: Path, out: Path, changed: Sequence[str]) -> Record:
-    """What both cost and say; ``out`` is made anew. ``changed``: values of the second, as KEY=VALUE."""
+def two_commands(folder: Path, out: Path, changed: Sequence[str], medium: str) -> Record:
+    """What both cost and say; ``out`` is made anew. ``changed``: values of the second, as KEY=VALUE. ``medium``: of the
+    folder, unless it is empty.
+    """
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
     group, config = GROUPS[folder.name], out / "gel.yaml"
-    words = ["--law", group.law, "--medium", group.medium, *MORE.get(folder.name, [])]
+    words = ["--law", group.law, "--medium", medium or group.medium, *MORE.get(folder.name, [])]
     begun, code = processor_time(["init", "--data", str(folder), *words, "--out", str(config)], out / "init.log")
-    record: Record = {"commit": commit(), "init": begun, "words": " ".join(words)}
+    record: Record = {"commit": commit(), "init": begun, "words": shlex.join(words)}
     if code:
         return {**record, "failed": (out / "init.log").read_text().splitlines()[-1]}
     record["run"], code = processor_time(
@@ -150,12 +155,12 @@ def main() -> None:
     parser.add_argument("--splits", type=int, default=0, help="random halves of each folder")
     parser.add_argument("--minutes", type=float, default=60.0, help="start no folder after so long")
     parser.add_argument("--out", type=Path, default=Path("runs/two_commands"), help="folder of the runs and records")
+    parser.add_argument("--medium", default="", help="of the first command, for all folders")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="of the second command")
     asked = parser.parse_args()
     of = {folder.name: folder.resolve() for folder in asked.folders}
-    records = fill(
-        asked.out / "records.jsonl", of, lambda key: two_commands(of[key], asked.out / key, asked.set), asked.minutes
-    )
+    made = partial(two_commands, changed=asked.set, medium=asked.medium)
+    records = fill(asked.out / "records.jsonl", of, lambda key: made(of[key], asked.out / key), asked.minutes)
     print(table(list(records.values())))
     for key in records if asked.splits else ():
         if "used" in records[key]:

@@ -74,7 +74,8 @@ _MOVIES = (".tif", ".tiff", ".png", ".bmp", ".jpg", ".jpeg", ".gif", ".mp4", ".a
     "--medium",
     default="gel",
     show_default=True,
-    help="water, polyacrylamide, agarose, gelatin, peg, …: density and speed of sound, and how well they are known.",
+    help="water, polyacrylamide, agarose, gelatin, peg, … or with a concentration, 'agarose 1 %': density and speed of "
+    "sound, and how well they are known.",
 )
 @click.option("--out", type=click.Path(path_type=Path), help="YAML file to write; default <name of the data>.yaml.")
 @click.option("--force", is_flag=True, help="Replace that file.")

@@ -1,8 +1,9 @@
 """Media by name: density and speed of sound of water, gels and solutions, and how well each is known.
 
 The volumes of water and polymer add, 1/ρ = (1−w)/ρ_w + w v, and the speed of sound rises in proportion to the mass
-fraction w, c = c_w + s w. A gel made elsewhere differs from that by ``rho_error`` and ``c_error``; where nobody says
-how much polymer there is, the usual amount and its spread count as well. At 25 °C; c_w changes by 0.18 % a kelvin.
+fraction w, c = c_w + s w. A gel made elsewhere differs from that by ``rho_error`` and ``c_error``, by what swelling or
+drying does as well; where nobody says how much polymer there is, the usual amount and its spread count too, and what
+rheometry codes take (``rho_codes``). At 25 °C; c_w changes by 0.18 % a kelvin.
 """
 
 import math
@@ -27,7 +28,8 @@ class KnownMedium:
 @dataclass(frozen=True)
 class _Kind:
     """``volume`` v of the dissolved polymer in m³/kg, ``rise`` s of the speed in m/s; ``usual`` mass fraction and its
-    standard deviation; relative errors of ρ and c beyond that of the concentration.
+    standard deviation; relative errors of ρ and c beyond that of the concentration. ``rho_codes``: relative error of ρ
+    where only the name is known, which reaches the density that codes take for such gels.
     """
 
     volume: float
@@ -36,6 +38,7 @@ class _Kind:
     rho_error: float
     c_error: float
     source: str
+    rho_codes: float = 0.0
 
     def at(self, fraction: float) -> tuple[float, float]:
         """ρ and c at a mass fraction."""
@@ -50,10 +53,10 @@ _ADDED = "specific volumes of water and dry polymer added"
 _KINDS: Mapping[str, _Kind] = MappingProxyType(
     {
         "water": _Kind(1e-3, 0.0, (0.0, 0.0), 1e-3, 5e-3, "IAPWS-95; Del Grosso & Mader (1972), 25 °C, within 3 K"),
-        "polyacrylamide": _Kind(
-            0.70e-3, 300.0, (0.10, 0.04), 0.015, 0.01, f"{_ADDED} (rheometry codes: 1060 kg/m³); {_LIKE_PHANTOM}"
+        "polyacrylamide": _Kind(0.70e-3, 300.0, (0.10, 0.04), 0.006, 0.01, f"{_ADDED}; {_LIKE_PHANTOM}", 0.015),
+        "polyacrylamide-alginate": _Kind(
+            0.68e-3, 300.0, (0.14, 0.05), 0.006, 0.01, f"{_ADDED}; {_LIKE_PHANTOM}", 0.015
         ),
-        "polyacrylamide-alginate": _Kind(0.68e-3, 300.0, (0.14, 0.05), 0.015, 0.01, f"{_ADDED}; {_LIKE_PHANTOM}"),
         "agarose": _Kind(0.63e-3, 300.0, (0.010, 0.007), 3e-3, 6e-3, f"{_ADDED}; {_LIKE_PHANTOM}"),
         "gelatin": _Kind(0.69e-3, 300.0, (0.08, 0.04), 5e-3, 0.01, f"{_ADDED}; {_LIKE_PHANTOM}"),
         "peg": _Kind(
@@ -81,11 +84,11 @@ def known_medium(name: str, concentration: float | None = None) -> KnownMedium:
     kind = _KINDS[name]
     fraction, spread = kind.usual if concentration is None else (concentration, 0.0)
     (rho, c), (rho_more, c_more) = kind.at(fraction), kind.at(fraction + spread)
-    words = kind.source if concentration is None else f"{name} at {concentration:.3g} by mass; {kind.source}"
+    source, rho_error = f"{name}: {kind.source}", kind.rho_error
+    if concentration is not None:
+        source = f"{name} at {concentration:.3g} by mass: {kind.source}"
+    elif kind.rho_codes:
+        source, rho_error = f"{source} (rheometry codes: 1060 kg/m³)", kind.rho_codes
     return KnownMedium(
-        rho,
-        c,
-        math.hypot(math.log(rho_more / rho), kind.rho_error),
-        math.hypot(math.log(c_more / c), kind.c_error),
-        words,
+        rho, c, math.hypot(math.log(rho_more / rho), rho_error), math.hypot(math.log(c_more / c), kind.c_error), source
     )

@@ -22,6 +22,7 @@ from en4dvar.plumbing.errors import ConfigError, DataError
 from en4dvar.report.result import load_result
 from en4dvar_bubble.collapse import RAYLEIGH, lobe
 from en4dvar_bubble.laws import REGISTRY
+from en4dvar_bubble.media import known_medium
 from en4dvar_bubble.starter.look import look, noise
 from en4dvar_bubble.starter.page import Source, yaml_text
 from en4dvar_bubble.starter.proposal import starter
@@ -94,6 +95,23 @@ def test_what_is_not_known_exactly_is_estimated(tmp_path: Path) -> None:
     done = call("init", "--data", data, *UNITS, "--medium", "agarrose", "--force")
     assert done.exit_code == 2
     assert "unknown medium 'agarrose'; did you mean 'agarose'?" in done.output
+    done = call("init", "--data", data, *UNITS, "--medium", "polyacrylamide 8 %", "--force")
+    assert done.exit_code == 0, done.output
+    (rho,) = (term for term in build(load_config(Path("bubble.yaml")))[0].prior.terms if term.parameter.name == "rho")
+    usual = known_medium("polyacrylamide")
+    assert np.exp(rho.mean) == pytest.approx(1 / (0.92 / 997.05 + 0.08 * 0.70e-3), abs=1)  # volumes add
+    assert 1002 < np.exp(rho.mean) < usual.rho
+    assert rho.std < usual.rho_log_std / 2
+
+
+@pytest.mark.parametrize(
+    "said", ["gel 3 %", "water 3 %", "peg 70 %", "peg 0 %", "peg 8", "peg -3 %", "peg 8 m", "peg x"]
+)
+def test_a_concentration_is_of_a_polymer(said: str, tmp_path: Path) -> None:
+    data = simulate("laser", "0 us:70 us:0.63 us", "2 um", tmp_path / "bubble.csv")
+    done = call("init", "--data", data, *UNITS, "--medium", said)
+    assert done.exit_code == 2
+    assert f"medium '{said}': " in done.output
 
 
 def test_a_laser_bubble_gets_the_whole_physics_and_what_to_compare_it_with() -> None:

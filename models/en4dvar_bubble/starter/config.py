@@ -16,9 +16,8 @@ from en4dvar.inputs.steps import step_doubts
 from en4dvar.inputs.variables import indexed
 from en4dvar.plumbing.errors import ConfigError, DataError
 from en4dvar.plumbing.files import expanded
-from en4dvar.plumbing.hints import shown, suggest
 from en4dvar.plumbing.units import UnitError, convert, parse_quantity, parse_unit
-from en4dvar_bubble.starter.elsewhere import CHOICES
+from en4dvar_bubble.starter.elsewhere import known
 from en4dvar_bubble.starter.grouped import grouped
 from en4dvar_bubble.starter.look import Start
 from en4dvar_bubble.starter.page import TRACKED_COMMON, Source, quoted, yaml_text
@@ -70,7 +69,7 @@ def propose_config(
     folder: where the file will be; the path of the data inside it is relative to this folder.
     name: of the run, whose results go to ``runs/<name>``; default: that of the data.
     rate: of the camera's frames, e.g. ``"270 kHz"``, that the times are compared with.
-    medium: one of :data:`en4dvar_bubble.starter.elsewhere.CHOICES`, for density and speed of sound.
+    medium: for density and speed of sound, as :func:`en4dvar_bubble.starter.elsewhere.known` takes it.
     groups: which gel or day each data set is of: a column of the data, or a table, as ``gels.csv`` or ``gels.csv:gel``;
         default: its folder.
     errors: columns of the standard deviations of radii and times, in the units of ``radius`` and ``time``.
@@ -84,8 +83,7 @@ def propose_config(
     """
     if (time is None) == (time_step is None):
         raise ConfigError("give either the column of times and its unit, or a constant time step")
-    if medium not in CHOICES:
-        raise ConfigError(f"unknown medium {shown(medium)}{suggest(medium, CHOICES)}; known: {', '.join(CHOICES)}")
+    known(medium)
     source = Source(path_from(Path(folder), str(data)), time, time_step, radius, layout, errors, step_unit, rate)
     files = with_parts(
         find_files(Path.cwd(), [str(data)]), Column(*source.radius, "m"), layout, time[0] if time else None

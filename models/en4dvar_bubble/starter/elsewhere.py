@@ -14,7 +14,9 @@ from dataclasses import dataclass, replace
 
 from en4dvar.estimation.population.campaign import FEWEST_SETS
 from en4dvar.model.state import READING_SCALE
-from en4dvar.plumbing.units import parse_quantity
+from en4dvar.plumbing.errors import ConfigError, retold
+from en4dvar.plumbing.hints import shown, suggest
+from en4dvar.plumbing.units import UnitError, parse_quantity
 from en4dvar_bubble.media import MEDIA, known_medium
 from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.starter.grouped import NO_GROUPS, Grouped
@@ -50,13 +52,28 @@ _OF_ANY = (
 
 
 def known(medium: str) -> Sequence[Known]:
-    """What is known of an experiment in one of the :data:`CHOICES`."""
-    of_medium = _OF_ANY
-    if medium != ANY:
-        it = known_medium(medium)
+    """What is known of an experiment in one of the :data:`CHOICES`, which a concentration may follow: ``agarose 1 %``.
+
+    Raises
+    ------
+    ConfigError: another medium, or no concentration (mass of polymer over that of the whole) between 0 and 50 %.
+    """
+    name, _, text = medium.strip().partition(" ")
+    if name not in CHOICES:
+        raise ConfigError(f"unknown medium {shown(name)}{suggest(name, CHOICES)}; known: {', '.join(CHOICES)}")
+    of_medium, concentration = _OF_ANY, None
+    if text:
+        with retold(UnitError, ConfigError, f"medium {shown(medium)}: "):
+            concentration = parse_quantity(text, "1")
+        if name in (ANY, "water") or not 0 < concentration <= 0.5:
+            raise ConfigError(
+                f"medium {shown(medium)}: a concentration is of a polymer, up to 50 %: polyacrylamide 8 %"
+            )
+    if name != ANY:
+        it = known_medium(name, concentration)
         of_medium = (
-            Known("rho", f"{it.rho:.4g} kg/m^3", float(f"{it.rho_log_std:.2g}"), f"density of {medium}: {it.source}"),
-            Known("c", f"{it.c:.4g} m/s", float(f"{it.c_log_std:.2g}"), f"speed of sound in {medium}"),
+            Known("rho", f"{it.rho:.4g} kg/m^3", float(f"{it.rho_log_std:.2g}"), f"density of {it.source}"),
+            Known("c", f"{it.c:.4g} m/s", float(f"{it.c_log_std:.2g}"), f"speed of sound in {name}"),
         )
     return (*of_medium, PRESSURE, SCALE)
 
