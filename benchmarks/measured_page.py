@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -27,17 +28,21 @@ with each group.
 How to read it. *G*, *μ*: mean ± standard deviation; a number in brackets has no interval, for the reason that follows
 it. *After the window*: how many of the readings that were not fitted lie in the 90 % bands of what was expected of
 them, and their distance from the medians in per cent of R_max (rms, root mean square); the window ends at the second
-minimum, if there are two. In brackets: 90 % of such shares of as many bubbles drawn with replacement, since the
-readings of one bubble are missed together. χ² per degree of freedom: of ln G or ln μ about their weighted mean, 1 if
-bubbles of one gel differ by no more than their intervals say, and far above 1 if intervals are too narrow or the
-bubbles' gels differ; the readings after the window go on to the end of the record, through oscillations of which none
-was fitted. Density, scale and pressure are common to the bubbles of a folder and make χ² smaller. Where χ² is far above
-1, the stated intervals are too narrow. The bands allow for gas that a collapse takes or sets free (`gas_change`, see
+minimum, if there are two. In brackets: 90 % of the shares that as many readings would have if they were what the
+estimates expect; the readings of one bubble are missed together, so that shares of few bubbles scatter, mostly
+upwards. {chance}
+
+χ² per degree of freedom: of ln G or ln μ about their weighted mean, 1 if bubbles of one gel differ by no more than
+their intervals say, and far above 1 if intervals are too narrow or the bubbles' gels differ; the readings after the
+window go on to the end of the record, through oscillations of which none was fitted. Density, scale and pressure are
+common to the bubbles of a folder and make χ² smaller. Where χ² is far above 1, the stated intervals are too narrow. The
+bands allow for gas that a collapse takes or sets free (`gas_change`, see
 [physics](physics.md#vapour-and-a-warm-medium)) and, in liquids, for damping that is no viscosity (`viscosity_change`);
 where far more than 90 % lie in them, they allow for too much, and where far fewer do, something else happens to the
 bubble.
 """
 PRESSURE = re.compile(r"ambient pressure of ([\d.]+) ?MPa")
+ASKED = 0.85, 0.95  # of the readings up to the next minimum, in bands of 90 %
 ATMOSPHERE = 0.1  # MPa, which init takes for granted
 
 
@@ -106,7 +111,12 @@ def started(text: str) -> list[str]:
 def page(groups: Mapping[str, Sequence[Record]], command: str) -> str:
     """Markdown of all groups by the names of their folders, and of which commits their records are."""
     commits = dict.fromkeys(record["commit"] for records in groups.values() for record in records)
-    parts = [HEAD.format(command=command, commit=", ".join(commits)), _overview(groups)]
+    told = asked_for([counts_of(records, "next") for records in groups.values()])
+    chance = (
+        f"Were all bands right, each group would have {ASKED[0]:.0%} to {ASKED[1]:.0%} inside up to the next minimum"
+    )
+    chance += f"\nwith a chance of {told:.2g}, all of them together."
+    parts = [HEAD.format(command=command, commit=", ".join(commits), chance=chance), _overview(groups)]
     parts += [_group(GROUPS[name], records) for name, records in groups.items()]
     return "\n".join(parts)
 
@@ -126,7 +136,8 @@ def _overview(groups: Mapping[str, Sequence[Record]]) -> str:
             cells += [str(len(logs)) if some else "–", f"{chi2(logs):.2f}" if len(logs) > 1 and title != "all" else "–"]
         for part in ("next", "withheld"):
             count, inside = after(records, part)
-            low, high = np.quantile(_redrawn(records, part), (0.05, 0.95))
+            chances = np.cumsum(counts_of(records, part))
+            low, high = (np.searchsorted(chances, level) / max(1, len(chances) - 1) for level in (0.05, 0.95))
             cells += [str(count), f"{inside:.0%} ({low:.0%} to {high:.0%})" if count else "–"]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
@@ -191,11 +202,15 @@ def after(records: Sequence[Record], key: str = "withheld") -> tuple[int, float]
     return count, sum(each[0] * each[1] for each in told) / max(1, count)
 
 
-def _redrawn(records: Sequence[Record], key: str) -> np.ndarray:
-    """The share of :func:`after` of as many bubbles, drawn with replacement a thousand times."""
-    stream = np.random.default_rng(0)
-    samples = stream.integers(len(records), size=(1000, len(records)))
-    return np.array([after([records[i] for i in some], key)[1] for some in samples])
+def counts_of(records: Sequence[Record], part: str) -> np.ndarray:
+    """Chances that 0, 1, 2, … of all readings of a part (of :func:`after`) lie in their bands, if these are right."""
+    return reduce(np.convolve, [record["chances"][part] for record in records if record.get("chances")], np.ones(1))
+
+
+def asked_for(counts: Sequence[np.ndarray]) -> float:
+    """The chance that the shares of all groups are :data:`ASKED`, from each one's :func:`counts_of`."""
+    shares = [np.arange(len(of)) / max(1, len(of) - 1) for of in counts]
+    return float(np.prod([of[(ASKED[0] <= x) & (x <= ASKED[1])].sum() for of, x in zip(counts, shares, strict=True)]))
 
 
 def said(number: Record | None, factor: float) -> str:

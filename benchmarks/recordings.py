@@ -48,13 +48,19 @@ from click.testing import CliRunner
 from measured_page import GROUPS, after, chi2, intervals, page, said, started, stated
 from records import Record, fill
 from scipy.signal import peak_widths
+from scipy.special import ndtr
 from wrong_worlds import WORLDS, Wrong
 
 import en4dvar
+from en4dvar.assembly.build import build
 from en4dvar.cli import main as command_line
+from en4dvar.config import load_config
 from en4dvar.diagnosis.diagnostics import member_quantiles
+from en4dvar.diagnosis.withheld import expectations, predict_withheld
+from en4dvar.executor import SerialExecutor
 from en4dvar.inputs.window import minima
 from en4dvar.model.state import Array
+from en4dvar.problem import InverseProblem
 from en4dvar.report.result import Result
 from en4dvar.report.text import shown
 from en4dvar.report.withheld import withheld_lines
@@ -191,9 +197,10 @@ def verbatim(
     quick: bool,
     with_what_if: bool = False,
     change: Callable[[dict[str, Any]], None] | None = None,
+    with_chances: bool = False,
 ) -> Record:
     """What ``init`` and ``run`` say of a file, from a folder of its own, beside what its head states; with ``change``
-    of the configuration between them.
+    of the configuration between them, and ``with_chances`` how many readings after the window should be in their bands.
     """
     begun = time.process_time()
     with TemporaryDirectory() as name:
@@ -227,6 +234,9 @@ def verbatim(
                 found[key] = _posterior(result.posterior[key].values.ravel(), rows[key])
         found["withheld"] = _withheld(result.sample_stats.attrs, found.get("R_max", {"mean": np.nan})["mean"])
         found["next"] = _next(result, found.get("R_max", {"mean": np.nan})["mean"])
+        if with_chances and found["withheld"]:
+            parts = {"next": (found["next"] or [0])[0], "withheld": found["withheld"][0]}
+            found["chances"] = chances(build(load_config(config, changes))[0], result, parts)
         found["log_evidence"] = float(result.sample_stats.attrs.get("log_evidence", np.nan))
         return found
 
@@ -247,6 +257,25 @@ def _next(result: Result, largest: float) -> tuple[int, float, float] | None:
     off = np.array([float(str(line[4])) - float(str(line[6])) for line in lines[:count]])
     share = float(np.mean([line[-1] == 1 for line in lines[:count]]))
     return count, share, float(np.sqrt(np.mean(off**2))) * 1e-6 / largest  # readings are in µm
+
+
+def chances(problem: InverseProblem, result: Result, parts: dict[str, int]) -> dict[str, list[float]]:
+    """Of each part, so many readings after the window: the chance that 0, 1, 2, … of them lie in their 90 % bands, were
+    they what the estimate expects. Given a member they lie there independently, but all of them are of one member; what
+    the discrepancy makes them share besides is left out, so that the true spread is wider.
+    """
+    names = problem.prior.names
+    members = np.column_stack([result.posterior[name].values.ravel() for name in names])
+    mean, std = expectations(problem, problem.prior.from_physical(members), SerialExecutor()) or (np.zeros((1, 0)),) * 2
+    withheld = predict_withheld(problem, problem.prior.from_physical(members), SerialExecutor())
+    inside = ndtr((withheld.high - mean) / std) - ndtr((withheld.low - mean) / std) if withheld else mean
+    found = {}
+    for part, count in parts.items():
+        of = np.ones((len(inside), 1))
+        for share in inside[:, :count].T:
+            of = np.pad(of * (1 - share[:, None]), ((0, 0), (0, 1))) + np.pad(of * share[:, None], ((0, 0), (1, 0)))
+        found[part] = [float(f"{chance:.3g}") for chance in of.mean(axis=0)]
+    return found
 
 
 def to_the_next_minimum(within: Array, later: Array) -> int:
@@ -354,7 +383,10 @@ def measured(folder: Path, law: str, medium: str, o: argparse.Namespace) -> list
 
     def run(key: str) -> Record:
         text = files[key].read_text()
-        return {"commit": at, **verbatim(later(text, o.from_trough) if o.from_trough else text, law, words, o.quick)}
+        return {
+            "commit": at,
+            **verbatim(later(text, o.from_trough) if o.from_trough else text, law, words, o.quick, with_chances=True),
+        }
 
     done = fill(path, files, run, o.minutes)
     return list(done.values())

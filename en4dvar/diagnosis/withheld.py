@@ -64,6 +64,18 @@ def predict_withheld(problem: InverseProblem, members: Array, executor: Executor
 
     None where there are none, or fewer than two members can be run so far.
     """
+    whole, begin = problem.observations.continued, len(problem.observations)
+    expected = expectations(problem, members, executor)
+    if whole is None or expected is None:
+        return None
+    low, median, high = (_quantile(*expected, level) for level in (BAND[0], 0.5, BAND[1]))
+    return Withheld(whole.times[begin:], whole.values[begin:], low, median, high, len(members))
+
+
+def expectations(problem: InverseProblem, members: Array, executor: Executor) -> tuple[Array, Array] | None:
+    """Means and standard deviations (members that can be run so far, K) of what each expects of the readings after the
+    window; None as of :func:`predict_withheld`.
+    """
     within, whole = problem.observations, problem.observations.continued
     if whole is None:
         return None
@@ -75,13 +87,12 @@ def predict_withheld(problem: InverseProblem, members: Array, executor: Executor
         last = max(j for j, name in enumerate(names) if name.startswith(f"{quantity}_change_"))
         theirs[:, last] += spread * stream.permutation(scores)
     run = Composite(replace(changed, observations=whole), executor)(theirs)
-    begin, alive = len(within), np.flatnonzero(np.isfinite(run.predicted.values).all(axis=1))
+    alive = np.flatnonzero(np.isfinite(run.predicted.values).all(axis=1))
     if len(alive) < 2:
         return None
     expected = [whole.noise.continued(within.values, run.predicted[int(i)]) for i in alive]
     mean, std = (np.stack(part) for part in zip(*expected, strict=True))
-    low, median, high = (_quantile(mean, std, level) for level in (BAND[0], 0.5, BAND[1]))
-    return Withheld(whole.times[begin:], whole.values[begin:], low, median, high, len(members))
+    return mean, std
 
 
 def unforeseen(problem: InverseProblem) -> InverseProblem:

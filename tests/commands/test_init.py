@@ -154,12 +154,14 @@ def test_of_three_bubbles_the_run_ends_with_their_gel(tmp_path: Path) -> None:
         write(folder / f"b{n}.csv", scale=1 + n / 20)
     assert call("init", "--data", folder, *UNITS).exit_code == 0
     assert proposed(Path("gel.yaml")).population is None
+    assert proposed(Path("gel.yaml")).assimilation.what_if is True
     write(folder / "b3.csv")
     done = call("init", "--data", folder, *UNITS, "--force")
     assert "3 bubbles: the run ends with what they say of one gel together" in done.output
     asked = proposed(Path("gel.yaml")).population
     assert asked is not None
     assert asked.of == ("G", "mu")
+    assert proposed(Path("gel.yaml")).assimilation.what_if is False
     assert "rho, c, p_inf, reading_scale have one value in all bubbles" in Path("gel.yaml").read_text()
 
 

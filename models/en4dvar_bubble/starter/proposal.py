@@ -89,6 +89,11 @@ class Proposal:
     )
 
 
+EACH_ALONE = Entry(
+    "what_if", "false", "of each bubble alone, which the gel's numbers do not use; 'true' takes up to twice the time"
+)
+
+
 def propose(
     histories: Mapping[str, tuple[Array, Array]],
     start: Start | None = None,
@@ -152,6 +157,7 @@ def propose(
         tuple(warnings),
         together,
         chosen == "laser" and not _in_a_liquid(model) and float(np.median([v.n_minima for v in views])) > 2,
+        (*Proposal.assimilation, *[EACH_ALONE] * bool(together)),
     )
 
 
