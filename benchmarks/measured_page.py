@@ -113,9 +113,9 @@ def page(groups: Mapping[str, Sequence[Record]], command: str) -> str:
     commits = dict.fromkeys(record["commit"] for records in groups.values() for record in records)
     told = asked_for([counts_of(records, "next") for records in groups.values()])
     chance = (
-        f"Were all bands right, each group would have {ASKED[0]:.0%} to {ASKED[1]:.0%} inside up to the next minimum"
+        f"Were all bands right, every group would have {ASKED[0]:.0%} to {ASKED[1]:.0%} inside up to the next minimum"
     )
-    chance += f"\nwith a chance of {told:.2g}, all of them together."
+    chance += f"\nwith a chance of {told:.1%}."
     parts = [HEAD.format(command=command, commit=", ".join(commits), chance=chance), _overview(groups)]
     parts += [_group(GROUPS[name], records) for name, records in groups.items()]
     return "\n".join(parts)
