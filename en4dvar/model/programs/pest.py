@@ -12,7 +12,6 @@ import functools
 import math
 import re
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 from en4dvar.model.programs.errors import ProgramError
 
@@ -90,35 +89,32 @@ def _sign(text: str) -> str:
     return sign
 
 
-class Line(NamedTuple):
-    """A line of instructions with those that continue it: its number, and its items."""
-
-    number: int
-    items: tuple[str, ...]
-
-
 @functools.lru_cache(maxsize=64)
-def parsed(instructions: str, source: str = "instructions") -> tuple[Line, ...]:
-    """The lines of an instruction file, ``source`` by name. Raises :class:`ProgramError` at what is no instruction."""
+def parsed(instructions: str, source: str = "instructions") -> tuple[list[str], ...]:
+    """The items of each line of an instruction file, ``source`` by name, with those of the lines that continue it.
+
+    Raises :class:`ProgramError` at what is no instruction.
+    """
     sign = re.escape(_sign(instructions))
     item = re.compile(f"{sign}[^{sign}]*{sign}|[^\\s{sign}]+|{sign}.*")
-    lines: list[Line] = []
+    lines: list[list[str]] = []
     names: set[str] = set()
     for number, text in enumerate(instructions.splitlines()[1:], 2):
-        items = tuple(match[0] for match in item.finditer(text))
+        items = item.findall(text)
         if not items:
             continue
-        begins = items[0] == "&" and bool(lines)
-        for place, each in enumerate(items[1:] if begins else items):
-            _check(each, _sign(instructions), begins or place > 0, f"{source}:{number}")
+        if items[0] == "&" and lines:
+            begin, items = 1, items[1:]
+            lines[-1] += items
+        else:
+            begin = 0
+            lines.append(items)
+        for place, each in enumerate(items, begin):
+            _check(each, _sign(instructions), place > 0, f"{source}:{number}")
             name = _named(each)
             if name in names:
                 raise ProgramError(f"{source}:{number}: {name} is read twice")
             names |= {name} - {""}
-        if begins:
-            lines[-1] = Line(lines[-1].number, (*lines[-1].items, *items[1:]))
-        else:
-            lines.append(Line(number, items))
     return tuple(lines)
 
 
@@ -136,7 +132,7 @@ def _check(item: str, sign: str, within: bool, where: str) -> None:
 
 def observations_of(instructions: str, source: str = "instructions") -> list[str]:
     """Names of the observations that instructions read, in order. Raises :class:`ProgramError`."""
-    return [name for line in parsed(instructions, source) for item in line.items if (name := _named(item))]
+    return [name for items in parsed(instructions, source) for item in items if (name := _named(item))]
 
 
 def read(
@@ -152,11 +148,11 @@ def read(
     cursor = _Cursor(output.splitlines(), where, re.escape(delimiters))
     values: dict[str, float] = {}
     wrong = ""
-    for line in parsed(instructions, source):
-        cursor.advance(line.items[0])
+    for items in parsed(instructions, source):
+        cursor.advance(items[0])
         k = 1
-        while k < len(line.items):
-            item, following = line.items[k], line.items[k + 1 : k + 2]
+        while k < len(items):
+            item, following = items[k], items[k + 1 : k + 2]
             if (name := _named(item)) or _OBSERVATION.fullmatch(item):
                 text = cursor.observed(item, _marker(following[0]) if following else "")
                 if name:
@@ -164,9 +160,9 @@ def read(
                     values[name] = math.nan if number is None else float(f"{number[1]}e{number[2] or 0}")
                     wrong = wrong or f"{cursor.place}: {text.strip() or 'nothing'!r} is not a number for {name}"
             elif not cursor.moved(item):
-                if not all(_marker(each) for each in line.items[:k]):
+                if not all(map(_marker, items[:k])):
                     raise ProgramError(f"{cursor.place}: no {_marker(item)!r} behind column {cursor.column}")
-                cursor.advance(line.items[0])  # the markers belong to a line further down
+                cursor.advance(items[0])  # the markers belong to a line further down
                 k = 0
             k += 1
     if values and all(map(math.isnan, values.values())):
@@ -241,17 +237,14 @@ class _Cursor:
         assert observed is not None
         if observed[1]:
             token = self.token.search(line, self.column)
-            end = token.end() if token else self.column
-            if token and until and (cut := line.find(until, token.start(), token.end())) > token.start():
-                end = cut
-            text = line[token.start() : end] if token else ""
+            text, end = (token[0], token.end()) if token else ("", self.column)
+            if until and (cut := text.find(until)) > 0:
+                text, end = text[:cut], end - len(text) + cut
         else:
             first, end = int(observed[3]) - 1, int(observed[4])
             text = line[first:end]
             if item[0] == "(":  # the whole of what begins or lies in the columns
-                tokens = (token for token in self.token.finditer(line) if token.end() > first)
-                token = next(tokens, None)
-                inside = token is not None and token.start() < end
-                text, end = (token[0], token.end()) if token is not None and inside else ("", end)
+                token = next((t for t in self.token.finditer(line) if t.end() > first and t.start() < end), None)
+                text, end = (token[0], token.end()) if token else ("", end)
         self.column = end
         return text
