@@ -118,8 +118,7 @@ def _text(path: Path) -> Read:
     body, *lists = text_of(path).split("*")
     n_rows, n_columns, code = (int(word) for word in body.split()[:3])
     numbers = np.array([float(word.lower().replace("d", "e")) for word in body.split()[3:]])
-    names = [part.splitlines()[1:] for part in lists]
-    names = [[name for name in part if name.strip()] for part in names] * (1 if code == 2 else 2)
+    names = [list(filter(str.strip, part.splitlines()[1:])) for part in lists] * (1 if code == 2 else 2)
     values = np.diag(numbers) if code == -1 else numbers.reshape(n_rows, n_columns)
     return names[0], names[1], values
 

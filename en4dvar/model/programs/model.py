@@ -16,6 +16,7 @@ class CommandModel(FunctionModel):
     """An external program: parameters go into files or arguments, observables come out of files."""
 
     Settings = CommandSettings
+    threaded = True  # a thread that waits for a program leaves the interpreter to others
 
     def __init__(self, settings: CommandSettings):
         words = split(settings.command, settings.shell)
@@ -32,8 +33,3 @@ class CommandModel(FunctionModel):
     def from_settings(cls, settings: CommandSettings) -> CommandModel:
         """Raises :class:`~en4dvar.plumbing.user_code.RefusedError` where the program may not be run."""
         return cls(settings)
-
-    @property
-    def threaded(self) -> bool:
-        """A thread that waits for a program leaves the interpreter to others."""
-        return True

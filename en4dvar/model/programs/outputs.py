@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import functools
 import json
 import math
 from pathlib import Path
@@ -11,13 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from en4dvar.model.programs import pest
+from en4dvar.model.programs import pest, template
 from en4dvar.model.programs.errors import ProgramError
 from en4dvar.model.programs.settings import OutputOf
 from en4dvar.model.state import Array
 from en4dvar.plumbing.decoding import Allowed, DecodeError, decoded_whole
 from en4dvar.plumbing.errors import DataError, retold
-from en4dvar.plumbing.files import read_text
 from en4dvar.plumbing.hints import listed, short
 from en4dvar.plumbing.patterns import LONGEST, matches, text_of
 from en4dvar.plumbing.tables import is_number
@@ -53,7 +51,7 @@ def _instructed(output: OutputOf, folder: Path) -> Array:
     for file, paths in output.instruction_files.items():
         text = _text(folder, file)
         for path in paths:
-            values |= pest.read(_instructions(path), text, file, path.name, output.delimiters)
+            values |= pest.read(template.text_of(path), text, file, path.name, output.delimiters)
     names = list(values) if output.observations is None else [name.lower() for name in output.observations]
     return np.array([values[name] for name in names])
 
@@ -72,11 +70,6 @@ def _text(folder: Path, file: str) -> str:
         return text_of(folder / file)
     except DataError as error:
         raise ProgramError(str(error).replace(str(folder / file), file)) from None
-
-
-@functools.cache
-def _instructions(path: Path) -> str:
-    return read_text(path)
 
 
 def _at(times: Array, own: Array, values: Array, file: str) -> Array:

@@ -90,10 +90,9 @@ class Program:
         values = {name: repr(float(value)) for name, value in parameters.items()}
         values |= {"input": next(iter(self.settings.templates), ""), "output": OUTPUT}
         words = [fill(word, values) for word in self.words]
+        line: list[str] | str = words
         if self.settings.shell:  # which takes its line as it is
-            line: list[str] | str = ["/bin/sh", "-c", *words] if POSIX else f'cmd /d /s /c "{words[0]}"'
-        else:
-            line = words
+            line = ["/bin/sh", "-c", *words] if POSIX else f'cmd /d /s /c "{words[0]}"'
         with (folder / STDOUT).open("wb") as printed, tempfile.TemporaryFile(dir=folder) as said:
             with Child(line, folder, self.settings.environment, printed, said) as child:
                 status = child.wait(None if end is None else end - time.monotonic())

@@ -268,10 +268,9 @@ def _placed(command: str, base: Path, shell: bool) -> str:
     """The command with absolute paths of what lies beside the configuration. Raises ValueError: no such program."""
     known = {"here": shlex.quote(str(base)), "python": shlex.quote(sys.executable)}
     command = fill(command, known)
-    if shell:
-        split(command, shell)
-        return command
     first, *others = split(command, shell)
+    if shell:
+        return command
     if Path(first).name != first:
         path = base / expanded(first)
         if not path.is_file():

@@ -25,6 +25,7 @@ from en4dvar.plumbing.hints import suggest
 TIMES = "times"
 LONGEST = 256_000_000  # characters of an input file
 SUFFIXES = (".j2", ".tpl", ".template")
+_ENVIRONMENT = ImmutableSandboxedEnvironment(undefined=StrictUndefined, keep_trailing_newline=True)
 
 
 def input_name(template: Path) -> str:
@@ -34,14 +35,14 @@ def input_name(template: Path) -> str:
 
 def check_template(template: Path, names: Collection[str]) -> None:
     """Raise ValueError, in words, where a template cannot be read or names an unknown parameter."""
-    text = _text(template)
+    text = text_of(template)
     if pest.is_template(text):
         names = {pest.identifier(name) for name in names}
         with retold(ProgramError, ValueError, f"{template}: "):
             wanted: Collection[str] = pest.parameters_of(text)
     else:
         try:
-            wanted = find_undeclared_variables(_environment().parse(text))
+            wanted = find_undeclared_variables(_ENVIRONMENT.parse(text))
         except TemplateError as error:
             line = getattr(error, "lineno", None)
             raise ValueError(f"{template}{f':{line}' if line else ''}: {error}") from None
@@ -52,7 +53,7 @@ def check_template(template: Path, names: Collection[str]) -> None:
 
 def filled(template: Path, parameters: Mapping[str, float], times: Array) -> str:
     """The input file of a member; ``times`` (K,) are where it is observed. Raises :class:`ProgramError`."""
-    text = _text(template)
+    text = text_of(template)
     if pest.is_template(text):
         return pest.filled(text, parameters)
     values: dict[str, Any] = {name: float(value) for name, value in parameters.items()}
@@ -65,16 +66,10 @@ def filled(template: Path, parameters: Mapping[str, float], times: Array) -> str
 
 
 @functools.cache
-def _text(template: Path) -> str:
-    with retold(OSError, ValueError, f"{template}: "):
-        return read_text(template)
+def text_of(file: Path) -> str:
+    """A template or instructions, read once in a process. Raises ValueError."""
+    with retold(OSError, ValueError, f"{file}: "):
+        return read_text(file)
 
 
-@functools.cache
-def _environment() -> ImmutableSandboxedEnvironment:
-    return ImmutableSandboxedEnvironment(undefined=StrictUndefined, keep_trailing_newline=True)
-
-
-@functools.cache
-def _compiled(text: str) -> Any:
-    return _environment().from_string(text)
+_compiled = functools.cache(_ENVIRONMENT.from_string)
