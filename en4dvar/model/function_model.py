@@ -50,6 +50,8 @@ class FunctionModel(ForwardModel):
         twice). An exception loses all of them; a member is lost by NaN.
     """
 
+    dense = False
+
     def __init__(
         self,
         function: Function,
@@ -64,14 +66,9 @@ class FunctionModel(ForwardModel):
         self.jacobian, self.members, self.batch = jacobian, members, members or 1
         self.observables = tuple(Observable(name, unit, Returned(name), fewest=1) for name, unit in observables.items())
         self.time_unit = self.time_display_unit = time_unit
-        self._dense = dense
+        self.dense = dense
         self.layout = StateLayout((Field("theta", len(self.parameters)),))
         self._path = StateLayout(tuple(Field(observable.name, unit=observable.unit) for observable in self.observables))
-
-    @property
-    def dense(self) -> bool:
-        """The choice of the constructor."""
-        return self._dense
 
     @property
     def differentiable(self) -> bool:
