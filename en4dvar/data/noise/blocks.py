@@ -8,7 +8,7 @@ information are sums over blocks, and what each reading contributes stands at it
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -159,12 +159,8 @@ class BlockNoise(Noise):
     def scale_skewness(self) -> ScaleSkewness:
         """The mean over the readings: they inform the one scale together."""
         share = [len(block.where) / len(self.std) for block in self.blocks]
-        each = [block.noise.scale_skewness() for block in self.blocks]
-        return ScaleSkewness(
-            sum(w * skewness.of_predictions for w, skewness in zip(share, each, strict=True)),
-            sum(w * skewness.of_scale for w, skewness in zip(share, each, strict=True)),
-            sum(w * skewness.information for w, skewness in zip(share, each, strict=True)),
-        )
+        each = zip(*(astuple(block.noise.scale_skewness()) for block in self.blocks), strict=True)
+        return ScaleSkewness(*(sum(w * of_block for w, of_block in zip(share, of, strict=True)) for of in each))
 
     def matrices(self) -> dict[str, tuple[Array, str]]:
         bounds = {} if self.sides is None else record_of(self.sides)

@@ -24,6 +24,8 @@ class BoundNoise(Noise):
 
     sides: Array
 
+    quadratic = False
+
     def check(self, weights: Array) -> None:
         super().check(weights)
         if not np.all(np.abs(self.sides) == 1):
@@ -34,10 +36,6 @@ class BoundNoise(Noise):
     @property
     def words(self) -> str:
         return "".join(f", {words}" for side, words in WORDS.items() if np.any(self.sides == side))
-
-    @property
-    def quadratic(self) -> bool:
-        return False
 
     def influence(self, residual: Array) -> Array:
         return np.where(self.sides * residual < 0, 1.0, 0.0)

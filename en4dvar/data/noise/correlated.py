@@ -191,13 +191,8 @@ class CorrelatedNoise(Noise):
 
     correlation: Correlation | SharedErrors
 
-    @property
-    def words(self) -> str:
-        return ", correlated"
-
-    @property
-    def independent(self) -> bool:
-        return False
+    words = ", correlated"
+    independent = False
 
     def check(self, weights: Array) -> None:
         super().check(weights)

@@ -48,6 +48,7 @@ class DiscrepancyNoise(Noise):
     correlation: Correlation | SharedErrors | None = None
 
     discrepant: ClassVar[bool] = True
+    independent = False
 
     def check(self, weights: Array) -> None:
         super().check(weights)
@@ -57,10 +58,6 @@ class DiscrepancyNoise(Noise):
             raise ValueError(f"the kernel of the discrepancy is that of {len(self.kernel.times)} observations")
         if np.ptp(weights) > 0:
             raise ValueError("a discrepancy needs one weight for all observations")
-
-    @property
-    def independent(self) -> bool:
-        return False
 
     @property
     def words(self) -> str:
@@ -240,13 +237,8 @@ class DiscrepancyNoise(Noise):
 
 def in_rows(predicted: Predicted) -> Predicted:
     """The same with one leading dimension."""
-    k = predicted.values.shape[-1]
-    return Predicted(
-        predicted.values.reshape(-1, k),
-        None if predicted.rates is None else predicted.rates.reshape(-1, k),
-        None if predicted.noise_scale is None else np.asarray(predicted.noise_scale).reshape(-1),
-        None if predicted.discrepancy is None else predicted.discrepancy.reshape(-1, 2),
-    )
+    leading = predicted.values.ndim - 1
+    return predicted.each(lambda part: np.reshape(part, (-1, *np.shape(part)[leading:])))
 
 
 def whitened(residuals: Array, covariances: Array) -> tuple[Array, Array]:

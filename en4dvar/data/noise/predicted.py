@@ -2,6 +2,7 @@
 change.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,12 +26,12 @@ class Predicted:
 
     def __getitem__(self, runs: int | slice) -> "Predicted":
         """The same of some of the runs."""
-        return Predicted(
-            self.values[runs],
-            None if self.rates is None else self.rates[runs],
-            None if self.noise_scale is None else self.noise_scale[runs],
-            None if self.discrepancy is None else self.discrepancy[runs],
-        )
+        return self.each(lambda part: part[runs])
+
+    def each(self, of: Callable[[Array], Array]) -> "Predicted":
+        """What ``of`` makes of each of the arrays."""
+        others = (self.rates, self.noise_scale, self.discrepancy)
+        return Predicted(of(self.values), *(None if part is None else of(part) for part in others))
 
     @property
     def stacked(self) -> Array:
