@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from en4dvar.inputs.asked import Matrix
-from en4dvar.inputs.opened import readable, require_file
+from en4dvar.inputs.asked import Layout, Matrix
+from en4dvar.inputs.opened import opened
 from en4dvar.inputs.text_table import cells_of, check_width, delimiter_of, number_in, numbered_lines
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import DataError
@@ -29,8 +29,7 @@ def read_covariance(matrix: Matrix) -> Array:
 
 def read_square(path: Path, what: str = "correlation matrix") -> Array:
     """The numbers (K, K) of a CSV file without header. Raises :class:`DataError`."""
-    require_file(path)
-    with readable(path):
+    with opened(path, Layout("csv")):
         rows = _rows_of_numbers(path)
     if not rows or len(rows) != len(rows[0]):
         raise DataError(f"{path}: a {what} is square, but this has {len(rows)} rows of {len(rows[0]) if rows else 0}")

@@ -7,7 +7,7 @@ and ``M(2,:)``.
 import fnmatch
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TypeVar
 
 import numpy as np
@@ -57,16 +57,11 @@ class Variables:
 
     def of(self, part: str) -> "Variables":
         """What is not inside an array, and of arrays the element ``part`` under names without the index."""
-        return Variables(
-            _element(self.vectors, part),
-            _element(self.matrices, part),
-            _element(self.scalars, part),
-            _element(self.others, part),
-        )
+        return Variables(*(_element(getattr(self, kind.name), part) for kind in fields(self)))
 
     def of_first(self) -> "Variables":
         """Each array by its first element, under names without the index."""
-        return Variables(_first(self.vectors), _first(self.matrices), _first(self.scalars), _first(self.others))
+        return Variables(*(_first(getattr(self, kind.name)) for kind in fields(self)))
 
     def columns(self) -> dict[str, Array]:
         """Vectors of more than one number, and the columns of narrow matrices."""
