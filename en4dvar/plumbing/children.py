@@ -96,7 +96,7 @@ class Child:
         try:
             self.kill()
             self.process.wait()
-            if POSIX and not _closed(self.alive, 0.0):
+            if POSIX and not _readable(self.alive, 0.0):  # nothing is written: somebody holds its other end
                 self._end_what_escaped()
         finally:
             os.close(self.alive)
@@ -129,7 +129,7 @@ class Child:
         """End what is in another session by now, by the mark in its environment and the pipe that it still holds."""
         end = time.monotonic() + PATIENCE
         pipe = os.fstat(self.alive).st_ino
-        while not _closed(self.alive, 0.01) and time.monotonic() < end:
+        while not _readable(self.alive, 0.01) and time.monotonic() < end:
             for process in Path("/proc").glob("[0-9]*"):
                 with suppress(OSError):
                     marked = _mark().encode() in (process / "environ").read_bytes()
@@ -138,15 +138,10 @@ class Child:
 
 
 def _readable(handle: int, seconds: float | None) -> bool:
-    """Wait until a descriptor can be read; not longer than told."""
+    """Wait until a descriptor can be read, or a pipe has no other end any more; not longer than told."""
     poll = select.poll()
     poll.register(handle, select.POLLIN)
     return bool(poll.poll(None if seconds is None else max(0.0, seconds) * 1000))
-
-
-def _closed(pipe: int, seconds: float) -> bool:
-    """Whether nobody holds the other end of a pipe, into which nothing is written."""
-    return _readable(pipe, seconds)
 
 
 def end_those_of(threads: Collection[int]) -> None:
