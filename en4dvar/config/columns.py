@@ -5,7 +5,7 @@ from typing import Annotated, Any, Self, cast
 
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
-from en4dvar.config.context import PLACEHOLDER, Context, Made, observable_unit, require_sign, time_unit, unit_of
+from en4dvar.config.context import PLACEHOLDER, Context, Made, observable_unit, quantity, time_unit, unit_of
 from en4dvar.config.schema import QuantityText, Section
 from en4dvar.config.validate import Faults
 from en4dvar.inputs.asked import Column, TimeStep
@@ -52,7 +52,7 @@ class TimeColumn(Section):
     """Constant time step: a quantity such as 0.63 us, or the name of a scalar in the file (then with ``unit``)."""
     unit: Annotated[str | None, unit_of(time_unit)] = None
     """Unit of the times in the file, e.g. us; required with ``name``, never guessed."""
-    rate: QuantityText | None = None
+    rate: Annotated[float, quantity(lambda context: f"1/({time_unit(context)})", "positive")] | None = None
     """Frame rate of the camera, e.g. 270 kHz; the column of times is compared with it."""
 
     @model_validator(mode="after")
@@ -68,19 +68,11 @@ class TimeColumn(Section):
 
 def _times(section: TimeColumn, context: Context) -> Column | TimeStep:
     unit = time_unit(context)
-    rate = None if section.rate is None else _rate(section.rate, unit)
     if section.unit is not None:
-        named = Column(str(section.name or section.step), section.unit, unit, rate=rate)
+        named = Column(str(section.name or section.step), section.unit, unit, rate=section.rate)
         return named if section.name else TimeStep(named)
     with retold(UnitError, ConfigError, "", "step"):
         return TimeStep(value=parse_quantity(section.step or 0, unit))
-
-
-def _rate(text: Any, unit: str) -> float:
-    with retold(ValueError, ConfigError, "", "rate"):
-        value = parse_quantity(text, f"1/({unit})")
-        require_sign(value, "positive", text)
-    return value
 
 
 def _values(section: ValueColumn, context: Context) -> Column:
