@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import Field
 
 from en4dvar.config.columns import Columns
 from en4dvar.config.context import Context, Made, OfObservable, time_unit
@@ -67,20 +67,16 @@ class Files:
     texts: tuple[str, ...]
 
 
-def _not_empty(path: str | tuple[str, ...]) -> str | tuple[str, ...]:
-    if not path or not all(path):
-        raise ValueError("no file is named")
-    return path
-
-
 def _files(written: str | tuple[str, ...], context: Context) -> Files:
+    if not written or not all(written):
+        raise ValueError("no file is named")
     return Files(context.base, (written,) if isinstance(written, str) else written)
 
 
 class Data(Section):
     """Where the observations are, what they mean and how well they are known; in the model's units."""
 
-    path: Annotated[Files, Made(_files, Annotated[str | tuple[str, ...], AfterValidator(_not_empty)])]
+    path: Annotated[Files, Made(_files, str | tuple[str, ...])]
     """A data file, a folder (one without data files: its subfolders), a pattern such as data/*.csv, or a list of them;
     relative to this file's folder."""
     name: Name | None = None

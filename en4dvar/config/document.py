@@ -4,6 +4,7 @@ Scalars follow YAML 1.2's core schema: only ``true``/``false`` are booleans (``n
 number, dates are text. Duplicate keys, aliases and tags are refused: a configuration is plain data.
 """
 
+import copy
 import math
 import os
 import re
@@ -168,7 +169,7 @@ def override(document: Document, overrides: Mapping[str, Any], option: str = "--
 
     Raises :class:`ConfigError`, which names the ``option`` that they were given with.
     """
-    data = _copy(document.data)
+    data = copy.deepcopy(document.data)
     origins = dict(document.origins)
     faults: list[Fault] = []
     for dotted, value in overrides.items():
@@ -207,10 +208,6 @@ def _propose(what: str, path: Path) -> str:
     shell_path = shlex.quote(str(path))
     proposal = f"'en4dvar init --data {shell_path}' looks at the readings and proposes one"
     return f"{path}: {what}, not a configuration; {proposal}"
-
-
-def _copy(node: Any) -> Any:
-    return {k: _copy(v) for k, v in node.items()} if isinstance(node, dict) else node
 
 
 class _Refused(Exception):

@@ -29,19 +29,16 @@ from en4dvar.plumbing.files import expanded
 from en4dvar.plumbing.units import UnitError, convert, parse_quantity, split_quantity
 from en4dvar.priors.prior import PriorTerm
 
-_RELATIVE = re.compile(r"(.*%)\s+of\s+(?:the\s+)?maximum")
 
-
-def parse_error_std(text: Any, unit: str) -> Spread:
-    """``"1.4 um"`` or ``"1 % of maximum"``. Raises :class:`UnitError`."""
+def parse_error_std(text: Any, unit: str, whole: str = "maximum") -> Spread:
+    """``"1.4 um"``, or ``"1 % of maximum"`` or of another ``whole``. Raises :class:`UnitError`."""
     word = str(text).strip()
-    relative = _RELATIVE.fullmatch(word)
-    if relative:
+    if relative := re.fullmatch(rf"(.*%)\s+of\s+(?:the\s+)?{whole}", word):
         return Spread(parse_quantity(relative[1], "1"), relative=True)
     try:
         return Spread(parse_quantity(text, unit), unit=split_quantity(word)[1])
     except UnitError as error:
-        hint = f"; write '{word} of maximum'" if word.endswith("%") else ""
+        hint = f"; write '{word} of {whole}'" if word.endswith("%") else ""
         raise UnitError(f"{error}{hint}") from None
 
 
@@ -101,20 +98,10 @@ MARKS = Made(_marks, bool | MarkColumn)
 QUANTITY_OR_COLUMN = {"anyOf": [TEXT, ErrorColumn.model_json_schema()]}
 
 
-_OF_WINDOW = re.compile(r"(.*%)\s+of\s+(?:the\s+)?window")
-
-
 def _length(text: Any, context: Context) -> Spread:
-    relative = _OF_WINDOW.fullmatch(str(text).strip())
-    spread = Spread(
-        parse_quantity(relative[1] if relative else text, "1" if relative else time_unit(context)), bool(relative)
-    )
+    spread = parse_error_std(text, time_unit(context), "window")
     require_sign(spread.value, "positive", text)
     return spread
-
-
-def _rate_unit(context: Context) -> str:
-    return f"({observable_unit(context)})/({time_unit(context)})"
 
 
 LogStd = Annotated[float, Field(gt=0)]
@@ -147,7 +134,9 @@ class DiscrepancySection(Section):
     """Prior of ``discrepancy_length``, its correlation time."""
     kernel: Literal["exponential", "matern-3/2", "matern-5/2"] = "exponential"
     """Correlation in time: exponential (rough paths), or Matérn's with one or two derivatives."""
-    grows_beyond: Annotated[float | None, quantity(_rate_unit, "positive")] = None
+    grows_beyond: Annotated[
+        float | None, quantity(lambda c: f"({observable_unit(c)})/({time_unit(c)})", "positive")
+    ] = None
     """Rate of the observable beyond which the amplitude grows in proportion to it, e.g. 20 m/s; default: constant."""
 
     def kernel_at(self, times: Array) -> Kernel:
@@ -192,10 +181,6 @@ class CovarianceFile(Section):
     """Unit of the covariances, the observable's squared, e.g. um^2."""
 
 
-def _matrix(section: CovarianceFile, context: Context) -> Matrix:
-    return Matrix(context.base / expanded(section.path), section.unit, _square(context))
-
-
 class Error(Section):
     """Observation errors: a std or a covariance, of the times, correlation, a robust cost, what the model misses."""
 
@@ -215,7 +200,9 @@ class Error(Section):
     ] = ()
     """Errors that all readings share, independent of each other, each a std for all or ``{column: NAME}`` of a std with
     a sign for each reading: R is the diagonal plus the sum of their products."""
-    covariance: Annotated[Matrix | None, Made(_matrix, CovarianceFile)] = None
+    covariance: Annotated[
+        Matrix | None, Made(lambda file, c: Matrix(c.base / expanded(file.path), file.unit, _square(c)), CovarianceFile)
+    ] = None
     """File of the whole R."""
     robust: Literal["huber"] | None = None
     """Robust cost: readings far off count less."""

@@ -1,6 +1,6 @@
 """From a YAML file to a frozen :class:`Config`, or every fault of the file at once."""
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Generic, Literal, TypeVar
@@ -228,18 +228,13 @@ def read_file(kind: type[S], document: Document, base: Path, model: ForwardModel
     faults: list[Fault] = []
     section = document.data.get("model")
     built = (model, dict(section or {})) if model else read_model(section, base, document, faults)
-    model = built[0].with_parameters(_named(document)) if built else None
+    parameters = document.data.get("parameters")
+    model = built[0].with_parameters(parameters if isinstance(parameters, dict) else ()) if built else None
     context = context_of(document, base, model)
     file = check(kind, document.data, (), document, faults, context)
     if file is None or built is None or model is None:
         raise ConfigError(in_order(faults))
     return Read(file, model, document, context, built[1])
-
-
-def _named(document: Document) -> Collection[str]:
-    """Names in the ``parameters:`` section."""
-    parameters = document.data.get("parameters")
-    return parameters.keys() if isinstance(parameters, dict) else ()
 
 
 def context_of(document: Document, base: Path, model: ForwardModel | None) -> Context:

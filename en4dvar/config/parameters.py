@@ -14,7 +14,7 @@ from en4dvar.config.varies import VariesSection
 from en4dvar.data.observations import Observations
 from en4dvar.model.forward import ForwardModel
 from en4dvar.model.state import OF_READINGS, READING_OFFSET, TIME_SHIFT, Parameter
-from en4dvar.plumbing.errors import ConfigError
+from en4dvar.plumbing.errors import ConfigError, retold
 from en4dvar.plumbing.hints import brief, shown, suggest
 from en4dvar.plumbing.units import parse_quantity
 from en4dvar.priors.prior import PriorTerm
@@ -270,10 +270,8 @@ class Uncertain:
         if of_data is None:
             name = value.name if isinstance(value, Scalar) else value
             raise ConfigError(f"{name!r} is known only from the data, and there are none", key)
-        try:
+        with retold(ConfigError, ConfigError, "", key):
             return of_data(value)
-        except ConfigError as error:
-            raise ConfigError([replace(fault, path=key) for fault in error.problems]) from None
 
     def _std(self, mean: float) -> float:
         std = self.spec.std

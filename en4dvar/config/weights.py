@@ -62,8 +62,10 @@ class Weighing:
         weights = read if read is not None else np.ones(len(times))
         if self.of is not None:
             weights = np.asarray(self.of(times, values, prominence))
-        if weights.shape != times.shape or weights.dtype.kind not in "fiub":
-            raise DataError(f"{_count(weights)} for {len(times)} observations of the window")
+        numbers = weights.dtype.kind in "fiub"
+        if weights.shape != times.shape or not numbers:
+            words = f"{len(weights)} weights" if weights.ndim == 1 and numbers else f"weights {weights.shape}"
+            raise DataError(f"{words} for {len(times)} observations of the window")
         weights = weights.astype(float)
         if not (np.all(np.isfinite(weights)) and np.all(weights >= 0)):
             worst = weights[~(np.isfinite(weights) & (weights >= 0))][0]
@@ -71,12 +73,6 @@ class Weighing:
         if not np.any(weights > 0):
             raise DataError("all weights are zero; no observation counts")
         return weights
-
-
-def _count(weights: np.ndarray[Any, Any]) -> str:
-    return (
-        f"{len(weights)} weights" if weights.ndim == 1 and weights.dtype.kind in "fiub" else f"weights {weights.shape}"
-    )
 
 
 def weighing(written: Any, context: Context) -> Weighing:

@@ -130,10 +130,6 @@ def _split(line: str | Sequence[str], path: Path) -> list[str]:
     return cells_of(line, delimiter)
 
 
-def _has_all(cells: Sequence[str], wanted: Sequence[str]) -> bool:
-    return all(any(_same(cell, name) or matches(cell, name) for cell in cells) for name in wanted)
-
-
 def matches(name: str, pattern: str) -> bool:
     """Whether a pattern with ``*`` stands for a name."""
     return "*" in pattern and fnmatch.fnmatchcase(name, pattern)
@@ -144,9 +140,9 @@ def _names_and_numbers(head: Sequence[Sequence[str]], wanted: Sequence[str]) -> 
 
     It is the one above the last block of lines with numbers, unless it holds units, which stand below the names.
     """
-    named = next((i for i, cells in enumerate(head) if wanted and _has_all(cells, wanted)), None)
-    if named is not None:
-        return named, named + 1
+    for i, cells in enumerate(head if wanted else ()):
+        if all(any(_same(cell, name) or matches(cell, name) for cell in cells) for name in wanted):
+            return i, i + 1
     end = next((i for i in reversed(range(len(head))) if _holds_number(head[i])), 0)
     first = next((i + 1 for i in reversed(range(end)) if _words(head[i])), 0)
     if _holds_number(head[first]) and (first == 0 or (wanted and all(map(_NAMELESS.fullmatch, wanted)))):

@@ -155,7 +155,9 @@ def atomic_path(path: str | Path, durable: bool = True) -> Iterator[Path]:
     partial = path.with_name(f".{path.name}.{owner()}.tmp")
     try:
         _remove_leftovers(path.parent, _PARTIAL)
-        _make_anew(partial)  # an unwritable place gives the system's reason here, not a library's guess later
+        partial.unlink(missing_ok=True)  # it may be a link
+        # an unwritable place gives the system's reason here, not a library's guess later
+        os.close(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
         yield partial
         if durable:
             _fsync(partial, os.O_RDWR)
@@ -277,12 +279,6 @@ def here() -> str:
 def readable(text: object) -> str:
     r"""Text that can be written as UTF-8; bytes of a file's name that are not are shown as ``\udcfc``."""
     return str(text).encode("utf-8", "backslashreplace").decode("utf-8")
-
-
-def _make_anew(path: Path) -> None:
-    """An empty file that is not there already, as a link for instance."""
-    path.unlink(missing_ok=True)
-    os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
 
 
 def replace_file(source: Path, target: Path) -> None:
