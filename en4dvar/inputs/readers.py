@@ -75,14 +75,19 @@ def read_series(
         kept = kept[np.argsort(times[kept], kind="stable")]
     stated = {column.name: _stds(columns[column.name], column, kept, len(values), path) for column in errors}
     if isinstance(time, Column) and not repeats:
-        written = Written(columns[time.name], time.unit, lines, path)
-        order = in_order(times[kept], layout.unsorted == "sort", layout.repeated == "average", kept, written)
-        kept, stated = kept[order], {name: stds[order] for name, stds in stated.items()}
-    if repeats:
-        return Readings(times[kept], values[kept], str(path), scalars, stated)
-    means = Means(times[kept])
-    stated = {c.name: (means.std if c.kind == "std" else means.of)(stated[c.name]) for c in errors}
-    return Readings(means.times, means.of(values[kept]), str(path), scalars, stated)
+        if layout.unsorted == "sort":
+            order = np.argsort(times[kept], kind="stable")
+            kept, stated = kept[order], {name: stds[order] for name, stds in stated.items()}
+        _check_order(times[kept], kept, columns[time.name], time.unit, lines, layout, path)
+    times, values = times[kept], values[kept]
+    each, which, counts = np.unique(times, return_inverse=True, return_counts=True)
+    if not repeats and len(each) < len(times):  # readings of one time as their mean, their errors as independent
+        for c in errors:
+            own = stated[c.name]
+            sums = np.sqrt(np.bincount(which, own**2)) if c.kind == "std" else np.bincount(which, own)
+            stated[c.name] = np.asarray(sums / counts)
+        times, values = each, np.bincount(which, values) / counts
+    return Readings(times, values, str(path), scalars, stated)
 
 
 def _stds(written: Array, column: Column, kept: npt.NDArray[np.intp], count: int, path: Path) -> Array:
@@ -134,61 +139,33 @@ def _step(step: TimeStep, scalars: Mapping[str, float], path: Path) -> float:
     return value
 
 
-@dataclass(frozen=True)
-class Written:
-    """Times (K,) in ``unit`` as the file has them, and its lines (K,), () where it has none."""
+def _check_order(
+    times: Array,
+    kept: npt.NDArray[np.intp],
+    written: Array,
+    unit: str,
+    lines: Sequence[int],
+    layout: Layout,
+    path: Path,
+) -> None:
+    """Raise :class:`DataError` where ``times`` (K,) are not in order, or one occurs again and may not.
 
-    times: Array
-    unit: str
-    lines: Sequence[int]
-    path: Path
-
-
-def in_order(
-    times: Array, sort: bool, repeat: bool, kept: npt.NDArray[np.intp], written: Written
-) -> npt.NDArray[np.intp]:
-    """Indices (K,) that put ``times`` (K,) in order; ``kept`` (K,) are their places in the file.
-
-    Raises :class:`DataError`: they are not and shall not be sorted, or a time occurs again and may not (``repeat``).
+    ``kept`` (K,) are their places in the file, which has them ``written`` in ``unit``, and its ``lines``, if any.
     """
-    order = np.argsort(times, kind="stable") if sort else np.arange(len(times))
-    steps = np.diff(times[order])
-    wrong = np.flatnonzero(steps < 0 if repeat else steps <= 0)
-    if len(wrong):
-        before, after = kept[order[wrong[0] : wrong[0] + 2]]
-        raise DataError(_disorder(before, after, kept[0], written))
-    return order
-
-
-def _disorder(before: int, after: int, first: int, written: Written) -> str:
-    times, lines = written.times, written.lines
-    where = f"{written.path}:{lines[after]}" if lines else f"{written.path}: sample {after + 1}"
+    steps = np.diff(times)
+    wrong = np.flatnonzero(steps < 0 if layout.repeated == "average" else steps <= 0)
+    if not len(wrong):
+        return
+    before, after = kept[wrong[0] : wrong[0] + 2]
+    where = f"{path}:{lines[after]}" if lines else f"{path}: sample {after + 1}"
     sort = "sort the rows (data.unsorted: sort)"
     hint = f"; correct it, or {sort}"
-    if times[after] == times[before]:
+    if written[after] == written[before]:
         hint = "; keep one of the two readings, or their mean (data.repeated: average)"
-    elif times[after] <= times[first]:
+    elif written[after] <= written[kept[0]]:
         hint = (
             f"; if another series begins here, give it a file of its own or say whose each row is (data.by); or {sort}"
         )
-    unit = "" if "*" in written.unit else f" {written.unit}"
-    return f"{where}: times must increase, but {times[after]:g}{unit} follows {times[before]:g}{unit}{hint}"
-
-
-class Means:
-    """Readings of the same time as their mean; ``times`` (K',) are each once, of ``ordered`` (K,)."""
-
-    def __init__(self, ordered: Array):
-        self.times, self._which, self._counts = np.unique(ordered, return_inverse=True, return_counts=True)
-
-    def of(self, values: Array) -> Array:
-        """Means (K',) of ``values`` (K,)."""
-        if len(self.times) == len(values):
-            return values
-        return np.asarray(np.bincount(self._which, values) / self._counts)
-
-    def std(self, stds: Array) -> Array:
-        """Standard deviations (K',) of means of independent readings with ``stds`` (K,)."""
-        if len(self.times) == len(stds):
-            return stds
-        return np.asarray(np.sqrt(np.bincount(self._which, stds**2)) / self._counts)
+    shown = "" if "*" in unit else f" {unit}"
+    told = f"times must increase, but {written[after]:g}{shown} follows {written[before]:g}{shown}"
+    raise DataError(f"{where}: {told}{hint}")
