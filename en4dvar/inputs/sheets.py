@@ -84,6 +84,7 @@ def _rows(path: Path, name: str, area: str, formulas: bool) -> list[tuple[int, t
     """Numbered rows of cells."""
     try:
         from openpyxl import load_workbook
+        from openpyxl.utils import range_boundaries
     except ImportError:
         raise DataError(f"{path}: Excel needs: pip install openpyxl; or save the sheet as CSV") from None
     with warnings.catch_warnings():
@@ -92,7 +93,8 @@ def _rows(path: Path, name: str, area: str, formulas: bool) -> list[tuple[int, t
         try:
             sheet = _sheet(book, name, path)
             sheet.reset_dimensions()  # the stated ones may be wrong
-            bounds = _bounds(area)
+            keys = ("min_col", "min_row", "max_col", "max_row")
+            bounds: dict[str, int] = dict(zip(keys, range_boundaries(area), strict=True)) if area else {}
             rows, count = [], 0
             for number, cells in enumerate(sheet.iter_rows(**bounds, values_only=True), bounds.get("min_row", 1)):
                 if number > MOST_ROWS or len(cells) > WIDEST:
@@ -104,15 +106,6 @@ def _rows(path: Path, name: str, area: str, formulas: bool) -> list[tuple[int, t
             return rows
         finally:
             book.close()
-
-
-def _bounds(area: str) -> dict[str, int]:
-    from openpyxl.utils import range_boundaries
-
-    if not area:
-        return {}
-    keys = ("min_col", "min_row", "max_col", "max_row")
-    return dict(zip(keys, range_boundaries(area), strict=True))
 
 
 def _sheet(book: Any, name: str, path: Path) -> ReadOnlyWorksheet:

@@ -29,24 +29,17 @@ def read_covariance(matrix: Matrix) -> Array:
 
 def read_square(path: Path, what: str = "correlation matrix") -> Array:
     """The numbers (K, K) of a CSV file without header. Raises :class:`DataError`."""
+    rows: list[list[float]] = []
+    delimiter = None
     with opened(path, Layout("csv")):
-        rows = _rows_of_numbers(path)
+        for number, line in numbered_lines(path):
+            if delimiter is None:
+                delimiter = delimiter_of(line)
+                check_width(line, delimiter, path)
+            cells = enumerate(cells_of(line, delimiter), 1)
+            rows.append([number_in(cell, str(i), path, number, None) for i, cell in cells])
+            if len(rows[-1]) != len(rows[0]):
+                raise DataError(f"{path}:{number}: {len(rows[-1])} numbers, but {len(rows[0])} in the first row")
     if not rows or len(rows) != len(rows[0]):
         raise DataError(f"{path}: a {what} is square, but this has {len(rows)} rows of {len(rows[0]) if rows else 0}")
     return np.array(rows)
-
-
-def _rows_of_numbers(path: Path) -> list[list[float]]:
-    """Rows of equally many numbers."""
-    rows: list[list[float]] = []
-    delimiter = None
-    for number, line in numbered_lines(path):
-        if delimiter is None:
-            delimiter = delimiter_of(line)
-            check_width(line, delimiter, path)
-        rows.append(
-            [number_in(cell, str(i), path, number, None) for i, cell in enumerate(cells_of(line, delimiter), 1)]
-        )
-        if len(rows[-1]) != len(rows[0]):
-            raise DataError(f"{path}:{number}: {len(rows[-1])} numbers, but {len(rows[0])} in the first row")
-    return rows
