@@ -173,10 +173,8 @@ def _served(name: str, arguments: tuple[Any, ...], allowed: Allowed, answers: IO
             _write(answers, (_VALUE, value))
             limit_time(allowed.seconds)
     except MemoryError:
-        words = (
-            f"takes more than {in_bytes(allowed.memory)} of memory to be read; it is damaged, or not what it says it is"
-        )
-        return _FAULT, DataError(f"{arguments[0]}: {words}")
+        words = f"takes more than {in_bytes(allowed.memory)} of memory to be read"
+        return _FAULT, DataError(f"{arguments[0]}: {words}; {DOUBT}")
     except En4dvarError as error:
         return _FAULT, DataError(str(error))
     except Exception as error:

@@ -191,14 +191,13 @@ def _without_collection() -> Iterator[None]:
     """Within, Python does not look for cycles: among the million objects that the compiler keeps until it is done, a
     tenth of its time went into that.
     """
-    if not gc.isenabled():
-        yield
-        return
+    enabled = gc.isenabled()
     gc.disable()
     try:
         yield
     finally:
-        gc.enable()
+        if enabled:
+            gc.enable()
 
 
 @contextmanager

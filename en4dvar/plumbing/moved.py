@@ -49,14 +49,6 @@ def former_name(module: str, name: str) -> Any:
     return getattr(import_module(home), new)
 
 
-def new_name(module: str) -> str | None:
-    """The name of today for a module that moved, or for one below it; None where it did not move."""
-    for old, new in MOVED.items():
-        if module == old or module.startswith(f"{old}."):
-            return new + module[len(old) :]
-    return None
-
-
 def warn(old: str, new: str, level: int) -> None:
     """Tell the caller ``level`` frames up, frames of the import system left out, where a name went."""
     warnings.warn(f"{old} is now {new}; the old name goes with 2.0", DeprecationWarning, stacklevel=level + 1)
@@ -66,11 +58,12 @@ class FormerNames(Loader):
     """Finds modules by their former names, and loads them from where they are."""
 
     def find_spec(self, name: str, path: object = None, target: object = None) -> ModuleSpec | None:
-        new = new_name(name)
-        if new is None:
-            return None
-        warn(name, new, 2)
-        return ModuleSpec(name, self, origin=new)
+        for old, new in MOVED.items():
+            if name == old or name.startswith(f"{old}."):
+                today = new + name[len(old) :]
+                warn(name, today, 2)
+                return ModuleSpec(name, self, origin=today)
+        return None
 
     def create_module(self, spec: ModuleSpec) -> ModuleType:
         module = import_module(spec.origin or "")

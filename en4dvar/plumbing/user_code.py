@@ -57,7 +57,8 @@ def own_fault(error: BaseException) -> Exception:
     """What code of a user raised, as an :class:`Exception`; raised as it is where it is meant for the program."""
     if isinstance(error, Exception):
         return error
-    if isinstance(error, Stop) or (isinstance(error, KeyboardInterrupt) and _heeds_ctrl_c()):
+    heeds_ctrl_c = threading.current_thread() is threading.main_thread() and not _in_worker
+    if isinstance(error, Stop) or (isinstance(error, KeyboardInterrupt) and heeds_ctrl_c):
         raise error
     ended = EndedError(describe(error))
     ended.__cause__ = error
@@ -74,10 +75,6 @@ def in_worker() -> None:
     """This process works for another one: Ctrl-C is not meant for it."""
     global _in_worker
     _in_worker = True
-
-
-def _heeds_ctrl_c() -> bool:
-    return threading.current_thread() is threading.main_thread() and not _in_worker
 
 
 @contextmanager
@@ -142,8 +139,10 @@ class Code:
     @property
     def mark(self) -> Path | None:
         """The file that stands for it once the user's own configuration has named it; None: nothing does."""
-        folder = statehere()
-        if not self.digest or folder is None:
+        from platformdirs import user_state_path
+
+        folder = user_state_path("en4dvar", appauthor=False)
+        if not self.digest or not folder.is_absolute():  # no home is known
             return None
         named = "\0".join([*map(str, self.places), self.digest])
         return folder / "own-code" / hashlib.sha256(named.encode("utf-8", "surrogateescape")).hexdigest()
@@ -158,14 +157,6 @@ class Code:
             with suppress(OSError):
                 self.mark.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
                 self.mark.touch(mode=0o600)
-
-
-def statehere() -> Path | None:
-    """The user's folder for what is kept from run to run; None where no home is known."""
-    from platformdirs import user_state_path
-
-    folder = user_state_path("en4dvar", appauthor=False)
-    return folder if folder.is_absolute() else None
 
 
 def imported(what: str, module: str) -> ModuleType:
