@@ -17,7 +17,7 @@ from en4dvar.ensemble.forecast import check_problem
 from en4dvar.ensemble.tangent import derivatives_of
 from en4dvar.inputs.asked import Column, DataFile
 from en4dvar.plumbing.errors import ConfigError, DataError, Fault, retold
-from en4dvar.plumbing.units import UnitError, convert
+from en4dvar.plumbing.units import convert
 from en4dvar.priors.field_prior import FieldPrior
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.priors.varying import Varying
@@ -184,8 +184,7 @@ def resolve_parameters(
     faults: list[Fault] = []
     tied: list[Tied] = []
     for entry in config.parameters:
-        path = ("parameters", entry.parameter.name)
-        try:
+        with config.document.collecting(faults, "parameters", entry.parameter.name):
             if isinstance(entry, Fixed):
                 fixed[entry.parameter.name] = entry.value
             elif isinstance(entry, Uncertain):
@@ -197,17 +196,10 @@ def resolve_parameters(
                 raise ConfigError("the value comes from the data file, and there is none; set a value")
             else:
                 fixed[entry.parameter.name] = entry.value(observations.scalars, observations.source)
-        except ConfigError as error:
-            faults += config.document.placed(error, *path)
-        except UnitError as error:
-            faults.append(config.document.fault(path, str(error)))
     for entry in tied:
         if entry.to in fixed:
-            path = ("parameters", entry.parameter.name)
-            try:
+            with config.document.collecting(faults, "parameters", entry.parameter.name):
                 fixed[entry.parameter.name] = inside_bounds(fixed[entry.to] * entry.factor, entry.parameter)
-            except ConfigError as error:
-                faults.append(config.document.fault(path, str(error)))
     if faults:
         raise ConfigError(faults)
     return tuple(terms), fixed

@@ -143,16 +143,13 @@ def resolved(
     dependence: tuple[Dependence, ...] = ()
     made: dict[str, Entry] = {}
     if asking or ensemble is not None:
-        try:
+        with document.collecting(faults):
             dependence, made = _of_ensemble(asking, ensemble, apart)
-        except ConfigError as error:
-            faults += document.placed(error)
     estimated = [e.parameter.name for e in entries if isinstance(e, Uncertain)] + list(others)
     alone = {**apart, **{e.parameter.name: "its correlations are those of the ensemble" for e in asking}}
     parts = []
     for k, section in enumerate(correlations):
-        place = ("prior_correlation", k)
-        try:
+        with document.collecting(faults, "prior_correlation", k):
             for name in section.between:
                 if name in alone:
                     raise ConfigError(f"{name} cannot be correlated: {alone[name]}")
@@ -160,13 +157,9 @@ def resolved(
                     raise ConfigError(f"{name!r} is not a parameter with a prior{suggest(name, estimated)}")
             parts.append((section.between, section.of_all(read_square)))
             Dependence(*parts[-1])
-        except (ConfigError, DataError) as error:
-            faults.append(document.fault(place, str(error)))
     if not faults:
-        try:
+        with document.collecting(faults, "prior_correlation"):
             return tuple(made.get(e.parameter.name, e) for e in entries), (*dependence, *joined(parts))
-        except ConfigError as error:
-            faults.append(document.fault(("prior_correlation",), str(error)))
     raise ConfigError(faults)
 
 

@@ -18,9 +18,10 @@ from typing import Any, cast
 import yaml
 
 from en4dvar.inputs.asked import SUFFIXES
-from en4dvar.plumbing.errors import ConfigError, Fault
+from en4dvar.plumbing.errors import ConfigError, DataError, Fault
 from en4dvar.plumbing.files import open_plain
 from en4dvar.plumbing.hints import brief, no_such_file, shown
+from en4dvar.plumbing.units import UnitError
 
 Key = tuple[str | int, ...]
 Mark = tuple[int, int]  # line and column, from 1
@@ -78,6 +79,16 @@ class Document:
             yield
         except ConfigError as error:
             raise ConfigError(self.placed(error, *above)) from None
+
+    @contextmanager
+    def collecting(self, faults: list[Fault], *above: str | int) -> Iterator[None]:
+        """Within, the faults of an error of settings, units or data are :meth:`placed` among ``faults``."""
+        try:
+            yield
+        except ConfigError as error:
+            faults += self.placed(error, *above)
+        except (DataError, UnitError) as error:
+            faults.append(self.fault(above, str(error)))
 
     def has(self, path: Sequence[str | int]) -> bool:
         """True if the data contains ``path``."""

@@ -274,14 +274,12 @@ def values_of(
         except DataError as error:
             raise ConfigError([document.fault(where, str(error))]) from None
         return {name: float(np.median(values)) for name, values in members.items()}
-    values, faults = {}, []
+    values, faults = {}, list[Fault]()
     for name, text in start.place.items():
-        try:
+        with document.collecting(faults, *where, name):
             if name not in units:
                 raise UnitError(f"not estimated, it has no prior{suggest(name, units)}")
             values[name] = parse_quantity(text, units[name])
-        except UnitError as error:
-            faults.append(document.fault((*where, name), str(error)))
     if faults:
         raise ConfigError(faults)
     return values
