@@ -183,8 +183,7 @@ class _Hdf(_Reader):
         yield name, "a struct"
         if depth > DEEPEST:
             return
-        fields = list(group)
-        for field in fields:
+        for field in list(group):
             child = group.get(field, getlink=False)
             if _refers(child) and _class(child) != "cell":  # a struct array: of each field one reference an element
                 yield from self._elements(child, lambda k, field=field: f"{name}({k}).{field}", depth)
@@ -208,17 +207,12 @@ class _Hdf(_Reader):
             yield name, "complex" if it.dtype.names else "an object"
         elif "MATLAB_empty" in it.attrs:
             yield name, np.empty(0)
+        elif words := self.left_out(shape[::-1]):
+            yield name, words
         else:
-            yield name, self._numbers(it, name, shape[::-1])
-
-    def _numbers(self, it: Any, name: str, shape: tuple[int, ...]) -> Array | str:
-        """The numbers of a dataset, or in words why they are not read."""
-        words = self.left_out(shape)
-        if words:
-            return words
-        self._check(it, name)
-        values = np.asarray(it[()], dtype=np.float64)
-        return values.ravel() if values.size == max(shape) else values.T
+            self._check(it, name)
+            values = np.asarray(it[()], dtype=np.float64)
+            yield name, values.ravel() if values.size == max(shape) else values.T
 
     def _check(self, it: Any, name: str) -> None:
         """Raise :class:`_Refused` where a dataset is too large, or not in this file."""

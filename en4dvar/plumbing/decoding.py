@@ -103,18 +103,15 @@ class _Child(Child):
     def __exit__(self, *exception: object) -> None:
         if not self.kept:
             super().__exit__(*exception)
-            self.close()
+            for pipe in (self.process.stdin, self.process.stdout):
+                if pipe is not None:
+                    with suppress(OSError):
+                        pipe.close()
             return
         self.forget()
         self.kept = False
         with _changing:
             _idle.append(self)
-
-    def close(self) -> None:
-        for pipe in (self.process.stdin, self.process.stdout):
-            if pipe is not None:
-                with suppress(OSError):
-                    pipe.close()
 
     def send(self, request: Any) -> None:
         assert self.process.stdin is not None

@@ -221,14 +221,13 @@ def _remove_leftovers(folder: Path, names: re.Pattern[str]) -> None:
 
 def _is_gone(process: int) -> bool:
     """True if no process has this number; on Windows, where asking might end it, it is taken to be there."""
-    if not POSIX:
-        return False
     try:
-        os.kill(process, 0)
+        if POSIX:
+            os.kill(process, 0)
     except ProcessLookupError:
         return True
     except (OSError, OverflowError):
-        return False
+        pass
     return False
 
 

@@ -48,7 +48,7 @@ class _Search:
             links.append((name, about[0]))  # both versions of the structure begin with the kind of link
             return int(len(links) > MOST_OBJECTS)
 
-        _iterate(self.hdf5)(group, 0, 0, None, _Visit(visit), None)
+        self.hdf5.iterate(group, 0, 0, None, _Visit(visit), None)
         for name, kind in links:
             self._link(group, name, f"{path}/{name.decode('utf-8', 'replace')}", kind, depth)
 
@@ -105,20 +105,14 @@ def _library() -> Any:
         "H5Pclose": (integer, [hid]),
     }
     try:
-        hdf5 = ctypes.CDLL(loaded.__file__)
+        hdf5: Any = ctypes.CDLL(loaded.__file__)
+        iterate = "H5Literate1" if hasattr(hdf5, "H5Literate1") else "H5Literate"  # through the links of a group
+        arguments[iterate] = integer, [hid, integer, integer, ctypes.c_void_p, _Visit, ctypes.c_void_p]
         for function, (result, taken) in arguments.items():
             getattr(hdf5, function).restype, getattr(hdf5, function).argtypes = result, taken
-        _iterate(hdf5)
+        hdf5.iterate = getattr(hdf5, iterate)
         hdf5.H5open()
         hdf5.H5Eset_auto2(hid(0), None, None)
     except (OSError, AttributeError):
         return None
     return hdf5
-
-
-def _iterate(hdf5: Any) -> Any:
-    """The function of a library that goes through the links of a group, in whichever version it has."""
-    iterate = hdf5.H5Literate1 if hasattr(hdf5, "H5Literate1") else hdf5.H5Literate
-    iterate.restype = ctypes.c_int
-    iterate.argtypes = [ctypes.c_int64, ctypes.c_int, ctypes.c_int, ctypes.c_void_p, _Visit, ctypes.c_void_p]
-    return iterate
