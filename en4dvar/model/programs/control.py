@@ -216,31 +216,23 @@ def _equation(where: str, text: str, parameters: Mapping[str, PestRow]) -> _Read
 
 def _files(control: ControlFile) -> tuple[dict[str, str], dict[str, list[str]]]:
     """Input file → template, and output file → instruction files. Raises :class:`ConfigError`."""
-    both = _pairs(control, "model input/output")
-    inputs, outputs = _pairs(control, "model input"), _pairs(control, "model output")
-    for pair in both:
-        (outputs if pest.is_instructions(text_of(control.file(pair[0]))) else inputs).append(pair)
     templates: dict[str, str] = {}
-    for own, file in inputs:
-        if file in templates:
-            raise ConfigError(f"{control.path}: two templates become {file}")
-        templates[file] = str(control.file(own))
     instructions: dict[str, list[str]] = {}
-    for own, file in outputs:
-        instructions.setdefault(file, []).append(str(control.file(own)))
+    for section in ("model input", "model output", "model input/output"):
+        for row in control.rows(section, ["pest_file", "model_file", "more"]):
+            if not {"pest_file", "model_file"} <= set(row.cells) or "more" in row.cells:
+                raise ConfigError(f"{row.where}: a line of '* {section}' holds two names of files")
+            own = control.file(row.cells["pest_file"])
+            path = Path(row.cells["model_file"].strip("\"'").replace("\\", "/"))
+            file = str(path)
+            if path.is_absolute() or ".." in path.parts:
+                raise ConfigError(f"{row.where}: {file} lies outside of the folder that the model runs in")
+            if section == "model output" or (section != "model input" and pest.is_instructions(text_of(own))):
+                instructions.setdefault(file, []).append(str(own))
+            elif file in templates:
+                raise ConfigError(f"{control.path}: two templates become {file}")
+            else:
+                templates[file] = str(own)
     if not instructions:
         raise ConfigError(f"{control.path}: no instruction file")
     return templates, instructions
-
-
-def _pairs(control: ControlFile, section: str) -> list[tuple[str, str]]:
-    """Template or instructions, and the file of the model. Raises :class:`ConfigError`."""
-    pairs = []
-    for row in control.rows(section, ["pest_file", "model_file", "more"]):
-        if not {"pest_file", "model_file"} <= set(row.cells) or "more" in row.cells:
-            raise ConfigError(f"{row.where}: a line of '* {section}' holds two names of files")
-        own, file = row.cells["pest_file"], row.cells["model_file"].strip("\"'").replace("\\", "/")
-        if Path(file).is_absolute() or ".." in Path(file).parts:
-            raise ConfigError(f"{row.where}: {file} lies outside of the folder that the model runs in")
-        pairs.append((own, str(Path(file))))
-    return pairs

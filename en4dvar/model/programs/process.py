@@ -99,13 +99,10 @@ class Program:
             if status:
                 said.seek(max(0, said.seek(0, os.SEEK_END) - LONGEST_ERRORS))
                 advice = " (now and then? retries: 2 runs it again)" if status < 0 and not self.settings.retries else ""
-                raise ProgramError(_why(status, said.read()) + advice)
-
-
-def _why(status: int, errors: bytes) -> str:
-    lines = [line.strip() for line in errors.decode("utf-8", "replace").splitlines() if line.strip()]
-    said = f": {lines[-1][-LAST_WORDS:]}" if lines else ""
-    return f"the program {'was ended by' if status < 0 else 'ended with'} {status_named(status)}{said}"
+                lines = said.read().decode("utf-8", "replace").strip().splitlines()
+                reason = f": {lines[-1].strip()[-LAST_WORDS:]}" if lines else ""
+                how = "was ended by" if status < 0 else "ended with"
+                raise ProgramError(f"the program {how} {status_named(status)}{reason}{advice}")
 
 
 def _term(key: str, parameters: Mapping[str, float]) -> float:
