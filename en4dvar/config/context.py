@@ -17,6 +17,7 @@ from en4dvar.config.validate import Faults
 from en4dvar.model.forward import ForwardModel, Observable
 from en4dvar.plumbing.described import text_for
 from en4dvar.plumbing.errors import ConfigError
+from en4dvar.plumbing.files import expanded
 from en4dvar.plumbing.hints import brief, shown, suggest
 from en4dvar.plumbing.units import convert, parse_quantity, parse_unit
 
@@ -56,6 +57,10 @@ class Context:
     def observable(self) -> Observable:
         """The observable that the data hold. Raises :class:`Unknown`."""
         return _known(self.observed)
+
+    def path(self, text: str) -> Path:
+        """The absolute path of a file that the file names."""
+        return self.base.absolute() / expanded(text)
 
 
 def _known(thing: T | None) -> T:

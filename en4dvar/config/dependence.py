@@ -19,7 +19,6 @@ from en4dvar.inputs.members import read_members
 from en4dvar.inputs.square import read_square
 from en4dvar.model.state import Array, Parameter, TransformName
 from en4dvar.plumbing.errors import ConfigError, DataError, Fault, retold
-from en4dvar.plumbing.files import expanded
 from en4dvar.plumbing.hints import suggest
 from en4dvar.priors.dependence import Dependence, KernelName, correlation_of_places
 from en4dvar.priors.prior import PriorTerm
@@ -27,10 +26,7 @@ from en4dvar.priors.prior import PriorTerm
 KINDS = ("correlation", "matrix", "file", "kernel")
 
 
-def _path(text: str, context: Context) -> Path:
-    return context.base.absolute() / expanded(text)
-
-
+A_FILE = Made(lambda text, context: context.path(text), Annotated[str, Field(min_length=1)], {"type": "string"})
 Position = float | tuple[float, ...]
 
 
@@ -43,7 +39,7 @@ class PriorCorrelation(Section):
     """Of two parameters: of their values where normal, of their logarithms where lognormal, else of the scores."""
     matrix: tuple[tuple[float, ...], ...] | None = None
     """Rows of the correlation matrix, in the order of the names."""
-    file: Annotated[Path | None, Made(_path, Annotated[str, Field(min_length=1)], {"type": "string"})] = None
+    file: Annotated[Path | None, A_FILE] = None
     """CSV file of the correlation matrix, without header, relative to the configuration's folder."""
     kernel: KernelName | None = None
     """Correlation as a function of distance, for parameters with places: needs ``at`` and ``length``."""
@@ -84,7 +80,7 @@ class PriorCorrelation(Section):
 class PriorFile(Section):
     """Priors from an ensemble in a file: of the parameters that say ``{prior: ensemble}``."""
 
-    ensemble: Annotated[Path, Made(_path, Annotated[str, Field(min_length=1)], {"type": "string"})]
+    ensemble: Annotated[Path, A_FILE]
     """posterior.nc of an earlier run, other netCDF with a variable a parameter, or a CSV file with a column each."""
 
 

@@ -14,7 +14,7 @@ from en4dvar.config.document import Document
 from en4dvar.config.validate import check
 from en4dvar.model.forward import ForwardModel, StateField
 from en4dvar.plumbing import user_file
-from en4dvar.plumbing.errors import ConfigError, En4dvarError, Fault
+from en4dvar.plumbing.errors import ConfigError, En4dvarError, Fault, retold
 from en4dvar.plumbing.files import PathError
 from en4dvar.plumbing.hints import shown, suggest
 from en4dvar.plumbing.user_code import RefusedError, imported, loading
@@ -134,19 +134,16 @@ def read_model(
     if not isinstance(raw, dict):
         return None  # told with the other keys of the file
     name = raw.get("name", COMMAND if COMMAND in raw else None)
-    if not isinstance(name, str):
-        faults.append(document.fault(("model", "name"), "name the model, e.g. name: ./my_model.py:MyModel"))
-        return None
-    if name == HANDED:
-        words = f"{shown(raw.get('object'))} was handed over by a Python script; run that script again"
-        faults.append(document.fault(("model", "name"), words))
-        return None
-    try:
+    kind: Any = None
+    with document.collecting(faults, "model", "name"), retold(PathError, ConfigError):
+        if not isinstance(name, str):
+            raise ConfigError("name the model, e.g. name: ./my_model.py:MyModel")
+        if name == HANDED:
+            raise ConfigError(f"{shown(raw.get('object'))} was handed over by a Python script; run that script again")
         if user_file.is_file_reference(name):
             name = user_file.absolute(name, base)
-        kind: Any = find_model(name)
-    except (ConfigError, PathError) as error:
-        faults.append(document.fault(("model", "name"), str(error)))
+        kind = find_model(name)
+    if kind is None:
         return None
     options = {key: value for key, value in raw.items() if key != "name"}
     try:

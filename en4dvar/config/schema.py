@@ -28,7 +28,6 @@ from en4dvar.executor.limits import Limits, parse_bytes
 from en4dvar.plumbing import user_file
 from en4dvar.plumbing.described import Described, text_for
 from en4dvar.plumbing.errors import ConfigError
-from en4dvar.plumbing.files import expanded
 from en4dvar.plumbing.hints import shown
 from en4dvar.plumbing.units import Quantity, parse_quantity
 from en4dvar.schemes import DEFAULT, ON_A_WINDOW, keys_of, unread
@@ -199,16 +198,15 @@ def _localisation_of(section: LocalisationSection, context: Context) -> Localisa
     return Localisation(section.radius, at, moves, section.threshold)
 
 
-def _place(value: str | dict[str, QuantityText], context: Context) -> Path | dict[str, QuantityText]:
-    return context.base.absolute() / expanded(value) if isinstance(value, str) else value
-
-
 class GivenStart(Section):
     """Where the one descent starts; the prior stays as it is."""
 
     place: Annotated[
         Path | dict[str, QuantityText],
-        Made(_place, Annotated[str, Field(min_length=1)] | Annotated[dict[str, QuantityText], Field(min_length=1)]),
+        Made(
+            lambda value, context: context.path(value) if isinstance(value, str) else value,
+            Annotated[str, Field(min_length=1)] | Annotated[dict[str, QuantityText], Field(min_length=1)],
+        ),
     ] = Field(alias="from")
     """Values, such as ``{G: 5 kPa}`` (the others start at the prior's mean), a file of members such as posterior.nc
     of an earlier run, whose medians are taken, or summary.csv of an earlier campaign: each data set starts at the

@@ -21,7 +21,6 @@ from en4dvar.inputs.asked import Matrix
 from en4dvar.inputs.square import read_covariance
 from en4dvar.model.forward import ForwardModel, Observable
 from en4dvar.plumbing.errors import ConfigError, DataError, retold
-from en4dvar.plumbing.files import expanded
 from en4dvar.priors.prior import Prior
 from en4dvar.series.coordinates import EnsembleCoordinates
 from en4dvar.series.twin import TwinExperiment
@@ -34,7 +33,7 @@ def _errors(model: ForwardModel) -> dict[str, Observable]:
 def _correlation(path: str, context: Context) -> tuple[str, Correlation]:
     """The absolute path and the matrix."""
     with retold((DataError, ValueError), ConfigError):
-        file = (context.base / expanded(path)).absolute()
+        file = context.path(path)
         return str(file), Correlation(read_covariance(Matrix(file, "1", "1")))
 
 

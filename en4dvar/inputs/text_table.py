@@ -94,7 +94,9 @@ class Table:
         head = [_split(line, path) for _, line in lines[:PREAMBLE]]
         top, first = _names_and_numbers(head, wanted)
         self.nameless = top is None
-        delimiter = _delimiter(lines[first if top is None else top][1], self.nameless)
+        line = lines[first if top is None else top][1]
+        signs = (";", "\t") if self.nameless else ()  # numbers may have decimal commas
+        delimiter = next((s for s in signs if s in line), delimiter_of(line)) if isinstance(line, str) else ""
         self.rows = [(n, cells_of(x, delimiter) if isinstance(x, str) else list(x)) for n, x in lines[first:]]
         if any(_holds_number(cells) for _, cells in self.rows):
             while _words(self.rows[0][1]):
@@ -158,13 +160,6 @@ def _names_and_numbers(head: Sequence[Sequence[str]], wanted: Sequence[str]) -> 
     if len(head[top]) == 1 < len(head[first]):
         return None, first
     return top, top + 1
-
-
-def _delimiter(line: str | Sequence[str], numbers: bool) -> str:
-    """What separates the cells of a line, whose ``numbers`` may have decimal commas."""
-    if not isinstance(line, str):
-        return ""
-    return next((sign for sign in (";", "\t") if numbers and sign in line), delimiter_of(line))
 
 
 def _holds_number(cells: Sequence[str]) -> bool:
