@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BeforeValidator, Discriminator, Field, StrictInt, Tag
+from pydantic import Field, TypeAdapter
 
 from en4dvar.config.context import Context, Made
 from en4dvar.config.schema import Section
@@ -56,17 +56,21 @@ class Placing:
 
 
 def placing(written: Any, context: Context) -> Placing:
-    """Raises :class:`ConfigError`, its path the faulty key."""
+    """Raises :class:`ConfigError`, its path the faulty key, ValueError."""
+    section, entries = None, written if isinstance(written, list) else [written]
+    if isinstance(written, Mapping) and "column" in written:
+        section = PlaceColumn.model_validate(written, context=context)
+    elif not all(isinstance(entry, int | str) and not isinstance(entry, bool) for entry in entries):
+        raise ValueError("write an index, a coordinate such as '3 m', a list of either, or {column: NAME}")
     block = field_of(context.units, context.observable)
     size = block.size if block else None
-    if isinstance(written, PlaceColumn):
-        if written.unit is None:
-            return Placing(Column(written.column, "1", "1", kind="place"), size=size)
+    if section is not None:
+        if section.unit is None:
+            return Placing(Column(section.column, "1", "1", kind="place"), size=size)
         target = _coordinates(block, "unit")
         with retold(UnitError, ConfigError, "", "unit"):
-            convert(1.0, written.unit, target.coordinate_unit)
-        return Placing(Column(written.column, written.unit, target.coordinate_unit, kind="place"), of=target)
-    entries = written if isinstance(written, list) else [written]
+            convert(1.0, section.unit, target.coordinate_unit)
+        return Placing(Column(section.column, section.unit, target.coordinate_unit, kind="place"), of=target)
     if all(isinstance(entry, int) for entry in entries):
         return Placing(positions=np.array(entries, dtype=float), size=size)
     target = _coordinates(block, "")
@@ -83,23 +87,5 @@ def _coordinates(block: StateBlock | None, key: str) -> StateBlock:
     return block
 
 
-def _kind(written: Any) -> str:
-    return "a column" if isinstance(written, Mapping | PlaceColumn) else "places"
-
-
-def _known(written: Any) -> Any:
-    entries = written if isinstance(written, list) else [written]
-    column = isinstance(written, Mapping) and "column" in written
-    if not column and not all(isinstance(entry, int | str) and not isinstance(entry, bool) for entry in entries):
-        raise ValueError("write an index, a coordinate such as '3 m', a list of either, or {column: NAME}")
-    return written
-
-
-PLACES = Made(
-    placing,
-    Annotated[
-        Annotated[StrictInt | str | list[StrictInt | str], Tag("places")] | Annotated[PlaceColumn, Tag("a column")],
-        Discriminator(_kind),
-        BeforeValidator(_known),
-    ],
-)
+STATED = TypeAdapter[Any](int | str | list[int | str])
+PLACES = Made(placing, json={"oneOf": [STATED.json_schema(), PlaceColumn.model_json_schema()]})

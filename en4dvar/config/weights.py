@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BeforeValidator, Discriminator, Field, Tag
+from pydantic import Field, TypeAdapter
 
 from en4dvar.config.context import Context, Made, quantity, time_unit
 from en4dvar.config.schema import Section
@@ -19,7 +19,7 @@ from en4dvar.plumbing.files import PathError
 from en4dvar.plumbing.hints import shown
 from en4dvar.plumbing.user_code import loading, reason_of
 
-Number = Annotated[float, Field(ge=0)]
+NUMBERS = TypeAdapter(list[Annotated[float, Field(ge=0)]])
 
 
 class WeightColumn(Section):
@@ -76,16 +76,20 @@ class Weighing:
 
 
 def weighing(written: Any, context: Context) -> Weighing:
-    """Raises :class:`ConfigError` where a function is not to be had."""
+    """Raises ValueError, and :class:`ConfigError` where a function is not to be had."""
+    keys = written if isinstance(written, Mapping) else {}
     if isinstance(written, list):
-        numbers = np.array(written, dtype=float)
+        numbers = np.array(NUMBERS.validate_python(written), dtype=float)
         return Weighing(of=lambda times, values, prominence: numbers)
-    if isinstance(written, WeightColumn):
-        return Weighing(column=Column(written.column, "1", "1", kind="weight"))
-    if isinstance(written, AwayFromMinima):
-        reach = written.zero_near_minima
+    if "column" in keys:
+        column = WeightColumn.model_validate(written, context=context).column
+        return Weighing(column=Column(column, "1", "1", kind="weight"))
+    if "zero_near_minima" in keys:
+        reach = AwayFromMinima.model_validate(written, context=context).zero_near_minima
         return Weighing(of=lambda times, values, prominence: away_from_minima(times, values, reach, prominence))
-    return _of_function(written.function, context.base)
+    if "function" in keys:
+        return _of_function(WeightFunction.model_validate(written, context=context).function, context.base)
+    raise ValueError("write a list, {column: NAME}, {zero_near_minima: 2 us} or {function: ./weights.py:name}")
 
 
 def away_from_minima(times: Array, values: Array, reach: float, prominence: float) -> Array:
@@ -118,30 +122,5 @@ def _of_function(name: str, base: Path) -> Weighing:
     return Weighing(of=of, stated={"function": reference})
 
 
-_KINDS = ("column", "zero_near_minima", "function")
-
-
-def _kind(written: Any) -> str | None:
-    """Which of the ways to state weights it is; None: none of them."""
-    if isinstance(written, Mapping):
-        return next((f"a {key}" for key in _KINDS if key in written), None)
-    return "a list" if isinstance(written, list) else None
-
-
-def _known(written: Any) -> Any:
-    if _kind(written) is None:
-        raise ValueError("write a list, {column: NAME}, {zero_near_minima: 2 us} or {function: ./weights.py:name}")
-    return written
-
-
-WEIGHTS = Made(
-    weighing,
-    Annotated[
-        Annotated[list[Number], Tag("a list")]
-        | Annotated[WeightColumn, Tag("a column")]
-        | Annotated[AwayFromMinima, Tag("a zero_near_minima")]
-        | Annotated[WeightFunction, Tag("a function")],
-        Discriminator(_kind),
-        BeforeValidator(_known),
-    ],
-)
+SECTIONS = WeightColumn, AwayFromMinima, WeightFunction
+WEIGHTS = Made(weighing, json={"oneOf": [NUMBERS.json_schema(), *(kind.model_json_schema() for kind in SECTIONS)]})
