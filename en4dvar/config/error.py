@@ -4,6 +4,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, ConfigDict, Field
@@ -14,6 +15,7 @@ from en4dvar.config.context import (
     Context,
     Made,
     Spread,
+    Unit,
     observable_unit,
     quantity,
     require_sign,
@@ -64,8 +66,8 @@ def read_error_std(text: Any, context: Context) -> Spread | Column:
     return read_spread(text, context)
 
 
-def read_spread(text: Any, context: Context) -> Spread:
-    spread = parse_error_std(text, observable_unit(context))
+def read_spread(text: Any, context: Context, unit: Unit = observable_unit, whole: str = "maximum") -> Spread:
+    spread = parse_error_std(text, unit(context), whole)
     require_sign(spread.value, "positive", text)
     return spread
 
@@ -90,18 +92,11 @@ def _shared(written: Any, context: Context) -> tuple[Spread | Column, ...]:
     return tuple(replace(part, kind="shared") if isinstance(part, Column) else part for part in parts)
 
 
-def _marks(written: bool | MarkColumn, context: Context) -> bool | Column:
-    return written if isinstance(written, bool) else Column(written.column, "1", "1", kind="mark")
-
-
-MARKS = Made(_marks, bool | MarkColumn)
+MARKS = Made(
+    lambda mark, context: mark if isinstance(mark, bool) else Column(mark.column, "1", "1", kind="mark"),
+    bool | MarkColumn,
+)
 QUANTITY_OR_COLUMN = {"anyOf": [TEXT, ErrorColumn.model_json_schema()]}
-
-
-def _length(text: Any, context: Context) -> Spread:
-    spread = parse_error_std(text, time_unit(context), "window")
-    require_sign(spread.value, "positive", text)
-    return spread
 
 
 LogStd = Annotated[float, Field(gt=0)]
@@ -119,7 +114,9 @@ class AmplitudeSection(Section):
 class LengthSection(Section):
     """Lognormal prior of the time over which the discrepancy forgets itself."""
 
-    median: Annotated[Spread, Made(_length)] = Field("10 % of window", validate_default=True)
+    median: Annotated[Spread, Made(partial(read_spread, unit=time_unit, whole="window"))] = Field(
+        "10 % of window", validate_default=True
+    )
     """A time, or e.g. '10 % of window'."""
     log_std: LogStd = 0.7
     """Standard deviation of the natural logarithm."""
