@@ -107,7 +107,7 @@ def _varying(config: Config, observations: Observations, terms: Sequence[PriorTe
     """
     model, by_name = config.model, {term.parameter.name: term for term in terms}
     asked: list[tuple[tuple[str, ...], Callable[[], Varying | None]]] = [
-        (("parameters", e.parameter.name), partial(e.walk, model, by_name[e.parameter.name], observations))
+        (("parameters", e.parameter.name, "varies"), partial(e.walk, model, by_name[e.parameter.name], observations))
         for e in config.parameters
         if isinstance(e, Uncertain)
     ]

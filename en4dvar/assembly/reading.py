@@ -21,7 +21,7 @@ from en4dvar.inputs.steps import step_doubts
 from en4dvar.inputs.window import select
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution
-from en4dvar.plumbing.errors import ConfigError, DataError, retold
+from en4dvar.plumbing.errors import DataError, retold
 from en4dvar.plumbing.files import readable
 from en4dvar.plumbing.units import convert
 
@@ -169,8 +169,7 @@ def errors_of(
         correlation = covariance / np.outer(std, std)
         np.fill_diagonal(correlation, 1.0)
         return noise_of(std, time_std, correlation, discrepancy=kernel)
-    if error.std is None:
-        raise ConfigError("data.error: neither a std nor a covariance")
+    assert error.std is not None  # a rule of the section
 
     def of(part: Spread | Column, key: str) -> Array:
         return np.full(len(times), part.absolute(largest)) if isinstance(part, Spread) else stated[key]

@@ -246,7 +246,7 @@ class Uncertain:
     def walk(self, model: ForwardModel, term: PriorTerm, observations: Observations) -> RandomWalk | None:
         """How it varies over a window of observations; None where it does not.
 
-        Raises :class:`ConfigError`, its path the faulty key.
+        Raises :class:`ConfigError`, its path the faulty key of ``varies``.
         """
         varies = self.spec.varies
         if varies is None:
@@ -254,14 +254,9 @@ class Uncertain:
         centre = float(term.to_physical(np.array(term.mean)))
         if varies.std.relative and centre == 0:
             message = f"relative to the mean, which is zero; give it in {self.parameter.unit}"
-            raise ConfigError(message, "varies.std")
-        try:
-            std = varies.std.absolute(centre) / term.slope(term.mean)
-            return RandomWalk.of(model, term, varies.knots(observations), std, varies.estimated)
-        except ConfigError as error:
-            raise ConfigError(
-                [replace(f, path=f"varies.{f.path}" if f.path else "varies") for f in error.problems]
-            ) from None
+            raise ConfigError(message, "std")
+        std = varies.std.absolute(centre) / term.slope(term.mean)
+        return RandomWalk.of(model, term, varies.knots(observations), std, varies.estimated)
 
     def _location(self, key: Literal["mean", "median"], of_data: Callable[[str | Scalar], float] | None) -> float:
         value: float | str | Scalar | None = getattr(self.spec, key)
