@@ -254,16 +254,15 @@ class Quantity:
 
         parse_unit(self.unit)
         dump = core_schema.plain_serializer_function_ser_schema(self._write, when_used="json")
-        return core_schema.no_info_before_validator_function(self._read, handler(float), serialization=dump)
+        return core_schema.no_info_before_validator_function(
+            lambda text: parse_quantity(text, self.unit), handler(float), serialization=dump
+        )
 
     def __get_pydantic_json_schema__(self, core_schema: Any, handler: Any) -> dict[str, Any]:
         """A number with a unit is text in YAML; without one it is accepted only where there is no unit."""
         if self.unit == "1":
             return {"type": ["number", "string"]}
         return {"type": "string", "pattern": r"^\s*[+-]?[\d.]", "x-unit": self.unit}
-
-    def _read(self, value: Any) -> float:
-        return parse_quantity(value, self.unit)
 
     def _write(self, value: float) -> str | float:
         return value if self.unit == "1" else f"{value!r} {self.unit}"
