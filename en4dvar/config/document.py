@@ -112,7 +112,8 @@ def read_document(path: Path) -> Document:
         text = content.decode("utf-8-sig")
         return parse_document(text, str(path))
     except OSError as error:
-        raise ConfigError(_unreadable(path, error)) from None
+        missing = no_such_file(path) if isinstance(error, FileNotFoundError) else f"{path}: {error.strerror}"
+        raise ConfigError(_propose("a folder", path) if path.is_dir() else missing) from None
     except UnicodeDecodeError as error:
         fault = ConfigError([Fault(f"not UTF-8 text ({error.reason} at byte {error.start})", file=str(path))])
     except ConfigError as error:
@@ -207,12 +208,6 @@ def override(document: Document, overrides: Mapping[str, Any], option: str = "--
     if faults:
         raise ConfigError(faults)
     return replace(document, data=data, origins=origins)
-
-
-def _unreadable(path: Path, error: OSError) -> str:
-    if path.is_dir():
-        return _propose("a folder", path)
-    return no_such_file(path) if isinstance(error, FileNotFoundError) else f"{path}: {error.strerror}"
 
 
 def _propose(what: str, path: Path) -> str:
