@@ -19,20 +19,19 @@ from en4dvar.config.series import DATA, DataPlan
 from en4dvar.config.validate import Faults
 from en4dvar.config.varies import MODEL_ERROR, ErrorOf
 from en4dvar.model.forward import ForwardModel, Observable
-from en4dvar.plumbing.errors import ConfigError, Fault
+from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.hints import shown, suggest
 
 APART = ("time_std", "correlation_time", "shared", "covariance", "robust", "discrepancy")  # keys of data.error
 
 
 def _known_fields(names: tuple[str, ...], context: Context) -> tuple[str, ...]:
-    """Names of fields of the state. Raises :class:`ConfigError`."""
+    """Names of fields of the state."""
     known = dynamic_fields(context.model)
-    faults = [
-        Fault(f"unknown field {shown(n)}{suggest(n, known)}", str(k)) for k, n in enumerate(names) if n not in known
-    ]
-    if faults:
-        raise ConfigError(faults)
+    with Faults() as faults:
+        for k, name in enumerate(names):
+            if name not in known:
+                faults.add((k,), f"unknown field {shown(name)}{suggest(name, known)}")
     return names
 
 
