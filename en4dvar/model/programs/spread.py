@@ -34,9 +34,8 @@ def priors_in_files(
     uncertain = [name for name, prior in priors.items() if isinstance(prior, dict) and "prior" in prior]
     named = [rows[name].word("parnme") for name in uncertain]
     if draws := _file(control, PRIOR_DRAWS):
-        for row in rows.values():
-            place = draws.columns.index(own) if (own := row.word("parnme")) in draws.columns else None
-            if row.word("partrans") == "fixed" and place is not None and np.ptp(draws.values[:, place]) > 0:
+        for own in (row.word("parnme") for row in rows.values() if row.word("partrans") == "fixed"):
+            if own in draws.columns and np.ptp(draws.of([own])) > 0:
                 raise ConfigError(f"{draws.path}: {own} varies there, but is fixed in {control.path}")
         for name in uncertain:
             bounds = {key: priors[name][key] for key in ("lower", "upper")}
