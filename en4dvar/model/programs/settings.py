@@ -14,15 +14,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Self
 
-from pydantic import (
-    AfterValidator,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    ValidationInfo,
-    field_validator,
-    model_validator,
-)
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, ValidationInfo, model_validator
 
 from en4dvar.model.programs import pest
 from en4dvar.model.programs.errors import ProgramError
@@ -61,11 +53,16 @@ def _inside(name: str) -> str:
     return name
 
 
+def _base(info: ValidationInfo) -> Path:
+    """The folder of the configuration."""
+    return Path((info.context or {}).get("base", Path.cwd())).absolute()
+
+
 def _file(text: Any, info: ValidationInfo) -> Any:
     """A file beside the configuration, as an absolute path. Raises ValueError where it is not there."""
     if not isinstance(text, str | Path):
         return text
-    path = Path((info.context or {}).get("base", Path.cwd())) / expanded(str(text))
+    path = _base(info) / expanded(str(text))
     if not path.is_file():
         raise ValueError(no_such_file(path))
     return path.absolute()
@@ -188,17 +185,52 @@ def _with_unit(text: Any) -> Any:
     return {"unit": text} if isinstance(text, str) else text
 
 
+def _placed(command: str, info: ValidationInfo) -> str:
+    """The command with absolute paths of what lies beside the configuration. Raises ValueError: no such program."""
+    base, shell = _base(info), bool(info.data.get("shell"))
+    known = {"here": shlex.quote(str(base)), "python": shlex.quote(sys.executable)}
+    command = fill(command, known)
+    first, *others = split(command, shell)
+    if shell:
+        return command
+    if Path(first).name != first:
+        path = base / expanded(first)
+        if not path.is_file():
+            raise ValueError(no_such_file(path))
+        if not os.access(path, os.X_OK):
+            raise ValueError(f"{path}: is not executable; chmod +x it, or begin with the program that runs it")
+        first = str(path.absolute())
+    elif shutil.which(first) is None:
+        raise ValueError(f"no program {first!r} on the PATH; for one beside this file write ./{first}")
+    return shlex.join((first, *others))
+
+
+def _named_well(parameters: dict[str, ParameterOf]) -> dict[str, ParameterOf]:
+    for name in parameters:
+        if not name.isidentifier() or name in OWN_NAMES:
+            raise ValueError(f"{name!r} cannot be the name of a parameter")
+    return parameters
+
+
+def _folder(folder: Path, info: ValidationInfo) -> Path:
+    path = _base(info) / expanded(str(folder))
+    if not path.is_dir():
+        raise ValueError(f"{path}: no such folder")
+    return path
+
+
 class CommandSettings(_Section):
     """A program as forward model: how it is called, what goes in, what comes out."""
 
     shell: bool = False
     """Run the command by /bin/sh instead of splitting it into words."""
-    command: Annotated[str, Field(min_length=1)]
+    command: Annotated[str, Field(min_length=1), AfterValidator(_placed)]
     """Program and arguments, split as by a shell but run without one. {input} and {output} are names of files, {NAME} a
     parameter, {here} the folder of this file, {python} this Python. It runs in a scratch directory of its own."""
     parameters: Annotated[
         dict[str, Annotated[ParameterOf, BeforeValidator(_with_unit, json_schema_input_type=str | ParameterOf)]],
         Field(min_length=1),
+        AfterValidator(_named_well),
     ]
     """Name → unit, or a section: what is filled in."""
     outputs: Annotated[dict[str, OutputOf], Field(min_length=1)]
@@ -216,32 +248,8 @@ class CommandSettings(_Section):
     """Longest that one run may take, e.g. 60 s; past it the program is ended and the member has failed."""
     retries: Annotated[int, Field(ge=0, le=100)] = 0
     """How often a run that failed is tried again; for licences and full disks, not for models that vary."""
-    scratch: Path | None = None
+    scratch: Annotated[Path, AfterValidator(_folder)] | None = None
     """Folder that holds the scratch directories; default the system's for temporary files."""
-
-    @field_validator("scratch", mode="after")
-    @classmethod
-    def _folder(cls, folder: Path | None, info: ValidationInfo) -> Path | None:
-        if folder is None:
-            return None
-        path = (Path((info.context or {}).get("base", Path.cwd())) / expanded(str(folder))).absolute()
-        if not path.is_dir():
-            raise ValueError(f"{path}: no such folder")
-        return path
-
-    @field_validator("command", mode="after")
-    @classmethod
-    def _found(cls, command: str, info: ValidationInfo) -> str:
-        base = Path((info.context or {}).get("base", Path.cwd())).absolute()
-        return _placed(command, base, bool(info.data.get("shell")))
-
-    @field_validator("parameters", mode="after")
-    @classmethod
-    def _names(cls, parameters: dict[str, ParameterOf]) -> dict[str, ParameterOf]:
-        for name in parameters:
-            if not name.isidentifier() or name in OWN_NAMES:
-                raise ValueError(f"{name!r} cannot be the name of a parameter")
-        return parameters
 
     @model_validator(mode="after")
     def _belong_together(self) -> Self:
@@ -262,25 +270,6 @@ class CommandSettings(_Section):
         if double := {name for name in written if written.count(name) > 1}:
             raise ValueError(f"templates and files: two of them become {min(double)!r} in the scratch directory")
         return self
-
-
-def _placed(command: str, base: Path, shell: bool) -> str:
-    """The command with absolute paths of what lies beside the configuration. Raises ValueError: no such program."""
-    known = {"here": shlex.quote(str(base)), "python": shlex.quote(sys.executable)}
-    command = fill(command, known)
-    first, *others = split(command, shell)
-    if shell:
-        return command
-    if Path(first).name != first:
-        path = base / expanded(first)
-        if not path.is_file():
-            raise ValueError(no_such_file(path))
-        if not os.access(path, os.X_OK):
-            raise ValueError(f"{path}: is not executable; chmod +x it, or begin with the program that runs it")
-        first = str(path.absolute())
-    elif shutil.which(first) is None:
-        raise ValueError(f"no program {first!r} on the PATH; for one beside this file write ./{first}")
-    return shlex.join((first, *others))
 
 
 def fill(word: str, values: Mapping[str, str]) -> str:
