@@ -21,7 +21,6 @@ import numpy as np
 from en4dvar.model.state import Array
 from en4dvar.sampling.mixture import StudentMixture, effective_number, resampled
 
-NARROWEST = 0.03  # standard deviation of what is drawn about points, in units of the prior
 FEWEST = 60.0  # effective draws that a proposal is fitted to: with fewer, to tempered weights
 COMPONENTS = 4
 SETTLED, PARTS = 150.0, 8  # the same of proposals to a power of the posterior,
@@ -42,19 +41,6 @@ class Proposal(Protocol):
 
     def log_density(self, x: Array) -> Array:
         """(B,) at points (B, n)."""
-
-
-def standard(n: int) -> StudentMixture:
-    """The prior in its own coordinates, with the tails of a proposal."""
-    return StudentMixture(np.ones(1), np.zeros((1, n)), np.eye(n)[None])
-
-
-def about(points: Array, of_prior: float) -> StudentMixture:
-    """Student t about points (N, n), in no direction narrower than :data:`NARROWEST`, and a share ``of_prior``."""
-    first, n = standard(points.shape[1]), points.shape[1]
-    covariance = np.cov(points, rowvar=False).reshape(n, n) + NARROWEST**2 * np.eye(n)
-    root = np.concatenate([first.root, np.linalg.cholesky(covariance)[None]])
-    return StudentMixture(np.array([of_prior, 1 - of_prior]), np.vstack([first.centre, points.mean(axis=0)]), root)
 
 
 class Importance:

@@ -58,15 +58,13 @@ def advance(
     return np.ascontiguousarray(x.T), costs
 
 
-def walked(
-    cost: Callable[[Array], Array], start: Array, random: Any, rounds: int, left_out: int, costs: Array | None = None
-) -> Array:
+def walked(cost: Callable[[Array], Array], start: Array, random: Any, rounds: int, left_out: int) -> Array:
     """Positions (D, n) on exp(−cost) of walkers from ``start`` (W, n), two halves that move in turn.
 
-    Those of the first ``left_out`` rounds are left out. ``costs`` (W,): of the start, where they are known.
+    Those of the first ``left_out`` rounds are left out.
     """
     halves, kept = list(start.reshape(2, len(start) // 2, -1)), list[Array]()
-    of_each = [cost(part) for part in halves] if costs is None else list(costs.reshape(2, -1))
+    of_each = [cost(part) for part in halves]
     for number in range(rounds):
         for i in (0, 1):
             halves[i], of_each[i] = advance(cost, halves[i], of_each[i], halves[1 - i], random, MOVES)
