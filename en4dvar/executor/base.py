@@ -51,6 +51,13 @@ class Executor(ABC):
         ExecutorError: the workers cannot be reached.
         """
 
+    def results(self, function: Callable[..., T], calls: Iterable[Call]) -> Iterator[tuple[int, T]]:
+        """As :meth:`map`, of calls of which none may fail: raises what one of them raises."""
+        for i, value in self.map(function, calls):
+            if isinstance(value, Exception):
+                raise value
+            yield i, value
+
     def trajectories(self, model: ForwardModel, x: Array, times: Array) -> Sequence[Outcome]:
         """Initial states (B, n_state) and times (K,) or (B, K) → B trajectories or failures, in the order of members.
 

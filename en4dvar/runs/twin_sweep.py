@@ -213,9 +213,7 @@ class SweepKind(RunKind[TwinSweep]):
         done = {i: run for i, run in enumerate(kept) if run is not None}
         left = [i for i in range(len(jobs)) if i not in done]
         tell(len(done), len(jobs))
-        for n, value in executor.map(_one, (jobs[i] for i in left)):
-            if isinstance(value, Exception):
-                raise value
+        for n, value in executor.results(_one, (jobs[i] for i in left)):
             done[left[n]] = value
             write_checkpoint(session.directory.at(files[left[n]]), marks[left[n]], value)
             tell(len(done), len(jobs))

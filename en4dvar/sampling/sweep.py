@@ -11,7 +11,6 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
 from zipfile import BadZipFile
 
 import numpy as np
@@ -28,7 +27,6 @@ from en4dvar.problem import InverseProblem
 from en4dvar.sampling.nearest import Targets, best_over_shifts, targets
 
 BATCH = 128  # trajectories whose full solution is in memory at once, a worker
-T = TypeVar("T")
 Progress = Callable[[int, int], None]
 
 
@@ -129,7 +127,7 @@ def run_sweep(
     parts = [design[i : i + settings.chunk] for i in range(0, len(design), settings.chunk)]
     total, done = settings.trajectories + refinement_size(settings, len(problems)), 0
     best_of_set: dict[int, Best] = {}
-    for i, best in _results(executor, score.chunk, [(x, _file(folder, i)) for i, x in enumerate(parts)]):
+    for i, best in executor.results(score.chunk, [(x, _file(folder, i)) for i, x in enumerate(parts)]):
         best_of_set[i] = best
         done += len(parts[i])
         if progress is not None:
@@ -272,21 +270,11 @@ def _own(score: _Score, x: Array, executor: Executor) -> tuple[Array, Array]:
     """NRMSE and shift (S, L) of coordinates (S, L, n), each against its own set."""
     n_sets, count, n = x.shape
     flat = x.reshape(-1, n)
-    scores = dict(_results(executor, score.of, [(flat[i : i + BATCH],) for i in range(0, len(flat), BATCH)]))
+    scores = dict(executor.results(score.of, [(flat[i : i + BATCH],) for i in range(0, len(flat), BATCH)]))
     parts = zip(*(scores[i] for i in range(len(scores))), strict=True)
     nrmse, shift = (np.concatenate(p).reshape(n_sets, count, n_sets) for p in parts)
     sets = np.arange(n_sets)
     return nrmse[sets, :, sets], shift[sets, :, sets]
-
-
-def _results(
-    executor: Executor, function: Callable[..., T], calls: Sequence[tuple[Any, ...]]
-) -> Iterator[tuple[int, T]]:
-    """Index and value of every call, as they end; raises what a call raises."""
-    for i, value in executor.map(function, calls):
-        if isinstance(value, Exception):
-            raise value
-        yield i, value
 
 
 def _file(folder: Path | None, number: int) -> Path | None:
