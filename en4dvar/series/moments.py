@@ -90,30 +90,18 @@ class InnovationRecorder(MomentsRecorder):
 
     A rank is the probability that the mixture of the members' Gaussians gives to what lies below the observation: the
     share of members below it, errors of the observations added, without the chance of a draw. NaN where there is none.
+
+    ``ranks`` and ``evidence`` are those of everything recorded so far once :meth:`moments` has been asked for.
     """
 
-    def __init__(self, series: CycleSeries, of_data: bool, before: Moments | None = None):
+    def __init__(self, series: CycleSeries, of_data: bool, before: "SequentialState | None" = None):
         cycles, size = series.values.shape
-        super().__init__(cycles, size, before)
+        super().__init__(cycles, size, before.predicted if before else None)
         self._series, self._of_data = series, of_data
         self._std = np.broadcast_to(series.std, series.values.shape)
-        self._ranks, self._evidence = np.full(series.values.shape, np.nan), np.full(len(series.times), np.nan)
-
-    def resume(self, ranks: Array, evidence: Array) -> None:
-        """Take over what was recorded before."""
-        self._ranks[: len(ranks)], self._evidence[: len(evidence)] = ranks, evidence
-
-    @property
-    def ranks(self) -> Array:
-        """The ranks of everything recorded so far."""
-        self._flush()
-        return self._ranks
-
-    @property
-    def evidence(self) -> Array:
-        """The evidence of everything recorded so far."""
-        self._flush()
-        return self._evidence
+        self.ranks, self.evidence = np.full(series.values.shape, np.nan), np.full(len(series.times), np.nan)
+        if before is not None:
+            self.ranks[: len(before.ranks)], self.evidence[: len(before.evidence)] = before.ranks, before.evidence
 
     def _flush(self) -> None:
         if not self._cycles:
@@ -126,8 +114,8 @@ class InnovationRecorder(MomentsRecorder):
         np.subtract(self._series.values[at][:, None], gaps, out=gaps)
         gaps /= self._std[at][:, None]
         if self._of_data:
-            self._evidence[at] = log_evidence(gaps, self._std[at], self._series.correlation)
-        self._ranks[at] = ndtr(gaps, out=gaps).mean(axis=1)
+            self.evidence[at] = log_evidence(gaps, self._std[at], self._series.correlation)
+        self.ranks[at] = ndtr(gaps, out=gaps).mean(axis=1)
 
 
 def log_evidence(gaps: Array, std: Array, correlation: Correlation | None) -> Array:

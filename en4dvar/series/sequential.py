@@ -125,9 +125,7 @@ class _Run:
             self.trail = list(resume.trail)
             earlier = resume.forecast, resume.analysis, resume.smoothed
         self.before, self.after, self.smooth = (MomentsRecorder(cycles, size, moments, truth) for moments in earlier)
-        self.predicted = InnovationRecorder(series, truth is None, resume.predicted if resume else None)
-        if resume is not None:
-            self.predicted.resume(resume.ranks, resume.evidence)
+        self.predicted = InnovationRecorder(series, truth is None, resume)
 
     def state(self) -> SequentialState:
         done = self.done  # the next forecast may be there already

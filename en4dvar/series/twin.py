@@ -166,18 +166,15 @@ def _truth(experiment: TwinExperiment, seed: int) -> Array:
     start = experiment.start.drawn([member_stream(seed, "truth")])
     coordinates = experiment.start.coordinates
     times = [0.0, *experiment.times.tolist()]
-    flow = Flow(model, experiment.observables, times, SerialExecutor(), coordinates, error)
+    if error is not None:
+        stream = member_stream(seed, "model error of the truth")
+        start = np.hstack([start, stream.standard_normal((1, experiment.cycles * len(error.where)))])
     try:
-        if error is None:
-            (states,) = flow.move(start, 0, range(1, len(times)))
-            return coordinates.to_physical(states)
-        draws = member_stream(seed, "model error of the truth").standard_normal((experiment.cycles, len(error.where)))
-        path = [start]
-        for k, noise in enumerate(draws, 1):
-            path.append(flow.changed(flow.move(path[-1], k - 1, [k])[:, 0], noise[None], k))
+        flow = Flow(model, experiment.observables, times, SerialExecutor(), coordinates, error)
+        path = flow.forecast(start, 0, range(1, len(times)))
     except MembersLost as lost:
         raise En4dvarError(f"the truth cannot be integrated: {lost.reasons[0]}") from None
-    return coordinates.to_physical(np.concatenate(path[1:]))
+    return coordinates.to_physical(np.concatenate(path))
 
 
 def initial_ensemble(experiment: TwinExperiment, seed: int) -> Array:
