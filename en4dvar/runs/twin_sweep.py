@@ -46,17 +46,6 @@ class TwinRun:
 
 
 @dataclass(frozen=True)
-class Average:
-    """Mean of RMSE and spread over ``runs`` seeds, each with its standard error; NaN where there are too few."""
-
-    runs: int
-    rmse: float
-    rmse_error: float
-    spread: float
-    spread_error: float
-
-
-@dataclass(frozen=True)
 class TwinSweep:
     """``values`` of the varied ``keys``, one tuple a setting, and the ``runs`` of each, one a seed."""
 
@@ -70,7 +59,7 @@ class TwinSweep:
     def rows(self) -> list[dict[str, Any]]:
         """A row a setting and estimate, as for ``pandas.DataFrame``."""
         return [
-            dict(zip(self.keys, values, strict=True)) | {"estimate": name} | vars(average)
+            dict(zip(self.keys, values, strict=True)) | {"estimate": name} | average
             | {"failed": sum(bool(run.failure) for run in runs)}
             for values, runs in zip(self.values, self.runs, strict=True)
             for name, average in averages(runs).items()
@@ -92,7 +81,7 @@ class TwinSweep:
         for estimate, colour in zip(dict.fromkeys(row["estimate"] for row in self.rows), COLOURS, strict=False):
             at = [i for i, runs in enumerate(self.runs) if estimate in averages(runs)]
             means = [averages(self.runs[i])[estimate] for i in at]
-            rmse, error = (np.array([getattr(m, key) for m in means]) for key in ("rmse", "rmse_error"))
+            rmse, error = (np.array([mean[key] for mean in means]) for key in ("rmse", "rmse_error"))
             panel.bars(at, rmse - np.nan_to_num(error), rmse + np.nan_to_num(error), colour)
             panel.dots(at, rmse, colour, 3.0, label=estimate)
         return on_paper(Chart([Row(7 * POINTS, [panel])]))
@@ -108,8 +97,10 @@ class TwinSweep:
         return table([head, *lines])
 
 
-def averages(runs: Sequence[TwinRun]) -> dict[str, Average]:
-    """Of each estimate, over the runs that did not fail; of a setting whose runs all did, an empty analysis."""
+def averages(runs: Sequence[TwinRun]) -> dict[str, dict[str, float]]:
+    """Of each estimate how many ``runs`` did not fail, and the mean of their ``rmse`` and ``spread``, each with its
+    standard error; NaN where there are too few. Of a setting whose runs all failed, an empty analysis.
+    """
     names = dict.fromkeys(name for run in runs for name, _, _ in run.scores) or {"analysis": None}
     means = {}
     for name in names:
@@ -117,7 +108,8 @@ def averages(runs: Sequence[TwinRun]) -> dict[str, Average]:
         n = len(both)
         mean = both.mean(axis=0) if n else np.full(2, np.nan)
         error = both.std(axis=0, ddof=1) / np.sqrt(n) if n > 1 else np.full(2, np.nan)
-        means[name] = Average(n, float(mean[0]), float(error[0]), float(mean[1]), float(error[1]))
+        means[name] = {"runs": n, "rmse": float(mean[0]), "rmse_error": float(error[0]),
+                       "spread": float(mean[1]), "spread_error": float(error[1])}  # fmt: skip
     return means
 
 
