@@ -196,7 +196,7 @@ def _follow(config: TwinConfig | SequenceConfig, force: bool, resume: bool) -> N
     """Cycles, their table on standard output, warnings on standard error, and where the files are."""
     from en4dvar.config import TwinConfig
     from en4dvar.report.outcomes import estimates_table, scores_table
-    from en4dvar.runs.progress import cycle_progress
+    from en4dvar.runs.progress import counted
     from en4dvar.runs.sequence_run import SequenceKind, run_sequence
     from en4dvar.runs.twin_run import TwinKind, run_twin
 
@@ -205,7 +205,8 @@ def _follow(config: TwinConfig | SequenceConfig, force: bool, resume: bool) -> N
     else:
         own = SequenceKind(config), run_sequence, estimates_table, config.assimilation.members
     kind, conduct, table, members = own
-    with continuable(), cycle_progress(kind.cycles) as on_cycle:
+    with continuable(), counted("cycles") as tell:
+        on_cycle = (lambda cycle: tell(cycle + 1, kind.cycles)) if tell else None
         result = conduct(config, force=force, resume=resume, on_cycle=on_cycle, command=command_line())
     echo(table(result))
     if result.run.failures:

@@ -207,13 +207,6 @@ def shown(bar: Any) -> Iterator[Any]:
 
 
 @contextmanager
-def cycle_progress(cycles: int) -> Iterator[Callable[[int], None] | None]:
-    """A bar of assimilation cycles on the terminal (standard error), or None where there is no terminal."""
-    with counted("cycles") as tell:
-        yield (lambda cycle: tell(cycle + 1, cycles)) if tell else None
-
-
-@contextmanager
 def counted(what: str) -> Iterator[Callable[[int, int], None] | None]:
     """A bar on the terminal (standard error) that is told how many of how many are done, or None without a terminal."""
     from rich.console import Console

@@ -60,12 +60,12 @@ def simulate(config: Config, times: Array | None = None) -> Simulation:
     ------
     ConfigError, DataError: no times, or a value that only the data know. En4dvarError: the model fails.
     """
-    for series in _plan(config).series if config.data is not None else ():
+    for series in _series(config):
         _places(series, 1)
     times = config.simulate_times if times is None else times
     observations = None
     if config.data is not None and (times is None or any(entry.needs_data for entry in config.parameters)):
-        plan = _plan(config)
+        plan = DataPlan.of(config.data, config.observable)
         name, file = next(iter(data_files(plan).items()))
         observations = read_observations(plan, file, name)
     if times is None:
@@ -82,10 +82,9 @@ def simulate(config: Config, times: Array | None = None) -> Simulation:
     return Simulation(times, _forward(config, theta, times), theta)
 
 
-def _plan(config: Config) -> DataPlan:
-    """The series of the data."""
-    assert config.data is not None
-    return DataPlan.of(config.data, config.observable)
+def _series(config: Config) -> tuple[SeriesPlan, ...]:
+    """The series of the data, where there are data."""
+    return () if config.data is None else DataPlan.of(config.data, config.observable).series
 
 
 def _places(plan: SeriesPlan, count: int) -> Places | None:
@@ -120,9 +119,8 @@ def noise_level(text: str, config: Config, simulation: Simulation) -> dict[str, 
 
 def _observables(config: Config) -> dict[str, Observable]:
     """By the name of the series."""
-    if config.data is None:
-        return {config.observable.name: config.observable}
-    return {series.name: series.observable for series in _plan(config).series}
+    own = {series.name: series.observable for series in _series(config)}
+    return own or {config.observable.name: config.observable}
 
 
 def _forward(config: Config, theta: Mapping[str, float], times: Array) -> dict[str, Array]:
@@ -138,7 +136,7 @@ def _forward(config: Config, theta: Mapping[str, float], times: Array) -> dict[s
     (path,) = run_chunk(model, state[None], times + shift)
     if isinstance(path, Failure):
         raise En4dvarError(f"the model failed: {path.reason}")
-    where = {s.name: _places(s, len(times)) for s in _plan(config).series} if config.data is not None else {}
+    where = {series.name: _places(series, len(times)) for series in _series(config)}
     predictions = {}
     for name, observable in _observables(config).items():
         try:
@@ -157,8 +155,7 @@ def to_csv(simulation: Simulation, config: Config, comment: str = "") -> str:
     time = Column(f"t_{model.time_display_unit}", model.time_display_unit, model.time_unit)
     value = Column(f"{observable.name}_{observable.display_unit}", observable.display_unit, observable.unit)
     columns = [value]
-    if config.data is not None:
-        series = _plan(config).series
+    if series := _series(config):
         stated = series[0].data.columns.time
         time = stated if isinstance(stated, Column) else time
         columns = [plan.data.columns.observable for plan in series]
