@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from en4dvar.data.noise import DiscrepancyNoise, Linearisation, Predicted
 from en4dvar.descent.weight_space import WeightSpace
+from en4dvar.ensemble.forecast import of_framework
 from en4dvar.ensemble.linalg import with_moments
 from en4dvar.model.state import NOISE_SCALE, Array
 from en4dvar.priors.prior import member_stream
@@ -94,16 +95,11 @@ def _given(
 def _predicted(space: WeightSpace, at: Predicted, physical: Array) -> Predicted:
     """The predictions of the mode beside parameters (D, n) of the errors."""
     problem, count = space.problem, len(physical)
-
-    def column(name: str) -> Array:
-        names = problem.prior.names
-        return physical[:, names.index(name)] if name in names else np.full(count, problem.fixed.get(name, 1.0))
-
     return Predicted(
         np.tile(at.values, (count, 1)),
         None if at.rates is None else np.tile(at.rates, (count, 1)),
-        column(NOISE_SCALE.name) if problem.has_noise_scale else None,
-        np.stack([column(p.name) for p in problem.discrepancy], axis=1),
+        of_framework(problem, physical, NOISE_SCALE, 1.0) if problem.has_noise_scale else None,
+        np.stack([of_framework(problem, physical, p, 1.0) for p in problem.discrepancy], axis=1),
     )
 
 

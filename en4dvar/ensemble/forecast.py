@@ -108,7 +108,7 @@ class Composite:
         physical = problem.prior.to_physical(x[:, :named])
         failures = out_of_bounds(problem.prior, physical)
         alive, states = self._initial_states(physical, failures, x[:, named:])
-        shift = time_shift(problem, physical)
+        shift = of_framework(problem, physical, TIME_SHIFT, 0.0)
         shifted = times + shift[alive, None]
         outcomes = self.executor.trajectories(problem.model, states, shifted) if len(states) else ()
         observed, limits, reasons = reading.observe(outcomes, size)
@@ -125,8 +125,8 @@ class Composite:
         predicted = Predicted(
             observed[0][:, at_observations],
             self._rates(observed, at_observations, at_nodes) if len(observed) > 1 else None,
-            _of_framework(problem, physical, NOISE_SCALE, 1.0) if self._scaled else None,
-            np.stack([_of_framework(problem, physical, p, np.nan) for p in self._discrepancy], axis=1)
+            of_framework(problem, physical, NOISE_SCALE, 1.0) if self._scaled else None,
+            np.stack([of_framework(problem, physical, p, np.nan) for p in self._discrepancy], axis=1)
             if self._discrepancy
             else None,
         )
@@ -248,29 +248,17 @@ def _operators(problem: InverseProblem) -> list[tuple[Callable[[Any], Array], ..
     return [operators_of(parts), *([operators_of(parts, True, what)] if noise.needs_rates else [])]
 
 
-def time_shift(problem: InverseProblem, physical: Array) -> Array:
-    """t_s (B,) of physical control vectors (B, n)."""
-    return _of_framework(problem, physical, TIME_SHIFT, 0.0)
-
-
-def reading_scale(problem: InverseProblem, physical: Array) -> Array:
-    """Factor (B,) of the predictions of physical control vectors (B, n)."""
-    if not problem.has_reading_scale:
-        return np.ones(len(physical))
-    return _of_framework(problem, physical, READING_SCALE, 1.0)
-
-
 def as_read(problem: InverseProblem, physical: Array, observed: Array) -> Array:
     """Readings of an observable, and of its rates, (Q, B, M): times ``reading_scale``, plus ``reading_offset``."""
     if problem.has_reading_scale:
-        observed = observed * reading_scale(problem, physical)[:, None]
+        observed = observed * of_framework(problem, physical, READING_SCALE, 1.0)[:, None]
     if problem.has_reading_offset:
-        read = observed[0] + _of_framework(problem, physical, READING_OFFSET, 0.0)[:, None]
+        read = observed[0] + of_framework(problem, physical, READING_OFFSET, 0.0)[:, None]
         observed = np.concatenate([read[None], observed[1:]])
     return observed
 
 
-def _of_framework(problem: InverseProblem, physical: Array, parameter: Parameter, default: float) -> Array:
+def of_framework(problem: InverseProblem, physical: Array, parameter: Parameter, default: float) -> Array:
     """Values (B,) of a parameter that the framework itself uses."""
     if parameter.name in problem.prior.names:
         return np.asarray(physical[:, problem.prior.names.index(parameter.name)])

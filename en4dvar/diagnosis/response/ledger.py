@@ -20,12 +20,12 @@ import numpy as np
 
 from en4dvar.data.noise import Linearisation
 from en4dvar.diagnosis.response.linear import LinearResponse
-from en4dvar.ensemble.forecast import reading_scale, time_shift
+from en4dvar.ensemble.forecast import of_framework
 from en4dvar.ensemble.members import EVERYONE, InitialStates, Reading
 from en4dvar.ensemble.readout import Readout, batched, operators_of
 from en4dvar.executor.chunks import without_warnings
 from en4dvar.model.forward import Failure, PathQuantity, Trajectory
-from en4dvar.model.state import Array
+from en4dvar.model.state import READING_SCALE, TIME_SHIFT, Array
 from en4dvar.plumbing.user_code import reason_of
 from en4dvar.problem import InverseProblem
 
@@ -93,7 +93,8 @@ def _ledger(problem: InverseProblem, response: LinearResponse, std: Array, names
     physical = prior.to_physical(response.at)
     reasons = [""]
     alive, start = InitialStates(problem)(physical[None], reasons)
-    shift, scale = (float(of(problem, physical[None])[0]) for of in (time_shift, reading_scale))
+    shift = float(of_framework(problem, physical[None], TIME_SHIFT, 0.0)[0])
+    scale = float(of_framework(problem, physical[None], READING_SCALE, 1.0)[0]) if problem.has_reading_scale else 1.0
     times = problem.observations.times + shift
     path = None if alive is not EVERYONE else _path(problem, start, float(times.max()))
     if path is None:
