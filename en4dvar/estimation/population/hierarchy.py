@@ -29,7 +29,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from en4dvar.estimation.population.effort import Effort
 from en4dvar.estimation.population.hyper import Hyper, HyperPrior
 from en4dvar.estimation.population.mixtures import Mixture, condition, draw_conditioned, log_marginal
 from en4dvar.estimation.population.own import OwnLikelihood
@@ -41,6 +40,19 @@ from en4dvar.sampling.walkers import walked
 
 FIT = 3000  # positions that the proposal is fitted to
 RAISED, A_SET = 5.0, 0.25  # times more probably odd by its data, and times the number of sets: named
+
+
+@dataclass(frozen=True)
+class Effort:
+    """``hyper_`` walkers, their rounds, and components of the proposal fitted to them; ``draws`` of it that are
+    weighed, ``effective`` ones wanted.
+    """
+
+    hyper_walkers: int = 64
+    hyper_rounds: int = 60
+    hyper_components: int = 6
+    draws: int = 3000
+    effective: float = 300.0
 
 
 def named(belongs: Array, odd: float) -> tuple[int, ...]:
