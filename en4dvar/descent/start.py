@@ -108,7 +108,7 @@ def choose_start(
 
 def descent_from(space: WeightSpace, member: int) -> Descent:
     """One that starts from a member of the prior ensemble, or, of number N, from the mean."""
-    return Descent(space.start(space.drawn.at_member(member)), members=(member,))
+    return Descent(space.start(space.at_member(member)), members=(member,))
 
 
 def descent_at(space: WeightSpace, x: Array, number: int) -> Descent:
@@ -139,7 +139,7 @@ def given(problem: InverseProblem, start: Mapping[str, float | Mapping[str, floa
 
 def affordable(space: WeightSpace, scheme: Minimiser, run: Forecast) -> list[int]:
     """Members of lowest J, as many as go :func:`side_by_side`; at least one."""
-    costs = space.drawn.background_costs + space.observation_cost(run)
+    costs = space.background_costs + space.observation_cost(run)
     best = np.argsort(costs, kind="stable").tolist()
     count = side_by_side(space) if scheme.economical(space.basis) else 1
     return [i for i in best[:count] if np.isfinite(costs[i])] or best[:1]

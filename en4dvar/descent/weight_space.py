@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -17,7 +17,6 @@ from en4dvar.ensemble.tangent import check_derivatives, derivatives_of
 from en4dvar.executor import Executor
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import TooFewMembersError
-from en4dvar.priors.prior import Prior, Sampling
 from en4dvar.problem import InverseProblem
 from en4dvar.schemes.base import Weights
 from en4dvar.schemes.settings import AssimilationSettings
@@ -25,15 +24,28 @@ from en4dvar.schemes.settings import AssimilationSettings
 NOT_READ: Array = np.empty((0, 0))
 
 
-@dataclass(frozen=True)
-class PriorEnsemble:
-    """Members E0 (N, n), transformed, their mean (n,), anomalies X0 (N, n), variance (n,) and basis (N, r) of X0."""
+class WeightSpace:
+    """The ensemble of a problem, its model behind an executor, and the count of forward runs.
 
-    members: Array
-    mean: Array
-    anomalies: Array
-    variance: Array
-    basis: Array
+    ``members`` E0 (N, n), transformed, their ``mean`` (n,), ``anomalies`` X0 (N, n), ``prior_variance`` (n,) and the
+    ``basis`` (N, r) of X0.
+    """
+
+    def __init__(self, problem: InverseProblem, settings: AssimilationSettings, seed: int, executor: Executor):
+        self.problem, self.settings, self.scheme, self.executor = problem, settings, settings.own, executor
+        self.seed = seed
+        self.composite = Composite(problem, executor)
+        self.derivatives = derivatives_of(problem, getattr(settings.own.minimiser, "linearisation", ""))
+        self.members = problem.prior.sample(settings.members, seed, settings.sampling)
+        self.mean, self.anomalies = centre(self.members)
+        self.prior_variance, self.basis = self.members.var(axis=0), anomaly_basis(self.anomalies)
+        self.forward_runs = 0
+
+    @property
+    def needed_members(self) -> int:
+        """The members that must survive for a regression on the control vector."""
+        n_members, n = self.members.shape
+        return int(max(math.ceil(self.settings.min_active_fraction * n_members), min(n + 1, n_members)))
 
     def at_member(self, i: int) -> Array:
         """Weights (N,) of member i; those of the mean follow the last.
@@ -54,33 +66,6 @@ class PriorEnsemble:
     def _projection(self) -> Array:
         """U Uᵀ (N, N)."""
         return np.asarray(self.basis @ self.basis.T)
-
-
-def prior_ensemble(prior: Prior, n_members: int, seed: int, sampling: Sampling) -> PriorEnsemble:
-    """The ensemble that a data set starts from."""
-    members = prior.sample(n_members, seed, sampling)
-    mean, anomalies = centre(members)
-    return PriorEnsemble(members, mean, anomalies, members.var(axis=0), anomaly_basis(anomalies))
-
-
-class WeightSpace:
-    """The ensemble of a problem, its model behind an executor, and the count of forward runs."""
-
-    def __init__(self, problem: InverseProblem, settings: AssimilationSettings, seed: int, executor: Executor):
-        self.problem, self.settings, self.scheme, self.executor = problem, settings, settings.own, executor
-        self.seed = seed
-        self.composite = Composite(problem, executor)
-        self.derivatives = derivatives_of(problem, getattr(settings.own.minimiser, "linearisation", ""))
-        self.drawn = drawn = prior_ensemble(problem.prior, settings.members, seed, settings.sampling)
-        self.members, self.mean, self.anomalies = drawn.members, drawn.mean, drawn.anomalies
-        self.prior_variance, self.basis = drawn.variance, drawn.basis
-        self.forward_runs = 0
-
-    @property
-    def needed_members(self) -> int:
-        """The members that must survive for a regression on the control vector."""
-        n_members, n = self.members.shape
-        return int(max(math.ceil(self.settings.min_active_fraction * n_members), min(n + 1, n_members)))
 
     def control(self, w: Array) -> Array:
         """Control vectors (…, n) of weights (…, N)."""
