@@ -33,12 +33,7 @@ SEND_EVERY = 0.1  # s; a worker sends the records of its iterations no more ofte
 Told = tuple[str, Record, str]  # name of a data set, one of its records, and what the log says of it
 
 
-@dataclass(frozen=True)
-class Common:
-    """What the data sets of a run have in common: its configuration, and ``attributes`` of their files."""
-
-    config: Config
-    attributes: Mapping[str, Any]
+Common = tuple[Config, Mapping[str, Any]]  # of the data sets of a run: its configuration, attributes of their files
 
 
 @dataclass(frozen=True)
@@ -83,8 +78,9 @@ class FileJob:
 
     def made(self) -> Job:
         """Raises what :func:`~en4dvar.assembly.build.build_one` does."""
-        config, attributes = self.common.value.config, {**self.common.value.attributes, **self.attributes}
+        config, attributes = self.common.value
         problem, seed = build_one(config, self.name, self.source), own_seed(config.seed, self.name)
+        attributes = {**attributes, **self.attributes}
         return Job(problem, config.assimilation, seed, attributes, self.keeper, self.resume)
 
 
