@@ -17,7 +17,6 @@ from en4dvar.diagnosis.response.ledger import ledger
 from en4dvar.diagnosis.response.what_if import Fit, Shift, what_if, with_shifts
 from en4dvar.ensemble.forecast import Forecast, cost, forecast, log_posterior
 from en4dvar.estimation import conclusions
-from en4dvar.estimation.conclusions import Ensembles
 from en4dvar.estimation.localised import Localised
 from en4dvar.estimation.stages import Keep, LoopState, Sampled, Stages
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
@@ -146,12 +145,12 @@ def _concluded(
     path = ledger(problem, response, std) if stages.settings.what_if else None
     withheld = stages.expected(ends.members)
     space.forward_runs += sum(shift.runs for shift in shifts) + (path.runs if path else 0)
-    ensembles = Ensembles(space.members, ends.members, ends.mode, prior_run[:-1], ends.run, last)
     return conclusions.outcome_of(
         problem,
         stages.settings,
         stages.seed,
-        ensembles,
+        (space.members, ends.members, ends.mode),
+        (prior_run[:-1], ends.run, last),
         fixed_parameters=stages.fixed_parameters,
         error_std=observations.noise.total_std(last.predicted[0]),
         trajectory_times=stages.grid,

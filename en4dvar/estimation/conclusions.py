@@ -1,7 +1,7 @@
 """Conclusions from a descent and the posterior about it: minima, evidence, residuals, influence, discrepancy."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -28,35 +28,25 @@ from en4dvar.sampling.refine import Refined
 from en4dvar.schemes.settings import AssimilationSettings
 
 
-@dataclass(frozen=True)
-class Ensembles:
-    """Members (N, n) of the parameters ``before`` and ``after``, transformed, and the ``centre`` (n,).
-
-    ``prior_run``, ``run`` and ``central`` are the forecasts of them."""
-
-    before: Array
-    after: Array
-    centre: Array
-    prior_run: Forecast
-    run: Forecast
-    central: Forecast
-
-
 def outcome_of(
-    problem: InverseProblem, settings: AssimilationSettings, seed: int, of: Ensembles, **more: Any
-) -> Analysis:
-    """The outcome of an assimilation, of its ensembles and what ``more`` there is to say."""
-    prior, prior_run, run = problem.prior, of.prior_run, of.run
+    problem: InverseProblem, settings: AssimilationSettings, seed: int, ensembles: tuple[Array, Array, Array],
+    forecasts: tuple[Forecast, Forecast, Forecast], **more: Any,
+) -> Analysis:  # fmt: skip
+    """The outcome of an assimilation, of its ``ensembles`` and their ``forecasts`` and what ``more`` there is to say.
+
+    These are members (N, n) of the parameters before and after, transformed, and the centre (n,).
+    """
+    prior, (before, after, centre), (prior_run, run, central) = problem.prior, ensembles, forecasts
     return Analysis(
         problem=problem,
         settings=settings,
         seed=seed,
-        prior=prior.to_physical(of.before),
-        posterior=prior.to_physical(of.after),
-        centre=prior.to_physical(of.centre),
+        prior=prior.to_physical(before),
+        posterior=prior.to_physical(after),
+        centre=prior.to_physical(centre),
         prior_predictions=_whole_rows(prior_run.predictions),
         posterior_predictions=_whole_rows(run.predictions),
-        centre_predictions=of.central.predictions[0],
+        centre_predictions=central.predictions[0],
         log_likelihood=problem.observations.log_likelihood(run.predicted),
         prior_trajectories=_whole_rows(prior_run.path),
         posterior_trajectories=_whole_rows(run.path),

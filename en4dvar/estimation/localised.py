@@ -27,7 +27,6 @@ from en4dvar.ensemble.members import InitialStates
 from en4dvar.ensemble.missing import filled, fitted
 from en4dvar.ensemble.repeat import check_repeats
 from en4dvar.estimation import conclusions
-from en4dvar.estimation.conclusions import Ensembles
 from en4dvar.executor import Executor
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import En4dvarError, TooFewMembersError
@@ -85,7 +84,7 @@ class Localised:
             for (prior_field, columns), moment in zip(self._fields, moments, strict=True)
         ]
         analysis = conclusions.outcome_of(
-            problem, self.settings, self.seed, Ensembles(before, after, centre[:n], prior_run, run, central),
+            problem, self.settings, self.seed, (before, after, centre[:n]), (prior_run, run, central),
             fixed_parameters=self.fixed_parameters,
             error_std=problem.observations.std,
             trajectory_times=self.grid,
