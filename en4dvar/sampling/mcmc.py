@@ -26,8 +26,9 @@ from en4dvar.diagnosis.analysis import ChainRecord
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import En4dvarError
 from en4dvar.sampling.alike import LEAST, POOL, standing_for
+from en4dvar.sampling.emulated_cost import EmulatedCost
 from en4dvar.sampling.mixture import StudentMixture
-from en4dvar.sampling.walkers import Emulated, advance
+from en4dvar.sampling.walkers import advance
 
 DE_SHARE = 0.8  # of the moves, the rest are stretches
 JUMPS = 0.5  # share of the steps where there is a mixture to draw from
@@ -132,7 +133,7 @@ def sample(
     resume: ChainState | None = None,
     keep: Callable[[ChainState], None] | None = None,
     look: Callable[[ChainRecord], None] | None = None,
-    emulated: Emulated | None = None,
+    emulated: EmulatedCost | None = None,
     proposal: StudentMixture | None = None,
 ) -> Chain:
     """Sample a density from the neighbourhood of an ensemble.
@@ -177,7 +178,7 @@ def sample(
             keep(chain)
 
 
-def _moves(emcee: Any, emulated: Emulated | None, proposal: StudentMixture | None) -> list[tuple[Any, float]]:
+def _moves(emcee: Any, emulated: EmulatedCost | None, proposal: StudentMixture | None) -> list[tuple[Any, float]]:
     """Moves and their shares."""
     far = []
     if emulated is not None:
@@ -237,7 +238,7 @@ def _start(
     ensemble: Array,
     seed: int,
     walkers: int,
-    emulated: Emulated | None,
+    emulated: EmulatedCost | None,
 ) -> Any:
     """The walkers' first positions and the state of the random numbers. Raises :class:`En4dvarError`."""
     n_members, n = ensemble.shape
@@ -259,7 +260,7 @@ def _start(
     return emcee.State(start, random_state=np.random.RandomState(int(random.integers(2**32))).get_state())
 
 
-def _guided(emulated: Emulated) -> Callable[[Array, Any], tuple[Array, Array]]:
+def _guided(emulated: EmulatedCost) -> Callable[[Array, Any], tuple[Array, Array]]:
     """Proposals (W, n), every walker many moves on the emulator away, and the log of what corrects for it (W,)."""
 
     def propose(x: Array, random: Any) -> tuple[Array, Array]:

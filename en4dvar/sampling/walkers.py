@@ -1,7 +1,7 @@
 """Moves of an ensemble of walkers about others that stand still, on a density that is cheap to evaluate."""
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -11,16 +11,6 @@ STRETCHES = 0.3  # share of the moves, the others are differential evolution
 LEAPS = 0.1  # share of the latter of length 1, which takes walkers from one mode to another
 JITTER = 2e-5  # of the spread, the most
 MOVES = 5  # of one half of the walkers while the other stands still
-
-
-class Emulated(Protocol):
-    """An approximate −log density that costs nothing, and draws (S, n) of what it describes."""
-
-    @property
-    def draws(self) -> Array: ...
-
-    def cost(self, x: Array) -> Array:
-        """Minus the log density (B,) at positions (B, n), up to a constant."""
 
 
 def advance(
