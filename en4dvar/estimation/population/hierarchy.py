@@ -29,7 +29,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from en4dvar.estimation.population.hyper import Hyper, HyperPrior
+from en4dvar.estimation.population.hyper import HyperPrior
 from en4dvar.estimation.population.mixtures import Mixture, condition, draw_conditioned, log_marginal
 from en4dvar.estimation.population.own import OwnLikelihood
 from en4dvar.model.state import Array
@@ -92,7 +92,7 @@ class Hierarchy:
     def __init__(self, likelihoods: Sequence[OwnLikelihood], scales: HyperPrior):
         self.likelihoods, odd = likelihoods, scales.odd
         self.p, self.c = likelihoods[0].slopes.shape
-        self.hyper = Hyper(self.p, scales)
+        self.hyper = scales
         self.shares = np.array([1 - odd, odd / 2, *[odd / 2 / self.p] * self.p])[: None if odd else 1]
         self.wider = scales.mean_std**2 * np.vstack([np.zeros((2, self.p)), np.eye(self.p)])
 
@@ -100,7 +100,7 @@ class Hierarchy:
         """(B, S, K) ln of the share and the marginal likelihood of each data set in the population, under its own prior
         and where one parameter lies elsewhere, over that under its own prior.
         """
-        mean, variance = self.hyper.population(h[:, : 2 * self.p])
+        mean, variance = h[:, : self.p], np.exp(2 * h[:, self.p : 2 * self.p])
         theta = h[:, 2 * self.p :]
         parts = np.zeros((len(h), len(self.likelihoods), len(self.shares)))
         for s, likelihood in enumerate(self.likelihoods):
@@ -112,7 +112,8 @@ class Hierarchy:
 
     def log_density(self, h: Array) -> Array:
         """(B,), of all data in units of the sets' own evidences."""
-        logs: Array = self.hyper.log_density(h[:, : 2 * self.p]) - 0.5 * np.sum(h[:, 2 * self.p :] ** 2, axis=1)
+        nu, log_tau, theta = np.split(h, (self.p, 2 * self.p), axis=1)
+        logs: Array = self.hyper.log_density(nu, log_tau) - 0.5 * np.sum(theta**2, axis=1)
         logs -= 0.5 * self.c * math.log(2 * math.pi)
         inside = np.isfinite(logs)
         logs[inside] += np.logaddexp.reduce(self.log_parts(h[inside]), axis=2).sum(axis=1)
@@ -149,7 +150,7 @@ class Hierarchy:
             return np.asarray(np.where(np.isnan(logs), np.inf, -logs))
 
         walkers = effort.hyper_walkers
-        start = np.hstack([self.hyper.scattered(walkers, stream), stream.standard_normal((walkers, self.c))])
+        start = np.hstack([self.hyper.scattered(walkers, self.p, stream), stream.standard_normal((walkers, self.c))])
         return walked(cost, start, stream, effort.hyper_rounds, effort.hyper_rounds // 3)
 
     def _weighed(self, at: Array, stream: np.random.Generator, effort: Effort) -> tuple[Array, Array]:
@@ -164,7 +165,7 @@ class Hierarchy:
 
     def _given(self, h: Array, belongs: Array, stream: np.random.Generator) -> Array:
         """Draws (M, S, p) of x_i − B θ given h and the data: of the population, or odd as ``belongs`` (M, S, K)."""
-        mean, variance = self.hyper.population(h[:, : 2 * self.p])
+        mean, variance = h[:, : self.p], np.exp(2 * h[:, self.p : 2 * self.p])
         theta, x = h[:, 2 * self.p :], np.empty((len(h), len(self.likelihoods), self.p))
         for s, likelihood in enumerate(self.likelihoods):
             chosen = np.sum(stream.uniform(size=(len(h), 1)) > np.cumsum(belongs[:, s, :-1], axis=1), axis=1)

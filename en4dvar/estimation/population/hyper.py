@@ -28,28 +28,17 @@ class HyperPrior:
         float, Ge(0), Lt(1), "Probability that a data set is odd: of another population, in all parameters or in one."
     ] = 0.05
 
-
-class Hyper:
-    """The hyperprior over h = (ν, ln τ) of p coordinates."""
-
-    def __init__(self, p: int, scales: HyperPrior):
-        self.p, self.scales = p, scales
-        self.constant = -p * (0.5 * math.log(2 * math.pi) + math.log(scales.mean_std))
-        self.constant += p * (0.5 * math.log(2 / math.pi) - math.log(scales.spread))
-
-    def population(self, h: Array) -> tuple[Array, Array]:
-        """Mean and variance (B, p) of x given h (B, 2p)."""
-        return h[:, : self.p], np.exp(2 * h[:, self.p :])
-
-    def log_density(self, h: Array) -> Array:
-        """(B,), normalised; −inf where a spread is out of bounds."""
-        nu, log_tau = h[:, : self.p], h[:, self.p :]
-        logs = -0.5 * np.sum((nu / self.scales.mean_std) ** 2, axis=1)
-        logs += np.sum(log_tau - 0.5 * np.exp(2 * log_tau) / self.scales.spread**2, axis=1)
+    def log_density(self, nu: Array, log_tau: Array) -> Array:
+        """(B,) of ν and ln τ (B, p), normalised; −inf where a spread is out of bounds."""
+        p = nu.shape[1]
+        constant = -p * (0.5 * math.log(2 * math.pi) + math.log(self.mean_std))
+        constant += p * (0.5 * math.log(2 / math.pi) - math.log(self.spread))
+        logs = -0.5 * np.sum((nu / self.mean_std) ** 2, axis=1)
+        logs += np.sum(log_tau - 0.5 * np.exp(2 * log_tau) / self.spread**2, axis=1)
         inside = np.all((log_tau > math.log(SPREADS[0])) & (log_tau < math.log(SPREADS[1])), axis=1)
-        return np.where(inside, logs + self.constant, -np.inf)
+        return np.where(inside, logs + constant, -np.inf)
 
-    def scattered(self, count: int, stream: np.random.Generator) -> Array:
-        """(count, 2p) somewhere in the bulk of the hyperprior."""
-        nu = 0.5 * self.scales.mean_std * stream.standard_normal((count, self.p))
-        return np.hstack([nu, math.log(0.6 * self.scales.spread) + 0.5 * stream.standard_normal((count, self.p))])
+    def scattered(self, count: int, p: int, stream: np.random.Generator) -> Array:
+        """(count, 2p) of ν and ln τ somewhere in the bulk of the hyperprior."""
+        nu = 0.5 * self.mean_std * stream.standard_normal((count, p))
+        return np.hstack([nu, math.log(0.6 * self.spread) + 0.5 * stream.standard_normal((count, p))])
