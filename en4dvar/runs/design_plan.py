@@ -39,12 +39,6 @@ class Candidate:
         laws = (resolve(override(document, keys), base) for keys in config.design.laws.values())
         return cls(settings, config, tuple(laws))
 
-    @property
-    def readings(self) -> tuple[int, float] | None:
-        """How many readings are to be chosen, and how far apart."""
-        chosen = self.config.design.choose
-        return (chosen.readings, chosen.apart) if chosen else None
-
 
 def candidates(document: Document, base: Path) -> Iterator[Candidate]:
     """The file's own design, then every combination of its knobs. Raises :class:`ConfigError`."""

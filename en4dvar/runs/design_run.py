@@ -229,8 +229,9 @@ def _one(candidate: Candidate, method: Method, seed: int) -> tuple[tuple[Evaluat
     try:
         problem, laws = planned_problem(config), [planned_problem(law) for law in candidate.laws]
         sizes, alike = design.sizes, design.experiments
+        choice = (design.choose.readings, design.choose.apart) if design.choose else None
         told = design.common, _wanted(config, problem)
-        every = evaluate(problem, design.about, sizes, method, seed, alike, candidate.readings, laws, *told)
+        every = evaluate(problem, design.about, sizes, method, seed, alike, choice, laws, *told)
         costs = (design.price.of(planned.alike, len(planned.readings)) for planned in every)
         broken = [design.within.broken(len(o.readings), cost, o.beyond) for o, cost in zip(every, costs, strict=True)]
         kept = tuple(planned for planned, reason in zip(every, broken, strict=True) if not reason)
