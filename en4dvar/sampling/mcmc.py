@@ -165,11 +165,11 @@ def sample(
     while True:
         steps = 0 if chain is None else chain.steps
         if chain is not None:
-            mixing = _Mixing.of(chain, target)
+            judged = _judged(chain, target, ensemble)
             if look is not None:
-                look(ChainRecord(steps, float(np.max(mixing.r_hat)), float(np.min(mixing.effective))))
-            if mixing.converged or steps >= max_steps:
-                return _finished(chain, mixing, ensemble)
+                look(ChainRecord(steps, float(np.max(judged.r_hat)), float(np.min(judged.effective))))
+            if judged.converged or steps >= max_steps:
+                return judged
         sampler.reset()
         block = min(max_steps - steps, max(BLOCK, steps // 4))
         state = sampler.run_mcmc(state, block, skip_initial_state_check=True)
@@ -189,33 +189,20 @@ def _moves(emcee: Any, emulated: EmulatedCost | None, proposal: StudentMixture |
     return [(emcee.moves.DEMove(), near * DE_SHARE), (emcee.moves.StretchMove(), near * (1 - DE_SHARE)), *far]
 
 
-@dataclass(frozen=True)
-class _Mixing:
-    """Convergence of a chain, judged by its part after burn-in."""
-
-    samples: Array
-    r_hat: Array
-    effective: Array
-    converged: bool
-
-    @classmethod
-    def of(cls, chain: ChainState, target: float) -> "_Mixing":
-        samples = chain.samples[int(BURN_IN * chain.steps) :]
-        r_hat, effective = split_r_hat(samples), effective_sample_size(samples)
-        return cls(samples, r_hat, effective, bool(np.all(r_hat < MAX_R_HAT) and np.all(effective >= target)))
-
-
-def _finished(chain: ChainState, mixing: _Mixing, ensemble: Array) -> Chain:
-    flat = mixing.samples.reshape(-1, ensemble.shape[1])
+def _judged(chain: ChainState, target: float, ensemble: Array) -> Chain:
+    """The part of a chain after burn-in, and what it says of its convergence."""
+    samples = chain.samples[int(BURN_IN * chain.steps) :]
+    r_hat, effective = split_r_hat(samples), effective_sample_size(samples)
+    flat = samples.reshape(-1, ensemble.shape[1])
     spread = flat.std(axis=0)
     return Chain(
-        samples=mixing.samples,
-        log_density=chain.log_density[-len(mixing.samples) :],
-        r_hat=mixing.r_hat,
-        effective=mixing.effective,
+        samples=samples,
+        log_density=chain.log_density[-len(samples) :],
+        r_hat=r_hat,
+        effective=effective,
         acceptance=float(np.mean(chain.accepted / chain.steps)),
         steps=chain.steps,
-        converged=mixing.converged,
+        converged=bool(np.all(r_hat < MAX_R_HAT) and np.all(effective >= target)),
         moved=(flat.mean(axis=0) - ensemble.mean(axis=0)) / spread,
         widened=spread / ensemble.std(axis=0, ddof=1),
     )
