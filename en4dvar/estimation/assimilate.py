@@ -262,8 +262,8 @@ def _log_evidence(stages: Stages, problem: InverseProblem) -> float:
 
 def _alone(stages: Stages, problem: InverseProblem, settings: AssimilationSettings) -> tuple[Analysis | None, int]:
     """An assimilation of another problem, without what if; None where too few members survive. And forward runs."""
-    other = Stages(problem, replace(settings, what_if=False), stages.seed, stages.space.executor, None, None)
-    other.compares, end = False, None
+    other = Stages(problem, replace(settings, what_if=False), stages.seed, stages.executor, compares=False)
+    end = None
     with suppress(TooFewMembersError):
         end = _through(other, None)
     return end, other.space.forward_runs

@@ -90,34 +90,32 @@ class Sampled:
     shape: Mapping[str, float]
 
 
+@dataclass
 class Stages:
     """One data set, in the order of the methods; each keeps a state to resume from as it goes on.
 
     ``compares``: whether what varies is compared with constant values and with knots beside its own, each fitted anew.
     """
 
-    compares = True
+    problem: InverseProblem
+    settings: AssimilationSettings
+    seed: int
+    executor: Executor
+    progress: Progress | None = None
+    keeper: Keep | None = None
+    compares: bool = True
 
-    def __init__(
-        self,
-        problem: InverseProblem,
-        settings: AssimilationSettings,
-        seed: int,
-        executor: Executor,
-        progress: Progress | None,
-        keep: Keep | None,
-    ):
+    def __post_init__(self) -> None:
+        problem, settings = self.problem, self.settings
         self.fixed_parameters = check_problem(problem)
-        self.problem, self.settings, self.seed = problem, settings, seed
-        self.progress, self._keep = progress, keep
-        self.scheme, self.minimiser = settings.own, settings.own.minimiser
+        self.minimiser = settings.own.minimiser
         plain = problem.observations.noise.quadratic and not problem.has_noise_scale
         if self.minimiser is None and (problem.estimates_discrepancy or not plain):
             raise ConfigError(
                 f"{settings.scheme} takes Gaussian errors of known covariance: no sigma, robust cost, bounds or "
                 f"discrepancy; use {' or '.join(MINIMISERS)}"
             )
-        self.space = WeightSpace(problem, settings, seed, executor)
+        self.space = WeightSpace(problem, settings, self.seed, self.executor)
         self.grid = plotting_times(problem)
         self._foreseen: tuple[Array, Withheld | None] | None = None
 
@@ -311,8 +309,8 @@ class Stages:
         return refined(space, cost, posterior, minima, self.seed, looking=looking, resume=resume, keep=keep, look=look)
 
     def keep(self, state: Callable[[], LoopState]) -> None:
-        if self._keep is not None:
-            self._keep(state)
+        if self.keeper is not None:
+            self.keeper(state)
 
     def tell(self, record: Record) -> None:
         if self.progress is not None:
