@@ -35,8 +35,9 @@ class Readout:
         predictions = []
         curves = []
         for operator, part in zip(self.operators, self.parts, strict=True):
-            values = np.asarray(operator(path))
-            self._check(values, part)
+            values, of_field = np.asarray(operator(path)), part.places is not None
+            if values.ndim < 1 + of_field or values.shape[-1 - of_field] != self.n_times:
+                raise MisshapenError
             rows = self.rows if isinstance(self.rows, slice) else self.rows[part.where]
             if part.places is None:
                 predictions.append(values[..., rows])
@@ -46,11 +47,6 @@ class Readout:
                 at = values[..., self.along] if part.places is None else values[..., self.along, :]
                 curves.append(part.read_along(at))
         return np.concatenate([*predictions, *curves], axis=-1)
-
-    def _check(self, values: Array, part: Part) -> None:
-        of_field = part.places is not None
-        if values.ndim < 1 + of_field or values.shape[-1 - of_field] != self.n_times:
-            raise MisshapenError
 
 
 def operators_of(parts: Sequence[Part], rates: bool = False, why: str = "") -> tuple[Callable[[Any], Array], ...]:

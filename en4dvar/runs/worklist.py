@@ -23,7 +23,7 @@ from en4dvar.results.codec import decode_text, encode_text
 from en4dvar.results.pack import PACK, Entry, Pack, file_names, read_outcome
 from en4dvar.results.seal import SealedBytes
 from en4dvar.runs.campaign import Campaign, DatasetOutcome, Outcomes
-from en4dvar.runs.jobs import Estimate, FileJob, Job, Told, estimate, estimate_and_tell
+from en4dvar.runs.jobs import Common, Estimate, FileJob, Job, Told, estimate, estimate_and_tell
 from en4dvar.runs.progress import LiveProgress, describe, intervals
 from en4dvar.runs.session import Session
 
@@ -71,7 +71,8 @@ class Worklist:
         self.stop = threading.Event()
         self.alone = len(sets) == 1
         self.pack = Pack(run.directory.at(self.record))
-        self.common = CommonValue((config, {**run.attributes, "identity": run.identity.settings}))
+        attributes = {**run.attributes, "identity": run.identity.settings}
+        self.common: CommonValue[Common] = CommonValue((config, attributes))
         self._failed_sets: dict[str, DatasetOutcome] = {}
         self._reached: dict[str, tuple[int, int]] = {}  # data set at work → its last round, iteration
 

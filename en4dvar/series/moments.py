@@ -175,7 +175,7 @@ class SequentialResult:
 class SequentialState(SequentialResult):
     """What a run has found so far, with all that the rest of it depends on, besides its arguments.
 
-    ``cycle`` observation times are done; ``ensemble`` (N', n_state + changes) stands at ``start`` (0: time zero, k:
+    ``cycle`` observation times are done; ``ensemble`` (N', n_state + changes) stand at ``start`` (0: time zero, k:
     observation time k). Random numbers are drawn by cycle, so that no generator has a state.
     """
 

@@ -159,7 +159,7 @@ class _Estimate:
             converged=lowest.converged,
             stop_reason=lowest.stop,
             log_evidence=members.log_evidence - normalisation,
-            forward_runs=self.other_runs + sum(experiment.forward_runs for experiment in experiments),
+            forward_runs=self.other_runs + sum(each.composite.forward_runs for each in experiments),
             cautions=tuple(cautions),
             agreement=agreed,
             without=without,

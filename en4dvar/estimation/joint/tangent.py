@@ -31,11 +31,6 @@ class Experiment:
         self.problem = joint.experiments[e]
         self.composite = Beside(Composite(self.problem, executor), self.problem.prior, epsilon)
 
-    @property
-    def forward_runs(self) -> int:
-        """So far."""
-        return self.composite.forward_runs
-
     def run(self, z: Array, grid: Array = NO_TIMES) -> Forecast:
         """Control vectors (B, n) in units of the prior."""
         return self.composite(self.joint.control(self.e, z), grid)
