@@ -98,7 +98,27 @@ class DesignKind(RunKind[Designs]):
     @cached_property
     def asked(self) -> Asked:
         """What is asked. Raises :class:`ConfigError`, :class:`DataError`."""
-        return _asked(self.config)
+        config = self.config
+        problem = planned_problem(config)
+        terms = {term.parameter.name: term.parameter for term in problem.prior.terms}
+        design, planned = config.design, Planned(problem, config.design.about, config.design.common)
+        about = [terms[name] for name in planned.about]
+        others = [terms[name] for name in planned.names[planned.asked :]] if design.wanted else []
+        _wanted(config, problem)
+        model, seen = config.model, problem.observable
+        return Asked(
+            parameters=tuple(p.name for p in about),
+            symbols=tuple(p.symbol for p in about),
+            labels=tuple(p.label for p in about),
+            units=tuple((p.unit, p.display_unit) for p in about),
+            knobs=tuple(config.design.knobs),
+            laws=tuple(config.design.laws),
+            enough=config.design.enough,
+            seen=seen.label,
+            wanted={name: str(text) for name, text in design.wanted.items()},
+            others=tuple((p.name, p.unit, p.display_unit) for p in others),
+            axes=((model.time_unit, model.time_display_unit), (seen.unit, seen.display_unit)),
+        )
 
     def check(self) -> None:
         _ = self.asked
@@ -107,7 +127,7 @@ class DesignKind(RunKind[Designs]):
         return f"the designs that are done are kept in {self.directory}"
 
     def conduct(self, run: Session, executor: Executor) -> Designs:
-        work = _Work(self.config, self.every, run, self.tell)
+        work = _Work(self, run)
         work.everything(executor)
         file = run.directory.at(self.result)
         save_designs(file, work.rows(), self.asked, {**run.attributes, "name": self.config.name})
@@ -125,29 +145,6 @@ def _known(document: Document, base: Path, after: Path) -> dict[str, Any]:
     return {"prior.ensemble": str(file.absolute()), **{f"parameters.{name}": {"prior": "ensemble"} for name in names}}
 
 
-def _asked(config: Config) -> Asked:
-    problem = planned_problem(config)
-    terms = {term.parameter.name: term.parameter for term in problem.prior.terms}
-    design, planned = config.design, Planned(problem, config.design.about, config.design.common)
-    about = [terms[name] for name in planned.about]
-    others = [terms[name] for name in planned.names[planned.asked :]] if design.wanted else []
-    _wanted(config, problem)
-    model, seen = config.model, problem.observable
-    return Asked(
-        parameters=tuple(p.name for p in about),
-        symbols=tuple(p.symbol for p in about),
-        labels=tuple(p.label for p in about),
-        units=tuple((p.unit, p.display_unit) for p in about),
-        knobs=tuple(config.design.knobs),
-        laws=tuple(config.design.laws),
-        enough=config.design.enough,
-        seen=seen.label,
-        wanted={name: str(text) for name, text in design.wanted.items()},
-        others=tuple((p.name, p.unit, p.display_unit) for p in others),
-        axes=((model.time_unit, model.time_display_unit), (seen.unit, seen.display_unit)),
-    )
-
-
 def _wanted(config: Config, problem: InverseProblem) -> dict[str, tuple[float, bool]]:
     """What is to be known to what: in its unit, or relative to the value. Raises :class:`ConfigError`."""
     terms, wanted = {term.parameter.name: term.parameter for term in problem.prior.terms}, {}
@@ -163,14 +160,12 @@ def _wanted(config: Config, problem: InverseProblem) -> dict[str, tuple[float, b
 class _Work:
     """The candidates, what is done of them, and how the rest is decided."""
 
-    def __init__(
-        self, config: Config, every: Sequence[Candidate], run: Session, tell: Callable[[int, int], None] | None
-    ):
-        self.config, self.every, self.run, self.tell = config, every, run, tell
+    def __init__(self, kind: DesignKind, run: Session):
+        self.config, self.every, self.run, self.tell = kind.config, kind.every, run, kind.tell
         fingerprint = digest(run.identity.settings.encode())
         again = "all designs are evaluated again"
         self.state = run.restore(STATE, fingerprint, DesignState, again) or DesignState()
-        self.keeper = Keeper(run.directory.at(STATE), fingerprint, config.execution.checkpoint_every)
+        self.keeper = Keeper(run.directory.at(STATE), fingerprint, self.config.execution.checkpoint_every)
 
     def everything(self, executor: Executor) -> None:
         """Evaluate by the method asked for; ``auto`` checks the linearised information and replaces it if it is off."""
