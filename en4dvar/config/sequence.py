@@ -101,6 +101,11 @@ class SequenceConfig(Validated):
     assimilation: Sequential
     execution: Workers
 
+    @property
+    def scheme(self) -> str:
+        """Name of the scheme."""
+        return str(self.assimilation.scheme)
+
 
 def resolve_sequence(document: Document, base: Path, model: ForwardModel | None = None) -> SequenceConfig:
     """Validate a document with a ``sequence:`` section. Raises :class:`ConfigError`, every fault at once."""

@@ -105,6 +105,11 @@ class TwinConfig(Validated):
     scheme: str
     execution: Workers
 
+    @property
+    def model(self) -> ForwardModel:
+        """That of the truth and of the members."""
+        return self.experiment.model
+
 
 def resolve_twin(document: Document, base: Path) -> TwinConfig:
     """Validate a document with a ``twin:`` section. Raises :class:`ConfigError`, every fault at once."""

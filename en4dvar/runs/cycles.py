@@ -39,11 +39,6 @@ class Cycles(RunKind[R]):
 
     @property
     @abstractmethod
-    def scheme(self) -> str:
-        """Name of the scheme."""
-
-    @property
-    @abstractmethod
     def cycles(self) -> int:
         """How many there are."""
 
@@ -78,7 +73,7 @@ class Cycles(RunKind[R]):
         for state in latest:  # what it ends with is kept, too, so that it is never repeated
             keeper.write(state())
         run.log.write("\n".join(f"member lost: {reason}" for reason in result.run.failures))
-        own = {"identity": run.identity.settings, "name": self.config.name, "scheme": self.scheme}
+        own = {"identity": run.identity.settings, "name": self.config.name, "scheme": self.config.scheme}
         to_bytes({"/": self.laid_out(result, {**run.attributes, **own})}).write(run.directory.at(self.result))
         write_text(run.directory.at("summary.csv"), self.summary(result))
         if self.config.report:

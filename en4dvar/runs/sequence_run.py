@@ -64,10 +64,6 @@ class SequenceKind(Cycles[SeriesResult]):
         _ = self.problem
 
     @property
-    def scheme(self) -> str:
-        return str(self.config.assimilation.scheme)
-
-    @property
     def cycles(self) -> int:
         return len(self.problem.series.times)
 
@@ -82,7 +78,7 @@ def sequence_summary(config: SequenceConfig, problem: SeriesProblem) -> str:
     drawn = f" and {', '.join(start.prior.names)}" if start.prior else ""
     observed = ", ".join(observable.name for observable in problem.observables)
     return (
-        f"{config.name}: sequence of {problem.name}, state{drawn} estimated with {config.assimilation.scheme}, "
+        f"{config.name}: sequence of {problem.name}, state{drawn} estimated with {config.scheme}, "
         f"{problem.members} members, seed {config.seed}\n"
         f"{np.isfinite(series.values).sum()} readings of {observed} at {len(series.times)} times from "
         f"{series.times[0]:g} to {series.times[-1]:g}{unit}\nrun directory: {config.directory}"

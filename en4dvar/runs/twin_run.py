@@ -6,7 +6,6 @@ from typing import Any
 
 from en4dvar.config import TwinConfig, load_twin, loaded
 from en4dvar.executor import Executor
-from en4dvar.model.forward import ForwardModel
 from en4dvar.report.outcomes import TwinOutcome
 from en4dvar.results.checkpoint import FOLDER
 from en4dvar.results.series_file import twin_csv, twin_group
@@ -44,15 +43,6 @@ class TwinKind(Cycles[TwinResult]):
     writer = "en4dvar.report.twin:write_twin_report"
     laid_out = staticmethod(twin_group)
     summary = staticmethod(twin_csv)
-
-    @property
-    def model(self) -> ForwardModel:
-        model: ForwardModel = self.config.experiment.model
-        return model
-
-    @property
-    def scheme(self) -> str:
-        return str(self.config.scheme)
 
     @property
     def cycles(self) -> int:

@@ -7,7 +7,7 @@ Every run is kept as it ends, under what it depends on: more seeds or values fin
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +17,6 @@ import numpy as np
 from en4dvar.config import TwinConfig, load_twin
 from en4dvar.config.document import parse_document
 from en4dvar.executor import Executor, ProcessesExecutor, SerialExecutor, available_cores
-from en4dvar.model.forward import ForwardModel
 from en4dvar.plumbing.errors import ConfigError, En4dvarError
 from en4dvar.plumbing.files import readable, write_text
 from en4dvar.plumbing.tables import csv_text, table
@@ -149,7 +148,8 @@ def sweep_twin(
     first = configs[0]
     all_seeds = tuple(range(first.seed, first.seed + seeds))
     path = Path(out) if out else first.directory.with_name(f"{first.directory.name}_sweep")
-    kind = SweepKind(first, path, configs, tuple(values), combinations, all_seeds, workers, progress)
+    first = replace(first, directory=path)
+    kind = SweepKind(first, configs, tuple(values), combinations, all_seeds, workers, progress)
     return conduct_run(kind, force, resume, command)
 
 
@@ -162,21 +162,12 @@ class SweepKind(RunKind[TwinSweep]):
     files = (result, "runs.csv", f"{FOLDER}/*.run")
 
     config: TwinConfig
-    out: Path
     configs: Sequence[TwinConfig]
     keys: tuple[str, ...]
     values: tuple[tuple[Any, ...], ...]
     seeds: tuple[int, ...]
     workers: int | None
     progress: Callable[[int, int], None] | None
-
-    @property
-    def directory(self) -> Path:
-        return self.out
-
-    @property
-    def model(self) -> ForwardModel:
-        return self.config.experiment.model
 
     def executor(self) -> Executor:
         """Processes: a cycle is more of the interpreter than of the model, also where that is compiled."""
