@@ -9,7 +9,7 @@ import numpy as np
 
 from en4dvar.descent.step_control import Trials
 from en4dvar.diagnosis import diagnostics as diag
-from en4dvar.ensemble.forecast import NO_TIMES, Composite, Forecast
+from en4dvar.ensemble.forecast import NO_TIMES, Composite, Forecast, costs
 from en4dvar.ensemble.linalg import FEW, Hessian, LowRank, anomaly_basis, centre
 from en4dvar.ensemble.missing import filled
 from en4dvar.ensemble.repeat import check_repeats
@@ -143,8 +143,7 @@ class WeightSpace:
 
     def costs(self, x: Array, run: Forecast) -> Array:
         """J (B,) of control vectors (B, n), from their forecast and the prior's own mean and covariance."""
-        z = self.problem.prior.white(x)
-        return np.where(run.active, 0.5 * np.sum(z**2, axis=1) + self.observation_cost(run), np.inf)
+        return costs(self.problem, x, run)
 
     def try_out(self, w: Array, expected: Callable[[Array], Array] | None = None) -> Trials:
         """J and predictions of central trajectories at weights (B, N).

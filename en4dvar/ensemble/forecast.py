@@ -186,11 +186,13 @@ def cost(problem: InverseProblem, x: Array, executor: Executor | None = None) ->
     J = ½ ‖z‖² + Σ_k β_k [½ (y_k − m_k)²/s_k² + ln(s_k/std_k)], z the white coordinates of x: (x_j − mean_j)/std_j
     where no parameters are correlated.
     """
-    run = forecast(problem, x, executor)
-    observation = problem.observations.cost(run.predicted)
+    return costs(problem, x, forecast(problem, x, executor))
+
+
+def costs(problem: InverseProblem, x: Array, run: Forecast) -> Array:
+    """The same, where the ``run`` of ``x`` is there."""
     with np.errstate(over="ignore"):
-        z = problem.prior.white(x)
-        return np.where(run.active, 0.5 * np.sum(z * z, axis=-1) + observation, np.inf)
+        return np.where(run.active, problem.prior.cost(x) + problem.observations.cost(run.predicted), np.inf)
 
 
 def log_posterior(problem: InverseProblem, x: Array, executor: Executor | None = None) -> Array:

@@ -353,11 +353,13 @@ class Prior:
         """½ ln det of the prior covariance in transformed space."""
         return float(np.sum(np.log(self.std))) + sum(block.log_det_root for block in self.blocks)
 
+    def cost(self, x: Array) -> Array:
+        """J_b (…,) of control vectors ``x`` (…, n): ½ ‖z‖² of their white coordinates z."""
+        return np.asarray(0.5 * np.sum(self.white(x) ** 2, axis=-1))
+
     def log_density(self, x: Array) -> Array:
         """Normalised log density (…,) in transformed space of control vectors ``x`` (…, n)."""
-        z = self.white(x)
-        constant = self.log_det_root + 0.5 * len(self.terms) * math.log(2 * math.pi)
-        return np.asarray(-0.5 * np.sum(z * z, axis=-1) - constant)
+        return -self.cost(x) - (self.log_det_root + 0.5 * len(self.terms) * math.log(2 * math.pi))
 
     def sample(self, n_members: int, seed: int, method: Sampling = "exact") -> Array:
         """Prior ensemble (N, n) in transformed space.

@@ -85,7 +85,7 @@ class EmulatedCost:
     def cost(self, x: Array) -> Array:
         """Ĵ (B,) of control vectors (B, n)."""
         observed = self.observations.cost(self.make.unstacked(self.emulator.predictions(self.bend(x))))
-        return np.minimum(observed, self.ceiling) + _prior_cost(self.prior, x)
+        return np.minimum(observed, self.ceiling) + self.prior.cost(x)
 
     def settled(self, random: np.random.Generator) -> EmulatedCost:
         """With draws of the walkers after :data:`LONGER` more rounds: where the posterior is bent, those of a hundred
@@ -168,19 +168,14 @@ def emulate(
         emulated = fitted_cost(prior, observations, degree, runs, 2 * n)
     settled = emulated.walk(walkers, kept, random, SETTLED)
     narrowed = prior.log_det_root - np.linalg.slogdet(coordinates.root)[1]
-    ceiling = float(np.min(runs.costs - _prior_cost(prior, runs.x)) + CEILING + max(0.0, narrowed))
+    ceiling = float(np.min(runs.costs - prior.cost(runs.x)) + CEILING + max(0.0, narrowed))
     return replace(emulated, ceiling=ceiling, share=share, draws=np.concatenate(settled[SETTLED // 3 :]))
 
 
 def _run(run: Run, prior: Prior, observations: Observations, x: Array) -> ModelRuns:
     """Run control vectors (B, n); the survivors."""
     outcome = run(x)
-    return ModelRuns.of(x, outcome, _prior_cost(prior, x) + observations.cost(outcome.predicted))
-
-
-def _prior_cost(prior: Prior, x: Array) -> Array:
-    z = prior.white(x)
-    return np.asarray(0.5 * (z * z).sum(axis=1))
+    return ModelRuns.of(x, outcome, prior.cost(x) + observations.cost(outcome.predicted))
 
 
 def fitted_cost(prior: Prior, observations: Observations, degree: int, runs: ModelRuns, near: float) -> EmulatedCost:

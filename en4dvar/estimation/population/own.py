@@ -20,11 +20,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from en4dvar.descent.minima import Minimum
-from en4dvar.ensemble.forecast import Composite, Forecast
+from en4dvar.ensemble.forecast import Composite, costs
 from en4dvar.ensemble.missing import Beside
 from en4dvar.estimation.population.mixtures import Mixture
 from en4dvar.executor import Executor
@@ -85,15 +86,11 @@ def own_draws(problem: InverseProblem, start: Array, seed: int, executor: Execut
     prior, observations = problem.prior, problem.observations
     composite = Beside(Composite(problem, executor), prior, BESIDE)
     seed = own_seed(seed, observations.name)
-
-    def costs(x: Array, run: Forecast) -> Array:
-        observed = observations.cost(run.predicted)
-        return np.where(run.active, 0.5 * np.sum(prior.white(x) ** 2, axis=1) + observed, np.inf)
-
     x = prior.from_white(start)
     covariance = np.atleast_2d(np.cov(x, rowvar=False)) + np.diag((NARROWEST * prior.std) ** 2)
     about = Minimum(x.mean(axis=0), covariance, 0.0)  # of one alone, J does not matter
-    draws = sample_modes(RecordedRuns(composite, costs, prior, observations), prior, [about], seed, ENOUGH)
+    runs = RecordedRuns(composite, partial(costs, problem), prior, observations)
+    draws = sample_modes(runs, prior, [about], seed, ENOUGH)
     taken = resampled(draws.shares, KEPT, member_stream(seed, "population: kept draws"))
     effective = _worth(KEPT, draws.effective)
     return OwnDraws(prior.white(draws.x[taken]), draws.log_evidence, effective, composite.forward_runs)
