@@ -138,11 +138,6 @@ class EmulatedProposal:
         walkers = tried.reshape(1 + RENEWED, WALKERS, -1)[best, np.arange(WALKERS)]
         return replace(self, mixture=mixture, walkers=walkers, log=log)
 
-    @property
-    def dimensions(self) -> int:
-        """n."""
-        return int(self.walkers.shape[1])
-
     def draw(self, count: int, stream: np.random.Generator) -> Array:
         """(count, n)."""
         return _moved(self.cost, self.walkers[stream.permutation(WALKERS)[:count]], self.walkers, stream)

@@ -3,8 +3,7 @@ r"""The emulator: what a forward model predicts, as polynomials of the control v
     m_k(x) ≈ Σ_a c_ka z^a,   z = W (x − x̄),   |a| ≤ degree
 
 Within a posterior predictions bend little, so that a few hundred runs tell them to a small part of the observation
-error, and to evaluate them costs nothing. :mod:`~en4dvar.sampling.emulated_cost` makes J of one data set of them,
-:mod:`en4dvar.estimation.population` the likelihoods of many.
+error, and to evaluate them costs nothing. :mod:`~en4dvar.sampling.emulated_cost` makes J of one data set of them.
 
 Sources: polynomial surrogates of posteriors, Marzouk & Xiu (2009), Commun. Comput. Phys. 6, 826; sampling where the
 surrogate says, Li & Marzouk (2014), SIAM J. Sci. Comput. 36, A1163.
@@ -20,16 +19,16 @@ from en4dvar.model.state import Array
 
 
 class Coordinates(NamedTuple):
-    """z = whiten (x − centre) of control vectors (B, n); ``root`` is the inverse of ``whiten``. Kernels can read it."""
+    """z = whiten (x − centre) of control vectors (B, n); ``root`` is the inverse of ``whiten``."""
 
     centre: Array
     root: Array
     whiten: Array
 
     @classmethod
-    def about(cls, points: Array, width: float = 1.0) -> "Coordinates":
-        """Those in which points (N, n) have mean zero and the standard deviation 1/``width`` in every direction."""
-        root = width * np.linalg.cholesky(np.atleast_2d(np.cov(points, rowvar=False)))
+    def about(cls, points: Array) -> "Coordinates":
+        """Those in which points (N, n) have mean zero and standard deviation 1 in every direction."""
+        root = np.linalg.cholesky(np.atleast_2d(np.cov(points, rowvar=False)))
         return cls(points.mean(axis=0), np.asarray(root), np.asarray(np.linalg.inv(root), dtype=float))
 
     def of(self, x: Array) -> Array:
@@ -42,7 +41,7 @@ class Coordinates(NamedTuple):
 
 
 class Emulator(NamedTuple):
-    """Polynomials of ``coordinates``: ``coefficients`` (M, K) of the monomials of ``parents``. Kernels can read it."""
+    """Polynomials of ``coordinates``: ``coefficients`` (M, K) of the monomials of ``parents``."""
 
     coordinates: Coordinates
     parents: npt.NDArray[np.int64]
@@ -68,11 +67,8 @@ class Emulator(NamedTuple):
 
     def predictions(self, x: Array) -> Array:
         """Outputs (B, K) at control vectors (B, n)."""
-        return self.at(self.coordinates.of(x))
-
-    def at(self, z: Array) -> Array:
-        """Outputs (B, K) at coordinates (B, n)."""
-        return np.asarray(np.ascontiguousarray(basis(z, self.parents).T) @ self.coefficients)
+        values = basis(self.coordinates.of(x), self.parents)
+        return np.asarray(np.ascontiguousarray(values.T) @ self.coefficients)
 
 
 def monomials(n: int, degree: int) -> npt.NDArray[np.int64]:

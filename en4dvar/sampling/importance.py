@@ -32,10 +32,6 @@ MOST = 3.0  # times √D mean weights of D draws: more than that none counts (Io
 class Proposal(Protocol):
     """A density in n coordinates that can be drawn from."""
 
-    @property
-    def dimensions(self) -> int:
-        """n."""
-
     def draw(self, count: int, stream: np.random.Generator) -> Array:
         """(count, n)."""
 
@@ -53,10 +49,9 @@ class Importance:
     """
 
     def __init__(self, first: Proposal, stream: np.random.Generator, count: int, wider: float = 1.0):
-        n = first.dimensions
         self.stream, self.count, self.wider = stream, count, wider
         self.proposals: list[Proposal] = [first]
-        self.z, self.target, self.mixture = np.empty((0, n)), np.empty(0), np.empty(0)  # mixture: ln Σ_t q_t
+        self.z, self.target, self.mixture = np.empty((0, 0)), np.empty(0), np.empty(0)  # mixture: ln Σ_t q_t
         self.log_weights, self.log, self.effective = np.empty(0), -np.inf, 0.0
 
     @property
@@ -81,7 +76,8 @@ class Importance:
         n = z.shape[1]
         target = log_likelihood - 0.5 * np.sum(z**2, axis=1) - 0.5 * n * np.log(2 * np.pi)
         self.mixture = self._mixed(z)
-        self.z, self.target = np.concatenate([self.z, z]), np.concatenate([self.target, target])
+        self.z = np.concatenate([self.z, z]) if len(self.z) else z
+        self.target = np.concatenate([self.target, target])
         self.log_weights = self.target - self.mixture + np.log(len(self.proposals))
         top = float(self.log_weights.max())
         if np.isfinite(top):

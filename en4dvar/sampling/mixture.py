@@ -27,11 +27,6 @@ class StudentMixture:
         share, centre, covariance = fit_gaussians(draws, stream, components, rounds=40, alike=alike)
         return cls(share, centre, np.asarray(np.linalg.cholesky(covariance), dtype=float))
 
-    @property
-    def dimensions(self) -> int:
-        """d."""
-        return int(self.centre.shape[1])
-
     def draw(self, count: int, stream: np.random.Generator) -> Array:
         """(count, d)."""
         part = np.searchsorted(np.cumsum(self.share), stream.uniform(size=count)).clip(max=len(self.share) - 1)

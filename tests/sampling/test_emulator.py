@@ -23,9 +23,9 @@ def test_monomials_are_all_of_them():
 def test_coordinates_are_standard_and_lead_back(n):
     rng = np.random.default_rng(1)
     x = 5 + rng.standard_normal((200, n)) @ rng.standard_normal((n, n))
-    coordinates = Coordinates.about(x, width=2.0)
+    coordinates = Coordinates.about(x)
     z = coordinates.of(x)
-    np.testing.assert_allclose(np.atleast_2d(np.cov(z.T)), np.eye(n) / 4, atol=1e-12)
+    np.testing.assert_allclose(np.atleast_2d(np.cov(z.T)), np.eye(n), atol=1e-12)
     np.testing.assert_allclose(coordinates.back(z), x, rtol=1e-12)
 
 
