@@ -177,11 +177,6 @@ def _truth(experiment: TwinExperiment, seed: int) -> Array:
     return coordinates.to_physical(np.concatenate(path))
 
 
-def initial_ensemble(experiment: TwinExperiment, seed: int) -> Array:
-    """Members (N, n_state) at time zero, each from its own stream."""
-    return experiment.start.members(experiment.members, seed)
-
-
 def conduct(
     experiment: TwinExperiment,
     seed: int,
@@ -199,7 +194,7 @@ def conduct(
     TooFewMembersError: the ensemble is lost. En4dvarError: the truth cannot be integrated.
     """
     truth, series = observe_truth(experiment, seed)
-    members = initial_ensemble(experiment, seed)
+    members = experiment.start.members(experiment.members, seed)
     run = run_sequential(
         experiment.model, experiment.observables, members, series, experiment.sequential, seed, executor, on_cycle,
         resume, keep, truth,

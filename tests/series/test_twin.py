@@ -20,7 +20,7 @@ from en4dvar.schemes.ienks import IEnKS
 from en4dvar.schemes.inflation import Inflation
 from en4dvar.schemes.localisation import BlockLocalisation
 from en4dvar.series.sequential import SequentialSettings, run_sequential
-from en4dvar.series.twin import TwinExperiment, TwinResult, conduct, initial_ensemble, observe_truth
+from en4dvar.series.twin import TwinExperiment, TwinResult, conduct, observe_truth
 from en4dvar_lorenz import Lorenz63, Lorenz96
 from en4dvar_lorenz.lorenz63 import Lorenz63Settings
 from en4dvar_lorenz.lorenz96 import Lorenz96Settings
@@ -60,7 +60,7 @@ def test_draws_stay_as_they_were():
     """More members leave the first ones, more cycles the earlier truth and observations."""
     small = lorenz96(ETKF(), 20, members=5)
     large = replace(small, members=9, cycles=30)
-    assert np.array_equal(initial_ensemble(large, 3)[:5], initial_ensemble(small, 3))
+    assert np.array_equal(large.start.members(9, 3)[:5], small.start.members(5, 3))
     (a, y), (b, z) = observe_truth(small, 3), observe_truth(large, 3)
     assert np.array_equal(b[:20], a)
     assert np.array_equal(z.values[:20], y.values)
@@ -91,7 +91,7 @@ def test_correlated_errors(tmp_path):
     blind = run_sequential(
         config.experiment.model,
         config.experiment.observables,
-        initial_ensemble(config.experiment, 1),
+        config.experiment.start.members(config.experiment.members, 1),
         replace(series, correlation=None),
         config.experiment.sequential,
         1,
@@ -163,7 +163,7 @@ def test_parameters_in_a_field_of_another_name_are_told_for_they_count_as_state(
 def test_an_ensemble_that_has_lost_the_truth_is_told():
     lost = decay(Named(), initial_std={"x": 1e-6})
     truth, series = observe_truth(lost, 1)
-    members = initial_ensemble(lost, 1) + np.array([0.5, 0.5, 0, 0])
+    members = lost.start.members(lost.members, 1) + np.array([0.5, 0.5, 0, 0])
     run = run_sequential(lost.model, lost.observables, members, series, lost.sequential)
     (warning,) = TwinResult(lost, 1, truth, series, run).warnings
     assert "far too sure of itself" in warning
