@@ -288,7 +288,8 @@ class DataWindow(Objective[Descent]):
         if not self.minimiser.regresses:
             doubtful = UNSEEN < descent.newton.norm < FAKED and weights.wider < WIDEST
             return replace(onwards, wider=WIDER * weights.wider) if doubtful else None
-        return None if self._same_members(onwards, weights) else onwards
+        apart = np.abs(self.scheme.members(onwards) - self.scheme.members(weights))
+        return None if np.max(apart) <= self.minimiser.step_tolerance else onwards  # it would run the same again
 
     def _onwards(self, descent: Descent, w: Array) -> Weights:
         """Weights at w (N,), with the transform of where the descent comes from and a bundle as wide."""
@@ -365,10 +366,6 @@ class DataWindow(Objective[Descent]):
 
             tangent = Tangent(linear.prediction.values, linear.anomalies, precision_times, self.space.basis)
         return Point(descent.weights.w, at.cost, descent.newton, tangent, self.space.derivatives is not None)
-
-    def _same_members(self, a: Weights, b: Weights) -> bool:
-        """Whether the scheme would run the same members again, to the step tolerance."""
-        return bool(np.max(np.abs(self.scheme.members(a) - self.scheme.members(b))) <= self.minimiser.step_tolerance)
 
     def _require_step(self, descent: Descent) -> None:
         """Raise where the members lost do not allow a step."""

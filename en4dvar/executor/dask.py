@@ -68,14 +68,9 @@ class DaskExecutor(FuturesExecutor):
         self._calls = itertools.count()
         self._seen = time.monotonic()  # when there was a worker
         self._configured = contextlib.ExitStack()
-        for name in (
-            "distributed.client",
-            "distributed.comm",
-            "distributed.core",
-            "distributed.batched",
-            "distributed.process",
-        ):
-            logging.getLogger(name).setLevel(logging.CRITICAL)  # what they tell of lost connections, we tell once
+        for name in ("client", "comm", "core", "batched", "process"):
+            # what they tell of lost connections, we tell once
+            logging.getLogger(f"distributed.{name}").setLevel(logging.CRITICAL)
         try:
             if address is None:
                 self._configured.enter_context(dask.config.set({"distributed.deploy.lost-worker-timeout": FOREVER}))

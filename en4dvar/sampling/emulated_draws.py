@@ -98,17 +98,13 @@ class EmulatedProposal:
             return emulated.cost(runs.prior.from_white(z)) / heat
 
         if isinstance(start, StudentMixture):
-            made, turns = cls.of_mixture(start, stream).bridged(cost, stream), FIRST_TURNS
+            made = cls(lambda z: -start.log_density(z), start, start.draw(WALKERS, stream), 0.0)
+            made, turns = made.bridged(cost, stream), FIRST_TURNS
         else:
             made, turns = start.bridged(cost, stream), TURNS
         for _ in range(turns):
             made = made.settled(stream)
         return made
-
-    @classmethod
-    def of_mixture(cls, mixture: StudentMixture, stream: np.random.Generator) -> "EmulatedProposal":
-        """The density of a mixture, with draws of it."""
-        return cls(lambda z: -mixture.log_density(z), mixture, mixture.draw(WALKERS, stream), 0.0)
 
     def bridged(self, cost: Callable[[Array], Array], stream: np.random.Generator) -> "EmulatedProposal":
         """The proposal exp(−``cost``), from this one."""

@@ -125,7 +125,8 @@ def run_sweep(
     low, high = ranges.low.min(axis=0), ranges.high.max(axis=0)
     design = sobol_box((low + high) / 2, (high - low) / 2, settings.trajectories, seed)
     parts = [design[i : i + settings.chunk] for i in range(0, len(design), settings.chunk)]
-    total, done = settings.trajectories + refinement_size(settings, len(problems)), 0
+    refining = (settings.rounds + 1) * settings.local * len(problems) if settings.rounds else 0
+    total, done = settings.trajectories + refining, 0
     best_of_set: dict[int, Best] = {}
     for i, best in executor.results(score.chunk, [(x, _file(folder, i)) for i, x in enumerate(parts)]):
         best_of_set[i] = best
@@ -146,11 +147,6 @@ def run_sweep(
         raise DataError(f"no trajectory of the design could be integrated for {', '.join(lost)}")
     prior = score.problem.prior
     return SweepResult(names, prior.parameters, prior.to_physical(best.x), best.shift, best.nrmse, done)
-
-
-def refinement_size(settings: SweepSettings, n_sets: int) -> int:
-    """Trajectories of the local refinement."""
-    return (settings.rounds + 1) * settings.local * n_sets if settings.rounds else 0
 
 
 def sobol_box(centre: Array, half: Array, count: int, seed: int) -> Array:
