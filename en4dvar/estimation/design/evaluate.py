@@ -101,7 +101,12 @@ def evaluate(
     ------
     ConfigError: a name that is not estimated; a choice that is not possible. TooFewMembersError: the model fails.
     """
-    problem, before = (problem, 0) if choice is None else _chosen(problem, about, sizes, seed, choice)
+    before = 0
+    if choice is not None:  # on draws of its own
+        whole, weights = Planned(problem, about), np.zeros(len(problem.observations))
+        weights[choose(whole, whole.draws(sizes.draws, own_seed(seed, "choice of readings")), *choice)] = 1
+        problem = replace(problem, observations=replace(problem.observations, weights=weights))
+        before = whole.forward_runs
     planned = Planned(problem, about, common)
     u = planned.draws(sizes.draws, seed)
     grid = plotting_times(problem)
@@ -153,12 +158,3 @@ def evaluate(
             )
         )
     return tuple(designs)
-
-
-def _chosen(
-    problem: InverseProblem, about: Sequence[str], sizes: SampleSizes, seed: int, choice: tuple[int, float]
-) -> tuple[InverseProblem, int]:
-    """The problem with the readings of the ``choice`` alone, and the runs it took; on draws of their own."""
-    planned, weights = Planned(problem, about), np.zeros(len(problem.observations))
-    weights[choose(planned, planned.draws(sizes.draws, own_seed(seed, "choice of readings")), *choice)] = 1
-    return replace(problem, observations=replace(problem.observations, weights=weights)), planned.forward_runs
