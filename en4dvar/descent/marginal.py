@@ -47,7 +47,13 @@ def marginal_members(space: WeightSpace, linear: Linearisation, mode: Array, pos
     weights /= weights.sum()
     if 1 / np.sum(weights**2) < ENOUGH:
         return posterior
-    members = _drawn(weights, draws, means, covariances, of_errors, len(posterior), stream)
+    # members (N, n) of the mixture, in units of the prior: systematic in h, random in u
+    places = (np.arange(len(posterior)) + stream.random()) / len(posterior)
+    chosen = np.minimum(np.searchsorted(np.cumsum(weights), places), len(weights) - 1)
+    normal = stream.standard_normal((len(posterior), means.shape[1]))
+    members = np.empty((len(posterior), len(of_errors)))
+    members[:, of_errors] = draws[chosen]
+    members[:, ~of_errors] = means[chosen] + np.einsum("dij,dj->di", np.linalg.cholesky(covariances[chosen]), normal)
     if space.settings.sampling == "exact":
         # The members mapped linearly so that mean and covariance are those of the whole mixture
         centres = np.empty((len(draws), len(of_errors)))
@@ -74,7 +80,13 @@ def _given(
     columns = np.column_stack([observations.values - at.values + slopes @ rest, slopes])
     x = np.tile(mode, (len(draws), 1))
     x[:, of_errors] = prior.mean[of_errors] + prior.std[of_errors] * draws
-    predicted = _predicted(space, at, prior.to_physical(x))
+    problem, physical, count = space.problem, prior.to_physical(x), len(draws)
+    predicted = Predicted(
+        np.tile(at.values, (count, 1)),
+        None if at.rates is None else np.tile(at.rates, (count, 1)),
+        of_framework(problem, physical, NOISE_SCALE, 1.0) if problem.has_noise_scale else None,
+        np.stack([of_framework(problem, physical, p, 1.0) for p in problem.discrepancy], axis=1),
+    )
     log_density, means, covariances = [], [], []
     for first in range(0, len(draws), AT_ONCE):
         covariance = noise.covariance(predicted[first : first + AT_ONCE]) / beta
@@ -90,35 +102,3 @@ def _given(
         covariances.append(inverse)
     log_prior = -0.5 * np.sum(draws**2, axis=1)
     return np.concatenate(log_density) + log_prior, np.concatenate(means), np.concatenate(covariances)
-
-
-def _predicted(space: WeightSpace, at: Predicted, physical: Array) -> Predicted:
-    """The predictions of the mode beside parameters (D, n) of the errors."""
-    problem, count = space.problem, len(physical)
-    return Predicted(
-        np.tile(at.values, (count, 1)),
-        None if at.rates is None else np.tile(at.rates, (count, 1)),
-        of_framework(problem, physical, NOISE_SCALE, 1.0) if problem.has_noise_scale else None,
-        np.stack([of_framework(problem, physical, p, 1.0) for p in problem.discrepancy], axis=1),
-    )
-
-
-def _drawn(
-    weights: Array,
-    draws: Array,
-    means: Array,
-    covariances: Array,
-    of_errors: Mask,
-    count: int,
-    stream: np.random.Generator,
-) -> Array:
-    """(N, n) members of the mixture, in units of the prior: systematic in h, random in u."""
-    places = (np.arange(count) + stream.random()) / count
-    chosen = np.minimum(np.searchsorted(np.cumsum(weights), places), len(weights) - 1)
-    roots = np.linalg.cholesky(covariances[chosen])
-    members = np.empty((count, len(of_errors)))
-    members[:, of_errors] = draws[chosen]
-    members[:, ~of_errors] = means[chosen] + np.einsum(
-        "dij,dj->di", roots, stream.standard_normal((count, means.shape[1]))
-    )
-    return members
