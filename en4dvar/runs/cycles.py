@@ -14,7 +14,7 @@ from en4dvar.executor import Executor, make_executor
 from en4dvar.plumbing.files import write_text
 from en4dvar.results.checkpoint import FOLDER, Keeper, digest
 from en4dvar.results.netcdf import Group, to_bytes
-from en4dvar.runs.kind import RunKind
+from en4dvar.runs.kind import FIGURES, REPORT, RunKind
 from en4dvar.runs.session import Session
 from en4dvar.series.moments import SequentialState
 from en4dvar.series.problem import SeriesResult
@@ -32,6 +32,7 @@ class Cycles(RunKind[R]):
     ``laid_out``: result, attributes → what its file holds; ``summary``: result → ``summary.csv``.
     """
 
+    pages = (REPORT, *FIGURES)
     laid_out: ClassVar[staticmethod[[Any, Mapping[str, Any]], Group]]
     summary: ClassVar[staticmethod[[Any], str]]
     config: Any

@@ -140,8 +140,5 @@ def _named(place: str) -> Any:
 
 def kind_in(folder: Path) -> type[Kind]:
     """The kind of the finished run in ``folder``; that of an estimate where there is no result of another kind."""
-    others = (kind_named(name) for name in KINDS if name != "estimate")
-    estimate = kind_named("estimate")
-    if (folder / estimate.result).exists():
-        return estimate
-    return next((kind for kind in others if (folder / kind.result).is_file()), estimate)
+    kinds = map(kind_named, KINDS)  # that of an estimate first
+    return next((kind for kind in kinds if (folder / kind.result).is_file()), kind_named("estimate"))

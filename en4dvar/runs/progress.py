@@ -139,13 +139,10 @@ class LiveProgress:
 
     def _show(self, description: str | None) -> None:
         description = description and without_control(description)
-        fields = {"completed": self._done, "total": self._total or None, "left": self._left()}
+        gone, done, total = time.monotonic() - self._began, self._done - self._before, self._total - self._before
+        left = time_left(gone, done, total, list(self._open.values()), self._lengths)
+        fields = {"completed": self._done, "total": self._total or None, "left": left}
         self._bar.update(self._task, **fields, **({"description": description} if description else {}))
-
-    def _left(self) -> str:
-        gone = time.monotonic() - self._began
-        done, total = self._done - self._before, self._total - self._before
-        return time_left(gone, done, total, list(self._open.values()), self._lengths)
 
 
 def time_left(gone: float, done: int, total: int, iterations: Sequence[int], lengths: Sequence[int]) -> str:

@@ -16,7 +16,6 @@ from en4dvar.results.checkpoint import FOLDER
 from en4dvar.results.series_file import sequence_csv, sequence_group
 from en4dvar.runs.cycles import Cycles, Keep
 from en4dvar.runs.engine import conduct_run
-from en4dvar.runs.kind import FIGURES, REPORT
 from en4dvar.series.moments import SequentialState
 from en4dvar.series.problem import SeriesProblem, SeriesResult, assimilate_series
 
@@ -46,7 +45,6 @@ class SequenceKind(Cycles[SeriesResult]):
     name = "sequence"
     result = "sequence.nc"
     files = (result, "summary.csv", f"{FOLDER}/sequence.cycle")
-    pages = (REPORT, *FIGURES)
     writer = "en4dvar.report.sequence:write_sequence_report"
     laid_out = staticmethod(sequence_group)
     summary = staticmethod(sequence_csv)

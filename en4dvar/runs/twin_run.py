@@ -11,7 +11,6 @@ from en4dvar.results.checkpoint import FOLDER
 from en4dvar.results.series_file import twin_csv, twin_group
 from en4dvar.runs.cycles import Cycles, Keep
 from en4dvar.runs.engine import conduct_run
-from en4dvar.runs.kind import FIGURES, REPORT
 from en4dvar.series.moments import SequentialState
 from en4dvar.series.twin import TwinResult, conduct
 
@@ -39,7 +38,6 @@ class TwinKind(Cycles[TwinResult]):
     name = "twin"
     result = "twin.nc"
     files = (result, "summary.csv", f"{FOLDER}/twin.cycle")
-    pages = (REPORT, *FIGURES)
     writer = "en4dvar.report.twin:write_twin_report"
     laid_out = staticmethod(twin_group)
     summary = staticmethod(twin_csv)
