@@ -4,15 +4,15 @@ The arguments become the configuration that a file would hold, and the arrays th
 directory, so that everything a configuration can say can be said here, in the same words.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
-from en4dvar.config.document import Document, document_of
-from en4dvar.config.load import Config, resolve
-from en4dvar.config.sequence import SequenceConfig, resolve_sequence
+from en4dvar.config.document import document_of
+from en4dvar.config.load import resolve
+from en4dvar.config.sequence import resolve_sequence
 from en4dvar.diagnosis.analysis import Progress
 from en4dvar.inputs.arrays import TIME
 from en4dvar.model.forward import ForwardModel
@@ -106,7 +106,9 @@ def estimate(
     with ExitStack() as held:
         where = Path(directory or Path(held.enter_context(temporary_folder())) / "run")
         _keep_data(where, call.beside, resume or force)  # which the configuration reads
-        config = replace(_checked(content, where, ready, resolve), directory=where)
+        with _words_of_arguments():
+            config = resolve(document_of(content), where.absolute(), ready)
+        config = replace(config, directory=where)
         _keep_data(where, call.files, resume or force)
         shown = progress if callable(progress) else held.enter_context(terminal_progress()) if progress else None
         (result,) = run_campaign(config, force=force, resume=resume, progress=shown, command="en4dvar.estimate")
@@ -162,23 +164,18 @@ def estimate_sequence(
     }
     with ExitStack() as held:
         where = Path(directory or Path(held.enter_context(temporary_folder())) / "run")
-        config = replace(_checked(content, where, ready, resolve_sequence), directory=where)
+        with _words_of_arguments():
+            config = resolve_sequence(document_of(content), where.absolute(), ready)
+        config = replace(config, directory=where)
         _keep_data(where, call.files, resume or force)
         return run_sequence(config, force=force, resume=resume, command="en4dvar.estimate_sequence")
 
 
-C = TypeVar("C", Config, SequenceConfig)
-
-
-def _checked(
-    content: Mapping[str, Any],
-    directory: Path,
-    model: ForwardModel,
-    resolved: Callable[[Document, Path, ForwardModel], C],
-) -> C:
-    """The configuration. Raises :class:`ConfigError` in the words of the arguments."""
+@contextmanager
+def _words_of_arguments() -> Iterator[None]:
+    """Within, a :class:`ConfigError` is raised in the words of the arguments."""
     try:
-        return resolved(document_of(content), directory.absolute(), model)
+        yield
     except ConfigError as error:
         raise ConfigError([replace(fault, path=_argument(fault.path)) for fault in error.problems]) from None
 
