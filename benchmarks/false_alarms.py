@@ -24,7 +24,6 @@ from laser_twin import make_laser_twin
 from records import Record, fill
 from worlds import Twin
 
-from en4dvar.descent.weight_space import prior_ensemble
 from en4dvar.diagnosis.honesty.examine import doubts
 from en4dvar.diagnosis.response.what_if import changed_problem
 from en4dvar.ensemble.forecast import forecast
@@ -66,7 +65,7 @@ def doubted(key: str) -> Record:
     """By which factors the readings and their errors may be wrong without a doubt of the model."""
     design, seed = key.rsplit("/", 1)
     problem = DESIGNS[design](int(seed)).problem
-    members = prior_ensemble(problem.prior, SETTINGS.members, int(seed), SETTINGS.sampling).members
+    members = problem.prior.sample(SETTINGS.members, int(seed), SETTINGS.sampling)
     predicted, physical = forecast(problem, members).predictions, problem.prior.to_physical(members)
     wrong = (changed_problem(problem, Alternative("scale", "", values=factor)) for factor in FACTORS)
     return {"doubted": [bool(doubts(one, physical, predicted)) for one in wrong]}
