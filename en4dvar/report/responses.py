@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from markupsafe import Markup
@@ -19,53 +19,44 @@ SHIFT_COLUMNS = (
 ENTRY_COLUMNS = ("parameter", "quantity", "unit", "q05", "q50", "q95")
 
 
-@dataclass(frozen=True)
-class StoredShift:
+class StoredShift(NamedTuple):
     """What one parameter would do under one alternative: ``change`` in ``unit``, the display unit.
 
     ``relative``: of the value, NaN where that may be negative. ``reason``: why linear response does not tell, or "".
+    Behind the cells of :data:`SHIFT_COLUMNS`, the symbol of the parameter.
     """
 
     alternative: str
     words: str
     parameter: str
-    symbol: str
     unit: str
     change: float
     relative: float
     in_std: float
     cost_change: float
     reason: str
+    symbol: str
 
     @property
     def exceeds(self) -> bool:
         """Whether it is more than the parameter's standard deviation."""
         return abs(self.in_std) > 1
 
-    @property
-    def cells(self) -> tuple[object, ...]:
-        """In the order of :data:`SHIFT_COLUMNS`."""
-        numbers = (self.change, self.relative, self.in_std, self.cost_change)
-        return (self.alternative, self.words, self.parameter, self.unit, *numbers, self.reason)
 
+class StoredEntry(NamedTuple):
+    """Where on the path one parameter was informed, in one quantity: ``low``, ``median``, ``high`` are 5, 50, 95 %.
 
-@dataclass(frozen=True)
-class StoredEntry:
-    """Where on the path one parameter was informed, in one quantity: ``low``, ``median``, ``high`` are 5, 50, 95 %."""
+    Behind the cells of :data:`ENTRY_COLUMNS`, the symbol of the parameter and the label of the quantity.
+    """
 
     parameter: str
-    symbol: str
     quantity: str
-    label: str
     unit: str
     low: float
     median: float
     high: float
-
-    @property
-    def cells(self) -> tuple[object, ...]:
-        """In the order of :data:`ENTRY_COLUMNS`."""
-        return self.parameter, self.quantity, self.unit, self.low, self.median, self.high
+    symbol: str
+    label: str
 
 
 def stored_ledger(result: StoredResult) -> tuple[tuple[StoredEntry, ...], ...]:
@@ -80,8 +71,8 @@ def stored_ledger(result: StoredResult) -> tuple[tuple[StoredEntry, ...], ...]:
         v = stats.variables[quantity + ending]
         shown = v.attrs["display_units"]
         numbers = convert(np.asarray(v.values[i], dtype=float), v.attrs["units"], shown).tolist()
-        symbol = about[parameter]["symbol"]
-        return StoredEntry(parameter, symbol, quantity.removeprefix("ledger_"), v.attrs["long_name"], shown, *numbers)
+        name, words = quantity.removeprefix("ledger_"), (about[parameter]["symbol"], v.attrs["long_name"])
+        return StoredEntry(parameter, name, shown, *numbers, *words)
 
     names = list(map(str, stats.coords["path_parameter"].values))
     return tuple(tuple(entry(i, name, q) for q in quantities) for i, name in enumerate(names))
@@ -102,8 +93,8 @@ def stored_shifts(result: StoredResult) -> tuple[tuple[StoredShift, ...], ...]:
         about = parameters[name].attrs
         value = convert(float(change[i, j]), about["units"], about["display_units"])
         numbers = value, float(relative[i, j]), float(in_std[i, j]), float(of["cost_change"][i])
-        known = str(alternatives[i]), str(of["words"][i]), name, about["symbol"], about["display_units"]
-        return StoredShift(*known, *numbers, str(of["reason"][i]))
+        known = str(alternatives[i]), str(of["words"][i]), name, about["display_units"]
+        return StoredShift(*known, *numbers, str(of["reason"][i]), about["symbol"])
 
     largest = np.where(of["reason"] == "", np.abs(in_std).max(axis=1), 1.0)
     order = np.argsort(-largest, kind="stable").tolist()
@@ -150,6 +141,6 @@ def exceeding(rows: Iterable[Sequence[StoredShift]]) -> list[Sequence[StoredShif
 def response_lines(result: StoredResult) -> tuple[Lines, Lines]:
     """Lines of ``what_if.csv`` and of ``ledger.csv``, the name of the data set first."""
     return (
-        [(result.name, *shift.cells) for row in stored_shifts(result) for shift in row],
-        [(result.name, *entry.cells) for row in stored_ledger(result) for entry in row],
+        [(result.name, *shift[: len(SHIFT_COLUMNS)]) for row in stored_shifts(result) for shift in row],
+        [(result.name, *entry[: len(ENTRY_COLUMNS)]) for row in stored_ledger(result) for entry in row],
     )

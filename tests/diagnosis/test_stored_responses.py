@@ -137,5 +137,5 @@ def test_every_variable_is_documented(run_dir):
     ],
 )
 def test_a_shift_is_as_fine_as_its_error_bar(change, relative, in_std, words):
-    shift = StoredShift("a", "…", "t", "$t$", "us", change, relative, in_std, 0.0, "")
+    shift = StoredShift("a", "…", "t", "us", change, relative, in_std, 0.0, "", "$t$")
     assert shift_text(shift) == words
