@@ -192,10 +192,12 @@ def _outlines(image: Array, p: Array, modes: int, noise: float, optics: Optics) 
     squared, product = of_rows(image, p, modes, ring)
     slopes = np.maximum(squared, 1e-30)
     outlines: list[Outline] = []
-    for group in _groups(np.append(0.0, gaps), APART * p[W]):
+    every = np.append(0.0, gaps)
+    # nested circles by their places, the largest first; those that are closer to the next are together
+    for group in np.split(np.arange(len(every)), 1 + np.flatnonzero(np.diff(every) >= APART * p[W])):
         # of the radius, or of the mean of radii that cannot be told apart
         weights = inverse[R] - np.mean([inverse[SHAPE + shape.size + s - 1] if s else 0 * p for s in group], axis=0)
-        inside = np.append(0.0, gaps)[group]
+        inside = every[group]
         circle = Circle(float(p[X]), float(p[Y]), float(p[R] - inside.mean()))
         sectors = int(np.clip(2 * np.pi * circle.R / max(4.0, 2 * p[W]), 8, 256))
         sums, spread, slope, fitted = influence(image, p, modes, ring, CUTOFF * noise, weights, sectors)
@@ -220,17 +222,6 @@ def _outlines(image: Array, p: Array, modes: int, noise: float, optics: Optics) 
         )
         outlines += [outline] * len(group)
     return outlines
-
-
-def _groups(gaps: Array, near: float) -> list[list[int]]:
-    """Nested circles by their places, the largest first; those closer than ``near`` to the next are together."""
-    groups = [[0]]
-    for s in range(1, len(gaps)):
-        if gaps[s] - gaps[s - 1] < near:
-            groups[-1].append(s)
-        else:
-            groups.append([s])
-    return groups
 
 
 def _left(fitted: Array, weights: Array, A: Array, inverse: Array) -> float:

@@ -78,12 +78,6 @@ def _row(j, i, p, modes, row):
 
 
 @kernel
-def _weight(u):
-    """Tukey's bisquare of a residual in units of its cutoff."""
-    return (1 - u * u) ** 2 if abs(u) < 1 else 0.0
-
-
-@kernel
 def _bounds(shape, x, y, reach):
     return (
         max(0, math.floor(y - reach)),
@@ -143,7 +137,7 @@ def normal_equations(image, p, modes, ring, cutoff):
             r = image[j, i] - _row(j, i, p, modes, row)
             u = min(1.0, abs(r) / cutoff)
             cost += 1 - (1 - u * u) ** 3
-            w = _weight(u)
+            w = (1 - u * u) ** 2
             if w == 0.0:
                 continue
             squares += w * r * r

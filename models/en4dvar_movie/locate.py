@@ -49,7 +49,6 @@ def _labelled(mask: Array) -> tuple[npt.NDArray[Any], npt.NDArray[np.intp]]:
 def rim(inside: npt.NDArray[Any]) -> Array:
     """Outermost points (K, 2), x and y, of each row and column of a patch, without those on the frame's border."""
     height, width = inside.shape
-    points = []
     rows = np.flatnonzero(inside.any(axis=1))
     left, right = inside.argmax(axis=1)[rows], width - 1 - inside[:, ::-1].argmax(axis=1)[rows]
     columns = np.flatnonzero(inside.any(axis=0))

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from en4dvar.plumbing.errors import DataError
 from en4dvar_movie.background import Background, find_background
-from en4dvar_movie.candidates import Candidate, Look, look_at
+from en4dvar_movie.candidates import Look, look_at
 from en4dvar_movie.corrections import Correction
 from en4dvar_movie.flashes import in_time
 from en4dvar_movie.following import Chain, chains, doubts, reasons, target
@@ -129,11 +129,8 @@ def _readings(
     bubble = bubbles[number] if bubbles else Chain(())
     doubtful = doubts(bubble, [*bubbles[:number], *bubbles[number + 1 :]])
     why = reasons(looks, bubble)
-    of_frame = {c.frame: c for c in bubble.candidates}
-    sightings = [
-        _sightings(of_frame[look.frame]) if look.frame in of_frame else [Sighting(look.frame, None, why[look.frame])]
-        for look in looks
-    ]
+    seen = {c.frame: [Sighting(c.frame, outline, "") for outline in c.outlines] for c in bubble.candidates}
+    sightings = [seen.get(look.frame) or [Sighting(look.frame, None, why[look.frame])] for look in looks]
     rate, flashes, exposure = times
     if len(flashes) > 1:
         sightings = ordered(sightings, rate, flashes)
@@ -141,10 +138,6 @@ def _readings(
     doubtful.update({c.frame: c.doubt for c in bubble.candidates if c.doubt})
     share = exposure * rate if len(flashes) == 1 else 0.0
     yield from readings_of(flat, optics, corrections, doubtful, share)
-
-
-def _sightings(candidate: Candidate) -> list[Sighting]:
-    return [Sighting(candidate.frame, outline, "") for outline in candidate.outlines]
 
 
 def ordered(sightings: list[list[Sighting]], rate: float, flashes: Sequence[float]) -> list[list[Sighting]]:
@@ -214,8 +207,5 @@ def doubted(readings: Sequence[Reading]) -> str:
 
 
 def _ranges(frames: Sequence[int]) -> str:
-    starts = [n for n, frame in enumerate(frames) if n == 0 or frame != frames[n - 1] + 1]
-    ends = [*(n - 1 for n in starts[1:]), len(frames) - 1]
-    return ", ".join(
-        f"{frames[a]}" if a == b else f"{frames[a]}-{frames[b]}" for a, b in zip(starts, ends, strict=True)
-    )
+    parts = np.split(frames, 1 + np.flatnonzero(np.diff(frames) != 1))
+    return ", ".join(f"{part[0]}" if len(part) == 1 else f"{part[0]}-{part[-1]}" for part in parts)

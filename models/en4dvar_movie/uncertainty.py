@@ -109,11 +109,10 @@ def _moved(outline: Outline, sharp: float) -> float:
 def _turns(outlines: Sequence[Outline | None]) -> list[bool]:
     """True if the radius of a frame lies below, or above, those of both neighbours."""
     where = [k for k, o in enumerate(outlines) if o is not None]
-    radii = np.array([o.circle.R for o in outlines if o is not None])
-    turns = [False] * len(outlines)
-    for n in range(1, len(where) - 1):
-        turns[where[n]] = bool((radii[n] - radii[n - 1]) * (radii[n + 1] - radii[n]) <= 0)
-    return turns
+    steps = np.diff([o.circle.R for o in outlines if o is not None])
+    turns = np.zeros(len(outlines), dtype=bool)
+    turns[where[1:-1]] = steps[:-1] * steps[1:] <= 0
+    return turns.tolist()
 
 
 def _smoothed(outlines: Sequence[Outline | None]) -> Array:
