@@ -1,14 +1,12 @@
 """A study as one netCDF file: a group a gel and model with both routes, and a population's draws."""
 
-from collections.abc import Mapping
 from datetime import UTC, datetime
-from typing import Any
 
 import numpy as np
 
 from en4dvar.estimation.population import Population
-from en4dvar.model.state import Parameter
-from en4dvar.results.netcdf import Group, Variable, to_bytes
+from en4dvar.model.state import Array, Parameter
+from en4dvar.results.netcdf import Group, Variable, to_bytes, variable
 from en4dvar.results.seal import SealedBytes
 from en4dvar_agarose.fits import Fit, Study
 from en4dvar_agarose.paper import Route
@@ -40,24 +38,23 @@ def study_netcdf(study: Study) -> SealedBytes:
 def _fit(study: Study, fit: Fit) -> Group:
     variables: dict[str, Variable] = {}
     for j, p in enumerate(fit.prior.parameters):
-        about = _words(p)
-        variables[p.name] = Variable(("dataset", "draw"), np.stack([a.posterior[:, j] for a in fit.analyses]), about)
-        variables[f"dfs_{p.name}"] = _plain(
-            np.array([a.dfs_per_parameter[j] for a in fit.analyses]), f"DFS of {p.name}"
-        )
+        variables[p.name] = _of(p, ("dataset", "draw"), np.stack([a.posterior[:, j] for a in fit.analyses]))
+        dfs = [a.dfs_per_parameter[j] for a in fit.analyses]
+        variables[f"dfs_{p.name}"] = variable("dataset", dfs, "1", f"DFS of {p.name}")
         truths = np.array([study.truth.get(name, {}).get(p.name, np.nan) for name in fit.names])
         if study.truth and np.isfinite(truths).any():
-            variables[f"truth_{p.name}"] = Variable(("dataset",), truths, about)
+            variables[f"truth_{p.name}"] = _of(p, "dataset", truths)
     for j, p in enumerate(fit.sweep.parameters):
-        variables[f"sweep_{p.name}"] = Variable(("dataset",), fit.sweep.theta[:, j], _words(p))
-    variables["sweep_t_s"] = Variable(("dataset",), fit.sweep.shift, {"units": "s", "long_name": "time shift"})
+        variables[f"sweep_{p.name}"] = _of(p, "dataset", fit.sweep.theta[:, j])
+    variables["sweep_t_s"] = variable("dataset", fit.sweep.shift, "s", "time shift")
     of_routes: dict[Route, str] = {"sweep": "best fit of the sweep", "en4dvar": "centre of the posterior"}
     for route, words in of_routes.items():
-        variables[f"nrmse_{route}"] = _plain(fit.nrmse(route), f"NRMSE, {words}")
-    variables["log_evidence"] = _plain(fit.log_evidence, "log-evidence, adaptive importance sampling")
+        variables[f"nrmse_{route}"] = variable("dataset", fit.nrmse(route), "1", f"NRMSE, {words}")
+    words = "log-evidence, adaptive importance sampling"
+    variables["log_evidence"] = variable("dataset", fit.log_evidence, "1", words)
     if fit.sampled:
-        effective = np.array([draws.effective for draws in fit.sampled])
-        variables["evidence_draws"] = _plain(effective, "effective number of draws of the log-evidence")
+        words, effective = "effective number of draws of the log-evidence", [draws.effective for draws in fit.sampled]
+        variables["evidence_draws"] = variable("dataset", effective, "1", words)
     coords = {"dataset": Variable(("dataset",), np.array(fit.names, dtype=object), {"long_name": "data set"})}
     return Group(variables, coords)
 
@@ -65,9 +62,9 @@ def _fit(study: Study, fit: Fit) -> Group:
 def _population(population: Population) -> Group:
     variables: dict[str, Variable] = {}
     for j, term in enumerate(population.terms):
-        name, about = term.parameter.name, _words(term.parameter)
-        variables[f"mean_{name}"] = Variable(("draw",), population.posterior.mean[:, j], about)
-        variables[f"spread_{name}"] = Variable(("draw",), population.posterior.between[:, j], about)
+        p = term.parameter
+        variables[f"mean_{p.name}"] = _of(p, "draw", population.posterior.mean[:, j])
+        variables[f"spread_{p.name}"] = _of(p, "draw", population.posterior.between[:, j])
     judged = {
         "effective_draws": population.size,
         "effective_draws_hierarchy": population.effective[0],
@@ -78,9 +75,5 @@ def _population(population: Population) -> Group:
     return Group(variables, attrs=judged)
 
 
-def _words(p: Parameter) -> Mapping[str, Any]:
-    return {"units": p.unit, "long_name": p.label, "display_units": p.display_unit}
-
-
-def _plain(values: np.ndarray[Any, Any], words: str) -> Variable:
-    return Variable(("dataset",), values, {"units": "1", "long_name": words})
+def _of(p: Parameter, dims: str | tuple[str, ...], values: Array) -> Variable:
+    return variable(dims, values, p.unit, p.label, display_units=p.display_unit)
