@@ -31,21 +31,22 @@ def all_figures(study: Study) -> Iterator[Captioned]:
 def _figures(study: Study) -> Iterator[Captioned]:
     count = "; ".join(f"{len(study.any_fit(gel).problems)} in {gel} gel" for gel in study.fits)
     yield "scaled", f"Scaled radius against time, R/R_max against t/t_c: {count}.", scaled_data(study)
-    for gel, models in study.fits.items():
-        for model, fit in models.items():
-            caption = f"Radius against time, {gel} gel; line: best {NAMES[model]} fit of the filled set (IMR sweep)."
-            yield f"dimensional_{gel_key(gel)}_{model}", caption, dimensional(fit)
+    for fit in study.every_fit:
+        caption = (
+            f"Radius against time, {fit.gel} gel; line: best {NAMES[fit.model]} fit of the filled set (IMR sweep)."
+        )
+        yield f"dimensional_{gel_key(fit.gel)}_{fit.model}", caption, dimensional(fit)
     routes: dict[Route, str] = {"sweep": "IMR sweep", "en4dvar": "En4D-Var, ensemble means"}
     for route, words in routes.items():
         caption = f"Distributions of shear modulus, stiffening, viscosity, stress-free radius; {words}."
         yield f"distributions_{route}", caption, distributions(study, route)
         yield f"nrmse_{route}", f"Distributions of NRMSE for the models; {words}.", nrmse_figure(study, route)
-    for gel, fit in ((gel, models["qlkv"]) for gel, models in study.fits.items() if "qlkv" in models):
+    for fit in (fit for fit in study.every_fit if fit.model == "qlkv"):
         members = len(fit.members("mu"))
-        caption = f"Combined final ensembles of all sets, {members} members; {gel} gel, general QLKV."
-        yield f"members_{gel_key(gel)}", caption, combined(study, fit)
-        caption = f"Iterative estimates, one line a data set; {gel} gel, general QLKV."
-        yield f"iterations_{gel_key(gel)}", caption, iterations(fit)
+        caption = f"Combined final ensembles of all sets, {members} members; {fit.gel} gel, general QLKV."
+        yield f"members_{gel_key(fit.gel)}", caption, combined(study, fit)
+        caption = f"Iterative estimates, one line a data set; {fit.gel} gel, general QLKV."
+        yield f"iterations_{gel_key(fit.gel)}", caption, iterations(fit)
     if study.populations:
         caption = "Population mean (95 % interval) by the hierarchical step and mean of the stacked ensembles"
         yield "population", f"{caption}{', with the truths' if study.truth else ''}.", population(study)
@@ -167,8 +168,8 @@ def _density(panel: Panel, values: Array, colour: str, dash: str, label: str) ->
 
 def nrmse_figure(study: Study, route: Route) -> Chart:
     """Histograms of NRMSE, a panel a model, gels by colour and line style."""
-    models = list(dict.fromkeys(m for fits in study.fits.values() for m in fits))
-    every = np.concatenate([fit.nrmse(route) for fits in study.fits.values() for fit in fits.values()])
+    models = list(dict.fromkeys(fit.model for fit in study.every_fit))
+    every = np.concatenate([fit.nrmse(route) for fit in study.every_fit])
     edges = np.linspace(min(0.9, np.floor(every.min() * 100) / 100), 1.0, 21)
     panels: list[Panel] = []
     for model, letter in zip(models, "abc", strict=False):

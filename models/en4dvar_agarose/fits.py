@@ -125,6 +125,11 @@ class Study:
     seconds: Mapping[str, float] = field(default_factory=dict)
     narrow: Mapping[str, Fit] = field(default_factory=dict)
 
+    @property
+    def every_fit(self) -> tuple[Fit, ...]:
+        """Of all gels and models, in their order."""
+        return tuple(fit for models in self.fits.values() for fit in models.values())
+
     def any_fit(self, gel: str) -> Fit:
         """The fit of some model; all have the same data sets."""
         return next(iter(self.fits[gel].values()))
@@ -150,10 +155,9 @@ def read_truth(path: Path) -> dict[str, dict[str, float]]:
     """Data set → parameter → SI value, of a ``truth.csv`` of a synthetic campaign. Raises :class:`DataError`."""
     try:
         lines = [line for line in read_text(path).splitlines() if not line.startswith("#")]
-        rows = list(csv.DictReader(lines))
         return {
             row["dataset"]: {name: factor * float(row[column]) for column, (name, factor) in _TRUTH_UNITS.items()}
-            for row in rows
+            for row in csv.DictReader(lines)
         }
     except (OSError, KeyError, ValueError) as error:
         raise DataError(f"{path}: not the truth of a synthetic campaign of bubbles: {error!r}") from None

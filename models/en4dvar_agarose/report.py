@@ -49,7 +49,6 @@ def _page(study: Study, figures: list[dict[str, Any]]) -> str:
     environment = Environment(
         loader=PackageLoader("en4dvar_agarose", "."), autoescape=True, undefined=StrictUndefined, trim_blocks=True
     )
-    fits = [fit for models in study.fits.values() for fit in models.values()]
     return environment.get_template("page.html.j2").render(
         plan=study.plan,
         sweep=study.plan.sweep,
@@ -57,7 +56,7 @@ def _page(study: Study, figures: list[dict[str, Any]]) -> str:
         hyper=HYPER,
         decisive=DECISIVE,
         gels=len(study.fits),
-        members=fits[0].analyses[0].settings.members,
+        members=study.every_fit[0].analyses[0].settings.members,
         sets=sum(len(study.any_fit(gel).problems) for gel in study.fits),
         findings=findings(study),
         tables=[_table(study, route) for route in ROUTE_KEYS],
@@ -113,8 +112,8 @@ def findings(study: Study) -> list[str]:
                 )
     sentences += [words_of for gel in study.fits if (words_of := _apparent_modulus(study, gel))]
     for route in ROUTE_KEYS:
-        used = [m for m in NAMES if any(m in models for models in study.fits.values())]
-        scores = {m: np.concatenate([f[m].nrmse(route) for f in study.fits.values() if m in f]) for m in used}
+        each = {m: [fit.nrmse(route) for fit in study.every_fit if fit.model == m] for m in NAMES}
+        scores = {m: np.concatenate(values) for m, values in each.items() if values}
         words = ", ".join(f"{LABELS[m]} {v.min():.3f} to {v.max():.3f}, mean {v.mean():.3f}" for m, v in scores.items())
         sentences.append(f"NRMSE, {ROUTES[route]}: {words}.")
     return sentences
@@ -152,11 +151,10 @@ def _table(study: Study, route: Route) -> dict[str, Any]:
 
 def _dfs(study: Study) -> Rows:
     rows = []
-    for gel, models in study.fits.items():
-        for model, fit in models.items():
-            mean = fit.dfs()
-            shares = [f"{100 * mean[q.name]:.0f} %" if q.name in mean else "–" for q in QUANTITIES]
-            rows.append([gel, LABELS[model], *shares])
+    for fit in study.every_fit:
+        mean = fit.dfs()
+        shares = [f"{100 * mean[q.name]:.0f} %" if q.name in mean else "–" for q in QUANTITIES]
+        rows.append([fit.gel, LABELS[fit.model], *shares])
     return rows
 
 

@@ -1,7 +1,5 @@
 """A sweep as text; tables 1 and 2 beside the paper's printed values and a twin's truth, as CSV, Markdown and LaTeX."""
 
-import csv
-import io
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -50,19 +48,18 @@ class Row:
 def table(study: Study, route: Route) -> tuple[Row, ...]:
     """The rows of table 1 (``sweep``) or 2 (``en4dvar``), in the units of the paper."""
     rows = []
-    for gel, models in study.fits.items():
-        for model, fit in models.items():
-            cells = []
-            for q in QUANTITIES:
-                mean, std = fit.summary(route, q.name) if fit.has(q.name) else (np.nan, np.nan)
-                true = study.true_values(gel, q.name) * q.factor
-                pairs: dict[Source, Pair | None] = {
-                    "paper": TABLES[route].get(gel, {}).get(model, {}).get(q.name),
-                    "computed": (mean * q.factor, std * q.factor) if fit.has(q.name) else None,
-                    "truth": (float(true.mean()), float(true.std(ddof=1))) if len(true) > 1 else None,
-                }
-                cells.append(Cell(q, pairs, fixed=fit.has(q.name) and not fit.estimated(q.name)))
-            rows.append(Row(gel, model, tuple(cells)))
+    for fit in study.every_fit:
+        cells = []
+        for q in QUANTITIES:
+            mean, std = fit.summary(route, q.name) if fit.has(q.name) else (np.nan, np.nan)
+            true = study.true_values(fit.gel, q.name) * q.factor
+            pairs: dict[Source, Pair | None] = {
+                "paper": TABLES[route].get(fit.gel, {}).get(fit.model, {}).get(q.name),
+                "computed": (mean * q.factor, std * q.factor) if fit.has(q.name) else None,
+                "truth": (float(true.mean()), float(true.std(ddof=1))) if len(true) > 1 else None,
+            }
+            cells.append(Cell(q, pairs, fixed=fit.has(q.name) and not fit.estimated(q.name)))
+        rows.append(Row(fit.gel, fit.model, tuple(cells)))
     return tuple(rows)
 
 
@@ -86,20 +83,15 @@ def sources(study: Study) -> dict[Source, str]:
 
 def as_csv(study: Study, rows: Sequence[Row], route: Route) -> str:
     """One line a gel, model and quantity, every digit kept; a comment says what is synthetic."""
-    out = io.StringIO()
-    if study.plan.synthetic:
-        out.write(
-            f"# {ROUTES[route]} on a SYNTHETIC twin of the paper's campaign; only the paper_ columns are printed\n"
-        )
-    writer = csv.writer(out, lineterminator="\n")
     heads = [f"{source}_{moment}" for source in get_args(Source) for moment in ("mean", "std")]
-    writer.writerow(["gel", "model", "quantity", "unit", *heads])
+    lines = [["gel", "model", "quantity", "unit", *heads]]
     for row in rows:
         for cell in row.cells:
             values = [value for source in get_args(Source) for value in (cell.pairs[source] or (np.nan, np.nan))]
             numbers = [f"{value:.6g}" if np.isfinite(value) else "" for value in values]
-            writer.writerow([row.gel, LABELS[row.model], cell.quantity.name, cell.quantity.unit, *numbers])
-    return out.getvalue()
+            lines.append([row.gel, LABELS[row.model], cell.quantity.name, cell.quantity.unit, *numbers])
+    words = f"# {ROUTES[route]} on a SYNTHETIC twin of the paper's campaign; only the paper_ columns are printed\n"
+    return f"{words if study.plan.synthetic else ''}{csv_text(lines)}"
 
 
 def as_markdown(study: Study, rows: Sequence[Row], route: Route) -> str:
@@ -172,23 +164,20 @@ def spread_notes(study: Study) -> list[str]:
 def per_set_csv(study: Study) -> str:
     """One line a gel, model, data set and parameter, in the units of the tables: both routes, truth, fit, DFS."""
     head = "gel,model,dataset,parameter,unit,sweep,en4dvar_mean,en4dvar_std,q05,q50,q95,dfs,truth"
-    lines = [f"{head},nrmse_sweep,nrmse_en4dvar,log_evidence"]
-    for gel, models in study.fits.items():
-        for model, fit in models.items():
-            scores = {route: fit.nrmse(route) for route in ("sweep", "en4dvar")}
-            for q in QUANTITIES:
-                if not fit.estimated(q.name):
-                    continue
-                j, best = fit.prior.names.index(q.name), fit.values("sweep", q.name)
-                for i, (a, evidence) in enumerate(zip(fit.analyses, fit.log_evidence, strict=True)):
-                    x = q.factor * a.posterior[:, j]
-                    true = study.truth.get(a.name, {}).get(q.name, np.nan) * q.factor
-                    numbers = [best[i] * q.factor, np.nanmean(x), np.nanstd(x, ddof=1)]
-                    numbers += [*np.nanquantile(x, (0.05, 0.5, 0.95)), a.dfs_per_parameter[j], true]
-                    numbers += [scores["sweep"][i], scores["en4dvar"][i], evidence]
-                    values = ",".join(f"{v:.6g}" for v in numbers)
-                    lines.append(f"{gel},{model},{a.name},{q.name},{q.unit},{values}")
-    return "\n".join(lines) + "\n"
+    lines = [f"{head},nrmse_sweep,nrmse_en4dvar,log_evidence".split(",")]
+    for fit in study.every_fit:
+        of_sets = fit.analyses, fit.nrmse("sweep"), fit.nrmse("en4dvar"), fit.log_evidence
+        for q in QUANTITIES:
+            if not fit.estimated(q.name):
+                continue
+            j = fit.prior.names.index(q.name)
+            for best, a, *scores in zip(fit.values("sweep", q.name), *of_sets, strict=True):
+                x = q.factor * a.posterior[:, j]
+                true = study.truth.get(a.name, {}).get(q.name, np.nan) * q.factor
+                numbers = [best * q.factor, np.nanmean(x), np.nanstd(x, ddof=1)]
+                numbers += [*np.nanquantile(x, (0.05, 0.5, 0.95)), a.dfs_per_parameter[j], true, *scores]
+                lines.append([fit.gel, fit.model, a.name, q.name, q.unit, *(f"{v:.6g}" for v in numbers)])
+    return csv_text(lines)
 
 
 def sweep_csv(result: SweepResult) -> str:
