@@ -19,19 +19,19 @@ WRITERS = (  # what templates call
 )  # fmt: skip
 
 
-def render(template: str, **content: Any) -> str:
-    """The page of a template as text, with the scripts of charts and of tables that are sorted.
+def render(template: str, package: str = "en4dvar.report", **content: Any) -> str:
+    """The page of a template of a package as text; of ours with the scripts of charts and of tables that are sorted.
 
     A content security policy forbids the page every address and every script but these: what escaping might miss
-    would still not run.
+    would still not run. A template of an application gets the colours on ``light`` and on ``dark`` ground.
     """
-    return _environment().get_template(template).render(**content)
+    return _environment(package).get_template(template).render(**content)
 
 
 @cache
-def _environment() -> Environment:
+def _environment(package: str) -> Environment:
     environment = Environment(
-        loader=PackageLoader("en4dvar.report", "."),
+        loader=PackageLoader(package, "."),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
@@ -41,10 +41,10 @@ def _environment() -> Environment:
     script = _text("table.js") + _text("chart.js")
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     policy = f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"
-    light, dark = css_variables(LIGHT), css_variables(DARK)
+    light, dark = (Markup(css_variables(colours)) for colours in (LIGHT, DARK))
     palette = f":root {{ {light} }}\n@media screen and (prefers-color-scheme: dark) {{ :root {{ {dark} }} }}\n"
     style = Markup(palette + _text("style.css"))
-    environment.globals |= {"policy": policy, "style": style, "script": Markup(script)}
+    environment.globals |= {"policy": policy, "style": style, "script": Markup(script), "light": light, "dark": dark}
     environment.globals |= {write.__name__: write for write in WRITERS}
     return environment
 

@@ -4,12 +4,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
 
 from en4dvar.plumbing.files import inside, make_folder, write_text
 from en4dvar.report.chart import COLUMN
-from en4dvar.report.palette import DARK, LIGHT, css_variables
+from en4dvar.report.html import render
 from en4dvar.report.svg import keep, svg
 from en4dvar_agarose import measured, paper, tables
 from en4dvar_agarose.figures import all_figures
@@ -46,10 +44,9 @@ def write_study(study: Study, directory: Path) -> Path:
 
 
 def _page(study: Study, figures: list[dict[str, Any]]) -> str:
-    environment = Environment(
-        loader=PackageLoader("en4dvar_agarose", "."), autoescape=True, undefined=StrictUndefined, trim_blocks=True
-    )
-    return environment.get_template("page.html.j2").render(
+    return render(
+        "page.html.j2",
+        "en4dvar_agarose",
         plan=study.plan,
         sweep=study.plan.sweep,
         seconds=study.seconds,
@@ -73,8 +70,6 @@ def _page(study: Study, figures: list[dict[str, Any]]) -> str:
         campaigns=_campaigns() if study.plan.synthetic else [],
         reliability=_reliability() if study.plan.synthetic else [],
         figures=figures,
-        light=Markup(css_variables(LIGHT)),
-        dark=Markup(css_variables(DARK)),
     )
 
 

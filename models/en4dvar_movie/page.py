@@ -7,11 +7,9 @@ import io
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
 
 from en4dvar.report.chart import PAGE, Chart, Panel, Row
-from en4dvar.report.palette import DARK, LIGHT, css_variables
+from en4dvar.report.html import render
 from en4dvar.report.svg import svg
 from en4dvar_movie.frames import Frame, Movie
 from en4dvar_movie.outline import MODES
@@ -28,13 +26,10 @@ DASHES = ("", "--", ":", "", "--")
 
 def page_text(movie: Movie, track: Track, scale: Scale, command: str) -> str:
     """The page, one file without addresses."""
-    environment = Environment(
-        loader=PackageLoader("en4dvar_movie", "."), autoescape=True, undefined=StrictUndefined, trim_blocks=True
-    )
     used = [r for r in track.readings if r.used]
-    return environment.get_template("page.html.j2").render(
-        light=Markup(css_variables(LIGHT)),
-        dark=Markup(css_variables(DARK)),
+    return render(
+        "page.html.j2",
+        "en4dvar_movie",
         movie=movie.path.name,
         notes=[*movie.notes, *track.notes],
         command=command,
