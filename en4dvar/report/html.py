@@ -19,7 +19,7 @@ WRITERS = (  # what templates call
 )  # fmt: skip
 
 
-def render(template: str, package: str = "en4dvar.report", **content: Any) -> str:
+def render(template: str, package: str = "en4dvar.report", /, **content: Any) -> str:
     """The page of a template of a package as text; of ours with the scripts of charts and of tables that are sorted.
 
     A content security policy forbids the page every address and every script but these: what escaping might miss

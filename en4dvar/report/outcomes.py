@@ -8,7 +8,7 @@ from en4dvar.plumbing.tables import table
 from en4dvar.report.sequence import sequence_figures
 from en4dvar.report.svg import on_paper
 from en4dvar.report.twin import scores as scores_in_time
-from en4dvar.results.series_file import estimates, sequence_group, twin_group
+from en4dvar.results.series_file import estimates, series_group
 from en4dvar.series.problem import SeriesResult
 from en4dvar.series.twin import TwinResult
 
@@ -37,7 +37,7 @@ class TwinOutcome(TwinResult):
 
     def plot(self) -> Figure:
         """RMSE and spread in time."""
-        return on_paper(scores_in_time(twin_group(self, {})))
+        return on_paper(scores_in_time(series_group(self, {})))
 
 
 class SequenceOutcome(SeriesResult):
@@ -60,7 +60,7 @@ class SequenceOutcome(SeriesResult):
 
     def plot(self) -> Figure:
         """The state in time, or the parameters where it is known."""
-        _, _, chart = next(sequence_figures(sequence_group(self, {})))
+        _, _, chart = next(sequence_figures(series_group(self, {})))
         return on_paper(chart)
 
 

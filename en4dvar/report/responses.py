@@ -70,9 +70,9 @@ def stored_ledger(result: StoredResult) -> tuple[tuple[StoredEntry, ...], ...]:
     def entry(i: int, parameter: str, quantity: str) -> StoredEntry:
         v = stats.variables[quantity + ending]
         shown = v.attrs["display_units"]
-        numbers = convert(np.asarray(v.values[i], dtype=float), v.attrs["units"], shown).tolist()
-        name, words = quantity.removeprefix("ledger_"), (about[parameter]["symbol"], v.attrs["long_name"])
-        return StoredEntry(parameter, name, shown, *numbers, *words)
+        low, median, high = convert(np.asarray(v.values[i], dtype=float), v.attrs["units"], shown).tolist()
+        name, symbol, label = quantity.removeprefix("ledger_"), about[parameter]["symbol"], v.attrs["long_name"]
+        return StoredEntry(parameter, name, shown, low, median, high, symbol, label)
 
     names = list(map(str, stats.coords["path_parameter"].values))
     return tuple(tuple(entry(i, name, q) for q in quantities) for i, name in enumerate(names))

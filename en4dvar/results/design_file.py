@@ -102,10 +102,6 @@ class Designs:
 
 def save_designs(path: Path, rows: Sequence[DesignRow], asked: Asked, attributes: Mapping[str, Any]) -> Path:
     """Write the file; it appears complete or not at all. Raises :class:`OutputError`."""
-    return to_bytes({"/": _group(rows, asked, attributes)}).write(path)
-
-
-def _group(rows: Sequence[DesignRow], asked: Asked, attributes: Mapping[str, Any]) -> Group:
     (time, _), (value, _) = asked.axes
     units = {"method": "", "std": "", "times": time, "grid": time, "fan": value}
     fixed = {"parameter": len(asked.parameters), "level": len(FAN)}
@@ -125,7 +121,8 @@ def _group(rows: Sequence[DesignRow], asked: Asked, attributes: Mapping[str, Any
         for key, (name, label) in DECISION.items():
             variables[name] = variable("design", _padded(decisions, key, [], {}), "1", label)
     root = {**attributes, "asked": json.dumps(asked.__dict__)}
-    return Group(variables, {"parameter": variable("parameter", text(asked.parameters), "", "asked for")}, root)
+    parameters = {"parameter": variable("parameter", text(asked.parameters), "", "asked for")}
+    return to_bytes({"/": Group(variables, parameters, root)}).write(path)
 
 
 def _padded(

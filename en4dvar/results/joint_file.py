@@ -18,7 +18,7 @@ from en4dvar.plumbing.caution import Caution, parsed, worst_first
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.units import convert
 from en4dvar.results.declared import text
-from en4dvar.results.netcdf import Group, Groups, Variable, read_groups, to_bytes, understood, variable
+from en4dvar.results.netcdf import Group, Variable, read_groups, to_bytes, understood, variable
 from en4dvar.results.xarrays import tree_of
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 FILE = "joint.nc"
 QUANTILES = (0.05, 0.5, 0.95)
-_DRAWS = ("chain", "draw")
+DRAWS = ("chain", "draw")
 
 
 @dataclass(frozen=True)
@@ -39,11 +39,6 @@ class Alone:
 
 def save_joint(path: Path, estimate: JointEstimate, alone: Sequence[Alone], attributes: Mapping[str, Any]) -> Path:
     """Write the file; it appears complete or not at all. Raises :class:`OutputError`."""
-    return to_bytes(joint_groups(estimate, alone, attributes)).write(path)
-
-
-def joint_groups(estimate: JointEstimate, alone: Sequence[Alone], attributes: Mapping[str, Any]) -> Groups:
-    """All of the file."""
     names = [experiment.observations.name for experiment in estimate.joint.experiments]
     datasets = {"dataset": variable("dataset", text(names), "", "data set")}
     root = {
@@ -75,7 +70,7 @@ def joint_groups(estimate: JointEstimate, alone: Sequence[Alone], attributes: Ma
     }
     if estimate.without:
         groups["/without"] = Group(_shared(estimate.rest), attrs={"warnings": _lines(estimate.rest)})
-    return groups
+    return to_bytes(groups).write(path)
 
 
 def _lines(estimate: JointEstimate) -> str:
@@ -100,7 +95,7 @@ def _shared(estimate: JointEstimate) -> dict[str, Variable]:
         label = f"{p.label}, {group}" if group else p.label
         mode = float(estimate.shared_mode[j])
         name = shared_name(estimate.joint.shared[j])
-        variables[name] = variable(_DRAWS, estimate.shared[None, :, j], p.unit, label, mode=mode, **_about(p))
+        variables[name] = variable(DRAWS, estimate.shared[None, :, j], p.unit, label, mode=mode, **_about(p))
     return variables
 
 
@@ -118,7 +113,7 @@ def _own(estimate: JointEstimate, names: Sequence[str]) -> dict[str, Variable]:
     taken = {shared_name(key) for key in estimate.joint.shared}
     return {
         f"{name}_own" if name in taken else name: variable(
-            (*_DRAWS, "dataset"), array, parameters[name].unit, parameters[name].label, **_about(parameters[name])
+            (*DRAWS, "dataset"), array, parameters[name].unit, parameters[name].label, **_about(parameters[name])
         )
         for name, array in values.items()
     }

@@ -127,20 +127,11 @@ def netcdf_attributes(attributes: Mapping[Any, Any]) -> dict[str, Any]:
     return {str(key): plain(value) for key, value in attributes.items()}
 
 
-def variable(
-    dims: str | tuple[str, ...],
-    values: Any,
-    units: str,
-    long_name: str,
-    *,
-    fill: bool = True,
-    single: bool = False,
-    **attrs: Any,
-) -> Variable:
+def variable(dims: str | tuple[str, ...], values: Any, units: str, long_name: str, **attrs: Any) -> Variable:
     """A variable with what CF asks of it."""
     dims = (dims,) if isinstance(dims, str) else dims
     attributes = netcdf_attributes({"units": units, "long_name": long_name, **attrs})
-    return Variable(dims, np.asarray(values), attributes, fill, single)
+    return Variable(dims, np.asarray(values), attributes)
 
 
 Groups = Mapping[str, Group]

@@ -16,11 +16,10 @@ from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.caution import Caution, worst_first
 from en4dvar.plumbing.hints import natural
 from en4dvar.priors.prior import PriorTerm
-from en4dvar.problem import InverseProblem
 from en4dvar.results.checkpoint import digest
 from en4dvar.results.declared import parameter_of, text
-from en4dvar.results.joint_file import QUANTILES, StoredGroups, load_groups
-from en4dvar.results.netcdf import Group, Groups, Variable, to_bytes, understood, variable
+from en4dvar.results.joint_file import DRAWS, QUANTILES, StoredGroups, load_groups
+from en4dvar.results.netcdf import Group, Variable, to_bytes, understood, variable
 
 FILE = "population.nc"
 GROUPS = "groups"  # the folder of a run directory that holds one folder a group, each with its FILE
@@ -31,7 +30,6 @@ WORDS = {
     "next": "the next one",
 }
 HEADLINE = "median"
-_DRAWS = ("chain", "draw")
 
 
 def save_population(
@@ -42,15 +40,8 @@ def save_population(
 
     Raises :class:`OutputError`.
     """
-    return to_bytes(population_groups(population, alone, cautions, attributes)).write(path)
-
-
-def population_groups(
-    population: Population, alone: Sequence[Array], cautions: Sequence[Caution], attributes: Mapping[str, Any]
-) -> Groups:
-    """All of the file."""
-    names = text(problem.observations.name for problem in population.problems)
-    datasets = {"dataset": variable("dataset", names, "", "data set")}
+    observed = [problem.observations for problem in population.problems]
+    datasets = {"dataset": variable("dataset", text(o.name for o in observed), "", "data set")}
     free, effective = population.without_hyperprior(int(attributes["seed"]))
     root = {
         **attributes,
@@ -61,20 +52,27 @@ def population_groups(
         "common": " ".join(population.common),
         "effective_draws": population.size,
         "effective_draws_without_hyperprior": effective,
-        "log_evidence": population.log_evidence - sum(p.observations.log_normalisation() for p in population.problems),
+        "log_evidence": population.log_evidence - sum(o.log_normalisation() for o in observed),
         "forward_runs": population.forward_runs,
         "combinations": "\n".join(map(combination_line, population.combinations())),
         "warnings": "\n".join(c.line for c in worst_first(cautions)),
     }
-    return {
+    beside = _alone(population, alone)
+    if len(population.belongs):
+        words = "probability that the data set is of the population"
+        beside["belongs"] = variable("dataset", population.belongs, "1", words)
+    digests = text(digest(o.times.tobytes() + o.values.tobytes()) for o in observed)  # of the same readings the same
+    beside["readings"] = variable("dataset", digests, "", "SHA-256 of times and values of the readings")
+    groups = {
         "/": Group(attrs=root),
         "/posterior": Group(_draws(population, population.posterior) | _sets(population), datasets),
         "/prior": Group(_draws(population, population.prior)),
         "/without_hyperprior": Group(_draws(population, free)),
         "/white": Group(_white(population)),
-        "/alone": Group(_alone(population, alone) | _belongs(population) | _readings(population.problems), datasets),
+        "/alone": Group(beside, datasets),
         "/empirical": Group(_empirical(population)),
     }
+    return to_bytes(groups).write(path)
 
 
 def combination_line(combination: Combination) -> str:
@@ -99,7 +97,7 @@ def _draws(population: Population, draws: Draws) -> dict[str, Variable]:
                 more["learned"] = float(learned[what][j])
             if what == HEADLINE and draws is population.posterior:
                 more["std_between"], more["std_common"] = (float(part[j]) for part in population.parts)
-            result[f"{p.name}_{what}"] = variable(_DRAWS, values, p.unit, f"{p.label}: {words}", **_about(p), **more)
+            result[f"{p.name}_{what}"] = variable(DRAWS, values, p.unit, f"{p.label}: {words}", **_about(p), **more)
     return result
 
 
@@ -111,20 +109,8 @@ def _white(population: Population) -> dict[str, Variable]:
     for j, name in enumerate((*population.names, *population.common)):
         term = first.terms[first.names.index(name)]
         prior = json.dumps([term.transform, term.mean, term.std, [*term.bounds], [*term.shape]])
-        white[name] = variable(_DRAWS, columns[None, :, j], "1", f"{name} in units of its prior", prior=prior)
+        white[name] = variable(DRAWS, columns[None, :, j], "1", f"{name} in units of its prior", prior=prior)
     return white
-
-
-def _readings(problems: Sequence[InverseProblem]) -> dict[str, Variable]:
-    """(dataset,) which tells whether two populations hold the same readings."""
-    each = text(digest(p.observations.times.tobytes() + p.observations.values.tobytes()) for p in problems)
-    return {"readings": variable("dataset", each, "", "SHA-256 of times and values of the readings")}
-
-
-def _belongs(population: Population) -> dict[str, Variable]:
-    """(dataset,) how probably each data set is of the population."""
-    words = "probability that the data set is of the population"
-    return {"belongs": variable("dataset", population.belongs, "1", words)} if len(population.belongs) else {}
 
 
 def _empirical(population: Population) -> dict[str, Variable]:
@@ -142,7 +128,7 @@ def _sets(population: Population) -> dict[str, Variable]:
     """(chain, draw, dataset) of every parameter, given all data."""
     terms: tuple[PriorTerm, ...] = population.problems[0].constant.prior.terms
     return {
-        p.name: variable((*_DRAWS, "dataset"), population.sets[None, :, :, j], p.unit, p.label, **_about(p))
+        p.name: variable((*DRAWS, "dataset"), population.sets[None, :, :, j], p.unit, p.label, **_about(p))
         for j, p in enumerate(term.parameter for term in terms)
     }
 

@@ -4,19 +4,18 @@ import json
 import math
 from collections.abc import Callable
 from dataclasses import asdict
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from en4dvar.data.noise import BlockNoise
 from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.diagnosis.diagnostics import active_members, nrmse
-from en4dvar.diagnosis.residuals import Residuals
-from en4dvar.diagnosis.withheld import Withheld
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import codes
 from en4dvar.results.declared import Attribute
 
+P = TypeVar("P")
 CONVENTIONS = "CF-1.11 ACDD-1.3"
 REFERENCES = (
     "Bocquet & Sakov (2014), doi:10.1002/qj.2236; Sakov, Oliver & Bertino (2012), doi:10.1175/MWR-D-11-00176.1; "
@@ -80,24 +79,19 @@ def _discrepancy_share(a: Analysis) -> float | None:
     return 1 - float(left @ left) / (float(residual @ residual) or np.nan)
 
 
-def _withheld(name: str, meaning: str, value: Callable[[Withheld], Any]) -> Attribute:
-    """Written where there are readings after the window."""
-    return Attribute(name, meaning, lambda a: None if a.withheld is None else value(a.withheld))
+def _of(part: Callable[[Analysis], P | None]) -> Callable[[str, str, Callable[[P], Any]], Attribute]:
+    """Attributes of a part of an analysis, which are written where there is one."""
+
+    def attribute(name: str, meaning: str, value: Callable[[P], Any]) -> Attribute:
+        return Attribute(name, meaning, lambda a: None if (held := part(a)) is None else value(held))
+
+    return attribute
 
 
-def _residual(name: str, meaning: str, value: Callable[[Residuals], Any]) -> Attribute:
-    """A number of the residuals; none where there are too few readings."""
-    return Attribute(name, meaning, lambda a: value(a.residuals) if a.residuals and a.residuals.enough else None)
-
-
-def _change(name: str, meaning: str, value: Callable[[Analysis], Any]) -> Attribute:
-    """Written where parameters may vary in time."""
-    return Attribute(name, meaning, lambda a: None if a.log_evidence_change is None else value(a))
-
-
-def _search(name: str, meaning: str, value: Callable[[Any], Any]) -> Attribute:
-    """Written of a scheme that searches for several minima."""
-    return Attribute(name, meaning, lambda a: None if a.descents is None else value(a.descents))
+_withheld = _of(lambda a: a.withheld)
+_residual = _of(lambda a: a.residuals if a.residuals and a.residuals.enough else None)
+_change = _of(lambda a: None if a.log_evidence_change is None else a)  # of parameters that may vary in time
+_search = _of(lambda a: a.descents)  # of a scheme that searches for several minima
 
 
 ROOT = (

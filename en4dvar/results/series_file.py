@@ -30,17 +30,11 @@ def read_series(path: Path) -> Group:
     return read_groups(path)["/"]
 
 
-def sequence_group(result: SeriesResult, attributes: Mapping[str, Any]) -> Group:
-    """Estimates over (time, state), observations and innovations over (time, observation), members."""
-    return _group("sequence.nc", result, attributes)
-
-
-def twin_group(result: TwinResult, attributes: Mapping[str, Any]) -> Group:
-    """Truth, observations, moments and scores over (time, state)."""
-    return _group("twin.nc", result, attributes)
-
-
-def _group(file: str, result: SeriesResult | TwinResult, attributes: Mapping[str, Any]) -> Group:
+def series_group(result: SeriesResult | TwinResult, attributes: Mapping[str, Any]) -> Group:
+    """Estimates over (time, state), observations and innovations over (time, observation); members of a sequence, truth
+    and scores of a twin experiment.
+    """
+    file = "twin.nc" if isinstance(result, TwinResult) else "sequence.nc"
     root = netcdf_attributes({**attributes_of(ATTRIBUTES[file], result), **attributes})
     return Group(lay_out(TABLES[file], result, SCOPES), lay_out(COORDINATES[file], result, SCOPES), root)
 

@@ -6,7 +6,7 @@ After a kill they go on from the latest checkpoint.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar
 
@@ -14,6 +14,7 @@ from en4dvar.executor import Executor, make_executor
 from en4dvar.plumbing.files import write_text
 from en4dvar.results.checkpoint import FOLDER, Keeper, digest
 from en4dvar.results.netcdf import Group, to_bytes
+from en4dvar.results.series_file import series_group
 from en4dvar.runs.kind import FIGURES, REPORT, RunKind
 from en4dvar.runs.session import Session
 from en4dvar.series.moments import SequentialState
@@ -29,11 +30,10 @@ class Cycles(RunKind[R]):
     """A run of cycles, one after the other; its files are called after the kind.
 
     ``on_cycle`` is called with the number of each cycle, or the index of its last observation time, from 0.
-    ``laid_out``: result, attributes → what its file holds; ``summary``: result → ``summary.csv``.
+    ``summary``: result → ``summary.csv``.
     """
 
     pages = (REPORT, *FIGURES)
-    laid_out: ClassVar[staticmethod[[Any, Mapping[str, Any]], Group]]
     summary: ClassVar[staticmethod[[Any], str]]
     config: Any
     on_cycle: Callable[[int], None] | None = None
@@ -49,7 +49,7 @@ class Cycles(RunKind[R]):
 
     def again(self, executor: Executor) -> Group:
         """What its file holds, computed again, without attributes of the making."""
-        return self.laid_out(self.assimilated(executor, None, None), {})
+        return series_group(self.assimilated(executor, None, None), {})
 
     def executor(self) -> Executor:
         return make_executor(self.model, self.config.execution.workers)
@@ -75,7 +75,7 @@ class Cycles(RunKind[R]):
             keeper.write(state())
         run.log.write("\n".join(f"member lost: {reason}" for reason in result.run.failures))
         own = {"identity": run.identity.settings, "name": self.config.name, "scheme": self.config.scheme}
-        to_bytes({"/": self.laid_out(result, {**run.attributes, **own})}).write(run.directory.at(self.result))
+        to_bytes({"/": series_group(result, {**run.attributes, **own})}).write(run.directory.at(self.result))
         write_text(run.directory.at("summary.csv"), self.summary(result))
         if self.config.report:
             self.page(run.directory.work, figures=self.config.figures)

@@ -13,7 +13,7 @@ from en4dvar.executor import Executor
 from en4dvar.inputs.asked import DataFile
 from en4dvar.report.outcomes import SequenceOutcome
 from en4dvar.results.checkpoint import FOLDER
-from en4dvar.results.series_file import sequence_csv, sequence_group
+from en4dvar.results.series_file import sequence_csv
 from en4dvar.runs.cycles import Cycles, Keep
 from en4dvar.runs.engine import conduct_run
 from en4dvar.series.moments import SequentialState
@@ -46,7 +46,6 @@ class SequenceKind(Cycles[SeriesResult]):
     result = "sequence.nc"
     files = (result, "summary.csv", f"{FOLDER}/sequence.cycle")
     writer = "en4dvar.report.sequence:write_sequence_report"
-    laid_out = staticmethod(sequence_group)
     summary = staticmethod(sequence_csv)
 
     @cached_property

@@ -8,7 +8,7 @@ from en4dvar.config import TwinConfig, load_twin, loaded
 from en4dvar.executor import Executor
 from en4dvar.report.outcomes import TwinOutcome
 from en4dvar.results.checkpoint import FOLDER
-from en4dvar.results.series_file import twin_csv, twin_group
+from en4dvar.results.series_file import twin_csv
 from en4dvar.runs.cycles import Cycles, Keep
 from en4dvar.runs.engine import conduct_run
 from en4dvar.series.moments import SequentialState
@@ -39,7 +39,6 @@ class TwinKind(Cycles[TwinResult]):
     result = "twin.nc"
     files = (result, "summary.csv", f"{FOLDER}/twin.cycle")
     writer = "en4dvar.report.twin:write_twin_report"
-    laid_out = staticmethod(twin_group)
     summary = staticmethod(twin_csv)
 
     @property

@@ -23,7 +23,7 @@ EARLY = tuple(f"en4dvar.runs.{step}" for step in ("runner.data_files", "runner.b
 BEGUN = (
     *(f"en4dvar.runs.engine.{step}" for step in ("identity", "provenance", "RunLog.write", "RunDirectory.publish")),
     *(f"en4dvar.runs.{step}" for step in ("session.write_checkpoint", "runner.datasets", "worklist.summary_rows")),
-    *(f"en4dvar.runs.twin_run.{step}" for step in ("TwinKind.laid_out", "conduct", "TwinKind.summary")),
+    *(f"en4dvar.runs.{step}" for step in ("cycles.series_group", "twin_run.conduct", "twin_run.TwinKind.summary")),
 )
 pytestmark = pytest.mark.parametrize("before", ["", "--force", "--resume"])  # a first run, or one after another
 
@@ -40,7 +40,7 @@ def told_at(
     step: str, before: str, folder: Path, monkeypatch: pytest.MonkeyPatch, *later: str
 ) -> tuple[str, list[str], list[str]]:
     """What is kept and what to type, as told after interrupts at ``step`` and ``later``, and what was typed."""
-    if ".twin_run." in step:
+    if ".twin_run." in step or ".cycles." in step:
         path = folder / "twin.yaml"
         path.write_text(TWIN)
     else:
