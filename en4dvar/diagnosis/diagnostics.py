@@ -127,18 +127,6 @@ def is_non_gaussian(shape: Mapping[str, float]) -> bool:
     return shape.get("gaussian_fit", 1.0) < GAUSSIAN_ENOUGH
 
 
-def shape_warnings(shape: Mapping[str, float]) -> tuple[str, ...]:
-    """Words for a posterior that no Gaussian ensemble describes."""
-    if not is_non_gaussian(shape):
-        return ()
-    if shape.get("emulator_fit", 0.0) >= EMULATED_ENOUGH:
-        return ("the posterior is far from Gaussian: mean and spread of the ensemble are not the posterior's",)
-    return (
-        f"the posterior is far from Gaussian (effective share of members {shape['gaussian_fit']:.2f}): mean and spread "
-        "of the ensemble may be off by more than they say",
-    )
-
-
 def active_members(failures: Sequence[str]) -> npt.NDArray[np.bool_]:
     """(N,) True where no reason of failure is given."""
     return np.array([reason == "" for reason in failures], dtype=bool)

@@ -52,10 +52,10 @@ class Movie:
         try:
             for number, read in enumerate(self.open()):
                 if number == 0:
-                    channel = _channel(read)
+                    channel, coloured = _channel(read)
                     name = ("red", "green", "blue")[channel]
                     words = f"{self.path}: frames are in colour; the channel with most light, {name}, is used"
-                    if _is_coloured(read) and words not in self.notes:
+                    if coloured and words not in self.notes:
                         self.notes.append(words)
                 frame = _grey(read, channel, f"{self.path}: frame {number}")
                 shape = shape or frame.shape
@@ -111,18 +111,13 @@ def _grey(read: Any, channel: int, where: str) -> Frame:
     return frame
 
 
-def _channel(read: Any) -> int:
-    """The channel with most light: in that of the lamp a bubble is darkest."""
-    frame = np.asarray(read)
-    return int(np.argmax(frame[..., :3].mean(axis=(0, 1)))) if frame.ndim == 3 and frame.shape[2] in (3, 4) else 0
-
-
-def _is_coloured(read: Any) -> bool:
+def _channel(read: Any) -> tuple[int, bool]:
+    """The channel with most light, for in that of the lamp a bubble is darkest; whether the frame is a coloured one."""
     frame = np.asarray(read)
     if frame.ndim != 3 or frame.shape[2] not in (3, 4):
-        return False
-    full = np.iinfo(frame.dtype).max if frame.dtype.kind in "ui" else 1.0
-    return float(np.mean(np.ptp(frame[..., :3], axis=2))) > COLOUR * full
+        return 0, False
+    colours, full = frame[..., :3], np.iinfo(frame.dtype).max if frame.dtype.kind in "ui" else 1.0
+    return int(np.argmax(colours.mean(axis=(0, 1)))), float(np.mean(np.ptp(colours, axis=2))) > COLOUR * full
 
 
 def _size(shape: tuple[int, ...]) -> str:

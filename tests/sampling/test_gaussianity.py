@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from toys import Linear, make_problem
 
-from en4dvar.diagnosis.diagnostics import gaussianity, is_non_gaussian, shape_warnings
+from en4dvar.diagnosis.diagnostics import gaussianity, is_non_gaussian
+from en4dvar.diagnosis.honesty.checks import gaussian
 from en4dvar.estimation.assimilate import assimilate
+from en4dvar.priors.prior import Prior
 from en4dvar.schemes.settings import AssimilationSettings
 
 
@@ -38,8 +40,9 @@ def test_a_curved_or_narrow_posterior_is_flagged():
     for costs in (banana, third):
         shape = gaussianity(x, np.zeros(3), costs)
         assert is_non_gaussian(shape)
-        assert "far from Gaussian" in shape_warnings(shape)[0]
-    assert shape_warnings(gaussianity(x, np.zeros(3), 0.5 * np.sum(x**2, axis=1))) == ()
+        (finding,) = gaussian(Prior(()), x, shape)
+        assert "far from Gaussian" in finding.words
+    assert not [*gaussian(Prior(()), x, gaussianity(x, np.zeros(3), 0.5 * np.sum(x**2, axis=1)))]
 
 
 def test_lost_members_have_no_weight_and_too_few_say_nothing():

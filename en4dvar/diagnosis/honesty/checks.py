@@ -14,7 +14,7 @@ from en4dvar.diagnosis.diagnostics import (
     MEAN_OFF,
     SPREAD_OFF,
     chi2_interval,
-    shape_warnings,
+    is_non_gaussian,
 )
 from en4dvar.diagnosis.residuals import Residuals
 from en4dvar.model.forward import ValidityLimit
@@ -226,10 +226,16 @@ def gaussian(prior: Prior, members: Array, shape: Mapping[str, float]) -> Findin
     Sizes are those of the numbers that are printed, for G of G and not of ln G: ``shape`` holds mean and std of the
     emulated posterior. The finding is about the parameters that are off, and serious where one is off by much.
     """
-    if not (words := shape_warnings(shape)):
+    if not is_non_gaussian(shape):
         return
     sizes, off, severity = [], [], None
+    words = "the posterior is far from Gaussian: mean and spread of the ensemble are not the posterior's"
     believed = shape.get("emulator_fit", 0.0) >= EMULATED_ENOUGH
+    if not believed:
+        words = (
+            f"the posterior is far from Gaussian (effective share of members {shape['gaussian_fit']:.2f}): mean and "
+            "spread of the ensemble may be off by more than they say"
+        )
     for j, p in enumerate(prior.parameters if believed else ()):
         std = shape.get(f"emulated_std_{p.name}", math.nan)
         shift = (float(members[:, j].mean()) - shape.get(f"emulated_mean_{p.name}", math.nan)) / std
@@ -240,7 +246,7 @@ def gaussian(prior: Prior, members: Array, shape: Mapping[str, float]) -> Findin
             if abs(shift) > 1 or not 0.5 < ratio < 2:
                 severity = SERIOUS
     more = f": {'; '.join(sizes)}" if sizes else ""
-    yield caution("non-gaussian", f"{words[0]}{more}", severity, tuple(off))
+    yield caution("non-gaussian", f"{words}{more}", severity, tuple(off))
 
 
 def _both(p: Parameter, members: Array, shape: Mapping[str, float]) -> str:

@@ -50,6 +50,7 @@ def examine(
     alive = active_members(a.posterior_failures)
     members = a.posterior[alive]
     last, n_used = a.iterations[-1], len(a.problem.observations.used)
+    whole = control.costs is not None  # the ensembles stand for the whole covariance
     warnings = (
         *earlier,
         *a.problem.observations.doubts,
@@ -57,14 +58,15 @@ def examine(
         *checks.down_weighted(a),
         *checks.weighted(a),
         *unfinished(a),
-        *_whole(prior, control, alive),
+        *(checks.rank(prior, control.prior, control.posterior[alive]) if whole else ()),
+        *(collapse(prior, control, alive) if whole else ()),
         *loss("prior forecast", a.prior_failures, prior, control.prior),
         *loss("iterations", worst_loss, prior),
         *loss("posterior forecast", a.posterior_failures, prior, control.posterior),
         *checks.fit(last.chi2_per_observation * n_used, n_used, last.dfs),
         *_structure(a),
         *checks.missed(a),
-        *(checks.conflict(prior, control.centre) if control.costs is not None else ()),
+        *(checks.conflict(prior, control.centre) if whole else ()),
         *checks.at_bound(prior, control.prior, control.posterior, a.posterior_failures),
         *_validity(a, alive),
         *checks.gaussian(prior, members, a.shape),
@@ -73,13 +75,6 @@ def examine(
     silent |= {term.parameter.name for change in a.problem.varying for term in change.terms}  # data may say little
     little = checks.information(prior, control.posterior[alive], a.dfs_per_parameter, silent)
     return advised(a, worst_first((*warnings, *little)))
-
-
-def _whole(prior: Prior, control: ControlEnsembles, alive: npt.NDArray[np.bool_]) -> checks.Findings:
-    """Warnings about the directions and the size of an ensemble that stands for the whole covariance."""
-    if control.costs is not None:
-        yield from checks.rank(prior, control.prior, control.posterior[alive])
-        yield from collapse(prior, control, alive)
 
 
 def _beside(a: Analysis) -> set[str]:

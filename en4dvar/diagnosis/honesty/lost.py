@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from en4dvar.diagnosis.diagnostics import active_members, common_reasons
+from en4dvar.diagnosis.honesty.checks import shown
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.units import convert
@@ -83,7 +84,5 @@ def _rank_score(values: Array, lost: Mask) -> float:
 
 def _shown(prior: Prior, j: int, x: float) -> str:
     """A transformed value as physical, in its display unit."""
-    parameter = prior.parameters[j]
-    value = convert(float(prior.terms[j].to_physical(np.asarray(x))), parameter.unit, parameter.display_unit)
-    unit = "" if parameter.display_unit == "1" else f" {parameter.display_unit}"
-    return f"{value:.3g}{unit}"
+    p = prior.parameters[j]
+    return shown(convert(float(prior.terms[j].to_physical(np.asarray(x))), p.unit, p.display_unit), p)
