@@ -77,20 +77,15 @@ def _track(root: Path, fields: Fields) -> list[str]:
 
 
 def _init(root: Path, fields: Fields) -> list[str]:
-    data, out = existing(root, fields, "table"), _new(root, fields, "proposal", ".yaml")
+    data, name = existing(root, fields, "table"), fields.get("proposal", "").strip()
+    if not name or Path(name).name != name or name.startswith("."):
+        raise FieldError("give the new proposal a name without '/', such as gel.yaml")
+    out = _unused(root, f"{name.removesuffix('.yaml')}.yaml", "give the new proposal another name")
     return ["init", f"--data={data}", *_options(fields, OF_INIT), f"--out={out}"]
 
 
-def _new(root: Path, fields: Fields, key: str, suffix: str) -> str:
-    """The name of a file that is not there: no command of the page replaces what somebody may have edited."""
-    name = fields.get(key, "").strip()
-    if not name or Path(name).name != name or name.startswith("."):
-        raise FieldError(f"give the new {key} a name without '/', such as gel{suffix}")
-    name = name if name.endswith(suffix) else f"{name}{suffix}"
-    return _unused(root, name, f"give the new {key} another name")
-
-
 def _unused(root: Path, name: str, otherwise: str) -> str:
+    """The name of a file that is not there: no command of the page replaces what somebody may have edited."""
     if below(root, name).exists():
         raise FieldError(f"{name}: exists and is not replaced; {otherwise}")
     return name
@@ -103,8 +98,8 @@ def _config(root: Path, fields: Fields) -> str:
     return name
 
 
-def _run_dir(root: Path, fields: Fields, key: str = "run") -> str:
-    name = fields.get(key, "").strip()
+def _run_dir(root: Path, fields: Fields) -> str:
+    name = fields.get("run", "").strip()
     if not name or name in (".", "..") or "/" in name or "\\" in name or name.startswith("-"):
         raise FieldError("give the run a name without '/'")
     below(root, f"runs/{name}")
@@ -114,10 +109,6 @@ def _run_dir(root: Path, fields: Fields, key: str = "run") -> str:
 def _run(root: Path, fields: Fields) -> list[str]:
     out = _unused(root, _run_dir(root, fields), "give the new run another name, or continue that run")
     return ["run", _config(root, fields), f"--out={out}"]
-
-
-def _resume(root: Path, fields: Fields) -> list[str]:
-    return ["run", _config(root, fields), f"--out={_run_dir(root, fields)}", "--resume"]
 
 
 def _compare(root: Path, fields: Fields) -> list[str]:
@@ -140,7 +131,7 @@ STEPS: dict[str, Callable[[Path, Fields], list[str]]] = {
     "validate": lambda root, fields: ["validate", _config(root, fields)],
     "prior": lambda root, fields: ["validate", _config(root, fields), "--plot"],
     "run": _run,
-    "resume": _resume,
+    "resume": lambda root, fields: ["run", _config(root, fields), f"--out={_run_dir(root, fields)}", "--resume"],
     "compare": _compare,
     "export": _export,
 }
