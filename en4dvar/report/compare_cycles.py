@@ -46,10 +46,11 @@ def compare_sequences(run_dirs: Sequence[Path]) -> tuple[SequenceScore, ...]:
         if not all(_same(reference, other, key) for key in READINGS):
             raise OutputError(f"{name} and {first} hold other readings or errors: their evidences cannot be compared")
     evidence = np.array([float(data.attrs["log_evidence"]) for data in runs.values()])
-    each = zip(runs.items(), evidence, softmax(evidence), strict=True)
+    sizes = [np.sqrt(np.nanmean(data["normalised_innovation"].values ** 2)) for data in runs.values()]
+    each = zip(evidence, evidence - evidence.max(), softmax(evidence), sizes, strict=True)
     return tuple(
-        SequenceScore(run, str(data.attrs["scheme"]), float(log), float(log - evidence.max()), float(p), _size(data))
-        for (run, data), log, p in each
+        SequenceScore(run, str(data.attrs["scheme"]), *map(float, numbers))
+        for (run, data), numbers in zip(runs.items(), each, strict=True)
     )
 
 
@@ -85,7 +86,3 @@ def _same(first: Group, other: Group, key: str) -> bool:
         return key not in first and key not in other
     a, b = first[key].values, other[key].values
     return a.dtype.kind == b.dtype.kind and np.array_equal(a, b, equal_nan=a.dtype.kind == "f")
-
-
-def _size(data: Group) -> float:
-    return float(np.sqrt(np.nanmean(data["normalised_innovation"].values ** 2)))

@@ -188,8 +188,13 @@ def _estimate(row: ParameterSummary, cautions: Sequence[Caution], notes: Notes) 
         value = _interval(row)
     elif row.untrusted:
         value = f"${_tex(plain_number(row.mean, 3))}$"
+    elif skewed(row):
+        middle, above, below = (
+            _tex(number_like(value, row.std)) for value in (row.q50, row.q95 - row.q50, row.q50 - row.q05)
+        )
+        value = f"${middle}^{{+{above}}}_{{-{below}}}$"
     else:
-        value = _asymmetric(row) if skewed(row) else plus_minus(row.mean, row.std)
+        value = plus_minus(row.mean, row.std)
     return f"{value}{notes.mark(row, cautions)}"
 
 
@@ -197,12 +202,6 @@ def skewed(row: ParameterSummary) -> bool:
     """Whether one side of the 90 % interval is more than twice the other: mean ± std would mislead."""
     below, above = row.q50 - row.q05, row.q95 - row.q50
     return max(below, above) > SKEWED * min(below, above)
-
-
-def _asymmetric(row: ParameterSummary) -> str:
-    """The median with its distances to the 5 and 95 % quantiles."""
-    above, below = (_tex(number_like(side, row.std)) for side in (row.q95 - row.q50, row.q50 - row.q05))
-    return f"${_tex(number_like(row.q50, row.std))}^{{+{above}}}_{{-{below}}}$"
 
 
 def _interval(row: ParameterSummary) -> str:
