@@ -29,11 +29,13 @@ from en4dvar.executor import ThreadsExecutor
 from en4dvar.priors.prior import own_seed
 from en4dvar.runs.synthetic import draw_campaign
 from en4dvar_agarose.fits import HYPER, LEVELS
-from en4dvar_agarose.measured import FOLDER, POPULATION_HEAD
+from en4dvar_agarose.measured import FOLDER
 from en4dvar_agarose.run import POPULATION
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 GELS = {"03": "0.3 %", "10": "1 %"}
+HEAD = ["gel", "seed", "parameter", "low", "median", "high", "true_mean", "mean_of_truths", "stacked_mean"]
+HEAD += ["effective_hierarchy", "effective_sets", "effective"]
 FIRST_SEED = 100
 THREADS = int(os.environ.get("THREADS", "2"))
 
@@ -73,7 +75,7 @@ def main() -> None:
     key, count = sys.argv[1], int(sys.argv[2])
     first = FIRST_SEED + (int(sys.argv[3]) if len(sys.argv) > 3 else 0)
     file = FOLDER / "population.csv"
-    kept = list(csv.reader(file.read_text(encoding="utf-8").splitlines())) if file.exists() else [POPULATION_HEAD]
+    kept = list(csv.reader(file.read_text(encoding="utf-8").splitlines())) if file.exists() else [HEAD]
     done = {(row[0], row[1]) for row in kept[1:]}
     for seed in range(first, first + count):
         if (GELS[key], str(seed)) in done:
@@ -82,7 +84,7 @@ def main() -> None:
         rows = campaign(key, seed)
         with file.open("a", encoding="utf-8", newline="") as stream:
             writer = csv.writer(stream, lineterminator="\n")
-            writer.writerows([*([] if file.stat().st_size else [POPULATION_HEAD]), *rows])
+            writer.writerows([*([] if file.stat().st_size else [HEAD]), *rows])
         told = ", ".join(f"{r[2]} {float(r[3]) / float(r[6]):.2f}–{float(r[5]) / float(r[6]):.2f}" for r in rows)
         judged = f"effective {rows[0][11]} (hierarchy {rows[0][9]}, data sets {rows[0][10]})"
         print(f"{seed}: interval / truth: {told}; {judged} ({time.perf_counter() - start:.1f} s)", flush=True)

@@ -29,10 +29,11 @@ from en4dvar.executor import ThreadsExecutor
 from en4dvar.problem import InverseProblem
 from en4dvar.schemes.settings import AssimilationSettings
 from en4dvar_agarose.fits import probability
-from en4dvar_agarose.measured import FOLDER, RELIABILITY_HEAD
+from en4dvar_agarose.measured import FOLDER
 
 THREADS = int(os.environ.get("THREADS", "2"))
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
+HEAD = ["experiment", "number", "generated_by", "delta_log_evidence"]
 FEWEST = 5
 
 
@@ -102,7 +103,7 @@ def main() -> None:
     name, count = sys.argv[1], int(sys.argv[2])
     first = int(sys.argv[3]) if len(sys.argv) > 3 else 0
     file = FOLDER / "reliability.csv"
-    kept = list(csv.reader(file.read_text(encoding="utf-8").splitlines())) if file.exists() else [RELIABILITY_HEAD]
+    kept = list(csv.reader(file.read_text(encoding="utf-8").splitlines())) if file.exists() else [HEAD]
     done = {(row[0], row[1]) for row in kept[1:]}
     experiment = EXPERIMENTS[name]
     bases = problems(experiment)
@@ -112,9 +113,7 @@ def main() -> None:
         law, difference = compare(bases, experiment, number)
         with file.open("a", encoding="utf-8", newline="") as stream:
             writer = csv.writer(stream, lineterminator="\n")
-            writer.writerows(
-                [*([] if file.stat().st_size else [RELIABILITY_HEAD]), [name, number, law, f"{difference:.4f}"]]
-            )
+            writer.writerows([*([] if file.stat().st_size else [HEAD]), [name, number, law, f"{difference:.4f}"]])
     rows = [row for row in csv.reader(file.read_text(encoding="utf-8").splitlines()) if row[0] == name]
     delta = np.array([float(row[3]) for row in rows])
     right = (delta > 0) == np.array([row[2] == "qlkv" for row in rows])

@@ -14,9 +14,6 @@ from en4dvar.model.state import Array
 from en4dvar_agarose.fits import probability
 
 FOLDER = Path(__file__).parent
-POPULATION_HEAD = ["gel", "seed", "parameter", "low", "median", "high", "true_mean", "mean_of_truths", "stacked_mean"]
-POPULATION_HEAD += ["effective_hierarchy", "effective_sets", "effective"]
-RELIABILITY_HEAD = ["experiment", "number", "generated_by", "delta_log_evidence"]
 
 LEVEL, FIRST = 0.95, 20  # of the intervals; campaigns that the criterion asks for
 EDGES = (0.5, 0.6, 0.75, 0.9, 0.99, 1.0 + 1e-9)  # of the stated probability of the favoured law
