@@ -225,14 +225,10 @@ def comparison_table(comparison: Comparison) -> str:
     if comparison.incomparable:
         verdicts = [comparison.verdict("")]
     notes = [STORED] if any(s.stored for s in comparison.scores) and not comparison.incomparable else []
-    return "\n".join([table([header, *rows]), *notes, "", *verdicts, *_warned(comparison.cautions)])
-
-
-def _warned(cautions: Sequence[ComparedCaution]) -> list[str]:
-    """Lines of the terminal: the worst warnings of all runs."""
-    lines = [f"{c.caution.kind}: {c.run}: {c.dataset}: {c.caution}" for c in cautions[:MOST_WARNINGS]]
-    more = len(cautions) - MOST_WARNINGS
-    return [*lines, *([f"and {more} more warnings and notes; see the report"] if more > 0 else [])]
+    warned = [f"{c.caution.kind}: {c.run}: {c.dataset}: {c.caution}" for c in comparison.cautions]
+    if (more := len(warned) - MOST_WARNINGS) > 0:
+        warned[MOST_WARNINGS:] = [f"and {more} more warnings and notes; see the report"]
+    return "\n".join([table([header, *rows]), *notes, "", *verdicts, *warned])
 
 
 def estimates_table(comparison: Comparison) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -146,7 +147,16 @@ class Result(StoredResult):
         return dealt.transpose("chain", "draw", ...)
 
     def _repr_html_(self) -> str:
-        return cell_html(self)
+        """A piece of HTML; everything in it is escaped."""
+
+        def each(tag: str, values: Iterable[object]) -> Markup:
+            return Markup("").join(Markup(f"<{tag}>{{}}</{tag}>").format(value) for value in values)
+
+        rows = [(row.label, row.unit, *estimate_cells(row), f"{row.dfs:.2f}") for row in self.rows]
+        head, body = each("th", HEADER), each("tr", (each("td", row) for row in rows))
+        warned = each("li", (f"{c.kind}: {c.words}" for c in self.cautions))
+        page = Markup("<div><b>{}</b><table><thead><tr>{}</tr></thead><tbody>{}</tbody></table><p>{}</p>{}</div>")
+        return str(page.format(self.name, head, body, self.ended, each("ul", [warned] * bool(warned))))
 
 
 def _in_display_units(group: xr.Dataset) -> xr.Dataset:
@@ -167,19 +177,3 @@ def load_result(path: str | Path) -> Result:
     """
     file = Path(path)
     return Result(load_stored(file / "posterior.nc" if file.is_dir() else file).groups)
-
-
-def cell_html(result: StoredResult) -> str:
-    """The result as a piece of HTML; everything in it is escaped."""
-    rows = [(row.label, row.unit, *estimate_cells(row), f"{row.dfs:.2f}") for row in result.rows]
-    head = Markup("").join(Markup("<th>{}</th>").format(cell) for cell in HEADER)
-    body = Markup("").join(
-        Markup("<tr>{}</tr>").format(Markup("").join(Markup("<td>{}</td>").format(cell) for cell in row))
-        for row in rows
-    )
-    warned = Markup("").join(Markup("<li>{}: {}</li>").format(c.kind, c.words) for c in result.cautions)
-    return str(
-        Markup("<div><b>{}</b><table><thead><tr>{}</tr></thead><tbody>{}</tbody></table><p>{}</p>{}</div>").format(
-            result.name, head, body, result.ended, Markup("<ul>{}</ul>").format(warned) if warned else ""
-        )
-    )

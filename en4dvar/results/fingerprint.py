@@ -96,9 +96,8 @@ def _packages_of(model: ForwardModel) -> dict[str, str]:
 def _paths(value: Any) -> Iterator[Path]:
     """Files named anywhere in a section, e.g. a tabulated pressure or the file of a user's own law."""
     if isinstance(value, Mapping):
-        for item in value.values():
-            yield from _paths(item)
-    elif isinstance(value, list):
+        value = [*value.values()]
+    if isinstance(value, list):
         for item in value:
             yield from _paths(item)
     elif isinstance(value, str):

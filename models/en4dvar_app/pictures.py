@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from en4dvar.inputs.opened import readable
 from en4dvar.plumbing.errors import DataError, En4dvarError
@@ -66,18 +65,15 @@ class Pictures:
         """One frame as BMP, which takes no time to compress; 16 bit are stretched over the range of the first frame."""
         from PIL import Image
 
-        out = io.BytesIO()
-        Image.fromarray(self._grey(self.frame(number))).save(out, "bmp")
+        frame, out = self.frame(number), io.BytesIO()
+        if frame.dtype != np.uint8:
+            if self._range is None:
+                first = self.frame(0)
+                self._range = float(first.min()), float(first.max())
+            low, high = self._range
+            frame = np.clip(255 * (frame - low) / max(high - low, 1e-12), 0, 255).astype(np.uint8)
+        Image.fromarray(frame).save(out, "bmp")
         return out.getvalue()
-
-    def _grey(self, frame: Frame) -> npt.NDArray[np.uint8]:
-        if frame.dtype == np.uint8:
-            return frame
-        if self._range is None:
-            first = self.frame(0)
-            self._range = float(first.min()), float(first.max())
-        low, high = self._range
-        return np.clip(255 * (frame - low) / max(high - low, 1e-12), 0, 255).astype(np.uint8)
 
 
 def readings(path: Path) -> dict[str, Any]:

@@ -145,7 +145,8 @@ def _shift(
     alternative: Alternative,
 ) -> Shift:
     unknown = np.full(len(std), np.nan)
-    about = alternative.name, _words(problem, alternative)
+    estimated = any(name in problem.prior.names for name in alternative.parameters)  # the prior says what it is
+    about = alternative.name, f"the prior said that {alternative.words}" if estimated else alternative.words
     try:
         changed = changed_problem(problem, alternative)
         of_prior = prior_shift(problem, tuple(alternative.parameters.items()))
@@ -224,9 +225,3 @@ def _same_run(problem: InverseProblem, changed: InverseProblem) -> bool:
     """True if the changed problem predicts the same, so that the run at the mode is known."""
     same_times = np.array_equal(problem.observations.times, changed.observations.times)
     return changed.model is problem.model and same_times and changed.fixed == problem.fixed
-
-
-def _words(problem: InverseProblem, alternative: Alternative) -> str:
-    """Those of the alternative; a parameter that is estimated is what the prior says of it."""
-    estimated = any(name in problem.prior.names for name in alternative.parameters)
-    return f"the prior said that {alternative.words}" if estimated else alternative.words
