@@ -81,22 +81,18 @@ def _reader(kind: Any) -> _Reader:
         return lambda raw, arrays: None if raw is None and type(None) in arguments else other(raw, arrays)
     if origin in (np.ndarray, npt.NDArray):  # from NumPy 2.5 on NDArray is an alias with a name of its own
         return lambda raw, arrays: arrays[raw["array"]]
+    if origin is tuple and arguments[1:] == (Ellipsis,):
+        item = _reader(arguments[0])
+        return lambda raw, arrays: tuple(item(part, arrays) for part in raw)
     if origin is tuple:
-        return _tuple_reader(arguments)
+        items = tuple(map(_reader, arguments))
+        return lambda raw, arrays: tuple(read(part, arrays) for read, part in zip(items, raw, strict=True))
     if origin is typing.Literal:
         return functools.partial(_choice, arguments)
     if is_dataclass(kind):
         hints = typing.get_type_hints(kind)
         return functools.partial(_dataclass, kind, {f.name: _reader(hints[f.name]) for f in fields(kind)})
     return functools.partial(_simple, (int, float) if kind is float else (kind,))
-
-
-def _tuple_reader(arguments: tuple[Any, ...]) -> _Reader:
-    if arguments[1:] == (Ellipsis,):
-        item = _reader(arguments[0])
-        return lambda raw, arrays: tuple(item(part, arrays) for part in raw)
-    items = tuple(map(_reader, arguments))
-    return lambda raw, arrays: tuple(read(part, arrays) for read, part in zip(items, raw, strict=True))
 
 
 def _dataclass(kind: Any, readers: dict[str, _Reader], raw: Any, arrays: _Arrays) -> Any:

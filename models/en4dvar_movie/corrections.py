@@ -47,10 +47,8 @@ def read_corrections(path: Path) -> dict[int, Correction]:
 
 
 def _correction(rest: list[str], where: str) -> Correction:
-    if rest[0].lower() == "out":
-        return Correction(True, None, " ".join(rest[1:]))
-    if rest[0].lower() == "ok":
-        return Correction(False, None, " ".join(rest[1:]))
+    if (word := rest[0].lower()) in ("out", "ok"):
+        return Correction(word == "out", None, " ".join(rest[1:]))
     try:
         x, y, radius = map(float, rest[:3])
     except ValueError:
