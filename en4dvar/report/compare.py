@@ -167,13 +167,10 @@ def compare_runs(runs: Sequence[str | Path] | Mapping[str, str | Path | StoredRe
 def with_evidences(comparison: Comparison, sampled: Sequence[Mapping[str, float]]) -> Comparison:
     """The same with other evidences. ``sampled``: of each run data set → log-evidence in place of the result's."""
     better = dict(zip(comparison.runs, sampled, strict=True))
-    scores = [
-        replace(score, log_evidence=better[score.run][score.dataset], stored=False)
-        if score.dataset in better[score.run]
-        else score
-        for score in comparison.scores
-        if score.dataset != ALL
-    ]
+    scores = [score for score in comparison.scores if score.dataset != ALL]
+    for i, score in enumerate(scores):
+        if score.dataset in better[score.run]:
+            scores[i] = replace(score, log_evidence=better[score.run][score.dataset], stored=False)
     return replace(comparison, scores=_judged(scores, [name for name in comparison.datasets if name != ALL]))
 
 

@@ -23,10 +23,8 @@ def histograms(result: StoredResult) -> Chart:
     for row in result.rows:
         exact, posterior = _prior_density(result, row.name), result.members("posterior", row.name)
         prior = result.members("prior", row.name)
-        value, doubt = (
-            f"{estimate(row, '')} {pretty_unit(row.unit)}".rstrip(),
-            ", not to be trusted" if row.untrusted else "",
-        )
+        value = f"{estimate(row, '')} {pretty_unit(row.unit)}".rstrip()
+        doubt = ", not to be trusted" if row.untrusted else ""
         panel = Panel(
             with_unit(row.symbol, row.unit), title=f"{value}{doubt}", title_colour="posterior", xticks=4, yticks=(),
             left=False, xlim=_reach(prior, posterior), ylim=(-0.14, 1.2),

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from en4dvar.diagnosis.diagnostics import HARDLY_INFORMED, METHOD, member_quantiles
+from en4dvar.diagnosis.diagnostics import HARDLY_INFORMED, member_quantiles
 from en4dvar.diagnosis.honesty.checks import MOVED
 from en4dvar.estimation.summary import ParameterSummary, estimate_cells
 from en4dvar.plumbing.caution import Caution, untrusted
@@ -134,9 +134,7 @@ def forest(
         panel.intervals(rows[has, 0], rows[has, 2], -has, "prior")
         panel.dots(rows[has, 1], -has, "prior", 3.0)
         if "dataset" in posterior.get(name, draws).dims:
-            low, middle, high = convert(
-                posterior[name].quantile(QUANTILES, ("chain", "draw"), method=METHOD).values, *units
-            )
+            low, middle, high = convert(member_quantiles(posterior[name].values[0], QUANTILES, axis=0), *units)
             panel.intervals(low[has], high[has], -has - 0.3, "posterior")
             panel.dots(middle[has], -has - 0.3, "posterior", 2.0)
         panel.x_logarithmic = bool(np.all(rows[has] > 0) and rows[has].max() > 20 * rows[has].min())

@@ -116,11 +116,9 @@ def _tiles(result: StoredResult) -> list[tuple[str, str, str, bool]]:
     informed = f"numbers determined by the data, of {n_estimated} estimated: the sum of the shares below"
     if "/fields" in result.groups:
         shares, informed = dfs, "numbers determined by the data, of cells and parameters"
-    information = (
-        ("–", "cannot be told where intervals are not to be trusted")
-        if doubted
-        else (plain_number(shares, 3), informed)
-    )
+    information = plain_number(shares, 3), informed
+    if doubted:
+        information = "–", "cannot be told where intervals are not to be trusted"
     ended = "by its own criterion" if s["converged"] else "not converged"
     return [
         ("Fit", number_like(nrmse, 0.01), "NRMSE: 1 is perfect, 0 is no better than a constant", not nrmse >= 0.9),

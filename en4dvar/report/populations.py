@@ -324,12 +324,8 @@ def _line_sentence(c: PopulationsCompared, name: str, of_it: StraightLine) -> st
     unit = pretty_unit(c.parameters[name].display_unit)
     slope = _three(np.exp(of_it.slope) if name in c.logarithmic else of_it.slope)
     rising = float(np.mean(of_it.slope > 0))
-    what = (
-        f"grows by a factor of {_range(slope)}"
-        if name in c.logarithmic
-        else f"grows by {_range(slope)} {unit}".rstrip()
-    )
-    words = f"{name} {what} for each unit of the number; it rises with probability {min(rising, SURE):.3f}"
+    by = f"a factor of {_range(slope)}" if name in c.logarithmic else f"{_range(slope)} {unit}".rstrip()
+    words = f"{name} grows by {by} for each unit of the number; it rises with probability {min(rising, SURE):.3f}"
     if of_it.chance < OFF_THE_LINE:
         chi = plain_number(of_it.misfit, 2)
         return f"{words}; they do not lie on a line (χ² {chi} of {of_it.freedom}), for which the interval is widened."

@@ -204,24 +204,14 @@ def _effective(study: Study) -> str:
 def _comparison(study: Study) -> Rows:
     rows = []
     for gel, comparison in study.comparisons.items():
-        compared = [
-            (name, value, verdict(value))
-            for name, value in zip(study.fits[gel]["qlkv"].names, comparison.single, strict=True)
-        ]
-        misfit = (
-            f"no verdict: no single gel fits (χ² per reading {comparison.chi2[0]:.1f} and {comparison.chi2[1]:.1f})"
-        )
-        compared += [
-            ("all sets, a gel each", comparison.independent, verdict(comparison.independent)),
-            ("all sets, one population", comparison.population, verdict(comparison.population)),
-            (
-                "all sets, one gel",
-                comparison.shared,
-                misfit if min(comparison.chi2) > MISFIT else verdict(comparison.shared),
-            ),
-        ]
-        for words, value, judgement in compared:
-            rows.append([gel, words, f"{value:+.1f}", f"{float(probability(np.array(value))):.2f}", judgement])
+        compared = [*zip(study.fits[gel]["qlkv"].names, comparison.single, strict=True)]
+        compared += [("all sets, a gel each", comparison.independent)]
+        compared += [("all sets, one population", comparison.population), ("all sets, one gel", comparison.shared)]
+        for words, value in compared:
+            rows.append([gel, words, f"{value:+.1f}", f"{float(probability(np.array(value))):.2f}", verdict(value)])
+        if min(comparison.chi2) > MISFIT:
+            nh, quadratic = comparison.chi2
+            rows[-1][-1] = f"no verdict: no single gel fits (χ² per reading {nh:.1f} and {quadratic:.1f})"
     return rows
 
 

@@ -48,13 +48,8 @@ def page_text(movie: Movie, track: Track, scale: Scale, command: str) -> str:
 
 def _radius(used: list[Reading], scale: Scale) -> Chart:
     um = 1e6 * scale.pixel
-    times, radius, reach = (
-        np.array(values)
-        for values in (
-            [1e6 * scale.time(r.sighting) for r in used], [um * r.radius for r in used],
-            [1.645 * um * r.errors.std for r in used],
-        )
-    )  # fmt: skip
+    times = 1e6 * np.array([scale.time(r.sighting) for r in used])
+    radius, reach = um * np.array([r.radius for r in used]), 1.645 * um * np.array([r.errors.std for r in used])
     panel = Panel("time (µs)", "radius (µm), 90 %")
     panel.bars(times, radius - reach, radius + reach, "centre", 1.0)
     panel.dots(times, radius, "ink", 2.5)

@@ -119,11 +119,9 @@ def _allowed(finding: Caution) -> Caution:
 def _validity(a: Analysis, alive: npt.NDArray[np.bool_]) -> checks.Findings:
     """Without a linearisation every reading that counts is taken to inform."""
     limits, observations, residuals = a.problem.model.validity, a.problem.observations, a.residuals
-    which, leverage = (
-        (observations.used, np.ones(len(observations.used)))
-        if residuals is None
-        else (residuals.which, residuals.leverage)
-    )
+    which, leverage = observations.used, np.ones(len(observations.used))
+    if residuals is not None:
+        which, leverage = residuals.which, residuals.leverage
     if limits:
         beyond = checks.validity(limits, a.extremes[alive], a.beyond[alive], observations.times[which], leverage)
         yield from map(_allowed, beyond) if a.discrepancy else beyond
