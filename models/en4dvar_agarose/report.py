@@ -56,7 +56,9 @@ def _page(study: Study, figures: list[dict[str, Any]]) -> str:
         members=study.every_fit[0].analyses[0].settings.members,
         sets=sum(len(study.any_fit(gel).problems) for gel in study.fits),
         findings=findings(study),
-        tables=[_table(study, route) for route in ROUTE_KEYS],
+        tables=[(tables.TITLES[route], tables.table(study, route)) for route in ROUTE_KEYS],
+        sources=tables.sources(study),
+        labels=LABELS,
         disagreements=tables.disagreements(study),
         spreads=tables.spread_notes(study),
         quantities=QUANTITIES,
@@ -126,22 +128,6 @@ def _apparent_modulus(study: Study, gel: str) -> str:
         f"follows that of the true G α / R₀ (correlation {np.corrcoef(sheet, apparent)[0, 1]:.2f}), so it scatters as "
         f"α and R₀ do, by ± {apparent.std():.2f} in ln G."
     )
-
-
-def _table(study: Study, route: Route) -> dict[str, Any]:
-    heads = tables.sources(study)
-    return {
-        "title": tables.TITLES[route],
-        "legend": "; ".join(heads.values()),
-        "rows": [
-            {
-                "gel": row.gel,
-                "model": LABELS[row.model],
-                "cells": [[cell.text(source) for source in heads] for cell in row.cells],
-            }
-            for row in tables.table(study, route)
-        ],
-    }
 
 
 def _dfs(study: Study) -> Rows:

@@ -48,14 +48,10 @@ def in_time(radii: Sequence[Array], times: Array, flashes: Sequence[float]) -> l
     ordered = [np.array([r[list(order)] for order in orders]) for r in radii]  # (S!, S) of each frame
     cost = _bend(ordered[0], offsets + times[0])
     came: list[Array] = []
+    before, now = np.indices((len(orders), len(orders)))
     for k in range(1, len(radii)):
-        joined = np.concatenate(
-            [
-                np.repeat(ordered[k - 1][:, None, -2:], len(orders), axis=1),
-                np.repeat(ordered[k][None], len(orders), axis=0),
-            ],
-            axis=2,
-        )  # of each pair of orders, the last two readings of the frame before and those of this one
+        # of each pair of orders, the last two readings of the frame before and those of this one
+        joined = np.concatenate([ordered[k - 1][before, -2:], ordered[k][now]], axis=2)
         instants = np.concatenate([offsets[-2:] + times[k - 1], offsets + times[k]])
         total = cost[:, None] + _bend(joined, instants)
         came.append(np.argmin(total, axis=0))
