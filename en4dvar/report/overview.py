@@ -141,9 +141,8 @@ def overview_figures(sets: Sequence[SetSummary]) -> list[Captioned]:
         "Each data set by itself: posterior mean and 5–95 % (blue), prior mean ± std (grey band; of the first data set "
         "where priors depend on the data). Orange rings without a bar: not to be trusted, for their warnings."
         if len(sets) <= NAMED
-        else "Data sets sorted by the posterior mean, with 5–95 % (blue, none where it is not to be "
-        "trusted); prior mean ± std (grey band; of the first "
-        "data set where priors depend on the data)."
+        else "Data sets sorted by the posterior mean, with 5–95 % (blue, none where it is not to be trusted); prior "
+        "mean ± std (grey band; of the first data set where priors depend on the data)."
     )
     return [("estimates", caption, estimates(sets))] if _parameters(sets) else []
 

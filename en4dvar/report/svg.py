@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -85,8 +84,8 @@ def _panel(panel: Panel, row: Row, top: float, x: float, width: float, name: str
     legend, above = _legend(panel, x, top, width)
     above += max((len(p.title.splitlines()) for p in row.panels), default=0) * (FONT + 2) + 4
     below = max((_below(p) for p in row.panels), default=0.0)
-    place = Frame(x, top + above, width, row.height - above - below, *panel.limits())
-    place = replace(place, logarithmic=panel.logarithmic, x_logarithmic=panel.x_logarithmic)
+    height = row.height - above - below
+    place = Frame(x, top + above, width, height, *panel.limits(), panel.logarithmic, panel.x_logarithmic)
     if panel.bare:
         return [written(panel.words, x + width / 2, place.y + place.height / 2 + 3, size=FONT)] if panel.words else []
     box = f'x="{place.x:.1f}" y="{place.y:.1f}" width="{place.width:.1f}" height="{place.height:.1f}"'
