@@ -57,19 +57,16 @@ def export_table(run_dir: str | Path, kind: Kind = "csv") -> str:
     stored = RunResults(Path(run_dir))
     if stored.files == [stored.whole]:
         posterior_file(run_dir)  # says what is missing
-    text = _table((result for _, result in stored), kind)  # one is in memory at a time
+    results = (result for _, result in stored)  # one is in memory at a time
+    rows = ((r.name, r.rows, r.cautions) for r in results)
+    if kind == "members":
+        text = _members_csv(results)
+    elif kind == "latex":
+        text = latex_table(sets) if (sets := list(rows)) else ""
+    else:
+        text = csv_text(summary_rows(rows, {}))
     stored.require(text)
     return text
-
-
-def _table(results: Iterable[StoredResult], kind: Kind) -> str:
-    if kind == "members":
-        return _members_csv(results)
-    rows = ((r.name, r.rows, r.cautions) for r in results)
-    if kind == "latex":
-        sets = list(rows)
-        return latex_table(sets) if sets else ""
-    return csv_text(summary_rows(rows, {}))
 
 
 def posterior_file(run_dir: str | Path) -> Path:

@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -159,22 +158,15 @@ def fits(joint: StoredJoint) -> Chart | None:
     return in_columns(panels, 3.6 * POINTS, width=PAGE) if panels else None
 
 
-def _sets(joint: StoredJoint) -> list[dict[str, Any]]:
-    """Each data set under the shared values: misfit per reading, and how far it is from all others alone."""
-    fit, absent = joint.group("fit"), np.full(len(joint.datasets), np.nan)
-    columns = [fit[c].values if c in fit else absent for c in ("chi2_per_observation", "distance", "chance")]
-    keys = ("name", "odd", "chi2", "distance", "chance")
-    odd = [name in joint.odd for name in joint.datasets]
-    return [dict(zip(keys, row, strict=True)) for row in zip(joint.datasets, odd, *columns, strict=True)]
-
-
 def write_joint(folder: Path) -> Path:
     """Write ``joint.html`` and ``joint.csv`` from ``joint.nc``; returns the path of the page.
 
     Raises :class:`OutputError`.
     """
     joint = load_joint(folder / FILE)
-    rows = estimates(joint)
+    rows, fit, absent = estimates(joint), joint.group("fit"), np.full(len(joint.datasets), np.nan)
+    # of each data set under the shared values the misfit per reading, and how far it is from all others alone
+    fitted = [fit[c].values if c in fit else absent for c in ("chi2_per_observation", "distance", "chance")]
     columns = ("name", "dataset", "without", "mean", "std", "q05", "q50", "q95", "unit")
     cells = [[getattr(e, c) for c in columns] + [" ".join(e.untrusted)] for e in rows]
     write_text(folder / "joint.csv", csv_text([[*columns, "warnings"], *cells]))
@@ -189,7 +181,8 @@ def write_joint(folder: Path) -> Path:
         caption=CAPTION,
         fits=svg(drawn, "fits", FITS) if (drawn := fits(joint)) else "",
         fits_caption=FITS + (f" The first {MOST_FITS}." if len(joint.datasets) > MOST_FITS else ""),
-        sets=_sets(joint),
+        sets=[*zip(joint.datasets, *fitted, strict=True)],
+        odd=joint.odd,
         attributes=joint.tree.attrs,
         cautions=[(c, "") for c in joint.cautions],
     )
