@@ -56,7 +56,7 @@ from en4dvar.assembly.build import build
 from en4dvar.cli import main as command_line
 from en4dvar.config import load_config
 from en4dvar.diagnosis.diagnostics import member_quantiles
-from en4dvar.diagnosis.withheld import expectations, predict_withheld
+from en4dvar.diagnosis.withheld import BAND, expectations, quantile
 from en4dvar.executor import SerialExecutor
 from en4dvar.inputs.window import minima
 from en4dvar.model.state import Array
@@ -264,11 +264,11 @@ def chances(problem: InverseProblem, result: Result, parts: dict[str, int]) -> d
     they what the estimate expects. Given a member they lie there independently, but all of them are of one member; what
     the discrepancy makes them share besides is left out, so that the true spread is wider.
     """
-    names = problem.prior.names
-    members = np.column_stack([result.posterior[name].values.ravel() for name in names])
-    mean, std = expectations(problem, problem.prior.from_physical(members), SerialExecutor()) or (np.zeros((1, 0)),) * 2
-    withheld = predict_withheld(problem, problem.prior.from_physical(members), SerialExecutor())
-    inside = ndtr((withheld.high - mean) / std) - ndtr((withheld.low - mean) / std) if withheld else mean
+    members = np.column_stack([result.posterior[name].values.ravel() for name in problem.prior.names])
+    expected = expectations(problem, problem.prior.from_physical(members), SerialExecutor())
+    assert expected is not None  # the run has bands
+    (mean, std), (low, high) = expected, (quantile(*expected, level) for level in BAND)
+    inside = ndtr((high - mean) / std) - ndtr((low - mean) / std)
     found = {}
     for part, count in parts.items():
         of = np.ones((len(inside), 1))

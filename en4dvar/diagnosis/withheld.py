@@ -68,7 +68,7 @@ def predict_withheld(problem: InverseProblem, members: Array, executor: Executor
     expected = expectations(problem, members, executor)
     if whole is None or expected is None:
         return None
-    low, median, high = (_quantile(*expected, level) for level in (BAND[0], 0.5, BAND[1]))
+    low, median, high = (quantile(*expected, level) for level in (BAND[0], 0.5, BAND[1]))
     return Withheld(whole.times[begin:], whole.values[begin:], low, median, high, len(members))
 
 
@@ -115,7 +115,7 @@ def unforeseen(problem: InverseProblem) -> InverseProblem:
     return within.varied([*varying.values()]) if varying else problem
 
 
-def _quantile(mean: Array, std: Array, level: float) -> Array:
+def quantile(mean: Array, std: Array, level: float) -> Array:
     """(K,) of the mixture of Gaussians of equal weight with these means and standard deviations (N, K)."""
     low, high = (mean - 8 * std).min(axis=0), (mean + 8 * std).max(axis=0)
     for _ in range(BISECTIONS):

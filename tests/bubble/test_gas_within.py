@@ -111,7 +111,7 @@ def test_what_follows_the_window_may_change_beyond_what_was_estimated(folder, to
     ]
     for which in ("low", "median", "high"):
         one, other = (getattr(withheld, which) for withheld in found)
-        np.testing.assert_allclose(one, other, rtol=1e-4)
+        np.testing.assert_allclose(one, other, rtol=1e-5)
     assert np.max(found[0].high - found[0].low) > 5 * ERROR
 
 
