@@ -1,14 +1,15 @@
 """Populations of bubbles whose single posteriors are exact: are medians and spreads held, and whom does it name as odd?
 
-    python benchmarks/campaigns.py synthetic [--n 200] [--seed 1] [--bubbles 3 6 12 40] [--kinds …] [--minutes 9]
+    python benchmarks/campaigns.py synthetic [--n 200] [--seed 1] [--bubbles 3 6 12 40] [--kinds …] [--spread 0.5]
     python benchmarks/campaigns.py pairs [--n 100] [--seed 1] [--bubbles 6 12]
-    python benchmarks/campaigns.py power [--n 400] [--seed 1] [--bubbles 6 12 40]
+    python benchmarks/campaigns.py power [--n 400] [--seed 1] [--bubbles 6 12 40] [--spread 0.5]
 
 ``synthetic``: campaigns of ``exact_campaigns.py``. ``normal``: mean, spread and odd bubbles as the hierarchy supposes.
 ``like``: bubbles that differ by a tenth of the prior, as of one gel. ``heavy``: the same by Student's t of three
 degrees. ``gel``, ``scale``, ``law``: ``like`` with one bubble of four times the modulus, of radii 8 % too large, of a
 gel that stiffens. Beside those named stands the best test there is: the odds of each bubble with median, spread and
-common quantities known, and a bound that 5 % of the ``like`` campaigns exceed.
+common quantities known, and a bound that 5 % of the ``like`` campaigns exceed. ``--spread``: of the hyperprior;
+``init`` writes 0.25 for gels.
 
 ``pairs``: two gels, the second 30 % stiffer, whose readings are shifted by the same scale, density and pressure: is the
 difference held, how often is it seen, what does the first gain where the second is known to 4 %, beside the closed form
@@ -41,13 +42,13 @@ from en4dvar.model.state import Array
 STIFFER, KNOWN = 1.3, 0.04  # of the second gel of a pair; how well its modulus is known
 
 
-def synthetic(seed: int, key: str) -> Record:
+def synthetic(seed: int, hyper: HyperPrior, key: str) -> Record:
     """Ranks of the truth among the draws, and who is named."""
     kind, bubbles, number = key.split("/")
     rng = np.random.default_rng([seed, KINDS.index(kind), int(bubbles), int(number)])
     of_it = campaign(kind, int(bubbles), rng)
     began = time.process_time()
-    result = found_of(of_it.drawn(rng), int(number))
+    result = found_of(of_it.drawn(rng), int(number), hyper=hyper)
     quantiles = np.array([one.quantiles for one in result.empirical])
     return {
         "nu": np.mean(result.posterior.nu < of_it.nu, axis=0),
@@ -143,11 +144,13 @@ def _share(of: Sequence[bool]) -> str:
     return f"{100 * np.mean(of):.0f} %" if len(of) else "–"
 
 
-def raised(bubbles: int, kind: str, count: int, errors: tuple[float, float], tau: Array, seed: int) -> Array:
+def raised(
+    bubbles: int, kind: str, count: int, errors: tuple[float, float], tau: Array, seed: int, hyper: HyperPrior
+) -> Array:
     """(count, S) by what factor the readings of G raise the odds of each bubble in as many campaigns; τ is one of
     ``tau`` (T,), the first bubble of a ``kind``.
     """
-    rng, hyper, slots = np.random.default_rng([seed, bubbles]), HyperPrior(), (..., None, None)
+    rng, slots = np.random.default_rng([seed, bubbles]), (..., None, None)
     each = [campaign(kind, bubbles, rng, (np.zeros(3), np.zeros(2)), errors) for _ in range(count)]
     nu, middle = np.linspace(-0.7, 0.7, 41), np.array([0.5, 0.25]) * hyper.odd
     log_prior = np.log(tau) - 0.5 * (tau / hyper.spread) ** 2
@@ -168,18 +171,18 @@ def raised(bubbles: int, kind: str, count: int, errors: tuple[float, float], tau
     return np.array(found)
 
 
-def power(seed: int, sizes: Sequence[int], count: int) -> None:
+def power(seed: int, sizes: Sequence[int], count: int, hyper: HyperPrior) -> None:
     print("| errors of G | bubbles | the first | named | by the best test | spread known | others named |")
     print("|---|---|---|---|---|---|---|")
     unknown, known = np.geomspace(0.02, 2.0, 21), np.array([LIKE])
     for errors in (ERRORS, (0.03, 0.08)):
         for size in sizes:
-            clean = [raised(size, "like", count, errors, tau, seed).max(axis=1) for tau in (unknown, known)]
+            clean = [raised(size, "like", count, errors, tau, seed, hyper).max(axis=1) for tau in (unknown, known)]
             bounds = [np.quantile(highest, 0.975) for highest in clean]
             limit = max(RAISED, A_SET * size)
             false = 1 - np.mean(clean[0] < limit) ** 2  # of G or of μ
             for kind in SHIFTS:
-                first = [raised(size, kind, count, errors, tau, seed + 1)[:, 0] for tau in (unknown, known)]
+                first = [raised(size, kind, count, errors, tau, seed + 1, hyper)[:, 0] for tau in (unknown, known)]
                 shares = [_share(of.tolist()) for of in (first[0] > limit, first[0] > bounds[0], first[1] > bounds[1])]
                 about = f"{100 * LOG_STD * errors[0]:.0f} to {100 * LOG_STD * errors[1]:.0f} %"
                 print(f"| {about} | {size} | {kind} | {' | '.join(shares)} | {100 * false:.0f} % |", flush=True)
@@ -192,17 +195,19 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--bubbles", type=int, nargs="+", default=[3, 6, 12, 40])
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS)
+    parser.add_argument("--spread", type=float, default=HyperPrior().spread, help="of the hyperprior")
     parser.add_argument("--minutes", type=float, default=9.0)
     parser.add_argument("--records", type=Path, default=Path("runs/campaigns"), help="folder of the records")
     asked = parser.parse_args()
+    hyper = HyperPrior(spread=asked.spread)
     if asked.what == "power":
-        power(asked.seed, asked.bubbles, asked.n)
+        power(asked.seed, asked.bubbles, asked.n, hyper)
         return
-    file = asked.records / f"{asked.what}_{asked.seed}.jsonl"
+    file = asked.records / f"{asked.what}_{asked.seed}_{asked.spread:g}.jsonl"
     kinds = asked.kinds if asked.what == "synthetic" else ["pair"]
     keys = [f"{kind}/{size}/{i}" for i in range(asked.n) for kind in kinds for size in asked.bubbles]
-    of_it = synthetic if asked.what == "synthetic" else pairs
-    records = list(fill(file, keys, partial(of_it, asked.seed), asked.minutes).values())
+    of_it = partial(synthetic, asked.seed, hyper) if asked.what == "synthetic" else partial(pairs, asked.seed)
+    records = list(fill(file, keys, of_it, asked.minutes).values())
     if asked.what == "synthetic":
         table_of(records, kinds, asked.bubbles)
     else:

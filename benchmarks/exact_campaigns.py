@@ -135,8 +135,9 @@ def campaign(
 
 
 def found_of(
-    drawn: Sequence[OwnDraws], seed: int, problems: Sequence[InverseProblem] = (), names: Sequence[str] = COMMON
-) -> Population:
+    drawn: Sequence[OwnDraws], seed: int, problems: Sequence[InverseProblem] = (), names: Sequence[str] = COMMON,
+    hyper: HyperPrior | None = None,
+) -> Population:  # fmt: skip
     problems = problems or [bubble(f"bubble{i}", names) for i in range(len(drawn))]
     start = [draws.z for draws in drawn]
-    return population_from(dict(enumerate(drawn)), {}, start, problems, NAMES, seed, HyperPrior(), Effort())
+    return population_from(dict(enumerate(drawn)), {}, start, problems, NAMES, seed, hyper or HyperPrior(), Effort())

@@ -29,6 +29,7 @@ from wrong_worlds import Wrong
 
 import en4dvar
 from en4dvar.cli import main as command_line
+from en4dvar.config import load_config
 from en4dvar.estimation.population import Effort, HyperPrior
 from en4dvar.estimation.population.campaign import population_from, sampled_sets, terms_of
 from en4dvar.runs.finished import finished
@@ -99,14 +100,16 @@ def odd(seed: int, size: int, spread: float, key: str) -> Record:
             return {"failed": made.output.splitlines()[-1]}
         for file, text in odd_ones.items():
             file.write_text(text)
+        population = load_config(config).population
+        assert population is not None
         changes = {f"model.{part}": value for part, value in QUICK.items()} | {"execution.workers": 1}
         changes |= {"output.report": False, "output.directory": str(Path(name) / "run"), "population": None}
         changes |= {"assimilation.what_if": False}
         en4dvar.run_campaign(config, overrides=changes)
-        return populations(Path(name) / "run", gel, spread, seed)
+        return populations(Path(name) / "run", gel, spread, seed, population.hyper)
 
 
-def populations(run_dir: Path, gel: dict[str, float], spread: float, seed: int) -> Record:
+def populations(run_dir: Path, gel: dict[str, float], spread: float, seed: int, hyper: HyperPrior) -> Record:
     """Of each kind: who is named, and whether the interval of the gel's medians holds the truth."""
     _, sets = finished([run_dir], True, None)
     problems, start = [s.problem for s in sets], [s.white for s in sets]
@@ -122,7 +125,7 @@ def populations(run_dir: Path, gel: dict[str, float], spread: float, seed: int) 
         if first is None or first not in drawn:
             continue
         some = {i: drawn[i] for i in (first, *(i for i in rest if i in drawn))}
-        result = population_from(some, {}, start, problems, names, seed, HyperPrior(), Effort())
+        result = population_from(some, {}, start, problems, names, seed, hyper, Effort())
         median = result.posterior.median
         record[kind] = {
             "named": list(result.odd),

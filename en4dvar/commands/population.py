@@ -11,19 +11,19 @@ from en4dvar.commands.common import Together, several_runs
     help="A parameter that varies from data set to data set about a common mean, e.g. G; any number of times.",
 )  # fmt: skip
 @click.option(
-    "--mean-std", type=click.FloatRange(min=0, min_open=True), default=1.0, show_default=True,
+    "--mean-std", type=click.FloatRange(min=0, min_open=True), show_default="as in the run's population:, or 1",
     help="Hyperprior of the mean: normal about that of the prior; its std as a multiple of the prior's.",
 )  # fmt: skip
 @click.option(
-    "--spread", type=click.FloatRange(min=0, min_open=True), default=0.5, show_default=True,
+    "--spread", type=click.FloatRange(min=0, min_open=True), show_default="as in the run's population:, or 0.5",
     help="Hyperprior of the spread: half-normal; its std as a multiple of the prior's.",
 )  # fmt: skip
 @click.option(
-    "--odd", type=click.FloatRange(min=0, max=1, max_open=True), default=0.05, show_default=True,
+    "--odd", type=click.FloatRange(min=0, max=1, max_open=True), show_default="as in the run's population:, or 0.05",
     help="Probability that a data set is odd: of another population, in all parameters or in one.",
 )  # fmt: skip
 @several_runs("population")
-def population(runs: Together, names: tuple[str, ...], mean_std: float, spread: float, odd: float) -> None:
+def population(runs: Together, names: tuple[str, ...], **hyper: float | None) -> None:
     """Estimate the mean of parameters over data sets and how much they vary: a material behind its samples.
 
     Takes finished runs of the same parameters, with at least three data sets together, whatever their errors. Unlike
@@ -34,9 +34,9 @@ def population(runs: Together, names: tuple[str, ...], mean_std: float, spread: 
     Example:
       en4dvar population runs/twelve_bubbles --of G --of mu
     """
-    from en4dvar.estimation.population import HyperPrior
     from en4dvar.report.population import population_lines
     from en4dvar.runs.population_run import population as estimate
 
-    result, page = estimate(runs.run_dirs, names, runs.out, hyper=HyperPrior(mean_std, spread, odd), **runs.options)
+    changed = {name: value for name, value in hyper.items() if value is not None}
+    result, page = estimate(runs.run_dirs, names, runs.out, hyper=changed, **runs.options)
     runs.conclude("\n".join(population_lines(result)), result.cautions, page)

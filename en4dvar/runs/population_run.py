@@ -30,7 +30,7 @@ def population(
     names: Sequence[str],
     out: Path,
     *,
-    hyper: HyperPrior | None = None,
+    hyper: HyperPrior | Mapping[str, float] | None = None,
     effort: Effort | None = None,
     workers: int | None = None,
     trust: bool = False,
@@ -40,7 +40,8 @@ def population(
     """Estimate the population of the parameters ``names`` behind the data sets of finished runs; writes
     ``population.nc``, ``.csv``, ``.tex`` and ``.html`` to ``out``. Returns what was found and the path of the page.
 
-    ``hyper`` is in units of the prior's standard deviations. The seed is that of the first run.
+    ``hyper`` is in units of the prior's standard deviations; a mapping says what of it differs from that of
+    ``population:`` in the configuration of the first run, whose seed is taken as well.
 
     Raises
     ------
@@ -67,7 +68,7 @@ class PopulationKind(TogetherKind):
     writer = "en4dvar.report.population:write_population"
 
     names: Sequence[str] = ()
-    hyper: HyperPrior | None = None
+    hyper: HyperPrior | Mapping[str, float] | None = None
     effort: Effort | None = None
 
     def estimate(
@@ -76,9 +77,11 @@ class PopulationKind(TogetherKind):
     ) -> None:  # fmt: skip
         tell(f"population of {', '.join(self.names)} behind {len(sets)} data sets")
         problems, white = [s.problem for s in sets], [s.white for s in sets]
+        asked = config.population.hyper if config.population else HyperPrior()
+        hyper = self.hyper if isinstance(self.hyper, HyperPrior) else replace(asked, **(self.hyper or {}))
         with retold(ValueError, TooFewMembersError, "no population: "):  # of forward runs that failed
             population = population_of(
-                problems, white, self.names, config.seed, kept=[s.drawn for s in sets], hyper=self.hyper,
+                problems, white, self.names, config.seed, kept=[s.drawn for s in sets], hyper=hyper,
                 effort=self.effort, executor=executor, tell=tell,
             )  # fmt: skip
         tell(f"{population.forward_runs} forward runs, {population.size:.0f} effective draws")

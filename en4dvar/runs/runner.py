@@ -137,7 +137,7 @@ class EstimateKind(RunKind[Campaign]):
         if asked := self.config.population:
             groups: Sequence[SetGroup | None] = groups_of(self.config, self.data) or [None]
             for group in groups:
-                PopulationKind(asked.of, asked.hyper).within(work, executor, group)
+                PopulationKind(asked.of).within(work, executor, group)
         if work.good() and self.config.report:
             self.page(run.directory.work, workers=self.report_workers, figures=self.config.figures)
         else:

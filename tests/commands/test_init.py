@@ -161,8 +161,13 @@ def test_of_three_bubbles_the_run_ends_with_their_gel(tmp_path: Path) -> None:
     asked = proposed(Path("gel.yaml")).population
     assert asked is not None
     assert asked.of == ("G", "mu")
+    assert asked.spread == 0.25
     assert proposed(Path("gel.yaml")).assimilation.what_if is False
     assert "rho, c, p_inf, reading_scale have one value in all bubbles" in Path("gel.yaml").read_text()
+    assert call("init", "--data", folder, *UNITS, "--law", "newtonian", "--force").exit_code == 0
+    asked = proposed(Path("gel.yaml")).population
+    assert asked is not None
+    assert (asked.of, asked.spread) == (("mu",), 0.05)  # a liquid has one viscosity
 
 
 def test_subfolders_are_gels_that_are_compared(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from execution_models import Stops
 from run_files import assert_same_results, configuration, interrupt, make_campaign
 
 from en4dvar.cli import main
-from en4dvar.estimation.population import Effort, HyperPrior
+from en4dvar.estimation.population import Effort
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.results.population_file import load_population
 from en4dvar.runs.engine import write_report
@@ -60,9 +60,18 @@ def test_it_is_what_the_command_says_and_has_a_page(finished, tmp_path):
     run = tmp_path / "run"
     shutil.copytree(finished[0], run)
     within = load_population(run / "population.nc")
-    after, _ = population([run], ["k"], tmp_path / "after", hyper=HyperPrior(2.0, 0.7))
+    after, _ = population([run], ["k"], tmp_path / "after")
     for name, values in after.group("posterior").data_vars.items():
         assert np.array_equal(values, within.group("posterior")[name]), name
+    asked = CliRunner().invoke(
+        main, ["population", str(run), "--of", "k", "--spread", "0.3", "--out", str(tmp_path / "o")]
+    )
+    assert asked.exit_code == 0, asked.output
+    attributes = load_population(tmp_path / "o" / "population.nc").tree.attrs
+    assert (attributes["hyperprior_mean_std"], attributes["hyperprior_spread"]) == (
+        2.0,
+        0.3,
+    )  # as asked, else the run's
     write_report(run)
     page = (run / "report.html").read_text()
     assert page.index("<h1>") < page.index("the median (geometric mean) of the population") < page.index("<svg")

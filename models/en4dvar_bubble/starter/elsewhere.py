@@ -33,6 +33,17 @@ WALLS = 8.0, 200.0
 """Median of a wall's distance, in R_max, and the largest, where a collapse takes 0.1 % longer."""
 
 
+LIKE_A_GEL = (
+    "  spread: 0.25 # half-normal, in std of the priors: bubbles of one gel differ by tens of per cent (published are "
+    "14 and 23 %), what is known of the gel by factors"
+)
+LIKE_A_LIQUID = (
+    "  spread: 0.05 # half-normal, in std of the priors: a liquid has one viscosity; a bubble that tells another one "
+    "is odd"
+)
+"""How much bubbles differ, as a line of ``population:``."""
+
+
 @dataclass(frozen=True)
 class Known:
     """A quantity as it stands in a configuration: its key, median with unit, std of its logarithm, and the source."""
@@ -115,10 +126,13 @@ def wall(radius: float, slowness: float) -> tuple[str, str, str]:
     return distance, prior, source
 
 
-def population(names: Sequence[str], count: int, medium: str, groups: Grouped = NO_GROUPS) -> tuple[str, ...]:
+def population(
+    names: Sequence[str], count: int, medium: str, liquid: bool, groups: Grouped = NO_GROUPS
+) -> tuple[str, ...]:
     """Lines for the section of the parameters ``names`` of one gel behind ``count`` bubbles; () of too few of them.
 
     ``groups``: of its bubbles, where there are several, one gel each; () where all have too few.
+    How much bubbles of one gel differ is known better than the gel itself; a liquid has one viscosity.
     """
     if max(map(len, groups.of.values()), default=count) < FEWEST_SETS:
         return ()
@@ -129,6 +143,7 @@ def population(names: Sequence[str], count: int, medium: str, groups: Grouped = 
     return (
         "population: # of the gel behind its bubbles, at the end of the run",
         f"  of: [{', '.join(names)}] # these vary from bubble to bubble about one median",
+        LIKE_A_LIQUID if liquid else LIKE_A_GEL,
         f"  # {common} have one value in all bubbles; the others are each bubble's own",
         *[f"  by: {kind} # each {groups.kind} has its own median and spread; they are compared"] * bool(groups.of),
         f"  # reference: {{{names[0]}: VALUE ± STD UNIT, source: NAME}} # a value to compare with, on the page",

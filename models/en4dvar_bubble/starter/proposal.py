@@ -147,7 +147,9 @@ def propose(
     if slow and _in_a_liquid(model):
         distance, prior, source = elsewhere.wall(look.lobe.R_max, ratio)
         wall = (Entry("wall", f"{{distance: {distance}}}", source),), (Entry("wall_distance", prior, "of that plane"),)
-    together = elsewhere.population([p.name for p in model.law.parameters], len(views), medium, groups)
+    together = elsewhere.population(
+        [p.name for p in model.law.parameters], len(views), medium, _in_a_liquid(model), groups
+    )
     return Proposal(
         _data(chosen, look, model, {**others, **guess.values}, histories),
         (*_model(law_name, model, look), *wall[0]),
