@@ -28,7 +28,16 @@ def _unit_text(written: Any) -> Any:
     return as_unit(str(written["pixel"]), "m")
 
 
-class ValueColumn(Section):
+class _NamedColumn(Section):
+    @model_validator(mode="before")
+    @classmethod
+    def _no_name_alone(cls, written: Any) -> Any:
+        if isinstance(written, str):
+            raise ValueError(f"its unit is missing; write {{name: {written}, unit: <that of the file>}}")
+        return written
+
+
+class ValueColumn(_NamedColumn):
     """A column of a CSV file or a field of a ``.mat`` file; the unit is required, never guessed."""
 
     name: Annotated[str, Field(min_length=1)]
@@ -37,7 +46,7 @@ class ValueColumn(Section):
     """Unit of the numbers in the file, e.g. um, or ``{pixel: 2.76 um}``; required, never guessed."""
 
 
-class TimeColumn(Section):
+class TimeColumn(_NamedColumn):
     """Observation times: a column, or a constant step (a scalar of the file, or a quantity such as ``0.63 us``)."""
 
     model_config = ConfigDict(

@@ -225,12 +225,11 @@ def parse_quantity(value: str | float, unit: str) -> float:
     >>> parse_quantity("0.42 kPa", "Pa"), parse_quantity("1 %", "1"), parse_quantity(3, "1")
     (420.0, 0.01, 3.0)
     """
-    if isinstance(value, bool) or not isinstance(value, str | int | float):
-        raise UnitError(f"{shown(value)} is not a quantity; write a number and a unit such as '1 {unit}'")
     text = str(value).strip()
     number, symbol = split_quantity(text)
     if not number:
-        raise UnitError(f"{shown(value)} is not a quantity; write a number and a unit such as '1 {unit}'")
+        wanted = "" if unit == "1" else f" and a unit such as '1 {unit}'"
+        raise UnitError(f"{shown(value)} is not a quantity; write a number{wanted}")
     if len(number) > LONGEST:
         raise UnitError(f"{shown(value)}: a number of {len(number)} characters")
     if not symbol and parse_unit(unit).powers != ONE.powers:

@@ -57,6 +57,8 @@ def test_defaults_of_the_model_and_the_time_shift(tmp_path: Path) -> None:
         ("toy_models:Oscillator", "no_module:No", "toy.yaml:10:9: model.name: model 'no_module:No' cannot be loaded"),
         ("toy_models:Oscillator", "pathlib:Path", "toy.yaml:10:9: model.name: 'pathlib:Path' is not a subclass"),
         (", unit: um", "", "toy.yaml:7:5: data.columns.position.unit: required, but not given"),
+        ("{name: t_ms, unit: ms}", "t_ms", "toy.yaml:6:11: data.columns.time: its unit is missing; write {name: t_ms,"),
+        ("{name: x_um, unit: um}", "x_um", "toy.yaml:7:15: data.columns.position: its unit is missing; write {name"),
         (", unit: ms", "", "toy.yaml:6:11: data.columns.time: the unit of column 't_ms' is missing"),
         ("unit: um", "unit: us", "toy.yaml:7:34: data.columns.position.unit: unit 'us' cannot be converted to 'm'"),
         ("unit: um", "unit: mum", "toy.yaml:7:34: data.columns.position.unit: unknown unit 'mum'"),

@@ -64,6 +64,11 @@ def test_refused(text: str, unit: str, message: str) -> None:
         parse_quantity(text, unit)
 
 
+def test_no_unit_is_asked_for_where_none_is_wanted() -> None:
+    with pytest.raises(UnitError, match=r"'two' is not a quantity; write a number$"):
+        parse_quantity("two", "1")
+
+
 def test_convert_arrays_round_once() -> None:
     values = np.array([1.4, 194.55, 517.0])
     assert convert(values, "um", "m").tolist() == [1.4e-6, 194.55e-6, 517e-6]
