@@ -7,6 +7,7 @@ import numpy as np
 import xarray as xr
 
 from en4dvar.estimation.population.campaign import DETERMINED, FEWEST, Combination
+from en4dvar.estimation.population.hierarchy import named
 from en4dvar.estimation.summary import ParameterSummary, results_table, summary_rows
 from en4dvar.plumbing.files import write_text
 from en4dvar.plumbing.tables import write_csv
@@ -57,6 +58,10 @@ def sentences(stored: StoredPopulation) -> tuple[str, ...]:
             of_it = stored.group("posterior")[f"{centre.name}_{stored.headline}"]
             lines.append(_in_parts(stored, centre, of_it, centre.std))
         lines += _compared(stored, centre)
+    odd = named(np.array([*stored.belongs.values()]), float(stored.tree.attrs.get("hyperprior_odd", 0)))
+    if odd:
+        names = ", ".join(stored.datasets[i] for i in odd)
+        lines.append(f"Perhaps not of the population, and as far as not, no part of these numbers: {names}.")
     if "empirical" in stored.tree.children:
         checked = [_of_sets(stored, centre) for centre in centres if not centre.untrusted]
         lines += [f"Check without a model of the population: {words}." for words in checked]

@@ -56,7 +56,7 @@ def _left(panel: Panel) -> float:
     if panel.bare or not panel.left:
         return 8.0 if panel.x_numbers and not panel.bare else 2.0  # half a number below the corner
     labels = [text for _, text in _y_ticks(panel)] if panel.y_numbers else []
-    widest = max(map(len, labels), default=0) * EM * SMALL
+    widest = max(map(len, labels), default=0) * WIDEST * SMALL
     return widest + 4.5 + (FONT + 5 if panel.ylabel else 0)
 
 

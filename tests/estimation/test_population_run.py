@@ -85,6 +85,15 @@ def test_where_draws_are_few_the_median_one_by_one_stands_with_its_interval(foun
     assert (float(low_text), float(high_text)) == pytest.approx((low, high), abs=0.02)
 
 
+def test_who_is_odd_is_said_beside_the_number(found):
+    stored = found[0]
+    assert not any("Perhaps not" in line for line in sentences(stored))
+    tree = stored.tree.copy(deep=True)
+    tree["alone"]["belongs"][2] = 0.3
+    line = "Perhaps not of the population, and as far as not, no part of these numbers: set2."
+    assert line in sentences(replace(stored, tree=tree))
+
+
 def test_the_next_spring_is_less_certain_than_the_mean(found):
     posterior = found[0].group("posterior")
     assert posterior["k_next"].std() > 1.2 * posterior["k_mean"].std()
