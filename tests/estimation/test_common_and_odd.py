@@ -290,3 +290,9 @@ def test_a_weighted_median():
     assert middle == pytest.approx(1.5)
     assert spread < x.std()
     assert median_of(np.array([0.0, 1.0, 2.0]), np.array([0.01, 50.0, 50.0]), member_stream(1, "a"))[0] < 1.0
+
+
+def test_a_few_that_are_sure_do_not_outweigh_many_others():
+    """Seven of ten lie about 0 ± 0.6, three at 1.4 ± 0.1."""
+    middle, std = np.array([-0.5, -0.3, -0.1, 0.1, 0.2, 0.3, 0.5, 1.4, 1.4, 1.4]), np.array([0.6] * 7 + [0.1] * 3)
+    assert median_of(middle, std, member_stream(1, "a"))[0] < 0.6

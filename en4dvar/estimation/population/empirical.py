@@ -2,7 +2,8 @@
 
 It stands beside that of the hierarchy as a check, and alone where there is no other. In white coordinates of the prior;
 each data set counts by 1/(s² + T²), s the standard deviation of its own posterior without what all have in common, and
-T² what the scatter of the medians (1.4826 times their median absolute deviation) leaves beyond the s². The interval is
+T² how much they differ beyond the s² (Paule & Mandel 1982, J. Res. NBS 87, 377): a few that are sure of themselves do
+not outweigh many others where they disagree with them. The interval is
 that of Student's t with the standard deviation of the weighted median under resampling of the data sets (Efron 1979,
 Ann. Stat. 7, 1), which is not taken to be smaller than the standard error of the weighted mean.
 """
@@ -12,13 +13,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import brentq
 from scipy.special import ndtri, stdtrit
 
 from en4dvar.model.state import Array
 from en4dvar.priors.prior import PriorTerm, member_stream
 
 RESAMPLED = 2000
-ROBUST = 1.4826  # times the median absolute deviation: the standard deviation of a normal distribution
 TAIL = 0.05
 
 
@@ -51,9 +52,14 @@ def empirical(term: PriorTerm, middle: Array, std: Array, common: float, seed: i
 
 def median_of(middle: Array, std: Array, stream: np.random.Generator) -> tuple[float, float]:
     """The weighted median of data sets (S,), and its standard deviation."""
-    scatter = ROBUST * np.median(np.abs(middle - np.median(middle)))
-    between = max(float(scatter**2 - np.median(std**2)), 0.0)
-    weights = 1 / np.maximum(std**2 + between, np.finfo(float).tiny)
+    variance = np.maximum(std**2, np.finfo(float).tiny)
+
+    def beyond(between: float) -> float:
+        weights = 1 / (variance + between)
+        return float(weights @ (middle - np.average(middle, weights=weights)) ** 2) - (len(middle) - 1)
+
+    between = brentq(beyond, 0.0, middle.var(ddof=1)) if beyond(0.0) > 0 else 0.0
+    weights = 1 / (variance + between)
     chosen = stream.integers(len(middle), size=(RESAMPLED, len(middle)))
     medians = _weighted_medians(middle[chosen], weights[chosen])
     spread = max(float(medians.std()), float(weights.sum() ** -0.5))
