@@ -1,6 +1,6 @@
 """Campaigns of bubbles through ``init`` and ``run`` of which one is odd: is it named, and what of the gel's number?
 
-    python benchmarks/odd_bubbles.py [--n 40] [--seed 1] [--bubbles 12] [--spread 0.2] [--minutes 9]
+    python benchmarks/odd_bubbles.py [--n 40] [--seed 1] [--bubbles 12] [--spread 0.2] [--liquid] [--minutes 9]
 
 Synthetic laser bubbles of one gel about 8 kPa and 0.1 Pa s, whose G and μ differ by ``--spread``; its density, pressure
 and pixel are off by draws of what ``init`` knows of them. Each is filmed at 270 kHz with errors of 0.5 % of R_max and
@@ -10,6 +10,8 @@ of another gel (soft polyacrylamide), its radii (``scale``) or its times (``cloc
 once, and the populations with each as the first of the twelve are made of them as ``run`` makes them. *Can be named* is
 by a test that is told how much bubbles differ: χ² of how far the first one's ln G and ln μ lie from the mean of the
 others, beyond what 5 % of clean campaigns exceed.
+
+``--liquid``: a liquid of about 0.02 Pa s instead, whose first bubble has four times the viscosity; no law differs.
 """
 
 from __future__ import annotations
@@ -38,7 +40,8 @@ KINDS = ("clean", "gel", "law", "other", "scale", "clock")
 QUICK = {"gas": "isothermal", "vapour": "none", "medium_heat": "cold", "vapour_pressure": "saturated"}
 NEO, STIFFENING = Wrong(), Wrong(law="quadratic-kelvin-voigt", of_law={"alpha": lambda truth: 0.5})
 OFF, OTHER = 1.08, {"G": 2.1 / 7.7, "mu": 0.118 / 0.101}  # soft over stiff polyacrylamide (Estrada et al. 2018)
-GEL, OF_GEL = {"G": 8e3, "mu": 0.1}, 0.3  # and how far the gels of campaigns differ, ln
+GEL, LIQUID, OF_GEL = {"G": 8e3, "mu": 0.1}, {"mu": 0.02}, 0.3  # and how far the gels of campaigns differ, ln
+NEWTONIAN = Wrong(fitted="newtonian")
 RATE, NOISE, BEFORE, CELLS = 270e3, 0.005, 4, 4000  # frames a second, of R_max, frames of the growth, of the path
 ATMOSPHERE, DENSITY, SOUND = (101.3, 0.01), (1030.0, 0.017), (1510.0, 0.015)  # as init proposes them
 PIXEL, RATIO = 0.005, (6.0, 12.0)  # std of the pixel, and R_max over R_eq
@@ -46,9 +49,10 @@ PIXEL, RATIO = 0.005, (6.0, 12.0)  # std of the pixel, and R_max over R_eq
 
 def film(truth: dict[str, float], constants: dict[str, str], kind: str, rng: np.random.Generator) -> str:
     """The file of a bubble, read as one of a ``kind``."""
-    factors = {"gel": {"G": 4.0}, "other": OTHER}.get(kind, {})
+    liquid = "G" not in truth
+    factors = {"gel": {"mu" if liquid else "G": 4.0}, "other": OTHER}.get(kind, {})
     truth = {name: value * factors.get(name, 1.0) for name, value in truth.items()}
-    world = STIFFENING if kind == "law" else NEO
+    world = NEWTONIAN if liquid else STIFFENING if kind == "law" else NEO
     t = (np.arange(-BEFORE, 40) + rng.random()) / RATE
     path = np.linspace(0.0, t[-1], CELLS)
     radius = world.radius(world.model(truth, QUICK, constants), truth, path)
@@ -59,10 +63,18 @@ def film(truth: dict[str, float], constants: dict[str, str], kind: str, rng: np.
     return "\n".join(["t_us,R_um", *rows]) + "\n"
 
 
-def campaign(seed: int, number: int, size: int, spread: float, folder: Path) -> dict[str, float]:
+def kinds(liquid: bool) -> tuple[str, ...]:
+    """How the first bubble may be."""
+    return tuple(kind for kind in KINDS if not liquid or kind not in ("law", "other"))
+
+
+def campaign(seed: int, number: int, size: int, spread: float, liquid: bool, folder: Path) -> dict[str, float]:
     """Files of a campaign, and of its first bubble odd in each way; the medians of its gel."""
     rng = np.random.default_rng([20340, seed, number])
-    gel = {name: value * float(np.exp(OF_GEL * rng.standard_normal())) for name, value in GEL.items()}
+    gel = {
+        name: value * float(np.exp(OF_GEL * rng.standard_normal()))
+        for name, value in (LIQUID if liquid else GEL).items()
+    }
     (p, p_std), (rho, rho_std), (c, c_std) = ATMOSPHERE, DENSITY, SOUND
     off = np.exp(np.array([p_std, rho_std, c_std, PIXEL]) * rng.standard_normal(4))
     constants = {"p_inf": f"{p * off[0]} kPa", "rho": f"{rho * off[1]} kg/m^3", "c": f"{c * off[2]} m/s"}
@@ -71,7 +83,7 @@ def campaign(seed: int, number: int, size: int, spread: float, folder: Path) -> 
         truth["R_max"] = 4e-4 * float(np.exp(0.1 * rng.standard_normal()))
         truth["R_eq"] = truth["R_max"] / rng.uniform(*RATIO)
         noise = int(rng.integers(2**32))
-        for kind in KINDS if i == 0 else KINDS[:1]:
+        for kind in kinds(liquid) if i == 0 else KINDS[:1]:
             name = f"b{i:02d}" if kind == "clean" else f"odd_{kind}"
             text = film(truth, constants, kind, np.random.default_rng(noise))
             (folder / f"{name}.csv").write_text(scaled(text, off[3]))
@@ -85,17 +97,18 @@ def scaled(text: str, factor: float) -> str:
     return "\n".join([head, *(f"{t},{factor * float(r):.6g}" for t, r in pairs)]) + "\n"
 
 
-def odd(seed: int, size: int, spread: float, key: str) -> Record:
+def odd(seed: int, size: int, spread: float, liquid: bool, key: str) -> Record:
     """Who is named of the bubbles of one gel, the first of them as they are and odd in each way."""
     with TemporaryDirectory() as name, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         folder, config = Path(name) / "films", Path(name) / "gel.yaml"
         folder.mkdir()
-        gel = campaign(seed, int(key), size, spread, folder)
+        gel = campaign(seed, int(key), size, spread, liquid, folder)
         odd_ones = {file: file.read_text() for file in folder.glob("odd_*.csv")}
         for file in odd_ones:
             file.unlink()
-        made = CliRunner().invoke(command_line, ["init", "--data", str(folder), "--out", str(config)])
+        law = ["--law", "newtonian"] if liquid else []
+        made = CliRunner().invoke(command_line, ["init", "--data", str(folder), "--out", str(config), *law])
         if made.exit_code:
             return {"failed": made.output.splitlines()[-1]}
         for file, text in odd_ones.items():
@@ -152,7 +165,7 @@ def share(of: Sequence[bool]) -> str:
 
 def table(records: Sequence[Record], spread: float) -> None:
     print("| the first bubble | campaigns | named | can be named | others named | medians inside 90 % ", end="")
-    print("| spreads inside 90 % | its own std of ln G, ln μ |")
+    print("| spreads inside 90 % | its own std of ln G, ln μ (of a liquid, ln μ) |")
     print("|---|---|---|---|---|---|---|---|")
     for kind in KINDS:
         of_it = [r[kind] for r in records if kind in r]
@@ -161,13 +174,16 @@ def table(records: Sequence[Record], spread: float) -> None:
             share((np.abs(np.ravel([r[key] for r in of_it]) - 0.5) < 0.45).tolist())
             for key in ("ranks", "spread ranks")
         ]
-        std = np.median([r["own std"][0] for r in of_it], axis=0) if of_it else [np.nan] * 2
+        inside[1] = inside[1] if spread else "–"
+        if not of_it:
+            continue
+        std = np.median([r["own std"][0] for r in of_it], axis=0)
         named = share([0 in r["named"] for r in of_it]) if kind != "clean" else "–"
         parts = [named, share([can_be_named(r, spread) for r in of_it]), share(others), *inside]
-        print(f"| {kind} | {len(of_it)} | {' | '.join(parts)} | {std[0]:.2f}, {std[1]:.2f} |")
+        print(f"| {kind} | {len(of_it)} | {' | '.join(parts)} | {', '.join(f'{s:.2f}' for s in std)} |")
     clean = [r for r in records if "clean" in r]
     off = np.array([np.median(r["clean"]["own mean"], axis=0) - r["medians"] for r in clean])
-    for name, of_it in zip(GEL, off.T, strict=True):
+    for name, of_it in zip(list(GEL)[-len(off.T) :], off.T, strict=True):
         error = of_it.std() / np.sqrt(len(of_it))
         print(f"clean: medians of single means lie {of_it.mean():+.3f} ± {error:.3f} from the gel's, in ln {name}")
     for r in records:
@@ -181,11 +197,12 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--bubbles", type=int, default=12)
     parser.add_argument("--spread", type=float, default=0.2, help="of ln G and ln mu between the bubbles of a gel")
+    parser.add_argument("--liquid", action="store_true")
     parser.add_argument("--minutes", type=float, default=9.0, help="start no campaign after so long")
     parser.add_argument("--records", type=Path, default=Path("runs/odd_bubbles"), help="folder of the records")
     o = parser.parse_args()
-    file = o.records / f"{o.seed}_{o.bubbles}_{o.spread:g}.jsonl"
-    records = fill(file, map(str, range(o.n)), partial(odd, o.seed, o.bubbles, o.spread), o.minutes)
+    file = o.records / f"{'liquid_' * o.liquid}{o.seed}_{o.bubbles}_{o.spread:g}.jsonl"
+    records = fill(file, map(str, range(o.n)), partial(odd, o.seed, o.bubbles, o.spread, o.liquid), o.minutes)
     table(list(records.values()), o.spread)
 
 
