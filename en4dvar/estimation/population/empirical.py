@@ -13,7 +13,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import brentq
 from scipy.special import ndtri, stdtrit
 
 from en4dvar.model.state import Array
@@ -52,6 +51,8 @@ def empirical(term: PriorTerm, middle: Array, std: Array, common: float, seed: i
 
 def median_of(middle: Array, std: Array, stream: np.random.Generator) -> tuple[float, float]:
     """The weighted median of data sets (S,), and its standard deviation."""
+    from scipy.optimize import brentq  # where it is used: every start would take longer
+
     variance = np.maximum(std**2, np.finfo(float).tiny)
 
     def beyond(between: float) -> float:
