@@ -136,12 +136,11 @@ class Asked:
 
     def incomplete(self, file: Path, advice: str) -> ConfigError:
         """The error that names what is :meth:`needed`."""
-        needed = self.needed()
-        columns_lack = any(option.endswith("column") for option, _, _ in needed)
-        options = ", ".join(f"{option} {value}{f' ({hint})' if hint else ''}" for option, value, hint in needed)
+        options = ", ".join(f"{option} {value}{f' ({hint})' if hint else ''}" for option, value, hint in self.needed())
         columns = ", ".join(self.contents.columns) or "none"
         message = f"{file}: columns with numbers: {columns}; units are never guessed: add {options}"
-        return ConfigError("\n".join([*(self.contents.others.values() if columns_lack else ()), message, advice]))
+        others = () if self.complete_columns else self.contents.others.values()
+        return ConfigError("\n".join([*others, message, advice]))
 
     def columns(self) -> dict[str, Any]:
         """Columns and units as ``propose_config`` takes them. Raises :class:`UnitError`: one is not of its kind."""

@@ -115,16 +115,14 @@ def histories(files: Mapping[str, DataFile], source: Source) -> tuple[dict[str, 
     ------
     DataError: none can be used. UnitError: a unit that is not of its kind.
     """
-    time = _times(source)
+    time, radius = _times(source), Column(*source.radius, "m", True)
     readings: dict[str, Readings] = {}
     unusable: list[str] = []
     for name, file in files.items():
         try:
-            series = read_series(file.path, time, Column(*source.radius, "m", True), source.layout, part=file.part)
+            readings[name] = read_series(file.path, time, radius, source.layout, part=file.part)
         except DataError as error:
             unusable.append(str(error))
-        else:
-            readings[name] = series
     if not readings:
         raise DataError("\n".join(unusable))
     return readings, unusable

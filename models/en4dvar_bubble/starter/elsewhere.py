@@ -134,9 +134,7 @@ def population(
     ``groups``: of its bubbles, where there are several, one gel each; () where all have too few.
     How much bubbles of one gel differ is known better than the gel itself; a liquid has one viscosity.
     """
-    if max(map(len, groups.of.values()), default=count) < FEWEST_SETS:
-        return ()
-    if not names:
+    if not names or max(map(len, groups.of.values()), default=count) < FEWEST_SETS:
         return ()
     common = ", ".join(quantity.key for quantity in known(medium))
     kind = groups.kind if groups.kind.isidentifier() else json.dumps(groups.kind, ensure_ascii=False)

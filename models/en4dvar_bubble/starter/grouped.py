@@ -1,7 +1,7 @@
 """Which gel, day or concentration each bubble is of: by its folder, or as a column of a table says."""
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -108,17 +108,10 @@ def _lines(path: Path) -> list[list[str]]:
 
 
 def _rows_of(name: str, file: DataFile, rows: Sequence[Sequence[str]], at: int) -> list[Sequence[str]]:
-    known = {*_words(name, file)}
-    return [row for row in rows if cell(row, at).replace("\\", "/") in known]
-
-
-def _words(name: str, file: DataFile) -> Iterator[str]:
-    """By which a table can name a data set."""
-    yield name
-    if file.part:
-        yield file.part
-    else:
-        yield from (file.path.name, file.path.stem, f"{file.path.parent.name}/{file.path.name}")
+    """Those that name a data set: by its part of a file, or by its file."""
+    path = file.path
+    words = (file.part,) if file.part else (path.name, path.stem, f"{path.parent.name}/{path.name}")
+    return [row for row in rows if cell(row, at).replace("\\", "/") in (name, *words)]
 
 
 def _in_data(file: DataFile, column: str, layout: Layout) -> str:

@@ -8,7 +8,7 @@ The collapse beside Rayleigh's: :mod:`en4dvar_bubble.collapse`.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -217,13 +217,11 @@ def _expected(t: Array, r: Array, at: float) -> tuple[float, float]:
     return float(inverse[2] @ r), math.sqrt(1 + float(inverse[2] @ inverse[2]))
 
 
-def _windows(times: Array, radius: Array) -> list[tuple[Array, Array]]:
-    windows = []
+def _windows(times: Array, radius: Array) -> Iterator[tuple[Array, Array]]:
     for i in range(len(radius) - WINDOW + 1):
         r, t = radius[i : i + WINDOW], times[i : i + WINDOW]
         if r.min() > STEEP * r.max() and np.diff(t).max() < 2.5 * np.diff(t).min():
-            windows.append((t, r))
-    return windows
+            yield t, r
 
 
 def _fitted(t: Array, r: Array, at: Array, degree: int) -> Array:

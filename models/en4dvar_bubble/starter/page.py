@@ -50,11 +50,6 @@ class Source:
         rate = f", rate: {quoted(self.rate)}" if self.rate is not None else ""
         return f"{{name: {quoted(self.time[0])}, unit: {quoted(self.time[1])}{rate}}}"
 
-    @property
-    def radius_entry(self) -> str:
-        """The ``radius`` column as YAML."""
-        return f"{{name: {quoted(self.radius[0])}, unit: {quoted(self.radius[1])}}}"
-
 
 # the table that 'en4dvar track' writes: its columns say their units
 TRACKED = Source("", ("t_us", "us"), None, ("R_um", "um"), errors=("R_std_um", "t_std_us"))
@@ -84,7 +79,7 @@ def yaml_text(name: str, source: Source, proposal: Proposal, command: str) -> st
         *source.layout_entries,
         "  columns:",
         f"    time: {source.time_entry}",
-        f"    {source.observable}: {source.radius_entry}",
+        f"    {source.observable}: {{name: {quoted(source.radius[0])}, unit: {quoted(source.radius[1])}}}",
     ]
     lines = [
         *head,

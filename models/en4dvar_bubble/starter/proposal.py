@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -151,9 +152,9 @@ def propose(
         [p.name for p in model.law.parameters], len(views), medium, _in_a_liquid(model), groups
     )
     return Proposal(
-        _data(chosen, look, model, {**others, **guess.values}, histories),
+        _data(look, model, {**others, **guess.values}, histories),
         (*_model(law_name, model, look), *wall[0]),
-        (*_parameters(model, chosen, look, believed, tops(looks, histories), medium), *wall[1]),
+        (*_parameters(model, look, believed, tops(looks, histories), medium), *wall[1]),
         SIMPLER[chosen],
         (*told, *[f"{len(views)} bubbles: {_ends_with(groups)}"] * bool(together)),
         tuple(warnings),
@@ -266,14 +267,10 @@ def _rest(look: Look) -> float:
 
 
 def _data(
-    start: Start,
-    look: Look,
-    model: BubbleModel,
-    theta: Mapping[str, float],
-    histories: Mapping[str, tuple[Array, Array]],
+    look: Look, model: BubbleModel, theta: Mapping[str, float], histories: Mapping[str, tuple[Array, Array]]
 ) -> tuple[Entry, ...]:
     """Window, clock and errors."""
-    if start == "laser":
+    if model.start == "laser":
         lines = [
             _window(look, histories),
             Entry("time_zero", "window", "the model's clock starts at the top, t_s later or earlier"),
@@ -287,7 +284,7 @@ def _data(
         std = _text(max(look.noise, LEAST_NOISE * look.lobe.R_max), "m", "um")
         words = "scatter of the readings where R is smooth; sigma below scales it"
     timing = _text(TIMING * look.step, "s", "us")
-    key = "  time_std" if start == "laser" else "  # time_std"  # a flash is short
+    key = "  time_std" if model.start == "laser" else "  # time_std"  # a flash is short
     robust = [Entry("  robust", "huber", "some readings are far from their neighbours and count less")] * bool(look.bad)
     return (
         *lines,
@@ -357,10 +354,8 @@ def _clock(look: Look, model: BubbleModel, theta: Mapping[str, float]) -> Entry:
     shift = 0.0
     if all(p.name in theta for p in model.parameters):
         (path,) = model.trajectories(model.initial_states({n: np.array([v]) for n, v in theta.items()}), times)
-        try:
+        with suppress(DataError, TypeError):
             shift = look.lobe.t_max - lobe(times, path["R"]).t_max  # type: ignore[index]
-        except (DataError, TypeError):
-            shift = 0.0
     if abs(shift) <= SAME_CLOCK:
         return Entry("time_zero", "file", "the file's clock agrees with that of the pulse")
     zero = min(shift, look.times[0])
@@ -389,10 +384,8 @@ def _model(law: str, model: BubbleModel, look: Look | None) -> tuple[Entry, ...]
     return tuple(lines)
 
 
-def _parameters(
-    model: BubbleModel, start: Start, look: Look, guess: Guess, top: Tops | None, medium: str
-) -> tuple[Entry, ...]:
-    lines = []
+def _parameters(model: BubbleModel, look: Look, guess: Guess, top: Tops, medium: str) -> tuple[Entry, ...]:
+    start, lines = model.start, []
     water = elsewhere.of_water(look.lobe.R_max) if medium == "water" and _in_a_liquid(model) else {}
     for p in model.law.parameters:
         if p.name in water:
@@ -411,7 +404,7 @@ def _parameters(
     if R_EQ.name in water and not np.isfinite(look.rest):
         radii[R_EQ.name] = Entry(R_EQ.name, *water[R_EQ.name])
     lines += radii.values()
-    mean, std = (0.0, 0.5e-6) if start == "acoustic" or top is None else top.t_s
+    mean, std = (0.0, 0.5e-6) if start == "acoustic" else top.t_s
     prior = f"{{prior: normal, mean: {_text(mean, 's', 'us', 4)}, std: {_text(std, 's', 'us')}}}"
     words = "the clock of the data against that of the pulse"
     if start == "laser":
