@@ -25,6 +25,7 @@ from en4dvar_bubble.collapse import doubts
 from en4dvar_bubble.dynamics import MACH_LIMITS, Dynamics, Wall
 from en4dvar_bubble.emission import OBSERVABLE
 from en4dvar_bubble.events import OBSERVABLES
+from en4dvar_bubble.laws import get_law
 from en4dvar_bubble.numbers import NAMES
 from en4dvar_bubble.packing import pack, with_gas
 from en4dvar_bubble.paths import Paths
@@ -66,7 +67,7 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
     def from_settings(cls, settings: BubbleSettings) -> "BubbleModel":
         """The model of a ``model:`` section."""
         return cls(
-            law=settings.constitutive_law,
+            law=get_law(settings.law),
             gas=settings.gas,
             start=settings.start,
             driving=settings.driving.build(),
@@ -138,24 +139,20 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
         return np.asarray(path.states[0, 0])
 
     def trajectories(self, x: Array, times: Array) -> Sequence[Trajectory | Failure]:
-        shared = self.share(x, times)
-        shared.work()
-        return shared.results()
+        return self.integrate(np.asarray(x, dtype=float), np.broadcast_to(times, (len(x), np.shape(times)[-1])))
 
     def share(self, x: Array, times: Array) -> Shared:
         times = np.broadcast_to(times, (len(x), np.shape(times)[-1]))
         return Shared(*self.prepared(np.asarray(x, dtype=float), times))
 
-    def integrate(self, x: Array, times: Array, t0: float = 0.0) -> Paths:
-        """All members from their states ``x`` (N, n_state) at ``t0`` (s) to ``times`` (N, K) (s, increasing)."""
+    def integrate(self, x: Array, times: Array, t0: Array | float = 0.0) -> Paths:
+        """All members from states ``x`` (N, n_state) at ``t0`` (s, one or (N,)) to ``times`` (N, K) (s, increasing)."""
         work, finish = self.prepared(x, times, t0)
         work()
         return finish()
 
     def resumed(self, x: Array, start: Array, times: Array) -> Sequence[Trajectory | Failure]:
-        work, finish = self.prepared(np.asarray(x, dtype=float), times, start)
-        work()
-        return finish()
+        return self.integrate(np.asarray(x, dtype=float), times, start)
 
     def prepared(
         self, x: Array, times: Array, t0: Array | float = 0.0

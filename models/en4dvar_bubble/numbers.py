@@ -3,7 +3,7 @@
 Constants of the medium and the gas, amplitude, time and shape of the driving, and the state at time zero.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import Field
 from types import MappingProxyType
 from typing import Any
@@ -37,15 +37,11 @@ def _of(constant: Field[Any]) -> Parameter:
     return Parameter(name, about["unit"], "lognormal", (least, most), label, symbol, shown, about["source"], True)
 
 
-def _of_medium() -> Iterator[tuple[str, Parameter]]:
-    for constant in CONSTANTS:
-        if constant.name not in _KNOWN:
-            yield constant.name, _of(constant)
-    label = "constant vapour pressure in the bubble"
-    yield "p_v", Parameter("p_v", "Pa", "lognormal", (0.0, np.inf), label, "$p_v$", "kPa", common=True)
-
-
-OF_MEDIUM: Mapping[str, Parameter] = MappingProxyType(dict(_of_medium()))
+_VAPOUR = "constant vapour pressure in the bubble"
+OF_MEDIUM: Mapping[str, Parameter] = MappingProxyType(
+    {constant.name: _of(constant) for constant in CONSTANTS if constant.name not in _KNOWN}
+    | {"p_v": Parameter("p_v", "Pa", "lognormal", (0.0, np.inf), _VAPOUR, "$p_v$", "kPa", common=True)}
+)
 """Constant of the medium → the parameter that sets it."""
 P_A = Parameter("p_A", "Pa", "normal", label="amplitude of the driving", symbol="$p_A$", display_unit="MPa")
 GAS_CONTENT = Parameter(

@@ -23,7 +23,7 @@ from en4dvar_bubble.driving import Reading
 from en4dvar_bubble.driving.settings import PULSE_SECTIONS, DrivingSettings, Section, with_kind
 from en4dvar_bubble.dynamics import R0, R_EQ, R_MAX, Gas, Heat, Start, Vapour
 from en4dvar_bubble.gas import saturated_vapour_pressure
-from en4dvar_bubble.laws import REGISTRY, ConstitutiveLaw, get_law
+from en4dvar_bubble.laws import REGISTRY
 from en4dvar_bubble.laws.loading import qualified
 from en4dvar_bubble.media import KnownMedium, known_medium
 from en4dvar_bubble.medium import CONSTANT_SETS, CONSTANTS, UNITS, WATER_25C, Medium
@@ -46,13 +46,8 @@ class _NamedSet(Section):
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core_schema: Any, handler: Any) -> dict[str, Any]:
-        names = list(get_args(SetName))
-        return {
-            "anyOf": [
-                {"enum": names, "description": "Name of a set of constants."},
-                super().__get_pydantic_json_schema__(core_schema, handler),
-            ]
-        }
+        names = {"enum": list(get_args(SetName)), "description": "Name of a set of constants."}
+        return {"anyOf": [names, super().__get_pydantic_json_schema__(core_schema, handler)]}
 
     @model_validator(mode="before")
     @classmethod
@@ -236,10 +231,6 @@ class BubbleSettings(Section):
         """The parameters of every built-in law and start, for editors; a configuration has those of its own."""
         of_laws = [p for law in REGISTRY.values() for p in law.parameters]
         return tuple({p.name: p for p in (*of_laws, R0, R_EQ, R_MAX, *ALL)}.values())
-
-    @property
-    def constitutive_law(self) -> ConstitutiveLaw:
-        return get_law(self.law)
 
     @property
     def liquid(self) -> Medium:
