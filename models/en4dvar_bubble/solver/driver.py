@@ -206,23 +206,19 @@ def reason(status: int, record: Array) -> str:
 @cache
 def _gas_operators(m: int, clustering: float) -> Array:
     """Collocation operators as one array in the kernel's layout, see :class:`arrays.Equations`."""
-    ops = np.zeros((2 * m + 3, m + 1))
-    if m:
-        b = ball(m, clustering)
-        ops[: m + 1], ops[m + 1 : 2 * m + 1] = b.derivative, b.laplacian[:m]
-        ops[2 * m + 1], ops[2 * m + 2] = b.y, b.weights
-    return ops
+    if not m:
+        return np.zeros((3, 1))
+    b = ball(m, clustering)
+    return np.vstack([b.derivative, b.laplacian[:m], b.y, b.weights])
 
 
 @cache
 def _medium_operators(m: int, length: float) -> Array:
     """The same for the medium."""
-    ops = np.zeros((2 * m + 3, m + 1))
-    if m:
-        e = exterior(m, length)
-        ops[: m + 1], ops[m + 1 : 2 * m + 1] = e.derivative, e.laplacian[:m]
-        ops[2 * m + 1], ops[2 * m + 2] = e.x - e.x**-2, e.x**-6.0
-    return ops
+    if not m:
+        return np.zeros((3, 1))
+    e = exterior(m, length)
+    return np.vstack([e.derivative, e.laplacian[:m], e.x - e.x**-2, e.x**-6.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,28 +235,19 @@ class Solver:
     """Wall Mach number that the radial equation bears."""
 
     @cached_property
-    def lengths(self) -> tuple[Any, Any]:
-        """``nodes`` and ``size`` of the equations: as tuples, whose length the compiler sees, for few nodes.
+    def _arrangement(self) -> tuple[Any, Any, Any, Any]:
+        """``nodes``, ``size``, ``where`` and ``places`` of the equations: for few nodes the first two are tuples, whose
+        length the compiler sees, and the matrix is not in tiles.
 
         Unrolling halves the time of a step and costs a compilation (some seconds, once) for every number of nodes.
         """
         system = self.system
         if system.general:
-            return None, None
+            return None, None, *tiles(system.dims)
         if system.gas in UNROLLED:
-            return (0,) * system.gas, (0,) * system.size
-        return np.zeros(system.gas), None
-
-    @cached_property
-    def tiles(self) -> tuple[Any, Any]:
-        """``where`` and ``places`` of the equations."""
-        system = self.system
-        if system.general:
-            return tiles(system.dims)
-        if system.gas in UNROLLED:
-            return None, None
+            return (0,) * system.gas, (0,) * system.size, None, None
         every = np.arange(system.size)
-        return kept_tiles(np.ones((len(every), len(every)), dtype=bool), every), every
+        return np.zeros(system.gas), None, kept_tiles(np.ones((len(every), len(every)), dtype=bool), every), every
 
     def equations(self, memory: Array, viscous: Array, pulse: Array, halved: bool = False) -> Equations:
         """What the compiled equations read beside the members' parameters; tables of laws and pulses (…, cells, 8).
@@ -274,8 +261,8 @@ class Solver:
             general = medium, memory, viscous, _ELASTIC_SPAN if system.strain else _VISCOUS_SPAN
         gas, reading = _gas_operators(system.gas, system.clustering), READINGS[self.reading]
         shared = gas, _REFINED_SPAN if halved else _ELASTIC_SPAN, pulse, driving.span
-        where, places = self.tiles
-        return Equations(*self.lengths, system.dims, *shared, reading, *general, where, places)
+        nodes, size, where, places = self._arrangement
+        return Equations(nodes, size, system.dims, *shared, reading, *general, where, places)
 
     @cached_property
     def control(self) -> Control:
@@ -318,10 +305,9 @@ class Solver:
         return call, Solution(*output)
 
     def _scratch(self, parameters: int, cells: int) -> Scratch:
-        system, (where, _) = self.system, self.tiles
+        system, where = self.system, self._arrangement[2]
         matrix = 0 if system.general else system.size**2
         of_tiles = (0, 0) if where is None else ((where.max() + 1) * AREA, len(where) * EDGE)
         border = system.size - system.wall_row + sums.py_func(system.dims) if system.general else 0
         of_fields = scratch_rows(system.dims)
-        of_lanes = parameters, cells, _FIRST_STEP
-        return scratch(system.dims, matrix, of_tiles, border, of_fields, *of_lanes)
+        return scratch(system.dims, matrix, of_tiles, border, of_fields, parameters, cells, _FIRST_STEP)
