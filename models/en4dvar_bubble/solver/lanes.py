@@ -30,30 +30,17 @@ _CONTRACT = ("contract",)
 TRIED_FIRST = {"target": "cpu"}  # of the meanings of an operator: numba asks those for any target, a dozen, after these
 
 
-class _Lanes(types.Type):
-    def __init__(self) -> None:
-        super().__init__(name="f64x8")
+class _Vector(types.Type):
+    """A value for each lane."""
 
 
-class _Mask(types.Type):
-    def __init__(self) -> None:
-        super().__init__(name="i1x8")
+lanes, mask = _Vector("f64x8"), _Vector("i1x8")
 
 
-lanes = _Lanes()
-mask = _Mask()
-
-
-@register_model(_Lanes)
-class _LanesModel(models.PrimitiveModel):
+@register_model(_Vector)
+class _VectorModel(models.PrimitiveModel):
     def __init__(self, dmm: Any, fe_type: Any) -> None:
-        super().__init__(dmm, fe_type, _VEC)
-
-
-@register_model(_Mask)
-class _MaskModel(models.PrimitiveModel):
-    def __init__(self, dmm: Any, fe_type: Any) -> None:
-        super().__init__(dmm, fe_type, _MASK)
+        super().__init__(dmm, fe_type, _VEC if fe_type == lanes else _MASK)
 
 
 def _splat(builder: Any, value: Any) -> Any:
