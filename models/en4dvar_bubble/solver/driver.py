@@ -184,23 +184,19 @@ class Solution:
     record: Array
 
     def reason(self, member: int) -> str:
-        """Why a member failed, "" where it did not."""
-        return reason(int(self.status[member]), self.record[member])
-
-
-def reason(status: int, record: Array) -> str:
-    """The failure in words."""
-    if status == integrate.OK:
-        return ""
-    words = {
-        integrate.STEP_LIMIT: "step limit reached",
-        integrate.NON_FINITE: "non-finite state",
-        integrate.STEP_UNDERFLOW: "step size underflow",
-        integrate.MACH_LIMIT: f"model validity: wall Mach {record[integrate.MAX_MACH]:.3g}",
-        integrate.WALL_LIMIT: "model validity: wall above the critical temperature of water",
-        integrate.TIME_LIMIT: "time limit reached",
-    }
-    return f"{words[status]} at t = {record[integrate.END_TIME]:.4g} µs"
+        """Why a member failed, in words; "" where it did not."""
+        status, record = int(self.status[member]), self.record[member]
+        if status == integrate.OK:
+            return ""
+        words = {
+            integrate.STEP_LIMIT: "step limit reached",
+            integrate.NON_FINITE: "non-finite state",
+            integrate.STEP_UNDERFLOW: "step size underflow",
+            integrate.MACH_LIMIT: f"model validity: wall Mach {record[integrate.MAX_MACH]:.3g}",
+            integrate.WALL_LIMIT: "model validity: wall above the critical temperature of water",
+            integrate.TIME_LIMIT: "time limit reached",
+        }
+        return f"{words[status]} at t = {record[integrate.END_TIME]:.4g} µs"
 
 
 @cache

@@ -20,7 +20,7 @@ from en4dvar_bubble.solver.rows import AMPLITUDE, PULSE_RATE, PULSE_SHIFT, SMEAR
 from en4dvar_bubble.solver.step import LEAST_ERROR, attempt, interpolant, judge
 from en4dvar_bubble.tables import fill_one
 
-# Status of a member; the reasons users read are made by ``driver.reason``.
+# Status of a member; the reasons users read are made by ``driver.Solution``.
 OK, STEP_LIMIT, NON_FINITE, STEP_UNDERFLOW, MACH_LIMIT, TIME_LIMIT, WALL_LIMIT = 0, 1, 2, 3, 4, 5, 6
 # Columns of the per-member record.
 STEPS, REJECTED, MAX_MACH, MAX_THETA, MIN_LOG_R, END_TIME, BEYOND, SMEAR, MARK, TO_MARK = 0, 1, 2, 3, 4, 5, 6, 7, 8, 9

@@ -147,8 +147,10 @@ def _choose_rows(eq):
 
 
 @nb.njit(inline="always")
-def _stages(lanes, eq, algebraic, w):
-    """The stages to ``k``, the argument of the last to ``stage``."""
+def attempt(lanes, eq, w):
+    """The stages of one step of all lanes to ``k``, the argument of the last to ``stage``."""
+    algebraic = _algebraic_rows(eq)
+    _linearise(lanes, eq, w)
     n = len(w.f)
     fast_row = n - 2  # V, the only row with an explicit time dependence
     step = load(lanes.h, 0)
@@ -197,14 +199,6 @@ def judge(lanes, shear, tolerances, w):
     store(w.norm, 1, exp(log(maximum(error_norm, LEAST_ERROR)) * _EXPONENT))
     mach = absolute(load(w.y_new, n - 2)) * exp(load(w.y_new, n - 1)) * load(lanes.loaded.par, INVERSE_C)
     store(w.norm, 2, mach)
-
-
-@nb.njit(inline="always")
-def attempt(lanes, eq, w):
-    """The stages of one step of all lanes."""
-    algebraic = _algebraic_rows(eq)
-    _linearise(lanes, eq, w)
-    _stages(lanes, eq, algebraic, w)
 
 
 @called
