@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from en4dvar.model.state import Array
-from en4dvar.plumbing.errors import En4dvarError
+from en4dvar.plumbing.errors import En4dvarError, retold
 from en4dvar.plumbing.hints import suggest
 from en4dvar.plumbing.units import parse_unit
 from en4dvar.plumbing.user_code import reason_of
@@ -115,10 +115,8 @@ def table_has_the_slope_of_the_law(law: ConstitutiveLaw) -> None:
 
     The table of a law that is too sharp for that has halved cells, and holds its stress to 1e-7.
     """
-    try:
+    with retold(ValueError, AssertionError):
         refuse_inexact(type(law))
-    except ValueError as refused:
-        raise AssertionError(str(refused)) from refused
     if is_sharp(type(law)):
         return
     error, stretch = slope_error(law)

@@ -39,16 +39,9 @@ def laws(names: tuple[str, ...], check: bool) -> None:
     """
     from en4dvar_bubble.laws.loading import available, get_law
 
-    broken: list[str] = []
-    if names:
-        chosen = [get_law(name) for name in names]
-    else:
-        chosen = []
-        for kind in available().values():
-            if isinstance(kind, En4dvarError):
-                broken.append(str(kind))
-            else:
-                chosen.append(kind())
+    kinds = () if names else available().values()
+    broken = [str(kind) for kind in kinds if isinstance(kind, En4dvarError)]
+    chosen = [get_law(name) for name in names] or [kind() for kind in kinds if not isinstance(kind, En4dvarError)]
     if check:
         broken += _check(chosen)
     else:

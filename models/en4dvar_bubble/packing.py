@@ -199,30 +199,27 @@ def _memory(
 def _constants(model: Dynamics, medium: Medium, own: Mapping[str, Array], n_members: int) -> Array:
     """The parameters (N, rows) of the solver that come from the medium and the driving; zeros elsewhere."""
     system = model.system
-    row: dict[int, float | Array] = {}
-    row[rows.VAPOUR] = medium.p_v / medium.rho
-    row[rows.AMBIENT] = medium.p_inf / medium.rho
-    row[rows.SURFACE] = 2 * medium.S / medium.rho * 1e6
-    row[rows.INVERSE_C] = 0.0 if system.radial == "rayleigh-plesset" else 1 / medium.c
-    row[rows.CONDUCTION] = medium.K_inf * medium.T_inf / medium.rho * 1e6
-    row[rows.KAPPA] = medium.kappa if system.gas else model.exponent(medium)
-    row[rows.SLOPE] = medium.conduction_slope
-    row[rows.AMPLITUDE] = own.get(P_A.name, model.driving.amplitude) / medium.rho
-    row[rows.TAIT_B] = medium.tait_B / medium.rho
-    row[rows.TAIT_N] = medium.tait_n
-    row[rows.DIFFUSION] = medium.D_v * 1e6
-    row[rows.DIFFUSION_P] = medium.D_p
-    row[rows.DIFFUSION_T] = medium.D_T
-    row[rows.SATURATION] = SATURATION / medium.rho
-    row[rows.SATURATION_T] = SATURATION_TEMPERATURE / medium.T_inf
-    row[rows.IMAGE] = model.image(own) * 1e-6
-    R_v = GAS_CONSTANT / medium.M_v
-    row[rows.CROSSING] = own.get(ACCOMMODATION.name, 0.0) * np.sqrt(R_v * medium.T_inf / (2 * np.pi))
-    row[rows.LATENT] = medium.L_v / (R_v * medium.T_inf) * medium.D_v * medium.rho / (medium.K_inf * medium.T_inf)
-    row[rows.MEDIUM_K] = medium.K_m / medium.K_inf
-    row[rows.MEDIUM_D] = medium.K_m / (medium.rho * medium.c_m) * 1e6
-    row[rows.HEATING] = 12 / (medium.c_m * medium.T_inf)
     par = np.zeros((n_members, rows.PARAMETERS + rows.PER_MEMORY * system.memory))
-    for at, value in row.items():
-        par[:, at] = value
+    par[:, rows.VAPOUR] = medium.p_v / medium.rho
+    par[:, rows.AMBIENT] = medium.p_inf / medium.rho
+    par[:, rows.SURFACE] = 2 * medium.S / medium.rho * 1e6
+    par[:, rows.INVERSE_C] = 0.0 if system.radial == "rayleigh-plesset" else 1 / medium.c
+    par[:, rows.CONDUCTION] = medium.K_inf * medium.T_inf / medium.rho * 1e6
+    par[:, rows.KAPPA] = medium.kappa if system.gas else model.exponent(medium)
+    par[:, rows.SLOPE] = medium.conduction_slope
+    par[:, rows.AMPLITUDE] = own.get(P_A.name, model.driving.amplitude) / medium.rho
+    par[:, rows.TAIT_B] = medium.tait_B / medium.rho
+    par[:, rows.TAIT_N] = medium.tait_n
+    par[:, rows.DIFFUSION] = medium.D_v * 1e6
+    par[:, rows.DIFFUSION_P] = medium.D_p
+    par[:, rows.DIFFUSION_T] = medium.D_T
+    par[:, rows.SATURATION] = SATURATION / medium.rho
+    par[:, rows.SATURATION_T] = SATURATION_TEMPERATURE / medium.T_inf
+    par[:, rows.IMAGE] = model.image(own) * 1e-6
+    R_v = GAS_CONSTANT / medium.M_v
+    par[:, rows.CROSSING] = own.get(ACCOMMODATION.name, 0.0) * np.sqrt(R_v * medium.T_inf / (2 * np.pi))
+    par[:, rows.LATENT] = medium.L_v / (R_v * medium.T_inf) * medium.D_v * medium.rho / (medium.K_inf * medium.T_inf)
+    par[:, rows.MEDIUM_K] = medium.K_m / medium.K_inf
+    par[:, rows.MEDIUM_D] = medium.K_m / (medium.rho * medium.c_m) * 1e6
+    par[:, rows.HEATING] = 12 / (medium.c_m * medium.T_inf)
     return par

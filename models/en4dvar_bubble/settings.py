@@ -16,7 +16,7 @@ from pydantic import (
 )
 
 from en4dvar.model.state import Parameter
-from en4dvar.plumbing.errors import ConfigError
+from en4dvar.plumbing.errors import ConfigError, retold
 from en4dvar.plumbing.hints import suggest
 from en4dvar.plumbing.units import Quantity, parse_quantity
 from en4dvar_bubble.driving import Reading
@@ -212,10 +212,8 @@ class BubbleSettings(Section):
     @classmethod
     def _known_law(cls, value: str, info: ValidationInfo) -> str:
         """A law from a file: its path is relative to the configuration's folder, and absolute from here on."""
-        try:
+        with retold(ConfigError, ValueError):
             return qualified(value, (info.context or {}).get("base"))
-        except ConfigError as error:
-            raise ValueError(str(error)) from error
 
     @field_validator("vapour_pressure", mode="before")
     @classmethod
