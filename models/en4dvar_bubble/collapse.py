@@ -158,16 +158,11 @@ class Expected:
         r = self.ratios[self.common]
         return bool(np.any(r <= ratio) if short else np.any(r >= ratio))
 
-    @property
-    def range(self) -> tuple[float, float]:
-        """The range that the prior can bring about, members and the tails beyond them."""
+    def reaches(self, ratio: float, apart: float) -> bool:
+        """True if the prior, members and the tails beyond them, brings a ratio about up to the factor ``apart``."""
         low, high = np.log([self.ratios.min(), self.ratios.max()])
         more = TAILS * (high - low)
-        return math.exp(low - more), math.exp(high + more)
-
-    def reaches(self, ratio: float, apart: float) -> bool:
-        """True if a ratio lies within that range, up to the factor ``apart``."""
-        return self.range[0] / apart <= ratio <= self.range[1] * apart
+        return math.exp(low - more) / apart <= ratio <= math.exp(high + more) * apart
 
 
 NOTHING = Expected(np.empty(0), np.empty(0, dtype=bool))

@@ -123,7 +123,7 @@ class Paths(Batch):
 
     def _chi(self) -> Array:
         system = self.model.system
-        gas = self.solution.states[:, :, system.first_vapour : system.first_medium]
+        gas = self.solution.states[:, :, system.gas : system.first_medium]
         if system.kinetic:
             gas = np.concatenate([gas, self.solution.states[:, :, system.first_memory - 1, None]], axis=2)
         return 1 - gas

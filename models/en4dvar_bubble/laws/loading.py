@@ -142,7 +142,8 @@ def get_law(name: str, base: Path | None = None) -> ConstitutiveLaw:
     if user_file.is_file_reference(name):
         law = user_file.load(user_file.absolute(name, base), f"law {name!r}")
     elif colon:
-        law = _from_module(where, attribute)
+        with loading(f"law '{name}' cannot be imported"):
+            law = user_file.class_of(imported(f"law '{name}'", where), attribute, where)
     else:
         law = _from_entry_point(name)
     return check_law(law, name)
@@ -162,12 +163,6 @@ def available() -> dict[str, type[ConstitutiveLaw] | ConfigError]:
         except ConfigError as error:
             laws[entry.name] = error
     return dict(sorted((laws | REGISTRY).items()))
-
-
-def _from_module(where: str, attribute: str) -> Any:
-    name = f"law '{where}:{attribute}'"
-    with loading(f"{name} cannot be imported"):
-        return user_file.class_of(imported(name, where), attribute, where)
 
 
 def _from_entry_point(name: str) -> Any:

@@ -140,10 +140,6 @@ class System:
         return Dims(*counts, RADIALS[self.radial], int(self.shear), int(self.strain))
 
     @property
-    def first_vapour(self) -> int:
-        return self.gas
-
-    @property
     def first_medium(self) -> int:
         return self.gas + self.vapour
 
@@ -158,7 +154,7 @@ class System:
     def tolerances(self, rtol: float) -> Array:
         """(2, n) absolute and relative tolerances; ln R has an absolute one, which is a relative one of R."""
         tol = np.full((2, self.size), rtol)
-        tol[0, self.first_vapour : self.first_medium] = rtol * _LEAST_GAS
+        tol[0, self.gas : self.first_medium] = rtol * _LEAST_GAS
         tol[0, self.wall_row + self.wall : self.first_memory] = rtol * _LEAST_GAS
         tol[0, self.first_memory : -2] = rtol * _STRESS_SCALE
         tol[0, -2] = rtol * _SLOWEST_RATE

@@ -12,11 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from en4dvar.inputs.asked import ANY
-from en4dvar.model.state import Array, Parameter
+from en4dvar.model.state import Array
 from en4dvar.plumbing.tables import csv_text
 from en4dvar_bubble.collapse import RAYLEIGH
 from en4dvar_bubble.medium import Medium
-from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.starter.page import Source
 from en4dvar_bubble.starter.proposal import WHY, Entry, Proposal, built, example, known_elsewhere
 
@@ -75,6 +74,8 @@ def propose_from_times(rows: Summaries, law: str | None, medium: str) -> Proposa
     """
     model, law_name = built("laser", law)
     told = f"{', '.join(rows.names)} are {len(rows.t_c)} rows of R_max, R_max/R_eq and collapse time in SI units"
+    lines = [example(p, model) for p in model.law.parameters]
+    of_gel = [replace(line, value=f"{line.value[:-1]}{SHARED}}}") for line in lines]
     radii = [
         Entry(name, f"{{prior: lognormal, median: {{from_file: {column}, unit: um}}, log_std: {RADIUS_STD}}}", words)
         for name, column, words in (
@@ -90,7 +91,7 @@ def propose_from_times(rows: Summaries, law: str | None, medium: str) -> Proposa
             Entry("start", "laser", "the clock starts at R_max"),
             *(Entry(key, value, WHY[value]) for key, value in {"gas": "heat", "vapour": "transport"}.items()),
         ),
-        (*(_shared(p, model) for p in model.law.parameters), *radii, *known_elsewhere(medium, SHARED)),
+        (*of_gel, *radii, *known_elsewhere(medium, SHARED)),
         {},
         (f"{told}, one a bubble; the gel is common to all",),
         assimilation=(
@@ -100,8 +101,3 @@ def propose_from_times(rows: Summaries, law: str | None, medium: str) -> Proposa
             Entry("what_if", "false"),
         ),
     )
-
-
-def _shared(p: Parameter, model: BubbleModel) -> Entry:
-    line = example(p, model)
-    return replace(line, value=f"{line.value[:-1]}{SHARED}}}")
