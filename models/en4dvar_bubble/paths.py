@@ -73,8 +73,7 @@ class Paths(Batch):
         """(N,) since when (s) the wall is faster than the radial equation bears, +inf: never; see :meth:`largest`."""
         if self.model.radial == "rayleigh-plesset":
             over = np.abs(self["Rdot"]) / self.medium(1).c > limit.value
-            first = np.take_along_axis(self.times, np.argmax(over, axis=1)[:, None], axis=1)[:, 0]
-            return np.where(over.any(axis=1), first, np.inf)
+            return np.asarray(np.where(over, self.times, np.inf).min(axis=1))
         return np.asarray(self.solution.record[:, BEYOND] * 1e-6)
 
     @property

@@ -52,7 +52,8 @@ def refine(function: Callable[[Array], Array], slope: bool) -> Refined:
         difference = made @ to_checked - exact
         error, size = np.abs(difference).max(axis=1), np.abs(exact).max(axis=1)
         if level == 0:
-            central = _largest(size[np.abs(left) < np.log(2)])
+            middle = size[np.abs(left) < np.log(2)]
+            central = float(np.max(middle, where=np.isfinite(middle), initial=0.0))
             floor = central * (np.log(2) if slope else 1.0)
         scale = np.maximum(floor, size)
         if slope:
@@ -82,11 +83,6 @@ def refine(function: Callable[[Array], Array], slope: bool) -> Refined:
     if slope:
         _add_up(records)
     return Refined(np.concatenate([records, np.zeros((1, 8))]), np.asarray(inexact, dtype=float))
-
-
-def _largest(sizes: Array) -> float:
-    finite = sizes[np.isfinite(sizes)]
-    return float(finite.max()) if finite.size else 0.0
 
 
 def _add_up(records: Array) -> None:
