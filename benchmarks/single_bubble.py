@@ -14,6 +14,7 @@ import numba as nb
 import numpy as np
 
 from en4dvar_bubble import BubbleModel
+from en4dvar_bubble.laws.tabulate import GRID
 from en4dvar_bubble.packing import pack
 from en4dvar_bubble.solver.arrays import Loaded
 from en4dvar_bubble.solver.integrate import groups
@@ -67,11 +68,15 @@ class Bubble:
         self._atol = system.tolerances(1.0)[0]
         wall = system.wall_row if system.wall else -1
         par = np.repeat(members.parameters[i][:, None], WIDTH, axis=1)
-        scratch = solver._scratch(len(par))
+        cells = max(members.tables.shape[1], GRID.cells)
+        scratch = solver._scratch(len(par), cells)
         par[SMEARED] = smeared
         par[TABLE] = np.arange(WIDTH) * scratch.elastic[0].size
-        fill(np.repeat(members.samples[i : i + 1], WIDTH, axis=0), members.factor, scratch.elastic)
-        equations = solver.equations(packed.memory, packed.viscous, packed.pulse)
+        if len(members.samples):
+            fill(np.repeat(members.samples[i : i + 1], WIDTH, axis=0), members.factor, scratch.elastic)
+        else:
+            scratch.elastic[:] = members.tables[i]
+        equations = solver.equations(packed.memory, packed.viscous, packed.pulse, cells > GRID.cells)
         self._rest = wall, equations, par, scratch.elastic, scratch
         self._lanes, self._found = np.empty((self.n, WIDTH)), np.empty((self.n, WIDTH))
 
