@@ -4,6 +4,7 @@
     python benchmarks/two_commands.py … --splits 10        and random halves of each finished run against each other
     python benchmarks/two_commands.py … --set KEY=VALUE    the second command with another value, any number of times
     python benchmarks/two_commands.py … --medium 'polyacrylamide 8 %'    the first with another medium than the page has
+    python benchmarks/two_commands.py … --from-trough 1    only what follows the first trough of each recording
 
 ``init --data FOLDER`` with the law and the medium of a folder of known name (``measured_page.py``), and ``run`` of what
 it writes, on one worker and with its page. Printed are the processor time of each, the medians of the gel with their
@@ -29,7 +30,7 @@ from pathlib import Path
 
 import numpy as np
 from measured_page import GROUPS
-from recordings import commit
+from recordings import commit, later
 from records import Record, fill
 
 from en4dvar.estimation.population import Effort
@@ -53,12 +54,17 @@ def processor_time(words: Sequence[str], log: Path) -> tuple[float, int]:
     return sum(after[2:4]) - sum(before[2:4]), code
 
 
-def two_commands(folder: Path, out: Path, changed: Sequence[str], medium: str) -> Record:
+def two_commands(folder: Path, out: Path, changed: Sequence[str], medium: str, trough: int = 0) -> Record:
     """What both cost and say; ``out`` is made anew. ``changed``: values of the second, as KEY=VALUE. ``medium``: of the
-    folder, unless it is empty.
+    folder, unless it is empty. ``trough``: what is before it is left out of each file.
     """
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
+    if trough:
+        whole, folder = folder, out / folder.name
+        folder.mkdir()
+        for file in whole.glob("*.csv"):
+            (folder / file.name).write_text(later(file.read_text(), trough))
     group, config = GROUPS[folder.name], out / "gel.yaml"
     words = ["--law", group.law, "--medium", medium or group.medium, *MORE.get(folder.name, [])]
     begun, code = processor_time(["init", "--data", str(folder), *words, "--out", str(config)], out / "init.log")
@@ -156,10 +162,11 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=60.0, help="start no folder after so long")
     parser.add_argument("--out", type=Path, default=Path("runs/two_commands"), help="folder of the runs and records")
     parser.add_argument("--medium", default="", help="of the first command, for all folders")
+    parser.add_argument("--from-trough", type=int, default=0, metavar="N", help="of each file, what follows it")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="of the second command")
     asked = parser.parse_args()
     of = {folder.name: folder.resolve() for folder in asked.folders}
-    made = partial(two_commands, changed=asked.set, medium=asked.medium)
+    made = partial(two_commands, changed=asked.set, medium=asked.medium, trough=asked.from_trough)
     records = fill(asked.out / "records.jsonl", of, lambda key: made(of[key], asked.out / key), asked.minutes)
     print(table(list(records.values())))
     for key in records if asked.splits else ():
