@@ -296,3 +296,10 @@ def test_a_few_that_are_sure_do_not_outweigh_many_others():
     """Seven of ten lie about 0 ± 0.6, three at 1.4 ± 0.1."""
     middle, std = np.array([-0.5, -0.3, -0.1, 0.1, 0.2, 0.3, 0.5, 1.4, 1.4, 1.4]), np.array([0.6] * 7 + [0.1] * 3)
     assert median_of(middle, std, member_stream(1, "a"))[0] < 0.6
+
+
+def test_data_sets_known_exactly_have_their_median():
+    for x in ([0.0, 1.0, 2.0], [0.1, 0.2, 0.7, 0.9, 1.3], [3.0, 3.0, 3.0]):
+        middle, spread = median_of(np.array(x), np.zeros(len(x)), member_stream(1, "a"))
+        assert middle == pytest.approx(np.median(x))
+        assert np.isfinite(spread)

@@ -20,6 +20,7 @@ from en4dvar.priors.prior import PriorTerm, member_stream
 
 RESAMPLED = 2000
 TAIL = 0.05
+SMALLEST = 1e-12  # variance that a data set is taken to have
 
 
 @dataclass(frozen=True)
@@ -53,13 +54,13 @@ def median_of(middle: Array, std: Array, stream: np.random.Generator) -> tuple[f
     """The weighted median of data sets (S,), and its standard deviation."""
     from scipy.optimize import brentq  # where it is used: every start would take longer
 
-    variance = np.maximum(std**2, np.finfo(float).tiny)
+    variance = np.maximum(std**2, SMALLEST)
 
     def beyond(between: float) -> float:
         weights = 1 / (variance + between)
         return float(weights @ (middle - np.average(middle, weights=weights)) ** 2) - (len(middle) - 1)
 
-    between = brentq(beyond, 0.0, middle.var(ddof=1)) if beyond(0.0) > 0 else 0.0
+    between = brentq(beyond, 0.0, 2 * middle.var(ddof=1)) if beyond(0.0) > 0 else 0.0
     weights = 1 / (variance + between)
     chosen = stream.integers(len(middle), size=(RESAMPLED, len(middle)))
     medians = _weighted_medians(middle[chosen], weights[chosen])
