@@ -6,7 +6,7 @@
     python benchmarks/recordings.py --world wall-3 --with-what-if --n 50    readings the fit cannot make
     python benchmarks/recordings.py --measured ../shared/data/bubbles/stiff_polyacrylamide
     python benchmarks/recordings.py --measured ../shared/data/bubbles/peg_water --law newtonian --medium water
-    python benchmarks/recordings.py --from-trough 3 --measured …    only what follows the third trough of each recording
+    python benchmarks/recordings.py --since 'trough 3' --measured …    only what follows that of each recording
     python benchmarks/recordings.py --page bubbles.md --measured ../shared/data/bubbles/*    folders of known names
 
 Synthetic: one bubble a recording, released in a gel of 0.1 to 100 kPa and 0.01 to 1 Pa s with the full gas model of
@@ -295,19 +295,6 @@ def _posterior(members: Any, row: dict[str, str]) -> Record:
     return {**said, **moments, "ln": (float(logs.mean()), float(logs.std(ddof=1))), "untrusted": row["untrusted"]}
 
 
-def later(text: str, trough: int) -> str:
-    """The file of a recording from so many troughs after the top on, as if nobody had seen what was before; without a
-    reading where it has fewer.
-    """
-    lines = text.splitlines()
-    first = next(i for i, line in enumerate(lines) if line[:1].isdigit())
-    radii = np.array([float(line.split(",")[1] or "nan") for line in lines[first:]])
-    read = np.flatnonzero(np.isfinite(radii))
-    troughs = read[minima(radii[read], PROMINENT)]
-    begins = troughs[trough - 1] if trough <= len(troughs) else len(radii)
-    return "\n".join([*lines[:first], *lines[first + begins :]]) + "\n"
-
-
 def synthetic(seed: int, o: argparse.Namespace) -> Record:
     make = movie if o.movie else recording
     law, truth, text = make(seed, QUICK if o.quick else FULL, WORLDS.get(o.world))
@@ -374,19 +361,15 @@ def agreement(records: list[Record]) -> None:
 
 def measured(folder: Path, law: str, medium: str, o: argparse.Namespace) -> list[Record]:
     """The records of a folder's bubbles."""
-    words = ["--medium", medium] * bool(medium)
-    asked = f"{folder.name} {law} {words}" + f" {o.from_trough}" * bool(o.from_trough)
+    words = ["--medium", medium] * bool(medium) + ["--since", o.since] * bool(o.since)
+    asked = f"{folder.name} {law} {words}"
     mark = hashlib.sha256(asked.encode()).hexdigest()[:6]
     files = {file.stem: file for file in sorted(folder.glob("*.csv"))}
     path = o.records / f"{folder.name}_{mark}.jsonl"
     at = commit()
 
     def run(key: str) -> Record:
-        text = files[key].read_text()
-        return {
-            "commit": at,
-            **verbatim(later(text, o.from_trough) if o.from_trough else text, law, words, o.quick, with_chances=True),
-        }
+        return {"commit": at, **verbatim(files[key].read_text(), law, words, o.quick, with_chances=True)}
 
     done = fill(path, files, run, o.minutes)
     return list(done.values())
@@ -403,9 +386,7 @@ def main() -> None:
     parser.add_argument("--movie", action="store_true", help="render a movie of each bubble, and track it")
     parser.add_argument("--with-what-if", action="store_true", help="as of run")
     parser.add_argument("--measured", type=Path, nargs="*", default=[], help="folders of measured bubbles instead")
-    parser.add_argument(
-        "--from-trough", type=int, default=0, metavar="N", help="leave out what is before the Nth trough"
-    )
+    parser.add_argument("--since", default="", metavar="INSTANT", help="of init: what is before is left out")
     parser.add_argument("--law", default="neo-hookean-kelvin-voigt", help="of the measured material")
     parser.add_argument("--medium", default="", help="of the measured material, as init takes it")
     parser.add_argument(

@@ -2,9 +2,10 @@
 
     python benchmarks/two_commands.py ../shared/data/bubbles/stiff_polyacrylamide [FOLDER …] [--minutes 60]
     python benchmarks/two_commands.py … --splits 10        and random halves of each finished run against each other
+    python benchmarks/two_commands.py … --twins 8          and how far bubbles of one value would be from each other
     python benchmarks/two_commands.py … --set KEY=VALUE    the second command with another value, any number of times
     python benchmarks/two_commands.py … --medium 'polyacrylamide 8 %'    the first with another medium than the page has
-    python benchmarks/two_commands.py … --from-trough 1    only what follows the first trough of each recording
+    python benchmarks/two_commands.py … --since 'trough 1'    only what follows the first trough of each recording
 
 ``init --data FOLDER`` with the law and the medium of a folder of known name (``measured_page.py``), and ``run`` of what
 it writes, on one worker and with its page. Printed are the processor time of each, the medians of the gel with their
@@ -13,6 +14,11 @@ it writes, on one worker and with its page. Printed are the processor time of ea
 Halves: the bubbles of a finished run are sampled once and split at random into halves with a population each; z of the
 difference of the medians of ln θ, what is common apart, which is of one value in both. Three bubbles, which have no
 such halves, are held against each other: z of the difference of two draws of the population.
+
+Twins: the readings of a finished run are drawn anew, of a truth that is a draw of each bubble's posterior but for one
+value in all of what varies; its errors are drawn, too, with what the model misses. Printed is the standard deviation of
+the medians of ln θ over bubbles, measured and of each set of twins, beside what one bubble is known to, and by how much
+bubbles are told to differ (5 %, median, 95 % of the std of ln θ) where as much was expected as the run says, or 0.5.
 """
 
 from __future__ import annotations
@@ -25,17 +31,22 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 from measured_page import GROUPS
-from recordings import commit, later
+from recordings import commit
 from records import Record, fill
 
-from en4dvar.estimation.population import Effort
-from en4dvar.estimation.population.campaign import FEWEST_SETS, Population, population_from, sampled_sets
+from en4dvar.ensemble.forecast import Composite
+from en4dvar.estimation.assimilate import assimilate
+from en4dvar.estimation.population import Effort, HyperPrior
+from en4dvar.estimation.population.campaign import FEWEST_SETS, Population, population_from, sampled_sets, terms_of
+from en4dvar.estimation.population.own import OwnDraws
 from en4dvar.model.state import Array
+from en4dvar.problem import InverseProblem
 from en4dvar.report.population import summaries
 from en4dvar.results.population_file import FILE, load_population
 from en4dvar.runs.finished import finished
@@ -54,19 +65,15 @@ def processor_time(words: Sequence[str], log: Path) -> tuple[float, int]:
     return sum(after[2:4]) - sum(before[2:4]), code
 
 
-def two_commands(folder: Path, out: Path, changed: Sequence[str], medium: str, trough: int = 0) -> Record:
+def two_commands(folder: Path, out: Path, changed: Sequence[str], medium: str, since: str = "") -> Record:
     """What both cost and say; ``out`` is made anew. ``changed``: values of the second, as KEY=VALUE. ``medium``: of the
-    folder, unless it is empty. ``trough``: what is before it is left out of each file.
+    folder, unless it is empty. ``since``: as init takes it.
     """
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
-    if trough:
-        whole, folder = folder, out / folder.name
-        folder.mkdir()
-        for file in whole.glob("*.csv"):
-            (folder / file.name).write_text(later(file.read_text(), trough))
     group, config = GROUPS[folder.name], out / "gel.yaml"
     words = ["--law", group.law, "--medium", medium or group.medium, *MORE.get(folder.name, [])]
+    words += ["--since", since] * bool(since)
     begun, code = processor_time(["init", "--data", str(folder), *words, "--out", str(config)], out / "init.log")
     record: Record = {"commit": commit(), "init": begun, "words": shlex.join(words)}
     if code:
@@ -155,23 +162,72 @@ def halves(run_dir: Path, splits: int) -> None:
         )
 
 
+def scatter(label: str, drawn: dict[int, OwnDraws], of: Sequence[InverseProblem], start: Sequence[Array],
+            names: Sequence[str], seed: int, hyper: HyperPrior) -> Population:  # fmt: skip
+    """Print how far the data sets are from each other; the population with the hyperprior of the run."""
+    told = {h.spread: population_from(drawn, {}, start, of, names, seed, h, Effort())
+            for h in (hyper, replace(hyper, spread=HyperPrior().spread))}  # fmt: skip
+    for j, (name, term) in enumerate(zip(names, terms_of(of, names), strict=True)):
+        own = term.std * np.array([d.z[:, of[s].prior.names.index(name)] for s, d in drawn.items()])
+        spreads = []
+        for expected, p in told.items():
+            shares = ", ".join(
+                f"{100 * q:.0f}" for q in term.std * np.quantile(p.posterior.tau[:, j], (0.05, 0.5, 0.95))
+            )
+            spreads.append(f"{shares} % where {100 * expected * term.std:.0f} were expected")
+        print(f"{label}: {name}: medians of ln scatter by {np.median(own, axis=1).std(ddof=1):.2f}, one is known to "
+              f"{own.std(axis=1).mean():.2f}; bubbles differ by {'; '.join(spreads)}", flush=True)  # fmt: skip
+    return told[hyper.spread]
+
+
+def twins(run_dir: Path, count: int, seed: int) -> None:
+    """How far bubbles that have one value are from each other, beside the measured ones."""
+    config, sets = finished([run_dir], True, None)
+    assert config.population is not None
+    names, hyper = config.population.of, config.population.hyper
+    problems, start = [s.problem for s in sets], [s.white for s in sets]
+    drawn, _ = sampled_sets(problems, start, config.seed, None, lambda words: None, [s.drawn for s in sets])
+    nu = scatter("measured", drawn, problems, start, names, config.seed, hyper).posterior.nu
+    columns = [problems[0].prior.names.index(name) for name in names]
+    for number in range(count):
+        rng = np.random.default_rng([seed, number])
+        one, made, begun = nu[rng.integers(len(nu))], [], []
+        for s, problem in enumerate(problems):
+            distances = np.sum((drawn[s].z[:, columns] - one) ** 2, axis=1)
+            truths = drawn[s].z[rng.permutation(np.argsort(distances)[:20])]
+            truths[:, columns] = one
+            runs = Composite(problem)(problem.prior.from_white(truths))
+            at = runs.predicted[next(i for i, reason in enumerate(runs.failures) if not reason)]
+            values = problem.observations.noise.drawn(at, rng)
+            twin = replace(problem, observations=replace(problem.observations, values=values, continued=None))
+            members = assimilate(twin, replace(config.assimilation, what_if=False), seed).posterior
+            made.append(twin)
+            begun.append(twin.prior.white(twin.prior.from_physical(members[np.isfinite(members).all(axis=1)])))
+        of_twins, _ = sampled_sets(made, begun, config.seed, None, lambda words: print(words, flush=True))
+        scatter(f"twins {number}", of_twins, made, begun, names, config.seed, hyper)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", type=Path, nargs="+")
     parser.add_argument("--splits", type=int, default=0, help="random halves of each folder")
+    parser.add_argument("--twins", type=int, default=0, help="sets of twins of each folder")
+    parser.add_argument("--seed", type=int, default=1, help="of the twins")
     parser.add_argument("--minutes", type=float, default=60.0, help="start no folder after so long")
     parser.add_argument("--out", type=Path, default=Path("runs/two_commands"), help="folder of the runs and records")
     parser.add_argument("--medium", default="", help="of the first command, for all folders")
-    parser.add_argument("--from-trough", type=int, default=0, metavar="N", help="of each file, what follows it")
+    parser.add_argument("--since", default="", metavar="INSTANT", help="of the first command")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="of the second command")
     asked = parser.parse_args()
     of = {folder.name: folder.resolve() for folder in asked.folders}
-    made = partial(two_commands, changed=asked.set, medium=asked.medium, trough=asked.from_trough)
+    made = partial(two_commands, changed=asked.set, medium=asked.medium, since=asked.since)
     records = fill(asked.out / "records.jsonl", of, lambda key: made(of[key], asked.out / key), asked.minutes)
     print(table(list(records.values())))
-    for key in records if asked.splits else ():
-        if "used" in records[key]:
+    for key in (key for key, record in records.items() if "used" in record):
+        if asked.splits:
             halves(asked.out / key / "run", asked.splits)
+        if asked.twins:
+            twins(asked.out / key / "run", asked.twins, asked.seed)
 
 
 if __name__ == "__main__":

@@ -93,6 +93,9 @@ class Data(Section):
     """What to do with rows whose times do not increase: refuse the file, or sort them."""
     repeated: Repeated = "refuse"
     """What to do with several readings of one time, without ``places``: refuse the file, or average them."""
+    since: Annotated[Instant, Made(_instant)] = Field("start", validate_default=True)
+    """First reading that is looked at, as if the file began with it: an instant as in ``window``, such as ``trough 1``,
+    seen in the whole file."""
     columns: Annotated[Columns, OfObservable("column role")]
     """Which columns hold the time and the observable, each with its unit: ``time: {name: t, unit: us}``."""
     window: WindowSection = Field({}, validate_default=True)
@@ -112,7 +115,7 @@ class Data(Section):
     @property
     def layout(self) -> Layout:
         """How the files are laid out."""
-        return Layout(self.format, self.decimal, self.by, self.sheet, self.unsorted, self.repeated)
+        return Layout(self.format, self.decimal, self.by, self.sheet, self.unsorted, self.repeated, self.since)
 
     @classmethod
     def rules(cls, keys: Mapping[str, Any], context: Context, faults: Faults) -> None:

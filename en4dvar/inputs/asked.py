@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from en4dvar.inputs.text_table import Decimal
+from en4dvar.inputs.window import BY_NAME, Instant
 
 Format = Literal["csv", "mat", "xlsx"]
 Disorder = Literal["refuse", "sort"]
@@ -70,7 +71,7 @@ class Matrix:
 class Layout:
     """How a file is laid out: its ``format`` (by default that of the suffix), the ``decimal`` sign of its text, the
     column that says ``by`` which data set a row belongs to, the ``sheet`` of a workbook with or without a range; what
-    is done with times that do not increase."""
+    is done with times that do not increase; from which instant on it is read."""
 
     format: Format | None = None
     decimal: Decimal = "."
@@ -78,6 +79,7 @@ class Layout:
     sheet: str = ""
     unsorted: Disorder = "refuse"
     repeated: Repeated = "refuse"
+    since: Instant = BY_NAME["start"]
 
 
 ANY = Layout()

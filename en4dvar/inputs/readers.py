@@ -14,8 +14,9 @@ import numpy.typing as npt
 
 from en4dvar.inputs.asked import ANY, Column, Layout, TimeStep
 from en4dvar.inputs.parts import columns_of
+from en4dvar.inputs.window import index_of
 from en4dvar.model.state import Array
-from en4dvar.plumbing.errors import DataError
+from en4dvar.plumbing.errors import DataError, retold
 from en4dvar.plumbing.hints import suggest
 from en4dvar.plumbing.units import convert
 
@@ -87,6 +88,13 @@ def read_series(
             sums = np.sqrt(np.bincount(which, own**2)) if c.kind == "std" else np.bincount(which, own)
             stated[c.name] = np.asarray(sums / counts)
         times, values = each, np.bincount(which, values) / counts
+    if layout.since != ANY.since:
+        with retold(DataError, DataError, f"{path}: data.since "):
+            since = slice(index_of(times, values, layout.since), None)
+            if len(times[since]) < fewest:
+                raise DataError(f"leaves {len(times[since])} of {len(times)} readings; at least {fewest} are needed")
+        times, values = times[since], values[since]
+        stated = {name: column[since] for name, column in stated.items()}
     return Readings(times, values, str(path), scalars, stated)
 
 

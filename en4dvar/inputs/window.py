@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 
 from en4dvar.model.state import Array
-from en4dvar.plumbing.errors import DataError
+from en4dvar.plumbing.errors import DataError, retold
 from en4dvar.plumbing.hints import shown
 from en4dvar.plumbing.units import UnitError, parse_quantity
 
@@ -67,14 +67,21 @@ def select(times: Array, values: Array, start: Instant, end: Instant, prominence
 
     Raises :class:`DataError` when an extremum is not there or the window is empty.
     """
-    first = _index(times, values, start, 0, prominence)
-    last = _index(times, values, end, first, prominence, last=True)
-    if last < first:
-        raise DataError("the window is empty: it ends before it starts")
+    with retold(DataError, DataError, "the window "):
+        first = index_of(times, values, start, 0, prominence)
+        last = index_of(times, values, end, first, prominence, last=True)
+        if last < first:
+            raise DataError("is empty: it ends before it starts")
     return slice(first, last + 1)
 
 
-def _index(times: Array, values: Array, instant: Instant, first: int, prominence: float, last: bool = False) -> int:
+def index_of(
+    times: Array, values: Array, instant: Instant, first: int = 0, prominence: float = 0.1, last: bool = False
+) -> int:
+    """The first sample of ``times`` (K,), ``values`` (K,) from an instant on, or the ``last`` one up to it.
+
+    Extrema are those from the sample ``first`` on. Raises :class:`DataError` when there is none such.
+    """
     if instant.kind == "start":
         return 0
     if instant.kind == "end":
@@ -90,7 +97,7 @@ def _index(times: Array, values: Array, instant: Instant, first: int, prominence
     indices = minima(values[first:], prominence)
     if instant.number > len(indices):
         raise DataError(
-            f"the window asks for minimum {instant.number}, but only {len(indices)} minima with a prominence of "
+            f"asks for minimum {instant.number}, but only {len(indices)} minima with a prominence of "
             f"{prominence:.0%} of the range follow its start"
         )
     index = int(indices[instant.number - 1])

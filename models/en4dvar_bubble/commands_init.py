@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from en4dvar_bubble.starter.summaries import Summaries
 
 _OF_MOVIE = ("pixel", "frame_rate", "exposure", "flashes", "raw", "corrections", "bubble", "region", "mask")
-_OF_LAYOUT = ("by", "sheet", "unsorted", "repeated", "format")
+_OF_LAYOUT = ("by", "sheet", "unsorted", "repeated", "format", "since")
 _OF_COLUMNS = ("time_unit", "radius_unit", "time_column", "radius_column", "time_step", "frame_rate", "pixel")
 _KEY = re.compile(rf"data\.({'|'.join(_OF_LAYOUT)})\b(?:: (\w+))?")
 _MOVIES = (".tif", ".tiff", ".png", ".bmp", ".jpg", ".jpeg", ".gif", ".mp4", ".avi", ".mov", ".mkv", ".cine")
@@ -68,6 +68,9 @@ _MOVIES = (".tif", ".tiff", ".png", ".bmp", ".jpg", ".jpeg", ".gif", ".mp4", ".a
 @click.option(
     "--repeated", type=click.Choice(["refuse", "average"]), help="What to do with several readings of a time."
 )
+@click.option(
+    "--since", metavar="INSTANT", help="Leave out what is before, e.g. 'trough 1': the first collapse, or '60 us'."
+)
 @click.option("--start", type=click.Choice(["acoustic", "laser"]), help="Start; default: what the data suggest.")
 @click.option("--law", metavar="LAW", shell_complete=completed_law, help="Constitutive law, see 'en4dvar laws'.")
 @click.option(
@@ -111,7 +114,6 @@ def init(
         return
     from en4dvar.commands.common import command_line
     from en4dvar.config.json_schema import schema_text
-    from en4dvar.inputs.asked import Layout
     from en4dvar.plumbing.errors import OutputError
     from en4dvar.plumbing.files import write_text
     from en4dvar_bubble.starter.config import propose_config, run_name
@@ -132,9 +134,8 @@ def init(
         proposal = starter(start or "acoustic", law)
         text = yaml_text(name, Source("bubble.csv", ("t_us", "us"), None, ("R_um", "um")), proposal, words)
     else:
-        of_layout: dict[str, Any] = {key: it for key in _OF_LAYOUT if (it := options[key]) is not None}
-        layout = Layout(**of_layout)
         with _in_words_of_options():
+            layout = _layout(options)
             columns = _columns_of(data, options, layout)
             if isinstance(columns, dict):
                 proposed = propose_config(
@@ -155,6 +156,20 @@ def init(
     write_text(target, text)
     write_text(target.parent / SCHEMA_FILE, schema_text())
     _tell(target, proposal, example_only=data is None)
+
+
+def _layout(options: Mapping[str, str | None]) -> Layout:
+    """How the data are laid out. Raises :class:`UnitError`: ``--since`` is no instant."""
+    from en4dvar.inputs.asked import Layout
+    from en4dvar.inputs.window import parse_instant
+    from en4dvar.plumbing.errors import retold
+    from en4dvar.plumbing.units import UnitError
+
+    told: dict[str, Any] = {key: it for key in _OF_LAYOUT if (it := options[key]) is not None}
+    if "since" in told:
+        with retold(UnitError, UnitError, "--since: "):
+            told["since"] = parse_instant(told["since"], "s")
+    return Layout(**told)
 
 
 @contextmanager

@@ -286,6 +286,24 @@ def test_one_table_of_many_bubbles(tmp_path: Path) -> None:
     assert np.array_equal(problems[0].observations.values, problems[1].observations.values)
 
 
+@pytest.mark.parametrize(("since", "written"), [("trough 1", "trough 1"), ("0.0189 ms", "18.9 us")])
+def test_what_is_before_an_instant_is_as_if_nobody_had_seen_it(tmp_path: Path, since: str, written: str) -> None:
+    """The first collapse of a film left out: its bubble is that of the rebound, R_max 60 um at 27 us."""
+    done = call("init", "--data", write(tmp_path / "b.csv"), "--since", since)
+    assert done.exit_code == 0, done.output
+    told = re.search(r"R_max (\S+) um", done.output)
+    assert told
+    assert float(told[1]) == pytest.approx(60, abs=1)
+    assert f"\n  since: {written}\n" in Path("b.yaml").read_text()
+    (problem,) = build(proposed(Path("b.yaml")))
+    assert problem.observations.values.max() < 61e-6
+    assert problem.observations.times[0] == 0  # of the window, which begins with the first reading after the top
+    refused = call("init", "--data", "b.csv", "--since", "trough 9", "--force")
+    assert refused.exit_code == 2
+    assert "b.csv: --since asks for minimum 9, but only 1" in refused.stderr
+    assert "--since: 'soon' is not an instant" in call("init", "--data", "b.csv", "--since", "soon", "--force").stderr
+
+
 @pytest.mark.parametrize(
     ("words", "wanted"), [(["bubble.csv"], "--data bubble.csv"), (["--data", "a.csv", "b.csv"], "a pattern in quotes")]
 )

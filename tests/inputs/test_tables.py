@@ -20,6 +20,7 @@ from en4dvar.inputs.matfile import mat_variables, variables_of
 from en4dvar.inputs.parts import parts_of, read_contents
 from en4dvar.inputs.readers import Readings, read_series
 from en4dvar.inputs.steps import step_doubts
+from en4dvar.inputs.window import parse_instant
 from en4dvar.plumbing.errors import DataError
 
 TIME, RADIUS = Column("t", "us", "us"), Column("R", "um", "um")
@@ -60,6 +61,32 @@ def test_the_names_are_found_above_the_numbers(tmp_path, text, names):
     (tmp_path / "a.csv").write_text(text, encoding="utf-8")
     contents = read_contents(tmp_path / "a.csv")
     assert {*contents.columns, *contents.others} - {"note"} == {*names}
+
+
+@pytest.mark.parametrize(
+    ("since", "times"),
+    [("start", [0, 1, 2, 3, 4, 5]), ("minimum", [2, 3, 4, 5]), ("top", [4, 5]), ("2.5 us", [3, 4, 5])],
+)
+def test_what_is_before_an_instant_is_left_out(tmp_path, since, times):
+    (tmp_path / "a.csv").write_text("t,R,s\n" + "".join(f"{t},{R},{t + 1}\n" for t, R in enumerate([5, 4, 1, 4, 6, 3])))
+    layout = Layout(since=parse_instant(since, "us"))
+    series = read_series(tmp_path / "a.csv", TIME, RADIUS, layout, [Column("s", "um", "um")], fewest=2)
+    assert series.times.tolist() == times
+    assert series.values.tolist() == [5, 4, 1, 4, 6, 3][-len(times) :]
+    assert series.errors["s"].tolist() == [t + 1 for t in times]
+
+
+@pytest.mark.parametrize(
+    ("since", "words"),
+    [
+        ("trough 2", "data.since asks for minimum 2, but only 1 minima"),
+        ("4 us", "data.since leaves 2 of 6 readings; at least 3 are needed"),
+    ],
+)
+def test_too_little_after_an_instant(tmp_path, since, words):
+    text = "t,R\n" + "".join(f"{t},{R}\n" for t, R in enumerate([5, 4, 1, 4, 6, 3]))
+    with pytest.raises(DataError, match=rf"a\.csv: {words}"):
+        csv(tmp_path, text, since=parse_instant(since, "us"))
 
 
 def test_rows_are_sorted_and_repeated_ones_averaged_where_it_is_said(tmp_path):

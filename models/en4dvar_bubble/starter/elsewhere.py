@@ -39,7 +39,7 @@ LIKE_A_GEL = (
 )
 LIKE_A_LIQUID = (
     "  spread: 0.05 # half-normal, in std of the priors: a liquid has one viscosity; a bubble that tells another one "
-    "is odd"
+    "is odd; where several are, leave the first collapse out of all: init --since 'trough 1'"
 )
 """How much bubbles differ, as a line of ``population:``."""
 

@@ -38,7 +38,10 @@ class Source:
         told = {
             name: getattr(self.layout, name) for name in ("format", "decimal", "by", "sheet", "unsorted", "repeated")
         }
-        return [f"  {name}: {quoted(it)}" for name, it in told.items() if it is not None and it != getattr(ANY, name)]
+        lines = [f"  {name}: {quoted(it)}" for name, it in told.items() if it is not None and it != getattr(ANY, name)]
+        since = self.layout.since
+        when = {"time": f"{1e6 * since.time:.9g} us", "maximum": "maximum", "top": "top", "end": "end"}
+        return lines + [f"  since: {when.get(since.kind, f'{since.kind} {since.number}')}"] * (since != ANY.since)
 
     @property
     def time_entry(self) -> str:
