@@ -127,6 +127,7 @@ def test_a_known_gel_tells_the_pulse(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_bands_of_the_pulse_hold_it(tmp_path):
     """Of 40 pulses from the prior, 90 % bands hold p_f over 84 to 96 % of the time."""
     inside = []

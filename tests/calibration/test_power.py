@@ -26,7 +26,10 @@ CONFIG = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("std", "size"), [("0.12", "larger"), ("0.08", "smaller"), (None, "")])
+@pytest.mark.parametrize(
+    ("std", "size"),
+    [("0.12", "larger"), *(pytest.param(*case, marks=pytest.mark.long) for case in (("0.08", "smaller"), (None, "")))],
+)
 def test_errors_a_fifth_wrong_are_found_in_a_hundred_sets(tmp_path, monkeypatch, std, size):
     """In all of 60 repetitions, so that the chance is at least 0.95, with 95 % confidence; right errors hardly ever."""
     monkeypatch.chdir(tmp_path)

@@ -117,6 +117,7 @@ def most_memory(folder, frames):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is counted in KiB on Linux")
 def test_a_movie_of_sixty_megabytes_is_never_held_whole(tmp_path: Path):
     short, long = most_memory(tmp_path, 300), most_memory(tmp_path, 10_000)

@@ -149,7 +149,7 @@ def over_widths(values, scale):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("truth", [(1.2, 1.2, 0.6, 0.6), (1.0,) * 4])
+@pytest.mark.parametrize("truth", [(1.2, 1.2, 0.6, 0.6), pytest.param((1.0,) * 4, marks=pytest.mark.long)])
 def test_an_estimated_width_of_the_walk_is_sampled(truth):
     """A cheap model: ``refine: auto`` draws some 13 000 by importance; about 2000 of them count.
 
