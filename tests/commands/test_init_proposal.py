@@ -35,13 +35,13 @@ ELSEWHERE = {"rho": 998.0, "c": 1484.0, "p_inf": 101325.0, "reading_scale": 1.0,
 pytestmark = pytest.mark.usefixtures("own_folder")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("start", "times", "noise_std"),
     [
         ("acoustic", "5.6 us:30.1 us:1.4 us", "1.4 um"),  # multi-flash imaging: some 18 frames
         ("acoustic", "0 us:60 us:0.5 us", "1.4 um"),  # from the nucleus through rebounds
-        # A high-speed film from R_max on, the bubble not yet at rest.
-        pytest.param("laser", "0 us:70 us:0.63 us", "2 um", marks=pytest.mark.slow),
+        ("laser", "0 us:70 us:0.63 us", "2 um"),  # a high-speed film from R_max on, the bubble not yet at rest
     ],
 )
 def test_synthetic_data_to_a_run(tmp_path: Path, start: str, times: str, noise_std: str) -> None:

@@ -37,7 +37,7 @@ def package(tmp_path):
     config = yaml.safe_load(QUICK_START.read_text(encoding="utf-8"))
     config["data"]["path"] = str(QUICK_START.parent / config["data"]["path"])
     config["output"] = {"report": False}
-    config["assimilation"] = {"scheme": "patient", "patience": 4}
+    config["assimilation"] = {"scheme": "patient", "patience": 4, "members": 16, "what_if": False}
     (tmp_path / "own.yaml").write_text(yaml.safe_dump(config))
     return {**os.environ, "PYTHONPATH": str(tmp_path)}
 
