@@ -4,6 +4,7 @@
     python benchmarks/recordings.py --seed 7 --start 24 --n 24 --minutes 5    a piece; the next call goes on
     python benchmarks/recordings.py --movie --n 40           movies of bubbles, tracked
     python benchmarks/recordings.py --world wall-3 --with-what-if --n 50    readings the fit cannot make
+    python benchmarks/recordings.py --set KEY=VALUE …        run with another value, any number of times
     python benchmarks/recordings.py --measured ../shared/data/bubbles/stiff_polyacrylamide
     python benchmarks/recordings.py --measured ../shared/data/bubbles/peg_water --law newtonian --medium water
     python benchmarks/recordings.py --since 'trough 3' --measured …    only what follows that of each recording
@@ -36,7 +37,7 @@ import sys
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -198,9 +199,11 @@ def verbatim(
     with_what_if: bool = False,
     change: Callable[[dict[str, Any]], None] | None = None,
     with_chances: bool = False,
+    values: Sequence[str] = (),
 ) -> Record:
     """What ``init`` and ``run`` say of a file, from a folder of its own, beside what its head states; with ``change``
-    of the configuration between them, and ``with_chances`` how many readings after the window should be in their bands.
+    of the configuration between them or ``values`` of it as KEY=VALUE, and ``with_chances`` how many readings after the
+    window should be in their bands.
     """
     begun = time.process_time()
     with TemporaryDirectory() as name:
@@ -219,7 +222,7 @@ def verbatim(
         changes |= {"output.directory": str(folder / "run")}
         changes |= {f"model.{key}": value for key, value in QUICK.items()} if quick else {}
         changes |= {"assimilation.what_if": "added"} if with_what_if else {}
-        changes |= stated(text)
+        changes |= {**stated(text), **dict(value.split("=", 1) for value in values)}
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
@@ -298,7 +301,7 @@ def _posterior(members: Any, row: dict[str, str]) -> Record:
 def synthetic(seed: int, o: argparse.Namespace) -> Record:
     make = movie if o.movie else recording
     law, truth, text = make(seed, QUICK if o.quick else FULL, WORLDS.get(o.world))
-    return {"law": law, "truth": truth, **verbatim(text, law, [], o.quick, o.with_what_if)}
+    return {"law": law, "truth": truth, **verbatim(text, law, [], o.quick, o.with_what_if, values=o.set)}
 
 
 def table(records: list[Record]) -> None:
@@ -362,14 +365,14 @@ def agreement(records: list[Record]) -> None:
 def measured(folder: Path, law: str, medium: str, o: argparse.Namespace) -> list[Record]:
     """The records of a folder's bubbles."""
     words = ["--medium", medium] * bool(medium) + ["--since", o.since] * bool(o.since)
-    asked = f"{folder.name} {law} {words}"
+    asked = f"{folder.name} {law} {words} {shlex.join(o.set)}".rstrip()
     mark = hashlib.sha256(asked.encode()).hexdigest()[:6]
     files = {file.stem: file for file in sorted(folder.glob("*.csv"))}
     path = o.records / f"{folder.name}_{mark}.jsonl"
     at = commit()
 
     def run(key: str) -> Record:
-        return {"commit": at, **verbatim(files[key].read_text(), law, words, o.quick, with_chances=True)}
+        return {"commit": at, **verbatim(files[key].read_text(), law, words, o.quick, with_chances=True, values=o.set)}
 
     done = fill(path, files, run, o.minutes)
     return list(done.values())
@@ -386,6 +389,7 @@ def main() -> None:
     parser.add_argument("--movie", action="store_true", help="render a movie of each bubble, and track it")
     parser.add_argument("--with-what-if", action="store_true", help="as of run")
     parser.add_argument("--measured", type=Path, nargs="*", default=[], help="folders of measured bubbles instead")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="of run")
     parser.add_argument("--since", default="", metavar="INSTANT", help="of init: what is before is left out")
     parser.add_argument("--law", default="neo-hookean-kelvin-voigt", help="of the measured material")
     parser.add_argument("--medium", default="", help="of the measured material, as init takes it")
@@ -396,7 +400,8 @@ def main() -> None:
     o = parser.parse_args()
     if not o.measured:
         keys = [str(1000 * o.seed + i) for i in range(o.start, o.start + o.n)]
-        marks = [o.world, "movie" * o.movie, "what_if" * o.with_what_if]
+        set_ = hashlib.sha256(shlex.join(o.set).encode()).hexdigest()[:6] if o.set else ""
+        marks = [o.world, "movie" * o.movie, "what_if" * o.with_what_if, set_]
         kind = "_".join(["quick" if o.quick else "full", *filter(None, marks)])
         table(list(fill(o.records / f"{kind}.jsonl", keys, lambda key: synthetic(int(key), o), o.minutes).values()))
     groups = {}
