@@ -291,6 +291,7 @@ def test_what_is_before_an_instant_is_as_if_nobody_had_seen_it(tmp_path: Path, s
     """The first collapse of a film left out: its bubble is that of the rebound, R_max 60 um at 27 us."""
     done = call("init", "--data", write(tmp_path / "b.csv"), "--since", since)
     assert done.exit_code == 0, done.output
+    assert ("--start acoustic" in done.output) == (since != "trough 1")  # a collapse is behind it, a time says nothing
     told = re.search(r"R_max (\S+) um", done.output)
     assert told
     assert float(told[1]) == pytest.approx(60, abs=1)
@@ -298,6 +299,8 @@ def test_what_is_before_an_instant_is_as_if_nobody_had_seen_it(tmp_path: Path, s
     (problem,) = build(proposed(Path("b.yaml")))
     assert problem.observations.values.max() < 61e-6
     assert problem.observations.times[0] == 0  # of the window, which begins with the first reading after the top
+    answered = call("init", "--data", "b.csv", "--since", since, "--start", "laser", "--force")
+    assert "only a proposal" not in answered.output
     refused = call("init", "--data", "b.csv", "--since", "trough 9", "--force")
     assert refused.exit_code == 2
     assert "b.csv: --since asks for minimum 9, but only 1" in refused.stderr

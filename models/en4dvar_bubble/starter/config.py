@@ -84,6 +84,8 @@ def propose_config(
     if (time is None) == (time_step is None):
         raise ConfigError("give either the column of times and its unit, or a constant time step")
     known(medium)
+    if layout.since.kind in ("minimum", "trough"):
+        start = start or "laser"  # behind a collapse a bubble is released from its maximum
     source = Source(path_from(Path(folder), str(data)), time, time_step, radius, layout, errors, step_unit, rate)
     files = with_parts(
         find_files(Path.cwd(), [str(data)]), Column(*source.radius, "m"), layout, time[0] if time else None

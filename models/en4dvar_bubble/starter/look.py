@@ -86,8 +86,8 @@ def look(times: Array, radius: Array, start: Start | None = None) -> Look:
     first = float(radius[0] / radius[largest])
     rest, drift = _rest(times, radius, peak) if np.isfinite(rebound) else (float("nan"), "")
     chosen, reason, clear = _start(first, np.isfinite(rebound), times[-1] > peak.t_max + CREEPS * peak.t_c)
-    if start is not None and start != chosen:
-        chosen, reason, clear = start, "as you say", True
+    if start is not None:
+        chosen, reason, clear = start, reason if start == chosen else "as you say", True
     return Look(
         n=len(times),
         times=(float(times[0]), float(times[-1])),
