@@ -97,7 +97,8 @@ def expected_runs(space: WeightSpace) -> int:
     A scheme that runs its whole ensemble does so once for each assimilation and once at the end, with the mean. A
     search takes prior and posterior forecast, and for each iteration a tangent (1, n or N runs) and the trials of the
     step control, ``starts`` descents side by side, one for each shorter window, and a part of one from a far member.
-    Where a discrepancy is estimated and nothing is sampled, it takes another search, and one descent from there.
+    Where a discrepancy is estimated and nothing is sampled, it takes another search, and one descent from there; where
+    something changes along the path, the descents of a constant one, and a part of one from there.
     """
     n_members, scheme, problem = len(space.members), space.scheme.minimiser, space.problem
     if scheme is None:
@@ -107,5 +108,6 @@ def expected_runs(space: WeightSpace) -> int:
     starts = scheme.starts if scheme.start == "best-member" and economical else 1
     challenger = CHALLENGER if scheme.searches and economical else 0.0
     held = 1 + starts + challenger if challenger and problem.estimates_discrepancy and not problem.model.cheap else 0.0
-    iterations = (starts + challenger + held + scheme.lengthen - 1) * min(ITERATIONS, scheme.max_iterations)
+    steady = starts + challenger if challenger and problem.constant is not problem else 0.0
+    iterations = (starts + challenger + held + steady + scheme.lengthen - 1) * min(ITERATIONS, scheme.max_iterations)
     return 2 * (n_members + 1) + round(iterations * (tangent + SEARCH))

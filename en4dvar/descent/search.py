@@ -3,7 +3,8 @@
 Members of low J may all lie in the basin of a wrong minimum. A challenger starts from the member farthest from the
 minimum, chosen by the forecast of the prior ensemble that is there anyway; where it ends elsewhere, others follow.
 Where noise and prior do not explain the lowest J, no member may lie in the right basin: many more draws of the prior
-are run, and the lowest of them start descents. Where readings after the window, which nothing was fitted to, come out
+are run, and the lowest of them start descents. Where something changes along the path, a descent starts where all of
+it constant fits best. Where readings after the window, which nothing was fitted to, come out
 otherwise than expected, a descent starts where all readings together lead. All rounds are kept as they go, so that an
 interrupted run repeats no descent.
 """
@@ -34,6 +35,7 @@ from en4dvar.diagnosis.withheld import unforeseen
 from en4dvar.ensemble.forecast import Forecast
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import TooFewMembersError
+from en4dvar.problem import InverseProblem
 from en4dvar.schemes.base import GaussNewtonStep, Minimiser
 
 SAME_COST = 0.01  # of J, by which a descent must end lower to be another one
@@ -112,7 +114,8 @@ class Search:
         explain and there were none yet.
         """
         n_members = len(self.space.members)
-        if outcome.descent.cost <= highest_plausible(self.space) or max(outcome.tried) > n_members:
+        drawn = any(n_members < i < self.last for i in outcome.tried)
+        if outcome.descent.cost <= highest_plausible(self.space) or drawn:
             return outcome
         return self.round(outcome, [n_members + 1 + i for i in range(side_by_side(self.space))])
 
@@ -121,9 +124,18 @@ class Search:
         if self.last in outcome.tried or not missed():
             return outcome
         self.over = max(self.over, self.begun.over)
+        return self._from(outcome, self.last)
+
+    def unchanging(self, outcome: Outcome) -> Outcome:
+        """After a descent from :attr:`steady`, where something changes along the path."""
+        constant = self.space.problem.constant is self.space.problem
+        return outcome if constant else self._from(outcome, self.last + 1)
+
+    def _from(self, outcome: Outcome, number: int) -> Outcome:
+        """After a descent from the minimum of another problem."""
         try:
-            return self.round(outcome, [self.last])
-        except TooFewMembersError:  # the model does not run that far
+            return self.round(outcome, [number])
+        except TooFewMembersError:  # the model does not run there
             return outcome
 
     @property
@@ -134,17 +146,28 @@ class Search:
     @cached_property
     def led(self) -> Array:
         """Where a descent (n,) ends in which the readings after the window take part, with what is unforeseen."""
-        space, more = self.space, self.space.problem.observations.continued
+        more = self.space.problem.observations.continued
         assert more is not None
-        problem = replace(unforeseen(space.problem), observations=more)
+        return self._minimum(replace(unforeseen(self.space.problem), observations=more))
+
+    @cached_property
+    def steady(self) -> Array:
+        """Where a descent (n,) ends in which all parameters are constant and the model has no error."""
+        return self._minimum(self.space.problem.constant)
+
+    def _minimum(self, problem: InverseProblem) -> Array:
+        """That of another problem, with what it does not estimate at the prior's mean."""
+        space = self.space
         whole = WeightSpace(problem, space.settings, self.seed, space.executor)
         run = whole.whole(np.vstack([whole.members, whole.mean]))
         scheme = replace(self.scheme, start="best-member")
         begun = choose_start(whole, scheme, run, self.seed, None, lambda state: None, lambda record: None).descent
         minimise(DataWindow(whole, self.seed, lambda: None, lambda record: None), [begun])
         space.forward_runs += whole.forward_runs
-        named = dict(zip(problem.prior.names, whole.control(begun.weights.w), strict=True))
-        return np.array([named[name] for name in space.problem.prior.names])
+        prior = space.problem.prior
+        named = dict(zip(prior.names, prior.mean, strict=True))
+        named |= dict(zip(problem.prior.names, whole.control(begun.weights.w), strict=True))
+        return np.array([named[name] for name in prior.names])
 
     @cached_property
     def lowest_draws(self) -> Array:
@@ -155,11 +178,14 @@ class Search:
         return np.asarray(draws[np.argsort(costs, kind="stable")[: side_by_side(space)]])
 
     def begin(self, number: int) -> Descent:
-        """From a member, the mean, :attr:`led` or one of :attr:`lowest_draws`; numbers as in :attr:`Outcome.tried`."""
+        """From a member, the mean, one of :attr:`lowest_draws`, :attr:`led` or :attr:`steady`; numbers as in
+        :attr:`Outcome.tried`.
+        """
         first = len(self.space.members) + 1
         if number < first:
             return descent_from(self.space, number)
-        x = self.led if number == self.last else self.lowest_draws[number - first]
+        drawn = number < self.last
+        x = self.lowest_draws[number - first] if drawn else self.led if number == self.last else self.steady
         return descent_at(self.space, x, number)
 
     def rest(self, outcome: Outcome) -> list[int]:

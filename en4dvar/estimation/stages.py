@@ -185,13 +185,13 @@ class Stages:
         if start.search is not None:
             space.forward_runs = start.forward_runs
         search = Search(space, scheme, prior_run, self.seed, begun, self.keep_search, self.tell)
-        outcome = search.challenged(outcome)
+        outcome = search.unchanging(search.challenged(outcome))
         sampling = self.settings.refine == "mcmc" or samples(space)
         if not sampling:
             outcome = search.settled(outcome)
         ends = self.gaussian(outcome.descent)
         over = search.last in start.tried
-        if (over or (sampling and begun.over > 1)) and not begun.lower:
+        if (over or (sampling and begun.over > search.over)) and not begun.lower:
             if over:
                 self.expected(ends.members)
             space.forward_runs = start.forward_runs  # they were counted before the rounds that follow

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 from same_bits import assert_same_bits
-from toys import Decay, Wave, make_problem, with_discrepancy
+from toys import Decay, Wave, make_observations, make_problem, with_discrepancy
+from varying_models import Ramp
 from wells import Parting, UnlikeWells, Wells, hidden_well, mass_of_positive, parted, two_wells
 
 from en4dvar.descent.search import Search
@@ -11,7 +12,9 @@ from en4dvar.diagnosis.analysis import Descents, StartRecord
 from en4dvar.estimation import stages
 from en4dvar.estimation.assimilate import LoopState, assimilate
 from en4dvar.estimation.stages import Stages
-from en4dvar.priors.prior import PriorTerm
+from en4dvar.priors.prior import Prior, PriorTerm
+from en4dvar.priors.varying import RandomWalk
+from en4dvar.problem import InverseProblem
 from en4dvar.results.codec import decode, encode
 from en4dvar.sampling import refine
 from en4dvar.schemes.settings import AssimilationSettings
@@ -153,6 +156,22 @@ def test_a_search_goes_on_from_any_state_to_the_same_bits():
             assert all(r.search and r.search.over >= begun.over for r in rest)
             assert len(rest) <= len(states) - i + 1
     assert seen == {(False, True, False), (False, False, True), (True, True, False), (True, False, False)}
+
+
+@pytest.mark.parametrize("refine", ["none", "auto"])
+def test_a_descent_from_where_nothing_changes_goes_on_to_the_same_bits(refine):
+    model, times = Ramp(), np.linspace(0.25, 5.0, 20)
+    first = PriorTerm.normal(model.parameters[0], 1.0, 0.5)
+    values = 1.0 + np.where(times < 2, 1.2 * times, 1.2 + 0.6 * times)
+    plain = InverseProblem(model, model.observables[0], make_observations(times, values, 0.05), Prior((first,)))
+    problem = plain.varied([RandomWalk.of(model, first, (2.0,), 0.5)])
+    settings = AssimilationSettings(members=16, refine=refine, what_if=False)
+    whole, states = interrupted(problem, settings, 3)
+    assert whole.descents.members.count(-2) == 1
+    assert assimilate(plain, settings, 3).descents.members.count(-2) == 0
+    searching = [state for state in states if state.search]
+    for state in searching[:: max(1, len(searching) // 8)]:
+        assert_same_bits(interrupted(problem, settings, 3, state)[0], whole)
 
 
 def in_the_wrong_well(monkeypatch):
