@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from en4dvar.plumbing.caution import Caution
 
 LONGEST = 120  # name of a folder
+Told = tuple[str, "tuple[Caution, ...]", Path]  # of an estimate of several runs: table, warnings, page
 
 
 class Failed(click.ClickException):
@@ -150,32 +151,15 @@ def ask(question: str) -> bool:
     return sys.stdin.isatty() and click.confirm(question, err=True)
 
 
-def tell(words: str) -> None:
-    """Print on standard error which step is being done."""
-    echo(words, err=True)
-
-
-@dataclass(frozen=True)
-class Together:
-    """Finished runs that one estimate is made of, the folder of its result, and how it is computed."""
-
-    run_dirs: tuple[Path, ...]
-    out: Path
-    told: bool
-    """Whether the user named the folder."""
-    options: dict[str, Any]
-    """Keywords of what computes it."""
-
-    def conclude(self, table: str, cautions: Iterable[Caution], page: Path) -> None:
-        """Print what was found; warnings go to standard error."""
-        echo(table)
-        for caution in cautions:
-            echo(f"{caution.kind}: {caution}", err=True)
-        echo(f"report: {page if self.told else from_here(page)}")
+tell = functools.partial(echo, err=True)  # which step is being done
 
 
 def several_runs(kind: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """The arguments RUN_DIR with --out, --workers and --trust, which the command gets as one :class:`Together`."""
+    """The arguments RUN_DIR with --out, --workers and --trust of a command that makes one estimate of finished runs.
+
+    It gets the runs, the folder of its result, and keywords of what computes it. What it returns is printed, warnings
+    on standard error.
+    """
 
     def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
         @click.argument(
@@ -189,9 +173,13 @@ def several_runs(kind: str) -> Callable[[Callable[..., Any]], Callable[..., Any]
         @functools.wraps(command)
         def with_runs(
             run_dirs: tuple[Path, ...], out: Path | None, workers: int | None, trust: bool, **options: Any
-        ) -> Any:
+        ) -> None:
             how = {"workers": workers, "trust": trust, "ask": ask, "tell": tell}
-            return command(Together(run_dirs, out or folder_of(kind, run_dirs), out is not None, how), **options)
+            table, cautions, page = command(run_dirs, out or folder_of(kind, run_dirs), how, **options)
+            echo(table)
+            for caution in cautions:
+                echo(f"{caution.kind}: {caution}", err=True)
+            echo(f"report: {page if out else from_here(page)}")
 
         return with_runs
 

@@ -23,7 +23,8 @@ MOST_PAIRS, MOST_NAMED, LEAST_SHOWN = 15, 100, 0.005  # of correlations: rows, p
 def problem_summary(config: Config, problems: Sequence[InverseProblem]) -> str:
     """The lines that ``validate`` prints: data sets, priors (centre and 5–95 %), fixed values, scheme."""
     first = problems[0]
-    settings, rows = config.assimilation, [row for problem in problems for row in _data_rows(problem)]
+    settings = config.assimilation
+    rows = [_series_row(problem, part) for problem in problems for part in problem.parts]
     cells = sum(prior.field.size for prior in first.fields)
     and_cells = f" and {cells} cells of fields" if cells else ""
     parts = [
@@ -95,14 +96,9 @@ def _seconds(value: float) -> str:
     return f"{value / 3600:.2g} h"
 
 
-def _data_rows(problem: InverseProblem) -> list[tuple[str, ...]]:
-    """One a series."""
-    name, parts = problem.observations.name, problem.parts
-    return [_series_row(problem, part, name if len(parts) == 1 else f"{name}: {part.name}") for part in parts]
-
-
-def _series_row(problem: InverseProblem, part: Part, name: str) -> tuple[str, ...]:
+def _series_row(problem: InverseProblem, part: Part) -> tuple[str, ...]:
     y, own, model, observable = problem.observations, part.where, problem.model, part.observable
+    name = y.name if len(problem.parts) == 1 else f"{y.name}: {part.name}"
     start, end = (convert(float(t), model.time_unit, model.time_display_unit) for t in y.times[own][[0, -1]])
     stated = y.values[own].max(), np.median(y.std[own])
     top, std = (convert(float(v), observable.unit, observable.display_unit) for v in stated)

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from en4dvar.commands.common import parted
-from en4dvar.commands.plugin_commands import first_sentence
-from en4dvar.plumbing.errors import En4dvarError, retold
+from en4dvar.commands.plugin_commands import about, loaded
 
 if TYPE_CHECKING:
     from en4dvar.config import Config
@@ -40,9 +39,9 @@ def forms() -> dict[str, EntryPoint]:
 
 
 def _options(entry: EntryPoint) -> list[click.Option]:
-    name, about = entry.name, first_sentence(entry) or f"From {entry.module.partition('.')[0]}."
+    name = entry.name
     return [
-        click.Option([f"--{name}"], metavar="FILE", type=click.Path(path_type=Path), help=about),
+        click.Option([f"--{name}"], metavar="FILE", type=click.Path(path_type=Path), help=about(entry)),
         click.Option([f"--{name}-set"], metavar="KEY=VALUE", multiple=True, help=f"Set a value of the {name}."),
     ]
 
@@ -65,7 +64,4 @@ def write_form(
     """Write a form and return the sentence about its file. Raises :class:`En4dvarError`: the form cannot be loaded, or
     refuses.
     """
-    entry = forms()[name]
-    with retold((ImportError, AttributeError), En4dvarError, f"--{name} ({entry.value}) cannot be loaded: "):
-        function = entry.load()
-    return str(function(config, times, out, settings, seed))
+    return str(loaded(forms()[name], f"--{name}")(config, times, out, settings, seed))

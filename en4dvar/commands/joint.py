@@ -1,8 +1,11 @@
 """``en4dvar joint``: data sets of finished runs estimated together."""
 
+from pathlib import Path
+from typing import Any
+
 import click
 
-from en4dvar.commands.common import Together, several_runs
+from en4dvar.commands.common import Told, several_runs
 
 
 @click.command()
@@ -11,7 +14,7 @@ from en4dvar.commands.common import Together, several_runs
     help="A parameter that has one value in all data sets, e.g. G; default: what their configurations share.",
 )  # fmt: skip
 @several_runs("joint")
-def joint(runs: Together, names: tuple[str, ...]) -> None:
+def joint(runs: tuple[Path, ...], out: Path, how: dict[str, Any], names: tuple[str, ...]) -> Told:
     """Estimate data sets together that share parameters: samples of one material, records of one instrument.
 
     Takes finished runs, any of which may be a campaign; their models, windows and errors may differ.
@@ -24,5 +27,5 @@ def joint(runs: Together, names: tuple[str, ...]) -> None:
     from en4dvar.report.joint import joint_table
     from en4dvar.runs.joint_run import join
 
-    result, page = join(runs.run_dirs, names, runs.out, **runs.options)
-    runs.conclude(joint_table(result), result.cautions, page)
+    result, page = join(runs, names, out, **how)
+    return joint_table(result), result.cautions, page

@@ -21,16 +21,14 @@ class PluginCommand(click.Command):
     """Stands for a command until it is invoked."""
 
     def __init__(self, entry: EntryPoint):
-        super().__init__(entry.name, short_help=first_sentence(entry) or f"From {entry.module.partition('.')[0]}.")
+        super().__init__(entry.name, short_help=about(entry))
         self.entry = entry
 
     def make_context(
         self, info_name: str | None, args: list[str], parent: click.Context | None = None, **extra: Any
     ) -> click.Context:
         """Import the command and let it take over. Raises :class:`En4dvarError` where that fails."""
-        words = f"command {self.name!r} ({self.entry.value}) cannot be loaded: "
-        with retold((ImportError, AttributeError), En4dvarError, words):
-            command = self.entry.load()
+        command = loaded(self.entry, f"command {self.name!r}")
         if not isinstance(command, click.Command):
             raise En4dvarError(f"command {self.name!r}: {self.entry.value} is not a click command")
         return command.make_context(info_name, args, parent, **extra)
@@ -41,8 +39,18 @@ def plugin_commands() -> dict[str, EntryPoint]:
     return {entry.name: entry for entry in entry_points(group=GROUP)}
 
 
-def first_sentence(entry: EntryPoint) -> str:
-    """First sentence of the command's docstring, read without importing; "" where it cannot be found."""
+def loaded(entry: EntryPoint, what: str) -> Any:
+    """What an entry point leads to. Raises :class:`En4dvarError`, which says of ``what``, where it cannot be loaded."""
+    with retold((ImportError, AttributeError), En4dvarError, f"{what} ({entry.value}) cannot be loaded: "):
+        return entry.load()
+
+
+def about(entry: EntryPoint) -> str:
+    """First sentence of the function's docstring, read without importing; its package where that cannot be found."""
+    return _first_sentence(entry) or f"From {entry.module.partition('.')[0]}."
+
+
+def _first_sentence(entry: EntryPoint) -> str:
     top, *rest = entry.module.split(".")
     spec = find_spec(top)
     if spec is None or spec.origin is None:

@@ -1,8 +1,11 @@
 """``en4dvar population``: how much a parameter varies between the data sets of finished runs."""
 
+from pathlib import Path
+from typing import Any
+
 import click
 
-from en4dvar.commands.common import Together, several_runs
+from en4dvar.commands.common import Told, several_runs
 
 
 @click.command()
@@ -23,7 +26,9 @@ from en4dvar.commands.common import Together, several_runs
     help="Probability that a data set is odd: of another population, in all parameters or in one.",
 )  # fmt: skip
 @several_runs("population")
-def population(runs: Together, names: tuple[str, ...], **hyper: float | None) -> None:
+def population(
+    runs: tuple[Path, ...], out: Path, how: dict[str, Any], names: tuple[str, ...], **hyper: float | None
+) -> Told:
     """Estimate the mean of parameters over data sets and how much they vary: a material behind its samples.
 
     Takes finished runs of the same parameters, with at least three data sets together, whatever their errors. Unlike
@@ -38,5 +43,5 @@ def population(runs: Together, names: tuple[str, ...], **hyper: float | None) ->
     from en4dvar.runs.population_run import population as estimate
 
     changed = {name: value for name, value in hyper.items() if value is not None}
-    result, page = estimate(runs.run_dirs, names, runs.out, hyper=changed, **runs.options)
-    runs.conclude("\n".join(population_lines(result)), result.cautions, page)
+    result, page = estimate(runs, names, out, hyper=changed, **how)
+    return "\n".join(population_lines(result)), result.cautions, page

@@ -148,9 +148,10 @@ def _populations(
     ``alone``: the folders hold nothing else. Raises :class:`OutputError`: they cannot be compared, and nothing else
     can be, or options ask for it.
     """
-    from en4dvar.report.populations import compare_populations, hold_populations, medians_table, sentences
+    from en4dvar.report.populations import compare_populations, medians_table, sentences
+    from en4dvar.results.population_file import FILE
 
-    held = hold_populations(run_dirs)
+    held = all((run_dir / FILE).is_file() for run_dir in run_dirs)
     asked = (held and alone) or against or apart or known
     if not (asked or held):
         return None

@@ -18,7 +18,7 @@ from en4dvar.plumbing.tables import write_csv
 from en4dvar.report.figures import all_figures
 from en4dvar.report.overview import Headline, SetSummary, overview_figures, render_overview
 from en4dvar.report.page import IDENTIFIERS, render_set
-from en4dvar.report.responses import ENTRY_COLUMNS, SHIFT_COLUMNS, Lines, response_lines
+from en4dvar.report.responses import ENTRY_COLUMNS, SHIFT_COLUMNS, stored_ledger, stored_shifts
 from en4dvar.report.svg import draw, svg
 from en4dvar.report.text import upper_first
 from en4dvar.report.varying import PIECE_COLUMNS, piece_lines
@@ -33,6 +33,7 @@ from en4dvar.results.store import StoredResult, load_stored
 
 PAGES = 40  # data sets of a campaign with a page from the start
 SHARE = 20  # pages that are worth the start of a process
+Lines = Sequence[Sequence[object]]
 TABLES = {
     "what_if.csv": SHIFT_COLUMNS, "ledger.csv": ENTRY_COLUMNS, "varying.csv": PIECE_COLUMNS,
     "withheld.csv": WITHHELD_COLUMNS,
@@ -81,7 +82,9 @@ def write_pages(run_dir: str | Path, datasets: Sequence[str] = (), workers: int 
 
 def _lines(result: StoredResult) -> tuple[Lines, ...]:
     """Of each of :data:`TABLES`, the name of the data set first."""
-    return *response_lines(result), piece_lines(result), withheld_lines(result)
+    shifts = [(result.name, *shift[: len(SHIFT_COLUMNS)]) for row in stored_shifts(result) for shift in row]
+    entries = [(result.name, *entry[: len(ENTRY_COLUMNS)]) for row in stored_ledger(result) for entry in row]
+    return shifts, entries, piece_lines(result), withheld_lines(result)
 
 
 def _write_tables(run_dir: Path, sets: Sequence[tuple[Lines, ...]]) -> None:

@@ -1,6 +1,6 @@
 """The page of a twin experiment or a sequence, and the rank histogram that both have."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +8,7 @@ from scipy.stats import binom
 
 from en4dvar.model.state import Array
 from en4dvar.plumbing.files import inside, write_text
+from en4dvar.plumbing.units import convert
 from en4dvar.report.chart import POINTS, Chart, Panel, Row
 from en4dvar.report.html import render
 from en4dvar.report.page import provenance_rows
@@ -91,6 +92,17 @@ def ranks(ranked: Array, members: int) -> Chart:
     panel.stairs(edges, shares, "prior", 0.7)
     panel.rule(1 / BINS, "ink")
     return Chart([Row(5.0 * POINTS, [panel])])
+
+
+def last_analysis(data: Group) -> Iterator[tuple[str, float, float, str]]:
+    """Name, mean, std and the unit they are shown in of the variables that are uncertain at the end."""
+    units = data["units"].values
+    displayed = data["display_units"].values if "display_units" in data else units
+    last = (data[f"analysis_{what}"].values[-1].tolist() for what in ("mean", "std"))
+    for name, unit, to, *numbers in zip(data["state"].values, units, displayed, *last, strict=True):
+        mean, std = (float(convert(number, str(unit), str(to))) for number in numbers)
+        if std > CERTAIN * abs(mean):
+            yield str(name), mean, std, str(to)
 
 
 def _lines(text: object) -> list[str]:

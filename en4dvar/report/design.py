@@ -17,7 +17,7 @@ from en4dvar.plumbing.tables import csv_text, table
 from en4dvar.plumbing.units import convert
 from en4dvar.report.chart import PAGE, POINTS, Chart, Panel, Row, in_columns
 from en4dvar.report.html import render
-from en4dvar.report.svg import svg
+from en4dvar.report.svg import draw
 from en4dvar.report.text import figure_text, rough_number, with_unit
 from en4dvar.results.design_file import DECISION, FILE, DesignRow, Designs, load_designs
 
@@ -28,6 +28,7 @@ NOTHING = 0.9  # of the prior's std: a posterior that is wider has learned nothi
 RARELY = 0.1  # share of experiments that decide which law holds, below which none is promised
 COARSE = 1.0  # relative std beyond which a percentage says nothing
 THIN = 0.1  # share of evidences with few effective draws that is told
+NUMBER = re.compile(r"\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*")  # begins the value of a knob; its unit follows
 GAINS = "Expected information against what can be turned, each mark a design; bars: Monte Carlo standard errors."
 FRONT = "Expected information against price; joined: the designs that no other beats in both."
 FANS = "What would be seen: median, 50 % and 90 % of the prior; marks below: the readings that are taken."
@@ -163,10 +164,10 @@ def gains(designs: Designs) -> Chart:
     for name in names:
         rows = [row for row in ranked(designs) if name in row.settings or name == "experiments"]
         values = [row.settings.get(name, row.evaluated.alike) for row in rows]
-        x, labels = _positions(values)
+        x, labels, unit = _positions(values)
         worth = np.array([row.evaluated.worth for row in rows])
         errors = np.array([row.evaluated.worth_error for row in rows])
-        panel = Panel(figure_text(name) + ("" if labels else _unit_of(values)), "information [nats]", names=labels)
+        panel = Panel(figure_text(name) + unit, "information [nats]", names=labels)
         if labels:
             panel.xticks = range(len(labels))
         panel.bars(x, worth - errors, worth + errors, "posterior", 0.6, 0.7)
@@ -222,11 +223,11 @@ def write_design(folder: Path) -> Path:
     designs = load_designs(folder / FILE)
     write_text(folder / "designs.csv", csv_text(_cells(designs)))
     rows, best = ranked(designs), {id(row) for row in front(designs)}
-    drawings = [("fans", FANS, svg(fans(designs), "fans", FANS))]
+    figures = [("fans", FANS, fans(designs))]
     if len({row.price for row in rows}) > 1:
-        drawings.insert(0, ("prices", FRONT, svg(prices(designs), "prices", FRONT)))
+        figures.insert(0, ("prices", FRONT, prices(designs)))
     if designs.asked.knobs or len({row.evaluated.alike for row in rows}) > 1:
-        drawings.insert(0, ("gains", GAINS, svg(gains(designs), "gains", GAINS)))
+        figures.insert(0, ("gains", GAINS, gains(designs)))
     page = render(
         "design.html.j2",
         title="Designs compared",
@@ -245,7 +246,7 @@ def write_design(folder: Path) -> Path:
             for row in front(designs)
         ],
         remarks=remarks(designs),
-        drawings=drawings,
+        drawings=draw(figures),
         attributes=designs.attributes,
     )
     return write_text(folder / "design.html", page)
@@ -284,21 +285,16 @@ def _cells(designs: Designs) -> list[list[Any]]:
     return [[*head, *ratios, "lost", "beyond_validity", *needed], *cells]
 
 
-def _positions(values: Sequence[Any]) -> tuple[Array, list[str]]:
-    """Where values of a knob lie on an axis: at their numbers, or one beside the other with labels."""
-    numbers = [_number(value) for value in values]
-    units = {_unit_of([value]) for value in values}
-    if len(units) == 1 and None not in numbers:
-        return np.array(numbers, dtype=float), []
-    names = list(dict.fromkeys(map(str, values)))
-    return np.array([names.index(str(value)) for value in values], dtype=float), names
+def _positions(values: Sequence[Any]) -> tuple[Array, list[str], str]:
+    """Where values of a knob lie on an axis: at their numbers, which have one unit, or beside each other with labels.
 
-
-def _number(value: Any) -> float | None:
-    match = re.match(r"\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)", str(value))
-    return float(match.group(1)) if match and not isinstance(value, bool) else None
-
-
-def _unit_of(values: Sequence[Any]) -> str:
-    rest = re.sub(r"^\s*[-+]?[\d.]+(?:[eE][-+]?\d+)?\s*", "", str(values[0])) if values else ""
-    return f" [{rest}]" if rest else ""
+    Returns the places, the labels, and the unit in brackets.
+    """
+    texts = list(map(str, values))
+    numbers = [match for match in map(NUMBER.match, texts) if match]
+    units = {match.string[match.end() :] for match in numbers}
+    if len(numbers) == len(texts) and len(units) == 1:
+        unit = units.pop()
+        return np.array([float(match[1]) for match in numbers]), [], f" [{unit}]" if unit else ""
+    names = list(dict.fromkeys(texts))
+    return np.array([names.index(text) for text in texts], dtype=float), names, ""

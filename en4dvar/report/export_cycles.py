@@ -10,7 +10,7 @@ from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.tables import csv_text
 from en4dvar.plumbing.units import convert
-from en4dvar.report.cycles import CERTAIN
+from en4dvar.report.cycles import last_analysis
 from en4dvar.report.export import Notes, escaped, latex_unit, plus_minus, tabular
 from en4dvar.results.netcdf import Group, understood
 from en4dvar.results.series_file import read_series
@@ -70,12 +70,9 @@ def _members(data: Group) -> Iterator[list[str]]:
 
 
 def _latex(data: Group) -> str:
-    names, units, factors = _shown(data)
-    last = zip(data["analysis_mean"].values[-1] * factors, data["analysis_std"].values[-1] * factors, strict=True)
     lines = [
-        f"{escaped(name)} & {latex_unit(unit) or '--'} & {plus_minus(float(mean), float(std))}"
-        for name, unit, (mean, std) in zip(names, units, last, strict=True)
-        if std > CERTAIN * abs(mean)
+        f"{escaped(name)} & {latex_unit(unit) or '--'} & {plus_minus(mean, std)}"
+        for name, mean, std, unit in last_analysis(data)
     ]
     head = "% en4dvar export: mean and standard deviation of the last analysis; needs \\usepackage{booktabs}"
     return "\n".join([head, *tabular("llr", "variable & unit & analysis", lines, Notes())]) + "\n"

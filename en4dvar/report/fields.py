@@ -19,17 +19,11 @@ CAPTION = (
 )
 
 
-def stored_fields(result: StoredResult) -> tuple[Group, list[str]]:
-    """The group of the fields, and their names; none of a result without."""
-    data = result.groups.get("/fields", Group())
-    return data, [name.removesuffix("_at") for name in data.variables if name.endswith("_at")]
-
-
 def maps(result: StoredResult) -> Chart:
     """Each field: a line with its band, or two maps, each over the scale of its colours."""
-    data, names = stored_fields(result)
+    data = result.groups["/fields"]
     rows: list[Row] = []
-    for name in names:
+    for name in (name.removesuffix("_at") for name in data.variables if name.endswith("_at")):
         at = data[f"{name}_at"].values
         if at.shape[1] == 1:
             rows.append(Row(5.6 * POINTS, [_line(data, name, at[:, 0])]))

@@ -15,21 +15,10 @@ MANY = 5000  # readings: beyond, their bars are one band
 FEW = 150  # readings whose marks are large
 
 
-@dataclass(frozen=True)
-class Band:
-    """Between two quantiles of the members of a group, and how that is drawn."""
-
-    group: str
-    levels: tuple[float, float]
-    colour: str
-    alpha: float
-    label: str
-
-
-BANDS = (
-    Band("prior_predictive", (0.05, 0.95), "prior", 0.28, "prior 90 %"),
-    Band("posterior_predictive", (0.05, 0.95), "posterior", 0.3, "posterior 90 %"),
-    Band("posterior_predictive", (0.25, 0.75), "posterior", 0.6, "posterior 50 %"),
+BANDS = (  # group of the members, two of their quantiles, and how what lies between is drawn
+    ("prior_predictive", (0.05, 0.95), "prior", 0.28, "prior 90 %"),
+    ("posterior_predictive", (0.05, 0.95), "posterior", 0.3, "posterior 90 %"),
+    ("posterior_predictive", (0.25, 0.75), "posterior", 0.6, "posterior 50 %"),
 )
 
 
@@ -90,10 +79,22 @@ def history(result: StoredResult) -> Chart:
 
 
 def _data(panel: Panel, result: StoredResult, series: SeriesShown) -> None:
-    """Data and predictions."""
-    curve = f"{series.axis.name}_path" in result.group("prior_predictive")
-    for band in BANDS:
-        (_along if curve else _bars)(panel, result, series, band)
+    """Data and predictions: along the path, or at each reading of a field."""
+    name = series.axis.name
+    curve = f"{name}_path" in result.group("prior_predictive")
+    for group, levels, colour, alpha, label in BANDS:
+        held = result.group(group)
+        values = shown(held[f"{name}_path" if curve else name])[0]
+        finite = np.isfinite(values)
+        alive = finite.any(axis=1) if curve else finite.all(axis=1)
+        if not alive.any():
+            continue
+        seen = finite.any(axis=0) if curve else slice(None)
+        low, high = member_quantiles(values[alive][:, seen], levels, axis=0)
+        if curve:
+            panel.band(shown(held["path_time"])[seen], low, high, colour, alpha, label)
+        else:
+            panel.bars(series.x, low, high, colour, 4.0 if len(series.x) <= FEW else 2.0, alpha, label)
     if curve:
         panel.line(series.x, series.centre, "centre", 0.9, label="best fit")
     else:
@@ -115,28 +116,6 @@ def _residuals(series: SeriesShown) -> Panel:
     panel.rule(0)
     panel.dots(series.x, residual, "ink", series.size)
     return panel
-
-
-def _along(panel: Panel, result: StoredResult, series: SeriesShown, band: Band) -> None:
-    """Quantiles of the members along the path."""
-    held = result.group(band.group)
-    values = shown(held[f"{series.axis.name}_path"])[0]
-    seen = np.isfinite(values).any(axis=0)
-    if not seen.any():
-        return
-    alive = np.isfinite(values).any(axis=1)
-    low, high = member_quantiles(values[alive][:, seen], band.levels, axis=0)
-    panel.band(shown(held["path_time"])[seen], low, high, band.colour, band.alpha, band.label)
-
-
-def _bars(panel: Panel, result: StoredResult, series: SeriesShown, band: Band) -> None:
-    """Quantiles of the members at each reading of a field."""
-    values = shown(result.group(band.group)[series.axis.name])[0]
-    alive = np.isfinite(values).all(axis=1)
-    if not alive.any():
-        return
-    low, high = member_quantiles(values[alive], band.levels, axis=0)
-    panel.bars(series.x, low, high, band.colour, 4.0 if len(series.x) <= FEW else 2.0, band.alpha, band.label)
 
 
 def _data_range(data: Array, std: Array) -> tuple[float, float]:

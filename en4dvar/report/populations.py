@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
@@ -59,17 +59,6 @@ class Difference:
     apart: tuple[float, float, float]
     untrusted: str = ""
 
-    @classmethod
-    def of(
-        cls, parameter: str, first: str, second: str, unit: str, together: Array, alone: Array, is_ratio: bool,
-        doubts: str,
-    ) -> Difference:  # fmt: skip
-        """Of draws (2, M) of both medians with what is common, and without."""
-        (a, b), (own_a, own_b) = together, alone
-        ratio = _three(a / b) if is_ratio else (np.nan,) * 3
-        apart = _three(own_a / own_b if is_ratio else own_a - own_b)
-        return cls(parameter, first, second, unit, ratio, _three(a - b), float(np.mean(a > b)), apart, doubts)
-
     @property
     def is_ratio(self) -> bool:
         return bool(np.isfinite(self.ratio[1]))
@@ -98,11 +87,6 @@ class PopulationsCompared:
 
     def __str__(self) -> str:
         return "\n".join(sentences(self))
-
-
-def hold_populations(run_dirs: Iterable[str | Path]) -> bool:
-    """Whether each is the folder of a population, or of a run that ended with one."""
-    return all((Path(run_dir) / FILE).is_file() for run_dir in run_dirs)
 
 
 def compare_populations(
@@ -154,9 +138,13 @@ def compare_populations(
         independent = _physical(drawn_together(alone, seed), terms[name])
         for (i, a), (j, b) in combinations(enumerate(stored), 2):
             doubts = dict.fromkeys((*untrusted(stored[a].cautions, name), *untrusted(stored[b].cautions, name)))
-            together, own = medians[name][:, [i, j]].T, independent[:, [i, j]].T
-            unit = terms[name][0].parameter.display_unit
-            differences.append(Difference.of(name, a, b, unit, together, own, name in logarithmic, " ".join(doubts)))
+            (x, y), (own_x, own_y) = medians[name][:, [i, j]].T, independent[:, [i, j]].T
+            ratio, by_itself = (np.nan,) * 3, _three(own_x - own_y)
+            if name in logarithmic:
+                ratio, by_itself = _three(x / y), _three(own_x / own_y)
+            unit, more = terms[name][0].parameter.display_unit, _three(x - y)
+            greater = float(np.mean(x > y))
+            differences.append(Difference(name, a, b, unit, ratio, more, greater, by_itself, " ".join(doubts)))
         notes += _calibrated(name, stored, values, terms[name][0].parameter, common, medians[name], independent)
         if held := [label for label, c in centres.items() if c.pulled]:
             notes.append(f"{name}: the data of {', '.join(held)} leave its median open: the hyperprior holds it")

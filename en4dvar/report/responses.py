@@ -11,7 +11,6 @@ from en4dvar.plumbing.units import convert
 from en4dvar.report.text import fixed, number_like, pretty_unit, symbol_html
 from en4dvar.results.store import StoredResult
 
-Lines = list[tuple[object, ...]]
 SHIFT_COLUMNS = (
     "alternative", "if", "parameter", "unit", "change", "relative_change", "change_in_std", "cost_change", "reason",
 )  # fmt: skip
@@ -136,11 +135,3 @@ def sentence(shifts: Sequence[StoredShift]) -> str:
 def exceeding(rows: Iterable[Sequence[StoredShift]]) -> list[Sequence[StoredShift]]:
     """The alternatives that move a parameter beyond its error bar, or may."""
     return [row for row in rows if row[0].reason or any(shift.exceeds for shift in row)]
-
-
-def response_lines(result: StoredResult) -> tuple[Lines, Lines]:
-    """Lines of ``what_if.csv`` and of ``ledger.csv``, the name of the data set first."""
-    return (
-        [(result.name, *shift[: len(SHIFT_COLUMNS)]) for row in stored_shifts(result) for shift in row],
-        [(result.name, *entry[: len(ENTRY_COLUMNS)]) for row in stored_ledger(result) for entry in row],
-    )

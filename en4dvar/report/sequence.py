@@ -1,6 +1,7 @@
 """Page and figures of a sequence, from ``sequence.nc`` alone: state, parameters, innovations in time, and ranks."""
 
 from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -8,13 +9,14 @@ import numpy.typing as npt
 
 from en4dvar.plumbing.units import convert
 from en4dvar.report.chart import PAGE, POINTS, Chart, Panel, interval, stacked
-from en4dvar.report.cycles import CERTAIN, RANKS, ranks, span_of, time_label, write_cycles_page
+from en4dvar.report.cycles import CERTAIN, RANKS, last_analysis, ranks, span_of, time_label, write_cycles_page
 from en4dvar.report.svg import Captioned
 from en4dvar.report.text import plain_number, pretty_unit, shown, with_unit
 from en4dvar.results.netcdf import Group
 from en4dvar.results.series_file import read_series
 
 SHOWN = 5  # variables or observations in a figure
+LISTED = 40  # in a table
 
 
 def write_sequence_report(run_dir: Path, files: bool = False) -> Path:
@@ -31,8 +33,12 @@ def write_sequence_report(run_dir: Path, files: bool = False) -> Path:
     )
     columns = ["observed", "readings", "root mean square of normalised innovations", "within 2 std"]
     last = "The analysis at the last observation time, given all observations."
+    estimates = [
+        (name, plain_number(mean, 4), plain_number(std, 2), pretty_unit(unit))
+        for name, mean, std, unit in islice(last_analysis(data), LISTED)
+    ]
     rows = []
-    for i, name in enumerate(data["observation"].values[:40]):
+    for i, name in enumerate(data["observation"].values[:LISTED]):
         innovations = data["normalised_innovation"].values[:, i]
         innovations = innovations[np.isfinite(innovations)]
         size = plain_number(float(np.sqrt(np.mean(innovations**2))), 3) if len(innovations) else "–"
@@ -50,7 +56,7 @@ def write_sequence_report(run_dir: Path, files: bool = False) -> Path:
             ("Readings", str(readings), f"of {data.sizes['observation']} quantities"),
         ],
         tables=[
-            ("State and parameters at the end", ["variable", "mean", "std", "unit"], _estimates(data), last),
+            ("State and parameters at the end", ["variable", "mean", "std", "unit"], estimates, last),
             ("Innovations", columns, rows, words),
         ],
         figures=sequence_figures(data),
@@ -117,14 +123,3 @@ def innovations(data: Group) -> Chart:
 def _some(places: npt.NDArray[np.intp], most: int) -> npt.NDArray[np.intp]:
     """All of few, else some that are spread evenly."""
     return np.asarray(places[np.unique(np.linspace(0, len(places) - 1, min(most, len(places))).astype(int))])
-
-
-def _estimates(data: Group) -> list[tuple[str, str, str, str]]:
-    rows: list[tuple[str, str, str, str]] = []
-    last = {what: data[f"analysis_{what}"].values[-1] for what in ("mean", "std")}
-    for i, name in enumerate(data["state"].values):
-        unit, shown = str(data["units"].values[i]), str(data["display_units"].values[i])
-        mean, std = (float(convert(float(values[i]), unit, shown)) for values in last.values())
-        if std > CERTAIN * abs(mean) and len(rows) < 40:
-            rows.append((str(name), plain_number(mean, 4), plain_number(std, 2), pretty_unit(shown)))
-    return rows

@@ -19,7 +19,15 @@ import numpy as np
 
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.results.checkpoint import digest
-from en4dvar.results.netcdf import Groups, Variable, attributes_of, netcdf_file, opened_netcdf, read_sealed
+from en4dvar.results.netcdf import (
+    Groups,
+    Variable,
+    attributes_of,
+    define_variable,
+    netcdf_file,
+    opened_netcdf,
+    read_sealed,
+)
 from en4dvar.results.pack import Pack
 from en4dvar.results.packed import Alike, Content, PackedLayout, opened, unpacked, unpacked_together
 
@@ -160,8 +168,7 @@ def datasets_of(path: Path) -> Iterator[str]:
 
 def _root_attribute(path: Path, name: str) -> str:
     """ "" where the file has none. Raises :class:`OutputError`."""
-    (value,) = read_sealed(attribute_of, path, name)
-    return str(value)
+    return str(*read_sealed(attribute_of, path, name))
 
 
 def attribute_of(path: Path, name: str) -> Iterator[str]:
@@ -178,35 +185,19 @@ def _define(target: netCDF4.Dataset, layout: _Layout, n_datasets: int) -> None:
         kept = {key: v for key, v in source.every.items() if not LEFT_OUT & {*v.dims, key}}
         for dim in sorted({dim for variable in kept.values() for dim in variable.dims}):
             group.createDimension(RENAMED.get(dim, dim), layout.n_observations if dim in RENAMED else source.sizes[dim])
-        _create(group, "dataset", np.dtype(object), ("dataset",), {"units": "1", "long_name": "data set"})
+        about = {"units": "1", "long_name": "data set"}
+        define_variable(group, "dataset", np.dtype(object), ("dataset",), about, missing=False)
         for key, variable in kept.items():
             own = key not in variable.dims or key == "time"  # of each data set
             dims = tuple(RENAMED.get(dim, dim) for dim in variable.dims)
-            kind = variable.values.dtype
-            made = _create(group, key, kind, ("dataset", *dims) if own else dims, attributes_of(variable), own)
+            kind, dims = variable.values.dtype, ("dataset", *dims) if own else dims
+            made = define_variable(group, key, kind, dims, attributes_of(variable), missing=own)
             if not own:
                 made[...] = variable.values
         for key, kind in layout.scalars[name].items():
             variable_name = f"{key}_total" if key in group.variables else key  # a parameter's share keeps its name
             about = {"units": "1", "long_name": key.replace("_", " "), "attribute": key}
-            _create(group, variable_name, np.dtype(kind), ("dataset",), about, padded=True)
-
-
-def _create(
-    group: netCDF4.Group,
-    name: str,
-    kind: np.dtype[Any],
-    dims: tuple[str, ...],
-    attributes: Mapping[str, Any],
-    padded: bool = False,
-) -> netCDF4.Variable[Any]:
-    """A variable; where it is ``padded``, floats that are missing are NaN."""
-    fill = np.nan if padded and kind.kind == "f" else None
-    stored = str if kind.kind in "OU" else np.dtype(np.int8) if kind.kind == "b" else kind
-    made = group.createVariable(name, stored, dims, fill_value=fill)
-    made.setncatts(attributes)
-    made.set_auto_maskandscale(False)
-    return made
+            define_variable(group, variable_name, np.dtype(kind), ("dataset",), about, missing=True)
 
 
 def _write(group: netCDF4.Group, begin: int, names: Sequence[str], block: Sequence[Alike]) -> None:

@@ -29,16 +29,11 @@ QUANTILES = (0.05, 0.5, 0.95)
 DRAWS = ("chain", "draw")
 
 
-@dataclass(frozen=True)
-class Alone:
-    """What one data set said by itself: physical members (N, n) of its parameters ``names``."""
+def save_joint(path: Path, estimate: JointEstimate, alone: Sequence[Array], attributes: Mapping[str, Any]) -> Path:
+    """Write the file; it appears complete or not at all. ``alone``: physical members (N_i, n_i) of each data set.
 
-    names: tuple[str, ...]
-    members: Array
-
-
-def save_joint(path: Path, estimate: JointEstimate, alone: Sequence[Alone], attributes: Mapping[str, Any]) -> Path:
-    """Write the file; it appears complete or not at all. Raises :class:`OutputError`."""
+    Raises :class:`OutputError`.
+    """
     names = [experiment.observations.name for experiment in estimate.joint.experiments]
     datasets = {"dataset": variable("dataset", text(names), "", "data set")}
     root = {
@@ -50,22 +45,11 @@ def save_joint(path: Path, estimate: JointEstimate, alone: Sequence[Alone], attr
         "effective_draws": estimate.members.effective,
         "warnings": _lines(estimate),
     }
-    # Quantiles (dataset, quantile) of each shared parameter as each data set has it by itself
-    each_alone = {}
-    for j, key in enumerate(estimate.joint.shared):
-        rows = np.full((len(alone), len(QUANTILES)), np.nan)
-        for e, single in enumerate(alone):
-            if estimate.joint.groups[e].get(key[0]) == key[1]:
-                values = single.members[:, single.names.index(key[0])]
-                rows[e] = member_quantiles(values, QUANTILES)
-        unit = estimate.joint.terms[j].parameter.unit
-        words = "5, 50 and 95 % of a data set alone"
-        each_alone[shared_name(key)] = variable(("dataset", "quantile"), rows, unit, words)
     groups = {
         "/": Group(attrs=root),
         "/posterior": Group(_shared(estimate) | _own(estimate, names), datasets),
         "/prior": Group(_prior(estimate)),
-        "/alone": Group(each_alone, datasets),
+        "/alone": Group(_alone(estimate, alone), datasets),
         "/fit": Group(_fit(estimate) | _agreement(estimate, names), datasets),
     }
     if estimate.without:
@@ -90,12 +74,24 @@ def _about(p: Parameter) -> dict[str, Any]:
 
 def _shared(estimate: JointEstimate) -> dict[str, Variable]:
     variables = {}
-    for j, ((_, group), term) in enumerate(zip(estimate.joint.shared, estimate.joint.terms, strict=True)):
-        p = term.parameter
-        label = f"{p.label}, {group}" if group else p.label
-        mode = float(estimate.shared_mode[j])
-        name = shared_name(estimate.joint.shared[j])
-        variables[name] = variable(DRAWS, estimate.shared[None, :, j], p.unit, label, mode=mode, **_about(p))
+    for j, (key, term) in enumerate(zip(estimate.joint.shared, estimate.joint.terms, strict=True)):
+        p, mode = term.parameter, float(estimate.shared_mode[j])
+        label = f"{p.label}, {key[1]}" if key[1] else p.label
+        members = estimate.shared[None, :, j]
+        variables[shared_name(key)] = variable(DRAWS, members, p.unit, label, mode=mode, **_about(p))
+    return variables
+
+
+def _alone(estimate: JointEstimate, alone: Sequence[Array]) -> dict[str, Variable]:
+    """Quantiles (dataset, quantile) of each shared parameter as each data set has it by itself; NaN of the others."""
+    variables, joint = {}, estimate.joint
+    for (name, group), term in zip(joint.shared, joint.terms, strict=True):
+        rows = np.full((len(alone), len(QUANTILES)), np.nan)
+        for e, members in enumerate(alone):
+            if joint.groups[e].get(name) == group:
+                rows[e] = member_quantiles(members[:, joint.experiments[e].prior.names.index(name)], QUANTILES)
+        words = "5, 50 and 95 % of a data set alone"
+        variables[shared_name((name, group))] = variable(("dataset", "quantile"), rows, term.parameter.unit, words)
     return variables
 
 
@@ -162,9 +158,9 @@ def _agreement(estimate: JointEstimate, names: Sequence[str]) -> dict[str, Varia
     """Each data set against all others, as the estimate without the odd ones has it."""
     agreed = estimate.agreement
     odd = np.array([int(name in estimate.odd) for name in names])
-    distance = variable("dataset", np.sqrt(agreed.squares), "1", "from the value of all others, in standard deviations")
+    words = "from the value of all others, in standard deviations"
     return {
-        "distance": distance,
+        "distance": variable("dataset", np.sqrt(agreed.squares), "1", words),
         "chance": variable("dataset", agreed.chances, "1", "probability of a larger distance if all share one value"),
         "odd": variable("dataset", odd, "1", "1: left out in the group without"),
     }

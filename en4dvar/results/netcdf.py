@@ -213,7 +213,7 @@ def groups_in(path: Path) -> Iterator[tuple[str, Group]]:
 
 def _read(group: Any) -> Iterator[tuple[str, Group]]:
     """A group of a file and those in it, by path."""
-    attributes = _said(group)
+    attributes = Said(group.__dict__)
     listed = [str(attributes.pop("coordinates", ""))]  # xarray lists here those that are no dimension
     held = {}
     for name, variable in group.variables.items():
@@ -228,7 +228,7 @@ def _read(group: Any) -> Iterator[tuple[str, Group]]:
 
 def _read_variable(variable: Any) -> tuple[Variable, str]:
     """With the names of coordinates that xarray lists beside it."""
-    about = _said(variable)
+    about = Said(variable.__dict__)
     fill, listed = "_FillValue" in about, str(about.pop("coordinates", ""))
     about.pop("_FillValue", None)
     values = np.asarray(variable[...], dtype=object if variable.dtype is str else None)
@@ -236,11 +236,6 @@ def _read_variable(variable: Any) -> tuple[Variable, str]:
         del about["dtype"]
         values = values.astype(bool)
     return Variable(variable.dimensions, values, about, fill), listed
-
-
-def _said(held: Any) -> dict[str, Any]:
-    """Attributes of a group or variable."""
-    return Said({key: held.getncattr(key) for key in held.ncattrs()})
 
 
 @contextmanager
@@ -276,12 +271,19 @@ def _define(file: netCDF4.Dataset, path: str, content: Group) -> Iterator[tuple[
     for name, size in content.sizes.items():
         group.createDimension(name, size)
     for name, variable in (*content.variables.items(), *content.coords.items()):
-        values, attributes = variable.values, attributes_of(variable)
-        if values.dtype == bool:
-            values = values.astype(np.int8)
-        kind = str if values.dtype.kind in "OU" else np.dtype(np.float32) if variable.single else values.dtype
-        missing = values.dtype.kind == "f" and variable.fill and name in content.variables
-        target = group.createVariable(name, kind, variable.dims, fill_value=np.nan if missing else None)
-        target.set_auto_maskandscale(False)
-        target.setncatts(attributes)
-        yield target, values.astype(object) if kind is str else values
+        kind = np.dtype(np.float32) if variable.single else variable.values.dtype
+        missing = variable.fill and name in content.variables
+        target = define_variable(group, name, kind, variable.dims, attributes_of(variable), missing)
+        unlike = {"O": object, "U": object, "b": np.int8}.get(kind.kind)  # what the file holds in their place
+        yield target, variable.values.astype(unlike) if unlike else variable.values
+
+
+def define_variable(
+    group: Any, name: str, kind: np.dtype[Any], dims: tuple[str, ...], attributes: Mapping[str, Any], missing: bool
+) -> Any:
+    """A variable of a file for values of a ``kind``, text and truth values too; ``missing``: floats may be, as NaN."""
+    stored = str if kind.kind in "OU" else np.dtype(np.int8) if kind.kind == "b" else kind
+    made = group.createVariable(name, stored, dims, fill_value=np.nan if missing and kind.kind == "f" else None)
+    made.set_auto_maskandscale(False)
+    made.setncatts(attributes)
+    return made

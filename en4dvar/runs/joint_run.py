@@ -13,7 +13,7 @@ from en4dvar.estimation.joint.problem import JointProblem, sharing
 from en4dvar.executor import Executor
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.results.checkpoint import FOLDER
-from en4dvar.results.joint_file import FILE, Alone, StoredJoint, load_joint, save_joint
+from en4dvar.results.joint_file import FILE, StoredJoint, load_joint, save_joint
 from en4dvar.runs.finished import Finished, carried
 from en4dvar.runs.together import Tell, TogetherKind
 from en4dvar.runs.trust import Ask
@@ -73,7 +73,7 @@ class JointKind(TogetherKind):
         singles = [Single.of_physical(dataset.problem.prior, dataset.members, dataset.centre) for dataset in sets]
         estimated = estimate_jointly(joint, config.assimilation, config.seed, executor, singles, tell)
         estimated = _with_carried(estimated, sets)
-        alone = [Alone(dataset.problem.prior.names, dataset.members) for dataset in sets]
+        alone = [dataset.members for dataset in sets]
         shared = " ".join(dict.fromkeys(name for name, _ in joint.shared))
         save_joint(path, estimated, alone, {**attributes, "seed": config.seed, "shared": shared})
 

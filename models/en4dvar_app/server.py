@@ -243,7 +243,7 @@ class Step(Guarded):
             elif running:
                 raise steps.FieldError("another command is running: wait for it, or cancel it")
             else:
-                words = steps.words_of(self.root, step, fields)
+                words = steps.STEPS[step](self.root, fields)
                 job.start(self.root, step, words[1], words, self.trust)
 
 

@@ -32,11 +32,6 @@ class FieldError(En4dvarError):
     """A field of the page that is missing or cannot be."""
 
 
-def words_of(root: Path, step: str, fields: Fields) -> list[str]:
-    """The words after ``en4dvar``. Raises :class:`FieldError`, and :class:`OutputError` for a path."""
-    return STEPS[step](root, fields)
-
-
 def beside(movie: str, suffix: str) -> str:
     """The name of what belongs to a movie: its table, the corrections, the picture that says what is looked at."""
     return f"{movie.rpartition('.')[0] or movie}{suffix}"
@@ -125,6 +120,7 @@ def _export(root: Path, fields: Fields) -> list[str]:
     return ["export", run, f"--out={out}"]
 
 
+# The folder and fields → the words after ``en4dvar``. Raise FieldError, and OutputError for a path.
 STEPS: dict[str, Callable[[Path, Fields], list[str]]] = {
     "track": _track,
     "init": _init,

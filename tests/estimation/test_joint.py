@@ -18,7 +18,7 @@ from en4dvar.plumbing.errors import ConfigError
 from en4dvar.priors.dependence import Dependence
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
-from en4dvar.results.joint_file import Alone, load_joint, save_joint
+from en4dvar.results.joint_file import load_joint, save_joint
 from en4dvar.schemes.settings import AssimilationSettings
 
 MEAN, STD = np.array([0.5, -0.5, 0.2]), np.array([0.8, 1.2, 0.9])
@@ -310,7 +310,7 @@ def test_a_model_is_asked_for_the_observations_alone_unless_more_is_free(tmp_pat
     np.testing.assert_array_equal(found.grids[0], problems[0].observations.times)
     np.testing.assert_allclose(found.forecasts[0].path, found.forecasts[0].predictions, rtol=0, atol=0)
     assert found.grids[1].shape == (200,)
-    save_joint(tmp_path / "joint.nc", found, [Alone(("a", "b", "c"), np.zeros((3, 3)))] * 2, {})
+    save_joint(tmp_path / "joint.nc", found, [np.zeros((3, 3))] * 2, {})
     band = load_joint(tmp_path / "joint.nc").group("fit")["band"].values
     assert np.isfinite(band[0]).all(axis=1).sum() == len(problems[0].observations)
     assert np.isfinite(band[1]).all()
