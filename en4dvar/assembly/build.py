@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 
 from en4dvar.assembly.find_files import find_files, with_parts
 from en4dvar.assembly.reading import read_observations
@@ -106,18 +105,14 @@ def _varying(config: Config, observations: Observations, terms: Sequence[PriorTe
     observations.
     """
     model, by_name = config.model, {term.parameter.name: term for term in terms}
-    asked: list[tuple[tuple[str, ...], Callable[[], Varying | None]]] = [
-        (("parameters", e.parameter.name, "varies"), partial(e.walk, model, by_name[e.parameter.name], observations))
-        for e in config.parameters
-        if isinstance(e, Uncertain)
-    ]
-    asked += [(("model_error", e.field.name), partial(e.changes, model, observations)) for e in config.model_error]
-    varying: list[Varying] = []
-    for path, make in asked:
-        with config.document.placing(*path):
-            process = make()
-        varying += [] if process is None else [process]
-    return varying
+    varying: list[Varying | None] = []
+    for name, entry in ((e.parameter.name, e) for e in config.parameters if isinstance(e, Uncertain)):
+        with config.document.placing("parameters", name, "varies"):
+            varying.append(entry.walk(model, by_name[name], observations))
+    for error in config.model_error:
+        with config.document.placing("model_error", error.field.name):
+            varying.append(error.changes(model, observations))
+    return [process for process in varying if process is not None]
 
 
 def _discrepancy(config: Config, observations: Observations) -> tuple[PriorTerm, ...]:

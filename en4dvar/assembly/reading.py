@@ -27,29 +27,32 @@ from en4dvar.plumbing.units import convert
 
 
 def read_observations(plan: DataPlan, file: DataFile, name: str, weights: str = "sum") -> Observations:
-    """The observations (y, t, R) of one data set inside the window. Raises :class:`DataError`."""
+    """The observations (y, t, R) of one data set inside the window; ``weights``: those of ``assimilation.weights`` on
+    top of their own. Raises :class:`DataError`.
+    """
     files = (file, *file.others)
     series = []
     for series_plan, where in zip(plan.series, files, strict=True):
         with retold(DataError, DataError, "", series_plan.name):
             series.append(read_one(series_plan, where, fewest=series_plan.observable.fewest if plan.alone else 1))
     observations = Observations.of_series(series, plan.correlation, name)
-    return observations if weights == "sum" else weighted(observations, weights)
-
-
-def weighted(observations: Observations, weights: str) -> Observations:
-    """The same with the weights of ``assimilation.weights``, ``mean`` or ``balanced``, on top of their own."""
     own = observations.weights
+    if weights == "sum":
+        return observations
     if weights == "mean":
         return replace(observations, weights=own / len(own))
     groups = np.concatenate([np.full(p.end - p.begin, p.group, dtype=object) for p in observations.parts] or [own * 0])
     return replace(observations, weights=balanced(own, groups.astype(str)))
 
 
-def read_one(plan: SeriesPlan, file: DataFile, fewest: int = 3) -> Series:
+def read_one(plan: SeriesPlan, file: DataFile, fewest: int) -> Series:
     """One series inside its window. Raises :class:`DataError`."""
-    data, path = plan.data, file.path
-    read = _readings(data, file, fewest)
+    data, path, weights, places = plan.data, file.path, plan.data.weights, plan.data.places
+    stated = (*_errors(data).values(), weights and weights.column, places and places.column)
+    read = read_series(
+        path, data.columns.time, data.columns.observable, data.layout, [column for column in stated if column],
+        file.part, repeats=places is not None, fewest=fewest,
+    )  # fmt: skip
     window = _window(data, read, path)
     times, values = read.times[window], read.values[window]
     zero = {"file": 0.0, "window": times[0]}.get(str(data.time_zero), data.time_zero)
@@ -61,12 +64,11 @@ def read_one(plan: SeriesPlan, file: DataFile, fewest: int = 3) -> Series:
         return read.errors[column.name][window] if column else None
 
     def errors(part: slice) -> Noise:
-        stated = {key: read.errors[column.name][part] for key, column in _errors(data).items()}
-        return errors_of(data, read.times[part] - float(zero), values, np.arange(len(read.times))[part], stated)
+        of_columns = {key: read.errors[column.name][part] for key, column in _errors(data).items()}
+        return errors_of(data, read.times[part] - float(zero), values, np.arange(len(read.times))[part], of_columns)
 
     try:
         noise, whole = errors(window), slice(window.start, max(window.stop, _window(data, read, path, until=True).stop))
-        weights, places = data.weights, data.places
         if len(times) < fewest:
             raise DataError(f"{len(times)} usable observations in the window; at least {fewest} are needed")
         return Series(
@@ -105,22 +107,6 @@ def _errors(data: Data) -> dict[str, Column]:
     clock = time if isinstance(time, Column) else time.column
     columns = data.error.columns(data.columns.observable.unit, clock.unit if clock else "")
     return columns | {key: marked for key, marked in data.error.bounds.items() if isinstance(marked, Column)}
-
-
-def _readings(data: Data, file: DataFile, fewest: int) -> Readings:
-    """All readings of the file, with the columns that belong to them."""
-    of_weights, of_places = data.weights and data.weights.column, data.places and data.places.column
-    further = [*_errors(data).values(), *(column for column in (of_weights, of_places) if column)]
-    return read_series(
-        file.path,
-        data.columns.time,
-        data.columns.observable,
-        data.layout,
-        further,
-        file.part,
-        repeats=data.places is not None,
-        fewest=fewest,
-    )
 
 
 def _window(data: Data, read: Readings, path: Path, until: bool = False) -> slice:

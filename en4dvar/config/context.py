@@ -152,6 +152,10 @@ def parse_spread(text: Any, unit: str) -> Spread:
     return spread
 
 
+SPREAD = Made(lambda text, context: parse_spread(text, subject_unit(context)))
+"""A :class:`Spread` of what the entry of a section is about."""
+
+
 def unit_of(target: Unit) -> Made:
     """The text of a unit that can be converted to ``target``."""
 

@@ -5,7 +5,7 @@ from typing import Annotated, Any, NamedTuple, TypeVar
 
 from annotated_types import Ge
 
-from en4dvar.config.context import Context, Made, Spread, parse_spread, quantity, read_each
+from en4dvar.config.context import SPREAD, Context, Made, Spread, parse_spread, quantity, read_each
 from en4dvar.config.schema import Section
 from en4dvar.config.validate import Faults
 from en4dvar.model.forward import ForwardModel
@@ -64,7 +64,7 @@ class InitialSpread(Section):
     function of their distance: cell by cell where the scheme is localised, else as the sum of its largest modes.
     """
 
-    std: Annotated[Spread, Made(lambda text, context: parse_spread(text, context.subject.unit))]
+    std: Annotated[Spread, SPREAD]
     """Standard deviation: in the field's unit (added to it), or in % (a factor)."""
     kernel: KernelName | None = None
     """Correlation of the components as a function of their distance."""

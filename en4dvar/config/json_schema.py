@@ -8,7 +8,7 @@ further kinds of files (group ``en4dvar.schemas``: the key that marks the kind â
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from importlib.metadata import entry_points
 from typing import Any
 
@@ -71,42 +71,38 @@ def schema_text() -> str:
 
 def _of(schema: Json) -> Json:
     """The schema of pydantic, references inside it resolved in place, defaults as a file would write them."""
-    tidied: Json = _tidy(_resolve(schema, schema.pop("$defs", {})))
-    return tidied
+    return _tidy(_resolve(schema, schema.pop("$defs", {})))
 
 
-def _resolve(node: Any, inner: Json) -> Any:
+def _resolve(node: Json, inner: Json) -> Json:
     """References replaced by what they mean; text beside a reference goes before the text behind it."""
-    if isinstance(node, list):
-        return [_resolve(item, inner) for item in node]
-    if not isinstance(node, dict):
-        return node
     if "x-definition" in node:  # of the whole schema, not of the section
         return {"$ref": f"#/$defs/{node['x-definition']}", **{k: v for k, v in node.items() if k != "x-definition"}}
     if "$ref" in node:
         target = _resolve(inner[node["$ref"].rpartition("/")[2]], inner)
-        return {**target, **{k: _resolve(v, inner) for k, v in node.items() if k != "$ref"}}
-    return {k: _resolve(v, inner) for k, v in node.items() if k != "discriminator"}
+        return {**target, **{k: _each(v, _resolve, inner) for k, v in node.items() if k != "$ref"}}
+    return {k: _each(v, _resolve, inner) for k, v in node.items() if k != "discriminator"}
 
 
-def _partial(node: Any) -> Any:
-    """The same with nothing required, at any depth."""
+def _each(node: Any, change: Callable[..., Json], *more: Any) -> Any:
+    """Every section that is in a list, or is itself the ``node``, changed; anything else as it is."""
     if isinstance(node, list):
-        return [_partial(item) for item in node]
-    if not isinstance(node, dict):
-        return node
-    parts = {k: _partial(v) for k, v in node.items() if k != "required" or not isinstance(v, list)}
+        return [_each(item, change, *more) for item in node]
+    return change(node, *more) if isinstance(node, dict) else node
+
+
+def _partial(node: Json) -> Json:
+    """The same with nothing required, at any depth."""
+    parts = {k: _each(v, _partial) for k, v in node.items() if k != "required" or not isinstance(v, list)}
     return {k: v for k, v in parts.items() if k != "oneOf" or {} not in v}  # alternatives that only required are none
 
 
-def _tidy(node: Any) -> Any:
+def _tidy(node: Json) -> Json:
     """Without generated titles and without defaults that JSON cannot hold; quantities as text with their unit."""
-    if isinstance(node, list):
-        return [_tidy(item) for item in node]
-    if not isinstance(node, dict):
-        return node
     tidy = {
-        key: {name: _tidy(child) for name, child in value.items()} if key == "properties" else _tidy(value)
+        key: {name: _each(child, _tidy) for name, child in value.items()}
+        if key == "properties"
+        else _each(value, _tidy)
         for key, value in node.items()
         if key != "title"
     }

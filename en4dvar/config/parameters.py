@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from en4dvar.config.context import Context, Made, Spread, parse_spread, read_each, subject_unit, unit_of
+from en4dvar.config.context import SPREAD, Context, Made, Spread, read_each, subject_unit, unit_of
 from en4dvar.config.schema import Section
 from en4dvar.config.validate import Faults
 from en4dvar.config.varies import VariesSection
@@ -103,7 +103,7 @@ class PriorSection(Section):
     """Mean with its unit, or ``maximum``: the largest observation of the window."""
     median: Location = None
     """Median with its unit, or ``maximum``: the largest observation of the window."""
-    std: Annotated[Spread | None, Made(lambda text, context: parse_spread(text, subject_unit(context)))] = None
+    std: Annotated[Spread | None, SPREAD] = None
     """Standard deviation with its unit, or in % of the mean; of a half-normal, that of the whole Gaussian."""
     log_std: Annotated[float, Field(gt=0)] | None = None
     """Standard deviation of the natural logarithm: 0.3 is about 30 %, 0.7 a factor of two."""

@@ -14,7 +14,7 @@ from en4dvar.config.initial_state import dynamic_fields
 from en4dvar.config.load import Read, Validated, observed_in, read_file
 from en4dvar.config.parameters import Entry, Tied, Uncertain, entries
 from en4dvar.config.schema import File, Output, Section
-from en4dvar.config.sequential import Sequential, Workers, spreads
+from en4dvar.config.sequential import Sequential, Workers, stds
 from en4dvar.config.series import DATA, DataPlan
 from en4dvar.config.validate import Faults
 from en4dvar.config.varies import MODEL_ERROR, ErrorOf
@@ -38,7 +38,7 @@ def _known_fields(names: tuple[str, ...], context: Context) -> tuple[str, ...]:
 class Sequence(Section):
     """The prior of the state at time zero, and the results that are kept."""
 
-    initial_std: Annotated[dict[str, Spread], spreads(dynamic_fields)] = Field({}, validate_default=True)
+    initial_std: Annotated[dict[str, Spread], stds(dynamic_fields, relative=True)] = Field({}, validate_default=True)
     """Spread of the model's initial state, by field, each of its values for itself: in the field's unit, or in % of a
     field that is positive and then estimated by its logarithm."""
     positive: Annotated[tuple[str, ...], Made(_known_fields, tuple[str, ...])] = ()

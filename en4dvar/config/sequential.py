@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from en4dvar.config.context import TEXT, Context, Made, parse_spread, quantity, read_each, subject_unit
+from en4dvar.config.context import SPREAD, TEXT, Context, Made, quantity, read_each, subject_unit
 from en4dvar.config.initial_state import dynamic_fields
 from en4dvar.config.schema import OfScheme, Section, keys_of_schemes, listed, or_in_a_file
 from en4dvar.config.validate import Faults
@@ -29,17 +29,11 @@ from en4dvar.series.smoothers import EnKS, EnRTS
 Things = Callable[[ForwardModel], Mapping[str, Any]]  # by their names, of those that a model knows
 
 
-def stds(known: Things) -> Made:
-    """Standard deviations by the name of a thing, at least one."""
-    return _by_name(known, quantity(subject_unit, "positive").make, 1)
+def stds(known: Things, relative: bool = False) -> Made:
+    """Standard deviations by the name of a thing, at least one; ``relative``: any number of them, some in %."""
+    read_one: Callable[[Any, Context], Any] = SPREAD.make if relative else quantity(subject_unit, "positive").make
+    fewest = 0 if relative else 1
 
-
-def spreads(known: Things) -> Made:
-    """Standard deviations, some in %, by the name of a thing."""
-    return _by_name(known, lambda text, context: parse_spread(text, context.subject.unit), 0)
-
-
-def _by_name(known: Things, read_one: Callable[[Any, Context], Any], fewest: int) -> Made:
     def read(section: Mapping[str, Any], context: Context) -> dict[str, Any]:
         things = known(context.model)
         with Faults() as faults:

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import model_validator
 
-from en4dvar.config.context import Context, Made, Spread, parse_spread, quantity, subject_unit, time_unit
+from en4dvar.config.context import SPREAD, Context, Made, Spread, parse_spread, quantity, subject_unit, time_unit
 from en4dvar.config.initial_state import of_fields
 from en4dvar.config.schema import Section
 from en4dvar.config.validate import Faults
@@ -87,7 +87,7 @@ class VariesSection(Knots):
 class ModelErrorSection(Knots):
     """A field of the state that changes at knots, by something the model does not know."""
 
-    std: Annotated[Spread, Made(lambda text, context: parse_spread(text, subject_unit(context)))]
+    std: Annotated[Spread, SPREAD]
     """Standard deviation of each change: in the field's unit (added to it), or in % (a factor)."""
 
 

@@ -164,12 +164,10 @@ class DaskExecutor(FuturesExecutor):
     def close(self) -> None:
         client, cluster = self._client, self._cluster
         self._client = self._cluster = None
-        with contextlib.suppress(TimeoutError):
-            if client is not None:
-                client.close(timeout=CLOSE_TIMEOUT)
-        with contextlib.suppress(TimeoutError):
-            if cluster is not None:
-                cluster.close(timeout=CLOSE_TIMEOUT)
+        for part in (client, cluster):
+            with contextlib.suppress(TimeoutError):
+                if part is not None:
+                    part.close(timeout=CLOSE_TIMEOUT)
         self._configured.close()
 
     def kill(self) -> None:

@@ -53,8 +53,6 @@ class DataFile:
     @property
     def paths(self) -> tuple[Path, ...]:
         """The files of all its series, each once."""
-        if not self.others:
-            return (self.path,)
         return tuple(dict.fromkeys((self.path, *(path for other in self.others for path in other.paths))))
 
 

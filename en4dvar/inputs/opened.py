@@ -3,7 +3,7 @@
 import csv
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import get_args
 
@@ -36,11 +36,9 @@ def format_of(path: Path, layout: Layout) -> Format | None:
     return layout.format or SUFFIXES.get(path.suffix.lower())
 
 
-@contextmanager
-def readable(path: Path) -> Iterator[None]:
+def readable(path: Path) -> AbstractContextManager[None]:
     """Whatever goes wrong in the system or in the csv module as :class:`DataError`."""
-    with retold((OSError, csv.Error), DataError, f"{path}: "):
-        yield
+    return retold((OSError, csv.Error), DataError, f"{path}: ")
 
 
 def require_file(path: Path) -> None:

@@ -34,8 +34,7 @@ def columns_of(
             scalars = scalars_in(path) if kind == "csv" else {}
             scalars |= _constant(table) if layout.by is not None else {}
             return _of_table(table, wanted), scalars, [line for line, _ in table.rows]
-        _refuse_by(path, layout)
-        variables = mat_variables(path).of(part)
+        variables = _variables(path, layout).of(part)
         return {name: _of_mat(variables, name, path) for name in wanted}, variables.scalars, []
 
 
@@ -57,8 +56,7 @@ def parts_of(path: Path, value: Column, layout: Layout = ANY, time: str | None =
             if value.name in table.names:
                 return ()
             return tuple(name for name in table.names if matches(name, value.name) and name != time)
-        _refuse_by(path, layout)
-        variables = mat_variables(path)
+        variables = _variables(path, layout)
     if several:
         return tuple(name for name in variables.matching(value.name) if name != time)
     if variables.vector(value.name) is not None:
@@ -70,9 +68,10 @@ def table_of(path: Path, kind: Format, layout: Layout, wanted: Sequence[str] = (
     return Table(path, layout.decimal, wanted, None if kind == "csv" else sheet_lines(path, layout.sheet))
 
 
-def _refuse_by(path: Path, layout: Layout) -> None:
+def _variables(path: Path, layout: Layout) -> Variables:
     if layout.by is not None:
         raise DataError(f"{path}: data.by is for tables; elements of a struct array are data sets without it")
+    return mat_variables(path)
 
 
 def _groups(table: Table, by: str) -> tuple[str, ...]:

@@ -5,7 +5,7 @@ that are, is a time that was written wrongly. Steps of all kinds are those of an
 """
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -29,49 +29,30 @@ def step_doubts(
     ``scalars``: of the file, whose units nobody said, so factors of 1000 are not told from agreement. ``rate``: of the
     frames, as the user says, per ``unit``. ``display``: the unit that messages use.
     """
-    return (*_rates(times, unit, display, scalars, rate), *_odd(times, unit, display))
-
-
-def frame(times: Array) -> float:
-    """The step between frames, NaN where the steps are not mostly whole numbers of one."""
-    steps = np.diff(times)
-    base = float(np.median(steps))
-    return base if np.mean(_off(steps / base) < WHOLE) >= MOSTLY else float("nan")
-
-
-def _off(frames: Array) -> Array:
-    """How far steps (K,) in frames are from a whole number of them, at least one."""
-    return np.abs(frames - np.maximum(np.rint(frames), 1))
-
-
-def _rates(
-    times: Array, unit: str, display: str, scalars: Mapping[str, float], rate: float | None
-) -> Iterator[Caution]:
-    step = frame(times)
-    if not np.isfinite(step):
-        step = float(np.median(np.diff(times)))
+    steps, cautions = np.diff(times), list[Caution]()
+    step = float(np.median(steps))
     told = f"the times are {convert(step, unit, display):.4g} {display} apart"
     if rate is not None and _off(np.array([step * rate]))[0] > SAME * step * rate:
-        said = convert(1 / rate, unit, display)
-        yield caution("implausible-data", f"{told}, which is no whole number of frames: at the rate given one takes "
-                      f"{said:.4g} {display}")  # fmt: skip
+        words = f"{told}, which is no whole number of frames: at the rate given one takes "
+        cautions.append(caution("implausible-data", f"{words}{convert(1 / rate, unit, display):.4g} {display}"))
     for name, value in scalars.items():
         if value > 0 and (_STEP.fullmatch(name) or _RATE.fullmatch(name)):
             frames = step / value if _STEP.fullmatch(name) else step * value
             frames /= 1000.0 ** np.rint(np.log10(frames) / 3)
             if abs(frames - 1) > SAME and _off(np.array([frames]))[0] > SAME * frames:
-                yield caution("implausible-data", f"{told}, but {name} of the file is {value:g}")
-
-
-def _odd(times: Array, unit: str, display: str) -> Iterator[Caution]:
-    step = frame(times)
-    if not np.isfinite(step):
-        return
-    odd = np.flatnonzero(_off(np.diff(times) / step) > ODD)
-    if len(odd):
-        first, after, base = convert(np.array([*times[odd[0] : odd[0] + 2], step]), unit, display)
+                cautions.append(caution("implausible-data", f"{told}, but {name} of the file is {value:g}"))
+    off = _off(steps / step)
+    odd = np.flatnonzero(off > ODD)
+    if len(odd) and np.mean(off < WHOLE) >= MOSTLY:
+        first, after, whole = convert(np.array([*times[odd[0] : odd[0] + 2], step]), unit, display)
         words = (
-            f"{len(odd)} of {len(times) - 1} steps between readings are no whole number of frames of {base:.4g} "
+            f"{len(odd)} of {len(steps)} steps between readings are no whole number of frames of {whole:.4g} "
             f"{display}, the first from {first:.6g} to {after:.6g} {display}: is a time wrong?"
         )
-        yield caution("implausible-data", words, "caution")
+        cautions.append(caution("implausible-data", words, "caution"))
+    return tuple(cautions)
+
+
+def _off(frames: Array) -> Array:
+    """How far steps (K,) in frames are from a whole number of them, at least one."""
+    return np.abs(frames - np.maximum(np.rint(frames), 1))

@@ -130,10 +130,9 @@ def _middle(times: Array, values: Array, index: int) -> float:
     return float(np.mean(np.interp([left[0], right[0]], np.arange(len(times)), times)))
 
 
-def maxima(values: Array, prominence: float = 0.1) -> Array:
-    """Indices of the local maxima of ``values`` (K,) behind their first minimum, of such a prominence."""
-    first = minima(values, prominence)[:1]
-    tops = minima(-values, prominence)
+def maxima(values: Array) -> Array:
+    """Indices of the local maxima of ``values`` (K,) behind their first minimum, of 10 % prominence."""
+    first, tops = minima(values)[:1], minima(-values)
     return tops[tops > first] if len(first) else first
 
 

@@ -16,8 +16,8 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import IO, Any, TypeVar
 
 from en4dvar.plumbing.children import Child, limit_memory, limit_time, status_named
@@ -161,9 +161,8 @@ def serve() -> None:
 
 def _served(name: str, arguments: tuple[Any, ...], allowed: Allowed, answers: IO[bytes]) -> tuple[int, Any]:
     """Give the values of a decoder; the last message of them."""
-    module, _, function = name.partition(":")
     try:
-        decoder = getattr(import_module(module), function)
+        decoder = resolve_name(name)
         limit_memory(allowed.memory)
         limit_time(allowed.seconds)
         for value in decoder(*arguments):

@@ -214,12 +214,12 @@ def _remove_leftovers(folder: Path, names: re.Pattern[str]) -> None:
     with suppress(OSError):
         for entry in list(os.scandir(folder)):
             match = names.fullmatch(entry.name)
-            if match and match[1] == _machine() and _is_gone(int(match[2])):
+            if match and match[1] == _machine() and is_gone(int(match[2])):
                 with suppress(OSError):
                     shutil.rmtree(entry) if entry.is_dir(follow_symlinks=False) else os.unlink(entry)
 
 
-def _is_gone(process: int) -> bool:
+def is_gone(process: int) -> bool:
     """True if no process has this number; on Windows, where asking might end it, it is taken to be there."""
     try:
         if POSIX:
@@ -233,9 +233,7 @@ def _is_gone(process: int) -> bool:
 
 def write_text(path: str | Path, text: str) -> Path:
     """Write ``text`` (UTF-8) atomically. Raises :class:`OutputError`."""
-    with atomic_path(path) as partial:
-        partial.write_text(text, encoding="utf-8", newline="\n")
-    return Path(path)
+    return write_bytes(path, text.encode("utf-8"))
 
 
 def write_bytes(path: str | Path, content: bytes) -> Path:

@@ -39,8 +39,8 @@ def suggest(word: object, known: Iterable[str] | Mapping[str, object]) -> str:
     ("; did you mean 'mu'?", "; did you mean 'mu'?")
     """
     names, text = list(known), str(word)
-    words = [known[name] if isinstance(known, Mapping) else "" for name in names]
-    meant = _meant(_letters(text), {n: w if isinstance(w, str) else "" for n, w in zip(names, words, strict=True)})
+    words = known if isinstance(known, Mapping) else {}
+    meant = _meant(_letters(text), {n: w if isinstance(w := words.get(n), str) else "" for n in names})
     close = get_close_matches(text, names, 1, 0.6) if len(text) < LONGEST else []  # quadratic in the length
     if nearest := meant or close:
         return f"; did you mean {' or '.join(map(repr, nearest))}?"

@@ -58,7 +58,7 @@ def load(name: str, what: str) -> Any:
     where, _, attribute = name.rpartition(":")
     path = Path(os.path.realpath(where))
     source = _source(path)
-    digest = _digest(source)
+    digest = hashlib.sha256(source).hexdigest()
     require_permission(Code(what, (path,), digest=digest))
     _permitted[path, digest] = source
     try:
@@ -98,7 +98,7 @@ class _Loader(Loader):
         source = _permitted.pop((self.file, self.digest), None)
         if source is None:  # imported by its name: by a worker, or by a file that names this module
             source = _source(self.file)
-            if _digest(source) != self.digest:
+            if hashlib.sha256(source).hexdigest() != self.digest:
                 raise ConfigError(f"{self.file}: the file has changed since it was loaded")
             require_permission(Code(f"file {self.file.name!r}", (self.file,), digest=self.digest))
         module.__file__ = str(self.file)
@@ -112,10 +112,6 @@ def _source(path: Path) -> bytes:
         raise ConfigError(no_such_file(path)) from None
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
-
-
-def _digest(source: bytes) -> str:
-    return hashlib.sha256(source).hexdigest()
 
 
 def _line(error: BaseException, path: Path) -> str:

@@ -89,13 +89,6 @@ def calibrate(
 
 
 @dataclass(frozen=True)
-class CalibrationState:
-    """The sets that are done, in the order in which they ended."""
-
-    done: tuple[Judged, ...] = ()
-
-
-@dataclass(frozen=True)
 class CalibrationKind(RunKind[Calibration]):
     """A configuration, and the one that readings are ``made`` with, which is ``changed`` (YAML); each of the ``sets``
     is a unit of work.
@@ -134,9 +127,8 @@ class CalibrationKind(RunKind[Calibration]):
 
     def conduct(self, run: Session, executor: Executor) -> Calibration:
         fingerprint = digest(run.identity.settings.encode() + repr(run.identity.data).encode())
-        state = run.restore(STATE, fingerprint, CalibrationState, "all sets are estimated again") or CalibrationState()
+        done = [*(run.restore(STATE, fingerprint, tuple[Judged, ...], "all sets are estimated again") or ())]
         keeper = Keeper(run.directory.at(STATE), fingerprint, self.config.execution.checkpoint_every)
-        done = list(state.done)
         known = {judged.number for judged in done}
         left = [i for i in range(1, self.sets + 1) if i not in known]
         common = CommonValue((self.config, self.made, list(self.data.items())))
@@ -145,10 +137,10 @@ class CalibrationKind(RunKind[Calibration]):
                 judged = Judged(left[i], "", failure=reason_of(judged))
             done.append(judged)
             run.log.write(f"set {judged.number}: {judged.failure or 'estimated'}")
-            keeper.keep(lambda: CalibrationState(tuple(done)))
+            keeper.keep(lambda: tuple(done))
             if self.progress:
                 self.progress(len(done), self.sets)
-        keeper.write(CalibrationState(tuple(done)))
+        keeper.write(tuple(done))
         told = sorted((judged for judged in done if judged.number <= self.sets), key=lambda judged: judged.number)
         name, file = next(iter(self.data.items()))
         estimated = build_one(self.config, name, file).prior.parameters

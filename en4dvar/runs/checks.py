@@ -1,6 +1,7 @@
 """What can be told before a run: every fault of configuration and data at once."""
 
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -32,33 +33,23 @@ def validate(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any
     """
     document, base = document_from(source)
     document = override(document, overrides or {})
+    faults: list[Fault] = []
     try:
         config = resolve_any(document, base)
     except ConfigError as error:
-        raise ConfigError(in_order([*error.problems, *_data_faults(document, base)])) from None
-    if isinstance(config, Config):
-        faults = list(_problem_faults(config))
-        if faults:
-            raise ConfigError(in_order(faults))
-    if isinstance(config, SequenceConfig):
-        try:
+        _read_data(document, base, faults)
+        raise ConfigError(in_order([*error.problems, *faults])) from None
+    with _collecting(faults, document):
+        if isinstance(config, Config):
+            _read_files(document, inverse_plan(config), partial(build_one, config), faults)
+        if isinstance(config, SequenceConfig):
             build_sequence(config)
-        except DataError as error:
-            raise ConfigError([document.fault(_place_of(error, document), str(error))]) from None
+    if faults:
+        raise ConfigError(in_order(faults))
     return config
 
 
-def _problem_faults(config: Config) -> Iterator[Fault]:
-    """What keeps the inverse problems of a valid configuration from being built."""
-    try:
-        plan = inverse_plan(config)
-    except ConfigError as error:
-        yield from error.problems
-        return
-    yield from _file_faults(config.document, plan, partial(build_one, config))
-
-
-def _data_faults(document: Document, base: Path) -> Iterator[Fault]:
+def _read_data(document: Document, base: Path, faults: list[Fault]) -> None:
     """Faults of the data files, for a configuration that has faults elsewhere than in its data section."""
     context = context_of(document, base, None)
     observed = context.observed
@@ -66,7 +57,7 @@ def _data_faults(document: Document, base: Path) -> Iterator[Fault]:
     if section is None or context.default is None:
         return
     plan = DataPlan.of(section.data, observed or context.default.observables[0])
-    yield from _file_faults(document, plan, lambda name, file: read_observations(plan, file, name))
+    _read_files(document, plan, lambda name, file: read_observations(plan, file, name), faults)
 
 
 class _DataSection(Section):
@@ -75,20 +66,25 @@ class _DataSection(Section):
     data: DATA
 
 
-def _file_faults(document: Document, plan: DataPlan, read: Callable[[str, DataFile], object]) -> Iterator[Fault]:
-    """What keeps data files from being read; a file's fault is told at the place that names the file."""
+def _read_files(
+    document: Document, plan: DataPlan, read: Callable[[str, DataFile], object], faults: list[Fault]
+) -> None:
+    """What keeps the data files from being read, each by itself."""
+    with _collecting(faults, document):
+        for name, file in data_files(plan).items():
+            with _collecting(faults, document):
+                read(name, file)
+
+
+@contextmanager
+def _collecting(faults: list[Fault], document: Document) -> Iterator[None]:
+    """Within, errors of settings and data are told as ``faults``; a file's at the place that names the file."""
     try:
-        files = data_files(plan)
+        yield
+    except ConfigError as error:
+        faults += error.problems
     except DataError as error:
-        yield document.fault(_place_of(error, document), str(error))
-        return
-    for name, file in files.items():
-        try:
-            read(name, file)
-        except ConfigError as error:
-            yield from error.problems
-        except DataError as error:
-            yield document.fault(_place_of(error, document), str(error))
+        faults.append(document.fault(_place_of(error, document), str(error)))
 
 
 def _place_of(error: DataError, document: Document) -> tuple[str, ...]:

@@ -40,13 +40,6 @@ class Done:
     failure: str = ""
 
 
-@dataclass(frozen=True)
-class DesignState:
-    """The candidates that are done, in the order in which they ended."""
-
-    done: tuple[Done, ...] = ()
-
-
 def run_design(
     source: str | Path | Mapping[str, Any],
     *,
@@ -164,7 +157,7 @@ class _Work:
         self.config, self.every, self.run, self.tell = kind.config, kind.every, run, kind.tell
         fingerprint = digest(run.identity.settings.encode())
         again = "all designs are evaluated again"
-        self.state = run.restore(STATE, fingerprint, DesignState, again) or DesignState()
+        self.done = [*(run.restore(STATE, fingerprint, tuple[Done, ...], again) or ())]  # in the order of their ends
         self.keeper = Keeper(run.directory.at(STATE), fingerprint, self.config.execution.checkpoint_every)
 
     def everything(self, executor: Executor) -> None:
@@ -198,23 +191,23 @@ class _Work:
 
     def _latest(self) -> list[Done]:
         """Of each candidate what came last: nested after laplace."""
-        return list({d.number: d for d in self.state.done}.values())
+        return list({d.number: d for d in self.done}.values())
 
     def _evaluate(self, executor: Executor, numbers: Sequence[int], method: Method) -> None:
-        done = {d.number for d in self.state.done if d.method == method}
+        done = {d.number for d in self.done if d.method == method}
         left = [n for n in numbers if n not in done]
         calls = ((self.every[n], method, self.config.seed) for n in left)
         for i, outcome in executor.map(_one, calls):
             results, failure = ((), reason_of(outcome)) if isinstance(outcome, Exception) else outcome
             ended = Done(left[i], method, results, failure)
-            self.state = DesignState((*self.state.done, ended))
+            self.done.append(ended)
             self.run.log.write(_line(ended))
-            self.keeper.keep(lambda: self.state)
+            self.keeper.keep(lambda: tuple(self.done))
             if self.tell:
                 self.tell(len(numbers) - len(left) + i + 1, len(numbers))
-        self.keeper.write(self.state)
-        if not any(d.results for d in self.state.done):
-            raise ConfigError(f"none of the designs can be evaluated: {self.state.done[0].failure}")
+        self.keeper.write(tuple(self.done))
+        if not any(d.results for d in self.done):
+            raise ConfigError(f"none of the designs can be evaluated: {self.done[0].failure}")
 
 
 def _one(candidate: Candidate, method: Method, seed: int) -> tuple[tuple[Evaluated, ...], str]:

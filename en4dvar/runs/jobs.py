@@ -150,7 +150,7 @@ class _Sender:
     _sent: ClassVar[float] = -math.inf  # when this process sent the last message, of any data set
 
     def __init__(self, tell: Callable[[tuple[Told, ...]], None]):
-        self._tell, self._lock = tell, threading.Lock()
+        self._tell, self._lock = tell, threading.RLock()
         self._waiting: list[Told] = []
         self._timer: threading.Timer | None = None
 
@@ -176,21 +176,18 @@ class _Sender:
     def rest(self) -> tuple[Told, ...]:
         """What waits and is not sent any more."""
         with self._lock:
-            return self._rest()
+            if self._timer is not None:
+                self._timer.cancel()
+                self._timer = None
+            records = tuple(self._waiting)
+            self._waiting.clear()
+            return records
 
     def _later(self) -> None:
         with self._lock, suppress(OSError):  # nobody is there to hear it: the call's own thread will notice
             self._send()
 
     def _send(self) -> None:
-        if records := self._rest():
+        if records := self.rest():
             self._tell(records)
             _Sender._sent = time.monotonic()
-
-    def _rest(self) -> tuple[Told, ...]:
-        if self._timer is not None:
-            self._timer.cancel()
-            self._timer = None
-        records = tuple(self._waiting)
-        self._waiting.clear()
-        return records

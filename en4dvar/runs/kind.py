@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from importlib import import_module
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 from en4dvar.executor import Executor, choose_executor
@@ -56,7 +56,7 @@ class Kind:
             return None
         told = (figures,) if {*FIGURES} <= {*cls.pages} else ()
         with understood(folder / cls.result):
-            page: Path = _named(cls.writer)(folder, *told)
+            page: Path = resolve_name(cls.writer)(folder, *told)
         return page
 
 
@@ -128,14 +128,8 @@ KINDS = {
 
 def kind_named(name: str) -> type[Kind]:
     """The declaration of a kind. Raises :class:`KeyError`."""
-    declared: type[Kind] = _named(KINDS[name])
+    declared: type[Kind] = resolve_name(KINDS[name])
     return declared
-
-
-def _named(place: str) -> Any:
-    """What ``module:name`` is."""
-    module, _, name = place.partition(":")
-    return getattr(import_module(module), name)
 
 
 def kind_in(folder: Path) -> type[Kind]:

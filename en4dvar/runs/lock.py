@@ -11,11 +11,12 @@ from pathlib import Path
 from filelock import lock_descriptor
 
 from en4dvar.plumbing.errors import OutputError
-from en4dvar.plumbing.files import POSIX, inside, own_file
+from en4dvar.plumbing.files import POSIX, inside, is_gone, own_file
 
 LOCK = ".en4dvar-lock"
 PATIENCE = 3.0  # s for the lock of a dead process to go
 _LONGEST = 500  # bytes of a lock's text
+_LONGEST_NUMBER = 9  # digits that the number of a process can have
 _OTHER = "another process"
 _UNSUPPORTED = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK)  # some network file systems
 
@@ -97,12 +98,6 @@ def _is_dead(owner: str) -> bool:
     if owner == _OTHER:  # not written yet
         return True
     number, _, host = owner.removeprefix("process ").partition(" on ")
-    if host != socket.gethostname() or not number.isdecimal() or not POSIX:
+    if host != socket.gethostname() or not number.isdecimal():
         return False
-    try:
-        os.kill(int(number), 0)
-    except (ProcessLookupError, OverflowError):  # the second: no process can have this number
-        return True
-    except OSError:
-        pass
-    return False
+    return POSIX and (len(number) > _LONGEST_NUMBER or is_gone(int(number)))

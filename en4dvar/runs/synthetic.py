@@ -5,8 +5,6 @@ were. When a series ends is decided by its readings alone, never by the truth. N
 even one that noise puts below zero: that would bias the noise, and with it whatever such readings tell.
 """
 
-import csv
-import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +18,7 @@ from en4dvar.model.forward import Failure
 from en4dvar.model.state import TIME_SHIFT, Array
 from en4dvar.plumbing.errors import En4dvarError, OutputError
 from en4dvar.plumbing.files import make_folder, write_text
+from en4dvar.plumbing.tables import csv_text
 from en4dvar.plumbing.units import convert
 from en4dvar.plumbing.user_code import reason_of
 from en4dvar.priors.prior import member_stream
@@ -116,15 +115,12 @@ def _data_csv(plan: CampaignPlan, dataset: SyntheticSet, command: str) -> str:
 
 def truth_csv(plan: CampaignPlan, sets: tuple[SyntheticSet, ...]) -> str:
     """One line a data set: parameters in display units, NRMSE of the truth."""
-    shown = [*plan.model.parameters]
-    display = {p.name: (p.unit, p.display_unit or p.unit) for p in shown}
+    display = {p.name: (p.unit, p.display_unit or p.unit) for p in plan.model.parameters}
     display[TIME_SHIFT.name] = (plan.model.time_unit, plan.model.time_display_unit)
-    text = io.StringIO()
-    text.write(f"# SYNTHETIC campaign {plan.name!r}: the truth behind its data sets; no estimation reads this file\n")
-    writer = csv.writer(text, lineterminator="\n")
     heads = [name if unit == "1" else f"{name}_{unit.replace(' ', '_')}" for name, (_, unit) in display.items()]
-    writer.writerow(["dataset", "group", *heads, "nrmse_of_truth"])
+    rows = [["dataset", "group", *heads, "nrmse_of_truth"]]
     for s in sets:
         row = [f"{convert(s.truth[name], *units):.9g}" for name, units in display.items()]
-        writer.writerow([s.name, s.group, *row, f"{s.nrmse:.4f}"])
-    return text.getvalue()
+        rows.append([s.name, s.group, *row, f"{s.nrmse:.4f}"])
+    about = f"# SYNTHETIC campaign {plan.name!r}: the truth behind its data sets; no estimation reads this file\n"
+    return about + csv_text(rows)

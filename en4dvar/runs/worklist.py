@@ -197,7 +197,7 @@ class Worklist:
 
         if len(todo) > 1 and len(todo) >= executor.workers > 1:
             stop = self.stop if isinstance(executor, ThreadsExecutor) else None
-            ends = executor.map(estimate_and_tell, jobs(executor.reads, stop), self._hear)
+            ends = executor.map(estimate_and_tell, jobs(executor.reads, stop), lambda _, records: self._tell(records))
         else:
             alone = SerialExecutor()
             ends = alone.map(lambda job: estimate(job, executor, partial(self._hear_one, job.problem)), jobs())
@@ -224,9 +224,6 @@ class Worklist:
         removed, never written in place. To look at each for a link is a tenth of what a data set costs this process.
         """
         return self.run.directory.work / d.iteration
-
-    def _hear(self, _: int, records: Sequence[Told]) -> None:
-        self._tell(records)
 
     def _hear_one(self, problem: InverseProblem, name: str, record: Record) -> None:
         self._tell([(name, record, describe(name, record) + intervals(name, record, problem.prior.parameters))])
