@@ -88,11 +88,8 @@ class Observations:
         times = [readings.times for readings in series]
         times = _same_instants(times) if len(times) > 1 else times
         with retold(ValueError, DataError, f"{name}: "):
-            noise = (
-                joint_noise(times, [readings.noise for readings in series], between)
-                if len(series) > 1
-                else series[0].noise
-            )
+            each = [readings.noise for readings in series]
+            noise = joint_noise(times, each, between) if len(each) > 1 else each[0]
         more = series[0].continued if len(series) == 1 else None
         ends = np.cumsum([len(t) for t in times]).tolist()
         parts = tuple(

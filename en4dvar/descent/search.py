@@ -282,7 +282,7 @@ def challenger(space: WeightSpace, run: Forecast, outcome: Outcome) -> int:
     """The member farthest from the lowest minimum, in standard deviations of the Gaussian about it, of those in the
     half of lower J that were not tried.
     """
-    costs = (space.background_costs + space.observation_cost(run))[:-1]
+    costs = (space.background_costs + space.problem.observations.cost(run.predicted))[:-1]
     order: list[int] = np.argsort(costs, kind="stable").tolist()
     better = order[: max(len(outcome.tried) + 1, int(np.isfinite(costs).sum()) // 2)]
     lowest = outcome.minima[0]

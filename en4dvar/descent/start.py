@@ -83,7 +83,7 @@ def choose_start(
     if not isinstance(begin, str):
         return Start(descent_at(space, given(space.problem, begin), beyond), tried=(beyond,))
     if begin == "prior-mean":
-        if np.isfinite(space.observation_cost(run)[-1]):
+        if np.isfinite(space.problem.observations.cost(run.predicted)[-1]):
             mean = len(space.members)
             return Start(descent_from(space, mean), tried=(mean,))
         words = f"the prior mean cannot be run ({run.failures[-1]}); started from the best prior member"
@@ -139,7 +139,7 @@ def given(problem: InverseProblem, start: Mapping[str, float | Mapping[str, floa
 
 def affordable(space: WeightSpace, scheme: Minimiser, run: Forecast) -> list[int]:
     """Members of lowest J, as many as go :func:`side_by_side`; at least one."""
-    costs = space.background_costs + space.observation_cost(run)
+    costs = space.background_costs + space.problem.observations.cost(run.predicted)
     best = np.argsort(costs, kind="stable").tolist()
     count = side_by_side(space) if scheme.economical(space.basis) else 1
     return [i for i in best[:count] if np.isfinite(costs[i])] or best[:1]

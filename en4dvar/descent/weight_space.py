@@ -137,10 +137,6 @@ class WeightSpace:
         alive = prior_run[: len(self.members)]
         check_repeats(self.problem.model, alive.predictions, alive.failures, again, self.problem.observations.name)
 
-    def observation_cost(self, run: Forecast) -> Array:
-        """J_o (B,)."""
-        return self.problem.observations.cost(run.predicted)
-
     def costs(self, x: Array, run: Forecast) -> Array:
         """J (B,) of control vectors (B, n), from their forecast and the prior's own mean and covariance."""
         return costs(self.problem, x, run)
@@ -155,7 +151,7 @@ class WeightSpace:
             stacked = run.predicted.stacked
             stacked = np.where(partial[:, None] & np.isnan(stacked), expected(w), stacked)
             run = replace(run, predicted=run.predicted.unstacked(stacked))
-        return Trials(diag.background_cost(w) + self.observation_cost(run), run.predictions)
+        return Trials(diag.background_cost(w) + self.problem.observations.cost(run.predicted), run.predictions)
 
     def require_members(self, failures: Sequence[str], stage: str) -> None:
         """Raise :class:`TooFewMembersError` unless enough members are active for a regression on the control vector."""

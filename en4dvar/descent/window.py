@@ -339,7 +339,7 @@ class DataWindow(Objective[Descent]):
             run = space.whole(x) if directions else filled(run, x)
         members, central = run[:-1], run[-1:]
         background = float(diag.background_cost(weights.w))
-        descent.at = at = Iterate(members, central, background, float(space.observation_cost(central)[0]))
+        descent.at = at = Iterate(members, central, background, float(self.observations.cost(central.predicted)[0]))
         descent.cost = at.cost
         if self._informing(at) < space.needed_members or not math.isfinite(at.cost):
             return None

@@ -1,7 +1,7 @@
 """The composite operator 𝓗: control vectors → predictions, and the cost and posterior density built on it."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
 
@@ -66,14 +66,8 @@ class Forecast:
         return len(self.failures)
 
     def __getitem__(self, members: slice) -> "Forecast":
-        return Forecast(
-            self.predicted[members],
-            self.path[members],
-            self.failures[members],
-            self.extremes[members],
-            self.beyond[members],
-            self.filled,
-        )
+        rows = ("predicted", "path", "failures", "extremes", "beyond")
+        return replace(self, **{name: getattr(self, name)[members] for name in rows})
 
 
 class Composite:
@@ -247,7 +241,7 @@ def _operators(problem: InverseProblem) -> list[tuple[Callable[[Any], Array], ..
     """H of every part, and its rate where R depends on it. Raises :class:`ConfigError` where there is no rate."""
     parts, noise = problem.parts, problem.observations.noise
     what = "a timing error" if noise.timed else "a discrepancy that grows with the rate"
-    return [operators_of(parts), *([operators_of(parts, True, what)] if noise.needs_rates else [])]
+    return [operators_of(parts), *([operators_of(parts, what)] if noise.needs_rates else [])]
 
 
 def as_read(problem: InverseProblem, physical: Array, observed: Array) -> Array:

@@ -163,14 +163,13 @@ class Reading:
                 continue
             try:
                 predictions = self._all([outcome])
+                if predictions[0].shape[2:] != (n_times,):
+                    raise MisshapenError
             except MisshapenError:
                 reasons[i] = "misshapen prediction"
                 continue
             except BaseException as error:  # H belongs to the user as well
                 reasons[i] = reason_of(error)
-                continue
-            if predictions[0].shape[2:] != (n_times,):
-                reasons[i] = "misshapen prediction"
                 continue
             if not np.isfinite(predictions[0]).all():
                 reasons[i] = NOT_FINITE

@@ -49,17 +49,18 @@ class Readout:
         return np.concatenate([*predictions, *curves], axis=-1)
 
 
-def operators_of(parts: Sequence[Part], rates: bool = False, why: str = "") -> tuple[Callable[[Any], Array], ...]:
-    """The operators of the parts, or their ``rates``, which are needed for ``why``.
+def operators_of(parts: Sequence[Part], needs_rates: str = "") -> tuple[Callable[[Any], Array], ...]:
+    """The operators of the parts or, where something ``needs_rates``, by its name, their rates.
 
     Raises :class:`ConfigError` where the model does not provide a rate.
     """
-    if not rates:
-        return tuple(part.observable.operator for part in parts)
+    operators = list[Callable[[Any], Array]]()
     for part in parts:
-        if not isinstance(part.observable.operator, RateOperator):
-            raise ConfigError(f"{why} needs the rate of {part.observable.name}, which the model does not provide")
-    return tuple(part.observable.operator.rate for part in parts if isinstance(part.observable.operator, RateOperator))
+        operator, name = part.observable.operator, part.observable.name
+        if needs_rates and not isinstance(operator, RateOperator):
+            raise ConfigError(f"{needs_rates} needs the rate of {name}, which the model does not provide")
+        operators.append(operator.rate if needs_rates and isinstance(operator, RateOperator) else operator)
+    return tuple(operators)
 
 
 def batched(problem: InverseProblem) -> bool:

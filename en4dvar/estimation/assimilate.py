@@ -134,8 +134,11 @@ def _concluded(
     # assimilation of its own, searched and, in doubt, sampled like this one. The posterior at zero changes (Savage &
     # Dickey) would spare the runs, but extrapolates the quadratic form of J from one minimum to the other, which may
     # be far away.
-    asked = stages.compares and problem.in_question
-    log_evidence_constant = _log_evidence(stages, problem.constant) if asked else None
+    log_evidence_constant = None
+    if stages.compares and problem.in_question:
+        end, runs = _alone(stages, problem.constant, stages.settings)
+        space.forward_runs += runs
+        log_evidence_constant = end.log_evidence if end else np.nan
     response = conclusions.response_of(space, descent, ends.mode, last)
     std = ends.members.std(axis=0, ddof=1)
     shifts: tuple[Shift, ...] = ()
@@ -251,13 +254,6 @@ def _mode(stages: Stages, problem: InverseProblem, start: Mapping[str, float] | 
     if stages.minimiser and start:
         settings = replace(settings, own=replace(stages.minimiser, start=start))
     return _alone(stages, problem, settings)
-
-
-def _log_evidence(stages: Stages, problem: InverseProblem) -> float:
-    """ln p(y) of another problem with the same readings, by an assimilation of its own; NaN where too few survive."""
-    end, runs = _alone(stages, problem, stages.settings)
-    stages.space.forward_runs += runs
-    return end.log_evidence if end else np.nan
 
 
 def _alone(stages: Stages, problem: InverseProblem, settings: AssimilationSettings) -> tuple[Analysis | None, int]:

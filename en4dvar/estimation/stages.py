@@ -226,20 +226,11 @@ class Stages:
         return self.rather(after, outcome, ends)
 
     def keep_search(self, state: Callable[[], tuple[Outcome, SearchState]]) -> None:
-        runs = self.space.forward_runs
-
-        def kept() -> LoopState:
-            outcome, search = state()
-            return replace(
-                self.latest,
-                forward_runs=runs,
-                descent=outcome.before,
-                minima=outcome.minima,
-                tried=outcome.tried,
-                search=search,
-            )
-
-        self.latest = kept()
+        outcome, search = state()
+        runs, minima, tried = self.space.forward_runs, outcome.minima, outcome.tried
+        self.latest = replace(
+            self.latest, forward_runs=runs, descent=outcome.before, minima=minima, tried=tried, search=search
+        )
         self.keep(lambda: self.latest)
 
     def gaussian(self, descent: Descent) -> Ends:
@@ -292,9 +283,6 @@ class Stages:
         """What takes the place of the posterior ensemble (N, n); for the rest see :meth:`sampled`."""
         space = self.space
 
-        def cost(x: Array) -> Array:
-            return space.costs(x, space.forecast(x))
-
         def keep(state: ChainState) -> None:
             self.keep(lambda: replace(self.latest, refinement=Refinement(state, space.forward_runs)))
 
@@ -306,7 +294,7 @@ class Stages:
             return earlier.chain
 
         look = self.tell
-        return refined(space, cost, posterior, minima, self.seed, looking=looking, resume=resume, keep=keep, look=look)
+        return refined(space, posterior, minima, self.seed, looking=looking, resume=resume, keep=keep, look=look)
 
     def keep(self, state: Callable[[], LoopState]) -> None:
         if self.keeper is not None:

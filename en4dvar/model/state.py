@@ -65,7 +65,6 @@ class Parameter(Shown):
 TIME_SHIFT = Parameter(
     name="t_s",
     unit="s",
-    bounds=(-np.inf, np.inf),
     label="time shift",
     symbol="$t_s$",
     display_unit="us",

@@ -60,9 +60,8 @@ class PriorTerm:
 
     def __post_init__(self) -> None:
         self._require(math.isfinite(self.mean), "the mean must be finite")
-        self._require(
-            math.isfinite(self.std) and self.std > 0, f"the standard deviation must be positive, not {self.std:g}"
-        )
+        positive = math.isfinite(self.std) and self.std > 0
+        self._require(positive, f"the standard deviation must be positive, not {self.std:g}")
         # The ensemble must spread by more than rounding, its squares and physical values must be numbers
         around = abs(self.mean) if self.transform == "normal" else max(1.0, abs(self.mean))
         self._require(
@@ -74,13 +73,11 @@ class PriorTerm:
         self._require(abs(self.mean) < LARGEST, f"{self.mean:g} is too large; less than {LARGEST:g}")
         if self.transform == "logit":
             low, high = self.bounds
-            self._require(
-                -math.inf < low < high < math.inf, f"logit needs finite bounds, low < high, not {self.bounds}"
-            )
+            finite = -math.inf < low < high < math.inf
+            self._require(finite, f"logit needs finite bounds, low < high, not {self.bounds}")
 
     def _require(self, condition: bool, message: str) -> None:
-        if not condition:
-            raise ConfigError(f"prior of {self.parameter.name}: {message}")
+        _require(self.parameter, condition, message)
 
     @classmethod
     def normal(cls, parameter: Parameter, mean: float, std: float) -> PriorTerm:
@@ -101,12 +98,9 @@ class PriorTerm:
         2.0
         """
         log_mean = _log(parameter, "mean", mean)
-        if not std > 0:
-            raise ConfigError(f"prior of {parameter.name}: the standard deviation must be positive, not {std:g}")
-        if not std < LARGEST * mean:
-            raise ConfigError(
-                f"prior of {parameter.name}: a standard deviation of {std:g} beside a mean of {mean:g} is too large"
-            )
+        _require(parameter, std > 0, f"the standard deviation must be positive, not {std:g}")
+        beside = f"a standard deviation of {std:g} beside a mean of {mean:g} is too large"
+        _require(parameter, std < LARGEST * mean, beside)
         variance = math.log1p((std / mean) ** 2)
         return cls(parameter, "lognormal", log_mean - variance / 2, math.sqrt(variance))
 
@@ -114,10 +108,8 @@ class PriorTerm:
     def logit(cls, parameter: Parameter, bounds: tuple[float, float], median: float, logit_std: float) -> PriorTerm:
         """logit((θ − a)/(b − a)) ~ N(logit of the median, logit_std²); ``bounds`` and ``median`` physical."""
         low, high = bounds
-        if not -math.inf < low < median < high < math.inf:
-            raise ConfigError(
-                f"prior of {parameter.name}: the median {median:g} must lie between finite bounds, not {bounds}"
-            )
+        inside = -math.inf < low < median < high < math.inf
+        _require(parameter, inside, f"the median {median:g} must lie between finite bounds, not {bounds}")
         return cls(parameter, "logit", math.log((median - low) / (high - median)), logit_std, (low, high))
 
     @classmethod
@@ -137,10 +129,8 @@ class PriorTerm:
     def beta(cls, parameter: Parameter, bounds: tuple[float, float], alpha: float, beta: float) -> PriorTerm:
         """(θ − a)/(b − a) ~ Beta(alpha, beta) between finite physical ``bounds`` (a, b)."""
         for name, value in (("alpha", alpha), ("beta", beta)):
-            if not SHAPES[0] <= value <= SHAPES[1]:
-                raise ConfigError(
-                    f"prior of {parameter.name}: {name} must lie between {SHAPES[0]:g} and {SHAPES[1]:g}, not {value:g}"
-                )
+            words = f"{name} must lie between {SHAPES[0]:g} and {SHAPES[1]:g}, not {value:g}"
+            _require(parameter, SHAPES[0] <= value <= SHAPES[1], words)
         return cls._by_quantiles(parameter, "beta", bounds, (alpha, beta))
 
     @classmethod
@@ -427,6 +417,10 @@ def _sigmoid(x: Array) -> Array:
 
 
 def _log(parameter: Parameter, what: str, value: float) -> float:
-    if not value > 0:
-        raise ConfigError(f"prior of {parameter.name}: the {what} of a lognormal must be positive, not {value:g}")
+    _require(parameter, value > 0, f"the {what} of a lognormal must be positive, not {value:g}")
     return math.log(value)
+
+
+def _require(parameter: Parameter, condition: bool, message: str) -> None:
+    if not condition:
+        raise ConfigError(f"prior of {parameter.name}: {message}")

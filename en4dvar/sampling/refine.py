@@ -121,7 +121,6 @@ def in_doubt(minima: Sequence[Minimum], agree: bool, shape: Mapping[str, float])
 
 def refined(
     space: WeightSpace,
-    cost: Callable[[Array], Array],
     posterior: Array,
     minima: Sequence[Minimum],
     seed: int,
@@ -133,10 +132,14 @@ def refined(
 ) -> Refined:
     """Members of the posterior that ``minima`` are the modes of, in place of ``posterior`` (N, n).
 
-    ``cost``: J (B,) of control vectors (B, n), by the model. By a Markov chain where the settings want one or
-    weighted draws are too few. ``looking``: end at a draw that lies lower than all minima. ``resume`` is asked when
-    the chain begins; it, ``keep``, ``look``: see :func:`~en4dvar.sampling.mcmc.sample`.
+    By a Markov chain where the settings want one or weighted draws are too few. ``looking``: end at a draw that lies
+    lower than all minima. ``resume`` is asked when the chain begins; it, ``keep``, ``look``: see
+    :func:`~en4dvar.sampling.mcmc.sample`.
     """
+
+    def cost(x: Array) -> Array:
+        return space.costs(x, space.forecast(x))
+
     prior, exact, enough = space.problem.prior, space.settings.sampling == "exact", space.settings.draws
     chain = space.settings.refine == "mcmc"
     below = minima[0].cost - MISSED if looking and minima else -math.inf

@@ -125,10 +125,11 @@ def run_sweep(
     low, high = ranges.low.min(axis=0), ranges.high.max(axis=0)
     design = sobol_box((low + high) / 2, (high - low) / 2, settings.trajectories, seed)
     parts = [design[i : i + settings.chunk] for i in range(0, len(design), settings.chunk)]
+    files = [inside(folder, f"chunk_{i:05d}.npz") if folder else None for i in range(len(parts))]
     refining = (settings.rounds + 1) * settings.local * len(problems) if settings.rounds else 0
     total, done = settings.trajectories + refining, 0
     best_of_set: dict[int, Best] = {}
-    for i, best in executor.results(score.chunk, [(x, _file(folder, i)) for i, x in enumerate(parts)]):
+    for i, best in executor.results(score.chunk, list(zip(parts, files, strict=True))):
         best_of_set[i] = best
         done += len(parts[i])
         if progress is not None:
@@ -271,10 +272,6 @@ def _own(score: _Score, x: Array, executor: Executor) -> tuple[Array, Array]:
     nrmse, shift = (np.concatenate(p).reshape(n_sets, count, n_sets) for p in parts)
     sets = np.arange(n_sets)
     return nrmse[sets, :, sets], shift[sets, :, sets]
-
-
-def _file(folder: Path | None, number: int) -> Path | None:
-    return inside(folder, f"chunk_{number:05d}.npz") if folder else None
 
 
 def _kept(file: Path) -> Best | None:

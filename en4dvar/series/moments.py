@@ -30,7 +30,7 @@ class Moments:
 
     def until(self, cycle: int) -> "Moments":
         """Copy of the rows before ``cycle``."""
-        return Moments(self.mean[:cycle].copy(), self.std[:cycle].copy(), self.rank[:cycle].copy())
+        return Moments(*(rows[:cycle].copy() for rows in vars(self).values()))
 
 
 class MomentsRecorder:
@@ -42,10 +42,8 @@ class MomentsRecorder:
     def __init__(self, cycles: int, size: int, before: Moments | None = None, truth: Array | None = None):
         self._truth = truth
         self._moments = Moments.empty(cycles, size, truth is not None)
-        if before is not None:
-            self._moments.mean[: len(before.mean)] = before.mean
-            self._moments.std[: len(before.std)] = before.std
-            self._moments.rank[: len(before.rank)] = before.rank
+        for whole, known in zip(vars(self._moments).values(), vars(before).values() if before else (), strict=False):
+            whole[: len(known)] = known
         self._cycles: list[int] = []
         self._scales: list[float] = []
         self._ensembles = np.empty((0, 0, size))

@@ -13,6 +13,7 @@ those of one ensemble; its reason is kept.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import fields
 from functools import partial
 
 import numpy as np
@@ -141,11 +142,8 @@ class _Run:
     def result(self) -> SequentialResult:
         if self.settings.smoother is not None:
             self.settings.smoother.ended(self.trail, len(self.iterations) - 1, self.put_smoothed)
-        before, after, smooth = (recorder.moments() for recorder in (self.before, self.after, self.smooth))
-        return SequentialResult(
-            before, after, smooth, self.predicted.moments(), self.predicted.ranks, self.predicted.evidence,
-            self.iterations, self.effective, self.ensemble, tuple(self.kept), tuple(self.failures), self.flow.runs,
-        )  # fmt: skip
+        state = self.state()
+        return SequentialResult(*(getattr(state, kept.name) for kept in fields(SequentialResult)))
 
     def cycle(self) -> None:
         """Assimilate the next observations and move the window to its next start."""

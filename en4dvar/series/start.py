@@ -36,31 +36,26 @@ class InitialEnsemble:
 
     def drawn(self, streams: Sequence[np.random.Generator], exact: bool = False) -> Array:
         """(N, n_state), as :meth:`members`, from random numbers of ``streams`` (N). Raises :class:`En4dvarError`."""
-        model, prior, n = self.model, self.prior, len(streams)
+        model, prior, n = self.model, self.prior or Prior(()), len(streams)
         std = np.concatenate([np.full(f.size, self.initial_std.get(f.name, 0.0)) for f in model.layout])
-        of_prior = np.array([stream.standard_normal(len(prior.terms)) for stream in streams]) if prior else None
+        of_prior = np.array([stream.standard_normal(len(prior.terms)) for stream in streams])
         of_state = np.array([stream.standard_normal(model.layout.size) for stream in streams])
-        free = std > 0
-        if exact and n > (of_prior.shape[1] if of_prior is not None else 0) + free.sum():
-            both = [] if of_prior is None else [of_prior]
-            whole = whiten_sample(np.hstack([*both, of_state[:, free]]))
-            of_prior = None if of_prior is None else whole[:, : of_prior.shape[1]]
-            of_state[:, free] = whole[:, len(whole[0]) - int(free.sum()) :]
-        x = None if prior is None or of_prior is None else prior.from_white(of_prior)
+        free, m = std > 0, len(prior.terms)
+        if exact and n > m + free.sum():
+            whole = whiten_sample(np.hstack([of_prior, of_state[:, free]]))
+            of_prior, of_state[:, free] = whole[:, :m], whole[:, m:]
+        x = prior.from_white(of_prior)
         origin = np.zeros((n, model.layout.size))
         for column, term in self.coordinates.terms:
-            assert prior is not None
-            assert x is not None
             origin[:, column] = x[:, prior.names.index(term.parameter.name)]
-        states = self.coordinates.from_physical(self._initial(x, n)[:, None], origin)[:, 0]
+        states = self.coordinates.from_physical(self._initial(prior, x)[:, None], origin)[:, 0]
         return np.asarray(states + std * of_state)
 
-    def _initial(self, x: Array | None, n_members: int) -> Array:
+    def _initial(self, prior: Prior, x: Array) -> Array:
         """The model's states (N, n_state) for control vectors (N, n) of the prior."""
-        model = self.model
+        model, n_members = self.model, len(x)
         theta = {name: np.full(n_members, value) for name, value in self.fixed.items()}
-        if self.prior is not None and x is not None:
-            theta |= dict(zip(self.prior.names, self.prior.to_physical(x).T, strict=True))
+        theta |= dict(zip(prior.names, prior.to_physical(x).T, strict=True))
         try:
             states = np.array(
                 model.initial_states(theta) if theta else [model.initial_state({})] * n_members, dtype=float

@@ -115,9 +115,6 @@ class BlockNoise(Noise):
     def drawn(self, predicted: Predicted, stream: np.random.Generator) -> Array:
         return self._each(predicted, lambda n, y, p: n.drawn(p, stream), predicted.values)
 
-    def influence(self, residual: Array) -> Array:
-        return np.asarray(self.thresholds / np.maximum(np.abs(residual), self.thresholds), dtype=float)
-
     def down_weights(self, values: Array, predicted: Predicted) -> Array | None:
         if not math.isfinite(self.counts_within):
             return None

@@ -118,7 +118,8 @@ class Noise:
 
     def down_weights(self, values: Array, predicted: Predicted) -> Array | None:
         """:meth:`influence` (K,) at a prediction; None where every observation counts in full in any case."""
-        return None
+        robust = math.isfinite(self.counts_within)
+        return self.influence(self.whitened_residual(values, predicted)) if robust else None
 
     def explained(self, values: Array, predicted: Predicted) -> tuple[Array, Array] | None:
         """Mean and std (K,) of the discrepancy given the residual at one prediction; None where there is none."""

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from en4dvar.data.noise.gaussian import Noise, ScaleSkewness
-from en4dvar.data.noise.predicted import Predicted
 from en4dvar.model.state import Array
 
 
@@ -31,9 +30,6 @@ class HuberNoise(Noise):
 
     def influence(self, residual: Array) -> Array:
         return np.asarray(self.threshold / np.maximum(np.abs(residual), self.threshold))
-
-    def down_weights(self, values: Array, predicted: Predicted) -> Array:
-        return self.influence(self.whitened_residual(values, predicted))
 
     def attributes(self) -> dict[str, float]:
         return {"huber_threshold": self.threshold}

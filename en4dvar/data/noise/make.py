@@ -22,18 +22,13 @@ def noise_of_record(
     times: Array, std: Array, time_std: Array, matrices: Mapping[str, Array], attributes: Mapping[str, object]
 ) -> Noise:
     """The errors whose :meth:`Noise.matrices` and :meth:`Noise.attributes` are among what a file holds."""
-    held = {key: float(cast(float, attributes[key])) for key in _NUMBERS if key in attributes}
+    numbers = "huber_threshold", "discrepancy_smoothness", "discrepancy_grows_beyond"
+    held = {key: float(cast(float, attributes[key])) for key in numbers if key in attributes}
     kernel = None
     if "discrepancy_smoothness" in held:
         kernel = Kernel(times, held["discrepancy_smoothness"], held["discrepancy_grows_beyond"])
-    correlation: Array | SharedErrors | None = matrices.get("correlation")
-    sides = matrices.get(SIDES)
-    if SHARED in matrices:
-        correlation = SharedErrors(matrices[SHARED])
-    return noise_of(std, time_std, correlation, held.get("huber_threshold"), kernel, sides)
-
-
-_NUMBERS = ("huber_threshold", "discrepancy_smoothness", "discrepancy_grows_beyond")
+    correlation = SharedErrors(matrices[SHARED]) if SHARED in matrices else matrices.get("correlation")
+    return noise_of(std, time_std, correlation, held.get("huber_threshold"), kernel, matrices.get(SIDES))
 
 
 def noise_of(

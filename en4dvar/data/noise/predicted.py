@@ -48,13 +48,8 @@ class Predicted:
 
     def unstacked(self, columns: Array) -> "Predicted":
         """The inverse of :attr:`stacked` for columns (…, Ky) of the same make, such as those of an emulator."""
-        values, rates, scale, discrepancy = self.parts(columns)
-        return Predicted(
-            values,
-            rates,
-            None if scale is None else np.exp(scale),
-            None if discrepancy is None else np.exp(discrepancy),
-        )
+        values, rates, *logs = self.parts(columns)
+        return Predicted(values, rates, *(None if log is None else np.exp(log) for log in logs))
 
     def parts(self, columns: Array) -> tuple[Array, Array | None, Array | None, Array | None]:
         """Which of the columns (…, Ky) of :attr:`stacked` belong to m, ṁ, ln σ (…,), and ln of the discrepancy."""

@@ -148,16 +148,20 @@ class RobustDiscrepancyNoise(DiscrepancyNoise):
 
     def _terms(self, values: Array, predicted: Predicted) -> Array:
         """Terms of J_o (…, K), β and ln std apart; NaN where a prediction is not finite."""
-
-        if self.correlation is None and self.kernel.ordered:
-            return self._filtered(values, predicted)
+        k, kappa = self.kernel, self._curvature
+        if self.correlation is None and k.ordered:  # in O(K)
+            with np.errstate(over="ignore", invalid="ignore"):
+                u, errors, s, delta, residual, a, length = self._at_mode(values, predicted)
+                _, roots = innovations(residual, s**2 / kappa + k.nugget * a**2, a, length, k.steps, k.smoothness)
+                terms = self.huber._loss(errors / s) + 0.5 * u * delta + np.log(roots) + 0.5 * math.log(kappa)
+            return np.asarray(terms).reshape(predicted.values.shape)
 
         def of(runs: Predicted) -> tuple[Array, ...]:
             residual, s, covariance = self._residual(values, runs)
             u, _ = solve_boxed(residual, s, covariance, self.threshold)
             delta = np.einsum("bij,bj->bi", covariance, u)
-            _, roots = whitened(residual, _with_diagonal(covariance, s**2 / self._curvature))
-            shrunk = np.log(roots) + 0.5 * math.log(self._curvature)
+            _, roots = whitened(residual, _with_diagonal(covariance, s**2 / kappa))
+            shrunk = np.log(roots) + 0.5 * math.log(kappa)
             return (np.asarray(self.huber._loss((residual - delta) / s) + 0.5 * u * delta + shrunk),)
 
         return np.asarray(self._in_parts(predicted, 1, of)[0])
@@ -170,15 +174,6 @@ class RobustDiscrepancyNoise(DiscrepancyNoise):
         residual, s, a = np.broadcast_arrays(values - runs.values, self.error_std(runs), a)
         u, delta = boxed(residual, s, k.nugget * a**2, a, length, k.steps, k.smoothness, self.threshold)
         return u, residual - delta, s, delta, residual, a, length
-
-    def _filtered(self, values: Array, predicted: Predicted) -> Array:
-        """:meth:`_terms` in O(K)."""
-        k, kappa = self.kernel, self._curvature
-        with np.errstate(over="ignore", invalid="ignore"):
-            u, errors, s, delta, residual, a, length = self._at_mode(values, predicted)
-            _, roots = innovations(residual, s**2 / kappa + k.nugget * a**2, a, length, k.steps, k.smoothness)
-            terms = self.huber._loss(errors / s) + 0.5 * u * delta + np.log(roots) + 0.5 * math.log(kappa)
-        return np.asarray(terms).reshape(predicted.values.shape)
 
     def _residual(self, values: Array, runs: Predicted) -> tuple[Array, Array, Array]:
         """y − m and s (B, K), A (B, K, K); NaN and one where either is not finite."""

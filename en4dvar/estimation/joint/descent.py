@@ -2,10 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
-from en4dvar.descent.loop import Objective, minimise
+from en4dvar.descent.loop import Objective
 from en4dvar.descent.step_control import SUFFICIENT, Move, Search
 from en4dvar.descent.window import FAKED, WIDER, WIDEST
 from en4dvar.estimation.joint.arrow import Arrow
@@ -55,33 +56,32 @@ class ArrowSystem:
         of_each = zip(joint.experiments, self.forms, strict=True)
         return np.array([float(p.observations.chi2_per_observation(f.central.predicted)[0]) for p, f in of_each])
 
-    def step(self) -> "ArrowStep":
-        """That of Gauss and Newton."""
+    @cached_property
+    def direction(self) -> tuple[Array, list[Array]]:
+        """The step of Gauss and Newton, in border and own quantities."""
         a, b = self.slope
-        x, y = self.arrow.solve(-a, [-own for own in b])
+        return self.arrow.solve(-a, [-own for own in b])
+
+    @cached_property
+    def norm(self) -> float:
+        """The length √(δᵀAδ) of that step in posterior standard deviations."""
+        (a, b), (x, y) = self.slope, self.direction
         decrease = -float(a @ x + sum(own @ v for own, v in zip(b, y, strict=True)))
-        return ArrowStep((x, y), float(np.sqrt(max(0.0, decrease))))
-
-
-@dataclass(frozen=True)
-class ArrowStep:
-    """A step in border and own quantities, and its length √(δᵀAδ) in posterior standard deviations."""
-
-    direction: tuple[Array, list[Array]]
-    norm: float
+        return float(np.sqrt(max(0.0, decrease)))
 
 
 @dataclass
 class JointDescent:
     """A descent: the ``place`` where it goes on, the ``system`` where it was linearised last, by a bundle that is
-    ``wider``, and the length of the step from there, J of its iterates, and why it ended."""
+    ``wider``, and the length of the step from there, J of its iterates, and why it ended. ``step``: the system of the
+    iteration under way, None where there is none."""
 
     place: Place
     system: ArrowSystem | None = None
     wider: float = 1.0
     norm: float = np.inf
     costs: list[float] = field(default_factory=list)
-    step: ArrowStep | None = None
+    step: ArrowSystem | None = None
     stop: str = ""
     converged: bool = False
     ended: bool = False
@@ -119,11 +119,11 @@ class JointObjective(Objective[JointDescent]):
     def __init__(self, joint: JointProblem, experiments: Sequence[Experiment], scheme: Minimiser):
         self.joint, self.experiments, self.scheme = joint, experiments, scheme
 
-    def linearise(self, going: Sequence[JointDescent]) -> list[ArrowStep | None]:
+    def linearise(self, going: Sequence[JointDescent]) -> list[ArrowSystem | None]:
         systems = [self._system(descent) for descent in going]
         for descent, system in zip(going, systems, strict=True):
             descent.system = system or descent.system
-        return [None if system is None else system.step() for system in systems]
+        return systems
 
     def _system(self, descent: JointDescent) -> ArrowSystem | None:
         """None where an experiment cannot be run there."""
@@ -159,12 +159,11 @@ class JointObjective(Objective[JointDescent]):
 
     def search(self, descent: JointDescent) -> Search:
         """The first of the lengths at which J has fallen enough."""
-        at, step = descent.at, descent.step
-        assert step is not None
+        at = descent.at
         for length in LENGTHS:
-            there = at.place.moved(step.direction, length)
+            there = at.place.moved(at.direction, length)
             cost = yield [there]
-            if cost <= at.cost - SUFFICIENT * length * step.norm**2:
+            if cost <= at.cost - SUFFICIENT * length * at.norm**2:
                 return Move(there, cost, length)
         return None
 
@@ -195,12 +194,3 @@ def cost(joint: JointProblem, experiments: Sequence[Experiment], place: Place) -
         if not np.isfinite(total):
             break
     return total
-
-
-def descend(
-    joint: JointProblem, experiments: Sequence[Experiment], start: Place, scheme: Minimiser
-) -> JointDescent | None:
-    """To a minimum of J; None where the start cannot be run."""
-    descent = JointDescent(start)
-    minimise(JointObjective(joint, experiments, scheme), [descent])
-    return descent if descent.system else None

@@ -6,12 +6,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from en4dvar.descent.loop import minimise
 from en4dvar.descent.weight_space import require_members
 from en4dvar.ensemble.forecast import Forecast, plotting_times
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.estimation.conclusions import missing_readings
 from en4dvar.estimation.joint.agreement import AT_MOST, Agreement, agreement, is_odd, oddest
-from en4dvar.estimation.joint.descent import JointDescent, Place, assembled, cost, descend
+from en4dvar.estimation.joint.descent import JointDescent, JointObjective, Place, assembled, cost
 from en4dvar.estimation.joint.doubts import doubts
 from en4dvar.estimation.joint.members import JointMembers, challenger, gaussian, sampled
 from en4dvar.estimation.joint.problem import JointProblem, Single
@@ -75,8 +76,8 @@ class JointEstimate:
 
     def control(self, e: int) -> Array:
         """(N + 1, n) physical members of experiment e and, last, the mode."""
-        z = _points(self.joint, self.members, self.mode, e)
-        return self.joint.experiments[e].prior.to_physical(self.joint.control(e, z))
+        prior = self.joint.experiments[e].prior
+        return prior.to_physical(prior.from_white(_points(self.joint, self.members, self.mode, e)))
 
 
 def estimate_jointly(
@@ -198,10 +199,8 @@ class _Estimate:
         """Where the quadratic forms of the single estimates meet, and where what is shared is as in one of them."""
         joint = self.joint
         likelihoods = [single.precision - np.eye(len(single.mode)) for single in singles]
-        arrow, shared_pull, own_pulls = assembled(
-            joint, likelihoods, [single.precision @ single.mode for single in singles]
-        )
-        x, y = arrow.solve(shared_pull, own_pulls)
+        arrow, a, b = assembled(joint, likelihoods, [single.precision @ single.mode for single in singles])
+        x, y = arrow.solve(a, b)
         starts = [Place(x, tuple(y))]
         for e in np.linspace(0, len(singles) - 1, min(TRIED, len(singles))).astype(int).tolist():
             shared, _ = joint.columns(e)
@@ -226,8 +225,9 @@ class _Estimate:
 
     def _descended(self, start: Place) -> list[JointDescent]:
         """One descent; none where the start cannot be run."""
-        descent = descend(self.joint, self.experiments, start, self.minimiser)
-        return [descent] if descent else []
+        descent = JointDescent(start)
+        minimise(JointObjective(self.joint, self.experiments, self.minimiser), [descent])
+        return [descent] if descent.system else []
 
     def _challenged(self, lowest: JointDescent) -> JointDescent:
         """Or the descent from a lower minimum that single experiments have, looked for where runs are cheap."""

@@ -24,6 +24,7 @@ from en4dvar.estimation.joint.problem import JointProblem
 from en4dvar.estimation.joint.tangent import Experiment
 from en4dvar.model.state import Array
 from en4dvar.priors.prior import member_stream
+from en4dvar.sampling.mixture import resampled
 
 DRAWS, INNER = 192, 12  # of what is shared, and of the own quantities for each of them
 STEPS = 2  # linearisations that the own quantities given what is shared are sought by
@@ -50,13 +51,15 @@ class JointMembers:
 
 def gaussian(at: ArrowSystem, seed: int, count: int) -> JointMembers:
     """By Laplace's approximation, with exact mean and covariance of every experiment's quantities."""
-    names = [f"joint {e}" for e in range(len(at.place.own))]
-    border = _numbers(seed, "joint border", count, len(at.place.border))
-    x, own = at.arrow.sample(border, lambda e: _numbers(seed, names[e], count, len(at.place.own[e])))
+
+    def numbers(words: str, size: int) -> Array:
+        return member_stream(seed, words).standard_normal((count, size))
+
+    border = numbers("joint border", len(at.place.border))
+    x, own = at.arrow.sample(border, lambda e: numbers(f"joint {e}", len(at.place.own[e])))
     evidence = -at.cost - 0.5 * at.arrow.log_determinant
-    return JointMembers(
-        at.place.border + x, tuple(v + dv for v, dv in zip(at.place.own, own, strict=True)), np.nan, evidence
-    )
+    own_members = tuple(v + dv for v, dv in zip(at.place.own, own, strict=True))
+    return JointMembers(at.place.border + x, own_members, np.nan, evidence)
 
 
 def sampled(
@@ -78,9 +81,8 @@ def sampled(
     effective = 1 / float(weights @ weights)
     if effective < FEWEST:
         return None
-    places = (np.arange(count) + stream.random()) / count
     order = np.argsort(border[:, 0], kind="stable") if border.shape[1] else np.arange(len(border))
-    taken = order[np.minimum(np.searchsorted(np.cumsum(weights[order]), places), len(border) - 1)]
+    taken = order[resampled(weights[order], count, stream)]
     own_members = tuple(
         np.stack([_one(own[i], log[i], stream) for i in taken]) for own, log in zip(chosen_own, logs, strict=True)
     )
@@ -142,10 +144,6 @@ def _one(own: Array, log: Array, stream: np.random.Generator) -> Array:
     """One of the draws (INNER, n_e), by their weights."""
     shares = np.cumsum(np.exp(log - logsumexp(log)))
     return np.asarray(own[min(int(np.searchsorted(shares, stream.random())), len(own) - 1)])
-
-
-def _numbers(seed: int, words: str, count: int, size: int) -> Array:
-    return np.asarray(member_stream(seed, words).standard_normal((count, size)))
 
 
 def challenger(experiments: Sequence[Experiment], at: ArrowSystem, seed: int) -> Place | None:

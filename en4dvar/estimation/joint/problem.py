@@ -104,11 +104,6 @@ class JointProblem:
         z[..., rest] = own
         return z
 
-    def control(self, e: int, z: Array) -> Array:
-        """Control vectors (…, n) of experiment e from those in units of its prior."""
-        prior = self.experiments[e].prior
-        return np.asarray(prior.mean + prior.std * z)
-
     @staticmethod
     def words(key: tuple[str, str]) -> str:
         """A shared quantity as it is called in tables."""

@@ -33,7 +33,7 @@ class Experiment:
 
     def run(self, z: Array, grid: Array = NO_TIMES) -> Forecast:
         """Control vectors (B, n) in units of the prior."""
-        return self.composite(self.joint.control(self.e, z), grid)
+        return self.composite(self.problem.prior.from_white(z), grid)
 
     def costs(self, z: Array) -> Array:
         """J_o (B,) of control vectors (B, n) in units of the prior; +inf where the model fails."""

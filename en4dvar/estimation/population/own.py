@@ -112,16 +112,13 @@ def own_likelihoods(
         *zip(*(_slopes(*both, draws.effective) for both, draws in zip(each, drawn, strict=True)), strict=True)
     )
     streams = (member_stream(own_seed(seed, name), "population: mixture") for name in names)
-    return [
-        _likelihood(x - theta @ slopes.T, slopes, draws.effective, stream)
-        for (x, theta), draws, stream in zip(each, drawn, streams, strict=True)
-    ]
-
-
-def _likelihood(adjusted: Array, slopes: Array, effective: float, stream: np.random.Generator) -> OwnLikelihood:
-    share, centre, covariance = _fitted(adjusted, effective, stream)
-    std = np.sqrt(1 + np.sum(slopes**2, axis=1))
-    return OwnLikelihood(Mixture.divided(centre, covariance, np.log(share), std), slopes, adjusted)
+    std, likelihoods = np.sqrt(1 + np.sum(slopes**2, axis=1)), []
+    for (x, theta), draws, stream in zip(each, drawn, streams, strict=True):
+        adjusted = x - theta @ slopes.T
+        share, centre, covariance = _fitted(adjusted, draws.effective, stream)
+        mixture = Mixture.divided(centre, covariance, np.log(share), std)
+        likelihoods.append(OwnLikelihood(mixture, slopes, adjusted))
+    return likelihoods
 
 
 def _slopes(x: Array, theta: Array, effective: float) -> tuple[Array, Array]:

@@ -124,17 +124,13 @@ class JoinedBatch(Batch):
             return [self.walk.path(i) for i in range(*index.indices(len(self)))]
         if not isinstance(index, str):
             return self.walk.path(range(len(self))[index])
-        if index not in self._fields:
-            self._fields[index] = self._field(index)
+        if index not in self._fields:  # (N, K) or (N, K, size)
+            if constant(index, self.layout, next(self._batches()).layout):
+                value = np.asarray(self.layout.part(self.walk.x, index))
+                self._fields[index] = np.repeat(value[:, None], self.times.shape[1], axis=1)
+            else:
+                self._fields[index] = self._joined([batch[index] for batch in self._batches()])
         return self._fields[index]
-
-    def _field(self, name: str) -> Array:
-        """(N, K) or (N, K, size)."""
-        first = next(self._batches())
-        if constant(name, self.layout, first.layout):
-            value = np.asarray(self.layout.part(self.walk.x, name))
-            return np.repeat(value[:, None], self.times.shape[1], axis=1)
-        return self._joined([batch[name] for batch in self._batches()])
 
     def _joined(self, values: Sequence[Array]) -> Array:
         """Values (N, C + 1, …) of the pieces as one array (N, K, …)."""
