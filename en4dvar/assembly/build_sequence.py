@@ -73,9 +73,8 @@ def _walks(config: SequenceConfig, terms: Sequence[PriorTerm]) -> Array:
     for entry in config.parameters:
         if not isinstance(entry, Uncertain) or entry.spec.varies is None:
             continue
-        name, varies = entry.parameter.name, entry.spec.varies
-        term = by_name[name]
-        centre = float(term.to_physical(np.array(term.mean)))
-        std = varies.std.absolute(centre) / term.slope(term.mean)
-        rate[config.model.layout[name]] = per_time(varies, std, f"parameters.{name}.varies")
+        name = entry.parameter.name
+        with config.document.placing("parameters", name, "varies"):
+            std = entry.spec.varies.std_of(by_name[name])
+        rate[config.model.layout[name]] = per_time(entry.spec.varies, std, f"parameters.{name}.varies")
     return rate

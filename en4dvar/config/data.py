@@ -19,6 +19,7 @@ from en4dvar.inputs.text_table import Decimal
 from en4dvar.inputs.window import Instant, parse_instant
 from en4dvar.model.forward import field_of
 from en4dvar.plumbing.errors import retold
+from en4dvar.plumbing.files import expanded
 from en4dvar.plumbing.hints import shown, suggest
 from en4dvar.plumbing.units import UnitError, parse_quantity
 
@@ -142,7 +143,7 @@ class Data(Section):
     def as_written(self, source: Mapping[str, Any]) -> dict[str, Any]:
         """The section as it was written, with absolute paths."""
         written = super().as_written(source)
-        paths = [str(self.path.base / text) for text in self.path.texts]
+        paths = [str(self.path.base / expanded(text)) for text in self.path.texts]
         written["path"] = paths[0] if len(paths) == 1 else paths
         if self.error.covariance is not None:
             written["error"]["covariance"]["path"] = str(self.error.covariance.path)

@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal
 
-import numpy as np
 from pydantic import Field
 
 from en4dvar.config.context import SPREAD, Context, Made, Spread, read_each, subject_unit, unit_of
@@ -251,12 +250,7 @@ class Uncertain:
         varies = self.spec.varies
         if varies is None:
             return None
-        centre = float(term.to_physical(np.array(term.mean)))
-        if varies.std.relative and centre == 0:
-            message = f"relative to the mean, which is zero; give it in {self.parameter.unit}"
-            raise ConfigError(message, "std")
-        std = varies.std.absolute(centre) / term.slope(term.mean)
-        return RandomWalk.of(model, term, varies.knots(observations), std, varies.estimated)
+        return RandomWalk.of(model, term, varies.knots(observations), varies.std_of(term), varies.estimated)
 
     def _location(self, key: Literal["mean", "median"], of_data: Callable[[str | Scalar], float] | None) -> float:
         value: float | str | Scalar | None = getattr(self.spec, key)

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Self
 
+import numpy as np
 from pydantic import model_validator
 
 from en4dvar.config.context import SPREAD, Context, Made, Spread, parse_spread, quantity, subject_unit, time_unit
@@ -16,6 +17,7 @@ from en4dvar.inputs.window import maxima
 from en4dvar.model.forward import ForwardModel
 from en4dvar.model.state import Field
 from en4dvar.plumbing.errors import ConfigError
+from en4dvar.priors.prior import PriorTerm
 from en4dvar.priors.varying import StateChanges
 
 MOST_KNOTS = 1000
@@ -82,6 +84,16 @@ class VariesSection(Knots):
     def estimated(self) -> bool:
         """True if ``std`` is that of the prior of the changes' standard deviation."""
         return isinstance(self.std, Estimated)
+
+    def std_of(self, term: PriorTerm) -> float:
+        """Standard deviation of each change in the coordinate of the prior of its parameter.
+
+        Raises :class:`ConfigError`, its path the key: a share of a mean that is zero.
+        """
+        centre = float(term.to_physical(np.array(term.mean)))
+        if self.std.relative and centre == 0:
+            raise ConfigError(f"relative to the mean, which is zero; give it in {term.parameter.unit}", "std")
+        return float(self.std.absolute(centre) / term.slope(term.mean))
 
 
 class ModelErrorSection(Knots):

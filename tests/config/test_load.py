@@ -137,6 +137,13 @@ def test_resolved_file_loads_again(tmp_path: Path) -> None:
     assert "epsilon: 0.001" in config.resolved
 
 
+def test_a_resolved_file_has_the_folder_that_a_tilde_stands_for(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("USERPROFILE", str(tmp_path))
+    resolved = load_config(write_toy(tmp_path), {"data.path": "~/toy.csv"}).resolved
+    assert f"path: {tmp_path / 'toy.csv'}\n" in resolved
+
+
 def test_simulate_grid(tmp_path: Path) -> None:
     grid = "simulate: {times: {from: 1 ms, to: 2 ms, step: 0.1 ms}}\n"
     config = load_config(write_toy(tmp_path, ("seed: 3\n", "seed: 3\n" + grid)))
