@@ -117,7 +117,8 @@ def _longer(name: str) -> list[str]:
     """How to fit one oscillation more."""
     options = "--set data.window.to='trough 3' --set model_error.gas='{at: maxima, std: 70 %}'"
     return [
-        "  # The gas may change within the window, too. One oscillation more often tells mu several times better:",
+        "  # The gas may change within the window, too. Where readings err by less than 2 % of R_max,",
+        "  # one oscillation more often tells mu several times better (docs/physics.md):",
         f"  #   en4dvar run THIS_FILE {options} --out {shlex.quote(f'runs/{name}_gas')}",
     ]
 
