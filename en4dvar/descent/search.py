@@ -3,10 +3,10 @@
 Members of low J may all lie in the basin of a wrong minimum. A challenger starts from the member farthest from the
 minimum, chosen by the forecast of the prior ensemble that is there anyway; where it ends elsewhere, others follow.
 Where noise and prior do not explain the lowest J, no member may lie in the right basin: many more draws of the prior
-are run, and the lowest of them start descents. Where something changes along the path, a descent starts where all of
-it constant fits best. Where readings after the window, which nothing was fitted to, come out
-otherwise than expected, a descent starts where all readings together lead. All rounds are kept as they go, so that an
-interrupted run repeats no descent.
+are run, and the lowest of them start descents. Where something changes along the path, a descent starts where the fit
+without any change ends. Where readings after the window, which nothing was fitted to, come out otherwise than expected,
+a descent starts where all readings together lead. All rounds are kept as they go, so that an interrupted run repeats no
+descent.
 """
 
 from collections.abc import Callable, Sequence
