@@ -71,7 +71,8 @@ class Files:
 def _files(written: str | tuple[str, ...], context: Context) -> Files:
     if not written or not all(written):
         raise ValueError("no file is named")
-    return Files(context.base, (written,) if isinstance(written, str) else written)
+    texts = (written,) if isinstance(written, str) else written
+    return Files(context.base, tuple(str(expanded(text)) for text in texts))
 
 
 class Data(Section):
@@ -143,7 +144,7 @@ class Data(Section):
     def as_written(self, source: Mapping[str, Any]) -> dict[str, Any]:
         """The section as it was written, with absolute paths."""
         written = super().as_written(source)
-        paths = [str(self.path.base / expanded(text)) for text in self.path.texts]
+        paths = [str(self.path.base / text) for text in self.path.texts]
         written["path"] = paths[0] if len(paths) == 1 else paths
         if self.error.covariance is not None:
             written["error"]["covariance"]["path"] = str(self.error.covariance.path)

@@ -132,7 +132,9 @@ def test_the_home_of_nobody(tmp_path: Path) -> None:
         ("toy_models:Oscillator", "~nosuchuser/x.py:Y"),
         ("{position_std: 2 um}", "{covariance: {path: ~nosuchuser/x.csv, unit: um^2}}"),
     ):
-        assert row("no-home").told(refused(write_toy(tmp_path, (old, new))))
+        message = refused(write_toy(tmp_path, (old, new)))
+        assert row("no-home").told(message)
+        assert re.search(r"toy.yaml:\d+:\d+: (data|model)\.", message), "where"
 
 
 @pytest.mark.parametrize("name", ["./own.py:Own", "../{folder}/own.py:Own", "own.py:Own", "{path}/own.py:Own"])
