@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -104,12 +104,12 @@ def init(
     if movie is not None and (data is not None or example is not None):
         raise click.UsageError("--movie makes the data; not together with --data or --example")
     of_movie = {name: text for name in _OF_MOVIE if (text := options[name]) is not None}
-    scales = ("pixel", "frame_rate") if data is not None else ()
-    if movie is None and (alone := [name.replace("_", "-") for name in of_movie if name not in scales]):
-        raise click.UsageError(f"--{alone[0]} needs a --movie")
+    if movie is None:
+        _refuse_alone(of_movie, () if data is None else ("pixel", "frame_rate"), "a --movie")
+        _refuse_alone(options, _OF_MOVIE if data is None else options, "--data")
     if example is not None:
-        if data is not None or out is not None:
-            raise click.UsageError("--example comes with its own data and file names")
+        if any(it is not None for it in (data, out, start, law)):
+            raise click.UsageError("--example comes with its own data, start, law and file names")
         _write_example(example, force)
         return
     from en4dvar.commands.common import command_line
@@ -156,6 +156,13 @@ def init(
     write_text(target, text)
     write_text(target.parent / SCHEMA_FILE, schema_text())
     _tell(target, proposal, example_only=data is None)
+
+
+def _refuse_alone(options: Mapping[str, str | None], allowed: Collection[str], wanted: str) -> None:
+    """Raise :class:`click.UsageError` for an option that is given and not allowed without what is wanted."""
+    for name, text in options.items():
+        if text is not None and name not in allowed:
+            raise click.UsageError(f"--{name.replace('_', '-')} needs {wanted}")
 
 
 def _layout(options: Mapping[str, str | None]) -> Layout:
@@ -254,6 +261,8 @@ def _columns_of(data: str, options: Mapping[str, str | None], layout: Layout) ->
         echo(f"others in the file: {told}", err=True)
     asked = asked.by_names()
     if not asked.complete_columns and (rows := summaries(contents.columns)) is not None:
+        if options["since"] is not None:
+            raise click.UsageError(f"{first} has a row a bubble, no readings that --since could leave out")
         return rows
     if _interactive() and asked.needed():
         asked = _answered(asked)

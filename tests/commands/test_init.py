@@ -371,6 +371,14 @@ def test_pixels_and_frames_without_their_size_end_with_the_next_command(
     assert last.endswith(following)
 
 
+@pytest.mark.parametrize("option", ["--since", "--groups", "--time-unit"])
+def test_an_option_of_data_needs_data(option: str) -> None:
+    for example in ((), ("--example", "quickstart")):
+        done = call("init", option, "day", *example)
+        assert (done.exit_code, f"{option} needs --data" in done.stderr) == (2, True)
+    assert "comes with its own data, start, law" in call("init", "--example", "quickstart", "--start", "laser").stderr
+
+
 def test_options_that_contradict_each_other(tmp_path: Path) -> None:
     done = call("init", "--data", write(tmp_path / "b.csv"), *UNITS, "--pixel", "2 um")
     assert (done.exit_code, done.stderr.splitlines()[-1][:37]) == (2, "--pixel makes pixels the unit of radi")

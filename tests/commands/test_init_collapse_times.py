@@ -110,6 +110,12 @@ def test_a_scalar_that_a_prior_lacks_is_named_with_its_line(begun):
         build(load_config("pool.yaml"))
 
 
+def test_a_row_a_bubble_has_no_readings_to_leave_out(begun):
+    refused = typed("init", "--data", "pool.mat", "--since", "trough 1", "--force")
+    assert refused.exit_code == 2
+    assert "no readings that --since could leave out" in refused.output
+
+
 def test_a_table_that_is_there_is_not_replaced(begun):
     Path("pool.yaml").unlink()
     again = typed("init", "--data", "pool.mat")
