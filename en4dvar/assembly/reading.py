@@ -70,7 +70,8 @@ def read_one(plan: SeriesPlan, file: DataFile, fewest: int) -> Series:
     try:
         noise, whole = errors(window), slice(window.start, max(window.stop, _window(data, read, path, until=True).stop))
         if len(times) < fewest:
-            raise DataError(f"{len(times)} usable observations in the window; at least {fewest} are needed")
+            held = f"{len(times)} of {len(read.times)} usable observations"
+            raise DataError(f"the window data.window holds {held}; at least {fewest} are needed")
         return Series(
             observable=plan.observable,
             times=times,

@@ -125,8 +125,19 @@ def test_a_folder_is_a_campaign_and_its_odd_file_is_named(tmp_path: Path) -> Non
     assert "other.csv: no column" in done.stderr
     assert "another.csv: the file holds no data" in done.stderr
     assert Path("gel_one.yaml").read_text().count("# MIND: ") == 2
+    (folder / "other.csv").write_text("t_us,R_um\n" + "".join(f"{t},{20 + t}\n" for t in range(20)))  # shows no bubble
+    done = call("init", "--data", folder, *UNITS, "--start", "laser", "--force")
+    assert done.exit_code == 0, done.output
+    assert "other: fewer than four samples from its maximum, reading 20 of 20" in done.stderr
+    *rows, spike = (folder / "b1.csv").read_text().splitlines()[:-4]  # whose maximum is a bad reading, almost the last
+    after = (folder / "b1.csv").read_text().splitlines()[-4:]
+    (folder / "other.csv").write_text("\n".join([*rows, f"{spike.split(',')[0]},900", *after]))
+    done = call("init", "--data", folder, *UNITS, "--start", "laser", "--force")
+    assert done.exit_code == 0, done.output
+    assert "other.csv: the window asks for minimum 1, but only 0 minima" in done.stderr
     for n in (1, 2):
         (folder / f"b{n}.csv").unlink()
+    (folder / "other.csv").write_text("a,b\n1,2\n")
     done = call("init", "--data", folder, *UNITS, "--force")
     assert done.exit_code == 2
     assert done.stderr.count("other.csv: ") == 2

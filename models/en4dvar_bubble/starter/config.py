@@ -2,13 +2,13 @@
 
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from en4dvar.assembly.build import build_one
 from en4dvar.assembly.find_files import find_files, with_parts
-from en4dvar.config import resolve
+from en4dvar.config import Config, resolve
 from en4dvar.config.document import parse_document
 from en4dvar.inputs.asked import ANY, Column, DataFile, Layout, TimeStep
 from en4dvar.inputs.readers import Readings, read_series
@@ -77,8 +77,8 @@ def propose_config(
 
     Raises
     ------
-    DataError: no usable file (of several, those that are not are named among the warnings), no bubble in them, or data
-    sets that suggest different starts. ConfigError: unknown law, or
+    DataError: no usable file, no bubble in any (of several, those that are of no use are named among the warnings), or
+    data sets that suggest different starts. ConfigError: unknown law, or
     neither ``time`` nor ``time_step``. UnitError: a unit that is not of its kind.
     """
     if (time is None) == (time_step is None):
@@ -103,11 +103,23 @@ def propose_config(
         common = max(series.scalars.get(TRACKED_COMMON, 0.0) for series in readings.values())
         proposal = with_columns(proposal, errors, f"{common:g} {source.radius[1]}" if common > 0 else "")
     proposal = replace(proposal, warnings=(*proposal.warnings, *doubts(source), *_steps(readings, source), *unusable))
-    text = yaml_text(name or run_name(str(data)), source, proposal, command)
-    config = resolve(parse_document(text), Path(folder).absolute())
-    for dataset in readings:
-        build_one(config, dataset, files[dataset])
-    return Proposed(text, proposal)
+    name = name or run_name(str(data))
+    config = resolve(parse_document(yaml_text(name, source, proposal, command)), Path(folder).absolute())
+    proposal = replace(proposal, warnings=(*proposal.warnings, *_unbuilt(config, proposal.datasets, files)))
+    return Proposed(yaml_text(name, source, proposal, command), proposal)
+
+
+def _unbuilt(config: Config, datasets: Sequence[str], files: Mapping[str, DataFile]) -> list[str]:
+    """Why data sets cannot be used as configured. Raises :class:`DataError` where none can be."""
+    reasons: list[str] = []
+    for dataset in datasets:
+        try:
+            build_one(config, dataset, files[dataset])
+        except DataError as error:
+            reasons.append(f"{dataset}: {error}")
+    if len(reasons) == len(datasets):
+        raise DataError("\n".join(reasons))
+    return reasons
 
 
 def histories(files: Mapping[str, DataFile], source: Source) -> tuple[dict[str, Readings], list[str]]:

@@ -74,6 +74,7 @@ class Proposal:
     ``simpler``: keys of the model, and their values, of quicker physics to compare with; empty where there is none.
     ``population``: what varies from bubble to bubble of one gel, line by line; empty where there are too few of them.
     ``longer``: in a gel, and most histories have a third minimum, at which the window may end.
+    ``datasets``: what it was made from; others show no bubble, as ``warnings`` tell.
     """
 
     data: tuple[Entry, ...]
@@ -84,6 +85,7 @@ class Proposal:
     warnings: tuple[str, ...] = ()
     population: tuple[str, ...] = ()
     longer: bool = False
+    datasets: tuple[str, ...] = ()
     assimilation: tuple[Entry, ...] = (
         Entry("members", "48"),
         Entry("draws", "400", "effective ones where the posterior is sampled: its mean is known to 5 % of its std"),
@@ -108,9 +110,10 @@ def propose(
 
     Raises
     ------
-    DataError: a history shows no bubble, or the data sets suggest different starts. ConfigError: unknown law.
+    DataError: no history shows a bubble, or the data sets suggest different starts. ConfigError: unknown law.
     """
-    looks = _looks(histories, start)
+    looks, unseen = _looks(histories, start)
+    histories = {name: histories[name] for name in looks}
     views = list(looks.values())
     chosen = views[0].start
     model, law_name = built(chosen, law)
@@ -157,9 +160,10 @@ def propose(
         (*_parameters(model, look, believed, tops(looks, histories), medium), *wall[1]),
         SIMPLER[chosen],
         (*told, *[f"{len(views)} bubbles: {_ends_with(groups)}"] * bool(together)),
-        tuple(warnings),
+        (*warnings, *unseen),
         together,
         chosen == "laser" and not _in_a_liquid(model) and float(np.median([v.n_minima for v in views])) > 2,
+        tuple(looks),
         (*Proposal.assimilation, *[EACH_ALONE] * bool(together)),
     )
 
@@ -221,16 +225,21 @@ def built(start: Start, law: str | None) -> tuple[BubbleModel, str]:
         return BubbleModel.from_settings(settings), name
 
 
-def _looks(histories: Mapping[str, tuple[Array, Array]], start: Start | None) -> dict[str, Look]:
-    looks: dict[str, Look] = {}
+def _looks(histories: Mapping[str, tuple[Array, Array]], start: Start | None) -> tuple[dict[str, Look], list[str]]:
+    """What each history shows, and why others show no bubble. Raises :class:`DataError` where none shows one."""
+    looks, unseen = dict[str, Look](), list[str]()
     for name, (times, radius) in histories.items():
-        with retold(DataError, DataError, f"{name}: "):
+        try:
             looks[name] = look(times, radius, start)
+        except DataError as error:
+            unseen.append(f"{name}: {error}")
+    if not looks:
+        raise DataError("\n".join(unseen))
     if len({view.start for view in looks.values()}) > 1:
         kinds = {kind: [n for n, view in looks.items() if view.start == kind] for kind in ("acoustic", "laser")}
         told = "; ".join(f"{kind}: {', '.join(names[:3])}" for kind, names in kinds.items())
         raise DataError(f"the data sets suggest different starts ({told}); say --start acoustic or --start laser")
-    return looks
+    return looks, unseen
 
 
 def _typical(views: Sequence[Look]) -> Look:
