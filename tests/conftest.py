@@ -17,7 +17,7 @@ import hypothesis
 import numpy as np
 import pytest
 from chromium import browser  # noqa: F401  a fixture: one for all, since Playwright runs once in a process
-from tenths import is_of_tenth
+from parts_by_day import is_of_part
 from threadpoolctl import threadpool_limits
 
 from en4dvar import report
@@ -165,13 +165,14 @@ def _analysis(n_members: int = 24, **changes: Any) -> Analysis:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--tenth", type=int, choices=range(10), help="of the tests, one tenth; which, their names decide")
+    parser.addoption("--part", metavar="K/N", help="one of N parts of the tests, 0 to N - 1; their names decide")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Keep the tenth that is asked for; the files of :data:`FIRST`, then those with the most tests."""
-    if (tenth := config.getoption("--tenth")) is not None:
-        items[:] = [item for item in items if is_of_tenth(item.nodeid, tenth)]
+    """Keep the part that is asked for; the files of :data:`FIRST`, then those with the most tests."""
+    if (asked := config.getoption("--part")) is not None:
+        part, of = map(int, asked.split("/"))
+        items[:] = [item for item in items if is_of_part(item.nodeid, part, of)]
     tests = Counter(item.path for item in items)
     ranks = {path: FIRST.index(path.stem) if path.stem in FIRST else len(FIRST) for path in tests}
     items.sort(key=lambda item: (ranks[item.path], -tests[item.path]))
