@@ -19,7 +19,7 @@ from en4dvar.commands.common import Failed, give_up_output, printable, to_contin
 from en4dvar.commands.design import design
 from en4dvar.commands.joint import joint
 from en4dvar.commands.listings import models, schema
-from en4dvar.commands.plugin_commands import PluginCommand, plugin_commands
+from en4dvar.commands.plugin_commands import GROUP, PluginCommand
 from en4dvar.commands.population import population
 from en4dvar.commands.results import compare, export, report, rerun
 from en4dvar.commands.run import run
@@ -28,6 +28,7 @@ from en4dvar.commands.sweep_twin import sweep_twin
 from en4dvar.commands.validate import validate
 from en4dvar.commands.warm_up import warm_up
 from en4dvar.plumbing.errors import En4dvarError
+from en4dvar.plumbing.installed import installed
 from en4dvar.runs.interrupt import heeded
 
 OF_THE_DEVICE = (
@@ -43,11 +44,11 @@ class Commands(click.Group):
     """Adds the commands of application packages; turns errors of ours and Ctrl-C into messages and exit codes."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return sorted({*super().list_commands(ctx), *plugin_commands()})
+        return sorted({*super().list_commands(ctx), *installed(GROUP)})
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         built_in = super().get_command(ctx, cmd_name)
-        plugin = None if built_in else plugin_commands().get(cmd_name)
+        plugin = None if built_in else installed(GROUP).get(cmd_name)
         return PluginCommand(plugin) if plugin else built_in
 
     def main(self, *args: Any, **options: Any) -> Any:
@@ -80,7 +81,7 @@ class Commands(click.Group):
         except En4dvarError as error:
             raise Failed(str(error), error.exit_code) from error
         except SystemExit as end:  # of a model or law: click ends in another way; another package's command may
-            if ctx.invoked_subcommand in plugin_commands():
+            if ctx.invoked_subcommand in installed(GROUP):
                 raise
             from en4dvar.plumbing.user_code import describe
 

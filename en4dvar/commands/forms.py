@@ -7,7 +7,7 @@ seed)``, which writes FILE and returns what is said of it. Nothing is imported b
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +15,7 @@ import click
 
 from en4dvar.commands.common import parted
 from en4dvar.commands.plugin_commands import about, loaded
+from en4dvar.plumbing.installed import installed
 
 if TYPE_CHECKING:
     from en4dvar.config import Config
@@ -29,13 +30,8 @@ class WithForms(click.Command):
     def get_params(self, ctx: click.Context) -> list[click.Parameter]:
         own = super().get_params(ctx)
         options = {option for parameter in own for option in parameter.opts}
-        added = [o for entry in forms().values() for o in _options(entry) if not options.intersection(o.opts)]
+        added = [o for entry in installed(GROUP).values() for o in _options(entry) if not options.intersection(o.opts)]
         return [*own[:-1], *added, own[-1]]  # --help stays the last
-
-
-def forms() -> dict[str, EntryPoint]:
-    """Entry points by name; nothing is imported."""
-    return {entry.name: entry for entry in entry_points(group=GROUP)}
 
 
 def _options(entry: EntryPoint) -> list[click.Option]:
@@ -49,7 +45,7 @@ def _options(entry: EntryPoint) -> list[click.Option]:
 def asked(options: Mapping[str, Any]) -> dict[str, tuple[Path, dict[str, str]]]:
     """Form → file and settings. Raises :class:`click.UsageError`: settings without a file, or not KEY=VALUE."""
     answers = {}
-    for name in forms():
+    for name in installed(GROUP):
         out, texts = options.get(name), options.get(f"{name}_set", ())
         if texts and out is None:
             raise click.UsageError(f"--{name}-set needs --{name} FILE")
@@ -64,4 +60,4 @@ def write_form(
     """Write a form and return the sentence about its file. Raises :class:`En4dvarError`: the form cannot be loaded, or
     refuses.
     """
-    return str(loaded(forms()[name], f"--{name}")(config, times, out, settings, seed))
+    return str(loaded(installed(GROUP)[name], f"--{name}")(config, times, out, settings, seed))

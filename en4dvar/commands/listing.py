@@ -1,11 +1,11 @@
 """The models there are, for ``en4dvar models``."""
 
-from importlib.metadata import entry_points
 from typing import Any
 
 from en4dvar.config.models import GROUP, build_model, find_model, settings_of
 from en4dvar.model.state import Parameter
 from en4dvar.plumbing.errors import En4dvarError
+from en4dvar.plumbing.installed import installed
 from en4dvar.plumbing.tables import table
 
 
@@ -14,7 +14,7 @@ def model_listing() -> str:
 
     A model that cannot be loaded or whose settings have no defaults is listed with the reason.
     """
-    return "\n\n".join(_description(name) for name in sorted({e.name for e in entry_points(group=GROUP)}))
+    return "\n\n".join(map(_description, installed(GROUP)))
 
 
 def _description(name: str) -> str:

@@ -5,7 +5,7 @@ its source; only invoking a command imports it.
 """
 
 import ast
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -32,11 +32,6 @@ class PluginCommand(click.Command):
         if not isinstance(command, click.Command):
             raise En4dvarError(f"command {self.name!r}: {self.entry.value} is not a click command")
         return command.make_context(info_name, args, parent, **extra)
-
-
-def plugin_commands() -> dict[str, EntryPoint]:
-    """Entry points by name; nothing is imported."""
-    return {entry.name: entry for entry in entry_points(group=GROUP)}
 
 
 def loaded(entry: EntryPoint, what: str) -> Any:

@@ -3,11 +3,11 @@
 import os
 import time
 from collections.abc import Callable, Iterator
-from importlib.metadata import entry_points
 
 import click
 
 from en4dvar.commands.common import echo
+from en4dvar.plumbing.installed import installed
 
 GROUP = "en4dvar.warm_up"
 """Entry points whose value is a function without arguments: what is compiled, in words → a small call that does."""
@@ -37,8 +37,8 @@ def examples() -> Iterator[tuple[str, Callable[[], object]]]:
     """Names of kernels, each with a call that compiles it. Raises :class:`En4dvarError`: a package is at fault."""
     from en4dvar.plumbing.errors import En4dvarError, retold
 
-    for entry in sorted(entry_points(group=GROUP)):
-        words = f"warm-up of {entry.name!r} ({entry.value}) cannot be loaded: "
+    for name, entry in installed(GROUP).items():
+        words = f"warm-up of {name!r} ({entry.value}) cannot be loaded: "
         with retold((ImportError, AttributeError), En4dvarError, words):
             examples_of_package = entry.load()()
         yield from examples_of_package.items()

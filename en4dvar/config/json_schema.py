@@ -9,7 +9,7 @@ further kinds of files (group ``en4dvar.schemas``: the key that marks the kind â
 import json
 import math
 from collections.abc import Callable, Iterator
-from importlib.metadata import entry_points
+from functools import cache
 from typing import Any
 
 from en4dvar.config.context import TEXT
@@ -22,6 +22,7 @@ from en4dvar.config.synthetic import CampaignFile
 from en4dvar.config.twin import TwinFile
 from en4dvar.model.state import OF_READINGS, Parameter
 from en4dvar.plumbing.errors import En4dvarError
+from en4dvar.plumbing.installed import installed
 
 Json = dict[str, Any]
 KINDS = "en4dvar.schemas"
@@ -49,9 +50,9 @@ def json_schema() -> Json:
             for model in models
         ]  # fmt: skip
     kinds = {"twin": "twin", "sequence": "sequence", "campaign": "campaign"}
-    for entry in entry_points(group=KINDS):
-        definitions[f"{entry.name}_file"] = _of(entry.load().model_json_schema())
-        kinds[entry.name] = f"{entry.name}_file"
+    for name, entry in installed(KINDS).items():
+        definitions[f"{name}_file"] = _of(entry.load().model_json_schema())
+        kinds[name] = f"{name}_file"
     chosen: Json = {"$ref": "#/$defs/estimation"}
     for key, name in reversed(kinds.items()):
         chosen = {**_if({"required": [key]}, {"$ref": f"#/$defs/{name}"}), "else": chosen}
@@ -64,6 +65,7 @@ def json_schema() -> Json:
     }
 
 
+@cache
 def schema_text() -> str:
     """The schema as the text of a ``.json`` file."""
     return json.dumps(json_schema(), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
@@ -118,7 +120,7 @@ def _tidy(node: Json) -> Json:
 
 def _models(definitions: Json) -> Iterator[str]:
     """Name of each registered model; its settings and parameters are added to the definitions."""
-    for name in sorted({entry.name for entry in entry_points(group=GROUP)}):
+    for name in installed(GROUP):
         try:
             kind: Any = find_model(name)
         except En4dvarError:

@@ -4,7 +4,6 @@ Its labels and symbols are tried before any work: matplotlib reads them when eve
 """
 
 import re
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ from en4dvar.plumbing import user_file
 from en4dvar.plumbing.errors import ConfigError, En4dvarError, Fault, retold
 from en4dvar.plumbing.files import PathError
 from en4dvar.plumbing.hints import shown, suggest
+from en4dvar.plumbing.installed import installed
 from en4dvar.plumbing.user_code import RefusedError, imported, loading
 
 GREEK = (
@@ -77,7 +77,7 @@ def find_model(name: str) -> type[ForwardModel]:
                 module, _, attribute = name.partition(":")
                 model = getattr(imported(f"model {shown(name)}", module), attribute)
             else:
-                registered = {e.name: e for e in entry_points(group=GROUP)}
+                registered = installed(GROUP)
                 if name not in registered:
                     raise ConfigError(f"unknown model {shown(name)}{suggest(name, registered)}; or write {OWN}")
                 model = registered[name].load()

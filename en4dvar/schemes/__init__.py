@@ -7,8 +7,8 @@ subclass of :class:`Scheme`. One that cannot be loaded is left out with a warnin
 import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import fields
-from importlib.metadata import entry_points
 
+from en4dvar.plumbing.installed import installed
 from en4dvar.schemes.base import Minimiser, Scheme
 from en4dvar.schemes.baselines import Climatology, OptimalInterpolation
 from en4dvar.schemes.bootstrap_filter import BootstrapFilter
@@ -40,16 +40,16 @@ SCHEMES: dict[str, type[Scheme]] = {
 def _installed() -> dict[str, type[Scheme]]:
     """The schemes of other packages."""
     kinds = {}
-    for entry in entry_points(group="en4dvar.schemes"):
+    for name, entry in installed("en4dvar.schemes").items():
         try:
             kind = entry.load()
             if not (isinstance(kind, type) and issubclass(kind, Scheme)):
                 raise TypeError("it is not a subclass of en4dvar.schemes.Scheme")
         except Exception as error:  # code of another package must not end every command
-            words = f"scheme {entry.name!r} ({entry.value}) cannot be loaded: {type(error).__name__}: {error}"
+            words = f"scheme {name!r} ({entry.value}) cannot be loaded: {type(error).__name__}: {error}"
             warnings.warn(words, RuntimeWarning, stacklevel=2)
         else:
-            kinds[entry.name] = kind
+            kinds[name] = kind
     return kinds
 
 

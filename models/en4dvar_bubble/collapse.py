@@ -80,7 +80,7 @@ class Lobe:
         return self.t_c / (RAYLEIGH * self.R_max * math.sqrt(medium.rho / medium.p_inf))
 
 
-def lobe(times: Array, radius: Array) -> Lobe:
+def lobe(times: Array, radius: Array, with_margin: bool = True) -> Lobe:
     """Maximum and collapse time, see the head of the module. Raises :class:`DataError`."""
     turning = None
     for lowest in LOWEST:
@@ -110,7 +110,7 @@ def lobe(times: Array, radius: Array) -> Lobe:
     middle = -b / (2 * c)
     peak = a - b**2 / (4 * c)
     t_max = times[int(np.argmax(radius))] + scale * middle
-    margin = _margin(z, y, np.array([c, b, a]))
+    margin = _margin(z, y, np.array([c, b, a])) if with_margin else 0.0
     return Lobe(float(radius.max() * peak**0.4), float(t_max), float(scale * np.sqrt(-peak / c)), margin)
 
 
@@ -129,14 +129,13 @@ def _margin(z: Array, y: Array, fit: Array) -> float:
 
 def _falling(radius: Array, lowest: float) -> slice:
     """From just before the maximum down to ``lowest`` of it, or to the end of the descent."""
-    top = first = last = int(np.argmax(radius))
-    while first > 0 and radius[first - 1] > 0.95 * radius[top]:
-        first -= 1
-    while last + 1 < len(radius) and lowest * radius[top] < radius[last + 1]:
-        if radius[last + 1 : last + 3].min() > radius[last] + 0.1 * radius[top]:  # one reading alone may be high
-            break
-        last += 1
-    return slice(first, last + 1)
+    top = int(np.argmax(radius))
+    largest, after = radius[top], radius[top + 1 :]
+    rising = np.flatnonzero(radius[:top] <= 0.95 * largest)
+    following = np.minimum(after, np.append(after[1:], np.inf))  # one reading alone may be high
+    ends = np.flatnonzero((after <= lowest * largest) | (following > radius[top:-1] + 0.1 * largest))
+    first, last = (rising[-1] + 1 if len(rising) else 0), top + (ends[0] if len(ends) else len(after))
+    return slice(int(first), int(last) + 1)
 
 
 def bounds(R_max: float, medium: Medium, gel: Gel = COMMON) -> tuple[float, float]:

@@ -16,8 +16,9 @@ from en4dvar.plumbing.moved import MOVED
 
 @pytest.fixture(autouse=True)
 def as_in_a_new_process(monkeypatch):
+    inside = tuple(f"{old}." for old in MOVED)
     for name in list(sys.modules):
-        if any(name == old or name.startswith(f"{old}.") for old in MOVED):
+        if f"{name}.".startswith(inside):
             monkeypatch.delitem(sys.modules, name)
 
 

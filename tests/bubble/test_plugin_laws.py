@@ -84,11 +84,11 @@ class TestFinding:
             get_law("no_such_package.laws:Gent")
 
     def test_entry_point(self, monkeypatch):
-        entries = [
-            EntryPoint("installed", "en4dvar_bubble.laws.kelvin_voigt:GentKelvinVoigt", loading.GROUP),
-            EntryPoint("broken", "no_such_package:Law", loading.GROUP),
-        ]
-        monkeypatch.setattr(loading, "entry_points", lambda group: entries if group == loading.GROUP else [])
+        entries = {
+            "installed": EntryPoint("installed", "en4dvar_bubble.laws.kelvin_voigt:GentKelvinVoigt", loading.GROUP),
+            "broken": EntryPoint("broken", "no_such_package:Law", loading.GROUP),
+        }
+        monkeypatch.setattr(loading, "installed", lambda group: entries if group == loading.GROUP else {})
         assert get_law("installed").name == "gent-kelvin-voigt"
         found = loading.available()
         assert found["installed"].__name__ == "GentKelvinVoigt"

@@ -35,8 +35,8 @@ def _package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.chdir(tmp_path)
     entries = {"poem": "verses:poem", "gone": "no_such_package:x", "out": "verses:poem"}
-    found = tuple(EntryPoint(name, value, forms.GROUP) for name, value in entries.items())
-    monkeypatch.setattr(forms, "entry_points", lambda group: found)
+    found = {name: EntryPoint(name, value, forms.GROUP) for name, value in entries.items()}
+    monkeypatch.setattr(forms, "installed", lambda group: found)
     monkeypatch.delitem(sys.modules, "verses", raising=False)
 
 

@@ -23,16 +23,16 @@ def test_models_are_listed_with_parameters_and_units() -> None:
 
 
 def test_a_model_that_cannot_be_loaded_is_listed_with_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
-    entries = [EntryPoint("gone", "no_such_package:Model", models.GROUP)]
-    monkeypatch.setattr(listing, "entry_points", lambda group: entries)
-    monkeypatch.setattr(models, "entry_points", lambda group: entries)
+    entries = {"gone": EntryPoint("gone", "no_such_package:Model", models.GROUP)}
+    monkeypatch.setattr(listing, "installed", lambda group: entries)
+    monkeypatch.setattr(models, "installed", lambda group: entries)
     assert "gone: model 'gone' cannot be loaded: No module named 'no_such_package'" in listing.model_listing()
 
 
 def test_a_model_without_default_settings_is_listed_with_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
-    entries = [EntryPoint("picky", "toy_config:Picky", models.GROUP)]
-    monkeypatch.setattr(listing, "entry_points", lambda group: entries)
-    monkeypatch.setattr(models, "entry_points", lambda group: entries)
+    entries = {"picky": EntryPoint("picky", "toy_config:Picky", models.GROUP)}
+    monkeypatch.setattr(listing, "installed", lambda group: entries)
+    monkeypatch.setattr(models, "installed", lambda group: entries)
     import toy_config
     from pydantic import BaseModel
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+from en4dvar import cli
 from en4dvar.cli import main
 from en4dvar.commands import plugin_commands
 
@@ -41,8 +42,8 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
         "three": "shouting.commands:not_a_command",
         "run": "shouting.commands:shout",
     }
-    found = tuple(EntryPoint(name, value, plugin_commands.GROUP) for name, value in entries.items())
-    monkeypatch.setattr(plugin_commands, "entry_points", lambda group: found)
+    found = {name: EntryPoint(name, value, plugin_commands.GROUP) for name, value in entries.items()}
+    monkeypatch.setattr(cli, "installed", lambda group: found)
     yield "shouting"
     for name in ("shouting", "shouting.commands"):
         sys.modules.pop(name, None)

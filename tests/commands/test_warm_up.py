@@ -69,7 +69,7 @@ def test_nothing_is_compiled_after_it(tmp_path):
 
 def test_a_package_that_cannot_be_loaded_is_one_error(monkeypatch):
     entry = EntryPoint("own", "toy_models:nothing_there", warm_up.GROUP)
-    monkeypatch.setattr(warm_up, "entry_points", lambda group: [entry])
+    monkeypatch.setattr(warm_up, "installed", lambda group: {"own": entry})
     outcome = CliRunner().invoke(main, ["warm-up"])
     assert outcome.exit_code == 1
     assert "warm-up of 'own' (toy_models:nothing_there) cannot be loaded: " in outcome.output

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Callable
-from importlib.metadata import entry_points
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,6 +15,7 @@ from en4dvar.model.state import Parameter
 from en4dvar.plumbing import user_file
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.hints import suggest
+from en4dvar.plumbing.installed import installed
 from en4dvar.plumbing.user_code import imported, loading, reason_of
 from en4dvar_bubble.laws.base import REGISTRY, ConstitutiveLaw
 from en4dvar_bubble.laws.memory import MemoryVariable
@@ -157,16 +157,16 @@ def qualified(name: str, base: Path | None = None) -> str:
 def available() -> dict[str, type[ConstitutiveLaw] | ConfigError]:
     """Every registered law by name, built in or by entry point; an entry point that fails, as its error."""
     laws: dict[str, type[ConstitutiveLaw] | ConfigError] = {}
-    for entry in entry_points(group=GROUP):
+    for name in installed(GROUP):
         try:
-            laws[entry.name] = type(get_law(entry.name))
+            laws[name] = type(get_law(name))
         except ConfigError as error:
-            laws[entry.name] = error
+            laws[name] = error
     return dict(sorted((laws | REGISTRY).items()))
 
 
 def _from_entry_point(name: str) -> Any:
-    registered = {entry.name: entry for entry in entry_points(group=GROUP)}
+    registered = installed(GROUP)
     if name not in registered:
         known = {law: REGISTRY[law].title if law in REGISTRY else "" for law in sorted({*REGISTRY, *registered})}
         own = "; a class of your own is my_law.py:ClassName" if name.endswith(".py") else ""
