@@ -112,6 +112,7 @@ def test_a_trend_with_the_order_is_told():
     assert "rises with the order of the data sets" in told.words
 
 
+@pytest.mark.slow
 def test_data_sets_that_say_less_and_less_are_no_trend():
     """Alone, they end nearer and nearer to their prior, which is 5 of its standard deviations away."""
     found = []

@@ -98,7 +98,7 @@ def truths(spread, count=SETS, seed=1):
     return 1.0 + spread * np.random.default_rng(seed).standard_normal(count)
 
 
-@pytest.mark.parametrize("spread", [0.0, 0.5])
+@pytest.mark.parametrize("spread", [pytest.param(0.0, marks=pytest.mark.slow), 0.5])
 def test_what_is_common_does_not_average_out(spread):
     problems = campaign(truths(spread))
     found = population_of(problems, members(problems), ["a"], 2, hyper=HYPER)

@@ -29,6 +29,7 @@ def test_radii_of_every_class_of_frame_are_the_true_ones(kind):
     assert np.sqrt(np.mean(scores**2)) < 3
 
 
+@pytest.mark.slow
 def test_dirt_that_drifts_in_the_empty_frames_moves_no_radius():
     """It would be a part of the background, and so at the same place in all frames."""
     true, off = np.linspace(9.0, 13.0, 15), []
@@ -55,6 +56,7 @@ def test_the_frames_of_a_bubble_that_begins_small_are_no_background():
         assert abs(np.mean([r.radius for r in found.readings[-8:]]) - 4) < 0.15
 
 
+@pytest.mark.slow
 def test_a_few_large_bubbles_tell_the_contrast_of_many_small_ones():
     """Of the light in a small bubble's centre, some is blurred to its edge."""
     true = np.concatenate([np.linspace(24.0, 4.0, 8), np.full(40, 3.8)])
@@ -109,6 +111,7 @@ def test_a_frame_that_the_file_holds_damaged_is_named_and_left_out():
     assert sum(r.used for r in found.readings) == 5
 
 
+@pytest.mark.slow
 def test_noise_at_the_edge_of_a_small_bubble_is_no_motion():
     """A bubble of 2.7 pixels whose wall moves slowly: noise widens its edge by more than 0.15 of its radius."""
     radii = np.concatenate([np.linspace(17.0, 8.0, 20), 2.7 + 0.4 * np.sin(np.arange(12.0))])

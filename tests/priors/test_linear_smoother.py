@@ -184,6 +184,7 @@ def test_evidence_of_constant_values_is_that_of_a_run_without():
     assert constant.log_evidence_change is None
 
 
+@pytest.mark.slow
 def test_a_constant_truth_is_seldom_told_to_change():
     """By Markov's inequality at most 1 in 20; these truths are not even drawn from the prior of constant ones."""
     found = [assimilate(problem((1.0,) * 4, seed), SETTINGS, 1).log_evidence_change for seed in range(20)]

@@ -113,6 +113,7 @@ def test_bands_cover_a_viscosity_that_is_halved_at_the_collapse(halved):
     assert halved.log_evidence_change > np.log(20)
 
 
+@pytest.mark.slow
 def test_what_if_is_answered(halved):
     assert len(halved.what_if) > 0
     alternative = next(one for one in halved.problem.model.alternatives if one.model is not None)

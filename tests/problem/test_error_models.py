@@ -146,6 +146,7 @@ def test_gradient_against_finite_differences(case, time_std, weight, members):
     assert np.linalg.norm(at.step.gradient - numeric) < 1e-4 * np.linalg.norm(numeric)
 
 
+@pytest.mark.slow
 def test_fisher_information_with_correlation_and_scale():
     """SᵀS against the covariance of the score over data drawn from the model (Monte Carlo)."""
     c = exponential(np.array([1.0, 2.0, 3.0]), 1.5)

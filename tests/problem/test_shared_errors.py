@@ -81,7 +81,7 @@ def test_posterior_and_evidence_of_a_linear_problem(weight):
     assert wider.max() > 3
 
 
-@pytest.mark.parametrize("time_std", [0.0, 0.1])
+@pytest.mark.parametrize("time_std", [0.0, pytest.param(0.1, marks=pytest.mark.slow)])
 def test_score_and_information_where_the_size_of_the_errors_is_estimated(time_std):
     """SᵀS against the covariance of the score over readings drawn from the model."""
     columns = np.array([[0.3, 0.1], [-0.2, 0.4], [0.5, 0.0]])

@@ -61,6 +61,7 @@ def test_as_many_draws_are_effective_as_are_asked_for(refine, by):
     assert few.forward_runs < many.forward_runs
 
 
+@pytest.mark.slow
 def test_without_jumps_walkers_of_two_wells_do_not_agree(monkeypatch):
     """R-hat compares walkers that started in different modes, so that it is near 1 only where they were exchanged."""
     problem = two_wells()
