@@ -88,6 +88,7 @@ def hidden(seed):
     return problem
 
 
+@pytest.mark.slow
 def test_a_well_without_a_member_is_found_where_noise_and_prior_explain_nothing_else(monkeypatch):
     for seed in (0, 4, 8, 15):
         analysis = assimilate(hidden(seed), AssimilationSettings(), seed)
@@ -235,6 +236,7 @@ def test_no_minimum_is_missed_because_a_discrepancy_excuses_whatever_is_missed(t
     assert found.centre[2] < 0.01
 
 
+@pytest.mark.slow
 def test_what_follows_a_search_with_errors_held_goes_on_from_any_state_to_the_same_bits():
     problem, settings = excused(3.0), AssimilationSettings(members=12, refine="none", what_if=False)
     whole, states = interrupted(problem, settings, 4)

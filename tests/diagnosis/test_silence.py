@@ -28,6 +28,7 @@ def test_the_quick_start_is_silent():
     assert assimilate(problem, config.assimilation, config.seed).cautions == ()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "settings", [{}, {"sampling": "random"}, {"linearisation": "transform"}, {"scheme": "es-mda"}], ids=str
 )

@@ -108,6 +108,7 @@ def test_bands_allow_for_changes_that_the_model_does_not_foresee():
     assert found.high == pytest.approx(1 + 0.2 * later, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_nine_in_ten_readings_lie_in_their_bands():
     """40 truths of the prior, with seven readings each: 280, of which 90 % ± 1.8 % are expected."""
     inside = []
