@@ -17,7 +17,7 @@ import hypothesis
 import numpy as np
 import pytest
 from chromium import browser  # noqa: F401  a fixture: one for all, since Playwright runs once in a process
-from parts_by_day import is_of_part
+from parts_by_day import is_of_day
 from threadpoolctl import threadpool_limits
 
 from en4dvar import report
@@ -165,17 +165,17 @@ def _analysis(n_members: int = 24, **changes: Any) -> Analysis:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--part", metavar="K/N", help="one of N parts of the tests, 0 to N - 1; their names decide")
+    parser.addoption("--day", type=int, help="a quarter of the tests, of the long ones a tenth: those of this day")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Keep the part that is asked for; the files of :data:`FIRST`, then those with the most tests."""
-    if (asked := config.getoption("--part")) is not None:
-        part, of = map(int, asked.split("/"))
-        items[:] = [item for item in items if is_of_part(item.nodeid, part, of)]
-    tests = Counter(item.path for item in items)
+    """Keep the tests of the day that is asked for; :data:`FIRST`, files with long tests, then those with the most."""
+    long = {item.nodeid for item in items if item.get_closest_marker("long")}
+    if (day := config.getoption("--day")) is not None:
+        items[:] = [item for item in items if is_of_day(item.nodeid, day, 10 if item.nodeid in long else 4)]
+    tests, begun_first = Counter(item.path for item in items), {item.path for item in items if item.nodeid in long}
     ranks = {path: FIRST.index(path.stem) if path.stem in FIRST else len(FIRST) for path in tests}
-    items.sort(key=lambda item: (ranks[item.path], -tests[item.path]))
+    items.sort(key=lambda item: (ranks[item.path], item.path not in begun_first, -tests[item.path]))
 
 
 def pytest_collection_finish() -> None:

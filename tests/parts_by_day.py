@@ -1,8 +1,8 @@
-"""Which part of the slow or long tests a test is of: ``.ci/run`` runs another part each day."""
+"""Which of the slow tests ``.ci/run`` runs on a day: every one in four days, and every long one in ten."""
 
 import hashlib
 
 
-def is_of_part(name: str, part: int, of: int) -> bool:
-    """Whether a test is of the part 0 to ``of`` - 1, on every machine and whatever else is collected."""
-    return int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big") % of == part
+def is_of_day(name: str, day: int, of: int) -> bool:
+    """Whether a test is of the part ``day % of`` of so many, on every machine and whatever else is collected."""
+    return int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big") % of == day % of
