@@ -20,7 +20,7 @@ from en4dvar.inputs.square import read_covariance
 from en4dvar.inputs.steps import step_doubts
 from en4dvar.inputs.window import select
 from en4dvar.model.state import Array
-from en4dvar.plumbing.caution import Caution
+from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.errors import DataError, retold
 from en4dvar.plumbing.files import readable
 from en4dvar.plumbing.units import convert
@@ -95,11 +95,19 @@ def read_one(plan: SeriesPlan, file: DataFile, fewest: int) -> Series:
 
 
 def _doubts(data: Data, read: Readings) -> tuple[Caution, ...]:
-    """Warnings about implausible times of a series, where the file states them."""
-    column, times = data.columns.time, np.unique(read.times)
+    """Readings that were left out, and warnings about implausible times of a series, where the file states them."""
+    column, times, left_out = data.columns.time, np.unique(read.times), tuple[Caution, ...]()
+    if read.left_out:
+        count = f"{len(read.left_out)} of {len(read.times) + len(read.left_out)}"
+        words = f"readings left out, for they are far from what their neighbours say: {count}"
+        if isinstance(column, Column):
+            listed = convert(np.array(read.left_out[:6]), column.target, column.unit)
+            more = " …" if len(read.left_out) > 6 else ""
+            words += f", at {', '.join(f'{time:.6g}' for time in listed)}{more} {column.unit}"
+        left_out = (caution("down-weighted", words),)
     if not isinstance(column, Column) or len(times) < 3:
-        return ()
-    return step_doubts(times, column.target, column.unit, read.scalars, column.rate)
+        return left_out
+    return left_out + step_doubts(times, column.target, column.unit, read.scalars, column.rate)
 
 
 def _errors(data: Data) -> dict[str, Column]:

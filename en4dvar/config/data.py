@@ -1,7 +1,7 @@
 """The ``data:`` section: which files, how they are read, which observations are used, and how well they are known."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -14,7 +14,7 @@ from en4dvar.config.places import PLACES, Placing
 from en4dvar.config.schema import Name, Section
 from en4dvar.config.validate import Faults
 from en4dvar.config.weights import WEIGHTS, Weighing
-from en4dvar.inputs.asked import Disorder, Format, Layout, Repeated
+from en4dvar.inputs.asked import Disorder, Format, Layout, Outliers, Repeated
 from en4dvar.inputs.text_table import Decimal
 from en4dvar.inputs.window import Instant, parse_instant
 from en4dvar.model.forward import field_of
@@ -95,6 +95,8 @@ class Data(Section):
     """What to do with rows whose times do not increase: refuse the file, or sort them."""
     repeated: Repeated = "refuse"
     """What to do with several readings of one time, without ``places``: refuse the file, or average them."""
+    outliers: Outliers = "keep"
+    """Readings far from what three neighbours to each side say (8 standard deviations): keep, or leave out."""
     since: Annotated[Instant, Made(_instant)] = Field("start", validate_default=True)
     """First reading that is looked at, as if the file began with it: an instant as in ``window``, such as ``trough 1``,
     seen in the whole file."""
@@ -117,12 +119,13 @@ class Data(Section):
     @property
     def layout(self) -> Layout:
         """How the files are laid out."""
-        return Layout(self.format, self.decimal, self.by, self.sheet, self.unsorted, self.repeated, self.since)
+        return Layout(**{part.name: getattr(self, part.name) for part in fields(Layout)})
 
     @classmethod
     def rules(cls, keys: Mapping[str, Any], context: Context, faults: Faults) -> None:
-        if keys.get("repeated") == "average" and "places" in keys:
-            faults.add(("repeated",), "not together with places, of which each has a reading of its own", at_key=True)
+        for key, word in (("repeated", "average"), ("outliers", "leave out")):
+            if keys.get(key) == word and "places" in keys:
+                faults.add((key,), "not together with places, of which each has a reading of its own", at_key=True)
         block = field_of(context.units, context.observed) if context.observed else None
         if block is not None and block.size > 1 and "places" not in keys:
             faults.add(("places",), f"required: {block.name!r} is a field of {block.size} values; say which were read")

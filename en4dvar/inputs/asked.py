@@ -11,6 +11,7 @@ from en4dvar.inputs.window import BY_NAME, Instant
 Format = Literal["csv", "mat", "xlsx"]
 Disorder = Literal["refuse", "sort"]
 Repeated = Literal["refuse", "average"]
+Outliers = Literal["keep", "leave out"]
 _TEXT: Mapping[str, Format] = {".csv": "csv", ".txt": "csv", ".dat": "csv", ".tsv": "csv"}
 SUFFIXES: Mapping[str, Format] = {**_TEXT, ".mat": "mat", ".xlsx": "xlsx", ".xlsm": "xlsx"}
 
@@ -69,7 +70,8 @@ class Matrix:
 class Layout:
     """How a file is laid out: its ``format`` (by default that of the suffix), the ``decimal`` sign of its text, the
     column that says ``by`` which data set a row belongs to, the ``sheet`` of a workbook with or without a range; what
-    is done with times that do not increase; from which instant on it is read."""
+    is done with times that do not increase and with readings that their neighbours refute; from which instant on it
+    is read."""
 
     format: Format | None = None
     decimal: Decimal = "."
@@ -77,6 +79,7 @@ class Layout:
     sheet: str = ""
     unsorted: Disorder = "refuse"
     repeated: Repeated = "refuse"
+    outliers: Outliers = "keep"
     since: Instant = BY_NAME["start"]
 
 

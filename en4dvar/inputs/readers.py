@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from en4dvar.inputs.asked import ANY, Column, Layout, TimeStep
+from en4dvar.inputs.outliers import outlying, scatter_of
 from en4dvar.inputs.parts import columns_of
 from en4dvar.inputs.window import index_of
 from en4dvar.model.state import Array
@@ -25,7 +26,8 @@ from en4dvar.plumbing.units import convert
 class Readings:
     """One observable in time, in the model's units, times increasing; ``scalars`` as the file has them.
 
-    ``errors`` are the columns that were asked for besides, by name, one number a reading.
+    ``errors`` are the columns that were asked for besides, by name, one number a reading; ``left_out`` the times of
+    readings that their neighbours refute.
     """
 
     times: Array
@@ -33,6 +35,7 @@ class Readings:
     source: str
     scalars: Mapping[str, float] = field(default_factory=dict)
     errors: Mapping[str, Array] = field(default_factory=dict)
+    left_out: tuple[float, ...] = ()
 
 
 def read_series(
@@ -88,14 +91,27 @@ def read_series(
             sums = np.sqrt(np.bincount(which, own**2)) if c.kind == "std" else np.bincount(which, own)
             stated[c.name] = np.asarray(sums / counts)
         times, values = each, np.bincount(which, values) / counts
+    return _rest(Readings(times, values, str(path), scalars, stated), layout, fewest)
+
+
+def _rest(read: Readings, layout: Layout, fewest: int) -> Readings:
+    """Without outliers and what is before an instant, where the layout says so. Raises :class:`DataError`."""
+    if layout.outliers == "leave out":
+        odd = outlying(read.times, read.values, scatter_of(read.times, read.values))
+        read = replace(_kept(read, ~odd), left_out=tuple(read.times[odd]))
     if layout.since != ANY.since:
-        with retold(DataError, DataError, f"{path}: data.since "):
-            since = slice(index_of(times, values, layout.since), None)
-            if len(times[since]) < fewest:
-                raise DataError(f"leaves {len(times[since])} of {len(times)} readings; at least {fewest} are needed")
-        times, values = times[since], values[since]
-        stated = {name: column[since] for name, column in stated.items()}
-    return Readings(times, values, str(path), scalars, stated)
+        with retold(DataError, DataError, f"{read.source}: data.since "):
+            since = slice(index_of(read.times, read.values, layout.since), None)
+            left, count = len(read.times[since]), len(read.times)
+            if left < fewest:
+                raise DataError(f"leaves {left} of {count} readings; at least {fewest} are needed")
+        read = _kept(read, since)
+    return read
+
+
+def _kept(read: Readings, which: slice | npt.NDArray[np.bool_]) -> Readings:
+    errors = {name: column[which] for name, column in read.errors.items()}
+    return replace(read, times=read.times[which], values=read.values[which], errors=errors)
 
 
 def _stds(written: Array, column: Column, kept: npt.NDArray[np.intp], count: int, path: Path) -> Array:

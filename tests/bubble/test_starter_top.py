@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from en4dvar.inputs.outliers import outlying, scatter_of
 from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.settings import BubbleSettings
-from en4dvar_bubble.starter.look import bad, look, noise
+from en4dvar_bubble.starter.look import look
 from en4dvar_bubble.starter.top import Top, top
 
 _PATH = solve_ivp(
@@ -56,17 +57,17 @@ def test_scatter_is_told_whatever_the_bubble_does(per_collapse: float) -> None:
     found = []
     for _ in range(40):
         t, r = history(stream, per_collapse, 0.01, 0.8)
-        found.append(noise(t, r))
+        found.append(scatter_of(t, r))
     assert np.median(found) == pytest.approx(0.01, rel=0.15)
 
 
 def test_a_reading_that_is_none_is_told_and_not_taken_for_the_top() -> None:
     stream = np.random.default_rng(7)
     t, r = history(stream, 30, 0.01, 0.8)
-    assert not bad(t, r, noise(t, r)).any()
+    assert not outlying(t, r, scatter_of(t, r)).any()
     where = int(np.argmin(np.abs(t - 0.35)))
     r[where] += 0.4
-    assert np.flatnonzero(bad(t, r, noise(t, r))).tolist() == [where]
+    assert np.flatnonzero(outlying(t, r, scatter_of(t, r))).tolist() == [where]
     seen = look(t, 1e-4 * r)
     assert seen.bad == (where,)
     assert seen.top.height == pytest.approx(1e-4, rel=0.02)

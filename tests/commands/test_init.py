@@ -129,12 +129,11 @@ def test_a_folder_is_a_campaign_and_its_odd_file_is_named(tmp_path: Path) -> Non
     done = call("init", "--data", folder, *UNITS, "--start", "laser", "--force")
     assert done.exit_code == 0, done.output
     assert "other: fewer than four samples from its maximum, reading 20 of 20" in done.stderr
-    *rows, spike = (folder / "b1.csv").read_text().splitlines()[:-4]  # whose maximum is a bad reading, almost the last
-    after = (folder / "b1.csv").read_text().splitlines()[-4:]
-    (folder / "other.csv").write_text("\n".join([*rows, f"{spike.split(',')[0]},900", *after]))
+    growing = "\n".join(f"{t},{100 - 0.005 * (t - 100) ** 2:.6g}" for t in range(100))  # whose top is its last reading
+    (folder / "other.csv").write_text(f"t_us,R_um\n{growing}\n")
     done = call("init", "--data", folder, *UNITS, "--start", "laser", "--force")
     assert done.exit_code == 0, done.output
-    assert "other.csv: the window asks for minimum 1, but only 0 minima" in done.stderr
+    assert "other.csv: the window data.window holds 1 of 100 usable observations" in done.stderr
     for n in (1, 2):
         (folder / f"b{n}.csv").unlink()
     (folder / "other.csv").write_text("a,b\n1,2\n")

@@ -17,13 +17,14 @@ from en4dvar.assembly.build import build
 from en4dvar.config import load_config, resolve
 from en4dvar.config.document import parse_document, read_document
 from en4dvar.inputs.asked import Column
+from en4dvar.inputs.outliers import scatter_of
 from en4dvar.inputs.readers import read_series
 from en4dvar.plumbing.errors import ConfigError, DataError
 from en4dvar.report.result import load_result
 from en4dvar_bubble.collapse import RAYLEIGH, lobe
 from en4dvar_bubble.laws import REGISTRY
 from en4dvar_bubble.media import known_medium
-from en4dvar_bubble.starter.look import look, noise
+from en4dvar_bubble.starter.look import look
 from en4dvar_bubble.starter.page import Source, yaml_text
 from en4dvar_bubble.starter.proposal import starter
 
@@ -188,11 +189,11 @@ def test_the_noise_is_what_was_added() -> None:
     times = np.linspace(-0.9, 0.9, 25)
     exact = 100e-6 * (1 - times**2) ** 0.4
     stream = np.random.default_rng(0)
-    found = [noise(times, exact + 1e-6 * stream.standard_normal(25)) for _ in range(200)]
+    found = [scatter_of(times, exact + 1e-6 * stream.standard_normal(25)) for _ in range(200)]
     assert np.median(found) == pytest.approx(1e-6, rel=0.05)
     low, high = np.quantile(found, [0.05, 0.95])  # which the prior of sigma spans
     assert 0.5e-6 < low < high < 1.7e-6
-    assert np.isnan(noise(times[::8], exact[::8]))
+    assert np.isnan(scatter_of(times[::8], exact[::8]))
 
 
 def test_what_is_no_bubble_is_told() -> None:
@@ -233,7 +234,8 @@ def test_a_cloud_of_fragments_is_not_predicted(tmp_path: Path, dirt: bool) -> No
     assert call("init", "--data", "b.csv", *UNITS).exit_code == 0
     config = proposed(Path("b.yaml"))
     window = config.document.data["data"]["window"]
-    assert window["to"] == ("76 us" if dirt else "trough 2")
+    assert window["to"] == "trough 2"
+    assert config.document.data["data"].get("outliers") == ("leave out" if dirt else None)
     (problem,) = build(config)
     assert problem.observations.times[-1] == pytest.approx(51e-6, abs=1.1e-6)
     assert problem.observations.continued.times[-1] == pytest.approx(73e-6, abs=2e-6)

@@ -176,3 +176,13 @@ def test_rows_that_say_which_data_set(tmp_path: Path) -> None:
         (tmp_path / "toy.csv").write_text(f"bubble,t_ms,x_um\n{rows}{text}")
         with pytest.raises(DataError, match=message):
             build(load_config(path, {"data.by": by}))
+
+
+def test_outliers_that_were_left_out_are_told(tmp_path):
+    rows = [f"{t},{100 - 0.1 * (t - 15) ** 2 + (9 if t == 8 else 0.1 * (t % 3))}" for t in range(30)]
+    path = write_toy(tmp_path, ("path: toy.csv", "path: toy.csv\n  outliers: leave out"))
+    (tmp_path / "toy.csv").write_text("t_ms,x_um\n" + "\n".join(rows))
+    (problem,) = build(load_config(path))
+    (told,) = problem.observations.doubts
+    assert told.code == "down-weighted"
+    assert told.words.endswith("say: 1 of 30, at 8 ms")

@@ -177,6 +177,7 @@ FAULTS = [
     ("p_std: 0.1}", "p_std: 0.1, discrepancy: estimated}", "series.p.error.discrepancy: a discrepancy is that"),
     ("{column: x, unit: m}", "{column: x, unit: kg}", "data.series.heads.places.unit:"),
     ("      places: {column: x, unit: m}\n", "", "data.series.heads.places: required: 'f' is a field of 5 values"),
+    ("      places:", "      outliers: leave out\n      places:", "series.heads.outliers: not together with places"),
     ("{column: x, unit: m}", "{columm: x}", "data.series.heads.places: write an index, a coordinate"),
     ("{column: x, unit: m}", "7", "7 is not the index of a component of the field; they go from 0 to 4"),
     ("{column: x, unit: m}", "[0, 1]", "2 places for 4 observations"),

@@ -20,6 +20,7 @@ data:
   path: toy.csv
   unsorted: sort
   repeated: average
+  outliers: leave out
   columns:
     time: {name: t_us, unit: us, rate: 2 MHz}
     position: {name: R_um, unit: um}

@@ -45,6 +45,22 @@ def test_csv_dialects(tmp_path: Path, text: str) -> None:
     assert series.values.tolist() == [1e-6, 2e-6, 3e-6]
 
 
+def test_outliers_are_left_out_with_what_stands_beside_them(tmp_path: Path) -> None:
+    t = np.arange(40.0)
+    R = 100 - 0.05 * (t - 18) ** 2 + 0.3 * np.random.default_rng(2).standard_normal(40)
+    R[[9, 27]] += [12, -9]
+    rows = np.column_stack([t, R, 0.1 + 0.01 * t])
+    (tmp_path / "a.csv").write_text("t,R,s\n" + "".join(f"{a:g},{b:.6g},{c:g}\n" for a, b, c in rows), encoding="utf-8")
+    std = Column("s", "um", "m")
+    whole, read = (
+        read_series(tmp_path / "a.csv", TIME, RADIUS, Layout(outliers=what), [std]) for what in ("keep", "leave out")
+    )
+    assert (len(whole.times), whole.left_out) == (40, ())
+    assert read.left_out == pytest.approx([9e-6, 27e-6])
+    np.testing.assert_allclose(read.times, 1e-6 * np.delete(t, [9, 27]))
+    np.testing.assert_allclose(read.errors["s"], 1e-6 * np.delete(rows[:, 2], [9, 27]))
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

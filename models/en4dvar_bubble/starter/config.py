@@ -98,6 +98,8 @@ def propose_config(
         medium,
         grouped(files, data, groups, layout),
     )
+    if proposal.outliers:
+        source = replace(source, layout=replace(layout, outliers="leave out"))
     proposal = _with_rest(proposal, readings, source.radius[1])
     if errors:
         common = max(series.scalars.get(TRACKED_COMMON, 0.0) for series in readings.values())

@@ -1,20 +1,15 @@
 """What a radius history shows by itself: maximum, collapse, start, noise, radius at rest.
 
-A window of seven neighbouring readings away from a collapse is a polynomial of degree four and errors: the sum of
-squares about it, two degrees of freedom, is χ²_2 times the variance of an error. The median over all windows tells that
-variance whatever a few of them hold: a bad reading, a gap, a rebound that is short.
-
 The collapse beside Rayleigh's: :mod:`en4dvar_bubble.collapse`.
 """
 
-import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
+from en4dvar.inputs.outliers import outlying, scatter_of
 from en4dvar.inputs.window import minima
 from en4dvar.model.state import Array
 from en4dvar_bubble.collapse import Lobe, lobe
@@ -30,17 +25,13 @@ GAS = 0.6  # of R_max: a bubble at rest is smaller
 ACOUSTIC_BEGINS = 0.1  # of R_max: one that begins below has grown from a nucleus
 EMERGES = 0.5  # of R_max: a nucleus that grows is seen before it is as large
 CREEPS = 1.5  # collapse times after the maximum: a history that goes on for longer without a rebound is damped
-WINDOW, DEGREE = 7, 4
-STEEP = 0.5  # of the largest reading of a window: one that holds less is on its way into a collapse
-MEDIAN_OF_CHI2 = 2 * math.log(2)  # of χ²_2
-BAD = 8.0  # standard deviations from what its neighbours say
 
 
 @dataclass(frozen=True)
 class Look:
     """What one history shows; SI.
 
-    ``noise`` is the std of the readings' scatter (:mod:`en4dvar_bubble.starter.look`), NaN with too few of them;
+    ``noise`` is the std of the readings' scatter (:mod:`en4dvar.inputs.outliers`), NaN with too few of them;
     ``bad`` are the readings that are none of the bubble, ``top`` is where and how high its maximum was.
     ``rebound`` is the second maximum over the first, NaN where none is seen; ``rest`` the median of the last quarter
     of a history that rebounds and comes to rest, NaN else; ``drift`` says in words what it does instead of resting, "".
@@ -75,8 +66,8 @@ def look(times: Array, radius: Array, start: Start | None = None) -> Look:
     ------
     DataError: no maximum with a descent after it.
     """
-    scatter = noise(times, radius)
-    odd = bad(times, radius, scatter)
+    scatter = scatter_of(times, radius)
+    odd = outlying(times, radius, scatter)
     times, radius = times[~odd], radius[~odd]
     peak = lobe(times, radius)
     highest = top(times, radius, scatter if np.isfinite(scatter) else UNKNOWN * float(radius.max()))
@@ -175,55 +166,3 @@ def typical(values: Sequence[float]) -> float:
     """Median of the finite values; NaN where there is none."""
     finite = [v for v in values if np.isfinite(v)]
     return float(np.median(finite)) if finite else float("nan")
-
-
-def noise(times: Array, radius: Array) -> float:
-    """Standard deviation of the errors of readings ``radius`` (K,) at ``times`` (K,); NaN without a window.
-
-    It is not less than what the readings are rounded to.
-    """
-    squares = [float(np.sum((r - _fitted(t, r, t, DEGREE)) ** 2)) for t, r in _windows(times, radius)]
-    if not squares:
-        return math.nan
-    return max(math.sqrt(float(np.median(squares)) / MEDIAN_OF_CHI2), rounding(radius))
-
-
-def rounding(radius: Array) -> float:
-    """Standard deviation of what readings lose by the smallest difference that there is between two of them."""
-    steps = np.diff(np.unique(radius))
-    usual = steps[steps > 1e-9 * radius.max()]
-    return float(usual.min()) / math.sqrt(12) if len(usual) else 0.0
-
-
-def bad(times: Array, radius: Array, scatter: float) -> npt.NDArray[np.bool_]:
-    """Which readings (K,) are no readings of the bubble: far from what three neighbours to either side say."""
-    bad = np.zeros(len(radius), dtype=bool)
-    for i in range(3, len(radius) - 3):
-        near = np.r_[i - 3 : i, i + 1 : i + 4]
-        t, r = times[near], radius[near]
-        if r.min() < STEEP * r.max() or radius[i] < 0.2 * r.min():
-            continue
-        expected, spread = _expected(t, r, times[i])
-        rough = float(np.sqrt(np.mean((r - _fitted(t, r, t, 2)) ** 2) * 2))  # of 6 readings and 3 coefficients
-        bad[i] = abs(radius[i] - expected) > BAD * spread * max(scatter, rough)
-    return bad
-
-
-def _expected(t: Array, r: Array, at: float) -> tuple[float, float]:
-    """What a parabola through readings says of another instant, and its std with that of a reading, in errors."""
-    scale = np.ptp(t)
-    X = np.vander((t - at) / scale, 3)
-    inverse = np.linalg.pinv(X)
-    return float(inverse[2] @ r), math.sqrt(1 + float(inverse[2] @ inverse[2]))
-
-
-def _windows(times: Array, radius: Array) -> Iterator[tuple[Array, Array]]:
-    for i in range(len(radius) - WINDOW + 1):
-        r, t = radius[i : i + WINDOW], times[i : i + WINDOW]
-        if r.min() > STEEP * r.max() and np.diff(t).max() < 2.5 * np.diff(t).min():
-            yield t, r
-
-
-def _fitted(t: Array, r: Array, at: Array, degree: int) -> Array:
-    z = 2 * (t - t.mean()) / np.ptp(t)
-    return np.asarray(np.polyval(np.polyfit(z, r, degree), 2 * (at - t.mean()) / np.ptp(t)))

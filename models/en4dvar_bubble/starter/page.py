@@ -4,7 +4,7 @@ import json
 import re
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 from en4dvar.inputs.asked import ANY, Layout
 from en4dvar_bubble.starter.proposal import Entry, Proposal
@@ -35,9 +35,7 @@ class Source:
     @property
     def layout_entries(self) -> list[str]:
         """What is said about the layout, line by line."""
-        told = {
-            name: getattr(self.layout, name) for name in ("format", "decimal", "by", "sheet", "unsorted", "repeated")
-        }
+        told = {part.name: getattr(self.layout, part.name) for part in fields(Layout) if part.name != "since"}
         lines = [f"  {name}: {quoted(it)}" for name, it in told.items() if it is not None and it != getattr(ANY, name)]
         since = self.layout.since
         when = {"time": f"{1e6 * since.time:.9g} us", "maximum": "maximum", "top": "top", "end": "end"}

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from en4dvar.inputs.window import Instant, parse_instant, select
+from en4dvar.inputs.window import Instant, select
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.errors import ConfigError, DataError, retold
 from en4dvar.plumbing.units import convert
@@ -74,7 +74,8 @@ class Proposal:
     ``simpler``: keys of the model, and their values, of quicker physics to compare with; empty where there is none.
     ``population``: what varies from bubble to bubble of one gel, line by line; empty where there are too few of them.
     ``longer``: in a gel, and most histories have a third minimum, at which the window may end.
-    ``datasets``: what it was made from; others show no bubble, as ``warnings`` tell.
+    ``datasets``: what it was made from; others show no bubble, as ``warnings`` tell. ``outliers``: among their
+    readings are some that are none of the bubble.
     """
 
     data: tuple[Entry, ...]
@@ -86,6 +87,7 @@ class Proposal:
     population: tuple[str, ...] = ()
     longer: bool = False
     datasets: tuple[str, ...] = ()
+    outliers: bool = False
     assimilation: tuple[Entry, ...] = (
         Entry("members", "48"),
         Entry("draws", "400", "effective ones where the posterior is sampled: its mean is known to 5 % of its std"),
@@ -164,6 +166,7 @@ def propose(
         together,
         chosen == "laser" and not _in_a_liquid(model) and float(np.median([v.n_minima for v in views])) > 2,
         tuple(looks),
+        any(view.bad for view in views),
         (*Proposal.assimilation, *[EACH_ALONE] * bool(together)),
     )
 
@@ -179,7 +182,7 @@ def _bad_words(name: str, view: Look) -> str:
     several = len(view.bad) > 1
     which = ", ".join(str(i + 1) for i in view.bad[:6])
     words = f"readings {which} are no readings" if several else f"reading {which} is no reading"
-    return f"{name}: {words} of the bubble by their neighbours; a robust cost counts them less"
+    return f"{name}: {words} of the bubble by their neighbours, and left out (data.outliers)"
 
 
 def _doubted(looks: Mapping[str, Look], model: BubbleModel) -> list[str]:
@@ -254,7 +257,6 @@ def _typical(views: Sequence[Look]) -> Look:
         n=sum(v.n for v in views),
         times=(min(v.times[0] for v in views), max(v.times[1] for v in views)),
         lobe=Lobe(*(typical([getattr(v.lobe, k) for v in views]) for k in ("R_max", "t_max", "t_c"))),
-        bad=next((v.bad for v in views if v.bad), ()),
         drift=next((v.drift for v in views if v.drift), ""),
         n_minima=min(v.n_minima for v in views),
         prominence=min(v.prominence for v in views),
@@ -281,7 +283,7 @@ def _data(
     """Window, clock and errors."""
     if model.start == "laser":
         lines = [
-            _window(look, histories),
+            _window(look, len(histories) == 1),
             Entry("time_zero", "window", "the model's clock starts at the top, t_s later or earlier"),
         ]
     else:
@@ -294,35 +296,25 @@ def _data(
         words = "scatter of the readings where R is smooth; sigma below scales it"
     timing = _text(TIMING * look.step, "s", "us")
     key = "  time_std" if model.start == "laser" else "  # time_std"  # a flash is short
-    robust = [Entry("  robust", "huber", "some readings are far from their neighbours and count less")] * bool(look.bad)
     return (
         *lines,
         Entry("error", "", "how well a reading is known"),
         Entry("  radius_std", std, words),
         Entry(key, timing, "5 % of the step between frames: exposure and jitter matter where R is steep"),
-        *robust,
         Entry("  discrepancy", DISCREPANCY, "what the model misses: its size and correlation time are estimated"),
     )
 
 
-def _window(look: Look, histories: Mapping[str, tuple[Array, Array]]) -> Entry:
-    """From the top to the second minimum; by times where a reading that is none would be taken for one of them."""
+def _window(look: Look, single: bool) -> Entry:
+    """From the top to the second minimum."""
     end = f"trough {min(look.n_minima, 2)}" if look.n_minima else "end"
     low = f", prominence: {100 * look.prominence:g} %" if look.prominence < 0.1 else ""
     words = "what happens before the top is not modelled"
-    ends = bool(look.drift and look.n_minima and len(histories) == 1)  # with its last minimum
+    ends = bool(look.drift and look.n_minima and single)  # with its last minimum
     if ends or (look.drift and not look.n_minima):
         words += f"; {look.drift}: " + ("no bubble after its last minimum" if ends else "end it before that")
-    limits = ["top", end, *[f"trough {look.n_minima}"] * ends]
-    if len(histories) == 1 and look.bad:
-        ((times, radius),) = histories.values()
-        times, radius = np.delete(times, look.bad), np.delete(radius, look.bad)
-        first, *last = (parse_instant(limit, "us") for limit in limits)
-        within = [times[select(times, radius, first, instant, look.prominence)] for instant in last]
-        limits = [_text(t, "s", "us", 8) for t in (within[0][0], *(part[-1] for part in within))]
-        low, words = "", f"the top to {end}; {words}"
-    until = f", until: {limits[2]}" if len(limits) > 2 else ""
-    return Entry("window", f"{{from: {limits[0]}, to: {limits[1]}{until}{low}}}", words)
+    until = f", until: trough {look.n_minima}" if ends else ""
+    return Entry("window", f"{{from: top, to: {end}{until}{low}}}", words)
 
 
 @dataclass(frozen=True)
