@@ -78,7 +78,7 @@ def _warn(preview: Preview) -> None:
         echo(f"warning: {name}: {lost}, e.g.: {reasons[0]}", err=True)
     of_model = doubts(preview.problem, preview.members, preview.run.predictions)
     for doubt in (*preview.problem.observations.doubts, *of_model):
-        echo(f"warning: {name}: {doubt.words}", err=True)
+        echo(f"{doubt.kind}: {name}: {doubt.words}", err=True)
     if preview.outside > 0.1:
         share = f"{100 * preview.outside:.0f} % of the observations lie outside everything the prior expects"
         echo(f"warning: {name}: {share}; check units, clock and window (--plot shows them)", err=True)

@@ -4,10 +4,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from scipy.io import savemat
 from toy_config import csv_text, write_toy
 
 from en4dvar.assembly.build import build, data_files, inverse_plan
+from en4dvar.cli import main
 from en4dvar.config import load_config
 from en4dvar.plumbing.errors import ConfigError, DataError
 
@@ -186,3 +188,4 @@ def test_outliers_that_were_left_out_are_told(tmp_path):
     (told,) = problem.observations.doubts
     assert told.code == "down-weighted"
     assert told.words.endswith("say: 1 of 30, at 8 ms")
+    assert "note: toy: readings left out" in CliRunner().invoke(main, ["validate", str(path)]).output
