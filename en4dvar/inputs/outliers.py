@@ -17,6 +17,7 @@ WINDOW, DEGREE = 7, 4
 STEEP = 0.5  # of the largest reading of a window: one that holds less, or crosses zero, falls too fast for a polynomial
 MEDIAN_OF_CHI2 = 2 * math.log(2)  # of χ²_2
 OUTLYING = 8.0  # standard deviations from what its neighbours say
+FALLS = 3.0  # standard deviations by which the nearest neighbours lie below the farthest at the bottom of a collapse
 
 
 def scatter_of(times: Array, values: Array) -> float:
@@ -38,7 +39,10 @@ def _rounding(values: Array) -> float:
 
 
 def outlying(times: Array, values: Array, scatter: float) -> npt.NDArray[np.bool_]:
-    """Which readings (K,) are far from what three neighbours to either side say, with ``scatter`` as errors have."""
+    """Which readings (K,) are far from what three neighbours to either side say, with ``scatter`` as errors have.
+
+    A reading below neighbours that fall towards it from both sides is the bottom of a collapse.
+    """
     odd = np.zeros(len(values), dtype=bool)
     for i in range(3, len(values) - 3):
         near = np.r_[i - 3 : i, i + 1 : i + 4]
@@ -46,6 +50,8 @@ def outlying(times: Array, values: Array, scatter: float) -> npt.NDArray[np.bool
         if r.min() < STEEP * r.max() or values[i] < 0.2 * r.min():
             continue
         expected, spread = _expected(t, r, times[i])
+        if values[i] < expected and (r[0] + r[5] - r[2] - r[3]) / 2 > FALLS * scatter:
+            continue
         rough = float(np.sqrt(np.mean((r - _fitted(t, r, t, 2)) ** 2) * 2))  # of 6 readings and 3 coefficients
         odd[i] = abs(values[i] - expected) > OUTLYING * spread * max(scatter, rough)
     return odd

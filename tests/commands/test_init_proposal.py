@@ -241,6 +241,27 @@ def test_a_cloud_of_fragments_is_not_predicted(tmp_path: Path, dirt: bool) -> No
     assert problem.observations.continued.times[-1] == pytest.approx(73e-6, abs=2e-6)
 
 
+def test_a_misread_frame_is_no_trough_and_no_top(tmp_path: Path) -> None:
+    """Collapses at 20 and 44 µs, a frame misread at 9 µs: behind the first trough the bubble is seen from 20 µs on."""
+    stream, times = np.random.default_rng(11), np.arange(4, 80, 0.5)
+    lobes = [np.maximum(1 - ((times - at) / half) ** 2, 0) ** 0.4 for at, half in ((0, 20), (32, 12), (52, 8), (66, 6))]
+    radius = np.sum(np.array([200, 110, 80, 70])[:, None] * lobes, axis=0) + 15
+    radius += 0.5 * stream.standard_normal(len(times))
+    spoilt = np.where(times == 9, 0.6 * radius, np.where(times == 32.0, 1.9 * radius, radius))
+    texts = []
+    for values in (radius, spoilt):
+        (tmp_path / "b.csv").write_text("t,R\n" + "".join(map("{:g},{:.3f}\n".format, times, values)))
+        assert call("init", "--data", "b.csv", *UNITS, "--since", "trough 1", "--force").exit_code == 0
+        texts.append(Path("b.yaml").read_text(encoding="utf-8"))
+    clean, of_spoilt = (resolve(parse_document(text), tmp_path).document.data for text in texts)
+    assert "outliers" not in clean["data"]  # the readings at 44 and 60 µs are collapses, not slips
+    assert of_spoilt["data"].pop("outliers") == "leave out"
+    assert "# MIND: b: the readings at 9, 32 us are none of the bubble by the neighbours" in texts[1]
+    tops = [float(it["parameters"]["R_max"]["mean"].split()[0]) for it in (clean, of_spoilt)]
+    assert tops[1] == pytest.approx(tops[0], rel=0.02)
+    assert [it["data"]["window"] for it in (clean, of_spoilt)] == [clean["data"]["window"]] * 2
+
+
 @pytest.mark.parametrize("start", ["acoustic", "laser"])
 @pytest.mark.parametrize("law", sorted(REGISTRY))
 def test_every_law_has_a_starter_that_validates(tmp_path: Path, start: str, law: str) -> None:

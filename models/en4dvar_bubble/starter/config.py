@@ -90,7 +90,7 @@ def propose_config(
     files = with_parts(
         find_files(Path.cwd(), [str(data)]), Column(*source.radius, "m"), layout, time[0] if time else None
     )
-    readings, unusable = histories(files, source)
+    readings, unusable = histories(files, replace(source, layout=replace(layout, outliers="leave out")))
     proposal = propose(
         {name: (series.times, series.values) for name, series in readings.items()},
         start,
@@ -98,13 +98,15 @@ def propose_config(
         medium,
         grouped(files, data, groups, layout),
     )
-    if proposal.outliers:
+    odd = [_outliers(name, series) for name, series in readings.items() if series.left_out]
+    if odd:
         source = replace(source, layout=replace(layout, outliers="leave out"))
     proposal = _with_rest(proposal, readings, source.radius[1])
     if errors:
         common = max(series.scalars.get(TRACKED_COMMON, 0.0) for series in readings.values())
         proposal = with_columns(proposal, errors, f"{common:g} {source.radius[1]}" if common > 0 else "")
-    proposal = replace(proposal, warnings=(*proposal.warnings, *doubts(source), *_steps(readings, source), *unusable))
+    told = (*proposal.warnings, *odd, *doubts(source), *_steps(readings, source), *unusable)
+    proposal = replace(proposal, warnings=told)
     name = name or run_name(str(data))
     config = resolve(parse_document(yaml_text(name, source, proposal, command)), Path(folder).absolute())
     proposal = replace(proposal, warnings=(*proposal.warnings, *_unbuilt(config, proposal.datasets, files)))
@@ -151,6 +153,17 @@ def _times(source: Source) -> Column | TimeStep:
         return TimeStep(value=parse_quantity(source.time_step, "s"))
     rate = None if source.rate is None else parse_quantity(source.rate, "1/s")
     return Column(*(source.time or ("", "s")), "s", rate=rate)
+
+
+def _outliers(name: str, series: Readings) -> str:
+    """That readings of a data set were left out, and when they are of."""
+    times = [f"{1e6 * time:.6g}" for time in series.left_out[:6]]
+    which = (
+        f"the reading at {times[0]} us is"
+        if len(series.left_out) == 1
+        else f"the readings at {', '.join(times)} us are"
+    )
+    return f"{name}: {which} none of the bubble by the neighbours, and left out (data.outliers)"
 
 
 def _steps(readings: Mapping[str, Readings], source: Source) -> list[str]:

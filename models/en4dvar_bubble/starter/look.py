@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from en4dvar.inputs.outliers import outlying, scatter_of
+from en4dvar.inputs.outliers import scatter_of
 from en4dvar.inputs.window import minima
 from en4dvar.model.state import Array
 from en4dvar_bubble.collapse import Lobe, lobe
@@ -32,7 +32,7 @@ class Look:
     """What one history shows; SI.
 
     ``noise`` is the std of the readings' scatter (:mod:`en4dvar.inputs.outliers`), NaN with too few of them;
-    ``bad`` are the readings that are none of the bubble, ``top`` is where and how high its maximum was.
+    ``top`` is where and how high the maximum was.
     ``rebound`` is the second maximum over the first, NaN where none is seen; ``rest`` the median of the last quarter
     of a history that rebounds and comes to rest, NaN else; ``drift`` says in words what it does instead of resting, "".
     ``step`` is the median time between samples; ``descent``
@@ -45,7 +45,6 @@ class Look:
     times: tuple[float, float]
     lobe: Lobe
     top: Top
-    bad: tuple[int, ...]
     step: float
     noise: float
     rebound: float
@@ -67,8 +66,6 @@ def look(times: Array, radius: Array, start: Start | None = None) -> Look:
     DataError: no maximum with a descent after it.
     """
     scatter = scatter_of(times, radius)
-    odd = outlying(times, radius, scatter)
-    times, radius = times[~odd], radius[~odd]
     peak = lobe(times, radius)
     highest = top(times, radius, scatter if np.isfinite(scatter) else UNKNOWN * float(radius.max()))
     largest = highest.reading
@@ -84,7 +81,6 @@ def look(times: Array, radius: Array, start: Start | None = None) -> Look:
         times=(float(times[0]), float(times[-1])),
         lobe=peak,
         top=highest,
-        bad=tuple(np.flatnonzero(odd).tolist()),
         step=float(np.median(np.diff(times))),
         noise=scatter,
         rebound=rebound,

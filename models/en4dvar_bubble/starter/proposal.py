@@ -74,8 +74,7 @@ class Proposal:
     ``simpler``: keys of the model, and their values, of quicker physics to compare with; empty where there is none.
     ``population``: what varies from bubble to bubble of one gel, line by line; empty where there are too few of them.
     ``longer``: in a gel, and most histories have a third minimum, at which the window may end.
-    ``datasets``: what it was made from; others show no bubble, as ``warnings`` tell. ``outliers``: among their
-    readings are some that are none of the bubble.
+    ``datasets``: what it was made from; others show no bubble, as ``warnings`` tell.
     """
 
     data: tuple[Entry, ...]
@@ -87,7 +86,6 @@ class Proposal:
     population: tuple[str, ...] = ()
     longer: bool = False
     datasets: tuple[str, ...] = ()
-    outliers: bool = False
     assimilation: tuple[Entry, ...] = (
         Entry("members", "48"),
         Entry("draws", "400", "effective ones where the posterior is sampled: its mean is known to 5 % of its std"),
@@ -135,7 +133,6 @@ def propose(
     warnings += [
         f"{name}: {view.drift}; no radius at rest is taken from it" for name, view in looks.items() if view.drift
     ]
-    warnings += [_bad_words(name, view) for name, view in looks.items() if view.bad]
     doubted, believed = _doubted(looks, model), guess
     if doubted:
         warnings += doubted
@@ -166,7 +163,6 @@ def propose(
         together,
         chosen == "laser" and not _in_a_liquid(model) and float(np.median([v.n_minima for v in views])) > 2,
         tuple(looks),
-        any(view.bad for view in views),
         (*Proposal.assimilation, *[EACH_ALONE] * bool(together)),
     )
 
@@ -176,13 +172,6 @@ def _ends_with(groups: Grouped) -> str:
         return "the run ends with what they say of one gel together"
     told = ", ".join(f"{name} ({len(names)})" for name, names in groups.of.items())
     return f"the run ends with the numbers of each {groups.kind}, and compares them: {told}"
-
-
-def _bad_words(name: str, view: Look) -> str:
-    several = len(view.bad) > 1
-    which = ", ".join(str(i + 1) for i in view.bad[:6])
-    words = f"readings {which} are no readings" if several else f"reading {which} is no reading"
-    return f"{name}: {words} of the bubble by their neighbours, and left out (data.outliers)"
 
 
 def _doubted(looks: Mapping[str, Look], model: BubbleModel) -> list[str]:
@@ -332,7 +321,7 @@ def tops(looks: Mapping[str, Look], histories: Mapping[str, tuple[Array, Array]]
     """
     shifts, heights = [], []
     for name, view in looks.items():
-        times, radius = (np.delete(values, view.bad) for values in histories[name])
+        times, radius = histories[name]
         first = select(times, radius, Instant("top"), Instant("end")).start
         shifts.append((times[first] - view.top.time, TOP_WIDTH * view.top.time_std, view.step))
         largest = float(radius[first:].max())
