@@ -96,8 +96,8 @@ class Data(Section):
     repeated: Repeated = "refuse"
     """What to do with several readings of one time, without ``places``: refuse the file, or average them."""
     outliers: Outliers = "keep"
-    """Readings far from what three neighbours to each side say (8 standard deviations): keep, or leave out. The bottom
-    of a collapse is kept."""
+    """Readings far from what three neighbours to each side say (8 standard deviations): keep, or leave out. Up to
+    three in a row are judged together; the bottom of a collapse is kept."""
     since: Annotated[Instant, Made(_instant)] = Field("start", validate_default=True)
     """First reading that is looked at, as if the file began with it: an instant as in ``window``, such as ``trough 1``,
     seen in the whole file."""

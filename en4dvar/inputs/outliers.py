@@ -6,10 +6,10 @@ variance whatever a few of them hold: a bad reading, a gap, a short rebound.
 """
 
 import math
-from collections.abc import Iterator
 
 import numpy as np
 import numpy.typing as npt
+from numpy.lib.stride_tricks import sliding_window_view
 
 from en4dvar.model.state import Array
 
@@ -17,7 +17,9 @@ WINDOW, DEGREE = 7, 4
 STEEP = 0.5  # of the largest reading of a window: one that holds less, or crosses zero, falls too fast for a polynomial
 MEDIAN_OF_CHI2 = 2 * math.log(2)  # of χ²_2
 OUTLYING = 8.0  # standard deviations from what its neighbours say
+IN_A_ROW = 3  # readings that are judged together
 FALLS = 3.0  # standard deviations by which the nearest neighbours lie below the farthest at the bottom of a collapse
+ASIDE = np.array([0, 1, 2, -3, -2, -1])  # the neighbours, of a window
 
 
 def scatter_of(times: Array, values: Array) -> float:
@@ -25,9 +27,15 @@ def scatter_of(times: Array, values: Array) -> float:
 
     It is not less than what the readings are rounded to.
     """
-    squares = [float(np.sum((r - _fitted(t, r, t, DEGREE)) ** 2)) for t, r in _windows(times, values)]
-    if not squares:
+    if len(values) < WINDOW:
         return math.nan
+    t, r = (sliding_window_view(it, WINDOW) for it in (times, values))
+    steps = np.diff(t)
+    smooth = (r.min(axis=1) > STEEP * r.max(axis=1)) & (steps.max(axis=1) < 2.5 * steps.min(axis=1))
+    if not smooth.any():
+        return math.nan
+    t, r = t[smooth], r[smooth]
+    squares = np.sum((r - _fitted(t, np.arange(WINDOW), DEGREE, r)[0]) ** 2, axis=1)
     return max(math.sqrt(float(np.median(squares)) / MEDIAN_OF_CHI2), _rounding(values))
 
 
@@ -41,37 +49,32 @@ def _rounding(values: Array) -> float:
 def outlying(times: Array, values: Array, scatter: float) -> npt.NDArray[np.bool_]:
     """Which readings (K,) are far from what three neighbours to either side say, with ``scatter`` as errors have.
 
-    A reading below neighbours that fall towards it from both sides is the bottom of a collapse.
+    Up to three in a row are judged together. Readings below neighbours that fall towards them from both sides are the
+    bottom of a collapse; several that move no farther than their neighbours do are an oscillation.
     """
     odd = np.zeros(len(values), dtype=bool)
-    for i in range(3, len(values) - 3):
-        near = np.r_[i - 3 : i, i + 1 : i + 4]
-        t, r = times[near], values[near]
-        if r.min() < STEEP * r.max() or values[i] < 0.2 * r.min():
-            continue
-        expected, spread = _expected(t, r, times[i])
-        if values[i] < expected and (r[0] + r[5] - r[2] - r[3]) / 2 > FALLS * scatter:
-            continue
-        rough = float(np.sqrt(np.mean((r - _fitted(t, r, t, 2)) ** 2) * 2))  # of 6 readings and 3 coefficients
-        odd[i] = abs(values[i] - expected) > OUTLYING * spread * max(scatter, rough)
+    for count in range(1, min(IN_A_ROW, len(values) - len(ASIDE)) + 1):
+        t, r = (sliding_window_view(it, len(ASIDE) + count) for it in (times, values))
+        near, here = r[:, ASIDE], r[:, 3:-3]
+        expected, spread = _fitted(t, ASIDE, 2, near)
+        rough = np.sqrt(2 * np.mean((near - expected[:, ASIDE]) ** 2, axis=1))  # of 6 readings and 3 coefficients
+        off = here - expected[:, 3:-3]
+        far = np.abs(off) > OUTLYING * spread[:, 3:-3] * np.maximum(scatter, rough)[:, None]
+        if count > 1:
+            far &= (np.abs(off) > np.ptp(near, axis=1)[:, None]) & (np.sign(off) == np.sign(off[:, :1]))
+        steep = (near.min(axis=1) < STEEP * near.max(axis=1)) | (here.min(axis=1) < 0.2 * near.min(axis=1))
+        falls = near[:, [0, 5]].mean(axis=1) - near[:, [2, 3]].mean(axis=1) > FALLS * scatter
+        for first in np.flatnonzero(far.all(axis=1) & ~steep & ~(falls & (off[:, 0] < 0))):
+            odd[first + 3 : first + 3 + count] = True
     return odd
 
 
-def _expected(t: Array, r: Array, at: float) -> tuple[float, float]:
-    """What a parabola through readings says of another instant, and its std with that of a reading, in errors."""
-    scale = np.ptp(t)
-    X = np.vander((t - at) / scale, 3)
-    inverse = np.linalg.pinv(X)
-    return float(inverse[2] @ r), math.sqrt(1 + float(inverse[2] @ inverse[2]))
+def _fitted(t: Array, near: npt.NDArray[np.intp], degree: int, values: Array) -> tuple[Array, Array]:
+    """Polynomials through ``values`` (n, k) at the instants ``near`` (k,) of windows ``t`` (n, m).
 
-
-def _windows(times: Array, values: Array) -> Iterator[tuple[Array, Array]]:
-    for i in range(len(values) - WINDOW + 1):
-        r, t = values[i : i + WINDOW], times[i : i + WINDOW]
-        if r.min() > STEEP * r.max() and np.diff(t).max() < 2.5 * np.diff(t).min():
-            yield t, r
-
-
-def _fitted(t: Array, r: Array, at: Array, degree: int) -> Array:
-    z = 2 * (t - t.mean()) / np.ptp(t)
-    return np.asarray(np.polyval(np.polyfit(z, r, degree), 2 * (at - t.mean()) / np.ptp(t)))
+    At all instants (n, m), and their standard deviations with that of a reading, in errors of one.
+    """
+    z = (t - t.mean(axis=1, keepdims=True)) / np.ptp(t, axis=1)[:, None]
+    powers = z[:, :, None] ** np.arange(degree + 1)
+    weights = powers @ np.linalg.pinv(powers[:, near])
+    return (weights @ values[:, :, None])[:, :, 0], np.sqrt(1 + np.sum(weights**2, axis=2))

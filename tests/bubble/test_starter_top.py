@@ -61,14 +61,15 @@ def test_scatter_is_told_whatever_the_bubble_does(per_collapse: float) -> None:
     assert np.median(found) == pytest.approx(0.01, rel=0.15)
 
 
-def test_a_reading_that_is_none_is_told_and_not_taken_for_the_top() -> None:
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_readings_that_are_none_are_told_and_not_taken_for_the_top(count: int) -> None:
     stream = np.random.default_rng(7)
     t, r = history(stream, 30, 0.01, 0.8)
     assert not outlying(t, r, scatter_of(t, r)).any()
     where = int(np.argmin(np.abs(t - 0.35)))
-    r[where] += 0.4
+    r[where : where + count] += 0.4
     odd = outlying(t, r, scatter_of(t, r))
-    assert np.flatnonzero(odd).tolist() == [where]
+    assert np.flatnonzero(odd).tolist() == list(range(where, where + count))
     assert look(t[~odd], 1e-4 * r[~odd]).top.height == pytest.approx(1e-4, rel=0.02)
 
 
