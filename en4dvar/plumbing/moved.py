@@ -22,7 +22,8 @@ MOVED |= {f"en4dvar.config.{n}": f"en4dvar.assembly.{n}" for n in ("build", "bui
 MOVED |= {f"en4dvar.{old}": f"en4dvar.{new}" for new, several in {
     "config.data": "config.window", "config.error": "config.error_std config.discrepancy",
     "config.sharing": "config.population", "config.models": "config.symbols", "data.noise.make": "data.noise.joint",
-    "descent.step_control": "descent.settling", "executor.chunks": "executor.shared",
+    "descent.step_control": "descent.settling", "executor.base": "executor.chunks executor.shared",
+    "executor.futures": "executor.local", "executor.limits": "executor.blas",
     "model.programs.process": "model.programs.adjusted", "series.moments": "series.outcome",
     "results.store": "results.groups", "results.complete": "results.beside", "report.result": "report.notebook",
     "report.svg": "report.words report.drawing", "runs.finished": "runs.evidence_run", "inputs.readers": "inputs.order",
