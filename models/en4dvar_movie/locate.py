@@ -48,18 +48,12 @@ def _labelled(mask: Array) -> tuple[npt.NDArray[Any], npt.NDArray[np.intp]]:
 
 def rim(inside: npt.NDArray[Any]) -> Array:
     """Outermost points (K, 2), x and y, of each row and column of a patch, without those on the frame's border."""
-    height, width = inside.shape
-    rows = np.flatnonzero(inside.any(axis=1))
-    left, right = inside.argmax(axis=1)[rows], width - 1 - inside[:, ::-1].argmax(axis=1)[rows]
-    columns = np.flatnonzero(inside.any(axis=0))
-    top, bottom = inside.argmax(axis=0)[columns], height - 1 - inside[::-1].argmax(axis=0)[columns]
-    points = [
-        *((x - 0.5, y) for x, y in zip(left, rows, strict=True) if x > 0),
-        *((x + 0.5, y) for x, y in zip(right, rows, strict=True) if x < width - 1),
-        *((x, y - 0.5) for x, y in zip(columns, top, strict=True) if y > 0),
-        *((x, y + 0.5) for x, y in zip(columns, bottom, strict=True) if y < height - 1),
-    ]
-    return np.array(points, dtype=float).reshape(-1, 2)
+    points = []
+    for part in (inside, inside.T):
+        lines, last = np.flatnonzero(part.any(axis=1)), part.shape[1] - 1
+        first, end = part.argmax(axis=1)[lines], last - part[:, ::-1].argmax(axis=1)[lines]
+        points += [np.stack([first - 0.5, lines], axis=1)[first > 0], np.stack([end + 0.5, lines], axis=1)[end < last]]
+    return np.concatenate([*points[:2], *(of_columns[:, ::-1] for of_columns in points[2:])])
 
 
 def circle_through(points: Array) -> Circle | None:

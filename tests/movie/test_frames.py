@@ -8,7 +8,7 @@ import tifffile
 from PIL import Image
 
 from en4dvar.plumbing.errors import DataError
-from en4dvar_movie.corrections import read_corrections
+from en4dvar_movie.choice import read_corrections
 from en4dvar_movie.frames import open_movie, with_scale
 from en4dvar_movie.writing import write_movie
 
