@@ -24,7 +24,9 @@ MOVED |= {f"en4dvar.{old}": f"en4dvar.{new}" for new, several in {
     "config.sharing": "config.population", "config.models": "config.symbols", "data.noise.make": "data.noise.joint",
     "descent.step_control": "descent.settling", "executor.base": "executor.chunks executor.shared",
     "executor.futures": "executor.local", "executor.limits": "executor.blas",
-    "model.programs.process": "model.programs.adjusted", "series.moments": "series.outcome",
+    "model.programs.model": "model.programs.adjusted model.programs.process",
+    "model.programs.pest": "model.programs.errors", "model.programs.control": "model.programs.refused",
+    "model.programs.matrices": "model.programs.spread", "series.moments": "series.outcome",
     "results.store": "results.groups", "results.complete": "results.beside", "report.result": "report.notebook",
     "report.svg": "report.words report.drawing", "runs.finished": "runs.evidence_run", "inputs.readers": "inputs.order",
     "estimation.joint.members": "estimation.joint.challenge", "estimation.stages": "loop_state estimation.loop_state",
@@ -33,6 +35,7 @@ MOVED |= {f"en4dvar.{old}": f"en4dvar.{new}" for new, several in {
 }.items() for old in several.split()}  # fmt: skip
 MOVED |= {"en4dvar.cycling": "en4dvar.series", "en4dvar.storage": "en4dvar.results"}
 MOVED |= {"en4dvar_agarose.summary": "en4dvar_agarose.tables", "en4dvar_agarose.evidence": "en4dvar_agarose.fits"}
+MOVED |= {"en4dvar_movie.corrections": "en4dvar_movie.choice", "en4dvar_movie.outlined": "en4dvar_movie.page"}
 
 # names that moved by themselves, with what they are called today
 NAMES = {

@@ -13,13 +13,15 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 
-from en4dvar.model.programs.errors import ProgramError
-
 _OBSERVATION = re.compile(r"!([^!]+)!|[\[(]([^\])]+)[\])]([1-9]\d*):([1-9]\d*)")
 _ADVANCE = re.compile(r"[lL]([1-9]\d*)")
 _MOVE = re.compile(r"[wW]|[tT][1-9]\d*")
 _NUMBER = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+))(?:[ed]([+-]?\d+))?", re.IGNORECASE)
 _NO_LETTER = re.compile(r"([+-]?(?:\d+\.\d*|\.\d+))([+-]\d{3})")  # Fortran leaves out the E of 1.5E-101
+
+
+class ProgramError(Exception):
+    """A program ended badly, or what it left cannot be read; the words are the reason of a member that failed."""
 
 
 def is_template(text: str) -> bool:
