@@ -58,24 +58,19 @@ def run_chunk(model: ForwardModel, x: Array, times: Array) -> Sequence[Outcome]:
 
     Where batches are timed (see :mod:`en4dvar.executor.limits`) they are run one by one from the start.
     """
-    if has_time_limit() and len(x) > model.batch:
-        return _by_batch(model, x, times)
-    try:
-        with without_warnings():
-            outcomes = within_time_limit(lambda: kept(model.trajectories(x, times)))
-        reason = f"the model returned {len(outcomes)} trajectories for {len(x)} members"
-    except TimeLimitError as error:
-        outcomes, reason = [], describe(error)
-    except BaseException as error:  # a model may fail in any way; the reason is kept
-        outcomes, reason = [], reason_of(error)
-    if len(outcomes) == len(x):
-        return outcomes
-    if len(x) <= model.batch:
-        return [Failure(reason)] * len(x)
-    return _by_batch(model, x, times)
-
-
-def _by_batch(model: ForwardModel, x: Array, times: Array) -> list[Outcome]:
+    if len(x) <= model.batch or not has_time_limit():
+        try:
+            with without_warnings():
+                outcomes = within_time_limit(lambda: kept(model.trajectories(x, times)))
+            reason = f"the model returned {len(outcomes)} trajectories for {len(x)} members"
+        except TimeLimitError as error:
+            outcomes, reason = [], describe(error)
+        except BaseException as error:  # a model may fail in any way; the reason is kept
+            outcomes, reason = [], reason_of(error)
+        if len(outcomes) == len(x):
+            return outcomes
+        if len(x) <= model.batch:
+            return [Failure(reason)] * len(x)
     times = np.broadcast_to(times, (len(x), np.shape(times)[-1]))
     parts = [slice(i, i + model.batch) for i in range(0, len(x), model.batch)]
     return [outcome for part in parts for outcome in run_chunk(model, x[part], times[part])]

@@ -31,11 +31,14 @@ MOVED |= {f"en4dvar.{old}": f"en4dvar.{new}" for new, several in {
     "report.svg": "report.words report.drawing", "runs.finished": "runs.evidence_run", "inputs.readers": "inputs.order",
     "estimation.joint.members": "estimation.joint.challenge", "estimation.stages": "loop_state estimation.loop_state",
     "results.declared": "results.axes", "inputs.parts": "inputs.contents",
+    "inputs.matfile": "inputs.variables", "inputs.asked": "inputs.opened",
     "estimation.population.hierarchy": "estimation.population.effort",
 }.items() for old in several.split()}  # fmt: skip
 MOVED |= {"en4dvar.cycling": "en4dvar.series", "en4dvar.storage": "en4dvar.results"}
 MOVED |= {"en4dvar_agarose.summary": "en4dvar_agarose.tables", "en4dvar_agarose.evidence": "en4dvar_agarose.fits"}
-MOVED |= {"en4dvar_movie.corrections": "en4dvar_movie.choice", "en4dvar_movie.outlined": "en4dvar_movie.page"}
+MOVED |= {f"en4dvar_movie.{old}": f"en4dvar_movie.{new}" for old, new in {
+    "corrections": "choice", "outlined": "page", "writing": "frames",
+}.items()}  # fmt: skip
 
 # names that moved by themselves, with what they are called today
 NAMES = {

@@ -2,7 +2,6 @@
 
 It knows images and circles and nothing of a bubble's dynamics; the renderer takes R(t) as arrays (``en4dvar simulate
 --movie``). From the ground up: ``frames``, ``kernels``, ``outline``, ``fitting``, ``locate``, ``background``,
-``uncertainty``, ``flashes``, ``candidates``, ``following``, ``choice``, ``tracking``, ``table``,
-``page``, ``scene``, ``writing``, ``filming``, ``commands``. Reading and writing movies needs the extra
-``movie``.
+``uncertainty``, ``flashes``, ``candidates``, ``following``, ``choice``, ``tracking``, ``table``, ``page``, ``scene``,
+``filming``, ``commands``. Reading and writing movies needs the extra ``movie``.
 """

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -71,9 +71,8 @@ def look_at(
         if outlines is None or any(_same(outlines[0].circle, c.circle) for c in candidates):
             continue
         fault = next((words for o in outlines if (words := _fault_of(o, optics, background.noise))), "")
-        candidate = Candidate(number, tuple(outlines), fault)
-        doubt = "" if candidate.fault else _doubt(steady, outlines[0], optics, circles)
-        candidates.append(replace(candidate, doubt=doubt))
+        doubt = "" if fault else _doubt(steady, outlines[0], optics, circles)
+        candidates.append(Candidate(number, tuple(outlines), fault, doubt))
     return Look(number, tuple(candidates), "" if candidates else "no circle fits the outline", spot)
 
 

@@ -30,7 +30,7 @@ BUBBLE = (
 # and inside the reader of movies
 MOVIE = (
     "decoders", "frames", "kernels", "outline", "fitting", "locate", "background", "uncertainty",
-    "flashes", "candidates", "following", "choice", "tracking", "table", "page", "scene", "writing",
+    "flashes", "candidates", "following", "choice", "tracking", "table", "page", "scene",
     "filming", "commands", "warm_up",
 )  # fmt: skip
 
