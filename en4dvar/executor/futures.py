@@ -164,18 +164,17 @@ class ThreadsExecutor(PoolExecutor):
         """
         try:
             shared = model.share(x, times)
-            if shared is None:
-                return super().trajectories(model, x, times)
-            helpers = min(self.workers, -(-len(x) // model.batch)) - 1
-            futures = [self._submit(shared.work, (), None) for _ in range(helpers)]
-            shared.work()
-            for future in futures:
-                future.result()
-            results = kept(shared.results())
+            if shared is not None:
+                helpers = min(self.workers, -(-len(x) // model.batch)) - 1
+                futures = [self._submit(shared.work, (), None) for _ in range(helpers)]
+                shared.work()
+                for future in futures:
+                    future.result()
+                if len(results := kept(shared.results())) == len(x):
+                    return results
         except BaseException as error:  # told member by member
             own_fault(error)
-            results = []
-        return results if len(results) == len(x) else super().trajectories(model, x, times)
+        return super().trajectories(model, x, times)
 
 
 def _join(threads: Collection[threading.Thread], seconds: float) -> None:

@@ -67,14 +67,12 @@ class Variables:
 
     def matching(self, pattern: str) -> tuple[str, ...]:
         """The names that a pattern with ``*`` stands for, columns and rows of matrices among them."""
-        return tuple(name for name in self._names() if fnmatch.fnmatchcase(name, pattern))
-
-    def _names(self) -> Iterator[str]:
-        yield from self.vectors
+        names = list(self.vectors)
         for name, matrix in self.matrices.items():
             if max(matrix.shape) <= WIDEST:
-                yield from (f"{name}(:,{k + 1})" for k in range(matrix.shape[1]))
-                yield from (f"{name}({k + 1},:)" for k in range(matrix.shape[0]))
+                names += [f"{name}(:,{k + 1})" for k in range(matrix.shape[1])]
+                names += [f"{name}({k + 1},:)" for k in range(matrix.shape[0])]
+        return tuple(name for name in names if fnmatch.fnmatchcase(name, pattern))
 
     def of(self, part: str) -> "Variables":
         """What is not inside an array, and of arrays the element ``part`` under names without the index."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from en4dvar.model.state import Array
-from en4dvar_movie.background import BRIGHT, CHANGED, LEAST_CONTRAST, Background, share_changed
+from en4dvar_movie.background import BRIGHT, CHANGED, Background, share_changed
 from en4dvar_movie.fitting import fit_outline, two_edges
 from en4dvar_movie.frames import Frame
 from en4dvar_movie.locate import TILE, locate
@@ -61,7 +61,7 @@ def look_at(
     elif share_changed(tiles, background.noise) > CHANGED:
         return Look(number, (), "flash: much of the frame is brighter than the background", spot)
     else:
-        places = [place for place, _ in locate(tiles, background.noise / TILE, LEAST_CONTRAST)]
+        places = [place for place, _ in locate(tiles, background.noise / TILE)]
     if not places:
         return Look(number, (), "no bubble: nothing differs from the background", spot)
     candidates: list[Candidate] = []

@@ -1,4 +1,4 @@
-"""Compiled loops over pixels: the blurred outline, its normal equations, and what each sector of it says.
+"""Compiled loops over pixels: the blurred outline, and its normal equations.
 
 The image near the outline is modelled as
 
@@ -162,19 +162,3 @@ def normal_equations(image, p, modes, ring, cutoff):
         for b in range(a):
             A[b, a] = A[a, b]
     return A, g, total, cost * cutoff * cutoff / 6
-
-
-@kernel
-def normalise(frame, level, gain, step):
-    """(frame − level) gain (H, W), and its means over tiles of ``step`` × ``step`` pixels; where the gain is NaN, NaN
-    and, in the means, zero."""
-    height, width = frame.shape
-    image = np.empty((height, width), dtype=np.float32)
-    tiles = np.zeros((height // step, width // step), dtype=np.float32)
-    for j in range(height):
-        for i in range(width):
-            value = (np.float32(frame[j, i]) - level[j, i]) * gain[j, i]
-            image[j, i] = value
-            if j // step < tiles.shape[0] and i // step < tiles.shape[1] and not math.isnan(value):
-                tiles[j // step, i // step] += value
-    return image, tiles / np.float32(step * step)

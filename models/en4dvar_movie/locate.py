@@ -14,31 +14,34 @@ from en4dvar_movie.outline import Circle
 TILE = 2  # pixels are averaged over tiles of this side
 LEAST = 6  # tiles of a patch
 MOST = 4  # patches of a frame
+LEAST_CONTRAST = 0.08  # of the background's brightness
 
 
-def patches(tiles: Array, noise: float, least_contrast: float) -> list[tuple[Array, float]]:
-    """The largest patches (H, W) of tiles darker than the background and their contrasts, the largest first.
+def locate(tiles: Array, noise: float) -> list[tuple[Circle, float]]:
+    """Circles in pixels near the outlines of what may be bubbles, and the contrast inside; the largest patch first.
 
-    ``tiles`` are zero on the background and negative in a bubble; ``noise`` is the std of a tile.
+    ``tiles`` (h, w) are zero on the background and negative in a bubble; ``noise`` is the std of a tile.
     """
     smooth = ndimage.uniform_filter(tiles, 3, mode="nearest")
-    floor = max(5 * noise / 3, least_contrast)
-    labels, sizes = _labelled(smooth < -floor)
+    labels, sizes = labelled(smooth < -max(5 * noise / 3, LEAST_CONTRAST))
     largest = np.argsort(-sizes, kind="stable")[:MOST]
     boxes = ndimage.find_objects(labels) if sizes[largest[:1]].sum() else []
+    shift = (TILE - 1) / 2
     result = []
     for label in largest[sizes[largest] >= LEAST]:
         box = boxes[label - 1]
         inside = labels[box] == label
         contrast = -float(np.percentile(smooth[box][inside], 10))
-        cores, core_sizes = _labelled(inside & (smooth[box] < -0.5 * contrast))
+        cores, core_sizes = labelled(inside & (smooth[box] < -0.5 * contrast))
         whole = np.zeros(tiles.shape, dtype=bool)
         whole[box] = cores == int(np.argmax(core_sizes))
-        result.append((whole, contrast))
+        circle = circle_through(rim(whole))
+        if circle is not None:
+            result.append((Circle(TILE * circle.x + shift, TILE * circle.y + shift, TILE * circle.R), contrast))
     return result
 
 
-def _labelled(mask: Array) -> tuple[npt.NDArray[Any], npt.NDArray[np.intp]]:
+def labelled(mask: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], npt.NDArray[np.intp]]:
     """The connected patches of a mask, and the size of each by its number; 0 of what belongs to none."""
     labels, _ = ndimage.label(mask)
     sizes = np.bincount(labels.ravel())
@@ -77,14 +80,3 @@ def circle_through(points: Array) -> Circle | None:
         off = np.abs(np.hypot(points[:, 0] - circle.x, points[:, 1] - circle.y) - circle.R)
         kept = points[off <= max(2.5 * float(np.median(off)), 0.75)]
     return circle
-
-
-def locate(tiles: Array, noise: float, least_contrast: float) -> list[tuple[Circle, float]]:
-    """Circles in pixels near the outlines of what may be bubbles, and the contrast inside; the largest patch first."""
-    shift = (TILE - 1) / 2
-    result = []
-    for inside, contrast in patches(tiles, noise, least_contrast):
-        circle = circle_through(rim(inside))
-        if circle is not None:
-            result.append((Circle(TILE * circle.x + shift, TILE * circle.y + shift, TILE * circle.R), contrast))
-    return result

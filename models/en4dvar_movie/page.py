@@ -85,8 +85,8 @@ def _strip(movie: Movie, track: Track) -> list[dict[str, Any]]:
 def _picture(number: int, frame: Frame, readings: list[Reading], full: float) -> dict[str, Any]:
     step = -(-max(frame.shape) // SIDE)
     small = grey(frame[::step, ::step], full)
-    shown = [r for r in readings if r.sighting.outline is not None and (r.used or r.doubt)]
-    outlines = [(r.sighting.outline.points(TURN) / step, r.doubt) for r in shown if r.sighting.outline is not None]
+    shown = [(r.sighting.outline, r.doubt) for r in readings if r.used or r.doubt]
+    outlines = [(outline.points(TURN) / step, doubt) for outline, doubt in shown if outline is not None]
     return {
         "frame": str(number),
         "png": png(small),
