@@ -138,34 +138,29 @@ def variables_of(path: Path) -> Iterator[Variables]:
         raise DataError(f"{path}: not a MATLAB v5 file (no such header); save it in MATLAB with save(..., '-v7')")
     hdf = head.startswith(b"MATLAB 7.3") or head[124:] in (b"\x00\x02IM", b"\x02\x00MI")
     try:
-        variables = gathered((_Hdf() if hdf else _Classic()).variables(path))
+        variables = gathered((_Hdf if hdf else _Classic)(path).variables())
     except (DataError, MemoryError):
         raise
-    except _Refused as error:
-        raise DataError(f"{path}: {error}") from None
     except Exception as error:  # the libraries tell damage by OSError, RuntimeError, KeyError, ValueError, …
         words = " ".join(str(error).split())[:200]
         raise DataError(f"{path}: not a MATLAB {'v7.3' if hdf else 'v5'} file that can be read ({words})") from None
     yield variables
 
 
-class _Refused(Exception):
-    """Why the file is not read."""
-
-
 class _Reader:
-    """How much of a file has been read."""
+    """How much of a file has been read. What takes more raises :class:`DataError`."""
 
-    def __init__(self) -> None:
+    def __init__(self, path: Path):
+        self.path = path
         self.numbers = self.in_matrices = self.objects = 0
 
     def named(self, name: str) -> str:
         """One more variable, field or element."""
         self.objects += 1
         if self.objects > MOST_OBJECTS:
-            raise _Refused(f"more than {MOST_OBJECTS} variables, fields and elements")
+            raise DataError(f"{self.path}: more than {MOST_OBJECTS} variables, fields and elements")
         if not name.isprintable():
-            raise _Refused("the name of a variable is damaged")
+            raise DataError(f"{self.path}: the name of a variable is damaged")
         return name
 
     def left_out(self, shape: tuple[int, ...]) -> str:
@@ -181,18 +176,18 @@ class _Reader:
     def count(self, numbers: int) -> None:
         self.numbers += numbers
         if self.numbers > MOST:
-            raise _Refused(f"more than {MOST} numbers in vectors")
+            raise DataError(f"{self.path}: more than {MOST} numbers in vectors")
 
 
 class _Classic(_Reader):
     """Version 5."""
 
-    def variables(self, path: Path) -> Found:
+    def variables(self) -> Found:
         from scipy.io import loadmat, whosmat
         from scipy.io.matlab import MatlabOpaque, varmats_from_mat
 
-        require_plain(path, LONGEST)
-        with open_plain(path) as file:
+        require_plain(self.path, LONGEST)
+        with open_plain(self.path) as file:
             variables = varmats_from_mat(file)  # each as a file of its own
         for name, alone in variables:
             if not name or name.startswith("__"):
@@ -200,7 +195,7 @@ class _Classic(_Reader):
             if name != "None":  # which scipy calls an object of a newer class, and cannot tell its size
                 ((_, shape, kind),) = whosmat(alone)
                 large = kind not in ("cell", "struct") and math.prod(shape) > MOST_IN_MATRICES
-                words = KINDS.get(kind) or (_Reader().left_out(shape) if large else "")
+                words = KINDS.get(kind) or (_Reader(self.path).left_out(shape) if large else "")
                 if words:
                     yield self.named(name), words
                     continue
@@ -238,15 +233,15 @@ class _Classic(_Reader):
 class _Hdf(_Reader):
     """Version 7.3."""
 
-    def variables(self, path: Path) -> Found:
+    def variables(self) -> Found:
         try:
             import h5py
         except ImportError:
             raise DataError(
-                f"{path}: a MATLAB v7.3 (HDF5) file, which needs: pip install h5py; or save it again in "
+                f"{self.path}: a MATLAB v7.3 (HDF5) file, which needs: pip install h5py; or save it again in "
                 "MATLAB with save(..., '-v7')"
             ) from None
-        with h5py.File(path, "r") as self.file:
+        with h5py.File(self.path, "r") as self.file:
             for name in self.file:
                 if not name.startswith("#"):  # what references point to
                     yield from self._child(self.file, name, name, 0)
@@ -308,14 +303,14 @@ class _Hdf(_Reader):
             yield name, values.ravel() if values.size == max(shape) else values.T
 
     def _check(self, it: Any, name: str) -> None:
-        """Raise :class:`_Refused` where a dataset is too large, or not in this file."""
-        _Reader().count(math.prod(it.chunks or ()))
+        """Raise :class:`DataError` where a dataset is too large, or not in this file."""
+        _Reader(self.path).count(math.prod(it.chunks or ()))
         if it.external is not None or it.is_virtual:
-            raise _Refused(f"the numbers of {name} are in another file, which is not opened")
+            raise DataError(f"{self.path}: the numbers of {name} are in another file, which is not opened")
         properties = it.id.get_create_plist()
         used = {properties.get_filter(k)[0] for k in range(properties.get_nfilters())}
         if not used <= FILTERS:
-            raise _Refused(f"{name} is packed by a filter that MATLAB does not use")
+            raise DataError(f"{self.path}: {name} is packed by a filter that MATLAB does not use")
 
 
 def _class(it: Any) -> str:

@@ -37,7 +37,7 @@ MOVED |= {f"en4dvar.{old}": f"en4dvar.{new}" for new, several in {
 MOVED |= {"en4dvar.cycling": "en4dvar.series", "en4dvar.storage": "en4dvar.results"}
 MOVED |= {"en4dvar_agarose.summary": "en4dvar_agarose.tables", "en4dvar_agarose.evidence": "en4dvar_agarose.fits"}
 MOVED |= {f"en4dvar_movie.{old}": f"en4dvar_movie.{new}" for old, new in {
-    "corrections": "choice", "outlined": "page", "writing": "frames",
+    "corrections": "choice", "locate": "outline", "outlined": "page", "writing": "frames",
 }.items()}  # fmt: skip
 
 # names that moved by themselves, with what they are called today

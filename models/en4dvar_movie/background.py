@@ -16,8 +16,7 @@ from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import DataError
 from en4dvar_movie.fitting import fit_outline
 from en4dvar_movie.frames import Frame, Movie
-from en4dvar_movie.locate import TILE, circle_through, labelled, locate, rim
-from en4dvar_movie.outline import Circle, Optics
+from en4dvar_movie.outline import TILE, Circle, Optics, circle_through, labelled, locate, rim
 
 Image = npt.NDArray[Any]  # brightness (H, W), of any precision
 DEAD = 0.25  # of the brightness about it: where a background shows nothing of a bubble, as writing does

@@ -10,8 +10,7 @@ from en4dvar.model.state import Array
 from en4dvar_movie.background import BRIGHT, CHANGED, Background, share_changed
 from en4dvar_movie.fitting import fit_outline, two_edges
 from en4dvar_movie.frames import Frame
-from en4dvar_movie.locate import TILE, locate
-from en4dvar_movie.outline import Circle, Optics, Outline
+from en4dvar_movie.outline import TILE, Circle, Optics, Outline, locate
 
 LEAST_SEEN = 0.12  # share of the outline inside the frame
 LEAST_RADIUS = 2.5  # pixels

@@ -29,7 +29,7 @@ BUBBLE = (
 
 # and inside the reader of movies
 MOVIE = (
-    "decoders", "frames", "kernels", "outline", "fitting", "locate", "background", "uncertainty",
+    "decoders", "frames", "kernels", "outline", "fitting", "background", "uncertainty",
     "flashes", "candidates", "following", "choice", "tracking", "table", "page", "scene",
     "filming", "commands", "warm_up",
 )  # fmt: skip
