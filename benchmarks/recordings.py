@@ -67,8 +67,8 @@ from en4dvar.report.text import shown
 from en4dvar.report.withheld import withheld_lines
 from en4dvar_bubble.model import BubbleModel
 from en4dvar_movie.filming import Camera, exposures
+from en4dvar_movie.frames import write_movie
 from en4dvar_movie.scene import Scene, render
-from en4dvar_movie.writing import write_movie
 
 LAWS = {"neo-hookean-kelvin-voigt": 0.5, "quadratic-kelvin-voigt": 0.3, "newtonian": 0.2}  # and how often
 FULL = {"gas": "heat", "vapour": "transport", "medium_heat": "conducting"}

@@ -3,31 +3,21 @@
 import os
 from typing import Literal
 
-from en4dvar.executor.base import Executor, ExecutorError, WorkerLostError
-from en4dvar.executor.blas import one_blas_thread
-from en4dvar.executor.chunks import Outcome, cut, run_chunk
-from en4dvar.executor.limits import NO_LIMITS, Limits, TimeLimitError
-from en4dvar.executor.local import SerialExecutor, ThreadsExecutor
+from en4dvar.executor.base import Executor, ExecutorError, Outcome, WorkerLostError, cut, run_chunk
+from en4dvar.executor.futures import SerialExecutor, ThreadsExecutor
+from en4dvar.executor.limits import NO_LIMITS, Limits, TimeLimitError, one_blas_thread
 from en4dvar.executor.processes import ProcessesExecutor
 from en4dvar.model.forward import ForwardModel
 
 __all__ = [
     "Executor", "ExecutorError", "Limits", "Outcome", "ProcessesExecutor", "SerialExecutor", "ThreadsExecutor",
-    "TimeLimitError", "WorkerLostError", "available_cores", "choose_executor", "cut", "make_executor",
-    "one_blas_thread", "run_chunk",
+    "TimeLimitError", "WorkerLostError", "available_cores", "choose_executor", "cut", "one_blas_thread", "run_chunk",
 ]  # fmt: skip
 
 
 def available_cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def make_executor(model: ForwardModel, workers: int = 1) -> Executor:
-    """The executor of this machine that serves ``model`` with ``workers`` workers."""
-    if workers == 1:
-        return SerialExecutor()
-    return ThreadsExecutor(workers) if model.threaded else ProcessesExecutor(workers)
 
 
 def choose_executor(
@@ -48,15 +38,14 @@ def choose_executor(
     """
     if limits and kind is None and address is None:
         kind = "processes"
-    if kind == "serial":
-        return SerialExecutor()
     if workers is None and address is None:
         workers = available_cores() if kind or model.threaded else 1
     if kind == "dask" or address is not None:
         from en4dvar.executor.dask import DaskExecutor
 
         return DaskExecutor(workers, address, limits)
-    workers = workers or 1
     if kind is None:
-        return make_executor(model, workers)
-    return ThreadsExecutor(workers) if kind == "threads" else ProcessesExecutor(workers, limits)
+        kind = "serial" if workers == 1 else "threads" if model.threaded else "processes"
+    if kind == "serial":
+        return SerialExecutor()
+    return ThreadsExecutor(workers or 1) if kind == "threads" else ProcessesExecutor(workers or 1, limits)

@@ -22,7 +22,6 @@ from collections.abc import Callable, Collection, Mapping
 from typing import TYPE_CHECKING, Any
 
 from en4dvar.executor.base import Call, ExecutorError, T, Tell, WorkerLostError
-from en4dvar.executor.blas import one_blas_thread_for_good
 from en4dvar.executor.futures import Events, FuturesExecutor
 from en4dvar.executor.limits import NO_LIMITS, Limits, apply_limits
 from en4dvar.plumbing.user_code import in_worker, own_fault
@@ -197,7 +196,6 @@ def dask_setup(_: Any) -> None:
 
 
 def _on_worker(limits: Limits, function: Callable[..., T], call: Call, listener: str | None) -> T:
-    one_blas_thread_for_good()
     apply_limits(limits)
     tell: list[Tell] = []
     if listener is not None:

@@ -1,21 +1,45 @@
-"""Common parts of executors whose calls run elsewhere and end as futures: in threads, processes, a cluster."""
+"""Executors within this process, and what those share whose calls end as futures: in threads, processes, a cluster."""
 
+import functools
 import itertools
 import queue
 import threading
 import time
 from abc import abstractmethod
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
-from en4dvar.executor.base import Call, Executor, Hear, T, Tell, WorkerLostError
+from en4dvar.executor.base import Call, Executor, Hear, Outcome, T, Tell, WorkerLostError, kept, run_chunk
+from en4dvar.model.forward import ForwardModel
+from en4dvar.model.state import Array
 from en4dvar.plumbing.children import HaltedError, end_those_of, raise_in, starts_again
 from en4dvar.plumbing.user_code import own_fault
 
 MOMENT, PATIENCE = 0.05, 1.0  # s for threads to end by themselves, and once they are told to
 Events = queue.SimpleQueue[Any]  # futures that ended, and (index, message) of what calls tell
+
+
+class SerialExecutor(Executor):
+    """Everything in this process, one call after the other."""
+
+    def map(
+        self, function: Callable[..., T], calls: Iterable[Call], hear: Hear | None = None
+    ) -> Iterator[tuple[int, T | Exception]]:
+        for i, call in enumerate(calls):
+            try:
+                value: T | Exception = function(*call, *([functools.partial(hear, i)] if hear else []))
+            except BaseException as error:
+                value = own_fault(error)
+            yield i, value
+
+    def trajectories(self, model: ForwardModel, x: Array, times: Array) -> Sequence[Outcome]:
+        """The trajectories as they come from the model: nothing is cut, nothing is collected."""
+        return run_chunk(model, x, times)
+
+    def close(self) -> None:
+        """Nothing to release."""
 
 
 class FuturesExecutor(Executor):
@@ -128,6 +152,29 @@ class PoolExecutor(FuturesExecutor):
             raise_in(number, HaltedError)
         _join(threads.values(), PATIENCE)
         starts_again([number for number, thread in threads.items() if not thread.is_alive()])
+
+
+class ThreadsExecutor(PoolExecutor):
+    """Threads of this process, for models whose ``trajectories`` release the interpreter lock (``compiled``)."""
+
+    def trajectories(self, model: ForwardModel, x: Array, times: Array) -> Sequence[Outcome]:
+        """As of any executor; a model that can share a batch among threads is prepared once, in the calling thread.
+
+        A forecast takes 1 ms: threads that contend for the interpreter, and one more to wake, would be a third of it.
+        """
+        try:
+            shared = model.share(x, times)
+            if shared is not None:
+                helpers = min(self.workers, -(-len(x) // model.batch)) - 1
+                futures = [self._submit(shared.work, (), None) for _ in range(helpers)]
+                shared.work()
+                for future in futures:
+                    future.result()
+                if len(results := kept(shared.results())) == len(x):
+                    return results
+        except BaseException as error:  # told member by member
+            own_fault(error)
+        return super().trajectories(model, x, times)
 
 
 def _join(threads: Collection[threading.Thread], seconds: float) -> None:

@@ -6,6 +6,8 @@ suspended the time does not count; after more than twice the limit it may be end
 repeated. Memory is the size of the data segment (Linux) beyond what the process had at its start; an allocation past it
 raises MemoryError, or ends a process whose compiled code does not check. Either way the members have failed, with the
 reason, and the run goes on. Other executors share the process of the run, which cannot be ended: they know no limits.
+
+BLAS uses one thread: sums in one order, whatever the machine, and faster at these sizes.
 """
 
 import faulthandler
@@ -15,7 +17,8 @@ import re
 import signal
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -64,11 +67,45 @@ MOMENT = 0.01  # s
 _limits = NO_LIMITS  # of this process
 _deadlines: dict[int, float] = {}  # thread → when its process is ended, on the monotonic clock
 _arming = threading.Lock()
+_changing = threading.Lock()  # of BLAS
+_held = False  # its limit belongs to the process: while one context holds it, those of any thread have nothing to do
+
+
+@functools.cache
+def _controller() -> Any:
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()  # looks through every loaded library: once is enough
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Context in which BLAS uses one thread.
+
+    Where several threads enter, one context around all of them must stay open.
+    """
+    global _held
+    limit = None
+    with _changing:
+        if not _held:
+            limit = _controller().limit(limits=1, user_api="blas")
+            _held = True
+    try:
+        yield
+    finally:
+        if limit is not None:
+            with _changing:
+                limit.restore_original_limits()
+                _held = False
 
 
 def apply_limits(limits: Limits) -> None:
-    """Make them hold in this process, which is a worker. Once; a repetition changes nothing."""
-    global _limits
+    """Make them hold in this process, which is a worker, with one thread of BLAS; a repetition changes nothing."""
+    global _limits, _held
+    with _changing:
+        if not _held:
+            _controller().limit(limits=1, user_api="blas")
+            _held = True
     if limits == _limits:
         return
     _limits = limits

@@ -20,7 +20,6 @@ from multiprocessing.reduction import ForkingPickler
 from typing import Any
 
 from en4dvar.executor.base import Call, ExecutorError, T, Tell, WorkerLostError
-from en4dvar.executor.blas import one_blas_thread_for_good
 from en4dvar.executor.futures import PoolExecutor
 from en4dvar.executor.limits import NO_LIMITS, Limits, apply_limits
 from en4dvar.plumbing.files import here
@@ -56,7 +55,10 @@ class _Worker:
         Raises :class:`_DeadError`.
         """
         while True:
-            content = memoryview(self.receive())
+            try:
+                content = memoryview(self.pipe.recv_bytes())
+            except (EOFError, OSError):
+                raise _DeadError from None
             try:
                 value = pickle.loads(content[1:])
             except BaseException as error:  # a value that cannot be made again here
@@ -65,13 +67,6 @@ class _Worker:
                 return value
             if tell:
                 tell(value)
-
-    def receive(self) -> bytes:
-        """The next message, whole. Raises :class:`_DeadError`."""
-        try:
-            return self.pipe.recv_bytes()
-        except (EOFError, OSError):
-            raise _DeadError from None
 
     def end(self) -> None:
         self.pipe.close()  # the sign for a worker to end
@@ -250,7 +245,6 @@ def prepare_worker(limits: Limits = NO_LIMITS) -> None:
     """Ctrl-C is the main process's business, BLAS uses one thread, and nobody works for a main process that is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     in_worker()
-    one_blas_thread_for_good()
     apply_limits(limits)
     threading.Thread(target=_end_with_parent, name="en4dvar-parent", daemon=True).start()
 

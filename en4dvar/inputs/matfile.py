@@ -1,4 +1,7 @@
-"""Numbers of MATLAB files, also inside structs and cell arrays, under the names that ``variables`` describes.
+"""Numbers of MATLAB files, also inside structs and cell arrays, under the names MATLAB has for them.
+
+What is in a struct or a cell array is ``film.R``, ``expts(2).R``, ``R{3}``; column and row of a matrix are ``M(:,2)``
+and ``M(2,:)``.
 
 Those of version 5 are read by scipy, those of version 7.3, which are HDF5, by h5py, in a process of their own: either
 library can be taken down by one flipped bit. Sizes are looked at before numbers are read. Of HDF5 nothing outside of
@@ -7,29 +10,119 @@ used but those that HDF5 brings along.
 MathWorks, *MAT-File Format* (R2019b), *MAT-File Versions*; the layout of HDF5 is that of ``save(…, '-v7.3')``.
 """
 
+import fnmatch
 import math
-from collections.abc import Iterator
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
-from en4dvar.inputs.variables import MOST, MOST_IN_MATRICES, Variables, array_words, gathered
+from en4dvar.inputs.text_table import WIDEST
 from en4dvar.model.state import Array
 from en4dvar.plumbing.decoding import Allowed, decoded_whole, require_plain
 from en4dvar.plumbing.errors import DataError
 from en4dvar.plumbing.files import open_plain
 
+T = TypeVar("T")
 MAT = Allowed(seconds=60, memory=8_000_000_000, size=256_000_000_000)
 LONGEST = 4_000_000_000  # bytes of a file of version 5, which is read whole
 HEADER = 128  # bytes
 DEEPEST = 4  # structs inside structs
 MOST_OBJECTS = 100_000
 FILTERS = {1, 2, 3}  # deflate, shuffle, Fletcher's checksum
+MOST = 1 << 25  # numbers in all vectors of a file: 256 MiB, whatever a small compressed file may unpack to
+MOST_IN_MATRICES = 1 << 22  # in all matrices of a file: what is larger is a film, not a table
+SHOWN = 12  # columns of a matrix that are told one by one
+_INDEX = re.compile(r"\((\d+)\)|\{(\d+)\}")
+_OF_MATRIX = re.compile(r"(.+)\((?::,([1-9]\d{0,8})|([1-9]\d{0,8}),:)\)")
 WORDS = {"char": "text", "cell": "a cell array", "function_handle": "a function"}
 KINDS = {"char": "text", "sparse": "a sparse matrix", "function": "a function", "object": "an object"}
 
 Found = Iterator[tuple[str, Array | str]]
+
+
+@dataclass(frozen=True)
+class Variables:
+    """Real ``vectors`` (K,) and ``matrices`` (n, m), finite ``scalars``, and in words what else there is.
+
+    A matrix is among the ``others`` too, and a scalar among the vectors.
+    """
+
+    vectors: Mapping[str, Array]
+    matrices: Mapping[str, Array]
+    scalars: Mapping[str, float]
+    others: Mapping[str, str]
+
+    def vector(self, name: str) -> Array | None:
+        """A vector by its name, also of a matrix; None where there is none."""
+        match = _OF_MATRIX.fullmatch(name)
+        if name in self.vectors or match is None or match[1] not in self.matrices:
+            return self.vectors.get(name)
+        matrix, index = self.matrices[match[1]], int(match[2] or match[3]) - 1
+        of = matrix.T if match[2] else matrix
+        return of[index] if index < len(of) else None
+
+    def matching(self, pattern: str) -> tuple[str, ...]:
+        """The names that a pattern with ``*`` stands for, columns and rows of matrices among them."""
+        names = list(self.vectors)
+        for name, matrix in self.matrices.items():
+            if max(matrix.shape) <= WIDEST:
+                names += [f"{name}(:,{k + 1})" for k in range(matrix.shape[1])]
+                names += [f"{name}({k + 1},:)" for k in range(matrix.shape[0])]
+        return tuple(name for name in names if fnmatch.fnmatchcase(name, pattern))
+
+    def of(self, part: str) -> "Variables":
+        """What is not inside an array, and of arrays the element ``part`` under names without the index."""
+        return Variables(*(_element(getattr(self, kind.name), part) for kind in fields(self)))
+
+    def of_first(self) -> "Variables":
+        """Each array by its first element, under names without the index."""
+        return Variables(*(_first(getattr(self, kind.name)) for kind in fields(self)))
+
+    def columns(self) -> dict[str, Array]:
+        """Vectors of more than one number, and the columns of narrow matrices."""
+        columns = {name: vector for name, vector in self.vectors.items() if vector.size > 1}
+        for name, matrix in self.matrices.items():
+            if matrix.shape[1] <= SHOWN:
+                columns |= {f"{name}(:,{k + 1})": column for k, column in enumerate(matrix.T)}
+        return columns
+
+
+def array_words(shape: Sequence[int]) -> str:
+    """What an array that is no vector is called."""
+    return f"an array of {' x '.join(map(str, shape))}"
+
+
+def gathered(elements: Iterable[tuple[str, Array | str]]) -> Variables:
+    """Variables of named vectors and matrices, or words in their place; of two with one name the last."""
+    every = dict(elements)
+    numbers = {name: it for name, it in every.items() if not isinstance(it, str)}
+    vectors = {name: it for name, it in numbers.items() if it.ndim == 1}
+    matrices = {name: it for name, it in numbers.items() if it.ndim == 2}
+    scalars = {name: float(it[0]) for name, it in vectors.items() if it.size == 1 and np.isfinite(it[0])}
+    words = {name: it for name, it in every.items() if isinstance(it, str)}
+    return Variables(vectors, matrices, scalars, words | {name: array_words(m.shape) for name, m in matrices.items()})
+
+
+def indexed(name: str) -> tuple[str, str]:
+    """``expts(2).R`` as ``expts.R`` and ``2``, ``C{3}`` as ``C`` and ``3``; by the first index, "" without one."""
+    match = _INDEX.search(name)
+    return (name[: match.start()] + name[match.end() :], match[1] or match[2]) if match else (name, "")
+
+
+def _element(elements: Mapping[str, T], part: str) -> dict[str, T]:
+    inside = {name: value for whole, value in elements.items() for name, i in (indexed(whole),) if i and i == part}
+    return {**elements, **inside}
+
+
+def _first(elements: Mapping[str, T]) -> dict[str, T]:
+    kept: dict[str, T] = {}
+    for whole, value in elements.items():
+        kept.setdefault(indexed(whole)[0], value)
+    return kept
 
 
 def mat_variables(path: Path) -> Variables:
@@ -45,34 +138,29 @@ def variables_of(path: Path) -> Iterator[Variables]:
         raise DataError(f"{path}: not a MATLAB v5 file (no such header); save it in MATLAB with save(..., '-v7')")
     hdf = head.startswith(b"MATLAB 7.3") or head[124:] in (b"\x00\x02IM", b"\x02\x00MI")
     try:
-        variables = gathered((_Hdf() if hdf else _Classic()).variables(path))
+        variables = gathered((_Hdf if hdf else _Classic)(path).variables())
     except (DataError, MemoryError):
         raise
-    except _Refused as error:
-        raise DataError(f"{path}: {error}") from None
     except Exception as error:  # the libraries tell damage by OSError, RuntimeError, KeyError, ValueError, …
         words = " ".join(str(error).split())[:200]
         raise DataError(f"{path}: not a MATLAB {'v7.3' if hdf else 'v5'} file that can be read ({words})") from None
     yield variables
 
 
-class _Refused(Exception):
-    """Why the file is not read."""
-
-
 class _Reader:
-    """How much of a file has been read."""
+    """How much of a file has been read. What takes more raises :class:`DataError`."""
 
-    def __init__(self) -> None:
+    def __init__(self, path: Path):
+        self.path = path
         self.numbers = self.in_matrices = self.objects = 0
 
     def named(self, name: str) -> str:
         """One more variable, field or element."""
         self.objects += 1
         if self.objects > MOST_OBJECTS:
-            raise _Refused(f"more than {MOST_OBJECTS} variables, fields and elements")
+            raise DataError(f"{self.path}: more than {MOST_OBJECTS} variables, fields and elements")
         if not name.isprintable():
-            raise _Refused("the name of a variable is damaged")
+            raise DataError(f"{self.path}: the name of a variable is damaged")
         return name
 
     def left_out(self, shape: tuple[int, ...]) -> str:
@@ -88,18 +176,18 @@ class _Reader:
     def count(self, numbers: int) -> None:
         self.numbers += numbers
         if self.numbers > MOST:
-            raise _Refused(f"more than {MOST} numbers in vectors")
+            raise DataError(f"{self.path}: more than {MOST} numbers in vectors")
 
 
 class _Classic(_Reader):
     """Version 5."""
 
-    def variables(self, path: Path) -> Found:
+    def variables(self) -> Found:
         from scipy.io import loadmat, whosmat
         from scipy.io.matlab import MatlabOpaque, varmats_from_mat
 
-        require_plain(path, LONGEST)
-        with open_plain(path) as file:
+        require_plain(self.path, LONGEST)
+        with open_plain(self.path) as file:
             variables = varmats_from_mat(file)  # each as a file of its own
         for name, alone in variables:
             if not name or name.startswith("__"):
@@ -107,7 +195,7 @@ class _Classic(_Reader):
             if name != "None":  # which scipy calls an object of a newer class, and cannot tell its size
                 ((_, shape, kind),) = whosmat(alone)
                 large = kind not in ("cell", "struct") and math.prod(shape) > MOST_IN_MATRICES
-                words = KINDS.get(kind) or (_Reader().left_out(shape) if large else "")
+                words = KINDS.get(kind) or (_Reader(self.path).left_out(shape) if large else "")
                 if words:
                     yield self.named(name), words
                     continue
@@ -145,15 +233,15 @@ class _Classic(_Reader):
 class _Hdf(_Reader):
     """Version 7.3."""
 
-    def variables(self, path: Path) -> Found:
+    def variables(self) -> Found:
         try:
             import h5py
         except ImportError:
             raise DataError(
-                f"{path}: a MATLAB v7.3 (HDF5) file, which needs: pip install h5py; or save it again in "
+                f"{self.path}: a MATLAB v7.3 (HDF5) file, which needs: pip install h5py; or save it again in "
                 "MATLAB with save(..., '-v7')"
             ) from None
-        with h5py.File(path, "r") as self.file:
+        with h5py.File(self.path, "r") as self.file:
             for name in self.file:
                 if not name.startswith("#"):  # what references point to
                     yield from self._child(self.file, name, name, 0)
@@ -215,14 +303,14 @@ class _Hdf(_Reader):
             yield name, values.ravel() if values.size == max(shape) else values.T
 
     def _check(self, it: Any, name: str) -> None:
-        """Raise :class:`_Refused` where a dataset is too large, or not in this file."""
-        _Reader().count(math.prod(it.chunks or ()))
+        """Raise :class:`DataError` where a dataset is too large, or not in this file."""
+        _Reader(self.path).count(math.prod(it.chunks or ()))
         if it.external is not None or it.is_virtual:
-            raise _Refused(f"the numbers of {name} are in another file, which is not opened")
+            raise DataError(f"{self.path}: the numbers of {name} are in another file, which is not opened")
         properties = it.id.get_create_plist()
         used = {properties.get_filter(k)[0] for k in range(properties.get_nfilters())}
         if not used <= FILTERS:
-            raise _Refused(f"{name} is packed by a filter that MATLAB does not use")
+            raise DataError(f"{self.path}: {name} is packed by a filter that MATLAB does not use")
 
 
 def _class(it: Any) -> str:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from en4dvar.inputs.opened import require_file
+from en4dvar.inputs.asked import require_file
 from en4dvar.inputs.parts import read_contents
 from en4dvar.inputs.text_table import numbered_lines
 from en4dvar.model.state import Array

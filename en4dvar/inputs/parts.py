@@ -8,12 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from en4dvar.inputs.asked import ANY, Column, Format, Layout
-from en4dvar.inputs.matfile import mat_variables
-from en4dvar.inputs.opened import format_of, opened
+from en4dvar.inputs.asked import ANY, Column, Format, Layout, format_of, opened
+from en4dvar.inputs.matfile import Variables, indexed, mat_variables
 from en4dvar.inputs.sheets import sheet_lines
 from en4dvar.inputs.text_table import Table, matches, scalars_in
-from en4dvar.inputs.variables import Variables, indexed
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import DataError
 from en4dvar.plumbing.hints import listed

@@ -124,11 +124,9 @@ def _stds(written: Array, column: Column, kept: npt.NDArray[np.intp], count: int
     stds = np.asarray(convert(written[kept], column.unit, column.target))
     fits, wrong_sign = {
         "std": (stds > 0, "not positive"),
-        "shared": (np.isfinite(stds), "not finite"),
         "weight": (stds >= 0, "negative"),
-        "place": (np.isfinite(stds), "not finite"),
         "mark": (np.isin(stds, (0, 1)), "neither 0 nor 1"),
-    }[column.kind]
+    }.get(column.kind, (np.isfinite(stds), "not finite"))
     wrong = np.flatnonzero(~(np.isfinite(stds) & fits))
     if len(wrong):
         said = written[kept[wrong[0]]]

@@ -4,9 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from en4dvar.inputs.asked import Layout, Matrix
-from en4dvar.inputs.opened import opened
-from en4dvar.inputs.text_table import cells_of, check_width, delimiter_of, number_in, numbered_lines
+from en4dvar.inputs.asked import Layout, Matrix, opened
+from en4dvar.inputs.text_table import cells_of, delimiter_of, number_in, numbered_lines
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import DataError
 from en4dvar.plumbing.units import convert
@@ -33,9 +32,7 @@ def read_square(path: Path, what: str = "correlation matrix") -> Array:
     delimiter = None
     with opened(path, Layout("csv")):
         for number, line in numbered_lines(path):
-            if delimiter is None:
-                delimiter = delimiter_of(line)
-                check_width(line, delimiter, path)
+            delimiter = delimiter_of(line, path) if delimiter is None else delimiter
             cells = enumerate(cells_of(line, delimiter), 1)
             rows.append([number_in(cell, str(i), path, number, None) for i, cell in cells])
             if len(rows[-1]) != len(rows[0]):

@@ -21,7 +21,8 @@ from en4dvar.plumbing.hints import listed, short
 from en4dvar.plumbing.tables import is_number
 from en4dvar.plumbing.units import is_unit
 
-Lines = Sequence[tuple[int, str | Sequence[str]]]
+Line = str | Sequence[str]  # of a text, or the cells of a sheet
+Lines = Sequence[tuple[int, Line]]
 Decimal = Literal[".", ","]
 COMMENT = ("#", "%", "//")
 LONGEST = 1_000_000_000  # bytes of a file
@@ -57,22 +58,27 @@ def _text(path: Path) -> str:
     raise DataError(f"{path}: not a text file")
 
 
-def delimiter_of(line: str) -> str:
-    """What separates the cells; "" for blanks."""
-    delimiter = max((",", ";", "\t"), key=line.count)
-    return delimiter if delimiter in line else ""
+def delimiter_of(line: Line, path: Path) -> str:
+    """What separates the cells of a first line; "" for blanks, and of a sheet.
 
-
-def check_width(line: str, delimiter: str, path: Path) -> None:
-    """Raise :class:`DataError` where a first line has more cells than a table has columns."""
+    Raises :class:`DataError` where it has more cells than a table has columns.
+    """
+    if not isinstance(line, str):
+        return ""
+    most = max((",", ";", "\t"), key=line.count)
+    delimiter = most if most in line else ""
     signs = line.count(delimiter) if delimiter else len(line) // 2
     if signs >= WIDEST and (count := signs + 1 if delimiter else len(line.split())) > WIDEST:
         raise DataError(
             f"{path}: {count} columns; at most {WIDEST} are read; if a line holds one column's numbers, transpose it"
         )
+    return delimiter
 
 
-def cells_of(line: str, delimiter: str) -> list[str]:
+def cells_of(line: Line, delimiter: str) -> list[str]:
+    """The cells of a line, those of a sheet as they are."""
+    if not isinstance(line, str):
+        return list(line)
     if not delimiter:
         return line.split()
     return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))]
@@ -91,13 +97,13 @@ class Table:
         lines = numbered_lines(path) if lines is None else lines
         if not lines:
             raise DataError(f"{path}: the file holds no data")
-        head = [_split(line, path) for _, line in lines[:PREAMBLE]]
+        head = [cells_of(line, delimiter_of(line, path)) for _, line in lines[:PREAMBLE]]
         top, first = _names_and_numbers(head, wanted)
         self.nameless = top is None
         line = lines[first if top is None else top][1]
         signs = (";", "\t") if self.nameless else ()  # numbers may have decimal commas
-        delimiter = next((s for s in signs if s in line), delimiter_of(line)) if isinstance(line, str) else ""
-        self.rows = [(n, cells_of(x, delimiter) if isinstance(x, str) else list(x)) for n, x in lines[first:]]
+        delimiter = next((s for s in signs if s in line), delimiter_of(line, path))
+        self.rows = [(n, cells_of(x, delimiter)) for n, x in lines[first:]]
         if any(_holds_number(cells) for _, cells in self.rows):
             while _words(self.rows[0][1]):
                 del self.rows[0]
@@ -121,15 +127,6 @@ class Table:
         """A column as numbers. Raises :class:`DataError`."""
         cells = ((line, row[i] if i < len(row) else "") for line, row in self.rows)
         return np.array([number_in(cell, name, self.path, line, self.decimal) for line, cell in cells], dtype=float)
-
-
-def _split(line: str | Sequence[str], path: Path) -> list[str]:
-    """The cells of a line by its own delimiter."""
-    if not isinstance(line, str):
-        return list(line)
-    delimiter = delimiter_of(line)
-    check_width(line, delimiter, path)
-    return cells_of(line, delimiter)
 
 
 def matches(name: str, pattern: str) -> bool:

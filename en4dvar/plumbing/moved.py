@@ -22,16 +22,23 @@ MOVED |= {f"en4dvar.config.{n}": f"en4dvar.assembly.{n}" for n in ("build", "bui
 MOVED |= {f"en4dvar.{old}": f"en4dvar.{new}" for new, several in {
     "config.data": "config.window", "config.error": "config.error_std config.discrepancy",
     "config.sharing": "config.population", "config.models": "config.symbols", "data.noise.make": "data.noise.joint",
-    "descent.step_control": "descent.settling", "executor.chunks": "executor.shared",
-    "model.programs.process": "model.programs.adjusted", "series.moments": "series.outcome",
+    "descent.step_control": "descent.settling", "executor.base": "executor.chunks executor.shared",
+    "executor.futures": "executor.local", "executor.limits": "executor.blas",
+    "model.programs.model": "model.programs.adjusted model.programs.process",
+    "model.programs.pest": "model.programs.errors", "model.programs.control": "model.programs.refused",
+    "model.programs.matrices": "model.programs.spread", "series.moments": "series.outcome",
     "results.store": "results.groups", "results.complete": "results.beside", "report.result": "report.notebook",
     "report.svg": "report.words report.drawing", "runs.finished": "runs.evidence_run", "inputs.readers": "inputs.order",
     "estimation.joint.members": "estimation.joint.challenge", "estimation.stages": "loop_state estimation.loop_state",
     "results.declared": "results.axes", "inputs.parts": "inputs.contents",
+    "inputs.matfile": "inputs.variables", "inputs.asked": "inputs.opened",
     "estimation.population.hierarchy": "estimation.population.effort",
 }.items() for old in several.split()}  # fmt: skip
 MOVED |= {"en4dvar.cycling": "en4dvar.series", "en4dvar.storage": "en4dvar.results"}
 MOVED |= {"en4dvar_agarose.summary": "en4dvar_agarose.tables", "en4dvar_agarose.evidence": "en4dvar_agarose.fits"}
+MOVED |= {f"en4dvar_movie.{old}": f"en4dvar_movie.{new}" for old, new in {
+    "corrections": "choice", "locate": "outline", "outlined": "page", "writing": "frames",
+}.items()}  # fmt: skip
 
 # names that moved by themselves, with what they are called today
 NAMES = {

@@ -25,7 +25,7 @@ from en4dvar.diagnosis.diagnostics import member_quantiles
 from en4dvar.ensemble.forecast import Composite
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.executor import Executor
-from en4dvar.executor.chunks import CommonValue
+from en4dvar.executor.base import CommonValue
 from en4dvar.inputs.asked import DataFile
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError, DataError, En4dvarError

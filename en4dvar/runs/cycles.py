@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar
 
-from en4dvar.executor import Executor, make_executor
+from en4dvar.executor import Executor, choose_executor
 from en4dvar.plumbing.files import write_text
 from en4dvar.results.checkpoint import FOLDER, Keeper, digest
 from en4dvar.results.netcdf import Group, to_bytes
@@ -52,7 +52,7 @@ class Cycles(RunKind[R]):
         return series_group(self.assimilated(executor, None, None), {})
 
     def executor(self) -> Executor:
-        return make_executor(self.model, self.config.execution.workers)
+        return choose_executor(self.model, workers=self.config.execution.workers)
 
     def kept(self) -> str:
         return f"the cycles up to the last checkpoint are kept in {self.directory}"

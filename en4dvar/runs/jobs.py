@@ -14,7 +14,7 @@ from en4dvar.diagnosis.analysis import IterationRecord, Progress, Record
 from en4dvar.estimation.assimilate import LoopState, assimilate
 from en4dvar.estimation.summary import brief, dataset_rows, remarks, summarise
 from en4dvar.executor import Executor
-from en4dvar.executor.chunks import CommonValue
+from en4dvar.executor.base import CommonValue
 from en4dvar.inputs.asked import DataFile
 from en4dvar.plumbing.tables import csv_text
 from en4dvar.priors.prior import own_seed

@@ -16,7 +16,7 @@ from en4dvar.config import AnyConfig, Config, TwinConfig, resolve_any
 from en4dvar.config.load import recorded as recorded_configuration
 from en4dvar.data.observations import SEVERAL
 from en4dvar.estimation.assimilate import assimilate
-from en4dvar.executor import choose_executor, make_executor, one_blas_thread
+from en4dvar.executor import choose_executor, one_blas_thread
 from en4dvar.model.forward import ForwardModel
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.results.campaign_file import failed_datasets
@@ -116,7 +116,7 @@ def _of_cycles(file: Path, workers: int | None, trust: bool, ask: Ask | None) ->
     kind: Cycles[Any] = TwinKind(config) if isinstance(config, TwinConfig) else SequenceKind(config)
     with of_strangers(file.parent, ask, trust):  # data may have weights by a function
         kind.check()
-    with make_executor(kind.model, workers or 1) as executor:
+    with choose_executor(kind.model, workers=workers or 1) as executor:
         again = kind.again(executor)
     was, now = ({f"/{name}": v.values for name, v in result.every.items()} for result in (recorded, again))
     repeated = Repeated(config.name, len(was), differences(was, now), "")

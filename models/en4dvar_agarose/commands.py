@@ -41,7 +41,7 @@ def sweep(
     import hashlib
 
     from en4dvar.assembly.build import build
-    from en4dvar.executor import available_cores, make_executor
+    from en4dvar.executor import choose_executor
     from en4dvar.plumbing.files import inside, write_text
     from en4dvar.plumbing.units import UnitError, parse_quantity
     from en4dvar.runs.interrupt import tell_interrupt, terminate_as_interrupt
@@ -71,7 +71,7 @@ def sweep(
         terminate_as_interrupt(),
         tell_interrupt(lambda: f"finished chunks are kept in {chunks}"),
         counted("trajectories") as progress,
-        make_executor(problems[0].model, workers or available_cores()) as executor,
+        choose_executor(problems[0].model, workers=workers) as executor,
     ):
         earliest = earliest_reading(problems[0].model)
         result = run_sweep(problems, chosen, loaded[0].seed, executor, chunks, progress, earliest)

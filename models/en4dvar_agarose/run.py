@@ -15,7 +15,7 @@ from en4dvar.estimation.joint import Single, estimate_jointly, sharing
 from en4dvar.estimation.population import Population, population_of
 from en4dvar.estimation.population.campaign import FEWEST_SETS
 from en4dvar.estimation.population.own import OwnDraws, own_draws
-from en4dvar.executor import Executor, make_executor, one_blas_thread
+from en4dvar.executor import Executor, choose_executor, one_blas_thread
 from en4dvar.model.forward import ForwardModel
 from en4dvar.plumbing.errors import TooFewMembersError, retold
 from en4dvar.priors.prior import Prior, own_seed
@@ -44,7 +44,7 @@ def run_study(plan: StudyPlan, workers: int = 1, say: Say | None = None, keep: S
     """
     problems = {(gel, m): build(c) for gel, models in plan.configs.items() for m, c in models.items()}
     model = next(iter(problems.values()))[0].model
-    with make_executor(model, workers) as executor:
+    with choose_executor(model, workers=workers) as executor:
         work = _Parts(plan, executor, workers, say or (lambda message: None), keep, {})
         with work.timed("sweep"):
             sweeps = work.sweeps(problems)

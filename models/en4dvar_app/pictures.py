@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from en4dvar.inputs.opened import readable
+from en4dvar.inputs.asked import readable
 from en4dvar.plumbing.errors import DataError, En4dvarError
 from en4dvar.plumbing.files import read_plain
 from en4dvar_movie.frames import Frame, Movie, open_movie

@@ -16,9 +16,7 @@ from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import DataError
 from en4dvar_movie.fitting import fit_outline
 from en4dvar_movie.frames import Frame, Movie
-from en4dvar_movie.kernels import normalise
-from en4dvar_movie.locate import TILE, circle_through, locate, rim
-from en4dvar_movie.outline import Circle, Optics
+from en4dvar_movie.outline import TILE, Circle, Optics, circle_through, labelled, locate, rim
 
 Image = npt.NDArray[Any]  # brightness (H, W), of any precision
 DEAD = 0.25  # of the brightness about it: where a background shows nothing of a bubble, as writing does
@@ -47,7 +45,6 @@ SPECK = 100  # pixels: the largest change that is no bubble
 BEGUN, SURE = 0.25, 2.0  # of the shade in a bubble's middle, and of a pixel's noise: what tells that it was there
 HALO, STILL = 9, 0.01  # side of squares whose mean tells more than a pixel, and what it may differ by
 SURELY = 1.4  # variances of noise beyond which the scatter in such a square is something else
-LEAST_CONTRAST = 0.08  # of the background's brightness
 BRIGHT = 0.25  # of the contrast: how much brighter a flash is
 STEADY = 10_000  # tiles that say how bright a frame is
 CHANGED = 0.3  # share of tiles that a flash changes
@@ -69,7 +66,10 @@ class Background:
 
     def normalised(self, frame: Frame) -> tuple[Array, Array]:
         """The image (H, W) and its tiles, without what the lamp flickers."""
-        image, tiles = normalise(frame, self.level, self.gain, TILE)
+        image = (frame.astype(np.float32) - self.level) * self.gain
+        rows, columns = (TILE * (side // TILE) for side in image.shape)
+        whole = np.where(np.isnan(image), np.float32(0), image)[:rows, :columns]
+        tiles = np.mean([whole[j::TILE, i::TILE] for j in range(TILE) for i in range(TILE)], axis=0)
         change = self._light(tiles[:: -(-tiles.size // STEADY)]) if self.relative else 0.0
         if abs(change) > FLICKER:  # a bubble that fills the frame, or a flash
             return image, tiles
@@ -213,8 +213,7 @@ def _begins_with_a_bubble(first: Image, samples: Sequence[Frame], noise: float, 
     """True if the first frame differs from a smooth surface in large patches whose rims other frames show elsewhere."""
     surface = smooth_surface([first])
     far = np.abs(ndimage.uniform_filter(first - surface, 5)) > max(4 * noise, 0.25 * float(np.median(np.abs(surface))))
-    labels, _ = ndimage.label(far & ~blind)
-    sizes = np.bincount(labels.ravel())
+    labels, sizes = labelled(far & ~blind)
     large = [n for n in range(1, len(sizes)) if sizes[n] > max(BLOB, 2e-4 * first.size) and _is_round(labels == n)]
     if not large:
         return False
@@ -242,10 +241,9 @@ def _quiet(leading: Sequence[Frame], first: Image, noise: float, blind: npt.NDAr
     show the shade in its middle.
     """
     for number, frame in enumerate(leading):
-        labels, count = ndimage.label(_changed(frame.astype(np.float32), first, noise) & ~blind)
-        sizes = np.bincount(labels.ravel())[1:]
-        if count and sizes.max() > SPECK:  # larger than dirt that drifts
-            y, x = np.mean(np.nonzero(labels == 1 + np.argmax(sizes)), axis=1).round().astype(int)
+        labels, sizes = labelled(_changed(frame.astype(np.float32), first, noise) & ~blind)
+        if sizes.max() > SPECK:  # larger than dirt that drifts
+            y, x = np.mean(np.nonzero(labels == np.argmax(sizes)), axis=1).round().astype(int)
             middle = np.s_[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2]
             frames = (_lit_as(f.astype(np.float32), first) for f in leading[: number + 1])
             shade = np.array([float(np.mean((f - first)[middle])) for f in frames])
@@ -314,7 +312,7 @@ def _steadied(background: Background, samples: Sequence[Frame]) -> Iterator[tupl
     """Of frames that show a circle, and no flash, the image in the light of the level, and the circles."""
     for frame in samples:
         image, tiles = background.normalised(frame)
-        places = locate(tiles, background.noise / TILE, LEAST_CONTRAST)
+        places = locate(tiles, background.noise / TILE)
         if places and share_changed(tiles, background.noise) <= CHANGED:
             yield background.steadied(image, tiles, places[0][0]), places
 

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from en4dvar.model.state import Array
-from en4dvar_movie.background import BRIGHT, CHANGED, LEAST_CONTRAST, Background, share_changed
+from en4dvar_movie.background import BRIGHT, CHANGED, Background, share_changed
 from en4dvar_movie.fitting import fit_outline, two_edges
 from en4dvar_movie.frames import Frame
-from en4dvar_movie.locate import TILE, locate
-from en4dvar_movie.outline import Circle, Optics, Outline
+from en4dvar_movie.outline import TILE, Circle, Optics, Outline, locate
 
 LEAST_SEEN = 0.12  # share of the outline inside the frame
 LEAST_RADIUS = 2.5  # pixels
@@ -61,7 +60,7 @@ def look_at(
     elif share_changed(tiles, background.noise) > CHANGED:
         return Look(number, (), "flash: much of the frame is brighter than the background", spot)
     else:
-        places = [place for place, _ in locate(tiles, background.noise / TILE, LEAST_CONTRAST)]
+        places = [place for place, _ in locate(tiles, background.noise / TILE)]
     if not places:
         return Look(number, (), "no bubble: nothing differs from the background", spot)
     candidates: list[Candidate] = []
@@ -71,9 +70,8 @@ def look_at(
         if outlines is None or any(_same(outlines[0].circle, c.circle) for c in candidates):
             continue
         fault = next((words for o in outlines if (words := _fault_of(o, optics, background.noise))), "")
-        candidate = Candidate(number, tuple(outlines), fault)
-        doubt = "" if candidate.fault else _doubt(steady, outlines[0], optics, circles)
-        candidates.append(replace(candidate, doubt=doubt))
+        doubt = "" if fault else _doubt(steady, outlines[0], optics, circles)
+        candidates.append(Candidate(number, tuple(outlines), fault, doubt))
     return Look(number, tuple(candidates), "" if candidates else "no circle fits the outline", spot)
 
 

@@ -54,16 +54,14 @@ def track(
     from en4dvar.executor import available_cores
     from en4dvar.plumbing.files import write_text
     from en4dvar.runs.progress import counted
-    from en4dvar_movie.choice import place, watched
-    from en4dvar_movie.corrections import read_corrections
+    from en4dvar_movie.choice import place, read_corrections, watched
     from en4dvar_movie.following import MOST
-    from en4dvar_movie.frames import open_movie
-    from en4dvar_movie.outlined import outlined as outlined_frames
+    from en4dvar_movie.frames import open_movie, require_suffix, write_movie
+    from en4dvar_movie.page import outlined as outlined_frames
     from en4dvar_movie.page import page_text
     from en4dvar_movie.table import to_csv
     from en4dvar_movie.tracking import doubted
     from en4dvar_movie.tracking import track as track_movie
-    from en4dvar_movie.writing import require_suffix, write_movie
 
     opened, scale = _scaled(open_movie(movie, raw), pixel, frame_rate, exposure, flashes)
     table = out or Path(f"{movie.stem}.csv")

@@ -19,8 +19,8 @@ from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.hints import suggest
 from en4dvar.plumbing.units import Quantity
 from en4dvar_movie.flashes import parse_flashes
+from en4dvar_movie.frames import require_suffix, write_movie
 from en4dvar_movie.scene import Scene, render
-from en4dvar_movie.writing import require_suffix, write_movie
 
 if TYPE_CHECKING:
     from en4dvar.config import Config

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from en4dvar.model.state import Array
-from en4dvar_movie.kernels import SHAPE, influence, normal_equations, of_rows, residuals
+from en4dvar_movie.kernels import SHAPE, normal_equations, residuals
 from en4dvar_movie.outline import MODES, Circle, Optics, Outline, share_inside
 
 ROUNDS = 30
@@ -43,7 +43,7 @@ def two_edges(image: Array, start: Circle, optics: Optics) -> float:
     (p, modes, _), (q, q_modes, noise) = single, double
     ring = _ring(p, q[-1:])
     fits = (p, modes), (q, q_modes)
-    wrong, less = (float(np.sum(np.minimum(residuals(image, *of, ring) / noise, 5.0) ** 2)) for of in fits)
+    wrong, less = (float(np.sum(np.minimum(residuals(image, *of, ring)[0] / noise, 5.0) ** 2)) for of in fits)
     sharp = q[W] < SHARP * optics.width and q[-1] > TWO * q[W]
     return float(q[-1]) if sharp and wrong - less > SURE * wrong else 0.0
 
@@ -69,7 +69,7 @@ def _fit(image: Array, start: Circle, optics: Optics, circles: int) -> tuple[Arr
         if fitted is None:
             return None
         p = _sorted(fitted, circles)
-        noise = max(1.4826 * float(np.median(np.abs(residuals(image, p, modes, ring)))), 1e-6)
+        noise = max(1.4826 * float(np.median(np.abs(residuals(image, p, modes, ring)[0]))), 1e-6)
     return p, modes, noise
 
 
@@ -141,7 +141,7 @@ def _descend(
     nested = len(p) > SHAPE + 2 * (modes - 1)
     bright = 0.0, -optics.contrast  # what the centre can be between
     darkest = (1 + DARKER * optics.spread) * optics.contrast
-    A, g, _, total, cost = normal_equations(image, p, modes, ring, cutoff)
+    A, g, total, cost = normal_equations(image, p, modes, ring, cutoff)
     if total < 3 * len(p):
         return None
     cost += 0.5 * float(precision @ (p - centre) ** 2)
@@ -164,8 +164,8 @@ def _descend(
             damping *= 10
             continue
         equations = normal_equations(image, trial, modes, ring, cutoff)
-        better = equations[4] + 0.5 * float(precision @ (trial - centre) ** 2)
-        if better <= cost and equations[3] > 0:
+        better = equations[3] + 0.5 * float(precision @ (trial - centre) ** 2)
+        if better <= cost and equations[2] > 0:
             done = np.max(np.abs(step[:W])) < close and cost - better <= max(close**2, 1e-7) * cost
             p, (A, g), cost, damping = trial, equations[:2], better, max(damping / 10, 1e-7)
             if done:
@@ -180,7 +180,10 @@ def _descend(
 def _outlines(image: Array, p: Array, modes: int, noise: float, optics: Optics) -> list[Outline] | None:
     gaps = p[SHAPE + 2 * (modes - 1) :]
     ring = _ring(p, gaps)
-    A, _, squares, total, _ = normal_equations(image, p, modes, ring, CUTOFF * noise)
+    off, rows, places = residuals(image, p, modes, ring)
+    left = np.maximum(1 - (off / (CUTOFF * noise)) ** 2, 0.0)  # of Tukey's weights the roots
+    total = np.sum(left**2)
+    A = rows.T @ (left[:, None] ** 2 * rows)
     _, precision = _known(p, gaps, ring, noise, optics)
     try:
         inverse = np.linalg.inv(A + np.diag(precision))
@@ -189,8 +192,11 @@ def _outlines(image: Array, p: Array, modes: int, noise: float, optics: Optics) 
     shape = p[SHAPE : SHAPE + 2 * (modes - 1)].reshape(-1, 2).T if modes > 1 else np.zeros((2, 0))
     mode_variance = float(np.diag(inverse)[SHAPE : SHAPE + shape.size].mean()) if modes > 1 else 0.0
     free = len(p) - 2 * _glare_is_far(p, gaps, ring)
-    squared, product = of_rows(image, p, modes, ring)
-    slopes = np.maximum(squared, 1e-30)
+    # how much larger even and odd rows show the radius: Σ r dm/dR / Σ (dm/dR)²
+    slopes, product = (np.bincount(places[:, 0] % 2, rows[:, R] * part, 2) for part in (rows[:, R], off))
+    slopes = np.maximum(slopes, 1e-30)
+    angles = np.arctan2(places[:, 0] - p[Y], places[:, 1] - p[X]) / (2 * np.pi) + 0.5
+    slope = np.sum(left * (5 * left - 4)) / total  # ψ' of all pixels over their weights
     outlines: list[Outline] = []
     every = np.append(0.0, gaps)
     # nested circles by their places, the largest first; those that are closer to the next are together
@@ -200,7 +206,10 @@ def _outlines(image: Array, p: Array, modes: int, noise: float, optics: Optics) 
         inside = every[group]
         circle = Circle(float(p[X]), float(p[Y]), float(p[R] - inside.mean()))
         sectors = int(np.clip(2 * np.pi * circle.R / max(4.0, 2 * p[W]), 8, 256))
-        sums, spread, slope, fitted = influence(image, p, modes, ring, CUTOFF * noise, weights, sectors)
+        sector = np.minimum((angles * sectors).astype(int), sectors - 1)
+        moved = left**2 * (rows @ weights)  # the influence of a pixel on the radius, over its residual
+        sums, spread = np.bincount(sector, moved * off, sectors), np.sum((moved * off) ** 2)
+        fitted = np.array([np.bincount(sector, moved * row, sectors) for row in rows.T]).T  # JᵀWJ·weights by sector
         # the step of robust weights is the M-estimator's, its error that of Huber (1981): ψ' instead of the weights
         variance = spread / max(slope, 0.3) ** 2 * total / max(total - free, 1.0)
         common = noise**2 * weights[CONTRAST] ** 2 * precision[CONTRAST]  # of the contrast that all frames share
@@ -213,7 +222,7 @@ def _outlines(image: Array, p: Array, modes: int, noise: float, optics: Optics) 
             variance=float(variance),
             ratio=float(np.sum(sums**2) / _left(fitted, weights, A, inverse) / max(spread, 1e-30)),
             common=float(common),
-            mode_std=float(np.sqrt(max(mode_variance, 0) * squares / total)),
+            mode_std=float(np.sqrt(max(mode_variance, 0) * np.sum((left * off) ** 2) / total)),
             seen=share_inside(image.shape, circle),
             rows=float(np.subtract(*(product / slopes))),
             rows_std=float(noise * np.sqrt(np.sum(1 / slopes))),

@@ -8,25 +8,18 @@ from itertools import pairwise, permutations
 import numpy as np
 
 from en4dvar.model.state import Array
-from en4dvar.plumbing.errors import En4dvarError
-from en4dvar.plumbing.units import parse_quantity
+from en4dvar.plumbing.units import UnitError, parse_quantity
 
 MOST = 5
 
 
-class FlashError(En4dvarError, ValueError):
-    """The instants of flashes are not what they must be."""
-
-    exit_code = 2
-
-
 def parse_flashes(text: str) -> tuple[float, ...]:
-    """``"0 us, 2 us, 4 us"`` as instants after that of the frame, s. Raises :class:`FlashError`, UnitError."""
+    """``"0 us, 2 us, 4 us"`` as instants after that of the frame, s. Raises :class:`UnitError`."""
     instants = tuple(parse_quantity(part, "s") for part in text.split(","))
     if len(instants) > MOST:
-        raise FlashError(f"{len(instants)} flashes in an exposure; at most {MOST} can be told apart")
+        raise UnitError(f"{len(instants)} flashes in an exposure; at most {MOST} can be told apart")
     if any(b <= a for a, b in pairwise(instants)):
-        raise FlashError(f"flashes {text!r}: give their instants in the order of time")
+        raise UnitError(f"flashes {text!r}: give their instants in the order of time")
     return instants
 
 

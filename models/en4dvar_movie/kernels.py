@@ -1,4 +1,4 @@
-"""Compiled loops over pixels: the blurred outline, its normal equations, and what each sector of it says.
+"""Compiled loops over pixels: the blurred outline, and its normal equations.
 
 The image near the outline is modelled as
 
@@ -78,7 +78,8 @@ def _row(j, i, p, modes, row):
 
 
 @kernel
-def _bounds(shape, x, y, reach):
+def _bounds(shape, ring):
+    x, y, _, reach = ring
     return (
         max(0, math.floor(y - reach)),
         min(shape[0], math.ceil(y + reach) + 1),
@@ -88,19 +89,26 @@ def _bounds(shape, x, y, reach):
 
 
 @kernel
+def _within(image, j, i, ring):
+    """Whether a pixel is looked at, and its distance from ``ring[:2]`` lies between ``ring[2]`` and ``ring[3]``."""
+    far = (i - ring[0]) ** 2 + (j - ring[1]) ** 2
+    return ring[2] ** 2 <= far <= ring[3] ** 2 and not math.isnan(image[j, i])
+
+
+@kernel
 def residuals(image, p, modes, ring):
-    """Residuals (n,) of the pixels whose distance from ``ring[:2]`` lies between ``ring[2]`` and ``ring[3]``."""
-    row = np.zeros(len(p))
-    top, bottom, left, right = _bounds(image.shape, ring[0], ring[1], ring[3])
-    values = np.empty(max(0, bottom - top) * max(0, right - left))
+    """Of the pixels in a ring, residuals (n,), the model's derivatives (n, P), and row and column (n, 2)."""
+    top, bottom, left, right = _bounds(image.shape, ring)
+    most = max(0, bottom - top) * max(0, right - left)
+    values, rows, places = np.empty(most), np.empty((most, len(p))), np.empty((most, 2), dtype=np.int64)
     n = 0
     for j in range(top, bottom):
         for i in range(left, right):
-            far = (i - ring[0]) ** 2 + (j - ring[1]) ** 2
-            if ring[2] ** 2 <= far <= ring[3] ** 2 and not math.isnan(image[j, i]):
-                values[n] = image[j, i] - _row(j, i, p, modes, row)
+            if _within(image, j, i, ring):
+                values[n] = image[j, i] - _row(j, i, p, modes, rows[n])
+                places[n] = j, i
                 n += 1
-    return values[:n]
+    return values[:n], rows[:n], places[:n]
 
 
 @summing_kernel
@@ -119,7 +127,7 @@ def _add(A, rows, weights):
 
 @kernel
 def normal_equations(image, p, modes, ring, cutoff):
-    """JᵀWJ (P, P), JᵀWr (P,), Σ w r², Σ w and the robust cost, W of Tukey's bisquare with ``cutoff``."""
+    """JᵀWJ (P, P), JᵀWr (P,), Σ w and the robust cost, W of Tukey's bisquare with ``cutoff``."""
     size = len(p)
     row = np.zeros(size)
     rows = np.zeros((size, BLOCK))  # of pixels whose products are added together, which is quicker
@@ -127,12 +135,11 @@ def normal_equations(image, p, modes, ring, cutoff):
     n = 0
     A = np.zeros((size, size))
     g = np.zeros(size)
-    squares = total = cost = 0.0
-    top, bottom, left, right = _bounds(image.shape, ring[0], ring[1], ring[3])
+    total = cost = 0.0
+    top, bottom, left, right = _bounds(image.shape, ring)
     for j in range(top, bottom):
         for i in range(left, right):
-            far = (i - ring[0]) ** 2 + (j - ring[1]) ** 2
-            if far < ring[2] ** 2 or far > ring[3] ** 2 or math.isnan(image[j, i]):
+            if not _within(image, j, i, ring):
                 continue
             r = image[j, i] - _row(j, i, p, modes, row)
             u = min(1.0, abs(r) / cutoff)
@@ -140,7 +147,6 @@ def normal_equations(image, p, modes, ring, cutoff):
             w = (1 - u * u) ** 2
             if w == 0.0:
                 continue
-            squares += w * r * r
             total += w
             for a in range(size):
                 rows[a, n] = row[a]
@@ -155,70 +161,4 @@ def normal_equations(image, p, modes, ring, cutoff):
     for a in range(size):
         for b in range(a):
             A[b, a] = A[a, b]
-    return A, g, squares, total, cost * cutoff * cutoff / 6
-
-
-@kernel
-def influence(image, p, modes, ring, cutoff, weights, sectors):
-    """Influence of each pixel on the radius, u_i = (weights·J_i) ψ_i of each pixel, in its sums.
-
-    Σ u_i by sector (K,), Σ u_i² over pixels, Σ ψ'_i / Σ w_i, and by sector JᵀWJ·weights (K, P): what a fit takes out.
-    """
-    row = np.zeros(len(p))
-    sums = np.zeros(sectors)
-    fitted = np.zeros((sectors, len(p)))
-    squares = slopes = total = 0.0
-    top, bottom, left, right = _bounds(image.shape, ring[0], ring[1], ring[3])
-    for j in range(top, bottom):
-        for i in range(left, right):
-            far = (i - ring[0]) ** 2 + (j - ring[1]) ** 2
-            if far < ring[2] ** 2 or far > ring[3] ** 2 or math.isnan(image[j, i]):
-                continue
-            r = image[j, i] - _row(j, i, p, modes, row)
-            u = 0.0
-            for a in range(len(row)):
-                u += weights[a] * row[a]
-            v = min(1.0, (r / cutoff) ** 2)
-            slopes += (1 - v) * (1 - 5 * v)
-            total += (1 - v) ** 2
-            turn = math.atan2(j - p[1], i - p[0]) / (2 * math.pi) + 0.5
-            k = min(sectors - 1, int(turn * sectors))
-            for a in range(len(row)):
-                fitted[k, a] += (1 - v) ** 2 * row[a] * u
-            u *= r * (1 - v) ** 2
-            sums[k] += u
-            squares += u * u
-    return sums, squares, slopes / total, fitted
-
-
-@kernel
-def of_rows(image, p, modes, ring):
-    """Of even and of odd rows (2,): Σ (dm/dR)² and Σ r dm/dR; their quotient is how much larger they show it."""
-    row = np.zeros(len(p))
-    squares, sums = np.zeros(2), np.zeros(2)
-    top, bottom, left, right = _bounds(image.shape, ring[0], ring[1], ring[3])
-    for j in range(top, bottom):
-        for i in range(left, right):
-            far = (i - ring[0]) ** 2 + (j - ring[1]) ** 2
-            if far < ring[2] ** 2 or far > ring[3] ** 2 or math.isnan(image[j, i]):
-                continue
-            r = image[j, i] - _row(j, i, p, modes, row)
-            squares[j % 2] += row[2] * row[2]
-            sums[j % 2] += r * row[2]
-    return squares, sums
-
-
-@kernel
-def normalise(frame, level, gain, step):
-    """(frame − level) gain (H, W), and its means over tiles of ``step`` × ``step`` pixels; where the gain is NaN, NaN
-    and, in the means, zero."""
-    height, width = frame.shape
-    image = np.empty((height, width), dtype=np.float32)
-    tiles = np.zeros((height // step, width // step), dtype=np.float32)
-    for j in range(height):
-        for i in range(width):
-            value = (np.float32(frame[j, i]) - level[j, i]) * gain[j, i]
-            image[j, i] = value
-            if j // step < tiles.shape[0] and i // step < tiles.shape[1] and not math.isnan(value):
-                tiles[j // step, i // step] += value
-    return image, tiles / np.float32(step * step)
+    return A, g, total, cost * cutoff * cutoff / 6

@@ -1,22 +1,25 @@
-"""The page that shows the work: a strip of frames with their outlines, radius and shape in time, what was left out."""
+"""What shows the work: the movie with its outlines, and a page with a strip of frames, radius and shape in time."""
 
 from __future__ import annotations
 
 import base64
 import io
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
+from en4dvar.model.state import Array
 from en4dvar.report.chart import PAGE, Chart, Panel, Row
 from en4dvar.report.html import render
 from en4dvar.report.svg import svg
 from en4dvar_movie.frames import Frame, Movie
 from en4dvar_movie.outline import MODES
-from en4dvar_movie.outlined import brightest, by_frame, grey
 from en4dvar_movie.table import Scale
 from en4dvar_movie.tracking import Reading, Track
 
+WIDE = 512  # pixels that a frame of the outlined movie has at least
+RED = (255, 90, 54)
 SHOWN = 60  # frames of the strip
 SIDE = 240  # pixels of a picture, at most
 TURN = np.linspace(0, 2 * np.pi, 121)
@@ -82,8 +85,8 @@ def _strip(movie: Movie, track: Track) -> list[dict[str, Any]]:
 def _picture(number: int, frame: Frame, readings: list[Reading], full: float) -> dict[str, Any]:
     step = -(-max(frame.shape) // SIDE)
     small = grey(frame[::step, ::step], full)
-    shown = [r for r in readings if r.sighting.outline is not None and (r.used or r.doubt)]
-    outlines = [(r.sighting.outline.points(TURN) / step, r.doubt) for r in shown if r.sighting.outline is not None]
+    shown = [(r.sighting.outline, r.doubt) for r in readings if r.used or r.doubt]
+    outlines = [(outline.points(TURN) / step, doubt) for outline, doubt in shown if outline is not None]
     return {
         "frame": str(number),
         "png": png(small),
@@ -104,3 +107,43 @@ def png(picture: Frame) -> str:
     buffer = io.BytesIO()
     Image.fromarray(picture).save(buffer, format="PNG", optimize=False)
     return base64.b64encode(buffer.getvalue()).decode()
+
+
+def by_frame(readings: Sequence[Reading]) -> dict[int, list[Reading]]:
+    """Frame → its readings, one a circle."""
+    of_frames: dict[int, list[Reading]] = {}
+    for reading in readings:
+        of_frames.setdefault(reading.sighting.frame, []).append(reading)
+    return of_frames
+
+
+def outlined(movie: Movie, track: Track) -> Iterator[Frame]:
+    """Coloured pictures (H, W, 3) of 8 bit, of even sides as videos need."""
+    readings = by_frame(track.readings)
+    full = brightest(track)
+    for number, frame in enumerate(movie.frames()):
+        scale = -(-WIDE // max(frame.shape))
+        large = np.kron(grey(frame, full), np.ones((scale, scale), np.uint8))
+        picture = np.repeat(np.pad(large, [(0, side % 2) for side in large.shape])[..., None], 3, axis=2)
+        for reading in readings.get(number, ()):
+            if reading.used and reading.sighting.outline is not None:
+                around = np.linspace(0, 2 * np.pi, int(8 * reading.radius * scale) + 16)
+                _draw(picture, (reading.sighting.outline.points(around) + 0.5) * scale)
+        yield picture
+
+
+def brightest(track: Track) -> float:
+    """The brightness that is shown as white."""
+    return max(1.3 * float(np.percentile(track.background.level, 95)), 1.0)
+
+
+def grey(frame: Frame, full: float) -> Frame:
+    """A frame of any depth in 8 bit."""
+    return np.clip(255.0 * frame / full, 0, 255).astype(np.uint8)
+
+
+def _draw(picture: Frame, points: Array) -> None:
+    for shift in ((0, 0), (1, 0), (0, 1)):  # a line of two pixels, which a video with fewer colours than pixels keeps
+        x, y = np.floor(points + shift).astype(int).T
+        inside = (x >= 0) & (y >= 0) & (x < picture.shape[1]) & (y < picture.shape[0])
+        picture[y[inside], x[inside]] = RED

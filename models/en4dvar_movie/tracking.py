@@ -3,18 +3,17 @@ them, then what neighbouring frames say of the errors."""
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
+from en4dvar.executor import SerialExecutor, ThreadsExecutor
 from en4dvar.plumbing.errors import DataError
 from en4dvar_movie.background import Background, find_background
 from en4dvar_movie.candidates import Look, look_at
-from en4dvar_movie.corrections import Correction
+from en4dvar_movie.choice import Correction
 from en4dvar_movie.flashes import in_time
 from en4dvar_movie.following import Chain, chains, doubts, reasons, target
 from en4dvar_movie.frames import Frame, Movie
@@ -90,17 +89,18 @@ def track(
     background, optics = find_background(movie, len(flashes), watched)
     fixed = corrections or {}
 
-    def look(numbered: tuple[int, Frame]) -> Look:
-        number, frame = numbered
+    def look(number: int, frame: Frame) -> Look:
         if number in movie.damaged:
             return Look(number, (), "the file is damaged here")
         start = fixed[number].start if number in fixed else None
         return look_at(number, frame, background, optics, start, len(flashes))
 
-    looks = []
-    for of_frame in in_order(look, enumerate(movie.frames()), workers):
-        looks.append(of_frame)
-        progress(len(looks))
+    of_frames: dict[int, Look] = {}
+    with SerialExecutor() if workers == 1 else ThreadsExecutor(workers) as executor:
+        for number, of_frame in executor.results(look, enumerate(movie.frames())):
+            of_frames[number] = of_frame
+            progress(len(of_frames))
+    looks = [of_frames[number] for number in sorted(of_frames)]
     by_hand = [number for number, correction in fixed.items() if correction.start is not None]
     bubbles = chains(looks, by_hand)
     notes: list[str] = []
@@ -110,82 +110,44 @@ def track(
         notes = [note] * bool(note)
     if point is not None and (not bubbles or bubbles[0].distance(*point)[0] > AWAY):
         raise DataError(f"{movie.path}: no bubble is seen near {point[0]:g},{point[1]:g} in any frame")
+    share = exposure * movie.rate if len(flashes) == 1 else 0.0
     read = [
-        tuple(_readings(looks, bubbles, n, fixed if n == 0 else {}, optics, (movie.rate, flashes, exposure)))
-        for n in range(max(len(bubbles), 1))
+        tuple(_readings(looks, bubble, bubbles, fixed if n == 0 else {}, optics, movie.rate, flashes, share))
+        for n, bubble in enumerate(bubbles or [Chain(())])
     ]
     return Track(read[0], background, optics, flashes, tuple(read[1:]), tuple(notes))
 
 
 def _readings(
     looks: Sequence[Look],
+    bubble: Chain,
     bubbles: Sequence[Chain],
-    number: int,
     corrections: Mapping[int, Correction],
     optics: Optics,
-    times: tuple[float, Sequence[float], float],
-) -> Iterator[Reading]:
-    """Readings of one of the bubbles, or of a movie without any."""
-    bubble = bubbles[number] if bubbles else Chain(())
-    doubtful = doubts(bubble, [*bubbles[:number], *bubbles[number + 1 :]])
-    why = reasons(looks, bubble)
-    seen = {c.frame: [Sighting(c.frame, outline, "") for outline in c.outlines] for c in bubble.candidates}
-    sightings = [seen.get(look.frame) or [Sighting(look.frame, None, why[look.frame])] for look in looks]
-    rate, flashes, exposure = times
-    if len(flashes) > 1:
-        sightings = ordered(sightings, rate, flashes)
-    flat = [circle for circles in sightings for circle in circles]
-    doubtful.update({c.frame: c.doubt for c in bubble.candidates if c.doubt})
-    share = exposure * rate if len(flashes) == 1 else 0.0
-    yield from readings_of(flat, optics, corrections, doubtful, share)
-
-
-def ordered(sightings: list[list[Sighting]], rate: float, flashes: Sequence[float]) -> list[list[Sighting]]:
-    """The nested circles of each frame in the order of the flashes; frames without all of them keep theirs."""
-    whole = [
-        k
-        for k, of_frame in enumerate(sightings)
-        if len(of_frame) == len(flashes) and not any(c.reason for c in of_frame)
-    ]
-    radii = [np.array([c.outline.circle.R for c in sightings[k] if c.outline is not None]) for k in whole]
-    at = np.array([sightings[k][0].frame / rate for k in whole])
-    result = list(sightings)
-    for k, order in zip(whole, in_time(radii, at, flashes), strict=True):
-        result[k] = [replace(sightings[k][circle], flash=flash) for flash, circle in enumerate(order)]
-    return result
-
-
-def in_order(
-    look: Callable[[tuple[int, Frame]], Look], frames: Iterable[tuple[int, Frame]], workers: int
-) -> Iterator[Look]:
-    """``look`` at each frame in threads; a few frames are held at a time."""
-    if workers == 1:
-        yield from map(look, frames)
-        return
-    waiting: deque[Future[Look]] = deque()
-    with ThreadPoolExecutor(workers) as pool:
-        for numbered in frames:
-            waiting.append(pool.submit(look, numbered))
-            if len(waiting) > 3 * workers:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
-
-
-def readings_of(
-    sightings: Sequence[Sighting],
-    optics: Optics,
-    corrections: Mapping[int, Correction],
-    doubtful: Mapping[int, str],
+    rate: float,
+    flashes: Sequence[float],
     exposure: float,
 ) -> Iterator[Reading]:
-    """Radii with their errors, and what is left out by hand or for a doubt that no correction removes."""
+    """Radii of a bubble with their errors, and what is left out by hand or for a doubt that no correction removes.
+
+    The nested circles of a frame are in the order of the flashes. ``exposure`` is a share of the step between frames.
+    """
+    doubtful = doubts(bubble, [other for other in bubbles if other is not bubble])
+    doubtful |= {c.frame: c.doubt for c in bubble.candidates if c.doubt}
+    doubtful = {frame: words for frame, words in doubtful.items() if frame not in corrections}
     out = {frame for frame, correction in corrections.items() if correction.out}
-    doubted = {frame: words for frame, words in doubtful.items() if frame not in corrections}
-    good = [None if s.frame in doubted or s.frame in out else s.outline for s in sightings]
+    why = reasons(looks, bubble)
+    radii = [np.array([outline.circle.R for outline in c.outlines]) for c in bubble.candidates]
+    orders = in_time(radii, np.array([c.frame / rate for c in bubble.candidates]), flashes)
+    seen = {
+        c.frame: [Sighting(c.frame, c.outlines[circle], "", flash) for flash, circle in enumerate(order)]
+        for c, order in zip(bubble.candidates, orders, strict=True)
+    }
+    sightings = [s for look in looks for s in seen.get(look.frame) or [Sighting(look.frame, None, why[look.frame])]]
+    good = [None if s.frame in doubtful or s.frame in out else s.outline for s in sightings]
     errors = errors_of(good, optics, exposure)
     for sighting, outline, error in zip(sightings, good, errors, strict=True):
-        correction, doubt = corrections.get(sighting.frame), doubted.get(sighting.frame, "")
+        correction, doubt = corrections.get(sighting.frame), doubtful.get(sighting.frame, "")
         if correction is not None and correction.out:
             words = f"left out by hand: {correction.words}".rstrip(": ")
             yield Reading(sighting, float("nan"), NOTHING, False, words)

@@ -29,8 +29,8 @@ BUBBLE = (
 
 # and inside the reader of movies
 MOVIE = (
-    "decoders", "frames", "kernels", "outline", "fitting", "locate", "background", "corrections", "uncertainty",
-    "flashes", "candidates", "following", "choice", "tracking", "table", "outlined", "page", "scene", "writing",
+    "decoders", "frames", "kernels", "outline", "fitting", "background", "uncertainty",
+    "flashes", "candidates", "following", "choice", "tracking", "table", "page", "scene",
     "filming", "commands", "warm_up",
 )  # fmt: skip
 

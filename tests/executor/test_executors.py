@@ -9,7 +9,7 @@ from same_bits import assert_same_bits
 from toys import Decay, Dying, Fragile, Vectorised, make_problem
 
 from en4dvar.estimation.assimilate import assimilate
-from en4dvar.executor import ProcessesExecutor, SerialExecutor, ThreadsExecutor, cut, make_executor
+from en4dvar.executor import ProcessesExecutor, SerialExecutor, ThreadsExecutor, choose_executor, cut
 from en4dvar.model.forward import Failure
 from en4dvar.schemes.settings import AssimilationSettings
 
@@ -74,10 +74,10 @@ def test_chunks_cover_members_and_respect_batches(batch, workers):
         assert all(part.start % batch == 0 and part.stop > part.start for part in chunks)
 
 
-def test_make_executor_chooses_by_model():
-    assert isinstance(make_executor(Decay(), 1), SerialExecutor)
-    assert isinstance(make_executor(Decay(compiled=True), 2), ThreadsExecutor)
-    assert isinstance(make_executor(Decay(), 2), ProcessesExecutor)
+def test_the_executor_is_chosen_by_the_model():
+    assert isinstance(choose_executor(Decay(), workers=1), SerialExecutor)
+    assert isinstance(choose_executor(Decay(compiled=True), workers=2), ThreadsExecutor)
+    assert isinstance(choose_executor(Decay(), workers=2), ProcessesExecutor)
     with pytest.raises(ValueError, match="at least 1"):
         ThreadsExecutor(0)
 

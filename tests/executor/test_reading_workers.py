@@ -7,7 +7,7 @@ import pytest
 from run_files import configuration, make_campaign
 
 from en4dvar.executor import ProcessesExecutor
-from en4dvar.executor.chunks import CommonValue
+from en4dvar.executor.base import CommonValue
 from en4dvar.runs import jobs
 from en4dvar.runs.runner import run_campaign
 

@@ -38,7 +38,7 @@ from en4dvar.results.checkpoint import read_checkpoint
 from en4dvar.results.netcdf import read_sealed
 from en4dvar.results.seal import seal_file
 from en4dvar.runs.runner import run, run_campaign
-from en4dvar_movie.corrections import read_corrections
+from en4dvar_movie.choice import read_corrections
 from en4dvar_movie.frames import open_movie
 
 ROWS = "t,y\n0,1\n1,2\n"

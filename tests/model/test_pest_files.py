@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from en4dvar.model.programs import pest
-from en4dvar.model.programs.errors import ProgramError
 from en4dvar.model.programs.model import CommandModel, CommandSettings
+from en4dvar.model.programs.pest import ProgramError
 
 PUBLIC = Path(__file__).parents[2].parent / "shared" / "reference" / "pest" / "pestpp" / "benchmarks"
 TEMPLATE = "ptf ~\nmodel input\n~   K1        ~ ~  s~\nlast ~k1~\n"

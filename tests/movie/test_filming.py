@@ -12,7 +12,7 @@ from en4dvar.cli import main
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar_movie.filming import Camera, described, exposures, film, parse_settings
 from en4dvar_movie.frames import open_movie
-from en4dvar_movie.outlined import RED
+from en4dvar_movie.page import RED
 from en4dvar_movie.scene import Scene, render
 from en4dvar_movie.tracking import track
 

@@ -17,7 +17,7 @@ from PIL import Image
 
 from en4dvar.cli import main
 from en4dvar_movie.candidates import Candidate
-from en4dvar_movie.corrections import Correction
+from en4dvar_movie.choice import Correction
 from en4dvar_movie.following import Chain, doubts
 from en4dvar_movie.outline import Circle, Outline
 from en4dvar_movie.tracking import doubted, track

@@ -8,9 +8,8 @@ import tifffile
 from PIL import Image
 
 from en4dvar.plumbing.errors import DataError
-from en4dvar_movie.corrections import read_corrections
-from en4dvar_movie.frames import open_movie, with_scale
-from en4dvar_movie.writing import write_movie
+from en4dvar_movie.choice import read_corrections
+from en4dvar_movie.frames import open_movie, with_scale, write_movie
 
 FRAMES = np.random.default_rng(2).integers(0, 256, (4, 32, 48), dtype=np.uint8)
 

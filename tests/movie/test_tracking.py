@@ -10,7 +10,7 @@ from movies import CLASSES, SHARED, against_a_person, film, movie_of, rendered
 
 from en4dvar.plumbing.errors import DataError
 from en4dvar_movie.background import find_background
-from en4dvar_movie.corrections import Correction
+from en4dvar_movie.choice import Correction
 from en4dvar_movie.scene import Scene, render
 from en4dvar_movie.tracking import track
 

@@ -23,7 +23,7 @@ from en4dvar.diagnosis.response.linear import LinearResponse
 from en4dvar.ensemble.forecast import of_framework
 from en4dvar.ensemble.members import EVERYONE, InitialStates, Reading
 from en4dvar.ensemble.readout import Readout, batched, operators_of
-from en4dvar.executor.chunks import without_warnings
+from en4dvar.executor.base import without_warnings
 from en4dvar.model.forward import Failure, PathQuantity, Trajectory
 from en4dvar.model.state import READING_SCALE, TIME_SHIFT, Array
 from en4dvar.plumbing.user_code import reason_of

@@ -4,14 +4,14 @@ Priors are those of PEST++'s ensemble smoother: ``parval1`` in the middle and bo
 (option ``par_sigma_range``), of the logarithm where ``partrans`` is ``log``; at the bounds they are cut off. The std of
 an observation is 1/weight; those of weight 0 are left out. Prior information counts as further observations. The
 observations of groups that hold inequalities are bounds. Files of covariances and of a prior ensemble take the place of
-bounds and weights. What would change the estimate and is not known here is an error that names it.
+bounds and weights. What it asks for that would change the estimate and is not done here is an error that names it.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,14 +19,40 @@ import numpy as np
 
 from en4dvar.model.programs import pest
 from en4dvar.model.programs.control_file import OBSERVATIONS, PARAMETERS, ControlFile, PestRow, read_control, text_of
-from en4dvar.model.programs.refused import refuse
-from en4dvar.model.programs.spread import errors_in_files, priors_in_files
+from en4dvar.model.programs.matrices import OFF, READ, errors_in_files, priors_in_files
 from en4dvar.plumbing.errors import ConfigError
 
 RANGE = 4.0  # standard deviations between the bounds: PEST++ (White et al. 2020), option par_sigma_range
 OBSERVED = "observations"
 BOUNDS = {"at_most": ("l_", "less", ">@"), "at_least": ("g_", "greater", "<@")}  # how their groups begin: PEST++
 RANGES = {"at_most": "less_than", "at_least": "greater_than"}  # columns of external tables, where the group is none
+SEARCH = "this is a search for an optimum, not an estimate"
+OPTIONS: Mapping[str, str] = {  # option of PEST++, or how several begin → why not
+    "ies_no_noise": "errors are drawn here, from the weights",
+    "ies_phi_factor": "weights are those of the control file",
+    "ies_restart": "an estimate begins at its prior here",
+    "ies_weight": "there is one weight an observation here",
+    "ies_loc": "name a localisation in assimilation= instead",
+    "ies_autoadaloc": "name a localisation in assimilation= instead",
+    "ies_reg_factor": "the prior alone regularises here",
+    "ies_drop_conflicts": "no observation is left out here",
+    "tie_by_group": "tie the parameters one by one",
+    "tpl_force_decimal": "numbers are written with an exponent where that is shorter",
+    "mou_": SEARCH,
+    "opt_": SEARCH,
+    "sqp_": SEARCH,
+    "da_par": "a prior ensemble is that of prior={'ensemble': 'members.csv'}",
+    "da_obs": "errors are drawn here, from the weights",
+    "da_restart": "an estimate begins at its prior here",
+    "da_weight": "there is one weight an observation here",
+}
+COLUMNS: Mapping[str, str] = {  # of external tables
+    "cycle": "the cycles of pestpp-da are not known here",
+    "state_par_link": "the cycles of pestpp-da are not known here",
+    "mean": "the middle of a prior is parval1 here",
+    "lower_bound": "errors have no bounds here",
+    "upper_bound": "errors have no bounds here",
+}
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[edED][+-]?\d+)?"
 _TERM = re.compile(rf"\s*([+-]?)\s*({_NUMBER})\s*\*\s*(?:(log)\s*\(\s*([^\s()]+)\s*\)|([^\s()*=]+))\s*", re.IGNORECASE)
 
@@ -52,7 +78,7 @@ def from_pest(path: str | Path, files: Sequence[str] = (), *, prior_information:
     parameters = _parameters(control, [row for row in rows if len(row.cells) > 2])
     parents = {row.word("parnme"): row.word("partrans") for row in rows if len(row.cells) == 2}
     equations = _equations(control, parameters) if prior_information else []
-    refuse(control, rows, observed, {reading.group for reading in equations})
+    _refuse(control, rows, observed, {reading.group for reading in equations})
     observations = [reading for row in observed for reading in _observations(row)]
     readings, names = [*observations, *equations], [reading.name for reading in observations]
     if not readings:
@@ -236,3 +262,52 @@ def _files(control: ControlFile) -> tuple[dict[str, str], dict[str, list[str]]]:
     if not instructions:
         raise ConfigError(f"{control.path}: no instruction file")
     return templates, instructions
+
+
+def _refuse(
+    control: ControlFile, parameters: Sequence[PestRow], observed: Sequence[PestRow], informed: set[str]
+) -> None:
+    """Raise :class:`ConfigError` with all that is refused; ``informed``: groups of prior information that counts."""
+    if reasons := [
+        *_modes(control, bool(informed)),
+        *_options(control),
+        *_rows(control, parameters, observed, informed),
+    ]:
+        raise ConfigError(f"{control.path}: " + "; ".join(dict.fromkeys(reasons)))
+
+
+def _modes(control: ControlFile, informed: bool) -> Iterator[str]:
+    words = [row.cells["line"].lower().split() for row in control.lines("control data")]
+    mode = control.options.get("pestmode", words[0][1] if words and len(words[0]) > 1 else "estimation").lower()
+    if mode.startswith("regul"):
+        if informed:
+            yield "regularisation mode adapts the weights of prior information; prior_information=False leaves it out"
+    elif mode != "estimation":
+        yield f"mode {mode} is not known here; estimation is"
+
+
+def _options(control: ControlFile) -> Iterator[str]:
+    for name, text in control.options.items():
+        for begin, why in OPTIONS.items():
+            if name.startswith(begin) and name not in READ and text.lower() not in OFF:
+                yield f"option {name}: {why}"
+                break
+        if name in ("enforce_bounds", "ies_enforce_bounds") and text.lower() in OFF:
+            yield f"option {name}: bounds hold here"
+
+
+def _rows(
+    control: ControlFile, parameters: Sequence[PestRow], observed: Sequence[PestRow], informed: set[str]
+) -> Iterator[str]:
+    used = {row.word("obgnme") for row in observed} | informed
+    for row in control.rows("observation groups", ["obgnme", "covfle"]):
+        if row.word("covfle") and row.word("obgnme") in used:
+            words = "correlated errors are those of option obscov"
+            yield f"group {row.word('obgnme')} has a covariance, {row.cells['covfle']}: {words}"
+    for row in parameters:
+        if row.word("dercom") not in ("", "0", "1"):
+            yield f"{row.word('parnme')} has a model command of its own for derivatives (dercom {row.word('dercom')})"
+    for row in [*parameters, *observed]:
+        for column, why in COLUMNS.items():
+            if row.word(column) not in ("", "-1", "0"):
+                yield f"column {column}: {why}"

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from en4dvar.model.programs import pest, template
-from en4dvar.model.programs.errors import ProgramError
+from en4dvar.model.programs.pest import ProgramError
 from en4dvar.model.programs.settings import OutputOf
 from en4dvar.model.state import Array
 from en4dvar.plumbing.decoding import Allowed, DecodeError, decoded_whole

@@ -13,13 +13,14 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 
-from en4dvar.model.programs.errors import ProgramError
-
-_OBSERVATION = re.compile(r"!([^!]+)!|[\[(]([^\])]+)[\])]([1-9]\d*):([1-9]\d*)")
-_ADVANCE = re.compile(r"[lL]([1-9]\d*)")
-_MOVE = re.compile(r"[wW]|[tT][1-9]\d*")
+_ITEM = r"[lL](?P<lines>[1-9]\d*)|(?P<blank>[wW])|[tT](?P<column>[1-9]\d*)|!(?P<free>[^!]+)!"
+_ITEM += r"|[\[(](?P<fixed>[^\])]+)[\])](?P<first>[1-9]\d*):(?P<last>[1-9]\d*)"
 _NUMBER = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+))(?:[ed]([+-]?\d+))?", re.IGNORECASE)
 _NO_LETTER = re.compile(r"([+-]?(?:\d+\.\d*|\.\d+))([+-]\d{3})")  # Fortran leaves out the E of 1.5E-101
+
+
+class ProgramError(Exception):
+    """A program ended badly, or what it left cannot be read; the words are the reason of a member that failed."""
 
 
 def is_template(text: str) -> bool:
@@ -90,44 +91,36 @@ def _sign(text: str) -> str:
 
 
 @functools.lru_cache(maxsize=64)
-def parsed(instructions: str, source: str = "instructions") -> tuple[list[str], ...]:
+def parsed(instructions: str, source: str = "instructions") -> tuple[list[re.Match[str]], ...]:
     """The items of each line of an instruction file, ``source`` by name, with those of the lines that continue it.
 
     Raises :class:`ProgramError` at what is no instruction.
     """
     sign = re.escape(_sign(instructions))
-    item = re.compile(f"{sign}[^{sign}]*{sign}|[^\\s{sign}]+|{sign}.*")
-    lines: list[list[str]] = []
+    words = re.compile(f"{sign}[^{sign}]*{sign}|[^\\s{sign}]+|{sign}.*")
+    known = re.compile(f"{_ITEM}|{sign}(?P<marker>[^{sign}]+){sign}")
+    lines: list[list[re.Match[str]]] = []
     names: set[str] = set()
     for number, text in enumerate(instructions.splitlines()[1:], 2):
-        items = item.findall(text)
-        if not items:
-            continue
-        if items[0] == "&" and lines:
-            begin, items = 1, items[1:]
-            lines[-1] += items
-        else:
-            begin = 0
-            lines.append(items)
-        for place, each in enumerate(items, begin):
-            _check(each, _sign(instructions), place > 0, f"{source}:{number}")
-            name = _named(each)
-            if name in names:
-                raise ProgramError(f"{source}:{number}: {name} is read twice")
+        where, items = f"{source}:{number}", words.findall(text)
+        if items[:1] == ["&"] and lines:
+            del items[0]
+        elif items:
+            lines.append([])
+        for word in items:
+            item = known.fullmatch(word)
+            if item and item["first"] and int(item["first"]) > int(item["last"]):
+                raise ProgramError(f"{where}: the columns of {word} do not increase")
+            if lines[-1] and (item is None or item["lines"]):
+                raise ProgramError(f"{where}: {word!r} is no instruction of PEST")
+            if item is None or not (lines[-1] or item["lines"] or item["marker"]):
+                words_of = "a line of instructions begins with a marker or l1, l2, …; not with"
+                raise ProgramError(f"{where}: {words_of} {word!r}")
+            if (name := _named(item)) in names:
+                raise ProgramError(f"{where}: {name} is read twice")
             names |= {name} - {""}
+            lines[-1].append(item)
     return tuple(lines)
-
-
-def _check(item: str, sign: str, within: bool, where: str) -> None:
-    """Raise :class:`ProgramError` unless this is an instruction; ``within`` a line others stand than at its start."""
-    marker = len(item) > 2 and item[0] == item[-1] == sign
-    observed = _OBSERVATION.fullmatch(item)
-    if observed and observed[3] and int(observed[3]) > int(observed[4]):
-        raise ProgramError(f"{where}: the columns of {item} do not increase")
-    if within and not (marker or observed or _MOVE.fullmatch(item)):
-        raise ProgramError(f"{where}: {item!r} is no instruction of PEST")
-    if not within and not (marker or _ADVANCE.fullmatch(item)):
-        raise ProgramError(f"{where}: a line of instructions begins with a marker or l1, l2, …; not with {item!r}")
 
 
 def observations_of(instructions: str, source: str = "instructions") -> list[str]:
@@ -153,15 +146,15 @@ def read(
         k = 1
         while k < len(items):
             item, following = items[k], items[k + 1 : k + 2]
-            if (name := _named(item)) or _OBSERVATION.fullmatch(item):
-                text = cursor.observed(item, _marker(following[0]) if following else "")
-                if name:
+            if item["free"] or item["fixed"]:
+                text = cursor.observed(item, following[0]["marker"] if following else None)
+                if name := _named(item):
                     number = _NUMBER.fullmatch(text.strip()) or _NO_LETTER.fullmatch(text.strip())
                     values[name] = math.nan if number is None else float(f"{number[1]}e{number[2] or 0}")
                     wrong = wrong or f"{cursor.place}: {text.strip() or 'nothing'!r} is not a number for {name}"
             elif not cursor.moved(item):
-                if not all(map(_marker, items[:k])):
-                    raise ProgramError(f"{cursor.place}: no {_marker(item)!r} behind column {cursor.column}")
+                if not all(before["marker"] for before in items[:k]):
+                    raise ProgramError(f"{cursor.place}: no {item['marker']!r} behind column {cursor.column}")
                 cursor.advance(items[0])  # the markers belong to a line further down
                 k = 0
             k += 1
@@ -170,17 +163,10 @@ def read(
     return values
 
 
-def _named(item: str) -> str:
+def _named(item: re.Match[str]) -> str:
     """The observation that an item reads, "" where it reads none."""
-    observed = _OBSERVATION.fullmatch(item)
-    name = (observed[1] or observed[2]).lower() if observed else ""
+    name = (item["free"] or item["fixed"] or "").lower()
     return "" if name == "dum" else name
-
-
-def _marker(item: str) -> str:
-    """The text of a marker, "" of another item."""
-    others = _OBSERVATION.fullmatch(item) or _MOVE.fullmatch(item) or _ADVANCE.fullmatch(item)
-    return "" if others else item[1:-1]
 
 
 class _Cursor:
@@ -197,53 +183,52 @@ class _Cursor:
         """File and line, for messages."""
         return f"{self.where}:{self.row + 1}"
 
-    def advance(self, item: str) -> None:
+    def advance(self, item: re.Match[str]) -> None:
         """Down to the line that the first item leads to. Raises :class:`ProgramError`."""
-        if counted := _ADVANCE.fullmatch(item):
-            self.row, self.column = self.row + int(counted[1]), 0
+        if item["lines"]:
+            self.row, self.column = self.row + int(item["lines"]), 0
             if self.row >= len(self.lines):
                 raise ProgramError(f"{self.where}: has {len(self.lines)} lines, but line {self.row + 1} is to be read")
             return
-        marker = _marker(item)
+        marker = item["marker"]
         for row in range(self.row + 1, len(self.lines)):
             if marker in self.lines[row]:
                 self.row, self.column = row, self.lines[row].index(marker) + len(marker)
                 return
         raise ProgramError(f"{self.where}: no {marker!r} below line {self.row + 1}")
 
-    def moved(self, item: str) -> bool:
+    def moved(self, item: re.Match[str]) -> bool:
         """Along the line, by ``w``, ``tn`` or a secondary marker, False where there is none.
 
         Raises :class:`ProgramError`.
         """
         line = self.lines[self.row]
-        if item in ("w", "W"):
+        if item["blank"]:
             blank = self.blank.search(line, self.column)
             if blank is None:
                 raise ProgramError(f"{self.place}: no blank behind column {self.column}")
             self.column = blank.end()
             return True
-        if _MOVE.fullmatch(item):
-            self.column = int(item[1:])
+        if item["column"]:
+            self.column = int(item["column"])
             return True
-        at = line.find(_marker(item), self.column)
+        at = line.find(item["marker"], self.column)
         if at >= 0:
-            self.column = at + len(_marker(item))
+            self.column = at + len(item["marker"])
         return at >= 0
 
-    def observed(self, item: str, until: str) -> str:
+    def observed(self, item: re.Match[str], until: str | None) -> str:
         """The text of an observation, which ends at the marker ``until`` if one follows; the cursor goes behind it."""
-        line, observed = self.lines[self.row], _OBSERVATION.fullmatch(item)
-        assert observed is not None
-        if observed[1]:
+        line = self.lines[self.row]
+        if item["free"]:
             token = self.token.search(line, self.column)
             text, end = (token[0], token.end()) if token else ("", self.column)
             if until and (cut := text.find(until)) > 0:
                 text, end = text[:cut], end - len(text) + cut
         else:
-            first, end = int(observed[3]) - 1, int(observed[4])
+            first, end = int(item["first"]) - 1, int(item["last"])
             text = line[first:end]
-            if item[0] == "(":  # the whole of what begins or lies in the columns
+            if item[0].startswith("("):  # the whole of what begins or lies in the columns
                 token = next((t for t in self.token.finditer(line) if t.end() > first and t.start() < end), None)
                 text, end = (token[0], token.end()) if token else ("", end)
         self.column = end

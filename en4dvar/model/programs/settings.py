@@ -17,7 +17,7 @@ from typing import Annotated, Any, Self
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, ValidationInfo, model_validator
 
 from en4dvar.model.programs import pest
-from en4dvar.model.programs.errors import ProgramError
+from en4dvar.model.programs.pest import ProgramError
 from en4dvar.model.programs.template import TIMES, check_template, input_name
 from en4dvar.plumbing.described import Described, text_for
 from en4dvar.plumbing.errors import retold

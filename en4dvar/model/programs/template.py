@@ -16,7 +16,7 @@ from jinja2.meta import find_undeclared_variables
 from jinja2.sandbox import ImmutableSandboxedEnvironment
 
 from en4dvar.model.programs import pest
-from en4dvar.model.programs.errors import ProgramError
+from en4dvar.model.programs.pest import ProgramError
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import retold
 from en4dvar.plumbing.files import in_bytes, read_text

@@ -5,8 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from en4dvar.inputs.asked import ANY, DataFile, Layout
-from en4dvar.inputs.opened import opened
+from en4dvar.inputs.asked import ANY, DataFile, Layout, opened
 from en4dvar.inputs.parts import cell, table_of
 from en4dvar.inputs.sheets import sheet_lines
 from en4dvar.inputs.text_table import cells_of, delimiter_of, numbered_lines
@@ -102,9 +101,8 @@ def _lines(path: Path) -> list[list[str]]:
         lines = sheet_lines(path, "") if kind == "xlsx" else numbered_lines(path)
     if not lines:
         raise DataError(f"{path}: the file holds no data")
-    first = lines[0][1]
-    delimiter = delimiter_of(first) if isinstance(first, str) else ""
-    return [cells_of(line, delimiter) if isinstance(line, str) else list(line) for _, line in lines]
+    delimiter = delimiter_of(lines[0][1], path)
+    return [cells_of(line, delimiter) for _, line in lines]
 
 
 def _rows_of(name: str, file: DataFile, rows: Sequence[Sequence[str]], at: int) -> list[Sequence[str]]:
