@@ -32,6 +32,10 @@ MOVED |= {f"en4dvar.{old}": f"en4dvar.{new}" for new, several in {
 }.items() for old in several.split()}  # fmt: skip
 MOVED |= {"en4dvar.cycling": "en4dvar.series", "en4dvar.storage": "en4dvar.results"}
 MOVED |= {"en4dvar_agarose.summary": "en4dvar_agarose.tables", "en4dvar_agarose.evidence": "en4dvar_agarose.fits"}
+MOVED |= {f"en4dvar_bubble.{old}": f"en4dvar_bubble.{new}" for old, new in {
+    "laws.zener": "laws.maxwell", "laws.refined": "laws.exactness", "laws.response": "battery",
+    "solver.parts": "solver.lanes",
+}.items()}  # fmt: skip
 
 # names that moved by themselves, with what they are called today
 NAMES = {
