@@ -39,6 +39,10 @@ MOVED |= {"en4dvar_agarose.summary": "en4dvar_agarose.tables", "en4dvar_agarose.
 MOVED |= {f"en4dvar_movie.{old}": f"en4dvar_movie.{new}" for old, new in {
     "corrections": "choice", "locate": "outline", "outlined": "page", "writing": "frames",
 }.items()}  # fmt: skip
+MOVED |= {f"en4dvar_bubble.{old}": f"en4dvar_bubble.{new}" for old, new in {
+    "laws.zener": "laws.maxwell", "laws.refined": "laws.exactness", "laws.response": "battery",
+    "solver.parts": "solver.lanes",
+}.items()}  # fmt: skip
 
 # names that moved by themselves, with what they are called today
 NAMES = {

@@ -208,10 +208,10 @@ def probability(difference: Array) -> Array:
     return np.asarray(0.5 * (1 + np.tanh(np.asarray(difference) / 2)))
 
 
-def verdict(difference: float, positive: str = "quadratic law", negative: str = "neo-Hookean") -> str:
+def verdict(difference: float) -> str:
     """In words: which model, and at what odds, or that the data cannot tell."""
     if not math.isfinite(difference):
         return "unknown"
     if abs(difference) < DECISIVE:
         return "undecidable"
-    return f"{positive if difference > 0 else negative} (odds e^{abs(difference):.0f} : 1)"
+    return f"{'quadratic law' if difference > 0 else 'neo-Hookean'} (odds e^{abs(difference):.0f} : 1)"

@@ -1,5 +1,6 @@
 """One self-contained page, the tables in three formats, the figures as PDF and PNG."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from en4dvar_agarose.paper import LABELS, NAMES, QUANTITIES, ROUTES, Route
 from en4dvar_agarose.store import study_netcdf
 
 ROUTE_KEYS: tuple[Route, ...] = ("sweep", "en4dvar")
-Rows = list[list[str]]
+Cells = Iterator[list[str]]
 TABLES = tuple(f"table{number}.{suffix}" for number in (1, 2) for suffix in ("csv", "md", "tex"))
 FILES = (  # of a study; ``*`` stands for any text
     *TABLES, "sets.csv", "study.yaml", "study.nc", "study.html", "figures/*.png", "figures/*.pdf",
@@ -62,36 +63,32 @@ def _page(study: Study, figures: list[dict[str, Any]]) -> str:
         disagreements=tables.disagreements(study),
         spreads=tables.spread_notes(study),
         quantities=QUANTITIES,
-        dfs=_dfs(study),
-        narrow=_narrow(study),
+        dfs=list(_dfs(study)),
+        narrow=list(_narrow(study)),
         coverage=_coverage(study),
-        population=_population(study),
+        population=list(_population(study)),
         effective=_effective(study),
         comparison=_comparison(study),
         judged=_judged(study),
-        campaigns=_campaigns() if study.plan.synthetic else [],
-        reliability=_reliability() if study.plan.synthetic else [],
+        campaigns=list(_campaigns()) if study.plan.synthetic else [],
+        reliability=list(_reliability()) if study.plan.synthetic else [],
         figures=figures,
     )
 
 
-def _campaigns() -> Rows:
-    rows = []
+def _campaigns() -> Cells:
     for c in measured.coverage():
         share = f"{c.held / c.campaigns:.2f} ± {c.error:.2f}"
-        rows.append([c.gel, c.parameter, str(c.held), share, str(c.of_drawn), str(c.campaigns)])
-    return rows
+        yield [c.gel, c.parameter, str(c.held), share, str(c.of_drawn), str(c.campaigns)]
 
 
-def _reliability() -> Rows:
-    rows = []
+def _reliability() -> Cells:
     for name, words in measured.EXPERIMENTS.items():
         difference, quadratic = measured.reliability(name)
         right = np.mean((difference > 0) == quadratic)
-        rows.append([words, "all", f"{right:.3f}", str(len(difference)), "–"])
+        yield [words, "all", f"{right:.3f}", str(len(difference)), "–"]
         for b in measured.bins(difference, quadratic):
-            rows.append([words, f"{b.stated:.3f}", f"{b.right:.3f}", str(b.count), f"{b.error:.3f}"])
-    return rows
+            yield [words, f"{b.stated:.3f}", f"{b.right:.3f}", str(b.count), f"{b.error:.3f}"]
 
 
 def findings(study: Study) -> list[str]:
@@ -130,17 +127,14 @@ def _apparent_modulus(study: Study, gel: str) -> str:
     )
 
 
-def _dfs(study: Study) -> Rows:
-    rows = []
+def _dfs(study: Study) -> Cells:
     for fit in study.every_fit:
         mean = fit.dfs()
         shares = [f"{100 * mean[q.name]:.0f} %" if q.name in mean else "–" for q in QUANTITIES]
-        rows.append([fit.gel, LABELS[fit.model], *shares])
-    return rows
+        yield [fit.gel, LABELS[fit.model], *shares]
 
 
-def _narrow(study: Study) -> Rows:
-    rows = []
+def _narrow(study: Study) -> Cells:
     for gel, narrow in study.narrow.items():
         for words, fit in (("of this study", study.fits[gel]["qlkv"]), ("as narrow as the printed spread", narrow)):
             j = fit.prior.names.index("R0")
@@ -149,11 +143,10 @@ def _narrow(study: Study) -> Rows:
             printed = tables.plus_minus(paper.TABLES["en4dvar"][gel]["qlkv"]["R0"])
             prior, dfs = f"{guess:.3g} µm, ± {100 * spread:.0f} %", f"{100 * fit.dfs()['R0']:.0f} %"
             estimates, lowest = tables.plus_minus((mean, std)), f"{fit.nrmse('en4dvar').min():.3f}"
-            rows.append([gel, words, prior, estimates, printed, dfs, lowest])
-    return rows
+            yield [gel, words, prior, estimates, printed, dfs, lowest]
 
 
-def _coverage(study: Study) -> Rows:
+def _coverage(study: Study) -> list[list[str]]:
     return [
         [gel, *(f"{100 * study.coverage(gel, 'qlkv', q.name):.0f} %" for q in QUANTITIES)]
         for gel in study.fits
@@ -161,8 +154,7 @@ def _coverage(study: Study) -> Rows:
     ]
 
 
-def _population(study: Study) -> Rows:
-    rows = []
+def _population(study: Study) -> Cells:
     for gel, distribution in study.populations.items():
         fit = study.fits[gel]["qlkv"]
         for q in QUANTITIES:
@@ -172,10 +164,7 @@ def _population(study: Study) -> Rows:
             std = np.median(distribution.posterior.between[:, j]) * q.factor
             known = tables.plus_minus((truth.mean(), truth.std(ddof=1))) if len(truth) > 1 else "–"
             cells = [f"{mean:.3g} [{low:.3g}, {high:.3g}]", f"{std:.2g}"]
-            rows.append(
-                [gel, f"{q.plain} ({q.unit})", *cells, tables.plus_minus((stacked.mean(), stacked.std())), known]
-            )
-    return rows
+            yield [gel, f"{q.plain} ({q.unit})", *cells, tables.plus_minus((stacked.mean(), stacked.std())), known]
 
 
 def _effective(study: Study) -> str:
@@ -187,7 +176,7 @@ def _effective(study: Study) -> str:
     )
 
 
-def _comparison(study: Study) -> Rows:
+def _comparison(study: Study) -> list[list[str]]:
     rows = []
     for gel, comparison in study.comparisons.items():
         compared = [*zip(study.fits[gel]["qlkv"].names, comparison.single, strict=True)]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -109,69 +108,50 @@ def simulate(
         x = model.initial_states(theta)
     except ValueError as error:
         raise ConfigError(f"parameters: {error}") from error
-    return _dataset(model, theta, t, _run(model, x, t, workers))
+    return _dataset(model, theta, t, *_run(model, x, t, workers))
 
 
-@dataclass(frozen=True)
-class _Output:
-    """What is kept of N members at K times: fields name → (N, K); status (N,), reasons (N,), record (N, …)."""
-
-    fields: dict[str, Array]
-    status: Array
-    reasons: Array
-    record: Array
-
-
-def _run(model: BubbleModel, x: Array, t: Array, workers: int) -> _Output:
-    """Integrate chunk by chunk, each by all threads together; a chunk writes its rows and is forgotten (law tables
-    alone are 32 kB per member).
+def _run(model: BubbleModel, x: Array, t: Array, workers: int) -> tuple[dict[str, Array], Array]:
+    """Of N members at K times: what is kept of each by name, :data:`_FIELDS` (N, K), ``status`` and ``reason`` (N,),
+    and the solver's record (N, …). Chunk by chunk, each by all threads together; a chunk writes its rows and is
+    forgotten (law tables alone are 32 kB per member).
     """
     n = len(x)
     workers = max(1, min(workers, n * model.system.size // _SHARE))
     chunk = _CHUNK * workers
-    out = _Output(
-        {name: np.empty((n, len(t))) for name in _FIELDS},
-        np.empty(n, dtype=np.int64),
-        np.full(n, "", dtype=object),
-        np.empty((n, RECORD)),
-    )
-
-    def run(begin: int, pool: ThreadPoolExecutor | None) -> None:
-        rows = slice(begin, min(begin + chunk, n))
-        size = rows.stop - rows.start
-        work, finish = model.prepared(x[rows], np.broadcast_to(t, (size, len(t))))
-        others = [pool.submit(work) for _ in range(min(workers, -(-size // WIDTH)) - 1)] if pool else []
-        work()
-        for other in others:
-            other.result()
-        paths = finish()
-        solution = paths.solution
-        failed = solution.status != 0
-        for name, values in out.fields.items():
-            values[rows] = paths[name]
-            if failed.any():
-                values[rows][failed] = np.nan
-        out.status[rows], out.record[rows] = solution.status, solution.record
-        for i in np.flatnonzero(failed):
-            out.reasons[begin + i] = solution.reason(int(i))
-
+    fields = {name: np.empty((n, len(t))) for name in _FIELDS}
+    status, reasons, record = np.empty(n, dtype=np.int64), np.full(n, "", dtype=object), np.empty((n, RECORD))
     with ThreadPoolExecutor(workers - 1) if workers > 1 else nullcontext() as pool:
         for begin in range(0, n, chunk):
-            run(begin, pool)
-    return out
+            rows = slice(begin, min(begin + chunk, n))
+            size = rows.stop - rows.start
+            work, finish = model.prepared(x[rows], np.broadcast_to(t, (size, len(t))))
+            others = [pool.submit(work) for _ in range(min(workers, -(-size // WIDTH)) - 1)] if pool else []
+            work()
+            for other in others:
+                other.result()
+            paths = finish()
+            solution = paths.solution
+            failed = solution.status != 0
+            for name, values in fields.items():
+                values[rows] = np.where(failed[:, None], np.nan, paths[name])
+            status[rows], record[rows] = solution.status, solution.record
+            reasons[rows] = [solution.reason(i) for i in range(size)]
+    return {**fields, "status": status, "reason": reasons.astype(str)}, record
 
 
-def _dataset(model: BubbleModel, theta: Mapping[str, Array], t: Array, out: _Output) -> xr.Dataset:
+def _dataset(
+    model: BubbleModel, theta: Mapping[str, Array], t: Array, kept: Mapping[str, Array], record: Array
+) -> xr.Dataset:
     import xarray as xr
 
-    medium, record = model.medium, out.record
     member = "member"
     data: dict[str, Any] = {
-        name: ((member, "time"), out.fields[name], {"units": unit, "long_name": text})
+        name: ((member, "time"), kept[name], {"units": unit, "long_name": text})
         for name, (unit, text) in _FIELDS.items()
     }
-    data["status"] = (member, out.status, {"long_name": "0 where the member was integrated to the end"})
-    data["reason"] = (member, out.reasons.astype(str), {"long_name": "why the member failed"})
+    data["status"] = (member, kept["status"], {"long_name": "0 where the member was integrated to the end"})
+    data["reason"] = (member, kept["reason"], {"long_name": "why the member failed"})
     data["steps"] = (member, record[:, STEPS].astype(int), {"long_name": "accepted time steps"})
     data["max_wall_mach"] = (member, record[:, MAX_MACH], {"units": "1", "long_name": "largest wall Mach number"})
     if model.system.gas:
@@ -190,7 +170,7 @@ def _dataset(model: BubbleModel, theta: Mapping[str, Array], t: Array, out: _Out
         "vapour": model.vapour,
         "medium_heat": model.medium_heat,
         "wall": str(model.wall) if model.wall else "none",
-        "constants": medium.json,
+        "constants": model.medium.json,
     }
     return xr.Dataset(data, coords=coordinates, attrs=attributes)
 

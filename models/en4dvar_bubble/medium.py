@@ -114,44 +114,17 @@ WATER_25C = Medium()
 # The public rheometry codes (GitHub: InertialMicrocavitationRheometry, comp-physics/IMR-archive) disagree.
 _IMR_V1 = "IMR_v1 (IMR-vanilla) src/IMRcall_parameters.m, archive commit fb83ef1; IMRv2 src/data_assimilation, 26c6bf3"
 
+_IMR = {
+    "p_inf": 101325.0, "T_inf": 298.15, "K_m": 0.55, "D_v": 24.2e-6, "L_v": 2264.76e3, "M_g": 28.966e-3,
+    "M_v": 18.01528e-3,
+}  # fmt: skip
+_IMR_1 = {"rho": 1060.0, "c": 1430.0, "S": 0.056, "A": 5.3e-5, "B": 1.17e-2, "c_m": 8.3144598 / 28.966e-3 * 1.4 / 0.4}
+_IMR_2 = {"rho": 1064.0, "c": 1484.0, "S": 0.07, "A": 5.28e-5, "B": 1.165e-2, "c_m": 4181.0}
+
 CONSTANT_SETS: Mapping[str, Medium] = MappingProxyType(
     {
         "water-25C": WATER_25C,
-        "imr-v1": WATER_25C.with_constants(
-            _IMR_V1,
-            rho=1060.0,
-            c=1430.0,
-            p_inf=101325.0,
-            S=0.056,
-            T_inf=298.15,
-            kappa=1.4,
-            A=5.3e-5,
-            B=1.17e-2,
-            K_m=0.55,
-            c_m=8.3144598 / 28.966e-3 * 1.4 / 0.4,
-            D_v=24.2e-6,
-            L_v=2264.76e3,
-            M_g=28.966e-3,
-            M_v=18.01528e-3,
-        ),
-        "imr-v2": WATER_25C.with_constants(
-            _IMR_V2,
-            rho=1064.0,
-            c=1484.0,
-            p_inf=101325.0,
-            S=0.07,
-            T_inf=298.15,
-            kappa=1.47,
-            A=5.28e-5,
-            B=1.165e-2,
-            tait_B=304.913e6,
-            tait_n=7.15,
-            K_m=0.55,
-            c_m=4181.0,
-            D_v=24.2e-6,
-            L_v=2264.76e3,
-            M_g=28.966e-3,
-            M_v=18.01528e-3,
-        ),
+        "imr-v1": WATER_25C.with_constants(_IMR_V1, **_IMR, **_IMR_1, kappa=1.4),
+        "imr-v2": WATER_25C.with_constants(_IMR_V2, **_IMR, **_IMR_2, kappa=1.47, tait_B=304.913e6, tait_n=7.15),
     }
 )

@@ -32,6 +32,8 @@ from en4dvar_bubble.paths import Paths
 from en4dvar_bubble.settings import BubbleSettings
 from en4dvar_bubble.solver.driver import Solution
 
+_LIKE_KEYS = "gas", "start", "radial", "vapour", "medium_heat", "hydrophone", "gas_change", "viscosity_change"
+
 
 @dataclass(frozen=True, eq=False)
 class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
@@ -68,19 +70,12 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
         """The model of a ``model:`` section."""
         return cls(
             law=get_law(settings.law),
-            gas=settings.gas,
-            start=settings.start,
             driving=settings.driving.build(),
             reading=settings.driving_read,
             medium=settings.liquid,
             accuracy=settings.solver_accuracy,
-            radial=settings.radial,
-            vapour=settings.vapour,
-            medium_heat=settings.medium_heat,
-            hydrophone=settings.hydrophone,
-            gas_change=settings.gas_change,
-            viscosity_change=settings.viscosity_change,
             wall=None if settings.wall is None else Wall(settings.wall.distance, settings.wall.kind),
+            **{name: getattr(settings, name) for name in _LIKE_KEYS},
         )
 
     def with_parameters(self, names: Collection[str]) -> "BubbleModel":

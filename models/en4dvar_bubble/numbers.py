@@ -16,6 +16,15 @@ from en4dvar_bubble.driving.pulses import PULSES, numbers_of
 from en4dvar_bubble.driving.tabulated import OF_RECORD
 from en4dvar_bubble.medium import CONSTANTS
 
+
+def positive(
+    name: str, unit: str, label: str, symbol: str, source: str = "", display_unit: str = "", least: float = 0.0,
+    common: bool = False,
+) -> Parameter:  # fmt: skip
+    """A parameter that cannot be negative, lognormal by default."""
+    return Parameter(name, unit, "lognormal", (least, np.inf), label, symbol, display_unit, source, common)
+
+
 _KNOWN = ("M_g",)  # no path depends on it: the mass fraction of vapour is only told
 _NAMES = {"S": "surface_tension"}  # the state has a field S, the stress integral
 _LABELS = {
@@ -37,43 +46,23 @@ def _of(constant: Field[Any]) -> Parameter:
     return Parameter(name, about["unit"], "lognormal", (least, most), label, symbol, shown, about["source"], True)
 
 
-_VAPOUR = "constant vapour pressure in the bubble"
 OF_MEDIUM: Mapping[str, Parameter] = MappingProxyType(
     {constant.name: _of(constant) for constant in CONSTANTS if constant.name not in _KNOWN}
-    | {"p_v": Parameter("p_v", "Pa", "lognormal", (0.0, np.inf), _VAPOUR, "$p_v$", "kPa", common=True)}
+    | {"p_v": positive("p_v", "Pa", "constant vapour pressure in the bubble", "$p_v$", "", "kPa", common=True)}
 )
 """Constant of the medium → the parameter that sets it."""
 P_A = Parameter("p_A", "Pa", "normal", label="amplitude of the driving", symbol="$p_A$", display_unit="MPa")
-GAS_CONTENT = Parameter(
-    "gas_content",
-    "1",
-    "lognormal",
-    (0.0, np.inf),
-    "amount of gas over that in equilibrium at the stress-free radius",
-    r"$n_g/n_\mathrm{eq}$",
-)
-R_START = Parameter("R_start", "m", "lognormal", (0.0, np.inf), "radius at time zero", "$R(0)$", "um")
+_CONTENT = "amount of gas over that in equilibrium at the stress-free radius"
+GAS_CONTENT = positive("gas_content", "1", _CONTENT, r"$n_g/n_\mathrm{eq}$")
+R_START = positive("R_start", "m", "radius at time zero", "$R(0)$", "", "um")
 RDOT_START = Parameter("Rdot_start", "m/s", "normal", label="velocity of the wall at time zero", symbol=r"$\dot{R}(0)$")
-WALL_DISTANCE = Parameter(
-    "wall_distance",
-    "m",
-    "lognormal",
-    (0.0, np.inf),
-    "distance of the wall from the centre of the bubble",
-    "$h$",
-    "um",
-    "Rattray (1951), PhD thesis, California Institute of Technology",
+_RATTRAY = "Rattray (1951), PhD thesis, California Institute of Technology"
+WALL_DISTANCE = positive(
+    "wall_distance", "m", "distance of the wall from the centre of the bubble", "$h$", _RATTRAY, "um"
 )
-ACCOMMODATION = Parameter(
-    "accommodation",
-    "1",
-    "lognormal",
-    (0.0, np.inf),
-    "part of the vapour's molecules at the wall that condense",
-    r"$\alpha_M$",
-    "",
-    "Hertz–Knudsen; water, measured 0.01 to 1: Marek & Straub (2001), Int. J. Heat Mass Transf. 44, 39",
-    True,
+_MAREK = "Hertz–Knudsen; water, measured 0.01 to 1: Marek & Straub (2001), Int. J. Heat Mass Transf. 44, 39"
+ACCOMMODATION = positive(
+    "accommodation", "1", "part of the vapour's molecules at the wall that condense", r"$\alpha_M$", _MAREK, common=True
 )
 """Where it is no parameter, the vapour at the wall is saturated: the limit of a large one."""
 _OF_PULSES = {p.name: p for made in PULSES.values() for _, _, p in numbers_of(made)}

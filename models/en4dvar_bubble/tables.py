@@ -2,7 +2,7 @@
 
 A table is built from samples on a uniform grid with four extra points at either end. Derivatives at the nodes come from
 eighth-order central differences, each cell is the quintic Hermite polynomial of value, slope and curvature. A cell
-takes eight doubles (six coefficients, one cache line). In tables of sharp functions (:mod:`laws.refined`) a cell may be
+takes eight doubles (six coefficients, one cache line). In tables of sharp laws (:mod:`laws.exactness`) a cell may be
 halved, and its halves again: the seventh number is how many times narrower a cell is than those of the grid (zero where
 none is halved), the eighth the place of its left half, which its right half follows.
 """

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import ConfigDict
 from pydantic import Field as Setting
-from scipy.sparse import coo_matrix, csc_matrix, identity
+from scipy.sparse import csc_matrix, diags, identity
 from scipy.sparse.linalg import splu
 
 from en4dvar import Failure, Field, ForwardModel, Observable, Parameter, StateField, StateLayout, Trajectory
@@ -102,23 +102,19 @@ class Aquifer(ForwardModel):
     def conductances(self, field: Array) -> csc_matrix:
         """−∇·(T ∇·) (n, n): symmetric, with the boundary, half a cell away, at head 0."""
         T = np.exp(field).reshape(self.shape)
-        cells = np.arange(self.size).reshape(self.shape)
-        diagonal = np.zeros(self.shape)
-        rows, columns, values = [], [], []
+        diagonal, beside = np.zeros(self.shape), np.zeros((2, *self.shape))  # and what is next along each axis
         for axis in (0, 1):
-            a, b = np.moveaxis(T, axis, 0)[:-1], np.moveaxis(T, axis, 0)[1:]
-            between = 2 * a * b / (a + b)
-            along = np.moveaxis(diagonal, axis, 0)
+            own, along = np.moveaxis(T, axis, 0), np.moveaxis(diagonal, axis, 0)
+            between = 2 * own[:-1] * own[1:] / (own[:-1] + own[1:])
             along[:-1] += between
             along[1:] += between
-            along[0] += 2 * np.moveaxis(T, axis, 0)[0]
-            along[-1] += 2 * np.moveaxis(T, axis, 0)[-1]
-            nearer, farther = np.moveaxis(cells, axis, 0)[:-1].ravel(), np.moveaxis(cells, axis, 0)[1:].ravel()
-            rows += [nearer, farther]
-            columns += [farther, nearer]
-            values += [-between.ravel()] * 2
-        rows.append(cells.ravel())
-        columns.append(cells.ravel())
-        values.append(diagonal.ravel())
-        entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
-        return coo_matrix(entries, shape=(self.size, self.size)).tocsc()
+            along[0] += 2 * own[0]
+            along[-1] += 2 * own[-1]
+            np.moveaxis(beside[axis], axis, 0)[:-1] = -between
+        bands, places = [diagonal.ravel()], [0]
+        for values, step in zip(beside, (self.shape[1], 1), strict=True):
+            bands += [values.ravel()[:-step]] * 2
+            places += [step, -step]
+        matrix = diags(bands, places, format="csc")
+        matrix.eliminate_zeros()  # from the end of one row to the next
+        return matrix

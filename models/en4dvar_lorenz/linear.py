@@ -5,8 +5,6 @@ What is expected of data on the line has a closed form. The state of the oscilla
 with Gaussian errors the Kalman filter and smoother are exact here.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Annotated
 
@@ -67,5 +65,5 @@ class Linear(Autonomous):
     integrate = staticmethod(oscillate)
 
     @classmethod
-    def from_settings(cls, settings: LinearSettings) -> Linear:
+    def from_settings(cls, settings: LinearSettings) -> "Linear":
         return cls((Field("x", 2 * settings.oscillators),), [1.0, 0.0] * settings.oscillators, np.inf)

@@ -3,8 +3,6 @@ r"""Lorenz-63: \(\dot x = σ(y − x),\; \dot y = ρx − y − xz,\; \dot z = x
 Source: Lorenz (1963), J. Atmos. Sci. 20, 130.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Annotated
 
@@ -56,5 +54,5 @@ class Lorenz63(Analytic):
     integrate = staticmethod(integrate)
 
     @classmethod
-    def from_settings(cls, settings: Lorenz63Settings) -> Lorenz63:
+    def from_settings(cls, settings: Lorenz63Settings) -> "Lorenz63":
         return cls((Field("x"), Field("y"), Field("z")), settings.initial, settings.step)

@@ -3,8 +3,6 @@ r"""Lorenz-96: \(\dot x_i = (x_{i+1} − x_{i−2}) x_{i−1} − x_i + F\) on a
 Source: Lorenz (1996), Predictability: a problem partly solved, Proc. ECMWF Seminar.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Annotated
 
@@ -53,5 +51,5 @@ class Lorenz96(Analytic):
     integrate = staticmethod(integrate)
 
     @classmethod
-    def from_settings(cls, settings: Lorenz96Settings) -> Lorenz96:
+    def from_settings(cls, settings: Lorenz96Settings) -> "Lorenz96":
         return cls((Field("x", settings.size),), np.eye(settings.size)[0], settings.step)

@@ -3,8 +3,6 @@ r"""Lotka–Volterra: prey \(\dot u = αu − βuv\), predators \(\dot v = −γ
 Sources: Lotka (1925), Elements of Physical Biology; Volterra (1926), Nature 118, 558.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Annotated
 
@@ -72,7 +70,7 @@ class LotkaVolterra(Analytic):
         self.longest_step = step
 
     @classmethod
-    def from_settings(cls, settings: LotkaVolterraSettings) -> LotkaVolterra:
+    def from_settings(cls, settings: LotkaVolterraSettings) -> "LotkaVolterra":
         return cls(settings.step)
 
     def initial_state(self, theta: Mapping[str, float]) -> np.ndarray:

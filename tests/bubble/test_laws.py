@@ -12,12 +12,11 @@ from scipy.integrate import quad, solve_ivp
 
 from en4dvar.model.state import Parameter
 from en4dvar.plumbing.errors import ConfigError
-from en4dvar_bubble.battery import CHECKS, describe, run_battery
+from en4dvar_bubble.battery import CHECKS, Cycle, describe, respond, run_battery
 from en4dvar_bubble.laws import REGISTRY, ConstitutiveLaw, Liquid, get_law
 from en4dvar_bubble.laws.loading import available
 from en4dvar_bubble.laws.memory import MemoryVariable
 from en4dvar_bubble.laws.parameters import ALPHA, MU, G
-from en4dvar_bubble.laws.response import Cycle, respond
 from en4dvar_bubble.laws.tabulate import GRID
 from en4dvar_bubble.tables import evaluate
 

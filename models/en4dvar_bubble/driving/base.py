@@ -33,6 +33,17 @@ class PulseNumber:
     role: Role
 
 
+@dataclass(frozen=True)
+class Shape:
+    """A ``function`` of time and of ``numbers``, as a shape that equals another one where both are the same."""
+
+    function: Callable[..., Array]
+    numbers: tuple[Any, ...]
+
+    def __call__(self, t: Array) -> Array:
+        return self.function(t, *self.numbers)
+
+
 class Clocks(NamedTuple):
     """How N members read the driving: at t_ref = (t − shift) · rate, in µs, from so many numbers on in the table."""
 
@@ -165,21 +176,13 @@ KNOTS = tuple(
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class _Deviating:
-    """``shape`` plus the sines that have ``values`` at equally spaced knots between the ends, where they are zero."""
-
-    shape: Callable[[Array], Array]
-    begin: float
-    end: float
-    values: tuple[float, ...]
-
-    def __call__(self, t: Array) -> Array:
-        order = np.arange(1, len(self.values) + 1)
-        sines = np.sin(np.pi / (len(order) + 1) * np.outer(order, order))  # its own inverse, but for a factor
-        heights = 2 / (len(order) + 1) * (sines @ np.array(self.values))
-        phase = np.pi * (t - self.begin) / (self.end - self.begin)
-        return np.asarray(self.shape(t) + np.sin(np.multiply.outer(phase, order)) @ heights)
+def _with_sines(t: Array, driving: Driving, values: tuple[float, ...]) -> Array:
+    """The shape plus the sines that have ``values`` at equally spaced knots between the ends, where they are zero."""
+    order = np.arange(1, len(values) + 1)
+    sines = np.sin(np.pi / (len(order) + 1) * np.outer(order, order))  # its own inverse, but for a factor
+    heights = 2 / (len(order) + 1) * (sines @ np.array(values))
+    phase = np.pi * (t - driving.begin) / (driving.end - driving.begin)
+    return np.asarray(driving.shape(t) + np.sin(np.multiply.outer(phase, order)) @ heights)
 
 
 def with_knots(driving: Driving, knots: int) -> Driving:
@@ -198,4 +201,4 @@ def with_knots(driving: Driving, knots: int) -> Driving:
 def _deviating(driving: Driving, knots: int, **keys: Any) -> Driving:
     values = tuple(float(keys.pop(f"knot_{k}", 0.0)) for k in range(1, knots + 1))
     base = driving.remade(**keys) if keys and driving.remade else driving
-    return replace(base, shape=_Deviating(base.shape, base.begin, base.end, values), numbers=(), remade=None)
+    return replace(base, shape=Shape(_with_sines, (base, values)), numbers=(), remade=None)

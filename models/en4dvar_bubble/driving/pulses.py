@@ -18,7 +18,7 @@ from annotated_types import Ge, Gt, Le
 
 from en4dvar.model.state import Array, Parameter, TransformName
 from en4dvar.plumbing.units import Quantity
-from en4dvar_bubble.driving.base import Driving, PulseNumber, Role
+from en4dvar_bubble.driving.base import Driving, PulseNumber, Role, Shape
 
 
 @dataclass(frozen=True)
@@ -101,17 +101,11 @@ def silence() -> Driving:
     return Driving(0.0, 0.0, 1e-6, np.zeros_like, cells=1)
 
 
-@dataclass(frozen=True)
-class _HalfCycle:
-    frequency: float
-    exponent: float
-    delay: float
-
-    def __call__(self, t: Array) -> Array:
-        phase = 2 * np.pi * self.frequency * (t - self.delay)
-        inside = np.abs(phase) < np.pi
-        base = np.where(inside, 0.5 * (1 + np.cos(np.where(inside, phase, np.pi))), 0.0)
-        return np.asarray(base**self.exponent)
+def _half_cycle(t: Array, frequency: float, exponent: float, delay: float) -> Array:
+    phase = 2 * np.pi * frequency * (t - delay)
+    inside = np.abs(phase) < np.pi
+    base = np.where(inside, 0.5 * (1 + np.cos(np.where(inside, phase, np.pi))), 0.0)
+    return np.asarray(base**exponent)
 
 
 @pulse("histotripsy")
@@ -126,23 +120,16 @@ def histotripsy(
     Amplitude and frequency are the paper's; n and δ are from the literature on this array (Vlaisavljevich et al. 2015).
     """
     half = 0.5 / frequency
-    return Driving(amplitude, delay - half, delay + half, _HalfCycle(frequency, exponent, delay))
+    return Driving(amplitude, delay - half, delay + half, Shape(_half_cycle, (frequency, exponent, delay)))
 
 
-@dataclass(frozen=True)
-class _Burst:
-    frequency: float
-    duration: float
-    phase: float
-    delay: float
-    taper: float  # fraction of the duration that rises and falls: 0 no envelope, 1 Hann
-
-    def __call__(self, t: Array) -> Array:
-        wave = np.sin(2 * np.pi * self.frequency * (t - self.delay) + self.phase)
-        if self.taper == 0.0:
-            return np.asarray(wave)
-        from_edge = 0.5 - np.abs((t - self.delay) / self.duration - 0.5)
-        return np.asarray(wave * 0.5 * (1 - np.cos(np.pi * np.clip(2 * from_edge / self.taper, 0.0, 1.0))))
+def _burst(t: Array, frequency: float, duration: float, phase: float, delay: float, taper: float) -> Array:
+    """``taper``: fraction of the duration that rises and falls; 0 no envelope, 1 Hann."""
+    wave = np.sin(2 * np.pi * frequency * (t - delay) + phase)
+    if taper == 0.0:
+        return np.asarray(wave)
+    from_edge = 0.5 - np.abs((t - delay) / duration - 0.5)
+    return np.asarray(wave * 0.5 * (1 - np.cos(np.pi * np.clip(2 * from_edge / taper, 0.0, 1.0))))
 
 
 @pulse("sine")
@@ -173,17 +160,12 @@ def sine_burst(
         cells = edge.denominator * -(-cells // edge.denominator)
         fraction = float(2 * edge)
         stops += [delay + float(edge) * duration, delay + float(1 - edge) * duration]
-    shape = _Burst(frequency, duration, phase, delay, fraction)
+    shape = Shape(_burst, (frequency, duration, phase, delay, fraction))
     return Driving(amplitude, delay, delay + duration, shape, cells, tuple(stops))
 
 
-@dataclass(frozen=True)
-class _Gaussian:
-    delay: float
-    width: float
-
-    def __call__(self, t: Array) -> Array:
-        return np.asarray(np.exp(-0.5 * ((t - self.delay) / self.width) ** 2))
+def _bell(t: Array, delay: float, width: float) -> Array:
+    return np.asarray(np.exp(-0.5 * ((t - delay) / width) ** 2))
 
 
 @pulse("gaussian")
@@ -197,19 +179,12 @@ def gaussian(
     It is cut at |t−δ| = 7σ, where it is 2e-11 of the amplitude.
     """
     half = _WIDTHS * width
-    return Driving(amplitude, delay - half, delay + half, _Gaussian(delay, width), stops=(delay,))
+    return Driving(amplitude, delay - half, delay + half, Shape(_bell, (delay, width)), stops=(delay,))
 
 
-@dataclass(frozen=True)
-class _Step:
-    begin: float
-    rise: float
-    duration: float
-
-    def __call__(self, t: Array) -> Array:
-        edge = np.minimum(t - self.begin, self.begin + self.duration - t)
-        s = np.clip(edge / self.rise, 0.0, 1.0)
-        return np.asarray(s**3 * (10 - 15 * s + 6 * s * s))
+def _plateau(t: Array, begin: float, rise: float, duration: float) -> Array:
+    s = np.clip(np.minimum(t - begin, begin + duration - t) / rise, 0.0, 1.0)
+    return np.asarray(s**3 * (10 - 15 * s + 6 * s * s))
 
 
 @pulse("step")
@@ -232,4 +207,4 @@ def step(
         raise ValueError(f"the duration {duration:g} s must be between 3 and 200 000 times the rise {rise:g} s")
     exact = duration / cells
     stops = (delay + exact, delay + duration - exact)
-    return Driving(amplitude, delay, delay + duration, _Step(delay, exact, duration), cells, stops)
+    return Driving(amplitude, delay, delay + duration, Shape(_plateau, (delay, exact, duration)), cells, stops)

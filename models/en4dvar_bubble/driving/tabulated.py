@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,7 +12,7 @@ from en4dvar.inputs.asked import Column, Format, Layout
 from en4dvar.inputs.readers import read_series
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.errors import retold
-from en4dvar_bubble.driving.base import Driving, PulseNumber
+from en4dvar_bubble.driving.base import Driving, PulseNumber, Shape
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
@@ -27,31 +27,21 @@ OF_RECORD = (PulseNumber(_DELAY, "delay", 0.0, "delay"), PulseNumber(_STRETCH, "
 _PROMINENCE = 0.02  # of the largest |p|: turning points that no time step may straddle
 
 
-@dataclass(frozen=True, eq=False)
-class _Record:
+def _record(t: Array, spline: CubicSpline, first: float, last: float, lead: float) -> Array:
     """Cubic spline through the samples, led from and to zero by one quintic at either end."""
+    inside = spline(np.clip(t, first, last))
+    before, after = _lead_in(t, spline, first, lead), _lead_in(t, spline, last, -lead)
+    return np.asarray(np.where(t < first, before, np.where(t > last, after, inside)))
 
-    spline: CubicSpline
-    first: float
-    last: float
-    lead: float
 
-    def __call__(self, t: Array) -> Array:
-        inside = self.spline(np.clip(t, self.first, self.last))
-        before = self._lead_in((t - self.first) / self.lead + 1, self.first, 1.0)
-        after = self._lead_in((self.last - t) / self.lead + 1, self.last, -1.0)
-        return np.asarray(np.where(t < self.first, before, np.where(t > self.last, after, inside)))
-
-    def _lead_in(self, s: Array, at: float, sign: float) -> Array:
-        """Zero with its derivatives at s = 0; value, slope and curvature of the record at s = 1."""
-        s = np.clip(s, 0.0, 1.0)
-        value = float(self.spline(at))
-        slope = float(self.spline(at, 1)) * self.lead * sign
-        bend = float(self.spline(at, 2)) * self.lead**2
-        third = 10 * value - 4 * slope + 0.5 * bend
-        fourth = -15 * value + 7 * slope - bend
-        fifth = 6 * value - 3 * slope + 0.5 * bend
-        return np.asarray(s**3 * (third + s * (fourth + s * fifth)))
+def _lead_in(t: Array, spline: CubicSpline, at: float, lead: float) -> Array:
+    """Zero with its derivatives at the time ``lead`` before ``at``; there value, slope and curvature of the record."""
+    s = np.clip((t - at) / lead + 1, 0.0, 1.0)
+    value, slope, bend = (float(spline(at, order)) * lead**order for order in (0, 1, 2))
+    third = 10 * value - 4 * slope + 0.5 * bend
+    fourth = -15 * value + 7 * slope - bend
+    fifth = 6 * value - 3 * slope + 0.5 * bend
+    return np.asarray(s**3 * (third + s * (fourth + s * fifth)))
 
 
 def tabulated(times: Array, pressure: Array, delay: float = 0.0, scale: float = 1.0) -> Driving:
@@ -86,7 +76,7 @@ def tabulated(times: Array, pressure: Array, delay: float = 0.0, scale: float = 
     from scipy.signal import find_peaks
 
     peaks = np.concatenate([find_peaks(sign * p, prominence=_PROMINENCE * largest)[0] for sign in (1, -1)])
-    shape = _Record(CubicSpline(t, p / largest), float(t[0]), float(t[-1]), float(lead))
+    shape = Shape(_record, (CubicSpline(t, p / largest), float(t[0]), float(t[-1]), float(lead)))
     stops = (float(t[0]), *(float(t[i]) for i in peaks), float(t[-1]))
     numbers = tuple(replace(number, value=delay) if number.role == "delay" else number for number in OF_RECORD)
     return Driving(largest, float(t[0] - lead), float(t[-1] + lead), shape, inner + 2, stops, numbers)

@@ -8,8 +8,6 @@ none). The viscous part is a Newtonian dashpot where ``parameters`` holds ``mu``
 kernel does not change.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any, ClassVar
@@ -19,10 +17,9 @@ import numpy as np
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.user_file import is_from_file
-from en4dvar_bubble.laws.exactness import is_sharp
+from en4dvar_bubble.laws.exactness import Refined, is_sharp, refine
 from en4dvar_bubble.laws.memory import MemoryTables, MemoryVariable
 from en4dvar_bubble.laws.parameters import MU, Values, columns
-from en4dvar_bubble.laws.refined import Refined, refine
 from en4dvar_bubble.laws.tabulate import (
     GRID,
     STRETCH,
@@ -33,7 +30,7 @@ from en4dvar_bubble.laws.tabulate import (
 )
 from en4dvar_bubble.tables import evaluate, from_values
 
-REGISTRY: dict[str, type[ConstitutiveLaw]] = {}
+REGISTRY: "dict[str, type[ConstitutiveLaw]]" = {}
 _TOGETHER = 48  # members sampled at once: their temporary arrays fit in the cache
 _EXAMPLE_BY_NAME = {"G": 5e3, "alpha": 0.03, "mu": 0.1}
 _EXAMPLE_BY_UNIT = {"Pa": 5e3, "Pa s": 0.1, "s": 1e-6, "1": 0.5, "N/m": 0.02}

@@ -1,7 +1,5 @@
 """Solids: a spring, a different one for each class, beside a Newtonian dashpot (Kelvin–Voigt)."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import numpy as np

@@ -1,8 +1,6 @@
 """Finding a law: built in, an entry point, a class of an installed package, or a class in a file of
 the user's own, and whether that class can serve as one."""
 
-from __future__ import annotations
-
 import traceback
 from collections.abc import Callable
 from pathlib import Path

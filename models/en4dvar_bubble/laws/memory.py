@@ -1,7 +1,5 @@
 """Memory variables: stresses that relax."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple

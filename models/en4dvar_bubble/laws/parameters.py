@@ -1,22 +1,14 @@
 """Parameters that several laws share; a law lists those it uses."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from types import SimpleNamespace
 from typing import Protocol, cast
 
 import numpy as np
 
-from en4dvar.model.state import Array, Parameter
-
-
-def positive(
-    name: str, unit: str, label: str, symbol: str, source: str, display_unit: str = "", least: float = 0.0
-) -> Parameter:
-    """A parameter that cannot be negative, lognormal by default."""
-    return Parameter(name, unit, "lognormal", (least, np.inf), label, symbol, display_unit, source)
-
+from en4dvar.model.state import Array
+from en4dvar.model.state import Parameter as Parameter  # laws that take all names of this module have it, too
+from en4dvar_bubble.numbers import positive as positive
 
 MANCIA = "Mancia et al. (2021), eq. 2"
 _WARNEZ = "Warnez & Johnsen (2015)"

@@ -4,8 +4,6 @@ The tension σ₀ at rest is the surface tension of the bubble, and what the coa
 −2[σ(λ) − σ₀]/R. So there is no stress at rest, where the gas has the pressure p_∞ + 2σ₀/R₀.
 """
 
-from __future__ import annotations
-
 import math
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """A solid that has been softened by the largest stretch that it has seen, which a released bubble has at time zero."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """From the functions of a law to its tables: elastic and memory functions on ln λ, the mean viscosity on ln |V|."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Liquids without memory: Newtonian, and thinned by shear."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 from en4dvar.model.state import Array, Parameter

@@ -6,8 +6,6 @@ into each kernel that calls it: what does not depend on the kind of equations is
 kind finds it compiled.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numba as nb

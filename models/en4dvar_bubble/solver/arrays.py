@@ -3,15 +3,12 @@
 n is the number of unknowns, N that of the members. Arrays that end in :data:`~lanes.WIDTH` hold one column per lane.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from en4dvar.model.state import Array
-from en4dvar_bubble.solver import rodas5p
-from en4dvar_bubble.solver.general import SHARED
+from en4dvar_bubble.solver import rodas5p, rows
 from en4dvar_bubble.solver.lanes import WIDTH
 
 IntArray = np.ndarray[Any, np.dtype[np.int64]]
@@ -140,7 +137,7 @@ def scratch(
     """
     n = dims.gas + dims.vapour + dims.medium + dims.wall + dims.kinetic + dims.memory + 2
     step = of_fields, n, matrix, 1, rodas5p.STAGES * n, n, n, 1, 3, 3 * n
-    general = border, border, SHARED, border, SHARED
+    general = border, border, rows.SHARED, border, rows.SHARED
     lanes = n, 1, 1, parameters, 1, 1, 1, 1
     edges = np.cumsum([0, *step, *tiles, *general, *lanes])
     raw = np.zeros((edges[-1] + 1) * WIDTH)

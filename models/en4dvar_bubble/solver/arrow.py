@@ -5,15 +5,14 @@ Y and θ_m, then the border, which begins with the sums. τ, Y and θ_m fill blo
 of τ, and all else is zero but for the border. Elimination in this order fills nothing in.
 """
 
-from __future__ import annotations
-
 from functools import cache
 
 import numba as nb
 import numpy as np
 
+from en4dvar_bubble.solver import rows
 from en4dvar_bubble.solver.arrays import Dims, IntArray
-from en4dvar_bubble.solver.general import CONTENT_SUM, SLOPE_SUM, VAPOUR_SUM, sums
+from en4dvar_bubble.solver.general import sums
 from en4dvar_bubble.solver.tiles import kept_tiles, whole
 
 
@@ -33,7 +32,7 @@ def pattern(dims: Dims) -> np.ndarray:
     full = np.zeros((size, size), dtype=bool)
     full[:gas, :gas] = full[gas:vapour, :vapour] = full[vapour:fields, vapour:fields] = True
     full[:vapour, fields:] = full[vapour:fields, fields + kept :] = full[fields:, fields:] = True
-    reach = {SLOPE_SUM: (0, gas), CONTENT_SUM: (0, vapour), VAPOUR_SUM: (gas, vapour)}
+    reach = {rows.SLOPE_SUM: (0, gas), rows.CONTENT_SUM: (0, vapour), rows.VAPOUR_SUM: (gas, vapour)}
     for row in range(kept):
         full[fields + row, slice(*reach[row])] = True
     if dims.wall:

@@ -5,10 +5,8 @@ fields are smooth there by construction: polynomials in ξ, where s = ξ, or in 
 wall. There is the thermal boundary layer of a collapse, which is thinner than the distance of Chebyshev points.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 from scipy.special import roots_jacobi
@@ -30,6 +28,11 @@ class Ball:
     derivative: Array
     laplacian: Array
     weights: Array
+
+    @cached_property
+    def rows(self) -> Array:
+        """All of them as one array in the kernel's layout, see :class:`arrays.Equations`."""
+        return np.vstack([self.derivative, self.laplacian[:-1], self.y, self.weights])
 
 
 @cache
@@ -79,6 +82,11 @@ class Exterior:
     x: Array
     derivative: Array
     laplacian: Array
+
+    @cached_property
+    def rows(self) -> Array:
+        """The same of the medium."""
+        return np.vstack([self.derivative, self.laplacian[:-1], self.x - self.x**-2, self.x**-6.0])
 
 
 @cache

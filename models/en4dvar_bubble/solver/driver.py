@@ -1,10 +1,8 @@
 """The NumPy side of the solver: accuracy, the arrays a system of equations needs, failure reasons."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,7 +12,7 @@ from en4dvar.model.state import Array
 from en4dvar.plumbing.kernel_cache import stamp_with_sources
 from en4dvar_bubble import tables as tables_module
 from en4dvar_bubble.driving import Driving, Reading
-from en4dvar_bubble.laws.refined import HALVINGS
+from en4dvar_bubble.laws.exactness import HALVINGS
 from en4dvar_bubble.laws.tabulate import GRID, VISCOUS_GRID
 from en4dvar_bubble.solver import integrate, rows
 from en4dvar_bubble.solver.apart import address
@@ -76,11 +74,10 @@ ACCURACIES: dict[AccuracyName, Accuracy] = {
 }
 # A released bubble is full of gas that is hot in its core when it bounces, under a thin layer at the wall; the acoustic
 # one has hardly any.
-_NODES_RELEASED: dict[AccuracyName, int] = {"fast": 8, "standard": 12, "reference": 32}
 GAS_CLUSTERING = {"acoustic": 0.0, "laser": 3.0}
 # It is so large that heat comes a few percent of its radius into the medium, where its grid is dense.
-_MEDIUM_RELEASED: dict[AccuracyName, int] = {"fast": 8, "standard": 12, "reference": 32}
 MEDIUM_LENGTHS = {"acoustic": 0.5, "laser": 0.05}
+_NODES_RELEASED: dict[AccuracyName, int] = {"fast": 8, "standard": 12, "reference": 32}  # in both
 
 
 def preset(name: AccuracyName, start: str) -> Accuracy:
@@ -88,7 +85,7 @@ def preset(name: AccuracyName, start: str) -> Accuracy:
     base = ACCURACIES[name]
     if start == "acoustic":
         return base
-    return replace(base, nodes=_NODES_RELEASED[name], medium_nodes=_MEDIUM_RELEASED[name])
+    return replace(base, nodes=_NODES_RELEASED[name], medium_nodes=_NODES_RELEASED[name])
 
 
 @dataclass(frozen=True)
@@ -163,6 +160,7 @@ class System:
 
 
 _ELASTIC_SPAN, _VISCOUS_SPAN = GRID.span, VISCOUS_GRID.span
+_NO_ROWS = np.zeros((3, 1))
 _REFINED_SPAN = np.append(_ELASTIC_SPAN[:4], HALVINGS)
 
 
@@ -193,24 +191,6 @@ class Solution:
             integrate.TIME_LIMIT: "time limit reached",
         }
         return f"{words[status]} at t = {record[integrate.END_TIME]:.4g} µs"
-
-
-@cache
-def _gas_operators(m: int, clustering: float) -> Array:
-    """Collocation operators as one array in the kernel's layout, see :class:`arrays.Equations`."""
-    if not m:
-        return np.zeros((3, 1))
-    b = ball(m, clustering)
-    return np.vstack([b.derivative, b.laplacian[:m], b.y, b.weights])
-
-
-@cache
-def _medium_operators(m: int, length: float) -> Array:
-    """The same for the medium."""
-    if not m:
-        return np.zeros((3, 1))
-    e = exterior(m, length)
-    return np.vstack([e.derivative, e.laplacian[:m], e.x - e.x**-2, e.x**-6.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,11 +227,11 @@ class Solver:
         ``halved``: the elastic tables have halved cells.
         """
         system, driving = self.system, self.driving
-        medium = _medium_operators(system.medium, system.medium_length)
+        medium = exterior(system.medium, system.medium_length).rows if system.medium else _NO_ROWS
         general: tuple[Any, Any, Any, Any] = (None,) * 4  # what nobody reads need not be compiled either
         if system.general:
             general = medium, memory, viscous, _ELASTIC_SPAN if system.strain else _VISCOUS_SPAN
-        gas, reading = _gas_operators(system.gas, system.clustering), READINGS[self.reading]
+        gas, reading = system.ball.rows if system.gas else _NO_ROWS, READINGS[self.reading]
         shared = gas, _REFINED_SPAN if halved else _ELASTIC_SPAN, pulse, driving.span
         nodes, size, where, places = self._arrangement
         return Equations(nodes, size, system.dims, *shared, reading, *general, where, places)

@@ -19,27 +19,10 @@ Radial motion (Keller & Miksis 1980; the paper's eq. 1), Mach number m = Ṙ/c:
     [R²(1−m) + 4νR/c] V̇ = Ṙ²(−5/2 + 3m/2) + (1+m) P + (R/c) dP/dt|_{V̇=0},   P = p_b − p_∞ − p_f − σ/R + J_e − 4νV
 """
 
-from __future__ import annotations
-
 from en4dvar.plumbing.compiled import inlined
+from en4dvar_bubble.solver import rows
 from en4dvar_bubble.solver.lanes import exp, load, maximum, splat, sqrt, store
 from en4dvar_bubble.solver.lookup import driving, lookup
-from en4dvar_bubble.solver.rows import (
-    AMBIENT,
-    AS_PRINTED,
-    CONDUCTION,
-    INSTANTANEOUS,
-    INVERSE_C,
-    KAPPA,
-    LOG_GAS,
-    LOG_R0,
-    RETARDED,
-    SLOPE,
-    SURFACE,
-    TABLE,
-    VAPOUR,
-    VISCOSITY,
-)
 
 
 @inlined
@@ -74,12 +57,12 @@ def _gas(y, nodes, par, ops, work):
     m = len(nodes)
     V = load(y, m)
     u = load(y, m + 1)
-    kappa = load(par, KAPPA)
+    kappa = load(par, rows.KAPPA)
     zero = splat(0.0)
     if m == 0:
-        p = exp(load(par, LOG_GAS) - kappa * u * 3.0)
+        p = exp(load(par, rows.LOG_GAS) - kappa * u * 3.0)
         return p, kappa * V * (-3.0), zero, zero
-    a = load(par, SLOPE)
+    a = load(par, rows.SLOPE)
     weights = ops[2 * m + 2]
     inverse_mean = splat(weights[m])
     for i in range(m):
@@ -91,8 +74,8 @@ def _gas(y, nodes, par, ops, work):
         inverse_mean = inverse_mean + weights[i] / theta
     wall = products(y, 0, m, ops, work, 2 * m)
     store(work, 4 * m + 1, inverse_mean)
-    p = exp(load(par, LOG_GAS) - u * 3.0) / inverse_mean
-    E = load(par, CONDUCTION) / p * exp(u * (-2.0))
+    p = exp(load(par, rows.LOG_GAS) - u * 3.0) / inverse_mean
+    E = load(par, rows.CONDUCTION) / p * exp(u * (-2.0))
     rate = (kappa - 1.0) * E * wall * 3.0 - kappa * V * 3.0
     return p, rate, E, wall
 
@@ -104,7 +87,7 @@ def rhs(y, t, eq, loaded, w):
     p, rate, E, _wall = _gas(y, nodes, par, ops, work)
     V = load(y, m)
     u = load(y, m + 1)
-    kappa = load(par, KAPPA)
+    kappa = load(par, rows.KAPPA)
     k1 = (kappa - 1.0) / kappa
     for i in range(m):
         first = load(work, 2 * m + i)
@@ -114,21 +97,21 @@ def rhs(y, t, eq, loaded, w):
         dtau = drift * V + E * (conduct * load(work, 3 * m + 1 + i) - k1 * first * first)
         store(out, i, dtau + (conduct + drift / (kappa * 3.0)) * rate)
     R = exp(u)
-    ic = load(par, INVERSE_C)
+    ic = load(par, rows.INVERSE_C)
     mach = R * V * ic
     Ric = R * ic
     when = load(t, 0)
-    if reading != INSTANTANEOUS:
+    if reading != rows.INSTANTANEOUS:
         when = when + Ric
     f, g, _ = driving(when, eq, par)
-    J, Jx, _ = lookup(loaded.elastic, load(par, TABLE), eq.elastic_span, u - load(par, LOG_R0))
-    surface = load(par, SURFACE) / R
-    nu4 = load(par, VISCOSITY) * 4.0
-    P = p + load(par, VAPOUR) - load(par, AMBIENT) - f - surface + J - nu4 * V
+    J, Jx, _ = lookup(loaded.elastic, load(par, rows.TABLE), eq.elastic_span, u - load(par, rows.LOG_R0))
+    surface = load(par, rows.SURFACE) / R
+    nu4 = load(par, rows.VISCOSITY) * 4.0
+    P = p + load(par, rows.VAPOUR) - load(par, rows.AMBIENT) - f - surface + J - nu4 * V
     slope = p * rate + (surface + Jx) * V
-    if reading == INSTANTANEOUS:
+    if reading == rows.INSTANTANEOUS:
         slope = slope - g
-    elif reading == AS_PRINTED:
+    elif reading == rows.AS_PRINTED:
         slope = slope - g * (mach + 1.0)
     Rdot2 = R * R * V * V
     numerator = Rdot2 * (mach * 1.5 - 2.5) + (mach + 1.0) * P + Ric * slope
@@ -149,7 +132,7 @@ def jacobian(y, t, eq, loaded, w):
     p, rate, E, wall = _gas(y, nodes, par, ops, work)
     V = load(y, m)
     u = load(y, m + 1)
-    kappa = load(par, KAPPA)
+    kappa = load(par, rows.KAPPA)
     k1 = (kappa - 1.0) / kappa
     heat = (kappa - 1.0) * 3.0 * E
     rate_u = heat * wall
@@ -157,17 +140,17 @@ def jacobian(y, t, eq, loaded, w):
     zero = splat(0.0)
 
     R = exp(u)
-    ic = load(par, INVERSE_C)
+    ic = load(par, rows.INVERSE_C)
     mach = R * V * ic
     Ric = R * ic
     when = load(t, 0)
-    if reading != INSTANTANEOUS:
+    if reading != rows.INSTANTANEOUS:
         when = when + Ric
     f, g, h = driving(when, eq, par)
-    J, Jx, Jxx = lookup(loaded.elastic, load(par, TABLE), eq.elastic_span, u - load(par, LOG_R0))
-    surface = load(par, SURFACE) / R
-    nu4 = load(par, VISCOSITY) * 4.0
-    P = p + load(par, VAPOUR) - load(par, AMBIENT) - f - surface + J - nu4 * V
+    J, Jx, Jxx = lookup(loaded.elastic, load(par, rows.TABLE), eq.elastic_span, u - load(par, rows.LOG_R0))
+    surface = load(par, rows.SURFACE) / R
+    nu4 = load(par, rows.VISCOSITY) * 4.0
+    P = p + load(par, rows.VAPOUR) - load(par, rows.AMBIENT) - f - surface + J - nu4 * V
     slope = p * rate + (surface + Jx) * V
     pressure_u = p * (-3.0)
     if m == 0:
@@ -178,10 +161,10 @@ def jacobian(y, t, eq, loaded, w):
     slope_V = p * rate_V + surface + Jx
     ahead = mach + 1.0
     numerator_t = -(ahead * g)
-    if reading == INSTANTANEOUS:
+    if reading == rows.INSTANTANEOUS:
         slope = slope - g
         numerator_t = numerator_t - Ric * h
-    elif reading == RETARDED:
+    elif reading == rows.RETARDED:
         P_u = P_u - g * Ric
     else:
         slope = slope - g * ahead
@@ -211,7 +194,7 @@ def jacobian(y, t, eq, loaded, w):
     if m == 0:
         return
 
-    a = load(par, SLOPE)
+    a = load(par, rows.SLOPE)
     mean = load(work, 4 * m + 1)
     for j in range(m):  # ∂ln p/∂τ_j and ∂π̇/∂τ_j, kept in the rows that the sums below need
         k = load(work, j)

@@ -5,32 +5,13 @@ the node's own values and of what the fields read of the border, so that each bl
 collocation matrices with scaled rows, and its columns of the border are derivatives with respect to ten numbers.
 """
 
-from __future__ import annotations
-
 import numba as nb
 
 from en4dvar.plumbing.compiled import called, inlined
 from en4dvar_bubble.solver import rows
 from en4dvar_bubble.solver.arrow import begins
 from en4dvar_bubble.solver.equations import products
-from en4dvar_bubble.solver.general import (
-    CONDUCT,
-    CONTENT_SUM,
-    DIFFUSE,
-    DRIFT,
-    FLOW,
-    GAS_WALL,
-    HEAT,
-    HOT,
-    RATE,
-    SHARED,
-    SLOPE_SUM,
-    SPREAD,
-    TAU_WALL,
-    VAPOUR_SUM,
-    border_rates,
-    sums,
-)
+from en4dvar_bubble.solver.general import border_rates, sums
 from en4dvar_bubble.solver.lanes import absolute, any_lane, exp, load, log, maximum, splat, sqrt, store
 from en4dvar_bubble.solver.tiles import EDGE, place
 
@@ -86,10 +67,10 @@ def _sum_up(y, eq, par, work, border):
             if any_lane(power > 0.0):
                 store(work, 2 * mT + i, exp(power * log(maximum(theta, 1e-12))))
         content = content + share
-    store(border, CONTENT_SUM, content)
-    store(border, SLOPE_SUM, products(y, 0, mT, eq.gas, work, 3 * mT))
+    store(border, rows.CONTENT_SUM, content)
+    store(border, rows.SLOPE_SUM, products(y, 0, mT, eq.gas, work, 3 * mT))
     if mY:
-        store(border, VAPOUR_SUM, products(y, mT, mY, eq.gas, work, 5 * mT + 1))
+        store(border, rows.VAPOUR_SUM, products(y, mT, mY, eq.gas, work, 5 * mT + 1))
     return products(y, mT + mY, mM, eq.medium, work, _of_medium(mT))
 
 
@@ -102,10 +83,10 @@ def _rates(eq, par, shared, work, out):
         return
     kappa, power = load(par, rows.KAPPA), load(par, rows.DIFFUSION_T)
     k1 = (kappa - 1.0) / kappa
-    E, rate, drift_V = load(shared, CONDUCT), load(shared, RATE), load(shared, DRIFT)
-    _add_wall(load(shared, TAU_WALL), mT, gas, work, 3 * mT)
+    E, rate, drift_V = load(shared, rows.CONDUCT), load(shared, rows.RATE), load(shared, rows.DRIFT)
+    _add_wall(load(shared, rows.TAU_WALL), mT, gas, work, 3 * mT)
     if mY:
-        _add_wall(load(shared, GAS_WALL), mY, gas, work, 5 * mT + 1)
+        _add_wall(load(shared, rows.GAS_WALL), mY, gas, work, 5 * mT + 1)
     for i in range(mT):
         conduct = load(work, i) * load(work, mT + i)
         slope, bend = load(work, 3 * mT + i), load(work, 4 * mT + 1 + i)
@@ -113,15 +94,15 @@ def _rates(eq, par, shared, work, out):
         store(out, i, k1 * conduct * (rate + E * bend) - drift * slope)
         if mY:
             slope_y, bend_y = load(work, 5 * mT + 1 + i), load(work, 6 * mT + 2 + i)
-            spread = load(shared, DIFFUSE) * load(work, 2 * mT + i)
+            spread = load(shared, rows.DIFFUSE) * load(work, 2 * mT + i)
             store(out, mT + i, spread * (bend_y + (power - 1.0) * slope / conduct * slope_y) - drift * slope_y)
     if mM:
         at = _of_medium(mT)
-        _add_wall(load(shared, HOT), mM, medium, work, at)
+        _add_wall(load(shared, rows.HOT), mM, medium, work, at)
         for j in range(mM):
-            flow = load(shared, FLOW) * medium[2 * mM + 1, j] * load(work, at + j)
-            heating = load(shared, HEAT) * medium[2 * mM + 2, j]
-            store(out, mT + mY + j, flow + load(shared, SPREAD) * load(work, at + mM + 1 + j) + heating)
+            flow = load(shared, rows.FLOW) * medium[2 * mM + 1, j] * load(work, at + j)
+            heating = load(shared, rows.HEAT) * medium[2 * mM + 2, j]
+            store(out, mT + mY + j, flow + load(shared, rows.SPREAD) * load(work, at + mM + 1 + j) + heating)
 
 
 @called
@@ -149,7 +130,7 @@ def _gas_blocks(y, eq, par, w):
     first_Y, _, border = begins(eq.dims)
     a, kappa, power = load(par, rows.SLOPE), load(par, rows.KAPPA), load(par, rows.DIFFUSION_T)
     k1 = (kappa - 1.0) / kappa
-    E, rate, drift_V = load(shared, CONDUCT), load(shared, RATE), load(shared, DRIFT)
+    E, rate, drift_V = load(shared, rows.CONDUCT), load(shared, rows.RATE), load(shared, rows.DRIFT)
     for i in range(mT):
         k, theta = load(work, i), load(work, mT + i)
         slope, bend = load(work, 3 * mT + i), load(work, 4 * mT + 1 + i)
@@ -161,15 +142,15 @@ def _gas_blocks(y, eq, par, w):
             store(matrix, row + j * EDGE, -(on_slope * ops[i, j] + on_bend * ops[mT + 1 + i, j]))
         store(matrix, diagonal, load(matrix, diagonal) - k1 * own * (rate + E * bend))
         share = ops[2 * mT + 2, i] / theta
-        store(matrix, place(where, border + SLOPE_SUM, i), splat(-ops[mT, i]))
+        store(matrix, place(where, border + rows.SLOPE_SUM, i), splat(-ops[mT, i]))
         if mY == 0:
-            store(matrix, place(where, border + CONTENT_SUM, i), share / conduct)
+            store(matrix, place(where, border + rows.CONTENT_SUM, i), share / conduct)
             continue
         slope_y, bend_y = load(work, 5 * mT + 1 + i), load(work, 6 * mT + 2 + i)
-        store(matrix, place(where, border + CONTENT_SUM, i), share / conduct * load(y, mT + i))
-        store(matrix, place(where, border + CONTENT_SUM, first_Y + i), -share)
-        store(matrix, place(where, border + VAPOUR_SUM, first_Y + i), splat(-ops[mT, i]))
-        spread = load(shared, DIFFUSE) * load(work, 2 * mT + i)
+        store(matrix, place(where, border + rows.CONTENT_SUM, i), share / conduct * load(y, mT + i))
+        store(matrix, place(where, border + rows.CONTENT_SUM, first_Y + i), -share)
+        store(matrix, place(where, border + rows.VAPOUR_SUM, first_Y + i), splat(-ops[mT, i]))
+        spread = load(shared, rows.DIFFUSE) * load(work, 2 * mT + i)
         mix = spread * (power - 1.0) / conduct
         row, diagonal = place(where, first_Y + i, 0), place(where, first_Y + i, i)
         row_y = place(where, first_Y + i, first_Y)
@@ -188,9 +169,9 @@ def _medium_block(eq, par, w):
     _, first, border = begins(eq.dims)
     wall = border + sums(eq.dims)
     for i in range(mM):
-        flow, row = load(shared, FLOW) * medium[2 * mM + 1, i], place(where, first + i, first)
+        flow, row = load(shared, rows.FLOW) * medium[2 * mM + 1, i], place(where, first + i, first)
         for j in range(mM):
-            value = flow * medium[i, j] + load(shared, SPREAD) * medium[mM + 1 + i, j]
+            value = flow * medium[i, j] + load(shared, rows.SPREAD) * medium[mM + 1 + i, j]
             store(matrix, row + j * EDGE, -value)
         store(matrix, place(where, wall, first + i), -(load(par, rows.MEDIUM_K) * medium[mM, i]))
 
@@ -203,31 +184,32 @@ def _border_column(column, eq, par, change, w):
     first_Y, first_M, _ = begins(eq.dims)
     kappa, power = load(par, rows.KAPPA), load(par, rows.DIFFUSION_T)
     k1 = (kappa - 1.0) / kappa
-    E, drift_V = load(shared, CONDUCT), load(shared, DRIFT)
+    E, drift_V = load(shared, rows.CONDUCT), load(shared, rows.DRIFT)
     for i in range(mT):
         conduct = load(work, i) * load(work, mT + i)
         slope, bend = load(work, 3 * mT + i), load(work, 4 * mT + 1 + i)
         radius = gas[2 * mT + 1, i]
-        drift = load(change, DRIFT) * radius - k1 * slope * load(change, CONDUCT)
-        wall_slope = load(change, TAU_WALL) * gas[i, mT]
-        wall_bend = load(change, TAU_WALL) * gas[mT + 1 + i, mT]
-        heat = load(change, RATE) + load(change, CONDUCT) * bend + E * wall_bend
+        drift = load(change, rows.DRIFT) * radius - k1 * slope * load(change, rows.CONDUCT)
+        wall_slope = load(change, rows.TAU_WALL) * gas[i, mT]
+        wall_bend = load(change, rows.TAU_WALL) * gas[mT + 1 + i, mT]
+        heat = load(change, rows.RATE) + load(change, rows.CONDUCT) * bend + E * wall_bend
         carried = drift_V * radius - k1 * E * slope
         total = k1 * conduct * heat + drift * slope + (carried - k1 * E * slope) * wall_slope
         store(matrix, place(where, i, column), -total)
         if mY:
             slope_y, bend_y, at_T = load(work, 5 * mT + 1 + i), load(work, 6 * mT + 2 + i), load(work, 2 * mT + i)
-            spread, mix = load(shared, DIFFUSE) * at_T, (power - 1.0) / conduct
-            wall_slope_y = load(change, GAS_WALL) * gas[i, mT]
-            total = load(change, DIFFUSE) * at_T * (bend_y + mix * slope * slope_y)
-            total = total + spread * (load(change, GAS_WALL) * gas[mT + 1 + i, mT] + mix * slope * wall_slope_y)
+            spread, mix = load(shared, rows.DIFFUSE) * at_T, (power - 1.0) / conduct
+            wall_slope_y = load(change, rows.GAS_WALL) * gas[i, mT]
+            total = load(change, rows.DIFFUSE) * at_T * (bend_y + mix * slope * slope_y)
+            total = total + spread * (load(change, rows.GAS_WALL) * gas[mT + 1 + i, mT] + mix * slope * wall_slope_y)
             total = total + (spread * mix - k1 * E) * wall_slope * slope_y + drift * slope_y + carried * wall_slope_y
             store(matrix, place(where, first_Y + i, column), -total)
     for i in range(mM):
-        flow, at, hot = medium[2 * mM + 1, i], _of_medium(mT) + i, load(change, HOT)
-        total = load(change, FLOW) * flow * load(work, at) + load(change, SPREAD) * load(work, at + mM + 1)
-        total = total + load(change, HEAT) * medium[2 * mM + 2, i] + load(shared, SPREAD) * hot * medium[mM + 1 + i, mM]
-        total = total + load(shared, FLOW) * flow * hot * medium[i, mM]
+        flow, at, hot = medium[2 * mM + 1, i], _of_medium(mT) + i, load(change, rows.HOT)
+        total = load(change, rows.FLOW) * flow * load(work, at) + load(change, rows.SPREAD) * load(work, at + mM + 1)
+        total = total + load(change, rows.HEAT) * medium[2 * mM + 2, i]
+        total = total + load(shared, rows.SPREAD) * hot * medium[mM + 1 + i, mM]
+        total = total + load(shared, rows.FLOW) * flow * hot * medium[i, mM]
         store(matrix, place(where, first_M + i, column), -total)
 
 
@@ -252,7 +234,7 @@ def general_jacobian(y, t, eq, loaded, w):
         value = load(w.border, max(b, 0))
         inverse = 1.0 / (late - now)
         if b >= 0:
-            floor_b = 0.01 if b == own - 2 else 0.0 if kept and b in (CONTENT_SUM, gas_wall) else 1.0
+            floor_b = 0.01 if b == own - 2 else 0.0 if kept and b in (rows.CONTENT_SUM, gas_wall) else 1.0
             store(w.border, b, value + maximum(absolute(value), floor_b) * _DELTA)
             inverse = 1.0 / (load(w.border, b) - value)
         border_rates(w.border, t, outward, eq, loaded, moved, changed)
@@ -261,7 +243,7 @@ def general_jacobian(y, t, eq, loaded, w):
             store(w.dt, 0, (load(changed, own - 2) - load(w.border_f, own - 2)) * inverse)
             continue
         store(w.border, b, value)
-        for i in range(SHARED):
+        for i in range(rows.SHARED):
             store(moved, i, (load(moved, i) - load(w.shared, i)) * inverse)
         _border_column(first + b, eq, par, moved, w)
         for i in range(kept, own):

@@ -28,13 +28,11 @@ Plane at the distance h: the pressure of the image, ±ρ/(2h) d(R²Ṙ)/dt (+ ri
 R it is ±ρ R/(2h) (R²V̇ + 3Ṙ²).
 
 The unknowns of the fields τ, Y and θ_m know of each other only through a few numbers: the *border*, which is τ_w, Y_w,
-the memory, V, u, and three sums over the nodes (:data:`SUMS` at most): the interior's share in τ'_w, in ⟨Y/θ⟩ and in
+the memory, V, u, and sums over the nodes (:data:`rows.SUMS` at most): the interior's share in τ'_w, in ⟨Y/θ⟩ and in
 Y'_w. Here are the border's equations; those of the fields are in :mod:`fields`, and :mod:`arrow` solves both.
 
 Sources: Prosperetti (1991); Estrada et al. (2018); Warnez & Johnsen (2015); Prosperetti & Lezzi (1986); Gilmore (1952).
 """
-
-from __future__ import annotations
 
 import numba as nb
 
@@ -42,21 +40,12 @@ from en4dvar.plumbing.compiled import called
 from en4dvar_bubble.solver import rows
 from en4dvar_bubble.solver.lanes import absolute, exp, load, log, maximum, splat, sqrt, store
 from en4dvar_bubble.solver.lookup import driving, lookup
-from en4dvar_bubble.solver.rows import AS_PRINTED, GILMORE, INSTANTANEOUS, MEMORY, PER_MEMORY, PRESSURE, RETARDED
-
-# Rows of the border: the sums where there are such fields, then τ_w, memory, V, u.
-SLOPE_SUM, CONTENT_SUM, VAPOUR_SUM = 0, 1, 2
-SUMS = 3
-# Rows of what the fields read of the border: E, π̇, V + π̇/3κ, D/R² without θ^b, Y_w, τ_w; of the medium
-# V, D_m/R², 12νV²/(c_p T_∞), θ_w − 1
-CONDUCT, RATE, DRIFT, DIFFUSE, GAS_WALL, TAU_WALL, FLOW, SPREAD, HEAT, HOT = range(10)
-SHARED = 10
 
 
 @nb.njit
 def sums(dims):
     """How many sums over the nodes are in the border."""
-    return SUMS if dims.vapour else 2 if dims.gas else 0
+    return rows.SUMS if dims.vapour else 2 if dims.gas else 0
 
 
 @called
@@ -72,8 +61,8 @@ def _contents(border, V, u, outward, eq, par, shared, out):
     tau_w = load(border, at) if wall else zero
     k_w = sqrt(maximum(a * tau_w * 2.0 + 1.0, 1e-12))
     theta_w = tau_w * 2.0 / (k_w + 1.0) + 1.0
-    slope_w = load(border, SLOPE_SUM) + tau_w * ops[mT, mT]
-    interior = load(border, CONTENT_SUM)
+    slope_w = load(border, rows.SLOPE_SUM) + tau_w * ops[mT, mT]
+    interior = load(border, rows.CONTENT_SUM)
     at_wall = ops[2 * mT + 2, mT] / theta_w
     content = exp(load(par, rows.LOG_GAS) - u * 3.0)
     per_area = exp(u * (-2.0))
@@ -94,24 +83,24 @@ def _contents(border, V, u, outward, eq, par, shared, out):
         diffusion = load(par, rows.DIFFUSION) * per_area
         at_T = exp(load(par, rows.DIFFUSION_T) * log(theta_w))
         dilution = dilution + load(par, rows.SMEARED) * absolute(V) / diffusion
-        inward = -(load(border, VAPOUR_SUM) + gas_w * ops[mT, mT]) * dilution * at_T
+        inward = -(load(border, rows.VAPOUR_SUM) + gas_w * ops[mT, mT]) * dilution * at_T
         flux = inward / gas_w
         if kinetic:
             crossing = load(par, rows.CROSSING) * sqrt(theta_w) * exp(-u) / diffusion
             store(out, at + wall, crossing * gas_w * (saturation / p - 1.0 + gas_w) - inward)
         rate = rate + kappa * diffusion * flux * 3.0
-        store(shared, DIFFUSE, diffusion * dilution)
-        store(shared, GAS_WALL, gas_w)
-    store(shared, CONDUCT, E)
-    store(shared, RATE, rate)
-    store(shared, DRIFT, rate / (kappa * 3.0) + V)
-    store(shared, TAU_WALL, tau_w)
+        store(shared, rows.DIFFUSE, diffusion * dilution)
+        store(shared, rows.GAS_WALL, gas_w)
+    store(shared, rows.CONDUCT, E)
+    store(shared, rows.RATE, rate)
+    store(shared, rows.DRIFT, rate / (kappa * 3.0) + V)
+    store(shared, rows.TAU_WALL, tau_w)
     if wall:
         hot = theta_w - 1.0
-        store(shared, FLOW, V)
-        store(shared, SPREAD, load(par, rows.MEDIUM_D) * per_area)
-        store(shared, HEAT, load(par, rows.HEATING) * load(par, rows.VISCOSITY) * V * V)
-        store(shared, HOT, hot)
+        store(shared, rows.FLOW, V)
+        store(shared, rows.SPREAD, load(par, rows.MEDIUM_D) * per_area)
+        store(shared, rows.HEAT, load(par, rows.HEATING) * load(par, rows.VISCOSITY) * V * V)
+        store(shared, rows.HOT, hot)
         outside = load(par, rows.MEDIUM_K) * (outward + hot * eq.medium[mM, mM])
         store(out, at, outside - slope_w - load(par, rows.LATENT) * p / theta_w * flux)
     return p, rate
@@ -135,11 +124,11 @@ def border_rates(border, t, outward, eq, loaded, shared, out):
     J_rate = Jx * V
     for j in range(q):
         s = load(border, oS + j)
-        at = load(par, MEMORY + PER_MEMORY * j + 2)
+        at = load(par, rows.MEMORY + rows.PER_MEMORY * j + 2)
         stiffness, _, _ = lookup(eq.memory, at, span, x)
         rest, _, _ = lookup(eq.memory, at + span[3] * 8.0, span, x)
-        convection = load(par, MEMORY + PER_MEMORY * j + 1)
-        change = (rest - s) / load(par, MEMORY + PER_MEMORY * j) + V * (convection * s + stiffness)
+        convection = load(par, rows.MEMORY + rows.PER_MEMORY * j + 1)
+        change = (rest - s) / load(par, rows.MEMORY + rows.PER_MEMORY * j) + V * (convection * s + stiffness)
         store(out, oS + j, change)
         J = J + s
         J_rate = J_rate + change
@@ -161,21 +150,21 @@ def border_rates(border, t, outward, eq, loaded, shared, out):
     R = exp(u)
     ic = load(par, rows.INVERSE_C)
     when = load(t, 0)
-    if reading != INSTANTANEOUS:
+    if reading != rows.INSTANTANEOUS:
         when = when + R * ic
     f, g, _ = driving(when, eq, par)
     surface = load(par, rows.SURFACE) / R
     wall_pressure = p + load(par, rows.VAPOUR) - surface + J - dashpot
     wall_slope = p * rate + surface * V + J_rate
     Rdot = R * V
-    if reading == RETARDED:
+    if reading == rows.RETARDED:
         g = splat(0.0)
-    elif reading == AS_PRINTED:
+    elif reading == rows.AS_PRINTED:
         g = g * (Rdot * ic + 1.0)
     ambient = load(par, rows.AMBIENT)
     weight = splat(1.0)
     damping = splat(1.0)
-    if radial == PRESSURE:
+    if radial == rows.PRESSURE:
         H = wall_pressure - ambient - f
         H_slope = wall_slope - g
     else:
@@ -188,7 +177,7 @@ def border_rates(border, t, outward, eq, loaded, shared, out):
         H = (exp(share * log_wall) - exp(share * log_far)) / (share * scale)
         damping = exp(-(log_wall / n))
         H_slope = wall_slope * damping - g * exp(-(log_far / n))
-        if radial == GILMORE:
+        if radial == rows.GILMORE:
             ic = 1.0 / sqrt(maximum(1.0 / (ic * ic) + (n - 1.0) * H, 1e-12))
             weight = 1.0 - Rdot * ic
     mach = Rdot * ic

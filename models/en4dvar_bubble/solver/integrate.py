@@ -2,8 +2,6 @@
 finishes.
 """
 
-from __future__ import annotations
-
 import math
 
 import numba as nb
@@ -14,8 +12,7 @@ from en4dvar.plumbing.compiled import called, kernel_called_by_address, kernel_w
 from en4dvar_bubble.solver import rodas5p
 from en4dvar_bubble.solver.apart import call, kept
 from en4dvar_bubble.solver.arrays import Lanes, Loaded, Workspace
-from en4dvar_bubble.solver.lanes import WIDTH, peek, take
-from en4dvar_bubble.solver.parts import parted
+from en4dvar_bubble.solver.lanes import WIDTH, parted, peek, take
 from en4dvar_bubble.solver.rows import AMPLITUDE, PULSE_RATE, PULSE_SHIFT, SMEARED, TABLE
 from en4dvar_bubble.solver.step import LEAST_ERROR, attempt, interpolant, judge
 from en4dvar_bubble.tables import fill_one

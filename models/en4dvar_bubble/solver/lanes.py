@@ -2,19 +2,19 @@
 
 A value of type ``lanes`` holds one number for each of :data:`WIDTH` members; arithmetic, comparison and ``sqrt`` act
 lane by lane, so what one member computes never depends on its neighbours (same bits in any lane, group or chunk).
-Rows of a C-contiguous ``(rows, 8)`` array, or of a part of one (:mod:`parts`), are read and written with :func:`load`
+Rows of a C-contiguous ``(rows, 8)`` array, or of a part of one (:class:`Rows`), are read and written with :func:`load`
 and :func:`store`. Multiply–adds may be fused.
 """
 
-from __future__ import annotations
-
+import math
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from itertools import pairwise
 from typing import Any
 
 from llvmlite import ir
 from numba.core import cgutils, types
-from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
+from numba.core.typing.templates import AbstractTemplate, ConcreteTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
 from en4dvar.plumbing.compiled import inlined
@@ -51,29 +51,34 @@ def _splat(builder: Any, value: Any) -> Any:
     return builder.shuffle_vector(first, ir.Constant(_VEC, ir.Undefined), zeros)
 
 
-def _operator(op: Any, result: Any, emit: Callable[[Any, Any, Any], Any]) -> None:
+_PAIRS = (lanes, lanes), (lanes, types.float64), (types.float64, lanes)
+
+
+def _kind(value: Any) -> Any:
+    """The type of lanes, or of a number for all of them."""
+    return lanes if value is lanes else types.float64
+
+
+def _operator(op: Any, result: Any, emit: Callable[..., Any], operands: Sequence[tuple[Any, ...]] = _PAIRS) -> None:
     """Let ``op`` of two lanes, or of lanes and a number for all of them, be what ``emit`` builds."""
 
     @infer_global(op)
     class _Template(ConcreteTemplate):
         metadata = TRIED_FIRST
-        cases = [  # noqa: RUF012  # numba reads the attribute as a list
-            signature(result, lanes, lanes),
-            signature(result, lanes, types.float64),
-            signature(result, types.float64, lanes),
-        ]
+        cases = [signature(result, *kinds) for kinds in operands]  # noqa: RUF012  # numba reads it as a list
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return emit(builder, _splat(builder, args[0]), _splat(builder, args[1]))
+        return emit(builder, *(_splat(builder, x) for x in args))
 
-    for case in _Template.cases:
-        lower_builtin(op, *case.args)(lower)
+    for kinds in operands:
+        lower_builtin(op, *kinds)(lower)
 
 
 _operator(operator.add, lanes, lambda builder, a, b: builder.fadd(a, b, flags=_CONTRACT))
 _operator(operator.sub, lanes, lambda builder, a, b: builder.fsub(a, b, flags=_CONTRACT))
 _operator(operator.mul, lanes, lambda builder, a, b: builder.fmul(a, b, flags=_CONTRACT))
 _operator(operator.truediv, lanes, lambda builder, a, b: builder.fdiv(a, b, flags=_CONTRACT))
+_operator(operator.neg, lanes, lambda builder, a: builder.fneg(a), [(lanes,)])
 _operator(operator.lt, mask, lambda builder, a, b: builder.fcmp_ordered("<", a, b))
 _operator(operator.le, mask, lambda builder, a, b: builder.fcmp_ordered("<=", a, b))
 _operator(operator.gt, mask, lambda builder, a, b: builder.fcmp_ordered(">", a, b))
@@ -86,31 +91,20 @@ class Value:
     def __init__(self, builder: Any, value: Any) -> None:
         self.builder, self.value = builder, value
 
-    def __sub__(self, other: Value) -> Value:
+    def __sub__(self, other: "Value") -> "Value":
         return Value(self.builder, self.builder.fsub(self.value, other.value, flags=_CONTRACT))
 
-    def __add__(self, other: Value) -> Value:
+    def __add__(self, other: "Value") -> "Value":
         return Value(self.builder, self.builder.fadd(self.value, other.value, flags=_CONTRACT))
 
-    def __mul__(self, other: Value) -> Value:
+    def __mul__(self, other: "Value") -> "Value":
         return Value(self.builder, self.builder.fmul(self.value, other.value, flags=_CONTRACT))
 
-    def __neg__(self) -> Value:
+    def __neg__(self) -> "Value":
         return Value(self.builder, self.builder.fneg(self.value))
 
-    def inverse(self) -> Value:
+    def inverse(self) -> "Value":
         return Value(self.builder, self.builder.fdiv(ir.Constant(_VEC, [1.0] * WIDTH), self.value))
-
-
-@infer_global(operator.neg)
-class _Negate(ConcreteTemplate):
-    metadata = TRIED_FIRST
-    cases = [signature(lanes, lanes)]  # noqa: RUF012
-
-
-@lower_builtin(operator.neg, lanes)
-def _lower_negate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    return builder.fneg(args[0])
 
 
 def row_pointer(context: Any, builder: Any, array_type: Any, array: Any, row: Any) -> Any:
@@ -140,8 +134,7 @@ def store(typingctx, array, row, value):
         builder.store(_splat(builder, args[2]), pointer, align=8)
         return context.get_dummy_value()
 
-    kind = lanes if value is lanes else types.float64
-    return types.void(array, types.int64, kind), codegen
+    return types.void(array, types.int64, _kind(value)), codegen
 
 
 @intrinsic
@@ -157,8 +150,7 @@ def select(typingctx, condition, a, b):
     def codegen(context, builder, sig, args):
         return builder.select(args[0], _splat(builder, args[1]), _splat(builder, args[2]))
 
-    kinds = [lanes if x is lanes else types.float64 for x in (a, b)]
-    return lanes(mask, *kinds), codegen
+    return lanes(mask, _kind(a), _kind(b)), codegen
 
 
 @intrinsic
@@ -194,38 +186,27 @@ def peek(typingctx, counter):
     return types.int64(counter), codegen
 
 
-def _unary(name: str) -> Any:
-    @intrinsic
-    def function(typingctx, x):
-        def codegen(context, builder, sig, args):
-            kind = ir.FunctionType(_VEC, [_VEC])
-            return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v8f64"), args)
+def _function(name: str, operands: int) -> Any:
+    """A function of LLVM's, of one or two ``operands``: lanes, or a number for all of them."""
 
+    def codegen(context, builder, sig, args):
+        kind = ir.FunctionType(_VEC, [_VEC] * operands)
+        called = cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v8f64")
+        return builder.call(called, [_splat(builder, x) for x in args])
+
+    @intrinsic
+    def of_one(typingctx, x):
         return lanes(lanes), codegen
 
-    return function
-
-
-sqrt = _unary("sqrt")
-floor = _unary("floor")
-absolute = _unary("fabs")
-
-
-def _binary(name: str) -> Any:
     @intrinsic
-    def function(typingctx, a, b):
-        def codegen(context, builder, sig, args):
-            kind = ir.FunctionType(_VEC, [_VEC, _VEC])
-            call = cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v8f64")
-            return builder.call(call, [_splat(builder, x) for x in args])
+    def of_two(typingctx, a, b):
+        return lanes(_kind(a), _kind(b)), codegen
 
-        return lanes(*[lanes if x is lanes else types.float64 for x in (a, b)]), codegen
-
-    return function
+    return of_one if operands == 1 else of_two
 
 
-minimum = _binary("minnum")
-maximum = _binary("maxnum")
+sqrt, floor, absolute = (_function(name, 1) for name in ("sqrt", "floor", "fabs"))
+minimum, maximum = (_function(name, 2) for name in ("minnum", "maxnum"))
 
 
 @intrinsic
@@ -295,9 +276,121 @@ def gather_rows(typingctx, table, index):
     return types.UniTuple(lanes, 6)(table, lanes), codegen
 
 
+class Rows(types.Type):
+    """Rows of :data:`WIDTH` numbers: where they begin and how many, 2 words where an array takes 9. The compiler moves
+    every field of the named groups at every call and every access to one of them: with arrays it takes twice as long.
+    """
+
+    def __init__(self, dtype: Any) -> None:
+        self.dtype = dtype
+        super().__init__(name=f"rows({dtype})")
+
+
+@register_model(Rows)
+class _RowsModel(models.StructModel):
+    def __init__(self, dmm: Any, fe_type: Any) -> None:
+        super().__init__(dmm, fe_type, [("data", types.CPointer(fe_type.dtype)), ("count", types.intp)])
+
+
+@intrinsic(prefer_literal=True)
+def parted(typingctx, block, edges, count):
+    """The first ``count`` parts of a C-contiguous (rows, 8) array, which must outlive them; part i is the rows
+    ``edges[i] … edges[i+1]−1``.
+    """
+
+    def codegen(context, builder, sig, args):
+        data, at = (
+            cgutils.create_struct_proxy(kind)(context, builder, value=value).data
+            for kind, value in zip(sig.args[:2], args[:2], strict=True)
+        )
+        parts = []
+        ends = [builder.load(builder.gep(at, [ir.Constant(_I64, i)])) for i in range(len(sig.return_type) + 1)]
+        for first, end in pairwise(ends):
+            part = cgutils.create_struct_proxy(sig.return_type.dtype)(context, builder)
+            part.data = builder.gep(data, [builder.mul(first, ir.Constant(_I64, WIDTH))])
+            part.count = builder.sub(end, first)
+            parts.append(part._getvalue())
+        return context.make_tuple(builder, sig.return_type, parts)
+
+    return types.UniTuple(Rows(block.dtype), count.literal_value)(block, edges, count), codegen
+
+
+@infer_global(len)
+class _Count(AbstractTemplate):
+    def generic(self, args: Any, kws: Any) -> Any:
+        return signature(types.intp, *args) if isinstance(args[0], Rows) else None
+
+
+@lower_builtin(len, Rows)
+def _lower_count(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    return builder.extract_value(args[0], 1)
+
+
+def _element(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    """Where ``of[i]``, the ``i``-th number, or ``of[row, lane]`` is."""
+    place = args[1]
+    if isinstance(sig.args[1], types.BaseTuple):
+        row, lane = cgutils.unpack_tuple(builder, place)
+        place = builder.add(builder.mul(row, ir.Constant(_I64, WIDTH)), lane)
+    return builder.gep(builder.extract_value(args[0], 0), [place])
+
+
+@infer_global(operator.getitem)
+class _Read(AbstractTemplate):
+    metadata = TRIED_FIRST
+
+    def generic(self, args: Any, kws: Any) -> Any:
+        return signature(args[0].dtype, args[0], _place(args[1])) if isinstance(args[0], Rows) else None
+
+
+@infer_global(operator.setitem)
+class _Write(AbstractTemplate):
+    metadata = TRIED_FIRST
+
+    def generic(self, args: Any, kws: Any) -> Any:
+        if isinstance(args[0], Rows):
+            return signature(types.none, args[0], _place(args[1]), args[0].dtype)
+        return None
+
+
+def _place(index: Any) -> Any:
+    return types.UniTuple(types.int64, 2) if isinstance(index, types.BaseTuple) else types.int64
+
+
+@lower_builtin(operator.getitem, Rows, types.Any)
+def _lower_read(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    return builder.load(_element(context, builder, sig, args))
+
+
+@lower_builtin(operator.setitem, Rows, types.Any, types.Any)
+def _lower_write(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    builder.store(args[2], _element(context, builder, sig, args))
+    return context.get_dummy_value()
+
+
 _LOG2E = 1.4426950408889634
 _LN2_HIGH = 6.93147180369123816490e-01
 _LN2_LOW = 1.90821492927058770002e-10
+
+
+def _polynomial(*coefficients: float) -> Any:
+    """A polynomial of lanes by Horner's rule, the highest coefficient first, unrolled."""
+
+    @intrinsic
+    def function(typingctx, x):
+        def codegen(context, builder, sig, args):
+            value, *others = (ir.Constant(_VEC, [c] * WIDTH) for c in coefficients)
+            for other in others:
+                value = builder.fadd(builder.fmul(value, args[0], flags=_CONTRACT), other, flags=_CONTRACT)
+            return value
+
+        return lanes(lanes), codegen
+
+    return function
+
+
+_taylor = _polynomial(*(1.0 / math.factorial(k) for k in range(13, -1, -1)))
+_artanh = _polynomial(*(1.0 / k for k in range(21, 1, -2)))
 
 
 @inlined
@@ -309,21 +402,7 @@ def exp(x):
     x = minimum(maximum(x, -708.0), 709.0)
     k = floor(x * _LOG2E + 0.5)
     r = (x - k * _LN2_HIGH) - k * _LN2_LOW
-    q = splat(1.0 / 6227020800.0)
-    q = q * r + 1.0 / 479001600.0
-    q = q * r + 1.0 / 39916800.0
-    q = q * r + 1.0 / 3628800.0
-    q = q * r + 1.0 / 362880.0
-    q = q * r + 1.0 / 40320.0
-    q = q * r + 1.0 / 5040.0
-    q = q * r + 1.0 / 720.0
-    q = q * r + 1.0 / 120.0
-    q = q * r + 1.0 / 24.0
-    q = q * r + 1.0 / 6.0
-    q = q * r + 0.5
-    q = q * r + 1.0
-    q = q * r + 1.0
-    return _scale_by_power_of_two(q, k)
+    return _scale_by_power_of_two(_taylor(r), k)
 
 
 @inlined
@@ -338,14 +417,4 @@ def log(x):
     exponent = select(large, exponent + 1.0, exponent)
     z = (m - 1.0) / (m + 1.0)
     w = z * z
-    q = splat(1.0 / 21.0)
-    q = q * w + 1.0 / 19.0
-    q = q * w + 1.0 / 17.0
-    q = q * w + 1.0 / 15.0
-    q = q * w + 1.0 / 13.0
-    q = q * w + 1.0 / 11.0
-    q = q * w + 1.0 / 9.0
-    q = q * w + 1.0 / 7.0
-    q = q * w + 1.0 / 5.0
-    q = q * w + 1.0 / 3.0
-    return exponent * _LN2_HIGH + (z * 2.0 + (z * 2.0 * w * q + exponent * _LN2_LOW))
+    return exponent * _LN2_HIGH + (z * 2.0 + (z * 2.0 * w * _artanh(w) + exponent * _LN2_LOW))

@@ -1,7 +1,5 @@
 """Smooth functions in the kernel: piecewise quintics, see :mod:`en4dvar_bubble.tables`."""
 
-from __future__ import annotations
-
 from en4dvar.plumbing.compiled import inlined
 from en4dvar_bubble.solver.lanes import any_lane, floor, gather_rows, load, maximum, minimum, select, splat
 from en4dvar_bubble.solver.rows import AMPLITUDE, PULSE_RATE, PULSE_SHIFT, PULSE_TABLE

@@ -7,8 +7,6 @@ Source: G. Steinebach, BIT Numerical Mathematics 63:27 (2023), doi:10.1007/s1054
 are checked in ``tests/convergence``.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 ORDER = 5

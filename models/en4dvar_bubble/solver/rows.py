@@ -1,6 +1,6 @@
-"""Rows of the kernel's parameter array, one column per member. Units: µm, µs, pressures over the density (µm²/µs²)."""
-
-from __future__ import annotations
+"""Rows of the kernel's parameter array, one column per member, and of the border of the general equations. Units: µm,
+µs, pressures over the density (µm²/µs²).
+"""
 
 LOG_GAS = 0  # ln of the gas content: p R³⟨1/θ⟩ (heat; of the non-condensible gas with vapour) or p R^{3κ} (polytropic)
 VAPOUR = 1  # constant vapour pressure added to the gas
@@ -43,3 +43,11 @@ PER_MEMORY = 3
 INSTANTANEOUS, RETARDED, AS_PRINTED = 0, 1, 2
 # Radial equations (Rayleigh–Plesset is Keller–Miksis in pressure with INVERSE_C = 0).
 PRESSURE, ENTHALPY, GILMORE = 0, 1, 2
+
+# The border of the general equations (:mod:`general`): the sums where there are such fields, then τ_w, memory, V, u.
+SLOPE_SUM, CONTENT_SUM, VAPOUR_SUM = 0, 1, 2
+SUMS = 3
+# What the fields read of the border: E, π̇, V + π̇/3κ, D/R² without θ^b, Y_w, τ_w; of the medium
+# V, D_m/R², 12νV²/(c_p T_∞), θ_w − 1
+CONDUCT, RATE, DRIFT, DIFFUSE, GAS_WALL, TAU_WALL, FLOW, SPREAD, HEAT, HOT = range(10)
+SHARED = 10

@@ -1,7 +1,5 @@
 """One step of RODAS5P for all lanes: Jacobian, factorisation, stages, error."""
 
-from __future__ import annotations
-
 import numba as nb
 from numba.core.types import BaseTuple, NoneType
 from numba.extending import overload

@@ -6,8 +6,6 @@ where it is zero; the tiles of one row follow each other. An unknown has its pla
 rows that no unknown has are those of unity.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
