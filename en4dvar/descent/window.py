@@ -8,12 +8,12 @@ record only.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from en4dvar.data.noise import Linearisation, Predicted
-from en4dvar.descent.loop import Objective
+from en4dvar.descent.loop import Descends, Objective
 from en4dvar.descent.step_control import NEAR, STEP_CONTROLS, Move, Point, Search, Settling, Tangent, Trials, each_once
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.diagnosis import diagnostics as diag
@@ -25,17 +25,7 @@ from en4dvar.ensemble.missing import filled
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import TooFewMembersError
 from en4dvar.priors.prior import member_stream
-from en4dvar.schemes.base import (
-    Evaluation,
-    GaussNewtonStep,
-    Minimiser,
-    Runs,
-    Step,
-    Weights,
-    dense,
-    gauss_newton,
-    regression,
-)  # fmt: skip
+from en4dvar.schemes.base import Evaluation, GaussNewtonStep, Minimiser, Runs, Step, Weights, gauss_newton, regression
 
 WIDER, WIDEST = 5.0, 25.0  # factors of a bundle where J does not fall along the step: of each further look, in all
 FAKED = 3.0  # posterior standard deviations: a longer step does not come from the model's own error
@@ -61,7 +51,7 @@ class Iterate:
 
 
 @dataclass
-class Descent:
+class Descent(Descends):
     """One descent: where it stands, the records of its iterations, and why it ended.
 
     ``worst_loss`` are the reasons of failure in the iteration that lost most members, or empty. ``cost`` is J where it
@@ -75,14 +65,11 @@ class Descent:
     records: tuple[IterationRecord, ...] = ()
     worst_loss: tuple[str, ...] = ()
     cost: float = math.inf
-    stop: str = ""
-    converged: bool = False
-    ended: bool = False
     members: tuple[int, ...] = ()
     highest: float = -math.inf
     settling: Settling | None = None
     at: Iterate | None = None
-    step: Step | GaussNewtonStep | None = None
+    step: Step | GaussNewtonStep | None = field(default=None, kw_only=True)
 
     @property
     def iteration(self) -> int:
@@ -117,13 +104,12 @@ class DataWindow(Objective[Descent]):
     def __init__(
         self,
         space: WeightSpace,
-        seed: int,
-        save: Callable[[], None],
-        tell: Callable[[Record], None],
+        save: Callable[[], None] = lambda: None,
+        tell: Callable[[Record], None] = lambda record: None,
         first: Forecast | None = None,
         grid: Array = NO_TIMES,
     ):
-        self.space, self.seed, self.save, self.tell, self.first, self.grid = space, seed, save, tell, first, grid
+        self.space, self.save, self.tell, self.first, self.grid = space, save, tell, first, grid
         self.scheme, self.observations = space.scheme, space.problem.observations
         self.tangents: list[tuple[Array, Array, Array]] = []  # weights (N,), reference (Ky,) and anomalies there
 
@@ -168,7 +154,7 @@ class DataWindow(Objective[Descent]):
 
     def draw(self, purpose: str, columns: int | None = None) -> Array:
         n_members, size = len(self.space.members), columns or len(self.observations)
-        return np.stack([member_stream(self.seed, purpose, i).standard_normal(size) for i in range(n_members)])
+        return np.stack([member_stream(self.space.seed, purpose, i).standard_normal(size) for i in range(n_members)])
 
     def judge(self, going: Sequence[Descent]) -> None:
         for descent in going:
@@ -312,7 +298,7 @@ class DataWindow(Objective[Descent]):
         if self.scheme.done(count - 1, taken):
             descent.stop, descent.converged = f"{count} assimilations", True
         basis = self.space.basis  # of the weights of the mean, those that move no parameter are no part of J_b
-        descent.weights = Weights(basis @ (basis.T @ taken.weights.w), dense(taken.weights.T))
+        descent.weights = Weights(basis @ (basis.T @ taken.weights.w), taken.weights.dense)
 
     def _run_ensemble(self, descent: Descent) -> Runs | None:
         space = self.space

@@ -107,16 +107,16 @@ def _through(stages: Stages, resume: LoopState | None) -> Analysis:
         descents=descents,
         draws=prior.to_physical(sampled.refined.draws) if sampled.refined else np.empty((0, 0)),
     )
-    cautions = (*start.warnings, *(sampled.refined.warnings if sampled.refined else ()))
+    cautions = [*start.warnings, *(sampled.refined.warnings if sampled.refined else ())]
     if len(outcome.tried) == 1:
-        cautions = (*cautions, caution("one-descent", "one descent only: another minimum is not excluded"))
-    cautions = (*cautions, *conclusions.future_missed(analysis.withheld))
-    cautions = (*cautions, *conclusions.missing_readings(ends.run.filled, stages.settings.refine == "mcmc"))
+        cautions.append(caution("one-descent", "one descent only: another minimum is not excluded"))
+    cautions += conclusions.future_missed(analysis.withheld)
+    cautions += conclusions.missing_readings(ends.run.filled, stages.settings.refine == "mcmc")
     if counting:
         weights = np.array([mode.weight for mode in analysis.modes])
-        cautions = (*cautions, *mode_cautions(prior, counting, weights, agree, sampled.refined))
-    cautions = (*cautions, *_missed_knots(stages, analysis))
-    analysis = replace(analysis, cautions=examine(analysis, control, outcome.descent.worst_loss, cautions))
+        cautions += mode_cautions(prior, counting, weights, agree, sampled.refined)
+    cautions += _missed_knots(stages, analysis)
+    analysis = replace(analysis, cautions=examine(analysis, control, outcome.descent.worst_loss, tuple(cautions)))
     analysis = replace(analysis, forward_runs=space.forward_runs)
     if stages.settings.what_if == "added":  # last, since what is examined is the posterior of the data
         widened = with_shifts(ends.members, analysis.what_if, stages.seed)

@@ -28,7 +28,15 @@ MOVED |= {f"en4dvar.{old}": f"en4dvar.{new}" for new, several in {
     "report.svg": "report.words report.drawing", "runs.finished": "runs.evidence_run", "inputs.readers": "inputs.order",
     "estimation.joint.members": "estimation.joint.challenge", "estimation.stages": "loop_state estimation.loop_state",
     "results.declared": "results.axes", "inputs.parts": "inputs.contents",
-    "estimation.population.hierarchy": "estimation.population.effort",
+    "estimation.population.hierarchy": "estimation.population.effort estimation.population.hyper",
+    "estimation.population.own": "estimation.population.mixtures",
+    "estimation.joint.descent": "estimation.joint.arrow estimation.joint.tangent",
+    "estimation.joint.agreement": "estimation.joint.doubts", "estimation.design.nested": "estimation.design.laws",
+    "estimation.design.planned": "estimation.design.laplace", "estimation.design.evaluate": "estimation.design.needed",
+    "estimation.conclusions": "descent.variance", "descent.start": "descent.lengthen",
+    "descent.beyond_gaussian": "descent.bounded descent.marginal descent.noise_scale",
+    "descent.field_data": "descent.field_gain", "ensemble.linalg": "ensemble.near_prior",
+    "ensemble.members": "ensemble.readout", "ensemble.forecast": "ensemble.spread_rates",
 }.items() for old in several.split()}  # fmt: skip
 MOVED |= {"en4dvar.cycling": "en4dvar.series", "en4dvar.storage": "en4dvar.results"}
 MOVED |= {"en4dvar_agarose.summary": "en4dvar_agarose.tables", "en4dvar_agarose.evidence": "en4dvar_agarose.fits"}

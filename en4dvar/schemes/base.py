@@ -17,8 +17,7 @@ from typing import Annotated, Any, ClassVar, Literal, Protocol, cast
 import numpy as np
 from annotated_types import Ge, Gt, Le
 
-from en4dvar.ensemble.linalg import Hessian, centre, min_norm_fit
-from en4dvar.ensemble.near_prior import NearPrior
+from en4dvar.ensemble.linalg import Hessian, NearPrior, centre, min_norm_fit
 from en4dvar.model.state import Array
 
 
@@ -51,12 +50,13 @@ class Weights:
     @property
     def rows(self) -> Array:
         """(N, N): member i is x̄0 + X0ᵀ rows[i]."""
-        return np.asarray(self.w + dense(self.T))
+        return np.asarray(self.w + self.dense)
 
-
-def dense(transform: Any) -> Array:
-    """A transform as a matrix (N, N)."""
-    return np.asarray(transform if isinstance(transform, np.ndarray) else transform.dense)
+    @property
+    def dense(self) -> Array:
+        """T as a matrix (N, N)."""
+        transform: Any = self.T
+        return np.asarray(transform if isinstance(transform, np.ndarray) else transform.dense)
 
 
 @lru_cache(maxsize=4)

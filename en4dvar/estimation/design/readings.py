@@ -1,6 +1,6 @@
 """Which readings to take: the most informative few of many candidates, by adding one at a time and then exchanging.
 
-The expected information by :mod:`en4dvar.estimation.design.laplace` grows by each reading's own rows of S alone,
+The expected information by :mod:`en4dvar.estimation.design.planned` grows by each reading's own rows of S alone,
 so that one set of runs at all candidates tells it for every choice. To add the best one at a time comes
 within 1 − 1/e of the best choice where the information is submodular (Krause & Guestrin 2005, UAI), as it is of
 independent readings about everything; exchanges then end in a choice that no single exchange improves.
@@ -11,8 +11,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.estimation.design.laplace import require_alive
-from en4dvar.estimation.design.planned import Planned
+from en4dvar.estimation.design.planned import Planned, require_alive
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError
 

@@ -11,12 +11,10 @@ from en4dvar.descent.weight_space import require_members
 from en4dvar.ensemble.forecast import Forecast, plotting_times
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.estimation.conclusions import missing_readings
-from en4dvar.estimation.joint.agreement import AT_MOST, Agreement, agreement, is_odd, oddest
-from en4dvar.estimation.joint.descent import JointDescent, JointObjective, Place, assembled, cost
-from en4dvar.estimation.joint.doubts import doubts
+from en4dvar.estimation.joint.agreement import AT_MOST, Agreement, agreement, doubts, is_odd, oddest
+from en4dvar.estimation.joint.descent import Experiment, JointDescent, JointObjective, Place, assembled, cost
 from en4dvar.estimation.joint.members import JointMembers, challenger, gaussian, sampled
 from en4dvar.estimation.joint.problem import JointProblem, Single
-from en4dvar.estimation.joint.tangent import Experiment
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, caution

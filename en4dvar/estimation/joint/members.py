@@ -19,9 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import gammaln, logsumexp
 
-from en4dvar.estimation.joint.descent import ArrowSystem, Place
+from en4dvar.estimation.joint.descent import ArrowSystem, Experiment, Place
 from en4dvar.estimation.joint.problem import JointProblem
-from en4dvar.estimation.joint.tangent import Experiment
 from en4dvar.model.state import Array
 from en4dvar.priors.prior import member_stream
 from en4dvar.sampling.mixture import resampled
