@@ -25,7 +25,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from en4dvar.descent.field_data import FieldData, Members, Pass, mean_of, silent
+from en4dvar.descent.field_data import FieldData, Pass, mean_of, silent
 from en4dvar.descent.loop import Descends, Objective, minimise
 from en4dvar.descent.step_control import Move, Search
 from en4dvar.ensemble.missing import fitted
@@ -44,28 +44,25 @@ def field_esmda(
     gain: Gain,
     coefficients: Sequence[float] = (4.0, 4.0, 4.0, 4.0),
     seed: int = 0,
-    fewest: int | None = None,
-    first: Array | None = None,
-    tell: Callable[[Pass], None] = silent,
-) -> Members:
+) -> None:
     """Prior members (N, n) → posterior members, in place, by ES-MDA with a localised gain.
-
-    Returns the members that came through all passes, ``fewest`` at least, by default all; the others stay where they
-    failed. ``first`` (N, K): predictions of the prior members, where they are known. ``tell`` hears of each pass.
 
     Raises :class:`En4dvarError`: predictions that are not finite.
     """
-    passes = Passes(ensemble, data, gain, mda_inflations(coefficients), seed, fewest, first, tell)
+    passes = Passes(ensemble, data, gain, mda_inflations(coefficients), seed)
     minimise(passes, [passes])
-    return passes.alive
 
 
 class Passes(Objective["Passes"], Descends):
-    """The passes of ES-MDA over an ensemble, which is their only descent, with R times each of the ``inflations``."""
+    """The passes of ES-MDA over an ensemble, which is their only descent, with R times each of the ``inflations``.
+
+    ``alive`` are the members that came through all, ``fewest`` at least, by default all of them; the others stay where
+    they failed. ``first`` (N, K): predictions of the prior members, where they are known. ``tell`` hears of each pass.
+    """
 
     def __init__(
-        self, ensemble: Array, data: FieldData, gain: Gain, inflations: Array, seed: int, fewest: int | None,
-        first: Array | None, tell: Callable[[Pass], None],
+        self, ensemble: Array, data: FieldData, gain: Gain, inflations: Array, seed: int, fewest: int | None = None,
+        first: Array | None = None, tell: Callable[[Pass], None] = silent,
     ):  # fmt: skip
         self.ensemble, self.data, self.gain, self.inflations, self.seed = ensemble, data, gain, inflations, seed
         self.fewest, self.first, self.tell = fewest, first, tell

@@ -11,7 +11,6 @@ centre and row i of the ensemble transform T.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Annotated, Any, ClassVar, Literal, Protocol, cast
 
 import numpy as np
@@ -44,7 +43,7 @@ class Weights:
     @classmethod
     def prior(cls, n_members: int) -> "Weights":
         """w = 0, T = I."""
-        identity = _identity(n_members)
+        identity = np.eye(n_members)
         return cls(np.zeros(n_members), identity, identity)
 
     @property
@@ -57,13 +56,6 @@ class Weights:
         """T as a matrix (N, N)."""
         transform: Any = self.T
         return np.asarray(transform if isinstance(transform, np.ndarray) else transform.dense)
-
-
-@lru_cache(maxsize=4)
-def _identity(n: int) -> Array:
-    identity = np.eye(n)
-    identity.flags.writeable = False
-    return identity
 
 
 @dataclass(frozen=True)

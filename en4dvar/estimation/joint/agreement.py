@@ -54,6 +54,22 @@ class Statement:
     pull: Array
     compared: npt.NDArray[np.intp]
 
+    @classmethod
+    def of(cls, joint: JointProblem, e: int, single: Single) -> "Statement":
+        """By its estimate alone, whose prior of what is shared is divided out."""
+        (shared, own), at, c = joint.columns(e), joint.of_border(e), len(joint.shared)
+        schur = single.precision[np.ix_(shared, shared)]
+        if own:
+            edge = single.precision[np.ix_(own, shared)]
+            schur = schur - edge.T @ np.linalg.solve(single.precision[np.ix_(own, own)], edge)
+        values, vectors = np.linalg.eigh(schur - np.eye(len(schur)))
+        precision, pull = np.zeros((c, c)), np.zeros(c)
+        # members are few: along a direction that they say nothing of the difference may turn negative
+        precision[np.ix_(at, at)] = (vectors * np.maximum(values, 0.0)) @ vectors.T
+        pull[at] = (vectors * np.where(values > 0, values + 1, 0.0)) @ vectors.T @ single.mode[shared]
+        others = [j for j in at if sum(j in joint.of_border(i) for i in range(len(joint.experiments))) > 1]
+        return cls(precision, pull, np.array(others, dtype=int))
+
 
 @dataclass(frozen=True)
 class Agreement:
@@ -72,9 +88,8 @@ class Agreement:
     degrees: float
 
 
-def agreement(joint: JointProblem, singles: Sequence[Single], rest: Collection[int], deviances: Array) -> Agreement:
+def agreement(joint: JointProblem, said: Sequence[Statement], rest: Collection[int], deviances: Array) -> Agreement:
     """Of each experiment with those of ``rest``; ``deviances`` (E,): 2 (J_o + J_b of its own) more than alone."""
-    said = [_alone(joint, e, single) for e, single in enumerate(singles)]
     squares, freedom = _squares(said, rest)
     scatter, degrees = _scatter(said, rest)
     chances = np.array([_chance(z, k, scatter, degrees) for z, k in zip(squares, freedom, strict=True)])
@@ -84,18 +99,16 @@ def agreement(joint: JointProblem, singles: Sequence[Single], rest: Collection[i
     return Agreement(squares, freedom, chances, together, float(np.sqrt(scatter)), degrees)
 
 
-def oddest(joint: JointProblem, singles: Sequence[Single]) -> int | None:
+def oddest(said: Sequence[Statement]) -> int | None:
     """The experiment that is farthest from all others, if that is improbable."""
-    each = range(len(singles))
-    squares, freedom = _squares([_alone(joint, e, singles[e]) for e in each], each)
+    squares, freedom = _squares(said, range(len(said)))
     with np.errstate(invalid="ignore"):
         e = int(np.argmax(np.nan_to_num(squares / freedom)))
-    return e if is_odd(joint, singles, e, float(squares[e])) else None
+    return e if is_odd(said, e, float(squares[e])) else None
 
 
-def is_odd(joint: JointProblem, singles: Sequence[Single], e: int, square: float) -> bool:
+def is_odd(said: Sequence[Statement], e: int, square: float) -> bool:
     """Whether the z² of an experiment is improbably large beside the scatter of the others."""
-    said = [_alone(joint, i, single) for i, single in enumerate(singles)]
     scatter = _scatter(said, [i for i in range(len(said)) if i != e])
     freedom = _squares(said, range(len(said)))[1][e]
     return bool(_chance(square, freedom, *scatter) * len(said) < ODD)
@@ -141,22 +154,6 @@ def _chance(square: float, freedom: float, scatter: float, degrees: float) -> fl
     if not degrees:
         return float(chdtrc(freedom, square))
     return float(fdtrc(freedom, degrees, square / (freedom * scatter)))
-
-
-def _alone(joint: JointProblem, e: int, single: Single) -> Statement:
-    """By its estimate alone, whose prior of what is shared is divided out."""
-    (shared, own), at, c = joint.columns(e), joint.of_border(e), len(joint.shared)
-    schur = single.precision[np.ix_(shared, shared)]
-    if own:
-        edge = single.precision[np.ix_(own, shared)]
-        schur = schur - edge.T @ np.linalg.solve(single.precision[np.ix_(own, own)], edge)
-    values, vectors = np.linalg.eigh(schur - np.eye(len(schur)))
-    precision, pull = np.zeros((c, c)), np.zeros(c)
-    # members are few: along a direction that they say nothing of the difference may turn negative
-    precision[np.ix_(at, at)] = (vectors * np.maximum(values, 0.0)) @ vectors.T
-    pull[at] = (vectors * np.where(values > 0, values + 1, 0.0)) @ vectors.T @ single.mode[shared]
-    others = [j for j in at if sum(j in joint.of_border(i) for i in range(len(joint.experiments))) > 1]
-    return Statement(precision, pull, np.array(others, dtype=int))
 
 
 def doubts(

@@ -11,7 +11,7 @@ from en4dvar.descent.weight_space import require_members
 from en4dvar.ensemble.forecast import Forecast, plotting_times
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.estimation.conclusions import missing_readings
-from en4dvar.estimation.joint.agreement import AT_MOST, Agreement, agreement, doubts, is_odd, oddest
+from en4dvar.estimation.joint.agreement import AT_MOST, Agreement, Statement, agreement, doubts, is_odd, oddest
 from en4dvar.estimation.joint.descent import Experiment, JointDescent, JointObjective, Place, assembled, cost
 from en4dvar.estimation.joint.members import JointMembers, challenger, gaussian, sampled
 from en4dvar.estimation.joint.problem import JointProblem, Single
@@ -141,10 +141,11 @@ class _Estimate:
             cautions.append(caution("starts-disagree", words))
         most = int(AT_MOST * len(experiments)) if most is None else most
         alone = np.array([self._alone(e, single) for e, single in enumerate(singles)])
-        without = self._without(lowest.at.cost, singles, alone, most) if most else None
+        said = [Statement.of(joint, e, single) for e, single in enumerate(singles)]
+        without = self._without(lowest.at.cost, singles, said, alone, most) if most else None
         names = without.rest.joint.names if without else joint.names
         kept = [e for e, name in enumerate(joint.names) if name in names]
-        agreed = agreement(joint, singles, kept, 2 * np.maximum(lowest.at.own_costs - alone, 0))
+        agreed = agreement(joint, said, kept, 2 * np.maximum(lowest.at.own_costs - alone, 0))
         cautions += doubts(joint, lowest.at.place.border, lowest.at.chi2(joint), agreed, kept, singles)
         normalisation = sum(problem.observations.log_normalisation() for problem in joint.experiments)
         return JointEstimate(
@@ -169,9 +170,11 @@ class _Estimate:
         own = single.mode[self.joint.columns(e)[1]]
         return float(self.experiments[e].costs(single.mode[None])[0] + 0.5 * own @ own)
 
-    def _without(self, cost: float, singles: Sequence[Single], alone: Array, most: int) -> JointEstimate | None:
+    def _without(
+        self, cost: float, singles: Sequence[Single], said: Sequence[Statement], alone: Array, most: int
+    ) -> JointEstimate | None:
         """The estimate without the oddest experiment, if J is then lower by more than chance explains."""
-        e = oddest(self.joint, singles)
+        e = oddest(said)
         if e is None:
             return None
         kept = [i for i in range(len(singles)) if i != e]
@@ -179,7 +182,7 @@ class _Estimate:
         estimate = _Estimate(self.joint.of(kept), self.settings, self.seed, self.executor, self.tell)
         rest = estimate.result([singles[i] for i in kept], most - 1)
         self.other_runs += rest.forward_runs
-        return rest if is_odd(self.joint, singles, e, 2 * (cost - rest.costs[-1] - alone[e])) else None
+        return rest if is_odd(said, e, 2 * (cost - rest.costs[-1] - alone[e])) else None
 
     def _singles(self) -> list[Single]:
         """Each experiment by itself."""
