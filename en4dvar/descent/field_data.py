@@ -1,4 +1,6 @@
-"""What localised schemes work on: readings with a model that predicts them, an ensemble, and what they tell."""
+"""What localised schemes work on: readings with a model that predicts them, an ensemble, and what they tell; and the
+localised gain of a problem, by where its readings and unknowns are.
+"""
 
 from __future__ import annotations
 

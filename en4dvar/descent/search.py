@@ -26,7 +26,7 @@ from en4dvar.ensemble.forecast import Forecast
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import TooFewMembersError
 from en4dvar.problem import InverseProblem
-from en4dvar.schemes.base import GaussNewtonStep, Minimiser
+from en4dvar.schemes.base import GaussNewtonStep
 
 SAME_COST = 0.01  # of J, by which a descent must end lower to be another one
 WIDER = 20  # times the ensemble: draws of the prior beyond it
@@ -80,10 +80,9 @@ class Search:
     """
 
     def __init__(
-        self, space: WeightSpace, scheme: Minimiser, run: Forecast, begun: SearchState, keep: Keep,
-        tell: Callable[[Record], None],
-    ):  # fmt: skip
-        self.space, self.scheme, self.run = space, scheme, run
+        self, space: WeightSpace, run: Forecast, begun: SearchState, keep: Keep, tell: Callable[[Record], None]
+    ):
+        self.space, self.run = space, run
         self.begun, self.keep, self.forward_runs = begun, keep, space.forward_runs
         self.over, self.began = 0, 0
         self.tell = lambda r: tell(replace(r, further=self.over) if isinstance(r, StartRecord) else r)
@@ -94,7 +93,7 @@ class Search:
 
     def settled(self, outcome: Outcome) -> Outcome:
         """After ``starts`` members more, and again while one descent alone ended lowest and the budget lasts."""
-        together = self.scheme.starts
+        together = self.space.minimiser.starts
         while not outcome.agreed and (rest := self.rest(outcome)):
             outcome = self.round(outcome, rest[:together])
         return outcome
@@ -148,10 +147,10 @@ class Search:
     def _minimum(self, problem: InverseProblem) -> Array:
         """That of another problem, with what it does not estimate at the prior's mean."""
         space = self.space
-        whole = WeightSpace(problem, space.settings, space.seed, space.executor)
+        settings = replace(space.settings, own=replace(space.minimiser, start="best-member"))
+        whole = WeightSpace(problem, settings, space.seed, space.executor)
         run = whole.whole(np.vstack([whole.members, whole.mean]))
-        scheme = replace(self.scheme, start="best-member")
-        begun = choose_start(whole, scheme, run).descent
+        begun = choose_start(whole, run).descent
         minimise(DataWindow(whole), [begun])
         space.forward_runs += whole.forward_runs
         prior = space.problem.prior

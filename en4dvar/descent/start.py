@@ -32,7 +32,6 @@ from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.errors import ConfigError, Fault
 from en4dvar.plumbing.hints import nearest
 from en4dvar.problem import InverseProblem
-from en4dvar.schemes.base import Minimiser
 
 ROUGH = 1e-2  # relative decrease of J at which a descent stops that only has to tell basins apart, or to lead on
 SAME = 1.0  # posterior standard deviations between descents that have met
@@ -65,8 +64,8 @@ Keep = Callable[[Callable[[], StartState]], None]
 
 
 def choose_start(
-    space: WeightSpace, scheme: Minimiser, run: Forecast, resume: StartState | None = None,
-    keep: Keep = lambda state: None, tell: Callable[[Record], None] = lambda record: None,
+    space: WeightSpace, run: Forecast, resume: StartState | None = None, keep: Keep = lambda state: None,
+    tell: Callable[[Record], None] = lambda record: None,
 ) -> Start:  # fmt: skip
     """``run``: forecast of the prior members and, last, of their mean.
 
@@ -75,9 +74,9 @@ def choose_start(
     ``resume``: where the comparison was interrupted. ``keep`` is called before each round of moves with the state to
     resume from, ``tell`` after it.
     """
-    beyond = len(space.members) + 1  # the number of what is no member
+    scheme, beyond = space.minimiser, len(space.members) + 1  # the latter numbers what is no member
     if scheme.lengthen > 1:
-        led = lengthened(space, scheme, run, tell)
+        led = lengthened(space, run, tell)
         return Start(Descent(space.start(led), members=(beyond,)), tried=(beyond,))
     warnings: tuple[Caution, ...] = ()
     begin = scheme.start
@@ -107,16 +106,17 @@ def choose_start(
     return Start(window.lowest, window.others(), tuple(starts[: window.rank]), warnings)
 
 
-def shortened(space: WeightSpace, scheme: Minimiser) -> Iterator[WeightSpace]:
-    """The data set in the first 1/L, 2/L, … of the time of its readings, L = ``scheme.lengthen``, the whole left out.
+def shortened(space: WeightSpace) -> Iterator[WeightSpace]:
+    """The data set in the first 1/L, 2/L, … of the time of its readings, L = ``lengthen``, the whole left out.
 
     A window that holds no more readings than the one before is left out, too.
     """
-    observations, tolerance = space.problem.observations, max(ROUGH, scheme.cost_tolerance)
+    observations, scheme = space.problem.observations, space.minimiser
     noise = observations.noise
     if not noise.independent and not space.problem.discrepancy:
         noise = noise_of(noise.std, noise.time_std)
-    settings = replace(space.settings, own=replace(scheme, lengthen=1, cost_tolerance=tolerance))
+    own = replace(scheme, lengthen=1, cost_tolerance=max(ROUGH, scheme.cost_tolerance))
+    settings = replace(space.settings, own=own)
     (begin, end), counted, of_all = observations.span, 0, int(np.sum(observations.weights > 0))
     for j in range(1, scheme.lengthen):
         inside = observations.times <= begin + (end - begin) * j / scheme.lengthen
@@ -126,18 +126,14 @@ def shortened(space: WeightSpace, scheme: Minimiser) -> Iterator[WeightSpace]:
             yield WeightSpace(problem, settings, space.seed, space.executor)
 
 
-def lengthened(space: WeightSpace, scheme: Minimiser, run: Forecast, tell: Callable[[Record], None]) -> Array:
+def lengthened(space: WeightSpace, run: Forecast, tell: Callable[[Record], None]) -> Array:
     """Weights (N,) at the end of the last but one window. ``run``: see :func:`choose_start`.
 
     Nothing is kept of it: a resumed run repeats it. Raises :class:`ConfigError` where all readings are at one time.
     """
     w: Array | None = None
-    for number, short in enumerate(shortened(space, scheme)):
-        if w is None:
-            assert short.scheme.minimiser is not None
-            descent = choose_start(short, short.scheme.minimiser, run, tell=tell).descent
-        else:
-            descent = Descent(short.start(w))
+    for number, short in enumerate(shortened(space)):
+        descent = choose_start(short, run, tell=tell).descent if w is None else Descent(short.start(w))
         descent.ended = False
         minimise(DataWindow(short), [descent])
         w = descent.weights.w
@@ -249,7 +245,7 @@ class Rounds(DataWindow):
                 self.record(descent, step.hessian.economical_transform, move.step_length)
                 descent.weights, descent.cost = self.space.onwards(move.w, step.hessian), move.cost
                 rough = max(before - move.cost, step.predicted_decrease) <= ROUGH * max(1.0, move.cost)
-                descent.ended = rough or descent.iteration == self.minimiser.max_iterations
+                descent.ended = rough or descent.iteration == self.space.minimiser.max_iterations
             else:
                 descent.ended = True
             if descent.ended:

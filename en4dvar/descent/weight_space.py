@@ -17,7 +17,7 @@ from en4dvar.executor import Executor
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import TooFewMembersError
 from en4dvar.problem import InverseProblem
-from en4dvar.schemes.base import Weights
+from en4dvar.schemes.base import Minimiser, Weights
 from en4dvar.schemes.settings import AssimilationSettings
 
 NOT_READ: Array = np.empty((0, 0))
@@ -39,6 +39,12 @@ class WeightSpace:
         self.mean, self.anomalies = centre(self.members)
         self.prior_variance, self.basis = self.members.var(axis=0), anomaly_basis(self.anomalies)
         self.forward_runs = 0
+
+    @property
+    def minimiser(self) -> Minimiser:
+        """The scheme, of descents to the minimum of J."""
+        assert self.scheme.minimiser is not None
+        return self.scheme.minimiser
 
     @property
     def needed_members(self) -> int:
@@ -68,9 +74,9 @@ class WeightSpace:
 
     def affordable(self, run: Forecast) -> list[int]:
         """Members of lowest J, as many as go :attr:`side_by_side`; at least one. ``run``: see :meth:`member_costs`."""
-        costs, minimiser = self.member_costs(run), self.scheme.minimiser
+        costs = self.member_costs(run)
         best = np.argsort(costs, kind="stable").tolist()
-        count = self.side_by_side if minimiser is not None and minimiser.economical(self.basis) else 1
+        count = self.side_by_side if self.minimiser.economical(self.basis) else 1
         return [i for i in best[:count] if np.isfinite(costs[i])] or best[:1]
 
     @cached_property

@@ -25,7 +25,7 @@ from en4dvar.ensemble.missing import filled
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import TooFewMembersError
 from en4dvar.priors.prior import member_stream
-from en4dvar.schemes.base import Evaluation, GaussNewtonStep, Minimiser, Runs, Step, Weights, gauss_newton, regression
+from en4dvar.schemes.base import Evaluation, GaussNewtonStep, Runs, Step, Weights, gauss_newton, regression
 
 WIDER, WIDEST = 5.0, 25.0  # factors of a bundle where J does not fall along the step: of each further look, in all
 FAKED = 3.0  # posterior standard deviations: a longer step does not come from the model's own error
@@ -113,12 +113,6 @@ class DataWindow(Objective[Descent]):
         self.scheme, self.observations = space.scheme, space.problem.observations
         self.tangents: list[tuple[Array, Array, Array]] = []  # weights (N,), reference (Ky,) and anomalies there
 
-    @property
-    def minimiser(self) -> Minimiser:
-        """The scheme, of descents to the minimum of J."""
-        assert self.space.scheme.minimiser is not None
-        return self.space.scheme.minimiser
-
     def keep(self, going: Sequence[Descent]) -> None:
         self.save()
 
@@ -161,7 +155,7 @@ class DataWindow(Objective[Descent]):
             self._require_step(descent)
             if self.scheme.minimiser is None or descent.stop:
                 continue
-            scheme, norm = self.minimiser, descent.newton.norm
+            scheme, norm = self.space.minimiser, descent.newton.norm
             if norm <= scheme.step_tolerance:
                 descent.stop, descent.converged = f"step of {norm:.2g} posterior standard deviations", True
             elif descent.iteration == scheme.max_iterations:
@@ -183,7 +177,7 @@ class DataWindow(Objective[Descent]):
     def searched(self, descent: Descent) -> Search:
         """By the configured step control."""
         point = self._point(descent)
-        search = STEP_CONTROLS[self.minimiser.step_control](point)
+        search = STEP_CONTROLS[self.space.minimiser.step_control](point)
         return each_once(search) if point.sparing else search
 
     def move(self, going: Sequence[Descent], moves: Sequence[Move | None]) -> None:
@@ -218,11 +212,11 @@ class DataWindow(Objective[Descent]):
 
     def small(self, cost: float) -> float:
         """A decrease of J that counts as none; below J = 1 it is absolute, for there J has no more to tell."""
-        return self.minimiser.cost_tolerance * max(cost, 1.0)
+        return self.space.minimiser.cost_tolerance * max(cost, 1.0)
 
     @property
     def _flat(self) -> str:
-        return f"relative decrease of J below {self.minimiser.cost_tolerance:g}"
+        return f"relative decrease of J below {self.space.minimiser.cost_tolerance:g}"
 
     def _go_on(self, descent: Descent, move: Move | None) -> None:
         at, step, again = descent.iterate, descent.newton, None
@@ -245,7 +239,7 @@ class DataWindow(Objective[Descent]):
 
     def _no_decrease(self, descent: Descent) -> None:
         """The search by J has ended; a regression goes on to settle."""
-        if self.minimiser.regresses:
+        if self.space.minimiser.regresses:
             return
         promised, small = descent.newton.predicted_decrease, self.small(descent.iterate.cost)
         descent.stop = self._flat if promised <= small else "no decrease possible along the step"
@@ -253,7 +247,7 @@ class DataWindow(Objective[Descent]):
 
     def _settles(self, descent: Descent) -> bool:
         near = descent.settling is not None or descent.newton.norm <= NEAR
-        return self.minimiser.regresses and near
+        return self.space.minimiser.regresses and near
 
     def _settle(self, descent: Descent) -> None:
         """A share of the step, whatever J of the central run says."""
@@ -271,11 +265,11 @@ class DataWindow(Objective[Descent]):
         """
         weights = descent.weights
         onwards = self._onwards(descent, weights.w)
-        if not self.minimiser.regresses:
+        if not self.space.minimiser.regresses:
             doubtful = UNSEEN < descent.newton.norm < FAKED and weights.wider < WIDEST
             return replace(onwards, wider=WIDER * weights.wider) if doubtful else None
         apart = np.abs(self.scheme.members(onwards) - self.scheme.members(weights))
-        return None if np.max(apart) <= self.minimiser.step_tolerance else onwards  # it would run the same again
+        return None if np.max(apart) <= self.space.minimiser.step_tolerance else onwards  # it would run the same again
 
     def _onwards(self, descent: Descent, w: Array) -> Weights:
         """Weights at w (N,), with the transform of where the descent comes from and a bundle as wide."""
@@ -345,7 +339,7 @@ class DataWindow(Objective[Descent]):
 
     def _point(self, descent: Descent) -> Point:
         at, tangent = descent.iterate, None
-        if (linear := at.linear) is not None and not self.minimiser.regresses:
+        if (linear := at.linear) is not None and not self.space.minimiser.regresses:
 
             def precision_times(vectors: Array) -> Array:
                 return self.observations.precision_times(linear.prediction, vectors)

@@ -8,7 +8,7 @@ settings, ES-MDA ``mda_coefficients``, both ``members``, ``sampling`` (``exact``
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -48,7 +48,9 @@ class Localised:
         self.gain = gain_of(problem, settings)
         self.problem, self.settings, self.seed, self.progress = problem, settings, seed, progress
         self.composite, self.grid = Composite(problem, executor), plotting_times(problem)
-        self.named = len(problem.prior.terms)
+        self.named = n = len(problem.prior.terms)
+        # each field with its columns of the ensemble
+        self.fields = [(own, slice(n + of.start, n + of.stop)) for own, of in problem.columns_of_fields]
         self.ensemble = prior_members(problem, settings, seed)
         self.everyone = np.arange(settings.members)
         self.fewest = max(2, math.ceil(settings.min_active_fraction * settings.members))
@@ -62,7 +64,7 @@ class Localised:
         problem, ensemble, n = self.problem, self.ensemble, self.named
         before, prior_mean = ensemble[:, :n].copy(), mean_of(ensemble, self.everyone)
         base = self._base(prior_mean[:n])
-        moments = [self._moments(prior_field, columns, base) for prior_field, columns in self._fields]
+        moments = [self._moments(prior_field, columns, base) for prior_field, columns in self.fields]
         prior_run = filled(self.forecast(ensemble, self.grid), ensemble)
         require_members(problem, prior_run.failures, self.fewest, "prior forecast")
         if not self.settings.stochastic_model:
@@ -80,7 +82,7 @@ class Localised:
         after = ensemble[:, :n].copy()
         fields = [
             self._field(prior_field, columns, base, centre, *moment)
-            for (prior_field, columns), moment in zip(self._fields, moments, strict=True)
+            for (prior_field, columns), moment in zip(self.fields, moments, strict=True)
         ]
         analysis = conclusions.outcome_of(
             problem, self.settings, self.seed, (before, after, centre[:n]), (prior_run, run, central),
@@ -189,12 +191,6 @@ class Localised:
         columns = range(self.ensemble.shape[1])
         step = max(1, PATHS // (8 * len(self.ensemble)))
         return np.concatenate([self.ensemble[which, i : i + step].var(axis=0) for i in columns[::step]])
-
-    @property
-    def _fields(self) -> Iterator[tuple[FieldPrior, slice]]:
-        """Each field with its columns of the ensemble."""
-        for prior_field, columns in self.problem.columns_of_fields:
-            yield prior_field, slice(self.named + columns.start, self.named + columns.stop)
 
     def _base(self, named: Array) -> Array:
         """The model's own initial state (n_state,) at the prior mean of the parameters with names."""

@@ -143,7 +143,7 @@ class Stages:
             self.keep(lambda: LoopState(space.forward_runs, comparison()))
 
         before = resume.comparison if resume else None
-        begun = choose_start(space, self.minimiser, prior_run, before, keep, self.tell)
+        begun = choose_start(space, prior_run, before, keep, self.tell)
         for record in begun.descent.records:
             self.tell(record)
         return LoopState(space.forward_runs, None, begun.descent, begun.minima, begun.tried, begun.warnings)
@@ -185,7 +185,7 @@ class Stages:
             return outcome, self.gaussian(descent)
         if start.search is not None:
             space.forward_runs = start.forward_runs
-        search = Search(space, scheme, prior_run, begun, self.keep_search, self.tell)
+        search = Search(space, prior_run, begun, self.keep_search, self.tell)
         outcome = search.unchanging(search.challenged(outcome))
         sampling = self.settings.refine == "mcmc" or samples(space)
         if not sampling:

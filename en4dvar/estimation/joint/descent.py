@@ -334,7 +334,12 @@ class JointObjective(Objective[JointDescent]):
     def try_out(self, candidates: Sequence[Place]) -> float:
         """J at the one candidate there is."""
         (place,) = candidates
-        return cost(self.joint, self.experiments, place)
+        total = place.background
+        for e, experiment in enumerate(self.experiments):
+            total += float(experiment.costs(self.joint.standard(e, place.border, place.own[e])[None])[0])
+            if not np.isfinite(total):
+                break
+        return total
 
     def move(self, going: Sequence[JointDescent], moves: Sequence[Move | None]) -> None:
         for descent, move in zip(going, moves, strict=True):
@@ -348,13 +353,3 @@ class JointObjective(Objective[JointDescent]):
     def _no_decrease(self, descent: JointDescent) -> None:
         descent.ended, descent.converged = True, descent.norm < FAKED
         descent.stop = f"J does not fall along the step, of {descent.norm:.1g} posterior standard deviations"
-
-
-def cost(joint: JointProblem, experiments: Sequence[Experiment], place: Place) -> float:
-    """J at a place."""
-    total = place.background
-    for e, experiment in enumerate(experiments):
-        total += float(experiment.costs(joint.standard(e, place.border, place.own[e])[None])[0])
-        if not np.isfinite(total):
-            break
-    return total

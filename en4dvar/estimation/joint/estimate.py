@@ -12,7 +12,7 @@ from en4dvar.ensemble.forecast import Forecast, plotting_times
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.estimation.conclusions import missing_readings
 from en4dvar.estimation.joint.agreement import AT_MOST, Agreement, Statement, agreement, doubts, is_odd, oddest
-from en4dvar.estimation.joint.descent import Experiment, JointDescent, JointObjective, Place, assembled, cost
+from en4dvar.estimation.joint.descent import Experiment, JointDescent, JointObjective, Place, assembled
 from en4dvar.estimation.joint.members import JointMembers, challenger, gaussian, sampled
 from en4dvar.estimation.joint.problem import JointProblem, Single
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
@@ -114,8 +114,9 @@ class _Estimate:
         if settings.own.minimiser is None:
             others = " or ".join(MINIMISERS)
             raise ConfigError(f"{settings.scheme} does not minimise J, as a joint estimate must; use {others}")
-        self.minimiser = scheme = settings.own.minimiser
+        scheme = settings.own.minimiser
         self.experiments = [Experiment(joint, e, scheme.epsilon, executor) for e in range(len(joint.experiments))]
+        self.objective = JointObjective(joint, self.experiments, scheme)
         self.other_runs = 0
 
     def result(self, singles: Sequence[Single], most: int | None = None) -> JointEstimate:
@@ -213,7 +214,7 @@ class _Estimate:
 
     def _descents(self, starts: Sequence[Place]) -> list[JointDescent]:
         """From one start after the other, that of lowest J first, until two have ended in the lowest minimum."""
-        costs = np.array([cost(self.joint, self.experiments, start) for start in starts])
+        costs = np.array([self.objective.try_out([start]) for start in starts])
         descents = list[JointDescent]()
         for i in np.argsort(costs, kind="stable"):
             if np.isfinite(costs[i]):
@@ -227,7 +228,7 @@ class _Estimate:
     def _descended(self, start: Place) -> list[JointDescent]:
         """One descent; none where the start cannot be run."""
         descent = JointDescent(start)
-        minimise(JointObjective(self.joint, self.experiments, self.minimiser), [descent])
+        minimise(self.objective, [descent])
         return [descent] if descent.system else []
 
     def _challenged(self, lowest: JointDescent) -> JointDescent:
@@ -244,7 +245,7 @@ class _Estimate:
         laplace = gaussian(lowest.at, self.seed, self.settings.members)
         if self.settings.refine == "none" or not all(problem.model.cheap for problem in self.joint.experiments):
             return laplace, []
-        members = sampled(self.joint, self.experiments, lowest.at, self.seed, self.settings.members)
+        members = sampled(self.experiments, lowest.at, self.seed, self.settings.members)
         if members is not None:
             return members, []
         words = "the joint posterior is far from Gaussian, and importance sampling did not reach it"
