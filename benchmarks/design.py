@@ -31,9 +31,8 @@ from scipy.stats import kendalltau
 from en4dvar.data.noise import noise_of
 from en4dvar.data.observations import Observations
 from en4dvar.estimation.assimilate import assimilate
-from en4dvar.estimation.design.evaluate import SampleSizes, evaluate
+from en4dvar.estimation.design.evaluate import SampleSizes, choose, evaluate
 from en4dvar.estimation.design.planned import Planned
-from en4dvar.estimation.design.readings import choose
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import En4dvarError
 from en4dvar.priors.prior import Prior

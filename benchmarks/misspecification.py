@@ -27,6 +27,7 @@ from typing import Any
 
 import numpy as np
 from acoustic_twin import MODEL, WIDE, make_twin, prior
+from en4dvar_bubble.laws.zener import ZenerNeoHookean, ZenerQuadratic
 from laser_twin import make_laser_twin
 from records import Record, fill
 from worlds import CENTRAL, Twin, World, experiment
@@ -42,7 +43,6 @@ from en4dvar.schemes.settings import AssimilationSettings
 from en4dvar_bubble import BubbleModel
 from en4dvar_bubble.laws.kelvin_voigt import FungKelvinVoigt, NeoHookeanKelvinVoigt, QuadraticKelvinVoigt
 from en4dvar_bubble.laws.parameters import ALPHA, MU_P
-from en4dvar_bubble.laws.zener import ZenerNeoHookean, ZenerQuadratic
 
 SETTINGS = {"a": AssimilationSettings(), "b": AssimilationSettings(what_if=False)}
 LASER = BubbleModel(law=NeoHookeanKelvinVoigt(), start="laser")  # with the default gas

@@ -170,6 +170,6 @@ class Dying(Linear):
 def visit(space, w):
     """The descent at weights ``w`` of a space: J there and the Gauss–Newton step."""
     descent = Descent(Weights(w, np.eye(len(space.members))))
-    window = DataWindow(space, 0, lambda: None, lambda record: None)
+    window = DataWindow(space)
     (descent.step,) = window.linearise([descent])
     return descent

@@ -10,7 +10,7 @@ from en4dvar.config.initial_state import Perturbed, modes_of
 from en4dvar.config.parameters import Fixed, Scalar, Tied, Uncertain, inside_bounds
 from en4dvar.config.series import DataPlan, SeriesPlan
 from en4dvar.data.observations import Observations
-from en4dvar.descent.field_gain import gain_of
+from en4dvar.descent.field_data import gain_of
 from en4dvar.descent.start import given
 from en4dvar.ensemble.forecast import check_problem
 from en4dvar.ensemble.tangent import derivatives_of

@@ -22,12 +22,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 
-from en4dvar.descent.field_data import FieldData, Members, Pass, mean_of, silent
-from en4dvar.descent.loop import Objective, minimise
+from en4dvar.descent.field_data import FieldData, Pass, mean_of, silent
+from en4dvar.descent.loop import Descends, Objective, minimise
 from en4dvar.descent.step_control import Move, Search
 from en4dvar.ensemble.missing import fitted
 from en4dvar.model.state import Array
@@ -45,34 +44,30 @@ def field_esmda(
     gain: Gain,
     coefficients: Sequence[float] = (4.0, 4.0, 4.0, 4.0),
     seed: int = 0,
-    fewest: int | None = None,
-    first: Array | None = None,
-    tell: Callable[[Pass], None] = silent,
-) -> Members:
+) -> None:
     """Prior members (N, n) → posterior members, in place, by ES-MDA with a localised gain.
-
-    Returns the members that came through all passes, ``fewest`` at least, by default all; the others stay where they
-    failed. ``first`` (N, K): predictions of the prior members, where they are known. ``tell`` hears of each pass.
 
     Raises :class:`En4dvarError`: predictions that are not finite.
     """
-    passes = Passes(ensemble, data, gain, mda_inflations(coefficients), seed, fewest, first, tell)
+    passes = Passes(ensemble, data, gain, mda_inflations(coefficients), seed)
     minimise(passes, [passes])
-    return passes.alive
 
 
-class Passes(Objective["Passes"]):
-    """The passes of ES-MDA over an ensemble, which is their only descent, with R times each of the ``inflations``."""
+class Passes(Objective["Passes"], Descends):
+    """The passes of ES-MDA over an ensemble, which is their only descent, with R times each of the ``inflations``.
+
+    ``alive`` are the members that came through all, ``fewest`` at least, by default all of them; the others stay where
+    they failed. ``first`` (N, K): predictions of the prior members, where they are known. ``tell`` hears of each pass.
+    """
 
     def __init__(
-        self, ensemble: Array, data: FieldData, gain: Gain, inflations: Array, seed: int, fewest: int | None,
-        first: Array | None, tell: Callable[[Pass], None],
+        self, ensemble: Array, data: FieldData, gain: Gain, inflations: Array, seed: int, fewest: int | None = None,
+        first: Array | None = None, tell: Callable[[Pass], None] = silent,
     ):  # fmt: skip
         self.ensemble, self.data, self.gain, self.inflations, self.seed = ensemble, data, gain, inflations, seed
         self.fewest, self.first, self.tell = fewest, first, tell
         self.alive = np.arange(len(ensemble))
-        self.iteration, self.stop, self.ended = 0, "", False
-        self.step: Any = None
+        self.iteration = 0
 
     def linearise(self, going: Sequence[Passes]) -> list[Update]:
         a, alpha, first = self.iteration, self.inflations[self.iteration], self.first
@@ -128,26 +123,16 @@ class DualSystem:
 
 
 @dataclass
-class FieldDescent:
+class FieldDescent(Descends):
     """Where a descent stands: the ``centre`` x̄0 + Σ_k L_k λ_k (n,) and its ``prediction`` (K,), ``costs`` J of each
-    iterate, the ``tangents`` Y_k (N, K) and ``duals`` λ_k (K,) so far, whether it ``converged``, and why it stopped."""
+    iterate, the ``tangents`` Y_k (N, K) and ``duals`` λ_k (K,) so far; its ``step`` is a :class:`DualSystem`."""
 
     centre: Array
     prediction: Array
     costs: list[float] = field(default_factory=list)
     tangents: tuple[Tangent, ...] = ()
     duals: tuple[Array, ...] = ()
-    converged: bool = False
-    stop: str = ""
-    ended: bool = False
-    step: DualSystem | None = None
     forward_runs: int = 0
-
-    @property
-    def system(self) -> DualSystem:
-        """That of the iterate."""
-        assert self.step is not None
-        return self.step
 
 
 def field_en4dvar(
@@ -236,7 +221,7 @@ class FieldObjective(Objective[FieldDescent]):
     def judge(self, going: Sequence[FieldDescent]) -> None:
         most, tolerance, cost_tolerance = self.limits
         for at in going:
-            costs, length = at.costs, at.system.length
+            costs, length = at.costs, at.step.length
             if length <= tolerance:
                 at.stop = f"step of {length:.2g} posterior standard deviations"
             elif len(costs) > 1 and costs[-2] - costs[-1] < cost_tolerance * costs[-1]:
@@ -247,7 +232,7 @@ class FieldObjective(Objective[FieldDescent]):
 
     def search(self, descent: FieldDescent) -> Search:
         """The longest step that lowers J."""
-        at, system = descent, descent.system
+        at, system = descent, descent.step
         for k in range(TRIALS):
             a = SHORTER**k
             dual = a * system.dual(a)
@@ -299,14 +284,14 @@ class FieldObjective(Objective[FieldDescent]):
 
     def _pass(self, at: FieldDescent) -> Pass:
         """The iterate as it is told, with the posterior ensemble of its tangent."""
-        centre, update = at.centre, self.update(at.system.tangent)
+        centre, update = at.centre, self.update(at.step.tangent)
 
         def members(part: slice) -> Array:
             anomalies = self.anomalies[:, part]
             return np.asarray(centre[part] + anomalies + update(part, anomalies))
 
         background = self.background(at.tangents, at.duals)
-        return Pass(centre, at.prediction, members, background, at.system.length, dfs=at.system.dfs)
+        return Pass(centre, at.prediction, members, background, at.step.length, dfs=at.step.dfs)
 
     def update(self, tangent: Tangent) -> Update:
         """What turns prior anomalies into posterior ones."""
@@ -315,7 +300,7 @@ class FieldObjective(Objective[FieldDescent]):
 
     def spread(self, at: FieldDescent) -> None:
         """The posterior ensemble about the centre, in place of the anomalies."""
-        update = self.update(at.system.tangent)
+        update = self.update(at.step.tangent)
         for part in parts(self.anomalies.shape[1], self.data.width(len(self.anomalies))):
             here = self.anomalies[:, part]
             here += update(part, here)

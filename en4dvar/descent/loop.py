@@ -7,17 +7,21 @@ scheme, of an ensemble; one of what is shared and what is own; or a dual one, in
 """
 
 from collections.abc import Sequence
-from typing import Any, Generic, Protocol, TypeVar
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
 
 from en4dvar.descent.step_control import Move, Search, run_searches
 
 
-class Descends(Protocol):
-    """What the loop needs of a descent: the step from where it stands, why it stops, and whether it has ended."""
+@dataclass(kw_only=True)
+class Descends:
+    """What the loop needs of a descent: the ``step`` from where it stands, of the iteration under way, why it stops,
+    and whether it has ended; and whether it has ``converged``."""
 
-    step: Any
-    stop: str
-    ended: bool
+    step: Any = None
+    stop: str = ""
+    converged: bool = False
+    ended: bool = False
 
 
 D = TypeVar("D", bound=Descends)

@@ -12,6 +12,7 @@ from en4dvar.descent.window import Descent
 from en4dvar.model.state import Array
 from en4dvar.priors.prior import Prior
 
+AGREE = 2  # descents from different members that must have ended in the lowest minimum
 REACHED = 2.0  # posterior standard deviations between a minimum and a descent that ended in it
 SLOPE = 4.0  # as many, within which one that ended early on the slope of a minimum is told from another minimum
 

@@ -16,18 +16,8 @@ from functools import cached_property
 import numpy as np
 
 from en4dvar.descent.loop import minimise
-from en4dvar.descent.minima import Minimum, merged
-from en4dvar.descent.start import (
-    AGREE,
-    Rounds,
-    StartState,
-    affordable,
-    choose_start,
-    descent_at,
-    descent_from,
-    highest_plausible,
-    side_by_side,
-)
+from en4dvar.descent.minima import AGREE, Minimum, merged
+from en4dvar.descent.start import Rounds, StartState, choose_start, descent_at, descent_from, highest_plausible
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.descent.window import DataWindow, Descent
 from en4dvar.diagnosis.analysis import Record, StartRecord
@@ -36,7 +26,7 @@ from en4dvar.ensemble.forecast import Forecast
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import TooFewMembersError
 from en4dvar.problem import InverseProblem
-from en4dvar.schemes.base import GaussNewtonStep, Minimiser
+from en4dvar.schemes.base import GaussNewtonStep
 
 SAME_COST = 0.01  # of J, by which a descent must end lower to be another one
 WIDER = 20  # times the ensemble: draws of the prior beyond it
@@ -90,10 +80,9 @@ class Search:
     """
 
     def __init__(
-        self, space: WeightSpace, scheme: Minimiser, run: Forecast, seed: int, begun: SearchState, keep: Keep,
-        tell: Callable[[Record], None],
-    ):  # fmt: skip
-        self.space, self.scheme, self.run, self.seed = space, scheme, run, seed
+        self, space: WeightSpace, run: Forecast, begun: SearchState, keep: Keep, tell: Callable[[Record], None]
+    ):
+        self.space, self.run = space, run
         self.begun, self.keep, self.forward_runs = begun, keep, space.forward_runs
         self.over, self.began = 0, 0
         self.tell = lambda r: tell(replace(r, further=self.over) if isinstance(r, StartRecord) else r)
@@ -104,7 +93,7 @@ class Search:
 
     def settled(self, outcome: Outcome) -> Outcome:
         """After ``starts`` members more, and again while one descent alone ended lowest and the budget lasts."""
-        together = self.scheme.starts
+        together = self.space.minimiser.starts
         while not outcome.agreed and (rest := self.rest(outcome)):
             outcome = self.round(outcome, rest[:together])
         return outcome
@@ -117,7 +106,7 @@ class Search:
         drawn = any(n_members < i < self.last for i in outcome.tried)
         if outcome.descent.cost <= highest_plausible(self.space) or drawn:
             return outcome
-        return self.round(outcome, [n_members + 1 + i for i in range(side_by_side(self.space))])
+        return self.round(outcome, [n_members + 1 + i for i in range(self.space.side_by_side)])
 
     def foretold(self, outcome: Outcome, missed: Callable[[], bool]) -> Outcome:
         """After a descent from :attr:`led`, where readings after the window ``missed`` what is expected of them."""
@@ -141,7 +130,7 @@ class Search:
     @property
     def last(self) -> int:
         """The number of :attr:`led` in :attr:`Outcome.tried`; where it is there, the search is over."""
-        return len(self.space.members) + 1 + side_by_side(self.space)
+        return len(self.space.members) + 1 + self.space.side_by_side
 
     @cached_property
     def led(self) -> Array:
@@ -158,11 +147,11 @@ class Search:
     def _minimum(self, problem: InverseProblem) -> Array:
         """That of another problem, with what it does not estimate at the prior's mean."""
         space = self.space
-        whole = WeightSpace(problem, space.settings, self.seed, space.executor)
+        settings = replace(space.settings, own=replace(space.minimiser, start="best-member"))
+        whole = WeightSpace(problem, settings, space.seed, space.executor)
         run = whole.whole(np.vstack([whole.members, whole.mean]))
-        scheme = replace(self.scheme, start="best-member")
-        begun = choose_start(whole, scheme, run, self.seed, None, lambda state: None, lambda record: None).descent
-        minimise(DataWindow(whole, self.seed, lambda: None, lambda record: None), [begun])
+        begun = choose_start(whole, run).descent
+        minimise(DataWindow(whole), [begun])
         space.forward_runs += whole.forward_runs
         prior = space.problem.prior
         named = dict(zip(prior.names, prior.mean, strict=True))
@@ -173,9 +162,9 @@ class Search:
     def lowest_draws(self) -> Array:
         """(B, n) of the draws that an ensemble :data:`WIDER` times as large would add, as many as go side by side."""
         space, n_members = self.space, len(self.space.members)
-        draws = space.problem.prior.sample((1 + WIDER) * n_members, self.seed, "random")[n_members:]
+        draws = space.problem.prior.sample((1 + WIDER) * n_members, space.seed, "random")[n_members:]
         costs = np.concatenate([space.costs(x, space.forecast(x)) for x in np.split(draws, WIDER)])
-        return np.asarray(draws[np.argsort(costs, kind="stable")[: side_by_side(space)]])
+        return np.asarray(draws[np.argsort(costs, kind="stable")[: space.side_by_side]])
 
     def begin(self, number: int) -> Descent:
         """From a member, the mean, one of :attr:`lowest_draws`, :attr:`led` or :attr:`steady`; numbers as in
@@ -192,7 +181,7 @@ class Search:
         """The members for which a descent can be afforded and that were not tried; none once the search is over."""
         if self.last in outcome.tried:
             return []
-        return [i for i in affordable(self.space, self.scheme, self.run) if i not in outcome.tried]
+        return [i for i in self.space.affordable(self.run) if i not in outcome.tried]
 
     def round(self, outcome: Outcome, members: Sequence[int]) -> Outcome:
         """After descents from these members side by side; nothing is run again of a round that is over."""
@@ -223,7 +212,7 @@ class Search:
             before = rival.kept
             self._keep(outcome, lambda: SearchState(minima=minima, rival=before))
 
-        lowered = lower(DataWindow(self.space, self.seed, keep, self.tell), rival, after)
+        lowered = lower(DataWindow(self.space, keep, self.tell), rival, after)
         return after if lowered is after else replace(lowered, before=before)
 
     def _compared(
@@ -234,7 +223,7 @@ class Search:
         def keep(state: Callable[[], StartState]) -> None:
             self._keep(outcome, lambda: SearchState(comparison=state()))
 
-        window = Rounds(self.space, self.seed, comparison or StartState(), keep, self.tell, outcome.minima)
+        window = Rounds(self.space, comparison or StartState(), keep, self.tell, outcome.minima)
         if comparison is None:
             window.begin_round(list(map(self.begin, members)))
         minimise(window, window.descents)
@@ -261,7 +250,7 @@ def lower(window: DataWindow, rival: Descent, outcome: Outcome) -> Outcome:
     return replace(outcome, descent=rival, minima=merged([Minimum.of(window.space, rival), *outcome.minima]))
 
 
-def from_draw(space: WeightSpace, outcome: Outcome, x: Array, seed: int, tell: Callable[[Record], None]) -> Outcome:
+def from_draw(space: WeightSpace, outcome: Outcome, x: Array, tell: Callable[[Record], None]) -> Outcome:
     """After a descent from a draw x (n,) of the posterior, if it ends lower than the lowest minimum; else as before.
 
     Nothing is kept of it: a resumed run comes to the same draw and repeats it. ``tell``: see
@@ -271,7 +260,7 @@ def from_draw(space: WeightSpace, outcome: Outcome, x: Array, seed: int, tell: C
     draw = max(*outcome.tried, len(space.members)) + 1
     rival = descent_at(space, x, draw)
     tell(StartRecord(1, (float(space.try_out(rival.weights.w[None]).costs[0]),), 1, rounds))
-    after = lower(DataWindow(space, seed, lambda: None, tell), rival, outcome)
+    after = lower(DataWindow(space, tell=tell), rival, outcome)
     if after is outcome:
         return outcome
     runs = outcome.runs + space.forward_runs - before
@@ -282,7 +271,7 @@ def challenger(space: WeightSpace, run: Forecast, outcome: Outcome) -> int:
     """The member farthest from the lowest minimum, in standard deviations of the Gaussian about it, of those in the
     half of lower J that were not tried.
     """
-    costs = (space.background_costs + space.problem.observations.cost(run.predicted))[:-1]
+    costs = space.member_costs(run)[:-1]
     order: list[int] = np.argsort(costs, kind="stable").tolist()
     better = order[: max(len(outcome.tried) + 1, int(np.isfinite(costs).sum()) // 2)]
     lowest = outcome.minima[0]

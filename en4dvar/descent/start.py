@@ -4,16 +4,23 @@ J of a strongly nonlinear model has several minima. The descents go side by side
 iteration, and stop as soon as they tell: converged roughly, or close to another one. The lowest is not descended
 again: its iterations are the first of the assimilation. Where no other descent ended where the lowest did, or even that
 J is higher than noise and prior explain, other members are tried, as many again while there are some left.
+
+Where J of the whole window has too many minima, windows are lengthened step by step. A chaotic model has about as many
+minima as its trajectories part within the window. J of its beginning has one, and the minimum of a window lies near
+that of the window a little shorter: each descent starts where the one before it ended (quasi-static variational
+assimilation: Pires, Vautard & Talagrand 1996, Tellus A 48, 96; Swanson, Vautard & Pires 1998, Tellus A 50, 369).
+Readings after the end of a window have the weight zero, and correlated errors count as independent on the way there,
+where windows only lead on; the whole window has R as it is.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from en4dvar.descent.lengthen import lengthened
+from en4dvar.data.noise import noise_of
 from en4dvar.descent.loop import minimise
-from en4dvar.descent.minima import REACHED, Minimum, merged
+from en4dvar.descent.minima import AGREE, REACHED, Minimum, merged
 from en4dvar.descent.step_control import Move, Search
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.descent.window import DataWindow, Descent
@@ -25,11 +32,9 @@ from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.errors import ConfigError, Fault
 from en4dvar.plumbing.hints import nearest
 from en4dvar.problem import InverseProblem
-from en4dvar.schemes.base import Minimiser
 
-ROUGH = 1e-2  # relative decrease of J at which a descent stops that only has to tell basins apart
+ROUGH = 1e-2  # relative decrease of J at which a descent stops that only has to tell basins apart, or to lead on
 SAME = 1.0  # posterior standard deviations between descents that have met
-AGREE = 2  # descents from different members that must have ended in the lowest minimum
 
 
 @dataclass(frozen=True)
@@ -59,8 +64,8 @@ Keep = Callable[[Callable[[], StartState]], None]
 
 
 def choose_start(
-    space: WeightSpace, scheme: Minimiser, run: Forecast, seed: int, resume: StartState | None, keep: Keep,
-    tell: Callable[[Record], None],
+    space: WeightSpace, run: Forecast, resume: StartState | None = None, keep: Keep = lambda state: None,
+    tell: Callable[[Record], None] = lambda record: None,
 ) -> Start:  # fmt: skip
     """``run``: forecast of the prior members and, last, of their mean.
 
@@ -69,14 +74,9 @@ def choose_start(
     ``resume``: where the comparison was interrupted. ``keep`` is called before each round of moves with the state to
     resume from, ``tell`` after it.
     """
-    beyond = len(space.members) + 1  # the number of what is no member
+    scheme, beyond = space.minimiser, len(space.members) + 1  # the latter numbers what is no member
     if scheme.lengthen > 1:
-
-        def of_first(short: WeightSpace) -> Descent:
-            assert short.scheme.minimiser is not None
-            return choose_start(short, short.scheme.minimiser, run, seed, None, lambda state: None, tell).descent
-
-        led = lengthened(space, scheme, of_first, tell)
+        led = lengthened(space, run, tell)
         return Start(Descent(space.start(led), members=(beyond,)), tried=(beyond,))
     warnings: tuple[Caution, ...] = ()
     begin = scheme.start
@@ -88,12 +88,12 @@ def choose_start(
             return Start(descent_from(space, mean), tried=(mean,))
         words = f"the prior mean cannot be run ({run.failures[-1]}); started from the best prior member"
         warnings = (caution("start-moved", words),)
-    starts = affordable(space, scheme, run)
+    starts = space.affordable(run)
     together = min(scheme.starts, len(starts))
     first = descent_from(space, starts[0])
     if together < 2:
         return Start(first, tried=(starts[0],), warnings=warnings)
-    window = Rounds(space, seed, resume or StartState(lowest=first), keep, tell)
+    window = Rounds(space, resume or StartState(lowest=first), keep, tell)
     while window.rank < len(starts):
         if not window.descents:
             window.begin_round([descent_from(space, i) for i in starts[window.rank : window.rank + together]])
@@ -104,6 +104,44 @@ def choose_start(
         window.descents = []
     window.lowest.ended = False  # it goes on, as the first iterations of the assimilation
     return Start(window.lowest, window.others(), tuple(starts[: window.rank]), warnings)
+
+
+def shortened(space: WeightSpace) -> Iterator[WeightSpace]:
+    """The data set in the first 1/L, 2/L, … of the time of its readings, L = ``lengthen``, the whole left out.
+
+    A window that holds no more readings than the one before is left out, too.
+    """
+    observations, scheme = space.problem.observations, space.minimiser
+    noise = observations.noise
+    if not noise.independent and not space.problem.discrepancy:
+        noise = noise_of(noise.std, noise.time_std)
+    own = replace(scheme, lengthen=1, cost_tolerance=max(ROUGH, scheme.cost_tolerance))
+    settings = replace(space.settings, own=own)
+    (begin, end), counted, of_all = observations.span, 0, int(np.sum(observations.weights > 0))
+    for j in range(1, scheme.lengthen):
+        inside = observations.times <= begin + (end - begin) * j / scheme.lengthen
+        weights = np.where(inside, observations.weights, 0.0)
+        if counted < (counted := int(np.sum(weights > 0))) < of_all:
+            problem = replace(space.problem, observations=replace(observations, weights=weights, noise=noise))
+            yield WeightSpace(problem, settings, space.seed, space.executor)
+
+
+def lengthened(space: WeightSpace, run: Forecast, tell: Callable[[Record], None]) -> Array:
+    """Weights (N,) at the end of the last but one window. ``run``: see :func:`choose_start`.
+
+    Nothing is kept of it: a resumed run repeats it. Raises :class:`ConfigError` where all readings are at one time.
+    """
+    w: Array | None = None
+    for number, short in enumerate(shortened(space)):
+        descent = choose_start(short, run, tell=tell).descent if w is None else Descent(short.start(w))
+        descent.ended = False
+        minimise(DataWindow(short), [descent])
+        w = descent.weights.w
+        space.forward_runs += short.forward_runs
+        tell(StartRecord(number + 1, (descent.cost,), 1))
+    if w is None:
+        raise ConfigError("all readings are at one time; there is no window to lengthen", "assimilation.lengthen")
+    return w
 
 
 def descent_from(space: WeightSpace, member: int) -> Descent:
@@ -137,19 +175,6 @@ def given(problem: InverseProblem, start: Mapping[str, float | Mapping[str, floa
     return x
 
 
-def affordable(space: WeightSpace, scheme: Minimiser, run: Forecast) -> list[int]:
-    """Members of lowest J, as many as go :func:`side_by_side`; at least one."""
-    costs = space.background_costs + space.problem.observations.cost(run.predicted)
-    best = np.argsort(costs, kind="stable").tolist()
-    count = side_by_side(space) if scheme.economical(space.basis) else 1
-    return [i for i in best[:count] if np.isfinite(costs[i])] or best[:1]
-
-
-def side_by_side(space: WeightSpace) -> int:
-    """Descents for which a linearisation of each costs no more than one bundle of N together."""
-    return int(len(space.members) // (space.basis.shape[1] + 1))
-
-
 def highest_plausible(space: WeightSpace) -> float:
     """The 99.95 % point of J at its minimum where model, prior and R are right: 2 J is χ²_K then (Talagrand 1999).
 
@@ -164,10 +189,10 @@ class Rounds(DataWindow):
     """Descents side by side that only have to tell which gets lowest, and where they end."""
 
     def __init__(
-        self, space: WeightSpace, seed: int, before: StartState, keep: Keep, tell: Callable[[Record], None],
+        self, space: WeightSpace, before: StartState, keep: Keep, tell: Callable[[Record], None],
         known: tuple[Minimum, ...] = (),
     ):  # fmt: skip
-        super().__init__(space, seed, lambda: keep(self.comparison), tell)
+        super().__init__(space, lambda: keep(self.comparison), tell)
         self.known = known
         self.descents, self.rank, self.rounds = [d.kept for d in before.descents], before.first, before.rounds
         self.lowest = before.lowest.kept if before.lowest else Descent(space.start(np.zeros(len(space.members))))
@@ -220,7 +245,7 @@ class Rounds(DataWindow):
                 self.record(descent, step.hessian.economical_transform, move.step_length)
                 descent.weights, descent.cost = self.space.onwards(move.w, step.hessian), move.cost
                 rough = max(before - move.cost, step.predicted_decrease) <= ROUGH * max(1.0, move.cost)
-                descent.ended = rough or descent.iteration == self.minimiser.max_iterations
+                descent.ended = rough or descent.iteration == self.space.minimiser.max_iterations
             else:
                 descent.ended = True
             if descent.ended:

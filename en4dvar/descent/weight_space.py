@@ -12,13 +12,12 @@ from en4dvar.diagnosis import diagnostics as diag
 from en4dvar.ensemble.forecast import NO_TIMES, Composite, Forecast, costs
 from en4dvar.ensemble.linalg import FEW, Hessian, LowRank, anomaly_basis, centre
 from en4dvar.ensemble.missing import filled
-from en4dvar.ensemble.repeat import check_repeats
 from en4dvar.ensemble.tangent import check_derivatives, derivatives_of
 from en4dvar.executor import Executor
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import TooFewMembersError
 from en4dvar.problem import InverseProblem
-from en4dvar.schemes.base import Weights
+from en4dvar.schemes.base import Minimiser, Weights
 from en4dvar.schemes.settings import AssimilationSettings
 
 NOT_READ: Array = np.empty((0, 0))
@@ -42,6 +41,12 @@ class WeightSpace:
         self.forward_runs = 0
 
     @property
+    def minimiser(self) -> Minimiser:
+        """The scheme, of descents to the minimum of J."""
+        assert self.scheme.minimiser is not None
+        return self.scheme.minimiser
+
+    @property
     def needed_members(self) -> int:
         """The members that must survive for a regression on the control vector."""
         n_members, n = self.members.shape
@@ -57,10 +62,22 @@ class WeightSpace:
             return np.zeros(n_members)
         return np.asarray(self._projection[i] if n_members <= FEW else self.basis @ self.basis[i])
 
+    def member_costs(self, run: Forecast) -> Array:
+        """J (N + 1,) of the members and their mean, whose ``run`` is there."""
+        weights = np.vstack([self.basis, np.zeros(self.basis.shape[1])])
+        return diag.background_cost(weights, len(self.members)) + self.problem.observations.cost(run.predicted)
+
     @property
-    def background_costs(self) -> Array:
-        """J_b (N + 1,) of the weights of the members and their mean."""
-        return diag.background_cost(np.vstack([self.basis, np.zeros(self.basis.shape[1])]), len(self.members))
+    def side_by_side(self) -> int:
+        """Descents for which a linearisation of each costs no more than one bundle of N together."""
+        return int(len(self.members) // (self.basis.shape[1] + 1))
+
+    def affordable(self, run: Forecast) -> list[int]:
+        """Members of lowest J, as many as go :attr:`side_by_side`; at least one. ``run``: see :meth:`member_costs`."""
+        costs = self.member_costs(run)
+        best = np.argsort(costs, kind="stable").tolist()
+        count = self.side_by_side if self.minimiser.economical(self.basis) else 1
+        return [i for i in best[:count] if np.isfinite(costs[i])] or best[:1]
 
     @cached_property
     def _projection(self) -> Array:
@@ -122,20 +139,6 @@ class WeightSpace:
             at = np.vstack([self.mean, self.members])[alive[0]]
             self.forward_runs += 1
             check_derivatives(self.problem, self.derivatives, at, self.forecast)
-
-    def check_repeats(self, prior_run: Forecast, extra_times: Array) -> None:
-        """Run two members of the prior forecast again, at the same instants.
-
-        Raises :class:`ConfigError`: they give other predictions.
-        """
-
-        def again(members: list[int]) -> tuple[Array, tuple[str, ...]]:
-            run = self.forecast(self.members[members], extra_times)
-            lacks = run.partial[:, None] & np.isnan(run.predictions)
-            return np.where(lacks, alive.predictions[members], run.predictions), run.lost
-
-        alive = prior_run[: len(self.members)]
-        check_repeats(self.problem.model, alive.predictions, alive.failures, again, self.problem.observations.name)
 
     def costs(self, x: Array, run: Forecast) -> Array:
         """J (B,) of control vectors (B, n), from their forecast and the prior's own mean and covariance."""

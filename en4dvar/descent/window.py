@@ -8,12 +8,12 @@ record only.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from en4dvar.data.noise import Linearisation, Predicted
-from en4dvar.descent.loop import Objective
+from en4dvar.descent.loop import Descends, Objective
 from en4dvar.descent.step_control import NEAR, STEP_CONTROLS, Move, Point, Search, Settling, Tangent, Trials, each_once
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.diagnosis import diagnostics as diag
@@ -25,17 +25,7 @@ from en4dvar.ensemble.missing import filled
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import TooFewMembersError
 from en4dvar.priors.prior import member_stream
-from en4dvar.schemes.base import (
-    Evaluation,
-    GaussNewtonStep,
-    Minimiser,
-    Runs,
-    Step,
-    Weights,
-    dense,
-    gauss_newton,
-    regression,
-)  # fmt: skip
+from en4dvar.schemes.base import Evaluation, GaussNewtonStep, Runs, Step, Weights, gauss_newton, regression
 
 WIDER, WIDEST = 5.0, 25.0  # factors of a bundle where J does not fall along the step: of each further look, in all
 FAKED = 3.0  # posterior standard deviations: a longer step does not come from the model's own error
@@ -61,7 +51,7 @@ class Iterate:
 
 
 @dataclass
-class Descent:
+class Descent(Descends):
     """One descent: where it stands, the records of its iterations, and why it ended.
 
     ``worst_loss`` are the reasons of failure in the iteration that lost most members, or empty. ``cost`` is J where it
@@ -75,14 +65,11 @@ class Descent:
     records: tuple[IterationRecord, ...] = ()
     worst_loss: tuple[str, ...] = ()
     cost: float = math.inf
-    stop: str = ""
-    converged: bool = False
-    ended: bool = False
     members: tuple[int, ...] = ()
     highest: float = -math.inf
     settling: Settling | None = None
     at: Iterate | None = None
-    step: Step | GaussNewtonStep | None = None
+    step: Step | GaussNewtonStep | None = field(default=None, kw_only=True)
 
     @property
     def iteration(self) -> int:
@@ -117,21 +104,14 @@ class DataWindow(Objective[Descent]):
     def __init__(
         self,
         space: WeightSpace,
-        seed: int,
-        save: Callable[[], None],
-        tell: Callable[[Record], None],
+        save: Callable[[], None] = lambda: None,
+        tell: Callable[[Record], None] = lambda record: None,
         first: Forecast | None = None,
         grid: Array = NO_TIMES,
     ):
-        self.space, self.seed, self.save, self.tell, self.first, self.grid = space, seed, save, tell, first, grid
+        self.space, self.save, self.tell, self.first, self.grid = space, save, tell, first, grid
         self.scheme, self.observations = space.scheme, space.problem.observations
         self.tangents: list[tuple[Array, Array, Array]] = []  # weights (N,), reference (Ky,) and anomalies there
-
-    @property
-    def minimiser(self) -> Minimiser:
-        """The scheme, of descents to the minimum of J."""
-        assert self.space.scheme.minimiser is not None
-        return self.space.scheme.minimiser
 
     def keep(self, going: Sequence[Descent]) -> None:
         self.save()
@@ -168,14 +148,14 @@ class DataWindow(Objective[Descent]):
 
     def draw(self, purpose: str, columns: int | None = None) -> Array:
         n_members, size = len(self.space.members), columns or len(self.observations)
-        return np.stack([member_stream(self.seed, purpose, i).standard_normal(size) for i in range(n_members)])
+        return np.stack([member_stream(self.space.seed, purpose, i).standard_normal(size) for i in range(n_members)])
 
     def judge(self, going: Sequence[Descent]) -> None:
         for descent in going:
             self._require_step(descent)
             if self.scheme.minimiser is None or descent.stop:
                 continue
-            scheme, norm = self.minimiser, descent.newton.norm
+            scheme, norm = self.space.minimiser, descent.newton.norm
             if norm <= scheme.step_tolerance:
                 descent.stop, descent.converged = f"step of {norm:.2g} posterior standard deviations", True
             elif descent.iteration == scheme.max_iterations:
@@ -197,7 +177,7 @@ class DataWindow(Objective[Descent]):
     def searched(self, descent: Descent) -> Search:
         """By the configured step control."""
         point = self._point(descent)
-        search = STEP_CONTROLS[self.minimiser.step_control](point)
+        search = STEP_CONTROLS[self.space.minimiser.step_control](point)
         return each_once(search) if point.sparing else search
 
     def move(self, going: Sequence[Descent], moves: Sequence[Move | None]) -> None:
@@ -232,11 +212,11 @@ class DataWindow(Objective[Descent]):
 
     def small(self, cost: float) -> float:
         """A decrease of J that counts as none; below J = 1 it is absolute, for there J has no more to tell."""
-        return self.minimiser.cost_tolerance * max(cost, 1.0)
+        return self.space.minimiser.cost_tolerance * max(cost, 1.0)
 
     @property
     def _flat(self) -> str:
-        return f"relative decrease of J below {self.minimiser.cost_tolerance:g}"
+        return f"relative decrease of J below {self.space.minimiser.cost_tolerance:g}"
 
     def _go_on(self, descent: Descent, move: Move | None) -> None:
         at, step, again = descent.iterate, descent.newton, None
@@ -259,7 +239,7 @@ class DataWindow(Objective[Descent]):
 
     def _no_decrease(self, descent: Descent) -> None:
         """The search by J has ended; a regression goes on to settle."""
-        if self.minimiser.regresses:
+        if self.space.minimiser.regresses:
             return
         promised, small = descent.newton.predicted_decrease, self.small(descent.iterate.cost)
         descent.stop = self._flat if promised <= small else "no decrease possible along the step"
@@ -267,7 +247,7 @@ class DataWindow(Objective[Descent]):
 
     def _settles(self, descent: Descent) -> bool:
         near = descent.settling is not None or descent.newton.norm <= NEAR
-        return self.minimiser.regresses and near
+        return self.space.minimiser.regresses and near
 
     def _settle(self, descent: Descent) -> None:
         """A share of the step, whatever J of the central run says."""
@@ -285,11 +265,11 @@ class DataWindow(Objective[Descent]):
         """
         weights = descent.weights
         onwards = self._onwards(descent, weights.w)
-        if not self.minimiser.regresses:
+        if not self.space.minimiser.regresses:
             doubtful = UNSEEN < descent.newton.norm < FAKED and weights.wider < WIDEST
             return replace(onwards, wider=WIDER * weights.wider) if doubtful else None
         apart = np.abs(self.scheme.members(onwards) - self.scheme.members(weights))
-        return None if np.max(apart) <= self.minimiser.step_tolerance else onwards  # it would run the same again
+        return None if np.max(apart) <= self.space.minimiser.step_tolerance else onwards  # it would run the same again
 
     def _onwards(self, descent: Descent, w: Array) -> Weights:
         """Weights at w (N,), with the transform of where the descent comes from and a bundle as wide."""
@@ -312,7 +292,7 @@ class DataWindow(Objective[Descent]):
         if self.scheme.done(count - 1, taken):
             descent.stop, descent.converged = f"{count} assimilations", True
         basis = self.space.basis  # of the weights of the mean, those that move no parameter are no part of J_b
-        descent.weights = Weights(basis @ (basis.T @ taken.weights.w), dense(taken.weights.T))
+        descent.weights = Weights(basis @ (basis.T @ taken.weights.w), taken.weights.dense)
 
     def _run_ensemble(self, descent: Descent) -> Runs | None:
         space = self.space
@@ -359,7 +339,7 @@ class DataWindow(Objective[Descent]):
 
     def _point(self, descent: Descent) -> Point:
         at, tangent = descent.iterate, None
-        if (linear := at.linear) is not None and not self.minimiser.regresses:
+        if (linear := at.linear) is not None and not self.space.minimiser.regresses:
 
             def precision_times(vectors: Array) -> Array:
                 return self.observations.precision_times(linear.prediction, vectors)

@@ -6,15 +6,18 @@ in trouble get a reason, the others do not notice.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from operator import methodcaller
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from en4dvar.data.series import Part
 from en4dvar.executor import Outcome
 from en4dvar.model.batch import Batch
-from en4dvar.model.forward import Failure, ValidityLimit
+from en4dvar.model.forward import Failure, RateOperator, ValidityLimit
 from en4dvar.model.state import Array, Field
+from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.user_code import own_fault, reason_of
 from en4dvar.priors.prior import Prior
 from en4dvar.problem import InverseProblem, Tie
@@ -48,17 +51,18 @@ class InitialStates:
         self.fixed = tuple((name, float(problem.fixed[name])) for name in own if name in problem.fixed)
         self.perturbed = tuple((p, columns.get(p.parameter.name)) for p in problem.perturbations)
 
-    def __call__(self, physical: Array, failures: list[str], cells: Array | None = None) -> tuple[Indices, Array]:
-        """Which members (B', of B) have an initial state, and the states (B', n_state).
+    def __call__(self, physical: Array, cells: Array | None = None) -> tuple[Indices, Array, list[str]]:
+        """Which members (B', of B) have an initial state, the states (B', n_state), and why the others have none (B,).
 
-        ``physical`` (B, n) is the control vector, ``cells`` (B, m) what it says of whole fields. Members with an entry
-        in ``failures`` (B,) have no state; the reasons of those that the model refuses are added there.
+        ``physical`` (B, n) is the control vector, ``cells`` (B, m) what it says of whole fields. Members with a
+        parameter outside its bounds have no state, and those that the model refuses.
         """
+        failures = out_of_bounds(self.problem.prior, physical)
         alive, cells = _without(failures), np.empty((len(physical), 0)) if cells is None else cells
         if all(failures):
-            return alive, np.empty((0, self.size))
+            return alive, np.empty((0, self.size)), failures
         try:
-            return alive, self._build(physical[alive], cells[alive])
+            return alive, self._build(physical[alive], cells[alive]), failures
         except BaseException as error:  # some member has no state: find out which, one by one
             own_fault(error)
             states = []
@@ -67,7 +71,7 @@ class InitialStates:
                 states.append(self._build(physical[i : i + 1], cells[i : i + 1]))
             except BaseException as error:  # a model may refuse parameters in any way; the reason is kept
                 failures[i] = reason_of(error)
-        return _without(failures), np.concatenate([np.empty((0, self.size)), *states])
+        return _without(failures), np.concatenate([np.empty((0, self.size)), *states]), failures
 
     def _build(self, physical: Array, cells: Array) -> Array:
         """States (B, n_state); ValueError where one is not a state."""
@@ -178,16 +182,61 @@ class Reading:
         return values, beyond, reasons
 
     def _all(self, outcomes: Sequence[Any]) -> tuple[Array, Array]:
-        values: list[Any]
-        beyond: list[Any]
-        if isinstance(outcomes, Batch) and self.batched:
-            values = [read(outcomes) for read in self.quantities]
-            beyond = [(outcomes.largest(limit.name), outcomes.beyond(limit)) for limit in self.limits]
-        else:
-            values = [[read(path) for path in outcomes] for read in self.quantities]
-            beyond = [
-                ([path.largest(limit.name) for path in outcomes], [path.beyond(limit) for path in outcomes])
-                for limit in self.limits
-            ]
+        def each(read: Callable[[Any], Any]) -> Any:
+            return read(outcomes) if isinstance(outcomes, Batch) and self.batched else [read(path) for path in outcomes]
+
+        values = [each(read) for read in self.quantities]
+        beyond = [(each(methodcaller("largest", of.name)), each(methodcaller("beyond", of))) for of in self.limits]
         shape = (len(self.limits), 2, len(outcomes))
         return np.array(values, dtype=np.float64), np.array(beyond, dtype=np.float64).reshape(shape).transpose(2, 0, 1)
+
+
+@dataclass(frozen=True)
+class Readout:
+    """(…, K + P M) of a path at T instants: the K readings of all parts, then the curves of the P parts that have one.
+
+    ``operators`` are those of the ``parts``, or their rates; ``rows`` (K,) says at which instant each reading was
+    taken, ``along`` (M,) those that a curve is read at.
+    """
+
+    operators: tuple[Callable[[Any], Array], ...]
+    parts: tuple[Part, ...]
+    n_times: int
+    rows: Indices
+    along: Indices
+
+    def __call__(self, path: Any) -> Array:
+        predictions = []
+        curves = []
+        for operator, part in zip(self.operators, self.parts, strict=True):
+            values, of_field = np.asarray(operator(path)), part.places is not None
+            if values.ndim < 1 + of_field or values.shape[-1 - of_field] != self.n_times:
+                raise MisshapenError
+            rows = self.rows if isinstance(self.rows, slice) else self.rows[part.where]
+            if part.places is None:
+                predictions.append(values[..., rows])
+            else:
+                predictions.append(part.places.read(values, rows))
+            if part.has_path:
+                at = values[..., self.along] if part.places is None else values[..., self.along, :]
+                curves.append(part.read_along(at))
+        return np.concatenate([*predictions, *curves], axis=-1)
+
+
+def operators_of(parts: Sequence[Part], needs_rates: str = "") -> tuple[Callable[[Any], Array], ...]:
+    """The operators of the parts or, where something ``needs_rates``, by its name, their rates.
+
+    Raises :class:`ConfigError` where the model does not provide a rate.
+    """
+    operators = list[Callable[[Any], Array]]()
+    for part in parts:
+        operator, name = part.observable.operator, part.observable.name
+        if needs_rates and not isinstance(operator, RateOperator):
+            raise ConfigError(f"{needs_rates} needs the rate of {name}, which the model does not provide")
+        operators.append(operator.rate if needs_rates and isinstance(operator, RateOperator) else operator)
+    return tuple(operators)
+
+
+def batched(problem: InverseProblem) -> bool:
+    """True if all operators take a :class:`~en4dvar.model.batch.Batch`."""
+    return all(getattr(part.observable.operator, "batched", False) for part in problem.parts)

@@ -10,9 +10,11 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from en4dvar.ensemble.forecast import Forecast
 from en4dvar.model.forward import ForwardModel
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError
+from en4dvar.problem import InverseProblem
 
 ROUNDING = 1e-9  # of the largest value: what members of a batch may owe to those beside them
 NOT_THE_MODEL = ("TimeLimitError: ", "MemoryError: ", "a worker process died")  # reasons that depend on the machine
@@ -59,6 +61,19 @@ def check_repeats(
             "a state that it keeps makes posteriors wrong and results different each time. Seed it in each member and "
             "keep nothing between members, or accept it with assimilation: {stochastic_model: true}"
         )
+
+
+def check_forecast_repeats(problem: InverseProblem, run: Forecast, again: Callable[[list[int]], Forecast]) -> None:
+    """The same of the forecast of an ensemble, in which the readings that members lack are filled in: these are not
+    compared. ``again``: members → their forecast, at the same instants.
+    """
+
+    def repeated(members: list[int]) -> tuple[Array, tuple[str, ...]]:
+        second = again(members)
+        lacks = second.partial[:, None] & np.isnan(second.predictions)
+        return np.where(lacks, run.predictions[members], second.predictions), second.lost
+
+    check_repeats(problem.model, run.predictions, run.failures, repeated, problem.observations.name)
 
 
 def _in_batches(model: ForwardModel) -> bool:

@@ -107,16 +107,16 @@ def _through(stages: Stages, resume: LoopState | None) -> Analysis:
         descents=descents,
         draws=prior.to_physical(sampled.refined.draws) if sampled.refined else np.empty((0, 0)),
     )
-    cautions = (*start.warnings, *(sampled.refined.warnings if sampled.refined else ()))
+    cautions = [*start.warnings, *(sampled.refined.warnings if sampled.refined else ())]
     if len(outcome.tried) == 1:
-        cautions = (*cautions, caution("one-descent", "one descent only: another minimum is not excluded"))
-    cautions = (*cautions, *conclusions.future_missed(analysis.withheld))
-    cautions = (*cautions, *conclusions.missing_readings(ends.run.filled, stages.settings.refine == "mcmc"))
+        cautions.append(caution("one-descent", "one descent only: another minimum is not excluded"))
+    cautions += conclusions.future_missed(analysis.withheld)
+    cautions += conclusions.missing_readings(ends.run.filled, stages.settings.refine == "mcmc")
     if counting:
         weights = np.array([mode.weight for mode in analysis.modes])
-        cautions = (*cautions, *mode_cautions(prior, counting, weights, agree, sampled.refined))
-    cautions = (*cautions, *_missed_knots(stages, analysis))
-    analysis = replace(analysis, cautions=examine(analysis, control, outcome.descent.worst_loss, cautions))
+        cautions += mode_cautions(prior, counting, weights, agree, sampled.refined)
+    cautions += _missed_knots(stages, analysis)
+    analysis = replace(analysis, cautions=examine(analysis, control, outcome.descent.worst_loss, tuple(cautions)))
     analysis = replace(analysis, forward_runs=space.forward_runs)
     if stages.settings.what_if == "added":  # last, since what is examined is the posterior of the data
         widened = with_shifts(ends.members, analysis.what_if, stages.seed)
@@ -136,18 +136,19 @@ def _concluded(
     # be far away.
     log_evidence_constant = None
     if stages.compares and problem.in_question:
-        end, runs = _alone(stages, problem.constant, stages.settings)
-        space.forward_runs += runs
+        end = _alone(stages, problem.constant, stages.settings)
         log_evidence_constant = end.log_evidence if end else np.nan
     response = conclusions.response_of(space, descent, ends.mode, last)
     std = ends.members.std(axis=0, ddof=1)
     shifts: tuple[Shift, ...] = ()
+    begun = space.forward_runs  # those of fits are told with the shifts
     if stages.settings.what_if:
         fitted = partial(_fitted, stages, response.at, control.centre_cost)
         shifts = what_if(problem, response, std, control.centre_cost, space.executor, fitted)
+    space.forward_runs = begun + sum(shift.runs for shift in shifts)
     path = ledger(problem, response, std) if stages.settings.what_if else None
     withheld = stages.expected(ends.members)
-    space.forward_runs += sum(shift.runs for shift in shifts) + (path.runs if path else 0)
+    space.forward_runs += path.runs if path else 0
     return conclusions.outcome_of(
         problem,
         stages.settings,
@@ -187,8 +188,7 @@ def _without_excuse(stages: Stages) -> Array | None:
     searched = scheme and scheme.searches and scheme.economical(stages.space.basis)
     if not (searched and problem.estimates_discrepancy):
         return None
-    held, runs = _errors_held(stages, problem, problem.prior.mean, from_there=False)
-    stages.space.forward_runs += runs
+    held = _errors_held(stages, problem, problem.prior.mean, from_there=False)
     return held.centre if held else None
 
 
@@ -200,44 +200,41 @@ def _fitted(stages: Stages, at: Array, cost: float, changed: InverseProblem) -> 
     Both first hold the parameters of R, since a large discrepancy would excuse whatever is missed. Where that leads
     both to one place, the second is a descent from ``at`` that holds nothing.
     """
-    prior, fits, runs = changed.prior, list[Fit](), 0
+    prior, fits, begun = changed.prior, list[Fit](), stages.space.forward_runs
     held: Fit | None = None
 
     def descend(place: Array | None) -> None:
-        nonlocal runs
-        end, taken = _mode(stages, changed, None if place is None else _named(prior, place))
-        runs += taken
+        end = _mode(stages, changed, None if place is None else _named(prior, place))
         if end:
-            fits.append(Fit(prior.from_physical(end.centre), end.iterations[-1].cost, runs))
+            fits.append(Fit(prior.from_physical(end.centre), end.iterations[-1].cost, 0))
 
     if stages.minimiser:
-        held, runs = _errors_held(stages, changed, at, from_there=True)
+        held = _errors_held(stages, changed, at, from_there=True)
         descend(held.centre if held else at)
     if not fits or not fits[0].cost < cost + AS_GOOD:
-        wider, taken = _errors_held(stages, changed, at, from_there=False)
-        runs += taken
+        wider = _errors_held(stages, changed, at, from_there=False)
         again = held is not None and wider is not None and abs(wider.cost - held.cost) < SAME_COST
         descend(at if again else wider.centre if wider else None)
     best = min(fits, key=lambda fit: fit.cost, default=None)
-    return best and replace(best, runs=runs)
+    return best and replace(best, runs=stages.space.forward_runs - begun)
 
 
-def _errors_held(stages: Stages, problem: InverseProblem, at: Array, from_there: bool) -> tuple[Fit | None, int]:
+def _errors_held(stages: Stages, problem: InverseProblem, at: Array, from_there: bool) -> Fit | None:
     """Where descents lead that hold the parameters of R as in ``at`` (n,), and start there or look from the prior; None
-    where there is nothing to hold or to descend in, or too few members survive. And forward runs.
+    where there is nothing to hold or to descend in, or too few members survive.
     """
     prior, values = problem.prior, _named(problem.prior, at)
     errors = {name: x for name, x in values.items() if name in problem.of_errors}
     others = prior.of(tuple(term for term in prior.terms if term.parameter.name not in errors))
     if not (errors and others.terms):
-        return None, 0
+        return None
     held = replace(problem, prior=others, fixed={**problem.fixed, **errors})
-    end, runs = _mode(stages, held, {name: values[name] for name in others.names} if from_there else None)
+    end = _mode(stages, held, {name: values[name] for name in others.names} if from_there else None)
     if end is None:
-        return None, runs
+        return None
     values |= dict(zip(others.names, end.centre.tolist(), strict=True))
     centre = prior.from_physical(np.array([values[name] for name in prior.names]))
-    return Fit(centre, end.iterations[-1].cost, runs), runs
+    return Fit(centre, end.iterations[-1].cost, 0)
 
 
 def _named(prior: Prior, x: Array) -> dict[str, float]:
@@ -245,10 +242,8 @@ def _named(prior: Prior, x: Array) -> dict[str, float]:
     return dict(zip(prior.names, prior.to_physical(x).tolist(), strict=True))
 
 
-def _mode(stages: Stages, problem: InverseProblem, start: Mapping[str, float] | None) -> tuple[Analysis | None, int]:
-    """The mode of another problem, from a ``start`` or by a search, without what is after it; the rest of
-    :func:`_alone`.
-    """
+def _mode(stages: Stages, problem: InverseProblem, start: Mapping[str, float] | None) -> Analysis | None:
+    """The mode of another problem, from a ``start`` or by a search, without what is after it; else :func:`_alone`."""
     problem = replace(problem, observations=replace(problem.observations, continued=None))
     settings = replace(stages.settings, refine="none", emulator="off")
     if stages.minimiser and start:
@@ -256,13 +251,16 @@ def _mode(stages: Stages, problem: InverseProblem, start: Mapping[str, float] | 
     return _alone(stages, problem, settings)
 
 
-def _alone(stages: Stages, problem: InverseProblem, settings: AssimilationSettings) -> tuple[Analysis | None, int]:
-    """An assimilation of another problem, without what if; None where too few members survive. And forward runs."""
+def _alone(stages: Stages, problem: InverseProblem, settings: AssimilationSettings) -> Analysis | None:
+    """An assimilation of another problem, without what if; None where too few members survive. Its forward runs are
+    counted with the others.
+    """
     other = Stages(problem, replace(settings, what_if=False), stages.seed, stages.executor, compares=False)
     end = None
     with suppress(TooFewMembersError):
         end = _through(other, None)
-    return end, other.space.forward_runs
+    stages.space.forward_runs += other.space.forward_runs
+    return end
 
 
 def _missed_knots(stages: Stages, analysis: Analysis) -> tuple[Caution, ...]:
@@ -281,8 +279,7 @@ def _missed_knots(stages: Stages, analysis: Analysis) -> tuple[Caution, ...]:
         moved = [replace(varied, knots=tuple(t + shift for t in varied.knots)) for varied in model.varying]
         if min(varied.knots[0] for varied in moved) <= 0:
             continue
-        there, runs = _alone(stages, replace(problem, model=PiecewiseModel(model.model, moved)), stages.settings)
-        stages.space.forward_runs += runs
+        there = _alone(stages, replace(problem, model=PiecewiseModel(model.model, moved)), stages.settings)
         if there is None:
             continue
         gain = there.log_evidence - analysis.log_evidence

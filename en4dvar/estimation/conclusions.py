@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from en4dvar.data.noise import Predicted
+from en4dvar.data.noise import DiscrepancyNoise, Linearisation, Predicted
 from en4dvar.descent.minima import Minimum
 from en4dvar.descent.search import Outcome
-from en4dvar.descent.variance import shares_of_variance
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.descent.window import Descent
 from en4dvar.diagnosis import diagnostics as diag
@@ -19,7 +18,7 @@ from en4dvar.diagnosis.residuals import Residuals
 from en4dvar.diagnosis.response.linear import LinearResponse
 from en4dvar.diagnosis.withheld import Withheld
 from en4dvar.ensemble.forecast import Forecast
-from en4dvar.ensemble.members import InitialStates, out_of_bounds
+from en4dvar.ensemble.members import InitialStates
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.priors.prior import Prior
@@ -64,7 +63,7 @@ def fields_of(problem: InverseProblem, before: Array, after: Array, centre: Arra
 
     def states(x: Array) -> Array:
         physical, every = problem.prior.to_physical(x), np.full((len(x), layout.size), np.nan)
-        alive, started = initial(physical, out_of_bounds(problem.prior, physical))
+        alive, started, _ = initial(physical)
         every[alive] = started
         return every
 
@@ -199,3 +198,28 @@ def missing_readings(share: float, chain: bool = False) -> tuple[Caution, ...]:
     words += "; each is regressed on the members that have it"
     words += ", and no chain (refine: mcmc) is run, to which a draw without one is impossible" if chain else ""
     return (caution("readings-missing", words, "serious" if chain else None),) if share else ()
+
+
+def shares_of_variance(space: WeightSpace, linear: Linearisation) -> Array:
+    """(n, 3) shares of errors, discrepancy and prior in each parameter's variance, transformed; rows sum to 1.
+
+    With coordinates c of the weights, predictions C c, K = R + A and the Hessian 𝓐 = (N−1) I + SᵀS, the minimum answers
+    to y − m by 𝓐⁻¹CᵀK⁻¹, so that the covariance 𝓐⁻¹ of a linear problem is the sum of three,
+
+        𝓐⁻¹ [ CᵀK⁻¹R K⁻¹C + rows of the errors' own parameters ] 𝓐⁻¹,     𝓐⁻¹ CᵀK⁻¹A K⁻¹C 𝓐⁻¹,     (N−1) 𝓐⁻²,
+
+    each carried to the parameters by the prior anomalies.
+    """
+    observations = space.problem.observations
+    noise = observations.noise
+    assert isinstance(noise, DiscrepancyNoise)
+    _, sensitivity = observations.whiten(linear)
+    precision = len(space.members) - 1
+    inverse = np.linalg.inv(precision * np.eye(sensitivity.shape[1]) + sensitivity.T @ sensitivity)
+    gain = observations.precision_times(linear.prediction, linear.anomalies)  # β CᵀK⁻¹
+    discrepancy = gain @ noise.covariance_of_discrepancy(linear.prediction) @ gain.T / observations.weights[0]
+    errors = sensitivity.T @ sensitivity - discrepancy
+    to_parameters = space.anomalies.T @ space.basis @ inverse
+    parts = (errors, discrepancy, precision * np.eye(len(inverse)))
+    variances = np.stack([np.einsum("ij,jk,ik->i", to_parameters, part, to_parameters) for part in parts], axis=1)
+    return np.asarray(variances / variances.sum(axis=1, keepdims=True))

@@ -8,15 +8,14 @@ settings, ES-MDA ``mda_coefficients``, both ``members``, ``sampling`` (``exact``
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from en4dvar.data.noise import Predicted
 from en4dvar.descent.field import Passes, field_en4dvar
-from en4dvar.descent.field_data import FieldData, Pass, mean_of, prior_members
-from en4dvar.descent.field_gain import gain_of
+from en4dvar.descent.field_data import FieldData, Pass, gain_of, mean_of, prior_members
 from en4dvar.descent.loop import minimise
 from en4dvar.descent.weight_space import require_members
 from en4dvar.diagnosis import diagnostics as diag
@@ -25,7 +24,7 @@ from en4dvar.diagnosis.honesty import ControlEnsembles, examine
 from en4dvar.ensemble.forecast import NO_TIMES, Composite, Forecast, check_problem, plotting_times
 from en4dvar.ensemble.members import InitialStates
 from en4dvar.ensemble.missing import filled, fitted
-from en4dvar.ensemble.repeat import check_repeats
+from en4dvar.ensemble.repeat import check_forecast_repeats
 from en4dvar.estimation import conclusions
 from en4dvar.executor import Executor
 from en4dvar.model.state import Array
@@ -49,7 +48,9 @@ class Localised:
         self.gain = gain_of(problem, settings)
         self.problem, self.settings, self.seed, self.progress = problem, settings, seed, progress
         self.composite, self.grid = Composite(problem, executor), plotting_times(problem)
-        self.named = len(problem.prior.terms)
+        self.named = n = len(problem.prior.terms)
+        # each field with its columns of the ensemble
+        self.fields = [(own, slice(n + of.start, n + of.stop)) for own, of in problem.columns_of_fields]
         self.ensemble = prior_members(problem, settings, seed)
         self.everyone = np.arange(settings.members)
         self.fewest = max(2, math.ceil(settings.min_active_fraction * settings.members))
@@ -63,15 +64,15 @@ class Localised:
         problem, ensemble, n = self.problem, self.ensemble, self.named
         before, prior_mean = ensemble[:, :n].copy(), mean_of(ensemble, self.everyone)
         base = self._base(prior_mean[:n])
-        moments = [self._moments(prior_field, columns, base) for prior_field, columns in self._fields]
-        raw = self.forecast(lambda some: ensemble[some], len(ensemble), self.grid)
-        prior_run = filled(raw, ensemble)
+        moments = [self._moments(prior_field, columns, base) for prior_field, columns in self.fields]
+        prior_run = filled(self.forecast(ensemble, self.grid), ensemble)
         require_members(problem, prior_run.failures, self.fewest, "prior forecast")
-        self._check_repeats(raw)
+        if not self.settings.stochastic_model:
+            check_forecast_repeats(problem, prior_run, lambda some: self.forecast(ensemble[some], self.grid))
         variance = self._variance()
         centre, converged, stop, lost = self._descend(prior_run)
-        run = filled(self.forecast(lambda some: ensemble[some], len(ensemble), self.grid), ensemble)
-        central = self.forecast(lambda _: centre[None], 1)
+        run = filled(self.forecast(ensemble, self.grid), ensemble)
+        central = self.forecast(centre[None])
         if central.partial.any():
             both = np.vstack([centre, ensemble]), np.vstack([central.predictions, run.predictions])
             central = replace(central, predicted=Predicted(fitted(*both)[:1]), failures=("",))
@@ -81,7 +82,7 @@ class Localised:
         after = ensemble[:, :n].copy()
         fields = [
             self._field(prior_field, columns, base, centre, *moment)
-            for (prior_field, columns), moment in zip(self._fields, moments, strict=True)
+            for (prior_field, columns), moment in zip(self.fields, moments, strict=True)
         ]
         analysis = conclusions.outcome_of(
             problem, self.settings, self.seed, (before, after, centre[:n]), (prior_run, run, central),
@@ -98,11 +99,11 @@ class Localised:
         control = ControlEnsembles(before, after, centre[:n], None, math.nan)
         return replace(analysis, cautions=examine(analysis, control, earlier=conclusions.missing_readings(run.filled)))
 
-    def forecast(self, members: Callable[[slice], Array], count: int, extra_times: Array = NO_TIMES) -> Forecast:
-        """Of members that are taken a few at a time."""
-        self.forward_runs += count
-        firsts = range(0, count, self.at_once)
-        return _joined([self.composite(members(slice(i, min(i + self.at_once, count))), extra_times) for i in firsts])
+    def forecast(self, x: Array, extra_times: Array = NO_TIMES) -> Forecast:
+        """Of members (B, n + m), a few at a time."""
+        self.forward_runs += len(x)
+        firsts = range(0, len(x), self.at_once)
+        return _joined([self.composite(x[i : i + self.at_once], extra_times) for i in firsts])
 
     def _descend(self, prior_run: Forecast) -> tuple[Array, bool, str, Sequence[str]]:
         """Ensemble → posterior; the centre, whether and why it ended, and why members (N,) were lost on the way."""
@@ -137,7 +138,7 @@ class Localised:
         return mean_of(ensemble, passes.alive), True, f"{len(inflations)} assimilations", lost
 
     def _predict(self, members: Array) -> Array:
-        run = self.forecast(lambda some: members[some], len(members))
+        run = self.forecast(members)
         self.failures = tuple(reason for reason in run.failures if reason) or self.failures
         return np.asarray(run.predictions[:, self.problem.observations.used])
 
@@ -191,18 +192,12 @@ class Localised:
         step = max(1, PATHS // (8 * len(self.ensemble)))
         return np.concatenate([self.ensemble[which, i : i + step].var(axis=0) for i in columns[::step]])
 
-    @property
-    def _fields(self) -> Iterator[tuple[FieldPrior, slice]]:
-        """Each field with its columns of the ensemble."""
-        for prior_field, columns in self.problem.columns_of_fields:
-            yield prior_field, slice(self.named + columns.start, self.named + columns.stop)
-
     def _base(self, named: Array) -> Array:
         """The model's own initial state (n_state,) at the prior mean of the parameters with names."""
-        reasons, prior = [""], self.problem.prior
-        _, states = InitialStates(replace(self.problem, fields=()))(prior.to_physical(named)[None], reasons)
-        if reasons[0]:
-            raise En4dvarError(f"the model has no initial state at the prior mean: {reasons[0]}")
+        initial = InitialStates(replace(self.problem, fields=()))
+        _, states, (reason,) = initial(self.problem.prior.to_physical(named)[None])
+        if reason:
+            raise En4dvarError(f"the model has no initial state at the prior mean: {reason}")
         return np.asarray(states[0])
 
     def _moments(self, prior_field: FieldPrior, columns: slice, base: Array) -> tuple[Array, Array]:
@@ -225,17 +220,6 @@ class Localised:
             member[columns] = prior_field.applied(start, member[columns])
         at_centre = prior_field.applied(start, centre[columns])
         return FieldEstimate(prior_field, self.ensemble[:, columns], at_centre, mean, std, prior_mean, prior_std)
-
-    def _check_repeats(self, prior_run: Forecast) -> None:
-        if self.settings.stochastic_model:
-            return
-
-        def again(members: list[int]) -> tuple[Array, tuple[str, ...]]:
-            run = self.forecast(lambda some: self.ensemble[members][some], len(members), self.grid)
-            return np.nan_to_num(run.predictions), run.lost
-
-        name = self.problem.observations.name
-        check_repeats(self.problem.model, np.nan_to_num(prior_run.predictions), prior_run.lost, again, name)
 
 
 def _joined(runs: Sequence[Forecast]) -> Forecast:

@@ -5,14 +5,13 @@ Where one can be interrupted, and all that it needs to go on to the same bits, i
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
-from en4dvar.descent.bounded import bounded_members
+from en4dvar.descent.beyond_gaussian import bounded_members, marginal_members, mean_beyond_mode
 from en4dvar.descent.loop import minimise
-from en4dvar.descent.marginal import marginal_members
 from en4dvar.descent.minima import Minimum, merged
-from en4dvar.descent.noise_scale import mean_beyond_mode
 from en4dvar.descent.search import Outcome, Search, SearchState, from_draw
 from en4dvar.descent.start import StartState, choose_start
 from en4dvar.descent.weight_space import WeightSpace
@@ -21,6 +20,7 @@ from en4dvar.diagnosis import diagnostics as diag
 from en4dvar.diagnosis.analysis import Progress, Record
 from en4dvar.diagnosis.withheld import Withheld, predict_withheld
 from en4dvar.ensemble.forecast import Forecast, check_problem, plotting_times
+from en4dvar.ensemble.repeat import check_forecast_repeats
 from en4dvar.executor import Executor
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution
@@ -125,7 +125,8 @@ class Stages:
         prior_run = space.whole(np.vstack([space.members, space.mean]), self.grid)
         space.require_members(prior_run[:-1].failures, "prior forecast")
         if not self.settings.stochastic_model:
-            space.check_repeats(prior_run, self.grid)
+            again = partial(space.forecast, extra_times=self.grid)
+            check_forecast_repeats(self.problem, prior_run[:-1], lambda some: again(space.members[some]))
         space.check_derivatives(prior_run)
         start = self.start(prior_run, resume) if resume is None or resume.descent is None else resume
         return prior_run, start, self.iterate(start, prior_run)
@@ -142,7 +143,7 @@ class Stages:
             self.keep(lambda: LoopState(space.forward_runs, comparison()))
 
         before = resume.comparison if resume else None
-        begun = choose_start(space, self.minimiser, prior_run, self.seed, before, keep, self.tell)
+        begun = choose_start(space, prior_run, before, keep, self.tell)
         for record in begun.descent.records:
             self.tell(record)
         return LoopState(space.forward_runs, None, begun.descent, begun.minima, begun.tried, begun.warnings)
@@ -159,7 +160,7 @@ class Stages:
             self.latest = kept
             self.keep(lambda: kept)
 
-        window = DataWindow(space, self.seed, keep, self.tell, prior_run, self.grid)
+        window = DataWindow(space, keep, self.tell, prior_run, self.grid)
         minimise(window, [descent])
         return descent
 
@@ -184,7 +185,7 @@ class Stages:
             return outcome, self.gaussian(descent)
         if start.search is not None:
             space.forward_runs = start.forward_runs
-        search = Search(space, scheme, prior_run, self.seed, begun, self.keep_search, self.tell)
+        search = Search(space, prior_run, begun, self.keep_search, self.tell)
         outcome = search.unchanging(search.challenged(outcome))
         sampling = self.settings.refine == "mcmc" or samples(space)
         if not sampling:
@@ -222,7 +223,7 @@ class Stages:
 
     def searched_from(self, outcome: Outcome, ends: Ends, x: Array) -> tuple[Outcome, Ends]:
         """The same, after a descent from a draw x (n,) of the posterior that lies lower than all minima."""
-        after = from_draw(self.space, outcome, x, self.seed, self.tell)
+        after = from_draw(self.space, outcome, x, self.tell)
         return self.rather(after, outcome, ends)
 
     def keep_search(self, state: Callable[[], tuple[Outcome, SearchState]]) -> None:
@@ -243,9 +244,9 @@ class Stages:
         if self.minimiser is None:  # the last ensemble that was run is the posterior
             return Ends(members, mode, descent.iterate.members, descent.iterate.central)
         if problem.discrepancy and descent.iterate.linear is not None:
-            members = marginal_members(space, descent.iterate.linear, mode, members, self.seed)
+            members = marginal_members(space, descent.iterate.linear, mode, members)
         if descent.iterate.linear is not None:
-            members = bounded_members(space, descent.iterate.linear, descent.weights.w, members, self.seed)
+            members = bounded_members(space, descent.iterate.linear, descent.weights.w, members)
         final = space.whole(np.vstack([members, mode]), self.grid)
         return Ends(members, mode, final[:-1], final[-1:])
 
@@ -293,8 +294,7 @@ class Stages:
             space.forward_runs = earlier.forward_runs
             return earlier.chain
 
-        look = self.tell
-        return refined(space, posterior, minima, self.seed, looking=looking, resume=resume, keep=keep, look=look)
+        return refined(space, posterior, minima, self.seed, looking=looking, resume=resume, keep=keep, look=self.tell)
 
     def keep(self, state: Callable[[], LoopState]) -> None:
         if self.keeper is not None:

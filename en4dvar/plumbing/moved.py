@@ -32,7 +32,16 @@ MOVED |= {f"en4dvar.{old}": f"en4dvar.{new}" for new, several in {
     "estimation.joint.members": "estimation.joint.challenge", "estimation.stages": "loop_state estimation.loop_state",
     "results.declared": "results.axes", "inputs.parts": "inputs.contents",
     "inputs.matfile": "inputs.variables", "inputs.asked": "inputs.opened",
-    "estimation.population.hierarchy": "estimation.population.effort",
+    "estimation.population.hierarchy": "estimation.population.effort estimation.population.hyper",
+    "estimation.population.own": "estimation.population.mixtures estimation.population.empirical",
+    "estimation.joint.descent": "estimation.joint.arrow estimation.joint.tangent",
+    "estimation.joint.agreement": "estimation.joint.doubts", "estimation.design.nested": "estimation.design.laws",
+    "estimation.design.planned": "estimation.design.laplace",
+    "estimation.design.evaluate": "estimation.design.needed estimation.design.readings",
+    "estimation.conclusions": "descent.variance", "descent.start": "descent.lengthen",
+    "descent.beyond_gaussian": "descent.bounded descent.marginal descent.noise_scale",
+    "descent.field_data": "descent.field_gain", "ensemble.linalg": "ensemble.near_prior",
+    "ensemble.members": "ensemble.readout", "ensemble.forecast": "ensemble.spread_rates",
 }.items() for old in several.split()}  # fmt: skip
 MOVED |= {"en4dvar.cycling": "en4dvar.series", "en4dvar.storage": "en4dvar.results"}
 MOVED |= {"en4dvar_agarose.summary": "en4dvar_agarose.tables", "en4dvar_agarose.evidence": "en4dvar_agarose.fits"}

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from en4dvar.estimation.design.evaluate import Evaluated
-from en4dvar.estimation.design.laws import Decision
+from en4dvar.estimation.design.nested import Decision
 from en4dvar.model.state import Array
 from en4dvar.plumbing.files import write_text
 from en4dvar.plumbing.tables import csv_text, table

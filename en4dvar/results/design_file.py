@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from en4dvar.estimation.design.evaluate import FAN, Evaluated
-from en4dvar.estimation.design.laws import Decision
+from en4dvar.estimation.design.nested import Decision
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.results.declared import text

@@ -11,14 +11,12 @@ centre and row i of the ensemble transform T.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Annotated, Any, ClassVar, Literal, Protocol, cast
 
 import numpy as np
 from annotated_types import Ge, Gt, Le
 
-from en4dvar.ensemble.linalg import Hessian, centre, min_norm_fit
-from en4dvar.ensemble.near_prior import NearPrior
+from en4dvar.ensemble.linalg import Hessian, NearPrior, centre, min_norm_fit
 from en4dvar.model.state import Array
 
 
@@ -45,25 +43,19 @@ class Weights:
     @classmethod
     def prior(cls, n_members: int) -> "Weights":
         """w = 0, T = I."""
-        identity = _identity(n_members)
+        identity = np.eye(n_members)
         return cls(np.zeros(n_members), identity, identity)
 
     @property
     def rows(self) -> Array:
         """(N, N): member i is x̄0 + X0ᵀ rows[i]."""
-        return np.asarray(self.w + dense(self.T))
+        return np.asarray(self.w + self.dense)
 
-
-def dense(transform: Any) -> Array:
-    """A transform as a matrix (N, N)."""
-    return np.asarray(transform if isinstance(transform, np.ndarray) else transform.dense)
-
-
-@lru_cache(maxsize=4)
-def _identity(n: int) -> Array:
-    identity = np.eye(n)
-    identity.flags.writeable = False
-    return identity
+    @property
+    def dense(self) -> Array:
+        """T as a matrix (N, N)."""
+        transform: Any = self.T
+        return np.asarray(transform if isinstance(transform, np.ndarray) else transform.dense)
 
 
 @dataclass(frozen=True)

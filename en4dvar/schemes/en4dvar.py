@@ -15,7 +15,7 @@ import numpy as np
 
 from en4dvar.ensemble.linalg import bundle_steps, min_norm_fit
 from en4dvar.model.state import Array
-from en4dvar.schemes.base import Minimiser, Runs, Weights, dense, regression
+from en4dvar.schemes.base import Minimiser, Runs, Weights, regression
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class En4DVar(Minimiser):
         """Of the bundle (r, r) in coordinates of the basis, as shares of ε prior standard deviations."""
         if not len(weights.T):
             return np.eye(basis.shape[1])
-        return bundle_steps(*np.linalg.eigh(basis.T @ dense(weights.T) @ basis), self.epsilon)
+        return bundle_steps(*np.linalg.eigh(basis.T @ weights.dense @ basis), self.epsilon)
 
     def _on_both_sides(self, weights: Weights, basis: Array) -> bool:
         return weights.wider > 1 and 2 * basis.shape[1] < len(basis)

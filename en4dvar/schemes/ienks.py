@@ -70,8 +70,8 @@ class IEnKS(Scheme):
 
     def members(self, weights: Weights, basis: Array | None = None) -> Array:
         """Rows (N, N) of 1wᵀ + T or 1wᵀ + εI."""
-        spread = weights.T if self.linearisation == "transform" else self.epsilon * np.eye(len(weights.w))
-        return np.asarray(weights.w + spread)
+        bundle = self.linearisation == "bundle"
+        return np.asarray(weights.w + self.epsilon * np.eye(len(weights.w))) if bundle else weights.rows
 
     def linearise(self, weights: Weights, runs: Runs) -> tuple[Array, Array]:
         """Mean prediction p̄ (K',) and anomalies per unit weight Y (N, K')."""

@@ -95,7 +95,7 @@ class BlockDescents:
         self.ensemble = ensemble
         self.near = [(block, taper) for block, taper in zip(localisation.blocks, localisation.taper, strict=True)
                      if (taper > 0).any()]  # fmt: skip
-        self.weights = [Weights.prior(len(ensemble)) for _ in self.near]
+        self.weights = [Weights.prior(len(ensemble))] * len(self.near)
 
     def members(self, rows: Callable[[Weights], Array]) -> Array:
         """Members (N, n): ``rows`` (N, N) of each block's weights, and what is in no block as it was."""

@@ -27,7 +27,7 @@ from en4dvar.model.forward import ForwardModel, Observable
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import TooFewMembersError
 from en4dvar.priors.prior import member_stream
-from en4dvar.schemes.base import Weights, dense
+from en4dvar.schemes.base import Weights
 from en4dvar.series.model_error import fresh_noise
 from en4dvar.series.moments import InnovationRecorder, Moments, MomentsRecorder, SequentialResult, SequentialState
 from en4dvar.series.moving import Flow, MembersLost
@@ -161,7 +161,7 @@ class _Run:
             turned = self.rotations.of_cycle(newest - 1, len(anomalies))
             anomalies = rotate(anomalies, turned)
         if self.settings.smoother is not None:
-            transform = dense(descent.weights.T)
+            transform = descent.weights.dense
             if self.rotations is not None:
                 transform = rotate(transform, turned)
             weights, analysis = descent.weights.w + transform, mean + anomalies

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from en4dvar.descent.loop import Objective
+from en4dvar.descent.loop import Descends, Objective
 from en4dvar.descent.step_control import Move
 from en4dvar.ensemble.linalg import centre
 from en4dvar.model.state import Array
@@ -18,14 +18,11 @@ Batch = Sequence[tuple[int, float]]  # index of each observation time in the win
 
 
 @dataclass
-class CycleDescent:
+class CycleDescent(Descends):
     """The descent of one cycle."""
 
     weights: Weights
     iteration: int = 0
-    step: Step | GaussNewtonStep | None = None
-    stop: str = ""
-    ended: bool = False
 
 
 @dataclass(frozen=True)
@@ -110,7 +107,6 @@ class CycleWindow(Objective[CycleDescent]):
 
     def move(self, going: Sequence[CycleDescent], moves: Sequence[Move | None]) -> None:
         (descent,), scheme = going, self.scheme
-        assert descent.step is not None
         if self.local is None:
             descent.weights = descent.step.weights
         else:  # the blocks' own steps from the same runs, of which the largest tells when a cycle ends

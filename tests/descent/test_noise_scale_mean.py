@@ -10,7 +10,7 @@ from scipy.integrate import quad
 from toys import Vectorised, make_problem, with_noise
 
 from en4dvar.data.noise import noise_of
-from en4dvar.descent.noise_scale import log_derivatives
+from en4dvar.descent.beyond_gaussian import log_derivatives
 from en4dvar.estimation.assimilate import assimilate, log_posterior
 from en4dvar.model.state import NOISE_SCALE
 from en4dvar.priors.prior import Prior, PriorTerm

@@ -9,7 +9,7 @@ import pytest
 from toys import Vectorised, make_observations
 
 from en4dvar.estimation.joint import estimate_jointly, sharing
-from en4dvar.estimation.joint.doubts import DIFFER, trends
+from en4dvar.estimation.joint.agreement import DIFFER, trends
 from en4dvar.plumbing.caution import codes
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem

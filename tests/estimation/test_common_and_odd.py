@@ -12,10 +12,16 @@ from toys import Vectorised, make_problem, with_discrepancy
 from en4dvar.data.noise import noise_of
 from en4dvar.estimation.population import Effort, HyperPrior
 from en4dvar.estimation.population.campaign import _empirical, population_of
-from en4dvar.estimation.population.empirical import empirical, median_of
 from en4dvar.estimation.population.hierarchy import Hierarchy, named
-from en4dvar.estimation.population.mixtures import Mixture
-from en4dvar.estimation.population.own import OwnDraws, OwnLikelihood, own_likelihoods, pooled_slopes
+from en4dvar.estimation.population.own import (
+    Mixture,
+    OwnDraws,
+    OwnLikelihood,
+    empirical,
+    median_of,
+    own_likelihoods,
+    pooled_slopes,
+)
 from en4dvar.model.forward import Failure
 from en4dvar.model.state import NOISE_SCALE, Parameter
 from en4dvar.plumbing.errors import ConfigError

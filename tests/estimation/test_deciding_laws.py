@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import multivariate_normal
 from toys import Vectorised, make_observations
 
-from en4dvar.estimation.design.laws import Decision, deciding
+from en4dvar.estimation.design.nested import Decision, deciding
 from en4dvar.estimation.design.planned import Planned
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.priors.prior import Prior, PriorTerm

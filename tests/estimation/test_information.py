@@ -12,9 +12,8 @@ from en4dvar.assembly.build import build
 from en4dvar.config import load_config
 from en4dvar.ensemble.forecast import Composite
 from en4dvar.estimation.design.evaluate import SampleSizes, evaluate
-from en4dvar.estimation.design.laplace import expected
 from en4dvar.estimation.design.nested import nested
-from en4dvar.estimation.design.planned import Planned
+from en4dvar.estimation.design.planned import Planned, expected
 from en4dvar.model.function_model import FunctionModel
 from en4dvar.model.state import Parameter
 from en4dvar.plumbing.errors import ConfigError, TooFewMembersError

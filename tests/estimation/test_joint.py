@@ -9,9 +9,8 @@ import pytest
 from toys import Decay, Fragile, Linear, Vectorised, Wave, make_observations
 
 from en4dvar.estimation.joint import estimate
-from en4dvar.estimation.joint.arrow import Arrow
+from en4dvar.estimation.joint.descent import Arrow, Experiment
 from en4dvar.estimation.joint.problem import JointProblem, Single, sharing
-from en4dvar.estimation.joint.tangent import Experiment
 from en4dvar.executor import SerialExecutor
 from en4dvar.model.forward import Trajectory
 from en4dvar.plumbing.errors import ConfigError

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from en4dvar.estimation.population.mixtures import Mixture, log_marginal
+from en4dvar.estimation.population.own import Mixture, log_marginal
 
 STD = 0.3
 RNG = np.random.default_rng(0)

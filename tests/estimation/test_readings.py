@@ -9,8 +9,8 @@ import pytest
 from toys import Vectorised, make_observations
 
 from en4dvar.data.noise import noise_of
+from en4dvar.estimation.design.evaluate import choose
 from en4dvar.estimation.design.planned import Planned
-from en4dvar.estimation.design.readings import choose
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem

@@ -1,4 +1,4 @@
-"""Every slow test is run within six days, every long one within twenty: each is of one of parts that are about alike."""
+"""Every slow test is run within six days, every long one within twenty: the parts are about alike."""
 
 import itertools
 

@@ -6,7 +6,7 @@ With prediction m, its rate ṁ, value error std, timing error τ and noise scal
     J_o = Σ_k β_k [ ρ(v_k) + ln(s_k/std_k) ],   ρ(v) = ½ v², or Huber's function.
 
 Where the path is known between the readings, ṁ is its standard deviation over the uncertain instant, divided by that
-of the instant (:mod:`en4dvar.ensemble.spread_rates`); of a straight path that is |ṁ|.
+of the instant (:mod:`en4dvar.ensemble.forecast`); of a straight path that is |ṁ|.
 
 Where τ ≠ 0 or σ is estimated the variance depends on the control vector. The score and the Fisher information of the
 errors are those of linear least squares in the augmented whitened arrays

@@ -13,7 +13,7 @@ from en4dvar.model.state import Array
 
 @dataclass(frozen=True)
 class ScaleSkewness:
-    """Expected third derivatives of J_o along ln σ relative to informations (:mod:`en4dvar.descent.noise_scale`).
+    """Expected third derivatives of J_o along ln σ relative to informations (:mod:`en4dvar.descent.beyond_gaussian`).
 
     ``of_predictions`` r_m and ``of_scale`` r_u; ``information`` of ln σ in one observation.
     """

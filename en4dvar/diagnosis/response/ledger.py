@@ -21,8 +21,7 @@ import numpy as np
 from en4dvar.data.noise import Linearisation
 from en4dvar.diagnosis.response.linear import LinearResponse
 from en4dvar.ensemble.forecast import of_framework
-from en4dvar.ensemble.members import EVERYONE, InitialStates, Reading
-from en4dvar.ensemble.readout import Readout, batched, operators_of
+from en4dvar.ensemble.members import EVERYONE, InitialStates, Reading, Readout, batched, operators_of
 from en4dvar.executor.base import without_warnings
 from en4dvar.model.forward import Failure, PathQuantity, Trajectory
 from en4dvar.model.state import READING_SCALE, TIME_SHIFT, Array
@@ -91,8 +90,7 @@ def ledger(problem: InverseProblem, response: LinearResponse, std: Array) -> Led
 def _ledger(problem: InverseProblem, response: LinearResponse, std: Array, names: tuple[str, ...]) -> Ledger | None:
     model, prior = problem.model, problem.prior
     physical = prior.to_physical(response.at)
-    reasons = [""]
-    alive, start = InitialStates(problem)(physical[None], reasons)
+    alive, start, _ = InitialStates(problem)(physical[None])
     shift = float(of_framework(problem, physical[None], TIME_SHIFT, 0.0)[0])
     scale = float(of_framework(problem, physical[None], READING_SCALE, 1.0)[0]) if problem.has_reading_scale else 1.0
     times = problem.observations.times + shift

@@ -9,6 +9,6 @@ information (Lindley 1956, Ann. Math. Stat. 27, 986)
 in nats. Three estimates of it, from cheap to exact:
 
     linear    ½ ln det of prior over posterior covariance of a, linearised at the prior mean (exact if F, H are linear)
-    laplace   the mean of the same, linearised at draws of the prior (:mod:`en4dvar.estimation.design.laplace`)
+    laplace   the mean of the same, linearised at draws of the prior (:mod:`en4dvar.estimation.design.planned`)
     nested    both densities by importance sampling with runs of their own (:mod:`en4dvar.estimation.design.nested`)
 """

@@ -1,27 +1,43 @@
-"""The worth of a design: expected information with its error, and what each parameter would be known to."""
+r"""The worth of a design: expected information with its error, and what each parameter would be known to; and what else
+must be known, and how well, for what is asked to become as well known as is wanted; and which readings to take.
+
+Scale, density and pressure cannot be told from what is asked by more readings. A measurement of parameter b alone makes
+its prior std f times as large: it adds (f⁻² − 1) w wᵀ / (w wᵀ) to the prior's precision in the coordinates u of
+:class:`Planned`, w the row of W of this parameter. The posterior of what is asked, by linearisation, then grows with f,
+also where priors are correlated, and the largest f that allows what is wanted is found by bisection.
+
+The most informative few of many candidate readings are found by adding one at a time and then exchanging. The expected
+information by linearisation grows by each reading's own rows of S alone, so that one set of runs at all candidates
+tells it for every choice. To add the best one at a time comes within 1 − 1/e of the best choice where the information
+is submodular (Krause & Guestrin 2005, UAI), as it is of independent readings about everything; exchanges then end in a
+choice that no single exchange improves.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Annotated, Literal
 
 import numpy as np
+import numpy.typing as npt
 from annotated_types import Ge
 
 from en4dvar.ensemble.forecast import plotting_times
-from en4dvar.estimation.design.laplace import expected, require_alive
-from en4dvar.estimation.design.laws import Decision, deciding
-from en4dvar.estimation.design.needed import in_units, needed
-from en4dvar.estimation.design.nested import nested
-from en4dvar.estimation.design.planned import Planned
-from en4dvar.estimation.design.readings import choose
+from en4dvar.estimation.design.nested import Decision, deciding, nested
+from en4dvar.estimation.design.planned import Planned, Tangents, expected, require_alive, shared_spread
 from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import ConfigError
 from en4dvar.priors.prior import own_seed
 from en4dvar.problem import InverseProblem
 
 Method = Literal["linear", "laplace", "nested"]
 FAN = (0.05, 0.25, 0.5, 0.75, 0.95)
+LEAST, MOST, HALVINGS = 1e-4, 1e3, 20  # factors: below it is exactly known, above it anything; to 2e-5
+SWEEPS = 10  # of exchanges of the readings that are chosen, at most
+WORTH = 1e-9  # nats: an exchange that gains less is none
+Indices = npt.NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -158,3 +174,139 @@ def evaluate(
             )
         )
     return tuple(designs)
+
+
+def in_units(planned: Planned, names: tuple[str, ...], ratio: Array, u: Array) -> tuple[Array, Array]:
+    """Standard deviations of parameters (a,), given relative to the prior's in transformed space at draws ``u``.
+
+    ``ratio`` (R, a). In their units, the mean over the draws (R, n), and relative to the value, the median; with the
+    slope of the parameter map at each draw.
+    """
+    prior, std, relative = planned.problem.prior, np.empty(len(names)), np.empty(len(names))
+    x, physical = planned.control(u), prior.to_physical(planned.control(u))
+    for a, name in enumerate(names):
+        j = prior.names.index(name)
+        slopes = np.array([prior.terms[j].slope(float(value)) for value in x[:, j]])
+        of_draws = ratio[:, a] * prior.std[j] * np.abs(slopes)
+        with np.errstate(divide="ignore"):
+            std[a], relative[a] = of_draws.mean(), np.median(of_draws / np.abs(physical[:, j]))
+    return std, relative
+
+
+def needed(
+    planned: Planned, tangents: Tangents, wanted: Mapping[str, tuple[float, bool]], alike: int, scale: Array
+) -> tuple[Array, Array]:
+    """Factors (W, B + 1) of the prior stds of the B others, one by one and (the last) all at once.
+
+    They are the largest that allow each of ``wanted``: name → standard deviation in its unit, or, where true, relative
+    to the value. 0: not even if it were known exactly; inf: whatever it is; of all others 1 where it is met as planned.
+    ``scale`` (2, a) is by how much an estimate that is not linear has found more than this one, in units and relative.
+    Also the prior stds (2, B) of the others, in their units and relative to their values.
+    """
+    _, sensitivities = tangents.whitened(planned)
+    information = np.einsum("rki,rkj->rij", sensitivities, sensitivities)
+    rows = planned.root[planned.order][planned.asked :]
+    directions, count = rows / np.linalg.norm(rows, axis=1, keepdims=True), len(rows)
+
+    def measured(some: Array, at: tuple[int, int], factor: float) -> float:
+        prior = np.eye(directions.shape[1]) + (factor**-2 - 1) * (directions.T * some) @ directions
+        ratio = shared_spread(planned, information, alike, prior)[1]
+        return float((np.stack(in_units(planned, planned.about, ratio, tangents.u)) * scale)[at])
+
+    largest = np.empty((len(wanted), count + 1))
+    for factors, (name, (most, relative)) in zip(largest, wanted.items(), strict=True):
+        at = int(relative), planned.about.index(name)
+        for b, some in enumerate(np.vstack([np.eye(count), np.ones(count)])):
+            factors[b] = _largest(partial(measured, some, at), most, MOST if b < count else 1.0)
+    others = in_units(planned, planned.names[planned.asked :], np.ones((len(tangents.u), count)), tangents.u)
+    return largest, np.stack(others)
+
+
+def _largest(measure: Callable[[float], float], wanted: float, most: float) -> float:
+    """The largest factor at which a measure that grows with it is at most what is ``wanted``."""
+    if measure(most) <= wanted:
+        return np.inf if most == MOST else most
+    if measure(LEAST) > wanted:
+        return 0.0
+    low, high = np.log(LEAST), np.log(most)
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if measure(float(np.exp(middle))) <= wanted else (low, middle)
+    return float(np.exp(low))
+
+
+def choose(planned: Planned, u: Array, count: int, apart: float = 0.0) -> Indices:
+    """The ``count`` readings that tell most, each ``apart`` from the others in time, from draws (R, n) of the prior.
+
+    Raises
+    ------
+    ConfigError: errors that are correlated; no such choice is possible. TooFewMembersError: the model mostly fails.
+    """
+    observations = planned.problem.observations
+    if not observations.noise.independent:
+        raise ConfigError("readings can be chosen where their errors are independent of each other")
+    tangents = planned.tangents(u)
+    require_alive(len(tangents.at), len(u))
+    _, rows = tangents.whitened(planned)
+    search = _Search(rows.reshape(len(rows), -1, len(observations), rows.shape[2]), planned.asked)
+    near = np.abs(np.subtract.outer(observations.times, observations.times)) < apart * (1 - 1e-9)
+    np.fill_diagonal(near, True)
+    chosen: list[int] = []
+    for _ in range(count):
+        order = np.argsort(-search.gains(), kind="stable").tolist()
+        possible = (k for k in order if not near[chosen, k].any() and _room(near, [*chosen, k]) >= count)
+        best = next(possible, None)
+        if best is None:
+            raise ConfigError(f"no {count} of {len(observations)} readings lie so far apart from each other")
+        chosen.append(best)
+        search.add(best, 1)
+    for _ in range(SWEEPS):
+        moved = False
+        for place, reading in enumerate(chosen):
+            search.add(reading, -1)
+            others = [k for k in chosen if k != reading]
+            gains = np.where(near[others].any(axis=0), -np.inf, search.gains())
+            better = int(np.argmax(gains))
+            if gains[better] > gains[reading] + WORTH:
+                chosen[place], moved = better, True
+            search.add(chosen[place], 1)
+        if not moved:
+            break
+    return np.sort(np.array(chosen, dtype=np.intp))
+
+
+class _Search:
+    """Information of a growing set of readings, from their rows (R, B, K, n): B of each reading, of R draws."""
+
+    def __init__(self, rows: Array, asked: int):
+        self.rows, self.others = rows.transpose(0, 2, 1, 3), rows.transpose(0, 2, 1, 3)[..., asked:]
+        self.precision = np.tile(np.eye(rows.shape[-1]), (len(rows), 1, 1))
+        self.asked = asked
+
+    def add(self, k: int, sign: int) -> None:
+        """Reading k, or take it away."""
+        own = self.rows[:, k]
+        self.precision = self.precision + sign * np.einsum("rbi,rbj->rij", own, own)
+
+    def gains(self) -> Array:
+        """(K,) mean information, nats, that each reading would add."""
+        a = self.asked
+        return _added(self.rows, self.precision) - _added(self.others, self.precision[:, a:, a:])
+
+
+def _room(near: npt.NDArray[np.bool_], chosen: list[int]) -> int:
+    """How many readings can be chosen in all beside these, the earliest that is free each time."""
+    blocked, count = np.asarray(near[chosen].any(axis=0)), len(chosen)
+    for k in range(len(blocked)):
+        if not blocked[k]:
+            blocked, count = blocked | near[k], count + 1
+    return count
+
+
+def _added(rows: Array, precision: Array) -> Array:
+    """(K,) mean ½ ln det(I + s M⁻¹ sᵀ) of rows s (R, K, B, n)."""
+    if not rows.shape[-1]:
+        return np.zeros(rows.shape[1])
+    half = np.einsum("rkbi,rij->rkbj", rows, np.linalg.inv(precision))
+    inner = np.eye(rows.shape[2]) + np.einsum("rkbj,rkcj->rkbc", half, rows)
+    return np.asarray(0.5 * np.linalg.slogdet(inner)[1].mean(axis=0))

@@ -2,8 +2,8 @@ r"""Problems of several experiments: quantities that experiments share, and quan
 
     J(s, v_1 … v_E) = ½ ‖s‖² + Σ_e [ ½ ‖v_e‖² + J_o,e(s, v_e) ]
 
-in units of the prior, which enters once for what is shared. From the bottom up: ``arrow`` (the linear algebra),
-``problem`` (who shares what), ``tangent`` (an experiment's runs), ``descent``, ``members`` (the posterior ensemble),
+in units of the prior, which enters once for what is shared. From the bottom up: ``problem`` (who
+shares what), ``descent`` (the linear algebra, an experiment's runs, and J), ``members`` (the posterior ensemble),
 ``agreement`` (is one odd?), ``estimate``.
 """
 

@@ -1,21 +1,189 @@
-"""J of several data sets: each experiment is linearised in its own few directions, what is shared is solved once."""
+"""J of several data sets: each experiment is linearised in its own few directions, by runs close to a place; what is
+shared is solved once.
+"""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
-from en4dvar.descent.loop import Objective
+from en4dvar.data.noise import Linearisation
+from en4dvar.descent.loop import Descends, Objective
 from en4dvar.descent.step_control import SUFFICIENT, Move, Search
 from en4dvar.descent.window import FAKED, WIDER, WIDEST
-from en4dvar.estimation.joint.arrow import Arrow
+from en4dvar.ensemble.forecast import NO_TIMES, Composite, Forecast
+from en4dvar.ensemble.linalg import bundle_steps
+from en4dvar.ensemble.missing import Beside
 from en4dvar.estimation.joint.problem import JointProblem
-from en4dvar.estimation.joint.tangent import Experiment, Linearised
+from en4dvar.executor import Executor
 from en4dvar.model.state import Array
+from en4dvar.priors.prior import whiten_sample
 from en4dvar.schemes.base import Minimiser
 
 LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.03, 0.01)  # of a step, tried in turn until J falls
+
+
+@dataclass(frozen=True)
+class Arrow:
+    r"""A symmetric positive definite matrix of arrow form: a border that all blocks share, and blocks of their own.
+
+        [ A    B_1 … B_E ]        S  = A − Σ_e B_e C_e⁻¹ B_eᵀ
+        [ B_1ᵀ C_1       ]        x  = S⁻¹ (a − Σ_e B_e C_e⁻¹ b_e)
+        [ …          C_E ]        y_e = C_e⁻¹ (b_e − B_eᵀ x)
+
+    ``border`` A (c, c); for each of E experiments ``edges`` B_e (c, n_e) and ``blocks`` C_e (n_e, n_e). c and any n_e
+    may be 0. The cost grows with the number of blocks, not with its square.
+    """
+
+    border: Array
+    edges: Sequence[Array]
+    blocks: Sequence[Array]
+
+    @cached_property
+    def schur(self) -> Array:
+        """S (c, c): the precision of the border with all blocks eliminated."""
+        passed = (edge @ self._solve(e, edge.T) for e, edge in enumerate(self.edges))
+        return np.asarray(self.border - sum(passed, start=np.zeros_like(self.border)))
+
+    @property
+    def log_determinant(self) -> float:
+        """ln det of the whole matrix."""
+        own = sum(2 * float(np.log(np.diag(factor[0])).sum()) for factor in self._factors)
+        return own + float(np.linalg.slogdet(self.schur)[1] if len(self.border) else 0.0)
+
+    def solve(self, a: Array, b: Sequence[Array]) -> tuple[Array, list[Array]]:
+        """x (c,) and y_e (n_e,) for the right-hand side a (c,), b_e (n_e,)."""
+        passed = (edge @ self._solve(e, b[e]) for e, edge in enumerate(self.edges))
+        a = a - sum(passed, start=np.zeros_like(a))
+        x = np.asarray(np.linalg.solve(self.schur, a)) if len(a) else a
+        return x, [self._solve(e, b[e] - edge.T @ x) for e, edge in enumerate(self.edges)]
+
+    def sample(self, border: Array, own: Callable[[int], Array]) -> tuple[Array, list[Array]]:
+        """N draws of the Gaussian of mean zero with this precision: border (N, c), and (N, n_e) of each experiment.
+
+        Parameters
+        ----------
+        border: (N, c) standard normal numbers; own: gives those (N, n_e) of an experiment by its number.
+
+        Mean and covariance of the N draws of every pair (border, experiment) are exact. Those of different experiments
+        are independent given the border, up to what N draws correlate by chance.
+
+        Raises
+        ------
+        ValueError: N is not larger than c + n_e.
+        """
+        x = whiten_sample(border)
+        if x.shape[1]:
+            x = solve_triangular(np.linalg.cholesky(self.schur).T, x.T).T
+        return x, [self._own(e, edge, x, border, own(e)) for e, edge in enumerate(self.edges)]
+
+    def _own(self, e: int, edge: Array, x: Array, border: Array, numbers: Array) -> Array:
+        """Draws of an experiment's own quantities given those of the border."""
+        count, size = len(x), edge.shape[0] + edge.shape[1]
+        if count <= size:
+            raise ValueError(f"{count} draws are too few for {size} quantities; at least {size + 1}")
+        standard = whiten_sample(np.hstack([border, numbers]))[:, edge.shape[0] :]  # orthogonal to the border's
+        factor = self._factors[e][0]
+        return np.asarray(solve_triangular(factor, standard.T).T - self._solve(e, edge.T @ x.T).T)
+
+    def _solve(self, e: int, right: Array) -> Array:
+        return np.asarray(cho_solve(self._factors[e], right)) if len(right) else right
+
+    @cached_property
+    def _factors(self) -> list[tuple[Array, bool]]:
+        """Upper Cholesky factors of the blocks."""
+        return [cho_factor(block) if len(block) else (block, False) for block in self.blocks]
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """J_o at a point, its gradient (n,) and Gauss–Newton Hessian (n, n) in units of the prior, and the central run."""
+
+    cost: float
+    gradient: Array
+    hessian: Array
+    central: Forecast
+
+
+class Experiment:
+    """The runs of experiment ``e``: J_o of control vectors, and its linearisation."""
+
+    def __init__(self, joint: JointProblem, e: int, epsilon: float, executor: Executor):
+        self.joint, self.e, self.epsilon = joint, e, epsilon
+        self.problem = joint.experiments[e]
+        self.composite = Beside(Composite(self.problem, executor), self.problem.prior, epsilon)
+
+    def run(self, z: Array, grid: Array = NO_TIMES) -> Forecast:
+        """Control vectors (B, n) in units of the prior."""
+        return self.composite(self.problem.prior.from_white(z), grid)
+
+    def costs(self, z: Array) -> Array:
+        """J_o (B,) of control vectors (B, n) in units of the prior; +inf where the model fails."""
+        return self.problem.observations.cost(self.run(z).predicted)
+
+    def linearise(self, z: Array, wider: float = 1.0, hessian: Array | None = None) -> Linearised | None:
+        """At z (n,), by n runs beside it; None where it or too many of them fail.
+
+        A run that fails is replaced by the one on the other side. A bundle that is ``wider`` has runs on both sides.
+        The ``hessian`` (n, n) of J_o at the place before tells its steps (:func:`bundle_steps`).
+        """
+        size, steps = self.epsilon * wider, np.eye(len(z))
+        if hessian is not None:
+            precision, axes = np.linalg.eigh(steps + hessian)
+            steps = bundle_steps(1 / np.sqrt(precision), axes, self.epsilon)
+        observations, step = self.problem.observations, size * steps
+        run = self.run(np.vstack([z, z + step]))
+        stacked = run.predicted.stacked
+        change = (stacked[1:] - stacked[0]) / size
+        again = ~np.isfinite(change).all(axis=1) | (wider > 1)
+        if again.any():
+            behind = (stacked[0] - self.run(z - step[again]).predicted.stacked) / size
+            ahead = change[again]
+            both = 0.5 * (ahead + behind)
+            change[again] = np.where(np.isfinite(both), both, np.where(np.isfinite(ahead), ahead, behind))
+        cost = float(observations.cost(run.predicted)[0])
+        if not (np.isfinite(cost) and np.isfinite(change).all()):
+            return None
+        tangent = np.linalg.solve(steps, change)
+        d, S = observations.whiten(Linearisation.of_stacked(run.predicted[0], stacked[0], tangent))
+        return Linearised(cost, -S.T @ d, S.T @ S, run[:1])
+
+    def linearise_own(self, z: Array, columns: list[int]) -> tuple[Array, Array, Array]:
+        """J_o (M,), its gradient (M, k) and Gauss–Newton Hessian (M, k, k) in k ``columns`` alone, at places (M, n).
+
+        They are NaN where a run fails.
+        """
+        size, k, observations = self.epsilon, len(columns), self.problem.observations
+        beside = z[:, None] + size * np.vstack([np.zeros(z.shape[1]), np.eye(z.shape[1])[columns]])
+        run = self.run(beside.reshape(-1, z.shape[1]))
+        stacked = run.predicted.stacked.reshape(len(z), k + 1, -1)
+        gradient, hessian = np.full((len(z), k), np.nan), np.full((len(z), k, k), np.nan)
+        for i in np.flatnonzero(np.isfinite(stacked).all(axis=(1, 2))).tolist():
+            change = (stacked[i, 1:] - stacked[i, 0]) / size
+            d, S = observations.whiten(Linearisation.of_stacked(run.predicted[i * (k + 1)], stacked[i, 0], change))
+            gradient[i], hessian[i] = -S.T @ d, S.T @ S
+        return observations.cost(run.predicted)[:: k + 1], gradient, hessian
+
+    def settled(self, border: Array, start: Array, precision: Array, steps: int) -> tuple[Array, Array, Array]:
+        """The own quantities that J is low at, given what is shared (M, c): Gauss–Newton from ``start`` (M, n_e).
+
+        Where J has not fallen the step is halved. Returns the lowest places (M, n_e), their precision (M, n_e, n_e), or
+        the one given where no run lives, and J_o + J_b of the own quantities (M,) there, +inf where no run lives.
+        """
+        columns = self.joint.columns(self.e)[1]
+        lowest, mean, there, step = np.full(len(start), np.inf), start, start, np.zeros_like(start)
+        for _ in range(steps):
+            cost, gradient, hessian = self.linearise_own(self.joint.standard(self.e, border, there), columns)
+            cost = cost + 0.5 * np.sum(there**2, axis=1)
+            lower = (cost < lowest) & np.isfinite(gradient).all(axis=1)
+            lowest, mean = np.where(lower, cost, lowest), np.where(lower[:, None], there, mean)
+            precision = np.where(lower[:, None, None], np.eye(len(columns)) + hessian, precision)
+            newton = np.linalg.solve(precision, (mean + gradient)[..., None])[..., 0]
+            step = np.where(lower[:, None], newton, 0.5 * step)
+            there = mean - step
+        return mean, precision, lowest
 
 
 @dataclass(frozen=True)
@@ -71,20 +239,16 @@ class ArrowSystem:
 
 
 @dataclass
-class JointDescent:
+class JointDescent(Descends):
     """A descent: the ``place`` where it goes on, the ``system`` where it was linearised last, by a bundle that is
-    ``wider``, and the length of the step from there, J of its iterates, and why it ended. ``step``: the system of the
-    iteration under way, None where there is none."""
+    ``wider``, and the length of the step from there, and J of its iterates. ``step``: the system of the iteration under
+    way, None where there is none."""
 
     place: Place
     system: ArrowSystem | None = None
     wider: float = 1.0
     norm: float = np.inf
     costs: list[float] = field(default_factory=list)
-    step: ArrowSystem | None = None
-    stop: str = ""
-    converged: bool = False
-    ended: bool = False
 
     @property
     def at(self) -> ArrowSystem:
@@ -170,7 +334,12 @@ class JointObjective(Objective[JointDescent]):
     def try_out(self, candidates: Sequence[Place]) -> float:
         """J at the one candidate there is."""
         (place,) = candidates
-        return cost(self.joint, self.experiments, place)
+        total = place.background
+        for e, experiment in enumerate(self.experiments):
+            total += float(experiment.costs(self.joint.standard(e, place.border, place.own[e])[None])[0])
+            if not np.isfinite(total):
+                break
+        return total
 
     def move(self, going: Sequence[JointDescent], moves: Sequence[Move | None]) -> None:
         for descent, move in zip(going, moves, strict=True):
@@ -184,13 +353,3 @@ class JointObjective(Objective[JointDescent]):
     def _no_decrease(self, descent: JointDescent) -> None:
         descent.ended, descent.converged = True, descent.norm < FAKED
         descent.stop = f"J does not fall along the step, of {descent.norm:.1g} posterior standard deviations"
-
-
-def cost(joint: JointProblem, experiments: Sequence[Experiment], place: Place) -> float:
-    """J at a place."""
-    total = place.background
-    for e, experiment in enumerate(experiments):
-        total += float(experiment.costs(joint.standard(e, place.border, place.own[e])[None])[0])
-        if not np.isfinite(total):
-            break
-    return total

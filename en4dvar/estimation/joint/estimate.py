@@ -11,12 +11,10 @@ from en4dvar.descent.weight_space import require_members
 from en4dvar.ensemble.forecast import Forecast, plotting_times
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.estimation.conclusions import missing_readings
-from en4dvar.estimation.joint.agreement import AT_MOST, Agreement, agreement, is_odd, oddest
-from en4dvar.estimation.joint.descent import JointDescent, JointObjective, Place, assembled, cost
-from en4dvar.estimation.joint.doubts import doubts
+from en4dvar.estimation.joint.agreement import AT_MOST, Agreement, Statement, agreement, doubts, is_odd, oddest
+from en4dvar.estimation.joint.descent import Experiment, JointDescent, JointObjective, Place, assembled
 from en4dvar.estimation.joint.members import JointMembers, challenger, gaussian, sampled
 from en4dvar.estimation.joint.problem import JointProblem, Single
-from en4dvar.estimation.joint.tangent import Experiment
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, caution
@@ -116,8 +114,9 @@ class _Estimate:
         if settings.own.minimiser is None:
             others = " or ".join(MINIMISERS)
             raise ConfigError(f"{settings.scheme} does not minimise J, as a joint estimate must; use {others}")
-        self.minimiser = scheme = settings.own.minimiser
+        scheme = settings.own.minimiser
         self.experiments = [Experiment(joint, e, scheme.epsilon, executor) for e in range(len(joint.experiments))]
+        self.objective = JointObjective(joint, self.experiments, scheme)
         self.other_runs = 0
 
     def result(self, singles: Sequence[Single], most: int | None = None) -> JointEstimate:
@@ -143,10 +142,11 @@ class _Estimate:
             cautions.append(caution("starts-disagree", words))
         most = int(AT_MOST * len(experiments)) if most is None else most
         alone = np.array([self._alone(e, single) for e, single in enumerate(singles)])
-        without = self._without(lowest.at.cost, singles, alone, most) if most else None
+        said = [Statement.of(joint, e, single) for e, single in enumerate(singles)]
+        without = self._without(lowest.at.cost, singles, said, alone, most) if most else None
         names = without.rest.joint.names if without else joint.names
         kept = [e for e, name in enumerate(joint.names) if name in names]
-        agreed = agreement(joint, singles, kept, 2 * np.maximum(lowest.at.own_costs - alone, 0))
+        agreed = agreement(joint, said, kept, 2 * np.maximum(lowest.at.own_costs - alone, 0))
         cautions += doubts(joint, lowest.at.place.border, lowest.at.chi2(joint), agreed, kept, singles)
         normalisation = sum(problem.observations.log_normalisation() for problem in joint.experiments)
         return JointEstimate(
@@ -171,9 +171,11 @@ class _Estimate:
         own = single.mode[self.joint.columns(e)[1]]
         return float(self.experiments[e].costs(single.mode[None])[0] + 0.5 * own @ own)
 
-    def _without(self, cost: float, singles: Sequence[Single], alone: Array, most: int) -> JointEstimate | None:
+    def _without(
+        self, cost: float, singles: Sequence[Single], said: Sequence[Statement], alone: Array, most: int
+    ) -> JointEstimate | None:
         """The estimate without the oddest experiment, if J is then lower by more than chance explains."""
-        e = oddest(self.joint, singles)
+        e = oddest(said)
         if e is None:
             return None
         kept = [i for i in range(len(singles)) if i != e]
@@ -181,7 +183,7 @@ class _Estimate:
         estimate = _Estimate(self.joint.of(kept), self.settings, self.seed, self.executor, self.tell)
         rest = estimate.result([singles[i] for i in kept], most - 1)
         self.other_runs += rest.forward_runs
-        return rest if is_odd(self.joint, singles, e, 2 * (cost - rest.costs[-1] - alone[e])) else None
+        return rest if is_odd(said, e, 2 * (cost - rest.costs[-1] - alone[e])) else None
 
     def _singles(self) -> list[Single]:
         """Each experiment by itself."""
@@ -212,7 +214,7 @@ class _Estimate:
 
     def _descents(self, starts: Sequence[Place]) -> list[JointDescent]:
         """From one start after the other, that of lowest J first, until two have ended in the lowest minimum."""
-        costs = np.array([cost(self.joint, self.experiments, start) for start in starts])
+        costs = np.array([self.objective.try_out([start]) for start in starts])
         descents = list[JointDescent]()
         for i in np.argsort(costs, kind="stable"):
             if np.isfinite(costs[i]):
@@ -226,7 +228,7 @@ class _Estimate:
     def _descended(self, start: Place) -> list[JointDescent]:
         """One descent; none where the start cannot be run."""
         descent = JointDescent(start)
-        minimise(JointObjective(self.joint, self.experiments, self.minimiser), [descent])
+        minimise(self.objective, [descent])
         return [descent] if descent.system else []
 
     def _challenged(self, lowest: JointDescent) -> JointDescent:
@@ -243,7 +245,7 @@ class _Estimate:
         laplace = gaussian(lowest.at, self.seed, self.settings.members)
         if self.settings.refine == "none" or not all(problem.model.cheap for problem in self.joint.experiments):
             return laplace, []
-        members = sampled(self.joint, self.experiments, lowest.at, self.seed, self.settings.members)
+        members = sampled(self.experiments, lowest.at, self.seed, self.settings.members)
         if members is not None:
             return members, []
         words = "the joint posterior is far from Gaussian, and importance sampling did not reach it"

@@ -19,9 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import gammaln, logsumexp
 
-from en4dvar.estimation.joint.descent import ArrowSystem, Place
-from en4dvar.estimation.joint.problem import JointProblem
-from en4dvar.estimation.joint.tangent import Experiment
+from en4dvar.estimation.joint.descent import ArrowSystem, Experiment, Place
 from en4dvar.model.state import Array
 from en4dvar.priors.prior import member_stream
 from en4dvar.sampling.mixture import resampled
@@ -62,16 +60,14 @@ def gaussian(at: ArrowSystem, seed: int, count: int) -> JointMembers:
     return JointMembers(at.place.border + x, own_members, np.nan, evidence)
 
 
-def sampled(
-    joint: JointProblem, experiments: Sequence[Experiment], at: ArrowSystem, seed: int, count: int
-) -> JointMembers | None:
+def sampled(experiments: Sequence[Experiment], at: ArrowSystem, seed: int, count: int) -> JointMembers | None:
     """By importance; None where the proposal does not reach the posterior."""
     stream = member_stream(seed, "joint importance")
     border, log_weights = _proposed(at, stream)
     chosen_own: list[Array] = []
     logs: list[Array] = []
     for experiment in experiments:
-        own, log_ratio = _own(joint, experiment, at, border, stream)
+        own, log_ratio = _own(experiment, at, border, stream)
         log_weights = log_weights + logsumexp(log_ratio, axis=1) - np.log(INNER)
         chosen_own.append(own)
         logs.append(log_ratio)
@@ -108,23 +104,21 @@ def _proposed(at: ArrowSystem, stream: np.random.Generator) -> tuple[Array, Arra
     return border, log_p - log_q
 
 
-def _own(
-    joint: JointProblem, experiment: Experiment, at: ArrowSystem, border: Array, stream: np.random.Generator
-) -> tuple[Array, Array]:
+def _own(experiment: Experiment, at: ArrowSystem, border: Array, stream: np.random.Generator) -> tuple[Array, Array]:
     """Own quantities (M, INNER, n_e) of an experiment given border (M, c), and ln p(y, v)/q(v) (M, INNER)."""
     e, n = experiment.e, len(at.place.own[experiment.e])
-    means, precisions = _given(joint, experiment, at, border)
+    means, precisions = _given(experiment, at, border)
     roots = np.linalg.cholesky(precisions)
     z = stream.standard_normal((len(border), INNER, n))
     own = means[:, None] + WIDER * np.linalg.solve(np.swapaxes(roots, 1, 2)[:, None], z[..., None])[..., 0]
     logs = np.log(np.diagonal(roots, axis1=1, axis2=2)).sum(axis=1)[:, None]
     log_q = logs - 0.5 * np.sum(z**2, axis=2) - n * np.log(WIDER)
-    points = joint.standard(e, np.repeat(border, INNER, axis=0), own.reshape(-1, n))
+    points = experiment.joint.standard(e, np.repeat(border, INNER, axis=0), own.reshape(-1, n))
     costs = experiment.costs(points).reshape(len(border), INNER)
     return own, -costs - 0.5 * np.sum(own**2, axis=2) - log_q
 
 
-def _given(joint: JointProblem, experiment: Experiment, at: ArrowSystem, border: Array) -> tuple[Array, Array]:
+def _given(experiment: Experiment, at: ArrowSystem, border: Array) -> tuple[Array, Array]:
     """The Gaussian of an experiment's own quantities given border (M, c): mean (M, n_e), precision (M, n_e, n_e).
 
     That of the arrow, moved by a step of Gauss and Newton where J is lower there: what one experiment knows much better
@@ -133,7 +127,7 @@ def _given(joint: JointProblem, experiment: Experiment, at: ArrowSystem, border:
     e, arrow = experiment.e, at.arrow
     block = arrow.blocks[e]
     precision = np.broadcast_to(block, (len(border), *block.shape))
-    if not joint.columns(e)[1]:
+    if not experiment.joint.columns(e)[1]:
         return np.zeros((len(border), 0)), precision
     mean = at.place.own[e] - np.linalg.solve(block, arrow.edges[e].T @ (border - at.place.border).T).T
     mean, precision, _ = experiment.settled(border, mean, precision, STEPS)

@@ -6,7 +6,6 @@ Parameters with one value in all sets are for :mod:`en4dvar.estimation.joint`.
 """
 
 from en4dvar.estimation.population.campaign import Population, population_of
-from en4dvar.estimation.population.hierarchy import Effort
-from en4dvar.estimation.population.hyper import HyperPrior
+from en4dvar.estimation.population.hierarchy import Effort, HyperPrior
 
 __all__ = ["Effort", "HyperPrior", "Population", "population_of"]

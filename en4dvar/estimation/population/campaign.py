@@ -17,10 +17,8 @@ import numpy as np
 import scipy  # its trees where they are used: a twentieth of what every command imports
 
 from en4dvar.ensemble.forecast import check_problem
-from en4dvar.estimation.population.empirical import Empirical, empirical
-from en4dvar.estimation.population.hierarchy import Effort, Hierarchy, HierarchyDraws, named
-from en4dvar.estimation.population.hyper import HyperPrior
-from en4dvar.estimation.population.own import OwnDraws, OwnLikelihood, own_draws, own_likelihoods
+from en4dvar.estimation.population.hierarchy import Effort, Hierarchy, HierarchyDraws, HyperPrior, named
+from en4dvar.estimation.population.own import Empirical, OwnDraws, OwnLikelihood, empirical, own_draws, own_likelihoods
 from en4dvar.executor import Executor, one_blas_thread
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError

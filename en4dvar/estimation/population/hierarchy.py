@@ -26,20 +26,53 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Ge, Gt, Lt
 
-from en4dvar.estimation.population.hyper import HyperPrior
-from en4dvar.estimation.population.mixtures import Mixture, condition, draw_conditioned, log_marginal
-from en4dvar.estimation.population.own import OwnLikelihood
+from en4dvar.estimation.population.own import Mixture, OwnLikelihood, condition, draw_conditioned, log_marginal
 from en4dvar.model.state import Array
 from en4dvar.plumbing.compiled import kernel
 from en4dvar.priors.prior import member_stream
 from en4dvar.sampling.mixture import StudentMixture, effective_number, resampled
 from en4dvar.sampling.walkers import walked
 
+SPREADS = (1e-3, 10.0)  # of τ; smaller ones are indistinguishable, and lost to rounding in the marginals
 FIT = 3000  # positions that the proposal is fitted to
 RAISED, A_SET = 5.0, 0.25  # times more probably odd by its data, and times the number of sets: named
+
+
+@dataclass(frozen=True)
+class HyperPrior:
+    """What is known beforehand of the mean ν and the spread τ of a population, h = (ν, ln τ): the standard deviation of
+    ν about the prior mean and the scale of τ, in transformed coordinates; and of odd sets, their share.
+    """
+
+    mean_std: Annotated[
+        float, Gt(0), "Hyperprior of the mean: normal about the prior's, with so many of its standard deviations."
+    ] = 1.0
+    spread: Annotated[
+        float, Gt(0), "Hyperprior of the spread: half-normal, with so many of the prior's standard deviations."
+    ] = 0.5
+    odd: Annotated[
+        float, Ge(0), Lt(1), "Probability that a data set is odd: of another population, in all parameters or in one."
+    ] = 0.05
+
+    def log_density(self, nu: Array, log_tau: Array) -> Array:
+        """(B,) of ν and ln τ (B, p), normalised; −inf where a spread is out of bounds."""
+        p = nu.shape[1]
+        constant = -p * (0.5 * math.log(2 * math.pi) + math.log(self.mean_std))
+        constant += p * (0.5 * math.log(2 / math.pi) - math.log(self.spread))
+        logs = -0.5 * np.sum((nu / self.mean_std) ** 2, axis=1)
+        logs += np.sum(log_tau - 0.5 * np.exp(2 * log_tau) / self.spread**2, axis=1)
+        inside = np.all((log_tau > math.log(SPREADS[0])) & (log_tau < math.log(SPREADS[1])), axis=1)
+        return np.where(inside, logs + constant, -np.inf)
+
+    def scattered(self, count: int, p: int, stream: np.random.Generator) -> Array:
+        """(count, 2p) of ν and ln τ somewhere in the bulk of the hyperprior."""
+        nu = 0.5 * self.mean_std * stream.standard_normal((count, p))
+        return np.hstack([nu, math.log(0.6 * self.spread) + 0.5 * stream.standard_normal((count, p))])
 
 
 @dataclass(frozen=True)

@@ -21,16 +21,18 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
+from scipy.special import ndtri, stdtrit
 
 from en4dvar.descent.minima import Minimum
 from en4dvar.ensemble.forecast import Composite, costs
 from en4dvar.ensemble.missing import Beside
-from en4dvar.estimation.population.mixtures import Mixture
 from en4dvar.executor import Executor
 from en4dvar.model.state import Array
-from en4dvar.priors.prior import member_stream, own_seed
+from en4dvar.plumbing.compiled import kernel
+from en4dvar.priors.prior import PriorTerm, member_stream, own_seed
 from en4dvar.problem import InverseProblem
 from en4dvar.sampling.emulated_draws import RecordedRuns
 from en4dvar.sampling.mixture import fit_gaussians, resampled
@@ -41,8 +43,104 @@ NARROWEST = 0.03  # standard deviation of the first draws about members, in unit
 KEPT = 2000  # equally likely draws of each data set
 MOST_PARTS, ROUNDS = 4, 60  # components of a mixture; rounds of expectation maximisation
 BESIDE = 1e-3  # prior standard deviations that runs for readings that one lacks are apart
-SMALLEST = 1e-12  # variance that every slope is taken to have
+SMALLEST = 1e-12  # variance that every slope is taken to have, and every data set
 INFORMED = 0.1  # least share of the prior's variance that the data take away, for a slope to be read from draws
+RESAMPLED = 2000  # campaigns behind the interval of the median of data sets one by one
+TAIL = 0.05  # beyond each end of that interval
+
+
+class Mixture(NamedTuple):
+    r"""L of one set as a mixture of Gaussians, and what it says about a population: ``precision`` Λ (M, n, n),
+    ``linear`` η (M, n), ``constant`` k (M,). Kernels can read it.
+
+    The draws of a posterior L_i(x) N(x; 0, C_0) are described by a mixture Σ_m a_m N(c_m, Σ_m); the prior is divided
+    out of every component, so that
+
+        L_i(x) ∝ Σ_m exp(k_m + η_mᵀx − ½ xᵀΛ_m x),     Λ_m = Σ_m⁻¹ − C_0⁻¹,   η_m = Σ_m⁻¹ c_m,
+        ∫ L_i(x) N(x; ν, D) dx = Σ_m exp(k_m + ½ bᵀA⁻¹b − ½ νᵀD⁻¹ν) |I + DΛ_m|^{-1/2},  A = Λ_m + D⁻¹, b = η_m + D⁻¹ν,
+
+    and x given ν, D is drawn exactly: a component, then N(A⁻¹b, A⁻¹). A direction the data say nothing about has Λ = 0;
+    rounding below zero is cut off.
+    """
+
+    precision: Array
+    linear: Array
+    constant: Array
+
+    @classmethod
+    def divided(cls, mean: Array, covariance: Array, log_share: Array, prior_std: Array) -> Mixture:
+        """Components of the posterior, means (M, n) and covariances (M, n, n), with the prior N(0, diag prior_std²)
+        divided out. ``log_share`` (M,): ln of the components' shares.
+        """
+        # in units of the prior's standard deviation, so that cutting off means the same in every direction
+        z = mean / prior_std
+        values, vectors = np.linalg.eigh(covariance / np.outer(prior_std, prior_std))
+        gain = np.maximum(1 / values - 1, 0.0)
+        precision = np.einsum("sij,sj,skj->sik", vectors, gain, vectors)
+        inverse = precision + np.eye(len(prior_std))
+        linear = np.einsum("sij,sj->si", inverse, z)  # η = C⁻¹ z, with the same directions cut off
+        log_det = -np.linalg.slogdet(inverse)[1]
+        constant = log_share - 0.5 * log_det - 0.5 * np.einsum("si,si->s", linear, z)
+        return cls(precision / np.outer(prior_std, prior_std), linear / prior_std, constant)
+
+
+@kernel
+def condition(precision: Array, linear: Array, mean: Array, variance: Array, middle: Array, root: Array) -> float:
+    """A⁻¹b and the lower root of A; returns ½ bᵀA⁻¹b − ½ ln|DA| − ½ νᵀD⁻¹ν."""
+    n = mean.size
+    value = 0.0
+    for i in range(n):
+        for j in range(i + 1):
+            total = precision[i, j]
+            if i == j:
+                total += 1.0 / variance[i]
+            for k in range(j):
+                total -= root[i, k] * root[j, k]
+            if i == j:
+                root[i, i] = np.sqrt(total)
+                value -= np.log(root[i, i]) + 0.5 * np.log(variance[i])
+            else:
+                root[i, j] = total / root[j, j]
+        total = linear[i] + mean[i] / variance[i]
+        for k in range(i):
+            total -= root[i, k] * middle[k]
+        middle[i] = total / root[i, i]
+        value += 0.5 * middle[i] ** 2 - 0.5 * mean[i] ** 2 / variance[i]
+    _back(root, middle)
+    return value
+
+
+@kernel
+def _back(root: Array, z: Array) -> None:
+    """z ← root⁻ᵀ z."""
+    n = z.size
+    for i in range(n - 1, -1, -1):
+        total = z[i]
+        for k in range(i + 1, n):
+            total -= root[k, i] * z[k]
+        z[i] = total / root[i, i]
+
+
+@kernel
+def draw_conditioned(middle: Array, root: Array, z: Array, out: Array) -> None:
+    """A draw of N(middle, (root rootᵀ)⁻¹) from standard normal z, which is overwritten."""
+    _back(root, z)
+    for i in range(z.size):
+        out[i] = middle[i] + z[i]
+
+
+@kernel
+def log_marginal(mixture: Mixture, mean: Array, variance: Array) -> Array:
+    """(B,) ln ∫ L(x) N(x; mean, diag variance) dx, for ``mean`` and ``variance`` (B, n)."""
+    n_parts, n = mixture.linear.shape
+    middle, root, logs, out = np.empty(n), np.zeros((n, n)), np.empty(n_parts), np.empty(mean.shape[0])
+    for b in range(mean.shape[0]):
+        for m in range(n_parts):
+            part = condition(mixture.precision[m], mixture.linear[m], mean[b], variance[b], middle, root)
+            logs[m] = mixture.constant[m] + part
+        top = logs.max()
+        out[b] = top + np.log(np.sum(np.exp(logs - top)))
+    return out
 
 
 @dataclass(frozen=True)
@@ -168,3 +266,65 @@ def _log_density(x: Array, share: Array, centre: Array, covariance: Array) -> Ar
     z = np.linalg.solve(root, (x - centre[:, None]).transpose(0, 2, 1))
     logs = np.log(share) - np.log(np.einsum("mii->mi", root)).sum(axis=1) - 0.5 * x.shape[1] * math.log(2 * math.pi)
     return np.asarray(np.logaddexp.reduce(logs[:, None] - 0.5 * np.sum(z**2, axis=1), axis=0))
+
+
+@dataclass(frozen=True)
+class Empirical:
+    """Physical 5, 50 and 95 % of the median over data sets: ``quantiles`` (3,) with all that is uncertain, and the
+    parts of its half-width over 1.645 that come from between the data sets and from what they have in common.
+    """
+
+    quantiles: Array
+    between: float
+    common: float
+
+
+def empirical(term: PriorTerm, middle: Array, std: Array, common: float, seed: int) -> Empirical:
+    """The median of data sets one by one, with its interval from their scatter: an answer that needs no model of them,
+    of their medians and standard deviations (S,) in white coordinates; ``common``: the standard deviation they share.
+
+    It stands beside that of the hierarchy as a check, and alone where there is no other. Each data set counts by
+    1/(s² + T²), s the standard deviation of its own posterior without what all have in common, and T² how much they
+    differ beyond the s² (Paule & Mandel 1982, J. Res. NBS 87, 377): a few that are sure of themselves do not outweigh
+    many others where they disagree with them. The interval is that of Student's t with the standard deviation of the
+    weighted median under resampling of the data sets (Efron 1979, Ann. Stat. 7, 1), which is not taken to be smaller
+    than the standard error of the weighted mean.
+    """
+    centre, spread = median_of(middle, std, member_stream(seed, f"empirical {term.parameter.name}"))
+    factor = float(stdtrit(len(middle) - 1, 1 - TAIL) / ndtri(1 - TAIL))
+
+    def physical(z: float) -> float:
+        return float(term.to_physical(np.array([term.mean + term.std * z]))[0])
+
+    def half_width(size: float) -> float:
+        return (physical(centre + size) - physical(centre - size)) / 2
+
+    z = float(ndtri(1 - TAIL)) * float(np.hypot(factor * spread, common))
+    quantiles = np.array([physical(centre + shift) for shift in (-z, 0.0, z)])
+    return Empirical(quantiles, half_width(factor * spread), half_width(common))
+
+
+def median_of(middle: Array, std: Array, stream: np.random.Generator) -> tuple[float, float]:
+    """The weighted median of data sets (S,), and its standard deviation."""
+    from scipy.optimize import brentq  # where it is used: every start would take longer
+
+    variance = np.maximum(std**2, SMALLEST)
+
+    def beyond(between: float) -> float:
+        weights = 1 / (variance + between)
+        return float(weights @ (middle - np.average(middle, weights=weights)) ** 2) - (len(middle) - 1)
+
+    between = brentq(beyond, 0.0, 2 * middle.var(ddof=1)) if beyond(0.0) > 0 else 0.0
+    weights = 1 / (variance + between)
+    chosen = stream.integers(len(middle), size=(RESAMPLED, len(middle)))
+    medians = _weighted_medians(middle[chosen], weights[chosen])
+    spread = max(float(medians.std()), float(weights.sum() ** -0.5))
+    return float(_weighted_medians(middle[None], weights[None])[0]), spread
+
+
+def _weighted_medians(x: Array, weights: Array) -> Array:
+    """(B,) of rows (B, S): half of the weight lies below, interpolated between the middles of steps."""
+    order = np.argsort(x, axis=1, kind="stable")
+    x, weights = np.take_along_axis(x, order, axis=1), np.take_along_axis(weights, order, axis=1)
+    below = (np.cumsum(weights, axis=1) - 0.5 * weights) / weights.sum(axis=1, keepdims=True)
+    return np.array([np.interp(0.5, shares, values) for shares, values in zip(below, x, strict=True)])

@@ -6,8 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from en4dvar.estimation.population.hierarchy import Effort, Hierarchy
-from en4dvar.estimation.population.hyper import HyperPrior
+from en4dvar.estimation.population.hierarchy import Effort, Hierarchy, HyperPrior
 from en4dvar.estimation.population.own import OwnDraws, own_likelihoods
 
 

@@ -1,0 +1,218 @@
+r"""What the Gaussian about a mode of J lacks: a mixture, bounds, and a mean beyond the mode.
+
+Beside an estimated discrepancy the posterior is a mixture over amplitude, length and noise scale. At the mode
+of J these are too small, for a fit uses up degrees of freedom, and a posterior at one value of them is too narrow. With
+the predictions linear about the mode, m(u) = m(0) + M u in the other coordinates u ~ N(0, I), all that depends on the
+parameters h of the covariance K(h) is known in closed form,
+
+    p(h|y) ∝ N(y − m(0); 0, K + M Mᵀ) p(h),   u | h ~ N(P MᵀK⁻¹(y − m(0)), P),   P = (I + MᵀK⁻¹M)⁻¹,
+
+and needs no run of the model. p(h|y) is sampled by importance from Student's t about the mode (Kennedy & O'Hagan 2001;
+nested Laplace approximations: Rue, Martino & Chopin 2009, J. R. Stat. Soc. B 71, 319).
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+
+from en4dvar.data.noise import DiscrepancyNoise, Linearisation, Predicted, sides_of
+from en4dvar.descent.weight_space import WeightSpace
+from en4dvar.ensemble.forecast import of_framework
+from en4dvar.ensemble.linalg import with_moments
+from en4dvar.model.state import NOISE_SCALE, Array
+from en4dvar.priors.parameter_map import QUANTILE_MAPS
+from en4dvar.priors.prior import PriorTerm, member_stream
+from en4dvar.problem import InverseProblem
+
+Mask = npt.NDArray[np.bool_]
+DRAWS, FREEDOM = 1500, 5.0  # of Student's t
+WIDER = 1.3  # than the Gaussian at the mode
+AT_ONCE = 250
+ENOUGH = 60.0  # effective draws below which the ensemble stays as it is
+SWEEPS = 200
+STENCIL = 0.02  # width of differences, in prior standard deviations
+
+
+def marginal_members(space: WeightSpace, linear: Linearisation, mode: Array, posterior: Array) -> Array:
+    """Members (N, n), transformed, in place of ``posterior`` (N, n), the Gaussian about the ``mode`` (n,)."""
+    problem, prior = space.problem, space.problem.prior
+    of_errors = np.array([name in problem.of_errors for name in prior.names])
+    if not np.any([p.name in prior.names for p in problem.discrepancy]):
+        return posterior
+    z_mode = prior.white(mode)
+    stream = member_stream(space.seed, "discrepancy")
+    covariance = prior.white_covariance(np.atleast_2d(np.cov(posterior.T)))
+    root = WIDER * np.linalg.cholesky(covariance[np.ix_(of_errors, of_errors)])
+    normal = stream.standard_normal((DRAWS, len(root))) / np.sqrt(stream.chisquare(FREEDOM, (DRAWS, 1)) / FREEDOM)
+    draws = z_mode[of_errors] + normal @ root.T
+    log_proposal = -0.5 * (FREEDOM + len(root)) * np.log1p(np.sum(normal**2, axis=1) / FREEDOM)
+    log_marginal, means, covariances = _given(space, linear, mode, of_errors, draws)
+    log_weights = log_marginal - log_proposal
+    weights = np.exp(log_weights - np.nanmax(log_weights))
+    weights = np.where(np.isfinite(weights), weights, 0.0)
+    weights /= weights.sum()
+    if 1 / np.sum(weights**2) < ENOUGH:
+        return posterior
+    # members (N, n) of the mixture, in units of the prior: systematic in h, random in u
+    places = (np.arange(len(posterior)) + stream.random()) / len(posterior)
+    chosen = np.minimum(np.searchsorted(np.cumsum(weights), places), len(weights) - 1)
+    normal = stream.standard_normal((len(posterior), means.shape[1]))
+    members = np.empty((len(posterior), len(of_errors)))
+    members[:, of_errors] = draws[chosen]
+    members[:, ~of_errors] = means[chosen] + np.einsum("dij,dj->di", np.linalg.cholesky(covariances[chosen]), normal)
+    if space.settings.sampling == "exact":
+        # The members mapped linearly so that mean and covariance are those of the whole mixture
+        centres = np.empty((len(draws), len(of_errors)))
+        centres[:, of_errors], centres[:, ~of_errors] = draws, means
+        mean = weights @ centres
+        target = (weights[:, None] * (centres - mean)).T @ (centres - mean)
+        target[np.ix_(~of_errors, ~of_errors)] += np.einsum("d,dij->ij", weights, covariances)
+        members = with_moments(members, mean, target)
+    return prior.from_white(members)
+
+
+def _given(
+    space: WeightSpace, linear: Linearisation, mode: Array, of_errors: Mask, draws: Array
+) -> tuple[Array, Array, Array]:
+    """ln p(h|y) (D,) up to a constant, and mean (D, n') and covariance (D, n', n') of u, for draws of h (D, n'')."""
+    prior, observations = space.problem.prior, space.problem.observations
+    noise = observations.noise
+    assert isinstance(noise, DiscrepancyNoise)
+    at, beta = linear.prediction, float(observations.weights[0])
+    noise = noise.gaussian_at(observations.values, at)
+    to_control = np.ascontiguousarray(prior.white_change((space.anomalies.T @ space.basis).T).T)
+    slopes = (linear.anomalies.T @ np.linalg.pinv(to_control))[:, ~of_errors]
+    rest = prior.white(mode)[~of_errors]
+    columns = np.column_stack([observations.values - at.values + slopes @ rest, slopes])
+    x = np.tile(mode, (len(draws), 1))
+    x[:, of_errors] = prior.mean[of_errors] + prior.std[of_errors] * draws
+    problem, physical, count = space.problem, prior.to_physical(x), len(draws)
+    predicted = Predicted(
+        np.tile(at.values, (count, 1)),
+        None if at.rates is None else np.tile(at.rates, (count, 1)),
+        of_framework(problem, physical, NOISE_SCALE, 1.0) if problem.has_noise_scale else None,
+        np.stack([of_framework(problem, physical, p, 1.0) for p in problem.discrepancy], axis=1),
+    )
+    log_density, means, covariances = [], [], []
+    for first in range(0, len(draws), AT_ONCE):
+        covariance = noise.covariance(predicted[first : first + AT_ONCE]) / beta
+        solved = np.linalg.solve(covariance, np.broadcast_to(columns, (len(covariance), *columns.shape)))
+        products = columns.T @ solved
+        information = np.eye(slopes.shape[1]) + products[:, 1:, 1:]
+        inverse = np.linalg.inv(information)
+        mean = np.einsum("dij,dj->di", inverse, products[:, 1:, 0])
+        squares = products[:, 0, 0] - np.einsum("di,di->d", products[:, 0, 1:], mean)
+        dets = np.linalg.slogdet(covariance)[1] + np.linalg.slogdet(information)[1]
+        log_density.append(-0.5 * (squares + dets))
+        means.append(mean)
+        covariances.append(inverse)
+    log_prior = -0.5 * np.sum(draws**2, axis=1)
+    return np.concatenate(log_density) + log_prior, np.concatenate(means), np.concatenate(covariances)
+
+
+def bounded_members(space: WeightSpace, linear: Linearisation, w: Array, posterior: Array) -> Array:
+    """Members (N, n), transformed, in place of ``posterior`` (N, n), the Gaussian about the mode, of weights w (N,),
+    beside readings that are bounds: that of all else, cut off softly.
+
+    About a minimum of J the curvature of a bound is that of a Gaussian on one side and zero on the other, so no
+    Gaussian is near. With the predictions linear about it, all but the bounds is a Gaussian in closed form; its draws
+    are moved by elliptical slice sampling (Murray, Adams & MacKay 2010, AISTATS 9, 541), which needs no run of the
+    model.
+    """
+    observations, basis = space.problem.observations, space.basis
+    bounds = sides_of(observations.noise) != 0
+    if not bounds.any():
+        return posterior
+    d, S = observations.whiten(linear)
+    others = np.resize(~bounds, len(d))
+    d, S = d[others], S[others]
+    n_members, r = len(posterior), basis.shape[1]
+    prior = np.sqrt(n_members - 1)
+    orthogonal, root = np.linalg.qr(np.vstack([S, prior * np.eye(r)]))
+    middle = np.linalg.solve(root, orthogonal.T @ np.concatenate([d, -prior * basis.T @ w]))
+    weights = np.where(bounds, observations.weights, 0.0)
+
+    def cost(z: Array) -> Array:
+        """J_o (N,) of the bounds alone, at points z (N, r) that are N(0, I) but for the bounds."""
+        predicted = linear.prediction.values + (middle + np.linalg.solve(root, z.T).T) @ linear.anomalies
+        return observations.noise.cost(observations.values, weights, Predicted(predicted))
+
+    stream = member_stream(space.seed, "bounds")
+    z = np.tile(root @ -middle, (n_members, 1))  # at the mode
+    for _ in range(SWEEPS):
+        z = _moved(z, cost, stream)
+    return space.control(w + (middle + np.linalg.solve(root, z.T).T) @ basis.T)
+
+
+def _moved(z: Array, cost: Callable[[Array], Array], stream: np.random.Generator) -> Array:
+    """A move of each point z (N, r) along an ellipse through it, its arc shrunk until the draw is accepted."""
+    other, level = stream.standard_normal(z.shape), cost(z) - np.log(stream.uniform(size=len(z)))
+    angle = stream.uniform(0, 2 * np.pi, size=len(z))
+    low, high = angle - 2 * np.pi, angle.copy()
+    while True:
+        moved = z * np.cos(angle)[:, None] + other * np.sin(angle)[:, None]
+        refused = cost(moved) > level
+        if not refused.any():
+            return moved
+        low, high = np.where(refused & (angle < 0), angle, low), np.where(refused & (angle >= 0), angle, high)
+        angle = np.where(refused, stream.uniform(low, high), angle)
+
+
+def mean_beyond_mode(problem: InverseProblem, mode: Array, posterior: Array, dfs: float) -> Array:
+    r"""What to add to the ``mode`` (n,) for the mean (n,); zero without a noise scale, or beside a discrepancy,
+    where all parameters of the errors are marginalised (:func:`marginal_members`).
+
+    ``posterior`` (N, n) are members whose covariance is C, ``dfs`` = tr (M + U) C; all in transformed space.
+
+    With u = ln σ, v = (y − m)/s and ψ = ρ' the third derivatives of J_o with respect to u and any two directions do not
+    vanish on average: a fit uses up degrees of freedom, so that J prefers too small a σ. In the notation of
+    :mod:`en4dvar.data.noise`, with the information M = SᵀS of the predictions and U of ln σ, their expectations under
+    exp(−ρ) are
+
+        ∂²_m ∂_u J = −r_m M,   r_m = E[2ψ' + vψ''] / E[ψ/v],
+        ∂³_u J = −r_u U,       r_u = E[vψ + 3v²ψ' + v³ψ''] / E[vψ + v²ψ'],
+
+    both 2 where errors are Gaussian. For u = g(x), x the coordinate that is estimated, C = A⁻¹, the mean of any
+    coordinate lies −½ C tr(C ∇³J) beyond the mode (Tierney & Kadane 1986, J. Am. Stat. Assoc. 81, 82):
+
+        ½ C e_x [ g' (r_m tr MC + r_u tr UC) − 3 (g''/g') tr UC − g''' ∂_u J C_xx ].
+    """
+    prior, name = problem.prior, NOISE_SCALE.name
+    if name not in prior.names or not problem.has_noise_scale or problem.discrepancy:
+        return np.zeros(len(mode))
+    column = prior.names.index(name)
+    anomalies = posterior - posterior.mean(axis=0)
+    covariance = anomalies.T @ anomalies[:, column] / (len(posterior) - 1)
+    term, x, variance = prior.terms[column], float(mode[column]), float(covariance[column])
+    first, second, third = log_derivatives(term, x)
+    ratio = problem.observations.noise.scale_skewness()
+    of_scale = float(problem.observations.weights.sum()) * ratio.information * first**2 * variance
+    slope = -(x - term.mean) / term.std**2 / first  # of J_o in u: the mode balances it against the prior
+    skewness = (
+        first * (ratio.of_predictions * (dfs - of_scale) + ratio.of_scale * of_scale)
+        - 3 * second / first * of_scale
+        - third * slope * variance
+    )
+    return np.asarray(0.5 * covariance * skewness)
+
+
+def log_derivatives(term: PriorTerm, x: float) -> tuple[float, float, float]:
+    """Derivatives g', g'', g''' of u = ln σ in the transformed coordinate at ``x``."""
+    if term.transform == "lognormal":
+        return 1.0, 0.0, 0.0
+    if term.transform in QUANTILE_MAPS:
+        # The same by central differences over seven points
+        h, u = STENCIL, np.log(term.to_physical(x + STENCIL * np.arange(-3.0, 4.0)))
+        first = np.dot([-1, 9, -45, 0, 45, -9, 1], u) / (60 * h)
+        second = np.dot([2, -27, 270, -490, 270, -27, 2], u) / (180 * h**2)
+        return float(first), float(second), float(np.dot([1, -8, 13, 0, -13, 8, -1], u) / (8 * h**3))
+    sigma = float(term.to_physical(np.array(x)))
+    slopes = 1.0, 0.0, 0.0
+    if term.transform == "logit":
+        low, high = term.bounds
+        share = (sigma - low) / (high - low)
+        slope = (high - low) * share * (1 - share)
+        slopes = slope, slope * (1 - 2 * share), slope * (1 - 6 * share + 6 * share**2)
+    a, b, c = (slope / sigma for slope in slopes)
+    return a, b - a**2, c - 3 * a * b + 2 * a**3
