@@ -13,6 +13,13 @@ from en4dvar.plumbing.errors import ConfigError, retold
 from en4dvar.plumbing.units import UnitError, as_unit, parse_quantity
 
 
+class OfReadings(Section):
+    """A column with a number for each reading."""
+
+    column: Annotated[str, Field(min_length=1)]
+    """Header of the column (CSV) or name of the field (.mat)."""
+
+
 class Pixel(Section):
     """Lengths that were measured in pixels."""
 

@@ -10,10 +10,9 @@ from pydantic import Field
 from en4dvar.config.columns import Columns
 from en4dvar.config.context import Context, Made, OfObservable, time_unit
 from en4dvar.config.error import Error
-from en4dvar.config.places import PLACES, Placing
+from en4dvar.config.of_readings import PLACES, WEIGHTS, Placing, Weighing
 from en4dvar.config.schema import Name, Section
 from en4dvar.config.validate import Faults
-from en4dvar.config.weights import WEIGHTS, Weighing
 from en4dvar.inputs.asked import Disorder, Format, Layout, Outliers, Repeated
 from en4dvar.inputs.text_table import Decimal
 from en4dvar.inputs.window import Instant, parse_instant

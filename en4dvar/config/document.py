@@ -245,10 +245,8 @@ class _Tree:
 
     def read(self, text: str) -> Any:
         """The data; None where the text has a fault."""
-        loader = None
         try:
-            loader = _Loader(text)
-            node = loader.get_single_node()
+            node = yaml.compose(text, _Loader)
             return None if node is None else self._value(node, ())
         except _Refused as error:
             message, at = error.args
@@ -264,9 +262,6 @@ class _Tree:
             self.faults.append(Fault(f"not valid YAML: {str(error).splitlines()[0]}", file=self.file))
         except RecursionError:
             self.faults.append(Fault("not valid YAML: nested too deeply", file=self.file))
-        finally:
-            if loader is not None:
-                loader.dispose()
         return None
 
     def _value(self, node: yaml.Node, path: Key) -> Any:

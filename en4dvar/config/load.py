@@ -11,7 +11,7 @@ import yaml
 from en4dvar.config.context import Context, Made
 from en4dvar.config.data import Data
 from en4dvar.config.dependence import PriorCorrelation, PriorFile, resolved
-from en4dvar.config.design import Design
+from en4dvar.config.design import Design, Times, read_times
 from en4dvar.config.document import Document, document_from, override, parse_document
 from en4dvar.config.initial_state import PERTURBED, Initial, Perturbed
 from en4dvar.config.models import read_model
@@ -19,7 +19,6 @@ from en4dvar.config.parameters import Entry, Fixed, Uncertain, entries
 from en4dvar.config.schema import Assimilation, Execution, File, GivenStart, Output, Section
 from en4dvar.config.series import DATA, DataPlan
 from en4dvar.config.sharing import Groups, PopulationSection, Sharing, check_population, sharing_of
-from en4dvar.config.times import Times, read_times
 from en4dvar.config.validate import check
 from en4dvar.config.varies import MODEL_ERROR, ErrorOf
 from en4dvar.inputs.members import read_centres, read_members
