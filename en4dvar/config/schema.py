@@ -303,7 +303,7 @@ class Assimilation(_Settings):
     def unread(cls, section: Mapping[str, Any]) -> dict[str, str]:
         faults: dict[str, str] = super().unread(section)
         name = section.get("scheme", DEFAULT)
-        if section.get("localisation") is not None and name in ON_A_WINDOW:
+        if section.get("localisation") is not None and isinstance(name, str) and name in ON_A_WINDOW:
             faults |= beside_localisation(name, section)
         return faults
 

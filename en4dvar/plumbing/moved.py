@@ -18,10 +18,15 @@ HOMES = {
     "estimation": "assimilate stages localised conclusions summary joint population design",
 }
 MOVED = {f"en4dvar.{name}": f"en4dvar.{home}.{name}" for home, names in HOMES.items() for name in names.split()}
-MOVED |= {f"en4dvar.config.{n}": f"en4dvar.assembly.{n}" for n in ("build", "build_sequence", "reading", "find_files")}
+MOVED |= {f"en4dvar.config.{n}": f"en4dvar.assembly.{n}" for n in ("build", "build_sequence", "reading")}
 MOVED |= {f"en4dvar.{old}": f"en4dvar.{new}" for new, several in {
     "config.data": "config.window", "config.error": "config.error_std config.discrepancy",
-    "config.sharing": "config.population", "config.models": "config.symbols", "data.noise.make": "data.noise.joint",
+    "config.sharing": "config.population", "config.models": "config.symbols commands.listing",
+    "config.design": "config.times", "config.of_readings": "config.weights config.places",
+    "assembly.reading": "config.find_files assembly.find_files", "plumbing.decoding": "plumbing.patterns",
+    "commands.studies": "commands.calibrate commands.design commands.sweep_twin",
+    "commands.several": "commands.joint commands.population", "commands.installation": "commands.listings",
+    "commands.plugins": "commands.forms commands.plugin_commands", "data.noise.make": "data.noise.joint",
     "descent.step_control": "descent.settling", "executor.chunks": "executor.shared",
     "model.programs.process": "model.programs.adjusted", "series.moments": "series.outcome",
     "results.store": "results.groups", "results.complete": "results.beside", "report.result": "report.notebook",
