@@ -9,7 +9,6 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, ConfigDict, Field
 
-from en4dvar.config.columns import OfReadings
 from en4dvar.config.context import (
     PLACEHOLDER,
     TEXT,
@@ -23,7 +22,7 @@ from en4dvar.config.context import (
     time_unit,
     unit_of,
 )
-from en4dvar.config.schema import Section
+from en4dvar.config.schema import OfReadings, Section
 from en4dvar.config.validate import Faults
 from en4dvar.data.noise import SMOOTHNESS, Kernel
 from en4dvar.inputs.asked import Column, Matrix

@@ -201,22 +201,21 @@ class Read(Generic[S]):
     model_section: dict[str, Any]
 
     def common(self, parameters: Iterable[Entry]) -> dict[str, Any]:
-        """The fields of :class:`Validated`, of a file with a section ``output``."""
+        """The fields of :class:`Validated`, of a file with a section ``output``.
+
+        ``resolved`` is the file with overrides and defaults written out and paths absolute, as YAML that loads again.
+        """
         file: Any = self.file
         where = file.output.directory or Path("runs") / file.name
         said = {"directory": where, "report": file.output.report, "figures": file.output.figures}
-        resolved = self.resolved(parameters)
-        return {"document": self.document, "name": file.name, "seed": file.seed, "resolved": resolved, **said}
-
-    def resolved(self, parameters: Iterable[Entry]) -> str:
-        """The file with overrides and defaults written out and paths absolute, as YAML that loads again."""
-        content = self.file.as_written(self.document.data)
+        content = file.as_written(self.document.data)
         content["model"] = self.model_section
         for entry in parameters:
             name, unit = entry.parameter.name, entry.parameter.unit
             if isinstance(entry, Fixed) and name not in content["parameters"]:
                 content["parameters"][name] = f"{entry.value!r} {unit}" if unit != "1" else entry.value
-        return yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=120)
+        resolved = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=120)
+        return {"document": self.document, "name": file.name, "seed": file.seed, "resolved": resolved, **said}
 
 
 def read_file(kind: type[S], document: Document, base: Path, model: ForwardModel | None = None) -> Read[S]:

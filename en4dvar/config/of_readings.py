@@ -8,9 +8,8 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field, TypeAdapter
 
-from en4dvar.config.columns import OfReadings
 from en4dvar.config.context import Context, Made, quantity, time_unit
-from en4dvar.config.schema import Section
+from en4dvar.config.schema import OfReadings, Section
 from en4dvar.data.series import Places
 from en4dvar.inputs.asked import Column
 from en4dvar.inputs.window import minima

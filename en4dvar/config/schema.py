@@ -91,6 +91,13 @@ def section_of(*kinds: Any, base: type[Section] = Section) -> Any:
     return create_model(f"{base.__name__}Of", __base__=base, **declared)
 
 
+class OfReadings(Section):
+    """A column with a number for each reading."""
+
+    column: Annotated[str, Field(min_length=1)]
+    """Header of the column (CSV) or name of the field (.mat)."""
+
+
 class Output(Section):
     """Where results go."""
 

@@ -20,7 +20,7 @@ HOMES = {
 MOVED = {f"en4dvar.{name}": f"en4dvar.{home}.{name}" for home, names in HOMES.items() for name in names.split()}
 MOVED |= {f"en4dvar.config.{n}": f"en4dvar.assembly.{n}" for n in ("build", "build_sequence", "reading")}
 MOVED |= {f"en4dvar.{old}": f"en4dvar.{new}" for new, several in {
-    "config.data": "config.window", "config.error": "config.error_std config.discrepancy",
+    "config.data": "config.window config.columns", "config.error": "config.error_std config.discrepancy",
     "config.sharing": "config.population", "config.models": "config.symbols commands.listing",
     "config.design": "config.times", "config.of_readings": "config.weights config.places",
     "assembly.reading": "config.find_files assembly.find_files", "plumbing.decoding": "plumbing.patterns",
