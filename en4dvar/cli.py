@@ -14,19 +14,15 @@ from typing import Any
 
 import click
 
-from en4dvar.commands.calibrate import calibrate
 from en4dvar.commands.common import Failed, give_up_output, printable, to_continue
-from en4dvar.commands.design import design
-from en4dvar.commands.joint import joint
-from en4dvar.commands.listings import models, schema
-from en4dvar.commands.plugin_commands import GROUP, PluginCommand
-from en4dvar.commands.population import population
+from en4dvar.commands.installation import models, schema, warm_up
+from en4dvar.commands.plugins import COMMANDS, PluginCommand
 from en4dvar.commands.results import compare, export, report, rerun
 from en4dvar.commands.run import run
+from en4dvar.commands.several import joint, population
 from en4dvar.commands.simulate import simulate
-from en4dvar.commands.sweep_twin import sweep_twin
+from en4dvar.commands.studies import calibrate, design, sweep_twin
 from en4dvar.commands.validate import validate
-from en4dvar.commands.warm_up import warm_up
 from en4dvar.plumbing.errors import En4dvarError
 from en4dvar.plumbing.installed import installed
 from en4dvar.runs.interrupt import heeded
@@ -44,11 +40,11 @@ class Commands(click.Group):
     """Adds the commands of application packages; turns errors of ours and Ctrl-C into messages and exit codes."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return sorted({*super().list_commands(ctx), *installed(GROUP)})
+        return sorted({*super().list_commands(ctx), *installed(COMMANDS)})
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         built_in = super().get_command(ctx, cmd_name)
-        plugin = None if built_in else installed(GROUP).get(cmd_name)
+        plugin = None if built_in else installed(COMMANDS).get(cmd_name)
         return PluginCommand(plugin) if plugin else built_in
 
     def main(self, *args: Any, **options: Any) -> Any:
@@ -81,7 +77,7 @@ class Commands(click.Group):
         except En4dvarError as error:
             raise Failed(str(error), error.exit_code) from error
         except SystemExit as end:  # of a model or law: click ends in another way; another package's command may
-            if ctx.invoked_subcommand in installed(GROUP):
+            if ctx.invoked_subcommand in installed(COMMANDS):
                 raise
             from en4dvar.plumbing.user_code import describe
 

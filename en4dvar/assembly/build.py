@@ -3,8 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from en4dvar.assembly.find_files import find_files, with_parts
-from en4dvar.assembly.reading import read_observations
+from en4dvar.assembly.reading import find_files, read_observations, with_parts
 from en4dvar.config import Config, SequenceConfig
 from en4dvar.config.initial_state import Perturbed, modes_of
 from en4dvar.config.parameters import Fixed, Scalar, Tied, Uncertain, inside_bounds

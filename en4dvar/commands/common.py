@@ -17,10 +17,8 @@ import click
 
 if TYPE_CHECKING:
     from en4dvar.config import Config
-    from en4dvar.plumbing.caution import Caution
 
 LONGEST = 120  # name of a folder
-Told = tuple[str, "tuple[Caution, ...]", Path]  # of an estimate of several runs: table, warnings, page
 
 
 class Failed(click.ClickException):
@@ -154,38 +152,6 @@ def ask(question: str) -> bool:
 tell = functools.partial(echo, err=True)  # which step is being done
 
 
-def several_runs(kind: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """The arguments RUN_DIR with --out, --workers and --trust of a command that makes one estimate of finished runs.
-
-    It gets the runs, the folder of its result, and keywords of what computes it. What it returns is printed, warnings
-    on standard error.
-    """
-
-    def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
-        @click.argument(
-            "run_dirs", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="RUN_DIR [RUN_DIR...]"
-        )
-        @click.option(
-            "--out", type=click.Path(path_type=Path), help=f"Folder of the result; default {kind}_... beside the first."
-        )
-        @workers_option
-        @trust_option
-        @functools.wraps(command)
-        def with_runs(
-            run_dirs: tuple[Path, ...], out: Path | None, workers: int | None, trust: bool, **options: Any
-        ) -> None:
-            how = {"workers": workers, "trust": trust, "ask": ask, "tell": tell}
-            table, cautions, page = command(run_dirs, out or folder_of(kind, run_dirs), how, **options)
-            echo(table)
-            for caution in cautions:
-                echo(f"{caution.kind}: {caution}", err=True)
-            echo(f"report: {page if out else from_here(page)}")
-
-        return with_runs
-
-    return decorate
-
-
 def refuse_to_replace(out: Path | None, force: bool) -> None:
     """Raise :class:`OutputError` where ``out`` exists and is not to be replaced."""
     from en4dvar.plumbing.errors import OutputError
@@ -194,10 +160,11 @@ def refuse_to_replace(out: Path | None, force: bool) -> None:
         raise OutputError(f"{out}: exists; give --force to replace it")
 
 
-def deliver(text: str, out: Path | None, what: str) -> None:
+def deliver(text: str, out: Path | None, what: str, force: bool = True) -> None:
     """Write to the file ``out`` and say ``what`` is there, or print. Raises :class:`OutputError`."""
     from en4dvar.plumbing.files import write_text
 
+    refuse_to_replace(out, force)
     if out is None:
         click.echo(text, nl=False)
     elif what:

@@ -15,7 +15,6 @@ from en4dvar.commands.common import (
     echo,
     folder_of,
     from_here,
-    refuse_to_replace,
     tell,
     trust_option,
     workers_option,
@@ -206,11 +205,9 @@ def export(run_dir: Path, kind: Literal["csv", "latex", "members", "netcdf"], ou
             text = export_table(run_dir, kind)
         except LackingError as error:
             if isinstance(error.rest, str):
-                refuse_to_replace(out, force)
-                deliver(error.rest, out, "table")
+                deliver(error.rest, out, "table", force)
             raise
-    refuse_to_replace(out, force)
-    deliver(text, out, "table")
+    deliver(text, out, "table", force)
 
 
 @click.command()

@@ -10,7 +10,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from en4dvar.commands.common import Failed, Source, command_line, config_options, continuable, echo, note_beginning
+from en4dvar.commands.common import (
+    Failed,
+    Source,
+    command_line,
+    config_options,
+    continuable,
+    echo,
+    note_beginning,
+    workers_option,
+)  # fmt: skip
 
 if TYPE_CHECKING:
     from en4dvar.config import Config, SequenceConfig, TwinConfig
@@ -32,7 +41,7 @@ MOST_NAMED = 3  # data sets of a warning
 )
 @click.option("--no-report", is_flag=True, help="Write no page; 'en4dvar report' writes it later.")
 @click.option("--with-what-if", is_flag=True, help="Let the intervals hold the assumptions of the what-if table too.")
-@click.option("--workers", type=click.IntRange(min=1), help="Parallel workers; the numbers do not depend on it.")
+@workers_option
 @click.option("--scheduler", metavar="ADDRESS", help="Work on a dask cluster, e.g. tcp://10.0.0.1:8786.")
 def run(
     source: Source,

@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from en4dvar.commands.common import Source, command_line, config_options, deliver, echo, refuse_to_replace
-from en4dvar.commands.forms import WithForms, asked, write_form
+from en4dvar.commands.plugins import WithForms, asked, write_form
 
 
 @click.command(cls=WithForms)

@@ -1,4 +1,4 @@
-"""The ``design:`` section: which experiments are compared, about what, and how accurately."""
+"""Instants of planned readings; the ``design:`` section: which experiments are compared, about what, how accurately."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import fields
@@ -11,14 +11,42 @@ from pydantic import Field
 
 from en4dvar.config.context import Context, Made, quantity, time_unit
 from en4dvar.config.schema import QuantityText, Section, section_of
-from en4dvar.config.times import Times, read_times, time_grid
 from en4dvar.config.validate import Faults
 from en4dvar.estimation.design.evaluate import SampleSizes
 from en4dvar.model.state import Array
+from en4dvar.plumbing.units import UnitError, parse_quantity
 
 MOST = 2000  # designs
 Value = QuantityText | bool
 OF_A_LAW = ("model", "parameters", "prior", "prior_correlation")
+
+
+def time_grid(start: str | float, end: str | float, step: str | float, unit: str) -> Array:
+    """Instants (K,) from ``start`` to ``end``, both included. Raises :class:`UnitError`."""
+    first = 0.0 if start == "start" else parse_quantity(start, unit)
+    last, width = parse_quantity(end, unit), parse_quantity(step, unit)
+    if not width > 0 or not last > first:
+        raise UnitError(f"no instants from {first:g} to {last:g} {unit} in steps of {width:g} {unit}")
+    steps = (last - first) / width * (1 + 1e-9)
+    if not 2 <= steps < 1_000_000:
+        raise UnitError(f"{steps:.6g} steps; give between 2 and a million")
+    return np.asarray(first + width * np.arange(int(np.floor(steps)) + 1), dtype=float)
+
+
+class Times(Section):
+    """A uniform grid of instants, both ends included."""
+
+    start: Annotated[QuantityText, Field(alias="from")] = "start"
+    """First instant with its unit; start is time zero."""
+    end: Annotated[QuantityText, Field(alias="to")]
+    """Last instant with its unit."""
+    step: QuantityText
+    """Time step with its unit."""
+
+
+def read_times(times: Times, context: Context) -> Array:
+    """The instants (K,) of a grid."""
+    return time_grid(times.start, times.end, times.step, time_unit(context))
 
 
 class Knob(Section):

@@ -51,8 +51,8 @@ class Document:
     data: dict[str, Any]
     file: str = ""
     text: str = ""
-    keys: Mapping[Key, Mark] = field(default_factory=dict)
-    values: Mapping[Key, Mark] = field(default_factory=dict)
+    keys: dict[Key, Mark] = field(default_factory=dict)
+    values: dict[Key, Mark] = field(default_factory=dict)
     origins: Mapping[Key, str] = field(default_factory=dict)  # what an override came from, instead of the file
 
     def fault(self, path: Sequence[str | int], message: str, *, at_key: bool = False) -> Fault:
@@ -155,14 +155,14 @@ def _plain(value: Any, path: Key, document: Document, faults: list[Fault]) -> An
 
 def parse_document(text: str, file: str = "") -> Document:
     """Parse YAML text whose top level is a mapping. Raises :class:`ConfigError`."""
-    tree = _Tree(file)
-    data = tree.read(text)
-    if not tree.faults and not isinstance(data, dict):
+    document, faults = Document({}, file, text), list[Fault]()
+    data = _read(document, faults)
+    if not faults and not isinstance(data, dict):
         what = "the file is empty" if data is None else "expected 'key: value' lines at the top level"
-        tree.faults.append(Fault(what, file=file))
-    if tree.faults:
-        raise ConfigError(tree.faults)
-    return Document(data, file, text, tree.keys, tree.values)
+        faults.append(Fault(what, file=file))
+    if faults:
+        raise ConfigError(faults)
+    return replace(document, data=data)
 
 
 def document_from(source: str | Path | Mapping[str, Any]) -> tuple[Document, Path]:
@@ -189,9 +189,7 @@ def override(document: Document, overrides: Mapping[str, Any], option: str = "--
         if (dotted, option) == ("data.path", "--set"):
             origin = "--data"
         if isinstance(value, str):
-            tree = _Tree(origin)
-            value = tree.read(value)
-            faults += tree.faults
+            value = _read(Document({}, origin, value), faults)
         node = data
         for n, part in enumerate(path[:-1], 1):
             node = node.setdefault(part, {})
@@ -234,60 +232,51 @@ class _Loader(yaml.SafeLoader):
         return super().compose_node(parent, index)
 
 
-class _Tree:
-    """Plain data from YAML, with the place of every key and value, and what is wrong with it."""
+def _read(document: Document, faults: list[Fault]) -> Any:
+    """The data of a document's text, or None; its places and what is wrong with it are added."""
 
-    def __init__(self, file: str):
-        self.file = file
-        self.keys: dict[Key, Mark] = {}
-        self.values: dict[Key, Mark] = {}
-        self.faults: list[Fault] = []
+    def refuse(message: str, line: int = 0, column: int = 0) -> None:
+        faults.append(Fault(message, "", document.file, line, column))
 
-    def read(self, text: str) -> Any:
-        """The data; None where the text has a fault."""
-        loader = None
-        try:
-            loader = _Loader(text)
-            node = loader.get_single_node()
-            return None if node is None else self._value(node, ())
-        except _Refused as error:
-            message, at = error.args
-            self.faults.append(Fault(message, "", self.file, at.line + 1, at.column + 1))
-        except yaml.MarkedYAMLError as error:
-            mark = error.problem_mark or error.context_mark
-            where = (mark.line + 1, mark.column + 1) if mark else (0, 0)
-            words = f"not valid YAML: {error.problem or error.context}"
-            if "escape character" in words or "escape sequence" in words:
-                words += "; in double quotes a backslash stands for another sign: use single quotes, or / in paths"
-            self.faults.append(Fault(words, "", self.file, *where))
-        except yaml.YAMLError as error:
-            self.faults.append(Fault(f"not valid YAML: {str(error).splitlines()[0]}", file=self.file))
-        except RecursionError:
-            self.faults.append(Fault("not valid YAML: nested too deeply", file=self.file))
-        finally:
-            if loader is not None:
-                loader.dispose()
-        return None
+    try:
+        node = yaml.compose(document.text, _Loader)
+        return None if node is None else _value(node, (), document, faults)
+    except _Refused as error:
+        message, at = error.args
+        refuse(message, at.line + 1, at.column + 1)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        where = (mark.line + 1, mark.column + 1) if mark else ()
+        words = f"not valid YAML: {error.problem or error.context}"
+        if "escape character" in words or "escape sequence" in words:
+            words += "; in double quotes a backslash stands for another sign: use single quotes, or / in paths"
+        refuse(words, *where)
+    except yaml.YAMLError as error:
+        refuse(f"not valid YAML: {str(error).splitlines()[0]}")
+    except RecursionError:
+        refuse("not valid YAML: nested too deeply")
+    return None
 
-    def _value(self, node: yaml.Node, path: Key) -> Any:
-        self.values[path] = _mark(node)
-        if isinstance(node, yaml.SequenceNode):
-            return [self._value(child, (*path, i)) for i, child in enumerate(node.value)]
-        if not isinstance(node, yaml.MappingNode):
-            return _scalar(node)
-        result: dict[str, Any] = {}
-        for key, child in node.value:
-            if not isinstance(key, yaml.ScalarNode):
-                raise _Refused("a key must be a word", key.start_mark)
-            name, where = str(key.value), _mark(key)
-            here = (*path, name)
-            if name in result:
-                message = f"duplicate key {shown(name)}, first given on line {self.keys[here][0]}"
-                self.faults.append(Fault(message, _dotted(path), self.file, *where))
-                continue
-            self.keys[here] = where
-            result[name] = self._value(child, here)
-        return result
+
+def _value(node: yaml.Node, path: Key, document: Document, faults: list[Fault]) -> Any:
+    document.values[path] = _mark(node)
+    if isinstance(node, yaml.SequenceNode):
+        return [_value(child, (*path, i), document, faults) for i, child in enumerate(node.value)]
+    if not isinstance(node, yaml.MappingNode):
+        return _scalar(node)
+    result: dict[str, Any] = {}
+    for key, child in node.value:
+        if not isinstance(key, yaml.ScalarNode):
+            raise _Refused("a key must be a word", key.start_mark)
+        name = str(key.value)
+        here = (*path, name)
+        if name in result:
+            message = f"duplicate key {shown(name)}, first given on line {document.keys[here][0]}"
+            faults.append(Fault(message, _dotted(path), document.file, *_mark(key)))
+            continue
+        document.keys[here] = _mark(key)
+        result[name] = _value(child, here, document, faults)
+    return result
 
 
 def _scalar(node: Any) -> Any:

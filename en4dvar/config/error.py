@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Annotated, Any, Literal
@@ -22,7 +22,7 @@ from en4dvar.config.context import (
     time_unit,
     unit_of,
 )
-from en4dvar.config.schema import Section
+from en4dvar.config.schema import OfReadings, Section
 from en4dvar.config.validate import Faults
 from en4dvar.data.noise import SMOOTHNESS, Kernel
 from en4dvar.inputs.asked import Column, Matrix
@@ -44,26 +44,11 @@ def parse_error_std(text: Any, unit: str, whole: str = "maximum") -> Spread:
         raise UnitError(f"{error}{hint}") from None
 
 
-class ErrorColumn(Section):
+class ErrorColumn(OfReadings):
     """A column of standard deviations, one per reading."""
 
-    column: Annotated[str, Field(min_length=1)]
-    """Header of the column (CSV) or name of the field (.mat)."""
     unit: str | None = None
     """Unit of the numbers in it; default: that of the readings' own column."""
-
-
-def error_column(written: Any, context: Context, target: str) -> Column:
-    chosen = ErrorColumn.model_validate(written, context=context)
-    if chosen.unit is not None:
-        convert(1.0, chosen.unit, target)
-    return Column(chosen.column, chosen.unit or "", target)
-
-
-def read_error_std(text: Any, context: Context) -> Spread | Column:
-    if isinstance(text, Mapping):
-        return error_column(text, context, observable_unit(context))
-    return read_spread(text, context)
 
 
 def read_spread(text: Any, context: Context, unit: Unit = observable_unit, whole: str = "maximum") -> Spread:
@@ -72,19 +57,25 @@ def read_spread(text: Any, context: Context, unit: Unit = observable_unit, whole
     return spread
 
 
-def read_time_std(text: Any, context: Context) -> float | Column:
-    if isinstance(text, Mapping):
-        return error_column(text, context, time_unit(context))
-    value = parse_quantity(text, time_unit(context))
-    require_sign(value, "not negative", text)
-    return value
+def or_column(read: Callable[[Any, Context], Any], unit: Unit) -> Callable[[Any, Context], Any]:
+    """``read``, but of a section that names a column in ``unit`` this :class:`Column`."""
+
+    def read_either(written: Any, context: Context) -> Any:
+        if not isinstance(written, Mapping):
+            return read(written, context)
+        chosen = ErrorColumn.model_validate(written, context=context)
+        if chosen.unit is not None:
+            convert(1.0, chosen.unit, unit(context))
+        return Column(chosen.column, chosen.unit or "", unit(context))
+
+    return read_either
 
 
-class MarkColumn(Section):
+read_error_std = or_column(read_spread, observable_unit)
+
+
+class MarkColumn(OfReadings):
     """A column of 1 where a reading is a bound and 0 where it is none."""
-
-    column: Annotated[str, Field(min_length=1)]
-    """Header of the column (CSV) or name of the field (.mat)."""
 
 
 def _shared(written: Any, context: Context) -> tuple[Spread | Column, ...]:
@@ -186,7 +177,9 @@ class Error(Section):
         None, alias=f"{PLACEHOLDER}_std"
     )
     """Std of the observation error: a quantity, e.g. '1 % of maximum', or ``{column: NAME}``, one per reading."""
-    time_std: Annotated[float | Column, Made(read_time_std, json=QUANTITY_OR_COLUMN)] = 0.0
+    time_std: Annotated[
+        float | Column, Made(or_column(quantity(time_unit, "not negative").make, time_unit), json=QUANTITY_OR_COLUMN)
+    ] = 0.0
     """Std of the observation times, a quantity or ``{column: NAME}``: adds (rate × time_std)²."""
     model_std: Annotated[Spread | None, Made(read_spread)] = None
     """Std of what the model misses from reading to reading, e.g. '1 % of maximum'; its square is added."""

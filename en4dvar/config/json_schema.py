@@ -39,9 +39,8 @@ def json_schema() -> Json:
     definitions["series"] = _partial(_of(SeriesData.model_json_schema()))  # the rest is said for all series
     models = list(_models(definitions))
     definitions["model"] = _model_section(models)
-    for name, kind in (
-        ("estimation", Estimation), ("twin", TwinFile), ("sequence", SequenceFile), ("campaign", CampaignFile)
-    ):  # fmt: skip
+    marked: dict[str, Any] = {"twin": TwinFile, "sequence": SequenceFile, "campaign": CampaignFile}  # by their sections
+    for name, kind in ({"estimation": Estimation} | marked).items():
         definitions[name] = _of(kind.model_json_schema())
     for name in ("estimation", "twin", "sequence"):
         definitions[name]["allOf"] = [
@@ -49,7 +48,7 @@ def json_schema() -> Json:
                 {"properties": {"parameters": {"$ref": f"#/$defs/parameters_{model}"}}})
             for model in models
         ]  # fmt: skip
-    kinds = {"twin": "twin", "sequence": "sequence", "campaign": "campaign"}
+    kinds = {name: name for name in marked}
     for name, entry in installed(KINDS).items():
         definitions[f"{name}_file"] = _of(entry.load().model_json_schema())
         kinds[name] = f"{name}_file"

@@ -11,7 +11,7 @@ import yaml
 from en4dvar.config.context import Context, Made
 from en4dvar.config.data import Data
 from en4dvar.config.dependence import PriorCorrelation, PriorFile, resolved
-from en4dvar.config.design import Design
+from en4dvar.config.design import Design, Times, read_times
 from en4dvar.config.document import Document, document_from, override, parse_document
 from en4dvar.config.initial_state import PERTURBED, Initial, Perturbed
 from en4dvar.config.models import read_model
@@ -19,7 +19,6 @@ from en4dvar.config.parameters import Entry, Fixed, Uncertain, entries
 from en4dvar.config.schema import Assimilation, Execution, File, GivenStart, Output, Section
 from en4dvar.config.series import DATA, DataPlan
 from en4dvar.config.sharing import Groups, PopulationSection, Sharing, check_population, sharing_of
-from en4dvar.config.times import Times, read_times
 from en4dvar.config.validate import check
 from en4dvar.config.varies import MODEL_ERROR, ErrorOf
 from en4dvar.inputs.members import read_centres, read_members
@@ -202,22 +201,21 @@ class Read(Generic[S]):
     model_section: dict[str, Any]
 
     def common(self, parameters: Iterable[Entry]) -> dict[str, Any]:
-        """The fields of :class:`Validated`, of a file with a section ``output``."""
+        """The fields of :class:`Validated`, of a file with a section ``output``.
+
+        ``resolved`` is the file with overrides and defaults written out and paths absolute, as YAML that loads again.
+        """
         file: Any = self.file
         where = file.output.directory or Path("runs") / file.name
         said = {"directory": where, "report": file.output.report, "figures": file.output.figures}
-        resolved = self.resolved(parameters)
-        return {"document": self.document, "name": file.name, "seed": file.seed, "resolved": resolved, **said}
-
-    def resolved(self, parameters: Iterable[Entry]) -> str:
-        """The file with overrides and defaults written out and paths absolute, as YAML that loads again."""
-        content = self.file.as_written(self.document.data)
+        content = file.as_written(self.document.data)
         content["model"] = self.model_section
         for entry in parameters:
             name, unit = entry.parameter.name, entry.parameter.unit
             if isinstance(entry, Fixed) and name not in content["parameters"]:
                 content["parameters"][name] = f"{entry.value!r} {unit}" if unit != "1" else entry.value
-        return yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=120)
+        resolved = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=120)
+        return {"document": self.document, "name": file.name, "seed": file.seed, "resolved": resolved, **said}
 
 
 def read_file(kind: type[S], document: Document, base: Path, model: ForwardModel | None = None) -> Read[S]:

@@ -91,6 +91,13 @@ def section_of(*kinds: Any, base: type[Section] = Section) -> Any:
     return create_model(f"{base.__name__}Of", __base__=base, **declared)
 
 
+class OfReadings(Section):
+    """A column with a number for each reading."""
+
+    column: Annotated[str, Field(min_length=1)]
+    """Header of the column (CSV) or name of the field (.mat)."""
+
+
 class Output(Section):
     """Where results go."""
 
@@ -303,7 +310,7 @@ class Assimilation(_Settings):
     def unread(cls, section: Mapping[str, Any]) -> dict[str, str]:
         faults: dict[str, str] = super().unread(section)
         name = section.get("scheme", DEFAULT)
-        if section.get("localisation") is not None and name in ON_A_WINDOW:
+        if section.get("localisation") is not None and isinstance(name, str) and name in ON_A_WINDOW:
             faults |= beside_localisation(name, section)
         return faults
 

@@ -53,58 +53,46 @@ def check_population(
     """Raises :class:`ConfigError`: every parameter that is not estimated, or whose prior depends on the data set; an
     unknown kind of group.
     """
-    faults = [*_unfit(section, entries, document), *_unfit_known(section, entries, groups, document)]
+    faults: list[Fault] = []
+    estimated = {e.parameter.name: e for e in entries if isinstance(e, Uncertain)}
+    for i, name in enumerate(section.of):
+        with document.collecting(faults, "population", "of", i):
+            if name not in estimated:
+                raise ConfigError(f"{name}: not estimated, it has no prior{suggest(name, estimated)}")
+            if estimated[name].needs_data:
+                raise ConfigError(f"{name}: its prior depends on the data set ('maximum'), a population has one")
+    of_kind = groups.get(section.by or "", {})
+    for group in section.known:
+        with document.collecting(faults, "population", "known", *([group] if section.by else [])):
+            if section.by is None:
+                raise ConfigError("of groups, which need 'by'")
+            if section.by in groups and group not in of_kind:
+                raise ConfigError(f"no such group{suggest(group, of_kind)}")
     if section.by is not None and section.by not in groups:
         words = f"no kind of 'groups:' is called {shown(section.by)}{suggest(section.by, groups)}"
         faults.append(document.fault(("population", "by"), words))
+    stated = [("reference", (), section.reference), *(("known", (g,), values) for g, values in section.known.items())]
+    for key, above, values in stated:
+        for name, text in values.items():
+            with document.collecting(faults, "population", key, *above, name):
+                _check_value(name, text, section, estimated, key)
     if faults:
         raise ConfigError(faults)
 
 
-def _unfit(section: PopulationSection, entries: Sequence[Entry], document: Document) -> Iterator[Fault]:
-    estimated = {e.parameter.name: e for e in entries if isinstance(e, Uncertain)}
-    for i, name in enumerate(section.of):
-        where = ("population", "of", i)
-        if name not in estimated:
-            yield document.fault(where, f"{name}: not estimated, it has no prior{suggest(name, estimated)}")
-        elif estimated[name].needs_data:
-            yield document.fault(where, f"{name}: its prior depends on the data set ('maximum'), a population has one")
-    for name, text in section.reference.items():
-        said = ("population", "reference", name)
-        if name != SOURCE and name not in section.of:
-            yield document.fault(said, f"{shown(name)}: neither 'source' nor among 'of'{suggest(name, section.of)}")
-        elif name in estimated:
-            try:
-                reference_value(text, estimated[name].parameter.unit)
-            except UnitError as error:
-                yield document.fault(said, str(error))
-
-
-def _unfit_known(
-    section: PopulationSection, entries: Sequence[Entry], groups: Mapping[str, Mapping[str, object]], document: Document
-) -> Iterator[Fault]:
-    terms = {e.parameter.name: e for e in entries if isinstance(e, Uncertain)}
-    of_kind = groups.get(section.by or "", {})
-    for group, values in section.known.items():
-        if section.by is None:
-            yield document.fault(("population", "known"), "of groups, which need 'by'")
-        elif section.by in groups and group not in of_kind:
-            yield document.fault(("population", "known", group), f"no such group{suggest(group, of_kind)}")
-        for name, text in values.items():
-            where = ("population", "known", group, name)
-            if name not in section.of:
-                yield document.fault(where, f"{shown(name)}: not among 'of'{suggest(name, section.of)}")
-            elif name in terms:
-                try:
-                    value, std = reference_value(text, terms[name].parameter.unit)
-                except UnitError as error:
-                    yield document.fault(where, str(error))
-                    continue
-                low, high = terms[name].parameter.bounds
-                if not std > 0:
-                    yield document.fault(where, f"{shown(text)}: how well is it known? as '7.7 ± 0.2 kPa'")
-                elif not low < value < high:
-                    yield document.fault(where, f"{shown(text)}: beyond the bounds of {name}")
+def _check_value(name: str, text: str, section: PopulationSection, estimated: Mapping[str, Entry], key: str) -> None:
+    """Raises :class:`ConfigError`, :class:`UnitError`: what is said of a parameter as ``reference`` or as ``known``."""
+    if name not in section.of and (key, name) != ("reference", SOURCE):
+        neither = "neither 'source' nor" if key == "reference" else "not"
+        raise ConfigError(f"{shown(name)}: {neither} among 'of'{suggest(name, section.of)}")
+    if name not in estimated:
+        return
+    value, std = reference_value(text, estimated[name].parameter.unit)
+    low, high = estimated[name].parameter.bounds
+    if key == "known" and not std > 0:
+        raise ConfigError(f"{shown(text)}: how well is it known? as '7.7 ± 0.2 kPa'")
+    if key == "known" and not low < value < high:
+        raise ConfigError(f"{shown(text)}: beyond the bounds of {name}")
 
 
 SOURCE = "source"  # of a reference: where it is from

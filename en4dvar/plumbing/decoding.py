@@ -9,6 +9,7 @@ limits (Windows), only a crash stays in the child.
 import atexit
 import os
 import pickle
+import re
 import signal
 import subprocess
 import sys
@@ -22,11 +23,12 @@ from typing import IO, Any, TypeVar
 
 from en4dvar.plumbing.children import Child, limit_memory, limit_time, status_named
 from en4dvar.plumbing.errors import DataError, En4dvarError, retold
-from en4dvar.plumbing.files import here, in_bytes, open_plain
+from en4dvar.plumbing.files import here, in_bytes, open_plain, read_plain
 
 T = TypeVar("T")
 Decoder = Callable[..., Iterator[Any]]
 DOUBT = "it is damaged, or not what it says it is"
+LONGEST_TEXT = 256_000_000  # bytes of a text
 _VALUE, _END, _FAULT = range(3)
 _idle: "list[_Child]" = []
 _changing = threading.Lock()
@@ -176,3 +178,20 @@ def _served(name: str, arguments: tuple[Any, ...], allowed: Allowed, answers: IO
     except Exception as error:
         return _FAULT, DecodeError(" ".join(str(error).split())[:300] or type(error).__name__)
     return _END, None
+
+
+def matches(path: Path, pattern: str) -> Iterator[list[str]]:
+    """What a regular expression with one group finds in a file; a decoder.
+
+    Raises :class:`DataError` as :func:`text_of`.
+    """
+    yield re.findall(pattern, text_of(path), re.MULTILINE)
+
+
+def text_of(path: Path) -> str:
+    """What a program has written, its lines ended by ``\\n``; bytes that are no UTF-8 are replaced.
+
+    Raises :class:`DataError` where it cannot be read, or is longer than :data:`LONGEST_TEXT`.
+    """
+    with retold(OSError, DataError, f"no output file {path}: "):
+        return read_plain(path, LONGEST_TEXT).decode("utf-8", errors="replace").replace("\r\n", "\n")

@@ -18,15 +18,20 @@ HOMES = {
     "estimation": "assimilate stages localised conclusions summary joint population design",
 }
 MOVED = {f"en4dvar.{name}": f"en4dvar.{home}.{name}" for home, names in HOMES.items() for name in names.split()}
-MOVED |= {f"en4dvar.config.{n}": f"en4dvar.assembly.{n}" for n in ("build", "build_sequence", "reading", "find_files")}
+MOVED |= {f"en4dvar.config.{n}": f"en4dvar.assembly.{n}" for n in ("build", "build_sequence", "reading")}
 MOVED |= {f"en4dvar.{old}": f"en4dvar.{new}" for new, several in {
-    "config.data": "config.window", "config.error": "config.error_std config.discrepancy",
-    "config.sharing": "config.population", "config.models": "config.symbols", "data.noise.make": "data.noise.joint",
-    "descent.step_control": "descent.settling", "executor.base": "executor.chunks executor.shared",
-    "executor.futures": "executor.local", "executor.limits": "executor.blas",
-    "model.programs.model": "model.programs.adjusted model.programs.process",
+    "config.data": "config.window config.columns", "config.error": "config.error_std config.discrepancy",
+    "config.sharing": "config.population", "config.models": "config.symbols commands.listing",
+    "data.noise.make": "data.noise.joint", "descent.step_control": "descent.settling",
+    "executor.base": "executor.chunks executor.shared", "executor.futures": "executor.local",
+    "executor.limits": "executor.blas", "model.programs.model": "model.programs.adjusted model.programs.process",
     "model.programs.pest": "model.programs.errors", "model.programs.control": "model.programs.refused",
     "model.programs.matrices": "model.programs.spread", "series.moments": "series.outcome",
+    "config.design": "config.times", "config.of_readings": "config.weights config.places",
+    "assembly.reading": "config.find_files assembly.find_files", "plumbing.decoding": "plumbing.patterns",
+    "commands.studies": "commands.calibrate commands.design commands.sweep_twin",
+    "commands.several": "commands.joint commands.population", "commands.installation": "commands.listings",
+    "commands.plugins": "commands.forms commands.plugin_commands",
     "results.store": "results.groups", "results.complete": "results.beside", "report.result": "report.notebook",
     "report.svg": "report.words report.drawing", "runs.finished": "runs.evidence_run", "inputs.readers": "inputs.order",
     "estimation.joint.members": "estimation.joint.challenge", "estimation.stages": "loop_state estimation.loop_state",

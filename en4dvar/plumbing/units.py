@@ -7,6 +7,7 @@ the same double as ``1.4e-6``. Temperatures in °C are not units of this kind (t
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from difflib import get_close_matches
 from fractions import Fraction
@@ -120,17 +121,11 @@ def parse_unit(text: str) -> Unit:
     if len(text) > LONGEST:
         raise UnitError(f"cannot read unit {text[:20]!r}…: {len(text)} characters")
     clean = text.replace("µ", "u").replace("μ", "u").replace("·", "*").translate(_SUPERSCRIPT)
-    tokens: list[re.Match[str]] = []
-    at = 0
-    while at < len(clean):
-        match = _TOKEN.match(clean, at)
-        if match is None:
-            raise UnitError(f"cannot read unit {text!r} at {clean[at:]!r}")
-        tokens.append(match)
-        at = match.end()
-    unit, end = _product(tokens, 0, text)
-    if end != len(tokens):
-        raise UnitError(f"cannot read unit {text!r}: unbalanced ')'")
+    tokens = list(iter(_TOKEN.scanner(clean).match, None))  # type: ignore[attr-defined]
+    end = tokens[-1].end() if tokens else 0
+    if end < len(clean):
+        raise UnitError(f"cannot read unit {text!r} at {clean[end:]!r}")
+    unit = _product(iter(tokens), text)
     if not 1e-90 < unit.factor < 1e90:
         raise UnitError(f"cannot read unit {text!r}: a unit is a positive multiple of another")
     return unit
@@ -156,40 +151,41 @@ def as_unit(quantity: str, unit: str) -> str:
     return f"{number.lstrip('+')}*{symbol if symbol.isalpha() else f'({symbol})'}"
 
 
-def _product(tokens: list[re.Match[str]], i: int, text: str) -> tuple[Unit, int]:
-    """Factors up to a closing bracket or the end; returns the unit and the index where it stopped."""
+def _product(tokens: Iterator[re.Match[str]], text: str, closing: str = "") -> Unit:
+    """Factors up to the ``closing`` bracket, or else the end."""
     unit, operator, divided = ONE, "", False
-    expects_factor = True
-    while i < len(tokens):
-        op = tokens[i]["op"]
+    expects_factor, end = True, ""
+    for token in tokens:
+        op = token["op"]
         if op == ")":
+            end = op
             break
         if op in ("*", "/"):
             if expects_factor:
                 raise UnitError(f"cannot read unit {text!r}: {op!r} without a unit before it")
-            operator, expects_factor, i = op, True, i + 1
+            operator, expects_factor = op, True
             continue
-        if tokens[i]["number"]:
-            factor = Unit(Fraction(tokens[i]["number"]), ONE.powers)
+        if token["number"]:
+            factor = Unit(Fraction(token["number"]), ONE.powers)
             if not expects_factor:
                 raise UnitError(f"cannot read unit {text!r}: a number stands before a unit")
         elif op == "(":
-            factor, i = _product(tokens, i + 1, text)
-            if i == len(tokens):
-                raise UnitError(f"cannot read unit {text!r}: unbalanced '('")
+            factor = _product(tokens, text, ")")
         else:
-            power = tokens[i]["power"] or "1"
+            power = token["power"] or "1"
             if len(power) > 3 or abs(int(power)) > LARGEST_POWER:
                 raise UnitError(f"cannot read unit {text!r}: no unit has the power {power}")
-            factor = _symbol(tokens[i]["symbol"]) ** int(power)
+            factor = _symbol(token["symbol"]) ** int(power)
         if divided and operator != "/":
             raise UnitError(f"ambiguous unit {text!r}: write brackets, as in 'W/(m K)'")
         divided = divided or operator == "/"
         unit = unit * factor ** (-1 if operator == "/" else 1)
-        operator, expects_factor, i = "", False, i + 1
+        operator, expects_factor = "", False
     if expects_factor:
         raise UnitError(f"cannot read unit {text!r}: a unit is missing")
-    return unit, i
+    if end != closing:
+        raise UnitError(f"cannot read unit {text!r}: unbalanced {end or '('!r}")
+    return unit
 
 
 @lru_cache(maxsize=1024)

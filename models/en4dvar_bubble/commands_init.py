@@ -245,7 +245,7 @@ def _columns_of(data: str, options: Mapping[str, str | None], layout: Layout) ->
 
     Raises one :class:`ConfigError` that names every option to add.
     """
-    from en4dvar.assembly.find_files import find_files
+    from en4dvar.assembly.reading import find_files
     from en4dvar_bubble.starter.asked import Asked, first_with_columns
     from en4dvar_bubble.starter.summaries import summaries
 

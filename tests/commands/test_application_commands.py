@@ -11,13 +11,13 @@ from click.shell_completion import ShellComplete
 from click.testing import CliRunner
 
 from en4dvar.cli import main
-from en4dvar.commands.plugin_commands import GROUP
+from en4dvar.commands.plugins import COMMANDS
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "quickstart.yaml"
 
 
 def test_every_command_has_help_with_an_example() -> None:
-    entries = {entry.name: entry for entry in entry_points(group=GROUP)}
+    entries = {entry.name: entry for entry in entry_points(group=COMMANDS)}
     assert {"init", "laws", "study", "sweep"} <= set(entries)
     for name, entry in entries.items():
         text = inspect.cleandoc(entry.load().help or "")

@@ -8,7 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from en4dvar.cli import main
-from en4dvar.commands import forms
+from en4dvar.commands import plugins
 
 MODULE = '''
 def poem(config, times, out, settings, seed):
@@ -35,8 +35,8 @@ def _package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.chdir(tmp_path)
     entries = {"poem": "verses:poem", "gone": "no_such_package:x", "out": "verses:poem"}
-    found = {name: EntryPoint(name, value, forms.GROUP) for name, value in entries.items()}
-    monkeypatch.setattr(forms, "installed", lambda group: found)
+    found = {name: EntryPoint(name, value, plugins.FORMS) for name, value in entries.items()}
+    monkeypatch.setattr(plugins, "installed", lambda group: found)
     monkeypatch.delitem(sys.modules, "verses", raising=False)
 
 

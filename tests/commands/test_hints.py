@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from en4dvar.assembly.find_files import find_files
+from en4dvar.assembly.reading import find_files
 from en4dvar.plumbing.hints import suggest
 
 LAWS = {

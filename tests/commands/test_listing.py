@@ -6,7 +6,6 @@ import pytest
 from click.testing import CliRunner
 
 from en4dvar.cli import main
-from en4dvar.commands import listing
 from en4dvar.config import models
 
 
@@ -24,14 +23,12 @@ def test_models_are_listed_with_parameters_and_units() -> None:
 
 def test_a_model_that_cannot_be_loaded_is_listed_with_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     entries = {"gone": EntryPoint("gone", "no_such_package:Model", models.GROUP)}
-    monkeypatch.setattr(listing, "installed", lambda group: entries)
     monkeypatch.setattr(models, "installed", lambda group: entries)
-    assert "gone: model 'gone' cannot be loaded: No module named 'no_such_package'" in listing.model_listing()
+    assert "gone: model 'gone' cannot be loaded: No module named 'no_such_package'" in models.model_listing()
 
 
 def test_a_model_without_default_settings_is_listed_with_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     entries = {"picky": EntryPoint("picky", "toy_config:Picky", models.GROUP)}
-    monkeypatch.setattr(listing, "installed", lambda group: entries)
     monkeypatch.setattr(models, "installed", lambda group: entries)
     import toy_config
     from pydantic import BaseModel
@@ -51,5 +48,5 @@ def test_a_model_without_default_settings_is_listed_with_the_reason(monkeypatch:
             raise AssertionError("not reached")
 
     monkeypatch.setattr(toy_config, "Picky", Picky, raising=False)
-    text = listing.model_listing()
+    text = models.model_listing()
     assert text == "picky: Needs a size.\n  parameters depend on settings without default: size"

@@ -11,7 +11,7 @@ from click.testing import CliRunner
 
 from en4dvar import cli
 from en4dvar.cli import main
-from en4dvar.commands import plugin_commands
+from en4dvar.commands import plugins
 
 MODULE = '''
 import click
@@ -42,7 +42,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
         "three": "shouting.commands:not_a_command",
         "run": "shouting.commands:shout",
     }
-    found = {name: EntryPoint(name, value, plugin_commands.GROUP) for name, value in entries.items()}
+    found = {name: EntryPoint(name, value, plugins.COMMANDS) for name, value in entries.items()}
     monkeypatch.setattr(cli, "installed", lambda group: found)
     yield "shouting"
     for name in ("shouting", "shouting.commands"):

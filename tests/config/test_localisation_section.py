@@ -93,6 +93,7 @@ def test_a_campaign_of_fields(tmp_path: Path) -> None:
         ("radius: 300 cm", "radius: 3 m, at: {offset: 1 s}", "assimilation.localisation: "),
         ("  localisation: {radius: 300 cm}\n", "", "assimilation.members: 12 are too few for 18 parameters, 18 of"),
         ("members: 12", "scheme: etkf", "assimilation.localisation: a scheme for data that can be localised is"),
+        ("members: 12", "scheme: [etkf]", "line.yaml:15:11: assimilation.scheme: "),
         ("{u_std: 0.3 K}", "{u_std: 0.3 K, robust: huber}", "assimilation.localisation: takes independent Gaussian"),
         (", length: 150 cm", "", "initial_state.u.kernel: kernel and length go together; give length as well"),
         ("kernel: gaussian, ", "", "initial_state.u.length: kernel and length go together; give kernel as well"),

@@ -14,10 +14,9 @@ from en4dvar.model.programs import pest, template
 from en4dvar.model.programs.pest import ProgramError
 from en4dvar.model.programs.settings import OutputOf
 from en4dvar.model.state import Array
-from en4dvar.plumbing.decoding import Allowed, DecodeError, decoded_whole
+from en4dvar.plumbing.decoding import LONGEST_TEXT, Allowed, DecodeError, decoded_whole, matches, text_of
 from en4dvar.plumbing.errors import DataError, retold
 from en4dvar.plumbing.hints import listed, short
-from en4dvar.plumbing.patterns import LONGEST, matches, text_of
 from en4dvar.plumbing.tables import is_number
 
 COMMENT = ("#", "%", "//")
@@ -58,7 +57,7 @@ def _instructed(output: OutputOf, folder: Path) -> Array:
 
 def _found(folder: Path, file: str, pattern: str, seconds: float | None) -> list[str]:
     """The matches, by another process: a pattern may take years, in which nothing else of this one would run."""
-    allowed = Allowed(min(Allowed.seconds, math.ceil(seconds or Allowed.seconds)), size=LONGEST)
+    allowed = Allowed(min(Allowed.seconds, math.ceil(seconds or Allowed.seconds)), size=LONGEST_TEXT)
     try:
         return decoded_whole(matches, folder / file, pattern, allowed=allowed)
     except (DataError, DecodeError) as error:

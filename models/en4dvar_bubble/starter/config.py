@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from en4dvar.assembly.build import build_one
-from en4dvar.assembly.find_files import find_files, with_parts
+from en4dvar.assembly.reading import find_files, with_parts
 from en4dvar.config import Config, resolve
 from en4dvar.config.document import parse_document
 from en4dvar.inputs.asked import ANY, Column, DataFile, Layout, TimeStep

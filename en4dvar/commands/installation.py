@@ -1,16 +1,46 @@
-"""``en4dvar warm-up``."""
+"""Commands about what is installed: ``en4dvar models``, ``en4dvar schema`` and ``en4dvar warm-up``."""
 
 import os
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import click
 
-from en4dvar.commands.common import echo
+from en4dvar.commands.common import deliver, echo
 from en4dvar.plumbing.installed import installed
 
-GROUP = "en4dvar.warm_up"
+WARM_UP = "en4dvar.warm_up"
 """Entry points whose value is a function without arguments: what is compiled, in words → a small call that does."""
+
+
+@click.command()
+def models() -> None:
+    """List the models with their observables, parameters, units and settings.
+
+    \b
+    Example:
+      en4dvar models | less
+    """
+    from en4dvar.config.models import model_listing
+
+    echo(model_listing())
+
+
+@click.command()
+@click.option("--out", type=click.Path(path_type=Path), help="JSON file to write; default standard output.")
+def schema(out: Path | None) -> None:
+    """Print the JSON schema of configuration files: completion and checks in an editor.
+
+    Name it in the first line of a configuration:  # yaml-language-server: $schema=en4dvar.schema.json
+
+    \b
+    Example:
+      en4dvar schema --out en4dvar.schema.json
+    """
+    from en4dvar.config.json_schema import schema_text
+
+    deliver(schema_text(), out, "schema")
 
 
 @click.command("warm-up")
@@ -37,7 +67,7 @@ def examples() -> Iterator[tuple[str, Callable[[], object]]]:
     """Names of kernels, each with a call that compiles it. Raises :class:`En4dvarError`: a package is at fault."""
     from en4dvar.plumbing.errors import En4dvarError, retold
 
-    for name, entry in installed(GROUP).items():
+    for name, entry in installed(WARM_UP).items():
         words = f"warm-up of {name!r} ({entry.value}) cannot be loaded: "
         with retold((ImportError, AttributeError), En4dvarError, words):
             examples_of_package = entry.load()()

@@ -1,0 +1,114 @@
+"""What application packages add to the command line by entry points: subcommands, and forms of a simulation.
+
+Group ``en4dvar.commands``, name → click command. ``en4dvar --help`` must stay quick and must not fail because of a
+package, so help reads the command's docstring from its source; only invoking a command imports it.
+
+Group ``en4dvar.simulate``, name → function: ``movie`` makes ``en4dvar simulate --movie FILE --movie-set KEY=VALUE …``
+of ``movie(config, times, out, settings, seed)``, which writes FILE and returns what is said of it. Nothing is imported
+before such an option is used.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Mapping
+from importlib.metadata import EntryPoint
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from en4dvar.commands.common import parted
+from en4dvar.plumbing.errors import En4dvarError, retold
+from en4dvar.plumbing.installed import installed
+
+if TYPE_CHECKING:
+    from en4dvar.config import Config
+    from en4dvar.model.state import Array
+
+COMMANDS = "en4dvar.commands"
+FORMS = "en4dvar.simulate"
+
+
+class PluginCommand(click.Command):
+    """Stands for a command until it is invoked."""
+
+    def __init__(self, entry: EntryPoint):
+        super().__init__(entry.name, short_help=about(entry))
+        self.entry = entry
+
+    def make_context(
+        self, info_name: str | None, args: list[str], parent: click.Context | None = None, **extra: Any
+    ) -> click.Context:
+        """Import the command and let it take over. Raises :class:`En4dvarError` where that fails."""
+        command = loaded(self.entry, f"command {self.name!r}")
+        if not isinstance(command, click.Command):
+            raise En4dvarError(f"command {self.name!r}: {self.entry.value} is not a click command")
+        return command.make_context(info_name, args, parent, **extra)
+
+
+def loaded(entry: EntryPoint, what: str) -> Any:
+    """What an entry point leads to. Raises :class:`En4dvarError`, which says of ``what``, where it cannot be loaded."""
+    with retold((ImportError, AttributeError), En4dvarError, f"{what} ({entry.value}) cannot be loaded: "):
+        return entry.load()
+
+
+def about(entry: EntryPoint) -> str:
+    """First sentence of the function's docstring, read without importing; its package where that cannot be found."""
+    return _first_sentence(entry) or f"From {entry.module.partition('.')[0]}."
+
+
+def _first_sentence(entry: EntryPoint) -> str:
+    top, *rest = entry.module.split(".")
+    spec = find_spec(top)
+    if spec is None or spec.origin is None:
+        return ""
+    base = Path(spec.origin).parent.joinpath(*rest)
+    files = (base.with_suffix(".py"), base / "__init__.py") if rest else (Path(spec.origin),)
+    try:
+        source = next(file for file in files if file.is_file()).read_text(encoding="utf-8")
+        functions = (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.FunctionDef))
+        help_text = next(ast.get_docstring(f) or "" for f in functions if f.name == entry.attr)
+    except (OSError, ValueError, SyntaxError, StopIteration):
+        return ""
+    return " ".join(help_text.partition("\n\n")[0].split())
+
+
+class WithForms(click.Command):
+    """A command with two options for each form: its file, and its settings."""
+
+    def get_params(self, ctx: click.Context) -> list[click.Parameter]:
+        own = super().get_params(ctx)
+        options = {option for parameter in own for option in parameter.opts}
+        added = [o for entry in installed(FORMS).values() for o in _options(entry) if not options.intersection(o.opts)]
+        return [*own[:-1], *added, own[-1]]  # --help stays the last
+
+
+def _options(entry: EntryPoint) -> list[click.Option]:
+    name = entry.name
+    return [
+        click.Option([f"--{name}"], metavar="FILE", type=click.Path(path_type=Path), help=about(entry)),
+        click.Option([f"--{name}-set"], metavar="KEY=VALUE", multiple=True, help=f"Set a value of the {name}."),
+    ]
+
+
+def asked(options: Mapping[str, Any]) -> dict[str, tuple[Path, dict[str, str]]]:
+    """Form → file and settings. Raises :class:`click.UsageError`: settings without a file, or not KEY=VALUE."""
+    answers = {}
+    for name in installed(FORMS):
+        out, texts = options.get(name), options.get(f"{name}_set", ())
+        if texts and out is None:
+            raise click.UsageError(f"--{name}-set needs --{name} FILE")
+        if out is not None:
+            answers[name] = out, {key: value.strip() for key, value in parted(texts, f"--{name}-set").items()}
+    return answers
+
+
+def write_form(
+    name: str, config: Config, times: Array | None, out: Path, settings: Mapping[str, str], seed: int
+) -> str:
+    """Write a form and return the sentence about its file. Raises :class:`En4dvarError`: the form cannot be loaded, or
+    refuses.
+    """
+    return str(loaded(installed(FORMS)[name], f"--{name}")(config, times, out, settings, seed))

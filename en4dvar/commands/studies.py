@@ -1,0 +1,136 @@
+"""Commands that try what could be, from one configuration: ``en4dvar calibrate``, ``design`` and ``sweep-twin``."""
+
+from pathlib import Path
+
+import click
+
+from en4dvar.commands.common import (
+    Source,
+    command_line,
+    config_options,
+    continuable,
+    echo,
+    note_beginning,
+    parted,
+    workers_option,
+)  # fmt: skip
+
+
+@click.command()
+@config_options
+@click.option("--sets", type=click.IntRange(min=2), default=200, show_default=True, help="Number of synthetic sets.")
+@click.option(
+    "--made-with", "made", multiple=True, metavar="KEY=VALUE",
+    help="Make the readings, not the estimates, with another value; any number of times."
+)  # fmt: skip
+@click.option("--out", type=click.Path(path_type=Path), help="Folder; default runs/<name>_calibration.")
+@click.option("--force", is_flag=True, help="Replace an earlier calibration, once this one is complete.")
+@click.option("--resume", is_flag=True, help="Go on with an interrupted one, or with more sets.")
+@workers_option
+def calibrate(
+    source: Source, sets: int, made: tuple[str, ...], out: Path | None, force: bool, resume: bool, workers: int | None
+) -> None:
+    """Make synthetic data sets by the configuration itself, estimate them, and test the ranks of the truths.
+
+    Truths are drawn from the priors, readings from the model with the errors of the file, at the times of its data. Of
+    a correct posterior 90 % intervals hold nine truths in ten. With --made-with the readings are made otherwise, which
+    shows what a wrong assumption would do. Writes calibration.csv and a page.
+
+    \b
+    Example:
+      en4dvar calibrate configs/quickstart.yaml --sets 100
+    """
+    from en4dvar.runs.calibration_run import calibrate as conduct
+    from en4dvar.runs.progress import counted
+
+    if out is not None:
+        note_beginning(out, resume)
+    overrides = source.overrides(**{"execution.workers": workers})
+    with continuable(), counted("sets") as progress:
+        result = conduct(
+            source.path, sets, overrides=overrides, made_with=parted(made, "--made-with"), out=out, force=force,
+            resume=resume, progress=progress, command=command_line(),
+        )  # fmt: skip
+    echo(str(result))
+    for remark in result.remarks:
+        echo(f"note: {remark}", err=True)
+    echo(f"report: {result.directory / 'calibration.html'}")
+
+
+@click.command()
+@config_options
+@click.option(
+    "--after", metavar="RUN_DIR", type=click.Path(path_type=Path), help="Finished run whose posterior is the prior."
+)
+@click.option("--out", type=click.Path(path_type=Path), help="Directory of the result; default runs/<name>_design.")
+@click.option("--force", is_flag=True, help="Replace an earlier result in the directory.")
+@click.option("--resume", is_flag=True, help="Go on with an interrupted comparison; the numbers are the same.")
+def design(source: Source, after: Path | None, out: Path | None, force: bool, resume: bool) -> None:
+    """Compare planned experiments by the information they are expected to give.
+
+    The configuration is that of 'run'; its data file need not exist. A 'design:' section says when readings are
+    taken, which settings can be changed, and which parameters are asked about. Writes design.nc, designs.csv and a
+    page.
+
+    \b
+    Example:
+      en4dvar design configs/lotka_volterra_design.yaml
+    """
+    from en4dvar.report.design import design_table, remarks
+    from en4dvar.runs.design_run import run_design
+    from en4dvar.runs.progress import counted
+
+    with continuable(), counted("designs") as on_design:
+        plan, directory = run_design(
+            source.path, overrides=source.overrides(), after=after, out=out, force=force, resume=resume,
+            on_design=on_design, command=command_line(),
+        )  # fmt: skip
+    echo(design_table(plan))
+    for remark in remarks(plan):
+        echo(f"note: {remark}", err=True)
+    echo(f"report: {directory / 'design.html'}")
+
+
+@click.command(name="sweep-twin")
+@config_options
+@click.option(
+    "--vary", "varied", multiple=True, required=True, metavar="KEY=[VALUE, …]",
+    help="A key and its values; any number of times, for all combinations."
+)  # fmt: skip
+@click.option(
+    "--seeds", type=click.IntRange(min=1), default=5, show_default=True,
+    help="Number of seeds per combination, from the file's on.",
+)  # fmt: skip
+@click.option("--out", type=click.Path(path_type=Path), help="Folder of the table; default runs/<name>_sweep.")
+@click.option("--force", is_flag=True, help="Replace an earlier sweep, once this one is complete.")
+@click.option("--resume", is_flag=True, help="Take over finished runs; seeds and values may be added at the end.")
+@workers_option
+def sweep_twin(
+    source: Source, varied: tuple[str, ...], seeds: int, out: Path | None, force: bool, resume: bool,
+    workers: int | None,
+) -> None:  # fmt: skip
+    """Compare settings in twin experiments: RMSE and spread, mean ± standard error over seeds.
+
+    All settings see the same truths and observations. Writes sweep.csv and, with every run, runs.csv.
+
+    \b
+    Example:
+      en4dvar sweep-twin configs/lorenz96_etkf.yaml --vary 'assimilation.scheme=[etkf, esrf, enkf-n]' --seeds 10
+    """
+    from en4dvar.runs.twin_sweep import sweep_twin as sweep
+
+    def tell(done: int, of: int) -> None:
+        echo(f"{done} of {of} runs", err=True)
+
+    vary = parted(varied, "--vary")
+    if out is not None:
+        note_beginning(out, resume)
+    with continuable():
+        result = sweep(
+            source.path, vary, seeds, overrides=source.overrides(), out=out, workers=workers, force=force,
+            resume=resume, progress=tell, command=command_line(),
+        )  # fmt: skip
+    echo(str(result))
+    for reason in dict.fromkeys(run.failure for runs in result.runs for run in runs if run.failure):
+        echo(f"failed: {reason}", err=True)
+    echo(f"averages: {result.directory / 'sweep.csv'}")
