@@ -29,6 +29,8 @@ MOVED |= {f"en4dvar.{old}": f"en4dvar.{new}" for new, several in {
     "estimation.joint.members": "estimation.joint.challenge", "estimation.stages": "loop_state estimation.loop_state",
     "results.declared": "results.axes", "inputs.parts": "inputs.contents",
     "estimation.population.hierarchy": "estimation.population.effort",
+    "priors.varying.changes": "priors.varying.random_walk priors.varying.state_changes",
+    "priors.varying.model": "priors.varying.paths",
 }.items() for old in several.split()}  # fmt: skip
 MOVED |= {"en4dvar.cycling": "en4dvar.series", "en4dvar.storage": "en4dvar.results"}
 MOVED |= {"en4dvar_agarose.summary": "en4dvar_agarose.tables", "en4dvar_agarose.evidence": "en4dvar_agarose.fits"}
