@@ -14,8 +14,7 @@ from toys import Linear, Vectorised, Wave, make_problem, with_discrepancy
 from en4dvar.assembly.build import build
 from en4dvar.config import load_config
 from en4dvar.data.noise import Kernel, Linearisation, Predicted, RobustDiscrepancyNoise, noise_of
-from en4dvar.data.noise.discrepancy import whitened
-from en4dvar.data.noise.kernel import NUGGET
+from en4dvar.data.noise.discrepancy import NUGGET, whitened
 from en4dvar.data.noise.robust_discrepancy import _reweighted, solve_boxed
 from en4dvar.data.noise.state_space import boxed, innovations
 from en4dvar.diagnosis.response.linear import LinearResponse

@@ -28,14 +28,11 @@ A discrepancy of the model (:mod:`en4dvar.data.noise.discrepancy`) adds a Gaussi
 """
 
 from en4dvar.data.noise.blocks import BlockNoise
-from en4dvar.data.noise.bound import SIDES, BoundNoise, sides_of
 from en4dvar.data.noise.correlated import SHARED, CorrelatedNoise, Correlation, SharedErrors
-from en4dvar.data.noise.discrepancy import DiscrepancyNoise
-from en4dvar.data.noise.gaussian import Noise, ScaleSkewness
-from en4dvar.data.noise.huber import HuberNoise
-from en4dvar.data.noise.kernel import SMOOTHNESS, Kernel
+from en4dvar.data.noise.discrepancy import SMOOTHNESS, DiscrepancyNoise, Kernel
+from en4dvar.data.noise.gaussian import Linearisation, Noise, Predicted, ScaleSkewness
+from en4dvar.data.noise.losses import SIDES, BoundNoise, HuberNoise, sides_of
 from en4dvar.data.noise.make import joint_noise, noise_of, noise_of_readings, noise_of_record
-from en4dvar.data.noise.predicted import Linearisation, Predicted
 from en4dvar.data.noise.robust_discrepancy import RobustDiscrepancyNoise
 
 __all__ = [

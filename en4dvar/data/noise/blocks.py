@@ -15,11 +15,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csr_array
 
-from en4dvar.data.noise.bound import BoundNoise, record_of
 from en4dvar.data.noise.correlated import CorrelatedNoise, Correlation
-from en4dvar.data.noise.gaussian import Noise, ScaleSkewness
-from en4dvar.data.noise.huber import HuberNoise
-from en4dvar.data.noise.predicted import Linearisation, Predicted
+from en4dvar.data.noise.gaussian import Linearisation, Noise, Predicted, ScaleSkewness
+from en4dvar.data.noise.losses import BoundNoise, HuberNoise, record_of
 from en4dvar.model.state import Array
 
 Indices = npt.NDArray[np.intp]

@@ -8,12 +8,10 @@ import numpy as np
 from scipy.sparse import block_array, csr_array, eye_array
 
 from en4dvar.data.noise.blocks import BlockNoise
-from en4dvar.data.noise.bound import SIDES, BoundNoise, sides_of
 from en4dvar.data.noise.correlated import SHARED, CorrelatedNoise, Correlation, SharedErrors
-from en4dvar.data.noise.discrepancy import DiscrepancyNoise
+from en4dvar.data.noise.discrepancy import DiscrepancyNoise, Kernel
 from en4dvar.data.noise.gaussian import Noise
-from en4dvar.data.noise.huber import HuberNoise
-from en4dvar.data.noise.kernel import Kernel
+from en4dvar.data.noise.losses import SIDES, BoundNoise, HuberNoise, sides_of
 from en4dvar.data.noise.robust_discrepancy import RobustDiscrepancyNoise
 from en4dvar.model.state import Array
 

@@ -19,8 +19,8 @@ from scipy.linalg import cho_solve, solve_triangular
 
 from en4dvar.data.noise.correlated import CorrelatedNoise
 from en4dvar.data.noise.discrepancy import DiscrepancyNoise, augmented, both_sides, in_rows, whitened
-from en4dvar.data.noise.huber import HuberNoise
-from en4dvar.data.noise.predicted import Linearisation, Predicted
+from en4dvar.data.noise.gaussian import Linearisation, Predicted
+from en4dvar.data.noise.losses import HuberNoise
 from en4dvar.data.noise.state_space import boxed, innovations
 from en4dvar.model.state import Array
 
