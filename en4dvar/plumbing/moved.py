@@ -21,11 +21,13 @@ MOVED = {f"en4dvar.{name}": f"en4dvar.{home}.{name}" for home, names in HOMES.it
 MOVED |= {f"en4dvar.config.{n}": f"en4dvar.assembly.{n}" for n in ("build", "build_sequence", "reading", "find_files")}
 MOVED |= {f"en4dvar.{old}": f"en4dvar.{new}" for new, several in {
     "config.data": "config.window", "config.error": "config.error_std config.discrepancy",
-    "config.sharing": "config.population", "config.models": "config.symbols", "data.noise.make": "data.noise.joint",
+    "config.sharing": "config.population", "config.models": "config.symbols",
+    "data.noise.make": "data.noise.joint", "series.window": "series.moving",
     "data.noise.discrepancy": "data.noise.kernel", "data.noise.gaussian": "data.noise.predicted",
     "data.noise.losses": "data.noise.bound data.noise.huber",
     "descent.step_control": "descent.settling", "executor.chunks": "executor.shared",
     "model.programs.process": "model.programs.adjusted", "series.moments": "series.outcome",
+    "series.series": "series.aligned", "series.start": "series.coordinates",
     "results.store": "results.groups", "results.complete": "results.beside", "report.result": "report.notebook",
     "report.svg": "report.words report.drawing", "runs.finished": "runs.evidence_run", "inputs.readers": "inputs.order",
     "estimation.joint.members": "estimation.joint.challenge", "estimation.stages": "loop_state estimation.loop_state",
@@ -33,6 +35,7 @@ MOVED |= {f"en4dvar.{old}": f"en4dvar.{new}" for new, several in {
     "estimation.population.hierarchy": "estimation.population.effort",
     "priors.varying.changes": "priors.varying.random_walk priors.varying.state_changes",
     "priors.varying.model": "priors.varying.paths",
+    "sampling.emulated_cost": "sampling.emulator",
 }.items() for old in several.split()}  # fmt: skip
 MOVED |= {"en4dvar.cycling": "en4dvar.series", "en4dvar.storage": "en4dvar.results"}
 MOVED |= {"en4dvar_agarose.summary": "en4dvar_agarose.tables", "en4dvar_agarose.evidence": "en4dvar_agarose.fits"}
@@ -41,7 +44,7 @@ MOVED |= {"en4dvar_agarose.summary": "en4dvar_agarose.tables", "en4dvar_agarose.
 NAMES = {
     "en4dvar.problem.AssimilationSettings": "en4dvar.schemes.settings.AssimilationSettings",
     "en4dvar.problem.Localising": "en4dvar.schemes.settings.Localisation",
-}
+} | {f"en4dvar.series.{name}": f"en4dvar.data.series.{name}" for name in ("Places", "Part", "Series", "balanced")}
 
 
 def former_name(module: str, name: str) -> Any:
