@@ -34,7 +34,8 @@ MOVED |= {f"en4dvar.{old}": f"en4dvar.{new}" for new, several in {
     "results.declared": "results.axes", "inputs.parts": "inputs.contents",
     "estimation.population.hierarchy": "estimation.population.effort",
     "priors.varying.changes": "priors.varying.random_walk priors.varying.state_changes",
-    "priors.varying.model": "priors.varying.paths",
+    "priors.varying.model": "priors.varying.paths", "sampling.sweep": "sampling.nearest",
+    "sampling.refine": "sampling.shape",
     "sampling.emulated_cost": "sampling.emulator",
 }.items() for old in several.split()}  # fmt: skip
 MOVED |= {"en4dvar.cycling": "en4dvar.series", "en4dvar.storage": "en4dvar.results"}
