@@ -36,7 +36,8 @@ MOVED |= {f"en4dvar.{old}": f"en4dvar.{new}" for new, several in {
     "priors.varying.changes": "priors.varying.random_walk priors.varying.state_changes",
     "priors.varying.model": "priors.varying.paths", "sampling.sweep": "sampling.nearest",
     "sampling.refine": "sampling.shape",
-    "sampling.emulated_cost": "sampling.emulator",
+    "sampling.emulated_cost": "sampling.emulator", "diagnosis.honesty.checks": "diagnosis.honesty.lost",
+    "diagnosis.response.what_if": "diagnosis.response.linear",
 }.items() for old in several.split()}  # fmt: skip
 MOVED |= {"en4dvar.cycling": "en4dvar.series", "en4dvar.storage": "en4dvar.results"}
 MOVED |= {"en4dvar_agarose.summary": "en4dvar_agarose.tables", "en4dvar_agarose.evidence": "en4dvar_agarose.fits"}

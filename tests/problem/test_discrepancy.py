@@ -17,8 +17,7 @@ from en4dvar.data.noise import Kernel, Linearisation, Predicted, RobustDiscrepan
 from en4dvar.data.noise.discrepancy import NUGGET, whitened
 from en4dvar.data.noise.robust_discrepancy import _reweighted, solve_boxed
 from en4dvar.data.noise.state_space import boxed, innovations
-from en4dvar.diagnosis.response.linear import LinearResponse
-from en4dvar.diagnosis.response.what_if import NOWHERE, what_if
+from en4dvar.diagnosis.response.what_if import NOWHERE, LinearResponse, what_if
 from en4dvar.estimation.assimilate import assimilate, forecast, log_posterior
 from en4dvar.executor import SerialExecutor
 from en4dvar.model.forward import Alternative
