@@ -22,7 +22,7 @@ MOVED |= {f"en4dvar.config.{n}": f"en4dvar.assembly.{n}" for n in ("build", "bui
 MOVED |= {f"en4dvar.{old}": f"en4dvar.{new}" for new, several in {
     "config.data": "config.window", "config.error": "config.error_std config.discrepancy",
     "config.sharing": "config.population", "config.models": "config.symbols",
-    "data.noise.make": "data.noise.joint", "series.window": "series.moving",
+    "data.noise.make": "data.noise.joint data.noise.blocks", "series.window": "series.moving",
     "data.noise.discrepancy": "data.noise.kernel", "data.noise.gaussian": "data.noise.predicted",
     "data.noise.losses": "data.noise.bound data.noise.huber",
     "descent.step_control": "descent.settling", "executor.chunks": "executor.shared",

@@ -10,8 +10,11 @@ from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
+import numpy.typing as npt
 
 from en4dvar.model.state import Array
+
+Where = slice | npt.NDArray[np.intp]  # which readings
 
 
 @dataclass(frozen=True)
@@ -31,6 +34,11 @@ class Predicted:
     def __getitem__(self, runs: int | slice) -> "Predicted":
         """The same of some of the runs."""
         return self.each(lambda part: part[runs])
+
+    def among(self, where: Where) -> "Predicted":
+        """The same of some of the readings."""
+        rates = None if self.rates is None else self.rates[..., where]
+        return replace(self, values=self.values[..., where], rates=rates)
 
     def each(self, of: Callable[[Array], Array]) -> "Predicted":
         """What ``of`` makes of each of the arrays."""
@@ -84,6 +92,13 @@ class Linearisation:
     def of_stacked(cls, like: Predicted, reference: Array, anomalies: Array) -> "Linearisation":
         """From reference (Ky,) and anomalies (N, Ky) of what :attr:`Predicted.stacked` of ``like`` holds."""
         return cls(like.unstacked(reference), *like.parts(anomalies))
+
+    def among(self, where: Where) -> "Linearisation":
+        """The same of some of the readings."""
+        rates = None if self.rate_anomalies is None else self.rate_anomalies[:, where]
+        return replace(
+            self, prediction=self.prediction.among(where), anomalies=self.anomalies[:, where], rate_anomalies=rates
+        )
 
 
 @dataclass(frozen=True)

@@ -74,9 +74,8 @@ class RobustDiscrepancyNoise(DiscrepancyNoise):
     def _more_variance(self, values: Array, predicted: Predicted) -> Array:
         first = slice(len(values))
         kernel = replace(self.kernel, times=self.kernel.times[first])
-        rates = None if predicted.rates is None else predicted.rates[first]
         within = replace(self, std=self.std[first], time_std=self.time_std[first], kernel=kernel)
-        there = replace(predicted, values=predicted.values[first], rates=rates)
+        there = predicted.among(first)
         return np.asarray(within.error_std(there) ** 2 * (1 / within.down_weights(values, there) - 1))
 
     def cost(self, values: Array, weights: Array, predicted: Predicted) -> Array:

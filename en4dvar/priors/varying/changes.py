@@ -14,6 +14,7 @@ is multiplied by exp(c), or c is added to it, c ~ N(0, q²); these changes are p
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -54,7 +55,9 @@ class RandomWalk:
                 p = replace(p, unit="1", display_unit="1", label=f"{p.label}, in its standard deviations")
             return PriorTerm.normal(p, 0.0, 1.0 if estimated else std)
 
-        spread = PriorTerm.half_normal(_spread(first), std) if estimated else None
+        label = f"std of the changes of {SCALE.get(first.transform, 'score')} {first.parameter.label}"
+        of_changes = _of_walk(first, "change_std", label, bounds=(0.0, math.inf))
+        spread = PriorTerm.half_normal(of_changes, std) if estimated else None
         return cls(first, tuple(knots), tuple(change(k, knot) for k, knot in enumerate(knots, 1)), spread)
 
     @property
@@ -181,35 +184,18 @@ def clock(model: ForwardModel, knot: float) -> str:
 
 def _change(model: ForwardModel, first: PriorTerm, k: int, knot: float) -> Parameter:
     """The change at the k-th knot, counted from one."""
-    p, scale, (unit, shown) = first.parameter, SCALE.get(first.transform, "score"), _units(first)
+    p, scale = first.parameter, SCALE.get(first.transform, "score")
     if len(p.symbol) > 2 and p.symbol[0] == p.symbol[-1] == "$":
         function = rf"\mathrm{{{scale}}} " if scale else ""
         symbol = rf"$\Delta_{{{k}}}({function}{p.symbol[1:-1]})$"
     else:
         symbol = f"Δ{k} {scale} {p.symbol}".replace("  ", " ")
-    return Parameter(
-        f"{p.name}_change_{k}",
-        unit,
-        label=f"change of {scale} {p.label} at {clock(model, knot)}".replace("  ", " "),
-        symbol=symbol,
-        display_unit=shown,
-        source="random walk of a parameter that varies in time",
-    )
+    return _of_walk(first, f"change_{k}", f"change of {scale} {p.label} at {clock(model, knot)}", symbol=symbol)
 
 
-def _spread(first: PriorTerm) -> Parameter:
-    """The standard deviation of the changes."""
-    p, (unit, shown) = first.parameter, _units(first)
-    return Parameter(
-        f"{p.name}_change_std",
-        unit,
-        bounds=(0.0, math.inf),
-        label=f"std of the changes of {SCALE.get(first.transform, 'score')} {p.label}".replace("  ", " "),
-        display_unit=shown,
-        source="random walk of a parameter that varies in time",
-    )
-
-
-def _units(first: PriorTerm) -> tuple[str, str]:
-    """Unit and display unit of a change."""
-    return (first.parameter.unit, first.parameter.display_unit) if first.transform == "normal" else ("1", "1")
+def _of_walk(first: PriorTerm, name: str, label: str, **more: Any) -> Parameter:
+    """A quantity of the walk, in the unit of a change."""
+    p = first.parameter
+    unit, shown = (p.unit, p.display_unit) if first.transform == "normal" else ("1", "1")
+    source, label = "random walk of a parameter that varies in time", label.replace("  ", " ")
+    return Parameter(f"{p.name}_{name}", unit, label=label, display_unit=shown, source=source, **more)
