@@ -239,9 +239,6 @@ class DiscrepancyNoise(Noise):
 
         return np.asarray(self._in_parts(predicted, 1, conditional)[0])
 
-    def log_normalisation(self, weights: Array) -> float:
-        return float(np.sum(weights * (np.log(self.std) + self._log_norm())))
-
     def whiten(self, values: Array, weights: Array, at: Linearisation) -> tuple[Array, Array]:
         root = np.asarray(np.linalg.cholesky(self.covariance(at.prediction)), dtype=float)
         residual = values - at.prediction.values

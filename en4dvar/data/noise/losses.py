@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -38,7 +39,7 @@ class HuberNoise(Noise):
     def attributes(self) -> dict[str, float]:
         return {"huber_threshold": self.threshold}
 
-    @property
+    @cached_property
     def expected_curvature(self) -> float:
         """E[ρ''] under the density of ρ: the share within the threshold."""
         return self._inside / (self._inside + 2 / self.threshold * self._edge)
@@ -69,10 +70,9 @@ class HuberNoise(Noise):
         from scipy.special import ndtr, ndtri
 
         c, (which, where) = self.threshold, stream.uniform(size=(2, *shape))
-        inside = self._inside / (self._inside + 2 / c * self._edge)
         within = ndtri(ndtr(-c) + where * (1 - 2 * ndtr(-c)))
-        beyond = np.sign(which - (1 + inside) / 2) * (c - np.log(where) / c)
-        return np.asarray(np.where(which < inside, within, beyond))
+        beyond = np.sign(which - (1 + self.expected_curvature) / 2) * (c - np.log(where) / c)
+        return np.asarray(np.where(which < self.expected_curvature, within, beyond))
 
     def _loss(self, v: Array) -> Array:
         inner = np.minimum(np.abs(v), self.threshold)

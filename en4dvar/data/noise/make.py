@@ -9,7 +9,7 @@ are sums over blocks, and what each reading contributes stands at its place.
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import astuple, dataclass
 from functools import cached_property
 from typing import cast
 
@@ -108,22 +108,14 @@ class BlockNoise(Noise):
     def quadratic(self) -> bool:
         return all(block.noise.quadratic for block in self.blocks)
 
-    def frozen(self, predicted: Predicted) -> Noise:
-        return replace(self, std=self.error_std(predicted), time_std=np.zeros_like(self.std))
-
     def whitened_residual(self, values: Array, predicted: Predicted) -> Array:
         return self._each(predicted, lambda n, y, p: n.whitened_residual(y, p), values)
 
     def drawn(self, predicted: Predicted, stream: np.random.Generator) -> Array:
         return self._each(predicted, lambda n, y, p: n.drawn(p, stream), predicted.values)
 
-    def down_weights(self, values: Array, predicted: Predicted) -> Array | None:
-        if not math.isfinite(self.counts_within):
-            return None
-        return self._each(predicted, lambda n, y, p: n.influence(n.whitened_residual(y, p)), values)
-
-    def squares(self, values: Array, predicted: Predicted) -> Array:
-        return self._each(predicted, lambda n, y, p: n.squares(y, p), values)
+    def influence(self, residual: Array) -> Array:
+        return self._each(Predicted(residual), lambda n, v, _: n.influence(v), residual)
 
     def cost(self, values: Array, weights: Array, predicted: Predicted) -> Array:
         costs = [b.noise.cost(values[b.where], weights[b.where], predicted.among(b.where)) for b in self.blocks]

@@ -350,8 +350,7 @@ def _one_by_one(prior: Prior, members: Array) -> str:
 
 def _rank_score(values: Array, lost: Mask) -> float:
     """Standardised rank sum of the lost members: positive where their values are large."""
-    ranks = np.empty(len(values))
-    ranks[np.argsort(values, kind="stable")] = np.arange(1, len(values) + 1)
+    ranks = 1 + np.argsort(np.argsort(values, kind="stable"))
     n, m = int(lost.sum()), int((~lost).sum())
     expected, variance = n * (n + m + 1) / 2, n * m * (n + m + 1) / 12
     return float((ranks[lost].sum() - expected) / math.sqrt(variance))

@@ -227,7 +227,9 @@ def _shift(
     except Exception as error:  # a model may offer what does not suit the problem; the reason is kept
         return Shift(*about, unknown, unknown, unknown, np.nan, 0, f"cannot be set up: {error}")
     of_errors = np.array([name in problem.of_errors for name in problem.prior.names])
-    first = response.linear.prediction if _same_run(problem, changed) else None
+    same_times = np.array_equal(problem.observations.times, changed.observations.times)
+    same_run = changed.model is problem.model and same_times and changed.fixed == problem.fixed
+    first = response.linear.prediction if same_run else None
     chord = _chord(composite, response, std, of_prior, of_errors, first)
     moved, runs = chord.moved, chord.runs
     if chord.failure:
@@ -292,9 +294,3 @@ def _chord(
             break
         before = correction
     return _Chord(False, moved, moved, misfit, runs)
-
-
-def _same_run(problem: InverseProblem, changed: InverseProblem) -> bool:
-    """True if the changed problem predicts the same, so that the run at the mode is known."""
-    same_times = np.array_equal(problem.observations.times, changed.observations.times)
-    return changed.model is problem.model and same_times and changed.fixed == problem.fixed

@@ -29,12 +29,7 @@ Varying = RandomWalk | StateChanges
 def can_vary(model: ForwardModel, name: str) -> bool:
     """True if a parameter can change on the way: the state carries it, and it does not act at the start alone."""
     acts = not model.path_parameters or name in model.path_parameters
-    return (
-        model.resumable
-        and acts
-        and name in model.layout.names
-        and model.layout[name].stop - model.layout[name].start == 1
-    )
+    return model.resumable and acts and any(f.name == name and f.size == 1 for f in model.layout)
 
 
 @dataclass(frozen=True)
