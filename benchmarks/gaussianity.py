@@ -32,7 +32,7 @@ from en4dvar.estimation.assimilate import assimilate
 from en4dvar.executor import SerialExecutor
 from en4dvar.problem import InverseProblem
 from en4dvar.sampling import mcmc
-from en4dvar.sampling.shape import guide
+from en4dvar.sampling.refine import guide
 from en4dvar.schemes.settings import AssimilationSettings
 
 OFF = (0.5, 0.3)  # mean by standard deviations of the chain, std by a fraction

@@ -16,10 +16,9 @@ from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError, DataError
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.schemes.localisation import BlockLocalisation
-from en4dvar.series.aligned import AtPlaces
-from en4dvar.series.coordinates import EnsembleCoordinates
 from en4dvar.series.problem import SeriesProblem
-from en4dvar.series.start import InitialEnsemble
+from en4dvar.series.series import AtPlaces
+from en4dvar.series.start import EnsembleCoordinates, InitialEnsemble
 
 
 def sequence_data(config: SequenceConfig) -> dict[str, DataFile]:

@@ -22,7 +22,7 @@ from en4dvar.inputs.square import read_covariance
 from en4dvar.model.forward import ForwardModel, Observable
 from en4dvar.plumbing.errors import ConfigError, DataError, retold
 from en4dvar.priors.prior import Prior
-from en4dvar.series.coordinates import EnsembleCoordinates
+from en4dvar.series.start import EnsembleCoordinates
 from en4dvar.series.twin import TwinExperiment
 
 

@@ -69,7 +69,7 @@ class Observations:
         Parameters
         ----------
         correlation: of the errors of two series at equal times, by their names, in either order; see
-            :func:`en4dvar.data.noise.make_noise`.
+            :func:`en4dvar.data.noise.joint_noise`.
 
         Raises
         ------

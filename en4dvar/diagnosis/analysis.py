@@ -193,7 +193,7 @@ class Analysis:
     cautions: tuple[Caution, ...] = ()  # why not to trust the posterior, the worst first
     log_evidence: float = float("nan")  # ln p(y), Laplace approximation
     log_evidence_constant: float | None = None  # the same with constant parameters, NaN if unknown; None if none varies
-    shape: Mapping[str, float] = field(default_factory=dict)  # how Gaussian the posterior is (en4dvar.sampling.shape)
+    shape: Mapping[str, float] = field(default_factory=dict)  # how Gaussian the posterior is (en4dvar.sampling.refine)
     down_weights: Array | None = None  # (K,) of observations in a robust cost, at the centre; None with Gaussian errors
     refinement: Mapping[str, float] = field(default_factory=dict)  # summary of the Markov chain, if any
     residuals: Residuals | None = None  # whitened, at the centre, with what is expected of them

@@ -119,7 +119,7 @@ def gaussianity(members: Array, centre: Array, costs: Array) -> dict[str, float]
 
 def is_non_gaussian(shape: Mapping[str, float]) -> bool:
     """True if mean or spread of the ensemble are not the posterior's, from
-    :func:`~en4dvar.sampling.shape.examine_shape`.
+    :func:`~en4dvar.sampling.refine.examine_shape`.
     """
     if shape.get("emulator_fit", 0.0) >= EMULATED_ENOUGH:
         off = abs(shape["spread_ratio"] - 1)

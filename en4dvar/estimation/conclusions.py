@@ -15,7 +15,7 @@ from en4dvar.diagnosis import diagnostics as diag
 from en4dvar.diagnosis.analysis import Analysis, Descents, Discrepancy, FieldEstimate, Mode
 from en4dvar.diagnosis.influence import Influence
 from en4dvar.diagnosis.residuals import Residuals
-from en4dvar.diagnosis.response.linear import LinearResponse
+from en4dvar.diagnosis.response.what_if import LinearResponse
 from en4dvar.diagnosis.withheld import Withheld
 from en4dvar.ensemble.forecast import Forecast
 from en4dvar.ensemble.members import InitialStates

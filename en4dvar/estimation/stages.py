@@ -27,8 +27,7 @@ from en4dvar.plumbing.caution import Caution
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.problem import InverseProblem
 from en4dvar.sampling.mcmc import ChainState
-from en4dvar.sampling.refine import Refined, in_doubt, refined, samples
-from en4dvar.sampling.shape import CLEARED, examine_shape, examine_tails
+from en4dvar.sampling.refine import CLEARED, Refined, examine_shape, examine_tails, in_doubt, refined, samples
 from en4dvar.schemes import MINIMISERS
 from en4dvar.schemes.base import Weights
 from en4dvar.schemes.settings import AssimilationSettings

@@ -22,7 +22,7 @@ MOVED |= {f"en4dvar.config.{n}": f"en4dvar.assembly.{n}" for n in ("build", "bui
 MOVED |= {f"en4dvar.{old}": f"en4dvar.{new}" for new, several in {
     "config.data": "config.window config.columns", "config.error": "config.error_std config.discrepancy",
     "config.sharing": "config.population", "config.models": "config.symbols commands.listing",
-    "data.noise.make": "data.noise.joint", "descent.step_control": "descent.settling",
+    "data.noise.make": "data.noise.joint data.noise.blocks", "descent.step_control": "descent.settling",
     "executor.base": "executor.chunks executor.shared", "executor.futures": "executor.local",
     "executor.limits": "executor.blas", "model.programs.model": "model.programs.adjusted model.programs.process",
     "model.programs.pest": "model.programs.errors", "model.programs.control": "model.programs.refused",
@@ -31,7 +31,10 @@ MOVED |= {f"en4dvar.{old}": f"en4dvar.{new}" for new, several in {
     "assembly.reading": "config.find_files assembly.find_files", "plumbing.decoding": "plumbing.patterns",
     "commands.studies": "commands.calibrate commands.design commands.sweep_twin",
     "commands.several": "commands.joint commands.population", "commands.installation": "commands.listings",
-    "commands.plugins": "commands.forms commands.plugin_commands",
+    "commands.plugins": "commands.forms commands.plugin_commands", "series.window": "series.moving",
+    "data.noise.discrepancy": "data.noise.kernel", "data.noise.gaussian": "data.noise.predicted",
+    "data.noise.losses": "data.noise.bound data.noise.huber", "series.series": "series.aligned",
+    "series.start": "series.coordinates",
     "results.store": "results.groups", "results.complete": "results.beside", "report.result": "report.notebook",
     "report.svg": "report.words report.drawing", "runs.finished": "runs.evidence_run", "inputs.readers": "inputs.order",
     "estimation.joint.members": "estimation.joint.challenge", "estimation.stages": "loop_state estimation.loop_state",
@@ -47,6 +50,10 @@ MOVED |= {f"en4dvar.{old}": f"en4dvar.{new}" for new, several in {
     "descent.beyond_gaussian": "descent.bounded descent.marginal descent.noise_scale",
     "descent.field_data": "descent.field_gain", "ensemble.linalg": "ensemble.near_prior",
     "ensemble.members": "ensemble.readout", "ensemble.forecast": "ensemble.spread_rates",
+    "priors.varying.changes": "priors.varying.random_walk priors.varying.state_changes",
+    "priors.varying.model": "priors.varying.paths", "sampling.sweep": "sampling.nearest",
+    "sampling.refine": "sampling.shape", "sampling.emulated_cost": "sampling.emulator",
+    "diagnosis.honesty.checks": "diagnosis.honesty.lost", "diagnosis.response.what_if": "diagnosis.response.linear",
 }.items() for old in several.split()}  # fmt: skip
 MOVED |= {"en4dvar.cycling": "en4dvar.series", "en4dvar.storage": "en4dvar.results"}
 MOVED |= {"en4dvar_agarose.summary": "en4dvar_agarose.tables", "en4dvar_agarose.evidence": "en4dvar_agarose.fits"}
@@ -62,7 +69,7 @@ MOVED |= {f"en4dvar_bubble.{old}": f"en4dvar_bubble.{new}" for old, new in {
 NAMES = {
     "en4dvar.problem.AssimilationSettings": "en4dvar.schemes.settings.AssimilationSettings",
     "en4dvar.problem.Localising": "en4dvar.schemes.settings.Localisation",
-}
+} | {f"en4dvar.series.{name}": f"en4dvar.data.series.{name}" for name in ("Places", "Part", "Series", "balanced")}
 
 
 def former_name(module: str, name: str) -> Any:

@@ -107,12 +107,9 @@ class FieldPrior:
             scipy.fft.next_fast_len(side + math.ceil(REACH * self.length / step), real=True) if side > 1 else 1
             for side, step in zip(shape, steps, strict=True)
         )
-        squares = np.zeros(wide)
-        for axis, (count, step) in enumerate(zip(wide, steps, strict=True)):
-            i = np.arange(count)
-            along = [1] * len(wide)
-            along[axis] = count
-            squares += ((np.minimum(i, count - i) * step / self.length) ** 2).reshape(along)
+        cells = [np.arange(count) for count in wide]
+        apart = [np.minimum(i, len(i) - i) * step / self.length for i, step in zip(cells, steps, strict=True)]
+        squares = np.asarray(sum(np.ix_(*(along**2 for along in apart))))
         values = np.maximum(scipy.fft.rfftn(KERNELS[self.kernel](np.sqrt(squares))).real, 0.0)
         values /= scipy.fft.irfftn(values, wide).flat[0]
         return wide, np.sqrt(values)

@@ -15,10 +15,10 @@ from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import betainc, betaincinv, betaln, erf, erfinv, log_ndtr, ndtr, ndtri, ndtri_exp
 
-Array = NDArray[np.float64]
+from en4dvar.model.state import Array
+
 Numbers = tuple[float, ...]
 NEAR = 1e-5  # of a std from a bound: there the second order of a cut Gaussian is exact to 1e-10
 LOG_ROOT_2PI = 0.5 * math.log(2 * math.pi)

@@ -1,16 +1,24 @@
-"""A stand-in for J that costs nothing to evaluate: J of emulated predictions.
+r"""A stand-in for J that costs nothing to evaluate: J of predictions emulated by polynomials of the control vector.
 
-J is a sum of squares of residuals, and a cubic fitted to a few hundred runs gives it to a few tenths where J itself
+    m_k(x) ≈ Σ_a c_ka z^a,   z = W (x − x̄),   |a| ≤ degree
+
+Within a posterior predictions bend little, so that a few hundred runs tell them to a small part of the observation
+error. J is a sum of squares of residuals, and a cubic fitted to these runs gives it to a few tenths where J itself
 varies by tens. The fit is weighted towards runs of low J and made twice: first at draws of the Gaussian posterior, then
 with runs where the first emulator says the posterior is. The share of those runs that importance weights exp(Ĵ − J)
 leave effective says how far Ĵ can be trusted.
+
+Sources: polynomial surrogates of posteriors, Marzouk & Xiu (2009), Commun. Comput. Phys. 6, 826; sampling where the
+surrogate says, Li & Marzouk (2014), SIAM J. Sci. Comput. 36, A1163.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +29,6 @@ from en4dvar.diagnosis.diagnostics import effective_share
 from en4dvar.ensemble.forecast import Forecast
 from en4dvar.model.state import DISCREPANCY, NOISE_SCALE, Array
 from en4dvar.priors.prior import Prior
-from en4dvar.sampling.emulator import Coordinates, Emulator
 from en4dvar.sampling.walkers import advance
 
 DEGREES = (3, 2)  # tried in this order
@@ -36,6 +43,85 @@ LONGER = 60  # rounds of walkers that go on
 PER_ROUND = 10  # moves in a round
 
 Run = Callable[[Array], Forecast]
+
+
+class Coordinates(NamedTuple):
+    """z = whiten (x − centre) of control vectors (B, n); ``root`` is the inverse of ``whiten``."""
+
+    centre: Array
+    root: Array
+    whiten: Array
+
+    @classmethod
+    def about(cls, points: Array) -> Coordinates:
+        """Those in which points (N, n) have mean zero and standard deviation 1 in every direction."""
+        root = np.linalg.cholesky(np.atleast_2d(np.cov(points, rowvar=False)))
+        return cls(points.mean(axis=0), np.asarray(root), np.asarray(np.linalg.inv(root), dtype=float))
+
+    def of(self, x: Array) -> Array:
+        """z (B, n) of control vectors (B, n)."""
+        return np.asarray((x - self.centre) @ self.whiten.T)
+
+    def back(self, z: Array) -> Array:
+        """Control vectors (B, n) of z (B, n)."""
+        return np.asarray(self.centre + z @ self.root.T)
+
+
+class Emulator(NamedTuple):
+    """Polynomials of ``coordinates``: ``coefficients`` (M, K) of the monomials of ``parents``."""
+
+    coordinates: Coordinates
+    parents: npt.NDArray[np.int64]
+    coefficients: Array
+
+    @classmethod
+    def fitted(
+        cls, coordinates: Coordinates, degree: int, x: Array, outputs: Array, counts: Array, ridge: float
+    ) -> Emulator:
+        """Least squares on runs at ``x`` (B, n) that gave ``outputs`` (B, K) and count so much (B,).
+
+        ``ridge`` is relative to the normal equations of scaled columns: it decides where runs leave a coefficient open.
+        """
+        parents = monomials(x.shape[1], degree)
+        matrix = np.ascontiguousarray(basis(coordinates.of(x), parents).T)
+        weighted = matrix * counts[:, None]
+        normal = weighted.T @ matrix
+        scale = np.sqrt(np.diag(normal))
+        normal = normal / np.outer(scale, scale)
+        normal[np.diag_indices_from(normal)] += ridge
+        coefficients = np.linalg.solve(normal, (weighted.T @ outputs) / scale[:, None]) / scale[:, None]
+        return cls(coordinates, parents, np.asarray(coefficients))
+
+    def predictions(self, x: Array) -> Array:
+        """Outputs (B, K) at control vectors (B, n)."""
+        values = basis(self.coordinates.of(x), self.parents)
+        return np.asarray(np.ascontiguousarray(values.T) @ self.coefficients)
+
+
+def monomials(n: int, degree: int) -> npt.NDArray[np.int64]:
+    """(M, 2) of the monomials in n coordinates up to ``degree``, in order of degree; the first is 1.
+
+    Monomial j is monomial ``[j, 0]`` times coordinate ``[j, 1]``.
+    """
+    index: dict[tuple[int, ...], int] = {(): 0}
+    parents = [(0, 0)]
+    for d in range(1, degree + 1):
+        for combination in itertools.combinations_with_replacement(range(n), d):
+            index[combination] = len(parents)
+            parents.append((index[combination[:-1]], combination[-1]))
+    return np.array(parents, dtype=np.int64)
+
+
+def basis(z: Array, parents: npt.NDArray[np.int64]) -> Array:
+    """Monomials (M, B) of points (B, n), all of one degree at a time."""
+    values = np.empty((len(parents), len(z)))
+    values[0] = 1.0
+    begin = 1
+    while begin < len(parents):
+        end = int(np.searchsorted(parents[:, 0], begin))  # what is multiplied lies before
+        np.multiply(values[parents[begin:end, 0]], z.T[parents[begin:end, 1]], out=values[begin:end])
+        begin = end
+    return values
 
 
 @dataclass(frozen=True)

@@ -14,11 +14,11 @@ the last proposal alone, made afresh: their mean weight is unbiased.
 """
 
 from dataclasses import replace
-from typing import Protocol
 
 import numpy as np
 
 from en4dvar.model.state import Array
+from en4dvar.sampling.emulated_draws import EmulatedProposal
 from en4dvar.sampling.mixture import StudentMixture, effective_number, resampled
 
 FEWEST = 60.0  # effective draws that a proposal is fitted to: with fewer, to tempered weights
@@ -27,16 +27,7 @@ SETTLED, PARTS = 150.0, 8  # the same of proposals to a power of the posterior,
 MOST_FITTED = 1000  # and points that these are fitted to
 EACH = 4  # effective draws for each coordinate of a component: fitted to fewer it is flat in some direction
 MOST = 3.0  # times √D mean weights of D draws: more than that none counts (Ionides 2008)
-
-
-class Proposal(Protocol):
-    """A density in n coordinates that can be drawn from."""
-
-    def draw(self, count: int, stream: np.random.Generator) -> Array:
-        """(count, n)."""
-
-    def log_density(self, x: Array) -> Array:
-        """(B,) at points (B, n)."""
+Proposal = StudentMixture | EmulatedProposal
 
 
 class Importance:

@@ -128,6 +128,7 @@ def sample_modes(
     if not np.isfinite(sampler.log):
         raise ValueError("no draw about a minimum of J can be run")
     x = prior.from_white(sampler.z)
+    columns = prior.from_white_change(mixture.root.transpose(0, 2, 1))
     return WeightedDraws(
         x=x,
         shares=sampler.shares,
@@ -136,7 +137,7 @@ def sample_modes(
         lowest=sampler.lowest,
         best=x[np.argmax(sampler.target)],
         proposal=StudentMixture(
-            mixture.share, prior.from_white(mixture.centre), _of_columns(prior.from_white_change, mixture.root)
+            mixture.share, prior.from_white(mixture.centre), np.ascontiguousarray(columns.transpose(0, 2, 1))
         ),
     )
 
@@ -179,11 +180,6 @@ def _about(prior: Prior, minima: Sequence[Minimum]) -> StudentMixture:
     centre = np.vstack([*(prior.white(m.x) for m in minima), np.zeros(n)])
     root = np.stack([*(np.linalg.cholesky(prior.white_covariance(m.covariance)) for m in minima), np.eye(n)])
     return StudentMixture(share, centre, root)
-
-
-def _of_columns(change: Callable[[Array], Array], roots: Array) -> Array:
-    """The columns of matrices (M, n, n) after a change of coordinates."""
-    return np.ascontiguousarray(change(roots.transpose(0, 2, 1)).transpose(0, 2, 1))
 
 
 def nearest(prior: Prior, minima: Sequence[Minimum], x: Array) -> npt.NDArray[np.intp]:

@@ -4,30 +4,118 @@ This is the "IMR Approach" of Mancia et al. (2021). The design is a scrambled So
 coordinates of the priors within ``width`` standard deviations of their means. It is shared by all data sets, so a
 trajectory is computed once: where their priors differ it fills the smallest box around all of them, and each set takes
 its fit from within its own. Trajectories stream through in chunks; of each chunk only the best fit of every set is
-kept, on disk where a folder is given, and an interrupted sweep continues with the chunks that are missing.
+kept, on disk where a folder is given, and an interrupted sweep continues with the chunks that are missing. The fit is
+
+    NRMSE = 1 − ‖y − ŷ‖ / ‖y − ȳ‖        (section "IMR Approach")
+
+ŷ_i is the trace at the instant of its time grid nearest to t_i + t_s. Shifts are multiples of the grid's step, so a
+shift moves every index by the same number.
 """
 
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from pathlib import Path
 from zipfile import BadZipFile
 
 import numpy as np
+import numpy.typing as npt
 
 from en4dvar.data.noise import noise_of
 from en4dvar.data.observations import Observations
 from en4dvar.ensemble.forecast import forecast
 from en4dvar.executor import Executor, SerialExecutor
 from en4dvar.model.state import TIME_SHIFT, Array, Parameter
+from en4dvar.plumbing.compiled import kernel
 from en4dvar.plumbing.errors import ConfigError, DataError, retold
 from en4dvar.plumbing.files import atomic_path, inside, open_plain
 from en4dvar.priors.prior import member_stream
 from en4dvar.problem import InverseProblem
-from en4dvar.sampling.nearest import Targets, best_over_shifts, targets
 
 BATCH = 128  # trajectories whose full solution is in memory at once, a worker
 Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Targets:
+    """Readings of S data sets on one time grid.
+
+    ``grid`` (M,) s; ``values`` and ``nearest`` (sum K,) readings and indices of the grid without shift; readings of
+    set s are ``offsets[s]:offsets[s+1]``; ``scale`` (S,) ‖y − ȳ‖²; ``reach``: the shifts are −reach…reach steps.
+    """
+
+    grid: Array
+    step: float
+    values: Array
+    nearest: np.ndarray
+    offsets: np.ndarray
+    scale: Array
+    reach: int
+
+
+def targets(observations: Sequence[Observations], shift: float, step: float, earliest: float = -np.inf) -> Targets:
+    """The grid covers every reading at every shift within ±``shift`` (s), from ``earliest`` on.
+
+    Raises
+    ------
+    ValueError: a reading would be compared before ``earliest``.
+    """
+    reach = int(np.floor(shift / step * (1 + 1e-9)))
+    first = min(float(o.times[0]) for o in observations) - reach * step
+    if first < earliest:
+        raise ValueError(f"a reading shifted by {-reach * step:g} s would lie {earliest - first:g} s before the start")
+    last = max(float(o.times[-1]) for o in observations) + reach * step
+    grid = first + step * np.arange(int(np.ceil((last - first) / step * (1 - 1e-9))) + 1)
+    values = np.concatenate([o.values for o in observations])
+    nearest = np.concatenate([np.rint((o.times - first) / step).astype(np.int64) for o in observations])
+    offsets = np.concatenate([[0], np.cumsum([len(o) for o in observations])])
+    scale = np.array([np.sum((o.values - o.values.mean()) ** 2) for o in observations])
+    return Targets(np.asarray(grid, dtype=float), step, values, nearest, offsets, scale, reach)
+
+
+def best_over_shifts(traces: Array, aims: Targets) -> tuple[Array, Array]:
+    """Largest NRMSE (B, S) over the shifts of traces (B, M), and that shift (B, S) in s; −inf where a trace is NaN."""
+    shape = (len(traces), len(aims.scale))
+    squares, steps = np.empty(shape), np.empty(shape, dtype=np.int64)
+    _least_squares(np.ascontiguousarray(traces), aims.values, aims.nearest, aims.offsets, aims.reach, squares, steps)
+    return np.asarray(1 - np.sqrt(squares / aims.scale)), np.asarray(steps * aims.step)
+
+
+@kernel
+def _least_squares(
+    traces: Array,
+    values: Array,
+    nearest: npt.NDArray[np.int64],
+    offsets: npt.NDArray[np.int64],
+    reach: int,
+    squares: Array,
+    steps: npt.NDArray[np.int64],
+) -> None:
+    last = traces.shape[1] - 1
+    for b in range(traces.shape[0]):
+        trace = traces[b]
+        alive = True
+        for m in range(trace.size):
+            alive &= np.isfinite(trace[m])
+        for s in range(offsets.size - 1):
+            squares[b, s] = np.inf
+            steps[b, s] = 0
+            if not alive:
+                continue
+            for k in range(2 * reach + 1):
+                # from no shift outwards: of equal fits the smallest shift is kept
+                move = (k + 1) // 2 if k % 2 else -(k // 2)
+                total = 0.0
+                for i in range(offsets[s], offsets[s + 1]):
+                    at = min(max(nearest[i] + move, 0), last)
+                    difference = values[i] - trace[at]
+                    total += difference * difference
+                    if total >= squares[b, s]:
+                        break
+                if total < squares[b, s]:
+                    squares[b, s] = total
+                    steps[b, s] = move
 
 
 @dataclass(frozen=True)
@@ -134,9 +222,7 @@ def run_sweep(
         done += len(parts[i])
         if progress is not None:
             progress(done, total)
-    best = best_of_set[0]
-    for i in range(1, len(parts)):
-        best = best.merged(best_of_set[i])
+    best = reduce(Best.merged, (best_of_set[i] for i in range(len(parts))))
     for count, refined in _refined(score, best, settings, seed, executor):
         best = refined
         done += count
@@ -210,9 +296,7 @@ class _Score:
         """The best fits among coordinates (B, n), from ``file`` where they are, or kept there."""
         if file is not None and (kept := _kept(file)) is not None:
             return kept
-        best = self._best(x[:BATCH])
-        for i in range(BATCH, len(x), BATCH):
-            best = best.merged(self._best(x[i : i + BATCH]))
+        best = reduce(Best.merged, (self._best(x[i : i + BATCH]) for i in range(0, len(x), BATCH)))
         if file is not None:
             with atomic_path(file, durable=False) as partial, partial.open("wb") as stream:
                 np.savez(stream, **vars(best))

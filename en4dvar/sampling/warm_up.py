@@ -8,7 +8,7 @@ from en4dvar.data.noise import noise_of
 from en4dvar.data.noise.state_space import boxed, innovations
 from en4dvar.data.observations import Observations
 from en4dvar.sampling.mixture import fit_gaussians
-from en4dvar.sampling.nearest import best_over_shifts, targets
+from en4dvar.sampling.sweep import best_over_shifts, targets
 
 
 def examples() -> dict[str, Callable[[], object]]:

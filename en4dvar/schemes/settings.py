@@ -40,7 +40,7 @@ class AssimilationSettings:
     declaration of type, bounds, description and default of each. ``own`` is the scheme with its keys, which can be
     read as attributes of the settings, too.
 
-    The guidance of ``refine: mcmc`` uses the ``emulator`` as well (see :mod:`en4dvar.sampling.shape`).
+    The guidance of ``refine: mcmc`` uses the ``emulator`` as well (see :mod:`en4dvar.sampling.refine`).
 
     Raises
     ------

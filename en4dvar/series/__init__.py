@@ -7,11 +7,6 @@ from typing import Any
 
 
 def __getattr__(name: str) -> Any:
-    from en4dvar.plumbing.moved import warn
+    from en4dvar.plumbing.moved import former_name
 
-    if name in ("Places", "Part", "Series", "balanced"):
-        from en4dvar.data import series
-
-        warn(f"en4dvar.series.{name}", f"en4dvar.data.series.{name}", 2)
-        return getattr(series, name)
-    raise AttributeError(f"module 'en4dvar.series' has no attribute {name!r}")
+    return former_name(__name__, name)

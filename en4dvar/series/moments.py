@@ -24,10 +24,6 @@ class Moments:
     std: Array
     rank: Array
 
-    @classmethod
-    def empty(cls, cycles: int, size: int, ranked: bool) -> "Moments":
-        return cls(*(np.full((cycles, width), np.nan) for width in (size, size, size if ranked else 0)))
-
     def until(self, cycle: int) -> "Moments":
         """Copy of the rows before ``cycle``."""
         return Moments(*(rows[:cycle].copy() for rows in vars(self).values()))
@@ -41,7 +37,8 @@ class MomentsRecorder:
 
     def __init__(self, cycles: int, size: int, before: Moments | None = None, truth: Array | None = None):
         self._truth = truth
-        self._moments = Moments.empty(cycles, size, truth is not None)
+        widths = size, size, 0 if truth is None else size
+        self._moments = Moments(*(np.full((cycles, width), np.nan) for width in widths))
         for whole, known in zip(vars(self._moments).values(), vars(before).values() if before else (), strict=False):
             whole[: len(known)] = known
         self._cycles: list[int] = []

@@ -10,10 +10,9 @@ from en4dvar.data.series import Part, Series
 from en4dvar.executor import Executor
 from en4dvar.model.forward import Observable
 from en4dvar.model.state import Array
-from en4dvar.series.aligned import aligned
 from en4dvar.series.moments import SequentialResult, SequentialState
 from en4dvar.series.sequential import run_sequential
-from en4dvar.series.series import CycleSeries
+from en4dvar.series.series import CycleSeries, aligned
 from en4dvar.series.settings import SequentialSettings
 from en4dvar.series.start import InitialEnsemble
 

@@ -15,6 +15,7 @@ those of one ensemble; its reason is kept.
 from collections.abc import Callable, Sequence
 from dataclasses import fields
 from functools import partial
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -30,14 +31,14 @@ from en4dvar.priors.prior import member_stream
 from en4dvar.schemes.base import Weights
 from en4dvar.series.model_error import fresh_noise
 from en4dvar.series.moments import InnovationRecorder, Moments, MomentsRecorder, SequentialResult, SequentialState
-from en4dvar.series.moving import Flow, MembersLost
 from en4dvar.series.rotation import Rotations, rotate
 from en4dvar.series.series import CycleSeries as CycleSeries
 from en4dvar.series.settings import SequentialSettings as SequentialSettings
-from en4dvar.series.window import Ahead, Batch, CycleDescent, CycleWindow
+from en4dvar.series.window import Ahead, CycleDescent, CycleWindow, Flow, MembersLost, Share
 
 ALL = slice(None)
 Rows = npt.NDArray[np.intp] | slice  # of an ensemble: those that survive
+R = TypeVar("R")
 
 
 def run_sequential(
@@ -76,9 +77,9 @@ def run_sequential(
     if error is not None and error.form == "square-root" and settings.scheme.lag:
         raise ValueError("the square root of a model error is that of a filter; a smoother estimates the error")
     with one_blas_thread():
-        run = _Run(
-            model, tuple(observables), members, series, settings, seed, executor or SerialExecutor(), resume, truth
-        )
+        times = [0.0, *series.times.tolist()]
+        flow = Flow(model, tuple(observables), times, executor or SerialExecutor(), settings.coordinates, error)
+        run = _Run(flow, members, series, settings, seed, resume, truth)
         if not settings.stochastic_model:
             run.check_repeats()
         while run.done < len(series.times):
@@ -95,21 +96,17 @@ class _Run:
 
     def __init__(
         self,
-        model: ForwardModel,
-        observables: tuple[Observable, ...],
+        flow: Flow,
         members: Array,
         series: CycleSeries,
         settings: SequentialSettings,
         seed: int,
-        executor: Executor,
         resume: SequentialState | None,
         truth: Array | None,
     ):
+        self.flow, self.error = flow, flow.error
         self.series, self.settings, self.scheme, self.seed = series, settings, settings.scheme, seed
         self.initial_members, size = members.shape
-        self.error = settings.model_error
-        times = [0.0, *series.times.tolist()]
-        self.flow = Flow(model, observables, times, executor, settings.coordinates, self.error)
         self.rotations = Rotations(seed, self.initial_members) if settings.rotation else None
         cycles = len(series.times)
         self.iterations, self.effective = np.zeros(cycles), np.full(cycles, np.nan)
@@ -197,7 +194,7 @@ class _Run:
         draws = stream.standard_normal((self.initial_members, len(self.error.where)))
         return fresh_noise(centre(members)[1], draws[: len(members)])
 
-    def shares(self, newest: int, missing: bool = False) -> Batch:
+    def shares(self, newest: int, missing: bool = False) -> Share:
         """Which observations count in the window that ends at the ``newest``, and how much; or how much is missing."""
         shares = np.array(self.scheme.mda_weights)
         if missing:
@@ -297,22 +294,21 @@ class _Run:
         states, failures = run(both)
         check_repeats(flow.model, states, failures, lambda again: run([both[i] for i in again]))
 
-    def analyse(self, members: Array, batch: Batch) -> tuple[Rows, CycleWindow, CycleDescent]:
+    def analyse(self, members: Array, batch: Share) -> tuple[Rows, CycleWindow, CycleDescent]:
         """Which rows of the members survive, their window, and its descent; members lost are dropped from the prior."""
-        rows: Rows = ALL
-        while True:
+
+        def descend(rows: Rows) -> tuple[CycleWindow, CycleDescent]:
             alive = members[rows]
             window = CycleWindow(
                 self.flow, self.series, alive, self.start, batch, self.settings.localisation,
                 self.scheme, partial(self.stream, len(alive)),
             )  # fmt: skip
             descent = CycleDescent(Weights.prior(len(alive)))
-            try:
-                minimise(window, [descent])
-            except MembersLost as lost:
-                rows = self.survivors(rows, lost.reasons)
-                continue
-            return rows, window, descent
+            minimise(window, [descent])
+            return window, descent
+
+        rows, (window, descent) = self.surviving(descend)
+        return rows, window, descent
 
     def stream(self, n_members: int, name: str, size: int) -> Array:
         """Standard normal numbers (N, size), of each member the same however many follow it."""
@@ -320,10 +316,14 @@ class _Run:
 
     def run(self, members: Array, indices: Sequence[int]) -> tuple[Rows, list[Array]]:
         """Which rows survive, and the states (N', n) at the times of ``indices``."""
+        return self.surviving(lambda rows: self.flow.forecast(members[rows], self.start, indices))
+
+    def surviving(self, attempt: Callable[[Rows], R]) -> tuple[Rows, R]:
+        """The rows that none fails of, and what an attempt with them gives."""
         rows: Rows = ALL
         while True:
             try:
-                return rows, self.flow.forecast(members[rows], self.start, indices)
+                return rows, attempt(rows)
             except MembersLost as lost:
                 rows = self.survivors(rows, lost.reasons)
 

@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 from en4dvar.schemes.base import Scheme
 from en4dvar.schemes.inflation import Inflation
 from en4dvar.schemes.localisation import BlockLocalisation
-from en4dvar.series.coordinates import EnsembleCoordinates
 from en4dvar.series.model_error import ModelError
 from en4dvar.series.smoothers import EnKS, Smoother
+from en4dvar.series.start import EnsembleCoordinates
 
 NO_INFLATION = Inflation()
 

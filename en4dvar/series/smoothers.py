@@ -11,12 +11,14 @@
 For a linear model both are the Kalman smoother of the ensemble's moments. Analyses are taken before inflation, which
 would otherwise be repeated with every cycle that is gone back.
 
+``passed`` takes a cycle's ensembles (N, n) and the weights (N, N) of its analysis, ``ended`` follows the last cycle.
+``trail`` holds what a smoother keeps of earlier cycles, arrays (…, N, n); members lost are taken from them.
+
 Sources: Evensen & van Leeuwen (2000), Mon. Wea. Rev. 128, 1852; Raanes (2016), Q. J. R. Meteorol. Soc. 142, 1259.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -24,16 +26,6 @@ from en4dvar.ensemble.linalg import centre, min_norm_fit
 from en4dvar.model.state import Array
 
 Put = Callable[[int, Array], None]  # cycle, its smoothed ensemble (N, n)
-
-
-class Smoother(Protocol):
-    """``trail`` holds what a smoother keeps of earlier cycles, arrays (…, N, n); members lost are taken from them."""
-
-    def passed(self, trail: list[Array], cycle: int, forecast: Array, analysis: Array, rows: Array, put: Put) -> None:
-        """A cycle's ensembles (N, n) and the weights (N, N) of its analysis, without inflation."""
-
-    def ended(self, trail: list[Array], last: int, put: Put) -> None:
-        """After the ``last`` cycle."""
 
 
 @dataclass(frozen=True)
@@ -77,3 +69,6 @@ class EnRTS:
             following, analysis = trail[k]
             smoothed = analysis + weights @ centre(analysis)[1]
             put(k, smoothed)
+
+
+Smoother = EnKS | EnRTS

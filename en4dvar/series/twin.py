@@ -21,11 +21,11 @@ from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError, En4dvarError, retold
 from en4dvar.priors.prior import Prior, member_stream
 from en4dvar.series.moments import Moments, SequentialResult, SequentialState
-from en4dvar.series.moving import Flow, MembersLost, predictions
 from en4dvar.series.sequential import run_sequential
 from en4dvar.series.series import CycleSeries
 from en4dvar.series.settings import SequentialSettings
 from en4dvar.series.start import InitialEnsemble
+from en4dvar.series.window import Flow, MembersLost, predictions
 
 OVERCONFIDENT = 0.5  # spread over RMSE of an ensemble that has lost the truth
 

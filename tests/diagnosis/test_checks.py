@@ -12,9 +12,8 @@ from toys import Fragile, make_problem
 
 from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.diagnosis.honesty import ControlEnsembles, examine
-from en4dvar.diagnosis.honesty.checks import at_bound, rank, validity
+from en4dvar.diagnosis.honesty.checks import at_bound, loss, rank, validity, where_lost
 from en4dvar.diagnosis.honesty.examine import collapse
-from en4dvar.diagnosis.honesty.lost import loss, where_lost
 from en4dvar.model.forward import ValidityLimit
 from en4dvar.model.state import Parameter
 from en4dvar.plumbing.caution import Caution, caution

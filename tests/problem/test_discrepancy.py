@@ -14,12 +14,10 @@ from toys import Linear, Vectorised, Wave, make_problem, with_discrepancy
 from en4dvar.assembly.build import build
 from en4dvar.config import load_config
 from en4dvar.data.noise import Kernel, Linearisation, Predicted, RobustDiscrepancyNoise, noise_of
-from en4dvar.data.noise.discrepancy import whitened
-from en4dvar.data.noise.kernel import NUGGET
+from en4dvar.data.noise.discrepancy import NUGGET, whitened
 from en4dvar.data.noise.robust_discrepancy import _reweighted, solve_boxed
 from en4dvar.data.noise.state_space import boxed, innovations
-from en4dvar.diagnosis.response.linear import LinearResponse
-from en4dvar.diagnosis.response.what_if import NOWHERE, what_if
+from en4dvar.diagnosis.response.what_if import NOWHERE, LinearResponse, what_if
 from en4dvar.estimation.assimilate import assimilate, forecast, log_posterior
 from en4dvar.executor import SerialExecutor
 from en4dvar.model.forward import Alternative

@@ -18,7 +18,7 @@ from en4dvar.model.state import NOISE_SCALE
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.sampling import mcmc
 from en4dvar.sampling.emulated_cost import emulate, needed_runs
-from en4dvar.sampling.shape import CLEARED, guide
+from en4dvar.sampling.refine import CLEARED, guide
 from en4dvar.sampling.walkers import advance
 from en4dvar.schemes.settings import AssimilationSettings
 
@@ -146,7 +146,7 @@ def skewed(compiled=True):
 @pytest.fixture
 def nothing_cleared(monkeypatch):
     """An emulator for every posterior, also one that the members' own J do not call in question."""
-    monkeypatch.setattr("en4dvar.sampling.shape.CLEARED", 1.0)
+    monkeypatch.setattr("en4dvar.sampling.refine.CLEARED", 1.0)
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from en4dvar.sampling.emulator import Coordinates, Emulator, basis, monomials
+from en4dvar.sampling.emulated_cost import Coordinates, Emulator, basis, monomials
 
 
 def test_monomials_are_all_of_them():

@@ -19,8 +19,7 @@ from en4dvar.data.noise import noise_of
 from en4dvar.data.observations import Observations
 from en4dvar.executor import ThreadsExecutor
 from en4dvar.plumbing.errors import ConfigError, DataError
-from en4dvar.sampling.nearest import best_over_shifts, targets
-from en4dvar.sampling.sweep import SweepSettings, run_sweep, sobol_box
+from en4dvar.sampling.sweep import SweepSettings, best_over_shifts, run_sweep, sobol_box, targets
 from en4dvar_agarose.run import one_model
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"

@@ -6,8 +6,7 @@ from typing import Self
 
 import numpy as np
 
-from en4dvar.data.noise.gaussian import Noise
-from en4dvar.data.noise.predicted import Predicted
+from en4dvar.data.noise.gaussian import Noise, Predicted
 from en4dvar.model.state import Array
 
 

@@ -1,14 +1,104 @@
-"""Gaussian errors, independent of each other: the base of every kind, which says what differs."""
+"""What errors take from the state, and Gaussian ones, independent of each other: the base of every kind.
+
+R depends on predictions, their rates, and the parameters of the errors; a kind says what differs from :class:`Noise`.
+"""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
+import numpy.typing as npt
 
-from en4dvar.data.noise.predicted import Linearisation, Predicted
 from en4dvar.model.state import Array
+
+Where = slice | npt.NDArray[np.intp]  # which readings
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """Predictions with all that R takes from the state, of one run or of many (leading dimensions …).
+
+    ``values`` m (…, K), ``rates`` ṁ (…, K) of the observable or None where R needs none, ``noise_scale`` σ (…,) or
+    None where it is neither estimated nor fixed, ``discrepancy`` (…, 2) amplitude and length of the model's discrepancy
+    or None where there is none.
+    """
+
+    values: Array
+    rates: Array | None = None
+    noise_scale: Array | None = None
+    discrepancy: Array | None = None
+
+    def __getitem__(self, runs: int | slice) -> "Predicted":
+        """The same of some of the runs."""
+        return self.each(lambda part: part[runs])
+
+    def among(self, where: Where) -> "Predicted":
+        """The same of some of the readings."""
+        rates = None if self.rates is None else self.rates[..., where]
+        return replace(self, values=self.values[..., where], rates=rates)
+
+    def each(self, of: Callable[[Array], Array]) -> "Predicted":
+        """What ``of`` makes of each of the arrays."""
+        others = (self.rates, self.noise_scale, self.discrepancy)
+        return Predicted(of(self.values), *(None if part is None else of(part) for part in others))
+
+    @property
+    def stacked(self) -> Array:
+        """(B, Ky) of B runs side by side: m, and as far as they are there ṁ, ln σ, ln of amplitude and length."""
+        parts = [self.values]
+        if self.rates is not None:
+            parts.append(self.rates)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            if self.noise_scale is not None:
+                parts.append(np.log(self.noise_scale)[:, None])
+            if self.discrepancy is not None:
+                parts.append(np.log(self.discrepancy))
+        return np.hstack(parts) if len(parts) > 1 else parts[0]
+
+    def unstacked(self, columns: Array) -> "Predicted":
+        """The inverse of :attr:`stacked` for columns (…, Ky) of the same make, such as those of an emulator."""
+        values, rates, *logs = self.parts(columns)
+        return Predicted(values, rates, *(None if log is None else np.exp(log) for log in logs))
+
+    def parts(self, columns: Array) -> tuple[Array, Array | None, Array | None, Array | None]:
+        """Which of the columns (…, Ky) of :attr:`stacked` belong to m, ṁ, ln σ (…,), and ln of the discrepancy."""
+        k, end = self.values.shape[-1], columns.shape[-1]
+        discrepancy = None if self.discrepancy is None else columns[..., end - 2 :]
+        end -= 0 if discrepancy is None else 2
+        scale = None if self.noise_scale is None else columns[..., end - 1]
+        return columns[..., :k], None if self.rates is None else columns[..., k : 2 * k], scale, discrepancy
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """Predictions about one point, ``prediction``, and their anomalies per unit of some N coordinates.
+
+    ``anomalies`` ∂m (N, K), ``rate_anomalies`` ∂ṁ (N, K), ``log_scale_anomalies`` ∂ln σ (N,) and
+    ``log_discrepancy_anomalies`` (N, 2) of ln amplitude and ln length, the latter three None where the prediction has
+    none. Of weights, row i is the change of the prediction when the control vector moves by the prior anomaly of
+    member i.
+    """
+
+    prediction: Predicted
+    anomalies: Array
+    rate_anomalies: Array | None = None
+    log_scale_anomalies: Array | None = None
+    log_discrepancy_anomalies: Array | None = None
+
+    @classmethod
+    def of_stacked(cls, like: Predicted, reference: Array, anomalies: Array) -> "Linearisation":
+        """From reference (Ky,) and anomalies (N, Ky) of what :attr:`Predicted.stacked` of ``like`` holds."""
+        return cls(like.unstacked(reference), *like.parts(anomalies))
+
+    def among(self, where: Where) -> "Linearisation":
+        """The same of some of the readings."""
+        rates = None if self.rate_anomalies is None else self.rate_anomalies[:, where]
+        return replace(
+            self, prediction=self.prediction.among(where), anomalies=self.anomalies[:, where], rate_anomalies=rates
+        )
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ Kunisch 2002, SIAM J. Optim. 13, 865). Then ∂J_o/∂m = −u, and rows of d an
 """
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -19,8 +20,8 @@ from scipy.linalg import cho_solve, solve_triangular
 
 from en4dvar.data.noise.correlated import CorrelatedNoise
 from en4dvar.data.noise.discrepancy import DiscrepancyNoise, augmented, both_sides, in_rows, whitened
-from en4dvar.data.noise.huber import HuberNoise
-from en4dvar.data.noise.predicted import Linearisation, Predicted
+from en4dvar.data.noise.gaussian import Linearisation, Predicted
+from en4dvar.data.noise.losses import HuberNoise
 from en4dvar.data.noise.state_space import boxed, innovations
 from en4dvar.model.state import Array
 
@@ -74,9 +75,8 @@ class RobustDiscrepancyNoise(DiscrepancyNoise):
     def _more_variance(self, values: Array, predicted: Predicted) -> Array:
         first = slice(len(values))
         kernel = replace(self.kernel, times=self.kernel.times[first])
-        rates = None if predicted.rates is None else predicted.rates[first]
         within = replace(self, std=self.std[first], time_std=self.time_std[first], kernel=kernel)
-        there = replace(predicted, values=predicted.values[first], rates=rates)
+        there = predicted.among(first)
         return np.asarray(within.error_std(there) ** 2 * (1 / within.down_weights(values, there) - 1))
 
     def cost(self, values: Array, weights: Array, predicted: Predicted) -> Array:
@@ -95,14 +95,12 @@ class RobustDiscrepancyNoise(DiscrepancyNoise):
     def whiten(self, values: Array, weights: Array, at: Linearisation) -> tuple[Array, Array]:
         p = at.prediction
         u, light = self._solved(values, p)
-        s, discrepancy = self.error_std(p), self.covariance_of_discrepancy(p)
+        s, discrepancy, kappa = self.error_std(p), self.covariance_of_discrepancy(p), self.huber.expected_curvature
         root = np.linalg.cholesky(np.diag(s**2 / light) + discrepancy)
-        expected = np.asarray(np.linalg.cholesky(np.diag(s**2 / self._curvature) + discrepancy), dtype=float)
+        expected = np.asarray(np.linalg.cholesky(np.diag(s**2 / kappa) + discrepancy), dtype=float)
         white = solve_triangular(root, np.column_stack([values - p.values, at.anomalies.T]), lower=True)
         directions = self._directions(at)
-        changes = [
-            both_sides(expected, direction.errors / self._curvature + direction.discrepancy) for direction in directions
-        ]
+        changes = [both_sides(expected, direction.errors / kappa + direction.discrepancy) for direction in directions]
         # u² s²/w is vρ'(v); half of the diagonal of ∂R over s² is ∂ln s
         score = [
             0.5 * (u @ direction.discrepancy @ u + u**2 / light @ np.diag(direction.errors) - np.trace(change))
@@ -115,11 +113,6 @@ class RobustDiscrepancyNoise(DiscrepancyNoise):
         total = np.diag(self.error_std(at) ** 2 / light) + self.covariance_of_discrepancy(at)
         return np.asarray(weights[0] * cho_solve((np.linalg.cholesky(total), True), vectors.T).T)
 
-    @cached_property
-    def _curvature(self) -> float:
-        """κ."""
-        return self.huber.expected_curvature
-
     def _white(self, stream: np.random.Generator, shape: tuple[int, ...]) -> Array:
         return self.huber._white(stream, shape)
 
@@ -128,13 +121,9 @@ class RobustDiscrepancyNoise(DiscrepancyNoise):
 
     def _solved(self, values: Array, predicted: Predicted) -> tuple[Array, Array]:
         """u and w (K,) at one prediction."""
-        if self.correlation is None and self.kernel.ordered:
-            u, errors, s, *_ = self._at_mode(values, predicted)
-            most = self.threshold * s
-            return u[0], np.asarray(most / np.maximum(np.abs(errors), most))[0]
-        s, covariance = self.error_std(predicted), self.covariance_of_discrepancy(predicted)
-        u, light = solve_boxed((values - predicted.values)[None], s[None], covariance[None], self.threshold)
-        return u[0], light[0]
+        u, errors, s, *_ = self._at_mode(values, predicted)
+        most = self.threshold * s
+        return u, np.asarray(most / np.maximum(np.abs(errors), most))
 
     def whitened_residual(self, values: Array, predicted: Predicted) -> Array:
         """(S²/w + A)^{-1/2}(y − m) (…, K)."""
@@ -148,32 +137,31 @@ class RobustDiscrepancyNoise(DiscrepancyNoise):
 
     def _terms(self, values: Array, predicted: Predicted) -> Array:
         """Terms of J_o (…, K), β and ln std apart; NaN where a prediction is not finite."""
-        k, kappa = self.kernel, self._curvature
-        if self.correlation is None and k.ordered:  # in O(K)
-            with np.errstate(over="ignore", invalid="ignore"):
-                u, errors, s, delta, residual, a, length = self._at_mode(values, predicted)
-                _, roots = innovations(residual, s**2 / kappa + k.nugget * a**2, a, length, k.steps, k.smoothness)
-                terms = self.huber._loss(errors / s) + 0.5 * u * delta + np.log(roots) + 0.5 * math.log(kappa)
-            return np.asarray(terms).reshape(predicted.values.shape)
+        with np.errstate(over="ignore", invalid="ignore"):
+            u, errors, s, delta, roots = self._at_mode(values, predicted)
+            terms = self.huber._loss(errors / s) + 0.5 * u * delta + np.log(roots)
+            return np.asarray(terms + 0.5 * math.log(self.huber.expected_curvature))
 
-        def of(runs: Predicted) -> tuple[Array, ...]:
+    def _at_mode(self, values: Array, predicted: Predicted) -> Iterable[Array]:
+        """u, r − δ, s and δ at the mode in δ, and the diagonal of the root of S²/κ + A, (…, K) each."""
+        k, kappa = self.kernel, self.huber.expected_curvature
+
+        def dense(runs: Predicted) -> tuple[Array, ...]:
             residual, s, covariance = self._residual(values, runs)
             u, _ = solve_boxed(residual, s, covariance, self.threshold)
             delta = np.einsum("bij,bj->bi", covariance, u)
             _, roots = whitened(residual, _with_diagonal(covariance, s**2 / kappa))
-            shrunk = np.log(roots) + 0.5 * math.log(kappa)
-            return (np.asarray(self.huber._loss((residual - delta) / s) + 0.5 * u * delta + shrunk),)
+            return u, residual - delta, s, delta, roots
 
-        return np.asarray(self._in_parts(predicted, 1, of)[0])
-
-    def _at_mode(self, values: Array, predicted: Predicted) -> tuple[Array, ...]:
-        """u, r − δ, s, δ, r, a g (B, K) and ℓ (B,) at the mode in δ, in O(K)."""
-        runs, k = in_rows(predicted), self.kernel
+        if self.correlation is not None or not k.ordered:
+            return self._in_parts(predicted, 5, dense)
+        runs = in_rows(predicted)  # in O(K)
         amplitude, length = self._amplitude_and_length(runs)
         a = amplitude[:, None] * k.growth(runs.rates)
         residual, s, a = np.broadcast_arrays(values - runs.values, self.error_std(runs), a)
         u, delta = boxed(residual, s, k.nugget * a**2, a, length, k.steps, k.smoothness, self.threshold)
-        return u, residual - delta, s, delta, residual, a, length
+        _, roots = innovations(residual, s**2 / kappa + k.nugget * a**2, a, length, k.steps, k.smoothness)
+        return (np.reshape(part, predicted.values.shape) for part in (u, residual - delta, s, delta, roots))
 
     def _residual(self, values: Array, runs: Predicted) -> tuple[Array, Array, Array]:
         """y − m and s (B, K), A (B, K, K); NaN and one where either is not finite."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from en4dvar.data.noise.kernel import SMOOTHNESS
+from en4dvar.data.noise import SMOOTHNESS
 from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.model.state import NOISE_SCALE, Parameter
 from en4dvar.plumbing.caution import CATALOGUE, Caution

@@ -6,6 +6,7 @@ from dataclasses import replace
 from statistics import median
 
 import numpy as np
+import numpy.typing as npt
 
 from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.diagnosis.diagnostics import (
@@ -13,10 +14,11 @@ from en4dvar.diagnosis.diagnostics import (
     HARDLY_INFORMED,
     MEAN_OFF,
     SPREAD_OFF,
+    active_members,
     chi2_interval,
+    common_reasons,
     is_non_gaussian,
 )
-from en4dvar.diagnosis.residuals import Residuals
 from en4dvar.model.forward import ValidityLimit
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.caution import Caution, Severity, caution
@@ -34,6 +36,11 @@ THERE = 0.25  # of the errors' std: a discrepancy beyond it in nearly all member
 NINE_OF_TEN = (0.05, 0.95)
 SILENT = 0.1  # DFS of all readings beyond it that count as none
 EXTRAPOLATED = "no action is needed for the parameters; paths beyond the limit are extrapolated"
+MANY = 0.1  # share of members whose loss is serious
+SEPARATED = 3.0  # standard deviations of the rank sum beyond which a parameter tells lost members from others
+FAR = 1.5  # prior standard deviations from the prior mean that are worth naming for one or two members
+MOST_NAMED = 3
+Mask = npt.NDArray[np.bool_]
 Findings = Iterator[Caution]
 
 
@@ -67,12 +74,13 @@ def fit(chi2: float, n_observations: int, total_dfs: float) -> Findings:
         yield caution("overstated-error", words)
 
 
-def structure(residuals: Residuals | None, robust: bool, unit: str, times: Array) -> Findings:
+def structure(analysis: Analysis) -> Findings:
     """Residuals that are not the independent numbers of one variance that they should be.
 
     Each probability is that of a finding at least as odd where model, prior and errors are right; :data:`ODD` keeps all
-    together below half a per cent. ``times`` (K,) of all observations in ``unit``.
+    together below half a per cent.
     """
+    residuals = analysis.residuals
     if residuals is None or not residuals.enough:
         return
     runs, expected = residuals.runs
@@ -93,11 +101,12 @@ def structure(residuals: Residuals | None, robust: bool, unit: str, times: Array
             f"{_chance(residuals.collapse_chance)} where the errors are as stated): the times or the model err there"
         )
         yield caution("odd-residuals", words)
+    robust = math.isfinite(analysis.observations.noise.counts_within)
     if not robust and residuals.outlier[1] < ODD:
         which, probability = residuals.outlier
         place = int(np.flatnonzero(residuals.which == which)[0])
         words = (
-            f"the reading at {times[which]:.4g} {unit} is {abs(residuals.studentised[place]):.1f} standard deviations "
+            f"the reading at {moments(analysis)[which]} is {abs(residuals.studentised[place]):.1f} standard deviations "
             f"off (probability {_chance(probability)}); its leverage is {residuals.leverage[place]:.0%}"
         )
         yield caution("odd-residuals", words)
@@ -113,14 +122,20 @@ def missed(analysis: Analysis) -> Findings:
     low, high = np.nanquantile(analysis.posterior[:, names.index(amplitude.name)], NINE_OF_TEN)
     error = float(np.median(analysis.error_std))
     if low > THERE * error:
-        sizes = convert(np.array([low, high, error]), amplitude.unit, amplitude.display_unit)
-        least, most, noise = (shown(size, amplitude) for size in sizes)
+        least, most, noise = (shown(size, amplitude) for size in (low, high, error))
         words = (
             f"the model misses the readings by {least} to {most} (standard deviation of the discrepancy, 5 to 95 %), "
             f"beside errors of {noise}: the intervals allow for what shows in the residuals, not for what the "
             "parameters have absorbed"
         )
         yield caution("discrepancy-found", words)
+
+
+def moments(analysis: Analysis) -> list[str]:
+    """The times (K,) of all observations in the display unit."""
+    model = analysis.problem.model
+    times = convert(analysis.observations.times, model.time_unit, model.time_display_unit)
+    return [f"{time:.4g} {model.time_display_unit}" for time in times]
 
 
 def _chance(probability: float) -> str:
@@ -141,17 +156,14 @@ def conflict(prior: Prior, centre: Array) -> Findings:
 def _far(prior: Prior, z: Array, j: int) -> str:
     """Where the minimum lies and where the prior does, in the display unit."""
     term, p = prior.terms[j], prior.parameters[j]
-    at = prior.mean[j] + prior.std[j] * np.array([z[j], -1.0, 1.0])
-    value, low, high = convert(term.to_physical(at), p.unit, p.display_unit)
-    return (
-        f"{p.name} at {shown(value, p)} where the prior says {low:.3g} to {shown(high, p)}: {z[j]:+.1f} prior standard "
-        "deviations"
-    )
+    value, low, high = term.to_physical(prior.mean[j] + prior.std[j] * np.array([z[j], -1.0, 1.0]))
+    said = f"the prior says {convert(low, p.unit, p.display_unit):.3g} to {shown(high, p)}"
+    return f"{p.name} at {shown(value, p)} where {said}: {z[j]:+.1f} prior standard deviations"
 
 
 def shown(value: float, p: Parameter) -> str:
-    """A value in the display unit, with that unit."""
-    return f"{value:.3g} {p.display_unit}".removesuffix(" 1")
+    """A value, SI, in the display unit, with that unit."""
+    return f"{convert(value, p.unit, p.display_unit):.3g} {p.display_unit}".removesuffix(" 1")
 
 
 def at_bound(prior: Prior, members: Array, posterior: Array, failures: Sequence[str]) -> Findings:
@@ -177,8 +189,7 @@ def at_bound(prior: Prior, members: Array, posterior: Array, failures: Sequence[
             usual = float(np.mean(sign * (before - bound) <= NEAR * width))
             if share >= PILED_UP and share > 3 * usual:
                 words = f"{share:.0%} of the posterior members of {parameter.name} pile up at its {side} bound"
-                at = shown(convert(bound, parameter.unit, parameter.display_unit), parameter)
-                yield caution("at-bound", f"{words} ({at})", parameters=(parameter.name,))
+                yield caution("at-bound", f"{words} ({shown(bound, parameter)})", parameters=(parameter.name,))
 
 
 def validity(limits: Sequence[ValidityLimit], extremes: Array, since: Array, times: Array, leverage: Array) -> Findings:
@@ -259,17 +270,16 @@ def _both(p: Parameter, members: Array, shape: Mapping[str, float]) -> str:
 
 def down_weighted(analysis: Analysis, most: int = 6) -> Findings:
     """Observations that a robust cost counts less; ``most`` of them are listed."""
-    weights, observations, model = analysis.down_weights, analysis.problem.observations, analysis.problem.model
+    weights = analysis.down_weights
     if weights is None or not np.any(weights < 1):
         return
-    lighter = np.flatnonzero(weights < 1)
-    times = convert(observations.times, model.time_unit, model.time_display_unit)
+    lighter, moment, within = np.flatnonzero(weights < 1), moments(analysis), analysis.observations.noise.counts_within
     worst = lighter[np.argsort(weights[lighter], kind="stable")]
-    listed = ", ".join(f"{times[k]:.4g} {model.time_display_unit} (weight {weights[k]:.2g})" for k in worst[:most])
+    listed = ", ".join(f"{moment[k]} (weight {weights[k]:.2g})" for k in worst[:most])
     more = f" and {len(worst) - most} more" if len(worst) > most else ""
     words = (
-        f"{len(worst)} of {len(weights)} observations lie beyond {observations.noise.counts_within:g} standard "
-        f"deviations and were down-weighted (Huber): {listed}{more}"
+        f"{len(worst)} of {len(weights)} observations lie beyond {within:g} standard deviations and "
+        f"were down-weighted (Huber): {listed}{more}"
     )
     yield caution("down-weighted", words)
 
@@ -283,3 +293,69 @@ def weighted(analysis: Analysis) -> Findings:
         span = f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
         words = f"{len(odd)} of {len(weights)} observations count with weights of {span}"
         yield caution("not-bayesian", f"{words}: the intervals are not those of the Bayesian posterior")
+
+
+def loss(stage: str, failures: Sequence[str], prior: Prior, members: Array | None = None) -> Findings:
+    """The members (N,) that failed in a forecast; ``failures`` are reasons, "" for members alive.
+
+    ``members`` (N, n), transformed, are where they were run, if that tells anything.
+    """
+    lost = ~active_members(failures)
+    if not lost.any():
+        return
+    words = f"{lost.sum()} of {len(lost)} members failed in the {stage}: {common_reasons(failures)}"
+    if members is not None:
+        words = f"{words}; {where_lost(prior, members, lost)}"
+    yield caution("members-lost", words, "serious" if lost.mean() > MANY else None)
+
+
+def where_lost(prior: Prior, members: Array, lost: Mask) -> str:
+    """Where the lost members lie, in words and display units: the parameters that tell them from the others.
+
+    A parameter is named where the rank sum of the lost members (Mann & Whitney 1947, Ann. Math. Stat. 18, 50) is
+    :data:`SEPARATED` standard deviations from its expectation; one or two members are described one by one.
+    """
+    n_lost, n_alive = int(lost.sum()), int((~lost).sum())
+    if n_lost < 3 or n_alive < 3:
+        return _one_by_one(prior, members[lost]) if n_lost < 3 else "no parameter tells them from the few others"
+    sides: list[tuple[float, str]] = []
+    for j in range(members.shape[1]):
+        values = members[:, j]
+        score = _rank_score(values, lost)
+        if abs(score) < SEPARATED:
+            continue
+        mirrored = values if score > 0 else -values
+        edge, rest = float(np.min(mirrored[lost])), mirrored[~lost]
+        if edge <= float(rest.max()):  # not all on one side: most of the lost lie beyond this quantile
+            edge = float(np.quantile(mirrored[lost], 0.1))
+        beyond = int(np.sum(rest > edge))
+        others = f"as {beyond} of" if beyond else "none of"
+        side, at = ("above", edge) if score > 0 else ("below", -edge)
+        sides.append((abs(score), f"{prior.names[j]} {side} {_shown(prior, j, at)} ({others} the {n_alive} others)"))
+    if not sides:
+        return "they are spread over the whole ensemble"
+    named = [text for _, text in sorted(sides, key=lambda side: -side[0])[:MOST_NAMED]]
+    return f"lost members have {', '.join(named)}"
+
+
+def _one_by_one(prior: Prior, members: Array) -> str:
+    described = []
+    for row in members:
+        z = (row - prior.mean) / prior.std
+        far = [j for j in np.argsort(-np.abs(z)) if abs(z[j]) > FAR][:MOST_NAMED]
+        places = ", ".join(f"{prior.names[j]} = {_shown(prior, j, row[j])} ({z[j]:+.1f} prior std)" for j in far)
+        described.append(f"at {places}" if places else "near the centre of the prior")
+    return f"lost {' and '.join(dict.fromkeys(described))}"
+
+
+def _rank_score(values: Array, lost: Mask) -> float:
+    """Standardised rank sum of the lost members: positive where their values are large."""
+    ranks = 1 + np.argsort(np.argsort(values, kind="stable"))
+    n, m = int(lost.sum()), int((~lost).sum())
+    expected, variance = n * (n + m + 1) / 2, n * m * (n + m + 1) / 12
+    return float((ranks[lost].sum() - expected) / math.sqrt(variance))
+
+
+def _shown(prior: Prior, j: int, x: float) -> str:
+    """A transformed value as physical, in its display unit."""
+    return shown(float(prior.terms[j].to_physical(np.asarray(x))), prior.parameters[j])

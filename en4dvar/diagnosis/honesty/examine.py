@@ -11,10 +11,8 @@ from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.diagnosis.diagnostics import UNSEEN, active_members
 from en4dvar.diagnosis.honesty import checks
 from en4dvar.diagnosis.honesty.advice import advised
-from en4dvar.diagnosis.honesty.lost import loss
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, caution, untrusted, worst_first
-from en4dvar.plumbing.units import convert
 from en4dvar.priors.prior import Prior
 from en4dvar.problem import InverseProblem
 
@@ -60,15 +58,15 @@ def examine(
         *unfinished(a),
         *(checks.rank(prior, control.prior, control.posterior[alive]) if whole else ()),
         *(collapse(prior, control, alive) if whole else ()),
-        *loss("prior forecast", a.prior_failures, prior, control.prior),
-        *loss("iterations", worst_loss, prior),
-        *loss("posterior forecast", a.posterior_failures, prior, control.posterior),
+        *checks.loss("prior forecast", a.prior_failures, prior, control.prior),
+        *checks.loss("iterations", worst_loss, prior),
+        *checks.loss("posterior forecast", a.posterior_failures, prior, control.posterior),
         *checks.fit(last.chi2_per_observation * n_used, n_used, last.dfs),
-        *_structure(a),
+        *_allowed(a, checks.structure(a)),
         *checks.missed(a),
         *(checks.conflict(prior, control.centre) if whole else ()),
         *checks.at_bound(prior, control.prior, control.posterior, a.posterior_failures),
-        *_validity(a, alive),
+        *_allowed(a, _validity(a, alive)),
         *checks.gaussian(prior, members, a.shape),
     )
     silent = {name for name in prior.names if untrusted(warnings, name)} | _beside(a)
@@ -103,17 +101,11 @@ def doubts(problem: InverseProblem, members: Array, predicted: Array) -> Sequenc
     ]
 
 
-def _structure(a: Analysis) -> tuple[Caution, ...]:
-    model, observations = a.problem.model, a.problem.observations
-    times = convert(observations.times, model.time_unit, model.time_display_unit)
-    robust = math.isfinite(observations.noise.counts_within)
-    warnings = tuple(checks.structure(a.residuals, robust, model.time_display_unit, times))
-    return tuple(map(_allowed, warnings)) if a.discrepancy else warnings
-
-
-def _allowed(finding: Caution) -> Caution:
-    """A finding about what the model misses, where an estimated discrepancy allows for that: no veto of intervals."""
-    return replace(finding, severity="caution" if finding.severity == "serious" else finding.severity)
+def _allowed(a: Analysis, findings: checks.Findings) -> checks.Findings:
+    """Findings about what the model misses; no veto of intervals where an estimated discrepancy allows for that."""
+    for finding in findings:
+        vetoes = a.discrepancy is not None and finding.severity == "serious"
+        yield replace(finding, severity="caution") if vetoes else finding
 
 
 def _validity(a: Analysis, alive: npt.NDArray[np.bool_]) -> checks.Findings:
@@ -123,8 +115,7 @@ def _validity(a: Analysis, alive: npt.NDArray[np.bool_]) -> checks.Findings:
     if residuals is not None:
         which, leverage = residuals.which, residuals.leverage
     if limits:
-        beyond = checks.validity(limits, a.extremes[alive], a.beyond[alive], observations.times[which], leverage)
-        yield from map(_allowed, beyond) if a.discrepancy else beyond
+        yield from checks.validity(limits, a.extremes[alive], a.beyond[alive], observations.times[which], leverage)
 
 
 def unfinished(analysis: Analysis) -> checks.Findings:

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from en4dvar.data.noise import Linearisation
-from en4dvar.diagnosis.response.linear import LinearResponse
+from en4dvar.diagnosis.response.what_if import LinearResponse
 from en4dvar.ensemble.forecast import of_framework
 from en4dvar.ensemble.members import EVERYONE, InitialStates, Reading, Readout, batched, operators_of
 from en4dvar.executor.base import without_warnings

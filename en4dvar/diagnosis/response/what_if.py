@@ -1,17 +1,28 @@
-"""The response to a wrong assumption: where the posterior would lie, for each alternative that the model offers.
+r"""The linear response of a posterior: where its mode goes when predictions, observations or the prior change.
 
-The first run of an alternative, at the mode, gives the linear response. Unless that is small anyway each further one,
-where it leads, corrects it with the same tangent (a chord iteration), until what it changes is small in every
-parameter. An alternative that does not settle within :data:`MOST_RUNS` is beyond linear response and is fitted again.
+In coordinates c of the control vector, x = x̂ + Eᵀc, in which the prior's covariance is 1/(N−1), with the whitened
+tangent S (K', r) at the mode x̂ of J,
+
+    g(c) = (N−1) (c − c_b) − Sᵀ d(c),     A = (N−1) I + SᵀS,     δc = −A⁻¹ (g' − g),
+
+g' the gradient of the changed problem and g that of the problem itself (0 at its minimum, within what the iterations
+leave). With a constant R and the same prior this is δx = C JᵀR⁻¹ (δy − δm), C = EᵀA⁻¹E the covariance of the posterior.
+
+A wrong assumption is an alternative that the model offers. Its first run, at the mode, gives the linear response.
+Unless that is small anyway each further one, where it leads, corrects it with the same tangent (a chord iteration),
+until what it changes is small in every parameter. An alternative that does not settle within :data:`MOST_RUNS` is
+beyond linear response and is fitted again.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
-from en4dvar.data.noise import Predicted
-from en4dvar.diagnosis.response.linear import LinearResponse
+from en4dvar.data.noise import Linearisation, Predicted
+from en4dvar.data.observations import Observations
+from en4dvar.diagnosis.influence import ReadingTangent
 from en4dvar.ensemble.forecast import Composite
 from en4dvar.executor import Executor
 from en4dvar.model.forward import Alternative
@@ -24,6 +35,68 @@ SETTLED = 0.1  # of each parameter's shift, and of its std: a correction below o
 FAR = 3.0  # posterior standard deviations that a parameter of R may move: further away a chord seems to settle anywhere
 NOWHERE = "too few members survive"
 SMALL = 0.3  # posterior standard deviations of a first step that is believed without a second
+
+
+@dataclass(frozen=True)
+class LinearResponse:
+    """The tangent of the predictions at a control vector ``at`` (n,), and the prior about it.
+
+    ``linear`` holds anomalies (r, K) per unit of r coordinates, ``directions`` E (r, n) the control vector's change per
+    unit of each, ``precision`` is N − 1.
+    """
+
+    at: Array
+    linear: Linearisation
+    directions: Array
+    precision: float
+    observations: Observations
+
+    @property
+    def defined(self) -> bool:
+        """True if the mode could be run."""
+        return bool(np.isfinite(self.linear.prediction.values).all())
+
+    @cached_property
+    def whitened(self) -> tuple[Array, Array]:
+        """d (K',) and S (K', r) at ``at``."""
+        return self.observations.whiten(self.linear)
+
+    @cached_property
+    def gain(self) -> Array:
+        """∂x̂/∂d (n, K'): how the mode follows the whitened innovation."""
+        _, S = self.whitened
+        return np.asarray(self.directions.T @ np.linalg.solve(self._hessian(S), S.T))
+
+    def coordinates(self, changes: Array) -> Array:
+        """Coordinates (…, r) of changes (…, n) of the control vector, of least length."""
+        return np.asarray(np.linalg.lstsq(self.directions.T, changes.T, rcond=None)[0].T)
+
+    def step(
+        self, observations: Observations, linear: Linearisation, moved: Array, prior_shift: Array
+    ) -> tuple[Array, float]:
+        """δx (n,) to the mode of a changed problem, from ``at`` + ``moved`` (n,), where ``linear`` has its prediction
+        and a tangent, and by how much its J falls on the way, as far as it is quadratic.
+
+        ``observations`` are the changed ones, ``prior_shift`` (n,) is the change of the prior's mean.
+        """
+        d, S = self.whitened
+        changed, tangent = observations.whiten(linear)
+        gradient = self.precision * self.coordinates(moved - prior_shift) - tangent.T @ changed + S.T @ d
+        step = -np.linalg.solve(self._hessian(tangent), gradient)
+        return np.asarray(step @ self.directions), -0.5 * float(gradient @ step)
+
+    def tangent(self, members: Array) -> ReadingTangent:
+        """The rows of each reading, of independent errors, beside control vectors (N, n).
+
+        Rows of what moves R follow those of the observations, in the same order.
+        """
+        d, S = self.whitened
+        k = len(self.observations)
+        rows = d.reshape(-1, k).T, S.reshape(-1, k, S.shape[1]).transpose(1, 0, 2)
+        return ReadingTangent(*rows, self.coordinates(members - self.at), self.directions)
+
+    def _hessian(self, S: Array) -> Array:
+        return np.asarray(self.precision * np.eye(S.shape[1]) + S.T @ S)
 
 
 @dataclass(frozen=True)
@@ -154,7 +227,9 @@ def _shift(
     except Exception as error:  # a model may offer what does not suit the problem; the reason is kept
         return Shift(*about, unknown, unknown, unknown, np.nan, 0, f"cannot be set up: {error}")
     of_errors = np.array([name in problem.of_errors for name in problem.prior.names])
-    first = response.linear.prediction if _same_run(problem, changed) else None
+    same_times = np.array_equal(problem.observations.times, changed.observations.times)
+    same_run = changed.model is problem.model and same_times and changed.fixed == problem.fixed
+    first = response.linear.prediction if same_run else None
     chord = _chord(composite, response, std, of_prior, of_errors, first)
     moved, runs = chord.moved, chord.runs
     if chord.failure:
@@ -219,9 +294,3 @@ def _chord(
             break
         before = correction
     return _Chord(False, moved, moved, misfit, runs)
-
-
-def _same_run(problem: InverseProblem, changed: InverseProblem) -> bool:
-    """True if the changed problem predicts the same, so that the run at the mode is known."""
-    same_times = np.array_equal(problem.observations.times, changed.observations.times)
-    return changed.model is problem.model and same_times and changed.fixed == problem.fixed
