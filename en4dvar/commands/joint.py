@@ -25,7 +25,7 @@ def joint(runs: tuple[Path, ...], out: Path, how: dict[str, Any], names: tuple[s
       en4dvar joint runs/twelve_bubbles --share G --share mu
     """
     from en4dvar.report.joint import joint_table
-    from en4dvar.runs.joint_run import join
+    from en4dvar.runs.together import join
 
     result, page = join(runs, names, out, **how)
     return joint_table(result), result.cautions, page

@@ -40,7 +40,7 @@ def population(
       en4dvar population runs/twelve_bubbles --of G --of mu
     """
     from en4dvar.report.population import population_lines
-    from en4dvar.runs.population_run import population as estimate
+    from en4dvar.runs.together import population as estimate
 
     changed = {name: value for name, value in hyper.items() if value is not None}
     result, page = estimate(runs, names, out, hyper=changed, **how)

@@ -24,11 +24,16 @@ MOVED |= {f"en4dvar.{old}": f"en4dvar.{new}" for new, several in {
     "config.sharing": "config.population", "config.models": "config.symbols", "data.noise.make": "data.noise.joint",
     "descent.step_control": "descent.settling", "executor.chunks": "executor.shared",
     "model.programs.process": "model.programs.adjusted", "series.moments": "series.outcome",
-    "results.store": "results.groups", "results.complete": "results.beside", "report.result": "report.notebook",
-    "report.svg": "report.words report.drawing", "runs.finished": "runs.evidence_run", "inputs.readers": "inputs.order",
+    "results.store": "results.groups results.beside results.complete results.record",
+    "report.result": "report.notebook", "report.svg": "report.words report.drawing",
+    "runs.finished": "runs.evidence_run", "inputs.readers": "inputs.order",
     "estimation.joint.members": "estimation.joint.challenge", "estimation.stages": "loop_state estimation.loop_state",
     "results.declared": "results.axes", "inputs.parts": "inputs.contents",
-    "estimation.population.hierarchy": "estimation.population.effort",
+    "estimation.population.hierarchy": "estimation.population.effort", "results.netcdf": "results.xarrays",
+    "results.variables": "results.scopes results.sample_stats", "runs.rundir": "runs.replacement",
+    "runs.cycles": "runs.twin_run runs.sequence_run", "runs.engine": "runs.kind runs.session",
+    "runs.together": "runs.joint_run runs.population_run", "runs.simulation": "runs.synthetic",
+    "runs.design_run": "runs.design_plan", "runs.estimate": "runs.given", "results.checkpoint": "results.codec",
 }.items() for old in several.split()}  # fmt: skip
 MOVED |= {"en4dvar.cycling": "en4dvar.series", "en4dvar.storage": "en4dvar.results"}
 MOVED |= {"en4dvar_agarose.summary": "en4dvar_agarose.tables", "en4dvar_agarose.evidence": "en4dvar_agarose.fits"}

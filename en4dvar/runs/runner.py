@@ -18,12 +18,8 @@ from en4dvar.results.campaign_file import DamagedError, save_campaign
 from en4dvar.results.pack import PACK
 from en4dvar.results.population_file import GROUPS, load_groups_of
 from en4dvar.runs.campaign import Campaign
-from en4dvar.runs.engine import conduct_run
-from en4dvar.runs.joint_run import JointKind
-from en4dvar.runs.kind import FIGURES, REPORT, RunKind
-from en4dvar.runs.population_run import PopulationKind, groups_of, require_population
-from en4dvar.runs.session import Session
-from en4dvar.runs.together import SetGroup
+from en4dvar.runs.engine import FIGURES, REPORT, RunKind, Session, conduct_run
+from en4dvar.runs.together import JointKind, PopulationKind, SetGroup, groups_of, require_population
 from en4dvar.runs.worklist import ENDED, ITERATIONS, SUMMARY, Worklist, datasets
 
 if TYPE_CHECKING:
@@ -129,7 +125,7 @@ class EstimateKind(RunKind[Campaign]):
     def conduct(self, run: Session, executor: Executor) -> Campaign:
         work = self.work
         assert work is not None
-        if run.resumed:
+        if run.directory.resumed:
             work.recall()
         _estimate(work, executor)
         if self.config.sharing:
