@@ -30,14 +30,14 @@ from typing import Any, Literal
 
 import numpy as np
 from cheap_model import write_campaign
+from en4dvar.executor.chunks import CommonValue
 
 import en4dvar.runs.jobs
 import en4dvar_bubble
-from en4dvar.assembly.build import build_one, data_files, inverse_plan
+from en4dvar.assembly.build import data_files, inverse_plan
 from en4dvar.config import Config, load_config
 from en4dvar.ensemble.members import Reading
 from en4dvar.executor import Executor, ProcessesExecutor, SerialExecutor, ThreadsExecutor, one_blas_thread
-from en4dvar.priors.prior import own_seed
 from en4dvar.results.pack import PACK, Pack
 from en4dvar.runs.jobs import Job, estimate
 from en4dvar.runs.runner import run_campaign
@@ -83,10 +83,11 @@ def make(folder: Path, n_sets: int) -> Path:
 
 
 def jobs(config: Config) -> list[Job]:
-    return [
-        Job(build_one(config, name, file), config.assimilation, own_seed(config.seed, name), {})
-        for name, file in data_files(inverse_plan(config)).items()
-    ]
+    common = CommonValue((config, {}))
+    made = [Job(common, name, file) for name, file in data_files(inverse_plan(config)).items()]
+    for job in made:
+        _ = job.problem  # the file is read here
+    return made
 
 
 def seconds(action: Callable[[], object], clock: Callable[[], float] = time.perf_counter) -> float:

@@ -27,7 +27,7 @@ from en4dvar.estimation.assimilate import assimilate
 from en4dvar.estimation.population import population_of
 from en4dvar.executor import ThreadsExecutor
 from en4dvar.priors.prior import own_seed
-from en4dvar.runs.synthetic import draw_campaign
+from en4dvar.runs.simulation import draw_campaign
 from en4dvar_agarose.fits import HYPER, LEVELS
 from en4dvar_agarose.measured import FOLDER
 from en4dvar_agarose.run import POPULATION

@@ -44,15 +44,15 @@ from en4dvar.report.result import load_result as load_result
 from en4dvar.runs.calibration_run import calibrate as calibrate
 from en4dvar.runs.campaign import Campaign as Campaign
 from en4dvar.runs.checks import validate as validate
+from en4dvar.runs.cycles import run_sequence as run_sequence
+from en4dvar.runs.cycles import run_twin as run_twin
 from en4dvar.runs.engine import write_report as write_report
 from en4dvar.runs.estimate import estimate as estimate
 from en4dvar.runs.estimate import estimate_sequence as estimate_sequence
 from en4dvar.runs.runner import run as run
 from en4dvar.runs.runner import run_campaign as run_campaign
-from en4dvar.runs.sequence_run import run_sequence as run_sequence
 from en4dvar.runs.simulation import Simulation as Simulation
 from en4dvar.runs.simulation import simulate as simulate
-from en4dvar.runs.twin_run import run_twin as run_twin
 from en4dvar.runs.twin_sweep import TwinSweep as TwinSweep
 from en4dvar.runs.twin_sweep import sweep_twin as sweep_twin
 from en4dvar.schemes.settings import AssimilationSettings as AssimilationSettings

@@ -205,9 +205,8 @@ def _follow(config: TwinConfig | SequenceConfig, force: bool, resume: bool) -> N
     """Cycles, their table on standard output, warnings on standard error, and where the files are."""
     from en4dvar.config import TwinConfig
     from en4dvar.report.outcomes import estimates_table, scores_table
+    from en4dvar.runs.cycles import SequenceKind, TwinKind, run_sequence, run_twin
     from en4dvar.runs.progress import counted
-    from en4dvar.runs.sequence_run import SequenceKind, run_sequence
-    from en4dvar.runs.twin_run import TwinKind, run_twin
 
     if isinstance(config, TwinConfig):
         own: Any = TwinKind(config), run_twin, scores_table, config.experiment.members

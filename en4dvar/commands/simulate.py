@@ -62,7 +62,7 @@ def _simulate_campaign(source: Source, out: Path | None, seed: int | None, force
     from en4dvar.config.document import override, read_document
     from en4dvar.config.synthetic import resolve_campaign
     from en4dvar.plumbing.files import inside
-    from en4dvar.runs.synthetic import draw_campaign, write_campaign
+    from en4dvar.runs.simulation import draw_campaign, write_campaign
 
     document = override(read_document(source.path), source.overrides(seed=seed))
     base = source.path.resolve().parent

@@ -33,19 +33,18 @@ def validate(source: Source, plot: bool) -> None:
 
     loaded = check(source.path, source.overrides())
     if isinstance(loaded, TwinConfig):
-        from en4dvar.runs.twin_run import twin_summary
+        from en4dvar.runs.cycles import TwinKind
 
         if plot:
             raise click.UsageError("a twin experiment has no data to plot the prior over")
-        echo(twin_summary(loaded))
+        echo(str(TwinKind(loaded)))
         return
     if isinstance(loaded, SequenceConfig):
-        from en4dvar.assembly.build_sequence import build_sequence
-        from en4dvar.runs.sequence_run import sequence_summary
+        from en4dvar.runs.cycles import SequenceKind
 
         if plot:
             raise click.UsageError("--plot is for estimations; the report of a sequence shows its forecasts")
-        echo(sequence_summary(loaded, build_sequence(loaded)))
+        echo(str(SequenceKind(loaded)))
         return
     from en4dvar.assembly.build import build
     from en4dvar.commands.describe import cost_summary, problem_summary

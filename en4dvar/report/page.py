@@ -18,9 +18,8 @@ from en4dvar.report.svg import Drawing
 from en4dvar.report.text import number_like, plain_number
 from en4dvar.report.varying import stored_walks, verdict
 from en4dvar.report.withheld import withheld_words
-from en4dvar.results.sample_stats import SHARES
 from en4dvar.results.store import StoredResult
-from en4dvar.results.variables import ITERATIONS
+from en4dvar.results.variables import ITERATIONS, SHARES
 
 PROVENANCE = (
     "history", "date_created", "seed", "data_source", "git_commit", "configuration_file", "configuration_git_commit",

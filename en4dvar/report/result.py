@@ -18,10 +18,8 @@ from en4dvar.report import figures
 from en4dvar.report.history import history
 from en4dvar.report.page import IDENTIFIERS, render_set
 from en4dvar.report.svg import draw, on_paper
-from en4dvar.results.complete import of_members
-from en4dvar.results.netcdf import to_bytes
-from en4dvar.results.store import StoredResult, load_stored
-from en4dvar.results.xarrays import dataset_of, tree_of
+from en4dvar.results.netcdf import dataset_of, to_bytes, tree_of
+from en4dvar.results.store import StoredResult, load_stored, of_members
 
 if TYPE_CHECKING:
     import pandas as pd

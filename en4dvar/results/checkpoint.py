@@ -8,24 +8,36 @@ ensembles, perturbations and rotations are drawn again from the seed: their stre
 
 Every file starts with one line: format, version, kind, fingerprint of the run and the data set, and the SHA-256 of the
 rest. A file that was cut short, altered, or written by another run is named and not used.
+
+What it holds are frozen dataclasses of numbers, text and arrays, as an ``.npz`` archive: arrays as they are, everything
+else in one JSON text in which arrays are referred to by their name. What is read back is checked against the
+annotations of the dataclass. Nothing that is read is executed (no pickle).
 """
 
+import functools
 import hashlib
+import io
+import json
 import time
+import types
+import typing
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import numpy.typing as npt
 
 from en4dvar.plumbing.errors import OutputError, retold
 from en4dvar.plumbing.files import atomic_path, open_plain, read_at_most
-from en4dvar.results.codec import decode, encode
 
 D = TypeVar("D")
 FORMAT = "en4dvar-checkpoint"
 VERSION = "3"
 LONGEST = 64_000_000_000  # bytes of a checkpoint
 FOLDER = "checkpoints"
+_TEXT = "content"
 
 
 class CheckpointError(OutputError):
@@ -117,3 +129,96 @@ def file_digest(path: Path) -> str:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError:
         return ""
+
+
+# Dataclasses ⇄ bytes
+
+
+def encode(value: Any) -> bytes:
+    """Bytes of a dataclass whose fields are float, int, bool, str, None, float arrays, tuples and dataclasses."""
+    arrays: dict[str, np.ndarray[Any, Any]] = {}
+    text = json.dumps(_plain(value, arrays))  # repr of a float is exact; NaN and Infinity are kept
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, **{_TEXT: np.array(text)}, **arrays)
+    return buffer.getvalue()
+
+
+def encode_text(value: Any) -> bytes:
+    """As :func:`encode`, of a dataclass without arrays: its JSON text alone."""
+    return json.dumps(_plain(value, {})).encode("ascii")
+
+
+def decode(content: bytes, kind: type[D]) -> D:
+    """The dataclass of :func:`encode` or :func:`encode_text`. Raises :class:`ValueError` where the bytes are not one of
+    ``kind``.
+    """
+    with retold((OSError, KeyError, TypeError, ValueError, EOFError), ValueError, f"not a {kind.__name__}: "):
+        arrays: dict[str, np.ndarray[Any, Any]] = {}
+        text: bytes | str = content
+        if not content.startswith(b"{"):
+            with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+                arrays = {name: archive[name] for name in archive.files}
+            text = str(arrays.pop(_TEXT))
+        value: D = _reader(typing.cast(Any, kind))(json.loads(text), arrays)
+    return value
+
+
+def _plain(value: Any, arrays: dict[str, np.ndarray[Any, Any]]) -> Any:
+    if is_dataclass(value):
+        return {f.name: _plain(getattr(value, f.name), arrays) for f in fields(value)}
+    if isinstance(value, np.ndarray):
+        name = f"a{len(arrays)}"
+        arrays[name] = value
+        return {"array": name}
+    if isinstance(value, tuple):
+        return [_plain(item, arrays) for item in value]
+    if isinstance(value, np.generic):
+        return value.item()
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    raise TypeError(f"cannot store a {type(value).__name__}")
+
+
+_Arrays = dict[str, np.ndarray[Any, Any]]
+_Reader = Callable[[Any, _Arrays], Any]  # what the JSON text says → the value of a type
+
+
+@functools.cache  # a campaign reads as many of one kind as it has data sets
+def _reader(kind: Any) -> _Reader:
+    """Raises, when it reads, :class:`KeyError`, :class:`TypeError` or :class:`ValueError`."""
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin in (typing.Union, types.UnionType):
+        other = _reader(next(a for a in arguments if a is not type(None)))
+        return lambda raw, arrays: None if raw is None and type(None) in arguments else other(raw, arrays)
+    if origin in (np.ndarray, npt.NDArray):  # from NumPy 2.5 on NDArray is an alias with a name of its own
+        return lambda raw, arrays: arrays[raw["array"]]
+    if origin is tuple and arguments[1:] == (Ellipsis,):
+        item = _reader(arguments[0])
+        return lambda raw, arrays: tuple(item(part, arrays) for part in raw)
+    if origin is tuple:
+        items = tuple(map(_reader, arguments))
+        return lambda raw, arrays: tuple(read(part, arrays) for read, part in zip(items, raw, strict=True))
+    if origin is typing.Literal:
+        return functools.partial(_choice, arguments)
+    if is_dataclass(kind):
+        hints = typing.get_type_hints(kind)
+        return functools.partial(_dataclass, kind, {f.name: _reader(hints[f.name]) for f in fields(kind)})
+    return functools.partial(_simple, (int, float) if kind is float else (kind,))
+
+
+def _dataclass(kind: Any, readers: dict[str, _Reader], raw: Any, arrays: _Arrays) -> Any:
+    if set(raw) != set(readers):
+        raise ValueError(f"the fields of {kind} differ")
+    return kind(**{name: readers[name](item, arrays) for name, item in raw.items()})
+
+
+def _choice(choices: tuple[Any, ...], raw: Any, _: _Arrays) -> Any:
+    if raw not in choices:
+        raise ValueError(f"{raw!r} is not one of {choices}")
+    return raw
+
+
+def _simple(kinds: tuple[type, ...], raw: Any, _: _Arrays) -> Any:
+    if type(raw) not in kinds:
+        raise TypeError(f"{raw!r} is not a {kinds[-1].__name__}")
+    return raw

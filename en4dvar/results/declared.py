@@ -1,14 +1,14 @@
 """Variables and attributes of a result file, each declared once: name, dimensions, unit, meaning, and its values.
 
 Writing follows the declarations (:func:`lay_out`), and so do the check of a file that is read
-(:mod:`en4dvar.results.complete`) and the reference page of the documentation.
+(:mod:`en4dvar.results.store`) and the reference page of the documentation.
 
 A name may hold a placeholder, as in ``{parameter}_centre``. Such a variable exists once for each item of a scope (each
 parameter, each series), whose names take the places of all placeholders in its name and its dimensions.
 """
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -65,7 +65,6 @@ class When:
 
 OWN = UnitRule("its own", lambda _, item: item.about, ("units", "display_units", "symbol"))
 NUMBER = UnitRule("1", lambda _, item: {"units": "1"})
-TEXT = UnitRule("", lambda _, item: {"units": ""})
 ALWAYS = When("", lambda _, item: True)
 
 
@@ -99,13 +98,6 @@ class Declared:
         about = {**self.unit.attributes(subject, item), "long_name": self.meaning.format(label=item.label)}
         dims = tuple(self.dims.format(**item.names).split())
         return Variable(dims, np.asarray(values), netcdf_attributes(about), self.fill, self.single)
-
-    def expanded(self, names: Mapping[str, Sequence[Mapping[str, str]]]) -> Iterator[str]:
-        """The names of the variables, from the names of the items of each scope."""
-        if not self.scope:
-            yield self.name
-        for of_item in names.get(self.scope, ()):
-            yield self.name.format(**of_item)
 
 
 @dataclass(frozen=True)

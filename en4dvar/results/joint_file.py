@@ -18,8 +18,7 @@ from en4dvar.plumbing.caution import Caution, parsed, worst_first
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.units import convert
 from en4dvar.results.declared import text
-from en4dvar.results.netcdf import Group, Variable, read_groups, to_bytes, understood, variable
-from en4dvar.results.xarrays import tree_of
+from en4dvar.results.netcdf import Group, Variable, read_groups, to_bytes, tree_of, understood, variable
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -5,8 +5,10 @@ value of floats, truth values as bytes with ``dtype: bool``, text as variable-le
 sees the same. A file is made in memory: a worker far away can do it, and a file system is touched once.
 
 :class:`Group` and :class:`Variable` are what the program works with: the import of xarray takes as long as an estimate.
-:mod:`~en4dvar.results.xarrays` shows them through it.
+:func:`tree_of` and :func:`dataset_of` show them through it.
 """
+
+from __future__ import annotations
 
 import os
 import threading
@@ -14,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import netCDF4
 import numpy as np
@@ -24,6 +26,9 @@ from en4dvar.plumbing.errors import DataError, OutputError, retold
 from en4dvar.plumbing.files import atomic_path
 from en4dvar.plumbing.hdf5 import require_whole
 from en4dvar.results.seal import SealedBytes, check_seal, seal_file
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 _LOCK = threading.Lock()  # the netCDF library is not safe to use from several threads
 _MORE = 1 << 18  # bytes; more than the library had left to write
@@ -287,3 +292,21 @@ def define_variable(
     made.set_auto_maskandscale(False)
     made.setncatts(attributes)
     return made
+
+
+def tree_of(groups: Groups) -> xr.DataTree:
+    """All groups, by path."""
+    import xarray as xr
+
+    return xr.DataTree.from_dict({path: dataset_of(group) for path, group in groups.items()})
+
+
+def dataset_of(group: Group) -> xr.Dataset:
+    """One group."""
+    import xarray as xr
+
+    def shown(v: Variable) -> xr.Variable:
+        return xr.Variable(v.dims, v.stored, v.attrs, {} if v.fill else {"_FillValue": None})
+
+    variables, coords = ({name: shown(v) for name, v in part.items()} for part in (group.variables, group.coords))
+    return xr.Dataset(variables, coords, group.attrs)

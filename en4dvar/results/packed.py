@@ -9,8 +9,7 @@ import functools
 import json
 import math
 import struct
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -112,12 +111,8 @@ def unpacked_together(contents: Sequence[Content], wanted: Collection[str]) -> l
     return list(map(alike, places_of.values()))
 
 
-@contextmanager
-def _understanding() -> Iterator[None]:
-    with retold(
-        (struct.error, ValueError, KeyError, TypeError, AttributeError, IndexError), ValueError, "no packed groups: "
-    ):
-        yield
+_NONE = struct.error, ValueError, KeyError, TypeError, AttributeError, IndexError
+_understanding = functools.partial(retold, _NONE, ValueError, "no packed groups: ")
 
 
 @functools.lru_cache(maxsize=64)

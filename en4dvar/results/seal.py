@@ -68,13 +68,17 @@ def check_seal(path: Path) -> bool:
     """
     try:
         with open_plain(path) as file:
-            line = _last_line(file, path)
-            digest = _digest_before(file)
+            line, digest = _last_line(file, path), hashlib.sha256()
+            left = file.tell() - _LENGTH
+            file.seek(0)
+            while left > 0 and (block := file.read(min(left, 1 << 20))):
+                digest.update(block)
+                left -= len(block)
     except FileNotFoundError:
         raise OutputError(f"{path}: no such file") from None
     except OSError as error:
         raise OutputError(f"{path}: cannot be read: {error.strerror or error}") from None
-    if line != _line(digest):
+    if line != _line(digest.hexdigest()):
         raise OutputError(f"{path}: damaged or altered since it was written (its checksum does not match)")
     return line.decode("ascii") in WRITTEN
 
@@ -91,17 +95,6 @@ def _last_line(file: BinaryIO, path: Path) -> bytes:
     if words[1] != VERSION:
         raise OutputError(f"{path}: result format {words[1]}; this version of en4dvar reads {VERSION}")
     return line
-
-
-def _digest_before(file: BinaryIO) -> str:
-    """SHA-256 of what stands before the last line."""
-    digest = hashlib.sha256()
-    left = max(file.seek(0, os.SEEK_END) - _LENGTH, 0)
-    file.seek(0)
-    while left and (block := file.read(min(left, 1 << 20))):
-        digest.update(block)
-        left -= len(block)
-    return digest.hexdigest()
 
 
 def _line(digest: str) -> bytes:

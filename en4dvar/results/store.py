@@ -1,29 +1,39 @@
-"""A stored result: what a run hands back, as its groups, without xarray; an analysis laid out in the ArviZ schema."""
+"""A stored result: what a run hands back, as its groups, without xarray; an analysis laid out in the ArviZ schema.
 
-from collections.abc import Mapping, Sequence
+Some groups stand beside those of ArviZ: tools take every variable of the observed data for one that is predicted, and
+every dimension of the predictions for one of the readings. So errors of readings and paths have groups of their own.
+
+A file that is read is checked for what a result consists of, also behind a good seal, for anybody can seal a file.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import csr_array
 
+from en4dvar.config.models import symbol_fault
+from en4dvar.data.noise import SIDES, noise_of_readings, noise_of_record
 from en4dvar.data.observations import Observations
+from en4dvar.data.series import Part, Places
 from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.estimation.summary import ParameterSummary, brief, living, results_table
-from en4dvar.model.forward import Observable
+from en4dvar.model.forward import Observable, Trajectory
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.caution import Caution, parsed
 from en4dvar.plumbing.errors import OutputError, retold
-from en4dvar.results.complete import check_complete, joined, of_members
-from en4dvar.results.declared import Axis, attributes_of, axes_of, group_of, lay_out, parameter_of
+from en4dvar.plumbing.units import UnitError, convert
+from en4dvar.results.declared import MEMBER, Axis, Declared, attributes_of, axes_of, group_of, lay_out, parameter_of
 from en4dvar.results.netcdf import Group, Groups, Variable, read_groups, understood
 from en4dvar.results.pack import PACK, read_result
 from en4dvar.results.packed import unpacked
-from en4dvar.results.record import observations_of
-from en4dvar.results.scalars import ATTRIBUTES
-from en4dvar.results.scopes import SCOPES
-from en4dvar.results.variables import COORDINATES, GROUPS, OPTIONAL
+from en4dvar.results.scalars import ATTRIBUTES, SCALAR
+from en4dvar.results.variables import COORDINATES, GROUPS, OPTIONAL, SCOPES
 
 NEXT = ".en4dvar-next"  # in a run directory: the run that replaces its result
 COMPLETE = ".en4dvar-complete"  # in that: it is being put in place
@@ -131,8 +141,30 @@ class StoredResult:
 
         ``observables``: what the series hold, by their names; the file does not know how a model predicts them.
         """
-        later = self.groups.get("/withheld")
-        return observations_of(self.group("observed_data"), self.axes, self.name, observables or {}, later)
+        held, axes, later = "observed_data", self.axes, self.groups.get("/withheld")
+        data, std = self.group(held), self.of_readings(held, "reading_std")
+        times, time_std = (self.of_readings(held, key, shared=True) for key in ("time", "time_std"))
+        parts = _parts(data, axes, observables or {})
+        if parts:
+            matrix = _correlation(data, len(times)) if "correlation" in data else None
+            within = [float(data.attrs.get(f"{p.name}_huber_threshold", math.inf)) for p in parts]
+            thresholds = np.repeat(within, [p.end - p.begin for p in parts])
+            sides = data[SIDES].values if SIDES in data else None
+            noise = noise_of_readings(std, time_std, matrix, thresholds, sides)
+        else:
+            own = {key.removeprefix(f"{axes[0].name}_"): value.values for key, value in data.variables.items()}
+            noise = noise_of_record(times, std, time_std, own, data.attrs)
+        return Observations(
+            times=times,
+            values=np.concatenate([data[axis.name].values for axis in axes]),
+            noise=noise,
+            weights=self.of_readings(held, "weights", shared=True),
+            name=self.name,
+            source=str(data.attrs["data_source"]),
+            scalars={k.removeprefix(SCALAR): float(v) for k, v in data.attrs.items() if k.startswith(SCALAR)},
+            parts=parts,
+            continued=None if later is None else _continued(data, later, axes[0].name, self.name),
+        )
 
     @property
     def ended(self) -> str:
@@ -191,3 +223,158 @@ def build_groups(a: Analysis, attributes: Mapping[str, Any]) -> dict[str, Group]
         if variables or path not in OPTIONAL:
             groups[path] = group_of(variables, coordinates, attributes_of(ATTRIBUTES.get(path, ()), a))
     return groups
+
+
+# The check of what is read
+
+
+BESIDE: Mapping[str, str] = {
+    "observed_data": "observation_errors",
+    "prior_predictive": "prior_paths",
+    "posterior_predictive": "posterior_paths",
+}
+
+
+def joined(groups: Groups, path: str) -> Group:
+    """A group with the variables of the one beside it; files of earlier versions have all in one."""
+    group, beside = groups[path], groups.get(f"/{BESIDE.get(path[1:])}")
+    if beside is None:
+        return group
+    return Group({**group.variables, **beside.variables}, {**group.coords, **beside.coords}, group.attrs)
+
+
+_OPTIONAL = OPTIONAL | {*(f"/{name}" for name in BESIDE.values())}
+
+
+def check_complete(path: Path, groups: Groups) -> None:
+    """Check the groups of a file. Raises :class:`OutputError`, which names what is missing."""
+    for fault in _faults({path: joined(groups, path) for path in groups}):
+        raise OutputError(f"{path}: not a result of en4dvar: {fault}")
+
+
+def of_members(group: Group) -> dict[str, Variable]:
+    """The variables of a group with one number a member: its parameters, without their values over pieces of time."""
+    return {name: variable for name, variable in group.variables.items() if variable.dims == tuple(MEMBER.split())}
+
+
+def _faults(nodes: Groups) -> Iterator[str]:
+    required = [path for path in GROUPS if path not in _OPTIONAL]
+    if missing := [path[1:] for path in required if path not in nodes]:
+        yield f"no group {', '.join(missing)}"
+    for path, attributes in ATTRIBUTES.items():
+        if missing := [a.name for a in attributes if a.needed and a.name not in nodes[path].attrs]:
+            yield f"{path} has no attribute {', '.join(missing)}"
+    if not nodes["/log_likelihood"].variables:
+        yield "/log_likelihood has no variable"
+    held = (tuple(nodes[path].variables) for path in ("/log_likelihood", "/constant_data"))
+    declared = _declared(*held, tuple(of_members(nodes["/posterior"])))
+    for path in required:
+        content = nodes[path]
+        needed = {dim for variable in content.variables.values() for dim in variable.dims} & declared[
+            "coordinates"
+        ].keys()
+        needed |= {name for name, d in declared[path].items() if d.needed}
+        if missing := sorted(name for name in needed if name not in content):
+            yield f"{path} has no variable {', '.join(missing)}"
+        yield from _curve_faults(path, content, nodes)
+        yield from _label_faults(path, content, declared["coordinates"] | declared[path])
+
+
+@lru_cache(maxsize=8)
+def _declared(
+    series_names: tuple[str, ...], fixed: tuple[str, ...], parameters: tuple[str, ...]
+) -> dict[str, dict[str, Declared]]:
+    """By group, the declarations of the variables that it may have, by name; those of coordinates by themselves."""
+    axes = axes_of(series_names)
+    series = [{"series": axis.name, "shared": axis.own(""), "time": axis.time} for axis in axes]
+    names: dict[str, list[dict[str, str]]] = {
+        "": [{}],
+        "parameter": [{"parameter": name} for name in parameters],
+        "fixed": [{"fixed": name} for name in fixed],
+        **dict.fromkeys(("series", "shared", "time"), series),
+    }
+    tables = {path: (*table, *GROUPS.get(f"/{BESIDE.get(path[1:])}", ())) for path, table in GROUPS.items()}
+    tables["coordinates"] = COORDINATES
+    return {
+        path: {d.name.format(**of_item): d for d in table for of_item in names.get(d.scope, ())}
+        for path, table in tables.items()
+    }
+
+
+def _curve_faults(path: str, group: Group, nodes: Groups) -> Iterator[str]:
+    """Each series has a curve along the path, except one of a field."""
+    for name in nodes["/log_likelihood"].variables if path.endswith("_predictive") else ():
+        if f"{name}_path" not in group and f"{name}_place" not in nodes["/observed_data"]:
+            yield f"{path} has no variable {name}_path"
+
+
+def _label_faults(path: str, group: Group, declared: Mapping[str, Declared]) -> Iterator[str]:
+    """What keeps variables from being shown: other dimensions, a label or unit that is missing or means nothing."""
+    for name, variable in group.every.items():
+        about = variable.attrs
+        wanted = ["units", *["display_units"] * ("symbol" in about)]
+        if name in declared:
+            wanted, dims = [*declared[name].unit.keys, "long_name"], declared[name].dims.split()
+            if len(dims) != len(variable.dims):
+                yield f"{path}/{name} has {len(variable.dims)} dimensions instead of {len(dims)}"
+        if missing := [key for key in wanted if key not in about]:
+            yield f"{path}/{name} has no attribute {', '.join(missing)}"
+        try:
+            convert(1.0, str(about["units"]), str(about.get("display_units", about["units"])))
+        except UnitError as error:
+            yield f"{path}/{name}: {error}"
+        for key in ("symbol", "long_name"):
+            if reason := symbol_fault(str(about.get(key, ""))):
+                yield f"{path}/{name}: its {key} cannot be written in a figure: {reason}"
+
+
+# Parts of the observations of a file
+
+
+def _continued(data: Group, later: Group, series: str, name: str) -> Observations:
+    """The readings of the window and those after it."""
+
+    def both(of_window: str, after: str = "") -> Array:
+        return np.concatenate([data[of_window].values, later[after or of_window].values])
+
+    times, std = both("time", "withheld_time"), both(f"{series}_reading_std")
+    noise = noise_of_record(times, std, both("time_std"), {}, data.attrs)
+    return Observations(times, both(series), noise, np.ones(len(times)), name)
+
+
+def _correlation(data: Group, count: int) -> csr_array:
+    """Of all readings, from the matrix or from its entries that are not zero."""
+    values = data["correlation"].values
+    if values.ndim == 2:
+        return csr_array(values)
+    rows, columns = (data[f"correlation_{side}"].values for side in ("row", "column"))
+    return csr_array((values, (rows, columns)), shape=(count, count))
+
+
+def _parts(data: Group, axes: Sequence[Axis], observables: Mapping[str, Observable]) -> tuple[Part, ...]:
+    """The series; () of a single one without places."""
+    ends = np.cumsum([len(data[axis.name].values) for axis in axes]).tolist()
+    parts = [
+        Part(axis.name, observables.get(axis.name) or _unread(data, axis), begin, end, _places(data, axis))
+        for axis, begin, end in zip(axes, [0, *ends], ends, strict=False)
+    ]
+    return () if len(parts) == 1 and parts[0].places is None else tuple(parts)
+
+
+def _places(data: Group, axis: Axis) -> Places | None:
+    name = f"{axis.name}_place"
+    if name not in data:
+        return None
+    indices, shares = data[f"{name}_index"].values.astype(np.intp), data[f"{name}_share"].values
+    return Places(indices, shares, data[name].values, str(data[name].attrs["units"]))
+
+
+def _unread(data: Group, axis: Axis) -> Observable:
+    """What a file knows of an observable; only a model knows how it is predicted."""
+
+    def refuse(trajectory: Trajectory) -> Array:
+        raise NotImplementedError(f"{axis.name} is that of a file; give the model's observable")
+
+    about = data[axis.name].attrs
+    label = str(about["long_name"]).removesuffix(", observed")
+    return Observable(axis.name, about["units"], refuse, about["symbol"], about["display_units"], label)

@@ -36,9 +36,7 @@ from en4dvar.problem import InverseProblem
 from en4dvar.report.calibration import Calibration, load_calibration
 from en4dvar.results.calibration_file import ERRORS, FIT, LEVELS, Judged, write_sets
 from en4dvar.results.checkpoint import FOLDER, Keeper, digest
-from en4dvar.runs.engine import conduct_run
-from en4dvar.runs.kind import RunKind
-from en4dvar.runs.session import Session
+from en4dvar.runs.engine import RunKind, Session, conduct_run
 
 STATE = f"{FOLDER}/calibration"
 ATTEMPTS = 100  # truths that the model cannot run are drawn again so often
@@ -95,6 +93,7 @@ class CalibrationKind(RunKind[Calibration]):
     """
 
     name = "calibrate"
+    units = "sets that are done"
     result = "calibration.csv"
     files = (result, STATE)
     pages = ("calibration.html",)
@@ -121,9 +120,6 @@ class CalibrationKind(RunKind[Calibration]):
                 raise ConfigError("calibrate: fields that are estimated cell by cell have no ranks to test")
             if not np.array_equal(problem.observations.times, maker.observations.times):
                 raise DataError(f"{name}: the readings that are made are not at the times of those that are estimated")
-
-    def kept(self) -> str:
-        return f"the sets that are done are kept in {self.directory}"
 
     def conduct(self, run: Session, executor: Executor) -> Calibration:
         fingerprint = digest(run.identity.settings.encode() + repr(run.identity.data).encode())

@@ -7,12 +7,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, overload
+from typing import TYPE_CHECKING, Any
 
 from en4dvar.estimation.summary import ParameterSummary, frame, results_table
 from en4dvar.plumbing.caution import Caution
 from en4dvar.plumbing.errors import OutputError, TooFewMembersError, retold
-from en4dvar.results.codec import decode_text
+from en4dvar.results.checkpoint import decode
 from en4dvar.results.pack import Entry, read_outcome
 
 if TYPE_CHECKING:
@@ -119,13 +119,7 @@ class Outcomes(Sequence[DatasetOutcome]):
     def __len__(self) -> int:
         return len(self._stems)
 
-    @overload
-    def __getitem__(self, index: int) -> DatasetOutcome: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> tuple[DatasetOutcome, ...]: ...
-
-    def __getitem__(self, index: int | slice) -> DatasetOutcome | tuple[DatasetOutcome, ...]:
+    def __getitem__(self, index: Any) -> Any:
         stems = self._stems[index]
         return self._read(stems) if isinstance(stems, str) else tuple(map(self._read, stems))
 
@@ -140,5 +134,5 @@ class Outcomes(Sequence[DatasetOutcome]):
 
     def _read(self, stem: str) -> DatasetOutcome:
         with retold(ValueError, OutputError, f"{self._record / stem}: "):  # anybody can write a checksum
-            outcome = decode_text(self._raw(stem), DatasetOutcome)
+            outcome = decode(self._raw(stem), DatasetOutcome)
         return outcome if outcome.failure else replace(outcome, file=self._folder / self._files[stem])

@@ -1,38 +1,82 @@
-"""Runs of cycles, twin experiments and sequences: a netCDF file, ``summary.csv``, page. Resumable at any moment.
+"""The kinds of run that are cycles, one after the other: twin experiments, and sequences, which follow readings.
 
-After a kill they go on from the latest checkpoint.
+Each writes a netCDF file, ``summary.csv`` and a page. After a kill it goes on from the latest checkpoint.
 """
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
+import numpy as np
+
+from en4dvar.assembly.build_sequence import build_sequence, sequence_data
+from en4dvar.config import SequenceConfig, TwinConfig, load_sequence, load_twin, loaded
 from en4dvar.executor import Executor, choose_executor
+from en4dvar.inputs.asked import DataFile
 from en4dvar.plumbing.files import write_text
+from en4dvar.report.outcomes import SequenceOutcome, TwinOutcome
 from en4dvar.results.checkpoint import FOLDER, Keeper, digest
 from en4dvar.results.netcdf import Group, to_bytes
-from en4dvar.results.series_file import series_group
-from en4dvar.runs.kind import FIGURES, REPORT, RunKind
-from en4dvar.runs.session import Session
+from en4dvar.results.series_file import sequence_csv, series_group, twin_csv
+from en4dvar.runs.engine import FIGURES, REPORT, RunKind, Session, conduct_run
 from en4dvar.series.moments import SequentialState
-from en4dvar.series.problem import SeriesResult
-from en4dvar.series.twin import TwinResult
+from en4dvar.series.problem import SeriesProblem, SeriesResult, assimilate_series
+from en4dvar.series.twin import TwinResult, conduct
 
 Keep = Callable[[Callable[[], SequentialState]], None]
 R = TypeVar("R", SeriesResult, TwinResult)
 
 
+def run_twin(
+    config: TwinConfig | str | Path | Mapping[str, Any],
+    *,
+    overrides: Mapping[str, Any] | None = None,
+    force: bool = False,
+    resume: bool = False,
+    on_cycle: Callable[[int], None] | None = None,
+    command: str = "",
+) -> TwinOutcome:
+    """Conduct a twin experiment and write its run directory; arguments and errors as of :func:`en4dvar.run`.
+
+    ``on_cycle`` is called with the number of each cycle, from 0.
+    """
+    kind = TwinKind(loaded(config, load_twin, overrides), on_cycle)
+    return TwinOutcome(**vars(conduct_run(kind, force, resume, command)))
+
+
+def run_sequence(
+    config: SequenceConfig | str | Path | Mapping[str, Any],
+    *,
+    overrides: Mapping[str, Any] | None = None,
+    force: bool = False,
+    resume: bool = False,
+    on_cycle: Callable[[int], None] | None = None,
+    command: str = "",
+) -> SequenceOutcome:
+    """Assimilate a series of data and write its run directory; arguments and errors as of :func:`en4dvar.run`.
+
+    ``on_cycle`` is called with the index of the last observation time of each cycle, from 0.
+
+    Raises :class:`ConfigError` for ``overrides`` of a configuration that is loaded already.
+    """
+    kind = SequenceKind(loaded(config, load_sequence, overrides), on_cycle)
+    return SequenceOutcome(**vars(conduct_run(kind, force, resume, command)))
+
+
 @dataclass(frozen=True)
 class Cycles(RunKind[R]):
-    """A run of cycles, one after the other; its files are called after the kind.
+    """A run of cycles; its files are called after the kind.
 
     ``on_cycle`` is called with the number of each cycle, or the index of its last observation time, from 0.
     ``summary``: result → ``summary.csv``.
     """
 
+    units = "cycles up to the last checkpoint"
     pages = (REPORT, *FIGURES)
     summary: ClassVar[staticmethod[[Any], str]]
     config: Any
@@ -47,15 +91,26 @@ class Cycles(RunKind[R]):
     def assimilated(self, executor: Executor, resume: SequentialState | None, keep: Keep | None) -> R:
         """The result, from where to ``resume`` on; ``keep`` is given the state after each cycle."""
 
+    @abstractmethod
+    def _described(self) -> tuple[str, Any, int, str]:
+        """What it is, the prior of its parameters, its members, and its observations in words."""
+
+    def __str__(self) -> str:
+        """What ``validate`` prints of it."""
+        what, prior, members, observed = self._described()
+        drawn = f" and {', '.join(prior.names)}" if prior else ""
+        config = self.config
+        return (
+            f"{config.name}: {what}, state{drawn} estimated with {config.scheme}, {members} members, "
+            f"seed {config.seed}\n{observed}\nrun directory: {config.directory}"
+        )
+
     def again(self, executor: Executor) -> Group:
         """What its file holds, computed again, without attributes of the making."""
         return series_group(self.assimilated(executor, None, None), {})
 
     def executor(self) -> Executor:
         return choose_executor(self.model, workers=self.config.execution.workers)
-
-    def kept(self) -> str:
-        return f"the cycles up to the last checkpoint are kept in {self.directory}"
 
     def conduct(self, run: Session, executor: Executor) -> R:
         file = f"{FOLDER}/{self.name}.cycle"
@@ -80,3 +135,67 @@ class Cycles(RunKind[R]):
         if self.config.report:
             self.page(run.directory.work, figures=self.config.figures)
         return result
+
+
+class TwinKind(Cycles[TwinResult]):
+    """A configuration with a ``twin:`` section."""
+
+    name = "twin"
+    result = "twin.nc"
+    files = (result, "summary.csv", f"{FOLDER}/twin.cycle")
+    writer = "en4dvar.report.twin:write_twin_report"
+    summary = staticmethod(twin_csv)
+
+    @property
+    def cycles(self) -> int:
+        return int(self.config.experiment.cycles)
+
+    def assimilated(self, executor: Executor, resume: SequentialState | None, keep: Keep | None) -> TwinResult:
+        return conduct(self.config.experiment, self.config.seed, executor, self.on_cycle, resume, keep)
+
+    def _described(self) -> tuple[str, Any, int, str]:
+        twin = self.config.experiment
+        observed = ", ".join(f"{o.name} (std {twin.error_std[o.name]:.4g}{_unit(o.unit)})" for o in twin.observables)
+        every = f"{twin.cycles} cycles every {twin.interval:g}{_unit(self.model.time_unit)}"
+        told = f"{every} ({twin.burn_in} not counted), observed: {observed}"
+        return "twin experiment", twin.prior, twin.members, told
+
+
+class SequenceKind(Cycles[SeriesResult]):
+    """A configuration with a ``sequence:`` section."""
+
+    name = "sequence"
+    result = "sequence.nc"
+    files = (result, "summary.csv", f"{FOLDER}/sequence.cycle")
+    writer = "en4dvar.report.sequence:write_sequence_report"
+    summary = staticmethod(sequence_csv)
+
+    @cached_property
+    def problem(self) -> SeriesProblem:
+        """With the data read. Raises :class:`ConfigError`, :class:`DataError`."""
+        return build_sequence(self.config)
+
+    @cached_property
+    def data(self) -> Mapping[str, DataFile]:
+        return sequence_data(self.config)
+
+    def check(self) -> None:
+        _ = self.problem
+
+    @property
+    def cycles(self) -> int:
+        return len(self.problem.series.times)
+
+    def assimilated(self, executor: Executor, resume: SequentialState | None, keep: Keep | None) -> SeriesResult:
+        return assimilate_series(self.problem, self.config.seed, executor, self.on_cycle, resume, keep)
+
+    def _described(self) -> tuple[str, Any, int, str]:
+        problem, times = self.problem, self.problem.series.times
+        observed = ", ".join(observable.name for observable in problem.observables)
+        span = f"from {times[0]:g} to {times[-1]:g}{_unit(self.model.time_unit)}"
+        told = f"{np.isfinite(problem.series.values).sum()} readings of {observed} at {len(times)} times {span}"
+        return f"sequence of {problem.name}", problem.start.prior, problem.members, told
+
+
+def _unit(unit: str) -> str:
+    return "" if unit == "1" else f" {unit}"

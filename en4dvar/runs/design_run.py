@@ -1,33 +1,59 @@
 """The kind of run that plans experiments: every design of a file evaluated, kept as it ends, and reported."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from en4dvar.assembly.build import data_files, inverse_plan, problem_of
+from en4dvar.assembly.reading import errors_of, read_observations
 from en4dvar.config import Config, resolve
 from en4dvar.config.context import parse_spread
+from en4dvar.config.design import Value
 from en4dvar.config.document import Document, document_from, override
 from en4dvar.config.parameters import Uncertain
+from en4dvar.data.noise import noise_of
+from en4dvar.data.observations import Observations
+from en4dvar.data.series import Series
+from en4dvar.ensemble.forecast import forecast
 from en4dvar.estimation.design.evaluate import Evaluated, Method, evaluate
 from en4dvar.estimation.design.planned import Planned
 from en4dvar.executor import Executor
 from en4dvar.inputs.asked import DataFile
+from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError, En4dvarError, retold
 from en4dvar.plumbing.units import UnitError
 from en4dvar.plumbing.user_code import reason_of
 from en4dvar.problem import InverseProblem
 from en4dvar.results.checkpoint import FOLDER, Keeper, digest
 from en4dvar.results.design_file import FILE, Asked, DesignRow, Designs, load_designs, save_designs
-from en4dvar.runs.design_plan import Candidate, candidates, files_needed, planned_problem
-from en4dvar.runs.engine import conduct_run
-from en4dvar.runs.kind import RunKind
-from en4dvar.runs.session import Session
+from en4dvar.runs.engine import RunKind, Session, conduct_run
 
 STATE = f"{FOLDER}/designs"
 CHECKED = 3  # best designs whose linearised information is checked
 AGREE = 0.1  # nats
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A design: what its knobs are set to, and the configuration that this makes. Without settings: as in the file.
+
+    ``laws``: the same configuration with each of the laws that are to be told apart.
+    """
+
+    settings: Mapping[str, Value]
+    config: Config
+    laws: tuple[Config, ...] = ()
+
+    @classmethod
+    def of(cls, settings: Mapping[str, Value], document: Document, base: Path) -> "Candidate":
+        """From the document that the settings make. Raises :class:`ConfigError`."""
+        config = resolve(document, base)
+        laws = (resolve(override(document, keys), base) for keys in config.design.laws.values())
+        return cls(settings, config, tuple(laws))
 
 
 @dataclass(frozen=True)
@@ -75,6 +101,7 @@ class DesignKind(RunKind[Designs]):
     """A configuration whose experiments are yet to be made: ``every`` design is a unit of work."""
 
     name = "design"
+    units = "designs that are done"
     result = FILE
     files = (result, STATE)
     pages = ("designs.csv", "design.html")
@@ -115,9 +142,6 @@ class DesignKind(RunKind[Designs]):
 
     def check(self) -> None:
         _ = self.asked
-
-    def kept(self) -> str:
-        return f"the designs that are done are kept in {self.directory}"
 
     def conduct(self, run: Session, executor: Executor) -> Designs:
         work = _Work(self, run)
@@ -196,10 +220,10 @@ class _Work:
     def _evaluate(self, executor: Executor, numbers: Sequence[int], method: Method) -> None:
         done = {d.number for d in self.done if d.method == method}
         left = [n for n in numbers if n not in done]
-        calls = ((self.every[n], method, self.config.seed) for n in left)
-        for i, outcome in executor.map(_one, calls):
-            results, failure = ((), reason_of(outcome)) if isinstance(outcome, Exception) else outcome
-            ended = Done(left[i], method, results, failure)
+        calls = ((n, self.every[n], method, self.config.seed) for n in left)
+        for i, ended in executor.map(_one, calls):
+            if isinstance(ended, Exception):
+                ended = Done(left[i], method, (), reason_of(ended))
             self.done.append(ended)
             self.run.log.write(_line(ended))
             self.keeper.keep(lambda: tuple(self.done))
@@ -210,10 +234,9 @@ class _Work:
             raise ConfigError(f"none of the designs can be evaluated: {self.done[0].failure}")
 
 
-def _one(candidate: Candidate, method: Method, seed: int) -> tuple[tuple[Evaluated, ...], str]:
-    """Evaluate a candidate in a worker; the text says why it cannot be."""
-    config = candidate.config
-    design = config.design
+def _one(number: int, candidate: Candidate, method: Method, seed: int) -> Done:
+    """Evaluate a candidate in a worker."""
+    config, design = candidate.config, candidate.config.design
     try:
         problem, laws = planned_problem(config), [planned_problem(law) for law in candidate.laws]
         sizes, alike = design.sizes, design.experiments
@@ -223,9 +246,9 @@ def _one(candidate: Candidate, method: Method, seed: int) -> tuple[tuple[Evaluat
         costs = (design.price.of(planned.alike, len(planned.readings)) for planned in every)
         broken = [design.within.broken(len(o.readings), cost, o.beyond) for o, cost in zip(every, costs, strict=True)]
         kept = tuple(planned for planned, reason in zip(every, broken, strict=True) if not reason)
-        return kept, "" if kept else broken[0]
+        return Done(number, method, kept, "" if kept else broken[0])
     except En4dvarError as error:
-        return (), str(error)
+        return Done(number, method, (), str(error))
 
 
 def _line(done: Done) -> str:
@@ -235,3 +258,95 @@ def _line(done: Done) -> str:
     of = " of the law" if result.decision else f" ({result.method})"
     worth = f"{result.worth:.4g} nats ± {result.worth_error:.2g}{of}"
     return f"design {done.number}: {worth}, {result.forward_runs} runs"
+
+
+# From a configuration to the experiments it plans
+
+
+def candidates(document: Document, base: Path) -> Iterator[Candidate]:
+    """The file's own design, then every combination of its knobs. Raises :class:`ConfigError`."""
+    first = Candidate.of({}, document, base)
+    yield first
+    design = first.config.design
+    if design.knobs:
+        for settings in design.settings():
+            overrides = {design.knobs[name].key: value for name, value in settings.items()}
+            yield Candidate.of(settings, override(document, overrides), base)
+
+
+def planned_problem(config: Config) -> InverseProblem:
+    """The inverse problem of an experiment that is yet to be made.
+
+    Its readings are those of the model at the centre of the prior, of which errors may be a share.
+
+    Raises
+    ------
+    ConfigError: no times, or something that only readings can say. DataError: a data file that is needed cannot be
+        used. En4dvarError: the model fails at the centre of the prior.
+    """
+    plan, times = inverse_plan(config), _planned_times(config)
+    measured = None
+    for name, file in files_needed(config).items():
+        measured = read_observations(plan, file, name, config.weights)
+    if config.weights != "sum":
+        raise ConfigError([config.document.fault(("assimilation", "weights"), "only 'weights: sum' is Bayesian")])
+    if times is None and measured is not None:
+        return problem_of(config, measured)
+    assert times is not None
+    for series in plan.series:
+        error = series.data.error
+        for present, what in (
+            (bool(error.columns("", "")), "errors in a column of the file"),
+            (error.covariance is not None, "a covariance of readings"),
+            (series.data.weights is not None, "weights of readings"),
+            (series.data.places is not None, "places on a field"),
+        ):
+            if present:
+                raise ConfigError(
+                    f"data: {what} cannot be planned at design.times; leave design.times out, or state a std"
+                )
+    scale = 1.0 if measured is None else float(measured.values.max())  # for priors that refer to the largest reading
+    blank = _observations(config, [np.full(len(times), scale)] * len(plan.series), times, measured)
+    problem = problem_of(config, blank)
+    run = forecast(problem, problem.prior.mean[None])
+    if run.failures[0]:
+        raise En4dvarError(f"the model fails at the centre of the prior: {run.failures[0]}")
+    values = np.split(run.predictions[0], len(plan.series))
+    return replace(problem, observations=_observations(config, values, times, measured, stated=True))
+
+
+def _planned_times(config: Config) -> Array | None:
+    return config.design.times if config.design.times is not None else config.simulate_times
+
+
+def files_needed(config: Config) -> dict[str, DataFile]:
+    """The data file, by its name, that a plan takes its times or a prior's ``maximum`` from, if it needs one.
+
+    Raises :class:`ConfigError`, :class:`DataError`: there is none.
+    """
+    if _planned_times(config) is not None and not any(entry.needs_data for entry in config.parameters):
+        return {}
+    return dict([next(iter(data_files(inverse_plan(config)).items()))])
+
+
+def _observations(
+    config: Config, values: list[Array], times: Array, measured: Observations | None, stated: bool = False
+) -> Observations:
+    """Readings of all series at ``times``, with the errors that the file has ``stated``."""
+    plan = inverse_plan(config)
+    series = [
+        Series(
+            observable=planned.observable,
+            times=times,
+            values=own,
+            noise=errors_of(planned.data, times, own, np.arange(len(times)), {})
+            if stated
+            else noise_of(np.ones(len(times)), np.zeros(len(times))),
+            name=planned.name,
+            group=planned.group,
+            scalars=measured.scalars if measured else {},
+            source=measured.source if measured else "",
+        )
+        for planned, own in zip(plan.series, values, strict=True)
+    ]
+    return Observations.of_series(series, plan.correlation if stated else {}, config.name)

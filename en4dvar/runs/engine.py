@@ -1,22 +1,218 @@
-"""The engine of every kind of run: directory, lock, log, resume, interrupts, result in place, page."""
+"""A kind of run, declared: its files, what it is made of, how its units of work are combined, and its page.
 
-from collections.abc import Iterator, Sequence
+The engine does the rest, the same for every kind: it claims the directory and locks it, keeps what is done, resumes,
+answers interrupts, puts the result in place and writes the page. :data:`KINDS` lists the kinds.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from pkgutil import resolve_name
+from typing import Any, ClassVar, Generic, TypeVar
 
-from en4dvar.executor import ExecutorError, one_blas_thread
+from en4dvar.executor import Executor, ExecutorError, choose_executor, one_blas_thread
 from en4dvar.executor.processes import UnguardedError
-from en4dvar.plumbing.errors import OutputError
-from en4dvar.results.fingerprint import identity
+from en4dvar.inputs.asked import DataFile
+from en4dvar.model.forward import ForwardModel
+from en4dvar.plumbing.errors import ConfigError, OutputError
+from en4dvar.plumbing.files import write_text
+from en4dvar.results.checkpoint import FOLDER, CheckpointError, read_checkpoint, write_checkpoint
+from en4dvar.results.fingerprint import IDENTITY, Identity, identity
+from en4dvar.results.netcdf import understood
 from en4dvar.results.provenance import provenance
 from en4dvar.runs.interrupt import Interrupted, tell_interrupt, terminate_as_interrupt
-from en4dvar.runs.kind import FIGURES, RunKind, kind_in
 from en4dvar.runs.progress import RunLog
-from en4dvar.runs.rundir import LOG, RunDirectory
-from en4dvar.runs.session import Session, directory_mode
+from en4dvar.runs.rundir import LOG, OF_EVERY_RUN, Mode, RunDirectory
 
 R = TypeVar("R")
+S = TypeVar("S")
+REPORT = "report.html"
+FIGURES = ("figures/*.png", "figures/*.pdf")
+KINDS = {
+    "estimate": "en4dvar.runs.runner:EstimateKind",
+    "sequence": "en4dvar.runs.cycles:SequenceKind",
+    "twin": "en4dvar.runs.cycles:TwinKind",
+    "design": "en4dvar.runs.design_run:DesignKind",
+    "sweep-twin": "en4dvar.runs.twin_sweep:SweepKind",
+    "calibrate": "en4dvar.runs.calibration_run:CalibrationKind",
+    "joint": "en4dvar.runs.together:JointKind",
+    "population": "en4dvar.runs.together:PopulationKind",
+}
+
+
+class Kind:
+    """What the runs of a kind have in common.
+
+    ``files`` are those a run writes into its directory beside the ones of every run, ``pages`` those of its page, which
+    can be written again: names relative to the directory, in which ``*`` stands for any text. A file of such a name
+    that no run wrote is never replaced. ``result``: the one of ``files`` by which a finished run of this kind is known.
+    ``writer``: ``module:function`` that writes the page into a folder from its files, imported when it is wanted, for
+    what draws pages is slow to import; of a page with figures also told whether to keep these as files.
+    """
+
+    name: ClassVar[str]
+    files: ClassVar[tuple[str, ...]]
+    pages: ClassVar[tuple[str, ...]] = ()
+    result: ClassVar[str]
+    writer: ClassVar[str] = ""
+
+    @classmethod
+    def page(cls, folder: Path, datasets: Sequence[str] = (), workers: int = 1, figures: bool = False) -> Path | None:
+        """Write the page of a finished run from its result files; None for a kind that has none.
+
+        Parameters
+        ----------
+        folder: of the run. datasets: those that get a page of their own in any case. workers: processes that draw.
+        figures: also keep the figures as PDF and PNG.
+
+        Raises :class:`OutputError`.
+        """
+        if not cls.writer:
+            return None
+        told = (figures,) if {*FIGURES} <= {*cls.pages} else ()
+        with understood(folder / cls.result):
+            page: Path = resolve_name(cls.writer)(folder, *told)
+        return page
+
+
+class RunKind(Kind, ABC, Generic[R]):
+    """A run with a configuration and a directory of its own, whose units of work are kept as they end.
+
+    ``units``: what the user has of a run that is stopped, in words.
+    """
+
+    units: ClassVar[str]
+    config: Any
+    """The configuration of the run: its text, what it says resolved, seed, execution and output."""
+
+    @property
+    def directory(self) -> Path:
+        """Where the run writes."""
+        return Path(self.config.directory)
+
+    @property
+    def model(self) -> ForwardModel:
+        """The forward model, whose sources are part of what decides the numbers."""
+        model: ForwardModel = self.config.model
+        return model
+
+    @property
+    def data(self) -> Mapping[str, DataFile]:
+        """Name of each data set → its file."""
+        return {}
+
+    @property
+    def settings(self) -> str:
+        """What decides the numbers, as YAML: the resolved configuration, and what a kind is asked beside it."""
+        return str(self.config.resolved)
+
+    def check(self) -> None:
+        """Refuse, before anything is written, what cannot be computed. Raises errors of ours."""
+
+    def executor(self) -> Executor:
+        """Where the units of work are computed, as the configuration asks."""
+        asked = self.config.execution
+        return choose_executor(self.model, asked.executor, asked.workers, asked.address, asked.limits)
+
+    def kept(self) -> str:
+        """What the user has of a run that is stopped, and where."""
+        return f"the {self.units} are kept in {self.directory}"
+
+    def opened(self, run: Session) -> frozenset[str]:
+        """Look at what an earlier run left; returns the data sets that failed in it, whose files may differ now."""
+        return frozenset()
+
+    @abstractmethod
+    def conduct(self, run: Session, executor: Executor) -> R:
+        """Compute every unit of work that is not kept, combine them, and write the result files.
+
+        Raises :class:`OutputError` and what the computation raises.
+        """
+
+    def stop(self) -> None:
+        """End what computes in threads of this process."""
+
+
+def kind_named(name: str) -> type[Kind]:
+    """The declaration of a kind. Raises :class:`KeyError`."""
+    declared: type[Kind] = resolve_name(KINDS[name])
+    return declared
+
+
+def kind_in(folder: Path) -> type[Kind]:
+    """The kind of the finished run in ``folder``; that of an estimate where there is no result of another kind."""
+    kinds = map(kind_named, KINDS)  # that of an estimate first
+    return next((kind for kind in kinds if (folder / kind.result).is_file()), kind_named("estimate"))
+
+
+@dataclass
+class Session:
+    """A run at work in its directory.
+
+    ``attributes`` go into its result files; ``notices`` are what the run itself found worth a warning. It has ``begun``
+    once its directory says what it is.
+    """
+
+    config: Any
+    directory: RunDirectory
+    log: RunLog
+    identity: Identity
+    attributes: Mapping[str, str]
+    notices: list[str] = field(default_factory=list)
+    begun: bool = False
+
+    def earlier(self) -> Identity | None:
+        """The identity of the run that is resumed. Raises :class:`CheckpointError`."""
+        return read_checkpoint(self.directory.at(IDENTITY), "run", Identity) if self.directory.resumed else None
+
+    def begin(self, *files: str, retried: frozenset[str] = frozenset()) -> None:
+        """Write what the run is and claim the ``files`` it will write; a resumed run must be the same run.
+
+        ``retried``: data sets that failed, whose data files may differ.
+
+        Raises :class:`OutputError`: the run is not the same (says what has changed), the directory cannot be written.
+        """
+        directory, config = self.directory, self.config
+        earlier = self.earlier()
+        if earlier is not None and (difference := self.identity.difference(earlier, retried)):
+            raise OutputError(
+                f"{directory.path}: the run cannot be resumed to the same result, for this has changed:\n{difference}\n"
+                "give --force to compute everything again, or another --out"
+            )
+        directory.claim(*OF_EVERY_RUN, IDENTITY, *files)  # before anything is made that a failure would leave
+        directory.folder(FOLDER)
+        write_text(directory.at("config.yaml"), config.text)
+        write_text(directory.at("config.resolved.yaml"), config.resolved)
+        write_checkpoint(directory.at(IDENTITY), "run", self.identity)
+        self.begun = True
+
+    def restore(self, file: str, fingerprint: str, kind: type[S], otherwise: str) -> S | None:
+        """What a checkpoint of the run that is resumed holds; one that cannot be used is told, with what is done
+        ``otherwise``.
+        """
+        if not self.directory.resumed:
+            return None
+        try:
+            return read_checkpoint(self.directory.at(file), fingerprint, kind)
+        except CheckpointError as error:
+            self.notice(f"{error}; {otherwise}")
+            return None
+
+    def notice(self, message: str) -> None:
+        """Something about the run itself that the user should know."""
+        self.notices.append(message)
+        self.log.write(f"warning: {message}")
+
+
+def directory_mode(force: bool, resume: bool) -> Mode:
+    """How the run directory is opened. Raises :class:`ConfigError`."""
+    if force and resume:
+        raise ConfigError("force replaces a run, resume continues it; give one of them")
+    return "force" if force else "resume" if resume else "new"
 
 
 def conduct_run(kind: RunKind[R], force: bool = False, resume: bool = False, command: str = "") -> R:
@@ -83,7 +279,7 @@ def _session(kind: RunKind[Any], directory: RunDirectory, command: str) -> Itera
             "configuration_resolved": config.resolved,
         }
         with RunLog(directory.at(LOG), append=directory.resumed) as log:
-            run = Session(config, directory, directory.resumed, log, who, attributes)
+            run = Session(config, directory, log, who, attributes)
             try:
                 log.write(attributes["history"])
                 yield run

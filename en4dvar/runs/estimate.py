@@ -4,29 +4,37 @@ The arguments become the configuration that a file would hold, and the arrays th
 directory, so that everything a configuration can say can be said here, in the same words.
 """
 
+import pickle
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from en4dvar.config.document import document_of
+import numpy as np
+
+from en4dvar.config import Config, SequenceConfig
+from en4dvar.config.document import Document, document_of
 from en4dvar.config.load import resolve
+from en4dvar.config.models import HANDED, read_model
 from en4dvar.config.sequence import resolve_sequence
 from en4dvar.diagnosis.analysis import Progress
-from en4dvar.inputs.arrays import TIME
-from en4dvar.model.forward import ForwardModel
-from en4dvar.model.state import Array
-from en4dvar.plumbing.errors import ConfigError, OutputError
+from en4dvar.inputs.arrays import TIME, VALUE, columns_of, csv_of, require_columns, stacked, tables_of
+from en4dvar.model.forward import ForwardModel, Observable
+from en4dvar.model.function_model import FunctionModel, digest_of, name_of
+from en4dvar.model.state import OF_READINGS, Array, Parameter
+from en4dvar.plumbing.errors import ConfigError, DataError, Fault, OutputError, retold
 from en4dvar.plumbing.files import make_folder, temporary_folder, write_text
+from en4dvar.plumbing.hints import listed, suggest
 from en4dvar.report.outcomes import SequenceOutcome
 from en4dvar.report.result import Result
-from en4dvar.runs.given import Given
+from en4dvar.results.checkpoint import digest
+from en4dvar.runs.cycles import run_sequence
 from en4dvar.runs.progress import terminal_progress
-from en4dvar.runs.rundir import holds_run
+from en4dvar.runs.rundir import GIVEN, holds_run
 from en4dvar.runs.runner import run_campaign
-from en4dvar.runs.sequence_run import run_sequence
 
+MODELS = "give f(parameters, times), a ForwardModel, or a dict such as {'name': 'lorenz63'}"
 ARGUMENTS = {
     ("data", "error"): "error",
     ("data", "window"): "window",
@@ -36,6 +44,7 @@ ARGUMENTS = {
     ("sequence", "initial_std"): "initial_std",
 }
 ARRAYS = "arrays of a script"
+C = TypeVar("C", Config, SequenceConfig)
 
 
 def estimate(
@@ -104,12 +113,7 @@ def estimate(
         **{key: call.prior(section) if key == "prior" else section for key, section in sections.items()},
     }
     with ExitStack() as held:
-        where = Path(directory or Path(held.enter_context(temporary_folder())) / "run")
-        _keep_data(where, call.beside, resume or force)  # which the configuration reads
-        with _words_of_arguments():
-            config = resolve(document_of(content), where.absolute(), ready)
-        config = replace(config, directory=where)
-        _keep_data(where, call.files, resume or force)
+        config = held.enter_context(_configured(resolve, content, ready, call, directory, resume or force))
         shown = progress if callable(progress) else held.enter_context(terminal_progress()) if progress else None
         (result,) = run_campaign(config, force=force, resume=resume, progress=shown, command="en4dvar.estimate")
     if directory is None:
@@ -162,22 +166,28 @@ def estimate_sequence(
         "output": {"report": report and directory is not None},
         **sections,
     }
-    with ExitStack() as held:
-        where = Path(directory or Path(held.enter_context(temporary_folder())) / "run")
-        with _words_of_arguments():
-            config = resolve_sequence(document_of(content), where.absolute(), ready)
-        config = replace(config, directory=where)
-        _keep_data(where, call.files, resume or force)
+    with _configured(resolve_sequence, content, ready, call, directory, resume or force) as config:
         return run_sequence(config, force=force, resume=resume, command="en4dvar.estimate_sequence")
 
 
 @contextmanager
-def _words_of_arguments() -> Iterator[None]:
-    """Within, a :class:`ConfigError` is raised in the words of the arguments."""
-    try:
-        yield
-    except ConfigError as error:
-        raise ConfigError([replace(fault, path=_argument(fault.path)) for fault in error.problems]) from None
+def _configured(
+    resolve: Callable[[Document, Path, ForwardModel], C], content: Mapping[str, Any], model: ForwardModel,
+    call: "Given", directory: str | Path | None, replaces: bool,
+) -> Iterator[C]:  # fmt: skip
+    """What the ``content`` of a file asks for, whose arrays lie in the ``directory``, or in one that is there within.
+
+    Raises :class:`ConfigError` in the words of the arguments, :class:`OutputError`.
+    """
+    with ExitStack() as held:
+        where = Path(directory or held.enter_context(temporary_folder()) / "run")
+        _keep_data(where, call.beside, replaces)  # which the configuration reads
+        try:
+            config = resolve(document_of(content), where.absolute(), model)
+        except ConfigError as error:
+            raise ConfigError([replace(fault, path=_argument(fault.path)) for fault in error.problems]) from None
+        _keep_data(where, call.files, replaces)
+        yield replace(config, directory=where)
 
 
 def _argument(path: str) -> str:
@@ -199,3 +209,228 @@ def _keep_data(directory: Path, files: Mapping[str, str], replaces: bool) -> Non
             raise OutputError(f"{path}: {words}")
         make_folder(directory)
         write_text(path, text)
+
+
+# What a script hands over, readings, errors and a model, as the sections of a configuration and one data file
+
+
+@dataclass
+class GivenSeries:
+    """One series: its ``columns``, what they are of and their ``error``.
+
+    ``name``: "" of a single one, else that in front of its columns in the data file. ``more``: what it says besides, as
+    in ``data.series``. ``used``: the columns that go to the file, by their names there; ``files``: others, with text.
+    """
+
+    name: str
+    columns: Mapping[str, Array]
+    observable: str | None
+    error: Any
+    more: Mapping[str, Any] = field(default_factory=dict)
+    used: dict[str, Array] = field(init=False)
+    files: dict[str, str] = field(default_factory=dict, init=False)
+
+    def __post_init__(self) -> None:
+        self.used = {TIME: self.columns[TIME]}
+
+    def observed(self, known: Sequence[str]) -> str:
+        """The name of what was observed, of the ``known`` ones. Raises :class:`ConfigError`."""
+        if self.observable is not None:
+            return self.observable
+        others = [name for name in known if name in self.columns and name not in _columns_in(self.error)]
+        if len(others) != 1:
+            there = ", ".join(name for name in self.columns if name != TIME)
+            raise ConfigError(f"observable: name the column of readings, one of: {there}")
+        return others[0]
+
+    def section(self, model: ForwardModel) -> dict[str, Any]:
+        """What ``data:`` says of it, apart from the path. Raises :class:`DataError`, :class:`ConfigError`."""
+        named = {observable.name: observable for observable in model.observables}
+        name = self.observed(list(named))
+        if name not in named:
+            where = f"data: {self.name}" if self.name else "observable"
+            raise ConfigError(f"{where}: the model has no {name!r}; it has: {', '.join(named)}")
+        readings = {"name": self._kept(self._readings(name)), "unit": named[name].unit}
+        return {
+            "columns": {TIME: {"name": TIME, "unit": model.time_unit}, name: readings},
+            "error": {key: self._placed(value) for key, value in self._error(named[name]).items()},
+            **{key: self._placed(value) for key, value in self.more.items()},
+        }
+
+    def _readings(self, observable: str) -> str:
+        """The column of readings: of several series each may call it after itself, or have no other."""
+        if not self.name or observable in self.columns:
+            return observable
+        beside = _columns_in(self.error) + _columns_in(self.more)
+        others = [name for name in self.columns if name != TIME and name not in beside]
+        if self.name not in self.columns and len(others) != 1:
+            raise DataError(f"data: {self.name}: which column holds the readings? Call it {observable!r}")
+        return self.name if self.name in self.columns else others[0]
+
+    def _kept(self, column: str) -> str:
+        """What a column is called in the data file, which it goes to. Raises :class:`DataError`."""
+        with retold(DataError, DataError, f"data: {self._of()}"):
+            require_columns(self.columns, [column])
+        name = column if self.name in ("", column) else f"{self.name} {column}"
+        self.used[name] = self.columns[column]
+        return name
+
+    def _placed(self, value: Any) -> Any:
+        """The same, with the file's names of columns."""
+        if isinstance(value, list):
+            return [self._placed(part) for part in value]
+        named = isinstance(value, Mapping) and "column" in value and value["column"] not in self.used
+        return {**value, "column": self._kept(str(value["column"]))} if named else value
+
+    def _error(self, observable: Observable) -> dict[str, Any]:
+        """What a file says in ``data.error``; errors of each reading become columns."""
+        std, unit = f"{observable.name}_std", observable.unit
+        error = dict(self.error) if isinstance(self.error, Mapping) else {std: self.error}
+        for key, value in error.items():
+            if key == "shared":
+                parts = np.asarray(value).T if hasattr(value, "shape") else value
+                error[key] = [self._stated(part, f"shared {i}", unit) for i, part in enumerate(parts, 1)]
+            elif key == "covariance" and np.ndim(value) == 2:
+                file = f"data.{self.name}.covariance.csv".replace("..", ".")
+                self.files[file] = "".join(",".join(map(repr, row)) + "\n" for row in np.asarray(value, float).tolist())
+                error[key] = {"path": file, "unit": "1" if unit == "1" else f"({unit})*({unit})"}
+            else:
+                error[key] = self._stated(value, key, unit if key == std else "1")
+        return error
+
+    def _stated(self, value: Any, key: str, unit: str) -> Any:
+        """A number in ``unit``; numbers of each reading as a column of the data file."""
+        if isinstance(value, int | float | np.number) and not isinstance(value, bool) and unit != "1":
+            return f"{float(value)!r} {unit}"
+        if np.ndim(value) != 1:
+            return value
+        if len(value) != len(self.columns[TIME]):
+            counts = f"{len(value)} numbers for {len(self.columns[TIME])} readings"
+            raise DataError(f"error: {self._of()}{key} has {counts}")
+        column = f"{self.name} error {key}".lstrip()
+        self.used[column] = np.asarray(value, dtype=float)
+        return {"column": column}
+
+    def _of(self) -> str:
+        return f"{self.name}: " if self.name else ""
+
+
+class Given:
+    """The arguments of :func:`estimate`.
+
+    Raises :class:`DataError` for readings in no form that is known, :class:`ConfigError` where ``error``, ``series`` or
+    ``correlation`` do not suit the series.
+    """
+
+    def __init__(
+        self, model: Any, data: Any, time: str, observable: str | Sequence[str] | None, error: Any,
+        units: Mapping[str, str], priors: Mapping[str, Any], series: Mapping[str, Any], correlation: Any,
+    ):  # fmt: skip
+        self.units, self.priors, self.correlation = units, priors, correlation
+        self.beside: dict[str, str] = {}
+        with retold(DataError, DataError, "data: "):
+            tables = tables_of(data, time, None if isinstance(observable, str) else observable)
+        self.alone = tables is None
+        if tables is not None and isinstance(observable, str):
+            raise ConfigError("observable: of several series each says its own: series={'name': {'observable': …}}")
+        if tables is None and (series or correlation):
+            raise ConfigError(f"{'series' if series else 'correlation'}: data is one series, not a dict of several")
+        if tables is not None:
+            _check_keys("error", error, tables, whole=True)
+            _check_keys("series", series, tables)
+        self.series = []
+        for name, table in ({"": data} if tables is None else tables).items():
+            more, own = ({}, error) if self.alone else (series.get(name, {}), error[name])
+            chosen: Any = observable if self.alone else str(more.get("observable", name))
+            with retold(DataError, DataError, f"data: {name}: " if name else "data: "):
+                columns = columns_of(table, time, chosen or _only(model))
+            self.series.append(GivenSeries(name, columns, chosen, own, more))
+
+    def prior(self, section: Any) -> Any:
+        """The ``prior:`` section, with a file for an ensemble of arrays. Raises :class:`DataError`."""
+        if not (isinstance(section, Mapping) and isinstance(members := section.get("ensemble"), Mapping)):
+            return section
+        columns = {name: np.asarray(values, dtype=float) for name, values in members.items()}
+        if len({values.shape for values in columns.values()}) != 1 or next(iter(columns.values())).ndim != 1:
+            raise DataError("prior: give one number a member for each parameter, of all the same number of members")
+        self.beside["data.prior.csv"] = csv_of(columns)
+        return {**section, "ensemble": "data.prior.csv"}
+
+    @property
+    def files(self) -> dict[str, str]:
+        """Names of the data file and of those beside it, and their texts."""
+        beside = dict(item for series in self.series for item in series.files.items())
+        return {GIVEN: csv_of(stacked([series.used for series in self.series])), **beside, **self.beside}
+
+    def data(self, model: ForwardModel) -> dict[str, Any]:
+        """The ``data:`` section, apart from the window. Raises :class:`DataError`, :class:`ConfigError`."""
+        if self.alone:
+            return {"path": GIVEN, **self.series[0].section(model)}
+        correlation = {"correlation": self.correlation} if self.correlation else {}
+        return {"path": GIVEN, "series": {series.name: series.section(model) for series in self.series}, **correlation}
+
+    def model(self, model: Any) -> tuple[ForwardModel, dict[str, Any]]:
+        """The model, and what a configuration records of it. Raises :class:`ConfigError`."""
+        if isinstance(model, str | Mapping):
+            section = {"name": model} if isinstance(model, str) else dict(model)
+            faults: list[Fault] = []
+            built = read_model(section, Path.cwd(), document_of({"model": section}), faults)
+            if built is None:
+                raise ConfigError(faults)
+            return built
+        if isinstance(model, type) and issubclass(model, ForwardModel):
+            model = model()
+        if isinstance(model, ForwardModel):
+            return model, {"name": HANDED, "object": name_of(type(model)), "digest": _digest_of_model(model)}
+        if not callable(model):
+            raise ConfigError(f"model: {type(model).__name__} is neither a function nor a model; {MODELS}")
+        section = {"name": HANDED, "object": name_of(model), "digest": digest_of(model)}
+        return self._function(model), section
+
+    def _function(self, function: Any) -> FunctionModel:
+        names = [name for name in self.priors if name not in {p.name for p in OF_READINGS}]
+        if wrong := [name for name in names if not str(name).isidentifier()]:
+            raise ConfigError(f"priors: {wrong[0]!r} cannot be the name of a parameter; use letters, digits and _")
+        columns = {name for series in self.series for name in series.columns}
+        observed = [series.observed([name for name in series.columns if name != TIME]) for series in self.series]
+        unknown = self.units.keys() - self.priors.keys() - columns - set(observed)
+        if unknown:
+            raise ConfigError(
+                f"units: {sorted(unknown)[0]!r} is neither a parameter in priors nor a column of the data"
+            )
+        parameters = [Parameter(name, self.units.get(name, "1")) for name in names]
+        observables = {name: self.units.get(name, "1") for name in observed}
+        return FunctionModel(function, parameters, observables, self.units.get(TIME, "1"))
+
+
+def _check_keys(argument: str, keys: Any, series: Mapping[str, Any], whole: bool = False) -> None:
+    """Raise :class:`ConfigError` unless it is a dict with one entry a series, each of them where it shall be whole."""
+    if not isinstance(keys, Mapping):
+        raise ConfigError(f"{argument}: give a dict with one for each series: {listed(series)}")
+    if unknown := [str(name) for name in keys if name not in series]:
+        raise ConfigError(f"{argument}: no series {unknown[0]!r} in data{suggest(unknown[0], series)}")
+    if missing := [name for name in series if whole and name not in keys]:
+        raise ConfigError(f"{argument}: none for {missing[0]!r}; give one for each series: {listed(series)}")
+    if wrong := [name for name, own in keys.items() if not (whole or isinstance(own, Mapping))]:
+        raise ConfigError(f"{argument}: {wrong[0]}: give a dict such as {{'observable': 'y'}}")
+
+
+def _columns_in(sections: Any) -> list[str]:
+    """The columns that ``error``, or what a series says besides, names."""
+    values = list(sections.values()) if isinstance(sections, Mapping) else []
+    values += [part for value in values if isinstance(value, list) for part in value]
+    return [str(value["column"]) for value in values if isinstance(value, Mapping) and "column" in value]
+
+
+def _only(model: Any) -> str:
+    """What values without a name are called: the model's first observable, else y."""
+    observables = getattr(model, "observables", ())
+    return observables[0].name if isinstance(observables, tuple) and observables else VALUE
+
+
+def _digest_of_model(model: ForwardModel) -> str:
+    """Of a model's settings: what it says when it is sent to a worker; "" where it cannot be."""
+    try:
+        return digest(pickle.dumps(model))
+    except Exception:
+        return ""

@@ -5,7 +5,8 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, ClassVar
 
 from en4dvar.assembly.build import build_one
@@ -19,15 +20,13 @@ from en4dvar.inputs.asked import DataFile
 from en4dvar.plumbing.tables import csv_text
 from en4dvar.priors.prior import own_seed
 from en4dvar.problem import InverseProblem
-from en4dvar.results.checkpoint import Keeper, digest
-from en4dvar.results.codec import encode_text
+from en4dvar.results.checkpoint import Keeper, digest, encode_text
 from en4dvar.results.netcdf import to_bytes
 from en4dvar.results.packed import packed
 from en4dvar.results.seal import SealedBytes
 from en4dvar.results.store import build_groups
 from en4dvar.runs.campaign import DatasetOutcome
 from en4dvar.runs.progress import describe
-from en4dvar.schemes.settings import AssimilationSettings
 
 SEND_EVERY = 0.1  # s; a worker sends the records of its iterations no more often, whatever data sets they are of
 Told = tuple[str, Record, str]  # name of a data set, one of its records, and what the log says of it
@@ -38,21 +37,31 @@ Common = tuple[Config, Mapping[str, Any]]  # of the data sets of a run: its conf
 
 @dataclass(frozen=True)
 class Job:
-    """Everything that the estimate of one data set needs; picklable, so that it can be made anywhere.
+    """The estimate of one data set; picklable, so that it can be done anywhere: what it has in common with the others
+    is pickled once.
 
-    ``attributes`` go into the file. ``keeper`` keeps the state of the iterations; a worker that does not see its folder
-    keeps none. ``resume`` is where to start. ``stop`` gives the job up after the iteration under way (within one
-    process only). ``alone``: the result is a file of its own, not one of a pack.
+    ``source``: its data file; ``attributes``, beside the common ones, go into the file of its result. ``keeper`` keeps
+    the state of the iterations; a worker that does not see its folder keeps none. ``resume`` is where to start.
+    ``stop`` gives the job up after the iteration under way (within one process only). ``alone``: the result is a file
+    of its own, not one of a pack.
     """
 
-    problem: InverseProblem
-    settings: AssimilationSettings
-    seed: int
-    attributes: Mapping[str, Any]
+    common: CommonValue[Common]
+    name: str
+    source: DataFile
+    attributes: Mapping[str, Any] = field(default_factory=dict)
     keeper: Keeper | None = None
     resume: LoopState | None = None
     stop: threading.Event | None = None
     alone: bool = False
+
+    @cached_property
+    def problem(self) -> InverseProblem:
+        """From the data file, read where this is asked for first: it goes with the job then.
+
+        Raises what :func:`~en4dvar.assembly.build.build_one` does.
+        """
+        return build_one(self.common.value[0], self.name, self.source)
 
     def keep(self, state: Callable[[], LoopState]) -> None:
         """Keep the state of the iterations. Raises :class:`StoppedError` where the job was given up."""
@@ -60,28 +69,6 @@ class Job:
             raise StoppedError
         if self.keeper is not None and self.keeper.path.parent.is_dir():
             self.keeper.keep(state)
-
-
-@dataclass(frozen=True)
-class FileJob:
-    """A job that is made where it is done, from the data file; what it shares with the others is pickled once.
-
-    ``attributes`` are those of this data set alone, beside the common ones; the rest is as of :class:`Job`.
-    """
-
-    common: CommonValue[Common]
-    name: str
-    source: DataFile
-    attributes: Mapping[str, Any]
-    keeper: Keeper
-    resume: LoopState | None
-
-    def made(self) -> Job:
-        """Raises what :func:`~en4dvar.assembly.build.build_one` does."""
-        config, attributes = self.common.value
-        problem, seed = build_one(config, self.name, self.source), own_seed(config.seed, self.name)
-        attributes = {**attributes, **self.attributes}
-        return Job(problem, config.assimilation, seed, attributes, self.keeper, self.resume)
 
 
 @dataclass(frozen=True)
@@ -101,7 +88,7 @@ class StoppedError(Exception):
     """The job was given up."""
 
 
-def estimate(job: Job | FileJob, executor: Executor | None = None, progress: Progress | None = None) -> Estimate:
+def estimate(job: Job, executor: Executor | None = None, progress: Progress | None = None) -> Estimate:
     """Assimilate one data set; members run on ``executor``, by default in this process.
 
     Raises
@@ -109,9 +96,10 @@ def estimate(job: Job | FileJob, executor: Executor | None = None, progress: Pro
     ConfigError, DataError: the data file cannot be used. TooFewMembersError: the ensemble is lost. OutputError: a
         checkpoint cannot be written.
     """
-    job = job.made() if isinstance(job, FileJob) else job
-    analysis = assimilate(job.problem, job.settings, job.seed, executor, progress, job.resume, keep=job.keep)
-    groups = build_groups(analysis, job.attributes)
+    config, attributes = job.common.value
+    seed = own_seed(config.seed, job.name)
+    analysis = assimilate(job.problem, config.assimilation, seed, executor, progress, job.resume, keep=job.keep)
+    groups = build_groups(analysis, {**attributes, **job.attributes})
     content: SealedBytes | bytes = to_bytes(groups) if job.alone else packed(groups)
     sha256 = content.sha256 if isinstance(content, SealedBytes) else digest(content)
     summary = summarise(analysis)
@@ -131,7 +119,7 @@ def estimate(job: Job | FileJob, executor: Executor | None = None, progress: Pro
     return Estimate(content, sha256, encode_text(outcome), told)
 
 
-def estimate_and_tell(job: Job | FileJob, tell: Callable[[tuple[Told, ...]], None]) -> Estimate:
+def estimate_and_tell(job: Job, tell: Callable[[tuple[Told, ...]], None]) -> Estimate:
     """As :func:`estimate`, on a worker: ``tell`` gets the records, without their members, as iterations end; the last
     ones come with the estimate.
     """

@@ -27,25 +27,36 @@ LONGEST_NAME = 24  # of a data set in the live line
 WIDE = 110  # columns of a terminal that has room for a bar
 
 
+WORDS: dict[type[Record], tuple[str, str]] = {  # of the log, of the live line
+    StartRecord: (
+        "{stage}, round {r.rounds:2d}  lowest J {lowest:.6g}  of {count} descents  under way {r.active}",
+        "{stage}, round {r.rounds} of {count} descents: lowest J {lowest:.4g}",
+    ),
+    Descents: ("{r.words}", "{r.words}"),
+    ChainRecord: (
+        "chain, {r.steps:4d} steps  R-hat {r.r_hat:.3f}  effective sample size {r.effective:.0f}",
+        "chain of {r.steps} steps: R-hat {r.r_hat:.3f}, {r.effective:.0f} independent draws",
+    ),
+    IterationRecord: (
+        "iteration {r.iteration:2d}  J {r.cost:.6g} = {r.background:.4g} + {r.observation:.6g}  "
+        "|dw| {r.step_norm:.2e}  step {r.step_length:.3g}  chi2/K {r.chi2_per_observation:.3g}  "
+        "DFS {r.dfs:.2f}  active {r.active}",
+        "iteration {r.iteration}: J {r.cost:.4g}, χ²/K {r.chi2_per_observation:.3g}, step {r.step_length:.2g}",
+    ),
+}
+
+
 def describe(name: str, record: Record) -> str:
     """An iteration in one line: J and its terms, step, fit, information, members alive; or where start or chain are."""
+    return f"{name}: {_words(record, 0)}"
+
+
+def _words(record: Record, place: int) -> str:
+    more: dict[str, Any] = {}
     if isinstance(record, StartRecord):
-        return (
-            f"{name}: {_stage(record)}, round {record.rounds:2d}  lowest J {min(record.costs):.6g}  "
-            f"of {len(record.costs)} descents  under way {record.active}"
-        )
-    if isinstance(record, Descents):
-        return f"{name}: {record.words}"
-    if isinstance(record, ChainRecord):
-        return (
-            f"{name}: chain, {record.steps:4d} steps  R-hat {record.r_hat:.3f}  "
-            f"effective sample size {record.effective:.0f}"
-        )
-    return (
-        f"{name}: iteration {record.iteration:2d}  J {record.cost:.6g} = {record.background:.4g} + "
-        f"{record.observation:.6g}  |dw| {record.step_norm:.2e}  step {record.step_length:.3g}  "
-        f"chi2/K {record.chi2_per_observation:.3g}  DFS {record.dfs:.2f}  active {record.active}"
-    )
+        stage = "search for another minimum" if record.further else "start"
+        more = {"stage": stage, "lowest": min(record.costs), "count": len(record.costs)}
+    return WORDS[type(record)][place].format(r=record, **more)
 
 
 def intervals(name: str, record: Record, parameters: Sequence[Parameter]) -> str:
@@ -59,10 +70,6 @@ def intervals(name: str, record: Record, parameters: Sequence[Parameter]) -> str
         )
         words.append(f"{p.name} {middle} ({low} to {high}) {p.display_unit}")
     return f"\n{name}: iteration {record.iteration:2d}  90 %: {', '.join(words)}" if words else ""
-
-
-def _stage(record: StartRecord) -> str:
-    return "search for another minimum" if record.further else "start"
 
 
 class RunLog:
@@ -220,18 +227,4 @@ def counted(what: str) -> Iterator[Callable[[int, int], None] | None]:
 
 def _short(name: str, record: Record) -> str:
     known = name if len(name) <= LONGEST_NAME else f"{name[: LONGEST_NAME - 1]}…"
-    if isinstance(record, StartRecord):
-        return (
-            f"{known} {_stage(record)}, round {record.rounds} of {len(record.costs)} descents: "
-            f"lowest J {min(record.costs):.4g}"
-        )
-    if isinstance(record, Descents):
-        return f"{known} {record.words}"
-    if isinstance(record, ChainRecord):
-        return (
-            f"{known} chain of {record.steps} steps: R-hat {record.r_hat:.3f}, {record.effective:.0f} independent draws"
-        )
-    return (
-        f"{known} iteration {record.iteration}: J {record.cost:.4g}, χ²/K {record.chi2_per_observation:.3g}, "
-        f"step {record.step_length:.2g}"
-    )
+    return f"{known} {_words(record, 1)}"

@@ -25,10 +25,8 @@ from en4dvar.results.provenance import provenance
 from en4dvar.results.run_results import result_files
 from en4dvar.results.series_file import read_series, series_file
 from en4dvar.results.store import StoredResult, load_stored
-from en4dvar.runs.cycles import Cycles
-from en4dvar.runs.sequence_run import SequenceKind
+from en4dvar.runs.cycles import Cycles, SequenceKind, TwinKind
 from en4dvar.runs.trust import Ask, of_strangers
-from en4dvar.runs.twin_run import TwinKind
 
 SURROUNDINGS = ("python_version", "package_versions", "platform", "cpu", "git_commit")
 

@@ -3,11 +3,16 @@
 ``.en4dvar-files`` lists what a run wrote, so that replacing it removes that and nothing else. A run with ``--force``
 works in ``.en4dvar-next`` and takes the place of the earlier files when it is complete; where that is interrupted, the
 next run there finishes it, and commands that read say so and read nothing.
+
+The directory may be a stranger's: every name, of the list or of ours, goes through
+:func:`en4dvar.plumbing.files.inside`.
 """
 
 import itertools
+import os
 import re
 import shlex
+import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
@@ -17,23 +22,15 @@ from typing import Literal
 
 from en4dvar.executor.processes import end_unguarded
 from en4dvar.plumbing.errors import OutputError
-from en4dvar.plumbing.files import inside, make_folder, refused, remove_file, write_text
+from en4dvar.plumbing.files import inside, make_folder, open_plain, refused, remove_file, replace_file, write_text
 from en4dvar.results.store import COMPLETE, NEXT, require_settled
 from en4dvar.runs.interrupt import begun
 from en4dvar.runs.lock import LOCK, locked
-from en4dvar.runs.replacement import (
-    LISTING,
-    PARTIAL,
-    finish_replacement,
-    lines_of_list,
-    listed_files,
-    matching,
-    remove_folder,
-    remove_partial,
-    replace_earlier_run,
-    write_list,
-)
 
+LISTING = ".en4dvar-files"
+OLD = ".en4dvar-old"
+FOLDERS = ("datasets", "figures", "pages", "checkpoints")
+PARTIAL = re.compile(r"\..+\.\d+\.tmp")  # of en4dvar.plumbing.files, left by a process that was killed
 LOG = "run.log"
 OF_EVERY_RUN = ("config.yaml", "config.resolved.yaml", LOG)
 GIVEN = "data.csv"  # readings that a script handed over, written before its run begins
@@ -210,3 +207,89 @@ def _occupied(path: Path, listed: Sequence[str]) -> str:
 def _remove_if_empty(folder: Path) -> None:
     with suppress(OSError):
         folder.rmdir()
+
+
+# The list of what a run wrote, and a new run's taking the place of an earlier one's
+
+
+def finish_replacement(path: Path) -> None:
+    """Put in place what an earlier run had completed, and clear away what it had not begun."""
+    following = inside(path, NEXT)
+    remove_folder(inside(path, OLD))
+    if (following / COMPLETE).exists():
+        replace_earlier_run(path)
+    if not (following / LISTING).exists():  # of a run that ended before it began
+        remove_folder(following)
+
+
+def replace_earlier_run(path: Path) -> None:
+    """Move the files of ``.en4dvar-next`` into place. Can be repeated after it was interrupted anywhere."""
+    following = inside(path, NEXT)
+    names = listed_files(following)
+    targets = [inside(path, name) for name in names]
+    _remove(path, set(listed_files(path)) - set(names))
+    for name, target in zip(names, targets, strict=True):
+        if (following / name).exists():
+            target.parent.mkdir(parents=True, exist_ok=True)
+            replace_file(following / name, target)
+    write_list(path, names)
+    replace_file(following, path / OLD)  # at once: half of this folder would look like an interrupted run
+    remove_folder(path / OLD)
+
+
+def remove_folder(folder: Path) -> None:
+    """Remove a folder and what is in it, if it is there; links in it are removed, not followed."""
+    if folder.is_dir():
+        shutil.rmtree(folder)
+
+
+def _remove(path: Path, names: Iterable[str]) -> None:
+    for name in names:
+        if (file := inside(path, name)).is_file():
+            file.unlink()
+    for name in FOLDERS:
+        if (folder := inside(path, name)).is_dir() and not any(folder.iterdir()):
+            folder.rmdir()
+
+
+def remove_partial(work: Path) -> None:
+    """Remove what a process that was killed had half written."""
+    for folder in (work, *(inside(work, name) for name in FOLDERS)):
+        for file in folder.glob(".*.tmp"):
+            if PARTIAL.fullmatch(file.name):
+                file.unlink()
+
+
+def write_list(work: Path, names: Iterable[str]) -> None:
+    """List the files of a run. Raises :class:`OutputError`."""
+    write_text(work / LISTING, "".join(f"{name}\n" for name in names))
+
+
+def listed_files(work: Path) -> tuple[str, ...]:
+    """The files that the list of ``work`` names, each of a place in ``work``. Raises :class:`OutputError`."""
+    names: list[str] = []
+    for line in lines_of_list(work):
+        inside(work, line)
+        names += matching(work, line) if "*" in line else [line]  # those of a folder that are there
+    return tuple(names)
+
+
+def matching(work: Path, name: str) -> list[str]:
+    """The files in ``work`` that a name of a list stands for, ``*`` for any text. Raises :class:`OutputError`."""
+    place = inside(work, name)
+    if "*" not in name:
+        return [place.relative_to(work).as_posix()] * os.path.lexists(place)
+    there = (file for file in work.glob(name) if file.is_symlink() or not file.is_dir())
+    return sorted(file.relative_to(work).as_posix() for file in there)
+
+
+def lines_of_list(work: Path) -> tuple[str, ...]:
+    """The list of ``work`` as it is written. Raises :class:`OutputError`."""
+    listing = inside(work, LISTING)
+    try:
+        with open_plain(listing) as file:
+            return tuple(file.read().decode("utf-8").splitlines())
+    except FileNotFoundError:
+        return ()
+    except UnicodeDecodeError:
+        raise OutputError(f"{listing}: damaged; it is not a list of files") from None

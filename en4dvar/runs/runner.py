@@ -18,12 +18,8 @@ from en4dvar.results.campaign_file import DamagedError, save_campaign
 from en4dvar.results.pack import PACK
 from en4dvar.results.population_file import GROUPS, load_groups_of
 from en4dvar.runs.campaign import Campaign
-from en4dvar.runs.engine import conduct_run
-from en4dvar.runs.joint_run import JointKind
-from en4dvar.runs.kind import FIGURES, REPORT, RunKind
-from en4dvar.runs.population_run import PopulationKind, groups_of, require_population
-from en4dvar.runs.session import Session
-from en4dvar.runs.together import SetGroup
+from en4dvar.runs.engine import FIGURES, REPORT, RunKind, Session, conduct_run
+from en4dvar.runs.together import JointKind, PopulationKind, SetGroup, groups_of, require_population
 from en4dvar.runs.worklist import ENDED, ITERATIONS, SUMMARY, Worklist, datasets
 
 if TYPE_CHECKING:
@@ -114,7 +110,25 @@ class EstimateKind(RunKind[Campaign]):
         return data_files(inverse_plan(self.config))
 
     def check(self) -> None:
-        _require_one_usable(self.config, self.data)
+        """Raise what is wrong with the data files where none of them can be used, or one is in no group."""
+        config, files = self.config, self.data
+        for name in files:
+            config.sharing.of_dataset(name)
+        groups_of(config, files)
+        faults: list[Fault] = []
+        unusable: list[DataError] = []
+        for name, file in files.items():
+            try:
+                require_population(config, build_one(config, name, file), files)
+            except ConfigError as error:
+                faults += error.problems
+            except DataError as error:
+                unusable.append(error)
+            else:
+                return
+        if faults:
+            raise ConfigError(list(dict.fromkeys(faults)))
+        raise DataError("\n".join(map(str, unusable)))
 
     def kept(self) -> str:
         ended = self.work.ended if self.work else {}
@@ -129,7 +143,7 @@ class EstimateKind(RunKind[Campaign]):
     def conduct(self, run: Session, executor: Executor) -> Campaign:
         work = self.work
         assert work is not None
-        if run.resumed:
+        if run.directory.resumed:
             work.recall()
         _estimate(work, executor)
         if self.config.sharing:
@@ -158,29 +172,6 @@ class EstimateKind(RunKind[Campaign]):
         for of_group, _ in load_groups_of(folder).values():
             PopulationKind.page(of_group)
         return write_pages(folder, datasets, workers, figures)
-
-
-def _require_one_usable(config: Config, files: Mapping[str, DataFile]) -> None:
-    """Raise what is wrong with the data files where none of them can be used, or one is in no group, before anything is
-    written.
-    """
-    for name in files:
-        config.sharing.of_dataset(name)  # before anything is computed
-    groups_of(config, files)
-    faults: list[Fault] = []
-    unusable: list[DataError] = []
-    for name, file in files.items():
-        try:
-            require_population(config, build_one(config, name, file), files)
-        except ConfigError as error:
-            faults += error.problems
-        except DataError as error:
-            unusable.append(error)
-        else:
-            return
-    if faults:
-        raise ConfigError(list(dict.fromkeys(faults)))
-    raise DataError("\n".join(map(str, unusable)))
 
 
 def _estimate(work: Worklist, executor: Executor) -> None:

@@ -24,9 +24,7 @@ from en4dvar.report.chart import POINTS, Chart, Panel, Row
 from en4dvar.report.svg import on_paper
 from en4dvar.results.checkpoint import FOLDER, digest, write_checkpoint
 from en4dvar.results.fingerprint import identity
-from en4dvar.runs.engine import conduct_run
-from en4dvar.runs.kind import RunKind
-from en4dvar.runs.session import Session
+from en4dvar.runs.engine import RunKind, Session, conduct_run
 from en4dvar.series.twin import TwinExperiment, conduct
 
 if TYPE_CHECKING:
@@ -158,6 +156,7 @@ class SweepKind(RunKind[TwinSweep]):
     """A twin experiment in several settings (``configs``), each for several ``seeds``: a unit of work each."""
 
     name = "sweep-twin"
+    units = "finished runs"
     result = "sweep.csv"
     files = (result, "runs.csv", f"{FOLDER}/*.run")
 
@@ -173,9 +172,6 @@ class SweepKind(RunKind[TwinSweep]):
         """Processes: a cycle is more of the interpreter than of the model, also where that is compiled."""
         workers = self.workers or available_cores()
         return SerialExecutor() if workers == 1 else ProcessesExecutor(workers)
-
-    def kept(self) -> str:
-        return f"the finished runs are kept in {self.directory}"
 
     def conduct(self, run: Session, executor: Executor) -> TwinSweep:
         runs, n = self._runs(run, executor), len(self.seeds)

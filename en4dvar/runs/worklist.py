@@ -3,7 +3,7 @@
 import threading
 import traceback
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -18,14 +18,13 @@ from en4dvar.plumbing.errors import En4dvarError, OutputError
 from en4dvar.plumbing.files import atomic_path, open_plain, readable, remove_file
 from en4dvar.plumbing.tables import csv_text
 from en4dvar.problem import InverseProblem
-from en4dvar.results.checkpoint import FOLDER, Keeper, file_digest
-from en4dvar.results.codec import decode_text, encode_text
+from en4dvar.results.checkpoint import FOLDER, Keeper, decode, encode_text, file_digest
 from en4dvar.results.pack import PACK, Entry, Pack, file_names, read_outcome
 from en4dvar.results.seal import SealedBytes
 from en4dvar.runs.campaign import Campaign, DatasetOutcome, Outcomes
-from en4dvar.runs.jobs import Common, Estimate, FileJob, Job, Told, estimate, estimate_and_tell
+from en4dvar.runs.engine import Session
+from en4dvar.runs.jobs import Common, Estimate, Job, Told, estimate, estimate_and_tell
 from en4dvar.runs.progress import LiveProgress, describe, intervals
-from en4dvar.runs.session import Session
 
 SUMMARY = "summary.csv"
 ENDED = f"{FOLDER}/ended"  # how a single data set ended
@@ -61,28 +60,27 @@ def datasets(files: Mapping[str, DataFile]) -> tuple[Dataset, ...]:
 class Worklist:
     """Estimates what is left to do and keeps each data set's file and record as it ends.
 
-    ``ended`` fills with what is done: name → why there is no posterior, "" where there is one; everything else that is
+    ``ended`` fills with what is done: name → how it failed, None where there is a posterior; everything else that is
     known of a data set stays on disk. ``stop`` ends the estimates in threads of this process.
     """
 
     def __init__(self, config: Config, run: Session, sets: tuple[Dataset, ...], progress: Progress | None):
         self.config, self.run, self.sets, self.progress = config, run, sets, progress
-        self.ended: dict[str, str] = {}
+        self.ended: dict[str, DatasetOutcome | None] = {}
         self.stop = threading.Event()
         self.alone = len(sets) == 1
         self.pack = Pack(run.directory.at(self.record))
         attributes = {**run.attributes, "identity": run.identity.settings}
         self.common: CommonValue[Common] = CommonValue((config, attributes))
-        self._failed_sets: dict[str, DatasetOutcome] = {}
         self._reached: dict[str, tuple[int, int]] = {}  # data set at work → its last round, iteration
 
     def good(self) -> list[Dataset]:
         """The data sets that have a posterior."""
-        return [d for d in self.sets if not self.ended[d.name]]
+        return [d for d in self.sets if self.ended[d.name] is None]
 
     def failures(self) -> dict[str, str]:
         """Why a data set has no posterior, of those that have none."""
-        return {name: reason for name, reason in self.ended.items() if reason}
+        return {name: failed.failure for name, failed in self.ended.items() if failed}
 
     def outcomes(self, folder: Path) -> Outcomes:
         """What came of each data set, in order; ``folder`` is where the files of the run are."""
@@ -91,9 +89,8 @@ class Worklist:
 
     def campaign(self) -> Campaign:
         """What the run leaves behind. What has failed did so in this process, for a resumed run tries it again."""
-        directory, failed = self.run.directory, self._failed_sets
-        in_order = tuple(failed[d.name] for d in self.sets if d.name in failed)
-        return Campaign(self.config.directory, self.outcomes(directory.home), tuple(self.run.notices), in_order)
+        outcomes, failed = self.outcomes(self.run.directory.home), (self.ended.get(d.name) for d in self.sets)
+        return Campaign(self.config.directory, outcomes, tuple(self.run.notices), tuple(filter(None, failed)))
 
     def summarise(self) -> None:
         """Write the table of all data sets, unless it is there as it should be. Raises :class:`OutputError`."""
@@ -115,16 +112,13 @@ class Worklist:
 
     def failed_earlier(self) -> frozenset[str]:
         """The data sets that have failed in the run that is resumed."""
-        earlier = self.run.earlier()
-        known = {} if earlier is None else earlier.content
+        if (earlier := self.run.earlier()) is None:
+            return frozenset()
+        entries = ((d.name, self.pack.entries.get(d.stem)) for d in self.sets if d.name in earlier.content)
         return frozenset(
-            d.name
-            for d in self.sets
-            if earlier is not None
-            and d.name in known
-            and (entry := self.pack.entries.get(d.stem)) is not None
-            and entry.fingerprint == earlier.of_dataset(d.name)
-            and self._failed(entry)
+            name
+            for name, entry in entries
+            if entry and entry.fingerprint == earlier.of_dataset(name) and self._failed(entry)
         )
 
     def recall(self) -> None:
@@ -151,7 +145,7 @@ class Worklist:
             if self.alone and file_digest(self.run.directory.at(d.file)) != entry.content_digest:
                 self.estimate_again([d.name])
                 continue
-            self.ended[d.name] = ""
+            self.ended[d.name] = None
             if d.iteration in left:  # of a run killed between its last two steps
                 self.run.directory.remove(d.iteration)
         self.run.log.write(f"resumed: {len(self.ended)} of {len(self.sets)} data sets are done")
@@ -184,16 +178,17 @@ class Worklist:
             self.run.directory.remove(SUMMARY)  # of what was done before: where it is there, it is of every data set
         sent: list[Dataset] = []
 
-        def jobs(made_there: bool = False, stop: threading.Event | None = None) -> Iterator[tuple[Job | FileJob]]:
+        def jobs(reads: bool = False, stop: threading.Event | None = None) -> Iterator[tuple[Job]]:
             for d in todo:
                 try:
-                    job = self._job(d)
-                    unit = job if made_there else replace(job.made(), stop=stop, alone=self.alone)
+                    job = self._job(d, stop)
+                    if not reads:
+                        _ = job.problem  # its file is read here
                 except Exception as error:
                     self._fail(d, error)
                 else:
                     sent.append(d)
-                    yield (unit,)
+                    yield (job,)
 
         if len(todo) > 1 and len(todo) >= executor.workers > 1:
             stop = self.stop if isinstance(executor, ThreadsExecutor) else None
@@ -210,14 +205,14 @@ class Worklist:
     def _fingerprint(self, d: Dataset) -> str:
         return self.run.identity.of_dataset(d.name)
 
-    def _job(self, d: Dataset) -> FileJob:
+    def _job(self, d: Dataset, stop: threading.Event | None) -> Job:
         fingerprint, path = self._fingerprint(d), self._checkpoint(d)
         resume = self.run.restore(d.iteration, fingerprint, LoopState, f"{d.name} is estimated from the start")
         if resume is not None:
             self.run.log.write(f"{d.name}: continued {resume.reached}")
         keeper = Keeper(path, fingerprint, self.config.execution.checkpoint_every)
         own = {"data_sha256": self.run.identity.content[d.name]}
-        return FileJob(self.common, d.name, d.source, own, keeper, resume)
+        return Job(self.common, d.name, d.source, own, keeper, resume, stop, self.alone)
 
     def _checkpoint(self, d: Dataset) -> Path:
         """Where its iterations are kept: in a folder that was looked at as the run began, where files are replaced or
@@ -255,7 +250,7 @@ class Worklist:
         if isinstance(content, SealedBytes):  # a file of its own
             content.write(self.run.directory.at(d.file))
             content = b""
-        self._end(d, "", value.outcome, content, value.digest)
+        self._end(d, None, value.outcome, content, value.digest)
 
     def _fail(self, d: Dataset, error: Exception) -> None:
         if isinstance(error, OutputError | ExecutorError):
@@ -268,16 +263,18 @@ class Worklist:
         if len(self.sets) == 1:
             raise error
         exit_code = error.exit_code if isinstance(error, En4dvarError) else 1
-        self._failed_sets[d.name] = outcome = DatasetOutcome(d.name, failure=reason, exit_code=exit_code)
-        self._end(d, reason, encode_text(outcome))
+        failed = DatasetOutcome(d.name, failure=reason, exit_code=exit_code)
+        self._end(d, failed, encode_text(failed))
 
-    def _end(self, d: Dataset, failure: str, outcome: bytes, content: bytes = b"", content_digest: str = "") -> None:
+    def _end(
+        self, d: Dataset, failed: DatasetOutcome | None, outcome: bytes, content: bytes = b"", content_digest: str = ""
+    ) -> None:
         self.pack.append(d.stem, self._fingerprint(d), outcome, content, content_digest)
         remove_file(self._checkpoint(d))
-        self.ended[d.name] = failure
+        self.ended[d.name] = failed
         self._reached.pop(d.name, None)
         if isinstance(self.progress, LiveProgress):
-            self.progress.ended(d.name, len(self.ended), _in_one_line(decode_text(outcome, DatasetOutcome)))
+            self.progress.ended(d.name, len(self.ended), _in_one_line(decode(outcome, DatasetOutcome)))
 
 
 def _consists_of(path: Path, parts: Iterable[bytes]) -> bool:

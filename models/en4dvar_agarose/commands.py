@@ -99,9 +99,9 @@ def study(
       en4dvar study configs/agarose_study.yaml
     """
     from en4dvar.executor import available_cores
+    from en4dvar.runs.engine import directory_mode
     from en4dvar.runs.interrupt import tell_interrupt, terminate_as_interrupt
     from en4dvar.runs.rundir import RunDirectory
-    from en4dvar.runs.session import directory_mode
     from en4dvar_agarose.checkpoints import StudyCheckpoints
     from en4dvar_agarose.report import FILES, write_study
     from en4dvar_agarose.run import run_study

@@ -12,7 +12,7 @@ from en4dvar.cli import main
 from en4dvar.config.document import override, read_document
 from en4dvar.config.synthetic import resolve_campaign
 from en4dvar.plumbing.errors import ConfigError
-from en4dvar.runs.synthetic import draw_campaign
+from en4dvar.runs.simulation import draw_campaign
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 

@@ -12,7 +12,7 @@ from init_files import UNITS, call, proposed, simulate, write
 from en4dvar.assembly.build import build, data_files, inverse_plan
 from en4dvar.config import load_config
 from en4dvar.config.document import parse_document
-from en4dvar.runs.population_run import groups_of
+from en4dvar.runs.together import groups_of
 from en4dvar_bubble import commands_init
 from en4dvar_bubble.starter.page import quoted
 

@@ -9,8 +9,8 @@ import pytest
 from click.testing import CliRunner, Result
 from toy_config import write_toy
 
-import en4dvar.runs.runner
-import en4dvar.runs.twin_run  # noqa: F401 -- before a step is replaced, which they import by name
+import en4dvar.runs.cycles
+import en4dvar.runs.runner  # noqa: F401 -- before a step is replaced, which they import by name
 from en4dvar.cli import main
 
 TWIN = """\
@@ -19,11 +19,11 @@ model: {name: lorenz96, size: 12}
 twin: {cycles: 5, burn_in: 1, interval: 0.05, error: {x_std: 1}, initial_std: {x: 0.1}}
 assimilation: {scheme: etkf, members: 15, inflation: 1.02}
 """
-EARLY = tuple(f"en4dvar.runs.{step}" for step in ("runner.data_files", "runner.build_one", "kind.choose_executor"))
+EARLY = tuple(f"en4dvar.runs.{step}" for step in ("runner.data_files", "runner.build_one", "engine.choose_executor"))
 BEGUN = (
     *(f"en4dvar.runs.engine.{step}" for step in ("identity", "provenance", "RunLog.write", "RunDirectory.publish")),
-    *(f"en4dvar.runs.{step}" for step in ("session.write_checkpoint", "runner.datasets", "worklist.summary_rows")),
-    *(f"en4dvar.runs.{step}" for step in ("cycles.series_group", "twin_run.conduct", "twin_run.TwinKind.summary")),
+    *(f"en4dvar.runs.{step}" for step in ("engine.write_checkpoint", "runner.datasets", "worklist.summary_rows")),
+    *(f"en4dvar.runs.{step}" for step in ("cycles.series_group", "cycles.conduct", "cycles.TwinKind.summary")),
 )
 pytestmark = pytest.mark.parametrize("before", ["", "--force", "--resume"])  # a first run, or one after another
 
@@ -40,7 +40,7 @@ def told_at(
     step: str, before: str, folder: Path, monkeypatch: pytest.MonkeyPatch, *later: str
 ) -> tuple[str, list[str], list[str]]:
     """What is kept and what to type, as told after interrupts at ``step`` and ``later``, and what was typed."""
-    if ".twin_run." in step or ".cycles." in step:
+    if ".cycles." in step:
         path = folder / "twin.yaml"
         path.write_text(TWIN)
     else:

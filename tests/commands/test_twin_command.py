@@ -108,7 +108,7 @@ def test_report_again_from_the_file(finished):
 
 
 def test_interrupted_run_says_how_to_continue(tmp_path, monkeypatch):
-    monkeypatch.setattr("en4dvar.runs.twin_run.conduct", _interrupt)
+    monkeypatch.setattr("en4dvar.runs.cycles.conduct", _interrupt)
     outcome = call("run", write(tmp_path), "--out", tmp_path / "run")
     assert outcome.exit_code == 130
     assert "to continue: en4dvar" in outcome.stderr

@@ -11,8 +11,8 @@ import pytest
 
 import en4dvar
 from en4dvar.results.joint_file import load_joint
-from en4dvar.runs.joint_run import join
 from en4dvar.runs.runner import run_campaign
+from en4dvar.runs.together import join
 from en4dvar_diffusion.synthetic import truth
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -15,7 +15,7 @@ from en4dvar.estimation.stages import Stages
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.priors.varying import RandomWalk
 from en4dvar.problem import InverseProblem
-from en4dvar.results.codec import decode, encode
+from en4dvar.results.checkpoint import decode, encode
 from en4dvar.sampling import refine
 from en4dvar.schemes.settings import AssimilationSettings
 

@@ -12,7 +12,7 @@ from en4dvar.estimation.assimilate import LoopState, assimilate
 from en4dvar.executor import SerialExecutor
 from en4dvar.priors.prior import PriorTerm
 from en4dvar.problem import InverseProblem
-from en4dvar.results.codec import decode, encode
+from en4dvar.results.checkpoint import decode, encode
 from en4dvar.schemes.base import Runs, Weights
 from en4dvar.schemes.en4dvar import En4DVar
 from en4dvar.schemes.settings import AssimilationSettings

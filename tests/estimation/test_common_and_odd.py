@@ -26,7 +26,7 @@ from en4dvar.model.forward import Failure
 from en4dvar.model.state import NOISE_SCALE, Parameter
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.priors.prior import Prior, PriorTerm, member_stream
-from en4dvar.runs.population_run import _cautions
+from en4dvar.runs.together import _cautions
 
 STD, SETS, SLOPE = 0.3, 8, 0.5
 A, B = (Parameter(name, "m") for name in "ab")

@@ -24,8 +24,8 @@ from en4dvar.priors.varying import RandomWalk, StateChanges
 from en4dvar.problem import InverseProblem
 from en4dvar.report.population import sentences
 from en4dvar.results.population_file import load_population
-from en4dvar.runs.population_run import population
 from en4dvar.runs.runner import run_campaign
+from en4dvar.runs.together import population
 
 STD, SETS = 0.3, 6
 SMALL = Effort(hyper_walkers=32, draws=1500)

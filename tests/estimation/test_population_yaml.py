@@ -15,8 +15,8 @@ from en4dvar.estimation.population import Effort
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.results.population_file import load_population
 from en4dvar.runs.engine import write_report
-from en4dvar.runs.population_run import population
 from en4dvar.runs.runner import run_campaign
+from en4dvar.runs.together import population
 
 SMALL = Effort(hyper_walkers=16, hyper_rounds=30, hyper_components=2, draws=400)
 ASKED = "population: {of: [k], mean_std: 2, spread: 0.7, reference: {k: 1.9 ± 0.1 N/m, source: balance}}\n"

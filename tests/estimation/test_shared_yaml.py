@@ -18,8 +18,8 @@ from en4dvar.plumbing.errors import ConfigError
 from en4dvar.report.joint import joint_lines
 from en4dvar.results.joint_file import load_joint
 from en4dvar.runs.engine import write_report
-from en4dvar.runs.joint_run import join
 from en4dvar.runs.runner import run_campaign
+from en4dvar.runs.together import join
 
 K = "k: {prior: lognormal, median: 3 N/m, log_std: 0.3}"
 SHARED = K.replace("0.3}", "0.3, shared: spring}")

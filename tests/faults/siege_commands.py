@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from en4dvar.runs.kind import KINDS
+from en4dvar.runs.engine import KINDS
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 

@@ -16,8 +16,7 @@ from en4dvar.plumbing.files import atomic_path, inside, write_text
 from en4dvar.results.pack import PACK
 from en4dvar.results.store import COMPLETE, NEXT
 from en4dvar.runs.lock import LOCK
-from en4dvar.runs.replacement import LISTING, OLD
-from en4dvar.runs.rundir import RunDirectory
+from en4dvar.runs.rundir import LISTING, OLD, RunDirectory
 
 pytestmark = [
     pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="links and pipes of POSIX"),

@@ -14,9 +14,9 @@ from en4dvar.assembly.build import build
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.model.forward import ForwardModel
 from en4dvar.plumbing.errors import ConfigError
+from en4dvar.runs.cycles import run_twin
 from en4dvar.runs.rerun import rerun
 from en4dvar.runs.runner import run
-from en4dvar.runs.twin_run import run_twin
 from en4dvar.schemes.filters import ETKF
 from en4dvar.series.sequential import SequentialSettings
 from en4dvar.series.twin import TwinExperiment, conduct

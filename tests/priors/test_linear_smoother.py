@@ -16,7 +16,7 @@ from en4dvar.model.state import Parameter
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.priors.varying import RandomWalk, StateChanges
 from en4dvar.problem import InverseProblem, StatePerturbation
-from en4dvar.results.codec import decode, encode
+from en4dvar.results.checkpoint import decode, encode
 from en4dvar.schemes.settings import AssimilationSettings
 
 TIMES = np.linspace(0.25, 5.0, 20)

@@ -18,8 +18,8 @@ from en4dvar.estimation.population import Effort
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.report.populations import Difference, _sentence
 from en4dvar.results.population_file import load_population
-from en4dvar.runs.population_run import population
 from en4dvar.runs.runner import run_campaign
+from en4dvar.runs.together import population
 
 STIFFER = 1.3
 SMALL = Effort(hyper_walkers=32, draws=1500)

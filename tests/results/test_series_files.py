@@ -16,8 +16,8 @@ from en4dvar.plumbing.errors import ConfigError
 from en4dvar.report.figures import all_figures
 from en4dvar.report.page import render_set
 from en4dvar.report.result import Result, load_result
-from en4dvar.runs.joint_run import join
 from en4dvar.runs.rerun import rerun
+from en4dvar.runs.together import join
 from en4dvar.schemes.settings import AssimilationSettings
 
 

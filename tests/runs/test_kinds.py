@@ -18,10 +18,8 @@ import en4dvar
 from en4dvar.cli import main
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.report import TABLES
-from en4dvar.runs.kind import KINDS, kind_in, kind_named
-from en4dvar.runs.replacement import LISTING
-from en4dvar.runs.rundir import OF_EVERY_RUN, RunDirectory
-from en4dvar.runs.session import IDENTITY
+from en4dvar.runs.engine import IDENTITY, KINDS, kind_in, kind_named
+from en4dvar.runs.rundir import LISTING, OF_EVERY_RUN, RunDirectory
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 WORKED = {  # as `en4dvar` is called, in a folder with the files of `prepared`

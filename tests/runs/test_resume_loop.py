@@ -8,7 +8,7 @@ from same_bits import assert_same_bits
 from toys import Decay, Wave, make_problem, with_noise
 
 from en4dvar.estimation.assimilate import LoopState, assimilate
-from en4dvar.results.codec import decode, encode
+from en4dvar.results.checkpoint import decode, encode
 from en4dvar.sampling import mcmc
 from en4dvar.schemes.settings import AssimilationSettings
 

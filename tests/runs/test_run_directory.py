@@ -19,10 +19,9 @@ from en4dvar.cli import main
 from en4dvar.plumbing import files
 from en4dvar.plumbing.errors import DataError, OutputError, TooFewMembersError
 from en4dvar.results.pack import PACK, results_of
-from en4dvar.runs import replacement, rundir, session
+from en4dvar.runs import engine, rundir
 from en4dvar.runs.lock import LOCK, locked
-from en4dvar.runs.replacement import LISTING
-from en4dvar.runs.rundir import NEXT, RunDirectory
+from en4dvar.runs.rundir import LISTING, NEXT, RunDirectory
 from en4dvar.runs.runner import run, run_campaign
 
 
@@ -227,7 +226,7 @@ def test_a_run_that_could_not_begin_is_begun_by_resume(tmp_path, monkeypatch, fa
             raise OutputError(f"{file}: cannot be written: No space left on device")
         return written(file, text)
 
-    for module in (replacement, session):
+    for module in (rundir, engine):
         monkeypatch.setattr(module, "write_text", full)
     with pytest.raises(OutputError, match="No space left"):
         run(configuration(path, out))

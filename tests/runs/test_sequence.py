@@ -21,8 +21,8 @@ from en4dvar.data.noise import noise_of
 from en4dvar.plumbing.errors import ConfigError, DataError
 from en4dvar.priors.prior import PriorTerm
 from en4dvar.runs.checks import validate
+from en4dvar.runs.cycles import run_sequence
 from en4dvar.runs.interrupt import Interrupted
-from en4dvar.runs.sequence_run import run_sequence
 from en4dvar.schemes.ienks import IEnKS
 from en4dvar.series.problem import assimilate_series
 from en4dvar.series.twin import conduct

@@ -16,9 +16,9 @@ from twin_models import Ring
 from en4dvar.config import load_twin
 from en4dvar.model.forward import Failure
 from en4dvar.plumbing.errors import OutputError
-from en4dvar.results.codec import decode, encode
+from en4dvar.results.checkpoint import decode, encode
+from en4dvar.runs.cycles import run_twin
 from en4dvar.runs.interrupt import Interrupted
-from en4dvar.runs.twin_run import run_twin
 from en4dvar.schemes.filters import ESRF, ETKF, BootstrapFilter, EnKF, OptimalInterpolation
 from en4dvar.schemes.ienks import IEnKS
 from en4dvar.schemes.inflation import Inflation

@@ -64,7 +64,7 @@ def joint(runs: tuple[Path, ...], out: Path, how: dict[str, Any], names: tuple[s
       en4dvar joint runs/twelve_bubbles --share G --share mu
     """
     from en4dvar.report.joint import joint_table
-    from en4dvar.runs.joint_run import join
+    from en4dvar.runs.together import join
 
     result, page = join(runs, names, out, **how)
     return joint_table(result), result.cautions, page
@@ -102,7 +102,7 @@ def population(
       en4dvar population runs/twelve_bubbles --of G --of mu
     """
     from en4dvar.report.population import population_lines
-    from en4dvar.runs.population_run import population as estimate
+    from en4dvar.runs.together import population as estimate
 
     changed = {name: value for name, value in hyper.items() if value is not None}
     result, page = estimate(runs, names, out, hyper=changed, **how)
