@@ -16,14 +16,16 @@ from en4dvar.estimation.population.contrast import Centre, StraightLine, drawn_t
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.caution import untrusted
 from en4dvar.plumbing.errors import OutputError, retold
-from en4dvar.plumbing.files import write_text
+from en4dvar.plumbing.files import make_folder, write_text
 from en4dvar.plumbing.hints import suggest
-from en4dvar.plumbing.tables import csv_text, table
+from en4dvar.plumbing.tables import table, write_csv
 from en4dvar.plumbing.units import UnitError, convert
 from en4dvar.priors.prior import PriorTerm
 from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, in_columns
 from en4dvar.report.compare import named
-from en4dvar.report.svg import on_paper
+from en4dvar.report.html import render
+from en4dvar.report.paper import on_paper
+from en4dvar.report.svg import draw
 from en4dvar.report.text import figure_text, number_like, plain_number, pretty_unit, with_unit
 from en4dvar.results.joint_file import QUANTILES
 from en4dvar.results.netcdf import understood
@@ -355,6 +357,18 @@ def figure(c: PopulationsCompared) -> Chart:
     return in_columns(panels, height, width=COLUMN * (2 if len(panels) > 1 else 1))
 
 
+def write_populations(c: PopulationsCompared, out: str | Path) -> Path:
+    """Write ``compare.html``, ``populations.png`` and ``.pdf`` and the tables to a folder; returns the page.
+
+    Raises :class:`OutputError`.
+    """
+    out = make_folder(out)
+    ((_, _, drawn),) = draw([("populations", CAPTION, figure(c))], folder=out)
+    write_tables(c, out)
+    about = {"title": " – ".join(c.populations), "populations": tuple(sentences(c))}
+    return write_text(out / "compare.html", render("compare.html.j2", figure=drawn, caption=CAPTION, **about))
+
+
 def write_tables(c: PopulationsCompared, folder: Path) -> None:
     """``differences.csv`` and, with numbers, ``lines.csv``. Raises :class:`OutputError`."""
     three = [f"{what}_{q}" for what in ("ratio", "difference", "apart") for q in ("q05", "q50", "q95")]
@@ -363,11 +377,11 @@ def write_tables(c: PopulationsCompared, folder: Path) -> None:
         [d.parameter, d.first, d.second, d.unit, *d.ratio, *d.difference, *d.apart, d.greater, d.untrusted]
         for d in c.differences
     ]
-    write_text(folder / "differences.csv", csv_text([head, *rows]))
+    write_csv(folder / "differences.csv", [head, *rows])
     if c.lines:
         three = [f"{what}_{q}" for what in ("slope", "level") for q in ("q05", "q50", "q95")]
         lines = [
             [name, "ln" if name in c.logarithmic else "", *_three(it.slope), *_three(it.level), it.misfit, it.freedom]
             for name, it in c.lines.items()
         ]
-        write_text(folder / "lines.csv", csv_text([["parameter", "of", *three, "chi2", "freedom"], *lines]))
+        write_csv(folder / "lines.csv", [["parameter", "of", *three, "chi2", "freedom"], *lines])

@@ -4,12 +4,9 @@ The entries of a legend carry the label of their marks: with the page's script t
 says where the pointer is.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from markupsafe import Markup, escape
@@ -17,12 +14,10 @@ from markupsafe import Markup, escape
 from en4dvar.model.state import Array
 from en4dvar.plumbing.files import make_folder
 from en4dvar.report.chart import Chart, Mark, Panel, Row
+from en4dvar.report.paper import save_chart
 from en4dvar.report.paths import Frame, path_of
 from en4dvar.report.text import math_pieces
 from en4dvar.report.ticks import labelled
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 GAP = 6.0  # between panels
 FONT, SMALL = 8.0, 7.0
@@ -224,20 +219,6 @@ def draw(
     drawings = []
     for name, caption, chart in figures:
         if folder is not None:
-            keep(chart, make_folder(folder), f"{begin}{name}")
+            save_chart(chart, make_folder(folder), f"{begin}{name}")
         drawings.append((name, caption, svg(chart, f"{identifiers}{name}", caption)))
     return drawings
-
-
-def keep(chart: Chart, folder: Path, name: str) -> None:
-    """Write ``folder/name.pdf`` and ``folder/name.png``. Raises :class:`OutputError`."""
-    from en4dvar.report.paper import save_chart  # matplotlib takes longer to import than a page to draw
-
-    save_chart(chart, folder, name)
-
-
-def on_paper(chart: Chart) -> Figure:
-    """The figure of matplotlib, in the same size and colours as in the page."""
-    from en4dvar.report import paper
-
-    return paper.on_paper(chart)

@@ -19,8 +19,8 @@ from en4dvar.model.forward import ForwardModel
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError, OutputError
 from en4dvar.plumbing.files import make_folder, temporary_folder, write_text
-from en4dvar.report.outcomes import SequenceOutcome
 from en4dvar.report.result import Result
+from en4dvar.report.sequence import SequenceOutcome
 from en4dvar.runs.given import Given
 from en4dvar.runs.progress import terminal_progress
 from en4dvar.runs.rundir import holds_run

@@ -11,7 +11,7 @@ from en4dvar.assembly.build_sequence import build_sequence, sequence_data
 from en4dvar.config import SequenceConfig, load_sequence, loaded
 from en4dvar.executor import Executor
 from en4dvar.inputs.asked import DataFile
-from en4dvar.report.outcomes import SequenceOutcome
+from en4dvar.report.sequence import SequenceOutcome
 from en4dvar.results.checkpoint import FOLDER
 from en4dvar.results.series_file import sequence_csv
 from en4dvar.runs.cycles import Cycles, Keep

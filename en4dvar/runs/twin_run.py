@@ -6,7 +6,7 @@ from typing import Any
 
 from en4dvar.config import TwinConfig, load_twin, loaded
 from en4dvar.executor import Executor
-from en4dvar.report.outcomes import TwinOutcome
+from en4dvar.report.twin import TwinOutcome
 from en4dvar.results.checkpoint import FOLDER
 from en4dvar.results.series_file import twin_csv
 from en4dvar.runs.cycles import Cycles, Keep
