@@ -56,7 +56,7 @@ def validate(source: Source, plot: bool) -> None:
     echo(problem_summary(loaded, problems))
     chosen = problems[:1]
     if plot:
-        from en4dvar.report.predictive import PANELS
+        from en4dvar.report.history import PANELS
 
         chosen = problems[:PANELS]
     seeds = [own_seed(loaded.seed, problem.observations.name) for problem in chosen]
@@ -86,8 +86,8 @@ def _warn(preview: Preview) -> None:
 
 def _draw(config: Config, previews: Sequence[Preview], problems: Sequence[InverseProblem]) -> str:
     from en4dvar.plumbing.files import make_folder
+    from en4dvar.report.history import prior_predictive
     from en4dvar.report.paper import save_chart
-    from en4dvar.report.predictive import prior_predictive
 
     folder, name = make_folder(config.directory.parent), f"{config.directory.name}_prior"
     save_chart(prior_predictive(previews), folder, name)

@@ -8,7 +8,7 @@ from en4dvar.model.state import Array
 from en4dvar.priors.field_prior import regular_grid
 from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, Row, interval
 from en4dvar.report.palette import GREYS, VIRIDIS, ramp
-from en4dvar.report.text import shown, with_unit
+from en4dvar.report.text import axis_label, shown, with_unit
 from en4dvar.results.netcdf import Group
 from en4dvar.results.store import StoredResult
 
@@ -31,7 +31,7 @@ def maps(result: StoredResult) -> Chart:
         mean = shown(data[f"{name}_mean"])
         share = data[f"{name}_std"].values / data[f"{name}_prior_std"].values
         low, high = float(mean.min()), float(mean.max())
-        of_mean = _map(at, mean, (low, high if high > low else low + 1.0), VIRIDIS, _label(data, name))
+        of_mean = _map(at, mean, (low, high if high > low else low + 1.0), VIRIDIS, axis_label(data[name]))
         of_share = _map(at, share, (0.0, 1.0), GREYS, "posterior / prior std")
         tall = float(np.ptp(at[:, 0]) / np.ptp(at[:, 1])) if np.ptp(at[:, 1]) > 0 else 1.0
         rows.append(Row(min(max(tall, 0.3), 2.0) * 0.4 * COLUMN + 0.7 * POINTS, [of_mean[0], of_share[0]]))
@@ -39,15 +39,10 @@ def maps(result: StoredResult) -> Chart:
     return Chart(rows)
 
 
-def _label(data: Group, name: str) -> str:
-    about = data[name].attrs
-    return with_unit(str(about["symbol"]), str(about["display_units"]))
-
-
 def _line(data: Group, name: str, at: Array) -> Panel:
     order = np.argsort(at)
     positive = not np.any(data[name].values <= 0)
-    panel = Panel(with_unit("place", str(data[f"{name}_at"].attrs["units"])), _label(data, name))
+    panel = Panel(with_unit("place", str(data[f"{name}_at"].attrs["units"])), axis_label(data[name]))
     for kind, colour in (("prior_", "prior"), ("", "posterior")):
         mean, std = (shown(data[f"{name}_{kind}{what}"])[order] for what in ("mean", "std"))
         panel.band(at[order], *interval(mean, std, 1, positive), colour, 0.3)

@@ -6,12 +6,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from en4dvar.model.state import Array
-from en4dvar.plumbing.units import convert
-from en4dvar.report import fields, readings, varying, withheld
+from en4dvar.report import fields, readings, varying
 from en4dvar.report.chart import COLUMN, PAGE, POINTS, Chart, Panel, Row, in_columns
-from en4dvar.report.history import history
+from en4dvar.report.history import WITHHELD, expected, history
 from en4dvar.report.svg import Captioned
-from en4dvar.report.text import estimate, pretty_unit, shown, with_unit
+from en4dvar.report.text import axis_label, estimate, shown, unit_behind, with_unit
 from en4dvar.results.store import StoredResult
 
 MAX_PAIRS = 6
@@ -23,7 +22,7 @@ def histograms(result: StoredResult) -> Chart:
     for row in result.rows:
         exact, posterior = _prior_density(result, row.name), result.members("posterior", row.name)
         prior = result.members("prior", row.name)
-        value = f"{estimate(row, '')} {pretty_unit(row.unit)}".rstrip()
+        value = f"{estimate(row, '')}{unit_behind(row.unit)}"
         doubt = ", not to be trusted" if row.untrusted else ""
         panel = Panel(
             with_unit(row.symbol, row.unit), title=f"{value}{doubt}", title_colour="posterior", xticks=4, yticks=(),
@@ -52,8 +51,8 @@ def _prior_density(result: StoredResult, name: str) -> tuple[Array, Array, Array
         return None
     from scipy.special import ndtr
 
-    about, place = result.parameters[name].attrs, stats["parameter"].values.tolist().index(name)
-    values = convert(np.asarray(stats["prior_value"].values[place]), about["units"], about["display_units"])
+    place = stats["parameter"].values.tolist().index(name)
+    values = shown(result.parameters[name], stats["prior_value"].values[place])
     density = np.diff(ndtr(stats["prior_score"].values)) / np.diff(values)
     x = np.concatenate([values[:1], values[:-1] + np.diff(values) / 2, values[-1:]])
     density = np.concatenate([density[:1], density, density[-1:]]) / density.max()
@@ -161,7 +160,7 @@ def all_figures(result: StoredResult) -> Iterator[Captioned]:
         history(result),
     )
     if "/withheld" in result.groups:
-        yield "withheld", withheld.CAPTION, withheld.expected(result)
+        yield "withheld", WITHHELD, expected(result)
     if varying.stored_walks(result):
         yield (
             "varying",
@@ -196,8 +195,7 @@ def _discrepancy(result: StoredResult, time: Array, label: str) -> Panel:
     name, stats = result.observable, result.group("sample_stats")
     residual = shown(result.group("observed_data")[name]) - shown(stats[f"{name}_centre"])
     mean, std = shown(stats[f"{name}_discrepancy"]), shown(stats[f"{name}_discrepancy_std"])
-    unit = str(stats[f"{name}_discrepancy"].attrs["display_units"])
-    panel = Panel(label, with_unit("residual", unit), legend=True)
+    panel = Panel(label, axis_label(stats[f"{name}_discrepancy"], "residual"), legend=True)
     panel.rule(0)
     panel.band(time, mean - std, mean + std, "posterior", 0.35, "discrepancy ± std")
     panel.dots(time, residual, "ink", label="data − centre")

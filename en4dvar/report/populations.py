@@ -26,7 +26,7 @@ from en4dvar.report.compare import named
 from en4dvar.report.html import render
 from en4dvar.report.paper import on_paper
 from en4dvar.report.svg import draw
-from en4dvar.report.text import figure_text, number_like, plain_number, pretty_unit, with_unit
+from en4dvar.report.text import figure_text, number_like, plain_number, range_words, unit_behind, with_unit
 from en4dvar.results.joint_file import QUANTILES
 from en4dvar.results.netcdf import understood
 from en4dvar.results.population_file import FILE, StoredPopulation, load_population
@@ -229,14 +229,13 @@ def _calibrated(
 ) -> Iterator[str]:
     """What groups that are known from elsewhere do to the median (M, K) of a parameter in the others."""
     known = [label for label, of_it in values.items() if of_it]
-    unit = f" {pretty_unit(parameter.display_unit)}" if parameter.display_unit != "1" else ""
+    unit = unit_behind(parameter.display_unit)
     for k, (label, s) in enumerate(stored.items()):
         now, before = (_range(_three(draws[:, k]), plain=True) for draws in (together, alone))
         if name in values[label]:
             value, std = (convert(number, parameter.unit, parameter.display_unit) for number in values[label][name])
-            x = convert(
-                s.group("posterior")[f"{name}_{s.headline}"].values.ravel(), parameter.unit, parameter.display_unit
-            )
+            draws = s.group("posterior")[f"{name}_{s.headline}"].values
+            x = convert(draws.ravel(), parameter.unit, parameter.display_unit)
             off = (value - float(np.median(x))) / float(np.hypot(x.std(), std))
             words = f"{name} of {label} is known, {number_like(value, std)} ± {number_like(std, std)}{unit}"
             yield words + (f"; its own data say otherwise, {abs(off):.1f} std away" if abs(off) > FAR else "")
@@ -293,7 +292,7 @@ def sentences(c: PopulationsCompared) -> Iterator[str]:
 
 
 def _sentence(d: Difference) -> str:
-    unit = f" {pretty_unit(d.unit)}" if d.unit != "1" else ""
+    unit = unit_behind(d.unit)
     by = f"{_range(d.difference, plain=True)}{unit} more"
     if d.difference[1] < 0:
         low, middle, high = (-value for value in d.difference)
@@ -305,16 +304,16 @@ def _sentence(d: Difference) -> str:
     else:
         words = f"{d.parameter} of {d.first} is {by} than that of {d.second}"
     words += f"; it is {side} with probability {chance}"
-    alone = f"{number_like(d.apart[0], _std(d.apart))} … {number_like(d.apart[2], _std(d.apart))}"
-    words += f" (were nothing common: {alone}{' times' if d.is_ratio else unit})"
+    alone = range_words(d.apart[0], d.apart[2], _std(d.apart), "1" if d.is_ratio else d.unit)
+    words += f" (were nothing common: {alone}{' times' * d.is_ratio})"
     return f"{words}; not to be trusted: {d.untrusted.replace(' ', ', ')}." if d.untrusted else f"{words}."
 
 
 def _line_sentence(c: PopulationsCompared, name: str, of_it: StraightLine) -> str:
-    unit = pretty_unit(c.parameters[name].display_unit)
+    unit = unit_behind(c.parameters[name].display_unit)
     slope = _three(np.exp(of_it.slope) if name in c.logarithmic else of_it.slope)
     rising = float(np.mean(of_it.slope > 0))
-    by = f"a factor of {_range(slope)}" if name in c.logarithmic else f"{_range(slope)} {unit}".rstrip()
+    by = f"a factor of {_range(slope)}" if name in c.logarithmic else f"{_range(slope)}{unit}"
     words = f"{name} grows by {by} for each unit of the number; it rises with probability {min(rising, SURE):.3f}"
     if of_it.chance < OFF_THE_LINE:
         chi = plain_number(of_it.misfit, 2)
@@ -327,8 +326,9 @@ def _std(three: Sequence[float]) -> float:
 
 
 def _range(three: tuple[float, float, float], plain: bool = False) -> str:
-    low, middle, high = (number_like(value, _std(three)) for value in three)
-    return f"{middle} ({low} … {high})" if plain else f"{middle} (5–95 %: {low} … {high})"
+    low, middle, high = three
+    between = range_words(low, high, _std(three))
+    return f"{number_like(middle, _std(three))} ({between if plain else f'5–95 %: {between}'})"
 
 
 def medians_table(c: PopulationsCompared) -> str:
