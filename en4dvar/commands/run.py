@@ -133,8 +133,8 @@ def _tell_what_sets_share(directory: Path, warnings: _Warnings) -> None:
         warnings.joint = True
         warnings.add("all together", together.cautions, whole=True)
     for n, (name, (_, of)) in enumerate(populations_of(directory).items()):
-        from en4dvar.report.groups import group_lines
         from en4dvar.report.population import population_lines
+        from en4dvar.report.populations import group_lines
 
         if name and n == 0:
             echo("\n" + "\n".join(group_lines(directory)))

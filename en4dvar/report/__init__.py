@@ -148,15 +148,17 @@ def _headlines(run_dir: Path) -> list[Headline]:
 
 def _side_by_side(run_dir: Path) -> Iterator[Headline]:
     """The groups of the run compared, where there are two of them; their tables are written."""
-    from en4dvar.report import groups, populations
+    from en4dvar.report import populations
 
-    of = groups.groups_compared(run_dir)
+    of = populations.groups_compared(run_dir)
     if isinstance(of, str):
         yield Headline("summary.csv", "All data sets", [of], "", "")
     elif of is not None:
         populations.write_tables(of, run_dir)
         drawn = svg(populations.figure(of), "populations", populations.CAPTION)
-        yield Headline("differences.csv", "The differences", [*groups.group_sentences(of)], drawn, populations.CAPTION)
+        yield Headline(
+            "differences.csv", "The differences", [*populations.group_sentences(of)], drawn, populations.CAPTION
+        )
 
 
 def _write_page(run_dir: Path, stem: str, copies: str | None, trail: Sequence[tuple[str, str]]) -> None:

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,6 +16,7 @@ from en4dvar.plumbing.units import convert
 from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, Row, in_columns
 from en4dvar.report.text import axis_label, figure_text, number_like, percent, shown, unit_behind, with_unit
 from en4dvar.results.declared import Axis
+from en4dvar.results.netcdf import Group, Variable
 from en4dvar.results.store import StoredResult
 
 if TYPE_CHECKING:
@@ -39,59 +39,45 @@ WITHHELD = (
 )
 
 
-@dataclass(frozen=True)
-class SeriesShown:
-    """One series in display units: ``x`` (K,) times or places, ``data``, ``std`` and ``centre`` (K,)."""
-
-    axis: Axis
-    x: Array
-    x_label: str
-    data: Array
-    std: Array
-    centre: Array
-    label: str
-
-    @classmethod
-    def of(cls, result: StoredResult, axis: Axis) -> SeriesShown:
-        observed, name = result.group("observed_data"), axis.name
-        data, std = shown(observed[name]), shown(observed[f"{name}_std"])
-        x, x_label = shown(observed[axis.time]), axis_label(observed[axis.time], "time")
-        places = np.asarray(observed[f"{name}_place"].values) if f"{name}_place" in observed else np.empty(0)
-        if len(np.unique(places)) > len(np.unique(x)):
-            x = places
-            x_label = with_unit("place", str(observed[f"{name}_place"].attrs["units"]))
-        attrs = observed[name].attrs
-        label = str(attrs["long_name"]).removesuffix(", observed")
-        label = axis_label(observed[name], label if label == attrs["symbol"] else f"{label} {attrs['symbol']}")
-        return cls(axis, x, x_label, data, std, shown(result.group("sample_stats")[f"{name}_centre"]), label)
-
-    @property
-    def reach(self) -> tuple[float, float]:
-        """Limits along x."""
-        first, last = float(self.x.min()), float(self.x.max())
-        span = (last - first) or max(abs(first), 1.0)
-        return first - 0.03 * span, last + 0.03 * span
-
-
 def history(result: StoredResult) -> Chart:
     """Data ± std, prior and posterior predictive bands (50 and 90 %), the centre; below, residuals over their std."""
-    several = len(result.axes) > 1
+    several, observed = len(result.axes) > 1, result.group("observed_data")
     high, low = (5.0, 2.3) if several else (6.8, 2.7)
     rows = []
     for i, axis in enumerate(result.axes):
-        series = SeriesShown.of(result, axis)
+        x, x_label = _along(observed, axis)
+        data, std = shown(observed[axis.name]), shown(observed[f"{axis.name}_std"])
+        centre = shown(result.group("sample_stats")[f"{axis.name}_centre"])
+        first, last = float(x.min()), float(x.max())
+        span = (last - first) or max(abs(first), 1.0)
+        reach = first - 0.03 * span, last + 0.03 * span
         top = Panel(
-            ylabel=series.label, title=axis.name if several else "", xlim=series.reach,
-            ylim=_data_range(series.data, series.std), x_numbers=False, legend=i == 0,
+            ylabel=_quantity(observed[axis.name]), title=axis.name if several else "", xlim=reach,
+            ylim=_data_range(data, std), x_numbers=False, legend=i == 0,
         )  # fmt: skip
-        _data(top, result, series)
-        rows += [Row(high * POINTS, [top]), Row(low * POINTS, [_residuals(series)])]
+        _predictions(top, result, axis.name, x, centre)
+        _readings(top, x, data, std)
+        rows += [Row(high * POINTS, [top]), Row(low * POINTS, [_residuals(x, x_label, (data - centre) / std, reach)])]
     return Chart(rows)
 
 
-def _data(panel: Panel, result: StoredResult, series: SeriesShown) -> None:
-    """Data and predictions: along the path, or at each reading of a field."""
-    name = series.axis.name
+def _along(observed: Group, axis: Axis) -> tuple[Array, str]:
+    """(K,) times, or places of a field that is read at more of them than times, in the display unit; with a label."""
+    place = f"{axis.name}_place"
+    times, places = shown(observed[axis.time]), observed[place].values if place in observed else ()
+    if len(np.unique(places)) > len(np.unique(times)):
+        return np.asarray(places), with_unit("place", str(observed[place].attrs["units"]))
+    return times, axis_label(observed[axis.time], "time")
+
+
+def _quantity(observed: Variable) -> str:
+    """Label, symbol and unit of what was observed."""
+    label, symbol = str(observed.attrs["long_name"]).removesuffix(", observed"), observed.attrs["symbol"]
+    return axis_label(observed, label if label == symbol else f"{label} {symbol}")
+
+
+def _predictions(panel: Panel, result: StoredResult, name: str, x: Array, centre: Array) -> None:
+    """Along the path, or at each reading of a field."""
     curve = f"{name}_path" in result.group("prior_predictive")
     for group, levels, colour, alpha, label in BANDS:
         held = result.group(group)
@@ -105,12 +91,11 @@ def _data(panel: Panel, result: StoredResult, series: SeriesShown) -> None:
         if curve:
             panel.band(shown(held["path_time"])[seen], low, high, colour, alpha, label)
         else:
-            panel.bars(series.x, low, high, colour, 4.0 if len(series.x) <= FEW else 2.0, alpha, label)
+            panel.bars(x, low, high, colour, 4.0 if len(x) <= FEW else 2.0, alpha, label)
     if curve:
-        panel.line(series.x, series.centre, "centre", 0.9, label="best fit")
+        panel.line(x, centre, "centre", 0.9, label="best fit")
     else:
-        panel.dots(series.x, series.centre, "centre", 5.0, label="best fit", kind="dashes")
-    _readings(panel, series.x, series.data, series.std)
+        panel.dots(x, centre, "centre", 5.0, label="best fit", kind="dashes")
 
 
 def _readings(panel: Panel, x: Array, data: Array, std: Array) -> None:
@@ -126,15 +111,14 @@ def _size(x: Array) -> float:
     return 2.2 if len(x) <= FEW else 1.2
 
 
-def _residuals(series: SeriesShown) -> Panel:
-    residual = (series.data - series.centre) / series.std
+def _residuals(x: Array, x_label: str, residual: Array, along: tuple[float, float]) -> Panel:
     reach = 1.15 * max(3.0, float(np.max(np.abs(residual))))
-    panel = Panel(series.x_label, "residual / std", xlim=series.reach, ylim=(-reach, reach))
+    panel = Panel(x_label, "residual / std", xlim=along, ylim=(-reach, reach))
     panel.yticks = (-2, 0, 2) if reach < 8 else 4
     for limit, alpha in ((2, 0.12), (1, 0.16)):
         panel.span(-limit, limit, "posterior", alpha)
     panel.rule(0)
-    panel.dots(series.x, residual, "ink", _size(series.x))
+    panel.dots(x, residual, "ink", _size(x))
     return panel
 
 

@@ -1,7 +1,10 @@
-"""Populations side by side: is one median larger than another, by how much, how surely, and its trend."""
+"""Populations side by side, of several runs or of groups of the data sets of one, such as two materials: is one median
+larger than another, by how much, how surely, and its trend.
+"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
@@ -19,7 +22,7 @@ from en4dvar.plumbing.errors import OutputError, retold
 from en4dvar.plumbing.files import make_folder, write_text
 from en4dvar.plumbing.hints import suggest
 from en4dvar.plumbing.tables import table, write_csv
-from en4dvar.plumbing.units import UnitError, convert
+from en4dvar.plumbing.units import UnitError, convert, is_unit
 from en4dvar.priors.prior import PriorTerm
 from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, in_columns
 from en4dvar.report.compare import named
@@ -29,7 +32,7 @@ from en4dvar.report.svg import draw
 from en4dvar.report.text import figure_text, number_like, plain_number, range_words, unit_behind, with_unit
 from en4dvar.results.joint_file import QUANTILES
 from en4dvar.results.netcdf import understood
-from en4dvar.results.population_file import FILE, StoredPopulation, load_population
+from en4dvar.results.population_file import FILE, StoredPopulation, load_groups_of, load_population
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -37,6 +40,7 @@ if TYPE_CHECKING:
 Values = Mapping[str, tuple[float, float]]  # parameter → value and std
 SURE = 0.999  # no number of draws says more
 FAR = 2.5  # standard deviations between what is known and what the data say
+_NUMBER = re.compile(r"(?<![^\W_])(?<!\.)(\d+(?:\.\d+)?)[ _]?(%|[^\W\d_]+)(?![^\W_])")  # with a unit, in a name
 OFF_THE_LINE = 0.05  # probability below which populations differ by more than a line says
 CAPTION = (
     "Median and 5–95 % of the median of each population, given the data of all; what is common moves them together."
@@ -385,3 +389,47 @@ def write_tables(c: PopulationsCompared, folder: Path) -> None:
             for name, it in c.lines.items()
         ]
         write_csv(folder / "lines.csv", [["parameter", "of", *three, "chi2", "freedom"], *lines])
+
+
+def numbers_of(names: Sequence[str]) -> tuple[tuple[float, ...], str]:
+    """The number in each of the names and their unit, as of ``gel_5kPa`` and ``gel_8kPa``; nothing where a name has
+    none or several, units differ, or all numbers are the same.
+    """
+    of_names = [[(number, unit) for number, unit in _NUMBER.findall(name) if is_unit(unit)] for name in names]
+    units = {unit for of_name in of_names for _, unit in of_name}
+    if any(len(of_name) != 1 for of_name in of_names) or len(units) != 1:
+        return (), ""
+    numbers = tuple(float(of_name[0][0]) for of_name in of_names)
+    return (numbers, units.pop()) if len(set(numbers)) > 1 else ((), "")
+
+
+def groups_compared(run_dir: Path) -> PopulationsCompared | str | None:
+    """The groups of a run side by side; why not, where their data are the same; None where fewer than two have a
+    population.
+    """
+    folders = {name: folder for name, (folder, _) in load_groups_of(run_dir).items()}
+    if len(folders) < 2:
+        return None
+    numbers = numbers_of([*folders])[0] if len(folders) > 2 else ()  # a line through two is their difference
+    try:
+        return compare_populations(folders, numbers)
+    except OutputError as error:
+        return f"The groups are not compared: {error}."
+
+
+def group_sentences(of: PopulationsCompared) -> Iterator[str]:
+    """The answer, and which number the straight line is of."""
+    yield from sentences(of)
+    if of.lines:
+        yield f"The number of the straight line is that of the names of the groups, in {numbers_of(of.populations)[1]}."
+
+
+def group_lines(run_dir: Path) -> Iterator[str]:
+    """What the terminal shows of the groups of a run before each of them."""
+    of = groups_compared(run_dir)
+    if isinstance(of, str):
+        yield of
+    elif of is not None:
+        yield medians_table(of)
+        yield ""
+        yield from group_sentences(of)
