@@ -62,9 +62,9 @@ from en4dvar.executor import SerialExecutor
 from en4dvar.inputs.window import minima
 from en4dvar.model.state import Array
 from en4dvar.problem import InverseProblem
+from en4dvar.report.history import withheld_lines
 from en4dvar.report.result import Result
 from en4dvar.report.text import shown
-from en4dvar.report.withheld import withheld_lines
 from en4dvar_bubble.model import BubbleModel
 from en4dvar_movie.filming import Camera, exposures
 from en4dvar_movie.frames import write_movie

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -112,31 +113,38 @@ def compare(
       en4dvar compare runs/neo_hookean runs/quadratic
       en4dvar compare runs/gel_5 runs/gel_8 runs/gel_10 --against 5,8,10
     """
-    from en4dvar.report.compare import Comparison, compare_runs, comparison_table, estimates_table, with_evidences
+    from en4dvar.report.populations import write_populations
     from en4dvar.results.run_results import has_results
     from en4dvar.results.series_file import series_file
 
     if any(map(series_file, run_dirs)):
-        from en4dvar.report.compare_cycles import compare_sequences, sequences_table
+        from en4dvar.report.sequence import compare_sequences, sequences_table
 
         echo(sequences_table(compare_sequences(run_dirs)))
         return
     of = _populations(run_dirs, against, apart, known, not any(map(has_results, run_dirs)))
-    comparison = Comparison(()) if of else compare_runs(run_dirs)
-    if not (stored or of or comparison.incomparable):
+    write = partial(write_populations, of) if of else _compared(run_dirs, stored, workers, trust)
+    if not no_report:
+        page = write(out or folder_of("compare", run_dirs))
+        echo(f"report: {page if out else from_here(page)}")
+
+
+def _compared(
+    run_dirs: tuple[Path, ...], stored: bool, workers: int | None, trust: bool
+) -> Callable[[Path], Path]:  # fmt: skip
+    """What writes the page of the runs side by side, which are told on standard output."""
+    from en4dvar.report import compare as side_by_side
+
+    comparison = side_by_side.compare_runs(run_dirs)
+    if not (stored or comparison.incomparable):
         from en4dvar.runs.finished import sampled_evidences
 
         evidences = [sampled_evidences(run_dir, workers, trust, None, tell) for run_dir in run_dirs]
-        comparison = with_evidences(comparison, evidences)
-    if not of and len(comparison.estimates) <= MOST_ROWS:
-        echo(f"{estimates_table(comparison)}\n")
-    if not of:
-        echo(comparison_table(comparison))
-    if not no_report:
-        from en4dvar.report.overlay import write_comparison
-
-        page = write_comparison(comparison, out or folder_of("compare", run_dirs), of)
-        echo(f"report: {page if out else from_here(page)}")
+        comparison = side_by_side.with_evidences(comparison, evidences)
+    if len(comparison.estimates) <= MOST_ROWS:
+        echo(f"{side_by_side.estimates_table(comparison)}\n")
+    echo(side_by_side.comparison_table(comparison))
+    return partial(side_by_side.write_comparison, comparison)
 
 
 def _populations(
@@ -184,7 +192,7 @@ def export(run_dir: Path, kind: Literal["csv", "latex", "members", "netcdf"], ou
     Example:
       en4dvar export runs/quickstart --latex --out table.tex
     """
-    from en4dvar.report.export import export_table, posterior_file
+    from en4dvar.report.export import cycles_table, export_table, posterior_file
     from en4dvar.results.run_results import LackingError
     from en4dvar.results.series_file import series_file
 
@@ -196,17 +204,12 @@ def export(run_dir: Path, kind: Literal["csv", "latex", "members", "netcdf"], ou
         path = posterior_file(run_dir)
         echo(f"{path} follows the ArviZ schema as it is: arviz.from_netcdf({str(path)!r}); nothing to export")
         return
-    if cycles:
-        from en4dvar.report.export_cycles import cycles_table
-
-        text = cycles_table(cycles, kind)
-    else:
-        try:
-            text = export_table(run_dir, kind)
-        except LackingError as error:
-            if isinstance(error.rest, str):
-                deliver(error.rest, out, "table", force)
-            raise
+    try:
+        text = cycles_table(cycles, kind) if cycles else export_table(run_dir, kind)
+    except LackingError as error:
+        if isinstance(error.rest, str):
+            deliver(error.rest, out, "table", force)
+        raise
     deliver(text, out, "table", force)
 
 

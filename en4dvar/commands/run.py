@@ -142,8 +142,8 @@ def _tell_what_sets_share(directory: Path, warnings: _Warnings) -> None:
         warnings.joint = True
         warnings.add("all together", together.cautions, whole=True)
     for n, (name, (_, of)) in enumerate(populations_of(directory).items()):
-        from en4dvar.report.groups import group_lines
         from en4dvar.report.population import population_lines
+        from en4dvar.report.populations import group_lines
 
         if name and n == 0:
             echo("\n" + "\n".join(group_lines(directory)))
@@ -204,19 +204,18 @@ class _Warnings:
 def _follow(config: TwinConfig | SequenceConfig, force: bool, resume: bool) -> None:
     """Cycles, their table on standard output, warnings on standard error, and where the files are."""
     from en4dvar.config import TwinConfig
-    from en4dvar.report.outcomes import estimates_table, scores_table
     from en4dvar.runs.cycles import SequenceKind, TwinKind, run_sequence, run_twin
     from en4dvar.runs.progress import counted
 
     if isinstance(config, TwinConfig):
-        own: Any = TwinKind(config), run_twin, scores_table, config.experiment.members
+        own: Any = TwinKind(config), run_twin, config.experiment.members
     else:
-        own = SequenceKind(config), run_sequence, estimates_table, config.assimilation.members
-    kind, conduct, table, members = own
+        own = SequenceKind(config), run_sequence, config.assimilation.members
+    kind, conduct, members = own
     with continuable(), counted("cycles") as tell:
         on_cycle = (lambda cycle: tell(cycle + 1, kind.cycles)) if tell else None
         result = conduct(config, force=force, resume=resume, on_cycle=on_cycle, command=command_line())
-    echo(table(result))
+    echo(result.table())
     if result.run.failures:
         lost = f"{len(result.run.failures)} of {members} members lost"
         echo(f"warning: {config.name}: {lost}, the last: {result.run.failures[-1]}", err=True)

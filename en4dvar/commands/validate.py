@@ -55,7 +55,7 @@ def validate(source: Source, plot: bool) -> None:
     echo(problem_summary(loaded, problems))
     chosen = problems[:1]
     if plot:
-        from en4dvar.report.predictive import PANELS
+        from en4dvar.report.history import PANELS
 
         chosen = problems[:PANELS]
     seeds = [own_seed(loaded.seed, problem.observations.name) for problem in chosen]
@@ -85,10 +85,10 @@ def _warn(preview: Preview) -> None:
 
 def _draw(config: Config, previews: Sequence[Preview], problems: Sequence[InverseProblem]) -> str:
     from en4dvar.plumbing.files import make_folder
-    from en4dvar.report.predictive import prior_predictive
-    from en4dvar.report.svg import keep
+    from en4dvar.report.history import prior_predictive
+    from en4dvar.report.paper import save_chart
 
     folder, name = make_folder(config.directory.parent), f"{config.directory.name}_prior"
-    keep(prior_predictive(previews), folder, name)
+    save_chart(prior_predictive(previews), folder, name)
     left = f" ({len(previews)} of {len(problems)} data sets)" if len(previews) < len(problems) else ""
     return f"{Path(folder) / name}.png and .pdf{left}"

@@ -16,14 +16,13 @@ from en4dvar.plumbing.files import inside, make_folder, write_text
 from en4dvar.plumbing.hints import suggest
 from en4dvar.plumbing.tables import write_csv
 from en4dvar.report.figures import all_figures
+from en4dvar.report.history import WITHHELD_COLUMNS, withheld_lines
 from en4dvar.report.overview import Headline, SetSummary, overview_figures, render_overview
 from en4dvar.report.page import IDENTIFIERS, render_set
 from en4dvar.report.responses import ENTRY_COLUMNS, SHIFT_COLUMNS, stored_ledger, stored_shifts
 from en4dvar.report.svg import draw, svg
 from en4dvar.report.text import upper_first
 from en4dvar.report.varying import PIECE_COLUMNS, piece_lines
-from en4dvar.report.withheld import COLUMNS as WITHHELD_COLUMNS
-from en4dvar.report.withheld import withheld_lines
 from en4dvar.results.campaign_file import failed_datasets
 from en4dvar.results.joint_file import FILE, load_joint
 from en4dvar.results.pack import PACK
@@ -149,15 +148,17 @@ def _headlines(run_dir: Path) -> list[Headline]:
 
 def _side_by_side(run_dir: Path) -> Iterator[Headline]:
     """The groups of the run compared, where there are two of them; their tables are written."""
-    from en4dvar.report import groups, populations
+    from en4dvar.report import populations
 
-    of = groups.groups_compared(run_dir)
+    of = populations.groups_compared(run_dir)
     if isinstance(of, str):
         yield Headline("summary.csv", "All data sets", [of], "", "")
     elif of is not None:
         populations.write_tables(of, run_dir)
         drawn = svg(populations.figure(of), "populations", populations.CAPTION)
-        yield Headline("differences.csv", "The differences", [*groups.group_sentences(of)], drawn, populations.CAPTION)
+        yield Headline(
+            "differences.csv", "The differences", [*populations.group_sentences(of)], drawn, populations.CAPTION
+        )
 
 
 def _write_page(run_dir: Path, stem: str, copies: str | None, trail: Sequence[tuple[str, str]]) -> None:

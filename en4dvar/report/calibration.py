@@ -17,7 +17,8 @@ from en4dvar.plumbing.files import read_text, write_text
 from en4dvar.plumbing.tables import table
 from en4dvar.report.chart import PAGE, POINTS, Chart, Panel, in_columns
 from en4dvar.report.html import render
-from en4dvar.report.svg import draw, on_paper
+from en4dvar.report.paper import on_paper
+from en4dvar.report.svg import draw
 from en4dvar.report.text import figure_text
 from en4dvar.results.calibration_file import ERRORS, FIT, NUMBERS, Judged, read_sets
 

@@ -11,7 +11,7 @@ do not compare: there the posteriors are shown, and no probabilities.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -20,14 +20,18 @@ from scipy.special import softmax
 
 from en4dvar.data.observations import Observations
 from en4dvar.diagnosis.diagnostics import member_quantiles
-from en4dvar.estimation.summary import ParameterSummary, estimate_cells
+from en4dvar.estimation.summary import CSV_COLUMNS, ParameterSummary, csv_cells, estimate_cells
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, codes
 from en4dvar.plumbing.errors import OutputError, retold
-from en4dvar.plumbing.tables import table
+from en4dvar.plumbing.files import make_folder, write_text
+from en4dvar.plumbing.tables import table, write_csv
 from en4dvar.plumbing.units import UnitError, convert
 from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, in_columns
-from en4dvar.report.svg import on_paper
+from en4dvar.report.html import render
+from en4dvar.report.page import DFS_WORDS
+from en4dvar.report.paper import on_paper
+from en4dvar.report.svg import draw
 from en4dvar.report.text import figure_text, fixed, with_unit
 from en4dvar.results.run_results import result_files
 from en4dvar.results.store import StoredResult, load_stored
@@ -40,6 +44,11 @@ MOST_WARNINGS = 12  # on the terminal
 UNDECIDABLE = 1.0  # difference of log-evidence
 ALL = "all data sets"
 COLOURS = ("posterior", "centre", "background", "#cc79a7", "#b58900", "muted")
+CAPTION = (
+    "Posterior of each run, scaled to its peak; bars hold 5–95 % of the members, where these are to be trusted. "
+    "Where a run has several data sets, "
+    "the members of all of them are taken together."
+)
 STORED = "* as the result has it: Laplace's approximation, unless its posterior was sampled"
 
 
@@ -242,6 +251,33 @@ def estimates_table(comparison: Comparison) -> str:
         why = [", ".join(e.summary.untrusted)] * doubted
         rows.append((e.summary.name, e.summary.unit, e.dataset, e.run, mean, std, low, high, *why))
     return table([header, *rows])
+
+
+def write_comparison(comparison: Comparison, out: str | Path) -> Path:
+    """Write ``compare.html``, ``posteriors.png`` and ``.pdf``, ``estimates.csv`` and ``evidence.csv`` to a folder.
+
+    Files of an earlier comparison there are replaced. Returns the path of the page. Raises :class:`OutputError`.
+    """
+    out = make_folder(out)
+    ((_, _, figure),) = draw([("posteriors", CAPTION, overlay(comparison))], folder=out)
+    warned = {(s.run, s.dataset): s.warnings for s in comparison.scores}
+    rows = ([e.run, e.dataset, *csv_cells(e.summary), warned[e.run, e.dataset]] for e in comparison.by_parameter)
+    write_csv(out / "estimates.csv", [["run", "dataset", *CSV_COLUMNS, "warnings"], *rows])
+    columns = [f.name for f in fields(ModelScore)]
+    write_csv(out / "evidence.csv", [columns, *([getattr(s, c) for c in columns] for s in comparison.scores)])
+    page = render(
+        "compare.html.j2",
+        title=" – ".join(comparison.runs),
+        figure=figure,
+        caption=CAPTION,
+        incomparable=comparison.incomparable,
+        verdicts=[(name, comparison.verdict(name)) for name in comparison.datasets],
+        estimates=comparison.by_parameter,
+        scores=comparison.scores,
+        cautions=[(c.caution, f"{c.run}, {c.dataset}: ") for c in comparison.cautions],
+        dfs_words=DFS_WORDS,
+    )
+    return write_text(out / "compare.html", page)
 
 
 def overlay(comparison: Comparison) -> Chart:

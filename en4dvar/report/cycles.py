@@ -26,22 +26,13 @@ RANKS = (
 
 
 def write_cycles_page(
-    run_dir: Path,
-    data: Group,
-    *,
-    kind: str,
-    what: str,
-    cycle: str,
-    iterations: float,
-    facts: Sequence[tuple[str, str, str]],
-    tables: Sequence[Table],
-    figures: Iterable[Captioned],
-    files: bool,
-) -> Path:
+    run_dir: Path, data: Group, figures: Iterable[Captioned], files: bool, *, cycle: str, iterations: float,
+    facts: Sequence[tuple[str, str, str]], tables: Sequence[Table], **about: str,
+) -> Path:  # fmt: skip
     """Write ``report.html``, with ``files`` also figures as PDF and PNG; returns the path of the page.
 
     ``facts``: (quantity, value, in words) for the tiles on top, beside those of scheme, members and forward runs;
-    ``iterations``: forecasts of the window a ``cycle``, on average.
+    ``iterations``: forecasts of the window a ``cycle``, on average; ``about``: the ``kind`` of run and ``what`` it is.
     """
     a = data.attrs
     members, lost = int(a["members"]), int(a["members_lost"])
@@ -49,8 +40,6 @@ def write_cycles_page(
         "cycles.html.j2",
         title=str(a["name"]),
         created=str(a.get("date_created", "")),
-        kind=kind,
-        what=what,
         facts=[
             ("Scheme", str(a["scheme"]), f"forecasts of the window {cycle}: {plain_number(iterations, 3)}"),
             ("Members", f"{members - lost} of {members}", "did not fail up to the end of the run"),
@@ -64,6 +53,7 @@ def write_cycles_page(
         lost=_lines(a["members_lost_why"]),
         provenance=provenance_rows(a),
         configuration=str(a["configuration_resolved"]),
+        **about,
     )
     return write_text(run_dir / "report.html", page)
 
@@ -94,15 +84,19 @@ def ranks(ranked: Array, members: int) -> Chart:
     return Chart([Row(5.0 * POINTS, [panel])])
 
 
+def variables(data: Group) -> list[tuple[str, str, str]]:
+    """Name, unit and the unit shown of each variable of the state."""
+    columns = "state", "units", "display_units" if "display_units" in data else "units"
+    return list(zip(*(map(str, data[column].values) for column in columns), strict=True))
+
+
 def last_analysis(data: Group) -> Iterator[tuple[str, float, float, str]]:
     """Name, mean, std and the unit they are shown in of the variables that are uncertain at the end."""
-    units = data["units"].values
-    displayed = data["display_units"].values if "display_units" in data else units
     last = (data[f"analysis_{what}"].values[-1].tolist() for what in ("mean", "std"))
-    for name, unit, to, *numbers in zip(data["state"].values, units, displayed, *last, strict=True):
-        mean, std = (float(convert(number, str(unit), str(to))) for number in numbers)
+    for (name, unit, shown), *numbers in zip(variables(data), *last, strict=True):
+        mean, std = (float(convert(number, unit, shown)) for number in numbers)
         if std > CERTAIN * abs(mean):
-            yield str(name), mean, std, str(to)
+            yield name, mean, std, shown
 
 
 def _lines(text: object) -> list[str]:

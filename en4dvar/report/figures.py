@@ -1,20 +1,27 @@
 """The figures of a report: pure functions from a stored result to a chart in display units, 8.5 cm wide."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from en4dvar.model.state import Array
-from en4dvar.plumbing.units import convert
-from en4dvar.report import fields, readings, varying, withheld
-from en4dvar.report.chart import COLUMN, PAGE, POINTS, Chart, Panel, Row, in_columns
-from en4dvar.report.history import history
+from en4dvar.priors.field_prior import regular_grid
+from en4dvar.report import readings, varying
+from en4dvar.report.chart import COLUMN, PAGE, POINTS, Chart, Panel, Row, in_columns, interval
+from en4dvar.report.history import WITHHELD, expected, history
+from en4dvar.report.palette import GREYS, VIRIDIS, ramp
 from en4dvar.report.svg import Captioned
-from en4dvar.report.text import estimate, pretty_unit, shown, with_unit
+from en4dvar.report.text import axis_label, estimate, shown, unit_behind, with_unit
+from en4dvar.results.netcdf import Group
 from en4dvar.results.store import StoredResult
 
 MAX_PAIRS = 6
+LEVELS = 32  # colours of a map
+FIELDS = (
+    "Fields of the initial state: posterior mean, and posterior over prior standard deviation (1: the data say nothing "
+    "about the cell); for a field along a line, mean and std of the posterior (blue) over those of the prior (grey)."
+)
 
 
 def histograms(result: StoredResult) -> Chart:
@@ -23,7 +30,7 @@ def histograms(result: StoredResult) -> Chart:
     for row in result.rows:
         exact, posterior = _prior_density(result, row.name), result.members("posterior", row.name)
         prior = result.members("prior", row.name)
-        value = f"{estimate(row, '')} {pretty_unit(row.unit)}".rstrip()
+        value = f"{estimate(row, '')}{unit_behind(row.unit)}"
         doubt = ", not to be trusted" if row.untrusted else ""
         panel = Panel(
             with_unit(row.symbol, row.unit), title=f"{value}{doubt}", title_colour="posterior", xticks=4, yticks=(),
@@ -52,8 +59,8 @@ def _prior_density(result: StoredResult, name: str) -> tuple[Array, Array, Array
         return None
     from scipy.special import ndtr
 
-    about, place = result.parameters[name].attrs, stats["parameter"].values.tolist().index(name)
-    values = convert(np.asarray(stats["prior_value"].values[place]), about["units"], about["display_units"])
+    place = stats["parameter"].values.tolist().index(name)
+    values = shown(result.parameters[name], stats["prior_value"].values[place])
     density = np.diff(ndtr(stats["prior_score"].values)) / np.diff(values)
     x = np.concatenate([values[:1], values[:-1] + np.diff(values) / 2, values[-1:]])
     density = np.concatenate([density[:1], density, density[-1:]]) / density.max()
@@ -139,6 +146,61 @@ def pairs(result: StoredResult) -> Chart:
     return Chart(lines, side)
 
 
+def maps(result: StoredResult) -> Chart:
+    """Each field: a line with its band, or two maps, each over the scale of its colours."""
+    data = result.groups["/fields"]
+    rows: list[Row] = []
+    for name in (name.removesuffix("_at") for name in data.variables if name.endswith("_at")):
+        at = data[f"{name}_at"].values
+        if at.shape[1] == 1:
+            rows.append(Row(5.6 * POINTS, [_line(data, name, at[:, 0])]))
+            continue
+        mean = shown(data[f"{name}_mean"])
+        share = data[f"{name}_std"].values / data[f"{name}_prior_std"].values
+        low, high = float(mean.min()), float(mean.max())
+        of_mean = _map(at, mean, (low, high if high > low else low + 1.0), VIRIDIS, axis_label(data[name]))
+        of_share = _map(at, share, (0.0, 1.0), GREYS, "posterior / prior std")
+        tall = float(np.ptp(at[:, 0]) / np.ptp(at[:, 1])) if np.ptp(at[:, 1]) > 0 else 1.0
+        rows.append(Row(min(max(tall, 0.3), 2.0) * 0.4 * COLUMN + 0.7 * POINTS, [of_mean[0], of_share[0]]))
+        rows.append(Row(1.4 * POINTS, [of_mean[1], of_share[1]]))
+    return Chart(rows)
+
+
+def _line(data: Group, name: str, at: Array) -> Panel:
+    order = np.argsort(at)
+    positive = not np.any(data[name].values <= 0)
+    panel = Panel(with_unit("place", str(data[f"{name}_at"].attrs["units"])), axis_label(data[name]))
+    for kind, colour in (("prior_", "prior"), ("", "posterior")):
+        mean, std = (shown(data[f"{name}_{kind}{what}"])[order] for what in ("mean", "std"))
+        panel.band(at[order], *interval(mean, std, 1, positive), colour, 0.3)
+        panel.line(at[order], mean, colour)
+    return panel
+
+
+def _map(
+    at: Array, values: Array, scale: tuple[float, float], colours: Sequence[str], label: str
+) -> tuple[Panel, Panel]:
+    """Values (n,) at the first two coordinates of places ``at`` (n, D), the first of them downwards, and the scale."""
+    grid = regular_grid(at[:, :2])
+    down, across = grid[1] if grid else (0.0, 0.0)
+    (top, left), (bottom, right) = at[:, :2].min(axis=0), at[:, :2].max(axis=0)
+    panel = Panel(xticks=3, yticks=3)
+    panel.xlim, panel.ylim = (left - across / 2, right + across / 2), (bottom + down / 2, top - down / 2)
+    low, high = scale
+    level = np.clip(((values - low) / (high - low) * LEVELS).astype(int), 0, LEVELS - 1)
+    for k in range(LEVELS):
+        own, colour = at[level == k], ramp(colours, k / (LEVELS - 1))
+        if len(own) and grid:
+            panel.tiles(own[:, 1], own[:, 0], (across, down), colour)
+        elif len(own):
+            panel.dots(own[:, 1], own[:, 0], colour, 2.0)
+    bar = Panel(label, xlim=scale, ylim=(0.0, 1.0), yticks=(), left=False, xticks=4)
+    width = (high - low) / LEVELS
+    for k in range(LEVELS):
+        bar.tiles([low + (k + 0.5) * width], [0.5], (width, 1.0), ramp(colours, k / (LEVELS - 1)))
+    return panel, bar
+
+
 def all_figures(result: StoredResult) -> Iterator[Captioned]:
     """Everything that the result has enough members for."""
     parameters = result.parameters
@@ -151,7 +213,7 @@ def all_figures(result: StoredResult) -> Iterator[Captioned]:
             histograms(result),
         )
     if "/fields" in result.groups:
-        yield "fields", fields.CAPTION, fields.maps(result)
+        yield "fields", FIELDS, maps(result)
     yield (
         "history",
         "Readings with their standard deviation; what was thought possible before them (prior, grey) and what is after "
@@ -161,7 +223,7 @@ def all_figures(result: StoredResult) -> Iterator[Captioned]:
         history(result),
     )
     if "/withheld" in result.groups:
-        yield "withheld", withheld.CAPTION, withheld.expected(result)
+        yield "withheld", WITHHELD, expected(result)
     if varying.stored_walks(result):
         yield (
             "varying",
@@ -196,8 +258,7 @@ def _discrepancy(result: StoredResult, time: Array, label: str) -> Panel:
     name, stats = result.observable, result.group("sample_stats")
     residual = shown(result.group("observed_data")[name]) - shown(stats[f"{name}_centre"])
     mean, std = shown(stats[f"{name}_discrepancy"]), shown(stats[f"{name}_discrepancy_std"])
-    unit = str(stats[f"{name}_discrepancy"].attrs["display_units"])
-    panel = Panel(label, with_unit("residual", unit), legend=True)
+    panel = Panel(label, axis_label(stats[f"{name}_discrepancy"], "residual"), legend=True)
     panel.rule(0)
     panel.band(time, mean - std, mean + std, "posterior", 0.35, "discrepancy ± std")
     panel.dots(time, residual, "ink", label="data − centre")

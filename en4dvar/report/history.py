@@ -1,86 +1,83 @@
-"""Data over what was predicted, one pair of panels a series: in time, or over the places where a field was read."""
+"""Data over what was predicted: by a result, one pair of panels a series, in time or over the places where a field was
+read; by the prior alone (``en4dvar validate --plot``); and the readings after the window.
+"""
 
-from dataclasses import dataclass
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from en4dvar.diagnosis.diagnostics import member_quantiles
 from en4dvar.model.state import Array
-from en4dvar.report.chart import POINTS, Chart, Panel, Row
-from en4dvar.report.text import shown, with_unit
+from en4dvar.plumbing.units import convert
+from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, Row, in_columns
+from en4dvar.report.text import axis_label, figure_text, number_like, percent, shown, unit_behind, with_unit
 from en4dvar.results.declared import Axis
+from en4dvar.results.netcdf import Group, Variable
 from en4dvar.results.store import StoredResult
+
+if TYPE_CHECKING:
+    from en4dvar.data.series import Part
+    from en4dvar.descent.preview import Preview
 
 MANY = 5000  # readings: beyond, their bars are one band
 FEW = 150  # readings whose marks are large
-
+PANELS = 6  # of the prior predictive
 
 BANDS = (  # group of the members, two of their quantiles, and how what lies between is drawn
     ("prior_predictive", (0.05, 0.95), "prior", 0.28, "prior 90 %"),
     ("posterior_predictive", (0.05, 0.95), "posterior", 0.3, "posterior 90 %"),
     ("posterior_predictive", (0.25, 0.75), "posterior", 0.6, "posterior 50 %"),
 )
-
-
-@dataclass(frozen=True)
-class SeriesShown:
-    """One series in display units: ``x`` (K,) times or places, ``data``, ``std`` and ``centre`` (K,)."""
-
-    axis: Axis
-    x: Array
-    x_label: str
-    data: Array
-    std: Array
-    centre: Array
-    label: str
-
-    @classmethod
-    def of(cls, result: StoredResult, axis: Axis) -> "SeriesShown":
-        observed, name = result.group("observed_data"), axis.name
-        data, std = shown(observed[name]), shown(observed[f"{name}_std"])
-        x, x_label = shown(observed[axis.time]), with_unit("time", observed[axis.time].attrs["display_units"])
-        places = np.asarray(observed[f"{name}_place"].values) if f"{name}_place" in observed else np.empty(0)
-        if len(np.unique(places)) > len(np.unique(x)):
-            x = places
-            x_label = with_unit("place", str(observed[f"{name}_place"].attrs["units"]))
-        attrs = observed[name].attrs
-        label = str(attrs["long_name"]).removesuffix(", observed")
-        label = label if label == attrs["symbol"] else f"{label} {attrs['symbol']}"
-        label = with_unit(label, attrs["display_units"])
-        return cls(axis, x, x_label, data, std, shown(result.group("sample_stats")[f"{name}_centre"]), label)
-
-    @property
-    def size(self) -> float:
-        """Of a dot."""
-        return 2.2 if len(self.x) <= FEW else 1.2
-
-    @property
-    def reach(self) -> tuple[float, float]:
-        """Limits along x."""
-        first, last = float(self.x.min()), float(self.x.max())
-        span = (last - first) or max(abs(first), 1.0)
-        return first - 0.03 * span, last + 0.03 * span
+WITHHELD_COLUMNS = ("time_unit", "time", "unit", "reading", "q05", "q50", "q95", "inside")
+WITHHELD = (
+    "The readings after the window, which the estimate has not seen, and what it expected of them: median and 5 to "
+    "95 % of the posterior members with the errors of a reading and what the model may miss."
+)
 
 
 def history(result: StoredResult) -> Chart:
     """Data ± std, prior and posterior predictive bands (50 and 90 %), the centre; below, residuals over their std."""
-    several = len(result.axes) > 1
+    several, observed = len(result.axes) > 1, result.group("observed_data")
     high, low = (5.0, 2.3) if several else (6.8, 2.7)
     rows = []
     for i, axis in enumerate(result.axes):
-        series = SeriesShown.of(result, axis)
+        x, x_label = _along(observed, axis)
+        data, std = shown(observed[axis.name]), shown(observed[f"{axis.name}_std"])
+        centre = shown(result.group("sample_stats")[f"{axis.name}_centre"])
+        first, last = float(x.min()), float(x.max())
+        span = (last - first) or max(abs(first), 1.0)
+        reach = first - 0.03 * span, last + 0.03 * span
         top = Panel(
-            ylabel=series.label, title=axis.name if several else "", xlim=series.reach,
-            ylim=_data_range(series.data, series.std), x_numbers=False, legend=i == 0,
+            ylabel=_quantity(observed[axis.name]), title=axis.name if several else "", xlim=reach,
+            ylim=_data_range(data, std), x_numbers=False, legend=i == 0,
         )  # fmt: skip
-        _data(top, result, series)
-        rows += [Row(high * POINTS, [top]), Row(low * POINTS, [_residuals(series)])]
+        _predictions(top, result, axis.name, x, centre)
+        _readings(top, x, data, std)
+        rows += [Row(high * POINTS, [top]), Row(low * POINTS, [_residuals(x, x_label, (data - centre) / std, reach)])]
     return Chart(rows)
 
 
-def _data(panel: Panel, result: StoredResult, series: SeriesShown) -> None:
-    """Data and predictions: along the path, or at each reading of a field."""
-    name = series.axis.name
+def _along(observed: Group, axis: Axis) -> tuple[Array, str]:
+    """(K,) times, or places of a field that is read at more of them than times, in the display unit; with a label."""
+    place = f"{axis.name}_place"
+    times, places = shown(observed[axis.time]), observed[place].values if place in observed else ()
+    if len(np.unique(places)) > len(np.unique(times)):
+        return np.asarray(places), with_unit("place", str(observed[place].attrs["units"]))
+    return times, axis_label(observed[axis.time], "time")
+
+
+def _quantity(observed: Variable) -> str:
+    """Label, symbol and unit of what was observed."""
+    label, symbol = str(observed.attrs["long_name"]).removesuffix(", observed"), observed.attrs["symbol"]
+    return axis_label(observed, label if label == symbol else f"{label} {symbol}")
+
+
+def _predictions(panel: Panel, result: StoredResult, name: str, x: Array, centre: Array) -> None:
+    """Along the path, or at each reading of a field."""
     curve = f"{name}_path" in result.group("prior_predictive")
     for group, levels, colour, alpha, label in BANDS:
         held = result.group(group)
@@ -94,27 +91,34 @@ def _data(panel: Panel, result: StoredResult, series: SeriesShown) -> None:
         if curve:
             panel.band(shown(held["path_time"])[seen], low, high, colour, alpha, label)
         else:
-            panel.bars(series.x, low, high, colour, 4.0 if len(series.x) <= FEW else 2.0, alpha, label)
+            panel.bars(x, low, high, colour, 4.0 if len(x) <= FEW else 2.0, alpha, label)
     if curve:
-        panel.line(series.x, series.centre, "centre", 0.9, label="best fit")
+        panel.line(x, centre, "centre", 0.9, label="best fit")
     else:
-        panel.dots(series.x, series.centre, "centre", 5.0, label="best fit", kind="dashes")
-    if len(series.x) > MANY:  # one outline instead of a bar for each
-        panel.band(series.x, series.data - series.std, series.data + series.std, "ink", 0.3, "data ± std")
-    else:
-        panel.bars(series.x, series.data - series.std, series.data + series.std, "ink", 0.6, label="data ± std")
-    panel.dots(series.x, series.data, "ink", series.size, label="data ± std")
+        panel.dots(x, centre, "centre", 5.0, label="best fit", kind="dashes")
 
 
-def _residuals(series: SeriesShown) -> Panel:
-    residual = (series.data - series.centre) / series.std
+def _readings(panel: Panel, x: Array, data: Array, std: Array) -> None:
+    if len(x) > MANY:  # one outline instead of a bar for each
+        panel.band(x, data - std, data + std, "ink", 0.3, "data ± std")
+    else:
+        panel.bars(x, data - std, data + std, "ink", 0.6, label="data ± std")
+    panel.dots(x, data, "ink", _size(x), label="data ± std")
+
+
+def _size(x: Array) -> float:
+    """Of a dot."""
+    return 2.2 if len(x) <= FEW else 1.2
+
+
+def _residuals(x: Array, x_label: str, residual: Array, along: tuple[float, float]) -> Panel:
     reach = 1.15 * max(3.0, float(np.max(np.abs(residual))))
-    panel = Panel(series.x_label, "residual / std", xlim=series.reach, ylim=(-reach, reach))
+    panel = Panel(x_label, "residual / std", xlim=along, ylim=(-reach, reach))
     panel.yticks = (-2, 0, 2) if reach < 8 else 4
     for limit, alpha in ((2, 0.12), (1, 0.16)):
         panel.span(-limit, limit, "posterior", alpha)
     panel.rule(0)
-    panel.dots(series.x, residual, "ink", series.size)
+    panel.dots(x, residual, "ink", _size(x))
     return panel
 
 
@@ -123,3 +127,103 @@ def _data_range(data: Array, std: Array) -> tuple[float, float]:
     low, high = float((data - std).min()), float((data + std).max())
     below = low - 0.12 * (high - low)
     return max(0.0, below) if data.min() >= 0 else below, high + 0.25 * (high - low)
+
+
+def prior_predictive(previews: Sequence[Preview]) -> Chart:
+    """Data ± std over the prior ensemble's paths (bands hold 50 and 90 % of the members).
+
+    One panel a data set and series, in display units; at most :data:`PANELS` panels are drawn.
+    """
+    drawn = [(preview, part, path) for preview in previews for part, path in _curves(preview)][:PANELS]
+    panels = []
+    for preview, part, path in drawn:
+        panel = _prior(preview, part, path)
+        if len(drawn) > 1:
+            name = preview.problem.observations.name
+            panel.title = figure_text(f"{name}: {part.name}" if len(preview.problem.parts) > 1 else name)
+        panels.append(panel)
+    panels[0].legend = True
+    return in_columns(panels, 6.5 * POINTS, width=COLUMN * min(2, len(drawn)))
+
+
+def _curves(preview: Preview) -> Iterator[tuple[Part, Array | None]]:
+    """The series of a data set, each with its paths (N, M) along the grid; None of one that has several places."""
+    width, curves = len(preview.grid), itertools.count()
+    for part in preview.problem.parts:
+        first = width * next(curves) if part.has_path else 0
+        yield part, preview.run.path[:, first : first + width] if part.has_path else None
+
+
+def _prior(preview: Preview, part: Part, path: Array | None) -> Panel:
+    model, y, observable = preview.problem.model, preview.problem.observations, part.observable
+    unit, shown_unit, own = observable.unit, observable.display_unit, part.where
+    grid, times = (convert(t, model.time_unit, model.time_display_unit) for t in (preview.grid, y.times[own]))
+    members = (preview.run.predictions[:, own] if path is None else path)[preview.run.active]
+    paths, data, std = (convert(v, unit, shown_unit) for v in (members, y.values[own], y.std[own]))
+    label = observable.label
+    if label != observable.symbol:
+        symbol = observable.symbol
+        label = f"{label} {symbol}" if "$" in symbol or len(symbol) > 1 else f"{label} ${symbol}$"
+    panel = Panel(with_unit("time", model.time_display_unit), with_unit(label, shown_unit))
+    if len(paths) > 1:
+        for levels, alpha, words in (((0.05, 0.95), 0.3, "prior 90 %"), ((0.25, 0.75), 0.45, "50 %")):
+            low, high = member_quantiles(paths, levels, axis=0)
+            if path is None:
+                panel.bars(times, low, high, "prior", 3.0, alpha, words)
+            else:
+                panel.band(grid, low, high, "prior", alpha, words)
+        if path is None:
+            panel.dots(times, np.median(paths, axis=0), "prior", 5.0, label="median", kind="dashes")
+        else:
+            panel.line(grid, np.median(paths, axis=0), "prior", 0.9, label="median")
+    _readings(panel, times, data, std)
+    top = max(float(data.max()), float(np.quantile(paths, 0.95)) if len(paths) else 0.0)
+    bottom = min(float(data.min()), float(np.quantile(paths, 0.05)) if len(paths) else 0.0)
+    panel.ylim = bottom - 0.05 * (top - bottom), top + 0.08 * (top - bottom)
+    return panel
+
+
+def withheld_lines(result: StoredResult) -> list[tuple[object, ...]]:
+    """A line a reading after the window, in display units, the name of the data set first; none where none follows."""
+    if "/withheld" not in result.groups:
+        return []
+    held = result.groups["/withheld"]
+    units = [held[key].attrs["display_units"] for key in ("withheld_time", result.observable)]
+    columns = (values.tolist() for values in _withheld(result))
+    return [
+        (result.name, units[0], time, units[1], value, low, median, high, int(low <= value <= high))
+        for time, value, low, median, high in zip(*columns, strict=True)
+    ]
+
+
+def _withheld(result: StoredResult) -> Iterator[Array]:
+    """Times, readings, and the low, median and high of what was expected, each (K,)."""
+    name = result.observable
+    keys = "withheld_time", name, f"{name}_low", f"{name}_median", f"{name}_high"
+    return (shown(result.groups["/withheld"][key]) for key in keys)
+
+
+def withheld_words(result: StoredResult) -> str:
+    """How many lie in their bands, in a sentence; "" where no reading follows the window."""
+    stats = result.group("sample_stats").attrs
+    if "withheld_readings" not in stats:
+        return ""
+    count, inside, rms = (float(stats[f"withheld_{key}"]) for key in ("readings", "inside", "rms"))
+    observed = result.group("observed_data")[result.observable]
+    rms = float(shown(observed, rms))
+    off = f"{number_like(rms, rms)}{unit_behind(observed.attrs['display_units'])}"
+    return (
+        f"{inside * count:.0f} of {count:.0f} readings after the window ({percent(inside)}) lie in the 90 % bands of "
+        f"what was expected; they are off the medians by {off} (root mean square)."
+    )
+
+
+def expected(result: StoredResult) -> Chart:
+    """Readings after the window over bands of what was expected."""
+    held = result.groups["/withheld"]
+    times, readings, low, median, high = _withheld(result)
+    panel = Panel(axis_label(held["withheld_time"], "time"), axis_label(held[result.observable]), legend=True)
+    panel.band(times, low, high, "posterior", 0.3, "expected 90 %")
+    panel.line(times, median, "posterior", 0.9, label="median")
+    panel.dots(times, readings, "ink", 2.2, label="reading")
+    return Chart([Row(5.5 * POINTS, [panel])])

@@ -13,11 +13,10 @@ from en4dvar.estimation.summary import ParameterSummary, estimate_cells
 from en4dvar.plumbing.caution import Caution, untrusted
 from en4dvar.plumbing.files import write_text
 from en4dvar.plumbing.tables import csv_text, table
-from en4dvar.plumbing.units import convert
 from en4dvar.report.chart import COLUMN, PAGE, POINTS, Chart, Panel, in_columns
 from en4dvar.report.html import render
 from en4dvar.report.svg import svg
-from en4dvar.report.text import figure_text, number_like, pretty_unit, shown, with_unit
+from en4dvar.report.text import axis_label, figure_text, number_like, range_words, shown, unit_behind, with_unit
 from en4dvar.results.declared import parameter_of
 from en4dvar.results.joint_file import FILE, QUANTILES, StoredGroups, StoredJoint, load_joint
 
@@ -78,11 +77,10 @@ def joint_lines(joint: StoredJoint) -> list[str]:
     """What is shared, a line each, for the page of the campaign; one line for what the data leave as it was stated."""
     lines, shared = [], [e for e in estimates(joint) if not e.dataset]
     for e in (e for e in shared if not e.stated):
-        unit = f" {pretty_unit(e.unit)}" if e.unit != "1" else ""
         without = f" without {e.without}" if e.without else f", one value in {len(joint.datasets)} data sets"
-        interval = f"5–95 %: {number_like(e.q05, e.std)} … {number_like(e.q95, e.std)}{unit}"
+        interval = f"5–95 %: {range_words(e.q05, e.q95, e.std, e.unit)}"
         doubt = f"not to be trusted: {', '.join(e.untrusted)}" if e.untrusted else interval
-        lines.append(f"{e.label} {e.name} = {number_like(e.q50, e.std)}{unit} ({doubt}){without}")
+        lines.append(f"{e.label} {e.name} = {number_like(e.q50, e.std)}{unit_behind(e.unit)} ({doubt}){without}")
     if stated := [e.label for e in shared if e.stated]:
         lines.append(f"left as stated beforehand, for the data say nothing new of them: {', '.join(stated)}")
     return lines
@@ -117,23 +115,21 @@ def forest(
     named = count <= 60
     panels = []
     for name, draws in common.items():
-        about = draws.attrs
-        units = str(about["units"]), str(about["display_units"])
-        low, middle, high = convert(member_quantiles(draws.values, QUANTILES), *units)
-        panel = Panel(with_unit(str(about["symbol"]), units[1]), ylim=(-float(count), 1.0))
+        low, middle, high = shown(draws, member_quantiles(draws.values, QUANTILES))
+        panel = Panel(axis_label(draws), ylim=(-float(count), 1.0))
         panel.yticks, panel.y_names = (range(0, -count, -1), [figure_text(d) for d in datasets]) if named else ((), ())
         if not untrusted(groups.cautions, name):
             panel.band([low, high], np.full(2, -count), np.ones(2), "posterior", 0.2)
         panel.line([middle, middle], [-count, 1], "posterior")
         if reference and name in reference:
-            value = convert(reference[name][0], *units)
+            value = float(shown(draws, reference[name][0]))
             panel.line([value, value], [-count, 1], "ink", dash=":")
-        rows = convert(alone[name].values, *units)
+        rows = shown(draws, alone[name].values)
         has = np.flatnonzero(np.isfinite(rows[:, 1]))
         panel.intervals(rows[has, 0], rows[has, 2], -has, "prior")
         panel.dots(rows[has, 1], -has, "prior", 3.0)
         if "dataset" in posterior.get(name, draws).dims:
-            low, middle, high = convert(member_quantiles(posterior[name].values[0], QUANTILES, axis=0), *units)
+            low, middle, high = shown(draws, member_quantiles(posterior[name].values[0], QUANTILES, axis=0))
             panel.intervals(low[has], high[has], -has - 0.3, "posterior")
             panel.dots(middle[has], -has - 0.3, "posterior", 2.0)
         panel.x_logarithmic = bool(np.all(rows[has] > 0) and rows[has].max() > 20 * rows[has].min())

@@ -12,12 +12,12 @@ from en4dvar.plumbing.caution import worst_first
 from en4dvar.plumbing.units import convert
 from en4dvar.report import readings
 from en4dvar.report.figures import neighbours
+from en4dvar.report.history import withheld_words
 from en4dvar.report.html import render
 from en4dvar.report.responses import exceeding, stored_ledger, stored_shifts
 from en4dvar.report.svg import Drawing
-from en4dvar.report.text import number_like, plain_number
+from en4dvar.report.text import number_like, plain_number, shown
 from en4dvar.report.varying import stored_walks, verdict
-from en4dvar.report.withheld import withheld_words
 from en4dvar.results.store import StoredResult
 from en4dvar.results.variables import ITERATIONS, SHARES
 
@@ -179,8 +179,8 @@ def _modes(result: StoredResult) -> list[tuple[str, ...]]:
     for k in range(stats.sizes["mode"]):
         of = {key: float(stats[f"mode_{key}"].values[k]) for key in ("weight", "cost", "cost_spread", "descents")}
         centre = [
-            number_like(convert(float(stats["mode_centre"].values[k, j]), a["units"], a["display_units"]), row.std)
-            for j, (row, a) in enumerate(zip(result.rows, (v.attrs for v in result.parameters.values()), strict=True))
+            number_like(float(shown(v, stats["mode_centre"].values[k, j])), row.std)
+            for j, (row, v) in enumerate(zip(result.rows, result.parameters.values(), strict=True))
         ]
         spread = f" (they were ended within {of['cost_spread']:.2g} of its J)" if of["cost_spread"] else ""
         rows.append((f"{of['weight']:.2f}", f"{of['cost']:.2f}", f"{of['descents']:.0f}{spread}", *centre))

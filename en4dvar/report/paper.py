@@ -1,27 +1,26 @@
 """A chart as a matplotlib figure: PDF and PNG for a paper, and a figure for whoever works on with it.
 
-Only this module draws with matplotlib, whose import takes longer than all charts of a page.
+Only this module draws with matplotlib, whose import takes longer than all charts of a page: each function does it.
 """
+
+from __future__ import annotations
 
 import io
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib import style
-from matplotlib.axes import Axes
-from matplotlib.axis import Axis
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.backends.backend_pdf import FigureCanvasPdf
-from matplotlib.collections import PolyCollection
-from matplotlib.figure import Figure
 
 from en4dvar.plumbing.files import write_bytes
-from en4dvar.report.chart import Chart, Mark, Panel
+from en4dvar.report.chart import Chart, Mark, Panel, labelled
 from en4dvar.report.palette import LIGHT
-from en4dvar.report.ticks import labelled
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
+    from matplotlib.figure import Figure
 
 MANY = 5000  # points of a mark: beyond, they are drawn as pixels, for vectors would make a file of many megabytes
 LABEL = 110  # points that an entry of a legend takes
@@ -42,6 +41,9 @@ STYLE: list[str | Path | dict[str, Any]] = ["default", RC]  # whatever style the
 
 def on_paper(chart: Chart) -> Figure:
     """The figure, in the same size and colours as in the page."""
+    from matplotlib import style
+    from matplotlib.figure import Figure
+
     with style.context(STYLE):
         figure = Figure(figsize=(chart.width / 72, chart.height / 72), layout="constrained")
         columns = math.lcm(*(len(row.panels) for row in chart.rows))
@@ -57,7 +59,14 @@ def on_paper(chart: Chart) -> Figure:
 
 
 def save_chart(chart: Chart, folder: Path, name: str) -> None:
-    """``folder/name.pdf`` (vectors) and ``folder/name.png`` (200 dots an inch), undated, each by atomic rename."""
+    """``folder/name.pdf`` (vectors) and ``folder/name.png`` (200 dots an inch), undated, each by atomic rename.
+
+    Raises :class:`OutputError`.
+    """
+    from matplotlib import style
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.backends.backend_pdf import FigureCanvasPdf
+
     figure = on_paper(chart)
     with style.context(STYLE):
         engine = figure.get_layout_engine()
@@ -129,6 +138,8 @@ def _colour(name: str) -> str:
 
 
 def _mark(ax: Axes, mark: Mark) -> None:
+    from matplotlib.collections import PolyCollection
+
     how: dict[str, Any] = {"color": _colour(mark.colour), "alpha": mark.alpha, "label": mark.label or None}
     many = len(mark.x) > MANY
     if mark.kind == "line":

@@ -11,12 +11,11 @@ from en4dvar.estimation.population.hierarchy import named
 from en4dvar.estimation.summary import ParameterSummary, results_table, summary_rows
 from en4dvar.plumbing.files import write_text
 from en4dvar.plumbing.tables import write_csv
-from en4dvar.plumbing.units import convert
 from en4dvar.report.export import Found, latex_table
 from en4dvar.report.html import render
 from en4dvar.report.joint import NOTHING, forest
 from en4dvar.report.svg import svg
-from en4dvar.report.text import number_like, percent, plain_number, plus_minus, pretty_unit, shown
+from en4dvar.report.text import number_like, percent, plain_number, plus_minus, range_words, shown, unit_behind
 from en4dvar.results.declared import parameter_of
 from en4dvar.results.population_file import FILE, StoredPopulation, load_population
 
@@ -78,8 +77,7 @@ def sentences(stored: StoredPopulation) -> tuple[str, ...]:
 
 
 def _range(row: ParameterSummary) -> str:
-    unit = f" {pretty_unit(row.unit)}" if row.unit != "1" else ""
-    return f"{number_like(row.q05, row.std)} … {number_like(row.q95, row.std)}{unit}"
+    return range_words(row.q05, row.q95, row.std, row.unit)
 
 
 def _sentence(
@@ -89,7 +87,7 @@ def _sentence(
     if centre.untrusted and "empirical" in stored.tree.children:
         words = f"the draws of the population are not to be trusted ({', '.join(centre.untrusted)}): see the warnings"
         return f"{centre.label}: {_of_sets(stored, centre)}; {words}."
-    unit = f" {pretty_unit(centre.unit)}" if centre.unit != "1" else ""
+    unit = unit_behind(centre.unit)
     spread = f"{number_like(between.q50, between.std)}{unit} ({_range(between)})"
     draws = [stored.group("posterior")[f"{centre.name}_{what}"] for what in ("mean", "between")]
     logarithmic = _logarithmic(draws[0])
@@ -111,24 +109,19 @@ def _compared(stored: StoredPopulation, centre: ParameterSummary) -> Iterator[st
     if centre.name not in stored.reference:
         return
     posterior = stored.group("posterior")[f"{centre.name}_{stored.headline}"]
-    value, std = (float(convert(x, str(posterior.attrs["units"]), centre.unit)) for x in stored.reference[centre.name])
-    unit = f" {pretty_unit(centre.unit)}" if centre.unit != "1" else ""
+    value, std = map(float, shown(posterior, stored.reference[centre.name]))
     source = str(stored.tree.attrs.get("reference_source", ""))
     stated = plus_minus(value, std) if std == std else plain_number(value, 4)
     below = float(np.mean(shown(posterior) < value))
-    words = f"reference: {centre.name} = {stated}{unit}{f', {source}' if source else ''}"
+    words = f"reference: {centre.name} = {stated}{unit_behind(centre.unit)}{f', {source}' if source else ''}"
     side, chance = ("below", below) if below > 0.5 else ("above", 1 - below)
     yield f"{words}; the estimate lies {side} it with probability {chance:.2f}."
 
 
 def _in_parts(stored: StoredPopulation, mean: ParameterSummary, of: xr.DataArray, std: float) -> str:
     """What the interval is made of, where data sets have anything in common."""
-    about = of.attrs
-    between, common = (
-        float(convert(about[key], str(about["units"]), mean.unit)) for key in ("std_between", "std_common")
-    )
-    unit = f" {pretty_unit(mean.unit)}" if mean.unit != "1" else ""
-    shared = ", ".join(stored.common)
+    between, common = map(float, shown(of, [of.attrs["std_between"], of.attrs["std_common"]]))
+    unit, shared = unit_behind(mean.unit), ", ".join(stored.common)
     return (
         f"Of it ± {number_like(between, std)}{unit} is from the data sets and how they differ, and ± "
         f"{number_like(common, std)}{unit} from what they have in common ({shared}), which more of them do not reduce."
@@ -138,11 +131,11 @@ def _in_parts(stored: StoredPopulation, mean: ParameterSummary, of: xr.DataArray
 def _of_sets(stored: StoredPopulation, centre: ParameterSummary) -> str:
     """The median over the data sets one by one, which needs no model of how they vary."""
     of = stored.group("empirical")[centre.name]
-    low, middle, high = map(float, convert(of.values, str(of.attrs["units"]), centre.unit))
-    std, unit = (high - low) / 3.29, f" {pretty_unit(centre.unit)}" if centre.unit != "1" else ""
+    low, middle, high = shown(of)
+    std = (high - low) / 3.29
     words = (
         f"the median of {len(stored.datasets)} data sets one by one is {centre.name} = "
-        f"{number_like(middle, std)}{unit} (5–95 %: {number_like(low, std)} … {number_like(high, std)})"
+        f"{number_like(middle, std)}{unit_behind(centre.unit)} (5–95 %: {range_words(low, high, std)})"
     )
     parts = _in_parts(stored, centre, of, std).removesuffix(".") if centre.untrusted and stored.common else ""
     return f"{words}. {parts}" if parts else words

@@ -1,7 +1,10 @@
-"""Populations side by side: is one median larger than another, by how much, how surely, and its trend."""
+"""Populations side by side, of several runs or of groups of the data sets of one, such as two materials: is one median
+larger than another, by how much, how surely, and its trend.
+"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
@@ -16,18 +19,20 @@ from en4dvar.estimation.population.contrast import Centre, StraightLine, drawn_t
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.caution import untrusted
 from en4dvar.plumbing.errors import OutputError, retold
-from en4dvar.plumbing.files import write_text
+from en4dvar.plumbing.files import make_folder, write_text
 from en4dvar.plumbing.hints import suggest
-from en4dvar.plumbing.tables import csv_text, table
-from en4dvar.plumbing.units import UnitError, convert
+from en4dvar.plumbing.tables import table, write_csv
+from en4dvar.plumbing.units import UnitError, convert, is_unit
 from en4dvar.priors.prior import PriorTerm
 from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, in_columns
 from en4dvar.report.compare import named
-from en4dvar.report.svg import on_paper
-from en4dvar.report.text import figure_text, number_like, plain_number, pretty_unit, with_unit
+from en4dvar.report.html import render
+from en4dvar.report.paper import on_paper
+from en4dvar.report.svg import draw
+from en4dvar.report.text import figure_text, number_like, plain_number, range_words, unit_behind, with_unit
 from en4dvar.results.joint_file import QUANTILES
 from en4dvar.results.netcdf import understood
-from en4dvar.results.population_file import FILE, StoredPopulation, load_population
+from en4dvar.results.population_file import FILE, StoredPopulation, load_groups_of, load_population
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -35,6 +40,7 @@ if TYPE_CHECKING:
 Values = Mapping[str, tuple[float, float]]  # parameter → value and std
 SURE = 0.999  # no number of draws says more
 FAR = 2.5  # standard deviations between what is known and what the data say
+_NUMBER = re.compile(r"(?<![^\W_])(?<!\.)(\d+(?:\.\d+)?)[ _]?(%|[^\W\d_]+)(?![^\W_])")  # with a unit, in a name
 OFF_THE_LINE = 0.05  # probability below which populations differ by more than a line says
 CAPTION = (
     "Median and 5–95 % of the median of each population, given the data of all; what is common moves them together."
@@ -227,14 +233,13 @@ def _calibrated(
 ) -> Iterator[str]:
     """What groups that are known from elsewhere do to the median (M, K) of a parameter in the others."""
     known = [label for label, of_it in values.items() if of_it]
-    unit = f" {pretty_unit(parameter.display_unit)}" if parameter.display_unit != "1" else ""
+    unit = unit_behind(parameter.display_unit)
     for k, (label, s) in enumerate(stored.items()):
         now, before = (_range(_three(draws[:, k]), plain=True) for draws in (together, alone))
         if name in values[label]:
             value, std = (convert(number, parameter.unit, parameter.display_unit) for number in values[label][name])
-            x = convert(
-                s.group("posterior")[f"{name}_{s.headline}"].values.ravel(), parameter.unit, parameter.display_unit
-            )
+            draws = s.group("posterior")[f"{name}_{s.headline}"].values
+            x = convert(draws.ravel(), parameter.unit, parameter.display_unit)
             off = (value - float(np.median(x))) / float(np.hypot(x.std(), std))
             words = f"{name} of {label} is known, {number_like(value, std)} ± {number_like(std, std)}{unit}"
             yield words + (f"; its own data say otherwise, {abs(off):.1f} std away" if abs(off) > FAR else "")
@@ -291,7 +296,7 @@ def sentences(c: PopulationsCompared) -> Iterator[str]:
 
 
 def _sentence(d: Difference) -> str:
-    unit = f" {pretty_unit(d.unit)}" if d.unit != "1" else ""
+    unit = unit_behind(d.unit)
     by = f"{_range(d.difference, plain=True)}{unit} more"
     if d.difference[1] < 0:
         low, middle, high = (-value for value in d.difference)
@@ -303,16 +308,16 @@ def _sentence(d: Difference) -> str:
     else:
         words = f"{d.parameter} of {d.first} is {by} than that of {d.second}"
     words += f"; it is {side} with probability {chance}"
-    alone = f"{number_like(d.apart[0], _std(d.apart))} … {number_like(d.apart[2], _std(d.apart))}"
-    words += f" (were nothing common: {alone}{' times' if d.is_ratio else unit})"
+    alone = range_words(d.apart[0], d.apart[2], _std(d.apart), "1" if d.is_ratio else d.unit)
+    words += f" (were nothing common: {alone}{' times' * d.is_ratio})"
     return f"{words}; not to be trusted: {d.untrusted.replace(' ', ', ')}." if d.untrusted else f"{words}."
 
 
 def _line_sentence(c: PopulationsCompared, name: str, of_it: StraightLine) -> str:
-    unit = pretty_unit(c.parameters[name].display_unit)
+    unit = unit_behind(c.parameters[name].display_unit)
     slope = _three(np.exp(of_it.slope) if name in c.logarithmic else of_it.slope)
     rising = float(np.mean(of_it.slope > 0))
-    by = f"a factor of {_range(slope)}" if name in c.logarithmic else f"{_range(slope)} {unit}".rstrip()
+    by = f"a factor of {_range(slope)}" if name in c.logarithmic else f"{_range(slope)}{unit}"
     words = f"{name} grows by {by} for each unit of the number; it rises with probability {min(rising, SURE):.3f}"
     if of_it.chance < OFF_THE_LINE:
         chi = plain_number(of_it.misfit, 2)
@@ -325,8 +330,9 @@ def _std(three: Sequence[float]) -> float:
 
 
 def _range(three: tuple[float, float, float], plain: bool = False) -> str:
-    low, middle, high = (number_like(value, _std(three)) for value in three)
-    return f"{middle} ({low} … {high})" if plain else f"{middle} (5–95 %: {low} … {high})"
+    low, middle, high = three
+    between = range_words(low, high, _std(three))
+    return f"{number_like(middle, _std(three))} ({between if plain else f'5–95 %: {between}'})"
 
 
 def medians_table(c: PopulationsCompared) -> str:
@@ -355,6 +361,18 @@ def figure(c: PopulationsCompared) -> Chart:
     return in_columns(panels, height, width=COLUMN * (2 if len(panels) > 1 else 1))
 
 
+def write_populations(c: PopulationsCompared, out: str | Path) -> Path:
+    """Write ``compare.html``, ``populations.png`` and ``.pdf`` and the tables to a folder; returns the page.
+
+    Raises :class:`OutputError`.
+    """
+    out = make_folder(out)
+    ((_, _, drawn),) = draw([("populations", CAPTION, figure(c))], folder=out)
+    write_tables(c, out)
+    about = {"title": " – ".join(c.populations), "populations": tuple(sentences(c))}
+    return write_text(out / "compare.html", render("compare.html.j2", figure=drawn, caption=CAPTION, **about))
+
+
 def write_tables(c: PopulationsCompared, folder: Path) -> None:
     """``differences.csv`` and, with numbers, ``lines.csv``. Raises :class:`OutputError`."""
     three = [f"{what}_{q}" for what in ("ratio", "difference", "apart") for q in ("q05", "q50", "q95")]
@@ -363,11 +381,55 @@ def write_tables(c: PopulationsCompared, folder: Path) -> None:
         [d.parameter, d.first, d.second, d.unit, *d.ratio, *d.difference, *d.apart, d.greater, d.untrusted]
         for d in c.differences
     ]
-    write_text(folder / "differences.csv", csv_text([head, *rows]))
+    write_csv(folder / "differences.csv", [head, *rows])
     if c.lines:
         three = [f"{what}_{q}" for what in ("slope", "level") for q in ("q05", "q50", "q95")]
         lines = [
             [name, "ln" if name in c.logarithmic else "", *_three(it.slope), *_three(it.level), it.misfit, it.freedom]
             for name, it in c.lines.items()
         ]
-        write_text(folder / "lines.csv", csv_text([["parameter", "of", *three, "chi2", "freedom"], *lines]))
+        write_csv(folder / "lines.csv", [["parameter", "of", *three, "chi2", "freedom"], *lines])
+
+
+def numbers_of(names: Sequence[str]) -> tuple[tuple[float, ...], str]:
+    """The number in each of the names and their unit, as of ``gel_5kPa`` and ``gel_8kPa``; nothing where a name has
+    none or several, units differ, or all numbers are the same.
+    """
+    of_names = [[(number, unit) for number, unit in _NUMBER.findall(name) if is_unit(unit)] for name in names]
+    units = {unit for of_name in of_names for _, unit in of_name}
+    if any(len(of_name) != 1 for of_name in of_names) or len(units) != 1:
+        return (), ""
+    numbers = tuple(float(of_name[0][0]) for of_name in of_names)
+    return (numbers, units.pop()) if len(set(numbers)) > 1 else ((), "")
+
+
+def groups_compared(run_dir: Path) -> PopulationsCompared | str | None:
+    """The groups of a run side by side; why not, where their data are the same; None where fewer than two have a
+    population.
+    """
+    folders = {name: folder for name, (folder, _) in load_groups_of(run_dir).items()}
+    if len(folders) < 2:
+        return None
+    numbers = numbers_of([*folders])[0] if len(folders) > 2 else ()  # a line through two is their difference
+    try:
+        return compare_populations(folders, numbers)
+    except OutputError as error:
+        return f"The groups are not compared: {error}."
+
+
+def group_sentences(of: PopulationsCompared) -> Iterator[str]:
+    """The answer, and which number the straight line is of."""
+    yield from sentences(of)
+    if of.lines:
+        yield f"The number of the straight line is that of the names of the groups, in {numbers_of(of.populations)[1]}."
+
+
+def group_lines(run_dir: Path) -> Iterator[str]:
+    """What the terminal shows of the groups of a run before each of them."""
+    of = groups_compared(run_dir)
+    if isinstance(of, str):
+        yield of
+    elif of is not None:
+        yield medians_table(of)
+        yield ""
+        yield from group_sentences(of)

@@ -6,9 +6,8 @@ from markupsafe import Markup
 
 from en4dvar.diagnosis.influence import UNKNOWN
 from en4dvar.model.state import Array
-from en4dvar.plumbing.units import convert
 from en4dvar.report.chart import POINTS, Chart, Panel, Row
-from en4dvar.report.text import fixed, plain_number, pretty_unit, shown, signed, symbol_html, with_unit
+from en4dvar.report.text import axis_label, fixed, plain_number, pretty_unit, shown, signed, symbol_html
 from en4dvar.results.store import StoredResult
 
 CAPTION = (
@@ -36,7 +35,7 @@ def times(result: StoredResult) -> Array:
 
 def time_label(result: StoredResult) -> str:
     """Of an axis of :func:`times`."""
-    return with_unit("time", result.group("observed_data")[result.axes[0].time].attrs["display_units"])
+    return axis_label(result.group("observed_data")[result.axes[0].time], "time")
 
 
 def whitened(result: StoredResult) -> Array:
@@ -102,8 +101,7 @@ def _most_moving(result: StoredResult) -> Markup:
         return Markup("Each reading decides so much that only a fit without it tells what it changes.")
     j, k = np.unravel_index(int(np.nanargmax(np.abs(in_std))), in_std.shape)
     row = result.rows[int(j)]
-    about = result.parameters[row.name].attrs
-    size = convert(float(change[j, k]), about["units"], about["display_units"])
+    size = float(shown(result.parameters[row.name], change[j, k]))
     words = Markup(
         "Without the reading at {} {} would change most: by {} {}, {} posterior standard deviations."
     ).format(

@@ -7,8 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from en4dvar.plumbing.units import convert
-from en4dvar.report.text import fixed, number_like, pretty_unit, symbol_html
+from en4dvar.report.text import fixed, number_like, pretty_unit, shown, symbol_html
 from en4dvar.results.store import StoredResult
 
 SHIFT_COLUMNS = (
@@ -68,10 +67,9 @@ def stored_ledger(result: StoredResult) -> tuple[tuple[StoredEntry, ...], ...]:
 
     def entry(i: int, parameter: str, quantity: str) -> StoredEntry:
         v = stats.variables[quantity + ending]
-        shown = v.attrs["display_units"]
-        low, median, high = convert(np.asarray(v.values[i], dtype=float), v.attrs["units"], shown).tolist()
+        low, median, high = shown(v)[i].tolist()
         name, symbol, label = quantity.removeprefix("ledger_"), about[parameter]["symbol"], v.attrs["long_name"]
-        return StoredEntry(parameter, name, shown, low, median, high, symbol, label)
+        return StoredEntry(parameter, name, v.attrs["display_units"], low, median, high, symbol, label)
 
     names = list(map(str, stats.coords["path_parameter"].values))
     return tuple(tuple(entry(i, name, q) for q in quantities) for i, name in enumerate(names))
@@ -89,8 +87,7 @@ def stored_shifts(result: StoredResult) -> tuple[tuple[StoredShift, ...], ...]:
     parameters, alternatives = result.parameters, stats.coords["alternative"].values
 
     def shift(i: int, j: int, name: str) -> StoredShift:
-        about = parameters[name].attrs
-        value = convert(float(change[i, j]), about["units"], about["display_units"])
+        about, value = parameters[name].attrs, float(shown(parameters[name], change[i, j]))
         numbers = value, float(relative[i, j]), float(in_std[i, j]), float(of["cost_change"][i])
         known = str(alternatives[i]), str(of["words"][i]), name, about["display_units"]
         return StoredShift(*known, *numbers, str(of["reason"][i]), about["symbol"])

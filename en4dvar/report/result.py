@@ -17,7 +17,8 @@ from en4dvar.plumbing.units import convert
 from en4dvar.report import figures
 from en4dvar.report.history import history
 from en4dvar.report.page import IDENTIFIERS, render_set
-from en4dvar.report.svg import draw, on_paper
+from en4dvar.report.paper import on_paper
+from en4dvar.report.svg import draw
 from en4dvar.results.netcdf import dataset_of, to_bytes, tree_of
 from en4dvar.results.store import StoredResult, load_stored, of_members
 

@@ -1,22 +1,73 @@
-"""Page and figures of a sequence, from ``sequence.nc`` alone: state, parameters, innovations in time, and ranks."""
+"""Page and figures of a sequence, from ``sequence.nc`` alone: state, parameters, innovations in time, and ranks; what
+a session gets of it; and sequences of the same readings side by side, by the forecasts of their observations.
 
-from collections.abc import Iterator
+ln p(y) = Σ_k ln p(y_k | y_1 … y_{k−1}), each the density of N(H x̄, P + R) of the forecast: exact for a linear model and
+an ensemble of enough members, as in a Kalman filter. Source: Schweppe (1965), IEEE Trans. Inf. Theory 11, 61; for
+model selection by ensembles: Carrassi, Bocquet, Hannart & Ghil (2017), Q. J. R. Meteorol. Soc. 143, 866.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import softmax
 
+from en4dvar.plumbing.errors import OutputError
+from en4dvar.plumbing.tables import table
 from en4dvar.plumbing.units import convert
+from en4dvar.report import cycles
 from en4dvar.report.chart import PAGE, POINTS, Chart, Panel, interval, stacked
-from en4dvar.report.cycles import CERTAIN, RANKS, last_analysis, ranks, span_of, time_label, write_cycles_page
+from en4dvar.report.compare import named, preferred
+from en4dvar.report.paper import on_paper
 from en4dvar.report.svg import Captioned
 from en4dvar.report.text import plain_number, pretty_unit, shown, with_unit
 from en4dvar.results.netcdf import Group
-from en4dvar.results.series_file import read_series
+from en4dvar.results.series_file import estimates, read_series, series_file, series_group
+from en4dvar.series.problem import SeriesResult
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
 
 SHOWN = 5  # variables or observations in a figure
 LISTED = 40  # in a table
+MOST = 4  # variables in one line
+READINGS = ("time", "observation", "observations", "observation_std", "observation_correlation")
+
+
+class SequenceOutcome(SeriesResult):
+    """The state and parameters along a series of data."""
+
+    def __repr__(self) -> str:
+        told = [f"{name} {mean:.4g} ± {std:.2g} {unit}".removesuffix(" 1") for name, mean, std, unit in estimates(self)]
+        more = f" and {len(told) - MOST} more" if len(told) > MOST else ""
+        about = f"{self.problem.name}, {len(self.problem.series.times)} times"
+        return f"<SequenceOutcome {about}; at the end {', '.join(told[:MOST])}{more}>"
+
+    def __str__(self) -> str:
+        return "\n".join([self.table(), *(f"warning: {words}" for words in self.warnings)])
+
+    def table(self) -> str:
+        """State and parameters at the last time, aligned."""
+        rows = [(name, f"{mean:.5g}", f"{std:.3g}", unit) for name, mean, std, unit in estimates(self)]
+        return table([("at the end", "mean", "std", "unit"), *rows])
+
+    def summary(self) -> pd.DataFrame:
+        """Mean and standard deviation at the last time, a row a variable."""
+        from en4dvar.plumbing.whole_table import WholeTable
+
+        return WholeTable(estimates(self), columns=["variable", "mean", "std", "unit"]).set_index("variable")
+
+    def plot(self) -> Figure:
+        """The state in time, or the parameters where it is known."""
+        _, _, chart = next(sequence_figures(series_group(self, {})))
+        return on_paper(chart)
 
 
 def write_sequence_report(run_dir: Path, files: bool = False) -> Path:
@@ -33,9 +84,9 @@ def write_sequence_report(run_dir: Path, files: bool = False) -> Path:
     )
     columns = ["observed", "readings", "root mean square of normalised innovations", "within 2 std"]
     last = "The analysis at the last observation time, given all observations."
-    estimates = [
+    at_end = [
         (name, plain_number(mean, 4), plain_number(std, 2), pretty_unit(unit))
-        for name, mean, std, unit in islice(last_analysis(data), LISTED)
+        for name, mean, std, unit in islice(cycles.last_analysis(data), LISTED)
     ]
     rows = []
     for i, name in enumerate(data["observation"].values[:LISTED]):
@@ -44,9 +95,11 @@ def write_sequence_report(run_dir: Path, files: bool = False) -> Path:
         size = plain_number(float(np.sqrt(np.mean(innovations**2))), 3) if len(innovations) else "–"
         share = f"{100 * np.mean(np.abs(innovations) <= 2):.0f} %" if len(innovations) else "–"
         rows.append((str(name), str(len(innovations)), size, share))
-    return write_cycles_page(
+    return cycles.write_cycles_page(
         run_dir,
         data,
+        sequence_figures(data),
+        files,
         kind="Sequential assimilation",
         what=f"the series {data.attrs['data_set']}, cycle by cycle.",
         cycle="an observation time",
@@ -56,11 +109,9 @@ def write_sequence_report(run_dir: Path, files: bool = False) -> Path:
             ("Readings", str(readings), f"of {data.sizes['observation']} quantities"),
         ],
         tables=[
-            ("State and parameters at the end", ["variable", "mean", "std", "unit"], estimates, last),
+            ("State and parameters at the end", ["variable", "mean", "std", "unit"], at_end, last),
             ("Innovations", columns, rows, words),
         ],
-        figures=sequence_figures(data),
-        files=files,
     )
 
 
@@ -70,7 +121,7 @@ def sequence_figures(data: Group) -> Iterator[Captioned]:
     parameters, state = str(data.attrs["parameters"]).split(", "), list(map(str, data["state"].values))
     held = np.array([state.index(name) for name in parameters if name in state], dtype=np.intp)
     spread = data[f"{best}_std"].values.max(axis=0)
-    uncertain = np.flatnonzero(spread > CERTAIN * np.abs(data[f"{best}_mean"].values).max(axis=0))
+    uncertain = np.flatnonzero(spread > cycles.CERTAIN * np.abs(data[f"{best}_mean"].values).max(axis=0))
     dynamic = np.array([i for i in uncertain if i not in held], dtype=np.intp)
     if len(dynamic):
         words = "" if len(dynamic) <= SHOWN else f" {SHOWN} of {len(dynamic)} variables."
@@ -81,7 +132,7 @@ def sequence_figures(data: Group) -> Iterator[Captioned]:
         yield "parameters", caption, in_time(data, "analysis", held[:SHOWN])
     caption = "Innovations, the readings minus their forecasts, within two of their expected standard deviations."
     yield "innovations", caption, innovations(data)
-    yield "ranks", RANKS, ranks(data["rank"].values, int(data.attrs["members"]))
+    yield "ranks", cycles.RANKS, cycles.ranks(data["rank"].values, int(data.attrs["members"]))
 
 
 def in_time(data: Group, kind: str, chosen: npt.NDArray[np.intp]) -> Chart:
@@ -89,17 +140,16 @@ def in_time(data: Group, kind: str, chosen: npt.NDArray[np.intp]) -> Chart:
     time, read_as = shown(data["time"]), list(data["observation_state"].values)
     panels = []
     for i in chosen:
-        name = str(data["state"].values[i])
-        unit, display = str(data["units"].values[i]), str(data["display_units"].values[i])
+        name, unit, display = cycles.variables(data)[i]
         mean, std = (convert(data[f"{kind}_{what}"].values[:, i], unit, display) for what in ("mean", "std"))
-        panel = Panel(ylabel=with_unit(name, display), xlim=span_of(time))
+        panel = Panel(ylabel=with_unit(name, display), xlim=cycles.span_of(time))
         panel.band(time, *interval(mean, std, 2, bool(data["positive"].values[i])), "posterior", 0.25, "± 2 std")
         panel.line(time, mean, "posterior", 0.9, label=kind)
         if name in read_as:
             readings = convert(data["observations"].values[:, read_as.index(name)], unit, display)
             panel.dots(time, readings, "ink", 1.6, label="readings")
         panels.append(panel)
-    return stacked(panels, 2.8 * POINTS, time_label(data), PAGE)
+    return stacked(panels, 2.8 * POINTS, cycles.time_label(data), PAGE)
 
 
 def innovations(data: Group) -> Chart:
@@ -112,14 +162,81 @@ def innovations(data: Group) -> Chart:
         unit, display = (str(data[f"observation_{kind}"].values[i]) for kind in ("units", "display_units"))
         there = np.isfinite(innovation[:, i])
         at, width = time[there], 2 * convert(expected[there, i], unit, display)
-        panel = Panel(ylabel=with_unit(str(data["observation"].values[i]), display), xlim=span_of(time))
+        panel = Panel(ylabel=with_unit(str(data["observation"].values[i]), display), xlim=cycles.span_of(time))
         panel.band(at, -width, width, "prior", 0.3, "± 2 expected std")
         panel.rule(0, size=0.5)
         panel.dots(at, convert(innovation[there, i], unit, display), "ink", 1.6, label="innovation")
         panels.append(panel)
-    return stacked(panels, 2.6 * POINTS, time_label(data), PAGE)
+    return stacked(panels, 2.6 * POINTS, cycles.time_label(data), PAGE)
 
 
 def _some(places: npt.NDArray[np.intp], most: int) -> npt.NDArray[np.intp]:
     """All of few, else some that are spread evenly."""
     return np.asarray(places[np.unique(np.linspace(0, len(places) - 1, min(most, len(places))).astype(int))])
+
+
+@dataclass(frozen=True)
+class SequenceScore:
+    """``innovation``: root mean square of normalised innovations; ``difference`` to the largest log-evidence."""
+
+    run: str
+    scheme: str
+    log_evidence: float
+    difference: float
+    probability: float
+    innovation: float
+
+
+def compare_sequences(run_dirs: Sequence[Path]) -> tuple[SequenceScore, ...]:
+    """Score sequences, in the order given.
+
+    Raises
+    ------
+    OutputError: fewer than two, one of them no sequence, without an evidence, or of other readings.
+    """
+    runs = {name: _sequence(run_dir) for name, run_dir in named(run_dirs).items()}
+    (first, reference), *others = runs.items()
+    for name, other in others:
+        if not all(_same(reference, other, key) for key in READINGS):
+            raise OutputError(f"{name} and {first} hold other readings or errors: their evidences cannot be compared")
+    evidence = np.array([float(data.attrs["log_evidence"]) for data in runs.values()])
+    sizes = [np.sqrt(np.nanmean(data["normalised_innovation"].values ** 2)) for data in runs.values()]
+    each = zip(evidence, evidence - evidence.max(), softmax(evidence), sizes, strict=True)
+    return tuple(
+        SequenceScore(run, str(data.attrs["scheme"]), *map(float, numbers))
+        for (run, data), numbers in zip(runs.items(), each, strict=True)
+    )
+
+
+def sequences_table(scores: Sequence[SequenceScore]) -> str:
+    """What the terminal shows: a row a run, and which is preferred."""
+    header = ("run", "scheme", "log-evidence", "difference", "probability", "innovations / expected")
+    rows = [
+        (s.run, s.scheme, f"{s.log_evidence:.2f}", f"{s.difference:.2f}", f"{s.probability:.3f}", f"{s.innovation:.3g}")
+        for s in scores
+    ]
+    best, second = sorted(scores, key=lambda score: -score.log_evidence)[:2]
+    return f"{table([header, *rows])}\n\n{preferred(best.run, second.run, -second.difference)}"
+
+
+def _sequence(run_dir: Path) -> Group:
+    file = series_file(run_dir)
+    if file is None:
+        raise OutputError(f"{run_dir}: no sequence; sequences are compared with sequences of the same readings")
+    if file.stem == "twin":
+        raise OutputError(f"{run_dir}: a twin experiment has no evidence; RMSE and spread are in its summary.csv")
+    data = read_series(file)
+    if "log_evidence" not in data.attrs:
+        raise OutputError(f"{run_dir}: written by an earlier version, without an evidence; run it again")
+    if why := str(data.attrs["without_evidence"]):
+        raise OutputError(f"{run_dir}: has no evidence to compare: {why}")
+    if not np.isfinite(data.attrs["log_evidence"]):
+        raise OutputError(f"{run_dir}: has no evidence to compare: its ensemble has lost the readings")
+    return data
+
+
+def _same(first: Group, other: Group, key: str) -> bool:
+    if key not in first or key not in other:
+        return key not in first and key not in other
+    a, b = first[key].values, other[key].values
+    return a.dtype.kind == b.dtype.kind and np.array_equal(a, b, equal_nan=a.dtype.kind == "f")

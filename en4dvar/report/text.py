@@ -7,6 +7,7 @@ import re
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 from markupsafe import Markup, escape
 
 from en4dvar.estimation.summary import ParameterSummary
@@ -42,6 +43,11 @@ def pretty_unit(unit: str) -> str:
     text = re.sub(r"(?<![A-Za-z])u(?=[A-Za-z])", "µ", unit.strip())
     text = re.sub(r"(?<=[A-Za-zµ])(?:\^|\*\*)?(-?\d+)", lambda m: m[1].translate(_SUPERSCRIPT), text)
     return re.sub(r"\s*\*\s*|\s+", "·", text)
+
+
+def unit_behind(unit: str) -> str:
+    """``" kPa"``, to stand behind a number; nothing for a dimensionless quantity."""
+    return f" {pretty_unit(unit)}".rstrip()
 
 
 def with_unit(label: str, unit: str) -> str:
@@ -92,6 +98,11 @@ def number_like(value: float, std: float) -> str:
     return text.lstrip("-") if float(text) == 0 else text.replace("-", "−")
 
 
+def range_words(low: float, high: float, std: float, unit: str = "1") -> str:
+    """``"2.6 … 3.0 kPa"``, with the decimals that the std calls for."""
+    return f"{number_like(low, std)} … {number_like(high, std)}{unit_behind(unit)}"
+
+
 def plus_minus(mean: float, std: float) -> str:
     """``"2.80 ± 0.10"``: the spread with two significant digits, the mean to the same decimals."""
     return f"{number_like(mean, std)} ± {number_like(std, std)}"
@@ -132,10 +143,15 @@ def fixed(value: float, places: int) -> str:
     return f"{value:z.{places}f}" if math.isfinite(value) else "–"
 
 
-def shown(variable: Variable | xr.DataArray) -> Array:
-    """The values of a variable of a result file in its display unit."""
-    values = np.asarray(variable.values, dtype=float)
-    return convert(values, variable.attrs["units"], variable.attrs["display_units"])
+def shown(variable: Variable | xr.DataArray, values: npt.ArrayLike | None = None) -> Array:
+    """The values of a variable of a result file in its display unit, or others that have its unit."""
+    held = np.asarray(variable.values if values is None else values, dtype=float)
+    return convert(held, str(variable.attrs["units"]), str(variable.attrs["display_units"]))
+
+
+def axis_label(variable: Variable | xr.DataArray, words: str = "") -> str:
+    """Words, or the symbol of a variable of a result file, and its display unit."""
+    return with_unit(words or str(variable.attrs["symbol"]), str(variable.attrs["display_units"]))
 
 
 def figure_text(name: str) -> str:

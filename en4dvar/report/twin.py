@@ -1,25 +1,62 @@
 """Page and figures of a twin experiment, from ``twin.nc`` alone: RMSE and spread in time, the state and its truth,
-ranks of the truth among the members, and whether the spread says how large the error is.
+ranks of the truth among the members, and whether the spread says how large the error is; what a session gets of it.
 """
+
+from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from en4dvar.plumbing.tables import table
+from en4dvar.report import cycles
 from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, Row, stacked
-from en4dvar.report.cycles import RANKS, ranks, span_of, time_label, write_cycles_page
+from en4dvar.report.paper import on_paper
 from en4dvar.report.svg import Captioned
 from en4dvar.report.text import plain_number, pretty_unit, with_unit
 from en4dvar.results.netcdf import Group
-from en4dvar.results.series_file import MEAN, read_series
+from en4dvar.results.series_file import MEAN, read_series, series_group
+from en4dvar.series.twin import TwinResult
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
 
 COLOURS = {"forecast": "prior", "analysis": "posterior", "smoothed": "background"}
 SHOWN = 4  # variables of the state in the second figure
 LAST = 200  # cycles in it
 MOST_BARS = 21  # of the histogram of the truth's rank
 GROUPS = 12  # of spreads
+
+
+class TwinOutcome(TwinResult):
+    """A twin experiment's truth, observations and estimates; ``scores`` by estimate."""
+
+    def __repr__(self) -> str:
+        own = self.experiment
+        told = [f"{name} RMSE {s.mean_rmse:.3g}, spread {s.mean_spread:.3g}" for name, s in self.scores.items()]
+        return f"<TwinOutcome: {own.members} members, {own.cycles} cycles; {'; '.join(told)}>"
+
+    def __str__(self) -> str:
+        return "\n".join([self.table(), *(f"warning: {words}" for words in self.warnings)])
+
+    def table(self) -> str:
+        """RMSE and spread after the burn-in, aligned."""
+        rows = [(name, f"{s.mean_rmse:.4g}", f"{s.mean_spread:.4g}") for name, s in self.scores.items()]
+        return table([("estimate", "RMSE", "spread"), *rows])
+
+    def summary(self) -> pd.DataFrame:
+        """RMSE and spread after the burn-in, a row an estimate."""
+        from en4dvar.plumbing.whole_table import WholeTable
+
+        rows = {name: (score.mean_rmse, score.mean_spread) for name, score in self.scores.items()}
+        return WholeTable.from_dict(rows, orient="index", columns=["rmse", "spread"])
+
+    def plot(self) -> Figure:
+        """RMSE and spread in time."""
+        return on_paper(scores(series_group(self, {})))
 
 
 def write_twin_report(run_dir: Path, files: bool = False) -> Path:
@@ -37,9 +74,11 @@ def write_twin_report(run_dir: Path, files: bool = False) -> Path:
     for kind, _ in _kinds(data):
         rmse, spread = (float(data[f"{kind}_{what}"].attrs[MEAN]) for what in ("rmse", "spread"))
         rows.append((kind, plain_number(rmse, 4), plain_number(spread, 4), plain_number(spread / rmse, 3)))
-    return write_cycles_page(
+    return cycles.write_cycles_page(
         run_dir,
         data,
+        twin_figures(data),
+        files,
         kind="Twin experiment",
         what="a truth is drawn and observed, and the assimilation is judged against it.",
         cycle="a cycle",
@@ -49,8 +88,6 @@ def write_twin_report(run_dir: Path, files: bool = False) -> Path:
             ("Observations", str(data.sizes["observation"]), "a cycle"),
         ],
         tables=[("Scores", columns, rows, words)],
-        figures=twin_figures(data),
-        files=files,
     )
 
 
@@ -72,7 +109,7 @@ def twin_figures(data: Group) -> Iterator[Captioned]:
         "ensemble lies on the diagonal: where it is spread wide, its error is large.",
         reliability(data),
     )
-    yield "ranks", RANKS, ranks(data["rank"].values[burn_in:], int(data.attrs["members"]))
+    yield "ranks", cycles.RANKS, cycles.ranks(data["rank"].values[burn_in:], int(data.attrs["members"]))
 
 
 def scores(data: Group) -> Chart:
@@ -82,14 +119,14 @@ def scores(data: Group) -> Chart:
         rmse, spread = data[f"{kind}_rmse"], data[f"{kind}_spread"]
         average, top = float(rmse.attrs[MEAN]), _upper(rmse.values, spread.values)
         title = f"{kind}: RMSE {plain_number(average, 3)}"
-        panel = Panel(ylabel=with_unit("error", _unit(data)), title=title, xlim=span_of(time), ylim=(0.0, top))
+        panel = Panel(ylabel=with_unit("error", _unit(data)), title=title, xlim=cycles.span_of(time), ylim=(0.0, top))
         if burn_in := int(data.attrs["burn_in"]):
             panel.band(time[[0, burn_in - 1]], [0, 0], [top, top], "grid", 0.5)
         panel.line(time, rmse.values, colour, 0.7, label="RMSE")
         panel.line(time, spread.values, "centre", 0.7, "--", label="spread")
         panel.rule(average, colour)
         panels.append(panel)
-    return stacked(panels, 3.0 * POINTS, time_label(data))
+    return stacked(panels, 3.0 * POINTS, cycles.time_label(data))
 
 
 def errors(data: Group) -> Chart:
@@ -103,12 +140,12 @@ def errors(data: Group) -> Chart:
     for i in chosen:
         width = 2 * std[-LAST:, i]
         title = f"{data['state'].values[i]}: {100 * inside[i]:.0f} % within 2 std"
-        panel = Panel(ylabel=with_unit("error", str(data["units"].values[i])), title=title, xlim=span_of(time))
+        panel = Panel(ylabel=with_unit("error", str(data["units"].values[i])), title=title, xlim=cycles.span_of(time))
         panel.band(time, -width, width, "posterior", 0.25, "± 2 std")
         panel.rule(0, size=0.5)
         panel.line(time, error[-LAST:, i], "ink", 0.8, label="analysis − truth")
         panels.append(panel)
-    return stacked(panels, 2.8 * POINTS, time_label(data))
+    return stacked(panels, 2.8 * POINTS, cycles.time_label(data))
 
 
 def truth_ranks(data: Group) -> Chart:

@@ -8,9 +8,8 @@ import numpy as np
 from en4dvar.diagnosis.diagnostics import change_words, member_quantiles
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import untrusted
-from en4dvar.plumbing.units import convert
 from en4dvar.report.chart import POINTS, Chart, Panel, Row, steps
-from en4dvar.report.text import with_unit
+from en4dvar.report.text import shown, with_unit
 from en4dvar.results.store import StoredResult
 
 LEVELS = (0.05, 0.5, 0.95)
@@ -55,8 +54,7 @@ def stored_walks(result: StoredResult) -> tuple[StoredWalk, ...]:
 
 def _stored_walk(result: StoredResult, name: str) -> StoredWalk:
     posterior, observed = result.groups["/posterior"], result.groups["/observed_data"].every
-    about, time = posterior.variables[name + PIECES].attrs, posterior.coords[name + PIECE]
-    shown, clock = about["display_units"], time.attrs["display_units"]
+    pieces, time = posterior.variables[name + PIECES], posterior.coords[name + PIECE]
     begins = np.asarray(time.values, dtype=float)
     last = max(float(observed[axis.time].values[-1]) for axis in result.axes)
     edges = np.append(begins, max(last, begins[-1] + 0.02 * (begins[-1] - begins[0])))
@@ -66,14 +64,14 @@ def _stored_walk(result: StoredResult, name: str) -> StoredWalk:
         values = values[result.alive] if group == "posterior" else values
         values = values[np.isfinite(values).all(axis=1)]
         levels = member_quantiles(values, LEVELS, axis=0) if len(values) else np.full((3, len(begins)), np.nan)
-        return convert(levels, about["units"], shown)
+        return shown(pieces, levels)
 
     after = quantiles("posterior")
     if untrusted(result.cautions, name):
         after[[0, 2]] = np.nan  # the interval
     label = str(posterior.variables[name].attrs["long_name"])
-    shown_edges = convert(edges, time.attrs["units"], clock)
-    return StoredWalk(name, label, about["symbol"], shown, clock, shown_edges, after, quantiles("prior"))
+    units = pieces.attrs["display_units"], time.attrs["display_units"]
+    return StoredWalk(name, label, pieces.attrs["symbol"], *units, shown(time, edges), after, quantiles("prior"))
 
 
 def piece_lines(result: StoredResult) -> list[tuple[object, ...]]:

@@ -19,7 +19,8 @@ from en4dvar.config import SequenceConfig, TwinConfig, load_sequence, load_twin,
 from en4dvar.executor import Executor, choose_executor
 from en4dvar.inputs.asked import DataFile
 from en4dvar.plumbing.files import write_text
-from en4dvar.report.outcomes import SequenceOutcome, TwinOutcome
+from en4dvar.report.sequence import SequenceOutcome
+from en4dvar.report.twin import TwinOutcome
 from en4dvar.results.checkpoint import FOLDER, Keeper, digest
 from en4dvar.results.netcdf import Group, to_bytes
 from en4dvar.results.series_file import sequence_csv, series_group, twin_csv

@@ -26,8 +26,8 @@ from en4dvar.model.state import OF_READINGS, Array, Parameter
 from en4dvar.plumbing.errors import ConfigError, DataError, Fault, OutputError, retold
 from en4dvar.plumbing.files import make_folder, temporary_folder, write_text
 from en4dvar.plumbing.hints import listed, suggest
-from en4dvar.report.outcomes import SequenceOutcome
 from en4dvar.report.result import Result
+from en4dvar.report.sequence import SequenceOutcome
 from en4dvar.results.checkpoint import digest
 from en4dvar.runs.cycles import run_sequence
 from en4dvar.runs.progress import terminal_progress

@@ -21,7 +21,7 @@ from en4dvar.plumbing.errors import ConfigError, En4dvarError
 from en4dvar.plumbing.files import readable, write_text
 from en4dvar.plumbing.tables import csv_text, table
 from en4dvar.report.chart import POINTS, Chart, Panel, Row
-from en4dvar.report.svg import on_paper
+from en4dvar.report.paper import on_paper
 from en4dvar.results.checkpoint import FOLDER, digest, write_checkpoint
 from en4dvar.results.fingerprint import identity
 from en4dvar.runs.engine import RunKind, Session, conduct_run

@@ -9,7 +9,8 @@ import numpy as np
 from en4dvar.plumbing.files import inside, make_folder, write_text
 from en4dvar.report.chart import COLUMN
 from en4dvar.report.html import render
-from en4dvar.report.svg import keep, svg
+from en4dvar.report.paper import save_chart
+from en4dvar.report.svg import svg
 from en4dvar_agarose import measured, paper, tables
 from en4dvar_agarose.figures import all_figures
 from en4dvar_agarose.fits import DECISIVE, HYPER, LEVELS, MISFIT, Study, probability, verdict
@@ -38,7 +39,7 @@ def write_study(study: Study, directory: Path) -> Path:
     study_netcdf(study).write(directory / "study.nc")
     figures = []
     for name, caption, chart in all_figures(study):
-        keep(chart, figures_folder, name)
+        save_chart(chart, figures_folder, name)
         wide = chart.width > 1.5 * COLUMN
         figures.append({"name": name, "caption": caption, "svg": svg(chart, name, caption), "wide": wide})
     return write_text(directory / "study.html", _page(study, figures))

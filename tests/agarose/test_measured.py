@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from en4dvar.report.svg import keep
+from en4dvar.report.paper import save_chart
 from en4dvar_agarose.figures import reliability_figure
 from en4dvar_agarose.measured import bins, coverage, reliability
 
@@ -49,5 +49,5 @@ def test_population_means_are_covered():
 
 def test_its_figure_can_be_kept(tmp_path):
     """Its two panels have different legends."""
-    keep(reliability_figure(), tmp_path, "reliability")
+    save_chart(reliability_figure(), tmp_path, "reliability")
     assert {file.name for file in tmp_path.iterdir()} == {"reliability.pdf", "reliability.png"}

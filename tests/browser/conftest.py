@@ -13,8 +13,8 @@ from run_files import add_to_pack
 
 from en4dvar import report
 from en4dvar.plumbing.caution import caution
-from en4dvar.report import overlay, write_pages
-from en4dvar.report.compare import compare_runs
+from en4dvar.report import svg, write_pages
+from en4dvar.report.compare import compare_runs, write_comparison
 from en4dvar.report.figures import all_figures
 from en4dvar.report.result import Result
 from en4dvar.results.provenance import provenance
@@ -55,7 +55,7 @@ def opened(browser: Any) -> Iterator[Any]:
 def pages(analysis: Any, renamed: Any, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Kind of page → its file. One data set of the campaign has a name made to break out of the page."""
     with pytest.MonkeyPatch.context() as patch:  # the PDF and PNG copies of the figures are no part of a page
-        patch.setattr(overlay, "keep", lambda *_: None)
+        patch.setattr(svg, "save_chart", lambda *_: None)
         return _write_pages(analysis, renamed, tmp_path_factory.mktemp("pages"))
 
 
@@ -70,7 +70,7 @@ def _write_pages(analysis: Any, renamed: Any, folder: Path) -> dict[str, Path]:
         Result.from_analysis(one, provenance("name: test\n")).save(run / "posterior.nc")
     found["single"] = write_pages(folder / "single")
     comparison = compare_runs([folder / "single", folder / "calm"])
-    found["compare"] = overlay.write_comparison(comparison, folder / "compare")
+    found["compare"] = write_comparison(comparison, folder / "compare")
     campaign = folder / "campaign"
     for i, (stem, name) in enumerate((("b", "beta"), ("a", "alpha"), ("c", EVIL))):
         one = replace(renamed(calm, name), posterior=(1 + 0.2 * i) * calm.posterior, cautions=notes[:i])

@@ -15,7 +15,7 @@ from en4dvar.cli import main
 from en4dvar.config import load_config
 from en4dvar.descent.preview import preview
 from en4dvar.diagnosis.diagnostics import member_quantiles
-from en4dvar.report.predictive import prior_predictive
+from en4dvar.report.history import prior_predictive
 from en4dvar.runs.checks import validate
 
 ROOT = Path(__file__).resolve().parents[2]

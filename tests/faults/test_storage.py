@@ -17,8 +17,8 @@ from run_files import assert_same_results, configuration, interrupt, make_campai
 
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.report.chart import Chart, Panel, Row
+from en4dvar.report.paper import save_chart
 from en4dvar.report.result import load_result
-from en4dvar.report.svg import keep
 from en4dvar.results.netcdf import netcdf_file
 from en4dvar.results.pack import PACK, Pack, read_result, results_of
 from en4dvar.runs.runner import run_campaign
@@ -93,7 +93,7 @@ def test_no_room_for_a_figure(tmp_path, monkeypatch):
     resource.setrlimit(resource.RLIMIT_FSIZE, (300, limited[1]))
     try:
         with pytest.raises(OutputError, match=r"a\.pdf: cannot be written: File too large"):
-            keep(Chart([Row(90.0, [Panel()])]), tmp_path, "a")
+            save_chart(Chart([Row(90.0, [Panel()])]), tmp_path, "a")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limited)
     assert not list(tmp_path.iterdir())

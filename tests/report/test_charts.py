@@ -7,11 +7,9 @@ import re
 import numpy as np
 import pytest
 
-from en4dvar.report.chart import PAGE, Chart, Panel, Row, stacked, steps
+from en4dvar.report.chart import PAGE, Chart, Panel, Row, numbers, powers, stacked, steps, ticks
 from en4dvar.report.paper import on_paper, save_chart
-from en4dvar.report.paths import SHOWN
-from en4dvar.report.svg import svg
-from en4dvar.report.ticks import numbers, powers, ticks
+from en4dvar.report.svg import SHOWN, svg
 
 
 def drawn(panel, height=100.0):

@@ -20,9 +20,9 @@ from en4dvar.report.compare import (
     ALL,
     compare_runs,
     comparison_table,
+    overlay,
     with_evidences,
 )
-from en4dvar.report.overlay import overlay
 from en4dvar.report.result import Result
 from en4dvar.results.store import load_stored
 from en4dvar.schemes.settings import AssimilationSettings

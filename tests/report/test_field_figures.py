@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from en4dvar.report.fields import maps
+from en4dvar.report.figures import maps
 from en4dvar.report.palette import VIRIDIS
 from en4dvar.results.netcdf import Group, Variable
 from en4dvar.results.store import StoredResult

@@ -18,8 +18,8 @@ from scipy.stats import multivariate_normal
 
 from en4dvar.data.noise import Correlation
 from en4dvar.plumbing.errors import DataError, OutputError
-from en4dvar.report.compare_cycles import compare_sequences, sequences_table
-from en4dvar.report.export_cycles import cycles_table
+from en4dvar.report.export import cycles_table
+from en4dvar.report.sequence import compare_sequences, sequences_table
 from en4dvar.runs.cycles import run_sequence
 from en4dvar.runs.rerun import rerun
 from en4dvar.series.moments import log_evidence
