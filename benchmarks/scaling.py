@@ -30,7 +30,7 @@ from typing import Any, Literal
 
 import numpy as np
 from cheap_model import write_campaign
-from en4dvar.executor.chunks import CommonValue
+from en4dvar.executor.base import CommonValue
 
 import en4dvar.runs.jobs
 import en4dvar_bubble
