@@ -192,7 +192,7 @@ def export(run_dir: Path, kind: Literal["csv", "latex", "members", "netcdf"], ou
     Example:
       en4dvar export runs/quickstart --latex --out table.tex
     """
-    from en4dvar.report.export import cycles_table, export_table, posterior_file
+    from en4dvar.report.export import export_table, posterior_file
     from en4dvar.results.run_results import LackingError
     from en4dvar.results.series_file import series_file
 
@@ -205,7 +205,12 @@ def export(run_dir: Path, kind: Literal["csv", "latex", "members", "netcdf"], ou
         echo(f"{path} follows the ArviZ schema as it is: arviz.from_netcdf({str(path)!r}); nothing to export")
         return
     try:
-        text = cycles_table(cycles, kind) if cycles else export_table(run_dir, kind)
+        if cycles:
+            from en4dvar.report.cycles import cycles_table
+
+            text = cycles_table(cycles, kind)
+        else:
+            text = export_table(run_dir, kind)
     except LackingError as error:
         if isinstance(error.rest, str):
             deliver(error.rest, out, "table", force)

@@ -1,4 +1,4 @@
-"""The page of a twin experiment or a sequence, and the rank histogram that both have."""
+"""What twin experiments and sequences have in common: the page, the rank histogram, and tables for other programs."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -7,16 +7,21 @@ import numpy as np
 from scipy.stats import binom
 
 from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.files import inside, write_text
+from en4dvar.plumbing.tables import csv_text
 from en4dvar.plumbing.units import convert
 from en4dvar.report.chart import POINTS, Chart, Panel, Row
+from en4dvar.report.export import Kind, Notes, column_name, escaped, latex_unit, plus_minus, tabular
 from en4dvar.report.html import render
 from en4dvar.report.page import provenance_rows
 from en4dvar.report.svg import Captioned, draw
 from en4dvar.report.text import plain_number, with_unit
-from en4dvar.results.netcdf import Group
+from en4dvar.results.netcdf import Group, understood
+from en4dvar.results.series_file import read_series
 
 Table = tuple[str, Sequence[str], Sequence[Sequence[str]], str]  # heading, columns, rows, words below it
+KINDS = ("forecast", "analysis", "smoothed")  # of estimates in time
 BINS = 10
 CERTAIN = 1e-9  # of its size: the spread of what is known
 RANKS = (
@@ -97,6 +102,62 @@ def last_analysis(data: Group) -> Iterator[tuple[str, float, float, str]]:
         mean, std = (float(convert(number, unit, shown)) for number in numbers)
         if std > CERTAIN * abs(mean):
             yield name, mean, std, shown
+
+
+def cycles_table(file: Path, kind: Kind) -> str:
+    """A table of the result file of a sequence or a twin experiment as text, in display units.
+
+    Parameters
+    ----------
+    kind: ``csv``: a line for each time and variable of the state, mean and std of each estimate (and the truth of a
+        twin experiment); ``members``: a line for each member and time that is kept; ``latex``: rows of a table
+        (package booktabs), mean and std of the last analysis.
+
+    Raises
+    ------
+    OutputError: there is no result, it is damaged, or it holds no members (a twin experiment).
+    """
+    data = read_series(file)
+    if kind == "members" and "members" not in data:
+        raise OutputError(
+            f"{file}: a twin experiment keeps no members; --csv has mean and std of each variable in time"
+        )
+    with understood(file):
+        if kind == "latex":
+            return _last_analysis(data)
+        return csv_text(_state_members(data) if kind == "members" else _in_time(data))
+
+
+def _in_time(data: Group) -> Iterator[list[str]]:
+    state, every = variables(data), [f"{kind}_{what}" for kind in KINDS for what in ("mean", "std")]
+    columns = [column for column in (*every, "truth") if column in data]
+    yield ["time", "variable", "unit", *columns]
+    values = np.stack([data[column].values * _factors(data) for column in columns], axis=-1)
+    for time, at in zip(data["time"].values, values, strict=True):
+        for (name, _, unit), row in zip(state, at, strict=True):
+            yield [repr(float(time)), name, unit, *(f"{x:.10g}" if np.isfinite(x) else "" for x in row)]
+
+
+def _state_members(data: Group) -> Iterator[list[str]]:
+    yield ["time", "member", *(column_name(name, unit) for name, _, unit in variables(data))]
+    for time, members in zip(data["member_time"].values, data["members"].values * _factors(data), strict=True):
+        for i, member in enumerate(members):
+            if np.isfinite(member).all():  # the others were lost
+                yield [repr(float(time)), str(i), *(f"{x:.10g}" for x in member)]
+
+
+def _factors(data: Group) -> Array:
+    """(n,) of the variables of the state, to the units that they are shown in."""
+    return np.array([float(convert(1.0, unit, shown)) for _, unit, shown in variables(data)])
+
+
+def _last_analysis(data: Group) -> str:
+    lines = [
+        f"{escaped(name)} & {latex_unit(unit) or '--'} & {plus_minus(mean, std)}"
+        for name, mean, std, unit in last_analysis(data)
+    ]
+    head = "% en4dvar export: mean and standard deviation of the last analysis; needs \\usepackage{booktabs}"
+    return "\n".join([head, *tabular("llr", "variable & unit & analysis", lines, Notes())]) + "\n"
 
 
 def _lines(text: object) -> list[str]:

@@ -13,7 +13,7 @@ from en4dvar.estimation.design.evaluate import Evaluated
 from en4dvar.estimation.design.nested import Decision
 from en4dvar.model.state import Array
 from en4dvar.plumbing.files import write_text
-from en4dvar.plumbing.tables import csv_text, table
+from en4dvar.plumbing.tables import table, write_csv
 from en4dvar.plumbing.units import convert
 from en4dvar.report.chart import PAGE, POINTS, Chart, Panel, Row, in_columns
 from en4dvar.report.html import render
@@ -221,7 +221,7 @@ def write_design(folder: Path) -> Path:
     Raises :class:`OutputError`.
     """
     designs = load_designs(folder / FILE)
-    write_text(folder / "designs.csv", csv_text(_cells(designs)))
+    write_csv(folder / "designs.csv", _cells(designs))
     rows, best = ranked(designs), {id(row) for row in front(designs)}
     figures = [("fans", FANS, fans(designs))]
     if len({row.price for row in rows}) > 1:

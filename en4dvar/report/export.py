@@ -1,4 +1,4 @@
-"""Tables of a run for other programs: CSV of summary or members, in time of runs of cycles, LaTeX for a paper.
+"""Tables of a run for other programs: CSV of summary or members, LaTeX for a paper.
 
 netCDF needs no export: ``posterior.nc`` follows the ArviZ schema as it is.
 """
@@ -6,7 +6,7 @@ netCDF needs no export: ``posterior.nc`` follows the ArviZ schema as it is.
 import itertools
 import re
 import string
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -14,17 +14,12 @@ import numpy as np
 
 from en4dvar.config.models import GREEK
 from en4dvar.estimation.summary import LITTLE, MODAL, ParameterSummary, summary_rows
-from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, codes
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.tables import csv_text
-from en4dvar.plumbing.units import convert
-from en4dvar.report.cycles import last_analysis, variables
 from en4dvar.report.text import GREEK as LETTERS
 from en4dvar.report.text import number_like, plain_number, untrusted_words
-from en4dvar.results.netcdf import Group, understood
 from en4dvar.results.run_results import RunResults
-from en4dvar.results.series_file import read_series
 from en4dvar.results.store import StoredResult, require_settled
 
 _COMMANDS = (
@@ -33,7 +28,6 @@ _COMMANDS = (
     "max|min"
 )
 Kind = Literal["csv", "latex", "members"]
-KINDS = ("forecast", "analysis", "smoothed")  # of estimates in time
 _ESCAPES = {c: f"\\{c}" for c in "#$%&_{}"} | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\^{}"}
 _SIGNS = {
     "²": "^2", "³": "^3", "±": r"\pm", "×": r"\times", "−": "-", "→": r"\to", "≤": r"\le", "≥": r"\ge", "≈": r"\approx",
@@ -90,7 +84,7 @@ def _members_csv(results: Iterable[StoredResult]) -> str:
     header: dict[str, str] = {}
     for result in results:
         for row in result.rows:
-            header.setdefault(row.name, _column(row.name, row.unit))
+            header.setdefault(row.name, column_name(row.name, row.unit))
         warned = " ".join(codes(result.cautions))
         values = {name: result.members("posterior", name) for name in result.parameters}
         for i, member in enumerate(np.flatnonzero(result.alive)):
@@ -101,7 +95,7 @@ def _members_csv(results: Iterable[StoredResult]) -> str:
     return csv_text([["dataset", "member", *header.values(), "warnings"], *rows])
 
 
-def _column(name: str, unit: str) -> str:
+def column_name(name: str, unit: str) -> str:
     return f"{name} ({unit})" if unit != "1" else name
 
 
@@ -268,59 +262,3 @@ def latex_unit(unit: str) -> str:
 def escaped(text: str) -> str:
     """``text`` as LaTeX prints it, without what cannot be printed."""
     return "".join(_ESCAPES.get(c, c if c.isprintable() else " ") for c in text)
-
-
-def cycles_table(file: Path, kind: Kind) -> str:
-    """A table of the result file of a sequence or a twin experiment as text, in display units.
-
-    Parameters
-    ----------
-    kind: ``csv``: a line for each time and variable of the state, mean and std of each estimate (and the truth of a
-        twin experiment); ``members``: a line for each member and time that is kept; ``latex``: rows of a table
-        (package booktabs), mean and std of the last analysis.
-
-    Raises
-    ------
-    OutputError: there is no result, it is damaged, or it holds no members (a twin experiment).
-    """
-    data = read_series(file)
-    if kind == "members" and "members" not in data:
-        raise OutputError(
-            f"{file}: a twin experiment keeps no members; --csv has mean and std of each variable in time"
-        )
-    with understood(file):
-        if kind == "latex":
-            return _last_analysis(data)
-        return csv_text(_state_members(data) if kind == "members" else _in_time(data))
-
-
-def _in_time(data: Group) -> Iterator[list[str]]:
-    columns = [f"{kind}_{what}" for kind in KINDS for what in ("mean", "std") if f"{kind}_{what}" in data]
-    columns += ["truth"] * ("truth" in data)
-    yield ["time", "variable", "unit", *columns]
-    values = np.stack([data[column].values * _factors(data) for column in columns], axis=-1)
-    for time, at in zip(data["time"].values, values, strict=True):
-        for (name, _, unit), row in zip(variables(data), at, strict=True):
-            yield [repr(float(time)), name, unit, *(f"{x:.10g}" if np.isfinite(x) else "" for x in row)]
-
-
-def _state_members(data: Group) -> Iterator[list[str]]:
-    yield ["time", "member", *(_column(name, unit) for name, _, unit in variables(data))]
-    for time, members in zip(data["member_time"].values, data["members"].values * _factors(data), strict=True):
-        for i, member in enumerate(members):
-            if np.isfinite(member).all():  # the others were lost
-                yield [repr(float(time)), str(i), *(f"{x:.10g}" for x in member)]
-
-
-def _factors(data: Group) -> Array:
-    """(n,) of the variables of the state, to the units that they are shown in."""
-    return np.array([float(convert(1.0, unit, shown)) for _, unit, shown in variables(data)])
-
-
-def _last_analysis(data: Group) -> str:
-    lines = [
-        f"{escaped(name)} & {latex_unit(unit) or '--'} & {plus_minus(mean, std)}"
-        for name, mean, std, unit in last_analysis(data)
-    ]
-    head = "% en4dvar export: mean and standard deviation of the last analysis; needs \\usepackage{booktabs}"
-    return "\n".join([head, *tabular("llr", "variable & unit & analysis", lines, Notes())]) + "\n"

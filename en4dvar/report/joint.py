@@ -12,7 +12,7 @@ from en4dvar.diagnosis.honesty.checks import MOVED
 from en4dvar.estimation.summary import ParameterSummary, estimate_cells
 from en4dvar.plumbing.caution import Caution, untrusted
 from en4dvar.plumbing.files import write_text
-from en4dvar.plumbing.tables import csv_text, table
+from en4dvar.plumbing.tables import table, write_csv
 from en4dvar.report.chart import COLUMN, PAGE, POINTS, Chart, Panel, in_columns
 from en4dvar.report.html import render
 from en4dvar.report.svg import svg
@@ -165,7 +165,7 @@ def write_joint(folder: Path) -> Path:
     fitted = [fit[c].values if c in fit else absent for c in ("chi2_per_observation", "distance", "chance")]
     columns = ("name", "dataset", "without", "mean", "std", "q05", "q50", "q95", "unit")
     cells = [[getattr(e, c) for c in columns] + [" ".join(e.untrusted)] for e in rows]
-    write_text(folder / "joint.csv", csv_text([[*columns, "warnings"], *cells]))
+    write_csv(folder / "joint.csv", [[*columns, "warnings"], *cells])
     page = render(
         "joint.html.j2",
         title="Joint estimate",

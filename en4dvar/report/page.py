@@ -119,25 +119,18 @@ def _tiles(result: StoredResult) -> list[tuple[str, str, str, bool]]:
     if doubted:
         information = "–", "cannot be told where intervals are not to be trusted"
     ended = "by its own criterion" if s["converged"] else "not converged"
-    return [
+    tiles = [
         ("Fit", number_like(nrmse, 0.01), "NRMSE: 1 is perfect, 0 is no better than a constant", not nrmse >= 0.9),
         ("χ² per observation", plain_number(chi2, 3), chi2_words, chi2_odd),
         ("Information", *information, False),
         ("Members that ran", f"{alive} of {members}", "of the posterior ensemble", alive < members),
         ("Iterations", str(s["n_iterations"]), f"{ended}: {s['stop_reason']}", not s["converged"]),
-        *_descents(s),
     ]
-
-
-def _descents(stats: Mapping[str, Any]) -> list[tuple[str, str, str, bool]]:
-    """A tile; none of a scheme that does not search, and of results of before."""
-    if "n_descents" not in stats:
-        return []
-    total, agreeing = int(stats["n_descents"]), int(stats["n_agreeing"])
-    words = (
-        f"ended in the lowest minimum. {stats['descents']}; {stats['search_runs']} forward runs looked for another one"
-    )
-    return [("Starts that agree", f"{agreeing} of {total}", words, agreeing < 2)]
+    if "n_descents" in s:  # not where the scheme does not search, nor in results of before
+        total, agreeing = int(s["n_descents"]), int(s["n_agreeing"])
+        words = f"ended in the lowest minimum. {s['descents']}; {s['search_runs']} forward runs looked for another one"
+        tiles.append(("Starts that agree", f"{agreeing} of {total}", words, agreeing < 2))
+    return tiles
 
 
 def judge_chi2(chi2: float, n_observations: int, dfs: float, structured: bool = False) -> tuple[str, bool]:

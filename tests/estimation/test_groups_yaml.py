@@ -17,7 +17,7 @@ from toy_config import csv_text, write_toy
 from en4dvar.cli import main
 from en4dvar.model.state import Parameter
 from en4dvar.plumbing.errors import ConfigError
-from en4dvar.report import groups, populations
+from en4dvar.report import populations
 from en4dvar.report.populations import compare_populations, numbers_of
 from en4dvar.results.population_file import load_groups_of, load_population
 from en4dvar.runs.engine import write_report
@@ -104,9 +104,9 @@ def test_terminal_and_page_open_with_the_comparison(finished):
     ("names", "numbers"), [(["5 %", "8 %"], ()), (["5 %", "8 %", "10 %"], (5.0, 8.0, 10.0)), (["5 %", "8 %", "x"], ())]
 )
 def test_a_line_needs_three_groups(tmp_path, monkeypatch, names, numbers):
-    monkeypatch.setattr(groups, "load_groups_of", lambda run: {name: (run / name, None) for name in names})
-    monkeypatch.setattr(groups, "compare_populations", lambda folders, asked: asked)
-    assert groups.groups_compared(tmp_path) == numbers
+    monkeypatch.setattr(populations, "load_groups_of", lambda run: {name: (run / name, None) for name in names})
+    monkeypatch.setattr(populations, "compare_populations", lambda folders, asked: asked)
+    assert populations.groups_compared(tmp_path) == numbers
 
 
 def test_what_a_known_group_does_to_the_others_is_told():
