@@ -41,8 +41,8 @@ from en4dvar.problem import InverseProblem, discrepancy_parameters
 from en4dvar.schemes.settings import AssimilationSettings
 from en4dvar_bubble import BubbleModel
 from en4dvar_bubble.laws.kelvin_voigt import FungKelvinVoigt, NeoHookeanKelvinVoigt, QuadraticKelvinVoigt
+from en4dvar_bubble.laws.maxwell import ZenerNeoHookean, ZenerQuadratic
 from en4dvar_bubble.laws.parameters import ALPHA, MU_P
-from en4dvar_bubble.laws.zener import ZenerNeoHookean, ZenerQuadratic
 
 SETTINGS = {"a": AssimilationSettings(), "b": AssimilationSettings(what_if=False)}
 LASER = BubbleModel(law=NeoHookeanKelvinVoigt(), start="laser")  # with the default gas
