@@ -42,6 +42,7 @@ from en4dvar.problem import InverseProblem, discrepancy_parameters
 from en4dvar.schemes.settings import AssimilationSettings
 from en4dvar_bubble import BubbleModel
 from en4dvar_bubble.laws.kelvin_voigt import FungKelvinVoigt, NeoHookeanKelvinVoigt, QuadraticKelvinVoigt
+from en4dvar_bubble.laws.maxwell import ZenerNeoHookean, ZenerQuadratic
 from en4dvar_bubble.laws.parameters import ALPHA, MU_P
 
 SETTINGS = {"a": AssimilationSettings(), "b": AssimilationSettings(what_if=False)}

@@ -336,25 +336,16 @@ def _element(context: Any, builder: Any, sig: Any, args: Any) -> Any:
 
 
 @infer_global(operator.getitem)
-class _Read(AbstractTemplate):
-    metadata = TRIED_FIRST
-
-    def generic(self, args: Any, kws: Any) -> Any:
-        return signature(args[0].dtype, args[0], _place(args[1])) if isinstance(args[0], Rows) else None
-
-
 @infer_global(operator.setitem)
-class _Write(AbstractTemplate):
+class _Element(AbstractTemplate):
     metadata = TRIED_FIRST
 
     def generic(self, args: Any, kws: Any) -> Any:
-        if isinstance(args[0], Rows):
-            return signature(types.none, args[0], _place(args[1]), args[0].dtype)
-        return None
-
-
-def _place(index: Any) -> Any:
-    return types.UniTuple(types.int64, 2) if isinstance(index, types.BaseTuple) else types.int64
+        if not isinstance(args[0], Rows):
+            return None
+        place = types.UniTuple(types.int64, 2) if isinstance(args[1], types.BaseTuple) else types.int64
+        written = args[2:] and (args[0].dtype,)
+        return signature(types.none if written else args[0].dtype, args[0], place, *written)
 
 
 @lower_builtin(operator.getitem, Rows, types.Any)
