@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from en4dvar.model.state import Array
 from en4dvar_movie.kernels import SHAPE, normal_equations, residuals
@@ -208,8 +209,9 @@ def _outlines(image: Array, p: Array, modes: int, noise: float, optics: Optics) 
         sectors = int(np.clip(2 * np.pi * circle.R / max(4.0, 2 * p[W]), 8, 256))
         sector = np.minimum((angles * sectors).astype(int), sectors - 1)
         moved = left**2 * (rows @ weights)  # the influence of a pixel on the radius, over its residual
-        sums, spread = np.bincount(sector, moved * off, sectors), np.sum((moved * off) ** 2)
-        fitted = np.array([np.bincount(sector, moved * row, sectors) for row in rows.T]).T  # JᵀWJ·weights by sector
+        by_sector = csr_array((moved, (sector, np.arange(len(off)))), (sectors, len(off)))
+        sums, fitted = by_sector @ off, by_sector @ rows  # the latter is JᵀWJ·weights of each
+        spread = np.sum((moved * off) ** 2)
         # the step of robust weights is the M-estimator's, its error that of Huber (1981): ψ' instead of the weights
         variance = spread / max(slope, 0.3) ** 2 * total / max(total - free, 1.0)
         common = noise**2 * weights[CONTRAST] ** 2 * precision[CONTRAST]  # of the contrast that all frames share

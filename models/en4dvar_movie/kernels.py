@@ -78,8 +78,7 @@ def _row(j, i, p, modes, row):
 
 
 @kernel
-def _bounds(shape, ring):
-    x, y, _, reach = ring
+def _bounds(shape, x, y, reach):
     return (
         max(0, math.floor(y - reach)),
         min(shape[0], math.ceil(y + reach) + 1),
@@ -89,24 +88,22 @@ def _bounds(shape, ring):
 
 
 @kernel
-def _within(image, j, i, ring):
-    """Whether a pixel is looked at, and its distance from ``ring[:2]`` lies between ``ring[2]`` and ``ring[3]``."""
-    far = (i - ring[0]) ** 2 + (j - ring[1]) ** 2
-    return ring[2] ** 2 <= far <= ring[3] ** 2 and not math.isnan(image[j, i])
-
-
-@kernel
 def residuals(image, p, modes, ring):
-    """Of the pixels in a ring, residuals (n,), the model's derivatives (n, P), and row and column (n, 2)."""
-    top, bottom, left, right = _bounds(image.shape, ring)
+    """Residuals (n,) of the pixels whose distance from ``ring[:2]`` lies between ``ring[2]`` and ``ring[3]``, with the
+    model's derivatives (n, P), and the row and column (n, 2) of each."""
+    row = np.zeros(len(p))
+    top, bottom, left, right = _bounds(image.shape, ring[0], ring[1], ring[3])
     most = max(0, bottom - top) * max(0, right - left)
     values, rows, places = np.empty(most), np.empty((most, len(p))), np.empty((most, 2), dtype=np.int64)
     n = 0
     for j in range(top, bottom):
         for i in range(left, right):
-            if _within(image, j, i, ring):
-                values[n] = image[j, i] - _row(j, i, p, modes, rows[n])
-                places[n] = j, i
+            far = (i - ring[0]) ** 2 + (j - ring[1]) ** 2
+            if ring[2] ** 2 <= far <= ring[3] ** 2 and not math.isnan(image[j, i]):
+                values[n] = image[j, i] - _row(j, i, p, modes, row)
+                for a in range(len(p)):
+                    rows[n, a] = row[a]
+                places[n, 0], places[n, 1] = j, i
                 n += 1
     return values[:n], rows[:n], places[:n]
 
@@ -136,10 +133,11 @@ def normal_equations(image, p, modes, ring, cutoff):
     A = np.zeros((size, size))
     g = np.zeros(size)
     total = cost = 0.0
-    top, bottom, left, right = _bounds(image.shape, ring)
+    top, bottom, left, right = _bounds(image.shape, ring[0], ring[1], ring[3])
     for j in range(top, bottom):
         for i in range(left, right):
-            if not _within(image, j, i, ring):
+            far = (i - ring[0]) ** 2 + (j - ring[1]) ** 2
+            if far < ring[2] ** 2 or far > ring[3] ** 2 or math.isnan(image[j, i]):
                 continue
             r = image[j, i] - _row(j, i, p, modes, row)
             u = min(1.0, abs(r) / cutoff)
