@@ -22,7 +22,7 @@ from en4dvar.descent.field import field_esmda
 from en4dvar.descent.field_data import FieldData
 from en4dvar.ensemble.linalg import centre
 from en4dvar.schemes.base import Evaluation, Weights
-from en4dvar.schemes.filters import ESMDA
+from en4dvar.schemes.esmda import ESMDA
 from en4dvar.schemes.local_gain import ByCorrelation, ByDistance
 
 COEFFICIENTS = (9.333, 7.0, 4.0, 2.0)

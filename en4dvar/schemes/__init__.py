@@ -1,4 +1,4 @@
-"""Assimilation schemes: what is computed, and the keys read. A new one is a class and a line below.
+"""Assimilation schemes, one a file: what is computed, and the keys read. A new one is a file and a line below.
 
 Another package brings schemes of its own by entry points of the group ``en4dvar.schemes``: a name for ``scheme:`` and a
 subclass of :class:`Scheme`. One that cannot be loaded is left out with a warning; a name of ours is not replaced.
@@ -9,24 +9,17 @@ from collections.abc import Iterable, Mapping
 from dataclasses import fields
 
 from en4dvar.plumbing.installed import installed
-from en4dvar.plumbing.moved import MOVED
 from en4dvar.schemes.base import Minimiser, Scheme
+from en4dvar.schemes.baselines import Climatology, OptimalInterpolation
+from en4dvar.schemes.bootstrap_filter import BootstrapFilter
+from en4dvar.schemes.denkf import DEnKF
 from en4dvar.schemes.en4dvar import En4DVar
-from en4dvar.schemes.filters import (
-    ESMDA,
-    ESRF,
-    ETKF,
-    BootstrapFilter,
-    Climatology,
-    DEnKF,
-    EnKF,
-    EnKFN,
-    OptimalInterpolation,
-)
+from en4dvar.schemes.enkf import EnKF
+from en4dvar.schemes.enkf_n import EnKFN
+from en4dvar.schemes.esmda import ESMDA
+from en4dvar.schemes.esrf import ESRF
+from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.ienks import IEnKS
-
-FORMER = ("etkf", "denkf", "enkf", "esrf", "enkf_n", "baselines", "bootstrap_filter", "esmda")  # modules, now one
-MOVED |= {f"{__name__}.{module}": f"{__name__}.filters" for module in FORMER}
 
 # name in a configuration → class; its fields are keys of the section ``assimilation:``
 SCHEMES: dict[str, type[Scheme]] = {

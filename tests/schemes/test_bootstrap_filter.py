@@ -7,7 +7,7 @@ import pytest
 
 from en4dvar.ensemble.linalg import centre
 from en4dvar.schemes.base import Evaluation, Weights
-from en4dvar.schemes.filters import BootstrapFilter, likelihood_shares, systematic
+from en4dvar.schemes.bootstrap_filter import BootstrapFilter, likelihood_shares, systematic
 from en4dvar.schemes.localisation import BlockLocalisation
 from en4dvar.series.sequential import CycleSeries, SequentialSettings, run_sequential
 from en4dvar_lorenz import Linear

@@ -10,7 +10,7 @@ from same_bits import assert_same_bits
 from toys import Decay, Fragile, Linear, Vectorised, Wave, make_problem
 
 from en4dvar.estimation.assimilate import assimilate, log_posterior
-from en4dvar.schemes.filters import ESMDA
+from en4dvar.schemes.esmda import ESMDA
 from en4dvar.schemes.settings import AssimilationSettings
 
 NAMES, TRUTH = ("a", "b", "c"), np.array([1.0, -0.5, 0.7])

@@ -11,7 +11,6 @@ from en4dvar.schemes.base import Scheme
 
 ALLOWED = {
     "en4dvar.ensemble.linalg", "en4dvar.model.state", "en4dvar.plumbing.installed",
-    "en4dvar.plumbing.moved",
 }  # fmt: skip
 FILES = sorted(p for p in Path(en4dvar.schemes.__file__).parent.glob("*.py") if p.stem != "settings")
 

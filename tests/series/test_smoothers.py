@@ -8,7 +8,10 @@ import test_model_error as with_error
 from test_exact import CYCLES, batch_posterior, chaotic_twin, close, linear_twin
 from test_loop import Breaking, Forced, members, series
 
-from en4dvar.schemes.filters import ESRF, ETKF, Climatology, EnKFN
+from en4dvar.schemes.baselines import Climatology
+from en4dvar.schemes.enkf_n import EnKFN
+from en4dvar.schemes.esrf import ESRF
+from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.ienks import IEnKS
 from en4dvar.schemes.inflation import Inflation
 from en4dvar.schemes.localisation import BlockLocalisation

@@ -1,0 +1,94 @@
+"""Bootstrap particle filter: the members are weighed by their likelihoods, resampled, and jittered.
+
+    ω_i ∝ exp(−½ ‖d_i‖²),   d_i = d − S_i the whitened innovation of member i.
+
+No Gaussian is assumed and nothing is linear; the price is a number of members that grows exponentially with that of the
+observations. Systematic resampling makes N equal members of them at every cycle. Copies would stay copies where the
+model is deterministic, so that each is moved by ``jitter`` h: a draw from the kernel N(0, h² P), P the covariance of
+the weighted members, without the mean of the draws. The spread grows by √(1 + h²).
+
+Sources: Gordon, Salmond & Smith (1993), IEE Proc. F 140, 107; systematic: Kitagawa (1996), J. Comput. Graph. Stat. 5,
+1; jitter: Musso, Oudjane & Le Gland (2001), in Doucet et al., Sequential Monte Carlo Methods in Practice, ch. 12.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, cast
+
+import numpy as np
+import numpy.typing as npt
+from annotated_types import Ge
+from scipy.special import ndtr
+
+from en4dvar.ensemble.linalg import centre
+from en4dvar.model.state import Array
+from en4dvar.schemes.base import Draw, Evaluation, GaussNewtonStep, Step, Weights
+from en4dvar.schemes.etkf import ETKF
+
+
+@dataclass(frozen=True)
+class BootstrapFilter(ETKF):
+    """The filter; it takes no localisation."""
+
+    words: ClassVar[str] = "weighed and resampled members"
+
+    jitter: Annotated[float, Ge(0), "What a resampled member is moved by, in standard deviations of the posterior."] = (
+        0.2
+    )
+
+    on: ClassVar[tuple[str, ...]] = ("series",)
+    resamples: ClassVar[bool] = True
+
+    def advance(self, weights: Weights, evaluation: Evaluation, iteration: int, draw: Draw) -> Step | GaussNewtonStep:
+        """Resampled members as rows of weights: a member is x̄ + X_a(i), one that has survived."""
+        n = len(weights.w)
+        shares = likelihood_shares(evaluation)
+        start = float(ndtr(draw("resampling", 1)[0, 0]))
+        index = systematic(shares, start)
+        w = np.bincount(index, minlength=n) / n
+        transform = cast(Array, Resampled(index, w, shares, self.jitter, draw))
+        return Step(Weights(w, transform), math.sqrt(n - 1) * float(np.linalg.norm(w)), 1 / float(shares @ shares))
+
+
+@dataclass(frozen=True)
+class Resampled:
+    """The transform that takes the members of these ``index`` (N,), about their mean of weights ``w`` (N,), and moves
+    them by draws of the covariance that ``shares`` (N,) give, ``jitter`` times its root.
+    """
+
+    index: npt.NDArray[np.intp]
+    w: Array
+    shares: Array
+    jitter: float
+    draw: Draw
+
+    def __matmul__(self, anomalies: Array) -> Array:
+        moved = anomalies[self.index] - self.w @ anomalies
+        if not self.jitter:
+            return np.asarray(moved)
+        spread = np.sqrt(self.shares)[:, None] * (anomalies - self.shares @ anomalies)
+        root = np.linalg.qr(spread, mode="r")
+        return np.asarray(moved + self.jitter * centre(self.draw("jitter", len(root)))[1] @ root)
+
+    @property
+    def dense(self) -> Array:
+        """As a matrix (N, N), without the jitter, which earlier states have no part in."""
+        return np.asarray(np.eye(len(self.w))[self.index] - self.w)
+
+
+def likelihood_shares(evaluation: Evaluation) -> Array:
+    """Likelihoods (N,) of the members, of sum 1, relative to the largest, so that one is left however far all are."""
+    misfit = np.sum((evaluation.d[:, None] - evaluation.S) ** 2, axis=0)
+    likelihood = np.exp(-0.5 * (misfit - misfit.min()))
+    return np.asarray(likelihood / likelihood.sum())
+
+
+def systematic(shares: Array, start: float) -> npt.NDArray[np.intp]:
+    """Indices (N,) of the members resampled: the comb (start + j)/N, 0 < start < 1, in the cumulated shares (N,).
+
+    >>> systematic(np.array([0.5, 0.0, 0.25, 0.25]), 0.5).tolist()
+    [0, 0, 2, 3]
+    """
+    comb = (start + np.arange(len(shares))) / len(shares)
+    ends = np.cumsum(shares)
+    return np.searchsorted(ends / ends[-1], comb)
