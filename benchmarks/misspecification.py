@@ -27,7 +27,6 @@ from typing import Any
 
 import numpy as np
 from acoustic_twin import MODEL, WIDE, make_twin, prior
-from en4dvar_bubble.laws.maxwell import ZenerNeoHookean, ZenerQuadratic
 from laser_twin import make_laser_twin
 from records import Record, fill
 from worlds import CENTRAL, Twin, World, experiment

@@ -30,7 +30,6 @@ from typing import Any, Literal
 
 import numpy as np
 from cheap_model import write_campaign
-from en4dvar.executor.base import CommonValue
 
 import en4dvar.runs.jobs
 import en4dvar_bubble
@@ -38,6 +37,7 @@ from en4dvar.assembly.build import data_files, inverse_plan
 from en4dvar.config import Config, load_config
 from en4dvar.ensemble.members import Reading
 from en4dvar.executor import Executor, ProcessesExecutor, SerialExecutor, ThreadsExecutor, one_blas_thread
+from en4dvar.executor.base import CommonValue
 from en4dvar.results.pack import PACK, Pack
 from en4dvar.runs.jobs import Job, estimate
 from en4dvar.runs.runner import run_campaign
