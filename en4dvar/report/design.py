@@ -97,7 +97,9 @@ def needs(designs: Designs, row: DesignRow) -> list[str]:
             for f, (other, *units), std, relative in zip(used, designs.asked.others, *result.others, strict=True)
             if 0 < f < math.inf
         ]
-        if met:
+        if not each:
+            how = "" if met else ": not with these readings"
+        elif met:
             how = f" as long as each is known: {', '.join(known)}" if known else ", however badly each other is known"
         elif alone:
             how = f" if one of these were known better: {', '.join(known)}"

@@ -85,16 +85,21 @@ class Result(StoredResult):
         return self.plot_history()
 
     def plot_histograms(self) -> Figure:
-        """Posterior over prior, one panel a parameter."""
-        return on_paper(figures.histograms(self))
+        """Posterior over prior, one panel a parameter. Raises :class:`OutputError`: there is none, only fields."""
+        return on_paper(figures.histograms(self._with_parameters()))
 
     def plot_history(self) -> Figure:
         """Data, prior and posterior predictive bands and the residuals of the centre."""
         return on_paper(history(self))
 
     def plot_pairs(self) -> Figure:
-        """Posterior members of every pair of parameters with their correlation."""
-        return on_paper(figures.pairs(self))
+        """Posterior members of every pair of parameters with their correlation. Raises as :meth:`plot_histograms`."""
+        return on_paper(figures.pairs(self._with_parameters()))
+
+    def _with_parameters(self) -> Result:
+        if not self.rows:
+            raise OutputError("no parameter was estimated, only fields, which 'report' draws on the page of the result")
+        return self
 
     def save(self, path: str | Path) -> Path:
         """Write one netCDF file, which :func:`load_result` reads again. Raises :class:`OutputError`."""

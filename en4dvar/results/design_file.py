@@ -104,7 +104,7 @@ def save_designs(path: Path, rows: Sequence[DesignRow], asked: Asked, attributes
     """Write the file; it appears complete or not at all. Raises :class:`OutputError`."""
     (time, _), (value, _) = asked.axes
     units = {"method": "", "std": "", "times": time, "grid": time, "fan": value}
-    fixed = {"parameter": len(asked.parameters), "level": len(FAN)}
+    fixed = {"parameter": len(asked.parameters), "level": len(FAN), "other": len(asked.others)}
     worth = [row.result for row in rows]
     variables = {
         "number": variable("design", np.array([row.number for row in rows]), "1", "number of the design in the file"),

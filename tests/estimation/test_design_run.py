@@ -15,7 +15,8 @@ import en4dvar
 from en4dvar.cli import main
 from en4dvar.model.forward import ValidityLimit
 from en4dvar.plumbing.errors import ConfigError, DataError, En4dvarError, OutputError
-from en4dvar.report.design import front, readings_text, remarks
+from en4dvar.report.design import front, needs, readings_text, remarks
+from en4dvar.results.design_file import load_designs
 from en4dvar.runs import design_run
 from en4dvar.runs.design_run import run_design
 
@@ -270,3 +271,16 @@ def test_after_a_run_there_is_less_to_learn(tmp_path):
     assert one + other == pytest.approx(both, abs=0.02)
     with pytest.raises(En4dvarError, match="nowhere"):
         run_design(plan, out=tmp_path / "bad", after=tmp_path / "nowhere")
+
+
+def test_what_is_wanted_where_nothing_else_is_asked_for(tmp_path):
+    plan = _plan(
+        about=["a", "b"],
+        wanted={"a": "50 %", "b": "0.001 m"},
+        knobs={"every": {"key": "design.times.step", "values": ["0.2 s"]}},
+    )
+    run_design(plan, out=tmp_path / "out", overrides=PAGE)
+    designs = load_designs(tmp_path / "out" / "design.nc")
+    for row in designs.rows:
+        assert row.evaluated.others.shape == (2, 0)
+        assert needs(designs, row) == ["a to ± 50 %", "b to ± 0.001 m: not with these readings"]

@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from en4dvar.plumbing.errors import OutputError
 from en4dvar.report.figures import maps
 from en4dvar.report.palette import VIRIDIS
+from en4dvar.report.result import Result
 from en4dvar.results.netcdf import Group, Variable
 from en4dvar.results.store import StoredResult
 
@@ -50,3 +52,10 @@ def test_every_cell_of_a_map_has_the_colour_of_its_value(regular):
     assert drawn[-1] == VIRIDIS[-1]
     assert len(set(drawn)) == 12
     assert len({mark.colour for mark in maps_.panels[1].marks}) == 1  # posterior as wide as the prior
+
+
+@pytest.mark.parametrize("figure", ["plot_histograms", "plot_pairs"])
+def test_fields_alone_are_no_parameters_to_draw(figure, monkeypatch):
+    monkeypatch.setattr(Result, "rows", ())
+    with pytest.raises(OutputError, match="only fields"):
+        getattr(Result({}), figure)()
