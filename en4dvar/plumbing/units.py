@@ -121,8 +121,10 @@ def parse_unit(text: str) -> Unit:
     if len(text) > LONGEST:
         raise UnitError(f"cannot read unit {text[:20]!r}…: {len(text)} characters")
     clean = text.replace("µ", "u").replace("μ", "u").replace("·", "*").translate(_SUPERSCRIPT)
-    tokens = list(iter(_TOKEN.scanner(clean).match, None))  # type: ignore[attr-defined]
-    end = tokens[-1].end() if tokens else 0
+    tokens, end = list[re.Match[str]](), 0
+    while match := _TOKEN.match(clean, end):
+        tokens.append(match)
+        end = match.end()
     if end < len(clean):
         raise UnitError(f"cannot read unit {text!r} at {clean[end:]!r}")
     unit = _product(iter(tokens), text)

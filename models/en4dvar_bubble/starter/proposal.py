@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from en4dvar.inputs.window import Instant, select
+from en4dvar.model.forward import Trajectory
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.errors import ConfigError, DataError, retold
 from en4dvar.plumbing.units import convert
@@ -344,8 +345,9 @@ def _clock(look: Look, model: BubbleModel, theta: Mapping[str, float]) -> Entry:
     shift = 0.0
     if all(p.name in theta for p in model.parameters):
         (path,) = model.trajectories(model.initial_states({n: np.array([v]) for n, v in theta.items()}), times)
-        with suppress(DataError, TypeError):
-            shift = look.lobe.t_max - lobe(times, path["R"]).t_max  # type: ignore[index]
+        if isinstance(path, Trajectory):
+            with suppress(DataError):
+                shift = look.lobe.t_max - lobe(times, path["R"]).t_max
     if abs(shift) <= SAME_CLOCK:
         return Entry("time_zero", "file", "the file's clock agrees with that of the pulse")
     zero = min(shift, look.times[0])
