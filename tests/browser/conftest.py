@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from importlib import import_module
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from run_files import add_to_pack
 
 from en4dvar import report
 from en4dvar.plumbing.caution import caution
-from en4dvar.report import svg, write_pages
+from en4dvar.report import write_pages
 from en4dvar.report.compare import compare_runs, write_comparison
 from en4dvar.report.figures import all_figures
 from en4dvar.report.result import Result
@@ -55,7 +56,7 @@ def opened(browser: Any) -> Iterator[Any]:
 def pages(analysis: Any, renamed: Any, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Kind of page → its file. One data set of the campaign has a name made to break out of the page."""
     with pytest.MonkeyPatch.context() as patch:  # the PDF and PNG copies of the figures are no part of a page
-        patch.setattr(svg, "save_chart", lambda *_: None)
+        patch.setattr(import_module("en4dvar.report.svg"), "save_chart", lambda *_: None)
         return _write_pages(analysis, renamed, tmp_path_factory.mktemp("pages"))
 
 
