@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -95,7 +96,10 @@ def track(
         echo(f"doubtful, and not used until a line of --corrections confirms them: {doubtful}")
     for other, readings in zip(more, track.others, strict=False):
         echo(f"another bubble: {other}, {sum(r.used for r in readings)} {what}")
-    echo(f"readings: {table}\npage: {shown}\nnext: en4dvar init --data {table}")
+    echo(f"readings: {table}\npage: {shown}")
+    context = click.get_current_context()
+    if context.parent in (None, context.find_root()):  # 'init --movie' goes on by itself
+        echo(f"next: en4dvar init --data {shlex.quote(str(table))}")
 
 
 def _scaled(

@@ -55,11 +55,14 @@ def test_from_the_movie_to_observations(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_from_the_movie_to_the_configuration_in_one_step(tmp_path, monkeypatch):
-    assert tracked(tmp_path, monkeypatch).exit_code == 0
+    alone = tracked(tmp_path, monkeypatch)
+    assert alone.exit_code == 0
+    assert "next: en4dvar init --data gel.csv\n" in alone.output
     scale = ["--pixel", f"{PIXEL} um", "--frame-rate", "400 kHz"]
     words = ["init", "--movie", "gel.tif", *scale, "--start", "laser", "--out", "own.yaml"]
     outcome = CliRunner().invoke(main, words)
     assert outcome.exit_code == 0, outcome.output
+    assert outcome.output.count("next: ") == 1  # it goes on by itself
     readings = [(tmp_path / f"{name}.csv").read_text().split("\nframe,")[1] for name in ("gel", "own")]
     assert readings[0] == readings[1]
     (problem,) = build(load_config(tmp_path / "own.yaml"))
