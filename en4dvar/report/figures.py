@@ -17,6 +17,7 @@ from en4dvar.results.netcdf import Group
 from en4dvar.results.store import StoredResult
 
 MAX_PAIRS = 6
+WIDER = 3  # spans of the posterior by which the prior is seen to either side of it
 LEVELS = 32  # colours of a map
 FIELDS = (
     "Fields of the initial state: posterior mean, and posterior over prior standard deviation (1: the data say nothing "
@@ -296,8 +297,15 @@ def _quantiles(values: Array) -> Panel:
 
 
 def _reach(prior: Array, posterior: Array) -> tuple[float, float] | None:
-    """Limits that hold the posterior and 90 % of the prior: a long tail of the prior does not flatten the picture."""
-    ends = [*np.quantile(prior, (0.05, 0.95)), *posterior] if prior.size else list(posterior)
+    """Limits that hold the posterior and 90 % of the prior, as far as that is not many times wider: a prior that knew
+    little, or its long tail, does not flatten the picture.
+    """
+    ends = list(posterior)
+    if prior.size:
+        known = np.quantile(prior, (0.05, 0.95))
+        if ends and (width := float(np.ptp(posterior))) > 0:
+            known = np.clip(known, min(ends) - WIDER * width, max(ends) + WIDER * width)
+        ends += list(known)
     low, high = (float(min(ends)), float(max(ends))) if ends else (0.0, 0.0)
     margin = 0.05 * (high - low)
     return (low - margin, high + margin) if margin > 0 else None

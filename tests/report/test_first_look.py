@@ -60,6 +60,17 @@ def test_a_result_of_before_shows_the_draws_that_it_holds(analysis):
     assert len(heights) < 12  # steps
 
 
+@pytest.mark.parametrize("wide", [1, 1000])
+def test_a_prior_that_knew_little_does_not_flatten_the_posterior(analysis, wide):
+    analysis = replace(analysis, prior=wide * analysis.prior)
+    result = Result.from_analysis(analysis, {})
+    for panel in (p for row in histograms(result).rows for p in row.panels if p.xlim):
+        (ticks,) = (mark for mark in panel.marks if mark.kind == "ticks")
+        assert panel.xlim[0] < np.nanmin(ticks.x)
+        assert panel.xlim[1] > np.nanmax(ticks.x)
+        assert np.ptp(panel.xlim) < 8 * np.ptp(ticks.x[np.isfinite(ticks.x)])
+
+
 def page_of(analysis):
     result = Result.from_analysis(analysis, {})
     return render_set(result, draw(all_figures(result)), copies=False)
