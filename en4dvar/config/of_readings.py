@@ -23,7 +23,7 @@ from en4dvar.plumbing.hints import shown
 from en4dvar.plumbing.units import UnitError, convert, parse_quantity
 from en4dvar.plumbing.user_code import loading, reason_of
 
-NUMBERS = TypeAdapter(list[Annotated[float, Field(ge=0)]])
+NUMBERS = TypeAdapter(list[Annotated[float, Field(ge=0, allow_inf_nan=False)]])
 
 
 class WeightColumn(OfReadings):

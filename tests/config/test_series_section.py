@@ -186,6 +186,7 @@ FAULTS = [
     ("{column: w}", "{column: v}", "no column 'v'"),
     ("{column: w}", "[1, 2]", "2 weights for 4 observations"),
     ("{column: w}", "[1, 2, -1, 0]", "data.series.heads.weights.2: should be greater"),
+    ("{column: w}", "[1, 2, .inf, 0]", "data.series.heads.weights.2: should be a finite number"),
     ("{column: w}", "{colum: w}", "data.series.heads.weights: write a list"),
     ("{column: w}", "half", "data.series.heads.weights: write a list"),
     ("{column: w}", "[0, 0, 0, 0]", "all weights are zero"),
