@@ -30,9 +30,6 @@ D = TypeVar("D", bound=Descends)
 class Objective(Generic[D]):
     """What the loop needs of what it minimises; without a search each step is taken as it is."""
 
-    def keep(self, going: Sequence[D]) -> None:
-        """Keep what an interrupted run needs to go on from here."""
-
     def linearise(self, going: Sequence[D]) -> Sequence[Any]:
         """Run the members, of all descents in one call, and make a step of each; None where too few survive."""
         raise NotImplementedError
@@ -54,7 +51,6 @@ class Objective(Generic[D]):
 def minimise(objective: Objective[D], descents: Sequence[D]) -> None:
     """Iterate descents side by side, usually one, until each has ended."""
     while going := [descent for descent in descents if not descent.ended]:
-        objective.keep(going)
         for descent, step in zip(going, objective.linearise(going), strict=True):
             descent.step = step
         objective.judge(going)

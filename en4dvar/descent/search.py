@@ -5,8 +5,7 @@ minimum, chosen by the forecast of the prior ensemble that is there anyway; wher
 Where noise and prior do not explain the lowest J, no member may lie in the right basin: many more draws of the prior
 are run, and the lowest of them start descents. Where something changes along the path, a descent starts where the fit
 without any change ends. Where readings after the window, which nothing was fitted to, come out otherwise than expected,
-a descent starts where all readings together lead. All rounds are kept as they go, so that an interrupted run repeats no
-descent.
+a descent starts where all readings together lead.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,7 +16,7 @@ import numpy as np
 
 from en4dvar.descent.loop import minimise
 from en4dvar.descent.minima import AGREE, Minimum, merged
-from en4dvar.descent.start import Rounds, StartState, choose_start, descent_at, descent_from, highest_plausible
+from en4dvar.descent.start import Rounds, choose_start, descent_at, descent_from, highest_plausible
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.descent.window import DataWindow, Descent
 from en4dvar.diagnosis.analysis import Record, StartRecord
@@ -33,30 +32,13 @@ WIDER = 20  # times the ensemble: draws of the prior beyond it
 
 
 @dataclass(frozen=True)
-class SearchState:
-    """Where a search stands: how many rounds are ``over``, whether the last of them ended ``lower`` than those before,
-    the forward runs that they took, and those ``spent`` on the round under way; its ``comparison``, and from the end of
-    that on where its descents ended (``minima``) and the lowest of them, the ``rival``, before its latest iteration.
-    """
-
-    over: int = 0
-    lower: bool = False
-    runs: int = 0
-    spent: int = 0
-    comparison: StartState | None = None
-    minima: tuple[Minimum, ...] = ()
-    rival: Descent | None = None
-
-
-@dataclass(frozen=True)
 class Outcome:
-    """The lowest ``descent``, converged, the same as it was ``before`` its last iteration, all minima, the lowest
-    first, the members that were ``tried``, from which descents started (N: the prior mean; beyond it draws that
-    are no members), and the forward ``runs`` of a search of so many ``rounds``.
+    """The lowest ``descent``, converged, all minima, the lowest first, the members that were ``tried``, from which
+    descents started (N: the prior mean; beyond it draws that are no members), and the forward ``runs`` of a search of
+    so many ``rounds``.
     """
 
     descent: Descent
-    before: Descent
     minima: tuple[Minimum, ...]
     tried: tuple[int, ...]
     runs: int = 0
@@ -68,23 +50,14 @@ class Outcome:
         return self.minima[0].descents >= AGREE
 
 
-Keep = Callable[[Callable[[], tuple[Outcome, SearchState]]], None]
-
-
 class Search:
     """Descents from further members of the prior ensemble, whose forecast is ``run``, round after round.
 
-    ``keep`` is called before each move with a function that gives what it takes to go on from there: what was found
-    before the round, and ``begun``. ``forward_runs``: those up to there. ``tell``: see
-    :func:`~en4dvar.descent.start.choose_start`.
+    ``tell``: see :func:`~en4dvar.descent.start.choose_start`.
     """
 
-    def __init__(
-        self, space: WeightSpace, run: Forecast, begun: SearchState, keep: Keep, tell: Callable[[Record], None]
-    ):
-        self.space, self.run = space, run
-        self.begun, self.keep, self.forward_runs = begun, keep, space.forward_runs
-        self.over, self.began = 0, 0
+    def __init__(self, space: WeightSpace, run: Forecast, tell: Callable[[Record], None]):
+        self.space, self.run, self.over = space, run, 0
         self.tell = lambda r: tell(replace(r, further=self.over) if isinstance(r, StartRecord) else r)
 
     def challenged(self, outcome: Outcome) -> Outcome:
@@ -110,10 +83,7 @@ class Search:
 
     def foretold(self, outcome: Outcome, missed: Callable[[], bool]) -> Outcome:
         """After a descent from :attr:`led`, where readings after the window ``missed`` what is expected of them."""
-        if self.last in outcome.tried or not missed():
-            return outcome
-        self.over = max(self.over, self.begun.over)
-        return self._from(outcome, self.last)
+        return outcome if self.last in outcome.tried or not missed() else self._from(outcome, self.last)
 
     def unchanging(self, outcome: Outcome) -> Outcome:
         """After a descent from :attr:`steady`, where something changes along the path."""
@@ -184,48 +154,18 @@ class Search:
         return [i for i in self.space.affordable(self.run) if i not in outcome.tried]
 
     def round(self, outcome: Outcome, members: Sequence[int]) -> Outcome:
-        """After descents from these members side by side; nothing is run again of a round that is over."""
-        self.over += 1
-        if self.begun.over >= self.over:
-            return outcome
-        after = self._after(outcome, members)
-        after = replace(after, runs=outcome.runs + self.space.forward_runs - self.began, rounds=self.over)
-        self.keep(lambda: (after, SearchState(self.over, after.descent is not outcome.descent, after.runs)))
-        return after
-
-    def _after(self, outcome: Outcome, members: Sequence[int]) -> Outcome:
-        begun = self.begun if self.begun.over == self.over - 1 else SearchState()
-        if begun.comparison or begun.rival:
-            self.space.forward_runs = self.forward_runs
-        self.began = self.space.forward_runs - begun.spent
-        if begun.rival is None:
-            rival, minima = self._compared(outcome, members, begun.comparison)
-        else:
-            rival, minima = begun.rival.kept, begun.minima
+        """After descents from these members side by side."""
+        self.over, began = self.over + 1, self.space.forward_runs
+        rival, minima = self._compared(outcome, members)
         after = replace(outcome, minima=merged([*outcome.minima, *minima]), tried=(*outcome.tried, *members))
-        if begun.rival is None and outcome.descent.cost <= rival.cost:
-            return after
-        before = rival.kept
+        if rival.cost < outcome.descent.cost:
+            after = lower(DataWindow(self.space, self.tell), rival, after)
+        return replace(after, runs=outcome.runs + self.space.forward_runs - began, rounds=self.over)
 
-        def keep() -> None:
-            nonlocal before
-            before = rival.kept
-            self._keep(outcome, lambda: SearchState(minima=minima, rival=before))
-
-        lowered = lower(DataWindow(self.space, keep, self.tell), rival, after)
-        return after if lowered is after else replace(lowered, before=before)
-
-    def _compared(
-        self, outcome: Outcome, members: Sequence[int], comparison: StartState | None
-    ) -> tuple[Descent, tuple[Minimum, ...]]:
+    def _compared(self, outcome: Outcome, members: Sequence[int]) -> tuple[Descent, tuple[Minimum, ...]]:
         """The lowest of the descents, and where they ended: at the latest where they reach a known minimum."""
-
-        def keep(state: Callable[[], StartState]) -> None:
-            self._keep(outcome, lambda: SearchState(comparison=state()))
-
-        window = Rounds(self.space, comparison or StartState(), keep, self.tell, outcome.minima)
-        if comparison is None:
-            window.begin_round(list(map(self.begin, members)))
+        window = Rounds(self.space, self.tell, outcome.minima)
+        window.begin_round(list(map(self.begin, members)))
         minimise(window, window.descents)
         window.end_round()
         lowest = window.lowest
@@ -233,10 +173,6 @@ class Search:
             window.end_here(lowest)
         lowest.ended = False
         return lowest, tuple(window.minima)
-
-    def _keep(self, outcome: Outcome, state: Callable[[], SearchState]) -> None:
-        spent = self.space.forward_runs - self.began
-        self.keep(lambda: (outcome, replace(state(), over=self.over - 1, runs=outcome.runs, spent=spent)))
 
 
 def lower(window: DataWindow, rival: Descent, outcome: Outcome) -> Outcome:
@@ -253,14 +189,13 @@ def lower(window: DataWindow, rival: Descent, outcome: Outcome) -> Outcome:
 def from_draw(space: WeightSpace, outcome: Outcome, x: Array, tell: Callable[[Record], None]) -> Outcome:
     """After a descent from a draw x (n,) of the posterior, if it ends lower than the lowest minimum; else as before.
 
-    Nothing is kept of it: a resumed run comes to the same draw and repeats it. ``tell``: see
-    :func:`~en4dvar.descent.start.choose_start`.
+    ``tell``: see :func:`~en4dvar.descent.start.choose_start`.
     """
     before, rounds = space.forward_runs, outcome.rounds + 1
     draw = max(*outcome.tried, len(space.members)) + 1
     rival = descent_at(space, x, draw)
     tell(StartRecord(1, (float(space.try_out(rival.weights.w[None]).costs[0]),), 1, rounds))
-    after = lower(DataWindow(space, tell=tell), rival, outcome)
+    after = lower(DataWindow(space, tell), rival, outcome)
     if after is outcome:
         return outcome
     runs = outcome.runs + space.forward_runs - before

@@ -38,19 +38,6 @@ SAME = 1.0  # posterior standard deviations between descents that have met
 
 
 @dataclass(frozen=True)
-class StartState:
-    """All that the rest of a comparison depends on: the descents of this round, the rank by J of the member where the
-    first of them started, the rounds of moves so far, the lowest of the descents before, and where descents ended.
-    """
-
-    descents: tuple[Descent, ...] = ()
-    first: int = 0
-    rounds: int = 0
-    lowest: Descent | None = None
-    minima: tuple[Minimum, ...] = ()
-
-
-@dataclass(frozen=True)
 class Start:
     """The descent to go on with, the other minima that descents ended in, the members that were tried, and warnings."""
 
@@ -60,19 +47,12 @@ class Start:
     warnings: tuple[Caution, ...] = ()
 
 
-Keep = Callable[[Callable[[], StartState]], None]
-
-
-def choose_start(
-    space: WeightSpace, run: Forecast, resume: StartState | None = None, keep: Keep = lambda state: None,
-    tell: Callable[[Record], None] = lambda record: None,
-) -> Start:  # fmt: skip
+def choose_start(space: WeightSpace, run: Forecast, tell: Callable[[Record], None] = lambda record: None) -> Start:
     """``run``: forecast of the prior members and, last, of their mean.
 
     ``start: best-member`` compares descents from the ``starts`` members of lowest J, where a linearisation takes so
     few runs that all of them cost no more than one bundle of N members; else it takes the member of lowest J.
-    ``resume``: where the comparison was interrupted. ``keep`` is called before each round of moves with the state to
-    resume from, ``tell`` after it.
+    ``tell`` is called after each round of moves.
     """
     scheme, beyond = space.minimiser, len(space.members) + 1  # the latter numbers what is no member
     if scheme.lengthen > 1:
@@ -93,17 +73,15 @@ def choose_start(
     first = descent_from(space, starts[0])
     if together < 2:
         return Start(first, tried=(starts[0],), warnings=warnings)
-    window = Rounds(space, resume or StartState(lowest=first), keep, tell)
-    while window.rank < len(starts):
-        if not window.descents:
-            window.begin_round([descent_from(space, i) for i in starts[window.rank : window.rank + together]])
+    window, rank = Rounds(space, tell, lowest=first), 0
+    while rank < len(starts):
+        window.begin_round([descent_from(space, i) for i in starts[rank : rank + together]])
         minimise(window, window.descents)
-        window.rank += together
+        rank += together
         if window.end_round():
             break
-        window.descents = []
     window.lowest.ended = False  # it goes on, as the first iterations of the assimilation
-    return Start(window.lowest, window.others(), tuple(starts[: window.rank]), warnings)
+    return Start(window.lowest, window.others(), tuple(starts[:rank]), warnings)
 
 
 def shortened(space: WeightSpace) -> Iterator[WeightSpace]:
@@ -129,7 +107,7 @@ def shortened(space: WeightSpace) -> Iterator[WeightSpace]:
 def lengthened(space: WeightSpace, run: Forecast, tell: Callable[[Record], None]) -> Array:
     """Weights (N,) at the end of the last but one window. ``run``: see :func:`choose_start`.
 
-    Nothing is kept of it: a resumed run repeats it. Raises :class:`ConfigError` where all readings are at one time.
+    Raises :class:`ConfigError` where all readings are at one time.
     """
     w: Array | None = None
     for number, short in enumerate(shortened(space)):
@@ -189,20 +167,13 @@ class Rounds(DataWindow):
     """Descents side by side that only have to tell which gets lowest, and where they end."""
 
     def __init__(
-        self, space: WeightSpace, before: StartState, keep: Keep, tell: Callable[[Record], None],
-        known: tuple[Minimum, ...] = (),
+        self, space: WeightSpace, tell: Callable[[Record], None], known: tuple[Minimum, ...] = (),
+        lowest: Descent | None = None,
     ):  # fmt: skip
-        super().__init__(space, lambda: keep(self.comparison), tell)
-        self.known = known
-        self.descents, self.rank, self.rounds = [d.kept for d in before.descents], before.first, before.rounds
-        self.lowest = before.lowest.kept if before.lowest else Descent(space.start(np.zeros(len(space.members))))
-        self.minima = list(before.minima)
-        self.plausible = highest_plausible(space)
-
-    def comparison(self) -> StartState:
-        """As it is kept."""
-        descents = tuple(d.kept for d in self.descents)
-        return StartState(descents, self.rank, self.rounds, self.lowest.kept, tuple(self.minima))
+        super().__init__(space, tell)
+        self.known, self.rounds, self.plausible = known, 0, highest_plausible(space)
+        self.lowest = lowest or Descent(space.start(np.zeros(len(space.members))))
+        self.descents, self.minima = list[Descent](), list[Minimum]()
 
     def begin_round(self, descents: list[Descent]) -> None:
         """Beside the lowest so far, where that has not ended in a minimum."""

@@ -58,7 +58,7 @@ class Descent(Descends):
     was last evaluated. A descent whose ``stop`` is set ends with the next iterate, which is recorded and not left.
     ``members`` are those of the prior ensemble from which descents go on as this one: its own, and of those that met
     it, at J of up to ``highest``. ``settling`` is there once a regression has come close to its end.
-    ``at`` and ``step`` belong to the iteration under way and are not kept.
+    ``at`` and ``step`` belong to the iteration under way.
     """
 
     weights: Weights
@@ -88,11 +88,6 @@ class Descent(Descends):
         assert self.at is not None
         return self.at
 
-    @property
-    def kept(self) -> "Descent":
-        """A copy for a checkpoint."""
-        return replace(self, at=None, step=None)
-
 
 class DataWindow(Objective[Descent]):
     """The window of an estimate: one descent, to the minimum of J or through the passes of a scheme.
@@ -104,17 +99,13 @@ class DataWindow(Objective[Descent]):
     def __init__(
         self,
         space: WeightSpace,
-        save: Callable[[], None] = lambda: None,
         tell: Callable[[Record], None] = lambda record: None,
         first: Forecast | None = None,
         grid: Array = NO_TIMES,
     ):
-        self.space, self.save, self.tell, self.first, self.grid = space, save, tell, first, grid
+        self.space, self.tell, self.first, self.grid = space, tell, first, grid
         self.scheme, self.observations = space.scheme, space.problem.observations
         self.tangents: list[tuple[Array, Array, Array]] = []  # weights (N,), reference (Ky,) and anomalies there
-
-    def keep(self, going: Sequence[Descent]) -> None:
-        self.save()
 
     def linearise(self, going: Sequence[Descent]) -> list[Step | GaussNewtonStep | None]:
         self.tangents = []

@@ -114,6 +114,12 @@ class Forecast:
         """(B,) the failures of members that have no reading at all, or failed for another reason."""
         return tuple("" if some else reason for some, reason in zip(self.partial, self.failures, strict=True))
 
+    @property
+    def nbytes(self) -> int:
+        """Size of its arrays."""
+        arrays = self.predicted.values, self.predicted.rates, self.path, self.extremes, self.beyond
+        return sum(array.nbytes for array in arrays if array is not None)
+
     def __len__(self) -> int:
         return len(self.failures)
 
@@ -141,6 +147,11 @@ class Composite:
         self._spread = spread_rates(problem)
 
     def __call__(self, x: Array, extra_times: Array = NO_TIMES) -> Forecast:
+        """:meth:`run`, or what the executor has kept of it."""
+        outcome: Forecast = self.executor.once(self.run, x, extra_times)
+        return outcome
+
+    def run(self, x: Array, extra_times: Array = NO_TIMES) -> Forecast:
         """Run control vectors ``x`` (B, n; transformed) through F and H.
 
         Member i is observed at t_k + t_s,i, see :func:`as_read`. ``extra_times`` (M,), on the clock of the

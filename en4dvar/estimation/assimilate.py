@@ -18,7 +18,7 @@ from en4dvar.diagnosis.response.what_if import Fit, Shift, what_if, with_shifts
 from en4dvar.ensemble.forecast import Forecast, cost, forecast, log_posterior
 from en4dvar.estimation import conclusions
 from en4dvar.estimation.localised import Localised
-from en4dvar.estimation.stages import Keep, LoopState, Sampled, Stages
+from en4dvar.estimation.stages import Sampled, Stages
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, caution
@@ -30,7 +30,7 @@ from en4dvar.problem import InverseProblem
 from en4dvar.sampling.refine import mode_cautions, that_count
 from en4dvar.schemes.settings import AssimilationSettings
 
-__all__ = ["LoopState", "assimilate", "cost", "forecast", "log_posterior"]
+__all__ = ["assimilate", "cost", "forecast", "log_posterior"]
 
 AS_GOOD = 0.5  # of J above that of the problem itself: the data allow the change as well
 INTERVALS = 2.0  # between readings, by which knots are shifted
@@ -43,8 +43,6 @@ def assimilate(
     seed: int,
     executor: Executor | None = None,
     progress: Progress | None = None,
-    resume: LoopState | None = None,
-    keep: Keep | None = None,
 ) -> Analysis:
     """Estimate the parameters of one data set.
 
@@ -55,9 +53,6 @@ def assimilate(
     executor: where members run; default in this process.
     progress: called with the name of the data set and the record of each round of the start, each iteration and each
         look at the chain.
-    resume: where an earlier call with the same arguments was interrupted; the result has the same bits as without.
-    keep: called before each round of the start and each iteration, and at each look at the chain, with a function that
-        gives the state to resume from.
 
     Raises
     ------
@@ -66,14 +61,14 @@ def assimilate(
     with one_blas_thread():
         if settings.localisation is not None or problem.fields:
             return Localised(problem, settings, seed, executor or SerialExecutor(), progress).run()
-        return _through(Stages(problem, settings, seed, executor or SerialExecutor(), progress, keep), resume)
+        return _through(Stages(problem, settings, seed, executor or SerialExecutor(), progress))
 
 
-def _through(stages: Stages, resume: LoopState | None) -> Analysis:
+def _through(stages: Stages) -> Analysis:
     """All stages, then what is concluded from them."""
     space, prior = stages.space, stages.problem.prior
-    prior_run, start, descent = stages.descend(resume)
-    outcome, ends = stages.searched(start, descent, prior_run)
+    prior_run, start = stages.descend()
+    outcome, ends = stages.searched(start, prior_run)
     looking, excusable = True, True
     while True:
         counting = that_count(outcome.minima, prior)
@@ -81,7 +76,7 @@ def _through(stages: Stages, resume: LoopState | None) -> Analysis:
         descents = conclusions.descents_of(outcome, len(space.members))
         if descents and looking:  # else they are those that were told
             stages.tell(descents)
-        sampled = stages.sampled(ends, counting, agree, start.refinement, looking)
+        sampled = stages.sampled(ends, counting, agree, looking)
         if sampled.refined:
             lower = sampled.refined.lower
         else:  # a chain would have found what lies lower
@@ -258,7 +253,7 @@ def _alone(stages: Stages, problem: InverseProblem, settings: AssimilationSettin
     other = Stages(problem, replace(settings, what_if=False), stages.seed, stages.executor, compares=False)
     end = None
     with suppress(TooFewMembersError):
-        end = _through(other, None)
+        end = _through(other)
     stages.space.forward_runs += other.space.forward_runs
     return end
 

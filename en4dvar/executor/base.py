@@ -154,6 +154,10 @@ class Executor(ABC):
                 results += [Failure(reason)] * size
         return results
 
+    def once(self, run: Callable[..., Any], *asked: Array) -> Any:
+        """What ``run`` makes of arrays. An executor that has kept it, as a journal does, does not run it again."""
+        return run(*asked)
+
     @abstractmethod
     def close(self) -> None:
         """Stop the workers and wait for them."""

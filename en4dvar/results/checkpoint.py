@@ -1,10 +1,9 @@
 """Checkpoints: what an interrupted run needs to continue to the same bits.
 
 ``checkpoints/run.yaml`` says what was computed (resolved configuration, sources, data); ``<data set>.iteration`` holds
-the state of the loop before the latest iteration (weights, transform, records with the members alive), or the same of
-each descent while a start is looked for, and under ``refine: mcmc`` the chain so far with the state of its random
-numbers; ``<data set>.done`` that and how the data set ended. ``twin.cycle`` holds the same of a twin experiment. Prior
-ensembles, perturbations and rotations are drawn again from the seed: their streams are counter-based and have no state.
+the forward runs of a data set under way (:mod:`~en4dvar.results.journal`), ``ended`` how a single one ended.
+``twin.cycle`` holds the state of a twin experiment. Prior ensembles, perturbations and rotations are drawn again from
+the seed: their streams are counter-based and have no state.
 
 Every file starts with one line: format, version, kind, fingerprint of the run and the data set, and the SHA-256 of the
 rest. A file that was cut short, altered, or written by another run is named and not used.

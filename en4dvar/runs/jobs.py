@@ -12,15 +12,16 @@ from typing import Any, ClassVar
 from en4dvar.assembly.build import build_one
 from en4dvar.config import Config
 from en4dvar.diagnosis.analysis import IterationRecord, Progress, Record
-from en4dvar.estimation.assimilate import LoopState, assimilate
+from en4dvar.estimation.assimilate import assimilate
 from en4dvar.estimation.summary import brief, dataset_rows, remarks, summarise
-from en4dvar.executor import Executor
+from en4dvar.executor import Executor, SerialExecutor
 from en4dvar.executor.base import CommonValue
 from en4dvar.inputs.asked import DataFile
 from en4dvar.plumbing.tables import csv_text
 from en4dvar.priors.prior import own_seed
 from en4dvar.problem import InverseProblem
 from en4dvar.results.checkpoint import Keeper, digest, encode_text
+from en4dvar.results.journal import Journal, KnownRuns
 from en4dvar.results.netcdf import to_bytes
 from en4dvar.results.packed import packed
 from en4dvar.results.seal import SealedBytes
@@ -40,18 +41,17 @@ class Job:
     """The estimate of one data set; picklable, so that it can be done anywhere: what it has in common with the others
     is pickled once.
 
-    ``source``: its data file; ``attributes``, beside the common ones, go into the file of its result. ``keeper`` keeps
-    the state of the iterations; a worker that does not see its folder keeps none. ``resume`` is where to start.
-    ``stop`` gives the job up after the iteration under way (within one process only). ``alone``: the result is a file
-    of its own, not one of a pack.
+    ``source``: its data file; ``attributes``, beside the common ones, go into the file of its result. For the
+    forward runs ``before``, ``keeper`` and ``stop`` see :class:`Journal`. ``alone``: the result is a file of its own,
+    not one of a pack.
     """
 
     common: CommonValue[Common]
     name: str
     source: DataFile
     attributes: Mapping[str, Any] = field(default_factory=dict)
+    before: KnownRuns = field(default_factory=KnownRuns)
     keeper: Keeper | None = None
-    resume: LoopState | None = None
     stop: threading.Event | None = None
     alone: bool = False
 
@@ -62,13 +62,6 @@ class Job:
         Raises what :func:`~en4dvar.assembly.build.build_one` does.
         """
         return build_one(self.common.value[0], self.name, self.source)
-
-    def keep(self, state: Callable[[], LoopState]) -> None:
-        """Keep the state of the iterations. Raises :class:`StoppedError` where the job was given up."""
-        if self.stop is not None and self.stop.is_set():
-            raise StoppedError
-        if self.keeper is not None and self.keeper.path.parent.is_dir():
-            self.keeper.keep(state)
 
 
 @dataclass(frozen=True)
@@ -84,10 +77,6 @@ class Estimate:
     records: tuple[Told, ...] = ()
 
 
-class StoppedError(Exception):
-    """The job was given up."""
-
-
 def estimate(job: Job, executor: Executor | None = None, progress: Progress | None = None) -> Estimate:
     """Assimilate one data set; members run on ``executor``, by default in this process.
 
@@ -98,7 +87,8 @@ def estimate(job: Job, executor: Executor | None = None, progress: Progress | No
     """
     config, attributes = job.common.value
     seed = own_seed(config.seed, job.name)
-    analysis = assimilate(job.problem, config.assimilation, seed, executor, progress, job.resume, keep=job.keep)
+    journal = Journal(executor or SerialExecutor(), job.before, job.keeper, job.stop)
+    analysis = assimilate(job.problem, config.assimilation, seed, journal, journal.untold(progress))
     groups = build_groups(analysis, {**attributes, **job.attributes})
     content: SealedBytes | bytes = to_bytes(groups) if job.alone else packed(groups)
     sha256 = content.sha256 if isinstance(content, SealedBytes) else digest(content)

@@ -9,7 +9,6 @@ from pathlib import Path
 
 from en4dvar.config import Config
 from en4dvar.diagnosis.analysis import IterationRecord, Progress, Record, StartRecord
-from en4dvar.estimation.assimilate import LoopState
 from en4dvar.estimation.summary import brief, summary_rows
 from en4dvar.executor import Executor, ExecutorError, SerialExecutor, ThreadsExecutor
 from en4dvar.executor.base import CommonValue
@@ -19,6 +18,7 @@ from en4dvar.plumbing.files import atomic_path, open_plain, readable, remove_fil
 from en4dvar.plumbing.tables import csv_text
 from en4dvar.problem import InverseProblem
 from en4dvar.results.checkpoint import FOLDER, Keeper, decode, encode_text, file_digest
+from en4dvar.results.journal import KnownRuns
 from en4dvar.results.pack import PACK, Entry, Pack, file_names, read_outcome
 from en4dvar.results.seal import SealedBytes
 from en4dvar.runs.campaign import Campaign, DatasetOutcome, Outcomes
@@ -207,12 +207,15 @@ class Worklist:
 
     def _job(self, d: Dataset, stop: threading.Event | None) -> Job:
         fingerprint, path = self._fingerprint(d), self._checkpoint(d)
-        resume = self.run.restore(d.iteration, fingerprint, LoopState, f"{d.name} is estimated from the start")
-        if resume is not None:
-            self.run.log.write(f"{d.name}: continued {resume.reached}")
+        before = (
+            self.run.restore(d.iteration, fingerprint, KnownRuns, f"{d.name} is estimated from the start")
+            or KnownRuns()
+        )
+        if before.given:
+            self.run.log.write(f"{d.name}: continued after {sum(map(len, before.given))} forward runs")
         keeper = Keeper(path, fingerprint, self.config.execution.checkpoint_every)
         own = {"data_sha256": self.run.identity.content[d.name]}
-        return Job(self.common, d.name, d.source, own, keeper, resume, stop, self.alone)
+        return Job(self.common, d.name, d.source, own, before, keeper, stop, self.alone)
 
     def _checkpoint(self, d: Dataset) -> Path:
         """Where its iterations are kept: in a folder that was looked at as the run began, where files are replaced or

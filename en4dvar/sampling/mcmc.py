@@ -99,29 +99,6 @@ class Chain:
         }
 
 
-@dataclass(frozen=True)
-class ChainState:
-    """All that the rest of a chain depends on: positions (steps, walkers, n) and log densities (steps, walkers) so far,
-    steps accepted (walkers,), and the state of numpy's ``RandomState`` (its key, position and stored normal draw)."""
-
-    samples: Array
-    log_density: Array
-    accepted: Array
-    random_key: Array
-    random_position: int
-    random_has_normal: int
-    random_normal: float
-
-    @property
-    def steps(self) -> int:
-        return len(self.samples)
-
-    def emcee_state(self, emcee: Any) -> Any:
-        """Where the walkers stand at the end, for emcee to go on."""
-        random = ("MT19937", self.random_key, self.random_position, self.random_has_normal, self.random_normal)
-        return emcee.State(self.samples[-1], log_prob=self.log_density[-1], random_state=random)
-
-
 def sample(
     log_density: Callable[[Array], Array],
     ensemble: Array,
@@ -130,8 +107,6 @@ def sample(
     walkers: int = 48,
     max_steps: int = 4000,
     target: float | None = None,
-    resume: ChainState | None = None,
-    keep: Callable[[ChainState], None] | None = None,
     look: Callable[[ChainRecord], None] | None = None,
     emulated: EmulatedCost | None = None,
     proposal: StudentMixture | None = None,
@@ -145,8 +120,7 @@ def sample(
     seed: of the walkers; the same seed gives the same bits.
     walkers: at least 2 (n + 1), even. max_steps: at most. target: effective sample size to reach in each direction
         (default: :data:`ENOUGH`).
-    resume: where an earlier call with the same arguments was interrupted; the chain has the same bits as without.
-    keep: called with the state of the chain at each look at convergence. look: with what it shows.
+    look: called with what each look at convergence shows.
     emulated: an approximation at no cost; it guides the walkers, which start from draws of it.
     proposal: covers all modes; walkers jump to draws of it.
 
@@ -158,24 +132,17 @@ def sample(
 
     n, target = ensemble.shape[1], ENOUGH if target is None else target
     walkers = max(walkers, 2 * (n + 1)) + max(walkers, 2 * (n + 1)) % 2
-    chain = resume
-    state = _start(emcee, log_density, ensemble, seed, walkers, emulated) if chain is None else chain.emcee_state(emcee)
+    state = _start(emcee, log_density, ensemble, seed, walkers, emulated)
     sampler = emcee.EnsembleSampler(walkers, n, log_density, vectorize=True, moves=_moves(emcee, emulated, proposal))
     sampler.log_prob_fn = log_density  # bare: emcee's wrapper prints every position where Ctrl-C comes
     while True:
-        steps = 0 if chain is None else chain.steps
-        if chain is not None:
-            judged = _judged(chain, target, ensemble)
-            if look is not None:
-                look(ChainRecord(steps, float(np.max(judged.r_hat)), float(np.min(judged.effective))))
-            if judged.converged or steps >= max_steps:
-                return judged
-        sampler.reset()
-        block = min(max_steps - steps, max(BLOCK, steps // 4))
-        state = sampler.run_mcmc(state, block, skip_initial_state_check=True)
-        chain = _longer(chain, sampler, state.random_state)
-        if keep is not None:
-            keep(chain)
+        steps = sampler.backend.iteration
+        state = sampler.run_mcmc(state, min(max_steps - steps, max(BLOCK, steps // 4)), skip_initial_state_check=True)
+        judged = _judged(sampler, target, ensemble)
+        if look is not None:
+            look(ChainRecord(judged.steps, float(np.max(judged.r_hat)), float(np.min(judged.effective))))
+        if judged.converged or judged.steps >= max_steps:
+            return judged
 
 
 def _moves(emcee: Any, emulated: EmulatedCost | None, proposal: StudentMixture | None) -> list[tuple[Any, float]]:
@@ -189,34 +156,24 @@ def _moves(emcee: Any, emulated: EmulatedCost | None, proposal: StudentMixture |
     return [(emcee.moves.DEMove(), near * DE_SHARE), (emcee.moves.StretchMove(), near * (1 - DE_SHARE)), *far]
 
 
-def _judged(chain: ChainState, target: float, ensemble: Array) -> Chain:
+def _judged(sampler: Any, target: float, ensemble: Array) -> Chain:
     """The part of a chain after burn-in, and what it says of its convergence."""
-    samples = chain.samples[int(BURN_IN * chain.steps) :]
+    steps = sampler.backend.iteration
+    samples = sampler.get_chain()[int(BURN_IN * steps) :]
     r_hat, effective = split_r_hat(samples), effective_sample_size(samples)
     flat = samples.reshape(-1, ensemble.shape[1])
     spread = flat.std(axis=0)
     return Chain(
         samples=samples,
-        log_density=chain.log_density[-len(samples) :],
+        log_density=sampler.get_log_prob()[-len(samples) :],
         r_hat=r_hat,
         effective=effective,
-        acceptance=float(np.mean(chain.accepted / chain.steps)),
-        steps=chain.steps,
+        acceptance=float(np.mean(sampler.backend.accepted / steps)),
+        steps=steps,
         converged=bool(np.all(r_hat < MAX_R_HAT) and np.all(effective >= target)),
         moved=(flat.mean(axis=0) - ensemble.mean(axis=0)) / spread,
         widened=spread / ensemble.std(axis=0, ddof=1),
     )
-
-
-def _longer(chain: ChainState | None, sampler: Any, random: Any) -> ChainState:
-    """The chain so far, if any, and the block that the sampler has just run."""
-    samples, log_density, accepted = sampler.get_chain(), sampler.get_log_prob(), sampler.backend.accepted
-    if chain is not None:
-        samples = np.concatenate([chain.samples, samples])
-        log_density = np.concatenate([chain.log_density, log_density])
-        accepted = chain.accepted + accepted
-    _, key, position, has_normal, normal = random
-    return ChainState(samples, log_density, accepted, key, int(position), int(has_normal), float(normal))
 
 
 def _start(

@@ -220,15 +220,12 @@ def refined(
     seed: int,
     *,
     looking: bool,
-    resume: Callable[[], mcmc.ChainState | None],
-    keep: Callable[[mcmc.ChainState], None],
     look: Callable[[ChainRecord], None],
 ) -> Refined:
     """Members of the posterior that ``minima`` are the modes of, in place of ``posterior`` (N, n).
 
     By a Markov chain where the settings want one or weighted draws are too few. ``looking``: end at a draw that lies
-    lower than all minima. ``resume`` is asked when the chain begins; it, ``keep``, ``look``: see
-    :func:`~en4dvar.sampling.mcmc.sample`.
+    lower than all minima. ``look``: see :func:`~en4dvar.sampling.mcmc.sample`.
     """
 
     def cost(x: Array) -> Array:
@@ -257,8 +254,6 @@ def refined(
         start,
         seed,
         target=enough,
-        resume=resume(),
-        keep=keep,
         look=look,
         emulated=emulated,
         proposal=draws.proposal if several and draws is not None else None,

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from chaotic import chaotic
+from cut_anywhere import assert_cut_anywhere
 from toys import Linear, make_problem, with_noise
 
 from en4dvar.estimation.assimilate import assimilate
@@ -49,12 +50,7 @@ def test_a_linear_problem_ends_where_it_does_without(correlated):
 
 def test_an_interrupted_run_goes_on_to_the_same_bits():
     problem, _ = chaotic(seed=3)
-    settings, states = AssimilationSettings(**OPTIONS, lengthen=4), []
-    whole = assimilate(problem, settings, seed=1, keep=lambda state: states.append(state()))
-    for state in (states[0], states[-1]):
-        again = assimilate(problem, settings, seed=1, resume=state)
-        np.testing.assert_array_equal(again.posterior, whole.posterior)
-        assert again.forward_runs == whole.forward_runs
+    assert_cut_anywhere(problem, AssimilationSettings(**OPTIONS, lengthen=4), 1, cuts=4)
 
 
 def test_readings_at_one_time_have_no_window_to_lengthen():

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from same_bits import assert_same_bits
+from cut_anywhere import assert_cut_anywhere
 from toys import Decay, Wave, make_observations, make_problem, with_discrepancy
 from varying_models import Ramp
 from wells import Parting, UnlikeWells, Wells, hidden_well, mass_of_positive, parted, two_wells
@@ -10,14 +10,15 @@ from wells import Parting, UnlikeWells, Wells, hidden_well, mass_of_positive, pa
 from en4dvar.descent.search import Search
 from en4dvar.diagnosis.analysis import Descents, StartRecord
 from en4dvar.estimation import stages
-from en4dvar.estimation.assimilate import LoopState, assimilate
+from en4dvar.estimation.assimilate import assimilate
 from en4dvar.estimation.stages import Stages
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.priors.varying import RandomWalk
 from en4dvar.problem import InverseProblem
-from en4dvar.results.checkpoint import decode, encode
 from en4dvar.sampling import refine
 from en4dvar.schemes.settings import AssimilationSettings
+
+search_from = Search._from
 
 
 @pytest.mark.parametrize("settings", [{}, {"refine": "none"}, {"start": "prior-mean"}])
@@ -121,42 +122,15 @@ def test_no_draws_beyond_the_ensemble_where_the_lowest_minimum_is_plausible(monk
 
 
 @pytest.mark.slow
-def test_a_search_among_draws_goes_on_from_any_state_to_the_same_bits():
-    problem, settings, seen = hidden(4), AssimilationSettings(), set()
-    whole, states = interrupted(problem, settings, 4)
-    for state in states:
-        begun = state.search
-        if begun is None:
-            continue
-        descents = begun.comparison.descents if begun.comparison else ()
-        among = max(*state.tried, *(i for d in descents for i in d.members)) > 48
-        seen.add((among, begun.comparison is not None, begun.rival is not None))
-        assert_same_bits(interrupted(problem, settings, 4, state)[0], whole)
-    assert {kind[1:] for kind in seen if kind[0]} == {(True, False), (False, False)}
-
-
-def interrupted(problem, settings, seed, resume=None):
-    states = []
-    analysis = assimilate(problem, settings, seed, resume=resume, keep=lambda state: states.append(state()))
-    return analysis, [decode(encode(state), LoopState) for state in states]
+def test_a_search_among_draws_goes_on_to_the_same_bits():
+    assert max(assert_cut_anywhere(hidden(4), AssimilationSettings(), 4, cuts=20).descents.members) <= 48
 
 
 @pytest.mark.slow
-def test_a_search_goes_on_from_any_state_to_the_same_bits():
-    settings, seen = AssimilationSettings(start="prior-mean"), set()
+def test_a_search_goes_on_to_the_same_bits():
     for seed in (3, 7):
         problem = two_wells(UnlikeWells, compiled=seed == 7, mean=-0.3, seed=seed)
-        whole, states = interrupted(problem, settings, seed)
-        for i, state in enumerate(states):
-            if state.search is None:
-                continue
-            begun = state.search
-            seen.add((begun.over > 0, begun.comparison is not None, begun.rival is not None))
-            again, rest = interrupted(problem, settings, seed, state)
-            assert_same_bits(again, whole)
-            assert all(r.search and r.search.over >= begun.over for r in rest)
-            assert len(rest) <= len(states) - i + 1
-    assert seen == {(False, True, False), (False, False, True), (True, True, False), (True, False, False)}
+        assert_cut_anywhere(problem, AssimilationSettings(start="prior-mean"), seed, cuts=25)
 
 
 @pytest.mark.parametrize("refine", ["none", "auto"])
@@ -167,12 +141,9 @@ def test_a_descent_from_where_nothing_changes_goes_on_to_the_same_bits(refine):
     plain = InverseProblem(model, model.observables[0], make_observations(times, values, 0.05), Prior((first,)))
     problem = plain.varied([RandomWalk.of(model, first, (2.0,), 0.5)])
     settings = AssimilationSettings(members=16, refine=refine, what_if=False)
-    whole, states = interrupted(problem, settings, 3)
+    whole = assert_cut_anywhere(problem, settings, 3, cuts=9)
     assert whole.descents.members.count(-2) == 1
     assert assimilate(plain, settings, 3).descents.members.count(-2) == 0
-    searching = [state for state in states if state.search]
-    for state in searching[:: max(1, len(searching) // 8)]:
-        assert_same_bits(interrupted(problem, settings, 3, state)[0], whole)
 
 
 def in_the_wrong_well(monkeypatch):
@@ -213,11 +184,7 @@ def test_a_draw_that_leads_nowhere_is_told(monkeypatch):
 def test_a_chain_behind_a_descent_from_a_draw_goes_on_to_the_same_bits(monkeypatch):
     problem, settings = in_the_wrong_well(monkeypatch)
     monkeypatch.setattr(refine, "TOO_FEW", np.inf)
-    whole, states = interrupted(problem, settings, 1)
-    assert whole.descents.members == (-1, -2)
-    of_chain = [state for state in states if state.refinement is not None]
-    assert_same_bits(interrupted(problem, settings, 1, of_chain[-1])[0], whole)
-    assert_same_bits(interrupted(problem, settings, 1, states[0])[0], whole)
+    assert assert_cut_anywhere(problem, settings, 1, cuts=3).descents.members == (-1, -2)
 
 
 def excused(truth):
@@ -237,11 +204,9 @@ def test_no_minimum_is_missed_because_a_discrepancy_excuses_whatever_is_missed(t
 
 
 @pytest.mark.slow
-def test_what_follows_a_search_with_errors_held_goes_on_from_any_state_to_the_same_bits():
-    problem, settings = excused(3.0), AssimilationSettings(members=12, refine="none", what_if=False)
-    whole, states = interrupted(problem, settings, 4)
-    for state in states[:: len(states) // 4]:
-        assert_same_bits(interrupted(problem, settings, 4, state)[0], whole)
+def test_what_follows_a_search_with_errors_held_goes_on_to_the_same_bits():
+    settings = AssimilationSettings(members=12, refine="none", what_if=False)
+    assert_cut_anywhere(excused(3.0), settings, 4, cuts=5)
 
 
 def test_where_descents_ended_in_words():
@@ -299,18 +264,11 @@ def test_a_future_that_no_minimum_expects_is_told():
 @pytest.mark.slow
 @pytest.mark.parametrize("settings", [{}, {"refine": "none"}, {"start": "prior-mean"}])
 @pytest.mark.parametrize("off", [0.0, 30.0])
-def test_a_search_after_the_window_goes_on_from_any_state_to_the_same_bits(settings, off, monkeypatch):
+def test_a_search_after_the_window_goes_on_to_the_same_bits(settings, off, monkeypatch):
     if settings:
         alone(monkeypatch)
-    problem, seen = parted(UnlikeParting, compiled=settings.get("refine") != "none", off=off), set()
-    whole, states = interrupted(problem, AssimilationSettings(**settings), 1)
-    led = 48 + 1 + 48 // 3
-    for state in states:
-        begun = state.search
-        if begun is not None:
-            descents = begun.comparison.descents if begun.comparison else ()
-            among = max(*state.tried, *(i for d in descents for i in d.members))
-            seen.add((among == led, begun.comparison is not None))
-        again = interrupted(problem, AssimilationSettings(**settings), 1, state)[0]
-        assert_same_bits(again, whole)
-    assert {(True, True), (True, False)} <= seen
+    problem = parted(UnlikeParting, compiled=settings.get("refine") != "none", off=off)
+    led, told = 48 + 1 + 48 // 3, []
+    monkeypatch.setattr(Search, "_from", lambda self, outcome, i: told.append(i) or search_from(self, outcome, i))
+    assert_cut_anywhere(problem, AssimilationSettings(**settings), 1, cuts=9)
+    assert led in told

@@ -9,10 +9,6 @@ from pathlib import Path
 import pytest
 from run_files import assert_same_results, configuration, kill_after_writes, make_campaign, resumed_until_done, run_cli
 
-from en4dvar.estimation.assimilate import LoopState
-from en4dvar.inputs.asked import DataFile
-from en4dvar.results.checkpoint import read_checkpoint
-from en4dvar.results.fingerprint import identity
 from en4dvar.runs.interrupt import Interrupted
 from en4dvar.runs.runner import run_campaign
 from en4dvar.sampling import mcmc
@@ -29,7 +25,7 @@ def make(folder: Path, sets: int) -> Path:
 
 
 def test_interrupted_in_the_chain(tmp_path, monkeypatch):
-    """At the second look: the chain of the checkpoint is taken up, not begun again."""
+    """At the second look: the runs of the chain are taken up, and it is told from the last of them on."""
     monkeypatch.setattr(mcmc, "BLOCK", 20)
     monkeypatch.setattr(mcmc.sample, "__kwdefaults__", {**mcmc.sample.__kwdefaults__, "max_steps": 80})
     path, out = make(tmp_path, 1), tmp_path / "run"
@@ -37,30 +33,24 @@ def test_interrupted_in_the_chain(tmp_path, monkeypatch):
 
     sample, looks = mcmc.sample, []
 
-    def stopped(*arguments, keep, **options):
-        def look(state):
-            keep(state)
-            looks.append(len(state.samples))
+    def stopped(*arguments, look, **options):
+        def heard(record):
+            look(record)
+            looks.append(record.steps)
             if len(looks) == 2:
                 raise KeyboardInterrupt
 
-        return sample(*arguments, keep=look, **options)
+        return sample(*arguments, look=heard, **options)
 
     monkeypatch.setattr(mcmc, "sample", stopped)
     with pytest.raises(Interrupted):
         run_campaign(configuration(path, out))
     assert looks == [20, 40]
-    config = configuration(path, out)
-    fingerprint = identity(
-        config.resolved, config.model, {"set0": DataFile(tmp_path / "data" / "set0.csv")}
-    ).of_dataset("set0")
-    state = read_checkpoint(out / "checkpoints" / "set0.iteration", fingerprint, LoopState)
-    assert state is not None
-    assert state.refinement is not None
-    assert len(state.refinement.chain.samples) == 40
-    run_campaign(config, resume=True)
-    assert looks == [20, 40, 60, 80]
-    assert re.findall(r"set0: chain, +(\d+) steps  R-hat", (out / "run.log").read_text()) == ["20", "40", "60", "80"]
+    run_campaign(configuration(path, out), resume=True)
+    assert looks == [20, 40, 20, 40, 60, 80]
+    log = (out / "run.log").read_text()
+    assert re.findall(r"set0: chain, +(\d+) steps  R-hat", log) == ["20", "40", "40", "60", "80"]
+    assert re.search(r"set0: continued after \d{4} forward runs", log)
     assert_same_results(out, tmp_path / "quiet")
 
 
@@ -84,7 +74,7 @@ def kill_and_resume(folder: Path, kills: int, seed: int) -> None:
         finished += 1
 
 
-@pytest.mark.slow  # test_resume_loop.py resumes from every look at the chain
+@pytest.mark.slow  # test_resume_loop.py cuts a chain, too
 def test_killed_and_resumed(tmp_path):
     """SIGKILL at a random moment."""
     kill_and_resume(tmp_path, 1, 1)

@@ -1,0 +1,78 @@
+"""The forward runs of a data set under way, in the order in which they were asked for.
+
+Between them nothing is random and nothing is read, so that an interrupted estimate that begins again asks for the same
+ones: it is given those that were kept, makes the others, and comes to the same bits. This holds of everything that runs
+the model: prior forecast, start, iterations, searches, chains, importance draws and what-if fits.
+"""
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from en4dvar.diagnosis.analysis import Progress
+from en4dvar.ensemble.forecast import Forecast
+from en4dvar.executor import Executor
+from en4dvar.model.state import Array
+from en4dvar.results.checkpoint import Keeper, digest
+
+LARGEST = 2**27  # bytes of a journal; what follows is run again
+
+
+@dataclass(frozen=True)
+class KnownRuns:
+    """Forecasts ``given`` to what was ``asked``, by its digest."""
+
+    asked: tuple[str, ...] = ()
+    given: tuple[Forecast, ...] = ()
+
+
+class StoppedError(Exception):
+    """The data set was given up."""
+
+
+class Journal(Executor):
+    """An ``executor`` of forward runs that are kept, and that are not made where they are known from ``before``.
+
+    ``keeper`` writes them to a file; a worker that does not see its folder keeps none. ``stop`` gives the data set up
+    at its next forecast (within one process only).
+    """
+
+    def __init__(
+        self, executor: Executor, before: KnownRuns = KnownRuns(), keeper: Keeper | None = None,
+        stop: threading.Event | None = None,
+    ):  # fmt: skip
+        self.executor, self.workers, self.reads = executor, executor.workers, executor.reads
+        self.asked, self.given, self.at = list(before.asked), list(before.given), 0
+        self.room = LARGEST - sum(run.nbytes for run in before.given)
+        self.keeper, self.stop = keeper, stop
+
+    def untold(self, progress: Progress | None) -> Progress | None:
+        """What hears of what follows from the last run that is known on: the rest was told before the interruption."""
+        return progress and (lambda name, record: progress(name, record) if self.at >= len(self.asked) else None)
+
+    def once(self, run: Callable[..., Any], *asked: Array) -> Any:
+        if self.stop is not None and self.stop.is_set():
+            raise StoppedError
+        at, key = self.at, digest(b"".join(part.tobytes() for part in asked))
+        self.at += 1
+        if at < len(self.asked) and self.asked[at] == key:
+            return self.given[at]
+        del self.asked[at:], self.given[at:]
+        forecast = run(*asked)
+        seen = self.keeper is not None and self.keeper.path.parent.is_dir()
+        if self.keeper is not None and seen and at == len(self.asked) and self.room > 0:
+            self.asked.append(key)
+            self.given.append(forecast)
+            self.room -= forecast.nbytes
+            self.keeper.keep(lambda: KnownRuns(tuple(self.asked), tuple(self.given)))
+        return forecast
+
+    def map(self, *arguments: Any, **named: Any) -> Any:
+        return self.executor.map(*arguments, **named)
+
+    def trajectories(self, *arguments: Any) -> Any:
+        return self.executor.trajectories(*arguments)
+
+    def close(self) -> None:
+        """The executor is closed by who made it."""
