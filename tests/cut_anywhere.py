@@ -41,7 +41,7 @@ def kept_runs(problem, settings, seed):
 
 def gone_on(problem, settings, seed, runs, count):
     """The analysis after ``count`` of its forecasts were kept, and how many more it made."""
-    journal = Counted(SerialExecutor(), KnownRuns(runs.asked[:count], runs.given[:count]))
+    journal = Counted(SerialExecutor(), KnownRuns(runs.keys[:count], runs.forecasts[:count]))
     return assimilate(problem, settings, seed, journal), journal.made
 
 
@@ -49,7 +49,7 @@ def assert_cut_anywhere(problem, settings, seed, cuts=None):
     """Cut after each forecast, or ``cuts`` times at even distances: the same bits, and nothing is run twice."""
     whole, runs = kept_runs(problem, settings, seed)
     assert_same_bits(whole, assimilate(problem, settings, seed))
-    last = len(runs.asked)
+    last = len(runs.keys)
     assert last > 3
     for count in range(last + 1) if cuts is None else {round(last * i / (cuts - 1)) for i in range(cuts)}:
         again, made = gone_on(problem, settings, seed, runs, count)

@@ -84,8 +84,9 @@ class Stages:
             again = partial(space.forecast, extra_times=self.grid)
             check_forecast_repeats(self.problem, prior_run[:-1], lambda some: again(space.members[some]))
         space.check_derivatives(prior_run)
-        start = Start(Descent(Weights.prior(len(space.members))))
-        if self.minimiser is not None:
+        if self.minimiser is None:
+            start = Start(Descent(Weights.prior(len(space.members))))
+        else:
             start = choose_start(space, prior_run, self.tell)
         for record in start.descent.records:
             self.tell(record)

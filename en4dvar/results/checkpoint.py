@@ -8,22 +8,23 @@ the seed: their streams are counter-based and have no state.
 Every file starts with one line: format, version, kind, fingerprint of the run and the data set, and the SHA-256 of the
 rest. A file that was cut short, altered, or written by another run is named and not used.
 
-What it holds are frozen dataclasses of numbers, text and arrays, as an ``.npz`` archive: arrays as they are, everything
-else in one JSON text in which arrays are referred to by their name. What is read back is checked against the
+What it holds are frozen dataclasses of numbers, text and arrays: one JSON text, which says of each array its kind, its
+shape, its order and where it begins, and after it the numbers of all arrays. What is read back is checked against the
 annotations of the dataclass. Nothing that is read is executed (no pickle).
 """
 
 import functools
 import hashlib
-import io
 import json
+import math
+import struct
 import time
 import types
 import typing
 from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, Literal, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -33,10 +34,10 @@ from en4dvar.plumbing.files import atomic_path, open_plain, read_at_most
 
 D = TypeVar("D")
 FORMAT = "en4dvar-checkpoint"
-VERSION = "3"
+VERSION = "4"
 LONGEST = 64_000_000_000  # bytes of a checkpoint
 FOLDER = "checkpoints"
-_TEXT = "content"
+_HEAD = struct.Struct("<cQ")  # before what holds arrays: a letter and the size of the text
 
 
 class CheckpointError(OutputError):
@@ -135,42 +136,41 @@ def file_digest(path: Path) -> str:
 
 def encode(value: Any) -> bytes:
     """Bytes of a dataclass whose fields are float, int, bool, str, None, float arrays, tuples and dataclasses."""
-    arrays: dict[str, np.ndarray[Any, Any]] = {}
-    text = json.dumps(_plain(value, arrays))  # repr of a float is exact; NaN and Infinity are kept
-    buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **{_TEXT: np.array(text)}, **arrays)
-    return buffer.getvalue()
+    numbers = bytearray()
+    text = json.dumps(_plain(value, numbers)).encode("ascii")  # repr of a float is exact; NaN and Infinity are kept
+    return b"".join((_HEAD.pack(b"A", len(text)), text, numbers))
 
 
 def encode_text(value: Any) -> bytes:
     """As :func:`encode`, of a dataclass without arrays: its JSON text alone."""
-    return json.dumps(_plain(value, {})).encode("ascii")
+    return json.dumps(_plain(value, bytearray())).encode("ascii")
 
 
 def decode(content: bytes, kind: type[D]) -> D:
     """The dataclass of :func:`encode` or :func:`encode_text`. Raises :class:`ValueError` where the bytes are not one of
     ``kind``.
     """
-    with retold((OSError, KeyError, TypeError, ValueError, EOFError), ValueError, f"not a {kind.__name__}: "):
-        arrays: dict[str, np.ndarray[Any, Any]] = {}
-        text: bytes | str = content
+    with retold((KeyError, TypeError, ValueError, struct.error), ValueError, f"not a {kind.__name__}: "):
+        text, numbers = content, bytearray()
         if not content.startswith(b"{"):
-            with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-                arrays = {name: archive[name] for name in archive.files}
-            text = str(arrays.pop(_TEXT))
-        value: D = _reader(typing.cast(Any, kind))(json.loads(text), arrays)
+            end = _HEAD.size + _HEAD.unpack_from(content)[1]
+            text, numbers = content[_HEAD.size : end], bytearray(content[end:])
+        value: D = _reader(typing.cast(Any, kind))(json.loads(text), numbers)
     return value
 
 
-def _plain(value: Any, arrays: dict[str, np.ndarray[Any, Any]]) -> Any:
+def _plain(value: Any, numbers: bytearray) -> Any:
     if is_dataclass(value):
-        return {f.name: _plain(getattr(value, f.name), arrays) for f in fields(value)}
+        return {f.name: _plain(getattr(value, f.name), numbers) for f in fields(value)}
     if isinstance(value, np.ndarray):
-        name = f"a{len(arrays)}"
-        arrays[name] = value
-        return {"array": name}
+        order: Literal["F", "C"] = (
+            "F" if value.flags.fnc else "C"
+        )  # another order: other sums
+        told = [value.dtype.str, value.shape, order, len(numbers)]
+        numbers += value.tobytes(order)
+        return told
     if isinstance(value, tuple):
-        return [_plain(item, arrays) for item in value]
+        return [_plain(item, numbers) for item in value]
     if isinstance(value, np.generic):
         return value.item()
     if value is None or isinstance(value, bool | int | float | str):
@@ -178,8 +178,7 @@ def _plain(value: Any, arrays: dict[str, np.ndarray[Any, Any]]) -> Any:
     raise TypeError(f"cannot store a {type(value).__name__}")
 
 
-_Arrays = dict[str, np.ndarray[Any, Any]]
-_Reader = Callable[[Any, _Arrays], Any]  # what the JSON text says → the value of a type
+_Reader = Callable[[Any, bytearray], Any]  # what the JSON text says, and the numbers of arrays → the value of a type
 
 
 @functools.cache  # a campaign reads as many of one kind as it has data sets
@@ -188,15 +187,15 @@ def _reader(kind: Any) -> _Reader:
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin in (typing.Union, types.UnionType):
         other = _reader(next(a for a in arguments if a is not type(None)))
-        return lambda raw, arrays: None if raw is None and type(None) in arguments else other(raw, arrays)
+        return lambda raw, numbers: None if raw is None and type(None) in arguments else other(raw, numbers)
     if origin in (np.ndarray, npt.NDArray):  # from NumPy 2.5 on NDArray is an alias with a name of its own
-        return lambda raw, arrays: arrays[raw["array"]]
+        return _array
     if origin is tuple and arguments[1:] == (Ellipsis,):
         item = _reader(arguments[0])
-        return lambda raw, arrays: tuple(item(part, arrays) for part in raw)
+        return lambda raw, numbers: tuple(item(part, numbers) for part in raw)
     if origin is tuple:
         items = tuple(map(_reader, arguments))
-        return lambda raw, arrays: tuple(read(part, arrays) for read, part in zip(items, raw, strict=True))
+        return lambda raw, numbers: tuple(read(part, numbers) for read, part in zip(items, raw, strict=True))
     if origin is typing.Literal:
         return functools.partial(_choice, arguments)
     if is_dataclass(kind):
@@ -205,19 +204,28 @@ def _reader(kind: Any) -> _Reader:
     return functools.partial(_simple, (int, float) if kind is float else (kind,))
 
 
-def _dataclass(kind: Any, readers: dict[str, _Reader], raw: Any, arrays: _Arrays) -> Any:
+def _array(raw: Any, numbers: bytearray) -> np.ndarray[Any, Any]:
+    kind, shape, order, begin = raw
+    count = math.prod(shape)
+    if np.dtype(kind).hasobject or count < 0 or begin < 0:
+        raise ValueError("an array is nowhere")
+    values: np.ndarray[Any, Any] = np.frombuffer(numbers, kind, count, begin).reshape(shape, order=order)
+    return values.copy(order)
+
+
+def _dataclass(kind: Any, readers: dict[str, _Reader], raw: Any, numbers: bytearray) -> Any:
     if set(raw) != set(readers):
         raise ValueError(f"the fields of {kind} differ")
-    return kind(**{name: readers[name](item, arrays) for name, item in raw.items()})
+    return kind(**{name: readers[name](item, numbers) for name, item in raw.items()})
 
 
-def _choice(choices: tuple[Any, ...], raw: Any, _: _Arrays) -> Any:
+def _choice(choices: tuple[Any, ...], raw: Any, _: bytearray) -> Any:
     if raw not in choices:
         raise ValueError(f"{raw!r} is not one of {choices}")
     return raw
 
 
-def _simple(kinds: tuple[type, ...], raw: Any, _: _Arrays) -> Any:
+def _simple(kinds: tuple[type, ...], raw: Any, _: bytearray) -> Any:
     if type(raw) not in kinds:
         raise TypeError(f"{raw!r} is not a {kinds[-1].__name__}")
     return raw

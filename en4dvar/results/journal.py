@@ -21,10 +21,10 @@ LARGEST = 2**27  # bytes of a journal; what follows is run again
 
 @dataclass(frozen=True)
 class KnownRuns:
-    """Forecasts ``given`` to what was ``asked``, by its digest."""
+    """``forecasts``, and digests of the arrays (``keys``) that they were made of."""
 
-    asked: tuple[str, ...] = ()
-    given: tuple[Forecast, ...] = ()
+    keys: tuple[str, ...] = ()
+    forecasts: tuple[Forecast, ...] = ()
 
 
 class StoppedError(Exception):
@@ -43,29 +43,29 @@ class Journal(Executor):
         stop: threading.Event | None = None,
     ):  # fmt: skip
         self.executor, self.workers, self.reads = executor, executor.workers, executor.reads
-        self.asked, self.given, self.at = list(before.asked), list(before.given), 0
-        self.room = LARGEST - sum(run.nbytes for run in before.given)
+        self.keys, self.forecasts, self.at = list(before.keys), list(before.forecasts), 0
+        self.room = LARGEST - sum(run.nbytes for run in before.forecasts)
         self.keeper, self.stop = keeper, stop
 
     def untold(self, progress: Progress | None) -> Progress | None:
         """What hears of what follows from the last run that is known on: the rest was told before the interruption."""
-        return progress and (lambda name, record: progress(name, record) if self.at >= len(self.asked) else None)
+        return progress and (lambda name, record: progress(name, record) if self.at >= len(self.keys) else None)
 
     def once(self, run: Callable[..., Any], *asked: Array) -> Any:
         if self.stop is not None and self.stop.is_set():
             raise StoppedError
         at, key = self.at, digest(b"".join(part.tobytes() for part in asked))
         self.at += 1
-        if at < len(self.asked) and self.asked[at] == key:
-            return self.given[at]
-        del self.asked[at:], self.given[at:]
+        if at < len(self.keys) and self.keys[at] == key:
+            return self.forecasts[at]
+        del self.keys[at:], self.forecasts[at:]
         forecast = run(*asked)
         seen = self.keeper is not None and self.keeper.path.parent.is_dir()
-        if self.keeper is not None and seen and at == len(self.asked) and self.room > 0:
-            self.asked.append(key)
-            self.given.append(forecast)
+        if self.keeper is not None and seen and at == len(self.keys) and self.room > 0:
+            self.keys.append(key)
+            self.forecasts.append(forecast)
             self.room -= forecast.nbytes
-            self.keeper.keep(lambda: KnownRuns(tuple(self.asked), tuple(self.given)))
+            self.keeper.keep(lambda: KnownRuns(tuple(self.keys), tuple(self.forecasts)))
         return forecast
 
     def map(self, *arguments: Any, **named: Any) -> Any:

@@ -211,8 +211,8 @@ class Worklist:
             self.run.restore(d.iteration, fingerprint, KnownRuns, f"{d.name} is estimated from the start")
             or KnownRuns()
         )
-        if before.given:
-            self.run.log.write(f"{d.name}: continued after {sum(map(len, before.given))} forward runs")
+        if before.forecasts:
+            self.run.log.write(f"{d.name}: continued after {sum(map(len, before.forecasts))} forward runs")
         keeper = Keeper(path, fingerprint, self.config.execution.checkpoint_every)
         own = {"data_sha256": self.run.identity.content[d.name]}
         return Job(self.common, d.name, d.source, own, before, keeper, stop, self.alone)

@@ -33,7 +33,7 @@ class Row:
         return re.search(".*".join(parts), text) is not None
 
 
-DONE = "every finished data set; the others continue from their last iteration"
+DONE = "every finished data set; the others continue from their last forward runs"
 ROWS = tuple(
     Row(*cells)
     for cells in (
@@ -77,7 +77,7 @@ ROWS = tuple(
          "{file}: damaged or incomplete (its checksum does not match); {data set} is estimated from the start", "0",
          "everything else"),
         ("checkpoint-older", "a checkpoint of another version",
-         "{file}: checkpoint format 0; this version reads 3; {data set} is estimated from the start", "0",
+         "{file}: checkpoint format 0; this version reads 4; {data set} is estimated from the start", "0",
          "everything else"),
         ("result-damaged", "a result file is altered",
          "{file}: damaged or altered since it was written (its checksum does not match)", "2",

@@ -259,7 +259,7 @@ def test_a_pack_of_another_version_is_named(quiet, tmp_path):
         pytest.param(flip, "checkpoint-damaged", marks=pytest.mark.fault("checkpoint-damaged")),
         pytest.param(cut, "checkpoint-damaged", marks=pytest.mark.fault("checkpoint-damaged")),
         pytest.param(
-            lambda content, _: content.replace(b"checkpoint 3 ", b"checkpoint 0 "),
+            lambda content, _: content.replace(b"checkpoint 4 ", b"checkpoint 0 "),
             "checkpoint-older",
             marks=pytest.mark.fault("checkpoint-older"),
         ),

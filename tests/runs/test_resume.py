@@ -166,7 +166,7 @@ def altered(content):
 
 
 def of_an_older_version(content):
-    return content.replace(b"en4dvar-checkpoint 3 ", b"en4dvar-checkpoint 0 ", 1)
+    return content.replace(b"en4dvar-checkpoint 4 ", b"en4dvar-checkpoint 0 ", 1)
 
 
 def of_another_run(content):
@@ -182,7 +182,7 @@ def foreign(content):
 REASONS = {
     cut_short: "damaged or incomplete",
     altered: "damaged or incomplete",
-    of_an_older_version: "checkpoint format 0; this version reads 3",
+    of_an_older_version: "checkpoint format 0; this version reads 4",
     of_another_run: "belongs to another run",
     foreign: "not a checkpoint of en4dvar",
 }

@@ -48,20 +48,20 @@ def test_other_runs_than_those_asked_for_are_not_taken():
     """From where a journal holds something else on, the model is run."""
     problem, settings = make_problem(Linear(("a", "b")), [1.0, -0.5]), AssimilationSettings(members=9)
     whole, runs = kept_runs(problem, settings, 3)
-    wrong = KnownRuns((*runs.asked[:2], "0" * 64, *runs.asked[3:]), runs.given)
-    again, made = gone_on(problem, settings, 3, wrong, len(wrong.asked))
+    wrong = KnownRuns((*runs.keys[:2], "0" * 64, *runs.keys[3:]), runs.forecasts)
+    again, made = gone_on(problem, settings, 3, wrong, len(wrong.keys))
     assert_same_bits(again, whole)
-    assert made == len(runs.asked) - 2
+    assert made == len(runs.keys) - 2
 
 
 def test_a_journal_that_is_full_keeps_what_it_has(monkeypatch):
     """What did not find room is run again, and the bits are the same."""
     problem, settings = make_problem(Decay(), [1.5, 1.2]), AssimilationSettings(members=9)
     whole, runs = kept_runs(problem, settings, 3)
-    monkeypatch.setattr(journal, "LARGEST", sum(run.nbytes for run in runs.given[:3]))
+    monkeypatch.setattr(journal, "LARGEST", sum(run.nbytes for run in runs.forecasts[:3]))
     full, some = kept_runs(problem, settings, 3)
     assert_same_bits(full, whole)
-    assert some.asked == runs.asked[:3]
+    assert some.keys == runs.keys[:3]
     again, made = gone_on(problem, settings, 3, some, 3)
     assert_same_bits(again, whole)
-    assert made == len(runs.asked) - 3
+    assert made == len(runs.keys) - 3

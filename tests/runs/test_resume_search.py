@@ -52,8 +52,8 @@ def test_killed_in_a_later_descent(tmp_path, further):
     whole = assimilate(first, SETTINGS, SEED)
     known = killed(tmp_path / "set.iteration", further)
     assert_same_bits(assimilate(other, SETTINGS, SEED, Journal(SerialExecutor(), known)), whole)
-    assert known.given
-    assert other.model.runs == first.model.runs - sum(map(len, known.given))
+    assert known.forecasts
+    assert other.model.runs == first.model.runs - sum(map(len, known.forecasts))
 
 
 def test_nothing_is_told_twice():
@@ -61,7 +61,7 @@ def test_nothing_is_told_twice():
     _, runs = kept_runs(problem(), SETTINGS, SEED)
     every, later = [], []
     assimilate(problem(), SETTINGS, SEED, progress=lambda _, record: every.append(record))
-    known = KnownRuns(runs.asked[:20], runs.given[:20])
+    known = KnownRuns(runs.keys[:20], runs.forecasts[:20])
     journal = Journal(SerialExecutor(), known)
     assimilate(problem(), SETTINGS, SEED, journal, journal.untold(lambda _, record: later.append(record)))
     assert 0 < len(later) < len(every)
