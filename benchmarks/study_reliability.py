@@ -3,9 +3,9 @@
     python benchmarks/study_reliability.py paper 200 [first]      # the paper's experiment, 0.3 % gel
     python benchmarks/study_reliability.py deciding 100 [first]   # one that tells the laws apart
 
-Adds a line an experiment to models/en4dvar_agarose/measured/reliability.csv, which the study's report shows; those
-found there are left out, so a run that was stopped continues. Truths are drawn from the priors the evidence integrates
-over, so stated probability and frequency must agree.
+Adds a line an experiment to benchmarks/measured/reliability.csv, those found there left out, so that a run which was
+stopped continues, and prints the table of docs/agarose_study.md. Truths are drawn from the priors the evidence
+integrates over, so stated probability and frequency must agree.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import csv
 import os
 import sys
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -26,15 +27,17 @@ from en4dvar.ensemble.forecast import forecast
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.estimation.population.own import own_draws
 from en4dvar.executor import ThreadsExecutor
+from en4dvar.model.state import Array
 from en4dvar.problem import InverseProblem
 from en4dvar.schemes.settings import AssimilationSettings
 from en4dvar_agarose.fits import probability
-from en4dvar_agarose.measured import FOLDER
 
 THREADS = int(os.environ.get("THREADS", "2"))
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
+FILE = Path(__file__).resolve().parent / "measured" / "reliability.csv"
 HEAD = ["experiment", "number", "generated_by", "delta_log_evidence"]
 FEWEST = 5
+EDGES = (0.5, 0.6, 0.75, 0.9, 0.99, 1.0 + 1e-9)  # of the stated probability of the favoured law
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,50 @@ EXPERIMENTS = {
     # 1 % gel, two frames a µs, 0.3 µm, 32 µs: growth, collapse and the first rebound
     "deciding": Experiment(gel="10", noise=0.3e-6, spacing=(0.4e-6, 0.6e-6), stop=-1.0, most=64),
 }
+
+
+@dataclass(frozen=True)
+class Bin:
+    """Experiments whose stated probabilities lie in one bin: mean ``stated``, share ``right``, how many, and the
+    binomial standard deviation of the share if what is stated were true.
+    """
+
+    stated: float
+    right: float
+    count: int
+    error: float
+
+
+def reliability(experiment: str) -> tuple[Array, Array]:
+    """Log-evidence of the quadratic over the neo-Hookean law (E,) and whether that law made the data (E,)."""
+    kept = csv.DictReader(FILE.read_text(encoding="utf-8").splitlines())
+    rows = [row for row in kept if row["experiment"] == experiment]
+    difference = np.array([float(row["delta_log_evidence"]) for row in rows])
+    return difference, np.array([row["generated_by"] == "qlkv" for row in rows])
+
+
+def bins(difference: Array, quadratic: Array, edges: tuple[float, ...] = EDGES) -> tuple[Bin, ...]:
+    """Stated probability of the favoured law against how often it is the right one; empty bins left out."""
+    stated = np.maximum(probability(difference), probability(-difference))
+    right = (difference > 0) == quadratic
+    shares = []
+    for low, high in pairwise(edges):
+        here = (stated >= low) & (stated < high)
+        if here.any():
+            # independent, not identical, trials
+            error = float(np.sqrt(np.sum(stated[here] * (1 - stated[here])))) / int(here.sum())
+            shares.append(Bin(float(stated[here].mean()), float(right[here].mean()), int(here.sum()), error))
+    return tuple(shares)
+
+
+def table() -> list[str]:
+    """Rows of docs/agarose_study.md: of each experiment all, and bin by bin."""
+    rows = []
+    for name in EXPERIMENTS:
+        kept = reliability(name)
+        shown = [(f"{name}, all", b) for b in bins(*kept, (EDGES[0], EDGES[-1]))] + [(name, b) for b in bins(*kept)]
+        rows += [f"| {words} | {b.stated:.3f} | {b.right:.3f} | {b.count} | {b.error:.3f} |" for words, b in shown]
+    return rows
 
 
 def problems(experiment: Experiment) -> dict[str, InverseProblem]:
@@ -102,8 +149,7 @@ def compare(bases: dict[str, InverseProblem], experiment: Experiment, number: in
 def main() -> None:
     name, count = sys.argv[1], int(sys.argv[2])
     first = int(sys.argv[3]) if len(sys.argv) > 3 else 0
-    file = FOLDER / "reliability.csv"
-    kept = list(csv.reader(file.read_text(encoding="utf-8").splitlines())) if file.exists() else [HEAD]
+    kept = list(csv.reader(FILE.read_text(encoding="utf-8").splitlines())) if FILE.exists() else [HEAD]
     done = {(row[0], row[1]) for row in kept[1:]}
     experiment = EXPERIMENTS[name]
     bases = problems(experiment)
@@ -111,14 +157,10 @@ def main() -> None:
         if (name, str(number)) in done:
             continue
         law, difference = compare(bases, experiment, number)
-        with file.open("a", encoding="utf-8", newline="") as stream:
+        with FILE.open("a", encoding="utf-8", newline="") as stream:
             writer = csv.writer(stream, lineterminator="\n")
-            writer.writerows([*([] if file.stat().st_size else [HEAD]), [name, number, law, f"{difference:.4f}"]])
-    rows = [row for row in csv.reader(file.read_text(encoding="utf-8").splitlines()) if row[0] == name]
-    delta = np.array([float(row[3]) for row in rows])
-    right = (delta > 0) == np.array([row[2] == "qlkv" for row in rows])
-    stated = np.maximum(probability(delta), probability(-delta))
-    print(f"{name}: {len(rows)} experiments, {right.mean():.3f} decided rightly, stated {stated.mean():.3f}")
+            writer.writerows([*([] if FILE.stat().st_size else [HEAD]), [name, number, law, f"{difference:.4f}"]])
+    print("\n".join(table()))
 
 
 if __name__ == "__main__":

@@ -7,7 +7,6 @@ import numpy as np
 from en4dvar.model.state import Array
 from en4dvar.report.chart import COLUMN, PAGE, Chart, Panel, Row, in_columns
 from en4dvar.report.svg import Captioned
-from en4dvar_agarose import measured
 from en4dvar_agarose.fits import LEVELS, Fit, Study
 from en4dvar_agarose.paper import NAMES, QUANTITIES, Quantity, Route
 from en4dvar_bubble.model import BubbleModel
@@ -53,10 +52,6 @@ def _figures(study: Study) -> Iterator[Captioned]:
     if study.comparisons:
         caption = "Log-evidence of the quadratic over the neo-Hookean law; shaded: undecidable."
         yield "evidence", caption, evidence(study)
-    if study.plan.synthetic:
-        caption = "Stated probability of the favoured law against how often it was right; bars: binomial standard "
-        caption += "deviation. Repeated synthetic experiments, half by each law."
-        yield "reliability", caption, reliability_figure()
 
 
 def gel_key(gel: str) -> str:
@@ -262,24 +257,3 @@ def evidence(study: Study) -> Chart:
                 0.98 * reach * np.sign(beyond), height[~inside], GEL_COLOURS[row], 4.5, label=words, kind="rings"
             )
     return Chart([Row(0.6 * COLUMN, [panel])])
-
-
-def reliability_figure() -> Chart:
-    """Measured once and shipped: (a) stated probability against frequency, (b) the differences themselves."""
-    left = Panel("stated probability", "right", title="(a)", xlim=(0.48, 1.02), ylim=(0.35, 1.05), legend=True)
-    right = Panel("Δ log-evidence for the true law (ends: beyond)", "experiments", title="(b)")
-    left.line([0.5, 1], [0.5, 1], "muted", 0.8)
-    edges = np.arange(-12, 31.5, 1.5)
-    for row, (name, words) in enumerate(measured.EXPERIMENTS.items()):
-        difference, quadratic = measured.reliability(name)
-        colour = GEL_COLOURS[row]
-        stated, share, error = np.array([(b.stated, b.right, b.error) for b in measured.bins(difference, quadratic)]).T
-        left.bars(stated, share - error, share + error, colour, 1.0)
-        left.dots(stated, share, colour, 4.0, label=words, kind="rings" if row else "dots")
-        favoured = np.where(quadratic, difference, -difference)  # positive: for the law that made the data
-        counts = np.histogram(np.clip(favoured, -12, 30), edges)[0]
-        right.stairs(edges, counts, colour, 0.4, 1.0, DASHES[row])
-    right.ylim = 0.0, right.limits()[1][1]
-    right.band([-3, 3], [0, 0], np.full(2, right.ylim[1]), "grid", 1.0)
-    right.marks.insert(0, right.marks.pop())  # behind the others
-    return Chart([Row(0.36 * PAGE, [left, right])], PAGE)

@@ -11,7 +11,7 @@ from en4dvar.report.chart import COLUMN
 from en4dvar.report.html import render
 from en4dvar.report.paper import save_chart
 from en4dvar.report.svg import svg
-from en4dvar_agarose import measured, paper, tables
+from en4dvar_agarose import paper, tables
 from en4dvar_agarose.figures import all_figures
 from en4dvar_agarose.fits import DECISIVE, HYPER, LEVELS, MISFIT, Study, probability, verdict
 from en4dvar_agarose.paper import LABELS, NAMES, QUANTITIES, ROUTES, Route
@@ -71,25 +71,8 @@ def _page(study: Study, figures: list[dict[str, Any]]) -> str:
         effective=_effective(study),
         comparison=_comparison(study),
         judged=_judged(study),
-        campaigns=list(_campaigns()) if study.plan.synthetic else [],
-        reliability=list(_reliability()) if study.plan.synthetic else [],
         figures=figures,
     )
-
-
-def _campaigns() -> Cells:
-    for c in measured.coverage():
-        share = f"{c.held / c.campaigns:.2f} ± {c.error:.2f}"
-        yield [c.gel, c.parameter, str(c.held), share, str(c.of_drawn), str(c.campaigns)]
-
-
-def _reliability() -> Cells:
-    for name, words in measured.EXPERIMENTS.items():
-        difference, quadratic = measured.reliability(name)
-        right = np.mean((difference > 0) == quadratic)
-        yield [words, "all", f"{right:.3f}", str(len(difference)), "–"]
-        for b in measured.bins(difference, quadratic):
-            yield [words, f"{b.stated:.3f}", f"{b.right:.3f}", str(b.count), f"{b.error:.3f}"]
 
 
 def findings(study: Study) -> list[str]:

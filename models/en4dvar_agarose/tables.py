@@ -1,6 +1,5 @@
 """A sweep as text; tables 1 and 2 beside the paper's printed values and a twin's truth, as CSV, Markdown and LaTeX."""
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -9,6 +8,8 @@ import numpy as np
 
 from en4dvar.plumbing.tables import csv_text
 from en4dvar.plumbing.units import convert
+from en4dvar.report import text
+from en4dvar.report.export import escaped
 from en4dvar.sampling.sweep import SweepResult
 from en4dvar_agarose.fits import Study
 from en4dvar_agarose.paper import LABELS, QUANTITIES, ROUTES, TABLES, Model, Quantity, Route
@@ -30,10 +31,10 @@ class Cell:
     pairs: Mapping[Source, Pair | None]
     fixed: bool
 
-    def text(self, source: Source, sign: str = "±") -> str:
+    def text(self, source: Source) -> str:
         """Mean and standard deviation; a value that was held fixed has only the first."""
         pair = self.pairs[source]
-        return f"{pair[0]:.3g} (fixed)" if self.fixed and pair and source == "computed" else plus_minus(pair, sign)
+        return f"{pair[0]:.3g} (fixed)" if self.fixed and pair and source == "computed" else plus_minus(pair)
 
 
 @dataclass(frozen=True)
@@ -63,15 +64,11 @@ def table(study: Study, route: Route) -> tuple[Row, ...]:
     return tuple(rows)
 
 
-def plus_minus(pair: Pair | None, sign: str = "±") -> str:
-    """``0.42 ± 0.06``: the standard deviation to two digits, the mean to as many places; a dash for None."""
+def plus_minus(pair: Pair | None) -> str:
+    """``0.420 ± 0.062``; the mean alone without a standard deviation; a dash for None."""
     if pair is None:
         return "–"
-    mean, std = pair
-    if not (math.isfinite(std) and std > 0):
-        return f"{mean:.3g}"
-    places = max(0, 1 - math.floor(math.log10(std)))
-    return f"{mean:.{places}f} {sign} {std:.{places}f}"
+    return text.plus_minus(*pair) if pair[1] > 0 else f"{pair[0]:.3g}"
 
 
 def sources(study: Study) -> dict[Source, str]:
@@ -108,7 +105,7 @@ def as_markdown(study: Study, rows: Sequence[Row], route: Route) -> str:
 
 def as_latex(study: Study, rows: Sequence[Row], route: Route) -> str:
     """A ``tabular`` in a ``table*`` with booktabs-free rules, one line a source."""
-    caption = TITLES[route].partition(". ")[2].replace("±", r"$\pm$")
+    caption = escaped(TITLES[route].partition(". ")[2])
     note = " The computed values come from a synthetic twin campaign, not from measurements."
     units = {"10⁻²": r"$10^{-2}$", "µm": r"$\mu$m", "Pa s": r"Pa\,s"}
     lines = [
@@ -123,9 +120,9 @@ def as_latex(study: Study, rows: Sequence[Row], route: Route) -> str:
     for row in rows:
         if row.gel != gel:
             gel = row.gel
-            lines += [rf"\multicolumn{{6}}{{l}}{{{gel.replace('%', chr(92) + '%')} gel}} \\", r"\hline"]
+            lines += [rf"\multicolumn{{6}}{{l}}{{{escaped(gel)} gel}} \\", r"\hline"]
         for i, (source, heading) in enumerate(sources(study).items()):
-            cells = [cell.text(source, r"$\pm$").replace("–", "--") for cell in row.cells]
+            cells = [escaped(cell.text(source)) for cell in row.cells]
             lines.append(
                 rf"{LABELS[row.model] if i == 0 else ''} & {heading.partition(' (')[0]} & {' & '.join(cells)} \\"
             )

@@ -64,9 +64,7 @@ def test_every_table_and_figure_is_there(small):
             assert (out / f"table{number}.{suffix}").stat().st_size > 0
     names = {file.stem for file in (out / "figures").iterdir()}
     wanted = {"scaled", "distributions_sweep", "distributions_en4dvar", "nrmse_sweep", "nrmse_en4dvar", "population"}
-    wanted |= {"evidence", "reliability"} | {
-        f"{kind}_{gel}" for kind in ("members", "iterations") for gel in ("0_3", "1")
-    }
+    wanted |= {"evidence"} | {f"{kind}_{gel}" for kind in ("members", "iterations") for gel in ("0_3", "1")}
     wanted |= {f"dimensional_{gel}_{model}" for gel in ("0_3", "1") for model in ("nh", "qs", "qlkv")}
     assert names == wanted
     assert {file.suffix for file in (out / "figures").iterdir()} == {".pdf", ".png"}

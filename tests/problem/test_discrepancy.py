@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.optimize import minimize
+from scipy.optimize import lsq_linear, minimize
 from scipy.stats import multivariate_normal
 from toys import Linear, Vectorised, Wave, make_problem, with_discrepancy
 
@@ -15,13 +15,12 @@ from en4dvar.assembly.build import build
 from en4dvar.config import load_config
 from en4dvar.data.noise import Kernel, Linearisation, Predicted, RobustDiscrepancyNoise, noise_of
 from en4dvar.data.noise.discrepancy import NUGGET, whitened
-from en4dvar.data.noise.robust_discrepancy import _reweighted, solve_boxed
 from en4dvar.data.noise.state_space import boxed, innovations
 from en4dvar.diagnosis.response.what_if import NOWHERE, LinearResponse, what_if
 from en4dvar.estimation.assimilate import assimilate, forecast, log_posterior
 from en4dvar.executor import SerialExecutor
 from en4dvar.model.forward import Alternative
-from en4dvar.plumbing.errors import ConfigError
+from en4dvar.plumbing.errors import ConfigError, DataError
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.schemes.settings import AssimilationSettings
 
@@ -35,17 +34,26 @@ def matern(lag, length, nu):
     from scipy.special import gamma, kv
 
     x = np.sqrt(2 * nu) * np.where(lag > 0, lag, 1.0) / length
-    return np.where(lag > 0, 2 ** (1 - nu) / gamma(nu) * x**nu * kv(nu, x), 1.0 + (NUGGET if nu > 0.5 else 0.0))
+    smooth = np.where(lag > 0, 2 ** (1 - nu) / gamma(nu) * x**nu * kv(nu, x), 1.0)
+    return smooth + (NUGGET if nu > 0.5 else 0.0) * np.eye(len(lag))
 
 
 CORRELATION = np.exp(-np.abs(np.subtract.outer(TIMES, TIMES)) / 0.3)
 
 
+STEPS = {
+    "a camera with gaps, and no clock": [0.1, 0.1, 0.1, 0.3, 0.1, 0.1, 0.2, 0.07, 0.11, 0.1],
+    "some at one instant": [0.1, 0.0, 0.0, 0.3, 0.0, 0.1, 0.2, 0.07, 0.0, 0.1],
+    "all at one instant": [0.0] * 10,
+}
+
+
 @pytest.mark.parametrize("nu", NU)
-def test_the_filter_is_the_factor_of_the_covariance_for_any_steps_and_any_number_of_runs(nu):
-    """Each run has its own length, amplitudes and errors; steps of a camera, with gaps, and of no clock at all."""
+@pytest.mark.parametrize("steps", STEPS)
+def test_the_filter_is_the_factor_of_the_covariance_for_any_steps_and_any_number_of_runs(nu, steps):
+    """Each run has its own length, amplitudes and errors."""
     stream, runs = np.random.default_rng(3), 13
-    times = np.cumsum([0.1, 0.1, 0.1, 0.3, 0.1, 0.1, 0.2, 0.07, 0.11, 0.1])
+    times = np.cumsum(STEPS[steps])
     r, errors, a = (
         stream.standard_normal((runs, 10)),
         stream.uniform(0.1, 1, (runs, 10)),
@@ -151,44 +159,85 @@ def test_information_is_the_covariance_of_the_score(case):
     assert sensitivity.T @ sensitivity == pytest.approx(np.array(expected), rel=1e-6, abs=1e-6 * np.max(expected))
 
 
-def test_box_is_solved_and_both_ways_agree():
+def in_the_box(residual, s, covariance, c):
+    """u of one run: ‖(S² + A)^{1/2}ᵀ u − (S² + A)^{-1/2} r‖ is least where |u| ≤ c/s."""
+    root = np.linalg.cholesky(np.diag(s**2) + covariance)
+    return lsq_linear(root.T, np.linalg.solve(root, residual), (-c / s, c / s), "bvls", tol=1e-15).x
+
+
+def test_the_mode_is_the_minimum_and_solves_the_problem_in_the_box():
     """Against a general optimiser of min_δ Σ ρ((r − δ)/s) + ½ δᵀA⁻¹δ."""
     rng = np.random.default_rng(0)
-    s, c = np.full(K, 0.1), 0.7
-    covariance = Kernel(TIMES, 1.5).correlation(np.array(0.5)) * 0.3**2
+    s, a, length, c, kernel = np.full((5, K), 0.1), np.full((5, K), 0.3), np.full(5, 0.5), 0.7, Kernel(TIMES, 1.5)
+    covariance = kernel.correlation(np.array(0.5)) * 0.3**2
     residual = 0.3 * rng.standard_normal((5, K))
     residual[:, 4] += 2.0
-    u, weights = solve_boxed(residual, np.tile(s, (5, 1)), np.tile(covariance, (5, 1, 1)), c)
-    assert np.all(weights[:, 4] < 0.1)
+    u, delta = boxed(residual, s, kernel.nugget * a**2, a, length, kernel.steps, 1.5, c)
+    assert np.all(np.abs(residual - delta)[:, 4] > 10 * c * s[:, 4])
     precision = np.linalg.inv(covariance)
-    for r, one, w in zip(residual, u, weights, strict=True):
+    for r, one, mode in zip(residual, u, delta, strict=True):
 
         def loss(delta, r=r):
-            v = np.abs(r - delta) / s
+            v = np.abs(r - delta) / s[0]
             return np.sum(np.where(v < c, 0.5 * v**2, c * v - 0.5 * c**2)) + 0.5 * delta @ precision @ delta
 
-        delta = covariance @ one
         found = minimize(loss, np.zeros(K), method="BFGS", options={"gtol": 1e-9})
-        assert loss(delta) <= found.fun + 1e-9
-        assert np.linalg.solve(np.diag(s**2 / w) + covariance, r) == pytest.approx(one, rel=1e-9, abs=1e-9)
-        assert _reweighted(r, s, covariance, c) == pytest.approx(one, rel=1e-6, abs=1e-8)
+        assert loss(mode) <= found.fun + 1e-9
+        assert in_the_box(r, s[0], covariance, c) == pytest.approx(one, rel=1e-9, abs=1e-9)
 
 
-@pytest.mark.parametrize("nu", [0.5, 1.5, 2.5])
-def test_the_mode_of_a_robust_cost_is_the_same_by_filter_and_by_matrices(nu):
+@pytest.mark.parametrize("nu", NU)
+@pytest.mark.parametrize("places", [1, 4, 40])
+def test_the_mode_of_a_robust_cost_is_the_same_by_filter_and_by_matrices(nu, places):
+    """Also where readings of several places have the same instant."""
     rng = np.random.default_rng(1)
-    times = np.cumsum(0.2 + rng.random(40))
+    times = np.repeat(np.cumsum(0.2 + rng.random(40 // places)), places)
     kernel, length = Kernel(times, nu), np.exp(rng.normal(1.0, 0.7, 6))
     s, a = 0.3 + rng.random((6, 40)), np.exp(rng.standard_normal((6, 1))) * (1 + rng.random((6, 40)))
     residual = 2 * rng.standard_t(1.5, (6, 40))
     residual[5, 3] = np.nan
     covariance = a[:, :, None] * a[:, None, :] * kernel.correlation(length)
-    u, weights = solve_boxed(residual[:5], s[:5], covariance[:5], 0.7)
+    u = np.array([in_the_box(*run, 0.7) for run in zip(residual[:5], s[:5], covariance[:5], strict=True)])
     found, delta = boxed(residual, s, kernel.nugget * a**2, a, length, kernel.steps, nu, 0.7)
-    assert np.mean(weights < 1) > 0.2  # many in the tails, where Newton's method alone goes round in circles
-    assert found[:5] == pytest.approx(u, rel=1e-9, abs=1e-11)
-    assert delta[:5] == pytest.approx(np.einsum("bij,bj->bi", covariance[:5], u), rel=1e-9, abs=1e-10)
+    assert np.mean(np.abs(u) * s[:5] > 0.7 - 1e-9) > 0.2  # many in the tails, where whole steps go round in circles
+    assert found[:5] == pytest.approx(u, rel=1e-9, abs=1e-10)
+    assert delta[:5] == pytest.approx(np.einsum("bij,bj->bi", covariance[:5], u), rel=1e-9, abs=1e-9)
     assert np.isnan(found[5]).all()
+
+
+@pytest.mark.parametrize("nu", NU)
+@pytest.mark.parametrize("huber", [None, 0.7])
+def test_whitened_residuals_and_weights_of_readings_at_one_instant(nu, huber):
+    """Against S²/w + A itself, for many runs and for one; a run without a finite prediction has none."""
+    rng = np.random.default_rng(2)
+    kernel, k = Kernel(np.repeat([0.2, 0.5, 0.6, 1.4], 3), nu, 1.5), 12
+    noise, values = noise_of(rng.uniform(0.2, 0.4, k), np.full(k, 0.1), None, huber, kernel), rng.standard_t(2, k)
+    hyper = np.exp(0.5 * rng.standard_normal((2, 3, 2)))
+    runs = Predicted(rng.standard_normal((2, 3, k)), rng.standard_normal((2, 3, k)), np.ones((2, 3)), hyper)
+    runs.values[1, 2, 4] = np.nan
+    white, cost = noise.whitened_residual(values, runs), noise.cost(values, np.full(k, 0.3), runs)
+    assert np.isnan(white[1, 2, 4:]).all()
+    assert np.isinf(cost[1, 2])
+    for i, j in itertools.product(range(2), range(3)):
+        one = runs[i][j]
+        if not np.isfinite(one.values).all():
+            continue
+        r, s, covariance = values - one.values, noise.error_std(one), noise.covariance_of_discrepancy(one)
+        light = np.ones(k)
+        if huber is not None:
+            errors = np.abs(r - covariance @ in_the_box(r, s, covariance, huber))
+            light = huber * s / np.maximum(errors, huber * s)
+            assert noise.down_weights(values, one) == pytest.approx(light, rel=1e-8)
+        exact = np.linalg.solve(np.linalg.cholesky(np.diag(s**2 / light) + covariance), r)
+        assert white[i, j] == pytest.approx(exact, rel=1e-8, abs=1e-8)
+        assert noise.whitened_residual(values, one) == pytest.approx(white[i, j], rel=1e-12)
+        assert noise.cost(values, np.full(k, 0.3), one) == pytest.approx(cost[i, j], rel=1e-12)
+
+
+def test_times_of_a_kernel_do_not_decrease():
+    o = with_discrepancy(make_problem(Wave(), [1.0, 1.3])).observations
+    with pytest.raises(DataError, match="kernel of a discrepancy must not decrease"):
+        replace(o, noise=replace(o.noise, kernel=Kernel(o.times[::-1])))
 
 
 def test_robust_beside_a_discrepancy_is_each_of_the_two_in_its_limit():
@@ -210,8 +259,9 @@ def test_robust_beside_a_discrepancy_is_each_of_the_two_in_its_limit():
     )
 
 
-def test_singular_and_failed_runs_cost_infinity():
-    problem = with_discrepancy(make_problem(Wave(), [1.0, 1.3]))
+@pytest.mark.parametrize("nu", NU)
+def test_singular_and_failed_runs_cost_infinity(nu):
+    problem = with_discrepancy(make_problem(Wave(), [1.0, 1.3]), smoothness=nu)
     o, values = problem.observations, np.tile(problem.observations.values, (4, 1))
     values[1, 3] = np.nan
     hyper = np.array([[0.2, 0.6], [0.2, 0.6], [np.inf, 0.6], [1e160, 0.6]])

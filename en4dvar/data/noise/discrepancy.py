@@ -35,7 +35,8 @@ SMOOTHNESS = {"exponential": 0.5, "matern-3/2": 1.5, "matern-5/2": 2.5}  # name 
 
 @dataclass(frozen=True)
 class Kernel:
-    """cov(δ, δ') = a² g g' k(|t − t'|/ℓ) with a Matérn correlation k of smoothness ν, at ``times`` (K,).
+    """cov(δ, δ') = a² g g' k(|t − t'|/ℓ) with a Matérn correlation k of smoothness ν, at ``times`` (K,) that do not
+    decrease.
 
     ν = ½ is exp(−|t − t'|/ℓ), whose paths are continuous and nowhere smooth; those of ν = 3/2 have one derivative,
     those of 5/2 two. g = √(1 + (ṁ/``grows_beyond``)²) grows with the rate of the observable, since a model that is
@@ -66,11 +67,6 @@ class Kernel:
     def steps(self) -> Array:
         """From each time to the next (K − 1,)."""
         return np.diff(self.times)
-
-    @cached_property
-    def ordered(self) -> bool:
-        """Whether the times increase."""
-        return bool(np.all(self.steps > 0))
 
     @property
     def nugget(self) -> float:
@@ -136,6 +132,8 @@ class DiscrepancyNoise(Noise):
             self.correlation.check_size(len(weights))
         if self.kernel.times.shape != weights.shape:
             raise ValueError(f"the kernel of the discrepancy is that of {len(self.kernel.times)} observations")
+        if np.any(self.kernel.steps < 0):
+            raise ValueError("the times of the kernel of a discrepancy must not decrease")
         if np.ptp(weights) > 0:
             raise ValueError("a discrepancy needs one weight for all observations")
 
@@ -212,8 +210,7 @@ class DiscrepancyNoise(Noise):
         return np.zeros(len(values))
 
     def whitened_residual(self, values: Array, predicted: Predicted) -> Array:
-        v, _ = self._innovations(values, predicted)
-        return v
+        return np.asarray(self._innovations(values, predicted)[0])
 
     def cost(self, values: Array, weights: Array, predicted: Predicted) -> Array:
         v, roots = self._innovations(values, predicted)
@@ -297,19 +294,26 @@ class DiscrepancyNoise(Noise):
                 joined[:, part] = evaluate(runs[part])
         return joined.reshape(arrays, *predicted.values.shape)
 
-    def _innovations(self, values: Array, predicted: Predicted) -> tuple[Array, Array]:
-        """v and the diagonal of L, (…, K) each; NaN where a prediction is not finite or R + A is all but singular."""
-        if self.correlation is None and self.kernel.ordered:
-            with np.errstate(over="ignore", invalid="ignore"):
-                runs = in_rows(predicted)
-                amplitude, length = self._amplitude_and_length(runs)
-                a = amplitude[:, None] * self.kernel.growth(runs.rates)
-                errors = self.error_std(runs) ** 2 + self.kernel.nugget * a**2
-                residual, errors, a = np.broadcast_arrays(values - runs.values, errors, a)
-                v, roots = innovations(residual, errors, a, length, self.kernel.steps, self.kernel.smoothness)
-            return v.reshape(predicted.values.shape), roots.reshape(predicted.values.shape)
-        v, roots = self._in_parts(predicted, 2, lambda runs: whitened(values - runs.values, self.covariance(runs)))
-        return v, roots
+    def _innovations(self, values: Array, predicted: Predicted) -> Array:
+        """v and the diagonal of L (2, …, K); NaN where a prediction is not finite or R + A is all but singular."""
+        if self.correlation is not None:
+            return self._in_parts(predicted, 2, lambda runs: whitened(values - runs.values, self.covariance(runs)))
+        with np.errstate(over="ignore", invalid="ignore"):
+            residual, s, a, length = self._in_time(values, predicted)
+            return self._filtered(residual, s**2, a, length).reshape(2, *predicted.values.shape)
+
+    def _in_time(self, values: Array, predicted: Predicted) -> tuple[Array, Array, Array, Array]:
+        """y − m, s and a g (B, K) of the runs, and ℓ (B,)."""
+        runs = in_rows(predicted)
+        amplitude, length = self._amplitude_and_length(runs)
+        a = amplitude[:, None] * self.kernel.growth(runs.rates)
+        residual, s, a = np.broadcast_arrays(values - runs.values, self.error_std(runs), a)
+        return residual, s, a, length
+
+    def _filtered(self, residual: Array, variance: Array, a: Array, length: Array) -> Array:
+        """v and the diagonal of L (2, B, K) for independent errors of this ``variance`` (B, K), in O(K) a run."""
+        k = self.kernel
+        return innovations(residual, variance + k.nugget * a**2, a, length, k.steps, k.smoothness)
 
 
 def in_rows(predicted: Predicted) -> Predicted:

@@ -6,12 +6,11 @@ r"""Errors with heavy tails beside a discrepancy of the model.
 
 with the expected curvature κ = E[ρ''] in place of that at each reading, which jumps where one crosses the threshold. It
 is exact for Gaussian errors (c → ∞) and without a discrepancy. At the minimum u = A⁻¹δ = ρ'(v)/s with v = (r − δ)/s;
-u solves a quadratic problem in the box |u| ≤ c/s, found by Newton's method on who is at the edge (Hintermüller, Ito &
-Kunisch 2002, SIAM J. Optim. 13, 865). Then ∂J_o/∂m = −u, and rows of d and S are those of S²/w + A, w = ρ'(v)/v.
+u solves a quadratic problem in the box |u| ≤ c/s, found along the readings (:mod:`~en4dvar.data.noise.state_space`).
+Then ∂J_o/∂m = −u, and rows of d and S are those of S²/w + A, w = ρ'(v)/v.
 """
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -19,14 +18,11 @@ import numpy as np
 from scipy.linalg import cho_solve, solve_triangular
 
 from en4dvar.data.noise.correlated import CorrelatedNoise
-from en4dvar.data.noise.discrepancy import DiscrepancyNoise, augmented, both_sides, in_rows, whitened
+from en4dvar.data.noise.discrepancy import DiscrepancyNoise, augmented, both_sides
 from en4dvar.data.noise.gaussian import Linearisation, Predicted
 from en4dvar.data.noise.losses import HuberNoise
-from en4dvar.data.noise.state_space import boxed, innovations
+from en4dvar.data.noise.state_space import boxed
 from en4dvar.model.state import Array
-
-NEWTON, REWEIGHTED = 30, 500  # iterations; the latter follow where the former go round in circles
-SETTLED = 1e-13  # change of a weight
 
 
 @dataclass(frozen=True)
@@ -120,20 +116,17 @@ class RobustDiscrepancyNoise(DiscrepancyNoise):
         return self.huber._log_norm()
 
     def _solved(self, values: Array, predicted: Predicted) -> tuple[Array, Array]:
-        """u and w (K,) at one prediction."""
+        """u and w (…, K)."""
         u, errors, s, *_ = self._at_mode(values, predicted)
         most = self.threshold * s
         return u, np.asarray(most / np.maximum(np.abs(errors), most))
 
     def whitened_residual(self, values: Array, predicted: Predicted) -> Array:
         """(S²/w + A)^{-1/2}(y − m) (…, K)."""
-
-        def of(runs: Predicted) -> tuple[Array, ...]:
-            residual, s, covariance = self._residual(values, runs)
-            _, light = solve_boxed(residual, s, covariance, self.threshold)
-            return whitened(residual, _with_diagonal(covariance, s**2 / light))
-
-        return np.asarray(self._in_parts(predicted, 2, of)[0])
+        with np.errstate(over="ignore", invalid="ignore"):
+            residual, s, a, length = self._in_time(values, predicted)
+            light = np.reshape(self._solved(values, predicted)[1], s.shape)
+            return np.reshape(self._filtered(residual, s**2 / light, a, length)[0], predicted.values.shape)
 
     def _terms(self, values: Array, predicted: Predicted) -> Array:
         """Terms of J_o (…, K), β and ln std apart; NaN where a prediction is not finite."""
@@ -142,73 +135,10 @@ class RobustDiscrepancyNoise(DiscrepancyNoise):
             terms = self.huber._loss(errors / s) + 0.5 * u * delta + np.log(roots)
             return np.asarray(terms + 0.5 * math.log(self.huber.expected_curvature))
 
-    def _at_mode(self, values: Array, predicted: Predicted) -> Iterable[Array]:
-        """u, r − δ, s and δ at the mode in δ, and the diagonal of the root of S²/κ + A, (…, K) each."""
-        k, kappa = self.kernel, self.huber.expected_curvature
-
-        def dense(runs: Predicted) -> tuple[Array, ...]:
-            residual, s, covariance = self._residual(values, runs)
-            u, _ = solve_boxed(residual, s, covariance, self.threshold)
-            delta = np.einsum("bij,bj->bi", covariance, u)
-            _, roots = whitened(residual, _with_diagonal(covariance, s**2 / kappa))
-            return u, residual - delta, s, delta, roots
-
-        if self.correlation is not None or not k.ordered:
-            return self._in_parts(predicted, 5, dense)
-        runs = in_rows(predicted)  # in O(K)
-        amplitude, length = self._amplitude_and_length(runs)
-        a = amplitude[:, None] * k.growth(runs.rates)
-        residual, s, a = np.broadcast_arrays(values - runs.values, self.error_std(runs), a)
-        u, delta = boxed(residual, s, k.nugget * a**2, a, length, k.steps, k.smoothness, self.threshold)
-        _, roots = innovations(residual, s**2 / kappa + k.nugget * a**2, a, length, k.steps, k.smoothness)
-        return (np.reshape(part, predicted.values.shape) for part in (u, residual - delta, s, delta, roots))
-
-    def _residual(self, values: Array, runs: Predicted) -> tuple[Array, Array, Array]:
-        """y − m and s (B, K), A (B, K, K); NaN and one where either is not finite."""
-        residual = values - runs.values
-        s, covariance = np.broadcast_to(self.error_std(runs), residual.shape), self.covariance_of_discrepancy(runs)
-        broken = np.logical_not(np.isfinite(residual + s).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2)))
-        residual[broken] = np.nan
-        return residual, np.where(broken[:, None], 1.0, s), np.where(broken[:, None, None], 0.0, covariance)
-
-
-def _with_diagonal(covariance: Array, diagonal: Array) -> Array:
-    """Covariances (B, K, K) with variances (B, K) added."""
-    total = covariance.copy()
-    where = np.arange(covariance.shape[-1])
-    total[:, where, where] += diagonal
-    return total
-
-
-def solve_boxed(residual: Array, s: Array, covariance: Array, threshold: float) -> tuple[Array, Array]:
-    """u = ρ'(v)/s (B, K) with s v + A u = r, and the weights ρ'(v)/v (B, K)."""
-    most, total, unit = threshold / s, _with_diagonal(covariance, s**2), np.eye(s.shape[1])
-    side, u = np.zeros_like(s), np.full_like(s, np.nan)
-    going = np.isfinite(residual).all(axis=1)
-    for _ in range(NEWTON):
-        if not going.any():
-            break
-        edge = side[going] != 0
-        matrix = np.where(edge[:, :, None], unit, total[going])
-        u[going] = np.linalg.solve(matrix, np.where(edge, side[going] * most[going], residual[going])[..., None])[
-            ..., 0
-        ]
-        errors = residual - np.einsum("bij,bj->bi", covariance, u)
-        moved = np.where(np.abs(errors) > threshold * s, np.sign(errors), 0.0)
-        going = going & np.any(moved != side, axis=1)
-        side = moved
-    for i in np.flatnonzero(going):
-        u[i] = _reweighted(residual[i], s[i], covariance[i], threshold)
-    errors = residual - np.einsum("bij,bj->bi", covariance, u)
-    return u, threshold * s / np.maximum(np.abs(errors), threshold * s)
-
-
-def _reweighted(residual: Array, s: Array, covariance: Array, threshold: float) -> Array:
-    """The same u (K,) by iteratively reweighted least squares, which never fails to descend."""
-    weights, u = np.ones_like(s), np.zeros_like(s)
-    for _ in range(REWEIGHTED):
-        u = np.asarray(np.linalg.solve(np.diag(s**2 / weights) + covariance, residual), dtype=float)
-        before, weights = weights, threshold * s / np.maximum(np.abs(residual - covariance @ u), threshold * s)
-        if np.max(np.abs(weights - before)) < SETTLED:
-            break
-    return u
+    def _at_mode(self, values: Array, predicted: Predicted) -> Array:
+        """u, r − δ, s and δ at the mode in δ, and the diagonal of the root of S²/κ + A (5, …, K)."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            k, (residual, s, a, length) = self.kernel, self._in_time(values, predicted)
+            u, delta = boxed(residual, s, k.nugget * a**2, a, length, k.steps, k.smoothness, self.threshold)
+            _, roots = self._filtered(residual, s**2 / self.huber.expected_curvature, a, length)
+            return np.reshape([u, residual - delta, s, delta, roots], (5, *predicted.values.shape))

@@ -27,7 +27,7 @@ def innovations(residuals: Array, errors: Array, amplitudes: Array, lengths: Arr
     Parameters
     ----------
     residuals: (B, K) y − m. errors: (B, K) variances of ε. amplitudes: (B, K) a g.
-    lengths: (B,) ℓ. steps: (K − 1,) > 0 between readings. nu: ½, 3/2 or 5/2.
+    lengths: (B,) ℓ. steps: (K − 1,) ≥ 0 between readings. nu: ½, 3/2 or 5/2.
     """
     d, shrink, which = _different(lengths, steps, nu)
     r, e, a = (np.ascontiguousarray(part, dtype=float) for part in (residuals, errors, amplitudes))
@@ -44,7 +44,7 @@ def _different(lengths: Array, steps: Array, nu: float) -> tuple[Array, Array, I
     """λΔ and e^{−λΔ} (B, U) of each different step, and which of them each step (K − 1,) is."""
     with np.errstate(all="ignore"):
         rates = np.sqrt(2 * nu) / lengths
-        least = steps.min(initial=np.inf)  # those of a camera are equal but for rounding
+        least = steps[steps > 0].min(initial=np.finfo(float).max)  # those of a camera are equal but for rounding
         different, which = np.unique(np.round(steps / least, 12), return_inverse=True)
         d = np.outer(rates, different * least)
         return d, np.exp(-d), which
@@ -63,7 +63,7 @@ def _whiten(
         _set_transitions(order, d[run], shrink[run], moves)
         _ahead(order, residuals[run], errors[run], force, amplitudes[run], moves, which, room, new)
         for k in range(count):
-            root[k] = 1.0 / np.sqrt(room[k, 4])
+            root[k] = 1.0 / np.sqrt(room[k, 4]) if room[k, 4] > 0.0 else np.nan  # numba raises at a division by zero
             new[k] *= root[k]
 
 
@@ -75,7 +75,7 @@ def boxed(
     Parameters
     ----------
     residuals: (B, K) y − m. std: (B, K) s of ε. own: (B, K) variances of what in δ each reading has of its own.
-    amplitudes: (B, K) a g. lengths: (B,) ℓ. steps: (K − 1,) > 0 between readings. nu: ½, 3/2 or 5/2. c: threshold.
+    amplitudes: (B, K) a g. lengths: (B,) ℓ. steps: (K − 1,) ≥ 0 between readings. nu: ½, 3/2 or 5/2. c: threshold.
     """
     mode = np.empty((2, *residuals.shape))
     r, s, nuggets, a = (np.ascontiguousarray(part, dtype=float) for part in (residuals, std, own, amplitudes))
