@@ -163,9 +163,7 @@ def _plain(value: Any, numbers: bytearray) -> Any:
     if is_dataclass(value):
         return {f.name: _plain(getattr(value, f.name), numbers) for f in fields(value)}
     if isinstance(value, np.ndarray):
-        order: Literal["F", "C"] = (
-            "F" if value.flags.fnc else "C"
-        )  # another order: other sums
+        order: Literal["F", "C"] = "F" if value.flags.fnc else "C"  # another order: other sums
         told = [value.dtype.str, value.shape, order, len(numbers)]
         numbers += value.tobytes(order)
         return told

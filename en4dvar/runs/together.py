@@ -25,8 +25,9 @@ from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.errors import ConfigError, TooFewMembersError, retold
 from en4dvar.problem import InverseProblem
 from en4dvar.results import joint_file, population_file
-from en4dvar.results.checkpoint import FOLDER, digest, file_digest, write_checkpoint
+from en4dvar.results.checkpoint import FOLDER, Keeper, digest, file_digest, write_checkpoint
 from en4dvar.results.joint_file import StoredJoint, load_joint, save_joint
+from en4dvar.results.journal import Journal, KnownRuns
 from en4dvar.results.population_file import GROUPS, StoredPopulation, load_population, save_population
 from en4dvar.results.provenance import provenance
 from en4dvar.results.store import load_stored
@@ -111,14 +112,19 @@ class TogetherKind(Kind, ABC):
         if group:
             path = run.directory.folder(group.folder) / self.result
             record = f"{record}_{group.folder.replace('/', '_')}"
-        done = run.restore(record, fingerprint, str, f"the {what} is made again")
+        again, under_way = f"the {what} is made again", f"{record}.iteration"
+        done = run.restore(record, fingerprint, str, again)
         if done is not None and path.exists() and file_digest(path) == done:
             return
         sets = [finished_set(config, load_stored(run.directory.work / d.file), run.directory.path) for d in good]
         attributes = {**run.attributes, "identity": run.identity.settings, "runs": config.name}
         attributes |= {"group": group.name} if group else {}
-        self.estimate(sets, config, executor, attributes, path, lambda words: run.log.write(f"{what}: {words}"))
+        known = run.restore(under_way, fingerprint, KnownRuns, again) or KnownRuns()
+        keeper = Keeper(run.directory.at(under_way), fingerprint, config.execution.checkpoint_every)
+        journal = Journal(executor, known, keeper)
+        self.estimate(sets, config, journal, attributes, path, lambda words: run.log.write(f"{what}: {words}"))
         write_checkpoint(run.directory.at(record), fingerprint, file_digest(path))
+        run.directory.remove(under_way)
 
 
 def join(

@@ -103,11 +103,12 @@ def test_killed_in_the_joint_estimate_it_ends_with_the_same_bits(tmp_path):
     assert not (tmp_path / "cut" / "joint.nc").exists()
     Stops.calls = 0
     run_campaign(configuration(path, tmp_path / "cut"), resume=True)
-    assert Stops.calls < calls / 2  # the single estimates are not made again
+    assert Stops.calls <= 31  # neither are the single estimates made again, nor what the joint one had run
+    assert not list((tmp_path / "cut" / "checkpoints").glob("*.iteration"))
     assert_same_results(tmp_path / "whole", tmp_path / "cut")
     Stops.calls = 0
     run_campaign(configuration(path, tmp_path / "cut"), resume=True)
-    assert Stops.calls == 0  # neither is the joint one
+    assert Stops.calls == 0
 
 
 def test_the_bits_do_not_depend_on_the_workers(finished, tmp_path):
