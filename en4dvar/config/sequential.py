@@ -120,7 +120,8 @@ class Sequential(_OnASeries):
     rotation: bool = False
     """Rotate the ensemble at random after each analysis, mean and covariance kept."""
     additive: Literal["drawn", "square-root"] = "drawn"
-    """How a model error enters the ensemble of a filter: drawn, or by a square root in the space of the ensemble."""
+    """How a model error enters the ensemble of a filter: drawn, or by a square root in the space of the ensemble (not
+    with smoother enks)."""
     localisation: SeriesLocalisation | None = None
     """Gaspari–Cohn taper over the indices of the observed field."""
     smoother: Smoothing | None = None
@@ -132,16 +133,15 @@ class Sequential(_OnASeries):
     def _belongs_together(self) -> Sequential:
         if type(self).unread({key: getattr(self, key) for key in self.model_fields_set}):
             return self  # told already
-        made = self.made
-        if self.additive == "square-root" and made.lag:
-            raise ValueError("additive: square-root is for filters; a smoother estimates the model error")
         anywhere = BlockLocalisation(
             (), np.empty((0, 0))
         )  # settings that do not go together are told here, in their place
-        SequentialSettings(
-            made, localisation=anywhere if self.localisation else None,
+        settings = SequentialSettings(
+            self.made, localisation=anywhere if self.localisation else None,
             smoother=self.smoother.made if self.smoother else None,
         )  # fmt: skip
+        with Faults() as faults, faults.at("additive"):
+            replace(settings, model_error=ModelError(np.ones(1), self.additive))
         return self
 
     @property

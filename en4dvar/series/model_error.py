@@ -18,6 +18,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from en4dvar.ensemble.linalg import centre
 from en4dvar.model.state import Array
 from en4dvar.priors.prior import whiten_sample
 
@@ -64,9 +65,29 @@ class ModelError:
         spanned = s > SPANNED * s.max(initial=0.0)
         u, s, vt = u[:, spanned], s[spanned] / np.sqrt(len(states) - 1), vt[spanned]
         core = (vt * (self.rate * duration / scale**2)) @ vt.T / np.outer(s, s)
-        values, vectors = np.linalg.eigh(np.eye(len(s)) + core)
-        grown = (vectors * (np.sqrt(values) - 1)) @ vectors.T
-        return np.asarray(states + u @ (grown @ (u.T @ anomalies)))
+        return states + _growth(u, core, anomalies)
+
+
+def narrowed(states: Array, widened: Array, smoothed: Array) -> Array:
+    """``states`` (N, n) by what later observations say of them ``widened``, which then are ``smoothed``.
+
+    The covariance of states with and without a model error is P, not that of the members, which the square root has
+    moved. In moments m ← m + Gᵀ (m_s − m), P ← P + Gᵀ (P_s − P_w) G, G = P_w⁺ P; anomalies change by a symmetric root.
+    """
+    (_, anomalies), (mean, wide) = centre(states), centre(widened)
+    _, s, vt = np.linalg.svd(wide, full_matrices=False)
+    spanned = s > s.max() * max(wide.shape) * np.finfo(float).eps
+    inverse = vt[spanned].T / s[spanned]
+    u, shared = np.linalg.qr(anomalies @ inverse)  # G = inverse @ shared.T @ u.T @ anomalies
+    shift, later = centre((smoothed - mean) @ inverse @ shared.T)
+    return states + shift @ (u.T @ anomalies) + _growth(u, later.T @ later - shared @ shared.T, anomalies)
+
+
+def _growth(u: Array, core: Array, anomalies: Array) -> Array:
+    """What (I + U C Uᵀ)^{1/2} adds to anomalies (N, n), with orthonormal columns U (N, r) and C (r, r)."""
+    values, vectors = np.linalg.eigh(np.eye(len(core)) + core)
+    grown = (vectors * (np.sqrt(np.maximum(values, 0)) - 1)) @ vectors.T
+    return np.asarray(u @ (grown @ (u.T @ anomalies)))
 
 
 def fresh_noise(anomalies: Array, draws: Array) -> Array:

@@ -68,17 +68,15 @@ def run_sequential(
 
     Raises
     ------
-    TooFewMembersError: the ensemble is lost. ValueError: localisation with correlated errors, a square root of the
-        model error with a smoother. ConfigError: the model gives other numbers when a member is run again.
+    TooFewMembersError: the ensemble is lost. ValueError: localisation with correlated errors. ConfigError: the model
+        gives other numbers when a member is run again.
     """
     if settings.localisation is not None and series.correlation is not None:
         raise ValueError("localisation needs observations with independent errors")
-    error = settings.model_error
-    if error is not None and error.form == "square-root" and settings.scheme.lag:
-        raise ValueError("the square root of a model error is that of a filter; a smoother estimates the error")
     with one_blas_thread():
         times = [0.0, *series.times.tolist()]
-        flow = Flow(model, tuple(observables), times, executor or SerialExecutor(), settings.coordinates, error)
+        executor = executor or SerialExecutor()
+        flow = Flow(model, tuple(observables), times, executor, settings.coordinates, settings.model_error)
         run = _Run(flow, members, series, settings, seed, resume, truth)
         if not settings.stochastic_model:
             run.check_repeats()
@@ -145,11 +143,12 @@ class _Run:
     def cycle(self) -> None:
         """Assimilate the next observations and move the window to its next start."""
         first, newest = self.done + 1, min(self.done + self.scheme.shift, len(self.series.times))
-        members = self.forecast(first, newest)
+        forecasts = self.forecast(first, newest)
         repeated = len(self.scheme.mda_weights) > 1
         batch = self.shares(newest) if repeated else [(i, 1.0) for i in range(first, newest + 1)]
-        rows, window, descent = self.analyse(members, batch)
-        members = members[rows]
+        rows, window, descent = self.analyse(forecasts[-1], batch)
+        forecasts = [each[rows] for each in forecasts]
+        members = forecasts[-1]
         self.iterations[newest - 1] = descent.iteration
         self.effective[newest - 1] = getattr(descent.step, "effective", np.nan)
         mean, anomalies = window.posterior(descent)
@@ -162,7 +161,7 @@ class _Run:
             if self.rotations is not None:
                 transform = rotate(transform, turned)
             weights, analysis = descent.weights.w + transform, mean + anomalies
-            self.settings.smoother.passed(self.trail, newest - 1, members, analysis, weights, self.put_smoothed)
+            self.settings.smoother.passed(self.trail, newest - 1, forecasts, analysis, weights, self.put_smoothed)
         self.ensemble = mean + self.settings.inflation.apply(members, anomalies)
         if not repeated or first == 1:
             self.record_ahead([at for at in window.ahead if at.index >= first])
@@ -172,20 +171,23 @@ class _Run:
             self.ensemble = members
         self.done = newest
 
-    def forecast(self, first: int, newest: int) -> Array:
-        """The members that are to be analysed: of a filter at the newest time, else with the changes up to there."""
+    def forecast(self, first: int, newest: int) -> list[Array]:
+        """The members that are to be analysed: of a filter at the newest time, else with the changes up to there.
+
+        Before them, where a square root takes from a member its past, those that the model made of the past.
+        """
         members = self.ensemble
         if self.scheme.lag == 0:
             _, (members,) = self.run(members, [newest])
             self.start = newest
             if self.error is None:
-                return members
+                return [members]
             if self.error.form == "square-root":
-                return self.error.widened(members, self.flow.elapsed(newest))
-            return self.flow.changed(members, self.noise(members, newest), newest)
+                return [members, self.error.widened(members, self.flow.elapsed(newest))]
+            return [self.flow.changed(members, self.noise(members, newest), newest)]
         for index in range(first, newest + 1) if self.error else ():
             members = np.hstack([members, self.noise(members, index)])
-        return members
+        return [members]
 
     def noise(self, members: Array, index: int) -> Array:
         """Standard normal changes (N, q) of the state at the time of ``index``, independent of what members hold."""

@@ -25,7 +25,8 @@ class SequentialSettings:
 
     Raises
     ------
-    ValueError: a smoother behind what is no cycled filter, localisation of what has no local analysis.
+    ValueError: a smoother behind what is no cycled filter, localisation of what has no local analysis, a square root
+        of the model error where members must keep their past.
     """
 
     scheme: Scheme
@@ -48,6 +49,11 @@ class SequentialSettings:
             raise ValueError("enks needs the weights of one analysis for all of the state; with localisation use enrts")
         if self.localisation and self.scheme.resamples:
             raise ValueError("members of this scheme survive as a whole: it takes no localisation")
+        if self.model_error and self.model_error.form == "square-root":
+            if self.scheme.lag:
+                raise ValueError("square-root is for filters; a smoother with a window estimates the model error")
+            if isinstance(self.smoother, EnKS):
+                raise ValueError("square-root leaves no member its past, which enks needs; use enrts, or drawn")
 
     @property
     def smooths(self) -> bool:

@@ -14,7 +14,7 @@ from en4dvar.priors.prior import whiten_sample
 from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.ienks import IEnKS
 from en4dvar.schemes.inflation import Inflation
-from en4dvar.series.model_error import ModelError, fresh_noise
+from en4dvar.series.model_error import ModelError, fresh_noise, narrowed
 from en4dvar.series.sequential import SequentialSettings, run_sequential
 from en4dvar.series.series import CycleSeries
 from en4dvar_lorenz import Linear
@@ -162,6 +162,24 @@ def test_noise_is_exact_where_there_are_members_for_it():
     assert 0.3 < few.std() < 2
 
 
+@pytest.mark.parametrize("members", [4, 9])
+def test_narrowed_moments_are_those_of_rauch_tung_and_striebel(members):
+    """Also in the space of few members, and of variables whose units differ by six orders of magnitude."""
+    rng, units = np.random.default_rng(2), np.array([1.0, 1e-4, 1e2, 1.0, 1.0])
+    states, change = units * rng.standard_normal((2, members, 5))
+    wide = ModelError(units**2 * [1.0, 0.3, 0.0, 2.0, 1e-4]).widened(states, 0.7)
+    assert narrowed(states, wide, wide) / units == pytest.approx(states / units, abs=1e-9)  # nothing was learnt
+    weights = np.eye(members) + 0.3 * rng.standard_normal((members, members))
+    smoothed = wide.mean(axis=0) + weights @ (wide - wide.mean(axis=0)) + 0.2 * change[0]
+    found = narrowed(states, wide, smoothed) / units
+    before, after, known = (np.cov((ensemble / units).T) for ensemble in (states, wide, smoothed))
+    gain = before @ np.linalg.pinv(after, rcond=1e-12)
+    learnt = (smoothed.mean(axis=0) - wide.mean(axis=0)) / units
+    if members > 5:  # of fewer, what lies outside their space is projected on it
+        assert found.mean(axis=0) == pytest.approx(states.mean(axis=0) / units + gain @ learnt, abs=1e-8)
+    assert np.cov(found.T) == pytest.approx(before + gain @ (known - after) @ gain.T, abs=1e-8)
+
+
 def test_an_observation_at_time_zero():
     model, observed, ensemble, series = twin(9)
     first = CycleSeries(np.array([0.0, 0.4]), series.values[4:6], series.std)
@@ -175,6 +193,7 @@ def test_an_observation_at_time_zero():
     [
         (lambda: ModelError(np.zeros(3)), "one of them positive"),
         (lambda: ModelError(np.array([-1.0, 1.0])), "not negative"),
+        (lambda: SequentialSettings(IEnKS(1), model_error=ModelError(RATE, "square-root")), "is for filters"),
         (lambda: IEnKS(2, shift=3), "only 2 long"),
         (lambda: IEnKS(3, mda_weights=(1, 1)), "mda_weights are 3"),
         (lambda: IEnKS(2, mda_weights=(1, -1)), "must be positive"),

@@ -26,6 +26,7 @@ from en4dvar.schemes.esrf import ESRF
 from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.ienks import IEnKS
 from en4dvar.schemes.inflation import Inflation
+from en4dvar.series.model_error import ModelError
 from en4dvar.series.moments import Moments, SequentialState
 from en4dvar.series.sequential import SequentialSettings, run_sequential
 from en4dvar.series.series import CycleSeries
@@ -71,21 +72,23 @@ def assert_same(a, b):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("scheme", "smoother"),
+    ("scheme", "smoother", "error"),
     [
-        (ETKF(), None), (IEnKS(1), None), (IEnKS(3), None), (IEnKS(2, "bundle"), None), (EnKF(), EnKS(3)),
-        (ESRF(), EnRTS()), (BootstrapFilter(0.5), None), (OptimalInterpolation(), None),
+        (ETKF(), None, None), (IEnKS(1), None, None), (IEnKS(3), None, None), (IEnKS(2, "bundle"), None, None),
+        (EnKF(), EnKS(3), None), (ESRF(), EnRTS(), None), (ETKF(), EnKS(3), "drawn"), (ETKF(), EnRTS(), "drawn"),
+        (ETKF(), EnRTS(), "square-root"), (BootstrapFilter(0.5), None, None), (OptimalInterpolation(), None, None),
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("model", [Ring(), Losing()])
-def test_resumed_from_any_cycle(scheme, smoother, model):
+def test_resumed_from_any_cycle(scheme, smoother, error, model):
     rng = np.random.default_rng(0)
     members = model.initial_state({}) + 0.8 * rng.standard_normal((14, 12))
     series = CycleSeries(0.5 * np.arange(1, 12), rng.standard_normal((11, 6)), np.full(6, 0.7))
     truth = rng.standard_normal((11, 12))
     settings = SequentialSettings(
-        scheme, Inflation(1.02, rtps=0.3), rotation=True, min_active_fraction=0.1, smoother=smoother
-    )
+        scheme, Inflation(1.02, rtps=0.3), rotation=True, min_active_fraction=0.1, smoother=smoother,
+        model_error=ModelError(np.full(12, 0.01), error) if error else None,
+    )  # fmt: skip
 
     def run(resume=None):
         states = []
