@@ -292,7 +292,13 @@ class GivenSeries:
                 error[key] = [self._stated(part, f"shared {i}", unit) for i, part in enumerate(parts, 1)]
             elif key == "covariance" and np.ndim(value) == 2:
                 file = f"data.{self.name}.covariance.csv".replace("..", ".")
-                self.files[file] = "".join(",".join(map(repr, row)) + "\n" for row in np.asarray(value, float).tolist())
+                matrix, times = np.asarray(value, dtype=float), self.columns[TIME]
+                if matrix.shape != 2 * times.shape:
+                    raise DataError(f"error: {self._of()}{key} has shape {matrix.shape} for {len(times)} readings")
+                if self.name:  # in a file with rows of other series
+                    there = ~np.isnan(times + self.columns[self._readings(observable.name)])
+                    matrix = matrix[there][:, there]
+                self.files[file] = "".join(",".join(map(repr, row)) + "\n" for row in matrix.tolist())
                 error[key] = {"path": file, "unit": "1" if unit == "1" else f"({unit})*({unit})"}
             else:
                 error[key] = self._stated(value, key, unit if key == std else "1")
