@@ -14,6 +14,17 @@ TransformName = Literal[
 ]
 
 
+def hold_floats(whole: object, *keys: str) -> None:
+    """Make the attributes ``keys`` of ``whole``, even one that is frozen, arrays of float64.
+
+    Raises TypeError, ValueError for what is no real numbers.
+    """
+    for key in keys:
+        if np.iscomplexobj(value := getattr(whole, key)):
+            raise TypeError(f"{key}: complex numbers")
+        object.__setattr__(whole, key, np.asarray(value, dtype=float))
+
+
 class Shown:
     """What has a unit, and a label, a symbol and a display unit to be shown with: by default its name and its unit."""
 
