@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from en4dvar.assembly.build import data_files, resolve_parameters
 from en4dvar.assembly.reading import read_observations
@@ -23,7 +24,7 @@ from en4dvar.data.series import Places
 from en4dvar.diagnosis.diagnostics import nrmse
 from en4dvar.executor import run_chunk
 from en4dvar.inputs.asked import Column
-from en4dvar.model.forward import Failure, ForwardModel, Observable, Trajectory
+from en4dvar.model.forward import Failure, ForwardModel, Observable, Trajectory, instants_of
 from en4dvar.model.state import READING_OFFSET, READING_SCALE, TIME_SHIFT, Array
 from en4dvar.plumbing.errors import ConfigError, En4dvarError, OutputError
 from en4dvar.plumbing.files import make_folder, write_text
@@ -63,13 +64,13 @@ class Simulation:
         return replace(self, series=noisy)
 
 
-def simulate(config: Config, times: Array | None = None) -> Simulation:
+def simulate(config: Config, times: npt.ArrayLike | None = None) -> Simulation:
     """Run the model once, at the fixed values and the centres of the priors (median, in the prior's own transform).
 
     Parameters
     ----------
-    times: (K,) instants, of every series; default ``simulate.times`` of the configuration, else those of the first
-        data set.
+    times: (K,) instants from 0 on, of every series, increasing, in the model's unit; default ``simulate.times`` of the
+        configuration, else those of the first data set.
 
     Raises
     ------
@@ -87,6 +88,9 @@ def simulate(config: Config, times: Array | None = None) -> Simulation:
         if observations is None:
             raise ConfigError("no instants to simulate: give simulate.times in the file, or --times FROM:TO:STEP")
         times = observations.instants[0]
+    times = instants_of(times, unit := config.model.time_unit)
+    if times[0] < 0:
+        raise ConfigError(f"times: {times[0]:g} {unit} is before the model's clock begins, which is at 0")
     terms, fixed = resolve_parameters(config, observations)
     theta = {**fixed, **{t.parameter.name: float(t.to_physical(np.array(t.mean))) for t in terms}}
     theta |= {

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import numpy.typing as npt
 
+from en4dvar.model.forward import instants_of
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar_bubble.driving import Driving, Reading
@@ -101,9 +102,7 @@ def simulate(
         raise ConfigError(str(error)) from error
     model = model.with_parameters(dict(parameters or {}))
     theta = _members(model, dict(parameters or {}))
-    t = np.asarray([] if times is None else times, dtype=float)
-    if t.ndim != 1 or len(t) == 0 or not np.all(np.isfinite(t)) or np.any(np.diff(t) <= 0):
-        raise ConfigError("times: give a one-dimensional, increasing sequence of seconds")
+    t = instants_of(() if times is None else times, "s")
     try:
         x = model.initial_states(theta)
     except ValueError as error:
