@@ -12,6 +12,7 @@ import xarray as xr
 from toys import Linear
 
 import en4dvar
+from en4dvar.runs.checks import validate
 from en4dvar.runs.rerun import rerun
 
 TIMES = np.linspace(0.0, 3.0, 12)
@@ -189,6 +190,41 @@ def test_what_is_wrong_with_a_function_is_told(function, reason):
     with pytest.raises(en4dvar.TooFewMembersError) as caught:
         fit(function)
     assert reason in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["chain", "draw", "posterior_draw", "iteration", "J", "J_background", "dfs"])
+def test_a_name_that_the_result_has_itself_is_refused_before_anything_is_computed(name):
+    runs = []
+
+    def model(parameters, times):
+        runs.append(parameters)
+        return line({"a": parameters[name], "b": 0.0}, times)
+
+    with pytest.raises(en4dvar.ConfigError, match=f"the parameter '{name}' needs another name: the result has another"):
+        fit(model, priors={name: PRIORS["a"]})
+    assert not runs
+
+
+def test_names_that_collide_with_each_other_are_refused(tmp_path):
+    with pytest.raises(en4dvar.ConfigError, match="'a' needs another name: the result has another 'a_centre'"):
+        fit(lambda p, t: p["a"] + p["a_centre"] * t, priors={"a": PRIORS["a"], "a_centre": PRIORS["b"]})
+    with pytest.raises(en4dvar.ConfigError, match="the series 'mode' needs another name: the result has another 'mode"):
+        fit(lambda p, t: line(p, t), data={"time": TIMES, "mode": VALUES})
+    model = "class Creep(Linear):\n    def __init__(self):\n        super().__init__('Jb')\n"
+    (tmp_path / "creep.py").write_text(f"from toys import Linear\n{model}")
+    (tmp_path / "x.csv").write_text("t,y\n0,1\n1,2\n2,2\n")
+    asked = {
+        "name": "x",
+        "model": {"name": f"{tmp_path}/creep.py:Creep"},
+        "data": {
+            "path": f"{tmp_path}/x.csv",
+            "columns": {"time": {"name": "t", "unit": "s"}, "y": {"name": "y", "unit": "m"}},
+            "error": {"y_std": "0.1 m"},
+        },
+        "parameters": {"J": IN_METRES["a"], "b": IN_METRES["b"]},
+    }
+    with pytest.raises(en4dvar.ConfigError, match="the parameter 'J' needs another name"):
+        validate(asked)
 
 
 def test_a_function_cannot_vary_in_time():
