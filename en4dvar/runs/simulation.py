@@ -28,6 +28,7 @@ from en4dvar.model.forward import Failure, ForwardModel, Observable, Trajectory,
 from en4dvar.model.state import READING_OFFSET, READING_SCALE, TIME_SHIFT, Array
 from en4dvar.plumbing.errors import ConfigError, En4dvarError, OutputError
 from en4dvar.plumbing.files import make_folder, write_text
+from en4dvar.plumbing.hints import listed
 from en4dvar.plumbing.tables import csv_text
 from en4dvar.plumbing.units import UnitError, convert
 from en4dvar.plumbing.user_code import reason_of
@@ -56,10 +57,14 @@ class Simulation:
 
     def with_noise(self, std: float | Mapping[str, float], seed: int) -> "Simulation":
         """Independent Gaussian noise added, of a standard deviation in the observable's unit: one for all series, or
-        by their names.
+        by their names. Raises :class:`ConfigError`.
         """
+        if seed < 0:
+            raise ConfigError(f"seed: must not be negative, not {seed}")
         stream = np.random.Generator(np.random.Philox(seed))
         stds = std if isinstance(std, Mapping) else dict.fromkeys(self.series, std)
+        if stds.keys() != self.series.keys() or not all(value >= 0 for value in stds.values()):
+            raise ConfigError(f"std: give one for all series, or of each: {listed(self.series)}; none is negative")
         noisy = {name: v + stds[name] * stream.standard_normal(len(v)) for name, v in self.series.items()}
         return replace(self, series=noisy)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -125,6 +126,12 @@ def test_a_result_is_saved_shown_and_compared(tmp_path, result):
     assert f"{float(result.posterior['a'].mean()):.4g}" in shown
     compared = en4dvar.compare_runs({"line": result, "exponential": fit(growth), "file": tmp_path / "line.nc"})
     assert compared.verdict("data").startswith("undecidable: line and file differ by")
+    with pytest.raises(en4dvar.ConfigError, match="no data set 'dta'; did you mean 'data'"):
+        compared.verdict("dta")
+    with pytest.raises(en4dvar.OutputError, match="at least two run directories"):
+        en4dvar.compare_runs("runs/gel")
+    with pytest.raises(en4dvar.ConfigError, match="no kind of table is called 'xls'; known: csv, latex, members"):
+        en4dvar.export_table(tmp_path, "xls")
     for path in (tmp_path / "line", tmp_path / "line.html"):
         with pytest.raises(en4dvar.OutputError, match=r"ends in \.nc"):
             result.save(path)
@@ -163,6 +170,11 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "a null byte": ({"priors": {"a": {"prior": "no\0rmal"}}}, "priors.a.prior: a null byte"),
     "odd section": ({"asimilation": {}}, "asimilation: unknown key 'asimilation'; did you mean 'assimilation'?"),
     "setting": ({"assimilation": {"member": 3}}, "assimilation.member: unknown key 'member'; did you mean 'members'?"),
+    "a time": ({"data": (np.where(TIMES > 2.9, np.nan, TIMES), VALUES)}, "data: the time of reading 12 is NaN; leave"),
+    "order": ({"data": (TIMES[::-1], VALUES)}, "reading 2 of data: times must increase, but 2.72727 1 follows 3 1"),
+    "repeated": ({"data": (TIMES.round(), VALUES)}, "follows 0 1; keep one of the two readings, or their mean"),
+    "no parameter": ({"priors": {"reading_scale": PRIORS["a"]}}, "priors: none is of a parameter of the function"),
+    "members": ({"assimilation": {"members": 10**9}}, "assimilation.members: should be less than or equal to 100000"),
     "window": ({"window": {"form": 1}}, "window.form: unknown key 'form'; did you mean 'from'?"),
 }  # fmt: skip
 
@@ -174,6 +186,7 @@ def test_each_fault_is_one_message_with_its_argument(fault):
         fit(**arguments)
     assert words in str(caught.value)
     assert len(str(caught.value).splitlines()) == 1
+    assert not re.search(r"data\.|/tmp", str(caught.value))
 
 
 @pytest.mark.parametrize(
@@ -184,6 +197,7 @@ def test_each_fault_is_one_message_with_its_argument(fault):
         (lambda p, t: {"z": t}, "the function returned z, but no 'y'"),
         (lambda p, t: None, "the function returned shape () for y"),
         (lambda p, t: t * np.nan, "non-finite prediction"),
+        (lambda p, t: p["a"] + 1j * t, "the function returned complex numbers for y"),
     ],
 )
 def test_what_is_wrong_with_a_function_is_told(function, reason):

@@ -33,6 +33,11 @@ def fit(model: Any = two, data: Any = None, **more: Any) -> en4dvar.Result:
     return en4dvar.estimate(model, DATA if data is None else data, **given)
 
 
+def test_a_reading_is_counted_in_its_series():
+    with pytest.raises(en4dvar.DataError, match=r"reading 3 of q: times must increase, but 0\.3 1 follows 0\.45 1"):
+        fit(data={**DATA, "q": (np.where(T2[2] == T2, T2[0], T2), V2)})
+
+
 @pytest.mark.parametrize("several", [True, False])
 def test_a_covariance_loses_the_rows_of_missing_readings(several):
     seen = np.isin(np.arange(9), (0, 4), invert=True)
