@@ -6,13 +6,13 @@ import glob
 import itertools
 import os
 from collections import Counter
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import cast
 
 import numpy as np
-import numpy.typing as npt
 
 from en4dvar.config.context import Spread
 from en4dvar.config.data import Data
@@ -22,7 +22,7 @@ from en4dvar.data.observations import Observations
 from en4dvar.data.series import Series, balanced
 from en4dvar.inputs.asked import ANY, SUFFIXES, Column, DataFile, Layout
 from en4dvar.inputs.parts import parts_of
-from en4dvar.inputs.readers import Readings, read_series
+from en4dvar.inputs.readers import Readings, Rows, read_series
 from en4dvar.inputs.square import read_covariance
 from en4dvar.inputs.steps import step_doubts
 from en4dvar.inputs.window import select
@@ -139,7 +139,7 @@ def read_one(plan: SeriesPlan, file: DataFile, fewest: int) -> Series:
 
     def errors(part: slice) -> Noise:
         of_columns = {key: read.errors[column.name][part] for key, column in _errors(data).items()}
-        return errors_of(data, read.times[part] - float(zero), values, np.arange(len(read.times))[part], of_columns)
+        return errors_of(data, read.times[part] - float(zero), values, of_columns, partial(read.rows_among, used=part))
 
     try:
         noise, whole = errors(window), slice(window.start, max(window.stop, _window(data, read, path, until=True).stop))
@@ -214,14 +214,13 @@ def _span(times: Array, data: Data) -> str:
 
 
 def errors_of(
-    data: Data, times: Array, values: Array, samples: npt.NDArray[np.intp], stated: Mapping[str, Array]
+    data: Data, times: Array, values: Array, stated: Mapping[str, Array], rows: Callable[[int], Rows] = np.arange
 ) -> Noise:
-    """The observation errors at ``times`` (K,); ``samples`` (K,) are the places of the observations in the series.
+    """The observation errors at ``times`` (K,).
 
     ``values`` are those in the window. ``stated``: ``std``, ``time_std``, ``shared 0`` and so on, ``at_most`` and
-    ``at_least`` (K,) where columns of the file hold them.
-
-    A covariance file holds one row an observation of the window, or one a usable sample of the whole series.
+    ``at_least`` (K,) where columns of the file hold them. ``rows``: where the observations stand in a covariance file
+    of so many rows, see :meth:`~en4dvar.inputs.readers.Readings.rows_among`.
     """
     error, correlation = data.error, cast(Array | SharedErrors | None, None)
     largest = float(values.max())
@@ -230,10 +229,9 @@ def errors_of(
     time_std = np.full(len(times), error.time_std) if timing is None else timing
     if error.covariance is not None:
         covariance = read_covariance(error.covariance)
-        if len(covariance) > samples[-1] and len(covariance) != len(times):
-            covariance = covariance[np.ix_(samples, samples)]
-        if len(covariance) != len(times):
-            raise DataError(f"{error.covariance.path}: {len(covariance)} rows, but {len(times)} observations")
+        with retold(DataError, DataError, f"{error.covariance.path}: "):
+            where = rows(len(covariance))
+        covariance = covariance[np.ix_(where, where)]
         std = np.sqrt(np.diag(covariance))
         correlation = covariance / np.outer(std, std)
         np.fill_diagonal(correlation, 1.0)

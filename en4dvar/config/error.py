@@ -164,7 +164,7 @@ class CovarianceFile(Section):
     """A CSV file with the full matrix R, without header; its unit (e.g. ``um^2``) is required, never guessed."""
 
     path: Annotated[str, Field(min_length=1)]
-    """CSV file, relative to the configuration's folder; one row per observation of the window or of the series."""
+    """CSV file, relative to the configuration's folder; a row per row of the data, in its order, or per one used."""
     unit: Annotated[str, unit_of(_square)]
     """Unit of the covariances, the observable's squared, e.g. um^2."""
 

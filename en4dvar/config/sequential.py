@@ -100,7 +100,7 @@ else:
 
 class _Scheme(OfScheme):
     scheme: Annotated[OnASeries, Field(description=listed(ON_A_SERIES), json_schema_extra=or_in_a_file)]
-    members: Annotated[int, Field(ge=3)]
+    members: Annotated[int, Field(ge=3, le=100_000)]
     """Ensemble size N."""
 
 

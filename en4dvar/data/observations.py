@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from en4dvar.data.noise import Linearisation, Noise, Predicted, joint_noise, sides_of
 from en4dvar.data.series import Part, Series
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, hold_floats
 from en4dvar.plumbing.caution import Caution
 from en4dvar.plumbing.errors import DataError, retold
 from en4dvar.priors.prior import LARGEST
@@ -111,8 +111,11 @@ class Observations:
         )
 
     def __post_init__(self) -> None:
-        where, k = self.source or self.name, len(self.times)
-        for key in ("values", "weights"):
+        where = self.source or self.name
+        with retold((TypeError, ValueError), DataError, f"{where}: "):
+            hold_floats(self, "times", "values", "weights")
+        k = self.times.size
+        for key in ("times", "values", "weights"):
             if np.shape(getattr(self, key)) != (k,):
                 raise DataError(f"{where}: {key} has shape {np.shape(getattr(self, key))}, not ({k},)")
         if k < 1:

@@ -9,9 +9,9 @@ import numpy.typing as npt
 
 from en4dvar.data.noise import Noise
 from en4dvar.model.forward import Observable
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, hold_floats
 from en4dvar.plumbing.caution import Caution
-from en4dvar.plumbing.errors import DataError
+from en4dvar.plumbing.errors import DataError, retold
 
 
 @dataclass(frozen=True)
@@ -100,6 +100,8 @@ class Series:
         object.__setattr__(self, "group", self.group or self.name)
         if self.weights is None:
             object.__setattr__(self, "weights", np.ones(len(self.times)))
+        with retold((TypeError, ValueError), DataError, f"{self.name}: "):
+            hold_floats(self, "times", "values", "weights")
 
 
 @dataclass(frozen=True)

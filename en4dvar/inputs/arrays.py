@@ -36,6 +36,8 @@ def columns_of(data: Any, time: str = TIME, value: str = VALUE) -> dict[str, Arr
     if times is None:
         raise DataError(f"no column {time!r} of times{suggest(time, columns)}; say which it is: time='...'")
     numbers = {name: _numbers(name, column) for name, column in {TIME: times, **columns}.items()}
+    if missing := np.flatnonzero(np.isnan(numbers[TIME])).tolist():
+        raise DataError(f"the time of reading {missing[0] + 1} is NaN; leave out the reading, or set its value to NaN")
     for name, column in numbers.items():
         if column.shape != numbers[TIME].shape:
             raise DataError(f"{name!r} has shape {column.shape}, but there are {len(numbers[TIME])} times")

@@ -21,13 +21,16 @@ from en4dvar.plumbing.errors import DataError, retold
 from en4dvar.plumbing.hints import suggest
 from en4dvar.plumbing.units import convert
 
+Rows = npt.NDArray[np.intp]
+
 
 @dataclass(frozen=True)
 class Readings:
     """One observable in time, in the model's units, times increasing; ``scalars`` as the file has them.
 
     ``errors`` are the columns that were asked for besides, by name, one number a reading; ``left_out`` the times of
-    readings that their neighbours refute.
+    readings that their neighbours refute. ``rows`` are those of the file, counted from 0, that the readings stand in,
+    none where several are one reading, their mean; it has ``count`` rows, of which ``usable`` hold a reading.
     """
 
     times: Array
@@ -36,6 +39,28 @@ class Readings:
     scalars: Mapping[str, float] = field(default_factory=dict)
     errors: Mapping[str, Array] = field(default_factory=dict)
     left_out: tuple[float, ...] = ()
+    rows: Rows | None = None
+    count: int = 0
+    usable: Rows | None = None
+
+    def rows_among(self, size: int, used: slice) -> Rows:
+        """Where the readings ``used`` stand in a table of ``size`` rows that follow each other as in the file.
+
+        There is one a row of the file, one a usable row, or one a reading that is used. Raises :class:`DataError`.
+        """
+        number = len(self.times[used])
+        if self.rows is None or self.usable is None:
+            if size == number:
+                return np.arange(number)
+            raise DataError(f"{size} rows, but {number} observations, of which some are means of readings of one time")
+        rows = self.rows[used]
+        for every in (np.arange(self.count), self.usable, np.sort(rows)):
+            if len(every) == size:
+                return np.searchsorted(every, rows)
+        raise DataError(
+            f"{size} rows, but {number} observations are used, of {len(self.usable)} usable ones in {self.count} rows "
+            "of data; give a row to each of one of these"
+        )
 
 
 def read_series(
@@ -83,6 +108,8 @@ def read_series(
             order = np.argsort(times[kept], kind="stable")
             kept, stated = kept[order], {name: stds[order] for name, stds in stated.items()}
         _check_order(times[kept], kept, columns[time.name], time.unit, lines, layout, path)
+    count, usable = len(times), np.sort(kept)
+    rows: Rows | None = kept
     times, values = times[kept], values[kept]
     each, which, counts = np.unique(times, return_inverse=True, return_counts=True)
     if not repeats and len(each) < len(times):  # readings of one time as their mean, their errors as independent
@@ -90,8 +117,8 @@ def read_series(
             own = stated[c.name]
             sums = np.sqrt(np.bincount(which, own**2)) if c.kind == "std" else np.bincount(which, own)
             stated[c.name] = np.asarray(sums / counts)
-        times, values = each, np.bincount(which, values) / counts
-    return _rest(Readings(times, values, str(path), scalars, stated), layout, fewest)
+        times, values, rows = each, np.bincount(which, values) / counts, None
+    return _rest(Readings(times, values, str(path), scalars, stated, (), rows, count, usable), layout, fewest)
 
 
 def _rest(read: Readings, layout: Layout, fewest: int) -> Readings:
@@ -111,10 +138,11 @@ def _rest(read: Readings, layout: Layout, fewest: int) -> Readings:
 
 def _kept(read: Readings, which: slice | npt.NDArray[np.bool_]) -> Readings:
     errors = {name: column[which] for name, column in read.errors.items()}
-    return replace(read, times=read.times[which], values=read.values[which], errors=errors)
+    rows = None if read.rows is None else read.rows[which]
+    return replace(read, times=read.times[which], values=read.values[which], errors=errors, rows=rows)
 
 
-def _stds(written: Array, column: Column, kept: npt.NDArray[np.intp], count: int, path: Path) -> Array:
+def _stds(written: Array, column: Column, kept: Rows, count: int, path: Path) -> Array:
     """What belongs to the kept readings: standard deviations, weights or places.
 
     Raises :class:`DataError` where one is missing, or of the wrong sign.
@@ -163,7 +191,7 @@ def _step(step: TimeStep, scalars: Mapping[str, float], path: Path) -> float:
 
 def _check_order(
     times: Array,
-    kept: npt.NDArray[np.intp],
+    kept: Rows,
     written: Array,
     unit: str,
     lines: Sequence[int],

@@ -71,7 +71,9 @@ def select(times: Array, values: Array, start: Instant, end: Instant, prominence
         first = index_of(times, values, start, 0, prominence)
         last = index_of(times, values, end, first, prominence, last=True)
         if last < first:
-            raise DataError("is empty: it ends before it starts")
+            between = start.kind == end.kind == "time" and start.time <= end.time
+            none = between or first == len(times) or last < 0
+            raise DataError("holds no reading" if none else "is empty: it ends before it starts")
     return slice(first, last + 1)
 
 

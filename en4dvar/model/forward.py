@@ -13,10 +13,23 @@ from types import MappingProxyType
 from typing import ClassVar, Protocol, Self, runtime_checkable
 
 import numpy as np
+import numpy.typing as npt
 
 from en4dvar.model.state import Array, Field, Parameter, Shown, StateLayout
 from en4dvar.plumbing.caution import Caution
+from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.user_code import reason_of
+
+
+def instants_of(times: npt.ArrayLike, unit: str) -> Array:
+    """Instants (K,) on a model's clock. Raises :class:`ConfigError` where they do not increase."""
+    try:
+        instants = np.asarray(times, dtype=float)
+    except (TypeError, ValueError):
+        instants = np.empty(0)
+    if instants.ndim != 1 or not (len(instants) and np.all(np.diff(instants) > 0) and np.all(np.isfinite(instants))):
+        raise ConfigError(f"times: give a one-dimensional sequence of increasing numbers, in {unit}")
+    return instants
 
 
 @dataclass(frozen=True)

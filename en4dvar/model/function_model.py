@@ -135,6 +135,8 @@ def _values(columns: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> Ar
     """One observable of what a function returned. Raises ValueError, in words for its author."""
     if name not in columns:
         raise ValueError(f"the function returned {', '.join(map(str, columns)) or 'nothing'}, but no {name!r}")
+    if np.iscomplexobj(columns[name]):
+        raise ValueError(f"the function returned complex numbers for {name}; return real ones")
     values = np.asarray(columns[name], dtype=float)
     if values.shape != shape:
         raise ValueError(f"the function returned shape {values.shape} for {name}, expected {shape}, one per time")

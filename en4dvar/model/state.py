@@ -8,10 +8,24 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from en4dvar.plumbing.errors import retold
+from en4dvar.plumbing.units import UnitError, parse_unit
+
 Array = npt.NDArray[np.float64]
 TransformName = Literal[
     "normal", "lognormal", "logit", "uniform", "half-normal", "beta", "bounded-normal", "bounded-lognormal"
 ]
+
+
+def hold_floats(whole: object, *keys: str) -> None:
+    """Make the attributes ``keys`` of ``whole``, even one that is frozen, arrays of float64.
+
+    Raises TypeError, ValueError for what is no real numbers.
+    """
+    for key in keys:
+        if np.iscomplexobj(value := getattr(whole, key)):
+            raise TypeError(f"{key}: complex numbers")
+        object.__setattr__(whole, key, np.asarray(value, dtype=float))
 
 
 class Shown:
@@ -59,6 +73,10 @@ class Parameter(Shown):
     def __post_init__(self) -> None:
         if not self.name.isidentifier():
             raise ValueError(f"parameter name {self.name!r} is not an identifier")
+        if not self.bounds[0] < self.bounds[1]:
+            raise ValueError(f"parameter {self.name}: bounds {self.bounds}: the first must be below the second")
+        with retold(UnitError, ValueError, f"parameter {self.name}: "):
+            parse_unit(self.unit)
         super().__post_init__()
 
 
@@ -148,6 +166,11 @@ class Field(Shown):
     label: str = ""
     symbol: str = ""
     display_unit: str = ""
+
+    def __post_init__(self) -> None:
+        if self.size < 0:
+            raise ValueError(f"field {self.name}: a size of {self.size}")
+        super().__post_init__()
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,9 @@ from en4dvar.diagnosis.diagnostics import member_quantiles
 from en4dvar.estimation.summary import CSV_COLUMNS, ParameterSummary, csv_cells, estimate_cells
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, codes
-from en4dvar.plumbing.errors import OutputError, retold
+from en4dvar.plumbing.errors import ConfigError, OutputError, retold
 from en4dvar.plumbing.files import make_folder, write_text
+from en4dvar.plumbing.hints import shown, suggest
 from en4dvar.plumbing.tables import table, write_csv
 from en4dvar.plumbing.units import UnitError, convert
 from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, in_columns
@@ -137,9 +138,14 @@ class Comparison:
         return comparison_table(self)
 
     def verdict(self, dataset: str) -> str:
-        """The preferred model in words, or that the data do not decide, or that evidences do not compare."""
+        """The preferred model in words, or that the data do not decide, or that evidences do not compare.
+
+        Raises :class:`ConfigError` for a data set that is not among them.
+        """
         if self.incomparable:
             return f"not compared: {self.incomparable}"
+        if dataset not in self.datasets:
+            raise ConfigError(f"verdict: no data set {shown(dataset)}{suggest(dataset, self.datasets)}")
         best, second = sorted(self.of(dataset), key=lambda score: -score.log_evidence)[:2]
         words = preferred(best.run, second.run, -second.difference)
         doubts = [f"{score.run} ({score.doubted})" for score in (best, second) if score.doubted]
@@ -315,7 +321,7 @@ def _members(estimates: Sequence[ComparedEstimate], unit: str) -> Array:
 
 def named(runs: Sequence[str | Path] | Mapping[str, T]) -> Mapping[str, T | Path]:
     """Name → run: names of the folders, or their paths where names repeat; at least two runs."""
-    if len(runs) < 2:
+    if isinstance(runs, str | Path | StoredResult) or len(runs) < 2:
         raise OutputError("compare needs at least two run directories")
     if isinstance(runs, Mapping):
         return runs

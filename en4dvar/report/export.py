@@ -8,14 +8,15 @@ import re
 import string
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
 from en4dvar.config.models import GREEK
 from en4dvar.estimation.summary import LITTLE, MODAL, ParameterSummary, summary_rows
 from en4dvar.plumbing.caution import Caution, codes
-from en4dvar.plumbing.errors import OutputError
+from en4dvar.plumbing.errors import ConfigError, OutputError
+from en4dvar.plumbing.hints import shown, suggest
 from en4dvar.plumbing.tables import csv_text
 from en4dvar.report.text import GREEK as LETTERS
 from en4dvar.report.text import number_like, plain_number, untrusted_words
@@ -51,9 +52,11 @@ def export_table(run_dir: str | Path, kind: Kind = "csv") -> str:
 
     Raises
     ------
-    OutputError: the directory holds no results. LackingError: it lacks some, which are named; ``rest`` is the table of
-        the others.
+    ConfigError: an unknown kind. OutputError: the directory holds no results. LackingError: it lacks some, which are
+        named; ``rest`` is the table of the others.
     """
+    if kind not in get_args(Kind):
+        raise ConfigError(f"no kind of table is called {shown(kind)}{suggest(kind, get_args(Kind))}")
     stored = RunResults(Path(run_dir))
     if stored.files == [stored.whole]:
         posterior_file(run_dir)  # says what is missing

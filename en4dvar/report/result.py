@@ -120,10 +120,12 @@ class Result(StoredResult):
         ``units``: those of parameters and readings. ``chains``: the members that are alive, which have no order, are
         dealt out to so many, for plots and diagnostics that compare chains; what is left over is left out.
 
-        Raises ImportError where ArviZ is not installed, :class:`ConfigError` where members are too few for the chains.
+        Raises :class:`ConfigError` where ArviZ is not installed, or members are too few for the chains.
         """
-        import arviz
-
+        try:
+            import arviz
+        except ImportError:
+            raise ConfigError("to_inference_data needs ArviZ: pip install arviz") from None
         groups = {path.strip("/"): node.to_dataset() for path, node in self.tree.children.items()}
         if units == "display":
             groups = {name: _in_display_units(group) for name, group in groups.items()}

@@ -6,6 +6,7 @@ order. Whatever a report needs is stored, so that nothing downstream computes it
 """
 
 from collections.abc import Callable, Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,8 +19,23 @@ from en4dvar.diagnosis.influence import prior_distance
 from en4dvar.diagnosis.response.ledger import QUANTILES
 from en4dvar.diagnosis.response.what_if import Shift
 from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import ConfigError
 from en4dvar.priors.prior import Prior
-from en4dvar.results.declared import MEMBER, NUMBER, OWN, Declared, Item, Table, UnitRule, When, axes_of, shown_as, text
+from en4dvar.problem import InverseProblem
+from en4dvar.results.declared import (
+    ALWAYS,
+    MEMBER,
+    NUMBER,
+    OWN,
+    Declared,
+    Item,
+    Table,
+    UnitRule,
+    When,
+    axes_of,
+    shown_as,
+    text,
+)
 
 SCORES = np.linspace(-4.0, 4.0, 81)  # standard scores at which a prior is kept
 SHARES = ("errors", "discrepancy", "prior")
@@ -451,3 +467,18 @@ GROUPS: dict[str, Table] = {
 }
 OPTIONAL = frozenset({"/fields", "/withheld", "/posterior_draws"})
 """Groups that a file may lack."""
+NAMED = ("parameter", "series")  # placeholders that stand for names of a user's
+
+
+def require_free_names(problem: InverseProblem) -> None:
+    """Raise :class:`ConfigError` where a parameter or series has the name of another variable, or of a dimension."""
+    subject = SimpleNamespace(problem=problem, parameters=problem.prior.parameters)
+    for path, table in GROUPS.items():
+        taken = {name for d in table for name in (d.name, *d.dims.split()) if "{" not in name}
+        for declared in table:
+            for item in SCOPES[declared.scope](subject) if declared.scope in NAMED else ():
+                name = declared.name.format(**item.names)
+                if name in taken:
+                    whose = f"the {declared.scope} {item.names[declared.scope]!r} needs another name"
+                    raise ConfigError(f"{whose}: the result has another {name!r} in its group {path[1:]}")
+                taken |= {name} if declared.when is ALWAYS else set()

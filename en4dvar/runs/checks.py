@@ -17,6 +17,8 @@ from en4dvar.config.series import DATA, DataPlan
 from en4dvar.config.validate import check
 from en4dvar.inputs.asked import DataFile
 from en4dvar.plumbing.errors import ConfigError, DataError, Fault
+from en4dvar.problem import InverseProblem
+from en4dvar.results.variables import require_free_names
 
 
 def validate(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> AnyConfig:
@@ -41,12 +43,19 @@ def validate(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any
         raise ConfigError(in_order([*error.problems, *faults])) from None
     with _collecting(faults, document):
         if isinstance(config, Config):
-            _read_files(document, inverse_plan(config), partial(build_one, config), faults)
+            _read_files(document, inverse_plan(config), partial(checked_problem, config), faults)
         if isinstance(config, SequenceConfig):
             build_sequence(config)
     if faults:
         raise ConfigError(in_order(faults))
     return config
+
+
+def checked_problem(config: Config, name: str, file: DataFile) -> InverseProblem:
+    """The inverse problem of one data set, whose result can be written. Raises :class:`ConfigError`, `DataError`."""
+    problem = build_one(config, name, file)
+    require_free_names(problem)
+    return problem
 
 
 def _read_data(document: Document, base: Path, faults: list[Fault]) -> None:

@@ -339,7 +339,7 @@ def _observations(
             observable=planned.observable,
             times=times,
             values=own,
-            noise=errors_of(planned.data, times, own, np.arange(len(times)), {})
+            noise=errors_of(planned.data, times, own, {})
             if stated
             else noise_of(np.ones(len(times)), np.zeros(len(times))),
             name=planned.name,

@@ -5,6 +5,7 @@ directory, so that everything a configuration can say can be said here, in the s
 """
 
 import pickle
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
@@ -187,7 +188,10 @@ def _configured(
         except ConfigError as error:
             raise ConfigError([replace(fault, path=_argument(fault.path)) for fault in error.problems]) from None
         _keep_data(where, call.files, replaces)
-        yield replace(config, directory=where)
+        try:
+            yield replace(config, directory=where)
+        except DataError as error:
+            raise DataError(call.words(str(error), where)) from None
 
 
 def _argument(path: str) -> str:
@@ -292,7 +296,13 @@ class GivenSeries:
                 error[key] = [self._stated(part, f"shared {i}", unit) for i, part in enumerate(parts, 1)]
             elif key == "covariance" and np.ndim(value) == 2:
                 file = f"data.{self.name}.covariance.csv".replace("..", ".")
-                self.files[file] = "".join(",".join(map(repr, row)) + "\n" for row in np.asarray(value, float).tolist())
+                matrix, times = np.asarray(value, dtype=float), self.columns[TIME]
+                if matrix.shape != 2 * times.shape:
+                    raise DataError(f"error: {self._of()}{key} has shape {matrix.shape} for {len(times)} readings")
+                if self.name:  # in a file with rows of other series
+                    there = ~np.isnan(times + self.columns[self._readings(observable.name)])
+                    matrix = matrix[there][:, there]
+                self.files[file] = "".join(",".join(map(repr, row)) + "\n" for row in matrix.tolist())
                 error[key] = {"path": file, "unit": "1" if unit == "1" else f"({unit})*({unit})"}
             else:
                 error[key] = self._stated(value, key, unit if key == std else "1")
@@ -356,6 +366,22 @@ class Given:
         self.beside["data.prior.csv"] = csv_of(columns)
         return {**section, "ensemble": "data.prior.csv"}
 
+    def words(self, message: str, directory: Path) -> str:
+        """A ``message`` about the files in a directory as one about the arrays that they hold."""
+
+        def reading(row_of: re.Match[str]) -> str:
+            row = int(row_of[1]) - 2
+            for series in self.series:
+                if row < len(series.columns[TIME]):
+                    break
+                row -= len(series.columns[TIME])
+            return f"reading {row + 1} of {series.name or 'data'}"
+
+        folder = re.escape(f"{directory.absolute()}")
+        message = re.sub(rf"{folder}.{re.escape(GIVEN)}:(\d+)", reading, message)
+        message = re.sub(rf"{folder}.data(?:\.(\S+))?\.csv", lambda file: file[1] or "data", message)
+        return re.sub(r" \(data\.[^)]*\)|; see data\.\w+", "", message)
+
     @property
     def files(self) -> dict[str, str]:
         """Names of the data file and of those beside it, and their texts."""
@@ -389,6 +415,8 @@ class Given:
 
     def _function(self, function: Any) -> FunctionModel:
         names = [name for name in self.priors if name not in {p.name for p in OF_READINGS}]
+        if not names:
+            raise ConfigError("priors: none is of a parameter of the function; give one a prior, or a fixed number")
         if wrong := [name for name in names if not str(name).isidentifier()]:
             raise ConfigError(f"priors: {wrong[0]!r} cannot be the name of a parameter; use letters, digits and _")
         columns = {name for series in self.series for name in series.columns}

@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from en4dvar.assembly.build import build_one, data_files, inverse_plan
+from en4dvar.assembly.build import data_files, inverse_plan
 from en4dvar.config import Config, load_config, loaded
 from en4dvar.diagnosis.analysis import Progress
 from en4dvar.executor import Executor
@@ -18,6 +18,7 @@ from en4dvar.results.campaign_file import DamagedError, save_campaign
 from en4dvar.results.pack import PACK
 from en4dvar.results.population_file import GROUPS, load_groups_of
 from en4dvar.runs.campaign import Campaign
+from en4dvar.runs.checks import checked_problem
 from en4dvar.runs.engine import FIGURES, REPORT, RunKind, Session, conduct_run
 from en4dvar.runs.together import JointKind, PopulationKind, SetGroup, groups_of, require_population
 from en4dvar.runs.worklist import ENDED, ITERATIONS, SUMMARY, Worklist, datasets
@@ -119,7 +120,7 @@ class EstimateKind(RunKind[Campaign]):
         unusable: list[DataError] = []
         for name, file in files.items():
             try:
-                require_population(config, build_one(config, name, file), files)
+                require_population(config, checked_problem(config, name, file), files)
             except ConfigError as error:
                 faults += error.problems
             except DataError as error:

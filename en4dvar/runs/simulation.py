@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from en4dvar.assembly.build import data_files, resolve_parameters
 from en4dvar.assembly.reading import read_observations
@@ -23,10 +24,11 @@ from en4dvar.data.series import Places
 from en4dvar.diagnosis.diagnostics import nrmse
 from en4dvar.executor import run_chunk
 from en4dvar.inputs.asked import Column
-from en4dvar.model.forward import Failure, ForwardModel, Observable, Trajectory
+from en4dvar.model.forward import Failure, ForwardModel, Observable, Trajectory, instants_of
 from en4dvar.model.state import READING_OFFSET, READING_SCALE, TIME_SHIFT, Array
 from en4dvar.plumbing.errors import ConfigError, En4dvarError, OutputError
 from en4dvar.plumbing.files import make_folder, write_text
+from en4dvar.plumbing.hints import listed
 from en4dvar.plumbing.tables import csv_text
 from en4dvar.plumbing.units import UnitError, convert
 from en4dvar.plumbing.user_code import reason_of
@@ -55,21 +57,25 @@ class Simulation:
 
     def with_noise(self, std: float | Mapping[str, float], seed: int) -> "Simulation":
         """Independent Gaussian noise added, of a standard deviation in the observable's unit: one for all series, or
-        by their names.
+        by their names. Raises :class:`ConfigError`.
         """
+        if seed < 0:
+            raise ConfigError(f"seed: must not be negative, not {seed}")
         stream = np.random.Generator(np.random.Philox(seed))
         stds = std if isinstance(std, Mapping) else dict.fromkeys(self.series, std)
+        if stds.keys() != self.series.keys() or not all(value >= 0 for value in stds.values()):
+            raise ConfigError(f"std: give one for all series, or of each: {listed(self.series)}; none is negative")
         noisy = {name: v + stds[name] * stream.standard_normal(len(v)) for name, v in self.series.items()}
         return replace(self, series=noisy)
 
 
-def simulate(config: Config, times: Array | None = None) -> Simulation:
+def simulate(config: Config, times: npt.ArrayLike | None = None) -> Simulation:
     """Run the model once, at the fixed values and the centres of the priors (median, in the prior's own transform).
 
     Parameters
     ----------
-    times: (K,) instants, of every series; default ``simulate.times`` of the configuration, else those of the first
-        data set.
+    times: (K,) instants from 0 on, of every series, increasing, in the model's unit; default ``simulate.times`` of the
+        configuration, else those of the first data set.
 
     Raises
     ------
@@ -87,6 +93,9 @@ def simulate(config: Config, times: Array | None = None) -> Simulation:
         if observations is None:
             raise ConfigError("no instants to simulate: give simulate.times in the file, or --times FROM:TO:STEP")
         times = observations.instants[0]
+    times = instants_of(times, unit := config.model.time_unit)
+    if times[0] < 0:
+        raise ConfigError(f"times: {times[0]:g} {unit} is before the model's clock begins, which is at 0")
     terms, fixed = resolve_parameters(config, observations)
     theta = {**fixed, **{t.parameter.name: float(t.to_physical(np.array(t.mean))) for t in terms}}
     theta |= {

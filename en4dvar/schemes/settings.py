@@ -48,7 +48,7 @@ class AssimilationSettings:
     """
 
     scheme: str = DEFAULT
-    members: Annotated[int, Ge(3), "Ensemble size N."] = 48
+    members: Annotated[int, Ge(3), Le(100_000), "Ensemble size N."] = 48
     sampling: Annotated[
         Literal["exact", "random"],
         "Prior ensemble: second-order exact (mean and covariance are the prior's), or random.",

@@ -5,20 +5,24 @@ from __future__ import annotations
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, cast, get_args
 
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.model.state import Array
-from en4dvar.plumbing.errors import ConfigError
+from en4dvar.model.forward import instants_of
+from en4dvar.model.state import Array, Parameter
+from en4dvar.plumbing.errors import ConfigError, retold
+from en4dvar.plumbing.hints import shown, suggest
+from en4dvar.plumbing.units import parse_quantity
 from en4dvar_bubble.driving import Driving, Reading
 from en4dvar_bubble.dynamics import Gas, Heat, Start, Vapour, Wall
 from en4dvar_bubble.gas import from_kirchhoff
 from en4dvar_bubble.laws import ConstitutiveLaw, get_law
-from en4dvar_bubble.medium import WATER_25C, Medium
+from en4dvar_bubble.medium import CONSTANT_SETS, WATER_25C, Medium
 from en4dvar_bubble.model import BubbleModel
-from en4dvar_bubble.solver.driver import Accuracy, AccuracyName, Radial, preset
+from en4dvar_bubble.settings import BubbleSettings, MediumName
+from en4dvar_bubble.solver.driver import Accuracy, AccuracyName, Radial
 from en4dvar_bubble.solver.integrate import MAX_MACH, MAX_THETA, RECORD, STEPS
 from en4dvar_bubble.solver.lanes import WIDTH
 
@@ -45,7 +49,7 @@ def simulate(
     gas: Gas = "heat",
     driving: Driving | None = None,
     driving_read: Reading = "instantaneous",
-    medium: Medium = WATER_25C,
+    medium: Medium | str = WATER_25C,
     radial: Radial = "keller-miksis",
     vapour: Vapour = "none",
     medium_heat: Heat = "cold",
@@ -58,14 +62,15 @@ def simulate(
     Parameters
     ----------
     law: name of a constitutive law (``en4dvar laws``), or an instance.
-    parameters: SI values, name → number or (member,): the law's (``G``, ``alpha``, ``mu``, …), with ``R0`` for the
-        acoustic start, ``R_max`` and ``R_eq`` (or ``R0``, the same there) for the laser start; where wanted, any of
-        :mod:`en4dvar_bubble.numbers` (``p_A``, ``surface_tension``, ``c``, …) in place of the model's.
+    parameters: SI values, or text such as ``"4 kPa"``, name → one or (member,): the law's (``G``, ``alpha``, ``mu``,
+        …), with ``R0`` for the acoustic start, ``R_max`` and ``R_eq`` (or ``R0``, the same there) for the laser start;
+        where wanted, any of :mod:`en4dvar_bubble.numbers` (``p_A``, ``surface_tension``, ``c``, …) in place of the
+        model's.
     times: output times (time,) in s, increasing; time zero is the start of the simulation (laser: the instant of
         R_max).
     start, gas, driving, driving_read, medium, radial, vapour, medium_heat, wall, accuracy: the model, see
-        :class:`BubbleModel`; by default the acoustic start with the histotripsy pulse and the constants of water at
-        25 °C, p_f read at t, heat equation in the gas with a cold wall.
+        :class:`BubbleModel` (a ``medium`` also by its name, as in a file); by default the acoustic start with the
+        histotripsy pulse and the constants of water at 25 °C, p_f read at t, heat equation in the gas with a cold wall.
     workers: threads at most (few members are integrated by one); the result does not depend on it.
 
     Returns
@@ -77,8 +82,8 @@ def simulate(
 
     Raises
     ------
-    ConfigError: unknown law, a model that contradicts itself, missing or unknown parameters, lengths that differ,
-        times that do not increase, fewer than one worker.
+    ConfigError: unknown law or other name, a model that contradicts itself, missing or unknown parameters, lengths
+        that differ, times that do not increase, fewer than one worker.
     """
     if workers < 1:
         raise ConfigError(f"workers: at least 1, not {workers}")
@@ -90,20 +95,18 @@ def simulate(
             start=start,
             driving=cast(Driving, driving),
             reading=driving_read,
-            medium=medium,
+            medium=_medium(medium),
             radial=radial,
             vapour=vapour,
             medium_heat=medium_heat,
             wall=wall,
-            accuracy=preset(accuracy, start) if isinstance(accuracy, str) else accuracy,
+            accuracy=cast(Accuracy, accuracy),
         )
     except ValueError as error:
         raise ConfigError(str(error)) from error
     model = model.with_parameters(dict(parameters or {}))
     theta = _members(model, dict(parameters or {}))
-    t = np.asarray([] if times is None else times, dtype=float)
-    if t.ndim != 1 or len(t) == 0 or not np.all(np.isfinite(t)) or np.any(np.diff(t) <= 0):
-        raise ConfigError("times: give a one-dimensional, increasing sequence of seconds")
+    t = instants_of(() if times is None else times, "s")
     try:
         x = model.initial_states(theta)
     except ValueError as error:
@@ -175,6 +178,22 @@ def _dataset(
     return xr.Dataset(data, coords=coordinates, attrs=attributes)
 
 
+def _medium(medium: Medium | str) -> Medium:
+    """Also that of a name of ``model.constants`` or ``model.medium`` of a file. Raises :class:`ConfigError`."""
+    if not isinstance(medium, str):
+        return medium
+    names = (*CONSTANT_SETS, *get_args(MediumName))
+    if medium not in names:
+        raise ConfigError(f"medium: unknown name {shown(medium)}{suggest(medium, names)}")
+    return CONSTANT_SETS.get(medium) or BubbleSettings.model_validate({"medium": medium}).liquid
+
+
+def _numbers(value: Any, parameter: Parameter) -> Array:
+    """In the unit of the parameter. Raises :class:`ConfigError`."""
+    with retold((TypeError, ValueError), ConfigError, f"parameters: {parameter.name}: "):
+        return np.asarray(parse_quantity(value, parameter.unit) if isinstance(value, str) else value, dtype=float)
+
+
 def _members(model: BubbleModel, values: dict[str, npt.ArrayLike]) -> dict[str, Array]:
     """Parameters as arrays of one length. Raises :class:`ConfigError`."""
     if model.start == "laser" and "R0" in values and "R_eq" not in values:
@@ -187,7 +206,7 @@ def _members(model: BubbleModel, values: dict[str, npt.ArrayLike]) -> dict[str, 
         raise ConfigError(
             f"parameters: {'; '.join(parts)} ({model.law.name}, {model.start} start, takes {', '.join(wanted)})"
         )
-    arrays = {n: np.atleast_1d(np.asarray(v, dtype=float)) for n, v in values.items()}
+    arrays = {n: np.atleast_1d(_numbers(v, wanted[n])) for n, v in values.items()}
     lengths = {len(a) for a in arrays.values()} - {1}
     if len(lengths) > 1 or any(a.ndim != 1 for a in arrays.values()):
         raise ConfigError(f"parameters: lengths differ: { {n: a.shape for n, a in arrays.items()} }")

@@ -2,14 +2,16 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cache, cached_property, lru_cache
-from typing import Any, Literal
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 from scipy.special import digamma
 
 from en4dvar.model.state import Array, Field, Parameter, StateLayout
+from en4dvar.plumbing.errors import ConfigError
+from en4dvar.plumbing.hints import shown, suggest
 from en4dvar_bubble.collapse import RAYLEIGH
 from en4dvar_bubble.driving import Driving, Reading, histotripsy, silence
 from en4dvar_bubble.gas import CRITICAL_TEMPERATURE, kirchhoff, mass_fraction, saturated_vapour_pressure
@@ -34,6 +36,24 @@ Vapour = Literal["none", "frozen", "transport"]
 Heat = Literal["cold", "conducting"]
 
 
+@cache
+def _kinds(declared: type) -> dict[str, Any]:
+    """The fields of a dataclass that are declared as one of several names, or as a class of this package."""
+    hints = get_type_hints(declared)
+    named = {f.name: hints[f.name] for f in fields(declared)}
+    return {name: kind for name, kind in named.items() if get_origin(kind) is Literal or "en4dvar_bubble" in str(kind)}
+
+
+def require_kinds(whole: Any, declared: type) -> None:
+    """Raise :class:`ConfigError` where a field is not what the dataclass ``declared`` says."""
+    for name, kind in _kinds(declared).items():
+        value, literal = getattr(whole, name), get_origin(kind) is Literal
+        if literal and value not in get_args(kind):
+            raise ConfigError(f"{name}: unknown name {shown(value)}{suggest(value, get_args(kind))}")
+        if not literal and not isinstance(value, kind):
+            raise ConfigError(f"{name}: {shown(value)} is no {str(kind).rpartition('.')[2].strip(chr(39) + '>')}")
+
+
 @dataclass(frozen=True)
 class Wall:
     """A plane at ``distance`` (m; of R_max if ``relative``) from the centre of the bubble: ``rigid``, or the ``free``
@@ -43,6 +63,9 @@ class Wall:
     distance: float
     kind: Literal["rigid", "free", "slit"] = "rigid"
     relative: bool = False
+
+    def __post_init__(self) -> None:
+        require_kinds(self, Wall)
 
     def __str__(self) -> str:
         return f"{self.kind}, {self.distance:.6g} {'R_max' if self.relative else 'm'}"
@@ -87,7 +110,8 @@ class Dynamics:
 
     Raises
     ------
-    ValueError: options that exclude each other; a law of a user's that the solver's table cannot hold.
+    ConfigError: a name that is none of those, or another object. ValueError: options that exclude each other; a law of
+        a user's that the solver's table cannot hold.
     """
 
     law: ConstitutiveLaw = field(default_factory=QuadraticKelvinVoigt)
@@ -96,7 +120,7 @@ class Dynamics:
     driving: Driving = None  # type: ignore[assignment]  # chosen by the start
     reading: Reading = "instantaneous"
     medium: Medium = WATER_25C
-    accuracy: Accuracy = None  # type: ignore[assignment]  # ``standard`` for the start
+    accuracy: Accuracy = None  # type: ignore[assignment]  # or its name; by default ``standard`` for the start
     radial: Radial = "keller-miksis"
     vapour: Vapour = "none"
     medium_heat: Heat = "cold"
@@ -114,8 +138,10 @@ class Dynamics:
     def __post_init__(self) -> None:
         if self.driving is None:
             object.__setattr__(self, "driving", _usual_driving(self.start))
-        if self.accuracy is None:
-            object.__setattr__(self, "accuracy", preset("standard", self.start))
+        accuracy: Any = self.accuracy or "standard"
+        if isinstance(accuracy, str):
+            object.__setattr__(self, "accuracy", preset(accuracy, self.start))  # type: ignore[arg-type]
+        require_kinds(self, Dynamics)
         refuse_inexact(type(self.law))
         if self.law.released and self.start != "laser":
             raise ValueError(f"{self.law.name} needs start: laser: only a released bubble has an R_max at time zero")

@@ -11,7 +11,8 @@ import pytest
 import en4dvar_bubble
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar_bubble import api
-from en4dvar_bubble.medium import UNITS, WATER_25C
+from en4dvar_bubble.media import known_medium
+from en4dvar_bubble.medium import CONSTANT_SETS, UNITS, WATER_25C
 
 GEL = {"G": 6900.0, "alpha": 0.025, "mu": 0.15, "R0": 1.3e-6}
 TIMES = np.linspace(5e-6, 30e-6, 7)
@@ -49,6 +50,16 @@ def test_few_members_are_integrated_by_one_thread(members, beside, monkeypatch):
     assert asked == beside
 
 
+def test_units_and_names_are_those_of_a_file():
+    by_name = en4dvar_bubble.simulate(parameters={**GEL, "G": "6.9 kPa"}, times=TIMES, medium="imr-v2")
+    same = en4dvar_bubble.simulate(parameters=GEL, times=TIMES, medium=CONSTANT_SETS["imr-v2"])
+    assert by_name.equals(same)
+    gel = en4dvar_bubble.simulate(parameters=GEL, times=TIMES, medium="gelatin")
+    assert json.loads(gel.attrs["constants"])["rho"]["value"] == pytest.approx(known_medium("gelatin", None).rho)
+    with pytest.raises(ConfigError, match="vapour: unknown name 'foo'"):
+        en4dvar_bubble.BubbleModel(vapour="foo")
+
+
 def test_velocity_is_the_derivative_of_the_radius():
     t = np.linspace(10e-6, 20e-6, 1001)
     data = en4dvar_bubble.simulate(parameters=GEL, times=t, accuracy="reference")
@@ -68,6 +79,19 @@ def test_velocity_is_the_derivative_of_the_radius():
         ({"workers": 0}, "at least 1, not 0"),
         ({"gas": "polytropic", "vapour": "transport"}, "need gas: heat"),
         ({"law": "rubber"}, "unknown law 'rubber'"),
+        ({"gas": "polytrope"}, "gas: unknown name 'polytrope'; did you mean 'polytropic'"),
+        ({"vapour": "foo"}, "vapour: unknown name 'foo'; known: none, frozen, transport"),
+        ({"medium_heat": "foo"}, "medium_heat: unknown name 'foo'; known: cold, conducting"),
+        ({"start": "lazer"}, "start: unknown name 'lazer'; did you mean 'laser'"),
+        ({"radial": "foo"}, "radial: unknown name 'foo'; known: rayleigh-plesset, "),
+        ({"driving_read": "foo"}, "reading: unknown name 'foo'; known: instantaneous, "),
+        ({"accuracy": "foo"}, "accuracy: unknown name 'foo'; known: fast, "),
+        ({"accuracy": 3}, "accuracy: 3 is no Accuracy"),
+        ({"medium": "jelly"}, "medium: unknown name 'jelly'; known: water-25C, "),
+        ({"driving": "sine"}, "driving: 'sine' is no Driving"),
+        ({"wall": "rigid"}, r"wall: 'rigid' is no Wall"),
+        ({"parameters": {**GEL, "G": "4 kg"}}, "parameters: G: '4 kg'"),
+        ({"parameters": {**GEL, "G": ["4 kPa"]}}, "parameters: G: could not convert"),
     ],
 )
 def test_mistakes_are_named(change, message):

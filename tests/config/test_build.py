@@ -96,8 +96,11 @@ def test_refused(tmp_path: Path) -> None:
         build(load_config(path, {"data.window": "{to: minimum 9}"}))
     with pytest.raises(DataError, match="before time zero"):
         build(load_config(path, {"data.time_zero": "7 ms"}))
+    for window in ("from: 200 ms", "to: -1 ms", "from: 21 ms, to: 24 ms"):
+        with pytest.raises(DataError, match=r"the window holds no reading; the readings go from 0 to 150 ms$"):
+            build(load_config(path, {"data.window": f"{{{window}}}"}))
     with pytest.raises(DataError, match=r"it ends before it starts; the readings go from 0 to 150 ms$"):
-        build(load_config(path, {"data.window": "{from: 200 ms}"}))
+        build(load_config(path, {"data.window": "{from: 20 ms, to: 10 ms}"}))
     with pytest.raises(DataError, match=r"the window data\.window holds 2 of \d+ usable observations; at least 3"):
         build(load_config(path, {"data.window": "{to: 7 ms}"}))
     text = path.read_text()

@@ -55,6 +55,44 @@ def test_covariance_file(tmp_path: Path) -> None:
     assert y.std[[0, -1]] == pytest.approx([1e-6, 3e-6])
 
 
+ORDER = [*range(20), *range(25, 31), *range(20, 25)]  # of a file that is not sorted
+BLANK = [3, 7]
+
+
+@pytest.mark.parametrize(
+    ("key", "order", "first", "last"),
+    [
+        ("weights: " + str([1] * 29), range(31), 0, 30),
+        ("window: {from: 20 ms, to: 100 ms}", range(31), 4, 20),
+        ("since: 20 ms", range(31), 4, 30),
+        ("outliers: leave out", range(31), 0, 30),
+        ("unsorted: sort", ORDER, 0, 30),
+    ],
+)
+def test_rows_of_a_covariance_are_those_of_the_readings_that_are_kept(
+    tmp_path: Path, key: str, order: list[int], first: int, last: int
+) -> None:
+    odd = [15] if "outliers" in key else []
+    rows = [f"{5 * i},{'' if i in BLANK else 900 if i in odd else 200 + i}" for i in range(31)]
+    data = "\n".join(["t_ms,x_um", *(rows[i] for i in order), ""])
+    of_file = [list(order).index(i) for i in range(first, last + 1) if i not in BLANK + odd]
+    usable = [i for i in range(31) if i not in [list(order).index(b) for b in BLANK]]
+    for size, where in ((31, of_file), (29, [usable.index(i) for i in of_file])):
+        r = write_matrix(tmp_path, size)
+        (problem,) = build(load_config(write_toy(tmp_path, FROM_FILE, ("  error:", f"  {key}\n  error:"), data=data)))
+        y = problem.observations
+        held = np.outer(y.std, y.std) * y.noise.correlation.matrix
+        assert held == pytest.approx(1e-12 * r[np.ix_(where, where)], rel=1e-12)
+
+
+def test_a_covariance_has_no_row_for_the_mean_of_several_readings(tmp_path: Path) -> None:
+    data = csv_text() + "150,0\n"
+    repeated = FROM_FILE, ("  error:", "  repeated: average\n  error:")
+    write_matrix(tmp_path, 32)
+    with pytest.raises(DataError, match=r"R\.csv: 32 rows, but 31 observations, of which some are means of readings"):
+        build(load_config(write_toy(tmp_path, *repeated, data=data)))
+
+
 def test_covariance_files_that_cannot_be_used(tmp_path: Path) -> None:
     write_toy(tmp_path)
     for text, message in (
@@ -64,6 +102,7 @@ def test_covariance_files_that_cannot_be_used(tmp_path: Path) -> None:
         ("1,0\n0,-1\n", r"R.csv: the variances must be positive"),
         ("1,x\n0,1\n", r"R.csv:1: 'x' in column '2' is not a number"),
         ("1,0\n0,1\n", r"R.csv: 2 rows, but 31 observations"),
+        ("\n".join(",".join("1" * 32) for _ in range(32)), r"R.csv: 32 rows, but 31 observations are used, of 31 usa"),
         ("", r"R.csv: a covariance is square"),
     ):
         (tmp_path / "R.csv").write_text(text, encoding="utf-8")

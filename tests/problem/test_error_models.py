@@ -8,7 +8,8 @@ import pytest
 from scipy.stats import multivariate_normal
 from toys import Decay, Linear, Wave, make_observations, make_problem, visit, with_noise
 
-from en4dvar.data.noise import Linearisation, Predicted
+from en4dvar.data.noise import Linearisation, Predicted, noise_of
+from en4dvar.data.observations import Observations
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.ensemble.linalg import centre
 from en4dvar.estimation.assimilate import assimilate, forecast, log_posterior
@@ -318,3 +319,20 @@ def test_mean_and_anomalies_of_a_scaled_problem_do_not_depend_on_sigma():
     plain = make_problem(Linear(NAMES), TRUTH)
     a, b = (p.prior.sample(10, 3, "random") for p in (plain, with_errors(plain, sigma=0.5)))
     assert np.array_equal(centre(a)[1], centre(b)[1][:, :3])
+
+
+@pytest.mark.parametrize("kind", [list, "i4", "i8", "f4"])
+def test_numbers_of_any_kind_are_observations(kind):
+    def of(numbers):
+        return numbers.tolist() if kind is list else numbers.astype(kind)
+
+    times, values, ones = np.arange(1.0, 8.0), np.arange(3.0, 10.0), np.ones(7)
+    problem = make_problem(Linear(), np.ones(2))
+    floats = replace(problem, observations=Observations(times, values, noise_of(ones), ones))
+    others = replace(problem, observations=Observations(of(times), of(values), noise_of(of(ones)), of(ones)))
+    one, other = (assimilate(p, AssimilationSettings(members=8), seed=1) for p in (floats, others))
+    assert np.array_equal(one.posterior, other.posterior)
+    assert one.cautions == other.cautions
+    for wrong in (values + 1j, ["1 m"] * 7, np.ones((7, 1)), 1.0):
+        with pytest.raises(DataError):
+            Observations(wrong, values, noise_of(ones), ones)

@@ -69,6 +69,12 @@ def test_arviz_shows_display_units_and_compares_chains(result: Result) -> None:
         result.to_inference_data(chains=40)
 
 
+def test_without_arviz_it_is_told_how_to_install_it(result: Result, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "arviz", None)
+    with pytest.raises(ConfigError, match="needs ArviZ: pip install arviz"):
+        result.to_inference_data()
+
+
 def test_from_version_1_on_arviz_takes_a_tree(result: Result, monkeypatch: pytest.MonkeyPatch) -> None:
     """ArviZ 1.x has no InferenceData; its functions take xarray's DataTree, by the same names of groups."""
     before = result.to_inference_data(units="display", chains=4)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import xarray as xr
 from toys import Linear
 
 import en4dvar
+from en4dvar.runs.checks import validate
 from en4dvar.runs.rerun import rerun
 
 TIMES = np.linspace(0.0, 3.0, 12)
@@ -124,6 +126,12 @@ def test_a_result_is_saved_shown_and_compared(tmp_path, result):
     assert f"{float(result.posterior['a'].mean()):.4g}" in shown
     compared = en4dvar.compare_runs({"line": result, "exponential": fit(growth), "file": tmp_path / "line.nc"})
     assert compared.verdict("data").startswith("undecidable: line and file differ by")
+    with pytest.raises(en4dvar.ConfigError, match="no data set 'dta'; did you mean 'data'"):
+        compared.verdict("dta")
+    with pytest.raises(en4dvar.OutputError, match="at least two run directories"):
+        en4dvar.compare_runs("runs/gel")
+    with pytest.raises(en4dvar.ConfigError, match="no kind of table is called 'xls'; known: csv, latex, members"):
+        en4dvar.export_table(tmp_path, "xls")
     for path in (tmp_path / "line", tmp_path / "line.html"):
         with pytest.raises(en4dvar.OutputError, match=r"ends in \.nc"):
             result.save(path)
@@ -162,6 +170,11 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "a null byte": ({"priors": {"a": {"prior": "no\0rmal"}}}, "priors.a.prior: a null byte"),
     "odd section": ({"asimilation": {}}, "asimilation: unknown key 'asimilation'; did you mean 'assimilation'?"),
     "setting": ({"assimilation": {"member": 3}}, "assimilation.member: unknown key 'member'; did you mean 'members'?"),
+    "a time": ({"data": (np.where(TIMES > 2.9, np.nan, TIMES), VALUES)}, "data: the time of reading 12 is NaN; leave"),
+    "order": ({"data": (TIMES[::-1], VALUES)}, "reading 2 of data: times must increase, but 2.72727 1 follows 3 1"),
+    "repeated": ({"data": (TIMES.round(), VALUES)}, "follows 0 1; keep one of the two readings, or their mean"),
+    "no parameter": ({"priors": {"reading_scale": PRIORS["a"]}}, "priors: none is of a parameter of the function"),
+    "members": ({"assimilation": {"members": 10**9}}, "assimilation.members: should be less than or equal to 100000"),
     "window": ({"window": {"form": 1}}, "window.form: unknown key 'form'; did you mean 'from'?"),
 }  # fmt: skip
 
@@ -173,6 +186,7 @@ def test_each_fault_is_one_message_with_its_argument(fault):
         fit(**arguments)
     assert words in str(caught.value)
     assert len(str(caught.value).splitlines()) == 1
+    assert not re.search(r"data\.|/tmp", str(caught.value))
 
 
 @pytest.mark.parametrize(
@@ -183,12 +197,48 @@ def test_each_fault_is_one_message_with_its_argument(fault):
         (lambda p, t: {"z": t}, "the function returned z, but no 'y'"),
         (lambda p, t: None, "the function returned shape () for y"),
         (lambda p, t: t * np.nan, "non-finite prediction"),
+        (lambda p, t: p["a"] + 1j * t, "the function returned complex numbers for y"),
     ],
 )
 def test_what_is_wrong_with_a_function_is_told(function, reason):
     with pytest.raises(en4dvar.TooFewMembersError) as caught:
         fit(function)
     assert reason in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["chain", "draw", "posterior_draw", "iteration", "J", "J_background", "dfs"])
+def test_a_name_that_the_result_has_itself_is_refused_before_anything_is_computed(name):
+    runs = []
+
+    def model(parameters, times):
+        runs.append(parameters)
+        return line({"a": parameters[name], "b": 0.0}, times)
+
+    with pytest.raises(en4dvar.ConfigError, match=f"the parameter '{name}' needs another name: the result has another"):
+        fit(model, priors={name: PRIORS["a"]})
+    assert not runs
+
+
+def test_names_that_collide_with_each_other_are_refused(tmp_path):
+    with pytest.raises(en4dvar.ConfigError, match="'a' needs another name: the result has another 'a_centre'"):
+        fit(lambda p, t: p["a"] + p["a_centre"] * t, priors={"a": PRIORS["a"], "a_centre": PRIORS["b"]})
+    with pytest.raises(en4dvar.ConfigError, match="the series 'mode' needs another name: the result has another 'mode"):
+        fit(lambda p, t: line(p, t), data={"time": TIMES, "mode": VALUES})
+    model = "class Creep(Linear):\n    def __init__(self):\n        super().__init__('Jb')\n"
+    (tmp_path / "creep.py").write_text(f"from toys import Linear\n{model}")
+    (tmp_path / "x.csv").write_text("t,y\n0,1\n1,2\n2,2\n")
+    asked = {
+        "name": "x",
+        "model": {"name": f"{tmp_path}/creep.py:Creep"},
+        "data": {
+            "path": f"{tmp_path}/x.csv",
+            "columns": {"time": {"name": "t", "unit": "s"}, "y": {"name": "y", "unit": "m"}},
+            "error": {"y_std": "0.1 m"},
+        },
+        "parameters": {"J": IN_METRES["a"], "b": IN_METRES["b"]},
+    }
+    with pytest.raises(en4dvar.ConfigError, match="the parameter 'J' needs another name"):
+        validate(asked)
 
 
 def test_a_function_cannot_vary_in_time():

@@ -33,6 +33,28 @@ def fit(model: Any = two, data: Any = None, **more: Any) -> en4dvar.Result:
     return en4dvar.estimate(model, DATA if data is None else data, **given)
 
 
+def test_a_reading_is_counted_in_its_series():
+    with pytest.raises(en4dvar.DataError, match=r"reading 3 of q: times must increase, but 0\.3 1 follows 0\.45 1"):
+        fit(data={**DATA, "q": (np.where(T2[2] == T2, T2[0], T2), V2)})
+
+
+@pytest.mark.parametrize("several", [True, False])
+def test_a_covariance_loses_the_rows_of_missing_readings(several):
+    seen = np.isin(np.arange(9), (0, 4), invert=True)
+    R2 = np.outer(S2, S2) * 0.5 ** np.abs(np.subtract.outer(range(9), range(9)))
+    q = (T2, np.where(seen, V2, np.nan))
+    R, rows = R2[seen][:, seen], design(t2=T2[seen])
+    if several:
+        found = fit(data={"p": DATA["p"], "q": q}, error={"p": S1, "q": {"covariance": R2}})
+        R = np.block([[S1**2 * np.eye(7), np.zeros((7, 7))], [np.zeros((7, 7)), R]])
+        assert_closed_form(found, rows, np.concatenate([V1, V2[seen]]), R)
+    else:
+        found = fit(lambda p, t: two(p, t)["q"], q, error={"covariance": R2})
+        assert_closed_form(found, rows[7:], V2[seen], R)
+    with pytest.raises(en4dvar.DataError, match=r"covariance has shape \(8, 8\) for 9 readings"):
+        fit(lambda p, t: two(p, t)["q"], q, error={"covariance": R2[1:, 1:]})
+
+
 @pytest.fixture(scope="module")
 def result() -> en4dvar.Result:
     return fit()

@@ -54,6 +54,26 @@ def test_all_series_at_the_same_instants_in_one_table_that_is_read_again(tmp_pat
     assert again.times == pytest.approx(TIMES)  # those of the data
 
 
+def test_instants_are_a_sequence_that_increases_from_zero(tmp_path: Path) -> None:
+    config = load_config(write(tmp_path))
+    found = simulate(config, [0, 1])
+    assert found.series["p"] == pytest.approx([3, 5])
+    for wrong in ([1, 0], [0, 1, 1], [], [[0, 1]], 1.0, [0, np.nan], ["0 s"]):
+        with pytest.raises(ConfigError, match="times: give a one-dimensional sequence of increasing numbers, in s"):
+            simulate(config, wrong)
+    with pytest.raises(ConfigError, match=r"times: -0\.5 s is before the model's clock begins"):
+        simulate(config, (-0.5, 1.0))
+
+
+def test_noise_has_a_seed_and_a_std_of_each_series(tmp_path: Path) -> None:
+    found = simulate(load_config(write(tmp_path)))
+    with pytest.raises(ConfigError, match="seed: must not be negative, not -1"):
+        found.with_noise(0.1, -1)
+    for std in (-0.1, {"p": 0.1}, np.nan):
+        with pytest.raises(ConfigError, match="std: give one for all series, or of each: p, q, well"):
+            found.with_noise(std, 1)
+
+
 def test_noise_is_a_share_of_each_series(tmp_path: Path) -> None:
     config = load_config(write(tmp_path))
     found = simulate(config, np.linspace(0.1, 0.5, 4000))

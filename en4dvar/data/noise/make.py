@@ -205,7 +205,8 @@ def noise_of(
     ValueError: both a correlation and a robust cost, either or a discrepancy beside bounds, or a matrix that is no
         correlation.
     """
-    time_std = np.zeros_like(std) if time_std is None else time_std
+    std = np.asarray(std, dtype=float)
+    time_std = np.zeros_like(std) if time_std is None else np.asarray(time_std, dtype=float)
     if sides is not None and np.any(sides):
         if correlation is not None or huber is not None or discrepancy is not None:
             raise ValueError("bounds (at_most, at_least) stand beside no correlation, robust cost or discrepancy")

@@ -17,6 +17,7 @@ import numpy as np
 from annotated_types import Ge, Gt, Le
 
 from en4dvar.model.state import Array, Parameter, TransformName
+from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.units import Quantity
 from en4dvar_bubble.driving.base import Driving, PulseNumber, Role, Shape
 
@@ -86,9 +87,14 @@ def numbers_of(function: Pulse) -> Iterator[tuple[str, Role, Parameter]]:
 
 
 def _changeable(function: Pulse, arguments: Mapping[str, Any]) -> Iterator[PulseNumber]:
-    """Those of a pulse; a shape that cannot change, as that of a burst without envelope, is none of them."""
+    """Those of a pulse; a shape that cannot change, as that of a burst without envelope, is none of them.
+
+    Raises :class:`ConfigError` for a value that is out of bounds.
+    """
     for key, role, parameter in numbers_of(function):
-        value = arguments[key]
+        value, (least, most) = arguments[key], parameter.bounds
+        if not least <= value <= most:
+            raise ConfigError(f"{key} of the pulse must lie in [{least:g}, {most:g}] {parameter.unit}, not {value:g}")
         with suppress(ValueError):
             if role == "shape":
                 function(**{**arguments, key: value + 0.01})

@@ -9,6 +9,8 @@ from typing import Any, Literal
 import numpy as np
 
 from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import ConfigError
+from en4dvar.plumbing.hints import shown, suggest
 from en4dvar.plumbing.kernel_cache import stamp_with_sources
 from en4dvar_bubble import tables as tables_module
 from en4dvar_bubble.driving import Driving, Reading
@@ -81,7 +83,9 @@ _NODES_RELEASED: dict[AccuracyName, int] = {"fast": 8, "standard": 12, "referenc
 
 
 def preset(name: AccuracyName, start: str) -> Accuracy:
-    """The accuracy called ``name`` for a start, ``acoustic`` or ``laser``."""
+    """The accuracy called ``name`` for a start, ``acoustic`` or ``laser``. Raises :class:`ConfigError`."""
+    if name not in ACCURACIES:
+        raise ConfigError(f"accuracy: unknown name {shown(name)}{suggest(name, ACCURACIES)}")
     base = ACCURACIES[name]
     if start == "acoustic":
         return base
