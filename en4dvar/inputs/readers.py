@@ -2,7 +2,8 @@
 
 Rows that hold NaN or a blank are dropped; every remaining number must be finite and the times must increase. Fields of
 ``.mat`` files may be rows or columns; their leading zeros and NaN (frames before nucleation) are dropped and their
-scalars collected. Leading zeros of a column that cannot be zero are dropped from CSV files too.
+scalars collected. Of a column that cannot be zero all numbers of 0 or below are dropped, from CSV files too, and those
+after its first reading are told: they are codes of missing readings.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,13 +22,15 @@ from en4dvar.plumbing.errors import DataError, retold
 from en4dvar.plumbing.hints import suggest
 from en4dvar.plumbing.units import convert
 
+FAR, BELOW = "far from what their neighbours say", "0 or below, as a missing reading may be written"
+
 
 @dataclass(frozen=True)
 class Readings:
     """One observable in time, in the model's units, times increasing; ``scalars`` as the file has them.
 
     ``errors`` are the columns that were asked for besides, by name, one number a reading; ``left_out`` the times of
-    readings that their neighbours refute.
+    readings that are none, by the reason.
     """
 
     times: Array
@@ -35,7 +38,7 @@ class Readings:
     source: str
     scalars: Mapping[str, float] = field(default_factory=dict)
     errors: Mapping[str, Array] = field(default_factory=dict)
-    left_out: tuple[float, ...] = ()
+    left_out: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
 
 
 def read_series(
@@ -72,8 +75,11 @@ def read_series(
     if len(times) != len(values):
         raise DataError(f"{path}: {len(times)} times but {len(values)} values of {value.name!r}")
     zero = bool(lines) and not value.positive
-    first = 0 if zero else int(np.argmax(np.nan_to_num(values) != 0))
+    first = 0 if zero else int(np.argmax(values > 0 if value.positive else np.nan_to_num(values) != 0))
     kept = np.arange(first, len(values))[~(np.isnan(times) | np.isnan(values))[first:]]
+    below = values[kept] <= 0 if value.positive else np.zeros(len(kept), dtype=bool)
+    left_out = {BELOW: tuple(np.sort(times[kept[below]]))} if below.any() else {}
+    kept = kept[~below]
     _check(times[kept], values[kept], value.name, path, fewest, zero)
     if repeats:
         kept = kept[np.argsort(times[kept], kind="stable")]
@@ -91,14 +97,15 @@ def read_series(
             sums = np.sqrt(np.bincount(which, own**2)) if c.kind == "std" else np.bincount(which, own)
             stated[c.name] = np.asarray(sums / counts)
         times, values = each, np.bincount(which, values) / counts
-    return _rest(Readings(times, values, str(path), scalars, stated), layout, fewest)
+    return _rest(Readings(times, values, str(path), scalars, stated, left_out), layout, fewest)
 
 
 def _rest(read: Readings, layout: Layout, fewest: int) -> Readings:
     """Without outliers and what is before an instant, where the layout says so. Raises :class:`DataError`."""
     if layout.outliers == "leave out":
         odd = outlying(read.times, read.values, scatter_of(read.times, read.values))
-        read = replace(_kept(read, ~odd), left_out=tuple(read.times[odd]))
+        far = {FAR: tuple(read.times[odd])} if odd.any() else {}
+        read = replace(_kept(read, ~odd), left_out={**read.left_out, **far})
     if layout.since != ANY.since:
         with retold(DataError, DataError, f"{read.source}: data.since "):
             since = slice(index_of(read.times, read.values, layout.since), None)
@@ -141,7 +148,7 @@ def _check(times: Array, values: Array, name: str, path: Path, fewest: int, zero
     """Raise :class:`DataError` where readings are of no use; ``zero``: all of them may be."""
     if not len(values) or not (zero or np.any(values)):
         raise DataError(
-            f"{path}: {name!r} holds no usable value (all NaN{', or blank' if zero else ', blank or zero'})"
+            f"{path}: {name!r} holds no usable value (all NaN{', or blank' if zero else ', blank, or not above zero'})"
         )
     if not (np.all(np.isfinite(times)) and np.all(np.isfinite(values))):
         raise DataError(f"{path}: infinite values")

@@ -27,6 +27,25 @@ def test_units_that_cannot_be_right_are_noticed(tmp_path: Path) -> None:
     assert "no bubble has such a radius; are the units of both columns right?" in done.stderr
 
 
+def test_frames_without_a_bubble_change_nothing_but_a_note(tmp_path: Path) -> None:
+    """Codes of dropped frames, before the collapse and after the window: all is as if their cells were blank."""
+    head, *rows = write(tmp_path / "b.csv").read_text().splitlines()
+    written = {}
+    for name, code in (("blank", ""), ("coded", "0"), ("coded_too", "-1")):
+        dropped = [f"{row.split(',')[0]},{code}" if i in (12, 30, 55) else row for i, row in enumerate(rows)]
+        Path(f"{name}.csv").write_text("\n".join([head, *dropped, ""]))
+        done = call("init", "--data", f"{name}.csv", "--out", f"{name}.yaml")
+        told = f"warning: {name}: 3 readings of 0 or below are frames without a bubble, and left out\n"
+        assert (told in done.stderr) == (name != "blank")
+        text = Path(f"{name}.yaml").read_text().replace(name, "blank")
+        written[name] = [line for line in text.splitlines() if "frames without" not in line]
+        (problem,) = build(load_config(f"{name}.yaml"))
+        written[name] += [problem.observations.continued.times.tolist()]
+    assert written["blank"] == written["coded"] == written["coded_too"]
+    said = call("validate", "coded.yaml").stderr
+    assert "note: coded: readings left out, for they are 0 or below, as a missing reading may be written: 3 of" in said
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("header", "options", "told"),

@@ -12,7 +12,7 @@ from en4dvar.config import Config, resolve
 from en4dvar.config.document import parse_document
 from en4dvar.inputs.asked import ANY, Column, DataFile, Layout, TimeStep
 from en4dvar.inputs.matfile import indexed
-from en4dvar.inputs.readers import Readings, read_series
+from en4dvar.inputs.readers import BELOW, FAR, Readings, read_series
 from en4dvar.inputs.steps import step_doubts
 from en4dvar.plumbing.errors import ConfigError, DataError
 from en4dvar.plumbing.files import expanded
@@ -98,8 +98,8 @@ def propose_config(
         medium,
         grouped(files, data, groups, layout),
     )
-    odd = [_outliers(name, series) for name, series in readings.items() if series.left_out]
-    if odd:
+    odd = [words for name, series in readings.items() for words in _left_out(name, series)]
+    if any(FAR in series.left_out for series in readings.values()):
         source = replace(source, layout=replace(layout, outliers="leave out"))
     proposal = _with_rest(proposal, readings, source.radius[1])
     if errors:
@@ -155,15 +155,16 @@ def _times(source: Source) -> Column | TimeStep:
     return Column(*(source.time or ("", "s")), "s", rate=rate)
 
 
-def _outliers(name: str, series: Readings) -> str:
-    """That readings of a data set were left out, and when they are of."""
-    times = [f"{1e6 * time:.6g}" for time in series.left_out[:6]]
-    which = (
-        f"the reading at {times[0]} us is"
-        if len(series.left_out) == 1
-        else f"the readings at {', '.join(times)} us are"
-    )
-    return f"{name}: {which} none of the bubble by the neighbours, and left out (data.outliers)"
+def _left_out(name: str, series: Readings) -> list[str]:
+    """That readings of a data set were left out, and which."""
+    words = []
+    if none := series.left_out.get(BELOW):
+        which = "reading of 0 or below is a frame" if len(none) == 1 else "readings of 0 or below are frames"
+        words.append(f"{name}: {len(none)} {which} without a bubble, and left out")
+    if far := [f"{1e6 * time:.6g}" for time in series.left_out.get(FAR, ())[:6]]:
+        which = f"reading at {far[0]} us is" if len(far) == 1 else f"readings at {', '.join(far)} us are"
+        words.append(f"{name}: the {which} none of the bubble by the neighbours, and left out (data.outliers)")
+    return words
 
 
 def _steps(readings: Mapping[str, Readings], source: Source) -> list[str]:
