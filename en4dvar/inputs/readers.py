@@ -16,6 +16,7 @@ import numpy.typing as npt
 from en4dvar.inputs.asked import ANY, Column, Layout, TimeStep
 from en4dvar.inputs.outliers import outlying, scatter_of
 from en4dvar.inputs.parts import columns_of
+from en4dvar.inputs.time_order import InFile
 from en4dvar.inputs.window import index_of
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import DataError, retold
@@ -85,10 +86,11 @@ def read_series(
         kept = kept[np.argsort(times[kept], kind="stable")]
     stated = {column.name: _stds(columns[column.name], column, kept, len(values), path) for column in errors}
     if isinstance(time, Column) and not repeats:
+        written = columns[time.name][kept]
+        InFile(path, layout, kept, lines, written, time.unit, wanted).require_order(times[kept], values[kept])
         if layout.unsorted == "sort":
             order = np.argsort(times[kept], kind="stable")
             kept, stated = kept[order], {name: stds[order] for name, stds in stated.items()}
-        _check_order(times[kept], kept, columns[time.name], time.unit, lines, layout, path)
     times, values = times[kept], values[kept]
     each, which, counts = np.unique(times, return_inverse=True, return_counts=True)
     if not repeats and len(each) < len(times):  # readings of one time as their mean, their errors as independent
@@ -166,35 +168,3 @@ def _step(step: TimeStep, scalars: Mapping[str, float], path: Path) -> float:
     if not value > 0:
         raise DataError(f"{path}: the time step {value:g} is not positive")
     return value
-
-
-def _check_order(
-    times: Array,
-    kept: npt.NDArray[np.intp],
-    written: Array,
-    unit: str,
-    lines: Sequence[int],
-    layout: Layout,
-    path: Path,
-) -> None:
-    """Raise :class:`DataError` where ``times`` (K,) are not in order, or one occurs again and may not.
-
-    ``kept`` (K,) are their places in the file, which has them ``written`` in ``unit``, and its ``lines``, if any.
-    """
-    steps = np.diff(times)
-    wrong = np.flatnonzero(steps < 0 if layout.repeated == "average" else steps <= 0)
-    if not len(wrong):
-        return
-    before, after = kept[wrong[0] : wrong[0] + 2]
-    where = f"{path}:{lines[after]}" if lines else f"{path}: sample {after + 1}"
-    sort = "sort the rows (data.unsorted: sort)"
-    hint = f"; correct it, or {sort}"
-    if written[after] == written[before]:
-        hint = "; keep one of the two readings, or their mean (data.repeated: average)"
-    elif written[after] <= written[kept[0]]:
-        hint = (
-            f"; if another series begins here, give it a file of its own or say whose each row is (data.by); or {sort}"
-        )
-    shown = "" if "*" in unit else f" {unit}"
-    told = f"times must increase, but {written[after]:g}{shown} follows {written[before]:g}{shown}"
-    raise DataError(f"{where}: {told}{hint}")

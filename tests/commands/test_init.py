@@ -414,7 +414,11 @@ def _workbook(path: Path) -> Path:
     [
         ("0,9 1,8 3,7 2,7", "sort the rows (--unsorted sort)", "--unsorted sort"),
         ("0,9 1,8 1,7 2,7", "their mean (--repeated average)", "--repeated average"),
-        ("0,9 1,8 2,7 0,9", "say whose each row is (--by)", "--by NAME"),
+        (
+            "0,9 1,8 2,7 3,6 0,9 1,7 2,5 3,3",
+            "a column that says whose each row is, and name it by --by",
+            "name it by --by",
+        ),
     ],
 )
 def test_disorder_is_answered_with_options_of_init(tmp_path: Path, rows: str, words: str, following: str) -> None:

@@ -102,7 +102,10 @@ def test_outliers_are_left_out_with_what_stands_beside_them(tmp_path: Path) -> N
             "a.csv:5: times must increase, but 1 us follows 2 us; correct it, or sort the rows",
         ),
         ("t,R\n0,1\n0,2\n1,3\n", "a.csv:3: times must increase, but 0 us follows 0 us; keep one of the two"),
-        ("t,R\n1,1\n2,2\n3,3\n1,1\n", "a.csv:5: times must increase, but 1 us follows 3 us; if another series begins"),
+        (
+            "t,R\n1,1\n2,2\n3,3\n1,1\n",
+            "a.csv:5: times must increase, but 1 us follows 3 us; correct it, or sort the rows",
+        ),
         ("Camera,X\n\nt,S\n0,1\n", "no column 'R'; the columns are: t, S\n"),
         ("t,R\n0,1\nus,um\n1,2\n", "a.csv:3: 'um' in column 'R' is not a number"),
         ("t,R\n0,1\n1,2\n", "2 usable observations; at least 3"),
