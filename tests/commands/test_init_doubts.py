@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,32 @@ def test_units_that_cannot_be_right_are_noticed(tmp_path: Path) -> None:
     assert "are the units of both columns right?" in done.stderr
     assert "# MIND: the collapse takes" in Path("b.yaml").read_text()
     done = call("init", "--data", "b.csv", "--time-unit", "s", "--radius-unit", "m", "--force")  # both, by as much
-    assert "no bubble has such a radius; are the units of both columns right?" in done.stderr
+    assert (
+        "no bubble has such a radius; are the units of both columns right? Units 1000000 times smaller" in done.stderr
+    )
+    Path("s.csv").write_text(_in_other_units(Path("b.csv")))
+    done = call("init", "--data", "s.csv", *UNITS)
+    told = "R_max 0.195 um, read every 0.0007 us: no bubble has such a radius; are the units of both columns right? "
+    assert f"{told}Units 1000 times larger would make it a usual one" in done.stderr
+
+
+def _in_other_units(path: Path) -> str:
+    """The same bubble in ms and mm, under the same names."""
+    head, *rows = path.read_text().splitlines()
+    return "\n".join([head, *(",".join(f"{float(cell) / 1e3:.9g}" for cell in row.split(",")) for row in rows), ""])
+
+
+def test_a_file_in_other_units_than_the_rest_of_its_folder_is_named(tmp_path: Path) -> None:
+    (tmp_path / "gel").mkdir()
+    for n in range(3):
+        write(tmp_path / "gel" / f"b{n}.csv", scale=1 + n / 4)
+    assert "than the median" not in call("init", "--data", "gel", *UNITS).stderr
+    Path("gel/b1.csv").write_text(_in_other_units(Path("gel/b1.csv")))
+    said = call("init", "--data", "gel", *UNITS, "--force").stderr
+    assert re.search("b1: the largest radius is .* times smaller than the .* files; is it in mm, not in um", said)
+    assert "warning: b1: the time between readings is 1000 times smaller" in said
+    assert "is it in ms, not in us?" in said
+    assert said.count("than the median") == 2
 
 
 def test_frames_without_a_bubble_change_nothing_but_a_note(tmp_path: Path) -> None:

@@ -1,10 +1,13 @@
 """A starter configuration as text, from data files and what their columns mean."""
 
+import math
 import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+
+import numpy as np
 
 from en4dvar.assembly.build import build_one
 from en4dvar.assembly.reading import find_files, with_parts
@@ -27,6 +30,8 @@ _UNIT = re.compile(r"(?:[ _]*[(\[/] *|[ _])([µμ]?[A-Za-z]+) *[)\]]?$")
 FRAMES = re.compile(r"(?i)(frame|bild|image|index|#|n$|nr).*")
 _DIAMETER = re.compile(r"(?i)(d|diam\w*|durchmesser)([ _(\[].*)?$")
 _REST = re.compile(r"(?i)(.*\.)?r_?eq")
+LENGTHS, TIMES = ("nm", "um", "mm", "m"), ("ns", "us", "ms", "s")
+ODD_SCALE = 50.0  # of the median of all files: bubbles of one experiment are closer
 AT_REST = (0.02, 0.9)  # of R_max
 PIXELS = re.compile(r"(?i)(?<![a-z])(px|pix|pixels?)(?![a-z])|_(px|pix)")
 
@@ -105,7 +110,7 @@ def propose_config(
     if errors:
         common = max(series.scalars.get(TRACKED_COMMON, 0.0) for series in readings.values())
         proposal = with_columns(proposal, errors, f"{common:g} {source.radius[1]}" if common > 0 else "")
-    told = (*proposal.warnings, *odd, *doubts(source), *_steps(readings, source), *unusable)
+    told = (*proposal.warnings, *odd, *doubts(source), *scales(readings, source), *_steps(readings, source), *unusable)
     proposal = replace(proposal, warnings=told)
     name = name or run_name(str(data))
     config = resolve(parse_document(yaml_text(name, source, proposal, command)), Path(folder).absolute())
@@ -164,6 +169,24 @@ def _left_out(name: str, series: Readings) -> list[str]:
     if far := [f"{1e6 * time:.6g}" for time in series.left_out.get(FAR, ())[:6]]:
         which = f"reading at {far[0]} us is" if len(far) == 1 else f"readings at {', '.join(far)} us are"
         words.append(f"{name}: the {which} none of the bubble by the neighbours, and left out (data.outliers)")
+    return words
+
+
+def scales(readings: Mapping[str, Readings], source: Source) -> list[str]:
+    """Data sets of three or more whose largest radius, or time between readings, is of another order than the median
+    of all, and the units that would make them alike."""
+    sizes = {name: np.array([it.values.max(), np.median(np.diff(it.times))]) for name, it in readings.items()}
+    usual = np.median(list(sizes.values()), axis=0)
+    of_time = source.time[1] if source.time else "s"
+    kinds = (("largest radius", source.radius[1], LENGTHS), ("time between readings", of_time, TIMES))
+    words = []
+    for name, size in sizes.items() if len(sizes) > 2 else ():
+        for (what, unit, others), ratio in zip(kinds, usual / size, strict=True):
+            if abs(math.log10(ratio)) > math.log10(ODD_SCALE):
+                times = f"{ratio:.0f} times smaller" if ratio > 1 else f"{1 / ratio:.0f} times larger"
+                alike = [it for it in others if abs(math.log10(convert(1.0, it, unit) / ratio)) < 0.5]
+                hint = f"; is it in {alike[0]}, not in {unit}?" if alike else ""
+                words.append(f"{name}: the {what} is {times} than the median of all files{hint}")
     return words
 
 

@@ -57,6 +57,7 @@ WIDTHS: Mapping[Start, Mapping[str, tuple[float, float]]] = {
 BETWEEN = 1.645  # standard deviations from the median to 5 and 95 %
 SAME_CLOCK = 2e-6  # s: what a first guess can be off by
 BUBBLES = (1e-7, 0.1)  # m: between these radii
+SEEN = (3e-6, 50e-9, 1e-4)  # m, s, m: one below is not read in shorter steps; radius of a usual bubble
 
 
 @dataclass(frozen=True)
@@ -139,8 +140,8 @@ def propose(
         warnings += doubted
         possible = all(conceivable(view.lobe, model.medium) for view in views)
         believed = guess.common() if possible else Guess({}, {}, 0.0)
-    elif not BUBBLES[0] < look.lobe.R_max < BUBBLES[1]:
-        warnings.append("no bubble has such a radius; are the units of both columns right?")
+    elif words := _implausible(look):
+        warnings.append(words)
     elif guess.far:
         warnings.append(
             f"no G and mu of {model.law.name} give this {'R_max and ' if chosen == 'acoustic' else ''}collapse time: "
@@ -173,6 +174,18 @@ def _ends_with(groups: Grouped) -> str:
         return "the run ends with what they say of one gel together"
     told = ", ".join(f"{name} ({len(names)})" for name, names in groups.of.items())
     return f"the run ends with the numbers of each {groups.kind}, and compares them: {told}"
+
+
+def _implausible(look: Look) -> str:
+    """Why nobody has seen a bubble of this size and duration, though the one fits the other; "" where many have."""
+    smallest, shortest, usual = SEEN
+    R, step = look.lobe.R_max, look.step
+    if BUBBLES[0] < R < BUBBLES[1] and not (smallest > R and step < shortest):
+        return ""
+    power = round(math.log10(usual / R) / 3)
+    factor = f"Units {1000 ** abs(power)} times {'larger' if power > 0 else 'smaller'} would make it a usual one"
+    told = f"R_max {_text(R, 'm', 'um', 3)}, read every {_text(step, 's', 'us', 3)}"
+    return f"{told}: no bubble has such a radius; are the units of both columns right? {factor}"
 
 
 def _doubted(looks: Mapping[str, Look], model: BubbleModel) -> list[str]:
