@@ -113,6 +113,17 @@ def test_decimal_commas_are_noticed(tmp_path: Path) -> None:
     assert build(config)[0].observations.values.max() == pytest.approx(195e-6, rel=0.01)
 
 
+def test_rows_of_a_matrix_are_columns_where_it_is_flat(tmp_path: Path) -> None:
+    rows = np.loadtxt(write(tmp_path / "b.csv"), delimiter=",", skiprows=1).T
+    savemat("b.mat", {"data": rows})
+    done = call("init", "--data", "b.mat", *UNITS)
+    assert "columns with numbers: data(1,:), data(2,:); units are never guessed: add --time-column NAME" in done.stderr
+    done = call("init", "--data", "b.mat", *UNITS, "--time-column", "data(1,:)", "--radius-column", "data(2,:)")
+    assert done.exit_code == 0, done.output
+    (problem,) = build(proposed(Path("b.yaml")))
+    assert problem.observations.continued.values.min() == pytest.approx(1e-6 * rows[1].min())
+
+
 def test_vectors_that_a_mat_file_hides_are_told(tmp_path: Path) -> None:
     savemat("b.mat", {"film": {"note": "by hand"}})
     done = call("init", "--data", "b.mat", *UNITS)
