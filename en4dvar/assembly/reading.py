@@ -132,7 +132,14 @@ def read_one(plan: SeriesPlan, file: DataFile, fewest: int) -> Series:
     zero = {"file": 0.0, "window": times[0]}.get(str(data.time_zero), data.time_zero)
     times = times - float(zero)
     if times[0] < 0:
-        raise DataError(f"{path}: the first observation used lies {-times[0]:g} before time zero; see data.time_zero")
+        clock = data.columns.time
+        early, unit = -times[0], ""
+        if isinstance(clock, Column):
+            early, unit = convert(early, clock.target, clock.unit), f" {clock.unit}"
+        raise DataError(
+            f"{path}: the first observation used lies {early:g}{unit} before time zero, where the model's "
+            "clock starts; put it earlier (data.time_zero), or begin the window later (data.window.from)"
+        )
 
     def beside(column: Column | None) -> Array | None:
         return read.errors[column.name][window] if column else None

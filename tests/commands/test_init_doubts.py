@@ -102,6 +102,31 @@ def test_a_name_that_says_something_else_is_noticed(
     assert all(words in doubts[0] for words in told)
 
 
+def test_growth_alone_and_rows_before_the_bubble_are_told_in_words_of_the_recording(tmp_path: Path) -> None:
+    """And what is advised leads to a configuration that can be run."""
+    head, *rows = write(tmp_path / "b.csv").read_text().splitlines()
+    grown = [f"{0.7 * i - 5.55:.3f},{195 - (7 - i) ** 2:.2f}" for i in range(8)]
+    film = [f"{6 + float(row.split(',')[0]):g},{row.split(',')[1]}" for row in rows]
+    Path("growth.csv").write_text("\n".join([head, *grown, ""]))
+    done = call("init", "--data", "growth.csv")
+    assert done.exit_code == 2
+    assert "growth: the recording ends with the maximum, reading 8 of 8: it shows growth alone" in done.stderr
+    assert call("init", "--data", "growth.csv", "--start", "acoustic").exit_code == 0
+    proposed(Path("growth.yaml"))
+    empty = [f"{0.7 * i - 80:g},{3 + i % 3}" for i in range(100)]
+    Path("pre.csv").write_text("\n".join([head, *empty, *grown, *film, ""]))
+    assert call("init", "--data", "pre.csv").exit_code == 0  # of a laser's bubble the window begins at the top
+    (problem,) = build(proposed(Path("pre.yaml")))
+    assert problem.observations.values[0] == pytest.approx(195e-6, rel=0.01)
+    done = call("init", "--data", "pre.csv", "--start", "acoustic", "--force")
+    assert "pre: the first 100 readings are small beside the bubble, which appears at -5.55 us" in done.stderr
+    assert "next: " in done.stderr
+    assert done.stderr.rstrip().endswith("--since '-5.55 us'")
+    done = call("init", "--data", "pre.csv", "--start", "acoustic", "--force", "--since", "-5.55 us")
+    assert done.exit_code == 0, done.output
+    proposed(Path("pre.yaml"))
+
+
 def test_decimal_commas_are_noticed(tmp_path: Path) -> None:
     text = write(tmp_path / "b.csv").read_text().replace(",", ";").replace(".", ",")
     Path("b.csv").write_text(text)

@@ -11,7 +11,7 @@ from en4dvar.inputs.window import Instant, select
 from en4dvar.model.forward import Trajectory
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.errors import ConfigError, DataError, retold
-from en4dvar.plumbing.units import convert
+from en4dvar.plumbing.units import convert, parse_quantity
 from en4dvar_bubble.collapse import Lobe, conceivable, doubt, lobe
 from en4dvar_bubble.dynamics import R0, R_EQ, R_MAX
 from en4dvar_bubble.laws.loading import qualified
@@ -363,10 +363,10 @@ def _clock(look: Look, model: BubbleModel, theta: Mapping[str, float]) -> Entry:
                 shift = look.lobe.t_max - lobe(times, path["R"]).t_max
     if abs(shift) <= SAME_CLOCK:
         return Entry("time_zero", "file", "the file's clock agrees with that of the pulse")
-    zero = min(shift, look.times[0])
-    return Entry(
-        "time_zero", _text(zero, "s", "us"), "puts the guess's R_max on the data's: give the clock of your pulse"
-    )
+    text = _text(shift, "s", "us")
+    if parse_quantity(text, "s") > look.times[0]:  # no reading lies before the pulse
+        text = f"{math.floor(1e8 * look.times[0]) / 100:.12g} us"
+    return Entry("time_zero", text, "puts the guess's R_max on the data's: give the clock of your pulse")
 
 
 def _in_a_liquid(model: BubbleModel) -> bool:
