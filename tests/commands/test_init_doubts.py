@@ -102,6 +102,20 @@ def test_a_name_that_says_something_else_is_noticed(
     assert all(words in doubts[0] for words in told)
 
 
+def test_what_is_advised_for_a_few_readings_can_be_run(tmp_path: Path) -> None:
+    head, *rows = write(tmp_path / "b.csv").read_text().splitlines()
+    Path("bubble.csv").write_text("\n".join([head, *rows[:49:12], ""]))
+    said = call("init", "--data", "bubble.csv").stderr
+    assert "(en4dvar init --start laser, without --data)" in said
+    assert call("init", "--start", "laser").exit_code == 0
+    (problem,) = build(proposed(Path("bubble.yaml")))
+    assert len(problem.observations.times) == 5
+    words = Path("bubble.yaml").read_text().replace("to: end}", "to: trough 2}")
+    Path("bubble.yaml").write_text(words)
+    assert "only 0 minima" in (said := call("validate", "bubble.yaml").stderr)
+    assert "end it elsewhere ('to: end', or at a time)" in said
+
+
 def test_growth_alone_and_rows_before_the_bubble_are_told_in_words_of_the_recording(tmp_path: Path) -> None:
     """And what is advised leads to a configuration that can be run."""
     head, *rows = write(tmp_path / "b.csv").read_text().splitlines()

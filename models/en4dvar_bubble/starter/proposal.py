@@ -202,7 +202,8 @@ def starter(start: Start, law: str | None) -> Proposal:
     model, law_name = built(start, law)
     data = [Entry("error", "{radius_std: 1 % of maximum}", "how well a radius is known: put yours")]
     if start == "laser":
-        data[:0] = [Entry("window", "{from: top, to: trough 2}"), Entry("time_zero", "window")]
+        words = "where readings show two collapses, 'to: trough 2' ends it at the second"
+        data[:0] = [Entry("window", "{from: top, to: end}", words), Entry("time_zero", "window")]
     lines = [example(p, model) for p in model.law.parameters]
     lines += _radii(start, None)
     lines += [Entry("t_s", "{prior: normal, mean: 0 us, std: 0.5 us}", "the clock of the data against the model's")]
