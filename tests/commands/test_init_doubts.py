@@ -141,6 +141,49 @@ def test_growth_alone_and_rows_before_the_bubble_are_told_in_words_of_the_record
     proposed(Path("pre.yaml"))
 
 
+@pytest.mark.parametrize(
+    ("more", "told"),
+    [
+        (
+            "mean,77\nstd,60\n",
+            "'mean' in column 't_us' is not a number; delete lines 62 to 63, below the readings",
+        ),
+        ("n = 60,,\n", "'n = 60' in column 't_us' is not a number; delete line 62, below the readings"),
+        (
+            "t_us,R_um\n0,1\n",
+            "names the columns again: if another series begins here, give it a file of its own",
+        ),
+    ],
+)
+def test_what_stands_below_the_readings_is_told_with_what_to_do(tmp_path: Path, more: str, told: str) -> None:
+    """And no column is asked for that the file has."""
+    path = write(tmp_path / "b.csv")
+    path.write_text(path.read_text() + more)
+    done = call("init", "--data", "b.csv")
+    assert done.exit_code == 2
+    assert done.stderr.endswith(f"{told}\n")
+    assert "--time-column" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (("--pixel", "2.76"), "2.76 has no unit; write e.g. '2.76 um'"),
+        (("--frame-rate", "270"), "270 has no unit; write e.g. '270 kHz'"),
+        (("--time-step", "3.7"), "3.7 has no unit; write e.g. '3.7 us'"),
+    ],
+)
+def test_units_that_are_proposed_are_those_of_a_bubble(tmp_path: Path, options: tuple[str, str], told: str) -> None:
+    write(tmp_path / "b.csv", "t_us,R_px")
+    assert call("init", "--data", "b.csv", *options, *["--pixel", "1 um"] * ("--pixel" not in options)).stderr.endswith(
+        f"{told}\n"
+    )
+    write(tmp_path / "b.csv")
+    assert call("init", "--data", "b.csv").exit_code == 0
+    Path("b.yaml").write_text(re.sub(r"\n  R_eq: .*", "", Path("b.yaml").read_text()))
+    assert "write e.g. 'R_eq: {prior: normal, mean: 1 um, std: 0.1 um}'" in call("validate", "b.yaml").stderr
+
+
 def test_decimal_commas_are_noticed(tmp_path: Path) -> None:
     text = write(tmp_path / "b.csv").read_text().replace(",", ";").replace(".", ",")
     Path("b.csv").write_text(text)
@@ -226,7 +269,7 @@ def test_a_rate_that_the_times_contradict_is_told(tmp_path: Path) -> None:
     assert f"warning: b: {told}" in call("validate", "b.yaml").stderr
     (problem,) = build(load_config("b.yaml"))
     assert [c.code for c in problem.observations.doubts] == ["implausible-data"]
-    assert call("init", "--data", "b.csv", *UNITS, "--frame-rate", f"{1 / 0.7} MHz", "--force").exit_code == 0
+    assert call("init", "--data", "b.csv", "--frame-rate", f"{1 / 0.7} MHz", "--force").exit_code == 0
     assert build(load_config("b.yaml"))[0].observations.doubts == ()
     Path("b.yaml").write_text(Path("b.yaml").read_text().replace("MHz", "parsec"))
     assert "b.yaml:" in call("validate", "b.yaml").stderr

@@ -155,8 +155,8 @@ def _times(source: Source) -> Column | TimeStep:
     if source.step_unit is not None:
         return TimeStep(Column(source.time_step or "", source.step_unit, "s"))
     if source.time_step:
-        return TimeStep(value=parse_quantity(source.time_step, "s"))
-    rate = None if source.rate is None else parse_quantity(source.rate, "1/s")
+        return TimeStep(value=parse_quantity(source.time_step, "s", "us"))
+    rate = None if source.rate is None else parse_quantity(source.rate, "1/s", "kHz")
     return Column(*(source.time or ("", "s")), "s", rate=rate)
 
 
