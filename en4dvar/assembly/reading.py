@@ -132,7 +132,14 @@ def read_one(plan: SeriesPlan, file: DataFile, fewest: int) -> Series:
     zero = {"file": 0.0, "window": times[0]}.get(str(data.time_zero), data.time_zero)
     times = times - float(zero)
     if times[0] < 0:
-        raise DataError(f"{path}: the first observation used lies {-times[0]:g} before time zero; see data.time_zero")
+        clock = data.columns.time
+        early, unit = -times[0], ""
+        if isinstance(clock, Column):
+            early, unit = convert(early, clock.target, clock.unit), f" {clock.unit}"
+        raise DataError(
+            f"{path}: the first observation used lies {early:g}{unit} before time zero, where the model's "
+            "clock starts; put it earlier (data.time_zero), or begin the window later (data.window.from)"
+        )
 
     def beside(column: Column | None) -> Array | None:
         return read.errors[column.name][window] if column else None
@@ -171,14 +178,14 @@ def read_one(plan: SeriesPlan, file: DataFile, fewest: int) -> Series:
 def _doubts(data: Data, read: Readings) -> tuple[Caution, ...]:
     """Readings that were left out, and warnings about implausible times of a series, where the file states them."""
     column, times, left_out = data.columns.time, np.unique(read.times), tuple[Caution, ...]()
-    if read.left_out:
-        count = f"{len(read.left_out)} of {len(read.times) + len(read.left_out)}"
-        words = f"readings left out, for they are far from what their neighbours say: {count}"
+    every = len(read.times) + sum(map(len, read.left_out.values()))
+    for reason, when in read.left_out.items():
+        words = f"readings left out, for they are {reason}: {len(when)} of {every}"
         if isinstance(column, Column):
-            listed = convert(np.array(read.left_out[:6]), column.target, column.unit)
-            more = " …" if len(read.left_out) > 6 else ""
+            listed = convert(np.array(when[:6]), column.target, column.unit)
+            more = " …" if len(when) > 6 else ""
             words += f", at {', '.join(f'{time:.6g}' for time in listed)}{more} {column.unit}"
-        left_out = (caution("down-weighted", words),)
+        left_out += (caution("down-weighted", words),)
     if not isinstance(column, Column) or len(times) < 3:
         return left_out
     return left_out + step_doubts(times, column.target, column.unit, read.scalars, column.rate)

@@ -144,15 +144,15 @@ class Spread:
         return self.value * abs(whole) if self.relative else self.value
 
 
-def parse_spread(text: Any, unit: str) -> Spread:
+def parse_spread(text: Any, unit: str, usual: str = "") -> Spread:
     """``"0.1 kPa"``, or relative, ``"5 %"``; positive. Raises :class:`ConfigError`, :class:`UnitError`."""
     relative = str(text).strip().endswith("%") and unit != "%"
-    spread = Spread(parse_quantity(text, "1" if relative else unit), relative)
+    spread = Spread(parse_quantity(text, "1" if relative else unit, usual), relative)
     require_sign(spread.value, "positive", text)
     return spread
 
 
-SPREAD = Made(lambda text, context: parse_spread(text, subject_unit(context)))
+SPREAD = Made(lambda text, context: parse_spread(text, subject_unit(context), context.subject.display_unit))
 """A :class:`Spread` of what the entry of a section is about."""
 
 

@@ -43,7 +43,7 @@ def _unit_text(written: Any) -> Any:
         return written
     if written.keys() != {"pixel"}:
         raise ValueError("write a unit such as um, or {pixel: 2.76 um}")
-    return as_unit(str(written["pixel"]), "m")
+    return as_unit(str(written["pixel"]), "um")
 
 
 class _NamedColumn(Section):

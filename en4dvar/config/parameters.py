@@ -33,7 +33,7 @@ _RECIPES = {
 
 def _bounded(text: Any, parameter: Parameter) -> float:
     """A value in the parameter's unit. Raises :class:`ConfigError`, :class:`UnitError`."""
-    return inside_bounds(parse_quantity(text, parameter.unit), parameter, brief(str(text), 80))
+    return inside_bounds(parse_quantity(text, parameter.unit, parameter.display_unit), parameter, brief(str(text), 80))
 
 
 def inside_bounds(value: float, parameter: Parameter, shown: str = "") -> float:
@@ -304,9 +304,9 @@ def _why_not(model: ForwardModel, parameter: Parameter) -> str:
 
 
 def _missing(parameter: Parameter) -> str:
-    unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+    unit = "" if parameter.display_unit == "1" else f" {parameter.display_unit}"
     return (
-        f"{parameter.label} {parameter.name!r} (unit {parameter.unit}) has neither a prior nor a value; "
+        f"{parameter.label} {parameter.name!r} (unit {parameter.display_unit}) has neither a prior nor a value; "
         f"write e.g. '{parameter.name}: {{prior: normal, mean: 1{unit}, std: 0.1{unit}}}' or a fixed quantity"
     )
 

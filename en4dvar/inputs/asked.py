@@ -30,7 +30,7 @@ SHEETS = (".xls", ".xlsb", ".ods")
 class Column:
     """A column or field ``name`` written in ``unit``, wanted in ``target``.
 
-    ``positive``: zeros before its first reading are none. ``kind``: what its numbers must be, beside the readings.
+    ``positive``: numbers of 0 or below are no readings. ``kind``: what its numbers must be, beside the readings.
     ``rate``: of times, that of the frames per ``target``.
     """
 

@@ -83,11 +83,13 @@ class Variables:
         return Variables(*(_first(getattr(self, kind.name)) for kind in fields(self)))
 
     def columns(self) -> dict[str, Array]:
-        """Vectors of more than one number, and the columns of narrow matrices."""
+        """Vectors of more than one number, the columns of narrow matrices, and the rows of flat ones."""
         columns = {name: vector for name, vector in self.vectors.items() if vector.size > 1}
         for name, matrix in self.matrices.items():
             if matrix.shape[1] <= SHOWN:
                 columns |= {f"{name}(:,{k + 1})": column for k, column in enumerate(matrix.T)}
+            elif matrix.shape[0] <= SHOWN:
+                columns |= {f"{name}({k + 1},:)": row for k, row in enumerate(matrix)}
         return columns
 
 

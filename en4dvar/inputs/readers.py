@@ -2,7 +2,8 @@
 
 Rows that hold NaN or a blank are dropped; every remaining number must be finite and the times must increase. Fields of
 ``.mat`` files may be rows or columns; their leading zeros and NaN (frames before nucleation) are dropped and their
-scalars collected. Leading zeros of a column that cannot be zero are dropped from CSV files too.
+scalars collected. Of a column that cannot be zero all numbers of 0 or below are dropped, from CSV files too, and those
+after its first reading are told: they are codes of missing readings.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,6 +16,7 @@ import numpy.typing as npt
 from en4dvar.inputs.asked import ANY, Column, Layout, TimeStep
 from en4dvar.inputs.outliers import outlying, scatter_of
 from en4dvar.inputs.parts import columns_of
+from en4dvar.inputs.time_order import InFile
 from en4dvar.inputs.window import index_of
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import DataError, retold
@@ -22,6 +24,7 @@ from en4dvar.plumbing.hints import suggest
 from en4dvar.plumbing.units import convert
 
 Rows = npt.NDArray[np.intp]
+FAR, BELOW = "far from what their neighbours say", "0 or below, as a missing reading may be written"
 
 
 @dataclass(frozen=True)
@@ -29,7 +32,7 @@ class Readings:
     """One observable in time, in the model's units, times increasing; ``scalars`` as the file has them.
 
     ``errors`` are the columns that were asked for besides, by name, one number a reading; ``left_out`` the times of
-    readings that their neighbours refute. ``rows`` are those of the file, counted from 0, that the readings stand in,
+    readings that are none, by the reason. ``rows`` are those of the file, counted from 0, that the readings stand in,
     none where several are one reading, their mean; it has ``count`` rows, of which ``usable`` hold a reading.
     """
 
@@ -38,7 +41,7 @@ class Readings:
     source: str
     scalars: Mapping[str, float] = field(default_factory=dict)
     errors: Mapping[str, Array] = field(default_factory=dict)
-    left_out: tuple[float, ...] = ()
+    left_out: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     rows: Rows | None = None
     count: int = 0
     usable: Rows | None = None
@@ -97,17 +100,21 @@ def read_series(
     if len(times) != len(values):
         raise DataError(f"{path}: {len(times)} times but {len(values)} values of {value.name!r}")
     zero = bool(lines) and not value.positive
-    first = 0 if zero else int(np.argmax(np.nan_to_num(values) != 0))
+    first = 0 if zero else int(np.argmax(values > 0 if value.positive else np.nan_to_num(values) != 0))
     kept = np.arange(first, len(values))[~(np.isnan(times) | np.isnan(values))[first:]]
+    below = values[kept] <= 0 if value.positive else np.zeros(len(kept), dtype=bool)
+    left_out = {BELOW: tuple(np.sort(times[kept[below]]))} if below.any() else {}
+    kept = kept[~below]
     _check(times[kept], values[kept], value.name, path, fewest, zero)
     if repeats:
         kept = kept[np.argsort(times[kept], kind="stable")]
     stated = {column.name: _stds(columns[column.name], column, kept, len(values), path) for column in errors}
     if isinstance(time, Column) and not repeats:
+        written = columns[time.name][kept]
+        InFile(path, layout, kept, lines, written, time.unit, wanted).require_order(times[kept], values[kept])
         if layout.unsorted == "sort":
             order = np.argsort(times[kept], kind="stable")
             kept, stated = kept[order], {name: stds[order] for name, stds in stated.items()}
-        _check_order(times[kept], kept, columns[time.name], time.unit, lines, layout, path)
     count, usable = len(times), np.sort(kept)
     rows: Rows | None = kept
     times, values = times[kept], values[kept]
@@ -118,14 +125,15 @@ def read_series(
             sums = np.sqrt(np.bincount(which, own**2)) if c.kind == "std" else np.bincount(which, own)
             stated[c.name] = np.asarray(sums / counts)
         times, values, rows = each, np.bincount(which, values) / counts, None
-    return _rest(Readings(times, values, str(path), scalars, stated, (), rows, count, usable), layout, fewest)
+    return _rest(Readings(times, values, str(path), scalars, stated, left_out, rows, count, usable), layout, fewest)
 
 
 def _rest(read: Readings, layout: Layout, fewest: int) -> Readings:
     """Without outliers and what is before an instant, where the layout says so. Raises :class:`DataError`."""
     if layout.outliers == "leave out":
         odd = outlying(read.times, read.values, scatter_of(read.times, read.values))
-        read = replace(_kept(read, ~odd), left_out=tuple(read.times[odd]))
+        far = {FAR: tuple(read.times[odd])} if odd.any() else {}
+        read = replace(_kept(read, ~odd), left_out={**read.left_out, **far})
     if layout.since != ANY.since:
         with retold(DataError, DataError, f"{read.source}: data.since "):
             since = slice(index_of(read.times, read.values, layout.since), None)
@@ -169,7 +177,7 @@ def _check(times: Array, values: Array, name: str, path: Path, fewest: int, zero
     """Raise :class:`DataError` where readings are of no use; ``zero``: all of them may be."""
     if not len(values) or not (zero or np.any(values)):
         raise DataError(
-            f"{path}: {name!r} holds no usable value (all NaN{', or blank' if zero else ', blank or zero'})"
+            f"{path}: {name!r} holds no usable value (all NaN{', or blank' if zero else ', blank, or not above zero'})"
         )
     if not (np.all(np.isfinite(times)) and np.all(np.isfinite(values))):
         raise DataError(f"{path}: infinite values")
@@ -187,35 +195,3 @@ def _step(step: TimeStep, scalars: Mapping[str, float], path: Path) -> float:
     if not value > 0:
         raise DataError(f"{path}: the time step {value:g} is not positive")
     return value
-
-
-def _check_order(
-    times: Array,
-    kept: Rows,
-    written: Array,
-    unit: str,
-    lines: Sequence[int],
-    layout: Layout,
-    path: Path,
-) -> None:
-    """Raise :class:`DataError` where ``times`` (K,) are not in order, or one occurs again and may not.
-
-    ``kept`` (K,) are their places in the file, which has them ``written`` in ``unit``, and its ``lines``, if any.
-    """
-    steps = np.diff(times)
-    wrong = np.flatnonzero(steps < 0 if layout.repeated == "average" else steps <= 0)
-    if not len(wrong):
-        return
-    before, after = kept[wrong[0] : wrong[0] + 2]
-    where = f"{path}:{lines[after]}" if lines else f"{path}: sample {after + 1}"
-    sort = "sort the rows (data.unsorted: sort)"
-    hint = f"; correct it, or {sort}"
-    if written[after] == written[before]:
-        hint = "; keep one of the two readings, or their mean (data.repeated: average)"
-    elif written[after] <= written[kept[0]]:
-        hint = (
-            f"; if another series begins here, give it a file of its own or say whose each row is (data.by); or {sort}"
-        )
-    shown = "" if "*" in unit else f" {unit}"
-    told = f"times must increase, but {written[after]:g}{shown} follows {written[before]:g}{shown}"
-    raise DataError(f"{where}: {told}{hint}")

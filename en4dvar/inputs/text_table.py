@@ -125,8 +125,22 @@ class Table:
 
     def numbers(self, i: int, name: str) -> Array:
         """A column as numbers. Raises :class:`DataError`."""
-        cells = ((line, row[i] if i < len(row) else "") for line, row in self.rows)
-        return np.array([number_in(cell, name, self.path, line, self.decimal) for line, cell in cells], dtype=float)
+        numbers = np.empty(len(self.rows))
+        for k, (line, row) in enumerate(self.rows):
+            try:
+                numbers[k] = number_in(row[i] if i < len(row) else "", name, self.path, line, self.decimal)
+            except DataError as error:
+                raise DataError(f"{error}{self._below(k, i)}") from None
+        return numbers
+
+    def _below(self, k: int, i: int) -> str:
+        """What to do where the row ``k`` repeats the names, or ends the numbers of the column ``i``, as a mean does."""
+        (line, row), (last, _) = self.rows[k], self.rows[-1]
+        if row == self.names:
+            return "; the line names the columns again: if another series begins here, give it a file of its own"
+        if k and not any(_holds_number(row[i : i + 1]) for _, row in self.rows[k:]):
+            return f"; delete {f'line {line}' if line == last else f'lines {line} to {last}'}, below the readings"
+        return ""
 
 
 def matches(name: str, pattern: str) -> bool:

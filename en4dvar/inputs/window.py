@@ -100,7 +100,8 @@ def index_of(
     if instant.number > len(indices):
         raise DataError(
             f"asks for minimum {instant.number}, but only {len(indices)} minima with a prominence of "
-            f"{prominence:.0%} of the range follow its start"
+            f"{prominence:.0%} of the range follow its start; end it elsewhere ('to: end', or at a time), or lower its "
+            "prominence"
         )
     index = int(indices[instant.number - 1])
     if instant.kind == "trough":

@@ -171,7 +171,7 @@ class StateField:
 class Observable(Shown):
     """A quantity that can be measured: its name in YAML and netCDF, its units, and the operator H that predicts it.
 
-    ``positive``: it cannot be zero, so that zeros before the first reading of a file say that there was nothing yet.
+    ``positive``: it cannot be zero, so that numbers of 0 or below in a file say that there was nothing to read.
     ``fewest`` readings make a data set: 1 of a quantity of the whole path, 3 of one that is followed in time.
     """
 

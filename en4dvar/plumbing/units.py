@@ -142,7 +142,9 @@ def is_unit(text: str) -> bool:
 
 
 def as_unit(quantity: str, unit: str) -> str:
-    """A positive quantity in whatever has the dimension of ``unit``, as a unit itself. Raises :class:`UnitError`.
+    """A positive quantity in whatever has the dimension of ``unit``, the usual one, as a unit itself.
+
+    Raises :class:`UnitError`.
 
     >>> as_unit("2.76 um", "m"), as_unit("2.7e5 1/s", "Hz")
     ('2.76*um', '2.7e5*(1/s)')
@@ -215,10 +217,11 @@ def split_quantity(text: str) -> tuple[str, str]:
     return (number[0], text.strip()[number.end() :].strip()) if number else ("", "")
 
 
-def parse_quantity(value: str | float, unit: str) -> float:
+def parse_quantity(value: str | float, unit: str, usual: str = "") -> float:
     """A quantity such as ``"0.42 kPa"`` or ``"2.5 µs"``, expressed in ``unit``.
 
-    A number without unit is accepted only where ``unit`` is dimensionless. Raises :class:`UnitError`.
+    A number without unit is accepted only where ``unit`` is dimensionless. Raises :class:`UnitError`, which proposes
+    the ``usual`` unit, by default ``unit``.
 
     >>> parse_quantity("0.42 kPa", "Pa"), parse_quantity("1 %", "1"), parse_quantity(3, "1")
     (420.0, 0.01, 3.0)
@@ -226,12 +229,12 @@ def parse_quantity(value: str | float, unit: str) -> float:
     text = str(value).strip()
     number, symbol = split_quantity(text)
     if not number:
-        wanted = "" if unit == "1" else f" and a unit such as '1 {unit}'"
+        wanted = "" if unit == "1" else f" and a unit such as '1 {usual or unit}'"
         raise UnitError(f"{shown(value)} is not a quantity; write a number{wanted}")
     if len(number) > LONGEST:
         raise UnitError(f"{shown(value)}: a number of {len(number)} characters")
     if not symbol and parse_unit(unit).powers != ONE.powers:
-        raise UnitError(f"{text} has no unit; write e.g. '{text} {unit}'")
+        raise UnitError(f"{text} has no unit; write e.g. '{text} {usual or unit}'")
     with retold(UnitError, UnitError, f"{shown(text)}: "):
         factor = _factor(symbol or "1", unit)
     try:

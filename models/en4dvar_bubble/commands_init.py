@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 _OF_MOVIE = ("pixel", "frame_rate", "exposure", "flashes", "raw", "corrections", "bubble", "region", "mask")
 _OF_LAYOUT = ("by", "sheet", "unsorted", "repeated", "format", "since")
 _OF_COLUMNS = ("time_unit", "radius_unit", "time_column", "radius_column", "time_step", "frame_rate", "pixel")
-_KEY = re.compile(rf"data\.({'|'.join(_OF_LAYOUT)})\b(?:: (\w+))?")
+_KEY = re.compile(rf"data\.({'|'.join(_OF_LAYOUT)})\b(?:: (\w+|'[^']+'))?")
 _MOVIES = (".tif", ".tiff", ".png", ".bmp", ".jpg", ".jpeg", ".gif", ".mp4", ".avi", ".mov", ".mkv", ".cine")
 
 
@@ -190,7 +190,7 @@ def _in_words_of_options() -> Iterator[None]:
     except En4dvarError as error:
         words, advice = _with_options(str(error)), re.search(rf"\({_KEY.pattern}", str(error))
         if advice is not None:
-            value = advice[2] or ("NAME" if advice[1] == "by" else advice[1].upper())
+            value = (advice[2] or "").strip("'") or ("NAME" if advice[1] == "by" else advice[1].upper())
             words += f"\nnext: {command_line(also=(f'--{advice[1]}', value))}"
         raise Failed(words, error.exit_code) from None
 

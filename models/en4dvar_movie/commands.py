@@ -111,14 +111,14 @@ def _scaled(
     from en4dvar_movie.frames import with_scale
     from en4dvar_movie.table import Scale
 
-    def quantity(text: str | None, unit: str, option: str) -> float | None:
-        value = None if text is None else parse_quantity(text, unit)
+    def quantity(text: str | None, unit: str, usual: str, option: str) -> float | None:
+        value = None if text is None else parse_quantity(text, unit, usual)
         if value is not None and not value > 0:
             raise click.UsageError(f"{option} must be positive")
         return value
 
-    movie = with_scale(movie, quantity(pixel, "m", "--pixel"), quantity(frame_rate, "1/s", "--frame-rate"))
-    shutter = quantity(exposure, "s", "--exposure")
+    movie = with_scale(movie, quantity(pixel, "m", "um", "--pixel"), quantity(frame_rate, "1/s", "kHz", "--frame-rate"))
+    shutter = quantity(exposure, "s", "us", "--exposure")
     instants = parse_flashes(flashes) if flashes else (0.0,)
     between = f"the {1e6 / movie.rate:g} us between two frames"
     if shutter is not None and shutter * movie.rate > 1.001:

@@ -128,12 +128,7 @@ def test_a_folder_is_a_campaign_and_its_odd_file_is_named(tmp_path: Path) -> Non
     (folder / "other.csv").write_text("t_us,R_um\n" + "".join(f"{t},{20 + t}\n" for t in range(20)))  # shows no bubble
     done = call("init", "--data", folder, *UNITS, "--start", "laser", "--force")
     assert done.exit_code == 0, done.output
-    assert "other: fewer than four samples from its maximum, reading 20 of 20" in done.stderr
-    growing = "\n".join(f"{t},{100 - 0.005 * (t - 100) ** 2:.6g}" for t in range(100))  # whose top is its last reading
-    (folder / "other.csv").write_text(f"t_us,R_um\n{growing}\n")
-    done = call("init", "--data", folder, *UNITS, "--start", "laser", "--force")
-    assert done.exit_code == 0, done.output
-    assert "other.csv: the window data.window holds 1 of 100 usable observations" in done.stderr
+    assert "other: the recording ends with the maximum, reading 20 of 20: it shows growth alone" in done.stderr
     for n in (1, 2):
         (folder / f"b{n}.csv").unlink()
     (folder / "other.csv").write_text("a,b\n1,2\n")
@@ -414,7 +409,11 @@ def _workbook(path: Path) -> Path:
     [
         ("0,9 1,8 3,7 2,7", "sort the rows (--unsorted sort)", "--unsorted sort"),
         ("0,9 1,8 1,7 2,7", "their mean (--repeated average)", "--repeated average"),
-        ("0,9 1,8 2,7 0,9", "say whose each row is (--by)", "--by NAME"),
+        (
+            "0,9 1,8 2,7 3,6 0,9 1,7 2,5 3,3",
+            "a column that says whose each row is, and name it by --by",
+            "name it by --by",
+        ),
     ],
 )
 def test_disorder_is_answered_with_options_of_init(tmp_path: Path, rows: str, words: str, following: str) -> None:

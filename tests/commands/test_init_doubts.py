@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,51 @@ def test_units_that_cannot_be_right_are_noticed(tmp_path: Path) -> None:
     assert "are the units of both columns right?" in done.stderr
     assert "# MIND: the collapse takes" in Path("b.yaml").read_text()
     done = call("init", "--data", "b.csv", "--time-unit", "s", "--radius-unit", "m", "--force")  # both, by as much
-    assert "no bubble has such a radius; are the units of both columns right?" in done.stderr
+    assert (
+        "no bubble has such a radius; are the units of both columns right? Units 1000000 times smaller" in done.stderr
+    )
+    Path("s.csv").write_text(_in_other_units(Path("b.csv")))
+    done = call("init", "--data", "s.csv", *UNITS)
+    told = "R_max 0.195 um, read every 0.0007 us: no bubble has such a radius; are the units of both columns right? "
+    assert f"{told}Units 1000 times larger would make it a usual one" in done.stderr
+
+
+def _in_other_units(path: Path) -> str:
+    """The same bubble in ms and mm, under the same names."""
+    head, *rows = path.read_text().splitlines()
+    return "\n".join([head, *(",".join(f"{float(cell) / 1e3:.9g}" for cell in row.split(",")) for row in rows), ""])
+
+
+def test_a_file_in_other_units_than_the_rest_of_its_folder_is_named(tmp_path: Path) -> None:
+    (tmp_path / "gel").mkdir()
+    for n in range(3):
+        write(tmp_path / "gel" / f"b{n}.csv", scale=1 + n / 4)
+    assert "than the median" not in call("init", "--data", "gel", *UNITS).stderr
+    Path("gel/b1.csv").write_text(_in_other_units(Path("gel/b1.csv")))
+    said = call("init", "--data", "gel", *UNITS, "--force").stderr
+    assert re.search("b1: the largest radius is .* times smaller than the .* files; is it in mm, not in um", said)
+    assert "warning: b1: the time between readings is 1000 times smaller" in said
+    assert "is it in ms, not in us?" in said
+    assert said.count("than the median") == 2
+
+
+def test_frames_without_a_bubble_change_nothing_but_a_note(tmp_path: Path) -> None:
+    """Codes of dropped frames, before the collapse and after the window: all is as if their cells were blank."""
+    head, *rows = write(tmp_path / "b.csv").read_text().splitlines()
+    written = {}
+    for name, code in (("blank", ""), ("coded", "0"), ("coded_too", "-1")):
+        dropped = [f"{row.split(',')[0]},{code}" if i in (12, 30, 55) else row for i, row in enumerate(rows)]
+        Path(f"{name}.csv").write_text("\n".join([head, *dropped, ""]))
+        done = call("init", "--data", f"{name}.csv", "--out", f"{name}.yaml")
+        told = f"warning: {name}: 3 readings of 0 or below are frames without a bubble, and left out\n"
+        assert (told in done.stderr) == (name != "blank")
+        text = Path(f"{name}.yaml").read_text().replace(name, "blank")
+        written[name] = [line for line in text.splitlines() if "frames without" not in line]
+        (problem,) = build(load_config(f"{name}.yaml"))
+        written[name] += [problem.observations.continued.times.tolist()]
+    assert written["blank"] == written["coded"] == written["coded_too"]
+    said = call("validate", "coded.yaml").stderr
+    assert "note: coded: readings left out, for they are 0 or below, as a missing reading may be written: 3 of" in said
 
 
 @pytest.mark.slow
@@ -57,6 +102,88 @@ def test_a_name_that_says_something_else_is_noticed(
     assert all(words in doubts[0] for words in told)
 
 
+def test_what_is_advised_for_a_few_readings_can_be_run(tmp_path: Path) -> None:
+    head, *rows = write(tmp_path / "b.csv").read_text().splitlines()
+    Path("bubble.csv").write_text("\n".join([head, *rows[:49:12], ""]))
+    said = call("init", "--data", "bubble.csv").stderr
+    assert "(en4dvar init --start laser, without --data)" in said
+    assert call("init", "--start", "laser").exit_code == 0
+    (problem,) = build(proposed(Path("bubble.yaml")))
+    assert len(problem.observations.times) == 5
+    words = Path("bubble.yaml").read_text().replace("to: end}", "to: trough 2}")
+    Path("bubble.yaml").write_text(words)
+    assert "only 0 minima" in (said := call("validate", "bubble.yaml").stderr)
+    assert "end it elsewhere ('to: end', or at a time)" in said
+
+
+def test_growth_alone_and_rows_before_the_bubble_are_told_in_words_of_the_recording(tmp_path: Path) -> None:
+    """And what is advised leads to a configuration that can be run."""
+    head, *rows = write(tmp_path / "b.csv").read_text().splitlines()
+    grown = [f"{0.7 * i - 5.55:.3f},{195 - (7 - i) ** 2:.2f}" for i in range(8)]
+    film = [f"{6 + float(row.split(',')[0]):g},{row.split(',')[1]}" for row in rows]
+    Path("growth.csv").write_text("\n".join([head, *grown, ""]))
+    done = call("init", "--data", "growth.csv")
+    assert done.exit_code == 2
+    assert "growth: the recording ends with the maximum, reading 8 of 8: it shows growth alone" in done.stderr
+    assert call("init", "--data", "growth.csv", "--start", "acoustic").exit_code == 0
+    proposed(Path("growth.yaml"))
+    empty = [f"{0.7 * i - 80:g},{3 + i % 3}" for i in range(100)]
+    Path("pre.csv").write_text("\n".join([head, *empty, *grown, *film, ""]))
+    assert call("init", "--data", "pre.csv").exit_code == 0  # of a laser's bubble the window begins at the top
+    (problem,) = build(proposed(Path("pre.yaml")))
+    assert problem.observations.values[0] == pytest.approx(195e-6, rel=0.01)
+    done = call("init", "--data", "pre.csv", "--start", "acoustic", "--force")
+    assert "pre: the first 100 readings are small beside the bubble, which appears at -5.55 us" in done.stderr
+    assert "next: " in done.stderr
+    assert done.stderr.rstrip().endswith("--since '-5.55 us'")
+    done = call("init", "--data", "pre.csv", "--start", "acoustic", "--force", "--since", "-5.55 us")
+    assert done.exit_code == 0, done.output
+    proposed(Path("pre.yaml"))
+
+
+@pytest.mark.parametrize(
+    ("more", "told"),
+    [
+        (
+            "mean,77\nstd,60\n",
+            "'mean' in column 't_us' is not a number; delete lines 62 to 63, below the readings",
+        ),
+        ("n = 60,,\n", "'n = 60' in column 't_us' is not a number; delete line 62, below the readings"),
+        (
+            "t_us,R_um\n0,1\n",
+            "names the columns again: if another series begins here, give it a file of its own",
+        ),
+    ],
+)
+def test_what_stands_below_the_readings_is_told_with_what_to_do(tmp_path: Path, more: str, told: str) -> None:
+    """And no column is asked for that the file has."""
+    path = write(tmp_path / "b.csv")
+    path.write_text(path.read_text() + more)
+    done = call("init", "--data", "b.csv")
+    assert done.exit_code == 2
+    assert done.stderr.endswith(f"{told}\n")
+    assert "--time-column" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (("--pixel", "2.76"), "2.76 has no unit; write e.g. '2.76 um'"),
+        (("--frame-rate", "270"), "270 has no unit; write e.g. '270 kHz'"),
+        (("--time-step", "3.7"), "3.7 has no unit; write e.g. '3.7 us'"),
+    ],
+)
+def test_units_that_are_proposed_are_those_of_a_bubble(tmp_path: Path, options: tuple[str, str], told: str) -> None:
+    write(tmp_path / "b.csv", "t_us,R_px")
+    assert call("init", "--data", "b.csv", *options, *["--pixel", "1 um"] * ("--pixel" not in options)).stderr.endswith(
+        f"{told}\n"
+    )
+    write(tmp_path / "b.csv")
+    assert call("init", "--data", "b.csv").exit_code == 0
+    Path("b.yaml").write_text(re.sub(r"\n  R_eq: .*", "", Path("b.yaml").read_text()))
+    assert "write e.g. 'R_eq: {prior: normal, mean: 1 um, std: 0.1 um}'" in call("validate", "b.yaml").stderr
+
+
 def test_decimal_commas_are_noticed(tmp_path: Path) -> None:
     text = write(tmp_path / "b.csv").read_text().replace(",", ";").replace(".", ",")
     Path("b.csv").write_text(text)
@@ -66,6 +193,17 @@ def test_decimal_commas_are_noticed(tmp_path: Path) -> None:
     config = proposed(Path("b.yaml"))
     assert config.document.data["data"]["decimal"] == ","
     assert build(config)[0].observations.values.max() == pytest.approx(195e-6, rel=0.01)
+
+
+def test_rows_of_a_matrix_are_columns_where_it_is_flat(tmp_path: Path) -> None:
+    rows = np.loadtxt(write(tmp_path / "b.csv"), delimiter=",", skiprows=1).T
+    savemat("b.mat", {"data": rows})
+    done = call("init", "--data", "b.mat", *UNITS)
+    assert "columns with numbers: data(1,:), data(2,:); units are never guessed: add --time-column NAME" in done.stderr
+    done = call("init", "--data", "b.mat", *UNITS, "--time-column", "data(1,:)", "--radius-column", "data(2,:)")
+    assert done.exit_code == 0, done.output
+    (problem,) = build(proposed(Path("b.yaml")))
+    assert problem.observations.continued.values.min() == pytest.approx(1e-6 * rows[1].min())
 
 
 def test_vectors_that_a_mat_file_hides_are_told(tmp_path: Path) -> None:
@@ -131,7 +269,7 @@ def test_a_rate_that_the_times_contradict_is_told(tmp_path: Path) -> None:
     assert f"warning: b: {told}" in call("validate", "b.yaml").stderr
     (problem,) = build(load_config("b.yaml"))
     assert [c.code for c in problem.observations.doubts] == ["implausible-data"]
-    assert call("init", "--data", "b.csv", *UNITS, "--frame-rate", f"{1 / 0.7} MHz", "--force").exit_code == 0
+    assert call("init", "--data", "b.csv", "--frame-rate", f"{1 / 0.7} MHz", "--force").exit_code == 0
     assert build(load_config("b.yaml"))[0].observations.doubts == ()
     Path("b.yaml").write_text(Path("b.yaml").read_text().replace("MHz", "parsec"))
     assert "b.yaml:" in call("validate", "b.yaml").stderr

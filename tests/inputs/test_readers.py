@@ -10,7 +10,7 @@ from scipy.io import savemat
 
 from en4dvar.inputs.asked import Column, Layout, TimeStep
 from en4dvar.inputs.parts import read_contents
-from en4dvar.inputs.readers import Readings, read_series
+from en4dvar.inputs.readers import BELOW, FAR, Readings, read_series
 from en4dvar.plumbing.errors import DataError
 
 TIME, RADIUS = Column("t", "us", "s"), Column("R", "um", "m")
@@ -45,6 +45,23 @@ def test_csv_dialects(tmp_path: Path, text: str) -> None:
     assert series.values.tolist() == [1e-6, 2e-6, 3e-6]
 
 
+def test_no_number_of_0_or_below_is_a_reading_of_what_is_positive(tmp_path: Path) -> None:
+    """Wherever it stands, with its error, which may be blank; those before the first reading are not told."""
+    rows = "0,-1,\n1,0,\n2,5,1\n3,0,\n4,4,2\n5,-1,\n6,3,3\n7,2,4\n8,0,\n9,nan,\n"
+    (tmp_path / "a.csv").write_text(f"t,R,s\n{rows}")
+    radius = Column("R", "um", "m", positive=True)
+    read = read_series(tmp_path / "a.csv", TIME, radius, errors=[Column("s", "um", "m")])
+    np.testing.assert_allclose(read.times, [2e-6, 4e-6, 6e-6, 7e-6])
+    np.testing.assert_allclose(read.errors["s"], [1e-6, 2e-6, 3e-6, 4e-6])
+    assert read.left_out[BELOW] == pytest.approx([3e-6, 5e-6, 8e-6])
+    savemat(tmp_path / "a.mat", {"t": np.arange(6.0), "R": [0.0, 3, -1, 2, 1, 0]})
+    read = read_series(tmp_path / "a.mat", TIME, radius)
+    assert (read.times.size, len(read.left_out[BELOW])) == (3, 2)
+    (tmp_path / "a.csv").write_text("t,R\n0,-1\n1,-1\n2,0\n3,-1\n")
+    with pytest.raises(DataError, match=r"'R' holds no usable value .*not above zero"):
+        read_series(tmp_path / "a.csv", TIME, radius)
+
+
 def test_outliers_are_left_out_with_what_stands_beside_them(tmp_path: Path) -> None:
     t = np.arange(40.0)
     R = 100 - 0.05 * (t - 18) ** 2 + 0.3 * np.random.default_rng(2).standard_normal(40)
@@ -55,8 +72,8 @@ def test_outliers_are_left_out_with_what_stands_beside_them(tmp_path: Path) -> N
     whole, read = (
         read_series(tmp_path / "a.csv", TIME, RADIUS, Layout(outliers=what), [std]) for what in ("keep", "leave out")
     )
-    assert (len(whole.times), whole.left_out) == (40, ())
-    assert read.left_out == pytest.approx([9e-6, 27e-6])
+    assert (len(whole.times), whole.left_out) == (40, {})
+    assert read.left_out[FAR] == pytest.approx([9e-6, 27e-6])
     np.testing.assert_allclose(read.times, 1e-6 * np.delete(t, [9, 27]))
     np.testing.assert_allclose(read.errors["s"], 1e-6 * np.delete(rows[:, 2], [9, 27]))
 
@@ -85,7 +102,10 @@ def test_outliers_are_left_out_with_what_stands_beside_them(tmp_path: Path) -> N
             "a.csv:5: times must increase, but 1 us follows 2 us; correct it, or sort the rows",
         ),
         ("t,R\n0,1\n0,2\n1,3\n", "a.csv:3: times must increase, but 0 us follows 0 us; keep one of the two"),
-        ("t,R\n1,1\n2,2\n3,3\n1,1\n", "a.csv:5: times must increase, but 1 us follows 3 us; if another series begins"),
+        (
+            "t,R\n1,1\n2,2\n3,3\n1,1\n",
+            "a.csv:5: times must increase, but 1 us follows 3 us; correct it, or sort the rows",
+        ),
         ("Camera,X\n\nt,S\n0,1\n", "no column 'R'; the columns are: t, S\n"),
         ("t,R\n0,1\nus,um\n1,2\n", "a.csv:3: 'um' in column 'R' is not a number"),
         ("t,R\n0,1\n1,2\n", "2 usable observations; at least 3"),

@@ -74,7 +74,8 @@ class Asked:
                     time = other[radius]
             if _only(_STEP, self.contents.scalars) is None:
                 time = time or _only(FRAMES, names)
-        times = self.time_unit or (None if self.frame_rate else unit_in(time, "s"))
+        frames = self.frame_rate is not None and FRAMES.fullmatch(time or "")
+        times = self.time_unit or (None if frames else unit_in(time, "s"))
         radii = self.radius_unit or (None if self.pixel else unit_in(radius, "m"))
         named = replace(self, time_column=time, radius_column=radius, time_unit=times, radius_unit=radii)
         return named._of_camera()
@@ -84,9 +85,9 @@ class Asked:
         if asked.pixel is not None:
             if asked.radius_unit not in (None, *_AS_PIXELS):
                 raise ConfigError("--pixel makes pixels the unit of radii: give it, or --radius-unit, not both")
-            asked = replace(asked, radius_unit=as_unit(asked.pixel, "m"))
+            asked = replace(asked, radius_unit=as_unit(asked.pixel, "um"))
         if asked.frame_rate is not None and (asked._in_frames or asked._frame_each_row):
-            between = f"1/({as_unit(asked.frame_rate, 'Hz')})"
+            between = f"1/({as_unit(asked.frame_rate, 'kHz')})"
             step = f"{convert(1.0, between, 'us'):.12g} us" if asked._frame_each_row else asked.time_step
             asked = replace(asked, time_unit=between, time_step=step, frame_rate=None)
         return asked
@@ -134,9 +135,18 @@ class Asked:
             missing.append(("--radius-unit", "UNIT", "e.g. um"))
         return missing
 
+    def _spoilt(self) -> list[str]:
+        """Columns whose names tell that they are the missing ones, and that hold something else than numbers."""
+        named = {_TIME: self.time_column or self.time_step or self.step, _RADIUS: self.radius_column}
+        lacking = (_only(pattern, self.contents.others) for pattern, column in named.items() if column is None)
+        return [it for it in lacking if it and not any(name.startswith(f"{it}(") for name in self.contents.columns)]
+
     def incomplete(self, file: Path, advice: str) -> ConfigError:
         """The error that names what is :meth:`needed`."""
         options = ", ".join(f"{option} {value}{f' ({hint})' if hint else ''}" for option, value, hint in self.needed())
+        spoilt = [self.contents.others[name] for name in self._spoilt()]
+        if spoilt:
+            return ConfigError("\n".join(spoilt))
         columns = ", ".join(self.contents.columns) or "none"
         message = f"{file}: columns with numbers: {columns}; units are never guessed: add {options}"
         others = () if self.complete_columns else self.contents.others.values()

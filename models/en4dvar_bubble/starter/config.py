@@ -1,10 +1,13 @@
 """A starter configuration as text, from data files and what their columns mean."""
 
+import math
 import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+
+import numpy as np
 
 from en4dvar.assembly.build import build_one
 from en4dvar.assembly.reading import find_files, with_parts
@@ -12,7 +15,7 @@ from en4dvar.config import Config, resolve
 from en4dvar.config.document import parse_document
 from en4dvar.inputs.asked import ANY, Column, DataFile, Layout, TimeStep
 from en4dvar.inputs.matfile import indexed
-from en4dvar.inputs.readers import Readings, read_series
+from en4dvar.inputs.readers import BELOW, FAR, Readings, read_series
 from en4dvar.inputs.steps import step_doubts
 from en4dvar.plumbing.errors import ConfigError, DataError
 from en4dvar.plumbing.files import expanded
@@ -27,6 +30,8 @@ _UNIT = re.compile(r"(?:[ _]*[(\[/] *|[ _])([µμ]?[A-Za-z]+) *[)\]]?$")
 FRAMES = re.compile(r"(?i)(frame|bild|image|index|#|n$|nr).*")
 _DIAMETER = re.compile(r"(?i)(d|diam\w*|durchmesser)([ _(\[].*)?$")
 _REST = re.compile(r"(?i)(.*\.)?r_?eq")
+LENGTHS, TIMES = ("nm", "um", "mm", "m"), ("ns", "us", "ms", "s")
+ODD_SCALE = 50.0  # of the median of all files: bubbles of one experiment are closer
 AT_REST = (0.02, 0.9)  # of R_max
 PIXELS = re.compile(r"(?i)(?<![a-z])(px|pix|pixels?)(?![a-z])|_(px|pix)")
 
@@ -98,14 +103,14 @@ def propose_config(
         medium,
         grouped(files, data, groups, layout),
     )
-    odd = [_outliers(name, series) for name, series in readings.items() if series.left_out]
-    if odd:
+    odd = [words for name, series in readings.items() for words in _left_out(name, series)]
+    if any(FAR in series.left_out for series in readings.values()):
         source = replace(source, layout=replace(layout, outliers="leave out"))
     proposal = _with_rest(proposal, readings, source.radius[1])
     if errors:
         common = max(series.scalars.get(TRACKED_COMMON, 0.0) for series in readings.values())
         proposal = with_columns(proposal, errors, f"{common:g} {source.radius[1]}" if common > 0 else "")
-    told = (*proposal.warnings, *odd, *doubts(source), *_steps(readings, source), *unusable)
+    told = (*proposal.warnings, *odd, *doubts(source), *scales(readings, source), *_steps(readings, source), *unusable)
     proposal = replace(proposal, warnings=told)
     name = name or run_name(str(data))
     config = resolve(parse_document(yaml_text(name, source, proposal, command)), Path(folder).absolute())
@@ -150,20 +155,39 @@ def _times(source: Source) -> Column | TimeStep:
     if source.step_unit is not None:
         return TimeStep(Column(source.time_step or "", source.step_unit, "s"))
     if source.time_step:
-        return TimeStep(value=parse_quantity(source.time_step, "s"))
-    rate = None if source.rate is None else parse_quantity(source.rate, "1/s")
+        return TimeStep(value=parse_quantity(source.time_step, "s", "us"))
+    rate = None if source.rate is None else parse_quantity(source.rate, "1/s", "kHz")
     return Column(*(source.time or ("", "s")), "s", rate=rate)
 
 
-def _outliers(name: str, series: Readings) -> str:
-    """That readings of a data set were left out, and when they are of."""
-    times = [f"{1e6 * time:.6g}" for time in series.left_out[:6]]
-    which = (
-        f"the reading at {times[0]} us is"
-        if len(series.left_out) == 1
-        else f"the readings at {', '.join(times)} us are"
-    )
-    return f"{name}: {which} none of the bubble by the neighbours, and left out (data.outliers)"
+def _left_out(name: str, series: Readings) -> list[str]:
+    """That readings of a data set were left out, and which."""
+    words = []
+    if none := series.left_out.get(BELOW):
+        which = "reading of 0 or below is a frame" if len(none) == 1 else "readings of 0 or below are frames"
+        words.append(f"{name}: {len(none)} {which} without a bubble, and left out")
+    if far := [f"{1e6 * time:.6g}" for time in series.left_out.get(FAR, ())[:6]]:
+        which = f"reading at {far[0]} us is" if len(far) == 1 else f"readings at {', '.join(far)} us are"
+        words.append(f"{name}: the {which} none of the bubble by the neighbours, and left out (data.outliers)")
+    return words
+
+
+def scales(readings: Mapping[str, Readings], source: Source) -> list[str]:
+    """Data sets of three or more whose largest radius, or time between readings, is of another order than the median
+    of all, and the units that would make them alike."""
+    sizes = {name: np.array([it.values.max(), np.median(np.diff(it.times))]) for name, it in readings.items()}
+    usual = np.median(list(sizes.values()), axis=0)
+    of_time = source.time[1] if source.time else "s"
+    kinds = (("largest radius", source.radius[1], LENGTHS), ("time between readings", of_time, TIMES))
+    words = []
+    for name, size in sizes.items() if len(sizes) > 2 else ():
+        for (what, unit, others), ratio in zip(kinds, usual / size, strict=True):
+            if abs(math.log10(ratio)) > math.log10(ODD_SCALE):
+                times = f"{ratio:.0f} times smaller" if ratio > 1 else f"{1 / ratio:.0f} times larger"
+                alike = [it for it in others if abs(math.log10(convert(1.0, it, unit) / ratio)) < 0.5]
+                hint = f"; is it in {alike[0]}, not in {unit}?" if alike else ""
+                words.append(f"{name}: the {what} is {times} than the median of all files{hint}")
+    return words
 
 
 def _steps(readings: Mapping[str, Readings], source: Source) -> list[str]:

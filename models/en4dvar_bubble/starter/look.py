@@ -12,6 +12,7 @@ import numpy as np
 from en4dvar.inputs.outliers import scatter_of
 from en4dvar.inputs.window import minima
 from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import DataError
 from en4dvar_bubble.collapse import Lobe, lobe
 from en4dvar_bubble.starter.top import Top, top
 
@@ -24,6 +25,7 @@ DRIFTS = 0.15  # of ln R from one quarter of a history to the next
 GAS = 0.6  # of R_max: a bubble at rest is smaller
 ACOUSTIC_BEGINS = 0.1  # of R_max: one that begins below has grown from a nucleus
 EMERGES = 0.5  # of R_max: a nucleus that grows is seen before it is as large
+SEVERAL = 4  # readings before a bubble, or at least of one
 CREEPS = 1.5  # collapse times after the maximum: a history that goes on for longer without a rebound is damped
 
 
@@ -65,17 +67,25 @@ def look(times: Array, radius: Array, start: Start | None = None) -> Look:
     ------
     DataError: no maximum with a descent after it.
     """
+    _require_collapse(radius, start)
     scatter = scatter_of(times, radius)
     peak = lobe(times, radius)
     highest = top(times, radius, scatter if np.isfinite(scatter) else UNKNOWN * float(radius.max()))
     largest = highest.reading
     prominence, after = _minima(radius[largest:], scatter)
     rebound = second_maximum(radius)
-    first = float(radius[0] / radius[largest])
+    begins = _begins(radius, largest)
+    first = float(radius[begins] / radius[largest])
     rest, drift = _rest(times, radius, peak) if np.isfinite(rebound) else (float("nan"), "")
-    chosen, reason, clear = _start(first, np.isfinite(rebound), times[-1] > peak.t_max + CREEPS * peak.t_c)
+    chosen, reason, clear = _start(first, np.isfinite(rebound), times[-1] > peak.t_max + CREEPS * peak.t_c, begins)
     if start is not None:
         chosen, reason, clear = start, reason if start == chosen else "as you say", True
+    if chosen == "acoustic" and begins:
+        when = f"{1e6 * times[begins]:g} us"
+        raise DataError(
+            f"the first {begins} readings are small beside the bubble, which appears at {when}: ultrasound makes it "
+            f"grow from there; leave out what is before (data.since: '{when}')"
+        )
     return Look(
         n=len(times),
         times=(float(times[0]), float(times[-1])),
@@ -93,6 +103,23 @@ def look(times: Array, radius: Array, start: Start | None = None) -> Look:
         reason=reason,
         clear=clear,
     )
+
+
+def _begins(radius: Array, largest: int) -> int:
+    """The reading in which a bubble appears large at once, behind several that show next to nothing; else the first."""
+    after = int(np.flatnonzero(np.append(0.0, radius[:largest]) < ACOUSTIC_BEGINS * radius[largest])[-1])
+    return after if after >= SEVERAL and radius[after] > EMERGES * radius[largest] else 0
+
+
+def _require_collapse(radius: Array, start: Start | None) -> None:
+    """Raise :class:`DataError` where a bubble that a laser may have made is not recorded behind its maximum."""
+    largest, count = int(np.argmax(radius)), len(radius)
+    if largest > count - 3 and (start == "laser" or (start is None and radius[0] > ACOUSTIC_BEGINS * radius[largest])):
+        raise DataError(
+            f"the recording ends {'with' if largest == count - 1 else 'next to'} the maximum, reading {largest + 1} of "
+            f"{count}: it shows growth alone, and a bubble that a laser makes is estimated from its maximum on; "
+            "record the collapse, or if ultrasound made it grow, say --start acoustic"
+        )
 
 
 def _minima(radius: Array, scatter: float) -> tuple[float, int]:
@@ -142,9 +169,12 @@ def second_maximum(radius: Array) -> float:
     return float(between[peak] / radius[top]) if 0 < peak < len(between) - 1 else float("nan")
 
 
-def _start(first: float, rebounds: bool, creeps: bool) -> tuple[Start, str, bool]:
-    """The start that the data suggest, from the first radius over the maximum and what follows the collapse."""
-    begins = f"the history begins at {100 * first:.0f} % of R_max"
+def _start(first: float, rebounds: bool, creeps: bool, before: int) -> tuple[Start, str, bool]:
+    """The start that the data suggest, from the first radius over the maximum and what follows the collapse.
+
+    ``before``: as many readings show no bubble yet.
+    """
+    begins = f"{f'after {before} small readings ' if before else ''}the history begins at {100 * first:.0f} % of R_max"
     if first >= LASER_BEGINS:
         return "laser", begins, True
     if first < ACOUSTIC_BEGINS:

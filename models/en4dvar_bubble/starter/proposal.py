@@ -11,7 +11,7 @@ from en4dvar.inputs.window import Instant, select
 from en4dvar.model.forward import Trajectory
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.errors import ConfigError, DataError, retold
-from en4dvar.plumbing.units import convert
+from en4dvar.plumbing.units import convert, parse_quantity
 from en4dvar_bubble.collapse import Lobe, conceivable, doubt, lobe
 from en4dvar_bubble.dynamics import R0, R_EQ, R_MAX
 from en4dvar_bubble.laws.loading import qualified
@@ -57,6 +57,7 @@ WIDTHS: Mapping[Start, Mapping[str, tuple[float, float]]] = {
 BETWEEN = 1.645  # standard deviations from the median to 5 and 95 %
 SAME_CLOCK = 2e-6  # s: what a first guess can be off by
 BUBBLES = (1e-7, 0.1)  # m: between these radii
+SEEN = (3e-6, 50e-9, 1e-4)  # m, s, m: one below is not read in shorter steps; radius of a usual bubble
 
 
 @dataclass(frozen=True)
@@ -139,8 +140,8 @@ def propose(
         warnings += doubted
         possible = all(conceivable(view.lobe, model.medium) for view in views)
         believed = guess.common() if possible else Guess({}, {}, 0.0)
-    elif not BUBBLES[0] < look.lobe.R_max < BUBBLES[1]:
-        warnings.append("no bubble has such a radius; are the units of both columns right?")
+    elif words := _implausible(look):
+        warnings.append(words)
     elif guess.far:
         warnings.append(
             f"no G and mu of {model.law.name} give this {'R_max and ' if chosen == 'acoustic' else ''}collapse time: "
@@ -175,6 +176,18 @@ def _ends_with(groups: Grouped) -> str:
     return f"the run ends with the numbers of each {groups.kind}, and compares them: {told}"
 
 
+def _implausible(look: Look) -> str:
+    """Why nobody has seen a bubble of this size and duration, though the one fits the other; "" where many have."""
+    smallest, shortest, usual = SEEN
+    R, step = look.lobe.R_max, look.step
+    if BUBBLES[0] < R < BUBBLES[1] and not (smallest > R and step < shortest):
+        return ""
+    power = round(math.log10(usual / R) / 3)
+    factor = f"Units {1000 ** abs(power)} times {'larger' if power > 0 else 'smaller'} would make it a usual one"
+    told = f"R_max {_text(R, 'm', 'um', 3)}, read every {_text(step, 's', 'us', 3)}"
+    return f"{told}: no bubble has such a radius; are the units of both columns right? {factor}"
+
+
 def _doubted(looks: Mapping[str, Look], model: BubbleModel) -> list[str]:
     """Data sets whose scales cannot be right, one line for those with the same words."""
     doubts: dict[str, list[str]] = {}
@@ -189,7 +202,8 @@ def starter(start: Start, law: str | None) -> Proposal:
     model, law_name = built(start, law)
     data = [Entry("error", "{radius_std: 1 % of maximum}", "how well a radius is known: put yours")]
     if start == "laser":
-        data[:0] = [Entry("window", "{from: top, to: trough 2}"), Entry("time_zero", "window")]
+        words = "where readings show two collapses, 'to: trough 2' ends it at the second"
+        data[:0] = [Entry("window", "{from: top, to: end}", words), Entry("time_zero", "window")]
     lines = [example(p, model) for p in model.law.parameters]
     lines += _radii(start, None)
     lines += [Entry("t_s", "{prior: normal, mean: 0 us, std: 0.5 us}", "the clock of the data against the model's")]
@@ -350,10 +364,10 @@ def _clock(look: Look, model: BubbleModel, theta: Mapping[str, float]) -> Entry:
                 shift = look.lobe.t_max - lobe(times, path["R"]).t_max
     if abs(shift) <= SAME_CLOCK:
         return Entry("time_zero", "file", "the file's clock agrees with that of the pulse")
-    zero = min(shift, look.times[0])
-    return Entry(
-        "time_zero", _text(zero, "s", "us"), "puts the guess's R_max on the data's: give the clock of your pulse"
-    )
+    text = _text(shift, "s", "us")
+    if parse_quantity(text, "s") > look.times[0]:  # no reading lies before the pulse
+        text = f"{math.floor(1e8 * look.times[0]) / 100:.12g} us"
+    return Entry("time_zero", text, "puts the guess's R_max on the data's: give the clock of your pulse")
 
 
 def _in_a_liquid(model: BubbleModel) -> bool:
