@@ -97,6 +97,7 @@ def examine_tails(space: WeightSpace, ensemble: Array, costs: Array, before: Arr
 def _by_weights(prior: Prior, parts: Sequence[tuple[Array, Array]]) -> dict[str, float]:
     """The numbers of :func:`examine_tails`, of points (B, n) and their J (B,): the ensemble's, the prior's and others.
 
+    The posterior is that of the prior's members, which the ensemble stands for where they are drawn at random, too.
     Few weights may be most of the posterior, which their errors say. Where that is at members of the prior which the
     ensemble does not reach, it is elsewhere, however few these are: a model with steps, of which a bundle sees one.
     """
@@ -106,7 +107,8 @@ def _by_weights(prior: Prior, parts: Sequence[tuple[Array, Array]]) -> dict[str,
         coordinates = Coordinates.about(points)
         logs.append(-0.5 * np.sum(coordinates.of(x) ** 2, axis=1) - np.sum(np.log(np.diag(coordinates.root))))
     drawn, theta = np.logaddexp.reduce(logs), prior.to_physical(x)
-    shares, its_shares = _shares(-costs - drawn), _shares(logs[0] - drawn)
+    likelihood = prior.cost(x) - costs
+    shares, its_shares = _shares(likelihood + logs[1] - drawn), _shares(logs[0] - drawn)
     mean, std, at, wide = _moments(theta, shares)
     its_mean, its_std, its_at, its_wide = _moments(theta, its_shares)
     begin, end = len(parts[0][0]), len(parts[0][0]) + len(parts[1][0])
