@@ -14,6 +14,7 @@ from en4dvar.model.state import Array
 
 TAIL = 0.0005  # each tail of the central 99.9 % interval
 MEAN_OFF, SPREAD_OFF = 0.5, 0.3  # in posterior standard deviations, as a fraction: beyond, a posterior is non-Gaussian
+SURE = 2.0  # standard errors of weighted moments beyond what leaves a doubt, from which it is warned of
 EMULATED_ENOUGH = 0.2  # effective share of its runs below which an emulator is not believed
 GAUSSIAN_ENOUGH = 0.35  # the same of the members: the criterion where there is no emulator to believe
 DECISIVE = 20.0  # ratio of two evidences from which on the data are said to speak for one of the models
@@ -119,12 +120,12 @@ def gaussianity(members: Array, centre: Array, costs: Array) -> dict[str, float]
 
 def is_non_gaussian(shape: Mapping[str, float]) -> bool:
     """True if mean or spread of the ensemble are not the posterior's, from
-    :func:`~en4dvar.sampling.refine.examine_shape`.
+    :func:`~en4dvar.sampling.refine.examine_shape` and :func:`~en4dvar.sampling.refine.examine_tails`.
     """
     if shape.get("emulator_fit", 0.0) >= EMULATED_ENOUGH:
         off = abs(shape["spread_ratio"] - 1)
         return shape["mean_shift"] > MEAN_OFF or off > SPREAD_OFF
-    return shape.get("gaussian_fit", 1.0) < GAUSSIAN_ENOUGH
+    return shape.get("gaussian_fit", 1.0) < GAUSSIAN_ENOUGH or any(key.startswith("tail_mean") for key in shape)
 
 
 def active_members(failures: Sequence[str]) -> npt.NDArray[np.bool_]:

@@ -22,6 +22,7 @@ from en4dvar.model.state import Array
 FEWEST = 8  # readings below which nothing is said
 MOST = 500  # of them are looked at, evenly chosen blocks would tell no more
 ROUNDING = 1e-3  # standard deviations: residuals of which none is larger are those of arithmetic, not of readings
+FITTED = 0.005  # of the leverage of a reading: what less leaves of its residual is the error of the linearisation
 NO_VARIANCE = 1e-12  # of the largest eigenvalue of Q; below it a direction was fitted exactly, to rounding
 FREQUENCIES = np.expm1(np.linspace(np.log1p(1e-4), np.log1p(400.0), 700))
 
@@ -72,8 +73,9 @@ class Residuals:
 
     @cached_property
     def studentised(self) -> Array:
-        """Residuals (K,) over their own expected std."""
-        return np.asarray(self.white / np.sqrt(np.maximum(1 - self.leverage, 1e-12)))
+        """Residuals (K,) over their own expected std; 0 of a reading that only its own prediction is fitted to."""
+        left = 1 - self.leverage
+        return np.where(left > FITTED, self.white / np.sqrt(np.maximum(left, FITTED)), 0.0)
 
     @property
     def enough(self) -> bool:

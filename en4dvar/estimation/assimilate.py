@@ -76,7 +76,7 @@ def _through(stages: Stages) -> Analysis:
         descents = conclusions.descents_of(outcome, len(space.members))
         if descents and looking:  # else they are those that were told
             stages.tell(descents)
-        sampled = stages.sampled(ends, counting, agree, looking)
+        sampled = stages.sampled(ends, prior_run, counting, agree, looking)
         if sampled.refined:
             lower = sampled.refined.lower
         else:  # a chain would have found what lies lower

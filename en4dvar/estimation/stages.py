@@ -1,5 +1,6 @@
 """The stages of an assimilation: prior forecast, start, iterations, search for other minima, refinement."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -22,7 +23,18 @@ from en4dvar.executor import Executor
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.problem import InverseProblem
-from en4dvar.sampling.refine import CLEARED, Refined, examine_shape, examine_tails, in_doubt, refined, samples
+from en4dvar.sampling.refine import (
+    CLEARED,
+    SEEN,
+    Refined,
+    examine_shape,
+    examine_tails,
+    in_doubt,
+    refined,
+    samples,
+    that_count,
+    weighs,
+)
 from en4dvar.schemes import MINIMISERS
 from en4dvar.schemes.base import Weights
 from en4dvar.schemes.settings import AssimilationSettings
@@ -160,7 +172,9 @@ class Stages:
         final = space.whole(np.vstack([members, mode]), self.grid)
         return Ends(members, mode, final[:-1], final[-1:])
 
-    def sampled(self, ends: Ends, minima: Sequence[Minimum], agree: bool, looking: bool) -> Sampled:
+    def sampled(
+        self, ends: Ends, prior_run: Forecast, minima: Sequence[Minimum], agree: bool, looking: bool
+    ) -> Sampled:
         """The ensemble, sampled where that is asked for or there is a doubt.
 
         ``agree``: descents from different members ended in the lowest of the ``minima`` that count. ``looking``: end at
@@ -177,8 +191,12 @@ class Stages:
             costs = space.costs(ends.members, ends.run)
             shape = examine_shape(space, ends.members, ends.mode, costs, self.seed, settle)
             settles = cheap and bool(minima)
-            if settles and not in_doubt(minima, agree, shape):
-                shape |= examine_tails(space, ends.members, costs)
+            modes = that_count(minima, self.problem.prior, math.log(SEEN))  # of which a warning is given in any case
+            told = in_doubt(minima, agree, shape) if settles else "mean_shift" in shape or len(modes) > 1
+            if minima and weighs(space) and not told and not shape["non_gaussian"] and not prior_run.filled:
+                before = space.costs(space.members, prior_run[:-1])
+                shape |= examine_tails(space, ends.members, costs, before, settles)
+                shape["non_gaussian"] = diag.is_non_gaussian(shape)
             if not (settles and in_doubt(minima, agree, shape)):
                 return Sampled(ends, None, shape)
         sampled = refined(space, ends.members, minima, self.seed, looking=looking, look=self.tell)

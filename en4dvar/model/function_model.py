@@ -48,6 +48,7 @@ class FunctionModel(ForwardModel):
     members: the function takes so many members in one call, each parameter (members, 1) and ``times`` (members, K), and
         returns arrays (members, K). The last call is filled up, so that shapes are always the same (nothing is compiled
         twice). An exception loses all of them; a member is lost by NaN.
+    cheap: whether ten thousand calls take seconds, so that a doubt about a posterior is settled by sampling it.
     """
 
     dense = False
@@ -61,14 +62,20 @@ class FunctionModel(ForwardModel):
         dense: bool = False,
         jacobian: Function | None = None,
         members: int | None = None,
+        cheap: bool = False,
     ):
-        self.function, self.parameters = function, tuple(parameters)
+        self.function, self.parameters, self._cheap = function, tuple(parameters), cheap
         self.jacobian, self.members, self.batch = jacobian, members, members or 1
         self.observables = tuple(Observable(name, unit, Returned(name), fewest=1) for name, unit in observables.items())
         self.time_unit = self.time_display_unit = time_unit
         self.dense = dense
         self.layout = StateLayout((Field("theta", len(self.parameters)),))
         self._path = StateLayout(tuple(Field(observable.name, unit=observable.unit) for observable in self.observables))
+
+    @property
+    def cheap(self) -> bool:
+        """Whether somebody said so."""
+        return self._cheap or super().cheap
 
     @property
     def differentiable(self) -> bool:

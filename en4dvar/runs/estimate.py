@@ -67,6 +67,7 @@ def estimate(
     resume: bool = False,
     report: bool = True,
     progress: bool | Progress = True,
+    cheap: bool = False,
     **sections: Any,
 ) -> Result:
     """Estimate parameters of a model from readings that a script holds.
@@ -95,6 +96,7 @@ def estimate(
     force, resume: replace or continue the run in the directory.
     progress: show it on a terminal or in a notebook; or a function that is called as that of :func:`en4dvar.run`, with
         the name of the data set and the record of each iteration.
+    cheap: ten thousand calls of a function take seconds, so that a doubt about the posterior is settled by sampling it.
     sections: further sections of a file by name: ``assimilation``, ``execution``, ``initial_state``, ``model_error``;
         ``prior={"ensemble": {"k": array}}`` may hold the members themselves.
 
@@ -103,7 +105,7 @@ def estimate(
     ConfigError, DataError: says which argument, and what to do. Others as of :func:`en4dvar.run`.
     """
     call = Given(model, data, time, observable, error, units or {}, priors, series or {}, correlation)
-    ready, model_section = call.model(model)
+    ready, model_section = call.model(model, cheap)
     content = {
         "name": name,
         "seed": seed,
@@ -395,8 +397,10 @@ class Given:
         correlation = {"correlation": self.correlation} if self.correlation else {}
         return {"path": GIVEN, "series": {series.name: series.section(model) for series in self.series}, **correlation}
 
-    def model(self, model: Any) -> tuple[ForwardModel, dict[str, Any]]:
-        """The model, and what a configuration records of it. Raises :class:`ConfigError`."""
+    def model(self, model: Any, cheap: bool = False) -> tuple[ForwardModel, dict[str, Any]]:
+        """The model, ``cheap`` or not, and what a configuration records of it. Raises :class:`ConfigError`."""
+        if cheap and isinstance(model, str | Mapping | type | ForwardModel):
+            raise ConfigError("cheap: it is said of a function; a model says it itself (ForwardModel.cheap)")
         if isinstance(model, str | Mapping):
             section = {"name": model} if isinstance(model, str) else dict(model)
             faults: list[Fault] = []
@@ -410,10 +414,15 @@ class Given:
             return model, {"name": HANDED, "object": name_of(type(model)), "digest": _digest_of_model(model)}
         if not callable(model):
             raise ConfigError(f"model: {type(model).__name__} is neither a function nor a model; {MODELS}")
-        section = {"name": HANDED, "object": name_of(model), "digest": digest_of(model)}
-        return self._function(model), section
+        section = {
+            "name": HANDED,
+            "object": name_of(model),
+            "digest": digest_of(model),
+            **({"cheap": True} if cheap else {}),
+        }
+        return self._function(model, cheap), section
 
-    def _function(self, function: Any) -> FunctionModel:
+    def _function(self, function: Any, cheap: bool) -> FunctionModel:
         names = [name for name in self.priors if name not in {p.name for p in OF_READINGS}]
         if not names:
             raise ConfigError("priors: none is of a parameter of the function; give one a prior, or a fixed number")
@@ -428,7 +437,7 @@ class Given:
             )
         parameters = [Parameter(name, self.units.get(name, "1")) for name in names]
         observables = {name: self.units.get(name, "1") for name in observed}
-        return FunctionModel(function, parameters, observables, self.units.get(TIME, "1"))
+        return FunctionModel(function, parameters, observables, self.units.get(TIME, "1"), cheap=cheap)
 
 
 def _check_keys(argument: str, keys: Any, series: Mapping[str, Any], whole: bool = False) -> None:

@@ -3,12 +3,14 @@
 The members' own J, known from the posterior forecast, clear most runs. Where they do not, and the model is cheap, an
 emulator of J is fitted about the ensemble and sampled: its mean and standard deviations are those of the posterior
 within about a tenth, and what they differ from the ensemble's is what a Markov chain would find
-(benchmarks/gaussianity.py). A Gaussian that is too narrow draws no member where the tails of the posterior are: of a
-cheap model as many are run twice as far out (docs: shells).
+(benchmarks/gaussianity.py). A Gaussian that is too narrow draws no member where the tails of the posterior are, and a
+tangent does not see what is elsewhere: members of the prior may, and as many runs twice as far out as members.
+Weighted, they tell mean and spread of any model.
 """
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -38,6 +40,9 @@ KEPT = 500  # draws of the posterior beside the members
 CHAIN_FITS = 4  # of an emulator that has to guide a chain into the tails; two tell mean and spread
 SHIFT, SPREAD = 0.25, 0.15  # of the ensemble, by the emulator, that leave a doubt: half of what is warned of
 FAR = 2.0  # times as far out as the members
+TINY = 1e-3  # standard error, or share that is left, below which none matters
+ROUNDING = 1e-9  # of the standard deviation of all points: where one has all of the weight
+ELSEWHERE = 0.5  # share of the posterior at members of the prior beyond the ensemble's own share there
 CLEARED = 0.85  # effective share of the members above which no run was found that was off (docs: calibration)
 OVERLAP = "no action is needed: mean ± std describe the members"
 
@@ -66,33 +71,85 @@ def examine_shape(
     return {**shape, "non_gaussian": diag.is_non_gaussian(shape)}
 
 
-def examine_tails(space: WeightSpace, ensemble: Array, costs: Array) -> dict[str, float]:
-    """``tail_ratio``, the least standard deviation of the ensemble (N, n) over the posterior's, by members of J
-    ``costs`` (N,) and as many runs :data:`FAR` times as far out, weighted with the density that these are all drawn
-    from: of a Gaussian posterior 1, whatever the members are.
+def examine_tails(space: WeightSpace, ensemble: Array, costs: Array, before: Array, always: bool) -> dict[str, float]:
+    """How far mean and standard deviation of the ensemble (N, n) are from the posterior's in what is printed.
+
+    By members of J ``costs`` (N,), those of the prior of J ``before`` (N,) and, ``always`` or where these leave a
+    doubt, as many runs :data:`FAR` times as far out as the members. All are weighted with the density that they are
+    drawn from, for the posterior and for the Gaussian of the ensemble: of a Gaussian posterior both weights are the
+    same, whatever the points are. ``tail_shift`` is the largest distance of both means in posterior standard
+    deviations, ``tail_ratio`` the standard deviation of the ensemble over the posterior's where that is farthest from
+    1, ``tail_excess`` by how many standard errors of theirs a distance or ratio is beyond :data:`SHIFT` or
+    :data:`SPREAD`. ``tail_mean_<name>``, ``tail_std_<name>`` are those of a parameter that is surely off by what is
+    warned of. Nothing of an ensemble without a covariance.
     """
-    mean = ensemble.mean(axis=0)
-    far = mean + FAR * (ensemble - mean)
-    x = np.concatenate([ensemble, far])
-    squares = np.sum(Coordinates.about(ensemble).of(x) ** 2, axis=1)
-    drawn = np.logaddexp(-0.5 * squares, -0.5 * squares / FAR**2 - x.shape[1] * np.log(FAR))
-    posterior = _spread(x, -np.append(costs, space.costs(far, space.forecast(far))) - drawn)
-    return {"tail_ratio": float(np.min(_spread(x, -0.5 * squares - drawn) / posterior))}
+    weighed: dict[str, float] = {}
+    with suppress(np.linalg.LinAlgError):
+        parts = [(ensemble, costs), (space.members, before)]
+        weighed = _by_weights(space.problem.prior, parts)
+        if always or weighed["tail_excess"] > 0:
+            mean = ensemble.mean(axis=0)
+            far = mean + FAR * (ensemble - mean)
+            weighed = _by_weights(space.problem.prior, [*parts, (far, space.costs(far, space.forecast(far)))])
+    return weighed
 
 
-def _spread(x: Array, logs: Array) -> Array:
-    """Standard deviations (n,) of points (B, n) of log weights (B,)."""
+def _by_weights(prior: Prior, parts: Sequence[tuple[Array, Array]]) -> dict[str, float]:
+    """The numbers of :func:`examine_tails`, of points (B, n) and their J (B,): the ensemble's, the prior's and others.
+
+    The posterior is that of the prior's members, which the ensemble stands for where they are drawn at random, too.
+    Few weights may be most of the posterior, which their errors say. Where that is at members of the prior which the
+    ensemble does not reach, it is elsewhere, however few these are: a model with steps, of which a bundle sees one.
+    """
+    x, costs = (np.concatenate(every) for every in zip(*parts, strict=True))
+    logs = []
+    for points, _ in parts:
+        coordinates = Coordinates.about(points)
+        logs.append(-0.5 * np.sum(coordinates.of(x) ** 2, axis=1) - np.sum(np.log(np.diag(coordinates.root))))
+    drawn, theta = np.logaddexp.reduce(logs), prior.to_physical(x)
+    likelihood = prior.cost(x) - costs
+    shares, its_shares = _shares(likelihood + logs[1] - drawn), _shares(logs[0] - drawn)
+    mean, std, at, wide = _moments(theta, shares)
+    its_mean, its_std, its_at, its_wide = _moments(theta, its_shares)
+    begin, end = len(parts[0][0]), len(parts[0][0]) + len(parts[1][0])
+    elsewhere = np.sum((shares - its_shares)[begin:end]) > ELSEWHERE
+    shift, ratio = np.abs(its_mean - mean) / std, its_std / std
+    off = np.array([shift - SHIFT, np.abs(np.log(ratio)) - math.log1p(SPREAD)])
+    errors = 0.0 if elsewhere else np.linalg.norm([(at - its_at) / std, wide - its_wide], axis=1)
+    excess = np.max(off / np.maximum(errors, TINY), axis=0)
+    weighed = {
+        "tail_shift": float(np.max(shift)),
+        "tail_ratio": float(ratio[np.argmax(np.abs(np.log(ratio)))]),
+        "tail_excess": max(0.0, float(np.max(excess))),
+    }
+    sure = (excess > diag.SURE) & ((shift > diag.MEAN_OFF) | (np.abs(ratio - 1) > diag.SPREAD_OFF))
+    for j in np.flatnonzero(sure):
+        weighed |= {f"tail_mean_{prior.names[j]}": float(mean[j]), f"tail_std_{prior.names[j]}": float(std[j])}
+    return weighed
+
+
+def _shares(logs: Array) -> Array:
+    """Weights (B,) that sum to 1, from their logarithms."""
     shares = np.exp(logs - logs.max())
-    shares /= shares.sum()
-    return np.asarray(np.sqrt(shares @ (x - shares @ x) ** 2))
+    return np.asarray(shares / shares.sum())
+
+
+def _moments(theta: Array, shares: Array) -> tuple[Array, Array, Array, Array]:
+    """Mean and standard deviation (n,) of points (B, n) of ``shares`` (B,), and by what (B, n) mean and logarithm of
+    the standard deviation differ without each point, the latter to first order: their jackknife.
+    """
+    mean, left = shares @ theta, shares / np.maximum(1 - shares, TINY)
+    squares = (theta - mean) ** 2
+    std = np.maximum(np.sqrt(shares @ squares), ROUNDING * theta.std(axis=0))
+    return mean, std, left[:, None] * (theta - mean), 0.5 * left[:, None] * (squares / std**2 - 1)
 
 
 def doubtful(shape: Mapping[str, float]) -> bool:
-    """True if mean or spread of the ensemble are off, by the emulator, by half of what is warned of, or the spread is
-    too small by as much in view of the tails.
+    """True if mean or spread of the ensemble are off by half of what is warned of, by the emulator or, by more than
+    their standard error, by weights.
     """
     off = shape.get("mean_shift", 0.0) > SHIFT or abs(shape.get("spread_ratio", 1.0) - 1) > SPREAD
-    return off or 1 - shape.get("tail_ratio", 1.0) > SPREAD
+    return off or shape.get("tail_excess", 0.0) > 1
 
 
 def _off(emulator: EmulatedCost, ensemble: Array) -> dict[str, float]:
@@ -145,10 +202,10 @@ class Refined:
     warnings: tuple[Caution, ...] = ()
 
 
-def that_count(minima: Sequence[Minimum], prior: Prior) -> tuple[Minimum, ...]:
-    """The lowest, and the others that may hold some of the probability."""
+def that_count(minima: Sequence[Minimum], prior: Prior, beyond: float = COUNTS) -> tuple[Minimum, ...]:
+    """The lowest, and the others that may hold some of the probability, of evidence ``beyond`` that of the lowest."""
     logs = [m.log_evidence(prior) for m in minima]
-    return tuple(m for i, m in enumerate(minima) if i == 0 or logs[i] - logs[0] > COUNTS)
+    return tuple(m for i, m in enumerate(minima) if i == 0 or logs[i] - logs[0] > beyond)
 
 
 def mode_cautions(
@@ -191,9 +248,15 @@ def _apart(minima: Sequence[Minimum]) -> Array:
     return np.asarray(between.max(axis=(0, 1)))
 
 
+def weighs(space: WeightSpace) -> bool:
+    """True if J of single members tells of doubts with ``refine: auto``."""
+    auto = space.settings.refine == "auto" and not space.settings.stochastic_model
+    return auto and space.basis.shape[1] == len(space.mean)
+
+
 def samples(space: WeightSpace) -> bool:
     """True if a doubt is settled by sampling."""
-    return may_sample(space.problem, space.settings) and space.basis.shape[1] == len(space.mean)
+    return may_sample(space.problem, space.settings) and weighs(space)
 
 
 def may_sample(problem: InverseProblem, settings: AssimilationSettings) -> bool:

@@ -22,6 +22,7 @@ class DEnKF(ETKF):
     """The filter."""
 
     words: ClassVar[str] = "deterministic"
+    approximate: ClassVar[str] = "moves anomalies by half of the gain, which leaves them wider than the posterior"
 
     def advance(self, weights: Weights, evaluation: Evaluation, iteration: int, draw: Draw) -> Step | GaussNewtonStep:
         """Weights of the analysis."""

@@ -227,6 +227,7 @@ def alone(monkeypatch):
     """Nothing looks for another minimum within the window."""
     monkeypatch.setattr(Search, "challenged", lambda self, outcome: outcome)
     monkeypatch.setattr(Search, "rest", lambda self, outcome: [])
+    monkeypatch.setattr("en4dvar.estimation.stages.weighs", lambda space: False)  # nor do members of the prior tell it
 
 
 @pytest.mark.parametrize("kind", [Parting, UnlikeParting])

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from diagnosis.provoked import decay_experiments, linear_experiments, waved
 
 from en4dvar.assembly.build import build
 from en4dvar.config import load_config
-from en4dvar.estimation.assimilate import assimilate
+from en4dvar.estimation.assimilate import assimilate, log_posterior
 from en4dvar.schemes.settings import AssimilationSettings
 
 QUICKSTART = Path(__file__).resolve().parents[2] / "configs" / "quickstart.yaml"
@@ -41,7 +42,23 @@ def test_a_discrepancy_that_is_not_there_is_not_found():
     assert false_alarms([waved(0.0)]) == []
 
 
+def off_by_little(analysis):
+    """Whether mean and std are those of the posterior on a grid, by half of what is warned of."""
+    problem, x = analysis.problem, analysis.problem.prior.from_physical(analysis.posterior)
+    axes = [m + s * np.linspace(-7, 7, 121) for m, s in zip(x.mean(axis=0), x.std(axis=0), strict=True)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, x.shape[1])
+    logs, values = log_posterior(problem, grid), problem.prior.to_physical(grid)
+    mean = np.average(values, axis=0, weights=np.exp(logs - logs.max()))
+    std = np.sqrt(np.average((values - mean) ** 2, axis=0, weights=np.exp(logs - logs.max())))
+    shift, ratio = (analysis.posterior.mean(axis=0) - mean) / std, analysis.posterior.std(axis=0, ddof=1) / std
+    return bool(np.all(np.abs(shift) < 0.25) and np.all(np.abs(ratio - 1) < 0.15))
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("settings", [{"members": 24}, {"linearisation": "transform"}], ids=str)
+@pytest.mark.parametrize("settings", [{"members": 24}, {"linearisation": "transform"}, {}], ids=str)
 def test_mildly_nonlinear_experiments_raise_few_false_alarms(settings):
-    assert len(false_alarms(decay_experiments(60, 78), **settings)) <= 1
+    """Some of these posteriors are as far from Gaussian as is warned of: that is no false alarm."""
+    ends = [assimilate(p, AssimilationSettings(**settings), seed) for seed, p in enumerate(decay_experiments(60, 78))]
+    graver = [(a, {c.code for c in a.cautions if c.severity != "note"}) for a in ends]
+    assert sum(bool(codes - {"non-gaussian"}) for _, codes in graver) <= 1
+    assert not any("non-gaussian" in codes and off_by_little(a) for a, codes in graver)

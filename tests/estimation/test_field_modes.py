@@ -63,6 +63,17 @@ def test_a_linear_field_with_a_parameter_and_a_reading_of_no_place_is_the_closed
     assert analysis.posterior[:, 0].std(ddof=1) == pytest.approx(std[30], rel=1e-3)
 
 
+def test_modes_that_the_readings_do_not_tell_are_counted_in_one_warning():
+    analysis = assimilate(line(), AssimilationSettings(members=40), 1)
+    (said,) = (c for c in analysis.cautions if c.code == "not-informed")
+    little = [
+        name for name, dfs in zip(line().prior.names[1:], analysis.dfs_per_parameter[1:], strict=True) if dfs < 0.1
+    ]
+    assert said.parameters == tuple(little)
+    assert len(little) > 3
+    assert said.words.startswith(f"{len(little)} of {len(line().perturbations)} modes of the initial ")
+
+
 def test_so_many_modes_as_asked_for_and_factors():
     few = line(modes=5)
     assert len(few.perturbations) == 5

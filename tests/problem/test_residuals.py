@@ -48,6 +48,18 @@ def test_leverages_add_up_to_the_degrees_of_freedom():
     assert squares / 40 == pytest.approx(analysis.iterations[-1].chi2_per_observation, rel=1e-9)
 
 
+def test_a_reading_that_alone_tells_a_parameter_is_no_outlier():
+    """Its residual is what the linearisation errs by, over as good as nothing."""
+    sensitivity = np.zeros((K, 1))
+    sensitivity[7] = 1e7
+    white = np.random.default_rng(3).standard_normal(K)
+    white[7] = 0.15
+    found = looked_at(white, sensitivity)
+    assert found.leverage[7] == pytest.approx(1)
+    assert np.max(np.abs(found.studentised)) < 4
+    assert found.outlier[0] != 7
+
+
 def test_size_and_structure_are_told_apart():
     analysis = run(bent())
     codes = {c.code for c in analysis.cautions}

@@ -221,6 +221,13 @@ def _one_descent(case: Case) -> str:
     return f"set {' and '.join(wanted)}" if wanted else "compare with another seed"
 
 
+def _gaussian(case: Case) -> str:
+    if case.a.settings.own.approximate:
+        return f"set assimilation.scheme: {MINIMISERS[0]}, whose ensemble is the posterior"
+    said = "" if case.a.problem.model.cheap else ", or say that the model is cheap, if ten thousand runs take seconds"
+    return f"{CATALOGUE['non-gaussian'][1]}{said}"
+
+
 def _chain(case: Case) -> str:
     guided = case.a.settings.emulator == "on"
     first = "" if guided else "set assimilation.emulator: on, which guides the chain, or "
@@ -242,6 +249,7 @@ ADVICE: dict[str, Callable[[Case], str]] = {
     "odd-residuals": _odd,
     "model-validity": _validity,
     "chain-not-converged": _chain,
+    "non-gaussian": _gaussian,
     "at-bound": _bound,
     "prior-conflict": _conflict,
     "several-modes": _modes,

@@ -4,6 +4,7 @@ import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from statistics import median
+from types import MappingProxyType
 
 import numpy as np
 import numpy.typing as npt
@@ -36,10 +37,12 @@ THERE = 0.25  # of the errors' std: a discrepancy beyond it in nearly all member
 NINE_OF_TEN = (0.05, 0.95)
 SILENT = 0.1  # DFS of all readings beyond it that count as none
 EXTRAPOLATED = "no action is needed for the parameters; paths beyond the limit are extrapolated"
+UNREAD = "no action is needed where the field's own spread says so, cell by cell"
 MANY = 0.1  # share of members whose loss is serious
 SEPARATED = 3.0  # standard deviations of the rank sum beyond which a parameter tells lost members from others
 FAR = 1.5  # prior standard deviations from the prior mean that are worth naming for one or two members
 MOST_NAMED = 3
+NONE: Mapping[str, str] = MappingProxyType({})
 Mask = npt.NDArray[np.bool_]
 Findings = Iterator[Caution]
 
@@ -218,51 +221,65 @@ def validity(limits: Sequence[ValidityLimit], extremes: Array, since: Array, tim
             yield replace(caution("model-validity", words, "note"), advice=EXTRAPOLATED)
 
 
-def information(prior: Prior, posterior: Array, per_parameter: Array, silent: Collection[str] = ()) -> Findings:
+def information(
+    prior: Prior, posterior: Array, per_parameter: Array, silent: Collection[str] = (), modes: Mapping[str, str] = NONE
+) -> Findings:
     """Parameters of which the data say little: neither spread nor mean of the posterior (N, n) differ from the prior's.
 
     ``per_parameter`` (n,) is 1 − posterior over prior variance. Nothing is said of ``silent`` names: their members
-    may not be the posterior, or they need not be informed.
+    may not be the posterior, or they need not be informed. ``modes`` says of which field a name is a mode: those of a
+    field are counted in one finding.
     """
+    of_fields: dict[str, list[str]] = {}
     moved = np.abs(posterior.mean(axis=0) - prior.mean) / prior.std
     for name, value, far in zip(prior.names, per_parameter, moved, strict=True):
         if name not in silent and -WIDENED < value < HARDLY_INFORMED and far < MOVED:
+            if name in modes:
+                of_fields.setdefault(modes[name], []).append(name)
+                continue
             words = f"{name} is hardly informed by the data (DFS {value:.2f}): its posterior is close to its prior"
             yield caution("not-informed", words, parameters=(name,))
+    for field, names in of_fields.items():
+        count = sum(of == field for of in modes.values())
+        words = f"{len(names)} of {count} modes of the initial {field} are hardly informed by the data"
+        yield replace(caution("not-informed", words, parameters=tuple(names)), advice=UNREAD)
 
 
-def gaussian(prior: Prior, members: Array, shape: Mapping[str, float]) -> Findings:
+def gaussian(prior: Prior, members: Array, shape: Mapping[str, float], approximate: str = "") -> Findings:
     """Members (N, n), physical and alive, whose mean or spread are not the posterior's.
 
     Sizes are those of the numbers that are printed, for G of G and not of ln G: ``shape`` holds mean and std of the
-    emulated posterior. The finding is about the parameters that are off, and serious where one is off by much.
+    posterior by an emulator or by weights. The finding is about the parameters that are off, and serious where one is
+    off by much. ``approximate``: what a scheme does that is no posterior even where this is Gaussian.
     """
     if not is_non_gaussian(shape):
         return
     sizes, off, severity = [], [], None
-    words = "the posterior is far from Gaussian: mean and spread of the ensemble are not the posterior's"
-    believed = shape.get("emulator_fit", 0.0) >= EMULATED_ENOUGH
-    if not believed:
+    why = f"the scheme {approximate}" if approximate else "the posterior is far from Gaussian"
+    words = f"{why}: mean and spread of the ensemble are not the posterior's"
+    by = "emulated" if shape.get("emulator_fit", 0.0) >= EMULATED_ENOUGH else "tail"
+    told = [(j, p) for j, p in enumerate(prior.parameters) if f"{by}_mean_{p.name}" in shape]
+    if not told:
         words = (
-            f"the posterior is far from Gaussian (effective share of members {shape['gaussian_fit']:.2f}): mean and "
-            "spread of the ensemble may be off by more than they say"
+            f"{why} (effective share of members {shape['gaussian_fit']:.2f}): mean and spread of the ensemble may be "
+            "off by more than they say"
         )
-    for j, p in enumerate(prior.parameters if believed else ()):
-        std = shape.get(f"emulated_std_{p.name}", math.nan)
-        shift = (float(members[:, j].mean()) - shape.get(f"emulated_mean_{p.name}", math.nan)) / std
+    for j, p in told:
+        std = shape[f"{by}_std_{p.name}"]
+        shift = (float(members[:, j].mean()) - shape[f"{by}_mean_{p.name}"]) / std
         ratio = float(members[:, j].std(ddof=1)) / std
-        if abs(shift) > MEAN_OFF or abs(ratio - 1) > SPREAD_OFF:
+        if by == "tail" or abs(shift) > MEAN_OFF or abs(ratio - 1) > SPREAD_OFF:
             off.append(p.name)
-            sizes.append(_both(p, members[:, j], shape))
+            sizes.append(_both(p, members[:, j], shape, by))
             if abs(shift) > 1 or not 0.5 < ratio < 2:
                 severity = SERIOUS
     more = f": {'; '.join(sizes)}" if sizes else ""
     yield caution("non-gaussian", f"{words}{more}", severity, tuple(off))
 
 
-def _both(p: Parameter, members: Array, shape: Mapping[str, float]) -> str:
-    """Mean ± std of the members and of the emulated posterior, in the display unit."""
-    si = (members.mean(), members.std(ddof=1), shape[f"emulated_mean_{p.name}"], shape[f"emulated_std_{p.name}"])
+def _both(p: Parameter, members: Array, shape: Mapping[str, float], by: str) -> str:
+    """Mean ± std of the members and of the posterior, ``by`` an emulator or weights, in the display unit."""
+    si = (members.mean(), members.std(ddof=1), shape[f"{by}_mean_{p.name}"], shape[f"{by}_std_{p.name}"])
     mean, std, estimate, spread = (convert(float(v), p.unit, p.display_unit) for v in si)
     unit = "" if p.display_unit == "1" else f" {p.display_unit}"
     return f"{p.name} = {mean:.2g} ± {std:.2g}{unit} where it should be about {estimate:.2g} ± {spread:.2g}{unit}"

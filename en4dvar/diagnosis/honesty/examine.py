@@ -57,7 +57,7 @@ def examine(
         *checks.weighted(a),
         *unfinished(a),
         *(checks.rank(prior, control.prior, control.posterior[alive]) if whole else ()),
-        *(collapse(prior, control, alive) if whole else ()),
+        *(collapse(prior, control, alive) if whole and not a.refinement else ()),
         *checks.loss("prior forecast", a.prior_failures, prior, control.prior),
         *checks.loss("iterations", worst_loss, prior),
         *checks.loss("posterior forecast", a.posterior_failures, prior, control.posterior),
@@ -67,11 +67,12 @@ def examine(
         *(checks.conflict(prior, control.centre) if whole else ()),
         *checks.at_bound(prior, control.prior, control.posterior, a.posterior_failures),
         *_allowed(a, _validity(a, alive)),
-        *checks.gaussian(prior, members, a.shape),
+        *checks.gaussian(prior, members, a.shape, a.settings.own.approximate),
     )
     silent = {name for name in prior.names if untrusted(warnings, name)} | _beside(a)
     silent |= {term.parameter.name for change in a.problem.varying for term in change.terms}  # data may say little
-    little = checks.information(prior, control.posterior[alive], a.dfs_per_parameter, silent)
+    modes = {p.parameter.name: p.of.field.name for p in a.problem.perturbations if p.of is not None}
+    little = checks.information(prior, control.posterior[alive], a.dfs_per_parameter, silent, modes)
     return advised(a, worst_first((*warnings, *little)))
 
 
@@ -141,7 +142,8 @@ def unfinished(analysis: Analysis) -> checks.Findings:
 
 
 def collapse(prior: Prior, control: ControlEnsembles, alive: npt.NDArray[np.bool_]) -> checks.Findings:
-    """A spread far below what J allows: for a Gaussian posterior 2 (J − J_min) of its members is χ²_n, with mean n.
+    """A spread far below what J allows: for a Gaussian posterior 2 (J − J_min) of its members is χ²_n, with mean n; of
+    draws of another one it may be less.
 
     The lowest J met, of a member or of the centre, stands for the minimum.
     """

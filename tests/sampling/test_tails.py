@@ -1,0 +1,170 @@
+"""Posteriors that are not Gaussian, of plain functions, against quadrature: sampled if these are cheap, else told."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import en4dvar
+from en4dvar import ConfigError
+
+EIGHT = np.linspace(0.2, 3, 8)
+DECAYED = np.exp(-0.8 * EIGHT) + 0.1 * np.random.default_rng(2).standard_normal(8)
+ONE = np.array([1.0])
+
+
+class Bent(NamedTuple):
+    """A function of k and t, its readings and their error, the prior of k in words and in numbers, and where it is."""
+
+    function: Callable[[Any, Any], Any]
+    times: np.ndarray
+    values: Any
+    error: float
+    prior: dict[str, Any]
+    density: Any
+    reach: tuple[float, float]
+
+
+def decay(k, t):
+    return np.exp(-k * t)
+
+
+def normal(mean, std):
+    return {"prior": "normal", "mean": mean, "std": std}, stats.norm(mean, std), (mean - 6 * std, mean + 6 * std)
+
+
+def lognormal(median, std):
+    return {"prior": "lognormal", "median": median, "log_std": std}, stats.lognorm(std, scale=median), (1e-6, 200.0)
+
+
+def uniform(low, high):
+    return {"prior": "uniform", "lower": low, "upper": high}, stats.uniform(low, high - low), (low, high)
+
+
+BETA = {"prior": "beta", "lower": 0, "upper": 2, "alpha": 0.5, "beta": 0.5}
+CASES = {
+    "wider than its prior says in ln k": Bent(decay, ONE, [0.02], 0.1, *lognormal(1, 1)),
+    "a prior with two horns": Bent(decay, EIGHT, DECAYED, 0.3, BETA, stats.beta(0.5, 0.5, 0, 2), (1e-9, 2 - 1e-9)),
+    "at a bound of a uniform prior": Bent(decay, EIGHT, DECAYED, 0.1, *uniform(0.9, 3)),
+    "a reading beyond a bound": Bent(lambda k, t: k + 0 * t, ONE, [-0.1], 0.1, *uniform(0, 1)),
+    "saturated": Bent(lambda k, t: np.tanh(k) + 0 * t, ONE, [1.0], 0.05, *normal(0, 2)),
+    "flat": Bent(lambda k, t: k**3 + 0 * t, ONE, [0.0], 0.2, *normal(0.5, 1)),
+    "flat on one side": Bent(lambda k, t: np.maximum(k - 0.5, 0) + 0 * t, ONE, [0.0], 0.1, *normal(0, 1)),
+    "steep on one side": Bent(
+        lambda k, t: np.where(k > 0.5, 0.2, 5.0) * (k - 0.5) + 0 * t, ONE, [0.1], 0.2, *normal(0, 1)
+    ),
+    "a step": Bent(lambda k, t: 1.0 * (k > 0.5) + 0 * t, ONE, [1.0], 0.2, *normal(0, 1)),
+    "many steps": Bent(
+        lambda k, t: np.floor(10 * k) / 10 * t, np.array([1.0, 2, 3]), [1.0, 2.0, 3.0], 0.1, *normal(0, 1)
+    ),
+}
+
+
+def exact(case):
+    """Mean and standard deviation of the posterior."""
+    k = np.linspace(*case.reach, 400_001)
+    residuals = sum((y - case.function(k, t)) ** 2 for t, y in zip(case.times, case.values, strict=True))
+    logs = case.density.logpdf(k) - 0.5 * residuals / case.error**2
+    shares = np.exp(logs - logs.max())
+    mean = np.average(k, weights=shares)
+    return mean, np.sqrt(np.average((k - mean) ** 2, weights=shares))
+
+
+def estimated(case, seed=1, members=48, **more):
+    return en4dvar.estimate(
+        lambda p, t: case.function(p["k"], t), (case.times, np.array(case.values)), {"k": case.prior},
+        error=case.error, seed=seed, progress=False, assimilation={"members": members}, **more,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_cheap_function_is_sampled(name):
+    """1500 effective draws and 48 members of heavy tails tell a standard deviation to about a tenth."""
+    mean, std = exact(CASES[name])
+    found = estimated(CASES[name], cheap=True)
+    k = found.posterior["k"].values.ravel()
+    assert found.sample_stats.attrs["importance_draws"] > 0
+    assert k.mean() == pytest.approx(mean, abs=0.1 * std)
+    assert k.std(ddof=1) == pytest.approx(std, rel=0.2)
+    assert "ensemble-collapse" not in found.sample_stats.attrs["warning_codes"]
+
+
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("seed", [1, 2])
+def test_of_another_function_it_is_told(name, seed):
+    mean, std = exact(CASES[name])
+    found = estimated(CASES[name], seed)
+    k = found.posterior["k"].values.ravel()
+    assert abs(k.mean() - mean) > 0.5 * std or abs(k.std(ddof=1) / std - 1) > 0.3
+    codes = found.sample_stats.attrs["warning_codes"].split()
+    assert "non-gaussian" in codes or "several-modes" in codes
+
+
+def test_what_is_told_is_what_the_posterior_is():
+    """Weights of many members, against quadrature."""
+    case = CASES["wider than its prior says in ln k"]
+    mean, std = exact(case)
+    told = estimated(case, members=1000).sample_stats.attrs
+    assert told["tail_mean_k"] == pytest.approx(mean, abs=0.1 * std)
+    assert told["tail_std_k"] == pytest.approx(std, rel=0.15)
+
+
+@pytest.mark.parametrize(("n", "members"), [(1, 16), (12, 16), (1, 200), (12, 48)])
+def test_a_linear_function_is_neither_sampled_nor_doubted(n, members):
+    """Weights of the posterior and of the ensemble are the same, so that nothing hangs on what was drawn."""
+    names, slopes = [f"k{i}" for i in range(n)], np.random.default_rng(5).standard_normal((40, n)) / np.sqrt(n)
+    for seed in range(5):
+        y = slopes @ np.random.default_rng(seed).standard_normal(n) + np.random.default_rng(-seed % 99).standard_normal(
+            40
+        )
+        found = en4dvar.estimate(
+            lambda p, t: slopes @ [p[name] for name in names], (np.arange(40.0), y),
+            {name: {"prior": "normal", "mean": 0, "std": 1} for name in names},
+            error=1.0, seed=seed, progress=False, cheap=True, assimilation={"members": members},
+        ).sample_stats.attrs  # fmt: skip
+        assert "importance_draws" not in found
+        assert (found["tail_shift"], found["tail_ratio"]) == pytest.approx((0, 1), abs=1e-6)
+        assert found["tail_excess"] == 0
+
+
+@pytest.mark.slow
+def test_a_curve_that_the_readings_tell_is_not_doubted():
+    """Of 200 curves of three parameters, known from twenty readings, none is."""
+    t, doubted = np.linspace(0, 60, 20), 0
+    priors = {
+        "hot": {"prior": "normal", "mean": 90, "std": 5},
+        "k": {"prior": "lognormal", "median": 0.03, "log_std": 0.7},
+        "room": {"prior": "normal", "mean": 21, "std": 1},
+    }
+    for seed in range(200):
+        rng = np.random.default_rng([seed, 77])
+        z = rng.standard_normal(3)
+        hot, k, room = 90 + 5 * z[0], 0.03 * np.exp(0.7 * z[1]), 21 + z[2]
+        y = room + (hot - room) * np.exp(-k * t) + 0.5 * rng.standard_normal(20)
+        found = en4dvar.estimate(
+            lambda p, t: p["room"] + (p["hot"] - p["room"]) * np.exp(-p["k"] * t), (t, y), priors,
+            error=0.5, seed=seed, progress=False,
+        )  # fmt: skip
+        doubted += "non-gaussian" in found.sample_stats.attrs["warning_codes"]
+    assert doubted == 0
+
+
+def test_a_model_says_itself_whether_it_is_cheap():
+    with pytest.raises(ConfigError, match="cheap: it is said of a function"):
+        en4dvar.estimate("bubble", (ONE, ONE), {}, error=1.0, cheap=True)
+
+
+def test_a_scheme_that_is_not_the_posterior_is_not_called_non_gaussian():
+    t = np.linspace(0, 1, 20)
+    priors = {name: {"prior": "normal", "mean": 0, "std": 1} for name in "ab"}
+    found = en4dvar.estimate(
+        lambda p, t: p["a"] + p["b"] * t, (t, 1 + t), priors,
+        error=0.1, progress=False, assimilation={"scheme": "denkf"},
+    )  # fmt: skip
+    (said,) = (w for w in found.warnings if "effective share" in w)
+    assert "half of the gain" in said
+    assert "far from Gaussian" not in said
