@@ -36,9 +36,10 @@ from en4dvar.ensemble.forecast import log_posterior
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.estimation.stages import Stages
 from en4dvar.executor import SerialExecutor
-from en4dvar.priors.prior import own_seed
+from en4dvar.priors.prior import Prior, own_seed
 from en4dvar.problem import InverseProblem
-from en4dvar.sampling.refine import shares_of, that_count
+from en4dvar.sampling.modes import belonging
+from en4dvar.sampling.refine import that_count
 from en4dvar.schemes.settings import AssimilationSettings
 
 CHAIN, LASER, DRAWS = "mcmc:", "laser:", 6000
@@ -79,8 +80,14 @@ def reference(case: Case, particles: int) -> Record:
     spread = float(np.max(np.abs(np.log(a.std / both.std))))
     error = [float(np.max(np.abs(a.mean - both.mean) / both.std)), spread]
     minima = minima_of(case)
-    modes = [shares_of(prior, minima, population.draws) for population in (both, a, b)]
+    modes = [_shares(prior, minima, population.draws) for population in (both, a, b)]
     return {"mean": both.mean, "std": both.std, "error": error, "runs": both.runs, "modes": modes}
+
+
+def _shares(prior: Prior, minima: Sequence[Minimum], draws: np.ndarray) -> np.ndarray:
+    """(M,) of equally likely draws (D, n), that belong to each of M minima."""
+    equal = np.full(len(draws), 1 / len(draws))
+    return np.bincount(belonging(prior, minima, draws, equal), equal, minlength=len(minima))
 
 
 def minima_of(case: Case) -> Sequence[Minimum]:

@@ -157,7 +157,10 @@ def _analysis(n_members: int = 24, **changes: Any) -> Analysis:
         converged=True,
         stop_reason="step norm below 1e-3",
         forward_runs=6 * n_members,
-        modes=(Mode(truth, 23.0, 3, 0.02, 0.8), Mode(MEAN, 25.1, 2, 0.0, 0.2)),
+        modes=(
+            Mode(truth, 0.9 * truth, 1.1 * truth, 23.0, 3, 0.02, 0.8),
+            Mode(MEAN, 0.9 * MEAN, 1.1 * MEAN, 25.1, 2, 0.0, 0.2),
+        ),
         descents=Descents((4, 17, 9, -1, 30), (0, 0, 0, 1, 1), (23.0, 25.1), 0.02, 20),
         cautions=(caution("members-lost", "1 of 24 members failed in the posterior forecast: collapse too violent"),),
     )

@@ -68,7 +68,7 @@ def problem_of(config: Config, observations: Observations) -> InverseProblem:
         with config.document.placing():
             perturbed += [mode for prior in fields for mode in modes_of(prior)]
         fields = ()
-    terms = (*terms, *(start.term for start in perturbed), *_discrepancy(config, observations))
+    terms = (*terms, *(start.term for start in perturbed), *discrepancy_terms(config, observations))
     estimated = {term.parameter.name for term in terms}
     tied = tuple(
         Tie(e.parameter, e.to, e.factor) for e in config.parameters if isinstance(e, Tied) and e.to in estimated
@@ -114,7 +114,7 @@ def _varying(config: Config, observations: Observations, terms: Sequence[PriorTe
     return [process for process in varying if process is not None]
 
 
-def _discrepancy(config: Config, observations: Observations) -> tuple[PriorTerm, ...]:
+def discrepancy_terms(config: Config, observations: Observations) -> tuple[PriorTerm, ...]:
     """Priors of the discrepancy that the observations allow for."""
     asked = (
         None if config.data is None else DataPlan.of(config.data, config.observable).series[0].data.error.discrepancy

@@ -132,13 +132,21 @@ class Discrepancy:
     shares: Array
 
 
+BEYOND_5 = 1.6449  # standard deviations beyond which 5 % of a Gaussian lie
+
+
 @dataclass(frozen=True)
 class Mode:
-    """A minimum of J with some of the probability: ``centre`` (n,) physical, SI, J there, how many descents from
-    different members ended in it, by how much J of these differs, and its weight in the posterior.
+    """A minimum of J with some of the probability: J there, how many descents from different members ended in it, by
+    how much J of these differs, and its weight in the posterior.
+
+    ``centre``, ``q05`` and ``q95`` (n,) are the median of the draws that belong to it, and 5 and 95 % of them, where
+    the posterior was sampled; else the minimum, and those of the Gaussian about it. Physical, SI.
     """
 
     centre: Array
+    q05: Array
+    q95: Array
     cost: float
     descents: int
     spread: float

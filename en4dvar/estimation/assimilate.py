@@ -108,8 +108,7 @@ def _through(stages: Stages) -> Analysis:
     cautions += conclusions.future_missed(analysis.withheld)
     cautions += conclusions.missing_readings(ends.run.filled, stages.settings.refine == "mcmc")
     if counting:
-        weights = np.array([mode.weight for mode in analysis.modes])
-        cautions += mode_cautions(prior, counting, weights, agree, sampled.refined)
+        cautions += mode_cautions(prior, counting, analysis.modes, agree, sampled.refined)
     cautions += _missed_knots(stages, analysis)
     analysis = replace(analysis, cautions=examine(analysis, control, outcome.descent.worst_loss, tuple(cautions)))
     analysis = replace(analysis, forward_runs=space.forward_runs)

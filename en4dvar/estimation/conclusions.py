@@ -12,7 +12,7 @@ from en4dvar.descent.search import Outcome
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.descent.window import Descent
 from en4dvar.diagnosis import diagnostics as diag
-from en4dvar.diagnosis.analysis import Analysis, Descents, Discrepancy, FieldEstimate, Mode
+from en4dvar.diagnosis.analysis import BEYOND_5, Analysis, Descents, Discrepancy, FieldEstimate, Mode
 from en4dvar.diagnosis.influence import Influence
 from en4dvar.diagnosis.residuals import Residuals
 from en4dvar.diagnosis.response.what_if import LinearResponse
@@ -99,13 +99,24 @@ def descents_of(outcome: Outcome, n_members: int) -> Descents | None:
 
 
 def modes_of(prior: Prior, minima: Sequence[Minimum], sampled: Refined | None) -> tuple[Mode, ...]:
-    """The minima that count, with their weights; by Laplace where the posterior was not sampled."""
-    logs = np.array([m.log_evidence(prior) - minima[0].log_evidence(prior) for m in minima[1:]])
-    relative = np.append(1.0, np.exp(logs))[: len(minima)]
-    weights = sampled.weights if sampled and minima else relative / relative.sum()
+    """The minima that count, with their weights; by Laplace where the posterior was not sampled, else those that draws
+    belong to.
+    """
+    if sampled is None:
+        logs = np.array([m.log_evidence(prior) - minima[0].log_evidence(prior) for m in minima[1:]])
+        relative = np.append(1.0, np.exp(logs))[: len(minima)]
+        stds = [BEYOND_5 * np.sqrt(np.diag(m.covariance)) for m in minima]
+        own = [
+            (w, m.x + np.outer((-1, 0, 1), s)) for w, m, s in zip(relative / relative.sum(), minima, stds, strict=True)
+        ]
+    else:
+        own = list(sampled.modes)
     return tuple(
-        Mode(prior.to_physical(m.x), m.cost, m.descents, m.spread, float(weight))
-        for m, weight in zip(minima, weights, strict=True)
+        Mode(centre, q05, q95, m.cost, m.descents, m.spread, float(weight))
+        for m, weight, (q05, centre, q95) in (
+            (m, w, prior.to_physical(q)) for m, (w, q) in zip(minima, own, strict=True)
+        )
+        if weight > 0
     )
 
 

@@ -164,17 +164,20 @@ def _shares(result: StoredResult) -> list[tuple[str, str, str, list[str]]]:
 
 
 def _modes(result: StoredResult) -> list[tuple[str, ...]]:
-    """One line a minimum of J: its weight, J, descents that ended there, and its centre in display units."""
+    """One line a mode: weight, J, descents that ended there, and its centre with 5 to 95 %, in display units."""
     stats = result.group("sample_stats")
     if "mode_cost" not in stats:
         return []
     rows = []
     for k in range(stats.sizes["mode"]):
         of = {key: float(stats[f"mode_{key}"].values[k]) for key in ("weight", "cost", "cost_spread", "descents")}
-        centre = [
-            number_like(float(shown(v, stats["mode_centre"].values[k, j])), row.std)
-            for j, (row, v) in enumerate(zip(result.rows, result.parameters.values(), strict=True))
-        ]
+        centre = []
+        for j, (row, v) in enumerate(zip(result.rows, result.parameters.values(), strict=True)):
+            at, low, high = (
+                number_like(float(shown(v, stats[f"mode_{key}"].values[k, j])), row.std)
+                for key in ("centre", "q05", "q95")
+            )
+            centre.append(f"{at} ({low} … {high})")
         spread = f" (they were ended within {of['cost_spread']:.2g} of its J)" if of["cost_spread"] else ""
         rows.append((f"{of['weight']:.2f}", f"{of['cost']:.2f}", f"{of['descents']:.0f}{spread}", *centre))
     return rows

@@ -359,7 +359,9 @@ def _of_modes(name: str, dims: str, key: str, meaning: str) -> Declared:
 
 
 MODES = (
-    _of_modes("mode_centre", "mode parameter", "centre", f"minimum of J, {EACH_UNIT}"),
+    _of_modes("mode_centre", "mode parameter", "centre", f"median of its draws, or else minimum of J, {EACH_UNIT}"),
+    _of_modes("mode_q05", "mode parameter", "q05", f"5 % of its draws, or else of the Gaussian about it, {EACH_UNIT}"),
+    _of_modes("mode_q95", "mode parameter", "q95", f"95 % of its draws, or else of the Gaussian about it, {EACH_UNIT}"),
     _of_modes("mode_cost", "mode", "cost", "J at the minimum"),
     _of_modes("mode_weight", "mode", "weight", "probability of the mode"),
     _of_modes("mode_descents", "mode", "descents", "descents that ended there"),

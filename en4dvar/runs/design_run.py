@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from en4dvar.assembly.build import data_files, inverse_plan, problem_of
+from en4dvar.assembly.build import data_files, discrepancy_terms, inverse_plan, problem_of
 from en4dvar.assembly.reading import errors_of, read_observations
 from en4dvar.config import Config, resolve
 from en4dvar.config.context import parse_spread
@@ -312,7 +312,9 @@ def planned_problem(config: Config) -> InverseProblem:
     if run.failures[0]:
         raise En4dvarError(f"the model fails at the centre of the prior: {run.failures[0]}")
     values = np.split(run.predictions[0], len(plan.series))
-    return replace(problem, observations=_observations(config, values, times, measured, stated=True))
+    planned = _observations(config, values, times, measured, stated=True)
+    terms = (*problem.prior.terms, *discrepancy_terms(config, planned))  # the blank readings allow for none
+    return replace(problem, observations=planned, prior=replace(problem.prior, terms=terms))
 
 
 def _planned_times(config: Config) -> Array | None:

@@ -32,6 +32,7 @@ WIDER = 1.8  # at 1 the tail of a bent posterior is not found: standard deviatio
 FEW = 6  # directions up to which that is the factor of each; of more it is smaller, and their volume grows no further
 THIN = 0.15  # effective share of draws of a mixture below which the posterior is drawn by an emulator
 TOO_FEW = 60.0  # below so many the draws stand for nothing
+ALONG, NEAR, VALLEY = np.linspace(0, 1, 17), 0.125, 0.5  # windows between modes, and the share of draws of a valley
 OF_PRIOR = 0.2  # share of the first draws that come from the prior: what no descent found is not excluded
 
 Cost = Callable[[Array], Array]
@@ -132,7 +133,7 @@ def sample_modes(
     return WeightedDraws(
         x=x,
         shares=sampler.shares,
-        mode=nearest(prior, minima, x),
+        mode=belonging(prior, minima, x, sampler.shares),
         log_evidence=sampler.log,
         lowest=sampler.lowest,
         best=x[np.argmax(sampler.target)],
@@ -190,3 +191,37 @@ def nearest(prior: Prior, minima: Sequence[Minimum], x: Array) -> npt.NDArray[np
         squares = np.einsum("di,di->d", apart, np.linalg.solve(m.covariance, apart.T).T)
         logs.append(m.log_evidence(prior) - 0.5 * (squares + np.linalg.slogdet(m.covariance)[1]))
     return np.asarray(np.argmax(logs, axis=0))
+
+
+def belonging(prior: Prior, minima: Sequence[Minimum], x: Array, shares: Array) -> npt.NDArray[np.intp]:
+    """Numbers (D,) of the minima that draws (D, n) with ``shares`` (D,) belong to: on whose side of the valley between
+    them they lie, and where there is none all to the lower one.
+
+    Which Gaussian is densest says only where to look: far from all minima, along a bent posterior, it is an accident of
+    how wide they are.
+    """
+    mode = nearest(prior, minima, x)
+    for j in range(1, len(minima)):
+        for i in range(j):
+            first, second = (shares * (mode == number) for number in (i, j))
+            if first.any() and second.any():
+                mode[np.isin(mode, (i, j))] = i
+                mode[((first + second) > 0) & _beyond_valley(x, first, second)] = j
+    return mode
+
+
+def _beyond_valley(x: Array, first: Array, second: Array) -> npt.NDArray[np.bool_]:
+    """Which draws (D, n) lie beyond the place that has fewest, on the way from those with shares ``first`` (D,) to
+    those with shares ``second`` (D,), along the direction that tells them apart best; none where the way is filled.
+    """
+    both = first + second
+    a, b = (shares @ x / shares.sum() for shares in (first, second))
+    apart = x - both @ x / both.sum()
+    scale = np.sqrt(both @ apart**2) + np.finfo(float).tiny
+    total = ((both[:, None] * apart).T @ apart) / np.outer(scale, scale)
+    way = np.linalg.pinv(total, hermitian=True) @ ((b - a) / scale) / scale
+    t = (x - a) @ way / ((b - a) @ way)
+    counts = np.array([both[np.abs(t - at) <= NEAR].sum() for at in ALONG])
+    peaks = np.minimum(np.maximum.accumulate(counts), np.maximum.accumulate(counts[::-1])[::-1])
+    lowest = int(np.argmin(counts / peaks))
+    return np.asarray((t > ALONG[lowest]) & bool(counts[lowest] < VALLEY * peaks[lowest]))

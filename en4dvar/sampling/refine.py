@@ -14,11 +14,13 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from en4dvar.descent.minima import Minimum
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.diagnosis import diagnostics as diag
-from en4dvar.diagnosis.analysis import ChainRecord
+from en4dvar.diagnosis.analysis import BEYOND_5, ChainRecord, Mode
+from en4dvar.diagnosis.response.ledger import weighted_quantiles
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.units import convert
@@ -28,7 +30,7 @@ from en4dvar.sampling import mcmc
 from en4dvar.sampling.emulated_cost import Coordinates, EmulatedCost, emulate, needed_runs
 from en4dvar.sampling.emulated_draws import RecordedRuns
 from en4dvar.sampling.mixture import resampled
-from en4dvar.sampling.modes import TOO_FEW, WeightedDraws, nearest, sample_modes
+from en4dvar.sampling.modes import TOO_FEW, WeightedDraws, belonging, sample_modes
 from en4dvar.schemes.settings import AssimilationSettings
 
 COUNTS = math.log(1e-3)  # evidence of a minimum relative to that of the lowest, by Laplace, from which it may matter
@@ -187,14 +189,15 @@ def guide(space: WeightSpace, ensemble: Array, seed: int, fits: int = CHAIN_FITS
 class Refined:
     """Members (N, n), transformed, that take the ensemble's place, and what judges them.
 
-    ``weights`` (M,) of the modes; ``log_evidence`` ln ∫ exp(−J_o) N(x; prior) dx, NaN where it is not known;
+    ``modes``: of each minimum the weight, and the quantiles (3, n) of the draws that belong to it, NaN where none does;
+    ``log_evidence`` ln ∫ exp(−J_o) N(x; prior) dx, NaN where it is not known;
     ``lowest`` J that was met. ``draws`` (:data:`KEPT`, n) are equally likely; there are none of a chain. ``lower`` (n,)
     is a draw that lies lower than all minima; then nothing else was sampled.
     """
 
     members: Array
     summary: Mapping[str, float]
-    weights: Array = field(default_factory=lambda: np.ones(1))
+    modes: Sequence[tuple[float, Array]] = ()
     log_evidence: float = math.nan
     lowest: float = math.inf
     draws: Array = field(default_factory=lambda: np.empty((0, 0)))
@@ -209,9 +212,9 @@ def that_count(minima: Sequence[Minimum], prior: Prior, beyond: float = COUNTS) 
 
 
 def mode_cautions(
-    prior: Prior, minima: Sequence[Minimum], weights: Array, agree: bool, result: Refined | None
+    prior: Prior, minima: Sequence[Minimum], modes: Sequence[Mode], agree: bool, result: Refined | None
 ) -> Iterator[Caution]:
-    """Warnings about the minima that count, of these weights; ``result`` is there where sampled."""
+    """Warnings about the minima that count, and the ``modes`` about them; ``result`` is there where sampled."""
     lowest = minima[0].cost
     if result is not None and result.lowest < lowest - MISSED:
         words = f"a draw has J = {result.lowest:.1f}, lower than the lowest minimum that descents found, {lowest:.1f}"
@@ -220,15 +223,14 @@ def mode_cautions(
         costs = ", ".join(f"{m.cost:.1f}" for m in minima[1:]) or "elsewhere"
         words = f"only one descent ended in the lowest minimum, J = {lowest:.1f}; others ended at {costs}"
         yield caution("starts-disagree", words)
-    seen = [m for m, weight in zip(minima, weights, strict=True) if weight >= SEEN]
+    seen = [m for m in modes if m.weight >= SEEN]
     if len(seen) < 2:
         return
-    distances = _apart(seen)
-    centres = [prior.to_physical(m.x) for m in seen]
-    shares = " and ".join(f"{weight:.2f}" for weight in weights if weight >= SEEN)
+    distances = _apart(prior, seen)
+    shares = " and ".join(f"{m.weight:.2f}" for m in seen)
     most = int(np.argmax(distances))
     p = prior.parameters[most]
-    at = " and ".join(f"{convert(float(c[most]), p.unit, p.display_unit):.3g}" for c in centres)
+    at = " and ".join(f"{convert(float(m.centre[most]), p.unit, p.display_unit):.3g}" for m in seen)
     unit = "" if p.display_unit == "1" else f" {p.display_unit}"
     drawn = "members are drawn from all of them" if result else "members describe the first alone"
     words = f"the posterior has {len(seen)} modes, {p.name} = {at}{unit}, of weights {shares}; {drawn}"
@@ -240,10 +242,12 @@ def mode_cautions(
     yield caution("several-modes", words, None if result else "serious", names if result else ())
 
 
-def _apart(minima: Sequence[Minimum]) -> Array:
-    """(n,) the largest distance of two minima in each parameter, in the larger standard deviation of both."""
-    at = np.array([m.x for m in minima])
-    std = np.sqrt(np.array([np.diag(m.covariance) for m in minima]))
+def _apart(prior: Prior, modes: Sequence[Mode]) -> Array:
+    """(n,) the largest distance of two modes in each parameter, in the larger standard deviation of both."""
+    at, low, high = (
+        prior.from_physical(np.array([getattr(m, key) for m in modes])) for key in ("centre", "q05", "q95")
+    )
+    std = (high - low) / (2 * BEYOND_5)
     between = np.abs(at[:, None] - at) / np.maximum(std[:, None], std)
     return np.asarray(between.max(axis=(0, 1)))
 
@@ -308,7 +312,8 @@ def refined(
         members = draws.members(len(posterior), member_stream(seed, "members of the modes"), exact)
         summary = _summary(draws, posterior)
         kept = draws.x[resampled(draws.shares, KEPT, member_stream(seed, "kept draws"))]
-        return Refined(members, summary, draws.weights(len(minima)), draws.log_evidence, draws.lowest, kept)
+        own = _own_draws(draws.x, draws.shares, draws.mode, len(minima))
+        return Refined(members, summary, own, draws.log_evidence, draws.lowest, kept)
     several = draws is not None and len(minima) > 1
     start = _in_all(minima, len(posterior), seed) if several else posterior
     emulated = None if several else guide(space, posterior, seed)
@@ -321,21 +326,28 @@ def refined(
         emulated=emulated,
         proposal=draws.proposal if several and draws is not None else None,
     )
-    shares = shares_of(prior, minima, walked.flat) if several else np.ones(1)
+    equal = np.full(len(walked.flat), 1 / len(walked.flat))
+    mode = belonging(prior, minima, walked.flat, equal)
     known = draws is not None and draws.effective >= TOO_FEW
     return Refined(
         walked.thin(len(posterior), exact),
         walked.summary(),
-        shares,
+        _own_draws(walked.flat, equal, mode, len(minima)),
         draws.log_evidence if draws is not None and known else math.nan,
         float(-walked.log_density.max()),
         warnings=() if walked.converged else (caution("chain-not-converged", walked.warning()),),
     )
 
 
-def shares_of(prior: Prior, minima: Sequence[Minimum], draws: Array) -> Array:
-    """(M,) shares of draws (D, n) that belong to each of M minima; 0 where the chain has left one."""
-    return np.asarray(np.bincount(nearest(prior, minima, draws), minlength=len(minima)) / len(draws))
+def _own_draws(x: Array, shares: Array, mode: npt.NDArray[np.intp], count: int) -> list[tuple[float, Array]]:
+    """Of each of ``count`` modes its weight, and the quantiles (3, n) of its draws among those (D, n)."""
+    own = []
+    for number in range(count):
+        weight = float(shares[mode == number].sum())
+        of = shares[mode == number] / weight if weight else np.array([np.nan])
+        values = x[mode == number] if weight else np.full((1, x.shape[1]), np.nan)
+        own.append((weight, np.stack([weighted_quantiles(column, of) for column in values.T], axis=1)))
+    return own
 
 
 def _in_all(minima: Sequence[Minimum], count: int, seed: int) -> Array:

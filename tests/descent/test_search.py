@@ -163,7 +163,9 @@ def test_from_a_draw_below_all_minima_another_descent_starts(monkeypatch):
     assert (told.members, told.minimum) == ((-1, -2), (1, 0))
     assert " from a draw, " in told.words
     assert [round(float(mode.centre[0])) for mode in analysis.modes] == [1, -3]
-    assert analysis.centre[0] == pytest.approx(analysis.modes[0].centre[0], rel=1e-12)  # computed in two ways
+    assert analysis.centre[0] == pytest.approx(
+        analysis.modes[0].centre[0], rel=0.02
+    )  # minimum, and median of its draws
     assert analysis.modes[0].weight == pytest.approx(mass_of_positive(problem), abs=0.03)
     assert "starts-disagree" not in {c.code for c in analysis.cautions}
     assert [record.further for record in heard if isinstance(record, StartRecord)] == [1]

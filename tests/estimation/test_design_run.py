@@ -112,6 +112,22 @@ def test_resumed(tmp_path, monkeypatch):
         run_design(_plan(), out=tmp_path / "out")
 
 
+@pytest.mark.parametrize("log_std", [1e-3, 1.5])
+def test_a_discrepancy_of_the_model(log_std, tmp_path):
+    """Amplitude and length have their prior, here all but known or wide: against ½ ln det of R + A in closed form."""
+    plan = _plan(knobs={}, about=["a", "b"], method="laplace")
+    plan["parameters"] = {name: {"prior": "normal", "mean": "0.2 m", "std": "1 m"} for name in ("a", "b")}
+    plan["parameters"]["sigma"] = {"prior": "lognormal", "median": 1, "log_std": log_std}
+    of = {"amplitude": {"median": "0.4 m", "log_std": log_std}, "length": {"median": "0.5 s", "log_std": log_std}}
+    plan["data"]["error"]["discrepancy"] = {**of, "kernel": "exponential"}
+    found, _ = run_design(plan, out=tmp_path / "out")
+    t, j = np.arange(0.1, 2.51, 0.4), np.arange(2)
+    H = np.cos(t[:, None] * j + j**2 / 3)
+    K = 0.09 * np.eye(len(t)) + 0.16 * np.exp(-np.abs(t[:, None] - t) / 0.5)
+    exact = 0.5 * np.linalg.slogdet(np.eye(2) + H.T @ np.linalg.solve(K, H))[1]
+    assert found.rows[0].result.gain == pytest.approx(exact, abs=1e-3 if log_std < 1 else 0.6)
+
+
 def test_chosen_readings_tell_more_than_as_many_at_a_fixed_rate(tmp_path):
     chosen = {"times": {"from": "0.1 s", "to": "2.5 s", "step": "0.1 s"}, "knobs": {}, "choose": {"readings": 6}}
     found, _ = run_design(_plan(**chosen), out=tmp_path / "chosen")

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from toys import Decay, Fragile, Linear, Vectorised, Wave, make_observations
 
-from en4dvar.estimation.joint import estimate
-from en4dvar.estimation.joint.descent import Arrow, Experiment
+from en4dvar.estimation.joint import estimate, members
+from en4dvar.estimation.joint.descent import Arrow, Experiment, JointDescent, JointObjective, Place
 from en4dvar.estimation.joint.problem import JointProblem, Single, sharing
 from en4dvar.executor import SerialExecutor
 from en4dvar.model.forward import Trajectory
@@ -127,6 +127,29 @@ def test_importance_gives_the_same_posterior_and_evidence():
     members = np.column_stack([found.shared, *(found.control(e)[:-1, 2] for e in range(5))])
     np.testing.assert_allclose((members.mean(axis=0) - mean) / std, 0, atol=0.35)
     np.testing.assert_allclose(members.std(axis=0) / std, 1, atol=0.3)
+
+
+def test_more_draws_where_one_round_leaves_too_few(monkeypatch):
+    problems = _experiments(kind=Vectorised, compiled=True)
+    monkeypatch.setattr(members, "FEWEST", members.DRAWS + 1)
+    found = estimate.estimate_jointly(_joint(problems), replace(SETTINGS, refine="auto", members=500), seed=3)
+    assert found.members.effective > members.DRAWS
+    assert found.log_evidence == pytest.approx(_exact(problems)[2], abs=0.15)
+
+
+@pytest.mark.parametrize("far", [1.0, 1e4])
+def test_no_trial_moves_an_experiment_absurdly_far(far):
+    """Readings 10^4 times as far off as the prior expects ask for steps to where models overflow."""
+    problems = [
+        replace(p, observations=replace(p.observations, values=far * p.observations.values)) for p in _experiments()
+    ]
+    joint, scheme = _joint(problems), SETTINGS.own.minimiser
+    objective = JointObjective(joint, [Experiment(joint, e, 1e-3, SerialExecutor()) for e in range(5)], scheme)
+    descent = JointDescent(Place(np.zeros(3), tuple(np.zeros(1) for _ in problems)))
+    objective.linearise([descent])
+    (first,) = next(objective.search(descent))
+    longest = max(np.linalg.norm(joint.standard(e, first.border, first.own[e])) for e in range(5))
+    assert longest == pytest.approx(40.0) if far > 1 else longest < 5
 
 
 class Bent(Vectorised):

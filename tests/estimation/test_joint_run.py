@@ -77,6 +77,28 @@ def test_a_damaged_file_is_refused(campaign, tmp_path):
         load_joint(path)
 
 
+def test_discrepancies_of_their_own(tmp_path):
+    """Draws of a Matérn process, whose amplitude and length are each data set's own, hide the shared spring little."""
+    rng, path = np.random.default_rng(2), make_campaign(tmp_path, n=3)
+    for i in range(3):
+        head, unit, *rows = csv_text(k=2.4).splitlines()
+        t, x = np.array([row.split(",") for row in rows], dtype=float).T
+        d = np.sqrt(5) * np.abs(t[:, None] - t) / 15  # ms
+        root = np.linalg.cholesky(16 * (1 + d + d**2 / 3) * np.exp(-d) + 1e-6 * np.eye(len(t)))
+        noisy = x + root @ rng.standard_normal(len(t)) + rng.standard_normal(len(t))
+        lines = [head, unit, *(f"{time:g},{value:.6g}" for time, value in zip(t, noisy, strict=True)), ""]
+        (tmp_path / "data" / f"set{i}.csv").write_text("\n".join(lines))
+    error = "position_std: 1 um, discrepancy: {kernel: matern-5/2}"
+    path.write_text(path.read_text().replace("position_std: 2 um", error).replace("members: 8", "members: 30"))
+    found, _ = join([run_campaign(path, overrides=_quiet(tmp_path)).directory], ["k"], tmp_path / "out")
+    posterior, alone = found.group("posterior"), found.group("alone")["k"].values
+    assert posterior["discrepancy_amplitude"].dims == ("chain", "draw", "dataset")
+    low, high = np.quantile(posterior["k"], (0.05, 0.95))
+    assert abs(float(posterior["k"].mean()) - 2.4) < high - low
+    assert high - low < 0.9 * np.min(alone[:, 2] - alone[:, 0])
+    assert np.all(np.median(posterior["discrepancy_amplitude"], axis=(0, 1)) > 1e-6)  # of 4 um, beside 1 um
+
+
 ERRORS = {
     "timing": "position_std: 2 um, time_std: 0.1 ms",
     "robust": "position_std: 2 um, robust: huber",

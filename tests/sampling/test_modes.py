@@ -8,14 +8,15 @@ from same_bits import assert_same_bits
 from wells import UnlikeWells, Wells, mass_of_positive, two_wells
 
 from en4dvar.descent.minima import Minimum
+from en4dvar.diagnosis.analysis import Mode
 from en4dvar.estimation.assimilate import assimilate, log_posterior
 from en4dvar.estimation.summary import summarise
 from en4dvar.executor import ThreadsExecutor
 from en4dvar.model.state import Parameter
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.sampling import mcmc
-from en4dvar.sampling.modes import sample_modes
-from en4dvar.sampling.refine import Refined, mode_cautions, shares_of
+from en4dvar.sampling.modes import belonging, sample_modes
+from en4dvar.sampling.refine import Refined, mode_cautions
 from en4dvar.schemes.settings import AssimilationSettings
 
 KEYWORDS = mcmc.sample.__kwdefaults__
@@ -104,18 +105,44 @@ def test_a_mode_that_the_chain_has_left_has_no_share() -> None:
     prior = Prior((PriorTerm.normal(Parameter("a", "m"), 0.0, 1.0),))
     minima = [Minimum(np.array([x]), np.eye(1) * 0.01, cost, 1) for x, cost in ((0.0, 1.0), (1.0, 3.0), (-1.0, 5.0))]
     draws = np.array([[0.01], [-0.02], [1.01], [0.0]])
-    np.testing.assert_array_equal(shares_of(prior, minima, draws), [0.75, 0.25, 0.0])
+    np.testing.assert_array_equal(belonging(prior, minima, draws, np.full(4, 0.25)), [0, 0, 1, 0])
+
+
+@pytest.mark.parametrize(("floor", "modes"), [(0.0, 1), (6.0, 2)])
+def test_a_mode_is_where_its_own_draws_are(floor, modes):
+    """Flat between a = -4 and 4, or with a ``floor`` of J between two wells; the Gaussian about the second minimum is
+    far too wide, as on a bent ridge."""
+    prior = Prior(tuple(PriorTerm.normal(Parameter(name, "m"), 0.0, 10.0) for name in "ab"))
+
+    def cost(x):
+        between = floor * np.exp(-0.5 * (x[:, 0] / 1.5) ** 2)
+        return between + 4 * np.clip(np.abs(x[:, 0]) - 4, 0, None) ** 2 + 0.5 * x[:, 1] ** 2
+
+    minima = [
+        Minimum(np.array([3.9, 0.0]), np.diag([0.05, 1.0]), 0.0, (1, 2)),
+        Minimum(np.array([-3.9, 0.0]), np.diag([9.0, 1.0]), 0.1, (3,)),
+    ]
+    draws = sample_modes(cost, prior, minima, 1)
+    weights = draws.weights(2)
+    assert np.sum(weights > 0.02) == modes
+    if modes == 2:
+        assert weights[0] == pytest.approx(0.5, abs=0.05)
+        assert draws.shares @ (draws.mode == (draws.x[:, 0] < 0)) > 0.99
 
 
 @pytest.mark.parametrize(("apart", "severity"), [(1.5, "note"), (2.5, "caution")])
 def test_modes_that_overlap_are_only_worth_knowing(apart: float, severity: str) -> None:
     """Two Gaussians of one width make two peaks where they lie more than two standard deviations apart."""
     prior = Prior(tuple(PriorTerm.normal(Parameter(name, "m"), 0.0, 1.0) for name in "ab"))
-    minima = [Minimum(np.array([x, 0.0]), np.diag([0.01, 0.04]), 3.0, 2) for x in (0.0, 0.1 * apart)]
-    sampled, weights = Refined(np.zeros((8, 2)), {}), np.array([0.6, 0.4])
-    (told,) = mode_cautions(prior, minima, weights, True, sampled)
+    minima = [Minimum(np.array([x, 0.0]), np.diag([0.01, 0.04]), 3.0, (1, 2)) for x in (0.0, 0.1 * apart)]
+    half = 1.645 * np.array([0.1, 0.2])
+    modes = [
+        Mode(m.x, m.x - half, m.x + half, 3.0, 2, 0.0, weight) for m, weight in zip(minima, (0.6, 0.4), strict=True)
+    ]
+    sampled = Refined(np.zeros((8, 2)), {})
+    (told,) = mode_cautions(prior, minima, modes, True, sampled)
     assert (told.code, told.severity) == ("several-modes", severity)
-    (told,) = mode_cautions(prior, minima, weights, True, None)  # members describe one of them alone
+    (told,) = mode_cautions(prior, minima, modes, True, None)  # members describe one of them alone
     assert told.severity == "serious"
 
 

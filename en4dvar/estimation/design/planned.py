@@ -107,14 +107,22 @@ class Tangents:
         return Tangents(self.alive[chosen], self.u[chosen], tuple(self.at[k] for k in chosen))
 
     def whitened(self, planned: Planned, values: Array | None = None) -> tuple[Array, Array]:
-        """Innovations d (R, K') and sensitivities S (R, K', n) for readings (R, K); by default those predicted."""
+        """Innovations d (R, K') and sensitivities S (R, K', n) for readings (R, K); by default those predicted.
+
+        Of errors with parameters of their own points have different numbers of rows; rows of zeros, which say nothing,
+        make them equal.
+        """
         observations = planned.problem.observations
         each = [predicted.prediction.values for predicted in self.at] if values is None else values
         parts = [
             observations.noise.whiten(y, observations.weights, predicted)
             for y, predicted in zip(each, self.at, strict=True)
         ]
-        return np.stack([d for d, _ in parts]), np.stack([s for _, s in parts])
+        most = max((len(d) for d, _ in parts), default=0)
+        return (
+            np.stack([np.pad(d, (0, most - len(d))) for d, _ in parts]),
+            np.stack([np.pad(s, ((0, most - len(s)), (0, 0))) for _, s in parts]),
+        )
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from en4dvar.priors.prior import whiten_sample
 from en4dvar.schemes.base import Minimiser
 
 LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.03, 0.01)  # of a step, tried in turn until J falls
+LONGEST = 40.0  # step in prior standard deviations of one experiment, as of a data set alone (step_control.py)
 
 
 @dataclass(frozen=True)
@@ -322,9 +323,12 @@ class JointObjective(Objective[JointDescent]):
             descent.ended = bool(descent.stop)
 
     def search(self, descent: JointDescent) -> Search:
-        """The first of the lengths at which J has fallen enough."""
+        """The first of the lengths at which J has fallen enough, of a step that moves no experiment absurdly far."""
         at = descent.at
-        for length in LENGTHS:
+        border, own = at.direction
+        standard = self.joint.standard
+        far = max(float(np.linalg.norm(standard(e, border, step))) for e, step in enumerate(own))
+        for length in np.array(LENGTHS) * (LONGEST / max(far, LONGEST)):
             there = at.place.moved(at.direction, length)
             cost = yield [there]
             if cost <= at.cost - SUFFICIENT * length * at.norm**2:

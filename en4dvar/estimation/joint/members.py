@@ -22,12 +22,13 @@ from scipy.special import gammaln, logsumexp
 from en4dvar.estimation.joint.descent import ArrowSystem, Experiment, Place
 from en4dvar.model.state import Array
 from en4dvar.priors.prior import member_stream
-from en4dvar.sampling.mixture import resampled
+from en4dvar.sampling.mixture import effective_number, resampled
 
 DRAWS, INNER = 192, 12  # of what is shared, and of the own quantities for each of them
 STEPS = 2  # linearisations that the own quantities given what is shared are sought by
 FREEDOM = 7.0  # degrees of freedom of Student's t
 WIDER = 1.2  # the proposals than the Gaussian
+ROUNDS = 4  # of such draws at most, where fewer leave
 FEWEST = 24.0  # effective draws below which the weights say nothing
 OF_PRIOR, DEEPEST, DESCENTS = 48, 4, 8  # of the prior; of which are descended from; and with so many linearisations
 LOWER = 0.5  # of J
@@ -61,28 +62,30 @@ def gaussian(at: ArrowSystem, seed: int, count: int) -> JointMembers:
 
 
 def sampled(experiments: Sequence[Experiment], at: ArrowSystem, seed: int, count: int) -> JointMembers | None:
-    """By importance; None where the proposal does not reach the posterior."""
-    stream = member_stream(seed, "joint importance")
-    border, log_weights = _proposed(at, stream)
-    chosen_own: list[Array] = []
-    logs: list[Array] = []
-    for experiment in experiments:
-        own, log_ratio = _own(experiment, at, border, stream)
-        log_weights = log_weights + logsumexp(log_ratio, axis=1) - np.log(INNER)
-        chosen_own.append(own)
-        logs.append(log_ratio)
-    if not np.isfinite(log_weights).any():
-        return None
-    weights = np.exp(log_weights - logsumexp(log_weights))
-    effective = 1 / float(weights @ weights)
-    if effective < FEWEST:
+    """By importance, in rounds until enough are effective; None where the proposal does not reach the posterior."""
+    stream, rounds = member_stream(seed, "joint importance"), list[list[Array]]()
+    for _ in range(ROUNDS):
+        border, log_weights = _proposed(at, stream)
+        drawn = [_own(experiment, at, border, stream) for experiment in experiments]
+        for _, log_ratio in drawn:
+            log_weights = log_weights + logsumexp(log_ratio, axis=1) - np.log(INNER)
+        rounds.append([border, log_weights, *(part for pair in drawn for part in pair)])
+        border, log_weights, *pairs = (np.concatenate(parts) for parts in zip(*rounds, strict=True))
+        if not np.isfinite(log_weights).any():
+            return None
+        weights = np.exp(log_weights - logsumexp(log_weights))
+        effective = effective_number(weights)
+        if effective >= FEWEST:
+            break
+    else:
         return None
     order = np.argsort(border[:, 0], kind="stable") if border.shape[1] else np.arange(len(border))
     taken = order[resampled(weights[order], count, stream)]
     own_members = tuple(
-        np.stack([_one(own[i], log[i], stream) for i in taken]) for own, log in zip(chosen_own, logs, strict=True)
+        np.stack([_one(own[i], log[i], stream) for i in taken])
+        for own, log in zip(pairs[::2], pairs[1::2], strict=True)
     )
-    evidence = float(logsumexp(log_weights)) - float(np.log(DRAWS))
+    evidence = float(logsumexp(log_weights)) - float(np.log(len(border)))
     return JointMembers(border[taken], own_members, effective, evidence)
 
 
