@@ -220,6 +220,19 @@ def test_a_column_that_looks_like_errors_is_told_and_can_be_used_as_said(tmp_pat
     assert sorted(stds) == pytest.approx([1, 2])
 
 
+def test_the_columns_that_most_files_of_a_folder_have_are_taken(tmp_path: Path) -> None:
+    (tmp_path / "gel").mkdir()
+    for n in range(4):
+        write(tmp_path / "gel" / f"b{n}.csv", scale=1 + n / 20)
+    Path("gel/a.csv").write_text(_in_other_units(Path("gel/b3.csv")).replace("t_us,R_um", "t_ms,R_mm"))
+    done = call("init", "--data", "gel")
+    assert done.exit_code == 0, done.output
+    assert done.stderr.startswith(f"{tmp_path}/gel/b0.csv: t_us")
+    assert "a.csv: no column 'R_um'; the columns are: t_ms, R_mm" in done.stderr
+    assert "one of 5 files" in done.stderr
+    assert "4 bubbles" in done.stdout
+
+
 def test_vectors_that_a_mat_file_hides_are_told(tmp_path: Path) -> None:
     savemat("b.mat", {"film": {"note": "by hand"}})
     done = call("init", "--data", "b.mat", *UNITS)

@@ -24,6 +24,9 @@ _ERRORS = re.compile(rf"(?i)({_OF})([ _]*(r|radius))?|(d|u|delta)[ _]*(r|radius)
 _RADIUS = re.compile(r"(?i)r|radius|radii|rnew|roft|r[ _(\[].*|radius[ _(\[].*")
 
 
+LOOKED_AT = 20  # files of a folder
+
+
 @dataclass(frozen=True)
 class Asked:
     """The ``contents`` of a file, and the options about its columns as they were given; None is one that was not."""
@@ -188,21 +191,31 @@ class Asked:
 
 
 def first_with_columns(files: Sequence[Path], layout: Layout) -> tuple[Path, Contents, Layout]:
-    """The first file that holds columns of numbers, and with its decimal sign. Raises :class:`DataError`: none does."""
+    """The first file with the columns of numbers that most of the first files hold, and with its decimal sign.
+
+    Raises :class:`DataError`: none holds any.
+    """
     points, commas = (replace(layout, decimal=sign) for sign in (".", ","))
-    faults: list[str] = []
-    for file in files:
+    faults, alike = list[str](), dict[tuple[str, ...], list[tuple[Path, Contents, Layout]]]()
+    for count, file in enumerate(files):
+        if count >= LOOKED_AT and alike:
+            break
         try:
             contents, with_commas = (read_contents(file, signs) for signs in (points, commas))
         except DataError as error:
             faults.append(str(error))
             continue
         if len(with_commas.columns) > len(contents.columns):
-            return file, with_commas, commas
-        if contents.columns:
-            return file, contents, points
-        faults.append(next(iter(contents.others.values()), f"{file}: no column holds numbers"))
-    raise DataError("\n".join(faults))
+            template = (file, with_commas, commas)
+        else:
+            template = (file, contents, points)
+        if template[1].columns:
+            alike.setdefault(tuple(template[1].columns), []).append(template)
+        else:
+            faults.append(next(iter(contents.others.values()), f"{file}: no column holds numbers"))
+    if not alike:
+        raise DataError("\n".join(faults))
+    return max(alike.values(), key=len)[0]
 
 
 def _only(pattern: re.Pattern[str], names: Iterable[str]) -> str | None:
