@@ -271,6 +271,8 @@ def _columns_of(data: str, options: Mapping[str, str | None], layout: Layout) ->
 
         again = command_line(also=tuple(word for option, value, _ in needed for word in (option, value)))
         raise asked.incomplete(first, f"next: {again}")
+    for words in asked.unused:
+        echo(f"warning: {words}", err=True)
     return {**asked.columns(), "layout": layout}
 
 

@@ -206,6 +206,33 @@ def test_rows_of_a_matrix_are_columns_where_it_is_flat(tmp_path: Path) -> None:
     assert problem.observations.continued.values.min() == pytest.approx(1e-6 * rows[1].min())
 
 
+@pytest.mark.parametrize("name", ["dR_um", "R_err_um", "sigma_um", "radius_std", "R std [nm]"])
+def test_a_column_that_looks_like_errors_is_told_and_can_be_used_as_said(tmp_path: Path, name: str) -> None:
+    head, *rows = write(tmp_path / "b.csv").read_text().splitlines()
+    Path("b.csv").write_text("\n".join([f"{head},{name}", *(f"{row},{1 + i % 2}" for i, row in enumerate(rows)), ""]))
+    done = call("init", "--data", "b.csv")
+    assert done.exit_code == 0, done.output
+    (entry,) = re.findall(f"column '{re.escape(name)}' looks like errors .* in the section error '(.*)'", done.stderr)
+    text = Path("b.yaml").read_text()
+    Path("b.yaml").write_text(re.sub("radius_std: .* um ", f"{entry} ", text, count=1))
+    (problem,) = build(load_config("b.yaml"))
+    stds = problem.observations.noise.std[:2] * (1e9 if "nm" in name else 1e6)
+    assert sorted(stds) == pytest.approx([1, 2])
+
+
+def test_the_columns_that_most_files_of_a_folder_have_are_taken(tmp_path: Path) -> None:
+    (tmp_path / "gel").mkdir()
+    for n in range(4):
+        write(tmp_path / "gel" / f"b{n}.csv", scale=1 + n / 20)
+    Path("gel/a.csv").write_text(_in_other_units(Path("gel/b3.csv")).replace("t_us,R_um", "t_ms,R_mm"))
+    done = call("init", "--data", "gel")
+    assert done.exit_code == 0, done.output
+    assert done.stderr.startswith(f"{tmp_path}/gel/b0.csv: t_us")
+    assert "a.csv: no column 'R_um'; the columns are: t_ms, R_mm" in done.stderr
+    assert "one of 5 files" in done.stderr
+    assert "4 bubbles" in done.stdout
+
+
 def test_vectors_that_a_mat_file_hides_are_told(tmp_path: Path) -> None:
     savemat("b.mat", {"film": {"note": "by hand"}})
     done = call("init", "--data", "b.mat", *UNITS)

@@ -12,14 +12,19 @@ from en4dvar.inputs.asked import Layout
 from en4dvar.inputs.parts import Contents, read_contents
 from en4dvar.plumbing.errors import ConfigError, DataError
 from en4dvar.plumbing.units import as_unit, convert
-from en4dvar_bubble.starter.config import FRAMES, PIXELS, unit_in
-from en4dvar_bubble.starter.page import TRACKED
+from en4dvar_bubble.starter.config import FRAMES, PIXELS, unit_in, without_unit
+from en4dvar_bubble.starter.page import TRACKED, quoted
 
 _TIME = re.compile(r"(?i)t|time|t[ _(\[].*|time[ _(\[].*")
 _STEP = re.compile(r"(?i)delta_?t|dt|t_?step|time_?step")
 _SIZE = re.compile(r"(?i)delta_?x|dx|pixel_?size|(um|m)_?per_?(px|pixel)|px_?2_?(um|m)")
 _AS_PIXELS, _AS_FRAMES = ("px", "pixel", "pixels"), ("frame", "frames")
+_OF = r"err(or)?s?|std|sd|sigma|unc(ertainty)?"
+_ERRORS = re.compile(rf"(?i)({_OF})([ _]*(r|radius))?|(d|u|delta)[ _]*(r|radius)|(r|radius)[ _]*({_OF})")
 _RADIUS = re.compile(r"(?i)r|radius|radii|rnew|roft|r[ _(\[].*|radius[ _(\[].*")
+
+
+LOOKED_AT = 20  # files of a folder
 
 
 @dataclass(frozen=True)
@@ -46,6 +51,25 @@ class Asked:
         """The scalar of the file that is the time between two readings, where nothing else gives their times."""
         return None if self.time_column or self.time_step else _only(_STEP, self.contents.scalars)
 
+    @property
+    def errors(self) -> list[str]:
+        """Columns that are called as standard deviations of radii are."""
+        columns = self.contents.columns
+        return [name for name in columns if _ERRORS.fullmatch(without_unit(name)) and name != self.radius_column]
+
+    @property
+    def unused(self) -> list[str]:
+        """What is to be written where columns hold errors of the radii, which are proposed without them."""
+        if self.tracked:
+            return []
+        units = {name: unit_in(name, "m") for name in self.errors}
+        said = {name: f", unit: {unit}" if unit not in (None, self.radius_unit) else "" for name, unit in units.items()}
+        return [
+            f"column {name!r} looks like errors of the radii, and is not used; to use it write in the section error "
+            f"'radius_std: {{column: {quoted(name)}{unit}}}'"
+            for name, unit in said.items()
+        ]
+
     def shown(self, name: str) -> str:
         """A column or scalar and what it holds, in words."""
         if name not in self.contents.columns:
@@ -62,7 +86,7 @@ class Asked:
         """
         if self.tracked:
             return self
-        names = self.contents.columns
+        names = {name: it for name, it in self.contents.columns.items() if name not in self.errors}
         time, radius = self.time_column, self.radius_column or _only(_RADIUS, names)
         if self.time_step is None:
             time = time or _only(_TIME, names)
@@ -167,21 +191,31 @@ class Asked:
 
 
 def first_with_columns(files: Sequence[Path], layout: Layout) -> tuple[Path, Contents, Layout]:
-    """The first file that holds columns of numbers, and with its decimal sign. Raises :class:`DataError`: none does."""
+    """The first file with the columns of numbers that most of the first files hold, and with its decimal sign.
+
+    Raises :class:`DataError`: none holds any.
+    """
     points, commas = (replace(layout, decimal=sign) for sign in (".", ","))
-    faults: list[str] = []
-    for file in files:
+    faults, alike = list[str](), dict[tuple[str, ...], list[tuple[Path, Contents, Layout]]]()
+    for count, file in enumerate(files):
+        if count >= LOOKED_AT and alike:
+            break
         try:
             contents, with_commas = (read_contents(file, signs) for signs in (points, commas))
         except DataError as error:
             faults.append(str(error))
             continue
         if len(with_commas.columns) > len(contents.columns):
-            return file, with_commas, commas
-        if contents.columns:
-            return file, contents, points
-        faults.append(next(iter(contents.others.values()), f"{file}: no column holds numbers"))
-    raise DataError("\n".join(faults))
+            template = (file, with_commas, commas)
+        else:
+            template = (file, contents, points)
+        if template[1].columns:
+            alike.setdefault(tuple(template[1].columns), []).append(template)
+        else:
+            faults.append(next(iter(contents.others.values()), f"{file}: no column holds numbers"))
+    if not alike:
+        raise DataError("\n".join(faults))
+    return max(alike.values(), key=len)[0]
 
 
 def _only(pattern: re.Pattern[str], names: Iterable[str]) -> str | None:

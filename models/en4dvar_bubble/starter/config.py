@@ -250,6 +250,12 @@ def unit_in(name: str | None, kind: str) -> str | None:
         return None
 
 
+def without_unit(name: str) -> str:
+    """A column's name without what :func:`unit_in` reads."""
+    last = name.rpartition(".")[2]
+    return _UNIT.sub("", last) if unit_in(name, "m") else last
+
+
 def path_from(folder: Path, data: str) -> str:
     """``data`` as a file in ``folder`` says it: relative where both share more than the root."""
     path, here = expanded(data).absolute(), folder.absolute()
