@@ -250,14 +250,14 @@ def test_the_directory_is_there_before_the_model_is(tmp_path, monkeypatch):
         assert (out / rundir.LISTING).exists()
         raise DataError("unusable")
 
-    monkeypatch.setattr("en4dvar.runs.runner.build_one", looks)
+    monkeypatch.setattr("en4dvar.runs.runner.checked_problem", looks)
     with pytest.raises(DataError, match="unusable"):
         run(configuration(path, out))
     assert not out.exists()
     monkeypatch.undo()
     run(configuration(path, out))
     before = contents(out)
-    monkeypatch.setattr("en4dvar.runs.runner.build_one", lambda *_: looks())
+    monkeypatch.setattr("en4dvar.runs.runner.checked_problem", lambda *_: looks())
     with pytest.raises(DataError, match="unusable"):
         run(configuration(path, out), force=True)
     assert contents(out) == before
