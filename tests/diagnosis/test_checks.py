@@ -7,13 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from diagnosis.provoked import TWO, bounded, linear, run
+from diagnosis.provoked import TWO, bounded, linear, run, waved
 from toys import Fragile, make_problem
 
 from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.diagnosis.honesty import ControlEnsembles, examine
 from en4dvar.diagnosis.honesty.checks import at_bound, loss, rank, validity, where_lost
 from en4dvar.diagnosis.honesty.examine import collapse
+from en4dvar.estimation.summary import summarise
 from en4dvar.model.forward import ValidityLimit
 from en4dvar.model.state import Parameter
 from en4dvar.plumbing.caution import Caution, caution
@@ -179,3 +180,13 @@ def test_where_members_are_drawn_from_the_posterior_itself_the_search_matters_no
     ended = replace(analysis, converged=False, iterations=(last,), refinement=drawn)
     (told,) = examine(ended, control)
     assert (told.code, told.severity, told.advice) == ("not-converged", "note", "no action is needed")
+
+
+@pytest.mark.parametrize(("height", "severity"), [(3.0, "caution"), (60.0, "serious")])
+def test_a_discrepancy_as_large_as_the_signal_leaves_nothing_to_quote(height, severity):
+    """A wave of 3 errors, less than half of what the readings vary by, or of 60, almost all of it."""
+    analysis = run(waved(height))
+    (told,) = (c for c in analysis.cautions if c.code == "discrepancy-found")
+    assert told.severity == severity
+    assert all(("discrepancy-found" in row.untrusted) == (severity == "serious") for row in summarise(analysis))
+    assert ("check units" in told.advice) == (severity == "serious")

@@ -144,6 +144,15 @@ def _structure(case: Case) -> str:
     return "no kernel has the shape of what is missed: end the window earlier (data.window), or choose another model"
 
 
+def _missed(case: Case) -> str:
+    if case.caution.severity != "serious":
+        return CATALOGUE["discrepancy-found"][1]
+    return (
+        "quote nothing of this fit: look at the prior over the readings (en4dvar validate --plot); check units and "
+        "columns (data), how the history starts, the law and the medium (model), and values that are fixed (parameters)"
+    )
+
+
 def _may_be_robust(case: Case) -> bool:
     noise = case.a.observations.noise
     return noise.independent and not math.isfinite(noise.counts_within)
@@ -244,6 +253,7 @@ ADVICE: dict[str, Callable[[Case], str]] = {
     "ensemble-collapse": _members,
     "rank-deficient": _members,
     "misfit": _misfit,
+    "discrepancy-found": _missed,
     "overstated-error": _overstated,
     "residual-structure": _structure,
     "odd-residuals": _odd,

@@ -34,6 +34,7 @@ BEYOND = 0.1  # share of members beyond a limit of the model
 MOVED, WIDENED = 0.3, 0.5  # mean in prior std, relative variance: beyond, a posterior is not its prior
 SERIOUS: Severity = "serious"
 THERE = 0.25  # of the errors' std: a discrepancy beyond it in nearly all members is there
+NOTHING = 0.5  # of the readings' own std: a discrepancy beyond it in nearly all members leaves little explained
 NINE_OF_TEN = (0.05, 0.95)
 SILENT = 0.1  # DFS of all readings beyond it that count as none
 EXTRAPOLATED = "no action is needed for the parameters; paths beyond the limit are extrapolated"
@@ -117,7 +118,7 @@ def structure(analysis: Analysis) -> Findings:
 
 def missed(analysis: Analysis) -> Findings:
     """A discrepancy that is there: what the residuals show of it widens the intervals, what parameters absorbed does
-    not.
+    not. Serious where it is a large part of what there is to explain.
     """
     names, amplitude = analysis.problem.prior.names, next(iter(analysis.problem.discrepancy), None)
     if amplitude is None or amplitude.name not in names:
@@ -131,7 +132,14 @@ def missed(analysis: Analysis) -> Findings:
             f"beside errors of {noise}: the intervals allow for what shows in the residuals, not for what the "
             "parameters have absorbed"
         )
-        yield caution("discrepancy-found", words)
+        part = analysis.problem.parts[0].where
+        signal = float(np.std(analysis.observations.values[part][analysis.observations.weights[part] > 0]))
+        if low > NOTHING * signal:
+            words = (
+                f"the model explains little: it misses the readings by {least} to {most} (standard deviation of the "
+                f"discrepancy, 5 to 95 %), while these vary by {shown(signal, amplitude)}"
+            )
+        yield caution("discrepancy-found", words, SERIOUS if low > NOTHING * signal else None)
 
 
 def moments(analysis: Analysis) -> list[str]:
