@@ -58,6 +58,9 @@ class Document:
     def fault(self, path: Sequence[str | int], message: str, *, at_key: bool = False) -> Fault:
         """A fault at ``path``, or at its nearest ancestor that is written in the file."""
         dotted, message = brief(_dotted(path), 200), brief(message)
+        below = [origin for key, origin in self.origins.items() if len(path) > 1 and key[: len(path)] == tuple(path)]
+        if below:  # of what an option has set inside
+            return Fault(message, dotted, below[0])
         for n in range(len(path), -1, -1):
             key = tuple(path[:n])
             if key in self.origins:
@@ -205,7 +208,11 @@ def override(document: Document, overrides: Mapping[str, Any], option: str = "--
             origins[path] = origin
     if faults:
         raise ConfigError(faults)
-    return replace(document, data=data, origins=origins)
+    kept = [
+        {key: mark for key, mark in marks.items() if not any(key[: len(path)] == path for path in origins)}
+        for marks in (document.keys, document.values)
+    ]
+    return replace(document, data=data, origins=origins, keys=kept[0], values=kept[1])
 
 
 def _propose(what: str, path: Path) -> str:

@@ -228,9 +228,13 @@ def read_file(kind: type[S], document: Document, base: Path, model: ForwardModel
     built = (model, dict(section or {})) if model else read_model(section, base, document, faults)
     parameters = document.data.get("parameters")
     model = built[0].with_parameters(parameters if isinstance(parameters, dict) else ()) if built else None
+    for key, names in model.known_by.items() if model else ():
+        if document.data["model"].get(key) is not None and parameters and all(name in parameters for name in names):
+            words = f"not read, for it says {' and '.join(names)}, which are parameters; leave it out, or change these"
+            faults.append(document.fault(("model", key), words, at_key=True))
     context = context_of(document, base, model)
     file = check(kind, document.data, (), document, faults, context)
-    if file is None or built is None or model is None:
+    if file is None or built is None or model is None or faults:
         raise ConfigError(in_order(faults))
     return Read(file, model, document, context, built[1])
 

@@ -209,7 +209,8 @@ class ForwardModel(ABC):
     be otherwise, for :mod:`en4dvar.diagnosis.response.what_if`; ``path_quantities`` and ``path_parameters``, names
     of fields of the state that act along the path and not only at its start, are for
     :mod:`en4dvar.diagnosis.response.ledger`. ``optional_parameters`` are numbers that are known unless
-    ``parameters:`` names them: :meth:`with_parameters` is the model in which they are parameters too.
+    ``parameters:`` names them: :meth:`with_parameters` is the model in which they are parameters too; a setting in
+    ``known_by`` says nothing but the numbers of these names, and is refused beside parameters for all of them.
 
     ``defaults`` are values (SI) of parameters that ``parameters:`` need not name.
 
@@ -236,6 +237,7 @@ class ForwardModel(ABC):
     path_quantities: tuple[PathQuantity, ...] = ()
     path_parameters: tuple[str, ...] = ()
     optional_parameters: tuple[Parameter, ...] = ()
+    known_by: ClassVar[Mapping[str, tuple[str, ...]]] = MappingProxyType({})
     unforeseen: Mapping[str, float] = MappingProxyType({})
 
     def changed(self, name: str, x: Array, change: Array) -> Array:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from threading import Lock
+from types import MappingProxyType
 from typing import ClassVar
 
 import numpy as np
@@ -60,6 +61,7 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
         OBSERVABLE,
     )
 
+    known_by = MappingProxyType({"medium": ("rho", "c")})
     path_quantities = (
         PathQuantity("strain_rate", "s^-1", "hoop strain rate at the wall, |Ṙ|/R", r"$|\dot{R}|/R$"),
         PathQuantity("stretch", "1", "hoop stretch at the wall, R over the stress-free radius", r"$R/R_0$"),

@@ -156,6 +156,15 @@ class TestFaults:
         assert (found.path, found.line) == (path, line)
         assert message in found.message
 
+    def test_a_medium_that_says_nothing_is_refused(self, tmp_path):
+        """Beside parameters for both numbers that it gives; beside one of them it gives the other."""
+        rho, c = "  rho: 1030 kg/m^3\n", "  c: {prior: lognormal, median: 1.5 km/s, log_std: 0.01}\n"
+        tail = TAIL.replace("parameters:\n", f"parameters:\n{rho}{c}")
+        with pytest.raises(ConfigError, match=r"model\.medium: not read, for it says rho and c"):
+            load(HEAD + "  medium: agarose\n" + tail, tmp_path)
+        load(HEAD + "  medium: agarose\n" + tail.replace(rho, ""), tmp_path)
+        load(HEAD + tail, tmp_path)
+
 
 class TestConstants:
     def test_every_constant_of_every_set_has_a_unit_and_a_source(self):

@@ -77,3 +77,11 @@ def test_missing_file_names_its_neighbours(tmp_path: Path) -> None:
     (tmp_path / "latin.yaml").write_bytes(b"a: \xb5m\n")
     with pytest.raises(ConfigError, match="not UTF-8"):
         read_document(tmp_path / "latin.yaml")
+
+
+def test_what_stands_in_an_option_is_not_looked_for_in_the_file():
+    """A section that an option replaces has no lines any more; its fault is that of a value set inside."""
+    document = parse_document("a: {b: {c: 1}, d: 2}\n", "f.yaml")
+    assert str(override(document, {"a.b": {"c": 3}}).fault(("a", "b", "c"), "bad")) == "--set a.b: a.b.c: bad"
+    assert str(override(document, {"a.b.c": 3}).fault(("a", "b"), "bad")) == "--set a.b.c: a.b: bad"
+    assert str(override(document, {"a.b.c": 3}).fault(("a", "d"), "bad")) == "f.yaml:1:19: a.d: bad"

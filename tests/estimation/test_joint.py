@@ -214,6 +214,17 @@ def test_an_experiment_in_the_wrong_minimum_of_its_own_is_found():
     assert found.chi2.max() < 1
 
 
+def test_advice_names_nothing_that_a_joint_estimate_does_not_read(monkeypatch):
+    """It has no chain, and chooses its starts itself."""
+    monkeypatch.setattr(members, "FEWEST", np.inf)
+    monkeypatch.setattr(estimate, "_agreeing", lambda descents: 1)
+    problems = _experiments(2, kind=Vectorised, compiled=True)
+    settings = replace(SETTINGS, refine="auto", members=24)
+    found = estimate.estimate_jointly(_joint(problems), settings, seed=3)
+    assert {c.code for c in found.cautions} >= {"non-gaussian", "starts-disagree"}
+    assert not [c.advice for c in found.cautions if "refine" in c.advice or "starts" in c.advice]
+
+
 def test_a_member_of_any_experiment_may_fail():
     problems = _experiments()
     limit = estimate.estimate_jointly(_joint(problems), SETTINGS, seed=3).shared[:, 0]

@@ -136,10 +136,13 @@ class _Estimate:
             require_members(problem, run.failures[:-1], needed, "forecast of the joint posterior")
         cautions += missing_readings(max(forecast.filled for forecast in forecasts))
         if not lowest.converged:
-            cautions.append(caution("not-converged", f"the joint estimate has not converged: {lowest.stop}"))
+            advice = "make the runs again with a larger assimilation.max_iterations (that of the first counts)"
+            told = caution("not-converged", f"the joint estimate has not converged: {lowest.stop}")
+            cautions.append(replace(told, advice=f"{advice}, or narrower priors"))
         if _agreeing(descents) < 2:
             words = f"none of {len(descents) - 1} further descents of the joint estimate ended in its lowest minimum"
-            cautions.append(caution("starts-disagree", words))
+            advice = "a lower one may not have been found: make the runs again with narrower priors"
+            cautions.append(replace(caution("starts-disagree", words), advice=advice))
         most = int(AT_MOST * len(experiments)) if most is None else most
         alone = np.array([self._alone(e, single) for e, single in enumerate(singles)])
         said = [Statement.of(joint, e, single) for e, single in enumerate(singles)]
@@ -249,7 +252,8 @@ class _Estimate:
         if members is not None:
             return members, []
         words = "the joint posterior is far from Gaussian, and importance sampling did not reach it"
-        return laplace, [caution("non-gaussian", words)]
+        advice = "share fewer parameters, or ask how much they vary, by chains (en4dvar population)"
+        return laplace, [replace(caution("non-gaussian", words), advice=advice)]
 
 
 def _agreeing(descents: Sequence[JointDescent]) -> int:
