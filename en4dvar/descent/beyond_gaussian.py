@@ -28,7 +28,7 @@ from en4dvar.problem import InverseProblem
 Mask = npt.NDArray[np.bool_]
 DRAWS, FREEDOM = 1500, 5.0  # of Student's t
 WIDER = 1.3  # than the Gaussian at the mode
-AT_ONCE = 250
+AT_ONCE = 50
 ENOUGH = 60.0  # effective draws below which the ensemble stays as it is
 SWEEPS = 200
 STENCIL = 0.02  # width of differences, in prior standard deviations
@@ -96,15 +96,16 @@ def _given(
     )
     log_density, means, covariances = [], [], []
     for first in range(0, len(draws), AT_ONCE):
-        covariance = noise.covariance(predicted[first : first + AT_ONCE]) / beta
-        solved = np.linalg.solve(covariance, np.broadcast_to(columns, (len(covariance), *columns.shape)))
-        products = columns.T @ solved
+        white, roots = noise.whitened_columns(columns, predicted[first : first + AT_ONCE])
+        products = beta * np.einsum("dki,dkj->dij", white, white, optimize=True)
+        impossible = ~np.isfinite(products).all(axis=(1, 2))
+        products[impossible] = 0.0
         information = np.eye(slopes.shape[1]) + products[:, 1:, 1:]
         inverse = np.linalg.inv(information)
         mean = np.einsum("dij,dj->di", inverse, products[:, 1:, 0])
         squares = products[:, 0, 0] - np.einsum("di,di->d", products[:, 0, 1:], mean)
-        dets = np.linalg.slogdet(covariance)[1] + np.linalg.slogdet(information)[1]
-        log_density.append(-0.5 * (squares + dets))
+        dets = 2 * np.log(roots).sum(axis=1) + np.linalg.slogdet(information)[1]
+        log_density.append(np.where(impossible, -np.inf, -0.5 * (squares + dets)))
         means.append(mean)
         covariances.append(inverse)
     log_prior = -0.5 * np.sum(draws**2, axis=1)

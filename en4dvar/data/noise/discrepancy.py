@@ -249,6 +249,18 @@ class DiscrepancyNoise(Noise):
         root = np.linalg.cholesky(self.covariance(at))
         return np.asarray(weights[0] * cho_solve((root, True), vectors.T).T)
 
+    def whitened_columns(self, columns: Array, predicted: Predicted) -> tuple[Array, Array]:
+        """L⁻¹c (B, K, M) of columns c (K, M), and the diagonal of L (B, K), for R + A = LLᵀ of runs (B,)."""
+        if self.correlation is not None:
+            root = np.linalg.cholesky(self.covariance(predicted))
+            white = np.linalg.solve(root, np.broadcast_to(columns, (len(root), *columns.shape)))
+            return np.asarray(white), np.asarray(root.diagonal(0, 1, 2))
+        count, parts = columns.shape[1], self._in_time(predicted.values, predicted)[1:]
+        s, a, length = (np.repeat(part, count, axis=0) for part in parts)
+        white, roots = self._filtered(np.tile(columns.T, (len(parts[0]), 1)), s**2, a, length)
+        shape = len(parts[0]), count, len(columns)
+        return white.reshape(shape).swapaxes(1, 2), roots.reshape(shape)[:, 0]
+
     def _correlated(self, v: Array) -> Array:
         return v if self.correlation is None else self.correlation.correlated(v)
 

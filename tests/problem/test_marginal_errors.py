@@ -1,0 +1,33 @@
+"""What the mixture over the parameters of errors beside a discrepancy is made of."""
+
+import numpy as np
+import pytest
+
+from en4dvar.data.noise import Kernel, Predicted, noise_of
+from en4dvar.data.noise.discrepancy import NUGGET
+
+K = 9
+TIMES = np.linspace(0.2, 2.0, K)
+CORRELATION = np.exp(-np.abs(np.subtract.outer(TIMES, TIMES)) / 0.3)
+
+
+@pytest.mark.parametrize("correlated", [False, True])
+def test_columns_are_whitened_by_the_factor_of_the_covariance(correlated):
+    """Against R + A of each run in closed form, whose lengths, amplitudes, rates and scales differ."""
+    stream, runs = np.random.default_rng(4), 5
+    columns, rates = stream.standard_normal((K, 3)), stream.standard_normal((runs, K))
+    process = stream.uniform(0.2, 1.0, (runs, 2))
+    std, scale = stream.uniform(0.1, 0.3, K), stream.uniform(0.5, 2.0, runs)
+    noise = noise_of(
+        std, np.zeros(K), correlation=CORRELATION if correlated else None, discrepancy=Kernel(TIMES, 1.5, 1.5)
+    )
+    predicted = Predicted(stream.standard_normal((runs, K)), rates, scale, process)
+    white, roots = noise.whitened_columns(columns, predicted)
+    lag = np.abs(np.subtract.outer(TIMES, TIMES))
+    for b, (amplitude, length) in enumerate(process):
+        a, s = amplitude * np.sqrt(1 + (rates[b] / 1.5) ** 2), scale[b] * std
+        R = np.outer(s, s) * (CORRELATION if correlated else np.eye(K))
+        x = np.sqrt(3) * lag / length
+        L = np.linalg.cholesky(R + np.outer(a, a) * ((1 + x) * np.exp(-x) + NUGGET * np.eye(K)))
+        np.testing.assert_allclose(white[b], np.linalg.solve(L, columns), rtol=1e-8, atol=1e-8)
+        np.testing.assert_allclose(roots[b], np.diag(L), rtol=1e-8)
