@@ -77,7 +77,7 @@ def of_text(content: bytes, rng: Rng) -> bytes:
 
 
 def of_archive(content: bytes, rng: Rng) -> bytes:
-    """A part of a zip file (a workbook, what is in a checkpoint) changed before it is packed; or bytes."""
+    """A part of a zip file (a workbook) changed before it is packed; or bytes."""
     if rng.random() < 0.2:
         return of_bytes(content, rng)
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -99,9 +99,19 @@ def of_archive(content: bytes, rng: Rng) -> bytes:
 
 
 def resealed_checkpoint(path: Path, rng: Rng) -> None:
-    """The content of a checkpoint changed, its checksum made again."""
+    """The text or the numbers of a checkpoint changed, its checksum made again."""
     head, _, payload = path.read_bytes().partition(b"\n")
-    changed = of_archive(payload, rng)
+    size = struct.calcsize("<cQ")
+    end = size + struct.unpack_from("<cQ", payload)[1] if payload.startswith(b"A") else len(payload)
+    parts = [payload[size:end], payload[end:]] if end < len(payload) else [payload, b""]
+    match rng.integers(4):
+        case 0 if parts[1]:
+            parts[1] = of_bytes(parts[1], rng)
+        case 1:
+            parts[0] = of_bytes(parts[0], rng)
+        case _:
+            parts[0] = of_text(parts[0], rng)
+    changed = struct.pack("<cQ", b"A", len(parts[0])) + b"".join(parts) if parts[1] else parts[0]
     words = head.decode().split(" ")
     path.write_bytes(" ".join([*words[:-1], digest(changed)]).encode() + b"\n" + changed)
 
