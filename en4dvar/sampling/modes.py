@@ -200,7 +200,7 @@ def belonging(prior: Prior, minima: Sequence[Minimum], x: Array, shares: Array) 
     Which Gaussian is densest says only where to look: far from all minima, along a bent posterior, it is an accident of
     how wide they are.
     """
-    mode = nearest(prior, minima, x)
+    mode = nearest(prior, minima, x) if len(minima) > 1 else np.zeros(len(x), dtype=np.intp)
     for j in range(1, len(minima)):
         for i in range(j):
             first, second = (shares * (mode == number) for number in (i, j))

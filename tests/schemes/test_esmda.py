@@ -11,6 +11,7 @@ from same_bits import assert_same_bits
 from toys import Decay, Fragile, Linear, Vectorised, Wave, make_problem
 
 from en4dvar.estimation.assimilate import assimilate, log_posterior
+from en4dvar.sampling import mcmc
 from en4dvar.schemes.esmda import ESMDA
 from en4dvar.schemes.settings import AssimilationSettings
 
@@ -136,3 +137,12 @@ def test_coefficients_are_scaled():
     for wrong in ((), (1.0, -1.0), (0.0,)):
         with pytest.raises(ValueError, match="positive"):
             ESMDA(wrong)
+
+
+def test_a_chain_samples_behind_it(monkeypatch):
+    """There is no minimum of J, to which draws of the chain could belong."""
+    monkeypatch.setattr(mcmc.sample, "__kwdefaults__", {**mcmc.sample.__kwdefaults__, "max_steps": 50})
+    settings = AssimilationSettings(scheme="es-mda", members=9, refine="mcmc")
+    analysis = assimilate(make_problem(Decay(), [1.5, 1.2]), settings, 3)
+    assert analysis.modes == ()
+    assert np.isfinite(analysis.posterior).all()
