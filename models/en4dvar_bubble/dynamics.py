@@ -139,8 +139,9 @@ class Dynamics:
         if self.driving is None:
             object.__setattr__(self, "driving", _usual_driving(self.start))
         accuracy: Any = self.accuracy or "standard"
-        if isinstance(accuracy, str):
-            object.__setattr__(self, "accuracy", preset(accuracy, self.start))  # type: ignore[arg-type]
+        is_name = isinstance(accuracy, str)
+        if is_name:
+            object.__setattr__(self, "accuracy", preset(accuracy, self.start))
         require_kinds(self, Dynamics)
         refuse_inexact(type(self.law))
         if self.law.released and self.start != "laser":
