@@ -60,12 +60,12 @@ class Journal(Executor):
             return self.forecasts[at]
         del self.keys[at:], self.forecasts[at:]
         forecast = run(*asked)
-        seen = self.keeper is not None and self.keeper.path.parent.is_dir()
-        if self.keeper is not None and seen and at == len(self.keys) and self.room > 0:
+        keeper = self.keeper
+        if keeper is not None and keeper.path.parent.is_dir() and at == len(self.keys) and self.room > 0:
             self.keys.append(key)
             self.forecasts.append(forecast)
             self.room -= forecast.nbytes
-            self.keeper.keep(lambda: KnownRuns(tuple(self.keys), tuple(self.forecasts)))
+            keeper.keep(lambda: KnownRuns(tuple(self.keys), tuple(self.forecasts)))
         return forecast
 
     def map(self, *arguments: Any, **named: Any) -> Any:

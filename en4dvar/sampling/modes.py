@@ -70,10 +70,6 @@ class WeightedDraws:
         apart = self.x - self.mean
         return np.asarray((self.shares[:, None] * apart).T @ apart)
 
-    def weights(self, count: int) -> Array:
-        """Weights of so many modes."""
-        return np.asarray(np.bincount(self.mode, self.shares, minlength=count), dtype=float)
-
     def members(self, count: int, stream: np.random.Generator, exact: bool) -> Array:
         """(N, n) equally likely ones, of every mode as many as its weight says, to one.
 

@@ -123,7 +123,7 @@ def test_no_draws_beyond_the_ensemble_where_the_lowest_minimum_is_plausible(monk
 
 @pytest.mark.slow
 def test_a_search_among_draws_goes_on_to_the_same_bits():
-    assert max(assert_cut_anywhere(hidden(4), AssimilationSettings(), 4, cuts=20).descents.members) <= 48
+    assert -2 in assert_cut_anywhere(hidden(4), AssimilationSettings(), 4, cuts=20).descents.members  # from a draw
 
 
 @pytest.mark.slow
