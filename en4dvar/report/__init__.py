@@ -5,7 +5,8 @@ Nothing is recomputed: whatever is shown was stored by the run. One data set is 
 the worst warned of get theirs at once and the others when they are asked for by name.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from urllib.parse import quote
 
@@ -22,7 +23,7 @@ from en4dvar.report.page import IDENTIFIERS, render_set
 from en4dvar.report.responses import ENTRY_COLUMNS, SHIFT_COLUMNS, stored_ledger, stored_shifts
 from en4dvar.report.svg import draw, svg
 from en4dvar.report.text import upper_first
-from en4dvar.report.varying import PIECE_COLUMNS, piece_lines
+from en4dvar.report.varying import PIECE_COLUMNS, stored_walks
 from en4dvar.results.campaign_file import failed_datasets
 from en4dvar.results.joint_file import FILE, load_joint
 from en4dvar.results.pack import PACK
@@ -32,13 +33,14 @@ from en4dvar.results.store import StoredResult, load_stored
 
 PAGES = 40  # data sets of a campaign with a page from the start
 SHARE = 20  # pages that are worth the start of a process
-Lines = Sequence[Sequence[object]]
-TABLES = {
-    "what_if.csv": SHIFT_COLUMNS, "ledger.csv": ENTRY_COLUMNS, "varying.csv": PIECE_COLUMNS,
-    "withheld.csv": WITHHELD_COLUMNS,
-}  # fmt: skip
-JOINT_FILES = ("joint.html", "joint.csv")  # of a joint estimate
-POPULATION_FILES = ("population.html", "population.csv", "population.tex")
+Line = tuple[object, ...]
+TABLES: dict[str, tuple[Sequence[str], Callable[[StoredResult], Iterable[Line]]]] = {
+    # columns behind the name of the data set, and what gives lines that begin with these cells
+    "what_if.csv": (SHIFT_COLUMNS, lambda result: chain(*stored_shifts(result))),
+    "ledger.csv": (ENTRY_COLUMNS, lambda result: chain(*stored_ledger(result))),
+    "varying.csv": (PIECE_COLUMNS, lambda result: chain(*(walk.cells for walk in stored_walks(result)))),
+    "withheld.csv": (WITHHELD_COLUMNS, withheld_lines),
+}
 
 
 def write_pages(run_dir: str | Path, datasets: Sequence[str] = (), workers: int = 1, files: bool = False) -> Path:
@@ -72,39 +74,31 @@ def write_pages(run_dir: str | Path, datasets: Sequence[str] = (), workers: int 
     if not sets:
         stored.require()
     _write_tables(run_dir, lines)
+    stems = {s.name: s.stem for s in sets}
+    for name in datasets:
+        if name not in stems:
+            raise OutputError(f"{run_dir}: no data set {name!r}{suggest(name, stems)}")
     failures = failed_datasets(whole) | stored.lacking
     write_csv(run_dir / "summary.csv", summary_rows(((s.name, s.rows.values(), s.cautions) for s in sets), failures))
-    page = _write_campaign(run_dir, sets, failures, _asked(run_dir, sets, datasets), workers, files)
+    page = _write_campaign(run_dir, sets, failures, {stems[name] for name in datasets}, workers, files)
     stored.require(page)
     return page
 
 
-def _lines(result: StoredResult) -> tuple[Lines, ...]:
+def _lines(result: StoredResult) -> list[list[Line]]:
     """Of each of :data:`TABLES`, the name of the data set first."""
-    shifts = [(result.name, *shift[: len(SHIFT_COLUMNS)]) for row in stored_shifts(result) for shift in row]
-    entries = [(result.name, *entry[: len(ENTRY_COLUMNS)]) for row in stored_ledger(result) for entry in row]
-    return shifts, entries, piece_lines(result), withheld_lines(result)
+    return [[(result.name, *line[: len(columns)]) for line in lines(result)] for columns, lines in TABLES.values()]
 
 
-def _write_tables(run_dir: Path, sets: Sequence[tuple[Lines, ...]]) -> None:
+def _write_tables(run_dir: Path, sets: Sequence[list[list[Line]]]) -> None:
     """The :data:`TABLES` of the data sets, where there is something to write."""
-    for (name, columns), part in zip(TABLES.items(), zip(*sets, strict=True), strict=True):
-        lines = [line for of_set in part for line in of_set]
-        if lines:
+    for (name, (columns, _)), parts in zip(TABLES.items(), zip(*sets, strict=True), strict=True):
+        if lines := [*chain(*parts)]:
             write_csv(run_dir / name, [("dataset", *columns), *lines])
 
 
-def _asked(run_dir: Path, sets: Sequence[SetSummary], names: Sequence[str]) -> frozenset[str]:
-    """Stems of the data sets asked for."""
-    stems = {s.name: s.stem for s in sets}
-    for name in names:
-        if name not in stems:
-            raise OutputError(f"{run_dir}: no data set {name!r}{suggest(name, stems)}")
-    return frozenset(stems[name] for name in names)
-
-
 def _write_campaign(
-    run_dir: Path, sets: Sequence[SetSummary], failures: Mapping[str, str], asked: frozenset[str], workers: int,
+    run_dir: Path, sets: Sequence[SetSummary], failures: Mapping[str, str], asked: set[str], workers: int,
     files: bool,
 ) -> Path:  # fmt: skip
     folder = make_folder(inside(run_dir, "pages"))
@@ -130,35 +124,27 @@ def _write_campaign(
 
 
 def _headlines(run_dir: Path) -> list[Headline]:
-    """What the data sets say together, where the run estimated it."""
-    from en4dvar.report import joint, population  # with the estimates themselves, which other pages do not need
+    """What the data sets say together, where the run estimated it; the tables of its groups are written."""
+    from en4dvar.report import joint, population, populations  # with the estimates, which other pages do not need
 
-    headlines = [*_side_by_side(run_dir)]
+    headlines, groups = [], populations.groups_compared(run_dir)
+    if isinstance(groups, str):
+        headlines.append(Headline("summary.csv", "All data sets", [groups], "", ""))
+    elif groups is not None:
+        populations.write_tables(groups, run_dir)
+        drawn, caption = svg(populations.figure(groups), "populations", populations.CAPTION), populations.CAPTION
+        told = [*populations.group_sentences(groups)]
+        headlines.append(Headline("differences.csv", "The differences", told, drawn, caption))
     for name, (folder, of) in populations_of(run_dir).items():
         words = f"The population of {name}" if name else "The population behind them"
         told = [f"{name}: {line}" if name else upper_first(line) for line in population.sentences(of)]
-        address = quote((folder / POPULATION_FILES[0]).relative_to(run_dir).as_posix())
+        address = quote((folder / "population.html").relative_to(run_dir).as_posix())
         headlines.append(Headline(address, words, told, population.figure(of), population.caption(of)))
     if (run_dir / FILE).exists():
         shared = load_joint(run_dir / FILE)
         lines = [upper_first(line) for line in joint.joint_lines(shared)]
-        headlines.append(Headline(JOINT_FILES[0], "All of them together", lines, joint.figure(shared), joint.CAPTION))
+        headlines.append(Headline("joint.html", "All of them together", lines, joint.figure(shared), joint.CAPTION))
     return headlines
-
-
-def _side_by_side(run_dir: Path) -> Iterator[Headline]:
-    """The groups of the run compared, where there are two of them; their tables are written."""
-    from en4dvar.report import populations
-
-    of = populations.groups_compared(run_dir)
-    if isinstance(of, str):
-        yield Headline("summary.csv", "All data sets", [of], "", "")
-    elif of is not None:
-        populations.write_tables(of, run_dir)
-        drawn = svg(populations.figure(of), "populations", populations.CAPTION)
-        yield Headline(
-            "differences.csv", "The differences", [*populations.group_sentences(of)], drawn, populations.CAPTION
-        )
 
 
 def _write_page(run_dir: Path, stem: str, copies: str | None, trail: Sequence[tuple[str, str]]) -> None:

@@ -13,10 +13,10 @@ import numpy as np
 from scipy.stats import binomtest
 
 from en4dvar.diagnosis.ranks import BAND, Uniform, uniform_ranks
-from en4dvar.plumbing.files import read_text, write_text
+from en4dvar.plumbing.files import read_text
 from en4dvar.plumbing.tables import table
 from en4dvar.report.chart import PAGE, POINTS, Chart, Panel, in_columns
-from en4dvar.report.html import render
+from en4dvar.report.html import write_page
 from en4dvar.report.paper import on_paper
 from en4dvar.report.svg import draw
 from en4dvar.report.text import figure_text
@@ -173,16 +173,15 @@ def write_calibration(folder: Path) -> Path:
     """Write ``calibration.html`` from ``calibration.csv``. Raises :class:`OutputError`."""
     calibration = load_calibration(folder)
     figures: Sequence[tuple[str, str, Chart]] = [("ranks", CURVES, curves(calibration))] if calibration.verdicts else []
-    page = render(
+    return write_page(
+        folder / "calibration.html",
         "calibration.html.j2",
-        title=f"Calibration of {calibration.name}",
         calibration=calibration,
         head=HEAD,
         level=LEVEL,
         figures=draw(figures),
         configuration=_configuration(folder),
     )
-    return write_text(folder / "calibration.html", page)
 
 
 def load_calibration(folder: Path) -> Calibration:

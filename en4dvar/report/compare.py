@@ -24,13 +24,12 @@ from en4dvar.estimation.summary import CSV_COLUMNS, ParameterSummary, csv_cells,
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, codes
 from en4dvar.plumbing.errors import ConfigError, OutputError, retold
-from en4dvar.plumbing.files import make_folder, write_text
+from en4dvar.plumbing.files import make_folder
 from en4dvar.plumbing.hints import shown, suggest
 from en4dvar.plumbing.tables import table, write_csv
 from en4dvar.plumbing.units import UnitError, convert
 from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, in_columns
-from en4dvar.report.html import render
-from en4dvar.report.page import DFS_WORDS
+from en4dvar.report.html import write_page
 from en4dvar.report.paper import on_paper
 from en4dvar.report.svg import draw
 from en4dvar.report.text import figure_text, fixed, with_unit
@@ -271,19 +270,8 @@ def write_comparison(comparison: Comparison, out: str | Path) -> Path:
     write_csv(out / "estimates.csv", [["run", "dataset", *CSV_COLUMNS, "warnings"], *rows])
     columns = [f.name for f in fields(ModelScore)]
     write_csv(out / "evidence.csv", [columns, *([getattr(s, c) for c in columns] for s in comparison.scores)])
-    page = render(
-        "compare.html.j2",
-        title=" – ".join(comparison.runs),
-        figure=figure,
-        caption=CAPTION,
-        incomparable=comparison.incomparable,
-        verdicts=[(name, comparison.verdict(name)) for name in comparison.datasets],
-        estimates=comparison.by_parameter,
-        scores=comparison.scores,
-        cautions=[(c.caution, f"{c.run}, {c.dataset}: ") for c in comparison.cautions],
-        dfs_words=DFS_WORDS,
-    )
-    return write_text(out / "compare.html", page)
+    about = {"title": " – ".join(comparison.runs), "figure": figure, "caption": CAPTION, "comparison": comparison}
+    return write_page(out / "compare.html", "compare.html.j2", **about)
 
 
 def overlay(comparison: Comparison) -> Chart:

@@ -8,12 +8,12 @@ from scipy.stats import binom
 
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import OutputError
-from en4dvar.plumbing.files import inside, write_text
+from en4dvar.plumbing.files import inside
 from en4dvar.plumbing.tables import csv_text
 from en4dvar.plumbing.units import convert
 from en4dvar.report.chart import POINTS, Chart, Panel, Row
 from en4dvar.report.export import Kind, Notes, column_name, escaped, latex_unit, plus_minus, tabular
-from en4dvar.report.html import render
+from en4dvar.report.html import write_page
 from en4dvar.report.page import provenance_rows
 from en4dvar.report.svg import Captioned, draw
 from en4dvar.report.text import plain_number, with_unit
@@ -41,10 +41,11 @@ def write_cycles_page(
     """
     a = data.attrs
     members, lost = int(a["members"]), int(a["members_lost"])
-    page = render(
+    return write_page(
+        run_dir / "report.html",
         "cycles.html.j2",
         title=str(a["name"]),
-        created=str(a.get("date_created", "")),
+        attributes=a,
         facts=[
             ("Scheme", str(a["scheme"]), f"forecasts of the window {cycle}: {plain_number(iterations, 3)}"),
             ("Members", f"{members - lost} of {members}", "did not fail up to the end of the run"),
@@ -57,10 +58,8 @@ def write_cycles_page(
         warnings=_lines(a.get("warnings", "")),
         lost=_lines(a["members_lost_why"]),
         provenance=provenance_rows(a),
-        configuration=str(a["configuration_resolved"]),
         **about,
     )
-    return write_text(run_dir / "report.html", page)
 
 
 def span_of(time: Array) -> tuple[float, float] | None:

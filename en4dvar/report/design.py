@@ -12,11 +12,10 @@ import numpy as np
 from en4dvar.estimation.design.evaluate import Evaluated
 from en4dvar.estimation.design.nested import Decision
 from en4dvar.model.state import Array
-from en4dvar.plumbing.files import write_text
 from en4dvar.plumbing.tables import table, write_csv
 from en4dvar.plumbing.units import convert
 from en4dvar.report.chart import PAGE, POINTS, Chart, Panel, Row, in_columns
-from en4dvar.report.html import render
+from en4dvar.report.html import write_page
 from en4dvar.report.svg import draw
 from en4dvar.report.text import figure_text, rough_number, with_unit
 from en4dvar.results.design_file import DECISION, FILE, DesignRow, Designs, load_designs
@@ -230,12 +229,10 @@ def write_design(folder: Path) -> Path:
         figures.insert(0, ("prices", FRONT, prices(designs)))
     if designs.asked.knobs or len({row.evaluated.alike for row in rows}) > 1:
         figures.insert(0, ("gains", GAINS, gains(designs)))
-    page = render(
+    return write_page(
+        folder / "design.html",
         "design.html.j2",
-        title="Designs compared",
-        name=designs.attributes.get("name", ""),
-        asked=", ".join(designs.asked.parameters),
-        laws=designs.asked.laws,
+        designs=designs,
         by=by,
         rows=[(settings_text(row), row, words(designs, row), id(row) in best) for row in rows],
         lab=[
@@ -249,9 +246,7 @@ def write_design(folder: Path) -> Path:
         ],
         remarks=remarks(designs),
         drawings=draw(figures),
-        attributes=designs.attributes,
     )
-    return write_text(folder / "design.html", page)
 
 
 def readings_text(designs: Designs, row: DesignRow) -> str:

@@ -184,14 +184,14 @@ def _prior(preview: Preview, part: Part, path: Array | None) -> Panel:
 
 
 def withheld_lines(result: StoredResult) -> list[tuple[object, ...]]:
-    """A line a reading after the window, in display units, the name of the data set first; none where none follows."""
+    """A line a reading after the window, in display units; none where none follows."""
     if "/withheld" not in result.groups:
         return []
     held = result.groups["/withheld"]
     units = [held[key].attrs["display_units"] for key in ("withheld_time", result.observable)]
     columns = (values.tolist() for values in _withheld(result))
     return [
-        (result.name, units[0], time, units[1], value, low, median, high, int(low <= value <= high))
+        (units[0], time, units[1], value, low, median, high, int(low <= value <= high))
         for time, value, low, median, high in zip(*columns, strict=True)
     ]
 

@@ -4,11 +4,13 @@ import base64
 import hashlib
 from functools import cache
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from en4dvar.plumbing.files import write_text
 from en4dvar.report import responses, text
 from en4dvar.report.palette import DARK, LIGHT, css_variables
 
@@ -17,6 +19,11 @@ WRITERS = (  # what templates call
     text.pretty_unit, text.rough_number, text.symbol_html, text.untrusted_words, responses.sentence,
     responses.shift_text,
 )  # fmt: skip
+
+
+def write_page(path: Path, template: str, **content: Any) -> Path:
+    """Write the page of a template of ours. Raises :class:`OutputError`."""
+    return write_text(path, render(template, **content))
 
 
 def render(template: str, package: str = "en4dvar.report", /, **content: Any) -> str:

@@ -11,10 +11,9 @@ from en4dvar.diagnosis.diagnostics import HARDLY_INFORMED, member_quantiles
 from en4dvar.diagnosis.honesty.checks import MOVED
 from en4dvar.estimation.summary import ParameterSummary, estimate_cells
 from en4dvar.plumbing.caution import Caution, untrusted
-from en4dvar.plumbing.files import write_text
 from en4dvar.plumbing.tables import table, write_csv
 from en4dvar.report.chart import COLUMN, PAGE, POINTS, Chart, Panel, in_columns
-from en4dvar.report.html import render
+from en4dvar.report.html import write_page
 from en4dvar.report.svg import svg
 from en4dvar.report.text import axis_label, figure_text, number_like, range_words, shown, unit_behind, with_unit
 from en4dvar.results.declared import parameter_of
@@ -166,11 +165,10 @@ def write_joint(folder: Path) -> Path:
     columns = ("name", "dataset", "without", "mean", "std", "q05", "q50", "q95", "unit")
     cells = [[getattr(e, c) for c in columns] + [" ".join(e.untrusted)] for e in rows]
     write_csv(folder / "joint.csv", [[*columns, "warnings"], *cells])
-    page = render(
+    return write_page(
+        folder / "joint.html",
         "joint.html.j2",
-        title="Joint estimate",
-        runs=str(joint.tree.attrs["runs"]),
-        count=len(joint.datasets),
+        joint=joint,
         shared=[e for e in rows if not e.dataset],
         own=[e for e in rows if e.dataset],
         forest=figure(joint),
@@ -178,8 +176,4 @@ def write_joint(folder: Path) -> Path:
         fits=svg(drawn, "fits", FITS) if (drawn := fits(joint)) else "",
         fits_caption=FITS + (f" The first {MOST_FITS}." if len(joint.datasets) > MOST_FITS else ""),
         sets=[*zip(joint.datasets, *fitted, strict=True)],
-        odd=joint.odd,
-        attributes=joint.tree.attrs,
-        cautions=[(c, "") for c in joint.cautions],
     )
-    return write_text(folder / "joint.html", page)

@@ -83,17 +83,12 @@ def render_overview(
     listed = set(map(id, sorted(sets, key=lambda s: -s.gravity)[:LISTED]))
     return render(
         "campaign.html.j2",
-        title=f"{len(sets)} data sets",
-        created=sets[0].about.get("date_created", ""),
-        configuration=sets[0].about.get("configuration", ""),
         parameters=[_parameter(name, sets) for name in _parameters(sets)],
         failures=failures,
         sets=sets,
         listed=[dataset for dataset in sets if id(dataset) in listed],
         pages=pages,
         headlines=headlines,
-        without_page=sum(1 for dataset in sets if dataset.stem not in pages),
-        warned=sum(1 for dataset in sets if dataset.cautions),
         tally=_tally(sets),
         figures=figures,
     )

@@ -26,10 +26,6 @@ PROVENANCE = (
     "package_versions", "python_version", "platform", "cpu", "institution", "references", "Conventions",
 )  # fmt: skip
 IDENTIFIERS = "d0-"  # begin those of figures, which are addresses
-DFS_WORDS = (
-    "how much of the prior variance the data removed, one minus posterior over prior variance of the members shown, of "
-    "the logarithm where the prior is lognormal; at 0 % the width is the prior's, at 100 % the prior does not matter"
-)
 
 
 def render_set(
@@ -39,24 +35,19 @@ def render_set(
 
     ``trail``: links (words, address) above it; ``copies``: whether the figures are also kept as PDF and PNG.
     """
-    attributes, judged = result.attributes, result.group("sample_stats")
+    judged = result.group("sample_stats")
     return render(
         "set.html.j2",
-        title=result.name,
+        result=result,
         trail=trail,
         copies=copies,
-        created=attributes.get("date_created", ""),
-        configuration=str(attributes.get("configuration", "")),
         stats=judged.attrs,
         rows=result.rows,
         stated=[row.label for row in result.rows if _as_stated(row)],
         lead=[row for row in result.rows if not _as_stated(row)],
-        dfs_words=DFS_WORDS,
         trust=trust(result),
-        cautions=result.cautions,
         tiles=_tiles(result),
         shares=_shares(result),
-        discrepancy_share=judged.attrs.get("discrepancy_share"),
         what_if=(what_if := stored_shifts(result)),
         exceeding=exceeding(what_if),
         what_if_added=_recorded(result).get("what_if") == "added",
@@ -72,7 +63,7 @@ def render_set(
         iterations=_iterations(result),
         fixed_values=_fixed(result),
         settings=_settings(result),
-        provenance=provenance_rows(attributes),
+        provenance=provenance_rows(result.attributes),
     )
 
 

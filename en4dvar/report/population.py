@@ -12,7 +12,7 @@ from en4dvar.estimation.summary import ParameterSummary, results_table, summary_
 from en4dvar.plumbing.files import write_text
 from en4dvar.plumbing.tables import write_csv
 from en4dvar.report.export import Found, latex_table
-from en4dvar.report.html import render
+from en4dvar.report.html import write_page
 from en4dvar.report.joint import NOTHING, forest
 from en4dvar.report.svg import svg
 from en4dvar.report.text import number_like, percent, plain_number, plus_minus, range_words, shown, unit_behind
@@ -183,18 +183,13 @@ def write_population(folder: Path) -> Path:
     rows = summaries(stored)
     write_csv(folder / "population.csv", summary_rows(rows, {}))
     write_text(folder / "population.tex", latex_table(rows))
-    page = render(
+    return write_page(
+        folder / "population.html",
         "population.html.j2",
-        title="Population",
-        runs=str(stored.tree.attrs["runs"]),
-        count=len(stored.datasets),
+        stored=stored,
         sentences=sentences(stored),
         population=rows[: len(stored.words)],
         sets=rows[len(stored.words) :],
         forest=figure(stored),
         caption=caption(stored),
-        belongs=list(stored.belongs.items()),
-        attributes=stored.tree.attrs,
-        cautions=[(c, "") for c in stored.cautions],
     )
-    return write_text(folder / "population.html", page)

@@ -19,14 +19,14 @@ from en4dvar.estimation.population.contrast import Centre, StraightLine, drawn_t
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.caution import untrusted
 from en4dvar.plumbing.errors import OutputError, retold
-from en4dvar.plumbing.files import make_folder, write_text
+from en4dvar.plumbing.files import make_folder
 from en4dvar.plumbing.hints import suggest
 from en4dvar.plumbing.tables import table, write_csv
 from en4dvar.plumbing.units import UnitError, convert, is_unit
 from en4dvar.priors.prior import PriorTerm
 from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, in_columns
 from en4dvar.report.compare import named
-from en4dvar.report.html import render
+from en4dvar.report.html import write_page
 from en4dvar.report.paper import on_paper
 from en4dvar.report.svg import draw
 from en4dvar.report.text import figure_text, number_like, plain_number, range_words, unit_behind, with_unit
@@ -370,7 +370,7 @@ def write_populations(c: PopulationsCompared, out: str | Path) -> Path:
     ((_, _, drawn),) = draw([("populations", CAPTION, figure(c))], folder=out)
     write_tables(c, out)
     about = {"title": " – ".join(c.populations), "populations": tuple(sentences(c))}
-    return write_text(out / "compare.html", render("compare.html.j2", figure=drawn, caption=CAPTION, **about))
+    return write_page(out / "compare.html", "compare.html.j2", figure=drawn, caption=CAPTION, **about)
 
 
 def write_tables(c: PopulationsCompared, folder: Path) -> None:

@@ -74,11 +74,6 @@ def _stored_walk(result: StoredResult, name: str) -> StoredWalk:
     return StoredWalk(name, label, pieces.attrs["symbol"], *units, shown(time, edges), after, quantiles("prior"))
 
 
-def piece_lines(result: StoredResult) -> list[tuple[object, ...]]:
-    """Lines of ``varying.csv``, the name of the data set first."""
-    return [(result.name, *cells) for walk in stored_walks(result) for cells in walk.cells]
-
-
 def verdict(result: StoredResult) -> str:
     """What the evidence says of all that varies, in a sentence; "" where nothing does."""
     stats = result.group("sample_stats").attrs
