@@ -28,23 +28,18 @@ def validate(source: Source, plot: bool) -> None:
     Example:
       en4dvar validate configs/quickstart.yaml --plot
     """
-    from en4dvar.config import SequenceConfig, TwinConfig
+    from en4dvar.config import Config, TwinConfig
     from en4dvar.runs.checks import validate as check
 
     loaded = check(source.path, source.overrides())
-    if isinstance(loaded, TwinConfig):
-        from en4dvar.runs.cycles import TwinKind
+    if not isinstance(loaded, Config):
+        from en4dvar.runs.cycles import cycles_of
 
         if plot:
-            raise click.UsageError("a twin experiment has no data to plot the prior over")
-        echo(str(TwinKind(loaded)))
-        return
-    if isinstance(loaded, SequenceConfig):
-        from en4dvar.runs.cycles import SequenceKind
-
-        if plot:
-            raise click.UsageError("--plot is for estimations; the report of a sequence shows its forecasts")
-        echo(str(SequenceKind(loaded)))
+            of_sequence = "--plot is for estimations; the report of a sequence shows its forecasts"
+            of_twin = "a twin experiment has no data to plot the prior over"
+            raise click.UsageError(of_twin if isinstance(loaded, TwinConfig) else of_sequence)
+        echo(str(cycles_of(loaded)))
         return
     from en4dvar.assembly.build import build
     from en4dvar.commands.describe import cost_summary, problem_summary

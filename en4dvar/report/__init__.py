@@ -51,10 +51,8 @@ def write_pages(run_dir: str | Path, datasets: Sequence[str] = (), workers: int 
     and PNG, in a campaign of ``datasets`` or, where none is named, of all that have a page. Pages of a campaign are
     drawn by up to ``workers`` processes, each with its share of :data:`SHARE` or more.
 
-    Raises
-    ------
-    OutputError: there is nothing to read, a name is unknown, or the directory cannot be written. LackingError: results
-        of data sets cannot be read; the page of the others, ``rest``, names them.
+    Raises :class:`OutputError`: there is nothing to read, a name is unknown, or the directory cannot be written.
+    :class:`LackingError`: results of data sets cannot be read; the page of the others, ``rest``, names them.
     """
     run_dir = Path(run_dir)
     if not run_dir.is_dir():

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.stats import binom
@@ -16,9 +17,8 @@ from en4dvar.report.export import Kind, Notes, column_name, escaped, latex_unit,
 from en4dvar.report.html import write_page
 from en4dvar.report.page import provenance_rows
 from en4dvar.report.svg import Captioned, draw
-from en4dvar.report.text import plain_number, with_unit
-from en4dvar.results.netcdf import Group, understood
-from en4dvar.results.series_file import read_series
+from en4dvar.report.text import with_unit
+from en4dvar.results.netcdf import Group, read_groups, understood
 
 Table = tuple[str, Sequence[str], Sequence[Sequence[str]], str]  # heading, columns, rows, words below it
 KINDS = ("forecast", "analysis", "smoothed")  # of estimates in time
@@ -31,35 +31,17 @@ RANKS = (
 
 
 def write_cycles_page(
-    run_dir: Path, data: Group, figures: Iterable[Captioned], files: bool, *, cycle: str, iterations: float,
-    facts: Sequence[tuple[str, str, str]], tables: Sequence[Table], **about: str,
-) -> Path:  # fmt: skip
+    run_dir: Path, data: Group, figures: Iterable[Captioned], files: bool, **about: str | float | Sequence[Any]
+) -> Path:
     """Write ``report.html``, with ``files`` also figures as PDF and PNG; returns the path of the page.
 
-    ``facts``: (quantity, value, in words) for the tiles on top, beside those of scheme, members and forward runs;
-    ``iterations``: forecasts of the window a ``cycle``, on average; ``about``: the ``kind`` of run and ``what`` it is.
+    ``about``: the ``kind`` of run and ``what`` it is, ``iterations``: forecasts of the window a ``cycle``, on average;
+    ``facts`` (quantity, value, in words) for the tiles on top, beside those of scheme, members and forward runs;
+    ``tables`` as of :data:`Table`.
     """
-    a = data.attrs
-    members, lost = int(a["members"]), int(a["members_lost"])
-    return write_page(
-        run_dir / "report.html",
-        "cycles.html.j2",
-        title=str(a["name"]),
-        attributes=a,
-        facts=[
-            ("Scheme", str(a["scheme"]), f"forecasts of the window {cycle}: {plain_number(iterations, 3)}"),
-            ("Members", f"{members - lost} of {members}", "did not fail up to the end of the run"),
-            *facts,
-            ("Forward runs", str(int(a["forward_runs"])), "of one member over a window"),
-        ],
-        tables=tables,
-        figures=draw(figures, folder=inside(run_dir, "figures") if files else None),
-        copies=files,
-        warnings=_lines(a.get("warnings", "")),
-        lost=_lines(a["members_lost_why"]),
-        provenance=provenance_rows(a),
-        **about,
-    )
+    drawn = draw(figures, folder=inside(run_dir, "figures") if files else None)
+    about |= {"attributes": data.attrs, "provenance": provenance_rows(data.attrs), "figures": drawn, "copies": files}
+    return write_page(run_dir / "report.html", "cycles.html.j2", **about)
 
 
 def span_of(time: Array) -> tuple[float, float] | None:
@@ -106,17 +88,13 @@ def last_analysis(data: Group) -> Iterator[tuple[str, float, float, str]]:
 def cycles_table(file: Path, kind: Kind) -> str:
     """A table of the result file of a sequence or a twin experiment as text, in display units.
 
-    Parameters
-    ----------
-    kind: ``csv``: a line for each time and variable of the state, mean and std of each estimate (and the truth of a
-        twin experiment); ``members``: a line for each member and time that is kept; ``latex``: rows of a table
-        (package booktabs), mean and std of the last analysis.
+    ``kind``: ``csv``: a line for each time and variable of the state, mean and std of each estimate (and the truth of a
+    twin experiment); ``members``: a line for each member and time that is kept; ``latex``: rows of a table (package
+    booktabs), mean and std of the last analysis.
 
-    Raises
-    ------
-    OutputError: there is no result, it is damaged, or it holds no members (a twin experiment).
+    Raises :class:`OutputError`: there is no result, it is damaged, or it holds no members (a twin experiment).
     """
-    data = read_series(file)
+    data = read_groups(file)["/"]
     if kind == "members" and "members" not in data:
         raise OutputError(
             f"{file}: a twin experiment keeps no members; --csv has mean and std of each variable in time"
@@ -157,7 +135,3 @@ def _last_analysis(data: Group) -> str:
     ]
     head = "% en4dvar export: mean and standard deviation of the last analysis; needs \\usepackage{booktabs}"
     return "\n".join([head, *tabular("llr", "variable & unit & analysis", lines, Notes())]) + "\n"
-
-
-def _lines(text: object) -> list[str]:
-    return [line for line in str(text).split("\n") if line]

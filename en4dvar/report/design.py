@@ -261,25 +261,22 @@ def readings_text(designs: Designs, row: DesignRow) -> str:
 
 def _cells(designs: Designs) -> list[list[Any]]:
     """The table as CSV, parameters in their display units."""
-    shown = [unit for _, unit in designs.asked.units]
-    stds = [
-        f"{name}_std" + ("" if u == "1" else f" [{u}]") for name, u in zip(designs.asked.parameters, shown, strict=True)
-    ]
-    head = [*designs.asked.knobs, "experiments", "readings", "price", "gain_nats", "gain_error", "method"]
-    head += [*([name for name, _ in DECISION.values()] if designs.asked.laws else []), *stds]
-    ratios = [f"{name}_std_ratio" for name in designs.asked.parameters]
-    cells = []
+    asked, rows = designs.asked, []
+    others = [*(name for name, *_ in asked.others), "all"]
+    needed = [f"{name}_needs_{other}_factor" for name in asked.wanted for other in others]
     for row in ranked(designs):
         result = row.evaluated
-        std = [float(convert(x, *unit)) for x, unit in zip(result.std.tolist(), designs.asked.units, strict=True)]
-        knobs = [row.settings.get(name, "") for name in designs.asked.knobs]
-        worth = [result.alike, len(result.readings), row.price, result.gain, result.error, result.method]
-        worth += [getattr(result.decision, field) for field in DECISION] if result.decision else []
-        factors = [] if result.needed is None else result.needed.ravel().tolist()
-        cells.append([*knobs, *worth, *std, *map(float, result.ratio), result.lost, result.beyond, *factors])
-    others = [*(name for name, *_ in designs.asked.others), "all"]
-    needed = [f"{name}_needs_{other}_factor" for name in designs.asked.wanted for other in others]
-    return [[*head, *ratios, "lost", "beyond_validity", *needed], *cells]
+        cells = {name: row.settings.get(name, "") for name in asked.knobs}
+        cells |= {"experiments": result.alike, "readings": len(result.readings), "price": row.price}
+        cells |= {"gain_nats": result.gain, "gain_error": result.error, "method": result.method}
+        cells |= {name: getattr(result.decision, field) for field, (name, _) in DECISION.items() if result.decision}
+        for name, (unit, shown), std in zip(asked.parameters, asked.units, result.std.tolist(), strict=True):
+            cells[f"{name}_std" + ("" if shown == "1" else f" [{shown}]")] = float(convert(std, unit, shown))
+        cells |= {f"{name}_std_ratio": float(x) for name, x in zip(asked.parameters, result.ratio, strict=True)}
+        cells |= {"lost": result.lost, "beyond_validity": result.beyond}
+        cells |= zip(needed, [] if result.needed is None else result.needed.ravel().tolist(), strict=True)
+        rows.append(cells)
+    return [[*rows[0]], *([*cells.values()] for cells in rows)]
 
 
 def _positions(values: Sequence[Any]) -> tuple[Array, list[str], str]:

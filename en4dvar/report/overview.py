@@ -158,12 +158,11 @@ def _parameter(name: str, sets: Sequence[SetSummary]) -> dict[str, Any]:
 
 def _tally(sets: Sequence[SetSummary]) -> list[dict[str, Any]]:
     """One line a code: in how many data sets, with the words of the first of them."""
-    count: Counter[tuple[str, str]] = Counter()
+    every = [(c, dataset.name) for dataset in sets for c in dataset.cautions]
+    count = Counter(key for dataset in sets for key in {(c.severity, c.code) for c in dataset.cautions})
     first: dict[tuple[str, str], tuple[Caution, str]] = {}
-    for dataset in sets:
-        count.update({(c.severity, c.code) for c in dataset.cautions})
-        for c in dataset.cautions:
-            first.setdefault((c.severity, c.code), (c, dataset.name))
+    for c, name in every:
+        first.setdefault((c.severity, c.code), (c, name))
     return [
         {"severity": c.severity, "code": c.code, "count": count[c.severity, c.code], "advice": c.advice,
          "example": f"e.g. {first[c.severity, c.code][1]}: {c.words}"}

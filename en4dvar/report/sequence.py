@@ -27,8 +27,8 @@ from en4dvar.report.compare import named, preferred
 from en4dvar.report.paper import on_paper
 from en4dvar.report.svg import Captioned
 from en4dvar.report.text import plain_number, pretty_unit, shown, with_unit
-from en4dvar.results.netcdf import Group
-from en4dvar.results.series_file import estimates, read_series, series_file, series_group
+from en4dvar.results.netcdf import Group, read_groups
+from en4dvar.results.series_file import estimates, series_file, series_group
 from en4dvar.series.problem import SeriesResult
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ def write_sequence_report(run_dir: Path, files: bool = False) -> Path:
     Raises :class:`~en4dvar.plumbing.errors.OutputError` where there is nothing to read or the directory cannot
     be written.
     """
-    data = read_series(run_dir / "sequence.nc")
+    data = read_groups(run_dir / "sequence.nc")["/"]
     readings = int(np.isfinite(data["observations"].values).sum())
     words = (
         "Of a filter or smoother that is right, normalised innovations have a root mean square of 1, and 95 % of the "
@@ -190,9 +190,7 @@ class SequenceScore:
 def compare_sequences(run_dirs: Sequence[Path]) -> tuple[SequenceScore, ...]:
     """Score sequences, in the order given.
 
-    Raises
-    ------
-    OutputError: fewer than two, one of them no sequence, without an evidence, or of other readings.
+    Raises :class:`OutputError`: fewer than two, one of them no sequence, without an evidence, or of other readings.
     """
     runs = {name: _sequence(run_dir) for name, run_dir in named(run_dirs).items()}
     (first, reference), *others = runs.items()
@@ -225,7 +223,7 @@ def _sequence(run_dir: Path) -> Group:
         raise OutputError(f"{run_dir}: no sequence; sequences are compared with sequences of the same readings")
     if file.stem == "twin":
         raise OutputError(f"{run_dir}: a twin experiment has no evidence; RMSE and spread are in its summary.csv")
-    data = read_series(file)
+    data = read_groups(file)["/"]
     if "log_evidence" not in data.attrs:
         raise OutputError(f"{run_dir}: written by an earlier version, without an evidence; run it again")
     if why := str(data.attrs["without_evidence"]):

@@ -16,8 +16,8 @@ from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, Row, stacked
 from en4dvar.report.paper import on_paper
 from en4dvar.report.svg import Captioned
 from en4dvar.report.text import plain_number, pretty_unit, with_unit
-from en4dvar.results.netcdf import Group
-from en4dvar.results.series_file import MEAN, read_series, series_group
+from en4dvar.results.netcdf import Group, read_groups
+from en4dvar.results.series_file import MEAN, series_group
 from en4dvar.series.twin import TwinResult
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def write_twin_report(run_dir: Path, files: bool = False) -> Path:
     Raises :class:`~en4dvar.plumbing.errors.OutputError` where there is nothing to read or the directory cannot
     be written.
     """
-    data = read_series(run_dir / "twin.nc")
+    data = read_groups(run_dir / "twin.nc")["/"]
     burn_in = int(data.attrs["burn_in"])
     columns = ["estimate", with_unit("RMSE", _unit(data)), with_unit("spread", _unit(data)), "spread / RMSE"]
     words = "Averages over the cycles after the burn-in. The spread of a reliable ensemble is about its RMSE."

@@ -84,14 +84,10 @@ def save_campaign(
 ) -> Path:
     """Write the campaign's file; one that is there already, of the same results, is left as it is.
 
-    Parameters
-    ----------
-    sources: name of the data set → its name in the ``pack``, in order; not empty.
-    attributes: of the root. failures: name of the data set without a posterior → reason.
+    ``sources``: name of the data set → its name in the ``pack``, in order; not empty. ``attributes``: of the root.
+    ``failures``: name of the data set without a posterior → reason.
 
-    Raises
-    ------
-    DamagedError: results cannot be read. OutputError: the file cannot be written.
+    Raises :class:`DamagedError`: results cannot be read. :class:`OutputError`: the file cannot be written.
     """
     digests = [pack.entries[stem].content_digest for stem in sources.values()]
     made_of = digest(json.dumps([digests, [*sources], failures]).encode())
@@ -111,7 +107,7 @@ def save_campaign(
 
 def _holds(path: Path, made_of: str) -> bool:
     try:
-        return path.exists() and _root_attribute(path, MADE_OF) == made_of
+        return path.exists() and _said(path).get(MADE_OF) == made_of
     except OutputError:  # damaged: it is written anew
         return False
 
@@ -149,32 +145,27 @@ def failed_datasets(path: Path) -> dict[str, str]:
     """Name of the data set without a posterior → reason, from a campaign's file; empty where there is no such file."""
     if not path.is_file():
         return {}
-    return {str(k): str(v) for k, v in json.loads(_root_attribute(path, FAILURES) or "{}").items()}
+    return {str(k): str(v) for k, v in json.loads(_said(path).get(FAILURES) or "{}").items()}
 
 
 def datasets_in(path: Path) -> list[str]:
     """The data sets in a campaign's file, in order; none where there is no such file, or it cannot be read."""
     try:
-        return read_sealed(datasets_of, path) if path.is_file() else []
+        return _said(path)["dataset"] if path.is_file() else []
     except OutputError:
         return []
 
 
-def datasets_of(path: Path) -> Iterator[str]:
-    """Their names, as they are read."""
+def _said(path: Path) -> Any:
+    """Attributes of the root, and the names of the data sets. Raises :class:`OutputError`."""
+    return dict(read_sealed(said_in, path))
+
+
+def said_in(path: Path) -> Iterator[tuple[str, Any]]:
+    """As they are read."""
     with opened_netcdf(path) as file:
-        yield from map(str, file["posterior"]["dataset"][...].tolist())
-
-
-def _root_attribute(path: Path, name: str) -> str:
-    """ "" where the file has none. Raises :class:`OutputError`."""
-    return str(*read_sealed(attribute_of, path, name))
-
-
-def attribute_of(path: Path, name: str) -> Iterator[str]:
-    """An attribute of the root."""
-    with opened_netcdf(path) as file:
-        yield str(getattr(file, name, ""))
+        yield from ((name, str(getattr(file, name))) for name in file.ncattrs())
+        yield "dataset", list(map(str, file["posterior"]["dataset"][...].tolist()))
 
 
 def _define(target: netCDF4.Dataset, layout: _Layout, n_datasets: int) -> None:

@@ -15,6 +15,7 @@ annotations of the dataclass. Nothing that is read is executed (no pickle).
 
 import functools
 import hashlib
+import itertools
 import json
 import math
 import struct
@@ -47,9 +48,7 @@ class CheckpointError(OutputError):
 def write_checkpoint(path: Path, fingerprint: str, content: object) -> None:
     """Write a dataclass; it appears complete or not at all, also after a loss of power.
 
-    Raises
-    ------
-    OutputError: the file cannot be written.
+    Raises :class:`OutputError`: the file cannot be written.
     """
     payload = encode(content)
     head = " ".join((FORMAT, VERSION, type(content).__name__, fingerprint, digest(payload)))
@@ -91,9 +90,8 @@ class Keeper:
 def read_checkpoint(path: Path, fingerprint: str, kind: type[D]) -> D | None:
     """The dataclass in ``path``, or None where there is no such file.
 
-    Raises
-    ------
-    CheckpointError: the file is not a checkpoint, incomplete, altered, or of another version, run or kind.
+    Raises :class:`CheckpointError`: the file is not a checkpoint, incomplete, altered, or of another version, run or
+    kind.
     """
     try:
         with open_plain(path) as file:
@@ -188,18 +186,15 @@ def _reader(kind: Any) -> _Reader:
         return lambda raw, numbers: None if raw is None and type(None) in arguments else other(raw, numbers)
     if origin in (np.ndarray, npt.NDArray):  # from NumPy 2.5 on NDArray is an alias with a name of its own
         return _array
-    if origin is tuple and arguments[1:] == (Ellipsis,):
-        item = _reader(arguments[0])
-        return lambda raw, numbers: tuple(item(part, numbers) for part in raw)
     if origin is tuple:
-        items = tuple(map(_reader, arguments))
-        return lambda raw, numbers: tuple(read(part, numbers) for read, part in zip(items, raw, strict=True))
-    if origin is typing.Literal:
-        return functools.partial(_choice, arguments)
+        several = arguments[1:] == (Ellipsis,)
+        items = itertools.repeat(_reader(arguments[0])) if several else tuple(map(_reader, arguments))
+        return lambda raw, numbers: tuple(read(part, numbers) for read, part in zip(items, raw, strict=not several))
     if is_dataclass(kind):
         hints = typing.get_type_hints(kind)
         return functools.partial(_dataclass, kind, {f.name: _reader(hints[f.name]) for f in fields(kind)})
-    return functools.partial(_simple, (int, float) if kind is float else (kind,))
+    allowed = arguments if origin is typing.Literal else (int, float) if kind is float else (kind,)
+    return functools.partial(_simple, allowed)
 
 
 def _array(raw: Any, numbers: bytearray) -> np.ndarray[Any, Any]:
@@ -217,13 +212,8 @@ def _dataclass(kind: Any, readers: dict[str, _Reader], raw: Any, numbers: bytear
     return kind(**{name: readers[name](item, numbers) for name, item in raw.items()})
 
 
-def _choice(choices: tuple[Any, ...], raw: Any, _: bytearray) -> Any:
-    if raw not in choices:
-        raise ValueError(f"{raw!r} is not one of {choices}")
-    return raw
-
-
-def _simple(kinds: tuple[type, ...], raw: Any, _: bytearray) -> Any:
-    if type(raw) not in kinds:
-        raise TypeError(f"{raw!r} is not a {kinds[-1].__name__}")
+def _simple(allowed: tuple[Any, ...], raw: Any, _: bytearray) -> Any:
+    """A value of one of the types, or one of the values, that are allowed."""
+    if type(raw) not in allowed and raw not in allowed:
+        raise TypeError(f"{raw!r} is none of {allowed}")
     return raw

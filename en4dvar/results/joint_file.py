@@ -67,17 +67,17 @@ def shared_name(key: tuple[str, str]) -> str:
     return f"{name}_{plain}" if plain else name
 
 
-def _about(p: Parameter) -> dict[str, Any]:
-    return {"symbol": p.symbol, "display_units": p.display_unit}
+def of_parameter(p: Parameter, dims: str | tuple[str, ...], values: Any, words: str = "", **more: Any) -> Variable:
+    """A variable of a parameter, with how it is shown; ``words``: its meaning, by default the parameter's label."""
+    return variable(dims, values, p.unit, words or p.label, symbol=p.symbol, display_units=p.display_unit, **more)
 
 
 def _shared(estimate: JointEstimate) -> dict[str, Variable]:
     variables = {}
     for j, (key, term) in enumerate(zip(estimate.joint.shared, estimate.joint.terms, strict=True)):
-        p, mode = term.parameter, float(estimate.shared_mode[j])
-        label = f"{p.label}, {key[1]}" if key[1] else p.label
-        members = estimate.shared[None, :, j]
-        variables[shared_name(key)] = variable(DRAWS, members, p.unit, label, mode=mode, **_about(p))
+        label = ", ".join(filter(None, (term.parameter.label, key[1])))
+        members, mode = estimate.shared[None, :, j], float(estimate.shared_mode[j])
+        variables[shared_name(key)] = of_parameter(term.parameter, DRAWS, members, label, mode=mode)
     return variables
 
 
@@ -107,9 +107,7 @@ def _own(estimate: JointEstimate, names: Sequence[str]) -> dict[str, Variable]:
             parameters[p.name] = p
     taken = {shared_name(key) for key in estimate.joint.shared}
     return {
-        f"{name}_own" if name in taken else name: variable(
-            (*DRAWS, "dataset"), array, parameters[name].unit, parameters[name].label, **_about(parameters[name])
-        )
+        f"{name}_own" if name in taken else name: of_parameter(parameters[name], (*DRAWS, "dataset"), array)
         for name, array in values.items()
     }
 

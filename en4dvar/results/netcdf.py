@@ -173,10 +173,8 @@ def _write(variable: Any, values: np.ndarray[Any, Any]) -> None:
 def read_groups(path: Path) -> dict[str, Group]:
     """The groups of a sealed file by their paths, in memory; the file can be replaced while they are in use.
 
-    Raises
-    ------
-    OutputError: it is none of ours, cut short or altered (see :mod:`en4dvar.results.seal`), or its variables do not
-        agree with each other.
+    Raises :class:`OutputError`: it is none of ours, cut short or altered (see :mod:`en4dvar.results.seal`), or its
+    variables do not agree with each other.
     """
     return dict(read_sealed(groups_in, path))
 

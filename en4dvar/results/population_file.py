@@ -12,13 +12,13 @@ import numpy as np
 
 from en4dvar.diagnosis.diagnostics import member_quantiles
 from en4dvar.estimation.population.campaign import Combination, Draws, Population
-from en4dvar.model.state import Array, Parameter
+from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, worst_first
 from en4dvar.plumbing.hints import natural
 from en4dvar.priors.prior import PriorTerm
 from en4dvar.results.checkpoint import digest
 from en4dvar.results.declared import parameter_of, text
-from en4dvar.results.joint_file import DRAWS, QUANTILES, StoredGroups, load_groups
+from en4dvar.results.joint_file import DRAWS, QUANTILES, StoredGroups, load_groups, of_parameter
 from en4dvar.results.netcdf import Group, Variable, to_bytes, understood, variable
 
 FILE = "population.nc"
@@ -80,10 +80,6 @@ def combination_line(combination: Combination) -> str:
     return " ".join([f"{combination.std:.17g}", *(f"{name} {exponent:.17g}" for name, exponent in combination.parts)])
 
 
-def _about(p: Parameter) -> dict[str, Any]:
-    return {"symbol": p.symbol, "display_units": p.display_unit, "label": p.label}
-
-
 def _draws(population: Population, draws: Draws) -> dict[str, Variable]:
     of_centre, of_spread = population.learned
     learned = {"median": of_centre, "mean": of_centre, "between": of_spread}
@@ -91,13 +87,13 @@ def _draws(population: Population, draws: Draws) -> dict[str, Variable]:
     for j, term in enumerate(population.terms):
         p = term.parameter
         for what, words in WORDS.items():
-            values = getattr(draws, what)[None, :, j]
-            more: dict[str, Any] = {"transform": term.transform}
+            more: dict[str, Any] = {"label": p.label, "transform": term.transform}
             if what in learned:
                 more["learned"] = float(learned[what][j])
             if what == HEADLINE and draws is population.posterior:
                 more["std_between"], more["std_common"] = (float(part[j]) for part in population.parts)
-            result[f"{p.name}_{what}"] = variable(DRAWS, values, p.unit, f"{p.label}: {words}", **_about(p), **more)
+            values, words = getattr(draws, what)[None, :, j], f"{p.label}: {words}"
+            result[f"{p.name}_{what}"] = of_parameter(p, DRAWS, values, words, **more)
     return result
 
 
@@ -118,9 +114,9 @@ def _empirical(population: Population) -> dict[str, Variable]:
     result = {}
     for term, median in zip(population.terms, population.empirical, strict=True):
         p = term.parameter
-        parts: dict[str, Any] = {"std_between": median.between, "std_common": median.common}
         words = f"{p.label}: 5, 50 and 95 % of the median of the data sets one by one"
-        result[p.name] = variable("quantile", median.quantiles, p.unit, words, **_about(p), **parts)
+        parts = {"label": p.label, "std_between": median.between, "std_common": median.common}
+        result[p.name] = of_parameter(p, "quantile", median.quantiles, words, **parts)
     return result
 
 
@@ -128,7 +124,7 @@ def _sets(population: Population) -> dict[str, Variable]:
     """(chain, draw, dataset) of every parameter, given all data."""
     terms: tuple[PriorTerm, ...] = population.problems[0].constant.prior.terms
     return {
-        p.name: variable((*DRAWS, "dataset"), population.sets[None, :, :, j], p.unit, p.label, **_about(p))
+        p.name: of_parameter(p, (*DRAWS, "dataset"), population.sets[None, :, :, j], label=p.label)
         for j, p in enumerate(term.parameter for term in terms)
     }
 

@@ -16,11 +16,8 @@ PACKAGES = ("en4dvar", "numpy", "scipy", "numba", "xarray", "netCDF4", "pydantic
 def provenance(config_text: str, config_path: str | Path | None = None, command: str = "") -> dict[str, str]:
     """ACDD and provenance attributes for :meth:`en4dvar.report.result.Result.from_analysis`.
 
-    Parameters
-    ----------
-    config_text: the configuration, verbatim.
-    config_path: the file it was read from; the commit of the repository that tracks it is recorded.
-    command: what the user typed, for ``history``.
+    ``config_text``: the configuration, verbatim. ``config_path``: the file it was read from; the commit of the
+    repository that tracks it is recorded. ``command``: what the user typed, for ``history``.
 
     Nothing here fails: what cannot be found out (no git, an installed package) is left as an empty string.
     """

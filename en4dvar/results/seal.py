@@ -62,9 +62,8 @@ def seal_file(path: Path) -> None:
 def check_seal(path: Path) -> bool:
     """Read the whole file once and compare; returns whether this process has written it.
 
-    Raises
-    ------
-    OutputError: the file cannot be read, is not one of ours, is of another version, cut short or altered.
+    Raises :class:`OutputError`: the file cannot be read, is not one of ours, is of another version, cut short or
+    altered.
     """
     try:
         with open_plain(path) as file:

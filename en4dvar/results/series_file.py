@@ -10,7 +10,7 @@ from en4dvar.model.forward import ForwardModel, Observable, StateField
 from en4dvar.model.state import Array
 from en4dvar.plumbing.tables import csv_text
 from en4dvar.results.declared import Attribute, Declared, Item, Table, UnitRule, When, attributes_of, lay_out, text
-from en4dvar.results.netcdf import Group, netcdf_attributes, read_groups
+from en4dvar.results.netcdf import Group, netcdf_attributes
 from en4dvar.series.moments import SequentialResult
 from en4dvar.series.problem import SeriesProblem, SeriesResult, normalised_innovations
 from en4dvar.series.twin import TwinResult
@@ -23,11 +23,6 @@ STATE, OBSERVATION = "time state", "time observation"
 def series_file(run_dir: Path) -> Path | None:
     """The result of a twin experiment or a sequence in a run directory; None where there is none."""
     return next((run_dir / name for name in FILES if (run_dir / name).is_file()), None)
-
-
-def read_series(path: Path) -> Group:
-    """A result file, in memory. Raises :class:`OutputError` where there is nothing to read."""
-    return read_groups(path)["/"]
 
 
 def series_group(result: SeriesResult | TwinResult, attributes: Mapping[str, Any]) -> Group:

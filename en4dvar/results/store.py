@@ -199,9 +199,8 @@ def require_settled(run_dir: Path) -> None:
 def load_stored(path: str | Path) -> StoredResult:
     """Read ``posterior.nc`` into memory and close it, or what is at an address in a pack.
 
-    Raises
-    ------
-    OutputError: it is no result, of another version, cut short or altered (see :mod:`en4dvar.results.seal`).
+    Raises :class:`OutputError`: it is no result, of another version, cut short or altered (see
+    :mod:`en4dvar.results.seal`).
     """
     path = Path(path)
     with retold(ValueError, OutputError, f"{path}: not a result of en4dvar: "):  # anybody can write a checksum

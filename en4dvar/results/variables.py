@@ -5,7 +5,7 @@ dimension of its own, ``<name>_time``, and ``<name>_weights``. Every value is SI
 order. Whatever a report needs is stored, so that nothing downstream computes it again.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from types import SimpleNamespace
 from typing import Any
 
@@ -45,9 +45,9 @@ WITHOUT = "change of the posterior mean if the reading is left out"
 # What the placeholders of names stand for, units and conditions
 
 
-def _each_parameter(a: Analysis) -> Iterator[Item]:
-    for column, p in enumerate(a.parameters):
-        yield Item(column, {"parameter": p.name}, p.label, {**shown_as(p), "source": p.source})
+def _item(placeholder: str, held: Any, of: Any, **more: Any) -> Item:
+    """Of something that has a name, a label and a unit."""
+    return Item(held, {placeholder: of.name}, of.label, {**shown_as(of), **more})
 
 
 def _series(a: Analysis) -> Iterator[Item]:
@@ -55,11 +55,6 @@ def _series(a: Analysis) -> Iterator[Item]:
     for axis, part in zip(axes_of([part.name for part in parts]), parts, strict=True):
         o, names = part.observable, {"series": part.name, "shared": axis.own(""), "time": axis.time}
         yield Item(part, names, o.label, shown_as(o))
-
-
-def _walks(a: Analysis) -> Iterator[Item]:
-    for walk in a.problem.walks:
-        yield Item(walk, {"walk": walk.name}, walk.label, shown_as(walk.parameter))
 
 
 def _matrices(a: Analysis) -> Iterator[Item]:
@@ -80,27 +75,19 @@ def _fixed(a: Analysis) -> Iterator[Item]:
         yield Item(value, {"fixed": name}, p.label if p else "fixed value", about)
 
 
-def _limits(a: Analysis) -> Iterator[Item]:
-    for column, v in enumerate(a.problem.model.validity):
-        about = {"units": v.unit, "limit": v.value, "source": v.source}
-        yield Item(column, {"limit": v.name}, v.label, about)
-
-
-def _quantities(a: Analysis) -> Iterator[Item]:
-    for row, q in enumerate(a.ledger.quantities if a.ledger else ()):
-        yield Item(row, {"quantity": q.name}, q.label, shown_as(q))
-
-
-def _fields(a: Analysis) -> Iterator[Item]:
-    for estimate in a.fields:
-        f = estimate.prior.field
-        yield Item(estimate, {"field": f.name}, f.label, shown_as(f))
-
-
-SCOPES: dict[str, Callable[[Any], Iterator[Item]]] = {
-    "parameter": _each_parameter, "series": _series, "shared": _series, "time": _series, "walk": _walks,
-    "matrix": _matrices, "fixed": _fixed, "limit": _limits, "quantity": _quantities, "field": _fields,
-}  # fmt: skip
+SCOPES: dict[str, Callable[[Any], Iterable[Item]]] = {
+    **dict.fromkeys(("series", "shared", "time"), _series),
+    "parameter": lambda a: (_item("parameter", k, p, source=p.source) for k, p in enumerate(a.parameters)),
+    "walk": lambda a: (Item(w, {"walk": w.name}, w.label, shown_as(w.parameter)) for w in a.problem.walks),
+    "matrix": _matrices,
+    "fixed": _fixed,
+    "limit": lambda a: (
+        Item(k, {"limit": v.name}, v.label, {"units": v.unit, "limit": v.value, "source": v.source})
+        for k, v in enumerate(a.problem.model.validity)
+    ),
+    "quantity": lambda a: (_item("quantity", k, q) for k, q in enumerate(a.ledger.quantities if a.ledger else ())),
+    "field": lambda a: (_item("field", estimate, estimate.prior.field) for estimate in a.fields),
+}
 
 
 def _clock(**more: str) -> UnitRule:

@@ -8,7 +8,7 @@ tell most of it, so that its rank among that of other readings, one set drawn at
 errors are as large as stated, that of the truth has their distribution, whatever the posterior.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -30,13 +30,12 @@ from en4dvar.inputs.asked import DataFile
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError, DataError, En4dvarError
 from en4dvar.plumbing.units import convert
-from en4dvar.plumbing.user_code import reason_of
 from en4dvar.priors.prior import member_stream, own_seed
 from en4dvar.problem import InverseProblem
 from en4dvar.report.calibration import Calibration, load_calibration
 from en4dvar.results.calibration_file import ERRORS, FIT, LEVELS, Judged, write_sets
-from en4dvar.results.checkpoint import FOLDER, Keeper, digest
-from en4dvar.runs.engine import RunKind, Session, conduct_run
+from en4dvar.results.checkpoint import FOLDER, digest
+from en4dvar.runs.engine import KeptUnits, RunKind, Session, Tell, conduct_run
 
 STATE = f"{FOLDER}/calibration"
 ATTEMPTS = 100  # truths that the model cannot run are drawn again so often
@@ -52,7 +51,7 @@ def calibrate(
     out: str | Path | None = None,
     force: bool = False,
     resume: bool = False,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Tell | None = None,
     command: str = "",
 ) -> Calibration:
     """Estimate synthetic data sets made by a configuration itself, and say whether its intervals are right.
@@ -102,7 +101,7 @@ class CalibrationKind(RunKind[Calibration]):
     config: Config
     made: Config
     sets: int
-    progress: Callable[[int, int], None] | None = None
+    progress: Tell | None = None
     changed: str = ""
 
     @property
@@ -123,27 +122,20 @@ class CalibrationKind(RunKind[Calibration]):
 
     def conduct(self, run: Session, executor: Executor) -> Calibration:
         fingerprint = digest(run.identity.settings.encode() + repr(run.identity.data).encode())
-        done = [*(run.restore(STATE, fingerprint, tuple[Judged, ...], "all sets are estimated again") or ())]
-        keeper = Keeper(run.directory.at(STATE), fingerprint, self.config.execution.checkpoint_every)
-        known = {judged.number for judged in done}
-        left = [i for i in range(1, self.sets + 1) if i not in known]
+        kept = KeptUnits(run, STATE, fingerprint, Judged, "all sets are estimated again")
+        known = {judged.number for judged in kept.done}
         common = CommonValue((self.config, self.made, list(self.data.items())))
-        for i, judged in executor.map(_judged, ((common, number) for number in left)):
-            if isinstance(judged, Exception):
-                judged = Judged(left[i], "", failure=reason_of(judged))
-            done.append(judged)
-            run.log.write(f"set {judged.number}: {judged.failure or 'estimated'}")
-            keeper.keep(lambda: tuple(done))
-            if self.progress:
-                self.progress(len(done), self.sets)
-        keeper.write(tuple(done))
-        told = sorted((judged for judged in done if judged.number <= self.sets), key=lambda judged: judged.number)
+        calls = [(common, number) for number in range(1, self.sets + 1) if number not in known]
+        kept.work(
+            executor, _judged, calls, self.progress, self.sets,
+            failed=lambda _, number, reason: Judged(number, "", failure=reason),
+            line=lambda judged: f"set {judged.number}: {judged.failure or 'estimated'}",
+        )  # fmt: skip
+        told = sorted((judged for judged in kept.done if judged.number <= self.sets), key=lambda judged: judged.number)
         name, file = next(iter(self.data.items()))
         estimated = build_one(self.config, name, file).prior.parameters
         quantities = [*((p.name, p.display_unit or p.unit) for p in estimated), (FIT, "1"), (ERRORS, "1")]
         write_sets(run.directory.at(self.result), quantities, told)
-        if self.config.report:
-            self.page(run.directory.work)
         return replace(load_calibration(run.directory.work), directory=self.directory)
 
 

@@ -106,10 +106,8 @@ class Campaign:
 class Outcomes(Sequence[DatasetOutcome]):
     """Each is read when it is asked for, which raises :class:`OutputError` where it was altered.
 
-    Parameters
-    ----------
-    folder: of the run. record: the pack in it; entries: what that holds. files: name of the data set in the pack →
-        where its posterior is in the folder.
+    ``folder``: of the run. ``record``: the pack in it; ``entries``: what that holds. ``files``: name of the data set in
+    the pack → where its posterior is in the folder.
     """
 
     def __init__(self, folder: Path, record: str, entries: Mapping[str, Entry], files: Mapping[str, str]):

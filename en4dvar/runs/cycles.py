@@ -21,7 +21,7 @@ from en4dvar.inputs.asked import DataFile
 from en4dvar.plumbing.files import write_text
 from en4dvar.report.sequence import SequenceOutcome
 from en4dvar.report.twin import TwinOutcome
-from en4dvar.results.checkpoint import FOLDER, Keeper, digest
+from en4dvar.results.checkpoint import FOLDER, digest
 from en4dvar.results.netcdf import Group, to_bytes
 from en4dvar.results.series_file import sequence_csv, series_group, twin_csv
 from en4dvar.runs.engine import FIGURES, REPORT, RunKind, Session, conduct_run
@@ -116,10 +116,9 @@ class Cycles(RunKind[R]):
     def conduct(self, run: Session, executor: Executor) -> R:
         file = f"{FOLDER}/{self.name}.cycle"
         fingerprint = digest("\n".join([run.identity.settings, *map(str, run.identity.data)]).encode())
-        before = run.restore(file, fingerprint, SequentialState, "it is assimilated from the start")
+        before, keeper = run.kept(file, fingerprint, SequentialState, "it is assimilated from the start")
         if before is not None:
             run.log.write(f"continued after {before.cycle} of {self.cycles} cycles")
-        keeper = Keeper(run.directory.at(file), fingerprint, self.config.execution.checkpoint_every)
         latest: list[Callable[[], SequentialState]] = []
 
         def keep(state: Callable[[], SequentialState]) -> None:
@@ -133,8 +132,6 @@ class Cycles(RunKind[R]):
         own = {"identity": run.identity.settings, "name": self.config.name, "scheme": self.config.scheme}
         to_bytes({"/": series_group(result, {**run.attributes, **own})}).write(run.directory.at(self.result))
         write_text(run.directory.at("summary.csv"), self.summary(result))
-        if self.config.report:
-            self.page(run.directory.work, figures=self.config.figures)
         return result
 
 
@@ -196,6 +193,11 @@ class SequenceKind(Cycles[SeriesResult]):
         span = f"from {times[0]:g} to {times[-1]:g}{_unit(self.model.time_unit)}"
         told = f"{np.isfinite(problem.series.values).sum()} readings of {observed} at {len(times)} times {span}"
         return f"sequence of {problem.name}", problem.start.prior, problem.members, told
+
+
+def cycles_of(config: TwinConfig | SequenceConfig) -> Cycles[Any]:
+    """The run that a configuration is of."""
+    return TwinKind(config) if isinstance(config, TwinConfig) else SequenceKind(config)
 
 
 def _unit(unit: str) -> str:

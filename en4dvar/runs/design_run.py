@@ -1,6 +1,6 @@
 """The kind of run that plans experiments: every design of a file evaluated, kept as it ends, and reported."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -26,11 +26,10 @@ from en4dvar.inputs.asked import DataFile
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError, En4dvarError, retold
 from en4dvar.plumbing.units import UnitError
-from en4dvar.plumbing.user_code import reason_of
 from en4dvar.problem import InverseProblem
-from en4dvar.results.checkpoint import FOLDER, Keeper, digest
+from en4dvar.results.checkpoint import FOLDER, digest
 from en4dvar.results.design_file import FILE, Asked, DesignRow, Designs, load_designs, save_designs
-from en4dvar.runs.engine import RunKind, Session, conduct_run
+from en4dvar.runs.engine import KeptUnits, RunKind, Session, Tell, conduct_run
 
 STATE = f"{FOLDER}/designs"
 CHECKED = 3  # best designs whose linearised information is checked
@@ -74,7 +73,7 @@ def run_design(
     out: Path | None = None,
     force: bool = False,
     resume: bool = False,
-    on_design: Callable[[int, int], None] | None = None,
+    on_design: Tell | None = None,
     command: str = "",
 ) -> tuple[Designs, Path]:
     """Evaluate the designs of a configuration. Returns what was found and the directory it lies in.
@@ -82,9 +81,8 @@ def run_design(
     ``after``: a finished run (or a file of members), whose posterior is the prior of what is asked: what is next?
     ``on_design`` is called with how many designs are done, and of how many.
 
-    Raises
-    ------
-    ConfigError, DataError: the file cannot be used, or none of its designs. OutputError: the directory cannot.
+    Raises :class:`ConfigError`, :class:`DataError`: the file cannot be used, or none of its designs.
+    :class:`OutputError`: the directory cannot.
     """
     document, base = document_from(source)
     document = override(document, overrides or {})
@@ -109,7 +107,7 @@ class DesignKind(RunKind[Designs]):
 
     config: Config
     every: Sequence[Candidate]
-    tell: Callable[[int, int], None] | None = None
+    tell: Tell | None = None
 
     @cached_property
     def data(self) -> Mapping[str, DataFile]:
@@ -144,13 +142,51 @@ class DesignKind(RunKind[Designs]):
         _ = self.asked
 
     def conduct(self, run: Session, executor: Executor) -> Designs:
-        work = _Work(self, run)
-        work.everything(executor)
+        fingerprint = digest(run.identity.settings.encode())
+        kept = KeptUnits(run, STATE, fingerprint, Done, "all designs are evaluated again")
+        self._evaluate_all(kept, executor)
         file = run.directory.at(self.result)
-        save_designs(file, work.rows(), self.asked, {**run.attributes, "name": self.config.name})
-        if self.config.report:
-            self.page(run.directory.work)
+        save_designs(file, [*self._rows(kept.done)], self.asked, {**run.attributes, "name": self.config.name})
         return load_designs(file)
+
+    def _evaluate_all(self, kept: KeptUnits[Done], executor: Executor) -> None:
+        """By the method asked for; ``auto`` checks the linearised information and replaces it if it is off."""
+        every, method = range(len(self.every)), self.config.design.method
+        if method != "auto" or self.config.design.laws:  # what designs tell of the law, by which they rank, is exact
+            self._evaluate(kept, executor, every, "laplace" if method == "auto" else method)
+            return
+        self._evaluate(kept, executor, every, "laplace")
+        gains = {d.number: d.results[0].gain for d in _latest(kept.done) if d.results}
+        best = sorted(gains, key=lambda number: -gains[number])[:CHECKED]
+        checked = [number for number in dict.fromkeys([0, *best]) if number in gains]
+        self._evaluate(kept, executor, checked, "nested")
+        exact = {d.number: d.results[0] for d in _latest(kept.done) if d.method == "nested" and d.results}
+        if any(abs(exact[n].gain - gains[n]) > AGREE + 2 * exact[n].error for n in checked if n in exact):
+            self._evaluate(kept, executor, list(gains), "nested")
+
+    def _evaluate(self, kept: KeptUnits[Done], executor: Executor, numbers: Sequence[int], method: Method) -> None:
+        done = {d.number for d in kept.done if d.method == method}
+        calls = [(n, self.every[n], method, self.config.seed) for n in numbers if n not in done]
+        kept.work(
+            executor, _one, calls, self.tell, len(numbers), line=_line,
+            failed=lambda number, *_, reason: Done(number, method, (), reason),
+        )  # fmt: skip
+        if not any(d.results for d in kept.done):
+            raise ConfigError(f"none of the designs can be evaluated: {kept.done[0].failure}")
+
+    def _rows(self, done: Sequence[Done]) -> Iterator[DesignRow]:
+        """Every candidate, or number of experiments alike, in the order of the file."""
+        for d in sorted(_latest(done), key=lambda d: d.number):
+            settings, price = dict(self.every[d.number].settings), self.every[d.number].config.design.price
+            for result in d.results:
+                yield DesignRow(d.number, settings, result, price.of(result.alike, len(result.readings)))
+            if d.failure:
+                yield DesignRow(d.number, settings, None, float("nan"), d.failure)
+
+
+def _latest(done: Sequence[Done]) -> list[Done]:
+    """Of each candidate what came last: nested after laplace."""
+    return list({d.number: d for d in done}.values())
 
 
 def _known(document: Document, base: Path, after: Path) -> dict[str, Any]:
@@ -172,66 +208,6 @@ def _wanted(config: Config, problem: InverseProblem) -> dict[str, tuple[float, b
             spread = parse_spread(text, terms[name].unit)
         wanted[name] = spread.value, spread.relative
     return wanted
-
-
-class _Work:
-    """The candidates, what is done of them, and how the rest is decided."""
-
-    def __init__(self, kind: DesignKind, run: Session):
-        self.config, self.every, self.run, self.tell = kind.config, kind.every, run, kind.tell
-        fingerprint = digest(run.identity.settings.encode())
-        again = "all designs are evaluated again"
-        self.done = [*(run.restore(STATE, fingerprint, tuple[Done, ...], again) or ())]  # in the order of their ends
-        self.keeper = Keeper(run.directory.at(STATE), fingerprint, self.config.execution.checkpoint_every)
-
-    def everything(self, executor: Executor) -> None:
-        """Evaluate by the method asked for; ``auto`` checks the linearised information and replaces it if it is off."""
-        method = self.config.design.method
-        if method == "auto" and self.config.design.laws:
-            method = "laplace"  # the designs are ranked by what they tell of the law, which is exact
-        if method != "auto":
-            self._evaluate(executor, range(len(self.every)), method)
-            return
-        self._evaluate(executor, range(len(self.every)), "laplace")
-        gains = {d.number: d.results[0].gain for d in self._latest() if d.results}
-        best = sorted(gains, key=lambda number: -gains[number])[:CHECKED]
-        checked = [number for number in dict.fromkeys([0, *best]) if number in gains]
-        self._evaluate(executor, checked, "nested")
-        exact = {d.number: d.results[0] for d in self._latest() if d.method == "nested" and d.results}
-        if any(abs(exact[n].gain - gains[n]) > AGREE + 2 * exact[n].error for n in checked if n in exact):
-            self._evaluate(executor, list(gains), "nested")
-
-    def rows(self) -> list[DesignRow]:
-        """Every candidate, or number of experiments alike, in the order of the file."""
-        rows = []
-        for done in sorted(self._latest(), key=lambda d: d.number):
-            candidate = self.every[done.number]
-            for result in done.results:
-                cost = candidate.config.design.price.of(result.alike, len(result.readings))
-                rows.append(DesignRow(done.number, dict(candidate.settings), result, cost))
-            if done.failure:
-                rows.append(DesignRow(done.number, dict(candidate.settings), None, float("nan"), done.failure))
-        return rows
-
-    def _latest(self) -> list[Done]:
-        """Of each candidate what came last: nested after laplace."""
-        return list({d.number: d for d in self.done}.values())
-
-    def _evaluate(self, executor: Executor, numbers: Sequence[int], method: Method) -> None:
-        done = {d.number for d in self.done if d.method == method}
-        left = [n for n in numbers if n not in done]
-        calls = ((n, self.every[n], method, self.config.seed) for n in left)
-        for i, ended in executor.map(_one, calls):
-            if isinstance(ended, Exception):
-                ended = Done(left[i], method, (), reason_of(ended))
-            self.done.append(ended)
-            self.run.log.write(_line(ended))
-            self.keeper.keep(lambda: tuple(self.done))
-            if self.tell:
-                self.tell(len(numbers) - len(left) + i + 1, len(numbers))
-        self.keeper.write(tuple(self.done))
-        if not any(d.results for d in self.done):
-            raise ConfigError(f"none of the designs can be evaluated: {self.done[0].failure}")
 
 
 def _one(number: int, candidate: Candidate, method: Method, seed: int) -> Done:
@@ -279,10 +255,8 @@ def planned_problem(config: Config) -> InverseProblem:
 
     Its readings are those of the model at the centre of the prior, of which errors may be a share.
 
-    Raises
-    ------
-    ConfigError: no times, or something that only readings can say. DataError: a data file that is needed cannot be
-        used. En4dvarError: the model fails at the centre of the prior.
+    Raises :class:`ConfigError`: no times, or something that only readings can say. :class:`DataError`: a data file that
+    is needed cannot be used. :class:`En4dvarError`: the model fails at the centre of the prior.
     """
     plan, times = inverse_plan(config), _planned_times(config)
     measured = None

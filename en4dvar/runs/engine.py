@@ -7,7 +7,7 @@ answers interrupts, puts the result in place and writes the page. :data:`KINDS` 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,7 +20,8 @@ from en4dvar.inputs.asked import DataFile
 from en4dvar.model.forward import ForwardModel
 from en4dvar.plumbing.errors import ConfigError, OutputError
 from en4dvar.plumbing.files import write_text
-from en4dvar.results.checkpoint import FOLDER, CheckpointError, read_checkpoint, write_checkpoint
+from en4dvar.plumbing.user_code import reason_of
+from en4dvar.results.checkpoint import FOLDER, CheckpointError, Keeper, read_checkpoint, write_checkpoint
 from en4dvar.results.fingerprint import IDENTITY, Identity, identity
 from en4dvar.results.netcdf import understood
 from en4dvar.results.provenance import provenance
@@ -30,6 +31,7 @@ from en4dvar.runs.rundir import LOG, OF_EVERY_RUN, Mode, RunDirectory
 
 R = TypeVar("R")
 S = TypeVar("S")
+Tell = Callable[[int, int], None]  # how many are done, and of how many
 REPORT = "report.html"
 FIGURES = ("figures/*.png", "figures/*.pdf")
 KINDS = {
@@ -64,10 +66,8 @@ class Kind:
     def page(cls, folder: Path, datasets: Sequence[str] = (), workers: int = 1, figures: bool = False) -> Path | None:
         """Write the page of a finished run from its result files; None for a kind that has none.
 
-        Parameters
-        ----------
-        folder: of the run. datasets: those that get a page of their own in any case. workers: processes that draw.
-        figures: also keep the figures as PDF and PNG.
+        ``folder``: of the run. ``datasets``: those that get a page of their own in any case. ``workers``: processes
+        that draw. ``figures``: also keep the figures as PDF and PNG.
 
         Raises :class:`OutputError`.
         """
@@ -128,7 +128,7 @@ class RunKind(Kind, ABC, Generic[R]):
 
     @abstractmethod
     def conduct(self, run: Session, executor: Executor) -> R:
-        """Compute every unit of work that is not kept, combine them, and write the result files.
+        """Compute every unit of work that is not kept, combine them, and write the result files; the page follows.
 
         Raises :class:`OutputError` and what the computation raises.
         """
@@ -202,10 +202,40 @@ class Session:
             self.notice(f"{error}; {otherwise}")
             return None
 
+    def kept(self, file: str, fingerprint: str, kind: type[S], otherwise: str) -> tuple[S | None, Keeper]:
+        """As :meth:`restore`, and what keeps in the ``file`` what follows."""
+        every = self.config.execution.checkpoint_every
+        return self.restore(file, fingerprint, kind, otherwise), Keeper(self.directory.at(file), fingerprint, every)
+
     def notice(self, message: str) -> None:
         """Something about the run itself that the user should know."""
         self.notices.append(message)
         self.log.write(f"warning: {message}")
+
+
+class KeptUnits(Generic[S]):
+    """What is ``done`` of the units of work of a run, in the order of their ends; kept as by :meth:`Session.kept`."""
+
+    def __init__(self, run: Session, file: str, fingerprint: str, kind: type[S], otherwise: str):
+        before, self.keeper = run.kept(file, fingerprint, tuple[kind, ...], otherwise)  # type: ignore[valid-type]
+        self.log = run.log
+        self.done: list[S] = [*(before or ())]
+
+    def work(
+        self, executor: Executor, function: Callable[..., S], calls: Sequence[tuple[Any, ...]], tell: Tell | None,
+        total: int, *, failed: Callable[..., S], line: Callable[[S], str],
+    ) -> None:  # fmt: skip
+        """Do the ``calls`` that are left of a ``total``: ``failed`` makes a unit of a call and the reason why it ended
+        in an error, ``line`` is what the log says of a unit.
+        """
+        for count, (i, ended) in enumerate(executor.map(function, iter(calls)), 1):
+            unit = failed(*calls[i], reason=reason_of(ended)) if isinstance(ended, Exception) else ended
+            self.done.append(unit)
+            self.log.write(line(unit))
+            self.keeper.keep(lambda: tuple(self.done))
+            if tell:
+                tell(total - len(calls) + count, total)
+        self.keeper.write(tuple(self.done))
 
 
 def directory_mode(force: bool, resume: bool) -> Mode:
@@ -227,7 +257,10 @@ def conduct_run(kind: RunKind[R], force: bool = False, resume: bool = False, com
         with kind.executor() as executor, _session(kind, directory, command) as run:
             try:
                 run.begin(*kind.files, *kind.pages, retried=kind.opened(run))
-                return kind.conduct(run, executor)
+                result = kind.conduct(run, executor)
+                if kind.writer and kind.config.report:
+                    kind.page(directory.work, figures=kind.config.figures)
+                return result
             except BaseException:  # no worker writes once the directory is free for others
                 kind.stop()
                 with suppress(KeyboardInterrupt):  # of an impatient user: on to the next step
@@ -267,9 +300,8 @@ def _session(kind: RunKind[Any], directory: RunDirectory, command: str) -> Itera
     ``command``: what the user typed. What the user has of a run that is stopped becomes part of the last words of an
     interrupt and of errors that a resumed run survives.
 
-    Raises
-    ------
-    OutputError: the log cannot be written, the result not put in place. Interrupted: the block was.
+    Raises :class:`OutputError`: the log cannot be written, the result not put in place. :class:`Interrupted`: the block
+    was.
     """
     config = kind.config
     with tell_interrupt(kind.kept):

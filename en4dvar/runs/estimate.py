@@ -105,16 +105,10 @@ def estimate(
     ConfigError, DataError: says which argument, and what to do. Others as of :func:`en4dvar.run`.
     """
     call = Given(model, data, time, observable, error, units or {}, priors, series or {}, correlation)
-    ready, model_section = call.model(model, cheap)
-    content = {
-        "name": name,
-        "seed": seed,
-        "model": model_section,
-        "data": {**call.data(ready), **({"window": window} if window else {})},
-        "parameters": priors,
-        "output": {"report": report and directory is not None},
-        **{key: call.prior(section) if key == "prior" else section for key, section in sections.items()},
-    }
+    if "prior" in sections:
+        sections["prior"] = call.prior(sections["prior"])
+    ready, content = call.content(model, name, seed, cheap, **({"window": window} if window else {}))
+    content |= {"output": {"report": report and directory is not None}, **sections}
     with ExitStack() as held:
         config = held.enter_context(_configured(resolve, content, ready, call, directory, resume or force))
         shown = progress if callable(progress) else held.enter_context(terminal_progress()) if progress else None
@@ -158,17 +152,9 @@ def estimate_sequence(
     ConfigError, DataError: says which argument, and what to do. Others as of :func:`run_sequence`.
     """
     call = Given(model, data, time, observable, error, {}, priors or {}, series or {}, correlation)
-    ready, model_section = call.model(model)
-    content = {
-        "name": name,
-        "seed": seed,
-        "model": model_section,
-        "data": call.data(ready),
-        "parameters": priors or {},
-        "sequence": {"initial_std": initial_std or {}},
-        "output": {"report": report and directory is not None},
-        **sections,
-    }
+    ready, content = call.content(model, name, seed)
+    content |= {"sequence": {"initial_std": initial_std or {}}}
+    content |= {"output": {"report": report and directory is not None}, **sections}
     with _configured(resolve_sequence, content, ready, call, directory, resume or force) as config:
         return run_sequence(config, force=force, resume=resume, command="en4dvar.estimate_sequence")
 
@@ -389,6 +375,14 @@ class Given:
         """Names of the data file and of those beside it, and their texts."""
         beside = dict(item for series in self.series for item in series.files.items())
         return {GIVEN: csv_of(stacked([series.used for series in self.series])), **beside, **self.beside}
+
+    def content(
+        self, model: Any, name: str, seed: int, cheap: bool = False, **of_data: Any
+    ) -> tuple[ForwardModel, dict[str, Any]]:
+        """The model, and what a file says of it, of the data (and ``of_data`` besides) and of the parameters."""
+        ready, section = self.model(model, cheap)
+        data = {**self.data(ready), **of_data}
+        return ready, {"name": name, "seed": seed, "model": section, "data": data, "parameters": self.priors}
 
     def data(self, model: ForwardModel) -> dict[str, Any]:
         """The ``data:`` section, apart from the window. Raises :class:`DataError`, :class:`ConfigError`."""

@@ -50,10 +50,9 @@ class Finished:
 def finished(run_dirs: Sequence[Path], trust: bool, ask: Ask | None) -> tuple[Config, list[Finished]]:
     """The configuration of the first run, and the data sets of all.
 
-    Raises
-    ------
-    RefusedError: code of a stranger, see :func:`~en4dvar.runs.rerun.rerun`. OutputError: there is no result, or it is
-        damaged. ConfigError: a data set of several series, or with parameters that vary in time.
+    Raises :class:`RefusedError`: code of a stranger, see :func:`~en4dvar.runs.rerun.rerun`. :class:`OutputError`: there
+    is no result, or it is damaged. :class:`ConfigError`: a data set of several series, or with parameters that vary in
+    time.
     """
     first: Config | None = None
     sets: list[Finished] = []

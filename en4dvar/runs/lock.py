@@ -28,10 +28,8 @@ def locked(directory: Path) -> Iterator[None]:
     The lock is advisory and belongs to this process, not to the workers it starts. On a file system without locks it
     protects nothing, and a run is not refused there.
 
-    Raises
-    ------
-    OutputError: another run holds it (says which process on which machine), or it is no plain file. OSError: the
-        directory cannot be written.
+    Raises :class:`OutputError`: another run holds it (says which process on which machine), or it is no plain file.
+    :class:`OSError`: the directory cannot be written.
     """
     file = _acquire(directory)
     try:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from en4dvar.assembly.build import inverse_plan, problem_of
-from en4dvar.config import AnyConfig, Config, TwinConfig, resolve_any
+from en4dvar.config import AnyConfig, Config, resolve_any
 from en4dvar.config.load import recorded as recorded_configuration
 from en4dvar.data.observations import SEVERAL
 from en4dvar.estimation.assimilate import assimilate
@@ -21,11 +21,12 @@ from en4dvar.model.forward import ForwardModel
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.results.campaign_file import failed_datasets
 from en4dvar.results.fingerprint import Identity, digest_of, identity
+from en4dvar.results.netcdf import read_groups
 from en4dvar.results.provenance import provenance
 from en4dvar.results.run_results import result_files
-from en4dvar.results.series_file import read_series, series_file
+from en4dvar.results.series_file import series_file
 from en4dvar.results.store import StoredResult, load_stored
-from en4dvar.runs.cycles import Cycles, SequenceKind, TwinKind
+from en4dvar.runs.cycles import cycles_of
 from en4dvar.runs.trust import Ask, of_strangers
 
 SURROUNDINGS = ("python_version", "package_versions", "platform", "cpu", "git_commit")
@@ -71,11 +72,9 @@ class Rerun:
 def rerun(run_dir: str | Path, workers: int | None = None, *, trust: bool = False, ask: Ask | None = None) -> Rerun:
     """Repeat every estimate of a run and compare.
 
-    Parameters
-    ----------
-    run_dir: of ``en4dvar run``. workers: as of a run; the numbers do not depend on it.
-    trust: run whatever code the files name, a law or a model of a stranger's too. By default that is code below the
-        working directory and of installed packages alone; for other code ``ask`` is asked, which gets the question.
+    ``run_dir``: of ``en4dvar run``. ``workers``: as of a run; the numbers do not depend on it. ``trust``: run whatever
+    code the files name, a law or a model of a stranger's too. By default that is code below the working directory and
+    of installed packages alone; for other code ``ask`` is asked, which gets the question.
 
     Raises
     ------
@@ -108,10 +107,10 @@ def rerun(run_dir: str | Path, workers: int | None = None, *, trust: bool = Fals
 
 def _of_cycles(file: Path, workers: int | None, trust: bool, ask: Ask | None) -> Rerun:
     """Of a twin experiment or a sequence, whose data are read again. Raises as :func:`rerun`, :class:`DataError`."""
-    recorded = read_series(file)
+    recorded = read_groups(file)["/"]
     config = _configuration(file, recorded.attrs, trust, ask)
     assert not isinstance(config, Config)
-    kind: Cycles[Any] = TwinKind(config) if isinstance(config, TwinConfig) else SequenceKind(config)
+    kind = cycles_of(config)
     with of_strangers(file.parent, ask, trust):  # data may have weights by a function
         kind.check()
     with choose_executor(kind.model, workers=workers or 1) as executor:

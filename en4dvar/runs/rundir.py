@@ -60,10 +60,8 @@ class RunDirectory:
         empty is a new run: that of a batch job which was killed before it began. A new run that fails before it has
         written a file leaves nothing behind, unless it was interrupted and can be resumed.
 
-        Raises
-        ------
-        OutputError: the directory is in use; it is not empty (``new``) or holds no run (``resume``); it cannot be
-            written, or holds a foreign file where the run would write its own, or a link.
+        Raises :class:`OutputError`: the directory is in use; it is not empty (``new``) or holds no run (``resume``); it
+        cannot be written, or holds a foreign file where the run would write its own, or a link.
         """
         end_unguarded()
         path = Path(path)

@@ -6,7 +6,7 @@ were. When a series ends is decided by its readings alone, never by the truth. N
 even one that noise puts below zero: that would bias the noise, and with it whatever such readings tell.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -196,14 +196,15 @@ def to_csv(simulation: Simulation, config: Config, comment: str = "") -> str:
     values = [
         convert(v, column.target, column.unit) for column, v in zip(columns, simulation.series.values(), strict=True)
     ]
-    lines = [
-        *(f"# {line}" for line in comment.splitlines()),
-        f"# parameters: {truth}",
-        f"# {', '.join(f'{column.name} in {column.unit}' for column in (time, *columns))}",
-        ",".join(column.name for column in (time, *columns)),
-        *(",".join(f"{v:.9g}" for v in row) for row in zip(times, *values, strict=True)),
-    ]
-    return "\n".join(lines) + "\n"
+    units_of_columns = ", ".join(f"{column.name} in {column.unit}" for column in (time, *columns))
+    comments = [*comment.splitlines(), f"parameters: {truth}", units_of_columns]
+    return _commented(comments, [column.name for column in (time, *columns)], [times, *values], ".9g")
+
+
+def _commented(comments: Sequence[str], names: Sequence[str], columns: Sequence[Array], form: str) -> str:
+    """Columns as CSV, whose numbers have a form, below comments and names."""
+    rows = (",".join(f"{value:{form}}" for value in row) for row in zip(*columns, strict=True))
+    return "\n".join([*(f"# {line}" for line in comments), ",".join(names), *rows]) + "\n"
 
 
 # A synthetic campaign
@@ -280,15 +281,13 @@ def _data_csv(plan: CampaignPlan, dataset: SyntheticSet, command: str) -> str:
     model, seen = plan.model, plan.observable
     t, v = f"t_{model.time_display_unit}", f"{seen.symbol.strip('$')}_{seen.display_unit}"
     noise = convert(plan.settings.noise, seen.unit, seen.display_unit)
-    lines = [
-        f"# SYNTHETIC data, no measurement: set {dataset.name} of the twin campaign {plan.name!r}",
-        f"# {command}; seed {plan.seed}",
-        f"# {t} in {model.time_display_unit}, {v} in {seen.display_unit}; noise std {noise:.9g} {seen.display_unit}",
-        f"{t},{v}",
+    comments = [
+        f"SYNTHETIC data, no measurement: set {dataset.name} of the twin campaign {plan.name!r}",
+        f"{command}; seed {plan.seed}",
+        f"{t} in {model.time_display_unit}, {v} in {seen.display_unit}; noise std {noise:.9g} {seen.display_unit}",
     ]
     times = convert(dataset.times, model.time_unit, model.time_display_unit)
-    values = convert(dataset.values, seen.unit, seen.display_unit)
-    return "\n".join([*lines, *(f"{a:.5f},{b:.5f}" for a, b in zip(times, values, strict=True))]) + "\n"
+    return _commented(comments, [t, v], [times, convert(dataset.values, seen.unit, seen.display_unit)], ".5f")
 
 
 def truth_csv(plan: CampaignPlan, sets: tuple[SyntheticSet, ...]) -> str:

@@ -25,7 +25,7 @@ from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.errors import ConfigError, TooFewMembersError, retold
 from en4dvar.problem import InverseProblem
 from en4dvar.results import joint_file, population_file
-from en4dvar.results.checkpoint import FOLDER, Keeper, digest, file_digest, write_checkpoint
+from en4dvar.results.checkpoint import FOLDER, digest, file_digest, write_checkpoint
 from en4dvar.results.joint_file import StoredJoint, load_joint, save_joint
 from en4dvar.results.journal import Journal, KnownRuns
 from en4dvar.results.population_file import GROUPS, StoredPopulation, load_population, save_population
@@ -70,8 +70,9 @@ class TogetherKind(Kind, ABC):
         """
 
     def of_runs(
-        self, run_dirs: Sequence[Path], out: Path, workers: int | None, trust: bool, ask: Ask | None, tell: Tell
-    ) -> tuple[Path, Path]:
+        self, run_dirs: Sequence[Path], out: Path, workers: int | None = None, trust: bool = False,
+        ask: Ask | None = None, tell: Tell = lambda words: None,
+    ) -> tuple[Path, Path]:  # fmt: skip
         """Of the data sets of finished runs, with the settings of the first; returns the paths of result and page.
 
         Raises
@@ -119,36 +120,24 @@ class TogetherKind(Kind, ABC):
         sets = [finished_set(config, load_stored(run.directory.work / d.file), run.directory.path) for d in good]
         attributes = {**run.attributes, "identity": run.identity.settings, "runs": config.name}
         attributes |= {"group": group.name} if group else {}
-        known = run.restore(under_way, fingerprint, KnownRuns, again) or KnownRuns()
-        keeper = Keeper(run.directory.at(under_way), fingerprint, config.execution.checkpoint_every)
-        journal = Journal(executor, known, keeper)
+        known, keeper = run.kept(under_way, fingerprint, KnownRuns, again)
+        journal = Journal(executor, known or KnownRuns(), keeper)
         self.estimate(sets, config, journal, attributes, path, lambda words: run.log.write(f"{what}: {words}"))
         write_checkpoint(run.directory.at(record), fingerprint, file_digest(path))
         run.directory.remove(under_way)
 
 
-def join(
-    run_dirs: Sequence[Path],
-    names: Sequence[str],
-    out: Path,
-    *,
-    workers: int | None = None,
-    trust: bool = False,
-    ask: Ask | None = None,
-    tell: Tell = lambda words: None,
-) -> tuple[StoredJoint, Path]:
+def join(run_dirs: Sequence[Path], names: Sequence[str], out: Path, **how: Any) -> tuple[StoredJoint, Path]:
     """Estimate the data sets of finished runs together, with the parameters ``names`` in common, or what their
     configurations say where there are none; writes ``joint.nc``, ``joint.csv`` and ``joint.html`` to ``out``. Returns
     what was found and the path of the page.
 
-    Settings of the ensemble and the seed are those of the first run.
+    Settings of the ensemble and the seed are those of the first run; ``how`` as of :meth:`TogetherKind.of_runs`.
 
-    Raises
-    ------
-    RefusedError, OutputError: as of :meth:`TogetherKind.of_runs`. ConfigError: the data sets
-        cannot share these parameters. TooFewMembersError: the ensemble is lost.
+    Raises :class:`RefusedError`, :class:`OutputError`: as of :meth:`TogetherKind.of_runs`. :class:`ConfigError`: the
+    data sets cannot share these parameters. :class:`TooFewMembersError`: the ensemble is lost.
     """
-    file, page = JointKind(tuple(names)).of_runs(run_dirs, out, workers, trust, ask, tell)
+    file, page = JointKind(tuple(names)).of_runs(run_dirs, out, **how)
     return load_joint(file), page
 
 
@@ -199,25 +188,20 @@ def population(
     *,
     hyper: HyperPrior | Mapping[str, float] | None = None,
     effort: Effort | None = None,
-    workers: int | None = None,
-    trust: bool = False,
-    ask: Ask | None = None,
-    tell: Tell = lambda words: None,
+    **how: Any,
 ) -> tuple[StoredPopulation, Path]:
     """Estimate the population of the parameters ``names`` behind the data sets of finished runs; writes
     ``population.nc``, ``.csv``, ``.tex`` and ``.html`` to ``out``. Returns what was found and the path of the page.
 
     ``hyper`` is in units of the prior's standard deviations; a mapping says what of it differs from that of
-    ``population:`` in the configuration of the first run, whose seed is taken as well.
+    ``population:`` in the configuration of the first run, whose seed is taken as well; ``how`` as of
+    :meth:`TogetherKind.of_runs`.
 
-    Raises
-    ------
-    RefusedError, OutputError: as of :meth:`TogetherKind.of_runs`. ConfigError: there is no
-        population of these data sets, as :func:`~en4dvar.estimation.population.campaign.population_of` says.
-        TooFewMembersError: too many forward runs failed.
+    Raises :class:`RefusedError`, :class:`OutputError`: as of :meth:`TogetherKind.of_runs`. :class:`ConfigError`: there
+    is no population of these data sets, as :func:`~en4dvar.estimation.population.campaign.population_of` says.
+    :class:`TooFewMembersError`: too many forward runs failed.
     """
-    kind = PopulationKind(tuple(names), hyper, effort)
-    file, page = kind.of_runs(run_dirs, out, workers, trust, ask, tell)
+    file, page = PopulationKind(tuple(names), hyper, effort).of_runs(run_dirs, out, **how)
     return load_population(file), page
 
 

@@ -166,10 +166,8 @@ class Worklist:
 
         Many data sets are spread over the workers, one each; of few, the members are.
 
-        Raises
-        ------
-        OutputError: results cannot be written. ExecutorError: the workers are gone. Where the run has one data set
-        only, also what its estimate raises.
+        Raises :class:`OutputError`: results cannot be written. :class:`ExecutorError`: the workers are gone. Where the
+        run has one data set only, also what its estimate raises.
         """
         if isinstance(self.progress, LiveProgress):
             self.progress.begin(len(self.ended), len(self.sets))
