@@ -10,10 +10,10 @@ do not compare: there the posteriors are shown, and no probabilities.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from scipy.special import softmax
@@ -359,23 +359,15 @@ def _score(run: str, dataset: str, result: StoredResult) -> ModelScore:
 
 
 def _total(scores: Sequence[ModelScore]) -> ModelScore:
-    """Of one run: sums of evidence and DFS; means of the measures of fit."""
-    return replace(
-        scores[0],
-        dataset=ALL,
-        log_evidence=sum(s.log_evidence for s in scores),
-        chi2_per_observation=float(np.mean([s.chi2_per_observation for s in scores])),
-        dfs=sum(s.dfs for s in scores),
-        nrmse=float(np.mean([s.nrmse for s in scores])),
-        warnings=_joined(s.warnings for s in scores),
-        doubted=_joined(s.doubted for s in scores),
-        stored=any(s.stored for s in scores),
-    )
+    """Of one run: sums of evidence and DFS; means of the measures of fit; the codes of warnings, each once."""
 
+    def of_all(key: str) -> list[Any]:
+        return [getattr(score, key) for score in scores]
 
-def _joined(lists: Iterable[str]) -> str:
-    """The codes of several lists, each once."""
-    return " ".join(dict.fromkeys(code for codes in lists for code in codes.split()))
+    joined: dict[str, Any] = {key: sum(of_all(key)) for key in ("log_evidence", "dfs")}
+    joined |= {key: float(np.mean(of_all(key))) for key in ("chi2_per_observation", "nrmse")}
+    joined |= {key: " ".join(dict.fromkeys(" ".join(of_all(key)).split())) for key in ("warnings", "doubted")}
+    return replace(scores[0], dataset=ALL, **joined, stored=any(of_all("stored")))
 
 
 def _ranked(scores: Sequence[ModelScore]) -> list[ModelScore]:

@@ -30,9 +30,7 @@ RANKS = (
 )
 
 
-def write_cycles_page(
-    run_dir: Path, data: Group, figures: Iterable[Captioned], files: bool, **about: str | float | Sequence[Any]
-) -> Path:
+def write_cycles_page(run_dir: Path, data: Group, figures: Iterable[Captioned], files: bool, **about: Any) -> Path:
     """Write ``report.html``, with ``files`` also figures as PDF and PNG; returns the path of the page.
 
     ``about``: the ``kind`` of run and ``what`` it is, ``iterations``: forecasts of the window a ``cycle``, on average;

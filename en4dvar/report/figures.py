@@ -1,7 +1,8 @@
 """The figures of a report: pure functions from a stored result to a chart in display units, 8.5 cm wide."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -19,10 +20,6 @@ from en4dvar.results.store import StoredResult
 MAX_PAIRS = 6
 WIDER = 3  # spans of the posterior by which the prior is seen to either side of it
 LEVELS = 32  # colours of a map
-FIELDS = (
-    "Fields of the initial state: posterior mean, and posterior over prior standard deviation (1: the data say nothing "
-    "about the cell); for a field along a line, mean and std of the posterior (blue) over those of the prior (grey)."
-)
 
 
 def histograms(result: StoredResult) -> Chart:
@@ -189,69 +186,15 @@ def _map(
     panel.xlim, panel.ylim = (left - across / 2, right + across / 2), (bottom + down / 2, top - down / 2)
     low, high = scale
     level = np.clip(((values - low) / (high - low) * LEVELS).astype(int), 0, LEVELS - 1)
+    bar, width = Panel(label, xlim=scale, ylim=(0.0, 1.0), yticks=(), left=False, xticks=4), (high - low) / LEVELS
     for k in range(LEVELS):
         own, colour = at[level == k], ramp(colours, k / (LEVELS - 1))
+        bar.tiles([low + (k + 0.5) * width], [0.5], (width, 1.0), colour)
         if len(own) and grid:
             panel.tiles(own[:, 1], own[:, 0], (across, down), colour)
         elif len(own):
             panel.dots(own[:, 1], own[:, 0], colour, 2.0)
-    bar = Panel(label, xlim=scale, ylim=(0.0, 1.0), yticks=(), left=False, xticks=4)
-    width = (high - low) / LEVELS
-    for k in range(LEVELS):
-        bar.tiles([low + (k + 0.5) * width], [0.5], (width, 1.0), ramp(colours, k / (LEVELS - 1)))
     return panel, bar
-
-
-def all_figures(result: StoredResult) -> Iterator[Captioned]:
-    """Everything that the result has enough members for."""
-    parameters = result.parameters
-    if parameters:
-        yield (
-            "posterior",
-            "What is known after the readings (posterior, blue) and what was before (prior, grey), each scaled to its "
-            "peak. Bar: the 90 % interval; a number whose interval cannot be quoted, for a warning, has no bar "
-            "and says so. Ticks: the members that stand for the posterior. Dashed: the best fit.",
-            histograms(result),
-        )
-    if "/fields" in result.groups:
-        yield "fields", FIELDS, maps(result)
-    yield (
-        "history",
-        "Readings with their standard deviation; what was thought possible before them (prior, grey) and what is after "
-        "(posterior, blue: bands of 50 and 90 %, without the errors of readings); the best fit (line through its "
-        "values at the readings). Below: reading minus best fit, in standard deviations of the reading."
-        + (" Each series has its own panels." if len(result.axes) > 1 else ""),
-        history(result),
-    )
-    if "/withheld" in result.groups:
-        yield "withheld", WITHHELD, expected(result)
-    if varying.stored_walks(result):
-        yield (
-            "varying",
-            "What varies in time: median and 5–95 % of the posterior (blue) over 5–95 % of the prior (grey).",
-            varying.bands(result),
-        )
-    if len(readings.whitened(result)):
-        yield (
-            "residuals",
-            "Residuals of the best fit, in standard deviations and freed of the correlation of their errors "
-            "(whitened): in time (below it a discrepancy, mean ± std); their correlation with those 1, 2, … readings "
-            "later (band: 95 % of independent numbers); against normal quantiles; leverage, the share of each "
-            "reading in its own prediction.",
-            residuals(result),
-        )
-    if f"{result.observable}_prior_distance" in result.group("sample_stats"):
-        yield "influence", readings.CAPTION, readings.influence(result)
-    if np.isfinite(result.group("iterations")["J"].values).any():
-        yield "cost", "The cost J and its two terms at the iterate that starts each iteration.", cost(result)
-    if parameters:
-        yield (
-            "iterations",
-            "Parameters over the iterations: ensemble mean and middle 68 % (blue), centre (dashed).",
-            traces(result),
-        )
-    if 2 <= len(parameters) <= MAX_PAIRS and result.alive.sum() > 2:
-        yield "pairs", "Posterior members in pairs of parameters; above the diagonal the correlation.", pairs(result)
 
 
 def _discrepancy(result: StoredResult, time: Array, label: str) -> Panel:
@@ -323,3 +266,48 @@ def _pair(i: int, j: int, x: Array, y: Array) -> Panel:
         correlation = float(np.corrcoef(x, y)[0, 1]) if known else math.nan
         panel.bare, panel.words = True, f"{correlation:+.2f}".replace("-", "−") if known else "–"
     return panel
+
+
+# name, caption, where there is enough to draw it, and what does; ``{several}`` is said of several series
+FIGURES: tuple[tuple[str, str, Callable[[StoredResult], Any], Callable[[StoredResult], Chart]], ...] = (
+    ("posterior",
+     "What is known after the readings (posterior, blue) and what was before (prior, grey), each scaled to its "
+     "peak. Bar: the 90 % interval; a number whose interval cannot be quoted, for a warning, has no bar "
+     "and says so. Ticks: the members that stand for the posterior. Dashed: the best fit.",
+     lambda result: result.parameters, histograms),
+    ("fields",
+     "Fields of the initial state: posterior mean, and posterior over prior standard deviation (1: the data say "
+     "nothing about the cell); for a field along a line, mean and std of the posterior (blue) over those of the prior "
+     "(grey).",
+     lambda result: "/fields" in result.groups, maps),
+    ("history",
+     "Readings with their standard deviation; what was thought possible before them (prior, grey) and what is after "
+     "(posterior, blue: bands of 50 and 90 %, without the errors of readings); the best fit (line through its "
+     "values at the readings). Below: reading minus best fit, in standard deviations of the reading.{several}",
+     lambda result: True, history),
+    ("withheld", WITHHELD, lambda result: "/withheld" in result.groups, expected),
+    ("varying", "What varies in time: median and 5–95 % of the posterior (blue) over 5–95 % of the prior (grey).",
+     varying.stored_walks, varying.bands),
+    ("residuals",
+     "Residuals of the best fit, in standard deviations and freed of the correlation of their errors "
+     "(whitened): in time (below it a discrepancy, mean ± std); their correlation with those 1, 2, … readings "
+     "later (band: 95 % of independent numbers); against normal quantiles; leverage, the share of each "
+     "reading in its own prediction.",
+     lambda result: len(readings.whitened(result)), residuals),
+    ("influence", readings.CAPTION,
+     lambda result: f"{result.observable}_prior_distance" in result.group("sample_stats"), readings.influence),
+    ("cost", "The cost J and its two terms at the iterate that starts each iteration.",
+     lambda result: np.isfinite(result.group("iterations")["J"].values).any(), cost),
+    ("iterations", "Parameters over the iterations: ensemble mean and middle 68 % (blue), centre (dashed).",
+     lambda result: result.parameters, traces),
+    ("pairs", "Posterior members in pairs of parameters; above the diagonal the correlation.",
+     lambda result: 2 <= len(result.parameters) <= MAX_PAIRS and result.alive.sum() > 2, pairs),
+)  # fmt: skip
+
+
+def all_figures(result: StoredResult) -> Iterator[Captioned]:
+    """Everything that the result has enough members for."""
+    several = " Each series has its own panels." if len(result.axes) > 1 else ""
+    for name, caption, there, chart in FIGURES:
+        if there(result):
+            yield name, caption.format(several=several), chart(result)

@@ -12,7 +12,7 @@ from markupsafe import Markup
 
 from en4dvar.plumbing.files import write_text
 from en4dvar.report import responses, text
-from en4dvar.report.palette import DARK, LIGHT, css_variables
+from en4dvar.report.palette import DARK, LIGHT
 
 WRITERS = (  # what templates call
     text.estimate, text.fixed, text.number_like, text.percent, text.plain_number, text.plus_minus,
@@ -48,7 +48,8 @@ def _environment(package: str) -> Environment:
     script = _text("table.js") + _text("chart.js")
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     policy = f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"
-    light, dark = (Markup(css_variables(colours)) for colours in (LIGHT, DARK))
+    grounds = (" ".join(f"--{name}: {code};" for name, code in colours.items()) for colours in (LIGHT, DARK))
+    light, dark = map(Markup, grounds)
     palette = f":root {{ {light} }}\n@media screen and (prefers-color-scheme: dark) {{ :root {{ {dark} }} }}\n"
     style = Markup(palette + _text("style.css"))
     environment.globals |= {"policy": policy, "style": style, "script": Markup(script), "light": light, "dark": dark}

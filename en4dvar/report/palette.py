@@ -28,13 +28,3 @@ def ramp(anchors: Sequence[str], share: float) -> str:
     low, high = (bytes.fromhex(code[1:]) for code in anchors[first : first + 2])
     mixed = bytes(round(a + (b - a) * (place - first)) for a, b in zip(low, high, strict=True))
     return f"#{mixed.hex()}"
-
-
-def ink(colour: str) -> str:
-    """A colour of the palette as a CSS variable, any other as it is."""
-    return colour if colour.startswith("#") else f"var(--{colour})"
-
-
-def css_variables(palette: dict[str, str]) -> str:
-    """Declarations of the palette for a CSS rule."""
-    return " ".join(f"--{name}: {code};" for name, code in palette.items())

@@ -97,7 +97,7 @@ def _panel(ax: Axes, panel: Panel) -> None:
     xlim, ylim = panel.limits()
     ax.set(xlabel=panel.xlabel, ylabel=panel.ylabel, xlim=xlim, ylim=ylim)
     if panel.title:
-        ax.set_title(panel.title, color=_colour(panel.title_colour))
+        ax.set_title(panel.title, color=LIGHT.get(panel.title_colour))
     along = labelled(xlim, panel.xticks, panel.names, logarithmic=panel.x_logarithmic, whole=panel.whole)
     _ticks(ax.xaxis, along, rotation=90 if panel.names else 0)
     _ticks(ax.yaxis, labelled(ylim, panel.yticks, panel.y_names, logarithmic=panel.logarithmic))
@@ -133,14 +133,14 @@ def _ticks(axis: Axis, ticks: Sequence[tuple[float, str]], rotation: float = 0) 
     axis.set_ticks([], minor=True)
 
 
-def _colour(name: str) -> str:
-    return LIGHT.get(name, name)
-
-
 def _mark(ax: Axes, mark: Mark) -> None:
     from matplotlib.collections import PolyCollection
 
-    how: dict[str, Any] = {"color": _colour(mark.colour), "alpha": mark.alpha, "label": mark.label or None}
+    how: dict[str, Any] = {
+        "color": LIGHT.get(mark.colour, mark.colour),
+        "alpha": mark.alpha,
+        "label": mark.label or None,
+    }
     many = len(mark.x) > MANY
     if mark.kind == "line":
         ax.plot(mark.x, mark.y, mark.dash or "-", lw=mark.size, rasterized=many, **how)

@@ -70,10 +70,8 @@ def sentences(stored: StoredPopulation) -> tuple[str, ...]:
         words = f"the data leave {stored.headline} or spread open, or lie in its tail"
         return (*lines, f"What would hold without the hyperprior cannot be told from it: {words}.")
     free = (f"{m.name} {_range(m)}, spread {_range(s)}" for m, s in zip(free_centres, free_spreads, strict=True))
-    return (
-        *lines,
-        f"Without the hyperprior ({stored.headline} and spread equally likely everywhere): {'; '.join(free)}.",
-    )
+    words = f"{stored.headline} and spread equally likely everywhere"
+    return (*lines, f"Without the hyperprior ({words}): {'; '.join(free)}.")
 
 
 def _range(row: ParameterSummary) -> str:

@@ -17,7 +17,6 @@ from markupsafe import Markup, escape
 from en4dvar.model.state import Array
 from en4dvar.plumbing.files import make_folder
 from en4dvar.report.chart import Chart, Mark, Panel, Row, labelled
-from en4dvar.report.palette import ink
 from en4dvar.report.paper import save_chart
 from en4dvar.report.text import math_pieces
 
@@ -114,6 +113,7 @@ def _panel(panel: Panel, row: Row, top: float, x: float, width: float, name: str
     place = Frame(x, top + above, width, height, *panel.limits(), panel.logarithmic, panel.x_logarithmic)
     if panel.bare:
         return [written(panel.words, x + width / 2, place.y + place.height / 2 + 3, size=FONT)] if panel.words else []
+    lines = "".join(f"M{place.x:.1f} {y:.1f}h{place.width:.1f}" for y, _ in _placed(_y_ticks(panel), place.up))
     box = f'x="{place.x:.1f}" y="{place.y:.1f}" width="{place.width:.1f}" height="{place.height:.1f}"'
     drawn = "".join(path_of(mark, place) for mark in panel.marks)
     (x0, x1), (y0, y1) = place.xlim, place.ylim
@@ -122,7 +122,7 @@ def _panel(panel: Panel, row: Row, top: float, x: float, width: float, name: str
     return [
         *legend,
         f'<clipPath id="{name}"><rect {box}/></clipPath>',
-        *(_grid(panel, place) if panel.grid else ()),
+        *([f'<path d="{lines}" stroke="var(--grid)" stroke-width="0.5"/>'] if panel.grid else ()),
         f'<g clip-path="url(#{name})" fill="none">{drawn}</g>',
         *_axes(panel, place, below),
         *(
@@ -168,11 +168,6 @@ def _placed(ticks: list[tuple[float, str]], along: Callable[[Array], Array]) -> 
     """Ticks at their places in the drawing."""
     places = along(np.array([value for value, _ in ticks]))
     return zip(places.tolist(), (text for _, text in ticks), strict=True)
-
-
-def _grid(panel: Panel, place: Frame) -> Iterator[str]:
-    lines = "".join(f"M{place.x:.1f} {y:.1f}h{place.width:.1f}" for y, _ in _placed(_y_ticks(panel), place.up))
-    yield f'<path d="{lines}" stroke="var(--grid)" stroke-width="0.5"/>'
 
 
 def _legend(panel: Panel, x: float, top: float, width: float) -> tuple[list[str], float]:
@@ -256,7 +251,7 @@ def draw(
 
 
 def path_of(mark: Mark, place: Frame) -> str:
-    colour, edges = ink(mark.colour), ""
+    colour, edges = mark.colour if mark.colour.startswith("#") else f"var(--{mark.colour})", ""
     alpha = f' opacity="{mark.alpha:g}"' if mark.alpha < 1 else ""
     x, y, top = place.across(mark.x), place.up(mark.y), place.up(mark.top)
     far, base = place.x + place.width, place.y + place.height

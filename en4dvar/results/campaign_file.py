@@ -8,6 +8,7 @@ observations, the iterations, the descents and the modes stay in ``datasets.pack
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -127,18 +128,12 @@ def _layout(pack: Pack, sources: Mapping[str, str]) -> _Layout:
 
 def _blocks(pack: Pack, sources: Mapping[str, str]) -> Iterator[tuple[int, list[str], list[Content]]]:
     """Place of the first, names and contents of as many data sets as are written at once."""
-    begin, size = 0, 0
-    names: list[str] = []
-    block: list[Content] = []
-    for name, stem in sources.items():
-        content = pack.content(stem, check=False)  # it was for the layout
-        if block and size + len(content) > BLOCK:
-            yield begin, names, block
-            begin, size, names, block = begin + len(names), 0, [], []
-        names.append(name)
-        block.append(opened(content))
-        size += len(content)
-    yield begin, names, block
+    sizes = itertools.accumulate(pack.entries[stem].content_size for stem in sources.values())
+    placed = zip(itertools.count(), sources.items(), sizes, strict=False)
+    for _, block in itertools.groupby(placed, key=lambda place: place[2] // BLOCK):
+        held = list(block)
+        contents = [opened(pack.content(stem, check=False)) for _, (_, stem), _ in held]  # it was for the layout
+        yield held[0][0], [name for _, (name, _), _ in held], contents
 
 
 def failed_datasets(path: Path) -> dict[str, str]:

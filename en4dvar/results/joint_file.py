@@ -49,7 +49,7 @@ def save_joint(path: Path, estimate: JointEstimate, alone: Sequence[Array], attr
         "/posterior": Group(_shared(estimate) | _own(estimate, names), datasets),
         "/prior": Group(_prior(estimate)),
         "/alone": Group(_alone(estimate, alone), datasets),
-        "/fit": Group(_fit(estimate) | _agreement(estimate, names), datasets),
+        "/fit": Group(_fit(estimate, names), datasets),
     }
     if estimate.without:
         groups["/without"] = Group(_shared(estimate.rest), attrs={"warnings": _lines(estimate.rest)})
@@ -121,9 +121,11 @@ def _prior(estimate: JointEstimate) -> dict[str, Variable]:
     }
 
 
-def _fit(estimate: JointEstimate) -> dict[str, Variable]:
-    """Observations and predictive bands of each data set, padded with NaN, in display units."""
-    experiments = estimate.joint.experiments
+def _fit(estimate: JointEstimate, names: Sequence[str]) -> dict[str, Variable]:
+    """Observations and predictive bands of each data set, padded with NaN, in display units; and each data set against
+    all others, as the estimate without the odd ones has it.
+    """
+    experiments, agreed = estimate.joint.experiments, estimate.agreement
     most = max(len(experiment.observations) for experiment in experiments)
     times, values = np.full((2, len(experiments), most), np.nan)
     bands = np.full((len(experiments), max(map(len, estimate.grids)), 4), np.nan)
@@ -138,6 +140,8 @@ def _fit(estimate: JointEstimate) -> dict[str, Variable]:
         bands[e, : len(grid), 1:] = convert(member_quantiles(alive, QUANTILES, axis=0).T, *to_value)
     observables = [experiment.observable for experiment in experiments]
     time_units = text(experiment.model.time_display_unit for experiment in experiments)
+    apart = "from the value of all others, in standard deviations"
+    odd = np.array([int(name in estimate.odd) for name in names])
     alive_counts = np.array([int(run.active[:-1].sum()) for run in estimate.forecasts])
     return {
         "chi2_per_observation": variable("dataset", estimate.chi2, "1", "misfit per observation at the mode"),
@@ -148,16 +152,7 @@ def _fit(estimate: JointEstimate) -> dict[str, Variable]:
         "time": variable(("dataset", "observation"), times, "1", "times of the observations"),
         "value": variable(("dataset", "observation"), values, "1", "observations"),
         "band": variable(("dataset", "point", "what"), bands, "1", "time; 5, 50 and 95 % of the members there"),
-    }
-
-
-def _agreement(estimate: JointEstimate, names: Sequence[str]) -> dict[str, Variable]:
-    """Each data set against all others, as the estimate without the odd ones has it."""
-    agreed = estimate.agreement
-    odd = np.array([int(name in estimate.odd) for name in names])
-    words = "from the value of all others, in standard deviations"
-    return {
-        "distance": variable("dataset", np.sqrt(agreed.squares), "1", words),
+        "distance": variable("dataset", np.sqrt(agreed.squares), "1", apart),
         "chance": variable("dataset", agreed.chances, "1", "probability of a larger distance if all share one value"),
         "odd": variable("dataset", odd, "1", "1: left out in the group without"),
     }

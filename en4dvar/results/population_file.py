@@ -43,6 +43,10 @@ def save_population(
     observed = [problem.observations for problem in population.problems]
     datasets = {"dataset": variable("dataset", text(o.name for o in observed), "", "data set")}
     free, effective = population.without_hyperprior(int(attributes["seed"]))
+    combinations = (  # "0.05 G 1 alpha 0.98": the standard deviation, then names and exponents
+        " ".join([f"{c.std:.17g}", *(f"{name} {exponent:.17g}" for name, exponent in c.parts)])
+        for c in population.combinations()
+    )
     root = {
         **attributes,
         "parameters": " ".join(population.names),
@@ -54,7 +58,7 @@ def save_population(
         "effective_draws_without_hyperprior": effective,
         "log_evidence": population.log_evidence - sum(o.log_normalisation() for o in observed),
         "forward_runs": population.forward_runs,
-        "combinations": "\n".join(map(combination_line, population.combinations())),
+        "combinations": "\n".join(combinations),
         "warnings": "\n".join(c.line for c in worst_first(cautions)),
     }
     beside = _alone(population, alone)
@@ -73,11 +77,6 @@ def save_population(
         "/empirical": Group(_empirical(population)),
     }
     return to_bytes(groups).write(path)
-
-
-def combination_line(combination: Combination) -> str:
-    """``0.05 G 1 alpha 0.98``: the standard deviation, then names and exponents."""
-    return " ".join([f"{combination.std:.17g}", *(f"{name} {exponent:.17g}" for name, exponent in combination.parts)])
 
 
 def _draws(population: Population, draws: Draws) -> dict[str, Variable]:

@@ -268,17 +268,15 @@ def planned_problem(config: Config) -> InverseProblem:
         return problem_of(config, measured)
     assert times is not None
     for series in plan.series:
-        error = series.data.error
-        for present, what in (
-            (bool(error.columns("", "")), "errors in a column of the file"),
-            (error.covariance is not None, "a covariance of readings"),
-            (series.data.weights is not None, "weights of readings"),
-            (series.data.places is not None, "places on a field"),
-        ):
-            if present:
-                raise ConfigError(
-                    f"data: {what} cannot be planned at design.times; leave design.times out, or state a std"
-                )
+        said, error = series.data, series.data.error
+        of_readings = {
+            "errors in a column of the file": error.columns("", ""),
+            "a covariance of readings": error.covariance is not None,
+            "weights of readings": said.weights is not None,
+            "places on a field": said.places is not None,
+        }
+        for what in (what for what, present in of_readings.items() if present):
+            raise ConfigError(f"data: {what} cannot be planned at design.times; leave design.times out, or state a std")
     scale = 1.0 if measured is None else float(measured.values.max())  # for priors that refer to the largest reading
     blank = _observations(config, [np.full(len(times), scale)] * len(plan.series), times, measured)
     problem = problem_of(config, blank)

@@ -95,17 +95,18 @@ class RunDirectory:
         """
         return inside(self.work, name)
 
-    def claim(self, *names: str) -> Path:
-        """List files (relative names) as written by this run; returns the path of the last one.
+    def claim(self, *names: str) -> None:
+        """List files (relative names) as written by this run.
 
         ``*`` in a name stands for any text: of 10⁵ checkpoints a few are there at a time. Raises :class:`OutputError`
         where there is such a file that no run wrote.
         """
-        known, paths = lines_of_list(self.work), [self.at(name) for name in names]
+        known = lines_of_list(self.work)
+        for name in names:
+            self.at(name)  # refuses a link
         if new := [name for name in names if name not in known]:
             self._refuse_foreign([name for name in new if name != LOG])  # which is open by then
             write_list(self.work, [*known, *dict.fromkeys(new)])
-        return paths[-1] if paths else self.work
 
     def _refuse_foreign(self, names: Iterable[str]) -> None:
         """Raise :class:`OutputError` where a run would replace a file that none wrote."""

@@ -6,7 +6,7 @@ Every run is kept as it ends, under what it depends on: more seeds or values fin
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -18,8 +18,8 @@ from en4dvar.config import TwinConfig, load_twin
 from en4dvar.config.document import parse_document
 from en4dvar.executor import Executor, ProcessesExecutor, SerialExecutor, available_cores
 from en4dvar.plumbing.errors import ConfigError, En4dvarError
-from en4dvar.plumbing.files import readable, write_text
-from en4dvar.plumbing.tables import csv_text, table
+from en4dvar.plumbing.files import readable
+from en4dvar.plumbing.tables import table, write_csv
 from en4dvar.report.chart import POINTS, Chart, Panel, Row
 from en4dvar.report.paper import on_paper
 from en4dvar.results.checkpoint import FOLDER, digest, write_checkpoint
@@ -177,8 +177,9 @@ class SweepKind(RunKind[TwinSweep]):
         runs, n = self._runs(run, executor), len(self.seeds)
         of_settings = tuple(tuple(runs[i : i + n]) for i in range(0, len(runs), n))
         sweep = TwinSweep(self.keys, self.values, self.seeds, of_settings, self.directory)
-        write_text(run.directory.at("sweep.csv"), sweep_csv(sweep))
-        write_text(run.directory.at("runs.csv"), runs_csv(sweep))
+        rows = sweep.rows
+        write_csv(run.directory.at("sweep.csv"), [[*rows[0]], *([*map(_text, row.values())] for row in rows)])
+        write_csv(run.directory.at("runs.csv"), runs_table(sweep))
         return sweep
 
     def _runs(self, session: Session, executor: Executor) -> list[TwinRun]:
@@ -216,23 +217,15 @@ def _values(key: str, choices: Sequence[Any] | str) -> tuple[Any, ...]:
     return tuple(choices)
 
 
-def sweep_csv(sweep: TwinSweep) -> str:
-    """The averages as CSV."""
-    rows = sweep.rows
-    head = [*rows[0]]
-    return csv_text([head, *([_text(row[name]) for name in head] for row in rows)])
-
-
-def runs_csv(sweep: TwinSweep) -> str:
-    """A line a run and estimate, as CSV."""
-    lines: list[list[str]] = [[*sweep.keys, "seed", "estimate", "rmse", "spread", "failure"]]
+def runs_table(sweep: TwinSweep) -> Iterator[list[str]]:
+    """A line a run and estimate, below their heads."""
+    yield [*sweep.keys, "seed", "estimate", "rmse", "spread", "failure"]
     for values, runs in zip(sweep.values, sweep.runs, strict=True):
         own = [_text(value) for value in values]
         for seed, run in zip(sweep.seeds, runs, strict=True):
-            lines += [[*own, str(seed), name, repr(rmse), repr(spread), ""] for name, rmse, spread in run.scores]
+            yield from ([*own, str(seed), name, repr(rmse), repr(spread), ""] for name, rmse, spread in run.scores)
             if run.failure:
-                lines.append([*own, str(seed), "", "", "", run.failure])
-    return csv_text(lines)
+                yield [*own, str(seed), "", "", "", run.failure]
 
 
 def _text(value: Any) -> str:

@@ -128,7 +128,8 @@ def test_a_pattern_in_the_list_stands_for_the_files_that_are_there(tmp_path):
         for file in (out / "run.log", *(folder / name for name in names)):
             file.write_text("old")
     with RunDirectory.open(out, "force") as directory:
-        directory.claim("run.log").write_text("new")
+        directory.claim("run.log")
+        directory.at("run.log").write_text("new")
         directory.publish()
     assert {name for name in contents(out) if name.startswith("checkpoints/")} == {"checkpoints/mine.txt"}
     assert (out / "run.log").read_text() == "new"
