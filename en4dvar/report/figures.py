@@ -135,11 +135,9 @@ def pairs(result: StoredResult) -> Chart:
     for i, row in enumerate(rows):
         panels = [_pair(i, j, values[column.name], values[row.name]) for j, column in enumerate(rows)]
         panels[0].ylabel = with_unit(row.symbol, row.unit) if i else ""
-        for panel, column in zip(panels, rows, strict=True):
-            panel.x_numbers, panel.xlabel = i == len(rows) - 1, with_unit(column.symbol, column.unit)
-            panel.xlabel = panel.xlabel if panel.x_numbers else ""
-        for panel in panels[1:]:
-            panel.y_numbers = False
+        for j, (panel, column) in enumerate(zip(panels, rows, strict=True)):
+            panel.x_numbers, panel.y_numbers = i == len(rows) - 1, j == 0
+            panel.xlabel = with_unit(column.symbol, column.unit) if panel.x_numbers else ""
         lines.append(Row(side / len(rows), panels))
     return Chart(lines, side)
 

@@ -7,7 +7,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined, UndefinedError
 from markupsafe import Markup
 
 from en4dvar.plumbing.files import write_text
@@ -30,9 +30,13 @@ def render(template: str, package: str = "en4dvar.report", /, **content: Any) ->
     """The page of a template of a package as text; of ours with the scripts of charts and of tables that are sorted.
 
     A content security policy forbids the page every address and every script but these: what escaping might miss
-    would still not run. A template of an application gets the colours on ``light`` and on ``dark`` ground.
+    would still not run. A template of an application gets the colours on ``light`` and on ``dark`` ground. Raises
+    :class:`LookupError`: the content lacks what the page shows.
     """
-    return _environment(package).get_template(template).render(**content)
+    try:
+        return _environment(package).get_template(template).render(**content)
+    except UndefinedError as error:  # a file with a good seal may lack what the page shows
+        raise LookupError(str(error).rpartition(" has ")[2]) from None
 
 
 @cache

@@ -73,8 +73,7 @@ class SequenceOutcome(SeriesResult):
 def write_sequence_report(run_dir: Path, files: bool = False) -> Path:
     """Write ``report.html`` from ``sequence.nc``, with ``files`` also its figures as PDF and PNG; returns its path.
 
-    Raises :class:`~en4dvar.plumbing.errors.OutputError` where there is nothing to read or the directory cannot
-    be written.
+    Raises :class:`OutputError`: there is nothing to read, or the directory cannot be written.
     """
     data = read_groups(run_dir / "sequence.nc")["/"]
     readings = int(np.isfinite(data["observations"].values).sum())

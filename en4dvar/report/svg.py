@@ -62,8 +62,11 @@ def svg(chart: Chart, name: str, description: str) -> Markup:
     parts, top = [], 0.0
     margins = _left_margins(chart)
     for i, row in enumerate(chart.rows):
-        for j, (panel, x, width) in enumerate(_columns(row, margins, chart.width)):
-            parts += _panel(panel, row, top, x, width, f"{name}-{i}-{j}")
+        lefts = [margins[len(row.panels) if j else 0, j] for j in range(len(row.panels))]
+        x, width = 0.0, (chart.width - sum(lefts) - len(lefts) * GAP) / len(lefts)
+        for j, (panel, left) in enumerate(zip(row.panels, lefts, strict=True)):
+            parts += _panel(panel, row, top, x + left, width, f"{name}-{i}-{j}")
+            x += left + width + GAP
         top += row.height
     head = (
         f'<svg role="img" aria-label="{escape(description)}" viewBox="0 0 {chart.width:.5g} {chart.height:.5g}" '
@@ -93,16 +96,6 @@ def _left_margins(chart: Chart) -> dict[tuple[int, int], float]:
             key = (len(row.panels) if j else 0, j)
             margins[key] = max(margins.get(key, 0.0), _left(panel))
     return margins
-
-
-def _columns(row: Row, margins: dict[tuple[int, int], float], width: float) -> Iterator[tuple[Panel, float, float]]:
-    """Each panel, where its frame begins and how wide it is."""
-    n = len(row.panels)
-    lefts = [margins[n if j else 0, j] for j in range(n)]
-    each, x = (width - sum(lefts) - n * GAP) / n, 0.0
-    for panel, left in zip(row.panels, lefts, strict=True):
-        yield panel, x + left, each
-        x += left + each + GAP
 
 
 def _panel(panel: Panel, row: Row, top: float, x: float, width: float, name: str) -> list[str]:

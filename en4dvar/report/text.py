@@ -56,11 +56,6 @@ def with_unit(label: str, unit: str) -> str:
     return f"{label} ({shown})" if shown else label
 
 
-def decimals(std: float) -> int:
-    """Decimals that show ``std`` with two significant digits."""
-    return max(0, 1 - math.floor(math.log10(std))) if std > 0 and math.isfinite(std) else 3
-
-
 def plain_number(value: float, digits: int = 4) -> str:
     """``digits`` significant digits; powers of ten only where the number would be long; an en dash for NaN."""
     if not math.isfinite(value):
@@ -89,7 +84,7 @@ def number_like(value: float, std: float) -> str:
     >>> number_like(2.80123, 0.104), number_like(-0.0, 0.1), number_like(float("nan"), 1.0)
     ('2.80', '0.00', '–')
     """
-    places = decimals(std)
+    places = max(0, 1 - math.floor(math.log10(std))) if std > 0 and math.isfinite(std) else 3  # two digits of the std
     if not math.isfinite(value):
         return "–"
     if places > 6 or max(abs(value), abs(std) if math.isfinite(std) else 0.0) >= 1e6:

@@ -62,8 +62,7 @@ class TwinOutcome(TwinResult):
 def write_twin_report(run_dir: Path, files: bool = False) -> Path:
     """Write ``report.html`` from ``twin.nc``, with ``files`` also its figures as PDF and PNG; returns its path.
 
-    Raises :class:`~en4dvar.plumbing.errors.OutputError` where there is nothing to read or the directory cannot
-    be written.
+    Raises :class:`OutputError`: there is nothing to read, or the directory cannot be written.
     """
     data = read_groups(run_dir / "twin.nc")["/"]
     burn_in = int(data.attrs["burn_in"])

@@ -209,8 +209,7 @@ def load_stored(path: str | Path) -> StoredResult:
             group.check()
             joined(groups, path_in_file).check()
     with understood(path):
-        for fault in _faults({path_in_file: joined(groups, path_in_file) for path_in_file in groups}):
-            raise OutputError(f"{path}: not a result of en4dvar: {fault}")
+        check_complete(path, groups)
     return StoredResult(groups)
 
 
@@ -244,6 +243,12 @@ def joined(groups: Groups, path: str) -> Group:
 
 
 _OPTIONAL = OPTIONAL | {*(f"/{name}" for name in BESIDE.values())}
+
+
+def check_complete(path: Path, groups: Groups) -> None:
+    """Check the groups of a file. Raises :class:`OutputError`, which names what is missing."""
+    for fault in _faults({path: joined(groups, path) for path in groups}):
+        raise OutputError(f"{path}: not a result of en4dvar: {fault}")
 
 
 def of_members(group: Group) -> dict[str, Variable]:

@@ -31,8 +31,6 @@ from en4dvar.runs.progress import describe
 
 SEND_EVERY = 0.1  # s; a worker sends the records of its iterations no more often, whatever data sets they are of
 Told = tuple[str, Record, str]  # name of a data set, one of its records, and what the log says of it
-
-
 Common = tuple[Config, Mapping[str, Any]]  # of the data sets of a run: its configuration, attributes of their files
 
 

@@ -17,7 +17,6 @@ from en4dvar.config.load import recorded as recorded_configuration
 from en4dvar.data.observations import SEVERAL
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.executor import choose_executor, one_blas_thread
-from en4dvar.model.forward import ForwardModel
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.results.campaign_file import failed_datasets
 from en4dvar.results.fingerprint import Identity, digest_of, identity
@@ -102,7 +101,7 @@ def rerun(run_dir: str | Path, workers: int | None = None, *, trust: bool = Fals
             differ = differences(values, _values(again))
             repeated.append(Repeated(recorded.name, len(values), differ, _data_file(recorded)))
     failures = failed_datasets(campaign) if files != [campaign] else {}
-    return _found(repeated, config.resolved, config.model, first.attributes, failures)
+    return _compared(repeated, config, first.attributes, failures)
 
 
 def _of_cycles(file: Path, workers: int | None, trust: bool, ask: Ask | None) -> Rerun:
@@ -117,7 +116,7 @@ def _of_cycles(file: Path, workers: int | None, trust: bool, ask: Ask | None) ->
         again = kind.again(executor)
     was, now = ({f"/{name}": v.values for name, v in result.every.items()} for result in (recorded, again))
     repeated = Repeated(config.name, len(was), differences(was, now), "")
-    return _found([repeated], config.resolved, kind.model, recorded.attrs, {})
+    return _compared([repeated], config, recorded.attrs, {})
 
 
 def _configuration(file: Path, attributes: Mapping[Any, Any], trust: bool, ask: Ask | None) -> AnyConfig:
@@ -129,15 +128,11 @@ def _configuration(file: Path, attributes: Mapping[Any, Any], trust: bool, ask: 
         return resolve_any(document, file.parent.absolute())
 
 
-def _found(
-    sets: Sequence[Repeated],
-    resolved: str,
-    model: ForwardModel,
-    attributes: Mapping[Any, Any],
-    failures: Mapping[str, str],
+def _compared(
+    sets: Sequence[Repeated], config: AnyConfig, attributes: Mapping[Any, Any], failures: Mapping[str, str]
 ) -> Rerun:
     now, was = provenance("", None), Identity(str(attributes["identity"]), ())
-    changed = identity(resolved, model, {}).difference(was, frozenset())
+    changed = identity(config.resolved, config.model, {}).difference(was, frozenset())
     told = [(key, str(attributes[key]), now[key]) for key in SURROUNDINGS]
     surroundings = tuple(f"{key.replace('_', ' ')}: {old} → {new}" for key, old, new in told if old != new)
     return Rerun(tuple(sets), changed, surroundings, failures)

@@ -27,6 +27,7 @@ from en4dvar.priors.prior import Prior
 from en4dvar.report import write_pages
 from en4dvar.report.figures import all_figures, traces
 from en4dvar.report.history import history
+from en4dvar.report.html import render
 from en4dvar.report.overview import LISTED, SetSummary, overview_figures, render_overview
 from en4dvar.report.page import judge_chi2
 from en4dvar.report.result import Result, load_result
@@ -348,6 +349,20 @@ def test_nothing_to_report_is_one_clear_error(tmp_path):
         write_pages(tmp_path / "absent")
     with pytest.raises(OutputError, match=r"posterior\.nc: no such file"):
         write_pages(tmp_path)
+
+
+def test_a_page_says_what_the_file_lacks():
+    """Which whoever reads the file tells with its name; anybody can write a file with a good seal."""
+    with pytest.raises(LookupError, match="no attribute 'members'"):
+        render(
+            "cycles.html.j2",
+            attributes={"name": "a", "scheme": "b"},
+            kind="",
+            what="",
+            copies=False,
+            cycle="",
+            iterations=1,
+        )
 
 
 def test_unwritable_run_directory_is_one_clear_error(run_dir):
