@@ -51,7 +51,7 @@ def against_a_person() -> tuple[Track, Array]:
     by_hand = scipy.io.loadmat(SHARED / "PAstiff_xy002_RofT.mat")["Rnew"].ravel()
     found = track(open_movie(SHARED / "PAstiff_xy002.mp4"), 2)
     return found, np.array(
-        [r.radius - by_hand[r.sighting.frame] for r in found.readings if by_hand[r.sighting.frame] > 0]
+        [r.radius - by_hand[r.frame] for r in found.readings if by_hand[r.frame] > 0]
     )
 
 
@@ -88,7 +88,7 @@ def rendered(kind: str, number: int) -> tuple[Array, Array]:
     truth, frames = film(kind, number)
     flashes = (0.0, 0.25, 0.5) if truth.ndim == 2 else (0.0,)
     found = track(replace(movie_of(frames), rate=1.0), flashes=flashes)
-    readings = [sorted(f, key=lambda r: r.radius) for _, f in groupby(found.readings, key=lambda r: r.sighting.frame)]
+    readings = [sorted(f, key=lambda r: r.radius) for _, f in groupby(found.readings, key=lambda r: r.frame)]
     read = [f if len(f) == len(flashes) else f * len(flashes) for f in readings[Scene.before :]]
     wrong = np.array([[r.radius for r in f] for f in read]) - np.sort(truth.reshape(len(truth), -1), axis=1)
     return (wrong / np.array([[r.errors.std for r in f] for f in read])).ravel(), wrong.ravel()

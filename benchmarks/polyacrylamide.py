@@ -75,7 +75,7 @@ def movie(folder: Path) -> None:
 
     found = track(open_movie(SHARED / "PAstiff_xy002.mp4"), 2)
     by_hand = scipy.io.loadmat(SHARED / "PAstiff_xy002_RofT.mat")["Rnew"].ravel()
-    person = [replace(r, radius=float(by_hand[r.sighting.frame])) for r in found.readings]
+    person = [replace(r, radius=float(by_hand[r.frame])) for r in found.readings]
     scale = Scale(PIXEL, RATE)
     for name, readings in (("hand", person), ("track", found.readings)):
         write_text(folder / f"{name}.csv", to_csv(readings, scale, "PAstiff_xy002.mp4", name))

@@ -123,7 +123,7 @@ class Problem:
     @property
     def operators(self) -> tuple[Array, ...]:
         b = ball(self.nodes)
-        return b.derivative, np.ascontiguousarray(b.laplacian[: self.nodes]), b.y, b.weights
+        return b.derivative, np.ascontiguousarray(b.laplacian[: self.nodes]), b.x, b.weights
 
     def start(self, member: Array) -> Array:
         """At rest at R0."""

@@ -54,11 +54,6 @@ def inlined(function: F) -> F:
     return compiled
 
 
-def summing_kernel(function: F) -> F:
-    """A :func:`kernel` whose sums may be added in another order, side by side; the order is the same in every run."""
-    return _compiled(function, numba.njit(nogil=True, fastmath={"reassoc", "contract", "nsz"}))
-
-
 def _compiled(function: F, compile_: Callable[[F], Any]) -> F:
     if getattr(numba.config, "DISABLE_JIT", 0):
         raise ConfigError("NUMBA_DISABLE_JIT is set, but the solver's kernels run compiled alone; unset it")

@@ -67,14 +67,12 @@ def _alternatives(model: Dynamics) -> Iterator[Alternative]:
         yield Alternative("gas_model", words, replace(cast(Any, simple), gas="polytropic"))
     if model.medium_heat == "conducting":
         yield changed("medium_heat", "the gel stayed cold at the wall (medium_heat: cold)", medium_heat="cold")
-    if "p_v" in model.named:
-        pass
-    elif medium.p_v:
+    if medium.p_v and "p_v" not in model.named:
         yield changed("vapour", "there were no vapour in the bubble", medium=replace(medium, p_v=0.0))
-    elif model.vapour == "none":
-        yield changed("vapour", "vapour filled the bubble (vapour_pressure: saturated)", medium=saturated)
-    else:
+    elif model.vapour != "none":  # and p_v is no parameter
         yield changed("vapour", "there were no vapour in the bubble (vapour: none)", vapour="none")
+    elif "p_v" not in model.named:
+        yield changed("vapour", "vapour filled the bubble (vapour_pressure: saturated)", medium=saturated)
     yield Alternative("radius_at_rest", f"{rest} were 10 % larger", parameters={rest: REST})
     yield Alternative("length_scale", "all radii were 1 % larger (µm per pixel)", values=SCALE, observable="radius")
     yield Alternative("time_scale", "the time between frames were 1 % longer", times=CLOCK, observable="radius")

@@ -75,7 +75,7 @@ def simulate(
 
     Returns
     -------
-    Dataset with ``R`` (m), ``Rdot`` (m/s), ``p_b`` (Pa) on (member, time), NaN where a member failed; per member
+    Dataset with ``R`` (m), ``Rdot`` (m/s), ``p_b`` (Pa) on ("member", time), NaN where a member failed; per member
     ``status`` (0 is ok), ``reason``, ``steps``, ``max_wall_mach`` and, with the heat equation, ``max_temperature``
     (K, innermost node); the parameters as coordinates; the model and its constants, with unit and source (JSON), as
     attributes. Beyond the result itself it takes a few MB, whatever the number of members.
@@ -88,7 +88,7 @@ def simulate(
     if workers < 1:
         raise ConfigError(f"workers: at least 1, not {workers}")
     chosen = get_law(law) if isinstance(law, str) else law
-    try:
+    with retold(ValueError, ConfigError):
         model = BubbleModel(
             law=chosen,
             gas=gas,
@@ -102,15 +102,11 @@ def simulate(
             wall=wall,
             accuracy=cast(Accuracy, accuracy),
         )
-    except ValueError as error:
-        raise ConfigError(str(error)) from error
     model = model.with_parameters(dict(parameters or {}))
     theta = _members(model, dict(parameters or {}))
     t = instants_of(() if times is None else times, "s")
-    try:
+    with retold(ValueError, ConfigError, "parameters: "):
         x = model.initial_states(theta)
-    except ValueError as error:
-        raise ConfigError(f"parameters: {error}") from error
     return _dataset(model, theta, t, *_run(model, x, t, workers))
 
 
@@ -148,22 +144,25 @@ def _dataset(
 ) -> xr.Dataset:
     import xarray as xr
 
-    member = "member"
     data: dict[str, Any] = {
-        name: ((member, "time"), kept[name], {"units": unit, "long_name": text})
+        name: (("member", "time"), kept[name], {"units": unit, "long_name": text})
         for name, (unit, text) in _FIELDS.items()
     }
-    data["status"] = (member, kept["status"], {"long_name": "0 where the member was integrated to the end"})
-    data["reason"] = (member, kept["reason"], {"long_name": "why the member failed"})
-    data["steps"] = (member, record[:, STEPS].astype(int), {"long_name": "accepted time steps"})
-    data["max_wall_mach"] = (member, record[:, MAX_MACH], {"units": "1", "long_name": "largest wall Mach number"})
+    data["status"] = ("member", kept["status"], {"long_name": "0 where the member was integrated to the end"})
+    data["reason"] = ("member", kept["reason"], {"long_name": "why the member failed"})
+    data["steps"] = ("member", record[:, STEPS].astype(int), {"long_name": "accepted time steps"})
+    data["max_wall_mach"] = ("member", record[:, MAX_MACH], {"units": "1", "long_name": "largest wall Mach number"})
     if model.system.gas:
         own = model.medium_of(theta)
         hottest = own.T_inf * from_kirchhoff(record[:, MAX_THETA], own)
-        data["max_temperature"] = (member, hottest, {"units": "K", "long_name": "highest temperature near the centre"})
+        data["max_temperature"] = (
+            "member",
+            hottest,
+            {"units": "K", "long_name": "highest temperature near the centre"},
+        )
     coordinates: dict[str, Any] = {"time": ("time", t, {"units": "s", "long_name": "time"})}
     for p in model.parameters:
-        coordinates[p.name] = (member, theta[p.name], {"units": p.unit, "long_name": p.label})
+        coordinates[p.name] = ("member", theta[p.name], {"units": p.unit, "long_name": p.label})
     attributes = {
         "law": model.law.name,
         "start": model.start,

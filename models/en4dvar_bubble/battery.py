@@ -100,17 +100,9 @@ def cycles(law: ConstitutiveLaw) -> tuple[Cycle, ...]:
     return Cycle(min(3.0, highest), 1e-6), Cycle(min(3.0, highest), 1e-4), Cycle(max(1 / 1.5, lowest), 1e-6)
 
 
-@dataclass(frozen=True)
-class Finding:
-    """The outcome of one check; ``reason`` is empty where the law passes."""
-
-    check: str
-    reason: str
-
-
-def run_battery(law: ConstitutiveLaw) -> list[Finding]:
-    """All checks on one law."""
-    return [Finding(describe(check), _reason(check, law)) for check in CHECKS]
+def run_battery(law: ConstitutiveLaw) -> dict[str, str]:
+    """All checks on one law, in words, and the reason why it fails, "" where it passes."""
+    return {describe(check): _reason(check, law) for check in CHECKS}
 
 
 def small_strain(law: ConstitutiveLaw) -> str:

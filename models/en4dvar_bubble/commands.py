@@ -57,12 +57,12 @@ def _check(chosen: Sequence[ConstitutiveLaw]) -> list[str]:
     failing = []
     for law in chosen:
         findings = run_battery(law)
-        wrong = [f for f in findings if f.reason]
+        wrong = list(filter(None, findings.values()))
         click.echo(f"{law.name}: {len(findings) - len(wrong)} of {len(findings)} checks pass")
-        for finding in findings:
-            click.echo(f"  {'FAIL' if finding.reason else 'ok  '}  {finding.check}")
-            if finding.reason:
-                click.echo(f"        {finding.reason}")
+        for words, reason in findings.items():
+            click.echo(f"  {'FAIL' if reason else 'ok  '}  {words}")
+            if reason:
+                click.echo(f"        {reason}")
         click.echo(f"  At small strain: {small_strain(law)}")
         if "limits" not in type(law).__dict__ and is_from_file(type(law)):
             click.echo("  No parent law is declared (limits): a wrong factor or unit shows in the line above alone")

@@ -241,10 +241,7 @@ def _write_example(name: str, force: bool) -> None:
 
 
 def _columns_of(data: str, options: Mapping[str, str | None], layout: Layout) -> dict[str, Any] | Summaries:
-    """Columns and units for ``propose_config``: by option, by a telling name, or asked for; or a row a bubble.
-
-    Raises one :class:`ConfigError` that names every option to add.
-    """
+    """Columns and units for ``propose_config``, or a row a bubble. Raises :class:`ConfigError` with all it lacks."""
     from en4dvar.assembly.reading import find_files
     from en4dvar_bubble.starter.asked import Asked, first_with_columns
     from en4dvar_bubble.starter.summaries import summaries

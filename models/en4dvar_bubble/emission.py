@@ -11,51 +11,42 @@ this is ρ (R² R̈ + 2 R Ṙ²), the second derivative of the volume times ρ/4
 hydrophone meets too, is not in it, nor are steepening and absorption on the way.
 """
 
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
 from en4dvar.model.forward import Observable
 from en4dvar.model.state import Array
-from en4dvar_bubble.paths import BubbleTrajectory, Paths
-
-
-@dataclass(frozen=True)
-class Emission:
-    """H: the pressure (Pa) at the model's ``hydrophone``, at the instants at which it arrives there."""
-
-    batched: ClassVar[bool] = True
-
-    def __call__(self, trajectory: Any) -> Array:
-        """(K,) of a path, (N, K) of many. Raises ValueError: the path does not start where the model does."""
-        if isinstance(trajectory, BubbleTrajectory):
-            return np.asarray(emitted(trajectory.paths)[trajectory.member])
-        return emitted(trajectory)
-
-
-OBSERVABLE = Observable(
-    "acoustic_pressure", "Pa", Emission(), r"$p_\mathrm{ac}$", "kPa", "pressure that the bubble sends out"
-)
+from en4dvar_bubble.paths import OF_WHOLE, OfPath, Paths
 
 
 def emitted(paths: Paths) -> Array:
-    """(N, K) Pa at the model's hydrophone; the paths are run again, at the instants (s) when it was sent."""
+    """(N, K) Pa at the model's hydrophone, at the instants at which it arrives there; the paths are run again, at the
+    instants (s) when it was sent. Raises ValueError: they do not start where the model does.
+    """
     if np.any(paths.start):
         raise ValueError("what the bubble sent out before is read from whole paths, which a resumed one is not")
     model: Any = paths.model
-    if "emitted" not in paths.derived:
-        sent = paths.times - model.hydrophone / paths.medium(1).c
-        if model.start == "acoustic":  # at rest before time zero
-            sent = np.maximum(sent, 0.0)
-        run = model.integrate(paths.initial, sent)
-        medium, R, Rdot = run.medium(1), run["R"], run["Rdot"]
-        excess = run["p_b"] - 2 * medium.S / R + run["S"] - medium.p_inf - _driving(run)
-        nearby = 1 + R * np.reshape(model.image(model.parameter_values(run.initial)), (-1, 1))  # the image's pressure
-        source = R * (excess + 0.5 * medium.rho * Rdot**2) / nearby
-        lost = (run.solution.status != 0)[:, None]
-        paths.derived["emitted"] = np.where(lost, np.nan, source / model.hydrophone)
-    return np.asarray(paths.derived["emitted"])
+    sent = paths.times - model.hydrophone / paths.medium(1).c
+    if model.start == "acoustic":  # at rest before time zero
+        sent = np.maximum(sent, 0.0)
+    run = model.integrate(paths.initial, sent)
+    medium, R, Rdot = run.medium(1), run["R"], run["Rdot"]
+    excess = run["p_b"] - 2 * medium.S / R + run["S"] - medium.p_inf - _driving(run)
+    nearby = 1 + R * np.reshape(model.image(model.parameter_values(run.initial)), (-1, 1))  # the image's pressure
+    source = R * (excess + 0.5 * medium.rho * Rdot**2) / nearby
+    return np.where((run.solution.status != 0)[:, None], np.nan, source / model.hydrophone)
+
+
+OBSERVABLE = Observable(
+    "acoustic_pressure",
+    "Pa",
+    OfPath("pressure sent out"),
+    r"$p_\mathrm{ac}$",
+    "kPa",
+    "pressure that the bubble sends out",
+)
+OF_WHOLE["pressure sent out"] = emitted
 
 
 def _driving(run: Paths) -> Array:

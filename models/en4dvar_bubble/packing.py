@@ -105,9 +105,7 @@ def pack(model: Dynamics, x: Array, start: Array | float, times: Array) -> Packe
 
 
 def _states(model: Dynamics, x: Array, own: Mapping[str, Array]) -> tuple[Array, Array]:
-    """Initial values (N, n) and parameters (N, rows) of states (N, n_state) with parameters ``own``; what the law adds
-    to both is missing.
-    """
+    """Initial values (N, n) and parameters (N, rows) of states (N, n_state), without what the law adds to both."""
     medium, layout, system = model.medium_of(own), model.layout, model.system
     column = {name: x[:, s.start] for name, s in layout.slices.items()}
     log_R = np.log(column["R"] * 1e6)
@@ -146,9 +144,7 @@ def _states(model: Dynamics, x: Array, own: Mapping[str, Array]) -> tuple[Array,
 
 
 def _gas_at_wall(model: Dynamics, par: Array, column: Mapping[str, Array], theta: Array, gas_fraction: Array) -> Array:
-    """The Y_w (N,) with which the equation of a finite rate in :mod:`solver.general` holds, the positive one of its two
-    roots: a state that was changed need not hold it.
-    """
+    """The positive Y_w (N,) of the finite rate in :mod:`solver.general`, which a changed state need not hold."""
     p, R, slope = column["p_b"], column["R"] * 1e6, model.system.ball.derivative[-1]
     power = par[:, rows.DIFFUSION_P], par[:, rows.DIFFUSION_T]
     rho = model.medium_of(column).rho
@@ -181,9 +177,7 @@ def with_gas(model: Dynamics, x: Array, factor: Array) -> Array:
 def _memory(
     model: Dynamics, values: Mapping[str, Array], initial: Array, par: Array, x: Array, rho: float | Array
 ) -> Array:
-    """Tables of stiffness and equilibrium of the memory variables; writes their initial values and parameters. ``rho``
-    is one density, or (N, 1).
-    """
+    """Tables of the memory variables; writes their initial values and parameters. ``rho`` is one density, or (N, 1)."""
     system = model.system
     initial[:, system.first_memory : -2] = x[:, model.layout["Z"]] / rho
     memory = model.law.memory_tables(values)

@@ -1,7 +1,8 @@
 """Integrated members as trajectories: fields of the state vector, computed from the raw solution when asked for."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, cast
+from typing import Any, ClassVar, cast
 
 import numpy as np
 
@@ -20,10 +21,7 @@ from en4dvar_bubble.tables import evaluate
 
 @dataclass(frozen=True, eq=False)
 class Paths(Batch):
-    """Integrated members: ``initial`` states (N, n_state) at ``start`` (s), ``times`` (N, K) in s, the raw solution.
-
-    ``derived``: what was computed from the paths as a whole (:mod:`en4dvar_bubble.events`).
-    """
+    """Integrated members: ``initial`` states (N, n_state) at ``start`` (s), ``times`` (N, K) in s, the raw solution."""
 
     model: Dynamics
     initial: Array
@@ -31,8 +29,7 @@ class Paths(Batch):
     solution: Solution
     par: Array
     start: Array | float = 0.0
-    derived: dict[str, Any] = field(default_factory=dict)
-    _fields: dict[str, Array] = field(default_factory=dict)
+    _fields: dict[str, Any] = field(default_factory=dict)
 
     @property
     def whole(self) -> bool:  # type: ignore[override]
@@ -47,14 +44,16 @@ class Paths(Batch):
         return len(self.times)
 
     def __getitem__(self, name: Any) -> Any:
-        """A field of the state along the paths, (N, K) or (N, K, size), SI; a member by its number."""
+        """A field of the state along the paths, (N, K) or (N, K, size), SI, or what is of :data:`OF_WHOLE`; a member by
+        its number.
+        """
         if isinstance(name, slice):
             return [self[i] for i in range(*name.indices(len(self)))]
         if not isinstance(name, str):
             return self.failure(name) if self.solution.status[name] else BubbleTrajectory(self, name)
         if name not in self._fields:
-            compute: Any = getattr(self, f"_{name}", None)
-            self._fields[name] = self._constant(name) if compute is None else compute()
+            compute: Any = OF_WHOLE.get(name) or getattr(type(self), f"_{name}", None)
+            self._fields[name] = self._constant(name) if compute is None else compute(self)
         return self._fields[name]
 
     def failure(self, member: int) -> Failure:
@@ -86,7 +85,7 @@ class Paths(Batch):
     def last(self) -> Array:
         """States (N, n_state) at the last instant."""
         solution = replace(self.solution, states=self.solution.states[:, -1:])
-        return replace(self, times=self.times[:, -1:], solution=solution, derived={}, _fields={}).states[:, 0]
+        return replace(self, times=self.times[:, -1:], solution=solution, _fields={}).states[:, 0]
 
     def medium(self, axes: int) -> Medium:
         """See :meth:`Dynamics.medium_of`."""
@@ -169,6 +168,21 @@ class Paths(Batch):
         else:
             nu = self.par[:, None, rows.VISCOSITY]
         return np.asarray((stress - 4 * nu * V) * rho)
+
+
+OF_WHOLE: dict[str, Callable[[Paths], Any]] = {}
+"""What is computed once from the paths as a whole, by words, which no parameter has for its name."""
+
+
+@dataclass(frozen=True)
+class OfPath:
+    """H that reads what :data:`OF_WHOLE` computes: (K,) of a path, (N, K) of many."""
+
+    name: str
+    batched: ClassVar[bool] = True
+
+    def __call__(self, trajectory: Any) -> Array:
+        return np.asarray(trajectory[self.name])
 
 
 class BubbleTrajectory(Trajectory):

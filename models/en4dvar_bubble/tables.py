@@ -90,13 +90,13 @@ def fill_one(samples, member, factor, out, at):
 
 
 @kernel
-def from_slopes(slopes, step, zero):
-    """Coefficients (N, cells, 8) of the antiderivative that vanishes at node ``zero``, from samples of the
-    derivative.
+def from_slopes(slopes, step, zero, every):
+    """Coefficients (N, cells, 8), of cells ``every`` steps wide, of the antiderivative that vanishes at node ``zero``,
+    from samples of the derivative.
     """
     n, total = slopes.shape
     cells = total - 1 - 2 * HALO
-    out = np.empty((n, cells, 8))
+    out = np.empty((n, cells // every, 8))
     value = np.empty(cells + 1)
     first = np.empty(cells + 1)
     second = np.empty(cells + 1)
@@ -118,8 +118,11 @@ def from_slopes(slopes, step, zero):
             value[j + 1] = value[j] + _area(first, second, third, j)
         for j in range(zero - 1, -1, -1):
             value[j] = value[j + 1] - _area(first, second, third, j)
-        for j in range(cells):
-            quintic(out, i, j, value[j], first[j], second[j], value[j + 1], first[j + 1], second[j + 1])
+        for j in range(cells + 1):
+            first[j], second[j] = every * first[j], every * every * second[j]
+        for cell in range(cells // every):
+            j, k = cell * every, (cell + 1) * every
+            quintic(out, i, cell, value[j], first[j], second[j], value[k], first[k], second[k])
     return out
 
 

@@ -77,9 +77,7 @@ class Background:
         return (image - np.float32(change)) * scale, np.where(tiles == 0, 0, (tiles - np.float32(change)) * scale)
 
     def _light(self, tiles: Array) -> float:
-        """How much brighter than the level the background is, by the brightest tiles that are alike: of all tiles, the
-        median would be the bubble's edge where the bubble covers half of the frame.
-        """
+        """How much brighter than the level the background is, by its brightest tiles: the others may be the bubble."""
         alike = tiles > np.percentile(tiles, TOP) - max(ALIKE * self.noise / TILE, CLOSE)
         return float(np.median(tiles[alike])) if np.mean(alike) > MANY else 0.0
 
@@ -237,9 +235,7 @@ def _is_round(patch: npt.NDArray[np.bool_]) -> bool:
 
 
 def _quiet(leading: Sequence[Frame], first: Image, noise: float, blind: npt.NDArray[np.bool_]) -> int:
-    """How many leading frames look like the first: before a bubble is large enough to be told from dirt, most of them
-    show the shade in its middle.
-    """
+    """How many leading frames look like the first; most of those after them show the shade in a bubble's middle."""
     for number, frame in enumerate(leading):
         labels, sizes = labelled(_changed(frame.astype(np.float32), first, noise) & ~blind)
         if sizes.max() > SPECK:  # larger than dirt that drifts

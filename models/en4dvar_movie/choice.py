@@ -64,14 +64,6 @@ def _correction(rest: list[str], where: str) -> Correction:
     return Correction(False, Circle(x, y, radius), " ".join(rest[3:]))
 
 
-def place(text: str | None) -> tuple[float, float] | None:
-    """``--bubble X,Y``. Raises :class:`DataError`."""
-    if text is None:
-        return None
-    x, y = numbers(text, "--bubble", "X,Y")
-    return x, y
-
-
 def numbers(text: str, option: str, names: str) -> tuple[float, ...]:
     """``"12.5,30"`` as numbers, as many as ``names`` has. Raises :class:`DataError` that names the option."""
     try:

@@ -55,7 +55,7 @@ def track(
     from en4dvar.executor import available_cores
     from en4dvar.plumbing.files import write_text
     from en4dvar.runs.progress import counted
-    from en4dvar_movie.choice import place, read_corrections, watched
+    from en4dvar_movie.choice import numbers, read_corrections, watched
     from en4dvar_movie.following import MOST
     from en4dvar_movie.frames import open_movie, require_suffix, write_movie
     from en4dvar_movie.page import outlined as outlined_frames
@@ -73,7 +73,7 @@ def track(
     for target in (table, shown, outlined, *more):
         refuse_to_replace(target, force)
     fixed = read_corrections(corrections) if corrections else {}
-    point = place(choice["bubble"])
+    point = None if choice["bubble"] is None else numbers(choice["bubble"], "--bubble", "X,Y")
     part = watched(opened, choice["region"], choice["mask"])
     with counted("frames") as tell:
         progress = (lambda done: tell(done, opened.count)) if tell else (lambda done: None)
@@ -88,7 +88,7 @@ def track(
     write_text(shown, page_text(opened, track, scale, words))
     if outlined:
         pictures = outlined_frames(opened, track)
-        write_movie(outlined, pictures, len({r.sighting.frame for r in track.readings}), scale.pixel, scale.rate)
+        write_movie(outlined, pictures, len({r.frame for r in track.readings}), scale.pixel, scale.rate)
     used = [r for r in track.readings if r.used]
     what = "frames" if len(scale.flashes) == 1 else "circles"
     echo(f"{len(used)} of {len(track.readings)} {what} read; the others and why: see the page")

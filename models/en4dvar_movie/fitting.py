@@ -8,7 +8,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from en4dvar.model.state import Array
-from en4dvar_movie.kernels import SHAPE, normal_equations, residuals
+from en4dvar_movie.kernels import SHAPE, residuals
 from en4dvar_movie.outline import MODES, Circle, Optics, Outline, share_inside
 
 ROUNDS = 30
@@ -176,6 +176,16 @@ def _descend(
             if damping > 1e6:
                 break
     return p
+
+
+def normal_equations(
+    image: Array, p: Array, modes: int, ring: Array, cutoff: float
+) -> tuple[Array, Array, float, float]:
+    """JᵀWJ (P, P), JᵀWr (P,), Σ w and the robust cost, W of Tukey's bisquare with ``cutoff``."""
+    off, rows, _ = residuals(image, p, modes, ring)
+    left = np.maximum(1 - (off / cutoff) ** 2, 0.0)  # of Tukey's weights the roots
+    rows *= left[:, None]
+    return rows.T @ rows, (left * off) @ rows, float(left @ left), float(np.sum(1 - left**3)) * cutoff**2 / 6
 
 
 def _outlines(image: Array, p: Array, modes: int, noise: float, optics: Optics) -> list[Outline] | None:

@@ -106,7 +106,7 @@ def _cost(before: Array, after: Array, steps: Array) -> Array:
 
 
 def target(
-    bubbles: Sequence[Chain], looks: Sequence[Look], point: tuple[float, float] | None, firm: Iterable[int] = ()
+    bubbles: Sequence[Chain], looks: Sequence[Look], point: tuple[float, ...] | None, firm: Iterable[int] = ()
 ) -> tuple[int, str]:
     """Which of the bubbles is meant, and a note where that is not sure: the corrected, the one at ``point``, the
     laser's, or the one whose wall travels furthest."""

@@ -1,4 +1,4 @@
-"""Compiled loops over pixels: the blurred outline, and its normal equations.
+"""The compiled loop over pixels: the blurred outline and its derivatives.
 
 The image near the outline is modelled as
 
@@ -16,12 +16,11 @@ import math
 
 import numpy as np
 
-from en4dvar.plumbing.compiled import kernel, summing_kernel
+from en4dvar.plumbing.compiled import kernel
 
 NAMES = ("x", "y", "R", "w", "b", "c", "g", "rho_g")
 SHAPE = len(NAMES)  # the first mode's place
 FAR = 7.0  # widths from an edge where nothing of it is left in double precision but 1e-12
-BLOCK = 64  # pixels
 _ROOT_HALF = math.sqrt(0.5)
 _DENSITY = 1 / math.sqrt(2 * math.pi)
 
@@ -78,85 +77,23 @@ def _row(j, i, p, modes, row):
 
 
 @kernel
-def _bounds(shape, x, y, reach):
-    return (
-        max(0, math.floor(y - reach)),
-        min(shape[0], math.ceil(y + reach) + 1),
-        max(0, math.floor(x - reach)),
-        min(shape[1], math.ceil(x + reach) + 1),
-    )
-
-
-@kernel
 def residuals(image, p, modes, ring):
     """Residuals (n,) of the pixels whose distance from ``ring[:2]`` lies between ``ring[2]`` and ``ring[3]``, with the
     model's derivatives (n, P), and the row and column (n, 2) of each."""
     row = np.zeros(len(p))
-    top, bottom, left, right = _bounds(image.shape, ring[0], ring[1], ring[3])
+    (height, width), x, y, reach = image.shape, ring[0], ring[1], ring[3]
+    top, bottom = max(0, math.floor(y - reach)), min(height, math.ceil(y + reach) + 1)
+    left, right = max(0, math.floor(x - reach)), min(width, math.ceil(x + reach) + 1)
     most = max(0, bottom - top) * max(0, right - left)
     values, rows, places = np.empty(most), np.empty((most, len(p))), np.empty((most, 2), dtype=np.int64)
     n = 0
     for j in range(top, bottom):
         for i in range(left, right):
-            far = (i - ring[0]) ** 2 + (j - ring[1]) ** 2
-            if ring[2] ** 2 <= far <= ring[3] ** 2 and not math.isnan(image[j, i]):
+            far = (i - x) ** 2 + (j - y) ** 2
+            if ring[2] ** 2 <= far <= reach**2 and not math.isnan(image[j, i]):
                 values[n] = image[j, i] - _row(j, i, p, modes, row)
                 for a in range(len(p)):
                     rows[n, a] = row[a]
                 places[n, 0], places[n, 1] = j, i
                 n += 1
     return values[:n], rows[:n], places[:n]
-
-
-@summing_kernel
-def _add(A, rows, weights):
-    """A += Σ_k weights_k rows_k rows_kᵀ of rows (P, BLOCK), below the diagonal."""
-    scaled = np.empty(BLOCK)
-    for a in range(len(A)):
-        for k in range(BLOCK):
-            scaled[k] = rows[a, k] * weights[k]
-        for b in range(a + 1):
-            total = 0.0
-            for k in range(BLOCK):
-                total += scaled[k] * rows[b, k]
-            A[a, b] += total
-
-
-@kernel
-def normal_equations(image, p, modes, ring, cutoff):
-    """JᵀWJ (P, P), JᵀWr (P,), Σ w and the robust cost, W of Tukey's bisquare with ``cutoff``."""
-    size = len(p)
-    row = np.zeros(size)
-    rows = np.zeros((size, BLOCK))  # of pixels whose products are added together, which is quicker
-    weights = np.zeros(BLOCK)
-    n = 0
-    A = np.zeros((size, size))
-    g = np.zeros(size)
-    total = cost = 0.0
-    top, bottom, left, right = _bounds(image.shape, ring[0], ring[1], ring[3])
-    for j in range(top, bottom):
-        for i in range(left, right):
-            far = (i - ring[0]) ** 2 + (j - ring[1]) ** 2
-            if far < ring[2] ** 2 or far > ring[3] ** 2 or math.isnan(image[j, i]):
-                continue
-            r = image[j, i] - _row(j, i, p, modes, row)
-            u = min(1.0, abs(r) / cutoff)
-            cost += 1 - (1 - u * u) ** 3
-            w = (1 - u * u) ** 2
-            if w == 0.0:
-                continue
-            total += w
-            for a in range(size):
-                rows[a, n] = row[a]
-                g[a] += w * row[a] * r
-            weights[n] = w
-            n += 1
-            if n == BLOCK:
-                _add(A, rows, weights)
-                n = 0
-    weights[n:] = 0.0
-    _add(A, rows, weights)
-    for a in range(size):
-        for b in range(a):
-            A[b, a] = A[a, b]
-    return A, g, total, cost * cutoff * cutoff / 6

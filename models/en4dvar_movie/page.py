@@ -51,7 +51,7 @@ def page_text(movie: Movie, track: Track, scale: Scale, command: str) -> str:
 
 def _radius(used: list[Reading], scale: Scale) -> Chart:
     um = 1e6 * scale.pixel
-    times = 1e6 * np.array([scale.time(r.sighting) for r in used])
+    times = 1e6 * np.array([scale.time(r) for r in used])
     radius, reach = um * np.array([r.radius for r in used]), 1.645 * um * np.array([r.errors.std for r in used])
     panel = Panel("time (µs)", "radius (µm), 90 %")
     panel.bars(times, radius - reach, radius + reach, "centre", 1.0)
@@ -60,8 +60,8 @@ def _radius(used: list[Reading], scale: Scale) -> Chart:
 
 
 def _shape(used: list[Reading], scale: Scale) -> Chart:
-    times = [1e6 * scale.time(r.sighting) for r in used]
-    outlines = [r.sighting.outline for r in used]
+    times = [1e6 * scale.time(r) for r in used]
+    outlines = [r.outline for r in used]
     left, right = Panel("time (µs)", "eccentricity"), Panel("time (µs)", "mode over radius", legend=True)
     left.dots(times, [o.eccentricity if o else np.nan for o in outlines], "ink", 1.8)
     for n, colour, dash in zip(range(2, MODES + 1), COLOURS, DASHES, strict=False):
@@ -85,7 +85,7 @@ def _strip(movie: Movie, track: Track) -> list[dict[str, Any]]:
 def _picture(number: int, frame: Frame, readings: list[Reading], full: float) -> dict[str, Any]:
     step = -(-max(frame.shape) // SIDE)
     small = grey(frame[::step, ::step], full)
-    shown = [(r.sighting.outline, r.doubt) for r in readings if r.used or r.doubt]
+    shown = [(r.outline, r.doubt) for r in readings if r.used or r.doubt]
     outlines = [(outline.points(TURN) / step, doubt) for outline, doubt in shown if outline is not None]
     return {
         "frame": str(number),
@@ -113,7 +113,7 @@ def by_frame(readings: Sequence[Reading]) -> dict[int, list[Reading]]:
     """Frame → its readings, one a circle."""
     of_frames: dict[int, list[Reading]] = {}
     for reading in readings:
-        of_frames.setdefault(reading.sighting.frame, []).append(reading)
+        of_frames.setdefault(reading.frame, []).append(reading)
     return of_frames
 
 
@@ -126,9 +126,9 @@ def outlined(movie: Movie, track: Track) -> Iterator[Frame]:
         large = np.kron(grey(frame, full), np.ones((scale, scale), np.uint8))
         picture = np.repeat(np.pad(large, [(0, side % 2) for side in large.shape])[..., None], 3, axis=2)
         for reading in readings.get(number, ()):
-            if reading.used and reading.sighting.outline is not None:
+            if reading.used and reading.outline is not None:
                 around = np.linspace(0, 2 * np.pi, int(8 * reading.radius * scale) + 16)
-                _draw(picture, (reading.sighting.outline.points(around) + 0.5) * scale)
+                _draw(picture, (reading.outline.points(around) + 0.5) * scale)
         yield picture
 
 

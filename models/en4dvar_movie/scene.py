@@ -101,11 +101,7 @@ def _surface(scene: Scene, rng: np.random.Generator) -> Array:
 
 
 def _darken(frame: Array, radii: Array, moved: Array, M: Array, scene: Scene) -> None:
-    """Take the bubble's shade from a frame (H, W).
-
-    Only the box about the bubble is computed. It goes beyond the frame where that cuts the bubble, for light from
-    there is blurred into the frame.
-    """
+    """Take the bubble's shade from a frame (H, W) and its surroundings, whose light is blurred into the frame."""
     height, width = scene.shape
     x0, y0 = (scene.bubble or ((width - 1) / 2, (height - 1) / 2)) + moved
     margin = int(np.ceil(TRUNCATE * scene.blur)) + 2

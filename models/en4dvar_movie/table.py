@@ -9,7 +9,7 @@ from importlib.metadata import version
 import numpy as np
 
 from en4dvar.plumbing.tables import csv_text
-from en4dvar_movie.tracking import Reading, Sighting
+from en4dvar_movie.tracking import Reading
 
 MODES = (2, 3, 4)  # whose amplitudes are columns
 SHAPE = ("eccentricity", "angle_deg", *(f"mode_{n}_um" for n in MODES), "mode_std_um")
@@ -28,9 +28,9 @@ class Scale:
     exposure: float = float("nan")
     flashes: tuple[float, ...] = (0.0,)
 
-    def time(self, sighting: Sighting) -> float:
+    def time(self, reading: Reading) -> float:
         """When a circle was seen, s."""
-        return sighting.frame / self.rate + self.flashes[sighting.flash]
+        return reading.frame / self.rate + self.flashes[reading.flash]
 
     @property
     def time_std(self) -> float:
@@ -55,8 +55,8 @@ def to_csv(readings: Sequence[Reading], scale: Scale, movie: str, command: str) 
 
 def _row(reading: Reading, scale: Scale) -> Sequence[str]:
     um = 1e6 * scale.pixel
-    first = [str(reading.sighting.frame), f"{1e6 * scale.time(reading.sighting):.9g}"]
-    outline = reading.sighting.outline
+    first = [str(reading.frame), f"{1e6 * scale.time(reading):.9g}"]
+    outline = reading.outline
     last = [str(int(reading.used)), reading.reason]
     if not reading.used or outline is None:
         return [*first, *[""] * (len(COLUMNS) - 4), *last]

@@ -4,7 +4,7 @@ them, then what neighbouring frames say of the errors."""
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -24,27 +24,20 @@ AWAY = 10.0  # pixels from a bubble that a point may be to mean it
 
 
 @dataclass(frozen=True)
-class Sighting:
-    """The bubble in a frame at one of its flashes: its outline, or the ``reason`` why there is none."""
+class Reading:
+    """The bubble in a frame at one of its flashes: outline, radius and its errors, in pixels, ready for the table.
+
+    ``used`` is False where ``reason`` says why; ``doubt`` is why an outline that is there is not used until a
+    correction confirms it.
+    """
 
     frame: int
     outline: Outline | None
-    reason: str
+    reason: str = ""
     flash: int = 0
-
-
-@dataclass(frozen=True)
-class Reading:
-    """A frame's radius and its errors, in pixels, ready for the table; ``used`` False where ``reason`` says why.
-
-    ``doubt`` is why an outline that is there is not used until a correction confirms it.
-    """
-
-    sighting: Sighting
-    radius: float
-    errors: Errors
-    used: bool
-    reason: str
+    radius: float = float("nan")
+    errors: Errors = NOTHING
+    used: bool = False
     doubt: str = ""
 
 
@@ -69,7 +62,7 @@ def track(
     corrections: Mapping[int, Correction] | None = None,
     progress: Callable[[int], None] = lambda done: None,
     flashes: tuple[float, ...] = (0.0,),
-    point: tuple[float, float] | None = None,
+    point: tuple[float, ...] | None = None,
     watched: npt.NDArray[np.bool_] | None = None,
     exposure: float = 0.0,
 ) -> Track:
@@ -128,10 +121,7 @@ def _readings(
     flashes: Sequence[float],
     exposure: float,
 ) -> Iterator[Reading]:
-    """Radii of a bubble with their errors, and what is left out by hand or for a doubt that no correction removes.
-
-    The nested circles of a frame are in the order of the flashes. ``exposure`` is a share of the step between frames.
-    """
+    """Radii with errors, a frame's circles in the order of flashes; ``exposure`` is a share of the frames' step."""
     doubtful = doubts(bubble, [other for other in bubbles if other is not bubble])
     doubtful |= {c.frame: c.doubt for c in bubble.candidates if c.doubt}
     doubtful = {frame: words for frame, words in doubtful.items() if frame not in corrections}
@@ -140,22 +130,20 @@ def _readings(
     radii = [np.array([outline.circle.R for outline in c.outlines]) for c in bubble.candidates]
     orders = in_time(radii, np.array([c.frame / rate for c in bubble.candidates]), flashes)
     seen = {
-        c.frame: [Sighting(c.frame, c.outlines[circle], "", flash) for flash, circle in enumerate(order)]
+        c.frame: [Reading(c.frame, c.outlines[circle], flash=flash) for flash, circle in enumerate(order)]
         for c, order in zip(bubble.candidates, orders, strict=True)
     }
-    sightings = [s for look in looks for s in seen.get(look.frame) or [Sighting(look.frame, None, why[look.frame])]]
-    good = [None if s.frame in doubtful or s.frame in out else s.outline for s in sightings]
-    errors = errors_of(good, optics, exposure)
-    for sighting, outline, error in zip(sightings, good, errors, strict=True):
-        correction, doubt = corrections.get(sighting.frame), doubtful.get(sighting.frame, "")
+    readings = [r for look in looks for r in seen.get(look.frame) or [Reading(look.frame, None, why[look.frame])]]
+    good = [None if r.frame in doubtful or r.frame in out else r.outline for r in readings]
+    for reading, outline, errors in zip(readings, good, errors_of(good, optics, exposure), strict=True):
+        correction, doubt = corrections.get(reading.frame), doubtful.get(reading.frame, "")
         if correction is not None and correction.out:
-            words = f"left out by hand: {correction.words}".rstrip(": ")
-            yield Reading(sighting, float("nan"), NOTHING, False, words)
+            yield replace(reading, reason=f"left out by hand: {correction.words}".rstrip(": "))
         elif outline is None:
-            yield Reading(sighting, float("nan"), NOTHING, False, doubt or sighting.reason, doubt)
+            yield replace(reading, reason=doubt or reading.reason, doubt=doubt)
         else:
-            words = f"by hand: {correction.words}".rstrip(": ") if correction is not None else error.words
-            yield Reading(sighting, error.radius, error, True, words)
+            words = f"by hand: {correction.words}".rstrip(": ") if correction is not None else errors.words
+            yield replace(reading, radius=errors.radius, errors=errors, used=True, reason=words)
 
 
 def doubted(readings: Sequence[Reading]) -> str:
@@ -164,7 +152,7 @@ def doubted(readings: Sequence[Reading]) -> str:
     for reading in readings:
         if reading.doubt:
             frames = kinds.setdefault(reading.doubt.split(":")[0], [])
-            frames += [reading.sighting.frame] * (reading.sighting.frame not in frames)
+            frames += [reading.frame] * (reading.frame not in frames)
     return "; ".join(f"{kind}: {_ranges(frames)}" for kind, frames in kinds.items())
 
 

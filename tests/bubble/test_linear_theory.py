@@ -64,7 +64,7 @@ def simulated_rate(R0, G, mu, medium, heat, expected):
     x[model.layout["Rdot"]] = R0 * AMPLITUDE * expected.real
     x[model.layout["p_b"]] = p_g * (1 - AMPLITUDE * np.real(gas))
     if heat:
-        y = model.system.ball.y[: model.system.gas]
+        y = model.system.ball.x[: model.system.gas]
         profile = (medium.kappa - 1) / medium.kappa * -gas * (1 - np.sinh(z * y) / (y * np.sinh(z)))
         x[model.layout["T"]] = medium.T_inf * (1 + AMPLITUDE * np.real(profile))
     period = 2 * np.pi / expected.imag

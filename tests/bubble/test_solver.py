@@ -120,9 +120,9 @@ class TestCollocation:
     def test_exact_on_even_polynomials(self, m):
         b = ball(m)
         for degree in range(0, 2 * m + 1, 2):
-            f = b.y**degree
-            np.testing.assert_allclose(b.derivative @ f, degree * b.y ** max(degree - 1, 0) * (degree > 0), atol=1e-9)
-            expected = degree * (degree + 1) * b.y ** max(degree - 2, 0)
+            f = b.x**degree
+            np.testing.assert_allclose(b.derivative @ f, degree * b.x ** max(degree - 1, 0) * (degree > 0), atol=1e-9)
+            expected = degree * (degree + 1) * b.x ** max(degree - 2, 0)
             np.testing.assert_allclose(b.laplacian @ f, expected, atol=1e-7)
             assert b.weights @ f == pytest.approx(3 / (degree + 3), rel=1e-12)
 
@@ -134,17 +134,17 @@ class TestCollocation:
         def xi(y):
             return 1 - np.arcsinh((1 - y**2) * np.sinh(c)) / c
 
-        slope = 2 * b.y * np.sinh(c) / (c * np.hypot(1, (1 - b.y**2) * np.sinh(c)))
+        slope = 2 * b.x * np.sinh(c) / (c * np.hypot(1, (1 - b.x**2) * np.sinh(c)))
         for degree in range(m + 1):
-            expected = degree * xi(b.y) ** max(degree - 1, 0) * slope
-            np.testing.assert_allclose(b.derivative @ xi(b.y) ** degree, expected, atol=1e-9)
+            expected = degree * xi(b.x) ** max(degree - 1, 0) * slope
+            np.testing.assert_allclose(b.derivative @ xi(b.x) ** degree, expected, atol=1e-9)
             mean, _ = quad(lambda y, k=degree: 3 * y**2 * xi(y) ** k, 0, 1, epsabs=1e-13)
-            assert b.weights @ xi(b.y) ** degree == pytest.approx(mean, rel=1e-11)
+            assert b.weights @ xi(b.x) ** degree == pytest.approx(mean, rel=1e-11)
 
     def test_clustered_nodes_converge_on_even_polynomials_and_lie_nearer_the_wall(self):
         coarse, fine = ball(12, 3.0), ball(24, 3.0)
-        assert 1 - coarse.y[-2] < 0.4 * (1 - ball(12).y[-2])
-        errors = [np.abs(b.laplacian @ b.y**4 - 20 * b.y**2).max() for b in (coarse, fine)]
+        assert 1 - coarse.x[-2] < 0.4 * (1 - ball(12).x[-2])
+        errors = [np.abs(b.laplacian @ b.x**4 - 20 * b.x**2).max() for b in (coarse, fine)]
         assert errors[1] < 1e-3 * errors[0]
 
 

@@ -31,7 +31,7 @@ def test_circles_three_pixels_apart_are_read_at_their_flashes():
     """2.7 pixels from circle to circle, in the order of time: the smallest first while the bubble grows."""
     found = tracked()
     used = [r for r in found.readings if r.used]
-    assert [(r.sighting.frame - 3, r.sighting.flash) for r in used] == [(k, f) for k in range(6) for f in range(3)]
+    assert [(r.frame - 3, r.flash) for r in used] == [(k, f) for k in range(6) for f in range(3)]
     off = np.array([r.radius for r in used]) - path(AT).ravel()
     std = np.array([r.errors.std for r in used])
     assert np.abs(off).max() < 0.5

@@ -115,7 +115,7 @@ def test_a_bubble_that_touches_is_told():
 def test_a_correction_confirms_a_doubtful_frame():
     filmed = film("interlaced", 2)
     _, result = read(filmed)
-    number = next(r.sighting.frame for r in result.readings if r.doubt)
+    number = next(r.frame for r in result.readings if r.doubt)
     confirmed = read(filmed, corrections={number: Correction(False, None, "looked at")})[1].readings[number]
     assert confirmed.used
     assert confirmed.reason == "by hand: looked at"

@@ -107,7 +107,7 @@ def test_a_flash_is_named_and_left_out():
 
 def test_a_frame_that_the_file_holds_damaged_is_named_and_left_out():
     found = track(replace(movie_of(frames()), damaged={4}))
-    assert [r.sighting.frame for r in found.readings if r.reason == "the file is damaged here"] == [4]
+    assert [r.frame for r in found.readings if r.reason == "the file is damaged here"] == [4]
     assert sum(r.used for r in found.readings) == 5
 
 
@@ -154,7 +154,7 @@ def test_no_bubble_is_darker_than_the_clearest():
     radii = np.repeat(np.array([40.0, 35.0, 30.0, 0.0, 30.0, 35.0, 40.0])[:, None], 41, axis=1)
     radii[3] = 4 + 20 * np.abs(np.linspace(-1, 1, 41))
     found = track(movie_of(list(render(radii, Scene(centre=0.5), np.random.default_rng(4)))))
-    darkest = min(r.sighting.outline.contrast for r in found.readings if r.sighting.outline is not None)
+    darkest = min(r.outline.contrast for r in found.readings if r.outline is not None)
     assert darkest > 1.02 * found.optics.contrast
 
 
@@ -164,7 +164,7 @@ def test_dirt_is_no_bubble():
     shown[1] = frames(Scene(bubble=(62.0, 60.0)), np.array([3.5]))[3]
     shown.append(frames(Scene(bubble=(20.0, 100.0)), np.array([5.0]))[3])
     found = track(movie_of(shown))
-    assert [r.sighting.frame for r in found.readings if r.used] == [3, 4, 5, 6, 7, 8]
+    assert [r.frame for r in found.readings if r.used] == [3, 4, 5, 6, 7, 8]
     assert "background" in found.readings[1].reason
     assert "elsewhere" in found.readings[9].reason
 
@@ -206,7 +206,7 @@ def test_the_real_movie_agrees_with_a_person():
     assert len(off) == 98
     assert abs(np.median(off)) < 0.25
     assert np.mean(np.abs(off) < 2) > 0.97  # two frames of a collapse within the exposure are read smaller
-    assert [r.sighting.frame for r in found.readings if not r.used] == [0, 1, 2]
+    assert [r.frame for r in found.readings if not r.used] == [0, 1, 2]
 
 
 @pytest.mark.parametrize("noise", [2.0, 10.0])

@@ -87,10 +87,7 @@ def numbers_of(function: Pulse) -> Iterator[tuple[str, Role, Parameter]]:
 
 
 def _changeable(function: Pulse, arguments: Mapping[str, Any]) -> Iterator[PulseNumber]:
-    """Those of a pulse; a shape that cannot change, as that of a burst without envelope, is none of them.
-
-    Raises :class:`ConfigError` for a value that is out of bounds.
-    """
+    """Those of a pulse whose shape they can change. Raises :class:`ConfigError` for a value that is out of bounds."""
     for key, role, parameter in numbers_of(function):
         value, (least, most) = arguments[key], parameter.bounds
         if not least <= value <= most:

@@ -15,7 +15,7 @@ from en4dvar.plumbing.errors import retold
 from en4dvar_bubble.driving.base import Driving, PulseNumber, Shape
 
 if TYPE_CHECKING:
-    from scipy.interpolate import CubicSpline
+    from scipy.interpolate import BPoly, CubicSpline
 
 _MOST_CELLS = 200_000
 _DELAY = Parameter("pulse_delay", "s", label="delay of the pulse", symbol=r"$\delta$", display_unit="us")
@@ -27,21 +27,10 @@ OF_RECORD = (PulseNumber(_DELAY, "delay", 0.0, "delay"), PulseNumber(_STRETCH, "
 _PROMINENCE = 0.02  # of the largest |p|: turning points that no time step may straddle
 
 
-def _record(t: Array, spline: CubicSpline, first: float, last: float, lead: float) -> Array:
+def _record(t: Array, spline: CubicSpline, before: BPoly, after: BPoly) -> Array:
     """Cubic spline through the samples, led from and to zero by one quintic at either end."""
-    inside = spline(np.clip(t, first, last))
-    before, after = _lead_in(t, spline, first, lead), _lead_in(t, spline, last, -lead)
-    return np.asarray(np.where(t < first, before, np.where(t > last, after, inside)))
-
-
-def _lead_in(t: Array, spline: CubicSpline, at: float, lead: float) -> Array:
-    """Zero with its derivatives at the time ``lead`` before ``at``; there value, slope and curvature of the record."""
-    s = np.clip((t - at) / lead + 1, 0.0, 1.0)
-    value, slope, bend = (float(spline(at, order)) * lead**order for order in (0, 1, 2))
-    third = 10 * value - 4 * slope + 0.5 * bend
-    fourth = -15 * value + 7 * slope - bend
-    fifth = 6 * value - 3 * slope + 0.5 * bend
-    return np.asarray(s**3 * (third + s * (fourth + s * fifth)))
+    parts = [part(np.clip(t, part.x[0], part.x[-1])) for part in (before, spline, after)]
+    return np.asarray(np.where(t < spline.x[0], parts[0], np.where(t > spline.x[-1], parts[2], parts[1])))
 
 
 def tabulated(times: Array, pressure: Array, delay: float = 0.0, scale: float = 1.0) -> Driving:
@@ -72,11 +61,14 @@ def tabulated(times: Array, pressure: Array, delay: float = 0.0, scale: float = 
         lead = span / inner
     if inner + 2 > _MOST_CELLS:
         raise ValueError(f"{inner + 2} cells for {len(t)} samples, more than {_MOST_CELLS}: resample the record evenly")
-    from scipy.interpolate import CubicSpline  # half a second at the start of every worker that needs neither
+    from scipy.interpolate import BPoly, CubicSpline  # half a second at the start of every worker that needs neither
     from scipy.signal import find_peaks
 
     peaks = np.concatenate([find_peaks(sign * p, prominence=_PROMINENCE * largest)[0] for sign in (1, -1)])
-    shape = Shape(_record, (CubicSpline(t, p / largest), float(t[0]), float(t[-1]), float(lead)))
+    spline, zero = CubicSpline(t, p / largest), np.zeros(3)  # with its derivatives
+    first, last = (np.array([spline(at, order) for order in range(3)]) for at in t[[0, -1]])
+    before = BPoly.from_derivatives([t[0] - lead, t[0]], [zero, first])
+    shape = Shape(_record, (spline, before, BPoly.from_derivatives([t[-1], t[-1] + lead], [last, zero])))
     stops = (float(t[0]), *(float(t[i]) for i in peaks), float(t[-1]))
     numbers = tuple(replace(number, value=delay) if number.role == "delay" else number for number in OF_RECORD)
     return Driving(largest, float(t[0] - lead), float(t[-1] + lead), shape, inner + 2, stops, numbers)

@@ -182,9 +182,7 @@ def refuse_inexact(kind: type[Any]) -> None:
 
 
 def _refuse_rough(law: Any) -> None:
-    """Raise ValueError for a viscosity or a memory function of the stretch that a table does not hold to 1e-6 of the
-    larger of its size there and its largest between λ = 1/2 and 2.
-    """
+    """Raise ValueError where a table errs by 1e-6 of a viscosity or memory function, or of its largest near λ = 1."""
     p, (lowest, highest) = columns(law.example_values()), np.log(law.stretch_range)
     x = np.arange(lowest, highest, GRID.step / _POINTS_IN_CELL)
     functions: dict[str, Function] = {}

@@ -5,8 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from en4dvar.model.state import Array
-from en4dvar.plumbing.compiled import kernel
-from en4dvar_bubble.tables import HALO, Grid, from_slopes, from_values, quintic
+from en4dvar_bubble.tables import HALO, Grid, from_slopes, from_values
 
 Function = Callable[[Array], float | Array]
 
@@ -17,7 +16,7 @@ STRETCH = np.exp(GRID.nodes)
 # Strain energies that grow exponentially need derivatives from a finer grid than the cells of the table:
 # at 100 MPa a Fung material is then right to 1e-5 instead of 1e-3.
 _REFINE = 2
-_FINE = Grid(GRID.origin, GRID.step / _REFINE, (GRID.cells + 1) * _REFINE)
+_FINE = Grid(GRID.origin, GRID.step / _REFINE, GRID.cells * _REFINE)
 _FINE_LOG = _FINE.nodes
 _FINE_STRETCH = np.exp(_FINE_LOG)
 _UNSTRETCHED = int(np.flatnonzero(_FINE_LOG == 0.0)[0])
@@ -51,20 +50,7 @@ def from_strain_energy(rate: Function, n: int) -> Array:
     slopes = np.array(np.broadcast_to(fine, (n, len(_FINE_STRETCH))))
     near = [slopes[:, _UNSTRETCHED + k] + slopes[:, _UNSTRETCHED - k] for k in (1, 2, 3, 4)]
     slopes[:, _UNSTRETCHED] = sum(w * s for w, s in zip(_ACROSS, near, strict=True))
-    return np.asarray(_coarsen(from_slopes(slopes, _FINE.step, _UNSTRETCHED - HALO), _REFINE, GRID.cells))
-
-
-@kernel
-def _coarsen(fine: Array, ratio: int, cells: int) -> Array:
-    """Cells as wide as ``ratio`` fine ones, with value, slope and curvature of the fine table at their ends."""
-    n = fine.shape[0]
-    out = np.empty((n, cells, 8))
-    for i in range(n):
-        for j in range(cells):
-            a, b = fine[i, j * ratio], fine[i, (j + 1) * ratio]
-            first, second = float(ratio), 2.0 * ratio * ratio
-            quintic(out, i, j, a[0], a[1] * first, a[2] * second, b[0], b[1] * first, b[2] * second)
-    return out
+    return np.asarray(from_slopes(slopes, _FINE.step, _UNSTRETCHED - HALO, _REFINE))
 
 
 def differentiate(table: Array) -> Array:

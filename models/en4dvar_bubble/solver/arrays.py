@@ -8,8 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from en4dvar.model.state import Array
-from en4dvar_bubble.solver import rodas5p, rows
-from en4dvar_bubble.solver.lanes import WIDTH
 
 IntArray = np.ndarray[Any, np.dtype[np.int64]]
 
@@ -119,34 +117,6 @@ class Shared(NamedTuple):
     scratch: Scratch
     dims: Dims
     driving_span: Array
-
-
-def scratch(
-    dims: Dims,
-    matrix: int,
-    tiles: tuple[int, int],
-    border: int,
-    of_fields: int,
-    parameters: int,
-    cells: int,
-    first_step: float,
-) -> Scratch:
-    """That for a matrix of so many numbers, and in ``tiles`` of so many numbers and rows, a ``border`` of so many
-    unknowns, ``of_fields`` rows of scratch for the fields, members of so many ``parameters`` and tables of so many
-    ``cells``; lanes that wait for a member have the step ``first_step``.
-    """
-    n = dims.gas + dims.vapour + dims.medium + dims.wall + dims.kinetic + dims.memory + 2
-    step = of_fields, n, matrix, 1, rodas5p.STAGES * n, n, n, 1, 3, 3 * n
-    general = border, border, rows.SHARED, border, rows.SHARED
-    lanes = n, 1, 1, parameters, 1, 1, 1, 1
-    edges = np.cumsum([0, *step, *tiles, *general, *lanes])
-    raw = np.zeros((edges[-1] + 1) * WIDTH)
-    first = -(raw.ctypes.data // 8) % WIDTH  # on a 64-byte boundary: a row that straddles two cache lines costs twice
-    block = raw[first : first + edges[-1] * WIDTH].reshape(-1, WIDTH)
-    marks, turn = np.zeros((4, WIDTH), dtype=np.int64), np.zeros(6, dtype=np.int64)
-    marks[0] = -1  # no lane has a member
-    block[edges[-7] : edges[-6]] = first_step  # so that one without gets no further than finite numbers
-    return Scratch(block, edges, marks, turn, np.zeros((WIDTH, cells, 8)))
 
 
 class Loaded(NamedTuple):

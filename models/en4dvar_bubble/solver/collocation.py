@@ -17,29 +17,36 @@ _MORE = 30  # points of the quadrature for the map, an entire function
 
 
 @dataclass(frozen=True)
-class Ball:
-    """Operators on m interior nodes plus the wall.
+class Grid:
+    """Operators on m interior nodes plus the wall, which is last; they are shared: nobody can write to them.
 
-    ``y`` (m+1,) radii; ``derivative`` (m+1, m+1) d/dy; ``laplacian`` (m+1, m+1) y⁻² d/dy(y² d/dy);
-    ``weights`` (m+1,) of the mean over the ball, 3 ∫ f y² dy, exact for polynomials of degree m in ξ.
+    ``x`` (m+1,) radii r/R; ``derivative`` (m+1, m+1) d/dx; ``laplacian`` (m+1, m+1) x⁻² d/dx(x² d/dx); ``own`` (2, m+1)
+    what else the equations read, of a ball x and the weights of the mean, outside of it x − x⁻² and x⁻⁶.
     """
 
-    y: Array
+    x: Array
     derivative: Array
     laplacian: Array
-    weights: Array
+    own: Array
+
+    def __post_init__(self) -> None:
+        for array in vars(self).values():
+            array.setflags(write=False)
+
+    @property
+    def weights(self) -> Array:
+        """(m+1,) of the mean over the ball, 3 ∫ f x² dx, exact for polynomials of degree m in ξ."""
+        return np.asarray(self.own[1])
 
     @cached_property
     def rows(self) -> Array:
         """All of them as one array in the kernel's layout, see :class:`arrays.Equations`."""
-        return np.vstack([self.derivative, self.laplacian[:-1], self.y, self.weights])
+        return np.vstack([self.derivative, self.laplacian[:-1], self.own])
 
 
 @cache
-def ball(m: int, clustering: float = 0.0) -> Ball:
-    """Collocation operators for ``m`` ≥ 1 interior nodes (arrays shared: do not write to them). ``clustering`` c ≥ 0:
-    1 − s = sinh(c (1−ξ))/sinh(c); 0 is s = ξ.
-    """
+def ball(m: int, clustering: float = 0.0) -> Grid:
+    """That of ``m`` ≥ 1 interior nodes in the ball. ``clustering`` c ≥ 0: 1 − s = sinh(c (1−ξ))/sinh(c); 0 is s = ξ."""
     n = m + 1
     xi = (np.cos(2 * np.pi * np.arange(m, -1, -1) / (2 * m + 1)) + 1) / 2
     xi[-1] = 1.0
@@ -59,9 +66,7 @@ def ball(m: int, clustering: float = 0.0) -> Ball:
     w = w / w.sum() * np.sqrt(2 * s_there / (x + 1)) * slope_there
     moments = np.polynomial.legendre.legvander(x, m).T @ w
     weights = np.linalg.solve(np.polynomial.legendre.legvander(2 * xi - 1, m).T, moments)
-    for array in (y, derivative, laplacian, weights):
-        array.setflags(write=False)
-    return Ball(y, derivative, laplacian, weights)
+    return Grid(y, derivative, laplacian, np.stack([y, weights]))
 
 
 def _clustered(xi: Array, clustering: float) -> tuple[Array, Array]:
@@ -72,26 +77,11 @@ def _clustered(xi: Array, clustering: float) -> tuple[Array, Array]:
     return 1 - np.sinh(inward) / scale, clustering * np.cosh(inward) / scale
 
 
-@dataclass(frozen=True)
-class Exterior:
-    """Operators on M interior nodes plus the wall (last) for fields outside the unit ball that vanish at infinity.
-
-    ``x`` (M+1,) = r/R; ``derivative`` and ``laplacian`` (M+1, M+1) with respect to x.
-    """
-
-    x: Array
-    derivative: Array
-    laplacian: Array
-
-    @cached_property
-    def rows(self) -> Array:
-        """The same of the medium."""
-        return np.vstack([self.derivative, self.laplacian[:-1], self.x - self.x**-2, self.x**-6.0])
-
-
 @cache
-def exterior(m: int, length: float) -> Exterior:
-    """Rational Chebyshev collocation on x = 1 + ``length`` (1−ξ)/(1+ξ), clustered at the wall (arrays shared)."""
+def exterior(m: int, length: float) -> Grid:
+    """Rational Chebyshev collocation of fields outside the unit ball that vanish at infinity, on x = 1 + ``length``
+    (1−ξ)/(1+ξ), clustered at the wall.
+    """
     n = m + 1
     xi = np.cos(np.pi * np.arange(n + 1) / n)  # 1 (wall) … −1 (infinity)
     c = np.r_[2.0, np.ones(n - 1), 2.0] * (-1.0) ** np.arange(n + 1)
@@ -105,6 +95,4 @@ def exterior(m: int, length: float) -> Exterior:
     x = 1 + length * (1 - xi[keep]) / (1 + xi[keep])
     derivative = first[np.ix_(keep, keep)]
     laplacian = second + (2 / x)[:, None] * derivative
-    for array in (x, derivative, laplacian):
-        array.setflags(write=False)
-    return Exterior(x, derivative, laplacian)
+    return Grid(x, derivative, laplacian, np.stack([x - x**-2, x**-6.0]))

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -16,13 +16,14 @@ from en4dvar_bubble import tables as tables_module
 from en4dvar_bubble.driving import Driving, Reading
 from en4dvar_bubble.laws.exactness import HALVINGS
 from en4dvar_bubble.laws.tabulate import GRID, VISCOUS_GRID
-from en4dvar_bubble.solver import integrate, rows
+from en4dvar_bubble.solver import integrate, rodas5p, rows
 from en4dvar_bubble.solver.apart import address
-from en4dvar_bubble.solver.arrays import Control, Dims, Equations, Members, Output, Scratch, Shared, scratch
+from en4dvar_bubble.solver.arrays import Control, Dims, Equations, Members, Output, Scratch, Shared
 from en4dvar_bubble.solver.arrow import tiles
-from en4dvar_bubble.solver.collocation import Ball, ball, exterior
+from en4dvar_bubble.solver.collocation import Grid, ball, exterior
 from en4dvar_bubble.solver.fields import scratch_rows
 from en4dvar_bubble.solver.general import sums
+from en4dvar_bubble.solver.lanes import WIDTH
 from en4dvar_bubble.solver.tiles import AREA, EDGE, kept_tiles
 
 for _kernel in (integrate.integrate, integrate.between_steps):
@@ -31,11 +32,6 @@ for _kernel in (integrate.integrate, integrate.between_steps):
 AccuracyName = Literal["fast", "standard", "reference"]
 Radial = Literal["rayleigh-plesset", "keller-miksis", "keller-miksis-enthalpy", "gilmore"]
 
-READINGS: dict[Reading, int] = {
-    "instantaneous": rows.INSTANTANEOUS,
-    "retarded": rows.RETARDED,
-    "as-printed": rows.AS_PRINTED,
-}
 RADIALS: dict[Radial, int] = {
     "rayleigh-plesset": rows.PRESSURE,
     "keller-miksis": rows.PRESSURE,
@@ -131,7 +127,7 @@ class System:
         return self.first_memory + self.memory + 2
 
     @property
-    def ball(self) -> Ball:
+    def ball(self) -> Grid:
         """The grid of the gas, which has one."""
         return ball(self.gas, self.clustering)
 
@@ -212,11 +208,7 @@ class Solver:
 
     @cached_property
     def _arrangement(self) -> tuple[Any, Any, Any, Any]:
-        """``nodes``, ``size``, ``where`` and ``places`` of the equations: for few nodes the first two are tuples, whose
-        length the compiler sees, and the matrix is not in tiles.
-
-        Unrolling halves the time of a step and costs a compilation (some seconds, once) for every number of nodes.
-        """
+        """Nodes, size, where, places of the equations; of few nodes tuples, to unroll loops: half the time a step."""
         system = self.system
         if system.general:
             return None, None, *tiles(system.dims)
@@ -235,7 +227,7 @@ class Solver:
         general: tuple[Any, Any, Any, Any] = (None,) * 4  # what nobody reads need not be compiled either
         if system.general:
             general = medium, memory, viscous, _ELASTIC_SPAN if system.strain else _VISCOUS_SPAN
-        gas, reading = system.ball.rows if system.gas else _NO_ROWS, READINGS[self.reading]
+        gas, reading = system.ball.rows if system.gas else _NO_ROWS, get_args(Reading).index(self.reading)
         shared = gas, _REFINED_SPAN if halved else _ELASTIC_SPAN, pulse, driving.span
         nodes, size, where, places = self._arrangement
         return Equations(nodes, size, system.dims, *shared, reading, *general, where, places)
@@ -281,9 +273,19 @@ class Solver:
         return call, Solution(*output)
 
     def _scratch(self, parameters: int, cells: int) -> Scratch:
-        system, where = self.system, self._arrangement[2]
-        matrix = 0 if system.general else system.size**2
-        of_tiles = (0, 0) if where is None else ((where.max() + 1) * AREA, len(where) * EDGE)
-        border = system.size - system.wall_row + sums.py_func(system.dims) if system.general else 0
-        of_fields = scratch_rows(system.dims)
-        return scratch(system.dims, matrix, of_tiles, border, of_fields, parameters, cells, _FIRST_STEP)
+        """That for members of so many ``parameters`` and elastic tables of so many ``cells``."""
+        system, where, n = self.system, self._arrangement[2], self.system.size
+        matrix = 0 if system.general else n**2
+        tiled = (0, 0) if where is None else ((where.max() + 1) * AREA, len(where) * EDGE)
+        border = n - system.wall_row + sums.py_func(system.dims) if system.general else 0
+        step = scratch_rows(system.dims), n, matrix, 1, rodas5p.STAGES * n, n, n, 1, 3, 3 * n, *tiled
+        general = border, border, rows.SHARED, border, rows.SHARED
+        lanes = n, 1, 1, parameters, 1, 1, 1, 1
+        edges = np.cumsum([0, *step, *general, *lanes])
+        raw = np.zeros((edges[-1] + 1) * WIDTH)
+        first = -(raw.ctypes.data // 8) % WIDTH  # on a 64-byte boundary: a row that straddles two lines costs twice
+        block = raw[first : first + edges[-1] * WIDTH].reshape(-1, WIDTH)
+        marks, turn = np.zeros((4, WIDTH), dtype=np.int64), np.zeros(6, dtype=np.int64)
+        marks[0] = -1  # no lane has a member
+        block[edges[-7] : edges[-6]] = _FIRST_STEP  # so that one without gets no further than finite numbers
+        return Scratch(block, edges, marks, turn, np.zeros((WIDTH, cells, 8)))

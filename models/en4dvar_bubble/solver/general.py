@@ -50,9 +50,7 @@ def sums(dims):
 
 @called
 def _contents(border, V, u, outward, eq, par, shared, out):
-    """Pressure and π̇; what the fields read to ``shared``, residuals of the wall to ``out``. ``outward`` is the
-    interior's share in θ_m' at the wall.
-    """
+    """Pressure and π̇ by the interior's share ``outward`` in θ_m'; writes what fields read and the wall's residuals."""
     mT, mY, mM, wall, kinetic = eq.dims.gas, eq.dims.vapour, eq.dims.medium, eq.dims.wall, eq.dims.kinetic
     ops, kappa, zero = eq.gas, load(par, rows.KAPPA), splat(0.0)
     if mT == 0:

@@ -138,9 +138,7 @@ def _observe(lane, end, shared, lanes, w):
 
 @called
 def _next_step(lane, cut, lanes, w):
-    """The step after an accepted one, by Gustafsson's predictive controller: the trend of the error, not only its size,
-    sets it.
-    """
+    """The step after an accepted one, by the error's size and trend (Gustafsson's predictive controller)."""
     step, e, root = lanes.h[0, lane], max(w.norm[0, lane], LEAST_ERROR), w.norm[1, lane]
     shrink = root / _SAFETY
     if lanes.last_h[lane] > 0.0:

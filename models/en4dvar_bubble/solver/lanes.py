@@ -74,15 +74,12 @@ def _operator(op: Any, result: Any, emit: Callable[..., Any], operands: Sequence
         lower_builtin(op, *kinds)(lower)
 
 
-_operator(operator.add, lanes, lambda builder, a, b: builder.fadd(a, b, flags=_CONTRACT))
-_operator(operator.sub, lanes, lambda builder, a, b: builder.fsub(a, b, flags=_CONTRACT))
-_operator(operator.mul, lanes, lambda builder, a, b: builder.fmul(a, b, flags=_CONTRACT))
-_operator(operator.truediv, lanes, lambda builder, a, b: builder.fdiv(a, b, flags=_CONTRACT))
+_ARITHMETIC = {operator.add: "fadd", operator.sub: "fsub", operator.mul: "fmul", operator.truediv: "fdiv"}
+for _op, _name in _ARITHMETIC.items():
+    _operator(_op, lanes, lambda builder, a, b, name=_name: getattr(builder, name)(a, b, flags=_CONTRACT))
 _operator(operator.neg, lanes, lambda builder, a: builder.fneg(a), [(lanes,)])
-_operator(operator.lt, mask, lambda builder, a, b: builder.fcmp_ordered("<", a, b))
-_operator(operator.le, mask, lambda builder, a, b: builder.fcmp_ordered("<=", a, b))
-_operator(operator.gt, mask, lambda builder, a, b: builder.fcmp_ordered(">", a, b))
-_operator(operator.ge, mask, lambda builder, a, b: builder.fcmp_ordered(">=", a, b))
+for _op, _sign in {operator.lt: "<", operator.le: "<=", operator.gt: ">", operator.ge: ">="}.items():
+    _operator(_op, mask, lambda builder, a, b, sign=_sign: builder.fcmp_ordered(sign, a, b))
 
 
 class Value:
@@ -164,26 +161,23 @@ def any_lane(typingctx, condition):
     return types.boolean(mask), codegen
 
 
-@intrinsic
-def take(typingctx, counter):
-    """The number in ``counter[0]``, one more for whoever asks next; no two threads ever get the same."""
+def _of_counter(emit: Callable[[Any, Any], Any]) -> Any:
+    """What ``emit`` builds with the place of ``counter[0]``, of an array that several threads share."""
 
-    def codegen(context, builder, sig, args):
-        array = context.make_array(sig.args[0])(context, builder, args[0])
-        return builder.atomic_rmw("add", array.data, ir.Constant(_I64, 1), "monotonic")
+    @intrinsic
+    def operation(typingctx, counter):
+        def codegen(context, builder, sig, args):
+            return emit(builder, context.make_array(sig.args[0])(context, builder, args[0]).data)
 
-    return types.int64(counter), codegen
+        return types.int64(counter), codegen
+
+    return operation
 
 
-@intrinsic
-def peek(typingctx, counter):
-    """The number in ``counter[0]``, read anew at every call: another thread may be raising it."""
-
-    def codegen(context, builder, sig, args):
-        array = context.make_array(sig.args[0])(context, builder, args[0])
-        return builder.load_atomic(array.data, "acquire", 8)
-
-    return types.int64(counter), codegen
+take = _of_counter(lambda builder, place: builder.atomic_rmw("add", place, ir.Constant(_I64, 1), "monotonic"))
+"""The number there, one more for whoever asks next; no two threads ever get the same."""
+peek = _of_counter(lambda builder, place: builder.load_atomic(place, "acquire", 8))
+"""The number there, read anew at every call: another thread may be raising it."""
 
 
 def _function(name: str, operands: int) -> Any:

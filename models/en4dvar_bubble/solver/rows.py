@@ -39,7 +39,7 @@ PARAMETERS = 30
 MEMORY = PARAMETERS
 PER_MEMORY = 3
 
-# Readings of p_f.
+# Readings of p_f, in the order of :data:`driving.base.Reading`.
 INSTANTANEOUS, RETARDED, AS_PRINTED = 0, 1, 2
 # Radial equations (Rayleigh–Plesset is Keller–Miksis in pressure with INVERSE_C = 0).
 PRESSURE, ENTHALPY, GILMORE = 0, 1, 2

@@ -20,10 +20,7 @@ LEAST_ERROR = 1e-8  # the step grows as if the error were not smaller
 
 @inlined
 def _factorise(a, size):
-    """LU without pivoting, in place; the diagonal is replaced by its inverse. Rows i·n+j.
-
-    The temperature block comes first and is diagonally dominant; V and u follow as its border.
-    """
+    """LU without pivoting, in place, of rows i·n+j whose diagonal dominates; that is replaced by its inverse."""
     n = len(size)
     for k in range(n):
         pivot = 1.0 / load(a, k * n + k)
@@ -94,9 +91,7 @@ def _general(lanes, eq, w):
 
 
 def _linearise(lanes, eq, w):
-    """dy/dt to ``f``, ∂f_V/∂t to ``dt``, and 1/(hγ) − ∂f/∂y, without 1/(hγ) in algebraic rows, as its factors to
-    ``jac`` or ``tiles``, of the equations that the compiler chooses by the type of ``eq``.
-    """
+    """dy/dt to ``f``, ∂f_V/∂t to ``dt``, factors of 1/(hγ) − ∂f/∂y (algebraic rows: −∂f/∂y) to ``jac`` or ``tiles``."""
 
 
 @overload(_linearise, jit_options={"forceinline": True})

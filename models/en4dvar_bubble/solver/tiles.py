@@ -59,9 +59,7 @@ class _Numbers:
 
 
 def _of_registers(body: Callable[[list[Value], _Numbers, _Numbers], list[Value]]) -> Any:
-    """A function of numbers in registers, a tuple of lanes, and of rows of ``a`` from ``i`` on and of ``b`` from ``j``
-    on, written once for Python, unrolled by it.
-    """
+    """A function of numbers in registers, rows of ``a`` from ``i`` and of ``b`` from ``j`` on, unrolled by Python."""
 
     @intrinsic
     def operation(typingctx, numbers, a, i, b, j):

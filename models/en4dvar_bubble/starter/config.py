@@ -3,7 +3,7 @@
 import math
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,18 +11,18 @@ import numpy as np
 
 from en4dvar.assembly.build import build_one
 from en4dvar.assembly.reading import find_files, with_parts
-from en4dvar.config import Config, resolve
+from en4dvar.config import resolve
 from en4dvar.config.document import parse_document
 from en4dvar.inputs.asked import ANY, Column, DataFile, Layout, TimeStep
 from en4dvar.inputs.matfile import indexed
 from en4dvar.inputs.readers import BELOW, FAR, Readings, read_series
 from en4dvar.inputs.steps import step_doubts
-from en4dvar.plumbing.errors import ConfigError, DataError
+from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.files import expanded
 from en4dvar.plumbing.units import UnitError, convert, parse_quantity, parse_unit
 from en4dvar_bubble.starter.elsewhere import known
 from en4dvar_bubble.starter.grouped import grouped
-from en4dvar_bubble.starter.look import Start
+from en4dvar_bubble.starter.look import Start, usable
 from en4dvar_bubble.starter.page import TRACKED_COMMON, Source, quoted, yaml_text
 from en4dvar_bubble.starter.proposal import Entry, Proposal, propose, with_columns
 
@@ -114,21 +114,9 @@ def propose_config(
     proposal = replace(proposal, warnings=told)
     name = name or run_name(str(data))
     config = resolve(parse_document(yaml_text(name, source, proposal, command)), Path(folder).absolute())
-    proposal = replace(proposal, warnings=(*proposal.warnings, *_unbuilt(config, proposal.datasets, files)))
+    _, unbuilt = usable(proposal.datasets, lambda dataset: build_one(config, dataset, files[dataset]))
+    proposal = replace(proposal, warnings=(*proposal.warnings, *unbuilt))
     return Proposed(yaml_text(name, source, proposal, command), proposal)
-
-
-def _unbuilt(config: Config, datasets: Sequence[str], files: Mapping[str, DataFile]) -> list[str]:
-    """Why data sets cannot be used as configured. Raises :class:`DataError` where none can be."""
-    reasons: list[str] = []
-    for dataset in datasets:
-        try:
-            build_one(config, dataset, files[dataset])
-        except DataError as error:
-            reasons.append(f"{dataset}: {error}")
-    if len(reasons) == len(datasets):
-        raise DataError("\n".join(reasons))
-    return reasons
 
 
 def histories(files: Mapping[str, DataFile], source: Source) -> tuple[dict[str, Readings], list[str]]:
@@ -139,16 +127,11 @@ def histories(files: Mapping[str, DataFile], source: Source) -> tuple[dict[str, 
     DataError: none can be used. UnitError: a unit that is not of its kind.
     """
     time, radius = _times(source), Column(*source.radius, "m", True)
-    readings: dict[str, Readings] = {}
-    unusable: list[str] = []
-    for name, file in files.items():
-        try:
-            readings[name] = read_series(file.path, time, radius, source.layout, part=file.part)
-        except DataError as error:
-            unusable.append(str(error))
-    if not readings:
-        raise DataError("\n".join(unusable))
-    return readings, unusable
+
+    def read(name: str) -> Readings:
+        return read_series(files[name].path, time, radius, source.layout, part=files[name].part)
+
+    return usable(files, read, "{error}")
 
 
 def _times(source: Source) -> Column | TimeStep:

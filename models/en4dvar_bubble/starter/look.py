@@ -3,9 +3,9 @@
 The collapse beside Rayleigh's: :mod:`en4dvar_bubble.collapse`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from en4dvar_bubble.collapse import Lobe, lobe
 from en4dvar_bubble.starter.top import Top, top
 
 Start = Literal["acoustic", "laser"]
+T = TypeVar("T")
 LASER_BEGINS = 0.8  # of R_max: a history that begins above is one of a released bubble
 COLLAPSED = 0.2  # of R_max: from here on the wall of an acoustic bubble is too fast for the model
 SETTLED = 0.15  # std of ln R in the last quarter of a history that has come to rest
@@ -37,14 +38,12 @@ class Look:
     ``top`` is where and how high the maximum was.
     ``rebound`` is the second maximum over the first, NaN where none is seen; ``rest`` the median of the last quarter
     of a history that rebounds and comes to rest, NaN else; ``drift`` says in words what it does instead of resting, "".
-    ``step`` is the median time between samples; ``descent``
-    the last instant of the first descent, NaN where the history ends with it. ``n_minima`` follow the maximum with a
-    ``prominence`` relative to the range. ``reason`` says in words why ``start`` is
-    proposed, ``clear`` whether the data leave no doubt.
+    ``begin`` is the first instant, ``step`` the median time between samples; ``descent`` the last instant of the first
+    descent, NaN where the history ends with it. ``n_minima`` follow the maximum with a ``prominence`` relative to the
+    range. ``reason`` says in words why ``start`` is proposed, ``clear`` whether the data leave no doubt.
     """
 
-    n: int
-    times: tuple[float, float]
+    begin: float
     lobe: Lobe
     top: Top
     step: float
@@ -87,8 +86,7 @@ def look(times: Array, radius: Array, start: Start | None = None) -> Look:
             f"grow from there; leave out what is before (data.since: '{when}')"
         )
     return Look(
-        n=len(times),
-        times=(float(times[0]), float(times[-1])),
+        begin=float(times[0]),
         lobe=peak,
         top=highest,
         step=float(np.median(np.diff(times))),
@@ -170,10 +168,7 @@ def second_maximum(radius: Array) -> float:
 
 
 def _start(first: float, rebounds: bool, creeps: bool, before: int) -> tuple[Start, str, bool]:
-    """The start that the data suggest, from the first radius over the maximum and what follows the collapse.
-
-    ``before``: as many readings show no bubble yet.
-    """
+    """The start that the data suggest; ``before``: as many readings show no bubble yet."""
     begins = f"{f'after {before} small readings ' if before else ''}the history begins at {100 * first:.0f} % of R_max"
     if first >= LASER_BEGINS:
         return "laser", begins, True
@@ -186,6 +181,21 @@ def _start(first: float, rebounds: bool, creeps: bool, before: int) -> tuple[Sta
     if creeps:
         return "laser", f"{begins}, but goes on after the collapse, which a thick gel damps", False
     return "acoustic", f"{begins}, grows and ends with the first collapse", False
+
+
+def usable(
+    names: Iterable[str], result_of: Callable[[str], T], words: str = "{name}: {error}"
+) -> tuple[dict[str, T], list[str]]:
+    """Results by name, and in ``words`` why there is none of others. Raises :class:`DataError` where there is none."""
+    results, faults = dict[str, T](), list[str]()
+    for name in names:
+        try:
+            results[name] = result_of(name)
+        except DataError as error:
+            faults.append(words.format(name=name, error=error))
+    if not results:
+        raise DataError("\n".join(faults))
+    return results, faults
 
 
 def typical(values: Sequence[float]) -> float:

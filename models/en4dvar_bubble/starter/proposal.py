@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from en4dvar_bubble.settings import BubbleSettings
 from en4dvar_bubble.starter import elsewhere
 from en4dvar_bubble.starter.grouped import NO_GROUPS, Grouped
 from en4dvar_bubble.starter.guess import OF_GELS, Guess, first_guess
-from en4dvar_bubble.starter.look import Look, Start, look, typical
+from en4dvar_bubble.starter.look import Look, Start, look, typical, usable
 
 LAWS: Mapping[Start, str] = {"acoustic": "quadratic-kelvin-voigt", "laser": "neo-hookean-kelvin-voigt"}
 MODEL: Mapping[Start, Mapping[str, str]] = {
@@ -115,7 +116,6 @@ def propose(
     DataError: no history shows a bubble, or the data sets suggest different starts. ConfigError: unknown law.
     """
     looks, unseen = _looks(histories, start)
-    histories = {name: histories[name] for name in looks}
     views = list(looks.values())
     chosen = views[0].start
     model, law_name = built(chosen, law)
@@ -156,7 +156,7 @@ def propose(
         [p.name for p in model.law.parameters], len(views), medium, _in_a_liquid(model), groups
     )
     return Proposal(
-        _data(look, model, {**others, **guess.values}, histories),
+        _data(look, model, {**others, **guess.values}, len(views) == 1),
         (*_model(law_name, model, look), *wall[0]),
         (*_parameters(model, look, believed, tops(looks, histories), medium), *wall[1]),
         SIMPLER[chosen],
@@ -234,14 +234,7 @@ def built(start: Start, law: str | None) -> tuple[BubbleModel, str]:
 
 def _looks(histories: Mapping[str, tuple[Array, Array]], start: Start | None) -> tuple[dict[str, Look], list[str]]:
     """What each history shows, and why others show no bubble. Raises :class:`DataError` where none shows one."""
-    looks, unseen = dict[str, Look](), list[str]()
-    for name, (times, radius) in histories.items():
-        try:
-            looks[name] = look(times, radius, start)
-        except DataError as error:
-            unseen.append(f"{name}: {error}")
-    if not looks:
-        raise DataError("\n".join(unseen))
+    looks, unseen = usable(histories, lambda name: look(*histories[name], start))
     if len({view.start for view in looks.values()}) > 1:
         kinds = {kind: [n for n, view in looks.items() if view.start == kind] for kind in ("acoustic", "laser")}
         told = "; ".join(f"{kind}: {', '.join(names[:3])}" for kind, names in kinds.items())
@@ -251,19 +244,13 @@ def _looks(histories: Mapping[str, tuple[Array, Array]], start: Start | None) ->
 
 def _typical(views: Sequence[Look]) -> Look:
     """One look at several data sets: medians of the numbers, words of the first that is not clear."""
-    first = next((v for v in views if not v.clear), views[0])
+    medians = {key: typical([getattr(v, key) for v in views]) for key in ("step", "noise", "rebound", "rest")}
+    least: dict[str, Any] = {key: min(getattr(v, key) for v in views) for key in ("begin", "n_minima", "prominence")}
     return replace(
-        first,
-        step=typical([v.step for v in views]),
-        noise=typical([v.noise for v in views]),
-        rebound=typical([v.rebound for v in views]),
-        rest=typical([v.rest for v in views]),
-        n=sum(v.n for v in views),
-        times=(min(v.times[0] for v in views), max(v.times[1] for v in views)),
+        next((v for v in views if not v.clear), views[0]),
+        **medians | least,
         lobe=Lobe(*(typical([getattr(v.lobe, k) for v in views]) for k in ("R_max", "t_max", "t_c"))),
         drift=next((v.drift for v in views if v.drift), ""),
-        n_minima=min(v.n_minima for v in views),
-        prominence=min(v.prominence for v in views),
         descent=max((v.descent for v in views if np.isfinite(v.descent)), default=float("nan")),
     )
 
@@ -281,13 +268,11 @@ def _rest(look: Look) -> float:
     return look.rest if np.isfinite(look.rest) else GAS_FRACTION * look.lobe.R_max
 
 
-def _data(
-    look: Look, model: BubbleModel, theta: Mapping[str, float], histories: Mapping[str, tuple[Array, Array]]
-) -> tuple[Entry, ...]:
+def _data(look: Look, model: BubbleModel, theta: Mapping[str, float], single: bool) -> tuple[Entry, ...]:
     """Window, clock and errors."""
     if model.start == "laser":
         lines = [
-            _window(look, len(histories) == 1),
+            _window(look, single),
             Entry("time_zero", "window", "the model's clock starts at the top, t_s later or earlier"),
         ]
     else:
@@ -321,35 +306,32 @@ def _window(look: Look, single: bool) -> Entry:
     return Entry("window", f"{{from: top, to: {end}{until}{low}}}", words)
 
 
-@dataclass(frozen=True)
-class Tops:
-    """Priors of where and how high the tops of the histories are, against the first reading of the window."""
+class Tops(NamedTuple):
+    """Priors of where and how high the tops of histories are, against the first reading of the window: mean and std (s)
+    of the clock, mean (as text) and relative std of the height.
+    """
 
     t_s: tuple[float, float]
     R_max: tuple[str, float]
 
 
 def tops(looks: Mapping[str, Look], histories: Mapping[str, tuple[Array, Array]]) -> Tops:
-    """Mean and std (s) of the clock, mean (as text) and relative std of the height.
-
-    Of one history these are those of its top; of several, what covers the tops of all, beside the largest readings.
-    """
+    """Of one history those of its top; of several, what covers the tops of all, beside the largest readings."""
     shifts, heights = [], []
     for name, view in looks.items():
         times, radius = histories[name]
         first = select(times, radius, Instant("top"), Instant("end")).start
-        shifts.append((times[first] - view.top.time, TOP_WIDTH * view.top.time_std, view.step))
+        shifts.append((times[first] - view.top.time, TOP_WIDTH * view.top.time_std))
         largest = float(radius[first:].max())
         heights.append((view.top.height / largest - 1, TOP_WIDTH * view.top.height_std / largest))
-    shift, height = np.array(shifts), np.array(heights)
-    least = LEAST_SHIFT * float(np.mean(shift[:, 2]))
-    of_scale = elsewhere.SCALE.log_std
     if len(looks) == 1:
-        ((_, view),) = looks.items()
-        mean = _text(view.top.height, "m", "um", 5)
-        return Tops((shift[0, 0], math.hypot(shift[0, 1], least)), (mean, math.hypot(height[0, 1], of_scale)))
-    wide = [float(np.sqrt(np.mean(np.sum(values[:, :2] ** 2, axis=1)))) for values in (shift, height)]
-    return Tops((0.0, math.hypot(wide[0], least)), ("maximum", math.hypot(wide[1], of_scale)))
+        shift, height = shifts[0][0], _text(view.top.height, "m", "um", 5)
+        wide = [shifts[0][1], heights[0][1]]
+    else:
+        shift, height = 0.0, "maximum"
+        wide = [float(np.sqrt(np.mean(np.sum(np.square(values), axis=1)))) for values in (shifts, heights)]
+    least = LEAST_SHIFT * float(np.mean([view.step for view in looks.values()]))
+    return Tops((shift, math.hypot(wide[0], least)), (height, math.hypot(wide[1], elsewhere.SCALE.log_std)))
 
 
 def _clock(look: Look, model: BubbleModel, theta: Mapping[str, float]) -> Entry:
@@ -365,8 +347,8 @@ def _clock(look: Look, model: BubbleModel, theta: Mapping[str, float]) -> Entry:
     if abs(shift) <= SAME_CLOCK:
         return Entry("time_zero", "file", "the file's clock agrees with that of the pulse")
     text = _text(shift, "s", "us")
-    if parse_quantity(text, "s") > look.times[0]:  # no reading lies before the pulse
-        text = f"{math.floor(1e8 * look.times[0]) / 100:.12g} us"
+    if parse_quantity(text, "s") > look.begin:  # no reading lies before the pulse
+        text = f"{math.floor(1e8 * look.begin) / 100:.12g} us"
     return Entry("time_zero", text, "puts the guess's R_max on the data's: give the clock of your pulse")
 
 
@@ -397,13 +379,8 @@ def _parameters(model: BubbleModel, look: Look, guess: Guess, top: Tops, medium:
         if p.name in water:
             lines.append(Entry(p.name, *water[p.name]))
         elif p.name in guess.values:
-            low, high = WIDTHS[start][p.name]
-            width = f"{np.clip(guess.log_std[p.name], low, high):.2g}"
-            value = _text(guess.values[p.name], p.unit, p.display_unit)
-            off = math.exp(BETWEEN * float(width))
-            words = f"{p.label}: {guess.source}, may be off by a factor of {off:.2g}; "
-            words += "narrow it to what you knew before"
-            lines.append(Entry(p.name, f"{{prior: lognormal, median: {value}, log_std: {width}}}", words))
+            width = float(np.clip(guess.log_std[p.name], *WIDTHS[start][p.name]))
+            lines.append(_spread(p, guess.values[p.name], width, f"{guess.source},", "knew before"))
         else:
             lines.append(example(p, model))
     radii = {line.key: line for line in _radii(start, look, top)}
@@ -438,46 +415,43 @@ def example(p: Parameter, model: BubbleModel) -> Entry:
     if any(other.name == "G" for other in model.law.parameters):
         gels |= OF_GELS
     if p.name in gels:
-        median, width = gels[p.name]
-        prior = f"{{prior: lognormal, median: {_text(median, p.unit, p.display_unit)}, log_std: {width:g}}}"
-        words = f"{p.label}: {SPAN.get(p.name, 'of gels')}; may be off by a factor of {math.exp(BETWEEN * width):.2g}"
-        return Entry(p.name, prior, f"{words}; narrow it to what you know of your gel")
-    value = float(model.law.example_values()[p.name][0]) if p.name in model.law.example_values() else 1.0
-    text = _text(value, p.unit, p.display_unit)
-    words = f"{p.label}: an example value, not from the data"
+        return _spread(p, *gels[p.name], f"{SPAN.get(p.name, 'of gels')};", "know of your gel")
+    text = _text(float(model.law.example_values()[p.name][0]), p.unit, p.display_unit)
+    words = "an example value, not from the data"
     if p.transform == "lognormal":
-        return Entry(p.name, f"{{prior: lognormal, median: {text}, log_std: 0.5}}", words)
+        return _lognormal(p, text, "0.5", words)
+    words = f"{p.label}: {words}"
     if p.transform == "logit" and np.all(np.isfinite(p.bounds)):
         low, high = (_text(b, p.unit, p.display_unit) for b in p.bounds)
         return Entry(p.name, f"{{prior: logit, lower: {low}, upper: {high}, median: {text}, logit_std: 0.5}}", words)
     return Entry(p.name, f"{{prior: normal, mean: {text}, std: 20 %}}", words)
 
 
+def _spread(p: Parameter, median: float, log_std: float, source: str, known: str) -> Entry:
+    """A wide prior, and how far its median may be off."""
+    width = f"{log_std:.2g}"
+    words = f"{source} may be off by a factor of {math.exp(BETWEEN * float(width)):.2g}; narrow it to what you {known}"
+    return _lognormal(p, _text(median, p.unit, p.display_unit), width, words)
+
+
+def _lognormal(p: Parameter, median: str, log_std: str, words: str) -> Entry:
+    return Entry(p.name, f"{{prior: lognormal, median: {median}, log_std: {log_std}}}", f"{p.label}: {words}")
+
+
 def _radii(start: Start, look: Look | None, top: Tops | None = None) -> list[Entry]:
     if start == "acoustic":
-        value = _text(NUCLEUS, "m", "um")
-        return [
-            Entry(
-                R0.name,
-                f"{{prior: lognormal, median: {value}, log_std: 0.5}}",
-                f"{R0.label}: readings say little about it",
-            )
-        ]
-    known = look is not None and np.isfinite(look.rest)
-    words = (
-        "the radius at rest; wide, because a real bubble loses gas to the gel and the model's bubble keeps it"
-        if known
-        else f"{GAS_FRACTION:g} R_max: no radius at rest is seen"
-    )
+        return [_lognormal(R0, _text(NUCLEUS, "m", "um"), "0.5", "readings say little about it")]
+    value, width, words = "20 um", 0.4, R_EQ.label
+    if look is not None:
+        value, words = _text(_rest(look), "m", "um"), f"{GAS_FRACTION:g} R_max: no radius at rest is seen"
+    if look is not None and np.isfinite(look.rest):
+        width = 0.3
+        words = "the radius at rest; wide, because a real bubble loses gas to the gel and the model's bubble keeps it"
     mean, std = top.R_max if top else ("maximum", 0.03)
-    value, width = (_text(_rest(look), "m", "um") if look else "20 um"), 0.3 if known else 0.4
+    prior, source = f"{{prior: normal, mean: {mean}, std: {100 * std:.2g} %}}", "the errors of readings and scale"
     return [
-        Entry(R_EQ.name, f"{{prior: lognormal, median: {value}, log_std: {width}}}", words if look else R_EQ.label),
-        Entry(
-            R_MAX.name,
-            f"{{prior: normal, mean: {mean}, std: {100 * std:.2g} %}}",
-            "the top of the history, with the errors of readings and scale",
-        ),
+        Entry(R_EQ.name, f"{{prior: lognormal, median: {value}, log_std: {width}}}", words),
+        Entry(R_MAX.name, prior, f"the top of the history, with {source}"),
     ]
 
 
