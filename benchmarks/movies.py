@@ -50,9 +50,7 @@ def against_a_person() -> tuple[Track, Array]:
 
     by_hand = scipy.io.loadmat(SHARED / "PAstiff_xy002_RofT.mat")["Rnew"].ravel()
     found = track(open_movie(SHARED / "PAstiff_xy002.mp4"), 2)
-    return found, np.array(
-        [r.radius - by_hand[r.frame] for r in found.readings if by_hand[r.frame] > 0]
-    )
+    return found, np.array([r.radius - by_hand[r.frame] for r in found.readings if by_hand[r.frame] > 0])
 
 
 def movie_of(frames: list[Frame]) -> Movie:

@@ -19,6 +19,9 @@ from en4dvar_bubble.solver.integrate import BEYOND, END_TIME, MAX_MACH
 from en4dvar_bubble.tables import evaluate
 
 
+THETA, MOLE_FRACTION = "temperature of the gas over that far away", "mole fraction of vapour"
+
+
 @dataclass(frozen=True, eq=False)
 class Paths(Batch):
     """Integrated members: ``initial`` states (N, n_state) at ``start`` (s), ``times`` (N, K) in s, the raw solution."""
@@ -52,8 +55,9 @@ class Paths(Batch):
         if not isinstance(name, str):
             return self.failure(name) if self.solution.status[name] else BubbleTrajectory(self, name)
         if name not in self._fields:
+            estimated = name in {p.name for p in self.model.parameters}
             compute: Any = OF_WHOLE.get(name) or getattr(type(self), f"_{name}", None)
-            self._fields[name] = self._constant(name) if compute is None else compute(self)
+            self._fields[name] = self._constant(name) if estimated or compute is None else compute(self)
         return self._fields[name]
 
     def failure(self, member: int) -> Failure:
@@ -116,7 +120,7 @@ class Paths(Batch):
         return from_kirchhoff(tau, self.medium(2))
 
     def _T(self) -> Array:
-        theta: Array = self["theta"]
+        theta: Array = self[THETA]
         return theta * self.medium(2).T_inf
 
     def _chi(self) -> Array:
@@ -127,7 +131,7 @@ class Paths(Batch):
         return 1 - gas
 
     def _C(self) -> Array:
-        return mass_fraction(self["chi"], self.medium(2))
+        return mass_fraction(self[MOLE_FRACTION], self.medium(2))
 
     def _T_m(self) -> Array:
         system = self.model.system
@@ -142,15 +146,15 @@ class Paths(Batch):
         gas = self.par[:, None, rows.LOG_GAS]
         if not system.gas:
             return np.asarray(np.exp(gas - 3 * self.model.exponent(medium) * log_R) * medium.rho + medium.p_v)
-        m, weights, theta = system.gas, system.ball.weights, self["theta"]
+        m, weights, theta = system.gas, system.ball.weights, self[THETA]
         share = 1 / theta[:, :, :m]
         wall = theta[:, :, m] if system.wall else np.ones(1)
         at_wall = weights[m] / wall
         content = np.exp(gas - 3 * log_R) * medium.rho
         if system.vapour:
-            share = share * (1 - self["chi"][:, :, :m])
+            share = share * (1 - self[MOLE_FRACTION][:, :, :m])
         if system.kinetic:
-            at_wall = at_wall * (1 - self["chi"][:, :, m])
+            at_wall = at_wall * (1 - self[MOLE_FRACTION][:, :, m])
         elif system.vapour:
             content = content + saturated_vapour_pressure(wall * medium.T_inf) * at_wall
         return np.asarray(content / (share @ weights[:m] + at_wall) + medium.p_v)
@@ -170,7 +174,7 @@ class Paths(Batch):
         return np.asarray((stress - 4 * nu * V) * rho)
 
 
-OF_WHOLE: dict[str, Callable[[Paths], Any]] = {}
+OF_WHOLE: dict[str, Callable[[Paths], Any]] = {THETA: Paths._theta, MOLE_FRACTION: Paths._chi}
 """What is computed once from the paths as a whole, by words, which no parameter has for its name."""
 
 

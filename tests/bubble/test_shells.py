@@ -188,3 +188,12 @@ def test_a_viscosity_of_shear_rate_and_stretch_is_refused():
 
     with pytest.raises(ConfigError, match="defines both viscosity and strained_viscosity"):
         check_law(Both, "Both")
+
+
+def test_the_elasticity_is_in_the_state_also_where_its_name_is_that_of_something_else():
+    """χ is the mole fraction of vapour in the gas as well."""
+    model = BubbleModel(get_law("sarkar-shell"), gas="polytropic")
+    values = {**model.law.example_values(), "R0": np.full(1, R0)}
+    states = model.trajectories(model.initial_states(values), np.array([1e-7, 1e-6])).states
+    assert states.shape == (1, 2, model.layout.size)
+    np.testing.assert_array_equal(states[0, :, model.layout["chi"]], values["chi"][0])
