@@ -15,16 +15,15 @@ from typing import cast
 import numpy as np
 
 from en4dvar.config.context import Spread
-from en4dvar.config.data import Data
-from en4dvar.config.series import DataPlan, SeriesPlan
+from en4dvar.config.data import Data, DataPlan, SeriesPlan
 from en4dvar.data.noise import Noise, SharedErrors, noise_of
 from en4dvar.data.observations import Observations
 from en4dvar.data.series import Series, balanced
 from en4dvar.inputs.asked import ANY, SUFFIXES, Column, DataFile, Layout
+from en4dvar.inputs.implausible import step_doubts
+from en4dvar.inputs.members import read_covariance
 from en4dvar.inputs.parts import parts_of
 from en4dvar.inputs.readers import Readings, Rows, read_series
-from en4dvar.inputs.square import read_covariance
-from en4dvar.inputs.steps import step_doubts
 from en4dvar.inputs.window import select
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, caution

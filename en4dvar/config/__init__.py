@@ -7,8 +7,7 @@ from typing import Any, TypeVar
 from en4dvar.config.design import time_grid
 from en4dvar.config.document import Document, document_from, override
 from en4dvar.config.load import Config, load_config, resolve
-from en4dvar.config.sequence import SequenceConfig, resolve_sequence
-from en4dvar.config.twin import TwinConfig, resolve_twin
+from en4dvar.config.sequence import SequenceConfig, TwinConfig, resolve_sequence, resolve_twin
 from en4dvar.plumbing.errors import ConfigError, Fault
 
 __all__ = [

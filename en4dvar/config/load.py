@@ -9,18 +9,24 @@ import numpy as np
 import yaml
 
 from en4dvar.config.context import Context, Made
-from en4dvar.config.data import Data
-from en4dvar.config.dependence import PriorCorrelation, PriorFile, resolved
+from en4dvar.config.data import DATA, Data, DataPlan
+from en4dvar.config.dependence import (
+    Groups,
+    PopulationSection,
+    PriorCorrelation,
+    PriorFile,
+    Sharing,
+    check_population,
+    resolved,
+    sharing_of,
+)
 from en4dvar.config.design import Design, Times, read_times
 from en4dvar.config.document import Document, document_from, override, parse_document
-from en4dvar.config.initial_state import PERTURBED, Initial, Perturbed
 from en4dvar.config.models import read_model
 from en4dvar.config.parameters import Entry, Fixed, Uncertain, entries
 from en4dvar.config.schema import Assimilation, Execution, File, GivenStart, Output, Section
-from en4dvar.config.series import DATA, DataPlan
-from en4dvar.config.sharing import Groups, PopulationSection, Sharing, check_population, sharing_of
 from en4dvar.config.validate import check
-from en4dvar.config.varies import MODEL_ERROR, ErrorOf
+from en4dvar.config.varies import MODEL_ERROR, PERTURBED, ErrorOf, Initial, Perturbed
 from en4dvar.inputs.members import read_centres, read_members
 from en4dvar.model.forward import ForwardModel, Observable
 from en4dvar.model.state import NOISE_SCALE, Array

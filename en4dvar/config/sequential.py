@@ -11,10 +11,9 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from en4dvar.config.context import SPREAD, TEXT, Context, Made, quantity, read_each, subject_unit
-from en4dvar.config.initial_state import dynamic_fields
 from en4dvar.config.schema import OfScheme, Section, keys_of_schemes, listed, or_in_a_file
 from en4dvar.config.validate import Faults
-from en4dvar.config.varies import ErrorOf, Knots
+from en4dvar.config.varies import ErrorOf, Knots, dynamic_fields
 from en4dvar.model.forward import ForwardModel
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError

@@ -14,9 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from en4dvar.inputs.asked import ANY, Column, Layout, TimeStep
-from en4dvar.inputs.outliers import outlying, scatter_of
+from en4dvar.inputs.implausible import InFile, outlying, scatter_of
 from en4dvar.inputs.parts import columns_of
-from en4dvar.inputs.time_order import InFile
 from en4dvar.inputs.window import index_of
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import DataError, retold

@@ -10,24 +10,27 @@ from typing import Any
 
 # new package → the modules and packages of ``en4dvar`` that moved into it with 1.1
 HOMES = {
-    "plumbing": "errors hints units files tables caution kernel_cache compiled user_code user_file described",
-    "model": "state forward batch function_model programs",
+    "plumbing": "errors hints units files tables caution compiled user_code user_file described",
+    "model": "state forward function_model programs",
     "priors": "prior parameter_map dependence field_prior varying",
     "data": "observations noise",
     "diagnosis": "analysis residuals influence diagnostics response honesty",
     "estimation": "assimilate stages localised conclusions summary joint population design",
 }
 MOVED = {f"en4dvar.{name}": f"en4dvar.{home}.{name}" for home, names in HOMES.items() for name in names.split()}
-MOVED |= {f"en4dvar.config.{n}": f"en4dvar.assembly.{n}" for n in ("build", "build_sequence", "reading")}
+MOVED |= {f"en4dvar.config.{n}": f"en4dvar.assembly.{n}" for n in ("build", "reading")}
 MOVED |= {f"en4dvar.{old}": f"en4dvar.{new}" for new, several in {
-    "config.data": "config.window config.columns", "config.error": "config.error_std config.discrepancy",
-    "config.sharing": "config.population", "config.models": "config.symbols commands.listing",
+    "config.data": "config.window config.columns config.series", "config.varies": "config.initial_state",
+    "config.dependence": "config.population config.sharing", "config.sequence": "config.twin",
+    "config.models": "config.symbols commands.listing", "plumbing.compiled": "kernel_cache plumbing.kernel_cache",
     "data.noise.make": "data.noise.joint data.noise.blocks", "descent.step_control": "descent.settling",
     "executor.base": "executor.chunks executor.shared", "executor.futures": "executor.local",
-    "executor.limits": "executor.blas", "model.programs.model": "model.programs.adjusted model.programs.process",
+    "executor.limits": "executor.blas", "model.forward": "batch model.batch",
+    "model.programs.model": "model.programs.adjusted model.programs.process model.programs.outputs",
     "model.programs.pest": "model.programs.errors", "model.programs.control": "model.programs.refused",
-    "model.programs.matrices": "model.programs.spread", "series.moments": "series.outcome",
-    "config.design": "config.times", "config.of_readings": "config.weights config.places",
+    "model.programs.control_file": "model.programs.spread model.programs.matrices", "series.moments": "series.outcome",
+    "config.design": "config.times", "assembly.build": "assembly.build_sequence config.build_sequence",
+    "config.of_readings": "config.weights config.places config.error config.error_std config.discrepancy",
     "assembly.reading": "config.find_files assembly.find_files", "plumbing.decoding": "plumbing.patterns",
     "commands.synthetic": "commands.calibrate commands.design commands.sweep_twin",
     "commands.together": "commands.joint commands.population", "commands.installation": "commands.listings",
@@ -42,7 +45,8 @@ MOVED |= {f"en4dvar.{old}": f"en4dvar.{new}" for new, several in {
     "runs.finished": "runs.evidence_run", "inputs.readers": "inputs.order",
     "estimation.joint.members": "estimation.joint.challenge", "estimation.stages": "loop_state estimation.loop_state",
     "results.declared": "results.axes", "inputs.parts": "inputs.contents", "inputs.matfile": "inputs.variables",
-    "inputs.asked": "inputs.opened",
+    "inputs.asked": "inputs.opened", "inputs.members": "inputs.square",
+    "inputs.implausible": "inputs.outliers inputs.steps inputs.time_order",
     "estimation.population.hierarchy": "estimation.population.effort estimation.population.hyper",
     "estimation.population.own": "estimation.population.mixtures estimation.population.empirical",
     "estimation.joint.descent": "estimation.joint.arrow estimation.joint.tangent",

@@ -6,14 +6,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from en4dvar.assembly.build import build_one, data_files, inverse_plan
-from en4dvar.assembly.build_sequence import build_sequence
+from en4dvar.assembly.build import build_one, build_sequence, data_files, inverse_plan
 from en4dvar.assembly.reading import read_observations
 from en4dvar.config import AnyConfig, Config, SequenceConfig, resolve_any
+from en4dvar.config.data import DATA, DataPlan
 from en4dvar.config.document import Document, document_from, override
 from en4dvar.config.load import context_of, in_order
 from en4dvar.config.schema import Section
-from en4dvar.config.series import DATA, DataPlan
 from en4dvar.config.validate import check
 from en4dvar.inputs.asked import DataFile
 from en4dvar.plumbing.errors import ConfigError, DataError, Fault

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
-from en4dvar.assembly.build_sequence import build_sequence, sequence_data
+from en4dvar.assembly.build import build_sequence, sequence_data
 from en4dvar.config import SequenceConfig, TwinConfig, load_sequence, load_twin, loaded
 from en4dvar.executor import Executor, choose_executor
 from en4dvar.inputs.asked import DataFile

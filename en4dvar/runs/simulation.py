@@ -16,9 +16,9 @@ import numpy.typing as npt
 from en4dvar.assembly.build import data_files, resolve_parameters
 from en4dvar.assembly.reading import read_observations
 from en4dvar.config import Config, time_grid
-from en4dvar.config.error import parse_error_std
+from en4dvar.config.data import DataPlan, SeriesPlan
+from en4dvar.config.of_readings import parse_error_std
 from en4dvar.config.parameters import Tied
-from en4dvar.config.series import DataPlan, SeriesPlan
 from en4dvar.config.synthetic import CampaignPlan, GroupSection
 from en4dvar.data.series import Places
 from en4dvar.diagnosis.diagnostics import nrmse

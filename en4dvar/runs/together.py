@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from en4dvar.config import Config
-from en4dvar.config.sharing import SOURCE, reference_value
+from en4dvar.config.dependence import SOURCE, reference_value
 from en4dvar.diagnosis.diagnostics import HARDLY_INFORMED
 from en4dvar.estimation.joint import JointEstimate, Single, estimate_jointly
 from en4dvar.estimation.joint.problem import JointProblem, sharing

@@ -5,8 +5,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from en4dvar.model.batch import Batch
-from en4dvar.model.forward import Failure, Trajectory, ValidityLimit
+from en4dvar.model.forward import Batch, Failure, Trajectory, ValidityLimit
 from en4dvar.model.state import Array, StateLayout
 from en4dvar_bubble.dynamics import Dynamics
 from en4dvar_bubble.gas import from_kirchhoff, mass_fraction, saturated_vapour_pressure

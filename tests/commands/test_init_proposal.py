@@ -17,7 +17,7 @@ from en4dvar.assembly.build import build
 from en4dvar.config import load_config, resolve
 from en4dvar.config.document import parse_document, read_document
 from en4dvar.inputs.asked import Column
-from en4dvar.inputs.outliers import scatter_of
+from en4dvar.inputs.implausible import scatter_of
 from en4dvar.inputs.readers import read_series
 from en4dvar.plumbing.errors import ConfigError, DataError
 from en4dvar.report.result import load_result

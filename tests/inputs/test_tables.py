@@ -16,10 +16,10 @@ from scipy.io import savemat
 
 from en4dvar.inputs import sheets
 from en4dvar.inputs.asked import Column, Layout
+from en4dvar.inputs.implausible import step_doubts
 from en4dvar.inputs.matfile import mat_variables
 from en4dvar.inputs.parts import parts_of, read_contents
 from en4dvar.inputs.readers import Readings, read_series
-from en4dvar.inputs.steps import step_doubts
 from en4dvar.inputs.window import parse_instant
 from en4dvar.plumbing.errors import DataError
 

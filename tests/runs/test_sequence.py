@@ -15,7 +15,7 @@ from drift_series import STD, TIMES, VALUES
 from linear_drift import Drift
 
 import en4dvar
-from en4dvar.assembly.build_sequence import build_sequence
+from en4dvar.assembly.build import build_sequence
 from en4dvar.config import load_sequence, load_twin
 from en4dvar.data.noise import noise_of
 from en4dvar.plumbing.errors import ConfigError, DataError

@@ -18,8 +18,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from en4dvar.model.programs import pest
-from en4dvar.model.programs.control_file import OBSERVATIONS, PARAMETERS, ControlFile, PestRow, read_control, text_of
-from en4dvar.model.programs.matrices import OFF, READ, errors_in_files, priors_in_files
+from en4dvar.model.programs.control_file import (
+    OBSERVATIONS,
+    OFF,
+    PARAMETERS,
+    READ,
+    ControlFile,
+    PestRow,
+    errors_in_files,
+    priors_in_files,
+    read_control,
+    text_of,
+)
 from en4dvar.plumbing.errors import ConfigError
 
 RANGE = 4.0  # standard deviations between the bounds: PEST++ (White et al. 2020), option par_sigma_range
