@@ -8,8 +8,8 @@ import numpy as np
 from en4dvar.assembly.reading import find_files, read_observations, with_parts
 from en4dvar.config import Config
 from en4dvar.config.data import DataPlan, SeriesPlan
+from en4dvar.config.kinds import SequenceConfig
 from en4dvar.config.parameters import Fixed, Scalar, Tied, Uncertain, inside_bounds
-from en4dvar.config.sequence import SequenceConfig
 from en4dvar.config.sequential import SeriesLocalisation, error_rates, localisation_of, per_time
 from en4dvar.config.varies import Perturbed, modes_of
 from en4dvar.data.observations import Observations
@@ -17,7 +17,7 @@ from en4dvar.descent.field_data import gain_of
 from en4dvar.descent.start import given
 from en4dvar.ensemble.forecast import check_problem
 from en4dvar.ensemble.tangent import derivatives_of
-from en4dvar.inputs.asked import Column, DataFile
+from en4dvar.inputs.parts import Column, DataFile, Layout
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError, DataError, Fault, retold
 from en4dvar.plumbing.units import convert
@@ -58,7 +58,7 @@ def inverse_plan(config: Config) -> DataPlan:
         raise ConfigError([Fault("required: it says where the observations are", "data", config.document.file)])
     if not config.initial_state and not any(isinstance(entry, Uncertain) for entry in config.parameters):
         raise ConfigError([config.document.fault(("parameters",), "no parameter has a prior; nothing to estimate")])
-    return DataPlan.of(config.data, config.observable)
+    return config.data
 
 
 def build_one(config: Config, name: str, file: DataFile) -> InverseProblem:
@@ -109,9 +109,7 @@ def problem_of(config: Config, observations: Observations) -> InverseProblem:
 
 
 def _varying(config: Config, observations: Observations, terms: Sequence[PriorTerm]) -> list[Varying]:
-    """Parameters and model errors that vary in time. Raises :class:`ConfigError`: knots that do not suit the
-    observations.
-    """
+    """Parameters and model errors that vary in time; knots that do not suit the observations raise ConfigError."""
     model, by_name = config.model, {term.parameter.name: term for term in terms}
     varying: list[Varying | None] = []
     for name, entry in ((e.parameter.name, e) for e in config.parameters if isinstance(e, Uncertain)):
@@ -125,9 +123,7 @@ def _varying(config: Config, observations: Observations, terms: Sequence[PriorTe
 
 def discrepancy_terms(config: Config, observations: Observations) -> tuple[PriorTerm, ...]:
     """Priors of the discrepancy that the observations allow for."""
-    asked = (
-        None if config.data is None else DataPlan.of(config.data, config.observable).series[0].data.error.discrepancy
-    )
+    asked = None if config.data is None else config.data.series[0].data.error.discrepancy
     if asked is None or not observations.noise.discrepant:
         return ()
     first, last = observations.span
@@ -170,7 +166,9 @@ def _files_of(series: SeriesPlan) -> dict[str, DataFile]:
     with retold(DataError, DataError, "", series.name):
         files = find_files(data.path.base, data.path.texts)
     time = data.columns.time
-    return with_parts(files, data.columns.observable, data.layout, time.name if isinstance(time, Column) else None)
+    return with_parts(
+        files, data.columns.observable, data.part(Layout), time.name if isinstance(time, Column) else None
+    )
 
 
 def resolve_parameters(
@@ -223,7 +221,7 @@ def _of_data(config: Config | SequenceConfig, observations: Observations, unit: 
 
 def sequence_data(config: SequenceConfig) -> dict[str, DataFile]:
     """The data set, by its name. Raises :class:`DataError`: there are several."""
-    files = data_files(DataPlan.of(config.data, config.observable))
+    files = data_files(config.data)
     if len(files) > 1:
         raise DataError(f"a sequence is one data set, but there are {len(files)}: {', '.join(files)}")
     return files
@@ -231,9 +229,8 @@ def sequence_data(config: SequenceConfig) -> dict[str, DataFile]:
 
 def build_sequence(config: SequenceConfig) -> SeriesProblem:
     """The series and how it is assimilated. Raises :class:`ConfigError`, :class:`DataError`."""
-    plan = DataPlan.of(config.data, config.observable)
     ((name, file),) = sequence_data(config).items()
-    observations = read_observations(plan, file, name)
+    observations = read_observations(config.data, file, name)
     terms, fixed = resolve_parameters(config, observations)
     positive = {name for name, spread in config.sequence.initial_std.items() if spread.relative}
     positive |= set(config.sequence.positive)
@@ -254,7 +251,6 @@ def build_sequence(config: SequenceConfig) -> SeriesProblem:
 
 def _localisation(config: SequenceConfig, asked: SeriesLocalisation, problem: SeriesProblem) -> BlockLocalisation:
     """By the distance between cells of the field and the places that were read. Raises :class:`ConfigError`."""
-    plan = DataPlan.of(config.data, config.observable)
     operators = [read.operator for read in problem.observables]
     with config.document.placing("assimilation", "localisation"):
         if problem.series.correlation is not None:
@@ -263,7 +259,7 @@ def _localisation(config: SequenceConfig, asked: SeriesLocalisation, problem: Se
             raise ConfigError("needs readings of a field: data.places")
         places = [operator.places for operator in operators if isinstance(operator, AtPlaces)]
         cells = np.concatenate([np.sum(at.indices * at.shares, axis=1) for at in places])
-        return localisation_of(asked, config.model, {series.observable.name for series in plan.series}, cells)
+        return localisation_of(asked, config.model, {series.observable.name for series in config.data.series}, cells)
 
 
 def _walks(config: SequenceConfig, terms: Sequence[PriorTerm]) -> Array:

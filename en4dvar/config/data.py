@@ -1,7 +1,7 @@
 """The ``data:`` section, of one series or of several: which files, how they are read, which observations are used."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, cast
 
@@ -10,8 +10,10 @@ from pydantic import BeforeValidator, ConfigDict, Discriminator, Field, Tag, Wit
 from en4dvar.config.context import (
     PLACEHOLDER,
     Context,
+    Faults,
     Made,
     OfObservable,
+    Place,
     observable_unit,
     quantity,
     time_unit,
@@ -19,8 +21,7 @@ from en4dvar.config.context import (
 )
 from en4dvar.config.of_readings import PLACES, WEIGHTS, Error, Placing, Weighing
 from en4dvar.config.schema import Name, QuantityText, Section
-from en4dvar.config.validate import Faults, Place
-from en4dvar.inputs.asked import Column, Disorder, Format, Layout, Outliers, Repeated, TimeStep
+from en4dvar.inputs.parts import Column, Disorder, Format, Outliers, Repeated, TimeStep
 from en4dvar.inputs.text_table import Decimal
 from en4dvar.inputs.window import Instant, parse_instant
 from en4dvar.model.forward import Observable, field_of
@@ -106,16 +107,13 @@ def _values(section: ValueColumn, context: Context) -> Column:
     return Column(section.name, section.unit, observable_unit(context), positive)
 
 
-_VALUES = Made(_values, ValueColumn)
-
-
 class Columns(Section):
     """Which columns hold the time and the observable, each with its unit."""
 
     model_config = ConfigDict(json_schema_extra={"required": ["time"]}, populate_by_name=False)
     time: Annotated[Column | TimeStep, Made(_times, TimeColumn)] = cast(Any, None)  # a rule says what is missing
     """Observation times."""
-    observable: Annotated[Column, _VALUES, Field(alias=PLACEHOLDER)] = cast(Any, None)
+    observable: Annotated[Column, Made(_values, ValueColumn), Field(alias=PLACEHOLDER)] = cast(Any, None)
     """The observable."""
 
     @classmethod
@@ -218,11 +216,6 @@ class Data(Section):
     """Observation errors: ``<observable>_std``, ``time_std``, ``correlation_time``, ``covariance``, ``robust``,
     ``discrepancy``."""
 
-    @property
-    def layout(self) -> Layout:
-        """How the files are laid out."""
-        return Layout(**{part.name: getattr(self, part.name) for part in fields(Layout)})
-
     @classmethod
     def rules(cls, keys: Mapping[str, Any], context: Context, faults: Faults) -> None:
         for key, word in (("repeated", "average"), ("outliers", "leave out")):
@@ -289,18 +282,10 @@ class DataPlan:
     series: tuple[SeriesPlan, ...]
     correlation: Mapping[tuple[str, str], float]
 
-    @classmethod
-    def of(cls, data: "Data | DataPlan", observable: Observable) -> "DataPlan":
-        """The plan of either kind of section; ``observable`` is that of a single series."""
-        return data if isinstance(data, DataPlan) else cls((SeriesPlan(observable.name, observable, data),), {})
-
-    @property
-    def alone(self) -> bool:
-        """True if there is one series."""
-        return len(self.series) == 1
-
     def as_written(self, source: Mapping[str, Any]) -> dict[str, Any]:
         """The section as it was written, each series complete, with absolute paths."""
+        if "series" not in source:
+            return self.series[0].data.as_written(source)
         common, written = _common(source), dict[str, Any]()
         for series in self.series:
             section = series.data.as_written(_merged(common, source["series"][series.name]))
@@ -414,12 +399,9 @@ def _check_pair(name: str, other: str, section: DataOfSeries, faults: Faults) ->
         faults.add(("correlation", name, other), f"given as {other}: {{{name}: …}} as well", at_key=True)
 
 
-def _kind(written: Any) -> str:
-    several = (isinstance(written, dict) and "series" in written) or isinstance(written, DataPlan)
-    return "of several series" if several else "of one series"
-
-
+_ALONE = Made(lambda section, c: DataPlan((SeriesPlan(c.observable.name, c.observable, section),), {}), Data)
 DATA = Annotated[
-    Annotated[Data, Tag("of one series")] | Annotated[DataPlan, Made(_plan, DataOfSeries), Tag("of several series")],
-    Discriminator(_kind),
+    Annotated[DataPlan, _ALONE, Tag("of one series")]
+    | Annotated[DataPlan, Made(_plan, DataOfSeries), Tag("of several series")],
+    Discriminator(lambda data: "of several series" if isinstance(data, dict) and "series" in data else "of one series"),
 ]

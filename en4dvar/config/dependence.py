@@ -7,20 +7,19 @@ the ``groups:``, which have one value in several data sets; the ``population:`` 
 import itertools
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import Annotated, Any, cast
 
 import numpy as np
 from pydantic import Field
 
-from en4dvar.config.context import Context, Made
+from en4dvar.config.context import Context, Faults, Made
 from en4dvar.config.document import Document
 from en4dvar.config.parameters import Entry, Uncertain
 from en4dvar.config.schema import Name, Section, section_of
-from en4dvar.config.validate import Faults
 from en4dvar.estimation.population import HyperPrior
 from en4dvar.inputs.members import read_members, read_square
 from en4dvar.model.state import Array, Parameter, TransformName
@@ -31,7 +30,6 @@ from en4dvar.priors.dependence import Dependence, KernelName, correlation_of_pla
 from en4dvar.priors.prior import PriorTerm
 
 KINDS = ("correlation", "matrix", "file", "kernel")
-
 
 A_FILE = Made(lambda text, context: context.path(text), Annotated[str, Field(min_length=1)], {"type": "string"})
 Position = float | tuple[float, ...]
@@ -142,7 +140,7 @@ def resolved(
     ConfigError: every fault, located in the file.
     """
     faults: list[Fault] = []
-    asking = [e for e in entries if isinstance(e, Uncertain) and e.from_ensemble]
+    asking = [e for e in entries if isinstance(e, Uncertain) and e.spec.prior == "ensemble"]
     dependence: tuple[Dependence, ...] = ()
     made: dict[str, Entry] = {}
     if asking or ensemble is not None:
@@ -226,18 +224,10 @@ def term_of_members(parameter: Parameter, values: Array, kind: str | None) -> tu
     return term, np.asarray((x - term.mean) / term.std)
 
 
-if TYPE_CHECKING:
-
-    class _HyperPrior(HyperPrior, Section): ...
-
-else:
-    _HyperPrior = section_of(HyperPrior)
-
-
 GroupName = Annotated[str, Field(pattern=r"^[^\s\x00-\x1f\x7f][^\x00-\x1f\x7f]*$", max_length=100)]
 
 
-class PopulationSection(_HyperPrior):
+class PopulationSection(section_of(HyperPrior)):  # type: ignore[misc]
     """Mean and spread of parameters over the data sets of the run, estimated at its end."""
 
     of: Annotated[tuple[str, ...], Field(min_length=1)]
@@ -249,11 +239,6 @@ class PopulationSection(_HyperPrior):
     known: Annotated[dict[GroupName, dict[Name, str]], Field(default_factory=dict)]
     """Medians that a group is known to have, e.g. {standard: {k: 7.7 ± 0.2 N/m}}: they calibrate what all groups
     have in common, such as scale and density."""
-
-    @property
-    def hyper(self) -> HyperPrior:
-        """The prior of mean and spread."""
-        return HyperPrior(**{field.name: getattr(self, field.name) for field in fields(HyperPrior)})
 
 
 def check_population(
@@ -333,9 +318,6 @@ class Sharing:
     groups: Mapping[str, Mapping[str, Patterns]]
     document: Document
 
-    def __bool__(self) -> bool:
-        return bool(self.kinds)
-
     def of_dataset(self, name: str) -> dict[str, str]:
         """Shared parameter → group of a data set, "" for all. Raises :class:`ConfigError`: it is in none or several."""
         return {parameter: "" if kind == ALL else self.group_of(kind, name) for parameter, kind in self.kinds.items()}
@@ -363,7 +345,14 @@ def sharing_of(
     """The parameters that a file asks to be shared. Raises :class:`ConfigError`: every entry that cannot be."""
     asked = {e.parameter.name: e for e in entries if isinstance(e, Uncertain) and e.spec.shared is not None}
     kinds = {name: str(entry.spec.shared) for name, entry in asked.items()}
-    faults = [fault for name, entry in asked.items() for fault in _faults(name, entry, groups, document)]
+    faults = list[Fault]()
+    for name, kind in kinds.items():
+        where, known = ("parameters", name, "shared"), [ALL, *groups]
+        if kind not in known:
+            faults.append(document.fault(where, f"no kind of 'groups:' is called {shown(kind)}{suggest(kind, known)}"))
+        if asked[name].needs_data:
+            words = "its prior depends on the data set ('maximum'), but what is shared has one prior"
+            faults.append(document.fault(where, words))
     if kinds:
         faults += [
             document.fault(("parameters", e.parameter.name, "varies"), "not where parameters are shared by data sets")
@@ -378,12 +367,3 @@ def sharing_of(
     if faults:
         raise ConfigError(faults)
     return Sharing(kinds, groups, document)
-
-
-def _faults(name: str, entry: Uncertain, groups: Mapping[str, object], document: Document) -> Iterator[Fault]:
-    where, kind = ("parameters", name, "shared"), str(entry.spec.shared)
-    if kind != ALL and kind not in groups:
-        known = [ALL, *groups]
-        yield document.fault(where, f"no kind of 'groups:' is called {shown(kind)}{suggest(kind, known)}")
-    if entry.needs_data:
-        yield document.fault(where, "its prior depends on the data set ('maximum'), but what is shared has one prior")

@@ -17,6 +17,7 @@ from en4dvar.config.context import (
     PLACEHOLDER,
     TEXT,
     Context,
+    Faults,
     Made,
     Spread,
     Unit,
@@ -27,10 +28,9 @@ from en4dvar.config.context import (
     unit_of,
 )
 from en4dvar.config.schema import OfReadings, Section
-from en4dvar.config.validate import Faults
 from en4dvar.data.noise import SMOOTHNESS, Kernel
 from en4dvar.data.series import Places
-from en4dvar.inputs.asked import Column, Matrix
+from en4dvar.inputs.parts import Column, Matrix
 from en4dvar.inputs.window import minima
 from en4dvar.model.forward import field_of
 from en4dvar.model.state import Array, Parameter
@@ -101,7 +101,6 @@ MARKS = Made(
 )
 QUANTITY_OR_COLUMN = {"anyOf": [TEXT, ErrorColumn.model_json_schema()]}
 
-
 LogStd = Annotated[float, Field(gt=0)]
 
 
@@ -161,7 +160,6 @@ def estimated(written: Any) -> Any:
 
 
 HUBER = 1.345  # 95 % efficiency where the errors are Gaussian after all: Huber (1981), Robust Statistics
-
 
 BOUNDS = ("at_most", "at_least")
 BESIDE = ("covariance", "correlation_time", "shared", "robust", "discrepancy", "time_std")
@@ -257,11 +255,6 @@ class Error(Section):
         """True if the errors of one reading say nothing of those of another, and none is a bound."""
         correlated = self.covariance is not None or self.correlation_time is not None or self.shared
         return not correlated and not any(self.bounds.values())
-
-    @property
-    def huber(self) -> float | None:
-        """The threshold of the robust cost, None where the cost is quadratic."""
-        return self.threshold if self.robust else None
 
 
 NUMBERS = TypeAdapter(list[Annotated[float, Field(ge=0, allow_inf_nan=False)]])

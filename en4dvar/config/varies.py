@@ -15,6 +15,7 @@ from pydantic import model_validator
 from en4dvar.config.context import (
     SPREAD,
     Context,
+    Faults,
     Made,
     Spread,
     parse_spread,
@@ -24,7 +25,6 @@ from en4dvar.config.context import (
     time_unit,
 )
 from en4dvar.config.schema import Section
-from en4dvar.config.validate import Faults
 from en4dvar.data.observations import Observations
 from en4dvar.inputs.window import maxima
 from en4dvar.model.forward import ForwardModel
@@ -145,7 +145,6 @@ def _initial(section: InitialSpread, field: Field) -> Initial:
 
 PERTURBED = of_fields(InitialSpread, "give it a prior in parameters", _initial)
 
-
 MOST_KNOTS = 1000
 
 
@@ -205,11 +204,6 @@ class VariesSection(Knots):
     std: Annotated[Spread, Made(_change_std)]
     """Standard deviation of each change: in % of the value (lognormal: of its logarithm), or in the parameter's
     unit, which holds at the centre of the prior; or ``estimated``, with a half-normal prior of 50 %."""
-
-    @property
-    def estimated(self) -> bool:
-        """True if ``std`` is that of the prior of the changes' standard deviation."""
-        return isinstance(self.std, Estimated)
 
     def std_of(self, term: PriorTerm) -> float:
         """Standard deviation of each change in the coordinate of the prior of its parameter.

@@ -22,8 +22,7 @@ import numpy as np
 import numpy.typing as npt
 from numpy.lib.stride_tricks import sliding_window_view
 
-from en4dvar.inputs.asked import Layout, opened
-from en4dvar.inputs.parts import cell, table_of
+from en4dvar.inputs.parts import Layout, cell, opened, table_of
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.errors import DataError

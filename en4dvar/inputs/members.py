@@ -10,13 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from en4dvar.inputs.asked import Layout, Matrix, opened, require_file
-from en4dvar.inputs.parts import read_contents
+from en4dvar.inputs.parts import Layout, Matrix, opened, read_contents, require_file
 from en4dvar.inputs.text_table import cells_of, delimiter_of, number_in, numbered_lines
 from en4dvar.model.state import Array
-from en4dvar.plumbing.decoding import Allowed, DecodeError, decoded_whole
+from en4dvar.plumbing.decoding import Allowed, DecodeError, ForeignDataError, decoded_whole, require_whole
 from en4dvar.plumbing.errors import DataError, retold
-from en4dvar.plumbing.hdf5 import ForeignDataError, require_whole
 from en4dvar.plumbing.hints import listed, suggest
 from en4dvar.plumbing.tables import is_number
 from en4dvar.plumbing.units import UnitError, convert

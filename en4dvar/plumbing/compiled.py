@@ -152,16 +152,6 @@ class KernelCache(FunctionCache):
         self._cache_file = SignatureFiles(self.cache_path, self._impl.filename_base, stamp)
 
 
-def keep(dispatcher: Any) -> None:
-    """Keep the machine code of ``dispatcher`` (made by ``numba.njit``) on disk for later processes.
-
-    Raises
-    ------
-    OutputError: compiled code can be kept nowhere.
-    """
-    dispatcher._cache = KernelCache(dispatcher.py_func)
-
-
 def _digest(folder: Path, *more: Path) -> str:
     content = b"".join(path.read_bytes() for path in (*sorted(folder.glob("*.py")), *more))
     return sha256(content).hexdigest()
@@ -172,8 +162,16 @@ def stamp_with_sources(dispatcher: Any, folder: Path, *more: Path) -> None:
     dispatcher._cache.stamp(_digest(folder, *more))
 
 
-def compile_once(dispatcher: Any) -> None:
-    """Of processes that need ``dispatcher`` for the same arguments, let one compile; the others load what it kept."""
+def keep(dispatcher: Any) -> None:
+    """Keep the machine code of ``dispatcher`` (made by ``numba.njit``) on disk for later processes.
+
+    Of processes that need it for the same arguments, one compiles, and the others load what it kept.
+
+    Raises
+    ------
+    OutputError: compiled code can be kept nowhere.
+    """
+    dispatcher._cache = KernelCache(dispatcher.py_func)
     compile_: Callable[[Any], Any] = dispatcher.compile
 
     def alone(signature: Any) -> Any:
@@ -181,24 +179,13 @@ def compile_once(dispatcher: Any) -> None:
         digest = sha256(repr(signature).encode()).hexdigest()[:16]
         # numba's lock first, as where one kernel is compiled within another: threads never wait for each other's file
         lock = Path(cache.cache_path) / f"{cache._impl.filename_base}.{digest}.lock"
-        with global_compiler_lock, _held(lock), _without_collection():
+        with global_compiler_lock, _held(lock), ExitStack() as stack:
+            if gc.isenabled():  # to look for cycles among the compiler's million objects takes a tenth of its time
+                gc.disable()
+                stack.callback(gc.enable)
             return compile_(signature)
 
     dispatcher.compile = alone
-
-
-@contextmanager
-def _without_collection() -> Iterator[None]:
-    """Within, Python does not look for cycles: among the million objects that the compiler keeps until it is done, a
-    tenth of its time went into that.
-    """
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
 
 
 @contextmanager
@@ -230,7 +217,6 @@ def _kernels(**options: Any) -> Callable[[F], F]:
             raise ConfigError("NUMBA_DISABLE_JIT is set, but the solver's kernels run compiled alone; unset it")
         made: F = numba.njit(nogil=True, **options)(function)
         keep(made)
-        compile_once(made)
         KERNELS.append(made)
         return made
 

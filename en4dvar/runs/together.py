@@ -244,7 +244,7 @@ class PopulationKind(TogetherKind):
     ) -> None:  # fmt: skip
         tell(f"population of {', '.join(self.names)} behind {len(sets)} data sets")
         problems, white = [s.problem for s in sets], [s.white for s in sets]
-        asked = config.population.hyper if config.population else HyperPrior()
+        asked = config.population.part(HyperPrior) if config.population else HyperPrior()
         hyper = self.hyper if isinstance(self.hyper, HyperPrior) else replace(asked, **(self.hyper or {}))
         with retold(ValueError, TooFewMembersError, "no population: "):  # of forward runs that failed
             population = population_of(

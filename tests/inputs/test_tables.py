@@ -14,12 +14,11 @@ import pytest
 from openpyxl import Workbook
 from scipy.io import savemat
 
-from en4dvar.inputs import sheets
-from en4dvar.inputs.asked import Column, Layout
 from en4dvar.inputs.implausible import step_doubts
 from en4dvar.inputs.matfile import mat_variables
-from en4dvar.inputs.parts import parts_of, read_contents
+from en4dvar.inputs.parts import Column, Layout, parts_of, read_contents
 from en4dvar.inputs.readers import Readings, read_series
+from en4dvar.inputs.text_table import lines_of_workbook
 from en4dvar.inputs.window import parse_instant
 from en4dvar.plumbing.errors import DataError
 
@@ -285,7 +284,7 @@ def test_a_missing_package_is_named(tmp_path, monkeypatch):
     path = book(tmp_path / "a.xlsx", film=ROWS)
     monkeypatch.setitem(sys.modules, "openpyxl", None)
     with pytest.raises(DataError, match=r"a\.xlsx: .*pip install openpyxl"):
-        list(sheets.lines_of_workbook(path, ""))
+        list(lines_of_workbook(path, ""))
 
 
 def test_columns_and_rows_of_matrices(tmp_path):

@@ -12,6 +12,7 @@ from __future__ import annotations
 import csv
 import math
 import re
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -63,24 +64,24 @@ class PestRow(NamedTuple):
 
 @dataclass
 class ControlFile:
-    """What stands in it. ``options``: PEST++'s, name → text, lower case names."""
+    """The lines of each of its ``sections``, each a row with the one cell ``line``.
+
+    ``options``: PEST++'s, name → text, lower case names.
+    """
 
     path: Path
-    sections: dict[str, list[PestRow]] = field(default_factory=dict)
+    sections: dict[str, list[PestRow]] = field(default_factory=lambda: defaultdict(list))
     options: dict[str, str] = field(default_factory=dict)
-
-    def lines(self, name: str) -> list[PestRow]:
-        """The lines of a section, each a row with the one cell ``line``."""
-        return self.sections.get(name, [])
 
     def rows(self, name: str, columns: Sequence[str]) -> list[PestRow]:
         """Of a section with these columns, and of its external tables. Raises :class:`ConfigError`."""
-        inline = (PestRow(r.where, dict(zip(columns, r.cells["line"].split(), strict=False))) for r in self.lines(name))
-        return [*inline, *self.tables(name)]
+        lines = ((row.where, row.cells["line"].split()) for row in self.sections[name])
+        inline = [PestRow(where, dict(zip(columns, cells, strict=False))) for where, cells in lines]
+        return inline + self.tables(name)
 
     def tables(self, name: str) -> list[PestRow]:
         """The rows of the external tables of a section. Raises :class:`ConfigError`."""
-        return [row for line in self.lines(f"{name} external") for row in self._table(line)]
+        return [row for line in self.sections[f"{name} external"] for row in self._table(line)]
 
     def number(self, option: str, default: float) -> float:
         """A positive number among the options. Raises :class:`ConfigError`."""
@@ -124,17 +125,17 @@ def read_control(path: Path) -> ControlFile:
             name = " ".join(line[1:].lower().split())
             if name.removesuffix(" external") not in _SECTIONS:
                 raise ConfigError(f"{path}:{number}: no section of a control file is called {name!r}")
-            current = control.sections.setdefault(name, [])
+            current = control.sections[name]
         elif line.startswith("&") and current:
             last = current[-1]
             current[-1] = PestRow(last.where, {"line": f"{last.cells['line']} {line[1:]}"})
         elif line:
             current.append(PestRow(f"{path}:{number}", {"line": line}))
-    for row in control.lines("control data keyword"):
+    for row in control.sections["control data keyword"]:
         name, _, text = row.cells["line"].partition(" ")
         control.options[name.lower()] = text.strip().strip("\"'")
     for name in ("parameter data", "observation data", "model command line"):
-        if not control.lines(name) and not control.lines(f"{name} external"):
+        if not control.sections[name] and not control.sections[f"{name} external"]:
             raise ConfigError(f"{path}: no section '* {name}'")
     return control
 

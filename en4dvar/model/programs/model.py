@@ -23,8 +23,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from en4dvar.model.function_model import FunctionModel
-from en4dvar.model.programs import pest, template
-from en4dvar.model.programs.pest import ProgramError
+from en4dvar.model.programs import languages
+from en4dvar.model.programs.languages import ProgramError
 from en4dvar.model.programs.settings import LOGARITHM, OUTPUT, STDOUT, CommandSettings, OutputOf, fill, split
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.children import Child, TimeLimitError, require_going_on, scratch, status_named, within
@@ -48,11 +48,13 @@ def read(output: OutputOf, folder: Path, times: Array, seconds: float | None = N
     """
     file = output.file
     if output.pattern is not None:
-        values = _numbers(_found(folder, file, output.pattern, seconds), file)
+        # by another process: a pattern may take years, in which nothing else of this one would run
+        allowed = Allowed(min(Allowed.seconds, math.ceil(seconds or Allowed.seconds)), size=LONGEST_TEXT)
+        values = _numbers(decoded_whole(matches, folder / file, output.pattern, allowed=allowed), file)
     elif output.instructions:
         values = _instructed(output, folder)
     else:
-        text, find = _text(folder, file), _key if output.column is None else _column
+        text, find = text_of(folder / file), _key if output.column is None else _column
         values = find(text, output.key if output.column is None else output.column, file)
         if output.time is not None:
             return _at(times, find(text, output.time, file), values, file)
@@ -64,27 +66,11 @@ def read(output: OutputOf, folder: Path, times: Array, seconds: float | None = N
 def _instructed(output: OutputOf, folder: Path) -> Array:
     values: dict[str, float] = {}
     for file, paths in output.instruction_files.items():
-        text = _text(folder, file)
+        text = text_of(folder / file)
         for path in paths:
-            values |= pest.read(template.text_of(path), text, file, path.name, output.delimiters)
+            values |= languages.read(languages.text_of(path), text, file, path.name, output.delimiters)
     names = list(values) if output.observations is None else [name.lower() for name in output.observations]
     return np.array([values[name] for name in names])
-
-
-def _found(folder: Path, file: str, pattern: str, seconds: float | None) -> list[str]:
-    """The matches, by another process: a pattern may take years, in which nothing else of this one would run."""
-    allowed = Allowed(min(Allowed.seconds, math.ceil(seconds or Allowed.seconds)), size=LONGEST_TEXT)
-    try:
-        return decoded_whole(matches, folder / file, pattern, allowed=allowed)
-    except (DataError, DecodeError) as error:
-        raise ProgramError(str(error).replace(str(folder / file), file)) from None
-
-
-def _text(folder: Path, file: str) -> str:
-    try:
-        return text_of(folder / file)
-    except DataError as error:
-        raise ProgramError(str(error).replace(str(folder / file), file)) from None
 
 
 def _at(times: Array, own: Array, values: Array, file: str) -> Array:
@@ -185,6 +171,8 @@ class Program:
                 outputs, limit = self.settings.outputs.items(), self.settings.time_limit
                 values = within_limit(lambda: {n: read(output, folder, times, limit) for n, output in outputs})
                 return {name: np.concatenate([values[name], more[name]]) for name in values}
+        except (DataError, DecodeError) as error:
+            raise ProgramError(str(error).replace(f"{folder}{os.sep}", "")) from None
         except OSError as error:
             raise ProgramError(f"{error.filename or 'scratch folder'}: {error.strerror}") from None
         except (TimeLimitError, subprocess.TimeoutExpired):
@@ -195,7 +183,7 @@ class Program:
             shutil.copy(file, folder)
         for name, file in self.settings.templates.items():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            (folder / name).write_text(template.filled(file, parameters, times), encoding="utf-8", newline="")
+            (folder / name).write_text(languages.filled(file, parameters, times), encoding="utf-8", newline="")
 
     def _run(self, folder: Path, parameters: Mapping[str, float], end: float | None) -> None:
         values = {name: repr(float(value)) for name, value in parameters.items()}

@@ -1,30 +1,33 @@
-"""A series that is assimilated cycle by cycle: the file has a section ``sequence:`` beside ``data:``, or, of a twin
-experiment, ``twin:`` instead of ``data:``.
+"""Files of other kinds than an estimation: a series that is assimilated cycle by cycle, and synthetic readings.
+
+A twin experiment has a section ``twin:`` where others have ``data:``, a series of data ``sequence:`` beside it, a
+synthetic campaign ``campaign:``.
 """
 
+import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Self
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, ValidatorFunctionWrapHandler, WrapValidator, model_validator
 
-from en4dvar.config.context import Context, Made, Spread, quantity, time_unit
-from en4dvar.config.data import DATA, Data, DataPlan
+from en4dvar.config.context import Context, Faults, Made, Spread, quantity, time_unit
+from en4dvar.config.data import DATA, DataPlan
 from en4dvar.config.document import Document
-from en4dvar.config.load import Read, Validated, observed_in, read_file
+from en4dvar.config.load import Read, Validated, read_file
 from en4dvar.config.parameters import Entry, Fixed, Tied, Uncertain, entries
-from en4dvar.config.schema import File, Output, Section
+from en4dvar.config.schema import File, Name, Output, Section
 from en4dvar.config.sequential import Sequential, Workers, error_rates, localisation_of, stds
-from en4dvar.config.validate import Faults
-from en4dvar.config.varies import MODEL_ERROR, ErrorOf, dynamic_fields
+from en4dvar.config.varies import MODEL_ERROR, ErrorOf, Estimated, dynamic_fields
 from en4dvar.data.noise import Correlation
-from en4dvar.inputs.asked import Matrix
 from en4dvar.inputs.members import read_covariance
+from en4dvar.inputs.parts import Matrix
 from en4dvar.model.forward import ForwardModel, Observable
 from en4dvar.plumbing.errors import ConfigError, DataError, retold
 from en4dvar.plumbing.hints import shown, suggest
-from en4dvar.priors.prior import Prior
+from en4dvar.plumbing.units import parse_quantity
+from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.series.start import EnsembleCoordinates
 from en4dvar.series.twin import TwinExperiment
 
@@ -108,10 +111,11 @@ class TwinConfig(Validated):
     scheme: str
     execution: Workers
 
-    @property
-    def model(self) -> ForwardModel:
-        """That of the truth and of the members."""
-        return self.experiment.model
+
+def terms_and_fixed(entries: tuple[Entry, ...]) -> tuple[tuple[PriorTerm, ...], dict[str, float]]:
+    """The priors and the values of entries that need no data."""
+    terms = tuple(entry.term() for entry in entries if isinstance(entry, Uncertain))
+    return terms, {entry.parameter.name: entry.value for entry in entries if isinstance(entry, Fixed)}
 
 
 def resolve_twin(document: Document, base: Path) -> TwinConfig:
@@ -123,7 +127,7 @@ def resolve_twin(document: Document, base: Path) -> TwinConfig:
     if file.assimilation.localisation:
         with document.placing("assimilation", "localisation"):
             local = localisation_of(file.assimilation.localisation, model, observed.keys())
-    terms = tuple(entry.term() for entry in file.parameters if isinstance(entry, Uncertain))
+    terms, fixed = terms_and_fixed(file.parameters)
     prior = Prior(terms) if terms else None
     with document.placing():
         rate = error_rates(model, file.model_error or ())
@@ -138,10 +142,9 @@ def resolve_twin(document: Document, base: Path) -> TwinConfig:
         burn_in=twin.burn_in,
         error_correlation=twin.error_correlation[1] if twin.error_correlation else None,
         prior=prior,
-        fixed={entry.parameter.name: entry.value for entry in file.parameters if isinstance(entry, Fixed)},
+        fixed=fixed,
     )
-    common = read.common(())
-    return TwinConfig(**common, experiment=experiment, scheme=file.assimilation.scheme, execution=file.execution)
+    return TwinConfig(**read.common(()), experiment=experiment, scheme=file.assimilation.scheme)
 
 
 APART = ("time_std", "correlation_time", "shared", "covariance", "robust", "discrepancy")  # keys of data.error
@@ -214,19 +217,14 @@ def _errors(data: Any) -> Iterator[tuple[tuple[str, ...], Mapping[str, Any]]]:
 class SequenceConfig(Validated):
     """A validated configuration of a sequence. Nothing of the data file has been read yet."""
 
-    model: ForwardModel
     observable: Observable
-    data: Data | DataPlan
+    data: DataPlan
     parameters: tuple[Entry, ...]
     sequence: Sequence
     model_error: tuple[ErrorOf, ...]
     assimilation: Sequential
     execution: Workers
-
-    @property
-    def scheme(self) -> str:
-        """Name of the scheme."""
-        return str(self.assimilation.scheme)
+    scheme: str
 
 
 def resolve_sequence(document: Document, base: Path, model: ForwardModel | None = None) -> SequenceConfig:
@@ -250,14 +248,13 @@ def resolve_sequence(document: Document, base: Path, model: ForwardModel | None 
         raise ConfigError(faults)
     return SequenceConfig(
         **read.common(file.parameters),
-        model=read.model,
-        observable=observed_in(file.data, read),
+        observable=file.data.series[0].observable,
         data=file.data,
         parameters=file.parameters,
         sequence=file.sequence,
         model_error=file.model_error or (),
         assimilation=file.assimilation,
-        execution=file.execution,
+        scheme=file.assimilation.scheme,
     )
 
 
@@ -268,10 +265,105 @@ def _unfit(entry: Entry, model: ForwardModel) -> str:
         return "a sequence knows parameters of the model alone: neither time shift nor noise scale"
     if isinstance(entry, Tied):
         return "a sequence has no tied parameters; give a value or a prior"
-    if isinstance(entry, Uncertain) and entry.from_ensemble:
+    if isinstance(entry, Uncertain) and entry.spec.prior == "ensemble":
         return "a sequence takes no ensemble as a prior; give its moments"
-    if isinstance(entry, Uncertain) and entry.spec.varies is not None and entry.spec.varies.estimated:
+    if isinstance(entry, Uncertain) and entry.spec.varies and isinstance(entry.spec.varies.std, Estimated):
         return "a sequence does not estimate the std of a walk; give it in % or in the unit of the parameter"
     if isinstance(entry, Uncertain) and name not in model.layout.names:
         return f"the state of the model has no field {name!r}, through which a sequence estimates it; give it a value"
     return ""
+
+
+class GroupSection(Section):
+    """Data sets of one kind: how many, and what their parameters are drawn from."""
+
+    datasets: Annotated[int, Field(ge=1, le=999)]
+    """How many data sets."""
+    parameters: Annotated[tuple[Entry, ...], entries("a campaign")]
+    """What their truths are drawn from: a prior (drawn for each) or a quantity (common to all)."""
+
+
+def _end(text: Any, context: Context) -> float:
+    return 0.0 if text == 0 and text is not False else parse_quantity(text, time_unit(context))
+
+
+def _ascending(written: Any, validate: ValidatorFunctionWrapHandler) -> tuple[float, float]:
+    low, high = validate(written)
+    if low is not None and low > high:
+        raise ValueError(f"{written[0]} is larger than {written[1]}")
+    return low, high
+
+
+def _positive(pair: tuple[float, float]) -> tuple[float, float]:
+    if pair[0] is not None and not pair[0] > 0:
+        raise ValueError("must be positive")
+    return pair
+
+
+End = Annotated[float, Made(_end)]
+Interval = Annotated[tuple[End, End], WrapValidator(_ascending)]
+
+
+def _below(directory: str, context: Context) -> Path:
+    base = Path(os.path.abspath(context.base))  # a link may lead elsewhere, the configuration may not
+    if base not in Path(os.path.abspath(base / directory)).parents:
+        raise ValueError(f"must be a folder below {base}")
+    return context.base / directory
+
+
+class CampaignSection(Section):
+    """How the truths are observed, in the model's units. Pairs are the ends of uniform distributions."""
+
+    directory: Annotated[Path, Made(_below, Annotated[str, Field(min_length=1)])]
+    """Folder of the data files, relative to the configuration's."""
+    first: Interval
+    """Instant of the first reading."""
+    spacing: Annotated[Interval, AfterValidator(_positive)]
+    """Time between two readings."""
+    stop: Annotated[float, Field(gt=0, lt=1)]
+    """Readings end with the first one below this times the largest so far."""
+    most: Annotated[int, Field(ge=3, le=100_000)] = 60
+    """Largest number of readings."""
+    fewest: Annotated[int, Field(ge=3)] = 5
+    """A data set with fewer readings is drawn again."""
+    noise: Annotated[float, quantity(lambda context: context.units.observables[0].unit, "positive")]
+    """Std of the error of a reading, in the observable's unit."""
+    time_shift: Interval = (0.0, 0.0)
+    """t_s: a reading told at t was taken at t + t_s."""
+    groups: Annotated[dict[Name, GroupSection], Field(min_length=1)]
+    """Data sets of one kind, by name."""
+
+    @model_validator(mode="after")
+    def _after_time_zero(self) -> Self:
+        first, shift = self.first[0], self.time_shift[0]
+        with Faults() as faults:
+            if None not in (first, shift) and first + shift < 0:
+                faults.add(("first",), "the first reading could be taken before time zero")
+        return self
+
+
+class CampaignFile(File):
+    """A synthetic campaign: what is drawn, and how it is observed."""
+
+    name: Name
+    """Name of the campaign."""
+    campaign: CampaignSection
+    """How truths are drawn and observed."""
+
+
+@dataclass(frozen=True)
+class CampaignPlan:
+    """A validated campaign; ``directory`` is where its files go."""
+
+    name: str
+    seed: int
+    model: ForwardModel
+    directory: Path
+    settings: CampaignSection
+
+
+def resolve_campaign(document: Document, base: Path) -> CampaignPlan:
+    """Validate a document with a ``campaign:`` section. Raises :class:`ConfigError`, every fault at once."""
+    read = read_file(CampaignFile, document, base)
+    file = read.file
+    return CampaignPlan(file.name, file.seed, read.model, file.campaign.directory, file.campaign)
