@@ -32,7 +32,7 @@ from records import Record, fill
 from worlds import CENTRAL, Twin, World, experiment
 
 from en4dvar.config.context import Context
-from en4dvar.config.error import DiscrepancySection
+from en4dvar.config.of_readings import DiscrepancySection
 from en4dvar.data.noise import noise_of
 from en4dvar.ensemble.forecast import forecast
 from en4dvar.model.state import READING_SCALE

@@ -20,7 +20,7 @@ import numpy as np
 from en4dvar.assembly.build import build
 from en4dvar.config import load_config
 from en4dvar.config.document import read_document
-from en4dvar.config.synthetic import resolve_campaign
+from en4dvar.config.kinds import resolve_campaign, terms_and_fixed
 from en4dvar.data.noise import noise_of
 from en4dvar.data.observations import Observations
 from en4dvar.estimation.assimilate import assimilate
@@ -106,7 +106,7 @@ def campaign(key: str, seed: int) -> list[list[object]]:
         start = [base.prior.white(base.prior.from_physical(a.posterior)) for a in analyses]
         found = population_of(problems, start, POPULATION, seed, executor=executor, hyper=HYPER)
     low, median, high = np.quantile(found.posterior.mean, LEVELS, axis=0)
-    terms = {t.parameter.name: t for t in group.terms}
+    terms = {t.parameter.name: t for t in terms_and_fixed(group.parameters)[0]}
     rows: list[list[object]] = []
     for j, name in enumerate(POPULATION):
         term = terms[name]

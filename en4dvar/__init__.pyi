@@ -13,7 +13,7 @@ from en4dvar.data.series import Series as Series
 from en4dvar.descent.preview import Preview as Preview
 from en4dvar.descent.preview import preview as preview
 from en4dvar.diagnosis.analysis import Analysis as Analysis
-from en4dvar.model.batch import Batch as Batch
+from en4dvar.model.forward import Batch as Batch
 from en4dvar.model.forward import Failure as Failure
 from en4dvar.model.forward import ForwardModel as ForwardModel
 from en4dvar.model.forward import Observable as Observable

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from toy_models import Oscillator
 
-from en4dvar.model.batch import Batch
+from en4dvar.model.forward import Batch
 from en4dvar.model.state import Array
 
 

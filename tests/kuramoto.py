@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from en4dvar.model.batch import Batch
-from en4dvar.model.forward import ForwardModel, Observable, StateField
+from en4dvar.model.forward import Batch, ForwardModel, Observable, StateField
 from en4dvar.model.state import Field, Parameter, StateLayout
 from en4dvar.priors.dependence import correlation_of_places
 

@@ -98,7 +98,7 @@ def survive(folder: Path, count: int, seed: int, first: int = 0) -> Counter[str]
 
 
 def main() -> None:
-    from en4dvar.inputs.asked import Column, TimeStep
+    from en4dvar.inputs.parts import Column, TimeStep
     from en4dvar.inputs.readers import read_series
     from en4dvar.plumbing.errors import DataError
 

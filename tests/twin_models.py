@@ -8,8 +8,7 @@ import time
 import numpy as np
 from pydantic import BaseModel
 
-from en4dvar.model.batch import Batch
-from en4dvar.model.forward import ForwardModel, Observable, StateField
+from en4dvar.model.forward import Batch, ForwardModel, Observable, StateField
 from en4dvar.model.state import Field, StateLayout
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from en4dvar.model.batch import Batch
-from en4dvar.model.forward import Failure, ForwardModel, Observable, StateField
+from en4dvar.model.forward import Batch, Failure, ForwardModel, Observable, StateField
 from en4dvar.model.state import Field, Parameter, StateLayout
 
 KNOTS = (1.0, 2.0, 3.5)

@@ -1,25 +1,34 @@
-"""Settings → inverse problems: reads the data files, cuts the windows, evaluates what refers to the data."""
+"""Settings → problems and series: reads the data files, cuts the windows, evaluates what refers to the data."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from en4dvar.assembly.reading import find_files, read_observations, with_parts
-from en4dvar.config import Config, SequenceConfig
-from en4dvar.config.initial_state import Perturbed, modes_of
+from en4dvar.config import Config
+from en4dvar.config.data import DataPlan, SeriesPlan
+from en4dvar.config.kinds import SequenceConfig
 from en4dvar.config.parameters import Fixed, Scalar, Tied, Uncertain, inside_bounds
-from en4dvar.config.series import DataPlan, SeriesPlan
+from en4dvar.config.sequential import SeriesLocalisation, error_rates, localisation_of, per_time
+from en4dvar.config.varies import Perturbed, modes_of
 from en4dvar.data.observations import Observations
 from en4dvar.descent.field_data import gain_of
 from en4dvar.descent.start import given
 from en4dvar.ensemble.forecast import check_problem
 from en4dvar.ensemble.tangent import derivatives_of
-from en4dvar.inputs.asked import Column, DataFile
+from en4dvar.inputs.parts import Column, DataFile, Layout
+from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError, DataError, Fault, retold
 from en4dvar.plumbing.units import convert
 from en4dvar.priors.field_prior import FieldPrior
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.priors.varying import Varying
 from en4dvar.problem import InverseProblem, Tie, discrepancy_parameters
+from en4dvar.schemes.localisation import BlockLocalisation
+from en4dvar.series.problem import SeriesProblem
+from en4dvar.series.series import AtPlaces
+from en4dvar.series.start import EnsembleCoordinates, InitialEnsemble
 
 
 def build(config: Config) -> tuple[InverseProblem, ...]:
@@ -49,7 +58,7 @@ def inverse_plan(config: Config) -> DataPlan:
         raise ConfigError([Fault("required: it says where the observations are", "data", config.document.file)])
     if not config.initial_state and not any(isinstance(entry, Uncertain) for entry in config.parameters):
         raise ConfigError([config.document.fault(("parameters",), "no parameter has a prior; nothing to estimate")])
-    return DataPlan.of(config.data, config.observable)
+    return config.data
 
 
 def build_one(config: Config, name: str, file: DataFile) -> InverseProblem:
@@ -100,9 +109,7 @@ def problem_of(config: Config, observations: Observations) -> InverseProblem:
 
 
 def _varying(config: Config, observations: Observations, terms: Sequence[PriorTerm]) -> list[Varying]:
-    """Parameters and model errors that vary in time. Raises :class:`ConfigError`: knots that do not suit the
-    observations.
-    """
+    """Parameters and model errors that vary in time; knots that do not suit the observations raise ConfigError."""
     model, by_name = config.model, {term.parameter.name: term for term in terms}
     varying: list[Varying | None] = []
     for name, entry in ((e.parameter.name, e) for e in config.parameters if isinstance(e, Uncertain)):
@@ -116,9 +123,7 @@ def _varying(config: Config, observations: Observations, terms: Sequence[PriorTe
 
 def discrepancy_terms(config: Config, observations: Observations) -> tuple[PriorTerm, ...]:
     """Priors of the discrepancy that the observations allow for."""
-    asked = (
-        None if config.data is None else DataPlan.of(config.data, config.observable).series[0].data.error.discrepancy
-    )
+    asked = None if config.data is None else config.data.series[0].data.error.discrepancy
     if asked is None or not observations.noise.discrepant:
         return ()
     first, last = observations.span
@@ -161,7 +166,9 @@ def _files_of(series: SeriesPlan) -> dict[str, DataFile]:
     with retold(DataError, DataError, "", series.name):
         files = find_files(data.path.base, data.path.texts)
     time = data.columns.time
-    return with_parts(files, data.columns.observable, data.layout, time.name if isinstance(time, Column) else None)
+    return with_parts(
+        files, data.columns.observable, data.part(Layout), time.name if isinstance(time, Column) else None
+    )
 
 
 def resolve_parameters(
@@ -210,3 +217,59 @@ def _of_data(config: Config | SequenceConfig, observations: Observations, unit: 
         return convert(float(observations.values.max()), config.observable.unit, unit)
 
     return value
+
+
+def sequence_data(config: SequenceConfig) -> dict[str, DataFile]:
+    """The data set, by its name. Raises :class:`DataError`: there are several."""
+    files = data_files(config.data)
+    if len(files) > 1:
+        raise DataError(f"a sequence is one data set, but there are {len(files)}: {', '.join(files)}")
+    return files
+
+
+def build_sequence(config: SequenceConfig) -> SeriesProblem:
+    """The series and how it is assimilated. Raises :class:`ConfigError`, :class:`DataError`."""
+    ((name, file),) = sequence_data(config).items()
+    observations = read_observations(config.data, file, name)
+    terms, fixed = resolve_parameters(config, observations)
+    positive = {name for name, spread in config.sequence.initial_std.items() if spread.relative}
+    positive |= set(config.sequence.positive)
+    prior = Prior(terms) if terms else None
+    coordinates = EnsembleCoordinates.of(config.model, prior, sorted(positive))
+    with config.document.placing():
+        rate = error_rates(config.model, config.model_error, positive) + _walks(config, terms)
+        settings = config.assimilation.built(None, rate, coordinates)
+    std = {name: spread.value for name, spread in config.sequence.initial_std.items()}
+    start = InitialEnsemble(config.model, std, prior, fixed, coordinates)
+    settings = replace(settings, members_every=config.sequence.members_every)
+    problem = SeriesProblem.of(start, config.observable, observations, settings, config.assimilation.members)
+    if config.assimilation.localisation is None:
+        return problem
+    local = _localisation(config, config.assimilation.localisation, problem)
+    return replace(problem, settings=replace(problem.settings, localisation=local))
+
+
+def _localisation(config: SequenceConfig, asked: SeriesLocalisation, problem: SeriesProblem) -> BlockLocalisation:
+    """By the distance between cells of the field and the places that were read. Raises :class:`ConfigError`."""
+    operators = [read.operator for read in problem.observables]
+    with config.document.placing("assimilation", "localisation"):
+        if problem.series.correlation is not None:
+            raise ConfigError("needs observations with independent errors")
+        if not all(isinstance(operator, AtPlaces) for operator in operators):
+            raise ConfigError("needs readings of a field: data.places")
+        places = [operator.places for operator in operators if isinstance(operator, AtPlaces)]
+        cells = np.concatenate([np.sum(at.indices * at.shares, axis=1) for at in places])
+        return localisation_of(asked, config.model, {series.observable.name for series in config.data.series}, cells)
+
+
+def _walks(config: SequenceConfig, terms: Sequence[PriorTerm]) -> Array:
+    """Variance (n_state,) per unit of time of parameters that vary, in the coordinates of their priors."""
+    rate, by_name = np.zeros(config.model.layout.size), {term.parameter.name: term for term in terms}
+    for entry in config.parameters:
+        if not isinstance(entry, Uncertain) or entry.spec.varies is None:
+            continue
+        name = entry.parameter.name
+        with config.document.placing("parameters", name, "varies"):
+            std = entry.spec.varies.std_of(by_name[name])
+        rate[config.model.layout[name]] = per_time(entry.spec.varies, std, f"parameters.{name}.varies")
+    return rate

@@ -15,16 +15,14 @@ from typing import cast
 import numpy as np
 
 from en4dvar.config.context import Spread
-from en4dvar.config.data import Data
-from en4dvar.config.series import DataPlan, SeriesPlan
+from en4dvar.config.data import Data, DataPlan, SeriesPlan
 from en4dvar.data.noise import Noise, SharedErrors, noise_of
 from en4dvar.data.observations import Observations
 from en4dvar.data.series import Series, balanced
-from en4dvar.inputs.asked import ANY, SUFFIXES, Column, DataFile, Layout
-from en4dvar.inputs.parts import parts_of
+from en4dvar.inputs.implausible import step_doubts
+from en4dvar.inputs.members import read_covariance
+from en4dvar.inputs.parts import ANY, SUFFIXES, Column, DataFile, Layout, parts_of
 from en4dvar.inputs.readers import Readings, Rows, read_series
-from en4dvar.inputs.square import read_covariance
-from en4dvar.inputs.steps import step_doubts
 from en4dvar.inputs.window import select
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, caution
@@ -108,7 +106,7 @@ def read_observations(plan: DataPlan, file: DataFile, name: str, weights: str = 
     series = []
     for series_plan, where in zip(plan.series, files, strict=True):
         with retold(DataError, DataError, "", series_plan.name):
-            series.append(read_one(series_plan, where, fewest=series_plan.observable.fewest if plan.alone else 1))
+            series.append(read_one(series_plan, where, fewest=series_plan.observable.fewest if len(files) == 1 else 1))
     observations = Observations.of_series(series, plan.correlation, name)
     own = observations.weights
     if weights == "sum":
@@ -124,7 +122,7 @@ def read_one(plan: SeriesPlan, file: DataFile, fewest: int) -> Series:
     data, path, weights, places = plan.data, file.path, plan.data.weights, plan.data.places
     stated = (*_errors(data).values(), weights and weights.column, places and places.column)
     read = read_series(
-        path, data.columns.time, data.columns.observable, data.layout, [column for column in stated if column],
+        path, data.columns.time, data.columns.observable, data.part(Layout), [column for column in stated if column],
         file.part, repeats=places is not None, fewest=fewest,
     )  # fmt: skip
     window = _window(data, read, path)
@@ -260,4 +258,4 @@ def errors_of(
     if np.any(upper & lower):
         raise DataError("a reading is both at_most and at_least; give two readings, one of each")
     sides = np.broadcast_to(upper.astype(float) - lower, times.shape)
-    return noise_of(std, time_std, correlation, error.huber, kernel, sides)
+    return noise_of(std, time_std, correlation, error.threshold if error.robust else None, kernel, sides)

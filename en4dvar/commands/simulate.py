@@ -60,7 +60,7 @@ def simulate(
 
 def _simulate_campaign(source: Source, out: Path | None, seed: int | None, force: bool) -> None:
     from en4dvar.config.document import override, read_document
-    from en4dvar.config.synthetic import resolve_campaign
+    from en4dvar.config.kinds import resolve_campaign
     from en4dvar.plumbing.files import inside
     from en4dvar.runs.simulation import draw_campaign, write_campaign
 

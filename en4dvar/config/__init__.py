@@ -6,9 +6,8 @@ from typing import Any, TypeVar
 
 from en4dvar.config.design import time_grid
 from en4dvar.config.document import Document, document_from, override
+from en4dvar.config.kinds import SequenceConfig, TwinConfig, resolve_sequence, resolve_twin
 from en4dvar.config.load import Config, load_config, resolve
-from en4dvar.config.sequence import SequenceConfig, resolve_sequence
-from en4dvar.config.twin import TwinConfig, resolve_twin
 from en4dvar.plumbing.errors import ConfigError, Fault
 
 __all__ = [
@@ -27,9 +26,7 @@ def load_any(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any
 
 
 def resolve_any(document: Document, base: Path) -> AnyConfig:
-    """The counterpart of :func:`load_any` for a document that has been read; ``base`` is where its relative paths
-    start.
-    """
+    """:func:`load_any` of a document that has been read; ``base`` is where its relative paths start."""
     if "sequence" in document.data and "twin" not in document.data:
         return resolve_sequence(document, base)
     return resolve_twin(document, base) if "twin" in document.data else resolve(document, base)

@@ -1,17 +1,15 @@
 """Instants of planned readings; the ``design:`` section: which experiments are compared, about what, how accurately."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import fields
 from itertools import product
 from math import prod
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
 
-from en4dvar.config.context import Context, Made, quantity, time_unit
+from en4dvar.config.context import Context, Faults, Made, quantity, time_unit
 from en4dvar.config.schema import QuantityText, Section, section_of
-from en4dvar.config.validate import Faults
 from en4dvar.estimation.design.evaluate import SampleSizes
 from en4dvar.model.state import Array
 from en4dvar.plumbing.units import UnitError, parse_quantity
@@ -126,15 +124,7 @@ class Within(Section):
         return "; ".join(f"{text}: more than design.within.{key} = {most:g}" for key, most, text in over)
 
 
-if TYPE_CHECKING:
-
-    class _SampleSizes(SampleSizes, Section): ...
-
-else:
-    _SampleSizes = section_of(SampleSizes)
-
-
-class Design(_SampleSizes):
+class Design(section_of(SampleSizes)):  # type: ignore[misc]
     """Which experiments ``en4dvar design`` compares, and about what."""
 
     about: tuple[str, ...] = ()
@@ -177,11 +167,6 @@ class Design(_SampleSizes):
         sizes = [len(k["values"]) for k in knobs.values() if isinstance(k, dict) and isinstance(k.get("values"), list)]
         if prod(sizes) > MOST:
             faults.add(("knobs",), f"{prod(sizes)} combinations; at most {MOST}", at_key=True)
-
-    @property
-    def sizes(self) -> SampleSizes:
-        """How many runs."""
-        return SampleSizes(**{field.name: getattr(self, field.name) for field in fields(SampleSizes)})
 
     def settings(self) -> Iterator[dict[str, Value]]:
         """Name of the knob → value, of every combination."""

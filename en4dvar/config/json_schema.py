@@ -13,13 +13,11 @@ from functools import cache
 from typing import Any
 
 from en4dvar.config.context import TEXT
+from en4dvar.config.data import SeriesData
+from en4dvar.config.kinds import CampaignFile, SequenceFile, TwinFile
 from en4dvar.config.load import Estimation
 from en4dvar.config.models import COMMAND, GROUP, find_model, settings_of
 from en4dvar.config.parameters import FromFile, PriorSection, TiedSection
-from en4dvar.config.sequence import SequenceFile
-from en4dvar.config.series import SeriesData
-from en4dvar.config.synthetic import CampaignFile
-from en4dvar.config.twin import TwinFile
 from en4dvar.model.state import OF_READINGS, Parameter
 from en4dvar.plumbing.errors import En4dvarError
 from en4dvar.plumbing.installed import installed

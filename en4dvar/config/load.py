@@ -8,19 +8,24 @@ from typing import Annotated, Any, Generic, Literal, TypeVar
 import numpy as np
 import yaml
 
-from en4dvar.config.context import Context, Made
-from en4dvar.config.data import Data
-from en4dvar.config.dependence import PriorCorrelation, PriorFile, resolved
+from en4dvar.config.context import Context, Made, check
+from en4dvar.config.data import DATA, DataPlan
+from en4dvar.config.dependence import (
+    Groups,
+    PopulationSection,
+    PriorCorrelation,
+    PriorFile,
+    Sharing,
+    check_population,
+    resolved,
+    sharing_of,
+)
 from en4dvar.config.design import Design, Times, read_times
 from en4dvar.config.document import Document, document_from, override, parse_document
-from en4dvar.config.initial_state import PERTURBED, Initial, Perturbed
 from en4dvar.config.models import read_model
 from en4dvar.config.parameters import Entry, Fixed, Uncertain, entries
 from en4dvar.config.schema import Assimilation, Execution, File, GivenStart, Output, Section
-from en4dvar.config.series import DATA, DataPlan
-from en4dvar.config.sharing import Groups, PopulationSection, Sharing, check_population, sharing_of
-from en4dvar.config.validate import check
-from en4dvar.config.varies import MODEL_ERROR, ErrorOf
+from en4dvar.config.varies import MODEL_ERROR, PERTURBED, ErrorOf, Initial, Perturbed
 from en4dvar.inputs.members import read_centres, read_members
 from en4dvar.model.forward import ForwardModel, Observable
 from en4dvar.model.state import NOISE_SCALE, Array
@@ -78,6 +83,7 @@ class Validated:
     """What every validated file says: where results go, and as which text it is recorded."""
 
     document: Document
+    model: ForwardModel
     name: str
     seed: int
     directory: Path
@@ -95,10 +101,9 @@ class Validated:
 class Config(Validated):
     """A validated configuration. Nothing of the data files has been read yet."""
 
-    model: ForwardModel
     observable: Observable
     parameters: tuple[Entry, ...]
-    data: Data | DataPlan | None
+    data: DataPlan | None
     assimilation: AssimilationSettings
     weights: Literal["sum", "mean", "balanced"]
     execution: Execution
@@ -156,20 +161,18 @@ def resolve(document: Document, base: Path, model: ForwardModel | None = None) -
     parameters, blocks = resolved(file.parameters, file.prior, file.prior_correlation or (), others, apart, document)
     if file.population is not None:
         check_population(file.population, parameters, file.groups or {}, document)
-    several = isinstance(file.data, DataPlan) and not file.data.alone
+    several = file.data is not None and len(file.data.series) > 1
     settings = file.assimilation.settings
     minimiser = settings.own.minimiser
     if minimiser and isinstance(minimiser.start, GivenStart):
         settings = replace(settings, own=replace(minimiser, start=values_of(minimiser.start, parameters, document)))
     return Config(
         **read.common(file.parameters),
-        model=read.model,
-        observable=observed_in(file.data, read),
+        observable=file.data.series[0].observable if file.data else read.model.observables[0],
         parameters=parameters,
         data=file.data,
         assimilation=settings,
         weights=file.assimilation.weights,
-        execution=file.execution,
         simulate_times=file.simulate.times if file.simulate else None,
         sharing=sharing_of(parameters, file.groups or {}, bool(blocks), several, document),
         initial_state=file.initial_state or (),
@@ -178,13 +181,6 @@ def resolve(document: Document, base: Path, model: ForwardModel | None = None) -
         design=file.design or Design(),
         population=file.population,
     )
-
-
-def observed_in(data: Data | DataPlan | None, read: "Read[Any]") -> Observable:
-    """What the data hold; of several series that of the first."""
-    if isinstance(data, DataPlan):
-        return data.series[0].observable
-    return read.context.observed or read.model.observables[0]
 
 
 S = TypeVar("S", bound=Section)
@@ -201,7 +197,7 @@ class Read(Generic[S]):
     model_section: dict[str, Any]
 
     def common(self, parameters: Iterable[Entry]) -> dict[str, Any]:
-        """The fields of :class:`Validated`, of a file with a section ``output``.
+        """The fields of :class:`Validated`, and ``execution``, of a file with a section ``output``.
 
         ``resolved`` is the file with overrides and defaults written out and paths absolute, as YAML that loads again.
         """
@@ -215,7 +211,8 @@ class Read(Generic[S]):
             if isinstance(entry, Fixed) and name not in content["parameters"]:
                 content["parameters"][name] = f"{entry.value!r} {unit}" if unit != "1" else entry.value
         resolved = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=120)
-        return {"document": self.document, "name": file.name, "seed": file.seed, "resolved": resolved, **said}
+        said |= {"document": self.document, "model": self.model, "name": file.name, "seed": file.seed}
+        return {**said, "execution": file.execution, "resolved": resolved}
 
 
 def read_file(kind: type[S], document: Document, base: Path, model: ForwardModel | None = None) -> Read[S]:

@@ -9,8 +9,8 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict
 
+from en4dvar.config.context import check
 from en4dvar.config.document import Document
-from en4dvar.config.validate import check
 from en4dvar.model.forward import ForwardModel, StateField
 from en4dvar.model.state import Parameter
 from en4dvar.plumbing import user_file

@@ -1,27 +1,261 @@
-"""What is said of each reading beside its error: its weight (``data.weights``) and its place (``data.places``)."""
+"""What is said of each reading: how well it is known and what the model misses (``data.error``), its weight
+(``data.weights``) and its place (``data.places``).
+"""
 
+import math
+import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, TypeAdapter
+from pydantic import BeforeValidator, ConfigDict, Field, TypeAdapter
 
-from en4dvar.config.context import Context, Made, quantity, time_unit
+from en4dvar.config.context import (
+    PLACEHOLDER,
+    TEXT,
+    Context,
+    Faults,
+    Made,
+    Spread,
+    Unit,
+    observable_unit,
+    quantity,
+    require_sign,
+    time_unit,
+    unit_of,
+)
 from en4dvar.config.schema import OfReadings, Section
+from en4dvar.data.noise import SMOOTHNESS, Kernel
 from en4dvar.data.series import Places
-from en4dvar.inputs.asked import Column
+from en4dvar.inputs.parts import Column, Matrix
 from en4dvar.inputs.window import minima
 from en4dvar.model.forward import field_of
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, Parameter
 from en4dvar.model.state import Field as StateBlock
 from en4dvar.plumbing import user_file
 from en4dvar.plumbing.errors import ConfigError, DataError, retold
-from en4dvar.plumbing.files import PathError
+from en4dvar.plumbing.files import PathError, expanded
 from en4dvar.plumbing.hints import shown
-from en4dvar.plumbing.units import UnitError, convert, parse_quantity
+from en4dvar.plumbing.units import UnitError, convert, parse_quantity, split_quantity
 from en4dvar.plumbing.user_code import loading, reason_of
+from en4dvar.priors.prior import PriorTerm
+
+
+def parse_error_std(text: Any, unit: str, whole: str = "maximum") -> Spread:
+    """``"1.4 um"``, or ``"1 % of maximum"`` or of another ``whole``. Raises :class:`UnitError`."""
+    word = str(text).strip()
+    if relative := re.fullmatch(rf"(.*%)\s+of\s+(?:the\s+)?{whole}", word):
+        return Spread(parse_quantity(relative[1], "1"), relative=True)
+    try:
+        return Spread(parse_quantity(text, unit), unit=split_quantity(word)[1])
+    except UnitError as error:
+        hint = f"; write '{word} of {whole}'" if word.endswith("%") else ""
+        raise UnitError(f"{error}{hint}") from None
+
+
+class ErrorColumn(OfReadings):
+    """A column of standard deviations, one per reading."""
+
+    unit: str | None = None
+    """Unit of the numbers in it; default: that of the readings' own column."""
+
+
+def read_spread(text: Any, context: Context, unit: Unit = observable_unit, whole: str = "maximum") -> Spread:
+    spread = parse_error_std(text, unit(context), whole)
+    require_sign(spread.value, "positive", text)
+    return spread
+
+
+def or_column(read: Callable[[Any, Context], Any], unit: Unit) -> Callable[[Any, Context], Any]:
+    """``read``, but of a section that names a column in ``unit`` this :class:`Column`."""
+
+    def read_either(written: Any, context: Context) -> Any:
+        if not isinstance(written, Mapping):
+            return read(written, context)
+        chosen = ErrorColumn.model_validate(written, context=context)
+        if chosen.unit is not None:
+            convert(1.0, chosen.unit, unit(context))
+        return Column(chosen.column, chosen.unit or "", unit(context))
+
+    return read_either
+
+
+read_error_std = or_column(read_spread, observable_unit)
+
+
+class MarkColumn(OfReadings):
+    """A column of 1 where a reading is a bound and 0 where it is none."""
+
+
+def _shared(written: Any, context: Context) -> tuple[Spread | Column, ...]:
+    parts = [read_error_std(part, context) for part in (written if isinstance(written, list) else [written])]
+    return tuple(replace(part, kind="shared") if isinstance(part, Column) else part for part in parts)
+
+
+MARKS = Made(
+    lambda mark, context: mark if isinstance(mark, bool) else Column(mark.column, "1", "1", kind="mark"),
+    bool | MarkColumn,
+)
+QUANTITY_OR_COLUMN = {"anyOf": [TEXT, ErrorColumn.model_json_schema()]}
+
+LogStd = Annotated[float, Field(gt=0)]
+
+
+class AmplitudeSection(Section):
+    """Lognormal prior of the discrepancy's standard deviation."""
+
+    median: Annotated[Spread, Made(read_spread)] = Field("0.5 % of maximum", validate_default=True)
+    """A quantity in the observable's unit, or e.g. '2 % of maximum'."""
+    log_std: LogStd = 1.5
+    """Standard deviation of the natural logarithm."""
+
+
+class LengthSection(Section):
+    """Lognormal prior of the time over which the discrepancy forgets itself."""
+
+    median: Annotated[Spread, Made(partial(read_spread, unit=time_unit, whole="window"))] = Field(
+        "10 % of window", validate_default=True
+    )
+    """A time, or e.g. '10 % of window'."""
+    log_std: LogStd = 0.7
+    """Standard deviation of the natural logarithm."""
+
+
+class DiscrepancySection(Section):
+    """The discrepancy of the model: a Gaussian process beside the errors whose amplitude and length are estimated."""
+
+    amplitude: AmplitudeSection = Field({}, validate_default=True)
+    """Prior of ``discrepancy_amplitude``, its standard deviation."""
+    length: LengthSection = Field({}, validate_default=True)
+    """Prior of ``discrepancy_length``, its correlation time."""
+    kernel: Literal["exponential", "matern-3/2", "matern-5/2"] = "exponential"
+    """Correlation in time: exponential (rough paths), or Matérn's with one or two derivatives."""
+    grows_beyond: Annotated[
+        float | None, quantity(lambda c: f"({observable_unit(c)})/({time_unit(c)})", "positive")
+    ] = None
+    """Rate of the observable beyond which the amplitude grows in proportion to it, e.g. 20 m/s; default: constant."""
+
+    def kernel_at(self, times: Array) -> Kernel:
+        """The kernel at observation times (K,)."""
+        return Kernel(times, SMOOTHNESS[self.kernel], self.grows_beyond or math.inf)
+
+    def terms(self, parameters: tuple[Parameter, Parameter], maximum: float, window: float) -> tuple[PriorTerm, ...]:
+        """Priors of amplitude and length, from the largest observation and the duration of the window."""
+        amplitude, length = parameters
+        return (
+            PriorTerm.lognormal(amplitude, self.amplitude.median.absolute(maximum), self.amplitude.log_std),
+            PriorTerm.lognormal(length, self.length.median.absolute(window), self.length.log_std),
+        )
+
+
+def estimated(written: Any) -> Any:
+    if written == "estimated":
+        return {}
+    if written is not None and not isinstance(written, dict):
+        raise ValueError("write estimated, or the priors of its amplitude and length")
+    return written
+
+
+HUBER = 1.345  # 95 % efficiency where the errors are Gaussian after all: Huber (1981), Robust Statistics
+
+BOUNDS = ("at_most", "at_least")
+BESIDE = ("covariance", "correlation_time", "shared", "robust", "discrepancy", "time_std")
+
+
+def _square(context: Context) -> str:
+    unit = observable_unit(context)
+    return "1" if unit == "1" else f"({unit})*({unit})"
+
+
+class CovarianceFile(Section):
+    """A CSV file with the full matrix R, without header; its unit (e.g. ``um^2``) is required, never guessed."""
+
+    path: Annotated[str, Field(min_length=1)]
+    """CSV file, relative to the configuration's folder; a row per row of the data, in its order, or per one used."""
+    unit: Annotated[str, unit_of(_square)]
+    """Unit of the covariances, the observable's squared, e.g. um^2."""
+
+
+class Error(Section):
+    """Observation errors: a std or a covariance, of the times, correlation, a robust cost, what the model misses."""
+
+    model_config = ConfigDict(populate_by_name=False)
+    std: Annotated[Spread | Column | None, Made(read_error_std, json=QUANTITY_OR_COLUMN)] = Field(
+        None, alias=f"{PLACEHOLDER}_std"
+    )
+    """Std of the observation error: a quantity, e.g. '1 % of maximum', or ``{column: NAME}``, one per reading."""
+    time_std: Annotated[
+        float | Column, Made(or_column(quantity(time_unit, "not negative").make, time_unit), json=QUANTITY_OR_COLUMN)
+    ] = 0.0
+    """Std of the observation times, a quantity or ``{column: NAME}``: adds (rate × time_std)²."""
+    model_std: Annotated[Spread | None, Made(read_spread)] = None
+    """Std of what the model misses from reading to reading, e.g. '1 % of maximum'; its square is added."""
+    correlation_time: Annotated[float | None, quantity(time_unit, "positive")] = None
+    """Errors are correlated as exp(−|Δt|/τ)."""
+    shared: Annotated[
+        tuple[Spread | Column, ...], Made(_shared, json={"type": "array", "items": QUANTITY_OR_COLUMN})
+    ] = ()
+    """Errors that all readings share, independent of each other, each a std for all or ``{column: NAME}`` of a std with
+    a sign for each reading: R is the diagonal plus the sum of their products."""
+    covariance: Annotated[
+        Matrix | None, Made(lambda file, c: Matrix(c.base / expanded(file.path), file.unit, _square(c)), CovarianceFile)
+    ] = None
+    """File of the whole R."""
+    robust: Literal["huber"] | None = None
+    """Robust cost: readings far off count less."""
+    threshold: Annotated[float, quantity(lambda c: "1", "positive")] = HUBER
+    """Threshold of the robust cost in std."""
+    at_most: Annotated[bool | Column, MARKS] = False
+    """The readings are upper bounds: true, or ``{column: NAME}`` of 1 (bound) and 0; beyond one the std counts."""
+    at_least: Annotated[bool | Column, MARKS] = False
+    """The same of lower bounds."""
+    discrepancy: Annotated[
+        DiscrepancySection | None,
+        BeforeValidator(estimated, json_schema_input_type=Literal["estimated"] | DiscrepancySection | None),
+    ] = None
+    """What the model misses: ``estimated``, or priors. Adds ``discrepancy_amplitude`` and ``discrepancy_length``."""
+
+    @classmethod
+    def rules(cls, keys: Mapping[str, Any], context: Context, faults: Faults) -> None:
+        std = f"{PLACEHOLDER}_std"
+        for name, other, reason in (
+            ("covariance", std, "the file holds the variances"),
+            ("covariance", "model_std", "the file holds the variances"),
+            ("covariance", "correlation_time", "the file holds the correlations"),
+            ("covariance", "shared", "the file holds the correlations"),
+            ("shared", "correlation_time", "give R as a file, covariance: {path: …}"),
+            ("robust", "shared", "a robust cost needs independent observation errors"),
+            ("robust", "correlation_time", "a robust cost needs independent observation errors"),
+            ("robust", "covariance", "a robust cost needs independent observation errors"),
+            *((bound, other, "bounds need independent errors of known std") for bound in BOUNDS for other in BESIDE),
+        ):
+            if name in keys and other in keys:
+                faults.add((name,), f"not together with {other}: {reason}", at_key=True)
+        if "threshold" in keys and "robust" not in keys:
+            faults.add(("threshold",), "is that of the robust cost; write robust: huber as well", at_key=True)
+        if context.observed and not keys.keys() & {std, "covariance"}:
+            faults.add((std,), "required: the standard deviation of the observation error")
+
+    def columns(self, readings: str, times: str) -> dict[str, Column]:
+        """The columns of errors, in the units of ``readings`` and ``times`` where they have none of their own."""
+        shared = {f"shared {i}": (part, readings) for i, part in enumerate(self.shared)}
+        every = {"std": (self.std, readings), "time_std": (self.time_std, times), **shared}
+        return {key: replace(c, unit=c.unit or unit) for key, (c, unit) in every.items() if isinstance(c, Column)}
+
+    @property
+    def bounds(self) -> dict[str, bool | Column]:
+        """Which readings are upper and lower bounds."""
+        return {BOUNDS[0]: self.at_most, BOUNDS[1]: self.at_least}
+
+    @property
+    def separate(self) -> bool:
+        """True if the errors of one reading say nothing of those of another, and none is a bound."""
+        correlated = self.covariance is not None or self.correlation_time is not None or self.shared
+        return not correlated and not any(self.bounds.values())
+
 
 NUMBERS = TypeAdapter(list[Annotated[float, Field(ge=0, allow_inf_nan=False)]])
 

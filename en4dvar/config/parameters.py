@@ -6,10 +6,9 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from en4dvar.config.context import SPREAD, Context, Made, Spread, read_each, subject_unit, unit_of
+from en4dvar.config.context import SPREAD, Context, Faults, Made, Spread, read_each, subject_unit, unit_of
 from en4dvar.config.schema import Section
-from en4dvar.config.validate import Faults
-from en4dvar.config.varies import VariesSection
+from en4dvar.config.varies import Estimated, VariesSection
 from en4dvar.data.observations import Observations
 from en4dvar.model.forward import ForwardModel
 from en4dvar.model.state import OF_READINGS, READING_OFFSET, TIME_SHIFT, Parameter
@@ -183,11 +182,6 @@ class Uncertain:
     of_members: PriorTerm | None = None
 
     @property
-    def from_ensemble(self) -> bool:
-        """True if the prior is that of the members in a file."""
-        return self.spec.prior == "ensemble"
-
-    @property
     def needs_data(self) -> bool:
         return any(isinstance(where, str | Scalar) for where in (self.spec.mean, self.spec.median))
 
@@ -229,12 +223,12 @@ class Uncertain:
         return self.spec.model_fields_set - {"prior", "varies", "shared"}
 
     def _recipe(self) -> ConfigError:
-        takes, has = _RECIPES[self.spec.prior], ", ".join(sorted(self._given)) or "none of these"
-        return ConfigError(f"{'an' if self.from_ensemble else 'a'} {self.spec.prior} prior takes {takes}; given: {has}")
+        kind, has = self.spec.prior, ", ".join(sorted(self._given)) or "none of these"
+        return ConfigError(f"{'an' if kind == 'ensemble' else 'a'} {kind} prior takes {_RECIPES[kind]}; given: {has}")
 
     def check(self) -> None:
         """Raise :class:`ConfigError` for what can be told without data and files."""
-        if self.from_ensemble:
+        if self.spec.prior == "ensemble":
             if not self._given <= {"map", "unit"}:
                 raise self._recipe()
         elif not self.needs_data:
@@ -250,7 +244,9 @@ class Uncertain:
         varies = self.spec.varies
         if varies is None:
             return None
-        return RandomWalk.of(model, term, varies.knots(observations), varies.std_of(term), varies.estimated)
+        return RandomWalk.of(
+            model, term, varies.knots(observations), varies.std_of(term), isinstance(varies.std, Estimated)
+        )
 
     def _location(self, key: Literal["mean", "median"], of_data: Callable[[str | Scalar], float] | None) -> float:
         value: float | str | Scalar | None = getattr(self.spec, key)
@@ -318,7 +314,7 @@ def _needs_of_a_data_set(entry: Entry) -> Iterator[tuple[tuple[str, ...], str]]:
     if isinstance(entry, Tied):
         yield ("tied",), "has no tied parameters; give a value or a prior"
     if isinstance(entry, Uncertain):
-        if entry.from_ensemble:
+        if entry.spec.prior == "ensemble":
             yield ("prior",), "has no ensemble of its own; give it another prior"
         if entry.spec.varies is not None:
             yield ("varies",), "has constant parameters"

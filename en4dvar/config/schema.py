@@ -8,14 +8,13 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, cast, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, TypeVar, cast, get_type_hints
 
 from pydantic import ConfigDict, Discriminator, Field, Tag, WithJsonSchema, create_model, model_validator
 from pydantic.functional_validators import ModelWrapValidatorHandler
 from pydantic_core import from_json, to_json
 
-from en4dvar.config.context import Context, Made, Unknown, quantity
-from en4dvar.config.validate import Faults
+from en4dvar.config.context import Context, Faults, Made, Unknown, quantity
 from en4dvar.executor.limits import Limits, parse_bytes
 from en4dvar.plumbing import user_file
 from en4dvar.plumbing.described import Described, text_for
@@ -27,6 +26,7 @@ from en4dvar.schemes.base import Scheme
 from en4dvar.schemes.settings import AssimilationSettings, Localisation, beside_localisation
 
 QuantityText = str | int | float
+T = TypeVar("T")
 Name = Annotated[str, Field(pattern=r"^\w[\w.+ -]*$", max_length=100)]
 
 
@@ -51,6 +51,10 @@ class Section(Described):
                     cls.rules(section, info.context, faults)
             with faults.at(schema=cls):
                 return validate(section)
+
+    def part(self, kind: type[T]) -> T:
+        """A dataclass whose fields are keys of this section."""
+        return kind(**{field.name: getattr(self, field.name) for field in fields(cast(Any, kind))})
 
     def as_written(self, section: Mapping[str, Any]) -> dict[str, Any]:
         """The section as it was given, paths absolute, what was left out filled in with defaults; plain data."""
@@ -282,13 +286,11 @@ def or_in_a_file(schema: dict[str, Any]) -> None:
 
 if TYPE_CHECKING:
     OnAWindow = str
-    _Settings = OfScheme
 else:
     OnAWindow = Literal[tuple(ON_A_WINDOW)]
-    _Settings = keys_of_schemes(ON_A_WINDOW, AssimilationSettings)
 
 
-class Assimilation(_Settings):
+class Assimilation(keys_of_schemes(ON_A_WINDOW, AssimilationSettings)):  # type: ignore[misc]
     """The settings of the scheme, declared at :class:`AssimilationSettings`, and how observations count."""
 
     scheme: Annotated[OnAWindow, Field(description=listed(ON_A_WINDOW), json_schema_extra=or_in_a_file)] = (

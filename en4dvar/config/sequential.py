@@ -10,11 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from en4dvar.config.context import SPREAD, TEXT, Context, Made, quantity, read_each, subject_unit
-from en4dvar.config.initial_state import dynamic_fields
+from en4dvar.config.context import SPREAD, TEXT, Context, Faults, Made, quantity, read_each, subject_unit
 from en4dvar.config.schema import OfScheme, Section, keys_of_schemes, listed, or_in_a_file
-from en4dvar.config.validate import Faults
-from en4dvar.config.varies import ErrorOf, Knots
+from en4dvar.config.varies import ErrorOf, Knots, dynamic_fields
 from en4dvar.model.forward import ForwardModel
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError
@@ -26,11 +24,9 @@ from en4dvar.series.settings import SequentialSettings
 from en4dvar.series.smoothers import EnKS, EnRTS
 from en4dvar.series.start import EnsembleCoordinates
 
-Things = Callable[[ForwardModel], Mapping[str, Any]]  # by their names, of those that a model knows
 
-
-def stds(known: Things, relative: bool = False) -> Made:
-    """Standard deviations by the name of a thing, at least one; ``relative``: any number of them, some in %."""
+def stds(known: Callable[[ForwardModel], Mapping[str, Any]], relative: bool = False) -> Made:
+    """Standard deviations by the names of what is ``known``, at least one; ``relative``: any number, some in %."""
     read_one: Callable[[Any, Context], Any] = SPREAD.make if relative else quantity(subject_unit, "positive").make
     fewest = 0 if relative else 1
 
@@ -104,13 +100,7 @@ class _Scheme(OfScheme):
     """Ensemble size N."""
 
 
-if TYPE_CHECKING:
-    _OnASeries = _Scheme
-else:
-    _OnASeries = keys_of_schemes(ON_A_SERIES, base=_Scheme)
-
-
-class Sequential(_OnASeries):
+class Sequential(keys_of_schemes(ON_A_SERIES, base=_Scheme)):  # type: ignore[misc]
     """The scheme and what it does to the ensemble."""
 
     inflation: Annotated[float, Field(gt=0)] = 1.0
@@ -133,9 +123,8 @@ class Sequential(_OnASeries):
     def _belongs_together(self) -> Sequential:
         if type(self).unread({key: getattr(self, key) for key in self.model_fields_set}):
             return self  # told already
-        anywhere = BlockLocalisation(
-            (), np.empty((0, 0))
-        )  # settings that do not go together are told here, in their place
+        # settings that do not go together are told here, in their place
+        anywhere = BlockLocalisation((), np.empty((0, 0)))
         settings = SequentialSettings(
             self.made, localisation=anywhere if self.localisation else None,
             smoother=self.smoother.made if self.smoother else None,

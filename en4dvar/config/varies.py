@@ -1,24 +1,149 @@
-"""``varies:`` of a parameter and ``model_error:`` of the state: what changes at knots in time."""
+"""What is unsure of the state: its initial value (``initial_state:``), and what changes at knots in time.
+
+The latter is ``varies:`` of a parameter and ``model_error:`` of fields of the state.
+"""
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self, TypeVar
 
 import numpy as np
+from annotated_types import Ge
 from pydantic import model_validator
 
-from en4dvar.config.context import SPREAD, Context, Made, Spread, parse_spread, quantity, subject_unit, time_unit
-from en4dvar.config.initial_state import of_fields
+from en4dvar.config.context import (
+    SPREAD,
+    Context,
+    Faults,
+    Made,
+    Spread,
+    parse_spread,
+    quantity,
+    read_each,
+    subject_unit,
+    time_unit,
+)
 from en4dvar.config.schema import Section
-from en4dvar.config.validate import Faults
 from en4dvar.data.observations import Observations
 from en4dvar.inputs.window import maxima
 from en4dvar.model.forward import ForwardModel
-from en4dvar.model.state import Field
+from en4dvar.model.state import Field, Parameter
 from en4dvar.plumbing.errors import ConfigError
+from en4dvar.plumbing.hints import shown, suggest
+from en4dvar.priors.dependence import KernelName
+from en4dvar.priors.field_prior import FieldPrior
 from en4dvar.priors.prior import PriorTerm
 from en4dvar.priors.varying import StateChanges
+from en4dvar.problem import StatePerturbation
+
+S = TypeVar("S", bound=Section)
+T = TypeVar("T")
+
+
+class Perturbed(NamedTuple):
+    """A field estimated as a single number, and the effect of that number on the initial state."""
+
+    term: PriorTerm
+    perturbation: StatePerturbation
+
+
+Initial = Perturbed | FieldPrior
+
+
+def modes_of(prior: FieldPrior) -> list[Perturbed]:
+    """A field as the sum of its modes. Raises :class:`ConfigError`: it has too many cells."""
+    name, told = prior.field.name, []
+    for k, pattern in enumerate(prior.patterns(), 1):
+        parameter = Parameter(f"{name}_mode_{k}", "1", label=f"mode {k} of the initial {name}")
+        effect = StatePerturbation(parameter, name, prior.relative, tuple(pattern.tolist()), prior)
+        told.append(Perturbed(PriorTerm.normal(parameter, 0.0, 1.0), effect))
+    return told
+
+
+def perturbation(field: Field, std: str | float | Spread) -> Perturbed:
+    """N(0, std²) added to the field, or, for a std in %, a factor whose logarithm is N(0, std²).
+
+    Raises
+    ------
+    UnitError: a unit that is not the field's. ConfigError: a std that is not positive.
+    """
+    name, spread = f"initial_{field.name}", std if isinstance(std, Spread) else parse_spread(std, field.unit)
+    if spread.relative:
+        label = f"initial {field.name} relative to the model's"
+        parameter = Parameter(name, "1", "lognormal", (0.0, float("inf")), label)
+        term = PriorTerm.lognormal(parameter, 1.0, spread.value)
+        return Perturbed(term, StatePerturbation(parameter, field.name, relative=True))
+    parameter = Parameter(name, field.unit, label=f"initial {field.name} beyond the model's")
+    return Perturbed(PriorTerm.normal(parameter, 0.0, spread.value), StatePerturbation(parameter, field.name))
+
+
+class InitialSpread(Section):
+    """Spread of the initial value of a state field: in its unit (added), or in ``%`` (a factor).
+
+    One number for all components, or, with ``kernel`` and ``length``, each component by itself, correlated by a
+    function of their distance: cell by cell where the scheme is localised, else as the sum of its largest modes.
+    """
+
+    std: Annotated[Spread, SPREAD]
+    """Standard deviation: in the field's unit (added to it), or in % (a factor)."""
+    kernel: KernelName | None = None
+    """Correlation of the components as a function of their distance."""
+    length: Annotated[float, quantity(lambda context: str(context.subject.coordinate_unit), "positive")] | None = None
+    """Correlation length of the kernel, in the unit of the field's coordinates."""
+    modes: Annotated[int, Ge(1)] | None = None
+    """How many modes are estimated where nothing is localised; by default those with all but 1e-6 of the variance."""
+
+    @classmethod
+    def rules(cls, keys: Mapping[str, Any], context: Context, faults: Faults) -> None:
+        for key, other in (("kernel", "length"), ("length", "kernel")):
+            if key in keys and other not in keys:
+                faults.add((key,), f"kernel and length go together; give {other} as well", at_key=True)
+        if "modes" in keys and "kernel" not in keys:
+            faults.add(("modes",), "modes are those of a kernel; give kernel and length as well", at_key=True)
+        if "kernel" in keys and context.subject.coordinates is None:
+            name = context.subject.name
+            faults.add(("kernel",), f"the model gives no coordinates for {name}, so that no distance is known")
+
+
+def dynamic_fields(model: ForwardModel) -> dict[str, Field]:
+    """The fields of the state that are no parameters, by name."""
+    constant = {p.name for p in model.parameters}
+    return {f.name: f for f in model.layout if f.name not in constant}
+
+
+def of_fields(kind: type[S], instead: str, make: Callable[[S, Field], T], changes: bool = False) -> Made:
+    """What ``make`` makes of sections of a ``kind`` about fields of the state, in the order of the file; ``instead`` is
+    what to do for a parameter. ``changes``: also about what may change unforeseen.
+    """
+
+    def read(sections: Mapping[str, Any], context: Context) -> tuple[T, ...]:
+        fields = dynamic_fields(context.model)
+        if changes:
+            fields |= {name: Field(name) for name in context.model.unforeseen}
+
+        def one(entry: Any, context: Context) -> T:
+            return make(kind.model_validate(entry, context=context), context.subject)
+
+        def unknown(name: str) -> str:
+            if name in {p.name for p in context.model.parameters}:
+                return f"{name} is a parameter: {instead}"
+            return f"unknown field {shown(name)} of the state{suggest(name, fields)}"
+
+        with Faults() as faults:
+            return tuple(read_each(sections, fields, context, faults, one, unknown).values())
+
+    return Made(read, dict[str, Any], {"type": "object", "additionalProperties": kind.model_json_schema()})
+
+
+def _initial(section: InitialSpread, field: Field) -> Initial:
+    std = section.std
+    if section.kernel is None or section.length is None:
+        return perturbation(field, std)
+    return FieldPrior(field, std.value, section.kernel, section.length, std.relative, section.modes)
+
+
+PERTURBED = of_fields(InitialSpread, "give it a prior in parameters", _initial)
 
 MOST_KNOTS = 1000
 
@@ -79,11 +204,6 @@ class VariesSection(Knots):
     std: Annotated[Spread, Made(_change_std)]
     """Standard deviation of each change: in % of the value (lognormal: of its logarithm), or in the parameter's
     unit, which holds at the centre of the prior; or ``estimated``, with a half-normal prior of 50 %."""
-
-    @property
-    def estimated(self) -> bool:
-        """True if ``std`` is that of the prior of the changes' standard deviation."""
-        return isinstance(self.std, Estimated)
 
     def std_of(self, term: PriorTerm) -> float:
         """Standard deviation of each change in the coordinate of the prior of its parameter.

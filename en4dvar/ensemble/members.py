@@ -14,8 +14,7 @@ import numpy.typing as npt
 
 from en4dvar.data.series import Part
 from en4dvar.executor import Outcome
-from en4dvar.model.batch import Batch
-from en4dvar.model.forward import Failure, RateOperator, ValidityLimit
+from en4dvar.model.forward import Batch, Failure, RateOperator, ValidityLimit
 from en4dvar.model.state import Array, Field
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.user_code import own_fault, reason_of
@@ -139,7 +138,7 @@ class Reading:
     """Quantities read from a path: ``quantities`` (T,) each, H and, where it is needed, its rate; what becomes of
     ``limits`` of the model.
 
-    ``batched``: the quantities take a :class:`~en4dvar.model.batch.Batch` as well and give (B, T).
+    ``batched``: the quantities take a :class:`~en4dvar.model.forward.Batch` as well and give (B, T).
     """
 
     quantities: tuple[Callable[[Any], Array], ...]
@@ -238,5 +237,5 @@ def operators_of(parts: Sequence[Part], needs_rates: str = "") -> tuple[Callable
 
 
 def batched(problem: InverseProblem) -> bool:
-    """True if all operators take a :class:`~en4dvar.model.batch.Batch`."""
+    """True if all operators take a :class:`~en4dvar.model.forward.Batch`."""
     return all(getattr(part.observable.operator, "batched", False) for part in problem.parts)

@@ -10,8 +10,7 @@ from typing import Any, Generic, Self, TypeVar
 import numpy as np
 
 from en4dvar.executor.limits import TimeLimitError, has_time_limit, within_time_limit
-from en4dvar.model.batch import Batch
-from en4dvar.model.forward import Failure, ForwardModel, Trajectory
+from en4dvar.model.forward import Batch, Failure, ForwardModel, Trajectory
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import En4dvarError
 from en4dvar.plumbing.user_code import describe, reason_of

@@ -236,13 +236,8 @@ class _Hdf(_Reader):
     """Version 7.3."""
 
     def variables(self) -> Found:
-        try:
-            import h5py
-        except ImportError:
-            raise DataError(
-                f"{self.path}: a MATLAB v7.3 (HDF5) file, which needs: pip install h5py; or save it again in "
-                "MATLAB with save(..., '-v7')"
-            ) from None
+        import h5py
+
         with h5py.File(self.path, "r") as self.file:
             for name in self.file:
                 if not name.startswith("#"):  # what references point to

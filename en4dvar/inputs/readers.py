@@ -13,10 +13,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.inputs.asked import ANY, Column, Layout, TimeStep
-from en4dvar.inputs.outliers import outlying, scatter_of
-from en4dvar.inputs.parts import columns_of
-from en4dvar.inputs.time_order import InFile
+from en4dvar.inputs.implausible import InFile, outlying, scatter_of
+from en4dvar.inputs.parts import ANY, Column, Layout, TimeStep, columns_of
 from en4dvar.inputs.window import index_of
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import DataError, retold
@@ -151,10 +149,7 @@ def _kept(read: Readings, which: slice | npt.NDArray[np.bool_]) -> Readings:
 
 
 def _stds(written: Array, column: Column, kept: Rows, count: int, path: Path) -> Array:
-    """What belongs to the kept readings: standard deviations, weights or places.
-
-    Raises :class:`DataError` where one is missing, or of the wrong sign.
-    """
+    """Standard deviations, weights or places of the kept readings; one missing or of a wrong sign raises DataError."""
     if len(written) != count:
         raise DataError(f"{path}: {len(written)} values of {column.name!r} but {count} readings")
     stds = np.asarray(convert(written[kept], column.unit, column.target))

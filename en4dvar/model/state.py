@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Literal
 
 import numpy as np
@@ -80,6 +80,7 @@ class Parameter(Shown):
         super().__post_init__()
 
 
+_positive = partial(Parameter, transform="lognormal", bounds=(0.0, np.inf))
 TIME_SHIFT = Parameter(
     name="t_s",
     unit="s",
@@ -88,31 +89,21 @@ TIME_SHIFT = Parameter(
     display_unit="us",
     source="Spratt et al. (2021); the model is observed at t_k + t_s",
 )
-
-
-NOISE_SCALE = Parameter(
+NOISE_SCALE = _positive(
     name="sigma",
     unit="1",
-    transform="lognormal",
-    bounds=(0.0, np.inf),
     label="noise scale",
     symbol=r"$\sigma$",
     source="multiplies the std of every observation error; a model's own parameter of this name goes before it",
 )
-
-
-READING_SCALE = Parameter(
+READING_SCALE = _positive(
     name="reading_scale",
     unit="1",
-    transform="lognormal",
-    bounds=(0.0, np.inf),
     label="scale of the readings",
     symbol="$b$",
     source="the model is observed times this factor; a model's own parameter of this name goes before it",
     common=True,
 )
-
-
 READING_OFFSET = Parameter(
     name="reading_offset",
     unit="1",
@@ -121,27 +112,19 @@ READING_OFFSET = Parameter(
     source="what all readings are too large by, in the unit of the observable; a model's own parameter goes before it",
     common=True,
 )
-
-
 # what any model may be given beside its own parameters
 OF_READINGS = TIME_SHIFT, NOISE_SCALE, READING_SCALE, READING_OFFSET
-
-
 DISCREPANCY = (
-    Parameter(
+    _positive(
         name="discrepancy_amplitude",
         unit="1",
-        transform="lognormal",
-        bounds=(0.0, np.inf),
         label="amplitude of the discrepancy",
         symbol=r"$a_\delta$",
         source="standard deviation of the Gaussian process that y − m is beside its errors; in the observable's unit",
     ),
-    Parameter(
+    _positive(
         name="discrepancy_length",
         unit="s",
-        transform="lognormal",
-        bounds=(0.0, np.inf),
         label="correlation time of the discrepancy",
         symbol=r"$\ell_\delta$",
         source="time over which the discrepancy forgets itself; in the model's time unit",

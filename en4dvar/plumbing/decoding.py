@@ -4,6 +4,10 @@ A workbook of 300 kB may become 13 GB, a movie may send its library in circles o
 child, which is kept for the next file, and is ended where it takes more than it may. The limits count what the child
 does, not how long it waits, so that a busy machine or a slow disk refuses nothing. Where the system knows no such
 limits (Windows), only a crash stays in the child.
+
+HDF5 files must be all there. A variable of netCDF may be kept in any file of the machine (external storage, virtual
+data sets), and a group may be one of another file: whoever reads and hands on such a file hands on what it names. The
+netCDF library neither tells nor refuses, so the links and data sets are looked through first, by h5py.
 """
 
 import atexit
@@ -19,7 +23,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import IO, Any, TypeVar
+from typing import IO, Any, TypeVar, cast
 
 from en4dvar.plumbing.children import Child, limit_memory, limit_time, status_named
 from en4dvar.plumbing.errors import DataError, En4dvarError, retold
@@ -73,7 +77,9 @@ def decoded(decoder: Decoder, path: Path, *arguments: Any, allowed: Allowed = Al
     done = False
     with child:
         try:
-            child.send((f"{decoder.__module__}:{decoder.__qualname__}", (path, *arguments), allowed, here()))
+            request = f"{decoder.__module__}:{decoder.__qualname__}", (path, *arguments), allowed, here()
+            with suppress(OSError):  # it is gone: told when its answer is read
+                _write(cast(IO[bytes], child.process.stdin), request)
             while True:
                 kind, value = child.receive(path, allowed)
                 if kind == _VALUE:
@@ -114,11 +120,6 @@ class _Child(Child):
         self.kept = False
         with _changing:
             _idle.append(self)
-
-    def send(self, request: Any) -> None:
-        assert self.process.stdin is not None
-        with suppress(OSError):  # it is gone: told when its answer is read
-            _write(self.process.stdin, request)
 
     def receive(self, path: Path, allowed: Allowed) -> Any:
         """The next message. Raises :class:`DataError` where the child is gone."""
@@ -195,3 +196,45 @@ def text_of(path: Path) -> str:
     """
     with retold(OSError, DataError, f"no output file {path}: "):
         return read_plain(path, LONGEST_TEXT).decode("utf-8", errors="replace").replace("\r\n", "\n")
+
+
+MOST_OBJECTS = 100_000
+DEEPEST = 30
+
+
+class ForeignDataError(ValueError):
+    """Something of the file lies in another one."""
+
+
+def require_whole(path: Path) -> None:
+    """Raises :class:`ForeignDataError` where something of an HDF5 file lies in another one; files that are none pass.
+
+    Raises :class:`OSError`, :class:`RuntimeError` where it is damaged.
+    """
+    import h5py
+    from h5py import h5d, h5g, h5l, h5o
+
+    if not h5py.is_hdf5(path):
+        return
+    objects = 0
+    with h5py.File(path, "r") as file, retold((KeyError, TypeError), RuntimeError):
+        groups = [(file["/"].id, "", 0)]
+        while groups:
+            group, above, depth = groups.pop()
+            objects += len(group)
+            if objects > MOST_OBJECTS or depth > DEEPEST:
+                raise ForeignDataError(f"more than {MOST_OBJECTS} objects, or groups {DEEPEST} deep")
+            for name in group:
+                path_inside, link = f"{above}/{name.decode('utf-8', 'replace')}", group.links.get_info(name).type
+                if link == h5l.TYPE_SOFT:
+                    continue  # to another name of this file, which is looked at where it stands
+                if link != h5l.TYPE_HARD:
+                    raise ForeignDataError(f"{path_inside} is a link into another file, which is not opened")
+                held = h5o.open(group, name)
+                if isinstance(held, h5g.GroupID):
+                    groups.append((held, path_inside, depth + 1))
+                elif isinstance(held, h5d.DatasetID):
+                    how = held.get_create_plist()
+                    own = how.get_layout() in (h5d.COMPACT, h5d.CONTIGUOUS, h5d.CHUNKED)
+                    if not own or how.get_external_count():
+                        raise ForeignDataError(f"the numbers of {path_inside} are in another file, which is not opened")

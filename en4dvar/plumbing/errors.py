@@ -49,9 +49,6 @@ class DataError(En4dvarError):
         self.series = series
         super().__init__(message)
 
-    def __reduce__(self) -> "tuple[type[DataError], tuple[str, str]]":
-        return type(self), (str(self), self.series)
-
 
 class OutputError(En4dvarError):
     """The run directory cannot be used."""

@@ -12,7 +12,9 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from fractions import Fraction
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, overload
+
+from annotated_types import GroupedMetadata
 
 from en4dvar.plumbing.errors import En4dvarError, retold
 from en4dvar.plumbing.hints import shown
@@ -244,25 +246,18 @@ def parse_quantity(value: str | float, unit: str, usual: str = "") -> float:
 
 
 @dataclass(frozen=True)
-class Quantity:
+class Quantity(GroupedMetadata):
     """Pydantic annotation: ``Annotated[float, Quantity("Pa")]`` reads ``"0.42 kPa"`` as 420.0, dumps JSON with unit."""
 
     unit: str
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
-        from pydantic_core import core_schema
+    def __iter__(self) -> Iterator[object]:
+        from pydantic import BeforeValidator, PlainSerializer, WithJsonSchema
 
         parse_unit(self.unit)
-        dump = core_schema.plain_serializer_function_ser_schema(self._write, when_used="json")
-        return core_schema.no_info_before_validator_function(
-            lambda text: parse_quantity(text, self.unit), handler(float), serialization=dump
-        )
-
-    def __get_pydantic_json_schema__(self, core_schema: Any, handler: Any) -> dict[str, Any]:
-        """A number with a unit is text in YAML; without one it is accepted only where there is no unit."""
-        if self.unit == "1":
-            return {"type": ["number", "string"]}
-        return {"type": "string", "pattern": r"^\s*[+-]?[\d.]", "x-unit": self.unit}
-
-    def _write(self, value: float) -> str | float:
-        return value if self.unit == "1" else f"{value!r} {self.unit}"
+        plain = self.unit == "1"
+        yield BeforeValidator(lambda text: parse_quantity(text, self.unit))
+        yield PlainSerializer(lambda value: value if plain else f"{value!r} {self.unit}", when_used="json")
+        # a number with a unit is text in YAML; without one it is accepted only where there is no unit
+        text = {"type": "string", "pattern": r"^\s*[+-]?[\d.]", "x-unit": self.unit}
+        yield WithJsonSchema({"type": ["number", "string"]} if plain else text)

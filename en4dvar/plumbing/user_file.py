@@ -8,14 +8,12 @@ import hashlib
 import os
 import sys
 import traceback
-from collections.abc import Sequence
 from importlib import import_module
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder
-from importlib.util import spec_from_loader
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, cast
 
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.files import expanded, read_plain
@@ -79,30 +77,27 @@ def class_of(module: ModuleType, attribute: str, where: str) -> Any:
     return getattr(module, attribute)
 
 
-class _Finder(MetaPathFinder):
-    def find_spec(
-        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
-    ) -> ModuleSpec | None:
+class _Files(MetaPathFinder, Loader):
+    """Finds modules by the names that :func:`load` gives them, and executes what is permitted."""
+
+    def find_spec(self, fullname: str, path: object = None, target: object = None) -> ModuleSpec | None:
         if not fullname.startswith(_PREFIX):
             return None
         where, _, digest = fullname.removeprefix(_PREFIX).partition("_")
-        file = Path(bytes.fromhex(where).decode("utf-8", "surrogateescape"))
-        return spec_from_loader(fullname, _Loader(file, digest), origin=str(file))
-
-
-class _Loader(Loader):
-    def __init__(self, file: Path, digest: str):
-        self.file, self.digest = file, digest
+        file = bytes.fromhex(where).decode("utf-8", "surrogateescape")
+        return ModuleSpec(fullname, self, origin=file, loader_state=digest)
 
     def exec_module(self, module: ModuleType) -> None:
-        source = _permitted.pop((self.file, self.digest), None)
+        spec = cast(ModuleSpec, module.__spec__)
+        file, digest = Path(spec.origin or ""), spec.loader_state
+        source = _permitted.pop((file, digest), None)
         if source is None:  # imported by its name: by a worker, or by a file that names this module
-            source = _source(self.file)
-            if hashlib.sha256(source).hexdigest() != self.digest:
-                raise ConfigError(f"{self.file}: the file has changed since it was loaded")
-            require_permission(Code(f"file {self.file.name!r}", (self.file,), digest=self.digest))
-        module.__file__ = str(self.file)
-        exec(compile(source, str(self.file), "exec"), module.__dict__)
+            source = _source(file)
+            if hashlib.sha256(source).hexdigest() != digest:
+                raise ConfigError(f"{file}: the file has changed since it was loaded")
+            require_permission(Code(f"file {file.name!r}", (file,), digest=digest))
+        module.__file__ = str(file)
+        exec(compile(source, str(file), "exec"), module.__dict__)
 
 
 def _source(path: Path) -> bytes:
@@ -122,4 +117,4 @@ def _line(error: BaseException, path: Path) -> str:
     return f"{path}:{lines[-1]}" if lines else str(path)
 
 
-sys.meta_path.insert(sys.meta_path.index(PathFinder) if PathFinder in sys.meta_path else 0, _Finder())
+sys.meta_path.insert(sys.meta_path.index(PathFinder) if PathFinder in sys.meta_path else 0, _Files())

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from en4dvar.config.sharing import reference_value
+from en4dvar.config.dependence import reference_value
 from en4dvar.diagnosis.diagnostics import member_quantiles
 from en4dvar.estimation.population.contrast import Centre, StraightLine, drawn_together, line, without_pull
 from en4dvar.model.state import Array, Parameter

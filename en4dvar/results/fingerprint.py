@@ -16,7 +16,7 @@ from typing import Any
 
 import yaml
 
-from en4dvar.inputs.asked import DataFile
+from en4dvar.inputs.parts import DataFile
 from en4dvar.model.forward import ForwardModel
 from en4dvar.results.checkpoint import FOLDER, digest, file_digest
 from en4dvar.results.provenance import package_versions

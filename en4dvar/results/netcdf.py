@@ -21,10 +21,9 @@ from typing import TYPE_CHECKING, Any
 import netCDF4
 import numpy as np
 
-from en4dvar.plumbing.decoding import Allowed, DecodeError, decoded
+from en4dvar.plumbing.decoding import Allowed, DecodeError, decoded, require_whole
 from en4dvar.plumbing.errors import DataError, OutputError, retold
 from en4dvar.plumbing.files import atomic_path
-from en4dvar.plumbing.hdf5 import require_whole
 from en4dvar.results.seal import SealedBytes, check_seal, seal_file
 
 if TYPE_CHECKING:

@@ -26,7 +26,7 @@ from en4dvar.ensemble.forecast import Composite
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.executor import Executor
 from en4dvar.executor.base import CommonValue
-from en4dvar.inputs.asked import DataFile
+from en4dvar.inputs.parts import DataFile
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError, DataError, En4dvarError
 from en4dvar.plumbing.units import convert

@@ -6,16 +6,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from en4dvar.assembly.build import build_one, data_files, inverse_plan
-from en4dvar.assembly.build_sequence import build_sequence
+from en4dvar.assembly.build import build_one, build_sequence, data_files, inverse_plan
 from en4dvar.assembly.reading import read_observations
 from en4dvar.config import AnyConfig, Config, SequenceConfig, resolve_any
+from en4dvar.config.context import check
+from en4dvar.config.data import DATA, DataPlan
 from en4dvar.config.document import Document, document_from, override
 from en4dvar.config.load import context_of, in_order
 from en4dvar.config.schema import Section
-from en4dvar.config.series import DATA, DataPlan
-from en4dvar.config.validate import check
-from en4dvar.inputs.asked import DataFile
+from en4dvar.inputs.parts import DataFile
 from en4dvar.plumbing.errors import ConfigError, DataError, Fault
 from en4dvar.problem import InverseProblem
 from en4dvar.results.variables import require_free_names
@@ -61,11 +60,10 @@ def checked_problem(config: Config, name: str, file: DataFile) -> InverseProblem
 def _read_data(document: Document, base: Path, faults: list[Fault]) -> None:
     """Faults of the data files, for a configuration that has faults elsewhere than in its data section."""
     context = context_of(document, base, None)
-    observed = context.observed
     section = check(_DataSection, {"data": document.data.get("data")}, (), document, [], context)
     if section is None or context.default is None:
         return
-    plan = DataPlan.of(section.data, observed or context.default.observables[0])
+    plan = section.data
     _read_files(document, plan, lambda name, file: read_observations(plan, file, name), faults)
 
 

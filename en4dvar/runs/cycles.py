@@ -14,10 +14,10 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
-from en4dvar.assembly.build_sequence import build_sequence, sequence_data
+from en4dvar.assembly.build import build_sequence, sequence_data
 from en4dvar.config import SequenceConfig, TwinConfig, load_sequence, load_twin, loaded
 from en4dvar.executor import Executor, choose_executor
-from en4dvar.inputs.asked import DataFile
+from en4dvar.inputs.parts import DataFile
 from en4dvar.plumbing.files import write_text
 from en4dvar.report.sequence import SequenceOutcome
 from en4dvar.report.twin import TwinOutcome

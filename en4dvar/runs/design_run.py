@@ -19,10 +19,10 @@ from en4dvar.data.noise import noise_of
 from en4dvar.data.observations import Observations
 from en4dvar.data.series import Series
 from en4dvar.ensemble.forecast import forecast
-from en4dvar.estimation.design.evaluate import Evaluated, Method, evaluate
+from en4dvar.estimation.design.evaluate import Evaluated, Method, SampleSizes, evaluate
 from en4dvar.estimation.design.planned import Planned
 from en4dvar.executor import Executor
-from en4dvar.inputs.asked import DataFile
+from en4dvar.inputs.parts import DataFile
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError, En4dvarError, retold
 from en4dvar.plumbing.units import UnitError
@@ -215,7 +215,7 @@ def _one(number: int, candidate: Candidate, method: Method, seed: int) -> Done:
     config, design = candidate.config, candidate.config.design
     try:
         problem, laws = planned_problem(config), [planned_problem(law) for law in candidate.laws]
-        sizes, alike = design.sizes, design.experiments
+        sizes, alike = design.part(SampleSizes), design.experiments
         choice = (design.choose.readings, design.choose.apart) if design.choose else None
         told = design.common, _wanted(config, problem)
         every = evaluate(problem, design.about, sizes, method, seed, alike, choice, laws, *told)

@@ -16,7 +16,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 
 from en4dvar.executor import Executor, ExecutorError, choose_executor, one_blas_thread
 from en4dvar.executor.processes import UnguardedError
-from en4dvar.inputs.asked import DataFile
+from en4dvar.inputs.parts import DataFile
 from en4dvar.model.forward import ForwardModel
 from en4dvar.plumbing.errors import ConfigError, OutputError
 from en4dvar.plumbing.files import write_text

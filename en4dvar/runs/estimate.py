@@ -16,9 +16,9 @@ import numpy as np
 
 from en4dvar.config import Config, SequenceConfig
 from en4dvar.config.document import Document, document_of
+from en4dvar.config.kinds import resolve_sequence
 from en4dvar.config.load import resolve
 from en4dvar.config.models import HANDED, read_model
-from en4dvar.config.sequence import resolve_sequence
 from en4dvar.diagnosis.analysis import Progress
 from en4dvar.inputs.arrays import TIME, VALUE, columns_of, csv_of, require_columns, stacked, tables_of
 from en4dvar.model.forward import ForwardModel, Observable

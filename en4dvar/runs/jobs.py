@@ -16,7 +16,7 @@ from en4dvar.estimation.assimilate import assimilate
 from en4dvar.estimation.summary import brief, dataset_rows, remarks, summarise
 from en4dvar.executor import Executor, SerialExecutor
 from en4dvar.executor.base import CommonValue
-from en4dvar.inputs.asked import DataFile
+from en4dvar.inputs.parts import DataFile
 from en4dvar.plumbing.tables import csv_text
 from en4dvar.priors.prior import own_seed
 from en4dvar.problem import InverseProblem

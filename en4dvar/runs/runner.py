@@ -12,7 +12,7 @@ from en4dvar.assembly.build import data_files, inverse_plan
 from en4dvar.config import Config, load_config, loaded
 from en4dvar.diagnosis.analysis import Progress
 from en4dvar.executor import Executor
-from en4dvar.inputs.asked import DataFile
+from en4dvar.inputs.parts import DataFile
 from en4dvar.plumbing.errors import ConfigError, DataError, Fault
 from en4dvar.results.campaign_file import DamagedError, save_campaign
 from en4dvar.results.pack import PACK
@@ -147,7 +147,7 @@ class EstimateKind(RunKind[Campaign]):
         if run.directory.resumed:
             work.recall()
         _estimate(work, executor)
-        if self.config.sharing:
+        if self.config.sharing.kinds:
             JointKind().within(work, executor)
         if asked := self.config.population:
             groups: Sequence[SetGroup | None] = groups_of(self.config, self.data) or [None]

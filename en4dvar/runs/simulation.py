@@ -16,14 +16,14 @@ import numpy.typing as npt
 from en4dvar.assembly.build import data_files, resolve_parameters
 from en4dvar.assembly.reading import read_observations
 from en4dvar.config import Config, time_grid
-from en4dvar.config.error import parse_error_std
+from en4dvar.config.data import SeriesPlan
+from en4dvar.config.kinds import CampaignPlan, GroupSection, terms_and_fixed
+from en4dvar.config.of_readings import parse_error_std
 from en4dvar.config.parameters import Tied
-from en4dvar.config.series import DataPlan, SeriesPlan
-from en4dvar.config.synthetic import CampaignPlan, GroupSection
 from en4dvar.data.series import Places
 from en4dvar.diagnosis.diagnostics import nrmse
 from en4dvar.executor import run_chunk
-from en4dvar.inputs.asked import Column
+from en4dvar.inputs.parts import Column
 from en4dvar.model.forward import Failure, ForwardModel, Observable, Trajectory, instants_of
 from en4dvar.model.state import READING_OFFSET, READING_SCALE, TIME_SHIFT, Array
 from en4dvar.plumbing.errors import ConfigError, En4dvarError, OutputError
@@ -86,9 +86,8 @@ def simulate(config: Config, times: npt.ArrayLike | None = None) -> Simulation:
     times = config.simulate_times if times is None else times
     observations = None
     if config.data is not None and (times is None or any(entry.needs_data for entry in config.parameters)):
-        plan = DataPlan.of(config.data, config.observable)
-        name, file = next(iter(data_files(plan).items()))
-        observations = read_observations(plan, file, name)
+        name, file = next(iter(data_files(config.data).items()))
+        observations = read_observations(config.data, file, name)
     if times is None:
         if observations is None:
             raise ConfigError("no instants to simulate: give simulate.times in the file, or --times FROM:TO:STEP")
@@ -108,7 +107,7 @@ def simulate(config: Config, times: npt.ArrayLike | None = None) -> Simulation:
 
 def _series(config: Config) -> tuple[SeriesPlan, ...]:
     """The series of the data, where there are data."""
-    return () if config.data is None else DataPlan.of(config.data, config.observable).series
+    return () if config.data is None else config.data.series
 
 
 def _places(plan: SeriesPlan, count: int) -> Places | None:
@@ -240,10 +239,9 @@ def _draw(plan: CampaignPlan, kind: str, group: GroupSection, number: int) -> Sy
     model, asked = plan.model, plan.settings
     reason = ""
     for _ in range(ATTEMPTS):
-        theta = dict(group.fixed)
+        terms, theta = terms_and_fixed(group.parameters)
         theta |= {
-            t.parameter.name: float(t.to_physical(np.array(t.mean + t.std * stream.standard_normal())))
-            for t in group.terms
+            t.parameter.name: float(t.to_physical(np.array(t.mean + t.std * stream.standard_normal()))) for t in terms
         }
         shift = float(stream.uniform(*asked.time_shift))
         gaps = stream.uniform(*asked.spacing, asked.most - 1)
@@ -254,7 +252,7 @@ def _draw(plan: CampaignPlan, kind: str, group: GroupSection, number: int) -> Sy
         except En4dvarError as error:
             reason = str(error)
             continue
-        exact = np.asarray(plan.observable.operator(path), dtype=float)
+        exact = np.asarray(model.observables[0].operator(path), dtype=float)
         values = exact + noise
         below = np.flatnonzero(values < asked.stop * np.maximum.accumulate(values))
         count = int(below[0]) + 1 if len(below) else asked.most
@@ -278,7 +276,7 @@ def write_campaign(plan: CampaignPlan, sets: tuple[SyntheticSet, ...], command: 
 
 
 def _data_csv(plan: CampaignPlan, dataset: SyntheticSet, command: str) -> str:
-    model, seen = plan.model, plan.observable
+    model, seen = plan.model, plan.model.observables[0]
     t, v = f"t_{model.time_display_unit}", f"{seen.symbol.strip('$')}_{seen.display_unit}"
     noise = convert(plan.settings.noise, seen.unit, seen.display_unit)
     comments = [

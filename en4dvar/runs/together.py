@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from en4dvar.config import Config
-from en4dvar.config.sharing import SOURCE, reference_value
+from en4dvar.config.dependence import SOURCE, reference_value
 from en4dvar.diagnosis.diagnostics import HARDLY_INFORMED
 from en4dvar.estimation.joint import JointEstimate, Single, estimate_jointly
 from en4dvar.estimation.joint.problem import JointProblem, sharing
@@ -228,7 +228,7 @@ class PopulationKind(TogetherKind):
     ) -> None:  # fmt: skip
         tell(f"population of {', '.join(self.names)} behind {len(sets)} data sets")
         problems, white = [s.problem for s in sets], [s.white for s in sets]
-        asked = config.population.hyper if config.population else HyperPrior()
+        asked = config.population.part(HyperPrior) if config.population else HyperPrior()
         hyper = self.hyper if isinstance(self.hyper, HyperPrior) else replace(asked, **(self.hyper or {}))
         with retold(ValueError, TooFewMembersError, "no population: "):  # of forward runs that failed
             population = population_of(

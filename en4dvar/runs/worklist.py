@@ -12,7 +12,7 @@ from en4dvar.diagnosis.analysis import IterationRecord, Progress, Record, StartR
 from en4dvar.estimation.summary import brief, summary_rows
 from en4dvar.executor import Executor, ExecutorError, SerialExecutor, ThreadsExecutor
 from en4dvar.executor.base import CommonValue
-from en4dvar.inputs.asked import DataFile
+from en4dvar.inputs.parts import DataFile
 from en4dvar.plumbing.errors import En4dvarError, OutputError
 from en4dvar.plumbing.files import atomic_path, open_plain, readable, remove_file
 from en4dvar.plumbing.tables import csv_text

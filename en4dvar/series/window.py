@@ -12,8 +12,7 @@ from en4dvar.descent.step_control import Move
 from en4dvar.ensemble.linalg import centre
 from en4dvar.ensemble.missing import fitted
 from en4dvar.executor import Executor
-from en4dvar.model.batch import Batch
-from en4dvar.model.forward import Failure, ForwardModel, Observable, Trajectory
+from en4dvar.model.forward import Batch, Failure, ForwardModel, Observable, Trajectory
 from en4dvar.model.state import Array
 from en4dvar.schemes.base import Evaluation, GaussNewtonStep, Runs, Scheme, Step, Weights
 from en4dvar.schemes.localisation import BlockDescents, BlockLocalisation

@@ -7,9 +7,9 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from en4dvar.config import Config, load_config
+from en4dvar.config.context import check
 from en4dvar.config.document import Document, override, read_document
 from en4dvar.config.schema import Name, QuantityText, Section
-from en4dvar.config.validate import check
 from en4dvar.plumbing.errors import ConfigError, Fault
 from en4dvar.plumbing.units import UnitError, parse_quantity
 from en4dvar.sampling.sweep import SweepSettings

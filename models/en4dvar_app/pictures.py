@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from en4dvar.inputs.asked import readable
+from en4dvar.inputs.parts import readable
 from en4dvar.plumbing.errors import DataError, En4dvarError
 from en4dvar.plumbing.files import read_plain
 from en4dvar_movie.frames import Frame, Movie, open_movie
@@ -101,7 +101,7 @@ def _number(text: str | None) -> float | str | None:
 def columns(path: Path, sheet: str = "") -> dict[str, Any]:
     """Columns of a table with their numbers (thinned out if many), which would be taken for times and radii, and the
     names of those of words. Raises :class:`DataError`."""
-    from en4dvar.inputs.asked import SUFFIXES, Layout
+    from en4dvar.inputs.parts import SUFFIXES, Layout
     from en4dvar_bubble.starter.asked import Asked, first_with_columns
 
     files = sorted(p for p in path.iterdir() if p.suffix.lower() in SUFFIXES) if path.is_dir() else [path]

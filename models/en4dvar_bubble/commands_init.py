@@ -17,7 +17,7 @@ from en4dvar.commands.common import echo
 from en4dvar_bubble.commands import completed_law
 
 if TYPE_CHECKING:
-    from en4dvar.inputs.asked import Layout
+    from en4dvar.inputs.parts import Layout
     from en4dvar_bubble.starter.asked import Asked
     from en4dvar_bubble.starter.proposal import Proposal
     from en4dvar_bubble.starter.summaries import Summaries
@@ -167,7 +167,7 @@ def _refuse_alone(options: Mapping[str, str | None], allowed: Collection[str], w
 
 def _layout(options: Mapping[str, str | None]) -> Layout:
     """How the data are laid out. Raises :class:`UnitError`: ``--since`` is no instant."""
-    from en4dvar.inputs.asked import Layout
+    from en4dvar.inputs.parts import Layout
     from en4dvar.inputs.window import parse_instant
     from en4dvar.plumbing.errors import retold
     from en4dvar.plumbing.units import UnitError

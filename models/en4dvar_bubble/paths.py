@@ -6,8 +6,7 @@ from typing import Any, ClassVar, cast
 
 import numpy as np
 
-from en4dvar.model.batch import Batch
-from en4dvar.model.forward import Failure, Trajectory, ValidityLimit
+from en4dvar.model.forward import Batch, Failure, Trajectory, ValidityLimit
 from en4dvar.model.state import Array, StateLayout
 from en4dvar_bubble.dynamics import Dynamics
 from en4dvar_bubble.gas import from_kirchhoff, mass_fraction, saturated_vapour_pressure
@@ -17,7 +16,6 @@ from en4dvar_bubble.solver import rows
 from en4dvar_bubble.solver.driver import Solution
 from en4dvar_bubble.solver.integrate import BEYOND, END_TIME, MAX_MACH
 from en4dvar_bubble.tables import evaluate
-
 
 THETA, MOLE_FRACTION = "temperature of the gas over that far away", "mole fraction of vapour"
 

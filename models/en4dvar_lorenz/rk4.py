@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 from numba import njit
 
-from en4dvar.plumbing.compiled import F, kernel
-from en4dvar.plumbing.kernel_cache import stamp_with_sources
+from en4dvar.plumbing.compiled import F, kernel, stamp_with_sources
 
 
 def kept(function: F) -> F:

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.inputs.asked import readable, require_file
+from en4dvar.inputs.parts import readable, require_file
 from en4dvar.inputs.text_table import numbered_lines
 from en4dvar.plumbing.errors import DataError
 from en4dvar_movie.frames import Movie, open_picture

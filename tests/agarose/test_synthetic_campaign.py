@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 from en4dvar.cli import main
 from en4dvar.config.document import override, read_document
-from en4dvar.config.synthetic import resolve_campaign
+from en4dvar.config.kinds import resolve_campaign, terms_and_fixed
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.runs.simulation import draw_campaign
 
@@ -65,7 +65,8 @@ def test_truths_have_the_moments_of_table_1():
     many = plan()
     paper = {"G": (420.0, 62.0), "alpha": (0.029, 0.011), "mu": (0.086, 0.024), "R0": (0.43e-6, 0.31e-6)}
     rng = np.random.default_rng(0)
-    for term in many.settings.groups["agarose_03"].terms:
+    terms, _ = terms_and_fixed(many.settings.groups["agarose_03"].parameters)
+    for term in terms:
         values = term.to_physical(term.mean + term.std * rng.standard_normal(5000))
         mean, std = paper[term.parameter.name]
         assert np.all(values > 0)

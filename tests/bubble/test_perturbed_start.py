@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from en4dvar.config.initial_state import perturbation
+from en4dvar.config.varies import perturbation
 from en4dvar.data.noise import noise_of
 from en4dvar.data.observations import Observations
 from en4dvar.estimation.assimilate import assimilate, forecast

@@ -15,7 +15,7 @@ from scipy.integrate import quad
 
 import en4dvar_bubble.solver
 from en4dvar.model.forward import Failure
-from en4dvar.plumbing.kernel_cache import _digest
+from en4dvar.plumbing.compiled import _digest
 from en4dvar_bubble import Accuracy, BubbleModel, get_law, simulate
 from en4dvar_bubble.solver import integrate, lanes, rodas5p
 from en4dvar_bubble.solver.collocation import ball

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from en4dvar.inputs.outliers import outlying, scatter_of
+from en4dvar.inputs.implausible import outlying, scatter_of
 from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.settings import BubbleSettings
 from en4dvar_bubble.starter.look import look

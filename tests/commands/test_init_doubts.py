@@ -12,7 +12,7 @@ from scipy.io import savemat
 
 from en4dvar.assembly.build import build
 from en4dvar.config import load_config
-from en4dvar.inputs.asked import Column
+from en4dvar.inputs.parts import Column
 from en4dvar.inputs.readers import read_series
 from en4dvar_bubble.collapse import RAYLEIGH
 

@@ -16,8 +16,8 @@ from scipy.io import loadmat, savemat
 from en4dvar.assembly.build import build
 from en4dvar.config import load_config, resolve
 from en4dvar.config.document import parse_document, read_document
-from en4dvar.inputs.asked import Column
-from en4dvar.inputs.outliers import scatter_of
+from en4dvar.inputs.implausible import scatter_of
+from en4dvar.inputs.parts import Column
 from en4dvar.inputs.readers import read_series
 from en4dvar.plumbing.errors import ConfigError, DataError
 from en4dvar.report.result import load_result
@@ -89,7 +89,7 @@ def test_what_is_not_known_exactly_is_estimated(tmp_path: Path) -> None:
     known = {"sigma", "discrepancy_amplitude", "discrepancy_length", "rho", "c", "p_inf", "reading_scale"}
     assert known < set(problem.prior.names)
     assert problem.observations.noise.kernel.smoothness == 1.5
-    assert config.data.error.model_std is None
+    assert config.data.series[0].data.error.model_std is None
     of = {term.parameter.name: term for term in problem.prior.terms}
     assert np.exp(of["rho"].mean) == pytest.approx(1001, abs=5)
     assert of["rho"].std < 0.01

@@ -26,8 +26,8 @@ def test_good_file(tmp_path: Path) -> None:
     assert config.assimilation == AssimilationSettings(members=8, max_iterations=8)
     assert config.directory == Path("runs/toy")
     assert config.data is not None
-    assert config.data.error.std is not None
-    assert config.data.error.std.value == 2e-6
+    assert config.data.series[0].data.error.std is not None
+    assert config.data.series[0].data.error.std.value == 2e-6
     assert [type(p) for p in config.parameters] == [Uncertain, Uncertain, Fixed]
     assert config.model.mass == 2e-3  # type: ignore[attr-defined]
     with pytest.raises(FrozenInstanceError):

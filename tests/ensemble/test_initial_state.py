@@ -7,7 +7,7 @@ import pytest
 from toy_models import Oscillator, OscillatorSettings
 from toys import make_observations
 
-from en4dvar.config.initial_state import perturbation
+from en4dvar.config.varies import perturbation
 from en4dvar.ensemble.forecast import check_problem
 from en4dvar.estimation.assimilate import assimilate, forecast
 from en4dvar.plumbing.errors import ConfigError

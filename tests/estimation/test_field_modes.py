@@ -10,7 +10,7 @@ from kuramoto import NU as TRUE_NU
 from kuramoto import READ as CELLS_READ
 from scipy.optimize import least_squares
 
-from en4dvar.config.initial_state import modes_of
+from en4dvar.config.varies import modes_of
 from en4dvar.data.noise import noise_of
 from en4dvar.data.observations import Observations
 from en4dvar.data.series import Places, Series

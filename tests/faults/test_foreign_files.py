@@ -11,10 +11,9 @@ from run_files import run_cli
 from toy_config import write_toy
 
 from en4dvar.config.document import read_document
-from en4dvar.inputs.asked import Column, Matrix
-from en4dvar.inputs.parts import read_contents
+from en4dvar.inputs.members import read_covariance
+from en4dvar.inputs.parts import Column, Matrix, read_contents
 from en4dvar.inputs.readers import read_series
-from en4dvar.inputs.square import read_covariance
 from en4dvar.plumbing.errors import ConfigError, DataError
 
 TIME, RADIUS = Column("t", "us", "s"), Column("R", "um", "m")

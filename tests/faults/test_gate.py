@@ -24,11 +24,10 @@ from toy_config import write_toy
 
 from en4dvar.cli import main
 from en4dvar.config.document import read_document
-from en4dvar.inputs.members import read_members
+from en4dvar.inputs.members import read_members, read_square
 from en4dvar.inputs.parts import read_contents
-from en4dvar.inputs.square import read_square
 from en4dvar.model.programs.control import from_pest
-from en4dvar.model.programs.template import check_template
+from en4dvar.model.programs.languages import check_template
 from en4dvar.plumbing.decoding import Allowed, decoded_whole
 from en4dvar.plumbing.errors import DataError, En4dvarError, OutputError
 from en4dvar.plumbing.user_file import load

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from rows import row
 
-from en4dvar.plumbing import kernel_cache
+from en4dvar.plumbing import compiled
 
 ROOT = Path(__file__).resolve().parents[2]
 NOBODY = 65534
@@ -98,17 +98,17 @@ def test_a_configuration_is_validated_and_run(closed: tuple[Path, Run]) -> None:
 def test_a_folder_that_others_can_write_is_not_used(tmp_path: Path) -> None:
     """Numba runs what it finds in its cache: nobody may put it there before us, on no detour."""
     name = f"en4dvar-numba-{os.getuid()}"
-    own = kernel_cache._own_folder(tmp_path)
-    assert own == tmp_path / name == kernel_cache._own_folder(tmp_path)
+    own = compiled._own_folder(tmp_path)
+    assert own == tmp_path / name == compiled._own_folder(tmp_path)
     own.chmod(0o777)
-    assert kernel_cache._own_folder(tmp_path) != own
+    assert compiled._own_folder(tmp_path) != own
     own.rmdir()
     (tmp_path / "theirs").mkdir()
     own.symlink_to(tmp_path / "theirs")
-    assert kernel_cache._own_folder(tmp_path) != own
+    assert compiled._own_folder(tmp_path) != own
     own.unlink()
     own.touch()
-    made = kernel_cache._own_folder(tmp_path)
+    made = compiled._own_folder(tmp_path)
     assert made != own
     assert stat.S_IMODE(made.stat().st_mode) == 0o700
 
@@ -118,5 +118,5 @@ def test_nowhere_at_all_is_one_error(monkeypatch: pytest.MonkeyPatch) -> None:
         raise FileNotFoundError(2, "No usable temporary directory found")
 
     monkeypatch.setattr(tempfile, "gettempdir", nowhere)
-    with pytest.raises(kernel_cache.OutputError, match=r"No usable temporary directory found.*NUMBA_CACHE_DIR"):
-        kernel_cache._temporary_folder()
+    with pytest.raises(compiled.OutputError, match=r"No usable temporary directory found.*NUMBA_CACHE_DIR"):
+        compiled._temporary_folder()

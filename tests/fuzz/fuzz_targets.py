@@ -13,13 +13,12 @@ from pathlib import Path
 from en4dvar.assembly.build import build
 from en4dvar.config import Config
 from en4dvar.config.document import read_document
-from en4dvar.config.synthetic import resolve_campaign
+from en4dvar.config.kinds import resolve_campaign
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.executor import SerialExecutor
-from en4dvar.inputs.asked import Column, Matrix, TimeStep
-from en4dvar.inputs.parts import read_contents
+from en4dvar.inputs.members import read_covariance
+from en4dvar.inputs.parts import Column, Matrix, TimeStep, read_contents
 from en4dvar.inputs.readers import read_series
-from en4dvar.inputs.square import read_covariance
 from en4dvar.plumbing.errors import ConfigError, DataError, En4dvarError
 from en4dvar.plumbing.units import UnitError, parse_quantity
 from en4dvar.report.result import load_result

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from en4dvar.cli import main
 from en4dvar.config.document import read_document
-from en4dvar.config.synthetic import resolve_campaign
+from en4dvar.config.kinds import resolve_campaign
 from en4dvar.plumbing.errors import ConfigError
 
 CONFIGS = [yaml.safe_load(content) for content in seeds.of("configuration")]

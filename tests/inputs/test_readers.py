@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from en4dvar.inputs.asked import Column, Layout, TimeStep
-from en4dvar.inputs.parts import read_contents
+from en4dvar.inputs.parts import Column, Layout, TimeStep, read_contents
 from en4dvar.inputs.readers import BELOW, FAR, Readings, read_series
 from en4dvar.plumbing.errors import DataError
 

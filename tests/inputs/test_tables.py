@@ -14,12 +14,11 @@ import pytest
 from openpyxl import Workbook
 from scipy.io import savemat
 
-from en4dvar.inputs import sheets
-from en4dvar.inputs.asked import Column, Layout
-from en4dvar.inputs.matfile import mat_variables, variables_of
-from en4dvar.inputs.parts import parts_of, read_contents
+from en4dvar.inputs.implausible import step_doubts
+from en4dvar.inputs.matfile import mat_variables
+from en4dvar.inputs.parts import Column, Layout, parts_of, read_contents
 from en4dvar.inputs.readers import Readings, read_series
-from en4dvar.inputs.steps import step_doubts
+from en4dvar.inputs.text_table import lines_of_workbook
 from en4dvar.inputs.window import parse_instant
 from en4dvar.plumbing.errors import DataError
 
@@ -280,13 +279,12 @@ def test_matlab_73_of_strangers(tmp_path):
         mat_variables(tmp_path / "a.mat")
 
 
-@pytest.mark.parametrize(("module", "file"), [("openpyxl", "a.xlsx"), ("h5py", "a.mat")])
-def test_a_missing_package_is_named(tmp_path, monkeypatch, module, file):
+def test_a_missing_package_is_named(tmp_path, monkeypatch):
     """By what decodes, which a child does elsewhere."""
-    path = book(tmp_path / file, film=ROWS) if file == "a.xlsx" else hdf(tmp_path / file, laboratory)
-    monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(DataError, match=rf"{file}: .*pip install {module}"):
-        list(sheets.lines_of_workbook(path, "") if module == "openpyxl" else variables_of(path))
+    path = book(tmp_path / "a.xlsx", film=ROWS)
+    monkeypatch.setitem(sys.modules, "openpyxl", None)
+    with pytest.raises(DataError, match=r"a\.xlsx: .*pip install openpyxl"):
+        list(lines_of_workbook(path, ""))
 
 
 def test_columns_and_rows_of_matrices(tmp_path):

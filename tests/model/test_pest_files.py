@@ -9,17 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from en4dvar.model.programs import pest
+from en4dvar.model.programs import languages
+from en4dvar.model.programs.languages import ProgramError
 from en4dvar.model.programs.model import CommandModel, CommandSettings
-from en4dvar.model.programs.pest import ProgramError
 
 PUBLIC = Path(__file__).parents[2].parent / "shared" / "reference" / "pest" / "pestpp" / "benchmarks"
 TEMPLATE = "ptf ~\nmodel input\n~   K1        ~ ~  s~\nlast ~k1~\n"
 
 
 def test_each_space_holds_its_parameter_in_its_width():
-    assert pest.parameters_of(TEMPLATE) == {"k1", "s"}
-    lines = pest.filled(TEMPLATE, {"K1": 2 / 3, "s": 0.25}).splitlines()
+    assert languages.parameters_of(TEMPLATE) == {"k1", "s"}
+    lines = languages.spaces_filled(TEMPLATE, {"K1": 2 / 3, "s": 0.25}).splitlines()
     assert lines[0] == "model input"
     assert lines[1] == "0.66666666666667  0.25"[-22:] or len(lines[1]) == len("~   K1        ~ ~  s~")
     assert float(lines[1].split()[0]) == pytest.approx(2 / 3, rel=1e-12)
@@ -31,12 +31,12 @@ def test_each_space_holds_its_parameter_in_its_width():
     [(0.1, 12, "0.1"), (1e-7, 5, "1e-07"), (1e-7, 4, "1e-7"), (-123456.789, 7, "-123457"), (1 / 3, 3, "0.3")],
 )
 def test_a_number_keeps_as_many_digits_as_fit(value, width, text):
-    assert pest.fitted(value, width) == text
+    assert languages.fitted(value, width) == text
 
 
 def test_a_number_that_does_not_fit_is_told():
     with pytest.raises(ProgramError, match="-1e-200 does not fit into 4 characters"):
-        pest.fitted(-1e-200, 4)
+        languages.fitted(-1e-200, 4)
 
 
 OUTPUT = """SCHLUMBERGER ELECTRIC SOUNDING
@@ -60,8 +60,8 @@ heads: h1 = 3.25  h2 = 4.5d0
     ],
 )
 def test_instructions_read_what_they_say(instructions, expected):
-    assert pest.read(instructions, OUTPUT, "out") == expected
-    assert pest.observations_of(instructions) == list(expected)
+    assert languages.read(instructions, OUTPUT, "out") == expected
+    assert languages.observations_of(instructions) == list(expected)
 
 
 @pytest.mark.parametrize(
@@ -80,7 +80,7 @@ def test_instructions_read_what_they_say(instructions, expected):
     ],
 )  # fmt: skip
 def test_instructions_as_the_manual_of_pestpp_has_them(instructions, output, expected):
-    assert pest.read(instructions, output, "out", delimiters="|") == {"a": expected}
+    assert languages.read(instructions, output, "out", delimiters="|") == {"a": expected}
 
 
 @pytest.mark.skipif(not PUBLIC.is_dir(), reason=f"no {PUBLIC}")
@@ -96,7 +96,7 @@ def test_instructions_of_pestpps_benchmarks():
         "1236.5678495.123-900.999 2.2 2.6 3.0 3.4 3.8 4.0", "4.123x", "dummy_obs 5.5",
     ]  # fmt: skip
     instructions = (PUBLIC / "tplins_test_1" / "template" / "out1.dat.ins").read_text()
-    assert pest.read(instructions, "\n".join(lines) + "\n", "out1.dat") == expected
+    assert languages.read(instructions, "\n".join(lines) + "\n", "out1.dat") == expected
 
 
 @pytest.mark.skipif(not PUBLIC.is_dir(), reason=f"no {PUBLIC}")
@@ -106,7 +106,8 @@ def test_secondary_markers_of_pestpps_benchmarks(name, between):
     rows = [["1.0", "2.0", "3.0", "4.0"], ["32.0", "5.0", "6.0", "7.0"]]
     head = "time, of\n\ntime,SEEPAGE_FLUX1, of\n\ntime,SEEPAGE_FLUX1,SEEPAGE_FLUX2, of\n\n" if name[3] == "1" else ""
     text = head + "time,SEEPAGE_FLUX1,SEEPAGE_FLUX2,SEEPAGE_FLUX3\n" + "\n".join(between.join(row) for row in rows)
-    found = pest.read((PUBLIC / "secondary_marker_test" / "template" / name).read_text(), text, name, delimiters="|")
+    instructions = (PUBLIC / "secondary_marker_test" / "template" / name).read_text()
+    found = languages.read(instructions, text, name, delimiters="|")
     first = 0 if name[3] == "3" else 1  # the instructions of the third begin with the time
     assert found == {f"obs{i + 1}_{j + 1}": float(rows[j][first + i]) for i in range(3) for j in range(2)}
 
@@ -126,16 +127,16 @@ def test_secondary_markers_of_pestpps_benchmarks(name, between):
 )
 def test_what_is_no_instruction_is_told_with_its_line(lines, words):
     with pytest.raises(ProgramError) as caught:
-        pest.parsed(f"pif @\n{lines}\n", "x.ins")
+        languages.parsed(f"pif @\n{lines}\n", "x.ins")
     assert str(caught.value) == words
 
 
 @pytest.mark.parametrize("first", ["ptf", "ptf ", "ptf ~~", "ptf a"])
 def test_a_template_without_a_delimiter_is_told(first):
     with pytest.raises(ProgramError, match="the first line names"):
-        pest.parameters_of(f"{first}\n~ a ~\n")
+        languages.parameters_of(f"{first}\n~ a ~\n")
     with pytest.raises(ProgramError, match="line 3: one ~ without another"):
-        pest.parameters_of("ptf ~\n~ a ~\n~ b\n")
+        languages.parameters_of("ptf ~\n~ a ~\n~ b\n")
 
 
 @pytest.mark.parametrize(
@@ -153,12 +154,12 @@ def test_a_template_without_a_delimiter_is_told(first):
 )
 def test_what_cannot_be_read_is_told_with_its_line(instructions, words):
     with pytest.raises(ProgramError) as caught:
-        pest.read(instructions, OUTPUT, "out")
+        languages.read(instructions, OUTPUT, "out")
     assert str(caught.value) == words
 
 
 def test_what_is_no_number_is_lost_alone():
-    found = pest.read("pif @\nl1 !a! !b!\nl1 !c! [d]8:10\n", "1.5 ****\nNaN 2.5\n", "out")
+    found = languages.read("pif @\nl1 !a! !b!\nl1 !c! [d]8:10\n", "1.5 ****\nNaN 2.5\n", "out")
     np.testing.assert_array_equal([found[name] for name in "abcd"], [1.5, math.nan, math.nan, math.nan])
 
 

@@ -9,7 +9,7 @@ import pytest
 
 import en4dvar
 from en4dvar.model.programs.control import from_pest
-from en4dvar.model.programs.matrices import read_matrix
+from en4dvar.model.programs.control_file import read_matrix
 
 NAMES = ("k:1", "h", "other")  # the third is no parameter
 PRIOR = np.array([[0.25, 0.3, 0.0], [0.3, 1.0, 0.1], [0.0, 0.1, 2.0]])

@@ -7,8 +7,7 @@ import pytest
 from toy_models import Oscillator, OscillatorSettings
 from varying_models import KNOTS, Batched, Ending, Ramp, Steep
 
-from en4dvar.model.batch import Batch
-from en4dvar.model.forward import Failure, Trajectory
+from en4dvar.model.forward import Batch, Failure, Trajectory
 from en4dvar.model.state import Field
 from en4dvar.priors.prior import PriorTerm
 from en4dvar.priors.varying import PiecewiseModel, RandomWalk, StateChanges

@@ -12,7 +12,7 @@ from en4dvar.data.noise import noise_of
 from en4dvar.data.observations import Observations
 from en4dvar.diagnosis.response.what_if import changed_problem
 from en4dvar.estimation.assimilate import assimilate
-from en4dvar.model.batch import Batch
+from en4dvar.model.forward import Batch
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.priors.varying import PiecewiseModel, RandomWalk
 from en4dvar.problem import InverseProblem

@@ -7,13 +7,13 @@ import sys
 import pytest
 from run_files import environment
 
-from en4dvar.plumbing import kernel_cache
+from en4dvar.plumbing import compiled
 
 
 @pytest.fixture
 def processes(tmp_path):
     """What several processes have in hand that share a cache; each with its stamp."""
-    return lambda stamp="today": kernel_cache.SignatureFiles(str(tmp_path), "kernel", stamp)
+    return lambda stamp="today": compiled.SignatureFiles(str(tmp_path), "kernel", stamp)
 
 
 def test_what_two_processes_save_at_once_is_not_mixed_up(processes, monkeypatch):
@@ -79,8 +79,8 @@ def test_of_processes_that_start_at_once_one_compiles(tmp_path):
 
 
 def test_a_process_that_never_ends_its_compilation_is_not_waited_for_for_ever(tmp_path, monkeypatch):
-    monkeypatch.setattr(kernel_cache, "PATIENCE", 0.1)
+    monkeypatch.setattr(compiled, "PATIENCE", 0.1)
     with (tmp_path / "kernel.lock").open("w") as stopped:
         fcntl.flock(stopped, fcntl.LOCK_EX)
-        with kernel_cache._held(tmp_path / "kernel.lock"):
+        with compiled._held(tmp_path / "kernel.lock"):
             pass

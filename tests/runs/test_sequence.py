@@ -15,7 +15,7 @@ from drift_series import STD, TIMES, VALUES
 from linear_drift import Drift
 
 import en4dvar
-from en4dvar.assembly.build_sequence import build_sequence
+from en4dvar.assembly.build import build_sequence
 from en4dvar.config import load_sequence, load_twin
 from en4dvar.data.noise import noise_of
 from en4dvar.plumbing.errors import ConfigError, DataError
@@ -311,7 +311,8 @@ def test_the_bubble_in_time():
     """A_E2_002 (not shipped): without model error the end of the series is the posterior of all of it."""
     path = CONFIGS / "bubble_sequence.yaml"
     config = load_sequence(path)
-    if not (config.data.path.base / config.data.path.texts[0]).is_file():
+    files = config.data.series[0].data.path
+    if not (files.base / files.texts[0]).is_file():
         pytest.skip("A_E2_002.mat is not here")
     plain = {"data.error.radius_std": "1 % of maximum", "model_error": {}, "sequence.positive": []}
     found = []

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from en4dvar.assembly.build_sequence import build_sequence
+from en4dvar.assembly.build import build_sequence
 from en4dvar.config import load_sequence
 from en4dvar.runs.checks import validate
 from en4dvar.series.problem import assimilate_series

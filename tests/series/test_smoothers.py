@@ -7,8 +7,7 @@ import pytest
 from test_exact import CYCLES, batch_posterior, chaotic_twin, close, linear_twin
 from test_loop import Breaking, Forced, members, series
 
-from en4dvar.model.batch import Batch
-from en4dvar.model.forward import ForwardModel, Observable, StateField
+from en4dvar.model.forward import Batch, ForwardModel, Observable, StateField
 from en4dvar.model.state import Field, StateLayout
 from en4dvar.schemes.baselines import Climatology
 from en4dvar.schemes.enkf_n import EnKFN

@@ -17,35 +17,39 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from en4dvar.model.programs import pest
-from en4dvar.model.programs.control_file import OBSERVATIONS, PARAMETERS, ControlFile, PestRow, read_control, text_of
-from en4dvar.model.programs.matrices import OFF, READ, errors_in_files, priors_in_files
+from en4dvar.model.programs.control_file import (
+    OBSERVATIONS,
+    OFF,
+    PARAMETERS,
+    READ,
+    ControlFile,
+    PestRow,
+    errors_in_files,
+    priors_in_files,
+    read_control,
+    text_of,
+)
+from en4dvar.model.programs.languages import identifier, is_instructions
 from en4dvar.plumbing.errors import ConfigError
 
 RANGE = 4.0  # standard deviations between the bounds: PEST++ (White et al. 2020), option par_sigma_range
 OBSERVED = "observations"
 BOUNDS = {"at_most": ("l_", "less", ">@"), "at_least": ("g_", "greater", "<@")}  # how their groups begin: PEST++
 RANGES = {"at_most": "less_than", "at_least": "greater_than"}  # columns of external tables, where the group is none
-SEARCH = "this is a search for an optimum, not an estimate"
-OPTIONS: Mapping[str, str] = {  # option of PEST++, or how several begin → why not
-    "ies_no_noise": "errors are drawn here, from the weights",
-    "ies_phi_factor": "weights are those of the control file",
-    "ies_restart": "an estimate begins at its prior here",
-    "ies_weight": "there is one weight an observation here",
-    "ies_loc": "name a localisation in assimilation= instead",
-    "ies_autoadaloc": "name a localisation in assimilation= instead",
-    "ies_reg_factor": "the prior alone regularises here",
-    "ies_drop_conflicts": "no observation is left out here",
-    "tie_by_group": "tie the parameters one by one",
-    "tpl_force_decimal": "numbers are written with an exponent where that is shorter",
-    "mou_": SEARCH,
-    "opt_": SEARCH,
-    "sqp_": SEARCH,
-    "da_par": "a prior ensemble is that of prior={'ensemble': 'members.csv'}",
-    "da_obs": "errors are drawn here, from the weights",
-    "da_restart": "an estimate begins at its prior here",
-    "da_weight": "there is one weight an observation here",
+_WHY_NOT = {  # reason → options of PEST++, or how several begin
+    "errors are drawn here, from the weights": "ies_no_noise da_obs",
+    "weights are those of the control file": "ies_phi_factor",
+    "an estimate begins at its prior here": "ies_restart da_restart",
+    "there is one weight an observation here": "ies_weight da_weight",
+    "name a localisation in assimilation= instead": "ies_loc ies_autoadaloc",
+    "the prior alone regularises here": "ies_reg_factor",
+    "no observation is left out here": "ies_drop_conflicts",
+    "tie the parameters one by one": "tie_by_group",
+    "numbers are written with an exponent where that is shorter": "tpl_force_decimal",
+    "this is a search for an optimum, not an estimate": "mou_ opt_ sqp_",
+    "a prior ensemble is that of prior={'ensemble': 'members.csv'}": "da_par",
 }
+OPTIONS = {option: why for why, options in _WHY_NOT.items() for option in options.split()}
 COLUMNS: Mapping[str, str] = {  # of external tables
     "cycle": "the cycles of pestpp-da are not known here",
     "state_par_link": "the cycles of pestpp-da are not known here",
@@ -78,7 +82,11 @@ def from_pest(path: str | Path, files: Sequence[str] = (), *, prior_information:
     parameters = _parameters(control, [row for row in rows if len(row.cells) > 2])
     parents = {row.word("parnme"): row.word("partrans") for row in rows if len(row.cells) == 2}
     equations = _equations(control, parameters) if prior_information else []
-    _refuse(control, rows, observed, {reading.group for reading in equations})
+    informed = {reading.group for reading in equations}
+    if reasons := dict.fromkeys(
+        [*_refused(control, bool(informed)), *_refused_rows(control, rows, observed, informed)]
+    ):
+        raise ConfigError(f"{control.path}: {'; '.join(reasons)}")
     observations = [reading for row in observed for reading in _observations(row)]
     readings, names = [*observations, *equations], [reading.name for reading in observations]
     if not readings:
@@ -89,7 +97,7 @@ def from_pest(path: str | Path, files: Sequence[str] = (), *, prior_information:
     correlated = priors_in_files(control, parameters, priors, scalings)
     return {
         "model": {
-            "command": " && ".join(row.cells["line"].strip() for row in control.lines("model command line")),
+            "command": " && ".join(row.cells["line"].strip() for row in control.sections["model command line"]),
             "shell": True,
             "parameters": scalings,
             "templates": templates,
@@ -164,7 +172,7 @@ def _parameters(control: ControlFile, rows: Sequence[PestRow]) -> dict[str, Pest
     """Name as it is here → row. Raises :class:`ConfigError` where two become one."""
     named: dict[str, PestRow] = {}
     for row in rows:
-        name = pest.identifier(row.word("parnme"))
+        name = identifier(row.word("parnme"))
         if name in named:
             words = f"{named[name].word('parnme')} and {row.word('parnme')} are both {name!r} here"
             raise ConfigError(f"{row.where}: {words}; rename one of them")
@@ -188,7 +196,7 @@ def _prior(control: ControlFile, row: PestRow, parameters: Mapping[str, PestRow]
     if kind == "fixed":
         return value
     if kind == "tied":
-        to = pest.identifier(row.word("partied") or parents.get(name, ""))
+        to = identifier(row.word("partied") or parents.get(name, ""))
         if to not in parameters or parameters[to].word("partrans") == "tied":
             raise ConfigError(f"{row.where}: {name} is tied to no parameter that is estimated or fixed")
         if parameters[to].number("parval1") == 0:
@@ -212,7 +220,7 @@ def _prior(control: ControlFile, row: PestRow, parameters: Mapping[str, PestRow]
 
 def _equations(control: ControlFile, parameters: Mapping[str, PestRow]) -> list[_Reading]:
     """Prior information, ``label factor * name + factor * log(name) = value weight group``. Raises ConfigError."""
-    lines = [(row.where, row.cells["line"].partition(" ")[2]) for row in control.lines("prior information")]
+    lines = [(row.where, row.cells["line"].partition(" ")[2]) for row in control.sections["prior information"]]
     for row in control.tables("prior information"):
         equation, *further = (row.cells.get(key, "") for key in ("equation", "weight", "obgnme"))
         lines.append((row.where, " ".join([equation, *further])))
@@ -226,7 +234,7 @@ def _equation(where: str, text: str, parameters: Mapping[str, PestRow]) -> _Read
     at = 0
     while term := _TERM.match(left, at):
         sign, factor, log, of_log, plain = term.groups()
-        name = pest.identifier(of_log or plain)
+        name = identifier(of_log or plain)
         if name not in parameters:
             raise ConfigError(f"{where}: prior information on {of_log or plain}, which is no parameter")
         key = f"log10({name})" if log else name
@@ -253,7 +261,7 @@ def _files(control: ControlFile) -> tuple[dict[str, str], dict[str, list[str]]]:
             file = str(path)
             if path.is_absolute() or ".." in path.parts:
                 raise ConfigError(f"{row.where}: {file} lies outside of the folder that the model runs in")
-            if section == "model output" or (section != "model input" and pest.is_instructions(text_of(own))):
+            if section == "model output" or (section != "model input" and is_instructions(text_of(own))):
                 instructions.setdefault(file, []).append(str(own))
             elif file in templates:
                 raise ConfigError(f"{control.path}: two templates become {file}")
@@ -264,41 +272,27 @@ def _files(control: ControlFile) -> tuple[dict[str, str], dict[str, list[str]]]:
     return templates, instructions
 
 
-def _refuse(
-    control: ControlFile, parameters: Sequence[PestRow], observed: Sequence[PestRow], informed: set[str]
-) -> None:
-    """Raise :class:`ConfigError` with all that is refused; ``informed``: groups of prior information that counts."""
-    if reasons := [
-        *_modes(control, bool(informed)),
-        *_options(control),
-        *_rows(control, parameters, observed, informed),
-    ]:
-        raise ConfigError(f"{control.path}: " + "; ".join(dict.fromkeys(reasons)))
-
-
-def _modes(control: ControlFile, informed: bool) -> Iterator[str]:
-    words = [row.cells["line"].lower().split() for row in control.lines("control data")]
+def _refused(control: ControlFile, informed: bool) -> Iterator[str]:
+    """Modes and options that are not known here; ``informed``: prior information counts."""
+    words = [row.cells["line"].lower().split() for row in control.sections["control data"]]
     mode = control.options.get("pestmode", words[0][1] if words and len(words[0]) > 1 else "estimation").lower()
     if mode.startswith("regul"):
         if informed:
             yield "regularisation mode adapts the weights of prior information; prior_information=False leaves it out"
     elif mode != "estimation":
         yield f"mode {mode} is not known here; estimation is"
-
-
-def _options(control: ControlFile) -> Iterator[str]:
     for name, text in control.options.items():
-        for begin, why in OPTIONS.items():
-            if name.startswith(begin) and name not in READ and text.lower() not in OFF:
-                yield f"option {name}: {why}"
-                break
+        reasons = (why for begin, why in OPTIONS.items() if name.startswith(begin))
+        if name not in READ and text.lower() not in OFF and (why := next(reasons, "")):
+            yield f"option {name}: {why}"
         if name in ("enforce_bounds", "ies_enforce_bounds") and text.lower() in OFF:
             yield f"option {name}: bounds hold here"
 
 
-def _rows(
+def _refused_rows(
     control: ControlFile, parameters: Sequence[PestRow], observed: Sequence[PestRow], informed: set[str]
 ) -> Iterator[str]:
+    """What rows ask for and is not done here; ``informed``: groups of prior information that counts."""
     used = {row.word("obgnme") for row in observed} | informed
     for row in control.rows("observation groups", ["obgnme", "covfle"]):
         if row.word("covfle") and row.word("obgnme") in used:

@@ -1,16 +1,30 @@
-"""The sections of a control file of PEST or PEST++, version 1 or 2, as rows of named cells; nothing is interpreted."""
+"""Control files of PEST or PEST++, version 1 or 2: sections as rows of named cells, and the matrices that they name.
+
+These are covariances and ensembles, with names of rows and columns, as PEST, PEST++ and pyemu write them.
+
+By the name of the file: ``.jcb``, ``.jco``, ``.bin`` (PEST's binary matrix, that of PEST++ with long names, and its
+dense one), ``.csv``, ``.unc`` (PEST's uncertainty file); any other is PEST's matrix file of text. Source: White et al.
+(2020), Approaches to highly parameterized inversion: PEST++, USGS Techniques and Methods 7-C26, appendix B.
+"""
 
 from __future__ import annotations
 
 import csv
+import math
 import re
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.sparse.csgraph import connected_components
+
+from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError, retold
-from en4dvar.plumbing.files import read_text
+from en4dvar.plumbing.files import read_plain, read_text
 
 PARAMETERS = ["parnme", "partrans", "parchglim", "parval1", "parlbnd", "parubnd", "pargp", "scale", "offset", "dercom"]
 OBSERVATIONS = ["obsnme", "obsval", "weight", "obgnme"]
@@ -50,24 +64,24 @@ class PestRow(NamedTuple):
 
 @dataclass
 class ControlFile:
-    """What stands in it. ``options``: PEST++'s, name → text, lower case names."""
+    """The lines of each of its ``sections``, each a row with the one cell ``line``.
+
+    ``options``: PEST++'s, name → text, lower case names.
+    """
 
     path: Path
-    sections: dict[str, list[PestRow]] = field(default_factory=dict)
+    sections: dict[str, list[PestRow]] = field(default_factory=lambda: defaultdict(list))
     options: dict[str, str] = field(default_factory=dict)
-
-    def lines(self, name: str) -> list[PestRow]:
-        """The lines of a section, each a row with the one cell ``line``."""
-        return self.sections.get(name, [])
 
     def rows(self, name: str, columns: Sequence[str]) -> list[PestRow]:
         """Of a section with these columns, and of its external tables. Raises :class:`ConfigError`."""
-        inline = (PestRow(r.where, dict(zip(columns, r.cells["line"].split(), strict=False))) for r in self.lines(name))
-        return [*inline, *self.tables(name)]
+        lines = ((row.where, row.cells["line"].split()) for row in self.sections[name])
+        inline = [PestRow(where, dict(zip(columns, cells, strict=False))) for where, cells in lines]
+        return inline + self.tables(name)
 
     def tables(self, name: str) -> list[PestRow]:
         """The rows of the external tables of a section. Raises :class:`ConfigError`."""
-        return [row for line in self.lines(f"{name} external") for row in self._table(line)]
+        return [row for line in self.sections[f"{name} external"] for row in self._table(line)]
 
     def number(self, option: str, default: float) -> float:
         """A positive number among the options. Raises :class:`ConfigError`."""
@@ -111,17 +125,17 @@ def read_control(path: Path) -> ControlFile:
             name = " ".join(line[1:].lower().split())
             if name.removesuffix(" external") not in _SECTIONS:
                 raise ConfigError(f"{path}:{number}: no section of a control file is called {name!r}")
-            current = control.sections.setdefault(name, [])
+            current = control.sections[name]
         elif line.startswith("&") and current:
             last = current[-1]
             current[-1] = PestRow(last.where, {"line": f"{last.cells['line']} {line[1:]}"})
         elif line:
             current.append(PestRow(f"{path}:{number}", {"line": line}))
-    for row in control.lines("control data keyword"):
+    for row in control.sections["control data keyword"]:
         name, _, text = row.cells["line"].partition(" ")
         control.options[name.lower()] = text.strip().strip("\"'")
     for name in ("parameter data", "observation data", "model command line"):
-        if not control.lines(name) and not control.lines(f"{name} external"):
+        if not control.sections[name] and not control.sections[f"{name} external"]:
             raise ConfigError(f"{path}: no section '* {name}'")
     return control
 
@@ -130,3 +144,227 @@ def text_of(path: Path) -> str:
     """The text of a file. Raises :class:`ConfigError`."""
     with retold(OSError, ConfigError, f"{path}: "):
         return read_text(path)
+
+
+BINARY = (".jcb", ".jco", ".bin")
+LARGEST = 200_000_000  # bytes of a file, and numbers of a matrix times eight
+SHORT, LONG = (12, 20), (200, 200)  # characters of the names of columns and rows: PEST, PEST++
+
+OFF = ("", "0", "false", "no")
+PARCOV = ("parcov", "parameter_covariance", "parcov_filename")
+OBSCOV = ("obscov", "observation_covariance", "obscov_filename")
+PRIOR_DRAWS = ("ies_par_en", "ies_parameter_ensemble")
+ERROR_DRAWS = ("ies_obs_en", "ies_observation_ensemble")
+READ = (*PARCOV, *OBSCOV, *PRIOR_DRAWS, *ERROR_DRAWS)
+CHANCE = 6.0  # standard errors that draws may lie off
+
+
+@dataclass(frozen=True)
+class NamedMatrix:
+    """``values`` (M, K) with lower-case names of M ``rows`` and K ``columns``."""
+
+    path: Path
+    rows: tuple[str, ...]
+    columns: tuple[str, ...]
+    values: Array
+
+    def of(self, names: Sequence[str]) -> Array:
+        """Columns (M, k) of ``names``. Raises :class:`ConfigError`."""
+        return self.values[:, self._places(self.columns, names)]
+
+    def covariance(self, names: Sequence[str]) -> Array:
+        """The covariance (k, k) of ``names``. Raises :class:`ConfigError` where it is none."""
+        part = self.of(names)[self._places(self.rows, names)]
+        scale = np.sqrt(np.maximum(np.diag(part), 0.0))
+        if not np.all(scale > 0) or np.any(np.abs(part - part.T) > 1e-6 * np.outer(scale, scale)):
+            raise ConfigError(f"{self.path}: is no covariance of {names[0]}, …: symmetric, with variances above 0")
+        return np.asarray(0.5 * (part + part.T))
+
+    def _places(self, known: Sequence[str], names: Sequence[str]) -> list[int]:
+        places = {name: i for i, name in enumerate(known)}
+        if lacking := [name for name in names if name not in places]:
+            raise ConfigError(f"{self.path}: lacks {lacking[0]}, one of {len(lacking)} that it must have")
+        return [places[name] for name in names]
+
+
+def read_matrix(path: Path) -> NamedMatrix:
+    """The matrix in a file. Raises :class:`ConfigError`: unreadable, not finite, a name twice."""
+    kind = path.suffix.lower()
+    read = _binary if kind in BINARY else {".csv": _table, ".unc": _uncertainty}.get(kind, _text)
+    not_read = retold((ValueError, IndexError), ConfigError, f"{path}: is no matrix of PEST: ")
+    with retold(OSError, ConfigError, f"{path}: "), not_read:
+        rows, columns, values = read(path)
+    own, across = (tuple(name.strip().lower() for name in names) for names in (rows, columns))
+    matrix = NamedMatrix(path, own, across, values)
+    if values.shape != (len(matrix.rows), len(matrix.columns)) or not np.isfinite(values).all():
+        raise ConfigError(f"{path}: holds something else than finite numbers with a name for each row and column")
+    if len(set(matrix.columns)) < len(matrix.columns):
+        raise ConfigError(f"{path}: a column occurs twice")
+    return matrix
+
+
+Read = tuple[Sequence[str], Sequence[str], Array]
+
+
+def _binary(path: Path) -> Read:
+    content = read_plain(path, LARGEST)
+    first, second, count = (int(n) for n in np.frombuffer(content, "<i4", 3))
+    n_columns, n_rows = abs(first), abs(second)
+    if first == 0 and second == count:
+        return _dense(content, n_rows)
+    if n_columns * n_rows * 8 > LARGEST:
+        raise ValueError(f"{n_rows} rows of {n_columns} numbers")
+    widths, index = (SHORT, [("at", "<i4")]) if first < 0 else (LONG, [("row", "<i4"), ("column", "<i4")])
+    entries = np.frombuffer(content, np.dtype([*index, ("value", "<f8")]), count, offset=12)
+    down = entries["at"] - 1 if first < 0 else entries["row"] + n_rows * entries["column"]  # the columns, from 0
+    values = np.zeros(n_rows * n_columns)
+    values[down] = entries["value"]
+    names, end = [], 12 + entries.nbytes
+    for width, many in zip(widths, (n_columns, n_rows), strict=True):
+        names.append([content[end + i * width : end + (i + 1) * width].decode() for i in range(many)])
+        end += width * many
+    return names[1], names[0], values.reshape(n_columns, n_rows).T
+
+
+def _dense(content: bytes, n_columns: int) -> Read:
+    """The lengths of the columns' names, these, and of each row the length of its name, this and its numbers."""
+    lengths = np.frombuffer(content, "<i4", n_columns, offset=12)
+    end = 12 + lengths.nbytes
+    columns, rows, values = [], [], []
+    for length in lengths.tolist():
+        columns.append(content[end : end + length].decode())
+        end += length
+    while end < len(content):
+        (length,) = np.frombuffer(content, "<i4", 1, offset=end).tolist()
+        rows.append(content[end + 4 : end + 4 + length].decode())
+        values.append(np.frombuffer(content, "<f8", n_columns, offset=end + 4 + length))
+        end += 4 + length + 8 * n_columns
+    return rows, columns, np.array(values)
+
+
+def _table(path: Path) -> Read:
+    header, *lines = (row for row in csv.reader(text_of(path).splitlines()) if row)
+    return [row[0] for row in lines], header[1:], np.array([[float(cell) for cell in row[1:]] for row in lines])
+
+
+def _text(path: Path) -> Read:
+    """``rows columns code``, the numbers, and names; code 1 has one list of them, −1 is a diagonal."""
+    body, *lists = text_of(path).split("*")
+    n_rows, n_columns, code = (int(word) for word in body.split()[:3])
+    numbers = np.array([float(word.lower().replace("d", "e")) for word in body.split()[3:]])
+    names = [list(filter(str.strip, part.splitlines()[1:])) for part in lists] * (1 if code == 2 else 2)
+    values = np.diag(numbers) if code == -1 else numbers.reshape(n_rows, n_columns)
+    return names[0], names[1], values
+
+
+def _uncertainty(path: Path) -> Read:
+    """Blocks of standard deviations and of further matrix files."""
+    names: list[str] = []
+    blocks: list[Array] = []
+    for kind, lines in _blocks(path):
+        said = {words[0].lower(): words[1].strip("\"'") for words in lines}
+        factor = float(said.pop({"standard_deviation": "std_multiplier"}.get(kind, "variance_multiplier"), 1.0))
+        if kind == "standard_deviation":
+            names += said
+            blocks += [np.array([[(factor * float(std)) ** 2]]) for std in said.values()]
+        elif kind == "covariance_matrix" and set(said) == {"file"}:
+            part = read_matrix(path.parent / said["file"].replace("\\", "/"))
+            names += part.rows
+            blocks.append(factor * part.covariance(part.rows))
+        else:
+            raise ValueError(f"block {kind} with {', '.join(said)}")
+    return names, names, block_diag(*blocks)
+
+
+def _blocks(path: Path) -> Iterator[tuple[str, list[list[str]]]]:
+    """Kind and lines of each START … END."""
+    lines = [line.split("#")[0].split() for line in text_of(path).splitlines()]
+    kind, own = "", list[list[str]]()
+    for words in filter(None, lines):
+        if words[0].lower() == "start":
+            kind, own = words[1].lower(), []
+        elif words[0].lower() == "end":
+            yield kind, own
+        else:
+            own.append(words)
+
+
+def priors_in_files(
+    control: ControlFile, rows: Mapping[str, PestRow], priors: dict[str, Any], parameters: dict[str, dict[str, float]]
+) -> dict[str, Any]:
+    """Change ``priors`` to those of a prior ensemble or covariance, of which the ensemble counts; the further sections.
+
+    The members and the covariance are of the value before scale and offset, the covariance of its decadic logarithm
+    where ``partrans`` is ``log``. Raises :class:`ConfigError`.
+    """
+    uncertain = [name for name, prior in priors.items() if isinstance(prior, dict) and "prior" in prior]
+    named = [rows[name].word("parnme") for name in uncertain]
+    if draws := _file(control, PRIOR_DRAWS):
+        for own in (row.word("parnme") for row in rows.values() if row.word("partrans") == "fixed"):
+            if own in draws.columns and np.ptp(draws.of([own])) > 0:
+                raise ConfigError(f"{draws.path}: {own} varies there, but is fixed in {control.path}")
+        for name in uncertain:
+            bounds = {key: priors[name][key] for key in ("lower", "upper")}
+            parameters[name] = {**parameters[name], **bounds}
+            priors[name] = {"prior": "ensemble", "map": priors[name]["prior"]}
+        return {"prior": {"ensemble": dict(zip(uncertain, draws.of(named).T, strict=True))}}
+    if (matrix := _file(control, PARCOV)) is None:
+        return {}
+    covariance = matrix.covariance(named)
+    std = np.sqrt(np.diag(covariance))
+    for name, own in zip(uncertain, std.tolist(), strict=True):
+        key, unit = ("log_std", math.log(10)) if "log_std" in priors[name] else ("std", 1.0)
+        priors[name] = {**priors[name], key: own * unit}
+    correlation = covariance / np.outer(std, std)
+    np.fill_diagonal(correlation, 1.0)
+    blocks = []
+    count, which = connected_components(correlation != 0, directed=False)
+    for block in (np.flatnonzero(which == k) for k in range(count)):
+        if len(block) > 1:
+            rows_of = correlation[np.ix_(block, block)].tolist()
+            blocks.append({"between": [uncertain[i] for i in block], "matrix": rows_of})
+    return {"prior_correlation": blocks} if blocks else {}
+
+
+def errors_in_files(
+    control: ControlFile, names: Sequence[str], values: Array, std: Array, bounds: Array
+) -> Array | None:
+    """R (K, K) of all readings, of which the first are the observations ``names``; None where it is diag(std²).
+
+    What ``obscov`` says of the variance replaces the weights, in ``std`` (K,) too. A file of draws is held against it:
+    PEST++ adds them to the readings, and here errors are drawn anew. ``bounds`` (K,): which readings are inequalities.
+    Raises :class:`ConfigError`.
+    """
+    full = None
+    if matrix := _file(control, OBSCOV):
+        full = np.diag(std**2)
+        full[: len(names), : len(names)] = matrix.covariance(names)
+        std[:] = np.sqrt(np.diag(full))
+        full = full if np.count_nonzero(full) > len(full) else None
+        if full is not None and bounds.any():
+            raise ConfigError(f"{matrix.path}: correlated errors do not go together with groups of inequalities")
+    if draws := _file(control, ERROR_DRAWS):
+        _check_draws(draws, [(names[i], values[i], std[i]) for i in range(len(names)) if not bounds[i]])
+    return full
+
+
+def _check_draws(draws: NamedMatrix, observations: Sequence[tuple[str, float, float]]) -> None:
+    """Raise :class:`ConfigError` unless they are draws about the values with the stds."""
+    names, count = [name for name, _, _ in observations], len(draws.rows)
+    for (name, value, std), own in zip(observations, draws.of(names).T, strict=True):
+        mean, spread = float(own.mean()), float(own.std(ddof=1)) if count > 1 else math.inf
+        off = abs(mean - value) / std * math.sqrt(count), abs(spread / std - 1) * math.sqrt(2 * count)
+        if max(off) > CHANCE:
+            words = (
+                f"{name} has the mean {mean:g} and the std {spread:g} there, and {value:g} and {std:g} by its weight"
+            )
+            raise ConfigError(f"{draws.path}: {words}; errors are drawn from the weights here: leave the file out")
+
+
+def _file(control: ControlFile, options: Sequence[str]) -> NamedMatrix | None:
+    """The matrix that one of the options names."""
+    for name in options:
+        if (text := control.options.get(name, "")).lower() not in OFF:
+            with retold(ConfigError, ConfigError, f"{control.path}: option {name}: "):
+                return read_matrix(control.file(text))
+    return None

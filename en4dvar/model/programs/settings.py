@@ -16,9 +16,8 @@ from typing import Annotated, Any, Self
 
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, ValidationInfo, model_validator
 
-from en4dvar.model.programs import pest
-from en4dvar.model.programs.pest import ProgramError
-from en4dvar.model.programs.template import TIMES, check_template, input_name
+from en4dvar.model.programs import languages
+from en4dvar.model.programs.languages import TIMES, ProgramError, check_template, input_name
 from en4dvar.plumbing.described import Described, text_for
 from en4dvar.plumbing.errors import retold
 from en4dvar.plumbing.files import POSIX, expanded, read_text
@@ -83,7 +82,6 @@ def _named(files: Any) -> Any:
 
 
 Files = Annotated[tuple[File, ...], BeforeValidator(_several, json_schema_input_type=str | tuple[str, ...])]
-
 
 Templates = Annotated[
     dict[Annotated[str, AfterValidator(_inside)], File],
@@ -155,7 +153,19 @@ class OutputOf(_Section):
             raise ValueError("observations are those of instructions, and there are none")
         if self.instructions is None and (self.delimiters or self.combinations):
             raise ValueError("delimiters and combinations go with instructions, and there are none")
-        self._check_instructions()
+        names: list[str] = []
+        for path in itertools.chain.from_iterable(self.instruction_files.values()):
+            with retold(OSError, ValueError, f"{path}: "):
+                text = read_text(path)
+            if not languages.is_instructions(text):
+                raise ValueError(f"{path}: the first line of PEST's instructions is pif and a sign, e.g. pif @")
+            with retold(ProgramError, ValueError):
+                names += languages.observations_of(text, str(path))
+        if double := [name for name, count in Counter(names).items() if count > 1]:
+            raise ValueError(f"two of the instructions read {double[0]!r}")
+        known = set(names)
+        if lacking := [name for name in self.observations or () if name.lower() not in known]:
+            raise ValueError(f"the instructions read no {lacking[0]!r}{suggest(lacking[0], known)}")
         return self
 
     @property
@@ -163,22 +173,6 @@ class OutputOf(_Section):
         """Output file → its instruction files; none where values are found another way."""
         own = self.instructions
         return {self.file: (own,)} if isinstance(own, Path) else own or {}
-
-    def _check_instructions(self) -> None:
-        """Raise ValueError at what is no instruction, and where an observation is read by none, or twice."""
-        names: list[str] = []
-        for path in itertools.chain.from_iterable(self.instruction_files.values()):
-            with retold(OSError, ValueError, f"{path}: "):
-                text = read_text(path)
-            if not pest.is_instructions(text):
-                raise ValueError(f"{path}: the first line of PEST's instructions is pif and a sign, e.g. pif @")
-            with retold(ProgramError, ValueError):
-                names += pest.observations_of(text, str(path))
-        if double := [name for name, count in Counter(names).items() if count > 1]:
-            raise ValueError(f"two of the instructions read {double[0]!r}")
-        known = set(names)
-        if lacking := [name for name in self.observations or () if name.lower() not in known]:
-            raise ValueError(f"the instructions read no {lacking[0]!r}{suggest(lacking[0], known)}")
 
 
 def _with_unit(text: Any) -> Any:

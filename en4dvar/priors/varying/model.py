@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.model.batch import Batch
-from en4dvar.model.forward import Alternative, Failure, ForwardModel, Trajectory, ValidityLimit
+from en4dvar.model.forward import Alternative, Batch, Failure, ForwardModel, Trajectory, ValidityLimit
 from en4dvar.model.state import Array, StateLayout
 from en4dvar.plumbing.caution import Caution
 from en4dvar.priors.varying.changes import RandomWalk, StateChanges

@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal, Union, get_type_hints
 
 from pydantic import ConfigDict, Field, ValidationInfo, create_model, field_validator, model_validator
 
-from en4dvar.inputs.asked import Format
+from en4dvar.inputs.parts import Format
 from en4dvar.plumbing.described import Described
 from en4dvar.plumbing.errors import En4dvarError, retold
 from en4dvar.plumbing.units import Quantity, convert

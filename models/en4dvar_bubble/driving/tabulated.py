@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from en4dvar.inputs.asked import Column, Format, Layout
+from en4dvar.inputs.parts import Column, Format, Layout
 from en4dvar.inputs.readers import read_series
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.errors import retold

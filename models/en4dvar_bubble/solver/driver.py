@@ -9,9 +9,9 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from en4dvar.model.state import Array
+from en4dvar.plumbing.compiled import stamp_with_sources
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.hints import shown, suggest
-from en4dvar.plumbing.kernel_cache import stamp_with_sources
 from en4dvar_bubble import tables as tables_module
 from en4dvar_bubble.driving import Driving, Reading
 from en4dvar_bubble.laws.exactness import HALVINGS

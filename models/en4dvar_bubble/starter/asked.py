@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from en4dvar.inputs.asked import Layout
-from en4dvar.inputs.parts import Contents, read_contents
+from en4dvar.inputs.parts import Contents, Layout, read_contents
 from en4dvar.plumbing.errors import ConfigError, DataError
 from en4dvar.plumbing.units import as_unit, convert
 from en4dvar_bubble.starter.config import FRAMES, PIXELS, unit_in, without_unit

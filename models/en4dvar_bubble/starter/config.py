@@ -13,10 +13,10 @@ from en4dvar.assembly.build import build_one
 from en4dvar.assembly.reading import find_files, with_parts
 from en4dvar.config import resolve
 from en4dvar.config.document import parse_document
-from en4dvar.inputs.asked import ANY, Column, DataFile, Layout, TimeStep
+from en4dvar.inputs.implausible import step_doubts
 from en4dvar.inputs.matfile import indexed
+from en4dvar.inputs.parts import ANY, Column, DataFile, Layout, TimeStep
 from en4dvar.inputs.readers import BELOW, FAR, Readings, read_series
-from en4dvar.inputs.steps import step_doubts
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.files import expanded
 from en4dvar.plumbing.units import UnitError, convert, parse_quantity, parse_unit

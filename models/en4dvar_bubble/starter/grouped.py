@@ -5,10 +5,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from en4dvar.inputs.asked import ANY, DataFile, Layout, opened
-from en4dvar.inputs.parts import cell, table_of
-from en4dvar.inputs.sheets import sheet_lines
-from en4dvar.inputs.text_table import cells_of, delimiter_of, numbered_lines
+from en4dvar.inputs.parts import ANY, DataFile, Layout, cell, opened, table_of
+from en4dvar.inputs.text_table import cells_of, delimiter_of, numbered_lines, sheet_lines
 from en4dvar.plumbing.errors import DataError
 from en4dvar.plumbing.files import expanded, readable
 from en4dvar.plumbing.hints import listed, shown

@@ -9,7 +9,7 @@ from typing import Literal, TypeVar
 
 import numpy as np
 
-from en4dvar.inputs.outliers import scatter_of
+from en4dvar.inputs.implausible import scatter_of
 from en4dvar.inputs.window import minima
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import DataError
@@ -34,7 +34,7 @@ CREEPS = 1.5  # collapse times after the maximum: a history that goes on for lon
 class Look:
     """What one history shows; SI.
 
-    ``noise`` is the std of the readings' scatter (:mod:`en4dvar.inputs.outliers`), NaN with too few of them;
+    ``noise`` is the std of the readings' scatter (:mod:`en4dvar.inputs.implausible`), NaN with too few of them;
     ``top`` is where and how high the maximum was.
     ``rebound`` is the second maximum over the first, NaN where none is seen; ``rest`` the median of the last quarter
     of a history that rebounds and comes to rest, NaN else; ``drift`` says in words what it does instead of resting, "".

@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 
-from en4dvar.inputs.asked import ANY, Layout
+from en4dvar.inputs.parts import ANY, Layout
 from en4dvar_bubble.starter.proposal import Entry, Proposal
 
 SCHEMA_FILE = "en4dvar.schema.json"

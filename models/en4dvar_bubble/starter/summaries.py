@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from en4dvar.inputs.asked import ANY
+from en4dvar.inputs.parts import ANY
 from en4dvar.model.state import Array
 from en4dvar.plumbing.tables import csv_text
 from en4dvar_bubble.collapse import RAYLEIGH

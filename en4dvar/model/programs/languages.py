@@ -1,9 +1,12 @@
-"""Template and instruction files of PEST and PEST++, as their users have them.
+"""The languages of a program's files: templates of Jinja, templates and instructions of PEST and PEST++.
 
-Doherty, J., "PEST: Model-Independent Parameter Estimation, User Manual Part I", and the manual of PEST++, sections on
-template and instruction files. A parameter space is as wide as its delimiters say, and holds as many digits as fit. The
-instructions are ``ln``, ``@marker@`` (primary and secondary), ``w``, ``tn``, ``!name!`` and ``!dum!``, ``[name]a:b``,
-``(name)a:b`` and, at the start of a line, ``&``; anything else is an error.
+A template is the input file with ``{{ name }}`` where a parameter belongs (Jinja's language, in its sandbox), and
+numbers are written with all their digits. One whose first line is ``ptf`` and a sign is in PEST's language, as are
+instructions, which read numbers out of output files: Doherty, J., "PEST: Model-Independent Parameter Estimation, User
+Manual Part I", and the manual of PEST++, sections on template and instruction files. A parameter space is as wide as
+its delimiters say, and holds as many digits as fit. The instructions are ``ln``, ``@marker@`` (primary and secondary),
+``w``, ``tn``, ``!name!`` and ``!dum!``, ``[name]a:b``, ``(name)a:b`` and, at the start of a line, ``&``; anything else
+is an error.
 """
 
 from __future__ import annotations
@@ -11,7 +14,18 @@ from __future__ import annotations
 import functools
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from jinja2 import StrictUndefined, TemplateError
+from jinja2.meta import find_undeclared_variables
+from jinja2.sandbox import ImmutableSandboxedEnvironment
+
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import retold
+from en4dvar.plumbing.files import in_bytes, read_text
+from en4dvar.plumbing.hints import suggest
 
 _ITEM = r"[lL](?P<lines>[1-9]\d*)|(?P<blank>[wW])|[tT](?P<column>[1-9]\d*)|!(?P<free>[^!]+)!"
 _ITEM += r"|[\[(](?P<fixed>[^\])]+)[\])](?P<first>[1-9]\d*):(?P<last>[1-9]\d*)"
@@ -51,7 +65,7 @@ def parameters_of(text: str) -> set[str]:
     return {identifier(space[1]) for space in _spaces(text).finditer(text.partition("\n")[2])}
 
 
-def filled(text: str, parameters: Mapping[str, float]) -> str:
+def spaces_filled(text: str, parameters: Mapping[str, float]) -> str:
     """The input file; each space holds its parameter in its own width. Raises :class:`ProgramError`."""
     values = {identifier(name): value for name, value in parameters.items()}
 
@@ -233,3 +247,56 @@ class _Cursor:
                 text, end = (token[0], token.end()) if token else ("", end)
         self.column = end
         return text
+
+
+TIMES = "times"
+LONGEST = 256_000_000  # characters of an input file
+SUFFIXES = (".j2", ".tpl", ".template")
+_ENVIRONMENT = ImmutableSandboxedEnvironment(undefined=StrictUndefined, keep_trailing_newline=True)
+
+
+def input_name(template: Path) -> str:
+    """The name of the file that a template becomes: without the suffix that says it is one."""
+    return template.stem if template.suffix in SUFFIXES else template.name
+
+
+def check_template(template: Path, names: Collection[str]) -> None:
+    """Raise ValueError, in words, where a template cannot be read or names an unknown parameter."""
+    text = text_of(template)
+    if is_template(text):
+        names = {identifier(name) for name in names}
+        with retold(ProgramError, ValueError, f"{template}: "):
+            wanted: Collection[str] = parameters_of(text)
+    else:
+        try:
+            wanted = find_undeclared_variables(_ENVIRONMENT.parse(text))
+        except TemplateError as error:
+            line = getattr(error, "lineno", None)
+            raise ValueError(f"{template}{f':{line}' if line else ''}: {error}") from None
+    for name in sorted(wanted):
+        if name not in names and name != TIMES:
+            raise ValueError(f"{template}: {name!r} is no parameter of the model{suggest(name, names)}")
+
+
+def filled(template: Path, parameters: Mapping[str, float], times: Array) -> str:
+    """The input file of a member; ``times`` (K,) are where it is observed. Raises :class:`ProgramError`."""
+    text = text_of(template)
+    if is_template(text):
+        return spaces_filled(text, parameters)
+    values: dict[str, Any] = {name: float(value) for name, value in parameters.items()}
+    parts, left = list[str](), LONGEST
+    for part in _compiled(text).generate(values | {TIMES: times.tolist()}):
+        parts.append(part)
+        if (left := left - len(part)) < 0:
+            raise ProgramError(f"{template.name}: makes an input file of more than {in_bytes(LONGEST)}")
+    return "".join(parts)
+
+
+@functools.cache
+def text_of(file: Path) -> str:
+    """A template or instructions, read once in a process. Raises ValueError."""
+    with retold(OSError, ValueError, f"{file}: "):
+        return read_text(file)
+
+
+_compiled = functools.cache(_ENVIRONMENT.from_string)

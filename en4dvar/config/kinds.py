@@ -1,0 +1,369 @@
+"""Files of other kinds than an estimation: a series that is assimilated cycle by cycle, and synthetic readings.
+
+A twin experiment has a section ``twin:`` where others have ``data:``, a series of data ``sequence:`` beside it, a
+synthetic campaign ``campaign:``.
+"""
+
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Self
+
+from pydantic import AfterValidator, Field, ValidatorFunctionWrapHandler, WrapValidator, model_validator
+
+from en4dvar.config.context import Context, Faults, Made, Spread, quantity, time_unit
+from en4dvar.config.data import DATA, DataPlan
+from en4dvar.config.document import Document
+from en4dvar.config.load import Read, Validated, read_file
+from en4dvar.config.parameters import Entry, Fixed, Tied, Uncertain, entries
+from en4dvar.config.schema import File, Name, Output, Section
+from en4dvar.config.sequential import Sequential, Workers, error_rates, localisation_of, stds
+from en4dvar.config.varies import MODEL_ERROR, ErrorOf, Estimated, dynamic_fields
+from en4dvar.data.noise import Correlation
+from en4dvar.inputs.members import read_covariance
+from en4dvar.inputs.parts import Matrix
+from en4dvar.model.forward import ForwardModel, Observable
+from en4dvar.plumbing.errors import ConfigError, DataError, retold
+from en4dvar.plumbing.hints import shown, suggest
+from en4dvar.plumbing.units import parse_quantity
+from en4dvar.priors.prior import Prior, PriorTerm
+from en4dvar.series.start import EnsembleCoordinates
+from en4dvar.series.twin import TwinExperiment
+
+
+def _observation_stds(model: ForwardModel) -> dict[str, Observable]:
+    return {f"{observable.name}_std": observable for observable in model.observables}
+
+
+def _correlation(path: str, context: Context) -> tuple[str, Correlation]:
+    """The absolute path and the matrix."""
+    with retold((DataError, ValueError), ConfigError):
+        file = context.path(path)
+        return str(file), Correlation(read_covariance(Matrix(file, "1", "1")))
+
+
+class Twin(Section):
+    """How the truth is made and observed."""
+
+    cycles: Annotated[int, Field(ge=1)]
+    """Number of analyses."""
+    burn_in: Annotated[int, Field(ge=0)] = 0
+    """Cycles at the beginning that are left out of the scores."""
+    interval: Annotated[float, quantity(time_unit, "positive")]
+    """Time between two observations, in the model's unit of time."""
+    error: Annotated[dict[str, float], stds(_observation_stds)]
+    """Std of the observation errors, by observable: ``<observable>_std``."""
+    error_correlation: (
+        Annotated[tuple[str, Correlation], Made(_correlation, Annotated[str, Field(min_length=1)])] | None
+    ) = None
+    """CSV file of the correlation of the errors at one instant, full or block diagonal, one row an observation, without
+    header; relative to the configuration's folder. Default: independent errors."""
+    initial_std: Annotated[dict[str, float], stds(dynamic_fields)]
+    """Std of the initial ensemble, by field of the state."""
+
+    @model_validator(mode="after")
+    def _something_counts(self) -> Self:
+        if self.burn_in >= self.cycles:
+            raise ValueError(f"burn_in ({self.burn_in}) leaves none of {self.cycles} cycles")
+        return self
+
+    def as_written(self, source: Mapping[str, Any]) -> dict[str, Any]:
+        """The section as it was written, with an absolute path."""
+        written = super().as_written(source)
+        return written | ({"error_correlation": self.error_correlation[0]} if self.error_correlation else {})
+
+
+class TwinFile(File):
+    """A twin experiment; ``model`` and ``parameters`` are as for an estimation."""
+
+    parameters: Annotated[tuple[Entry, ...], entries("a twin experiment")] = Field({}, validate_default=True)
+    """Parameters to estimate (a prior) or to change from the model's default (a quantity)."""
+    twin: Twin
+    """How the truth is made and observed."""
+    model_error: Annotated[tuple[ErrorOf, ...], MODEL_ERROR] | None = None
+    """Fields of the state that the model misses in part, of the truth as well: each changes at random between two
+    observations, its variance growing by ``std`` squared in a time of ``every``."""
+    assimilation: Sequential
+    """The scheme and what it does to the ensemble."""
+    execution: Workers = Workers()
+    """Where members are integrated; never changes the numbers."""
+    output: Output = Output()
+    """Where results go."""
+
+    @classmethod
+    def rules(cls, keys: Mapping[str, Any], context: Context, faults: Faults) -> None:
+        twin, assimilation = keys.get("twin"), keys.get("assimilation")
+        correlated = isinstance(twin, dict) and twin.get("error_correlation") is not None
+        if correlated and isinstance(assimilation, dict) and assimilation.get("localisation"):
+            message = "needs observations with independent errors, but twin.error_correlation is given"
+            faults.add(("assimilation", "localisation"), message)
+        units = {field.unit for field in dynamic_fields(context.model).values()}
+        if len(units) > 1:
+            faults.add(("model",), f"RMSE and spread need one unit, but the state has {', '.join(sorted(units))}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TwinConfig(Validated):
+    """A validated twin experiment."""
+
+    experiment: TwinExperiment
+    scheme: str
+    execution: Workers
+
+
+def terms_and_fixed(entries: tuple[Entry, ...]) -> tuple[tuple[PriorTerm, ...], dict[str, float]]:
+    """The priors and the values of entries that need no data."""
+    terms = tuple(entry.term() for entry in entries if isinstance(entry, Uncertain))
+    return terms, {entry.parameter.name: entry.value for entry in entries if isinstance(entry, Fixed)}
+
+
+def resolve_twin(document: Document, base: Path) -> TwinConfig:
+    """Validate a document with a ``twin:`` section. Raises :class:`ConfigError`, every fault at once."""
+    read = read_file(TwinFile, document, base)
+    file, model, twin = read.file, read.model, read.file.twin
+    observed = {name.removesuffix("_std"): std for name, std in twin.error.items()}
+    local = None
+    if file.assimilation.localisation:
+        with document.placing("assimilation", "localisation"):
+            local = localisation_of(file.assimilation.localisation, model, observed.keys())
+    terms, fixed = terms_and_fixed(file.parameters)
+    prior = Prior(terms) if terms else None
+    with document.placing():
+        rate = error_rates(model, file.model_error or ())
+    experiment = TwinExperiment(
+        model=model,
+        sequential=file.assimilation.built(local, rate, EnsembleCoordinates.of(model, prior)),
+        members=file.assimilation.members,
+        cycles=twin.cycles,
+        interval=twin.interval,
+        error_std=observed,
+        initial_std=twin.initial_std,
+        burn_in=twin.burn_in,
+        error_correlation=twin.error_correlation[1] if twin.error_correlation else None,
+        prior=prior,
+        fixed=fixed,
+    )
+    return TwinConfig(**read.common(()), experiment=experiment, scheme=file.assimilation.scheme)
+
+
+APART = ("time_std", "correlation_time", "shared", "covariance", "robust", "discrepancy")  # keys of data.error
+
+
+def _known_fields(names: tuple[str, ...], context: Context) -> tuple[str, ...]:
+    """Names of fields of the state."""
+    known = dynamic_fields(context.model)
+    with Faults() as faults:
+        for k, name in enumerate(names):
+            if name not in known:
+                faults.add((k,), f"unknown field {shown(name)}{suggest(name, known)}")
+    return names
+
+
+class Sequence(Section):
+    """The prior of the state at time zero, and the results that are kept."""
+
+    initial_std: Annotated[dict[str, Spread], stds(dynamic_fields, relative=True)] = Field({}, validate_default=True)
+    """Spread of the model's initial state, by field, each of its values for itself: in the field's unit, or in % of a
+    field that is positive and then estimated by its logarithm."""
+    positive: Annotated[tuple[str, ...], Made(_known_fields, tuple[str, ...])] = ()
+    """Further fields that are estimated by their logarithm, of what exceeds their lower bound: none falls below it."""
+    members_every: Annotated[int, Field(ge=0)] = 0
+    """The ensemble is stored after each so many observation times, and at the end; 0: at the end only."""
+
+
+class SequenceFile(File):
+    """A series of data, assimilated by a filter or a smoother of a sliding window."""
+
+    data: DATA
+    """Where the observations are, what they mean and how well they are known."""
+    parameters: Annotated[tuple[Entry, ...], entries()] = Field({}, validate_default=True)
+    """For each parameter a prior (estimated beside the state), a quantity or a scalar of the data file (fixed)."""
+    sequence: Sequence
+    """What is known of the state at time zero, and what is kept."""
+    model_error: Annotated[tuple[ErrorOf, ...], MODEL_ERROR] | None = None
+    """Fields of the state that the model misses in part: each changes at random between two observations, its variance
+    growing by ``std`` squared in a time of ``every``."""
+    assimilation: Sequential
+    """The scheme and what it does to the ensemble."""
+    execution: Workers = Workers()
+    """Where members are integrated; never changes the numbers."""
+    output: Output = Output()
+    """Where results go."""
+
+    @classmethod
+    def rules(cls, keys: Mapping[str, Any], context: Context, faults: Faults) -> None:
+        for place, error in _errors(keys.get("data")):
+            for key in APART:
+                if key in error and (key != "discrepancy" or "series" not in place):  # which several series never have
+                    message = "not in a sequence, where the errors of every instant are Gaussian and for themselves"
+                    faults.add((*place, key), message, at_key=True)
+        if not context.model.resumable:
+            faults.add(("model",), "has no step: it cannot go on from a state on its way, as a sequence needs")
+
+
+def _errors(data: Any) -> Iterator[tuple[tuple[str, ...], Mapping[str, Any]]]:
+    """The sections of errors, of one series or of several, and where they are."""
+    if not isinstance(data, dict):
+        return
+    series = data.get("series")
+    each = [(("series", name), section) for name, section in series.items()] if isinstance(series, dict) else []
+    for place, section in [((), data), *each]:
+        if isinstance(section, dict) and isinstance(section.get("error"), dict):
+            yield ("data", *place, "error"), section["error"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SequenceConfig(Validated):
+    """A validated configuration of a sequence. Nothing of the data file has been read yet."""
+
+    observable: Observable
+    data: DataPlan
+    parameters: tuple[Entry, ...]
+    sequence: Sequence
+    model_error: tuple[ErrorOf, ...]
+    assimilation: Sequential
+    execution: Workers
+    scheme: str
+
+
+def resolve_sequence(document: Document, base: Path, model: ForwardModel | None = None) -> SequenceConfig:
+    """Validate a document with a ``sequence:`` section. Raises :class:`ConfigError`, every fault at once."""
+    read: Read[SequenceFile] = read_file(SequenceFile, document, base, model)
+    file = read.file
+    faults = [
+        document.fault(("sequence", "initial_std", name), "give it in %: the field is positive")
+        for name in file.sequence.positive
+        if name in file.sequence.initial_std and not file.sequence.initial_std[name].relative
+    ]
+    faults += [
+        document.fault(("parameters", entry.parameter.name), words)
+        for entry in file.parameters
+        if (words := _unfit(entry, read.model))
+    ]
+    uncertain = file.sequence.initial_std or any(isinstance(entry, Uncertain) for entry in file.parameters)
+    if not uncertain:
+        faults.append(document.fault(("sequence",), "nothing is uncertain: give initial_std, or a parameter a prior"))
+    if faults:
+        raise ConfigError(faults)
+    return SequenceConfig(
+        **read.common(file.parameters),
+        observable=file.data.series[0].observable,
+        data=file.data,
+        parameters=file.parameters,
+        sequence=file.sequence,
+        model_error=file.model_error or (),
+        assimilation=file.assimilation,
+        scheme=file.assimilation.scheme,
+    )
+
+
+def _unfit(entry: Entry, model: ForwardModel) -> str:
+    """Why a sequence cannot have this entry; "" where it can."""
+    name = entry.parameter.name
+    if name not in {p.name for p in model.parameters}:
+        return "a sequence knows parameters of the model alone: neither time shift nor noise scale"
+    if isinstance(entry, Tied):
+        return "a sequence has no tied parameters; give a value or a prior"
+    if isinstance(entry, Uncertain) and entry.spec.prior == "ensemble":
+        return "a sequence takes no ensemble as a prior; give its moments"
+    if isinstance(entry, Uncertain) and entry.spec.varies and isinstance(entry.spec.varies.std, Estimated):
+        return "a sequence does not estimate the std of a walk; give it in % or in the unit of the parameter"
+    if isinstance(entry, Uncertain) and name not in model.layout.names:
+        return f"the state of the model has no field {name!r}, through which a sequence estimates it; give it a value"
+    return ""
+
+
+class GroupSection(Section):
+    """Data sets of one kind: how many, and what their parameters are drawn from."""
+
+    datasets: Annotated[int, Field(ge=1, le=999)]
+    """How many data sets."""
+    parameters: Annotated[tuple[Entry, ...], entries("a campaign")]
+    """What their truths are drawn from: a prior (drawn for each) or a quantity (common to all)."""
+
+
+def _end(text: Any, context: Context) -> float:
+    return 0.0 if text == 0 and text is not False else parse_quantity(text, time_unit(context))
+
+
+def _ascending(written: Any, validate: ValidatorFunctionWrapHandler) -> tuple[float, float]:
+    low, high = validate(written)
+    if low is not None and low > high:
+        raise ValueError(f"{written[0]} is larger than {written[1]}")
+    return low, high
+
+
+def _positive(pair: tuple[float, float]) -> tuple[float, float]:
+    if pair[0] is not None and not pair[0] > 0:
+        raise ValueError("must be positive")
+    return pair
+
+
+End = Annotated[float, Made(_end)]
+Interval = Annotated[tuple[End, End], WrapValidator(_ascending)]
+
+
+def _below(directory: str, context: Context) -> Path:
+    base = Path(os.path.abspath(context.base))  # a link may lead elsewhere, the configuration may not
+    if base not in Path(os.path.abspath(base / directory)).parents:
+        raise ValueError(f"must be a folder below {base}")
+    return context.base / directory
+
+
+class CampaignSection(Section):
+    """How the truths are observed, in the model's units. Pairs are the ends of uniform distributions."""
+
+    directory: Annotated[Path, Made(_below, Annotated[str, Field(min_length=1)])]
+    """Folder of the data files, relative to the configuration's."""
+    first: Interval
+    """Instant of the first reading."""
+    spacing: Annotated[Interval, AfterValidator(_positive)]
+    """Time between two readings."""
+    stop: Annotated[float, Field(gt=0, lt=1)]
+    """Readings end with the first one below this times the largest so far."""
+    most: Annotated[int, Field(ge=3, le=100_000)] = 60
+    """Largest number of readings."""
+    fewest: Annotated[int, Field(ge=3)] = 5
+    """A data set with fewer readings is drawn again."""
+    noise: Annotated[float, quantity(lambda context: context.units.observables[0].unit, "positive")]
+    """Std of the error of a reading, in the observable's unit."""
+    time_shift: Interval = (0.0, 0.0)
+    """t_s: a reading told at t was taken at t + t_s."""
+    groups: Annotated[dict[Name, GroupSection], Field(min_length=1)]
+    """Data sets of one kind, by name."""
+
+    @model_validator(mode="after")
+    def _after_time_zero(self) -> Self:
+        first, shift = self.first[0], self.time_shift[0]
+        with Faults() as faults:
+            if None not in (first, shift) and first + shift < 0:
+                faults.add(("first",), "the first reading could be taken before time zero")
+        return self
+
+
+class CampaignFile(File):
+    """A synthetic campaign: what is drawn, and how it is observed."""
+
+    name: Name
+    """Name of the campaign."""
+    campaign: CampaignSection
+    """How truths are drawn and observed."""
+
+
+@dataclass(frozen=True)
+class CampaignPlan:
+    """A validated campaign; ``directory`` is where its files go."""
+
+    name: str
+    seed: int
+    model: ForwardModel
+    directory: Path
+    settings: CampaignSection
+
+
+def resolve_campaign(document: Document, base: Path) -> CampaignPlan:
+    """Validate a document with a ``campaign:`` section. Raises :class:`ConfigError`, every fault at once."""
+    read = read_file(CampaignFile, document, base)
+    file = read.file
+    return CampaignPlan(file.name, file.seed, read.model, file.campaign.directory, file.campaign)

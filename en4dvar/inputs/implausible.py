@@ -1,0 +1,221 @@
+"""Readings and times that cannot be what a file says: far from their neighbours, no whole frames apart, out of order.
+
+A window of seven neighbouring readings that is not steep is a polynomial of degree four and errors: the sum of squares
+about it, two degrees of freedom, is χ²_2 times the variance of an error. The median over all windows tells that
+variance whatever a few of them hold: a bad reading, a gap, a short rebound.
+
+Readings of a film lie whole frames apart, also where some frames could not be read. A step that is none, among many
+that are, is a time that was written wrongly. Steps of all kinds are those of another instrument, and nothing is said.
+
+Rows of one series that are shuffled are sorted. Several series one after another are not: sorted they would be one that
+nobody saw. Their times fall back with several increasing readings before and behind, or a column tells them apart.
+"""
+
+import itertools
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from numpy.lib.stride_tricks import sliding_window_view
+
+from en4dvar.inputs.parts import Layout, cell, opened, table_of
+from en4dvar.model.state import Array
+from en4dvar.plumbing.caution import Caution, caution
+from en4dvar.plumbing.errors import DataError
+from en4dvar.plumbing.units import convert
+
+WINDOW, DEGREE = 7, 4
+STEEP = 0.5  # of the largest reading of a window: one that holds less, or crosses zero, falls too fast for a polynomial
+MEDIAN_OF_CHI2 = 2 * math.log(2)  # of χ²_2
+OUTLYING = 8.0  # standard deviations from what its neighbours say
+IN_A_ROW = 3  # readings that are judged together
+FALLS = 3.0  # standard deviations by which the nearest neighbours lie below the farthest at the bottom of a collapse
+ASIDE = np.array([0, 1, 2, -3, -2, -1])  # the neighbours, of a window
+
+
+def scatter_of(times: Array, values: Array) -> float:
+    """Standard deviation of the errors of readings ``values`` (K,) at ``times`` (K,); NaN without a window.
+
+    It is not less than what the readings are rounded to.
+    """
+    if len(values) < WINDOW:
+        return math.nan
+    t, r = (sliding_window_view(it, WINDOW) for it in (times, values))
+    steps = np.diff(t)
+    smooth = (r.min(axis=1) > STEEP * r.max(axis=1)) & (steps.max(axis=1) < 2.5 * steps.min(axis=1))
+    if not smooth.any():
+        return math.nan
+    t, r = t[smooth], r[smooth]
+    squares = np.sum((r - _fitted(t, np.arange(WINDOW), DEGREE, r)[0]) ** 2, axis=1)
+    return max(math.sqrt(float(np.median(squares)) / MEDIAN_OF_CHI2), _rounding(values))
+
+
+def _rounding(values: Array) -> float:
+    """Standard deviation of what readings lose by the smallest difference that there is between two of them."""
+    steps = np.diff(np.unique(values))
+    usual = steps[steps > 1e-9 * values.max()]
+    return float(usual.min()) / math.sqrt(12) if len(usual) else 0.0
+
+
+def outlying(times: Array, values: Array, scatter: float) -> npt.NDArray[np.bool_]:
+    """Which readings (K,) are far from what three neighbours to either side say, with ``scatter`` as errors have.
+
+    Up to three in a row are judged together. Readings below neighbours that fall towards them from both sides are the
+    bottom of a collapse; several that move no farther than their neighbours do are an oscillation.
+    """
+    odd = np.zeros(len(values), dtype=bool)
+    for count in range(1, min(IN_A_ROW, len(values) - len(ASIDE)) + 1):
+        t, r = (sliding_window_view(it, len(ASIDE) + count) for it in (times, values))
+        near, here = r[:, ASIDE], r[:, 3:-3]
+        expected, spread = _fitted(t, ASIDE, 2, near)
+        rough = np.sqrt(2 * np.mean((near - expected[:, ASIDE]) ** 2, axis=1))  # of 6 readings and 3 coefficients
+        off = here - expected[:, 3:-3]
+        far = np.abs(off) > OUTLYING * spread[:, 3:-3] * np.maximum(scatter, rough)[:, None]
+        if count > 1:
+            far &= (np.abs(off) > np.ptp(near, axis=1)[:, None]) & (np.sign(off) == np.sign(off[:, :1]))
+        steep = (near.min(axis=1) < STEEP * near.max(axis=1)) | (here.min(axis=1) < 0.2 * near.min(axis=1))
+        falls = near[:, [0, 5]].mean(axis=1) - near[:, [2, 3]].mean(axis=1) > FALLS * scatter
+        for first in np.flatnonzero(far.all(axis=1) & ~steep & ~(falls & (off[:, 0] < 0))):
+            odd[first + 3 : first + 3 + count] = True
+    return odd
+
+
+def _fitted(t: Array, near: npt.NDArray[np.intp], degree: int, values: Array) -> tuple[Array, Array]:
+    """Polynomials through ``values`` (n, k) at the instants ``near`` (k,) of windows ``t`` (n, m).
+
+    At all instants (n, m), and their standard deviations with that of a reading, in errors of one.
+    """
+    z = (t - t.mean(axis=1, keepdims=True)) / np.ptp(t, axis=1)[:, None]
+    powers = z[:, :, None] ** np.arange(degree + 1)
+    weights = powers @ np.linalg.pinv(powers[:, near])
+    return (weights @ values[:, :, None])[:, :, 0], np.sqrt(1 + np.sum(weights**2, axis=2))
+
+
+MOSTLY = 0.8  # of the steps are whole frames: this is a film
+WHOLE = 0.1  # of a frame: times may be rounded
+ODD = 0.25  # of a frame off the next whole number
+SAME = 0.01  # rates that agree within this are the same
+_STEP = re.compile(r"(?i)(.*\.)?(delta_?t|dt|t_?step|time_?step)")
+_RATE = re.compile(r"(?i)(.*\.)?(fps|frame_?rate|f_?rate)")
+
+
+def step_doubts(
+    times: Array, unit: str, display: str, scalars: Mapping[str, float], rate: float | None = None
+) -> tuple[Caution, ...]:
+    """What contradicts times (K,) in ``unit``, increasing, K > 1.
+
+    ``scalars``: of the file, whose units nobody said, so factors of 1000 are not told from agreement. ``rate``: of the
+    frames, as the user says, per ``unit``. ``display``: the unit that messages use.
+    """
+    steps, cautions = np.diff(times), list[Caution]()
+    step = float(np.median(steps))
+    told = f"the times are {convert(step, unit, display):.4g} {display} apart"
+    if rate is not None and _off(np.array([step * rate]))[0] > SAME * step * rate:
+        words = f"{told}, which is no whole number of frames: at the rate given one takes "
+        cautions.append(caution("implausible-data", f"{words}{convert(1 / rate, unit, display):.4g} {display}"))
+    for name, value in scalars.items():
+        if value > 0 and (_STEP.fullmatch(name) or _RATE.fullmatch(name)):
+            frames = step / value if _STEP.fullmatch(name) else step * value
+            frames /= 1000.0 ** np.rint(np.log10(frames) / 3)
+            if abs(frames - 1) > SAME and _off(np.array([frames]))[0] > SAME * frames:
+                cautions.append(caution("implausible-data", f"{told}, but {name} of the file is {value:g}"))
+    off = _off(steps / step)
+    odd = np.flatnonzero(off > ODD)
+    if len(odd) and np.mean(off < WHOLE) >= MOSTLY:
+        first, after, whole = convert(np.array([*times[odd[0] : odd[0] + 2], step]), unit, display)
+        words = (
+            f"{len(odd)} of {len(steps)} steps between readings are no whole number of frames of {whole:.4g} "
+            f"{display}, the first from {first:.6g} to {after:.6g} {display}: is a time wrong?"
+        )
+        cautions.append(caution("implausible-data", words, "caution"))
+    return tuple(cautions)
+
+
+def _off(frames: Array) -> Array:
+    """How far steps (K,) in frames are from a whole number of them, at least one."""
+    return np.abs(frames - np.maximum(np.rint(frames), 1))
+
+
+SEVERAL = 4  # readings: a series has as many, and two of them as many each while both go on
+
+
+@dataclass(frozen=True)
+class InFile:
+    """The rows ``kept`` (K,) of a file, its ``lines`` if it has them, their times as ``written`` (K,) in ``unit``, and
+    the columns ``wanted``."""
+
+    path: Path
+    layout: Layout
+    kept: npt.NDArray[np.intp]
+    lines: Sequence[int]
+    written: Array
+    unit: str
+    wanted: Sequence[str]
+
+    def require_order(self, times: Array, values: Array) -> None:
+        """Raise :class:`DataError` where ``times`` (K,) of ``values`` (K,) are not in order, or one occurs again and
+        may not."""
+        order = np.argsort(times, kind="stable") if self.layout.unsorted == "sort" else np.arange(len(times))
+        steps = np.diff(times[order])
+        wrong = np.flatnonzero(steps < 0 if self.layout.repeated == "average" else steps <= 0)
+        if not len(wrong):
+            return
+        before, after = order[wrong[0] : wrong[0] + 2]
+        apart = (
+            "give each a file of its own"
+            + bool(self.lines) * ", or a column that says whose each row is, and name it by data.by"
+        )
+        ends = np.flatnonzero(np.diff(times) < 0)
+        if column := self._telling_apart(times):
+            name = column if column.isidentifier() else repr(column)
+            hint = f"column {column!r} says which of several series a row belongs to (data.by: {name})"
+        elif _several(times, ends):
+            before, after = ends[0], ends[0] + 1
+            hint = f"these look like {len(ends) + 1} series one after another: {apart}"
+        elif times[after] != times[before]:
+            hint = "correct it, or sort the rows (data.unsorted: sort)"
+        elif _differ(times, values):
+            hint = f"readings of one time differ by far more than they scatter: keep one; of several series, {apart}"
+        else:
+            hint = "keep one of the two readings, or their mean (data.repeated: average)"
+        unit = "" if "*" in self.unit else f" {self.unit}"
+        where = f":{self.lines[self.kept[after]]}" if self.lines else f": sample {self.kept[after] + 1}"
+        told = f"times must increase, but {self.written[after]:g}{unit} follows {self.written[before]:g}{unit}"
+        raise DataError(f"{self.path}{where}: {told}; {hint}")
+
+    def _telling_apart(self, times: Array) -> str | None:
+        """The column of a table that tells several series apart, each with increasing ``times`` (K,)."""
+        if self.layout.by is not None or not self.lines:
+            return None
+        with opened(self.path, self.layout) as kind:
+            table = table_of(self.path, kind, self.layout, self.wanted)
+        for i, name in enumerate(table.names):
+            cells = np.array([cell(table.rows[k][1], i) for k in self.kept])
+            each, which, counts = np.unique(cells, return_inverse=True, return_counts=True)
+            if name and "" not in each and len(each) > 1 and counts.min() >= SEVERAL:
+                sort = self.layout.unsorted == "sort"
+                rows = np.lexsort((times, which)) if sort else np.argsort(which, kind="stable")
+                increase = np.all((np.diff(times[rows]) > 0) | (np.diff(which[rows]) > 0))
+                stacked = np.count_nonzero(np.diff(which)) < len(each)
+                beside = np.count_nonzero(np.diff(which[np.lexsort((which, times))])) - len(each) >= SEVERAL
+                if increase and beside and (stacked or len(times) - len(np.unique(times)) >= SEVERAL):
+                    return name
+        return None
+
+
+def _several(times: Array, ends: npt.NDArray[np.intp]) -> bool:
+    """Whether ``times`` (K,), which fall back behind the ``ends``, are those of several series."""
+    pairs = itertools.pairwise(np.split(times, ends + 1))
+    both = [min(np.sum((c >= max(a[0], b[0])) & (c <= min(a[-1], b[-1]))) for c in (a, b)) for a, b in pairs]
+    return bool(both) and min(both) >= SEVERAL
+
+
+def _differ(times: Array, values: Array) -> bool:
+    """Whether readings of one time differ by more than their errors can explain."""
+    _, first, which = np.unique(times, return_index=True, return_inverse=True)
+    apart = np.delete(np.abs(values - values[first][which]), first)
+    return bool(np.median(apart) > OUTLYING * scatter_of(times[first], values[first]))
