@@ -19,7 +19,7 @@ import numpy.typing as npt
 from en4dvar.data.noise import DiscrepancyNoise, Linearisation, Predicted, sides_of
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.ensemble.forecast import of_framework
-from en4dvar.ensemble.linalg import with_moments
+from en4dvar.ensemble.linalg import effective_number, resampled, shares_of, with_moments
 from en4dvar.model.state import NOISE_SCALE, Array
 from en4dvar.priors.parameter_map import QUANTILE_MAPS
 from en4dvar.priors.prior import PriorTerm, member_stream
@@ -48,15 +48,12 @@ def marginal_members(space: WeightSpace, linear: Linearisation, mode: Array, pos
     draws = z_mode[of_errors] + normal @ root.T
     log_proposal = -0.5 * (FREEDOM + len(root)) * np.log1p(np.sum(normal**2, axis=1) / FREEDOM)
     log_marginal, means, covariances = _given(space, linear, mode, of_errors, draws)
-    log_weights = log_marginal - log_proposal
-    weights = np.exp(log_weights - np.nanmax(log_weights))
-    weights = np.where(np.isfinite(weights), weights, 0.0)
-    weights /= weights.sum()
-    if 1 / np.sum(weights**2) < ENOUGH:
+    logs = log_marginal - log_proposal
+    weights = shares_of(np.where(np.isnan(logs), -np.inf, logs))
+    if effective_number(weights) < ENOUGH:
         return posterior
     # members (N, n) of the mixture, in units of the prior: systematic in h, random in u
-    places = (np.arange(len(posterior)) + stream.random()) / len(posterior)
-    chosen = np.minimum(np.searchsorted(np.cumsum(weights), places), len(weights) - 1)
+    chosen = resampled(weights, len(posterior), stream)
     normal = stream.standard_normal((len(posterior), means.shape[1]))
     members = np.empty((len(posterior), len(of_errors)))
     members[:, of_errors] = draws[chosen]

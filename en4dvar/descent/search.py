@@ -137,9 +137,7 @@ class Search:
         return np.asarray(draws[np.argsort(costs, kind="stable")[: space.side_by_side]])
 
     def begin(self, number: int) -> Descent:
-        """From a member, the mean, one of :attr:`lowest_draws`, :attr:`led` or :attr:`steady`; numbers as in
-        :attr:`Outcome.tried`.
-        """
+        """From a member, the mean, a draw, :attr:`led` or :attr:`steady`; numbers as in :attr:`Outcome.tried`."""
         first = len(self.space.members) + 1
         if number < first:
             return descent_from(self.space, number)

@@ -46,9 +46,7 @@ class ReadingTangent:
     directions: Array
 
     def without(self, part: slice) -> Array:
-        """Change of the control vectors (K', N, n) of the members if a reading is left out; NaN where nothing is
-        known without it.
-        """
+        """Change of the members (K', N, n) if a reading is left out; NaN where nothing is known without it."""
         S, mean = self.S[part], self.coordinates.mean(axis=0)
         around = self.coordinates - mean
         P = around.T @ around / (len(around) - 1)

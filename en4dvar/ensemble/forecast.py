@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -133,9 +132,7 @@ class Composite:
 
     What does not depend on the members is found out once.
 
-    Raises
-    ------
-    ConfigError: a timing error on an observable without a rate.
+    Raises ConfigError: a timing error on an observable without a rate.
     """
 
     def __init__(self, problem: InverseProblem, executor: Executor | None = None):
@@ -167,16 +164,12 @@ class Composite:
         shift = of_framework(problem, physical, TIME_SHIFT, 0.0)
         shifted = times + shift[alive, None]
         outcomes = self.executor.trajectories(problem.model, states, shifted) if len(states) else ()
-        observed, limits, reasons = reading.observe(outcomes, size)
-        if isinstance(alive, slice):  # everyone
-            failures = reasons
-        else:
-            read = observed, limits
-            observed = np.full((len(observed), len(x), size), np.nan)
-            limits = np.full((len(x), len(reading.limits), 2), np.nan)
-            observed[:, alive], limits[alive] = read
-            for i, reason in zip(np.arange(len(x))[alive], reasons, strict=True):
-                failures[i] = reason
+        *read, reasons = reading.observe(outcomes, size)
+        observed = np.full((len(reading.quantities), len(x), size), np.nan)
+        limits = np.full((len(x), len(reading.limits), 2), np.nan)
+        observed[:, alive], limits[alive] = read
+        for i, reason in zip(np.arange(len(x))[alive], reasons, strict=True):
+            failures[i] = reason
         observed = as_read(problem, physical, observed)
         predicted = Predicted(
             observed[0][:, at_observations],
@@ -207,7 +200,7 @@ class Composite:
         at_extra: Indices = slice(0, 0)
         times = instants
         if len(extra_times):
-            times, at_instants, at_extra = _union(instants.tobytes(), extra_times.tobytes())
+            times, at_instants, at_extra = _union(instants, extra_times)
             rows, nodes = at_instants[rows], at_instants[nodes]
         if not observations.parts:
             quantities = tuple(of_parts[0] for of_parts in self._operators)
@@ -262,10 +255,8 @@ def log_posterior(problem: InverseProblem, x: Array, executor: Executor | None =
 def check_problem(problem: InverseProblem) -> tuple[Parameter, ...]:
     """The parameters of ``problem.fixed``, in its order.
 
-    Raises
-    ------
-    ConfigError: a parameter neither fixed nor estimated, both, or unknown to the model; a timing error on an
-        observable without a rate.
+    Raises ConfigError: a parameter neither fixed nor estimated, both, or unknown to the model; a timing error on an
+    observable without a rate.
     """
     if not problem.prior.terms and not problem.fields:
         raise ConfigError("prior: at least one parameter must be estimated")
@@ -323,15 +314,9 @@ def of_framework(problem: InverseProblem, physical: Array, parameter: Parameter,
     return np.full(len(physical), problem.fixed.get(parameter.name, default))
 
 
-@lru_cache(maxsize=1)  # arrays as long as the data
-def _union(times_: bytes, extra_: bytes) -> tuple[Array, npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-    """Increasing union of the times and where the observations and the extra times stand in it.
-
-    Kept, because the forecasts of prior and posterior of a data set ask for the same.
-    """
-    times, extra = np.frombuffer(times_), np.frombuffer(extra_)
+def _union(times: Array, extra: Array) -> tuple[Array, npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    """Increasing union of the times and where the observations and the extra times stand in it."""
     nearest = times[np.searchsorted(0.5 * (times[1:] + times[:-1]), extra)]
     extra = np.where(np.abs(extra - nearest) <= SAME_INSTANT * (times[-1] - times[0]), nearest, extra)
-    union: Array = np.unique(np.concatenate([times, extra]))
-    union.flags.writeable = False
+    union = np.unique(np.concatenate([times, extra]))
     return union, np.searchsorted(union, times), np.searchsorted(union, extra)

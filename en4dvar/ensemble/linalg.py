@@ -1,4 +1,4 @@
-"""Dense algebra of an ensemble: centring, the space its anomalies span, the Gauss–Newton Hessian, the analysis update.
+"""Dense algebra of an ensemble: centring, its span, weights of members, the Gauss–Newton Hessian, the analysis update.
 
 Nothing here is larger than (N, n) or (K', N); no n×n matrix is ever formed.
 """
@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
+import numpy.typing as npt
 from numpy.polynomial import Chebyshev, Polynomial
 
 from en4dvar.model.state import Array
@@ -27,19 +28,10 @@ def centre(ensemble: Array) -> tuple[Array, Array]:
     return mean, ensemble - mean
 
 
-def apply_weights(ensemble: Array, rows: Array, out: Array | None = None, chunk: int = 4096) -> Array:
-    """Analysis ensemble 1 x̄ᵀ + rows · X (M, n) of members (N, n) with mean x̄ and anomalies X; ``rows`` (M, N).
-
-    Works through ``chunk`` state variables at a time, so that centring and adding the mean happen in cache and no
-    second array of the size of the ensemble is made besides the result. ``out`` may be ``ensemble`` itself (M = N).
-    """
-    if out is None:
-        out = np.empty((len(rows), ensemble.shape[1]))
-    for first in range(0, ensemble.shape[1], chunk):
-        part = slice(first, first + chunk)
-        mean, anomalies = centre(ensemble[:, part])
-        np.add(mean, rows @ anomalies, out=out[:, part])
-    return out
+def apply_weights(ensemble: Array, rows: Array) -> Array:
+    """Analysis ensemble 1 x̄ᵀ + rows · X (M, n) of members (N, n) with mean x̄ and anomalies X; ``rows`` (M, N)."""
+    mean, anomalies = centre(ensemble)
+    return np.asarray(mean + rows @ anomalies)
 
 
 def anomaly_basis(anomalies: Array) -> Array:
@@ -78,6 +70,23 @@ def with_moments(members: Array, mean: Array, covariance: Array) -> Array:
     target = np.linalg.cholesky(np.atleast_2d(covariance))
     own = np.linalg.cholesky(np.atleast_2d(np.cov(members.T)))
     return np.asarray(mean + np.linalg.solve(own, anomalies.T).T @ target.T)
+
+
+def resampled(shares: Array, count: int, stream: np.random.Generator) -> npt.NDArray[np.intp]:
+    """(count,) indices, each as often as its share says (systematic resampling); shares add up to one."""
+    quantiles = (np.arange(count) + stream.uniform()) / count
+    return np.searchsorted(np.cumsum(shares), quantiles, side="right").clip(max=len(shares) - 1)
+
+
+def shares_of(logs: Array) -> Array:
+    """Weights (D,) that add up to one, of these logarithms; one must be finite."""
+    weights = np.exp(logs - logs.max())
+    return np.asarray(weights / weights.sum())
+
+
+def effective_number(weights: Array) -> float:
+    """Number of equally likely draws that are worth as much as draws of these weights, (Σ w)²/Σ w²."""
+    return float(weights.sum() ** 2 / np.sum(weights**2))
 
 
 @dataclass(frozen=True)
@@ -119,8 +128,11 @@ class Hessian:
         that loses no accuracy: squaring S costs rounding errors of eps · ‖S‖² in A ≥ N − 1, which vanish while the
         observations inform less than ``GRAM_LIMIT`` times the prior.
         """
-        if basis is not None:
-            return cls.of_each(s[None], basis)[0]
+        if basis is not None:  # further rows of zeros, so that every direction of the basis has an axis
+            padded = np.pad(s, ((0, max(0, basis.shape[1] - len(s))), (0, 0)))
+            _, sigma, right = np.linalg.svd(padded, full_matrices=False)
+            axes = right @ basis.T
+            return cls(sigma, sigma[:, None] * axes, axes)
         n_observations, n_members = s.shape
         small = n_observations < n_members
         gram = s @ s.T if small else s.T @ s
@@ -130,16 +142,6 @@ class Hessian:
             return cls(sigma, vectors @ s if small else sigma[:, None] * vectors)
         _, sigma, right = np.linalg.svd(s, full_matrices=False)
         return cls(sigma, sigma[:, None] * right)
-
-    @classmethod
-    def of_each(cls, s: Array, basis: Array) -> "list[Hessian]":
-        """:meth:`of` every matrix of ``s`` (B, K', r) with the same ``basis``, in fewer calls."""
-        lacking = basis.shape[1] - s.shape[1]
-        if lacking > 0:  # further rows of zeros, so that every direction of the basis has an axis
-            s = np.pad(s, ((0, 0), (0, lacking), (0, 0)))
-        _, sigma, right = np.linalg.svd(s, full_matrices=False)
-        axes = right @ basis.T
-        return [cls(values, values[:, None] * own, own) for values, own in zip(sigma, axes, strict=True)]
 
     @property
     def prior_precision(self) -> float:

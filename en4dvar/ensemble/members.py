@@ -28,10 +28,9 @@ EVERYONE = slice(None)
 def out_of_bounds(prior: Prior, physical: Array) -> list[str]:
     """Reasons (B,) of the members (B, n) with a parameter outside its bounds, "" for the others."""
     failures = [""] * len(physical)
-    low, high = prior.finite_bounds
-    inside = (physical >= low) & (physical <= high)
+    low, high = prior.bounds
+    inside = (physical >= low) & (physical <= high) & np.isfinite(physical)
     if not inside.all():
-        low, high = prior.bounds
         for i, j in np.argwhere(~inside):
             p = prior.parameters[j]
             failures[i] = failures[i] or f"{p.name} outside [{low[j]:g}, {high[j]:g}] {p.unit}"

@@ -246,9 +246,7 @@ def _mode(stages: Stages, problem: InverseProblem, start: Mapping[str, float] | 
 
 
 def _alone(stages: Stages, problem: InverseProblem, settings: AssimilationSettings) -> Analysis | None:
-    """An assimilation of another problem, without what if; None where too few members survive. Its forward runs are
-    counted with the others.
-    """
+    """An assimilation of another problem, without what if, whose runs count; None where too few members survive."""
     other = Stages(problem, replace(settings, what_if=False), stages.seed, stages.executor, compares=False)
     end = None
     with suppress(TooFewMembersError):

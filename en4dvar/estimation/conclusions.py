@@ -99,9 +99,7 @@ def descents_of(outcome: Outcome, n_members: int) -> Descents | None:
 
 
 def modes_of(prior: Prior, minima: Sequence[Minimum], sampled: Refined | None) -> tuple[Mode, ...]:
-    """The minima that count, with their weights; by Laplace where the posterior was not sampled, else those that draws
-    belong to.
-    """
+    """The minima that count, with weights: by Laplace where the posterior was not sampled, else those of its draws."""
     if sampled is None:
         logs = np.array([m.log_evidence(prior) - minima[0].log_evidence(prior) for m in minima[1:]])
         relative = np.append(1.0, np.exp(logs))[: len(minima)]

@@ -71,9 +71,7 @@ class ParameterSummary:
     def of(
         cls, p: Parameter, prior: Array, posterior: Array, centre: float, dfs: float, cautions: Sequence[Caution]
     ) -> ParameterSummary:
-        """Summary of members (N',) that are alive, in the display unit; the centre is SI. ``cautions`` are those of the
-        run.
-        """
+        """Of members (N',) alive, in the display unit; the centre is SI, ``cautions`` are those of the run."""
         prior_mean, prior_std = _moments(prior)
         mean, std = _moments(posterior)
         q05, q50, q95 = map(float, member_quantiles(posterior, (0.05, 0.5, 0.95)) if posterior.size else (np.nan,) * 3)

@@ -32,9 +32,7 @@ def choose_executor(
 
     With ``limits`` the default are processes, the only workers of this machine that can be held to them.
 
-    Raises
-    ------
-    ExecutorError: the dask cluster at ``address`` cannot be reached, or dask is not installed.
+    Raises ExecutorError: the dask cluster at ``address`` cannot be reached, or dask is not installed.
     """
     if limits and kind is None and address is None:
         kind = "processes"

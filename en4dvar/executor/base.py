@@ -117,9 +117,7 @@ class Executor(ABC):
         becomes ``hear(index of the call, message)`` here, in the thread that iterates, in order and before the call
         ends. Messages are small, few and picklable. A call that is repeated tells again.
 
-        Raises
-        ------
-        ExecutorError: the workers cannot be reached.
+        Raises ExecutorError: the workers cannot be reached.
         """
 
     def results(self, function: Callable[..., T], calls: Iterable[Call]) -> Iterator[tuple[int, T]]:

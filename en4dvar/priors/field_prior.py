@@ -99,8 +99,7 @@ class FieldPrior:
 
     @cached_property
     def _torus(self) -> tuple[tuple[int, ...], Array]:
-        """Cells along the axes of the torus, and the roots of its eigenvalues; what is negative of these is left out,
-        and the variance kept."""
+        """Cells along the axes of the torus, and roots of its eigenvalues, none negative; the variance is kept."""
         assert self.grid is not None
         shape, steps = self.grid
         wide = tuple(

@@ -53,9 +53,8 @@ def _cut_share(x: Array, low: float, high: float) -> Array:
     p = ndtr(x) * (ndtr(high) - ndtr(low))
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         t = p * math.sqrt(2 * math.pi) * np.exp(0.5 * low * low)
-        near = t * (
-            1 + 0.5 * low * t
-        )  # Φ(α + d) − Φ(α) = p to second order, where the difference of two Φ has no digits
+        # Φ(α + d) − Φ(α) = p to second order, where the difference of two Φ has no digits
+        near = t * (1 + 0.5 * low * t)
     return np.asarray(np.where(t * max(1.0, abs(low)) < NEAR, near, ndtri(ndtr(low) + p) - low) / (high - low))
 
 

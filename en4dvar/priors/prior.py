@@ -236,9 +236,7 @@ class Prior:
             raise ConfigError(f"prior: {', '.join(sorted(missing))} is correlated, but not estimated")
 
     def of(self, terms: tuple[PriorTerm, ...]) -> Prior:
-        """The prior of other ``terms``, with the correlations that this prior has between parameters that are among
-        them.
-        """
+        """The prior of other ``terms``, with the correlations that this prior has between those it knows."""
         names = {term.parameter.name for term in terms}
         return Prior(terms, tuple(kept for block in self.blocks if (kept := block.among(tuple(names)))))
 
@@ -258,12 +256,6 @@ class Prior:
         return np.array([p.bounds[0] for p in self.parameters]), np.array([p.bounds[1] for p in self.parameters])
 
     @cached_property
-    def finite_bounds(self) -> tuple[Array, Array]:
-        """:attr:`bounds` (n,) with the largest finite numbers for ±inf, so that an infinite value is outside."""
-        largest = np.finfo(float).max
-        return np.maximum(self.bounds[0], -largest), np.minimum(self.bounds[1], largest)
-
-    @cached_property
     def mean(self) -> Array:
         """(n,) in transformed space."""
         return np.array([term.mean for term in self.terms])
@@ -276,25 +268,11 @@ class Prior:
     def to_physical(self, x: Array) -> Array:
         """Physical values (…, n) of control vectors ``x`` (…, n)."""
         theta = np.array(x, dtype=float)
-        with np.errstate(over="ignore"):
-            for columns, term in self._columns:
-                part = theta[..., columns]
-                if term.transform == "lognormal":  # as PriorTerm.to_physical, in place
-                    np.exp(part, out=part)
-                else:
-                    part[...] = term.to_physical(part)
-        return theta
-
-    @cached_property
-    def _columns(self) -> tuple[tuple[slice, PriorTerm], ...]:
-        """Neighbouring parameters that one call transforms, with the first of their terms; ``normal`` needs none."""
-        groups: list[tuple[slice, PriorTerm]] = []
         for j, term in enumerate(self.terms):
-            if groups and groups[-1][0].stop == j and term.transform == "lognormal" == groups[-1][1].transform:
-                groups[-1] = slice(groups[-1][0].start, j + 1), groups[-1][1]
-            elif term.transform != "normal":
-                groups.append((slice(j, j + 1), term))
-        return tuple(groups)
+            if term.transform != "normal":
+                column = theta[..., j : j + 1]  # none of control vectors that are empty
+                column[...] = term.to_physical(column)
+        return theta
 
     def from_physical(self, theta: Array) -> Array:
         """Control vectors (…, n) of physical values ``theta`` (…, n). Raises ValueError outside a transform's range."""

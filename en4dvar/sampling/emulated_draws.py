@@ -18,10 +18,11 @@ import numpy as np
 
 from en4dvar.data.observations import Observations
 from en4dvar.ensemble.forecast import Forecast
+from en4dvar.ensemble.linalg import effective_number, resampled, shares_of
 from en4dvar.model.state import Array
 from en4dvar.priors.prior import Prior
 from en4dvar.sampling.emulated_cost import EmulatedCost, ModelRuns, fitted_cost, needed_runs
-from en4dvar.sampling.mixture import StudentMixture, effective_number, resampled
+from en4dvar.sampling.mixture import StudentMixture
 from en4dvar.sampling.walkers import advance
 
 NEAR = 3.0  # n τ above the lowest J: runs up to there are fitted
@@ -87,9 +88,7 @@ class EmulatedProposal:
     def fitted(
         cls, runs: RecordedRuns, start: "StudentMixture | EmulatedProposal", stream: np.random.Generator, heat: float
     ) -> "EmulatedProposal | None":
-        """Fitted to the runs so far; ``start`` is a mixture about them, or the proposal before. None where runs are too
-        few.
-        """
+        """To the runs so far, from a mixture about them or the proposal before; None where runs are too few."""
         emulated = runs.emulated(heat)
         if emulated is None:
             return None
@@ -110,13 +109,11 @@ class EmulatedProposal:
         """The proposal exp(−``cost``), from this one."""
         at, z = 0.0, self.walkers
         while at < 1.0:
-            change = self.cost(z) - cost(z)
-            change, step = change - change.max(), 1.0 - at
-            while effective_number(np.exp(step * change)) < HALF * WALKERS and step > 1e-3:
+            change, step = self.cost(z) - cost(z), 1.0 - at
+            while effective_number(shares_of(step * change)) < HALF * WALKERS and step > 1e-3:
                 step *= 0.8
             at = at + step if at + step < 1.0 - 1e-9 else 1.0
-            shares = np.exp(step * change)
-            z = z[resampled(shares / shares.sum(), WALKERS, stream)]
+            z = z[resampled(shares_of(step * change), WALKERS, stream)]
             z = _moved(cost if at == 1.0 else _between(self.cost, cost, at), z, z, stream)
         return replace(self, cost=cost, walkers=z)
 

@@ -17,9 +17,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from en4dvar.ensemble.linalg import effective_number, resampled, shares_of
 from en4dvar.model.state import Array
 from en4dvar.sampling.emulated_draws import EmulatedProposal
-from en4dvar.sampling.mixture import StudentMixture, effective_number, resampled
+from en4dvar.sampling.mixture import StudentMixture
 
 FEWEST = 60.0  # effective draws that a proposal is fitted to: with fewer, to tempered weights
 COMPONENTS = 4
@@ -28,6 +29,17 @@ MOST_FITTED = 1000  # and points that these are fitted to
 EACH = 4  # effective draws for each coordinate of a component: fitted to fewer it is flat in some direction
 MOST = 3.0  # times √D mean weights of D draws: more than that none counts (Ionides 2008)
 Proposal = StudentMixture | EmulatedProposal
+
+
+def flattened(logs: Array, wanted: float, least: float = 0.0) -> tuple[Array, float]:
+    """Shares (D,) by that power of weights, of these logarithms, which leaves so many effective as are ``wanted``, or
+    at the lowest power ``least``; and how many these are.
+    """
+    power, shares = 1.0, shares_of(logs)
+    while (effective := effective_number(shares)) < least or (effective < wanted and power > 1e-4):
+        power *= 0.8
+        shares = shares_of(power * logs)
+    return shares, effective
 
 
 class Importance:
@@ -53,8 +65,7 @@ class Importance:
     @property
     def shares(self) -> Array:
         """Weights (D,) of the draws, which sum to one; some draw must have one."""
-        weights = np.exp(self.log_weights - self.log_weights.max())
-        return np.asarray(weights / weights.sum())
+        return shares_of(self.log_weights)
 
     def draw(self) -> Array:
         """(M, n) draws of the next round."""
@@ -70,11 +81,9 @@ class Importance:
         self.z = np.concatenate([self.z, z]) if len(self.z) else z
         self.target = np.concatenate([self.target, target])
         self.log_weights = self.target - self.mixture + np.log(len(self.proposals))
-        top = float(self.log_weights.max())
-        if np.isfinite(top):
-            weights = np.exp(self.log_weights - top)
-            self.log = top + float(np.log(weights.mean()))
-            self.effective = effective_number(weights)
+        if np.isfinite(self.log_weights.max()):
+            self.log = float(np.logaddexp.reduce(self.log_weights) - np.log(len(self.z)))
+            self.effective = effective_number(self.shares)
 
     def _mixed(self, z: Array) -> Array:
         """ln Σ_t q_t of the draws so far, and of ``z``."""
@@ -87,13 +96,8 @@ class Importance:
         """Fitted to the draws so far; the first one while hardly any of them has a weight."""
         if np.isfinite(self.log_weights).sum() <= 2 * (self.z.shape[1] + 1):
             return self.proposals[0]
-        logs, power = self.log_weights - self.log_weights.max(), 1.0
-        weights = np.exp(logs)
         singular = 2.0 * (self.z.shape[1] + 1)  # draws behind a covariance, however little power is left to the weights
-        while (effective := effective_number(weights)) < singular or (effective < FEWEST and power > 1e-4):
-            power *= 0.8
-            weights = np.exp(power * logs)
-        where = resampled(weights / weights.sum(), self.count, self.stream)
+        where = resampled(flattened(self.log_weights, FEWEST, singular)[0], self.count, self.stream)
         fitted = StudentMixture.fitted(self.z[where], self.stream, COMPONENTS)
         return replace(fitted, root=self.wider * fitted.root)
 
@@ -111,23 +115,19 @@ class ClosingDraws(Importance):
     def tempered(self) -> Array:
         """Log weights (D,) of that power."""
         alive = np.isfinite(self.log_weights)
-        logs = np.where(alive, self.log_weights - (1 - self.wider**-2) * np.where(alive, self.target, 0.0), -np.inf)
-        return np.asarray(logs - logs.max()) if alive.any() else logs
+        return np.where(alive, self.log_weights - (1 - self.wider**-2) * np.where(alive, self.target, 0.0), -np.inf)
 
     @property
     def near(self) -> bool:
         """Whether so many draws tell that power that it need not be flattened further."""
-        return bool(np.isfinite(self.log)) and effective_number(np.exp(self.tempered)) >= SETTLED
+        return bool(np.isfinite(self.log)) and effective_number(shares_of(self.tempered)) >= SETTLED
 
     def next_proposal(self) -> StudentMixture:
         n = self.z.shape[1]
         if np.isfinite(self.log_weights).sum() <= 2 * (n + 1):
             return self.first
-        logs, power = self.tempered, 1.0
-        while (effective := effective_number(np.exp(power * logs))) < SETTLED and power > 1e-4:
-            power *= 0.8
-        weights = np.exp(power * logs)
-        where = resampled(weights / weights.sum(), min(2 * self.count, MOST_FITTED), self.stream)
+        shares, effective = flattened(self.tempered, SETTLED)
+        where = resampled(shares, min(2 * self.count, MOST_FITTED), self.stream)
         parts = max(1, min(PARTS, int(effective / (EACH * n))))
         return StudentMixture.fitted(self.z[where], self.stream, parts, alike=2 * n * len(where) / effective)
 
@@ -145,7 +145,7 @@ class FixedDraws(Importance):
         super().add(z, log_likelihood)
         if np.isfinite(self.log):
             self.log_weights = np.minimum(self.log_weights, self.log + np.log(MOST * np.sqrt(len(self.z))))
-            self.effective = effective_number(np.exp(self.log_weights - self.log_weights.max()))
+            self.effective = effective_number(self.shares)
 
     def _mixed(self, z: Array) -> Array:
         return np.concatenate([self.mixture, self.proposals[0].log_density(z)])

@@ -4,10 +4,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from en4dvar.model.state import Array
-from en4dvar.plumbing.compiled import kernel
 
 DEGREES = 5.0  # of freedom of a proposal: heavier tails than any part of the density has
 SMALLEST = 1e-4  # variance that a component keeps in every direction, relative to that of all points
@@ -44,17 +42,6 @@ class StudentMixture:
         return np.asarray(np.logaddexp.reduce(logs, axis=0) + constant)
 
 
-def resampled(shares: Array, count: int, stream: np.random.Generator) -> npt.NDArray[np.intp]:
-    """(count,) indices, each as often as its share says (systematic resampling); shares add up to one."""
-    quantiles = (np.arange(count) + stream.uniform()) / count
-    return np.searchsorted(np.cumsum(shares), quantiles, side="right").clip(max=len(shares) - 1)
-
-
-def effective_number(weights: Array) -> float:
-    """Number of equally likely draws that are worth as much as draws of these weights, (Σ w)²/Σ w²."""
-    return float(weights.sum() ** 2 / np.sum(weights**2))
-
-
 def fit_gaussians(
     x: Array, rng: np.random.Generator, components: int, rounds: int, alike: float = 0.0
 ) -> tuple[Array, Array, Array]:
@@ -72,66 +59,22 @@ def fit_gaussians(
         centre = np.vstack([centre, z[rng.choice(count, p=distance / distance.sum())]])
     covariance = np.tile(0.3 * np.eye(n), (components, 1, 1))
     share = np.full(components, 1 / components)
-    of_part = np.empty((count, components))
+    common = alike * components ** (-2.0 / n) * np.eye(n)
     for _ in range(rounds):
-        _expect(z, share, centre, covariance, of_part)
-        _maximise(z, of_part, share, centre, covariance, alike)
+        logs = log_gaussians(z, share, centre, covariance)
+        of_part = np.exp(logs - logs.max(axis=0))
+        of_part /= of_part.sum(axis=0)
+        size = of_part.sum(axis=1) + 1e-9 * count
+        share, centre = size / size.sum(), of_part @ z / size[:, None]
+        apart = z - centre[:, None]
+        scatter = (of_part[..., None] * apart).swapaxes(1, 2) @ apart + common
+        covariance = scatter / (size + alike)[:, None, None] + SMALLEST * np.eye(n)
     return share, middle + centre @ root.T, root @ covariance @ root.T
 
 
-@kernel
-def _expect(z: Array, share: Array, centre: Array, covariance: Array, of_part: Array) -> None:
-    """Probability ``of_part`` (D, M) of the components for points (D, n)."""
-    count, parts = of_part.shape
-    apart = np.empty(z.shape[1])
-    for m in range(parts):
-        lower = np.linalg.cholesky(covariance[m])
-        constant = np.log(share[m])
-        for i in range(apart.size):
-            constant -= np.log(lower[i, i])
-        for d in range(count):
-            log = constant
-            for i in range(apart.size):
-                scaled = z[d, i] - centre[m, i]
-                for k in range(i):
-                    scaled -= lower[i, k] * apart[k]
-                apart[i] = scaled / lower[i, i]
-                log -= 0.5 * apart[i] ** 2
-            of_part[d, m] = log
-    for d in range(count):
-        top, total = of_part[d].max(), 0.0
-        for m in range(parts):
-            of_part[d, m] = np.exp(of_part[d, m] - top)
-            total += of_part[d, m]
-        for m in range(parts):
-            of_part[d, m] /= total
-
-
-@kernel
-def _maximise(z: Array, of_part: Array, share: Array, centre: Array, covariance: Array, alike: float) -> None:
-    """Share, centre and covariance of the components are overwritten with what their points say."""
-    count, parts = of_part.shape
-    apart = np.empty(z.shape[1])
-    common = alike * parts ** (-2.0 / apart.size)
-    for m in range(parts):
-        size = 1e-9 * count
-        centre[m] = 0.0
-        for d in range(count):
-            size += of_part[d, m]
-            for i in range(apart.size):
-                centre[m, i] += of_part[d, m] * z[d, i]
-        share[m] = size
-        centre[m] /= size
-        covariance[m] = 0.0
-        for d in range(count):
-            for i in range(apart.size):
-                apart[i] = z[d, i] - centre[m, i]
-                for k in range(i + 1):
-                    covariance[m, i, k] += of_part[d, m] * apart[i] * apart[k]
-        for i in range(apart.size):
-            for k in range(i + 1):
-                if i == k:
-                    covariance[m, i, k] += common
-                covariance[m, i, k] = covariance[m, i, k] / (size + alike) + (SMALLEST if i == k else 0.0)
-                covariance[m, k, i] = covariance[m, i, k]
-    share /= share.sum()
+def log_gaussians(x: Array, share: Array, centre: Array, covariance: Array) -> Array:
+    """ln share_m N(x; centre_m, covariance_m) (M, D) of points (D, n), (2π)^{−n/2} apart."""
+    root = np.linalg.cholesky(covariance)
+    z = np.linalg.inv(root) @ (x - centre[:, None]).swapaxes(1, 2)
+    logs = np.log(share) - np.log(np.einsum("mii->mi", root)).sum(axis=1)
+    return np.asarray(logs[:, None] - 0.5 * np.sum(z**2, axis=1))

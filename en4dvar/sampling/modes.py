@@ -12,12 +12,13 @@ import numpy as np
 import numpy.typing as npt
 
 from en4dvar.descent.minima import Minimum
+from en4dvar.ensemble.linalg import effective_number, resampled
 from en4dvar.model.state import Array
 from en4dvar.priors.prior import Prior, member_stream
 from en4dvar.sampling.alike import LEAST, POOL, standing_for
 from en4dvar.sampling.emulated_draws import EmulatedProposal, RecordedRuns
 from en4dvar.sampling.importance import ClosingDraws, FixedDraws, Importance
-from en4dvar.sampling.mixture import StudentMixture, effective_number, resampled
+from en4dvar.sampling.mixture import StudentMixture
 
 DRAWS = 400  # of a round
 HEATS = (8.0, 4.0, 2.0, 1.5)  # of the rounds that train an emulator

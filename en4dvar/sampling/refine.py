@@ -21,6 +21,7 @@ from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.diagnosis import diagnostics as diag
 from en4dvar.diagnosis.analysis import BEYOND_5, ChainRecord, Mode
 from en4dvar.diagnosis.response.ledger import weighted_quantiles
+from en4dvar.ensemble.linalg import resampled, shares_of
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.units import convert
@@ -29,7 +30,6 @@ from en4dvar.problem import InverseProblem
 from en4dvar.sampling import mcmc
 from en4dvar.sampling.emulated_cost import Coordinates, EmulatedCost, emulate, needed_runs
 from en4dvar.sampling.emulated_draws import RecordedRuns
-from en4dvar.sampling.mixture import resampled
 from en4dvar.sampling.modes import TOO_FEW, WeightedDraws, belonging, sample_modes
 from en4dvar.schemes.settings import AssimilationSettings
 
@@ -110,7 +110,7 @@ def _by_weights(prior: Prior, parts: Sequence[tuple[Array, Array]]) -> dict[str,
         logs.append(-0.5 * np.sum(coordinates.of(x) ** 2, axis=1) - np.sum(np.log(np.diag(coordinates.root))))
     drawn, theta = np.logaddexp.reduce(logs), prior.to_physical(x)
     likelihood = prior.cost(x) - costs
-    shares, its_shares = _shares(likelihood + logs[1] - drawn), _shares(logs[0] - drawn)
+    shares, its_shares = shares_of(likelihood + logs[1] - drawn), shares_of(logs[0] - drawn)
     mean, std, at, wide = _moments(theta, shares)
     its_mean, its_std, its_at, its_wide = _moments(theta, its_shares)
     begin, end = len(parts[0][0]), len(parts[0][0]) + len(parts[1][0])
@@ -128,12 +128,6 @@ def _by_weights(prior: Prior, parts: Sequence[tuple[Array, Array]]) -> dict[str,
     for j in np.flatnonzero(sure):
         weighed |= {f"tail_mean_{prior.names[j]}": float(mean[j]), f"tail_std_{prior.names[j]}": float(std[j])}
     return weighed
-
-
-def _shares(logs: Array) -> Array:
-    """Weights (B,) that sum to 1, from their logarithms."""
-    shares = np.exp(logs - logs.max())
-    return np.asarray(shares / shares.sum())
 
 
 def _moments(theta: Array, shares: Array) -> tuple[Array, Array, Array, Array]:

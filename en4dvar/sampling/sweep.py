@@ -57,9 +57,7 @@ class Targets:
 def targets(observations: Sequence[Observations], shift: float, step: float, earliest: float = -np.inf) -> Targets:
     """The grid covers every reading at every shift within ±``shift`` (s), from ``earliest`` on.
 
-    Raises
-    ------
-    ValueError: a reading would be compared before ``earliest``.
+    Raises ValueError: a reading would be compared before ``earliest``.
     """
     reach = int(np.floor(shift / step * (1 + 1e-9)))
     first = min(float(o.times[0]) for o in observations) - reach * step
@@ -261,9 +259,7 @@ def _without_shift(problem: InverseProblem) -> InverseProblem:
 
 @dataclass(frozen=True)
 class _Ranges:
-    """The ranges that are searched for each set, ``low`` to ``high`` (S, n), transformed, and the prior's ``std`` (S,
-    n).
-    """
+    """The ranges searched for each set, ``low`` to ``high`` (S, n), transformed, and the prior's ``std`` (S, n)."""
 
     low: Array
     high: Array

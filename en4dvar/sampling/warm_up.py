@@ -7,24 +7,18 @@ import numpy as np
 from en4dvar.data.noise import noise_of
 from en4dvar.data.noise.state_space import boxed, innovations
 from en4dvar.data.observations import Observations
-from en4dvar.sampling.mixture import fit_gaussians
 from en4dvar.sampling.sweep import best_over_shifts, targets
 
 
 def examples() -> dict[str, Callable[[], object]]:
     """Name of each kernel, in words, and a call that compiles it; for ``en4dvar warm-up``."""
-    return {"sampling, mixtures": _mixture, "sweep, nearest neighbours": _nearest, "discrepancy": _discrepancy}
+    return {"sweep, nearest neighbours": _nearest, "discrepancy": _discrepancy}
 
 
 def _discrepancy() -> None:
     unit = np.ones((1, 3))
     innovations(unit, unit, unit, np.ones(1), np.ones(2), 1.5)
     boxed(unit, unit, unit, unit, np.ones(1), np.ones(2), 1.5, 1.0)
-
-
-def _mixture() -> None:
-    rng = np.random.default_rng(0)
-    fit_gaussians(rng.standard_normal((20, 2)), rng, components=2, rounds=1)
 
 
 def _nearest() -> None:

@@ -266,8 +266,7 @@ class Minimiser(Scheme):
 
     @property
     def searches(self) -> bool:
-        """Whether descents from several places are compared: not where there is one, or the start is given or led
-        through shorter windows."""
+        """Whether descents from several places are compared; a start that is stated or led there is one place."""
         return self.starts > 1 and isinstance(self.start, str) and self.lengthen == 1
 
     @property

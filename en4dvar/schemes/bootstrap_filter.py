@@ -20,7 +20,7 @@ import numpy.typing as npt
 from annotated_types import Ge
 from scipy.special import ndtr
 
-from en4dvar.ensemble.linalg import centre
+from en4dvar.ensemble.linalg import centre, shares_of
 from en4dvar.model.state import Array
 from en4dvar.schemes.base import Draw, Evaluation, GaussNewtonStep, Step, Weights
 from en4dvar.schemes.etkf import ETKF
@@ -79,8 +79,7 @@ class Resampled:
 def likelihood_shares(evaluation: Evaluation) -> Array:
     """Likelihoods (N,) of the members, of sum 1, relative to the largest, so that one is left however far all are."""
     misfit = np.sum((evaluation.d[:, None] - evaluation.S) ** 2, axis=0)
-    likelihood = np.exp(-0.5 * (misfit - misfit.min()))
-    return np.asarray(likelihood / likelihood.sum())
+    return shares_of(-0.5 * misfit)
 
 
 def systematic(shares: Array, start: float) -> npt.NDArray[np.intp]:

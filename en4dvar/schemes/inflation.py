@@ -17,9 +17,7 @@ from en4dvar.model.state import Array
 class Inflation:
     """λ ``multiplicative`` and α ``rtps`` (relaxation to prior spread, 0: none, 1: the spread of the prior).
 
-    Raises
-    ------
-    ValueError: a factor that is not positive, or α outside [0, 1].
+    Raises ValueError: a factor that is not positive, or α outside [0, 1].
     """
 
     multiplicative: float = 1.0

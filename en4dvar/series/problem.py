@@ -39,9 +39,7 @@ class SeriesProblem:
         members: int,
         name: str = "series",
     ) -> "SeriesProblem":
-        """The problem of readings of one or several observables, each series with its own times. Raises
-        :class:`DataError`.
-        """
+        """The problem of readings of observables, each series with its own times. Raises :class:`DataError`."""
         return cls.of(start, series[0].observable, Observations.of_series(series, name=name), settings, members)
 
     @classmethod

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -25,9 +24,7 @@ class CycleSeries:
     is that of the errors of one instant; None: independent. Errors of different instants are independent. ``names``
     (p,) are those of what was observed, for the record.
 
-    Raises
-    ------
-    ValueError: shapes that do not fit, times that do not increase from zero, std that is not positive.
+    Raises ValueError: shapes that do not fit, times that do not increase from zero, std that is not positive.
     """
 
     times: Array
@@ -52,22 +49,13 @@ class CycleSeries:
         Rows of what was not observed are zero.
         """
         std = self.std if self.std.ndim == 1 else self.std[k]
-        d, s = (self.values[k] - reference) / std, (anomalies / std).T
-        there = self._there[k]
-        if there.all():
-            return (d, s) if self.correlation is None else (
-                self.correlation.decorrelated(d), self.correlation.decorrelated(s.T).T
-            )  # fmt: skip
-        whitened = np.zeros_like(d), np.zeros_like(s)
-        if there.any():
-            among = None if self.correlation is None else Correlation(self.correlation.matrix[np.ix_(there, there)])
-            for whole, part in zip(whitened, (d[there], s[there]), strict=True):
-                whole[there] = part if among is None else among.decorrelated(part.T).T
-        return whitened
-
-    @cached_property
-    def _there(self) -> npt.NDArray[np.bool_]:
-        return np.isfinite(self.values)
+        d, s, there = (self.values[k] - reference) / std, anomalies / std, np.isfinite(self.values[k])
+        d, s = np.where(there, d, 0.0), np.where(there, s, 0.0)
+        if self.correlation is not None and there.any():
+            whole = self.correlation
+            among = whole if there.all() else Correlation(whole.matrix[np.ix_(there, there)])
+            d[there], s[:, there] = among.decorrelated(d[there]), among.decorrelated(s[:, there])
+        return d, s.T
 
 
 @dataclass(frozen=True)
@@ -87,10 +75,8 @@ def aligned(observations: Observations, parts: Sequence[Part]) -> tuple[tuple[Ob
 
     Weights divide variances; a reading of weight zero is none.
 
-    Raises
-    ------
-    DataError: errors of different instants that are not independent, of a timing error, robust or with a discrepancy;
-        a field read twice at one place and instant.
+    Raises DataError: errors of different instants that are not independent, of a timing error, robust or with a
+    discrepancy; a field read twice at one place and instant.
     """
     noise, where = observations.noise, observations.source or observations.name
     if np.any(noise.time_std > 0) or noise.attributes() or not noise.quadratic:

@@ -142,9 +142,7 @@ class TwinResult:
 def observe_truth(experiment: TwinExperiment, seed: int) -> tuple[Array, CycleSeries]:
     """The truth (K, n_state) and its observations.
 
-    Raises
-    ------
-    En4dvarError: the truth cannot be integrated. ConfigError: the correlation of the errors does not fit.
+    Raises En4dvarError: the truth cannot be integrated. ConfigError: the correlation of the errors does not fit.
     """
     model, times = experiment.model, experiment.times
     states = _truth(experiment, seed)
@@ -189,9 +187,7 @@ def conduct(
 
     ``resume`` and ``keep`` as for :func:`~en4dvar.series.sequential.run_sequential`.
 
-    Raises
-    ------
-    TooFewMembersError: the ensemble is lost. En4dvarError: the truth cannot be integrated.
+    Raises TooFewMembersError: the ensemble is lost. En4dvarError: the truth cannot be integrated.
     """
     truth, series = observe_truth(experiment, seed)
     members = experiment.start.members(experiment.members, seed)

@@ -224,9 +224,7 @@ class CycleWindow(Objective[CycleDescent]):
         for j, (index, weight) in enumerate(self.batch):
             own = slice(j * p, (j + 1) * p)
             d, S = self.series.whiten(index - 1, reference[own], anomalies[:, own])
-            parts.append((d, S) if weight == 1 else (np.sqrt(weight) * d, np.sqrt(weight) * S))
-        if len(parts) == 1:
-            return Evaluation(*parts[0])
+            parts.append((np.sqrt(weight) * d, np.sqrt(weight) * S))
         return Evaluation(np.concatenate([d for d, _ in parts]), np.concatenate([S for _, S in parts]))
 
     def draw(self, purpose: str, columns: int | None = None) -> Array:

@@ -7,7 +7,7 @@ import pytest
 from toy_models import Oscillator, OscillatorSettings
 from varying_models import KNOTS, Batched, Ending, Ramp, Steep
 
-from en4dvar.model.forward import Batch, Failure, Trajectory
+from en4dvar.model.forward import Failure, Trajectory
 from en4dvar.model.state import Field
 from en4dvar.priors.prior import PriorTerm
 from en4dvar.priors.varying import PiecewiseModel, RandomWalk, StateChanges
@@ -43,8 +43,7 @@ def own_times(members=4):
 def test_paths_in_closed_form(kind):
     model, values, times = ramp(kind), theta(), own_times()
     paths = model.trajectories(model.initial_states(values), times)
-    assert isinstance(paths, Batch) == (kind is Batched)
-    y = paths["y"] if isinstance(paths, Batch) else np.stack([path["y"] for path in paths])
+    y = np.stack([path["y"] for path in paths])
     assert y == pytest.approx(expected(values, times), abs=1e-13)
     rates = np.cumsum(np.stack(list(values.values())), axis=0)
     for i, path in enumerate(paths):
@@ -56,11 +55,6 @@ def test_paths_in_closed_form(kind):
         assert path.states.shape == (len(TIMES), model.layout.size)
         assert np.array_equal(path.states[:, 0], path["y"])
         assert np.array_equal(path.states[:, 2:], path["r_pieces"])
-    if isinstance(paths, Batch):
-        assert np.array_equal(paths.states, np.stack([path.states for path in paths]))
-        assert np.array_equal(paths.last, paths.states[:, -1])
-        assert np.array_equal(paths["r_pieces"], np.stack([path["r_pieces"] for path in paths]))
-        assert np.array_equal(paths.largest("r"), [path.largest("r") for path in paths])
 
 
 @pytest.mark.parametrize("kind", [Ramp, Batched])

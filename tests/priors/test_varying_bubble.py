@@ -12,7 +12,6 @@ from en4dvar.data.noise import noise_of
 from en4dvar.data.observations import Observations
 from en4dvar.diagnosis.response.what_if import changed_problem
 from en4dvar.estimation.assimilate import assimilate
-from en4dvar.model.forward import Batch
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.priors.varying import PiecewiseModel, RandomWalk
 from en4dvar.problem import InverseProblem
@@ -45,14 +44,12 @@ def test_without_a_change_the_path_is_that_of_the_constant_model():
     fine = BubbleModel(accuracy=Accuracy(nodes=4, rtol=1e-9))
     model = varied(fine, knots=(10e-6, 25e-6, 40e-6))
     paths = model.trajectories(model.initial_states(theta(3, np.zeros((3, 3)))), TIMES)
-    assert isinstance(paths, Batch)
     (whole,) = fine.trajectories(fine.initial_states({k: np.array([v]) for k, v in TRUTH.items()}), TIMES)
-    assert paths["R"][0] == pytest.approx(whole["R"], rel=1e-6)
-    assert paths.largest("wall_mach")[0] == pytest.approx(whole.largest("wall_mach"), rel=1e-3)
+    assert paths[0]["R"] == pytest.approx(whole["R"], rel=1e-6)
+    assert paths[0].largest("wall_mach") == pytest.approx(whole.largest("wall_mach"), rel=1e-3)
     (limit,) = fine.validity
-    assert paths.beyond(limit) == pytest.approx(np.full(3, whole.beyond(limit)), rel=1e-4)
-    assert paths[0].beyond(limit) == paths.beyond(limit)[0]
-    assert paths["strain_rate"].shape == (3, len(TIMES))
+    assert [path.beyond(limit) for path in paths] == pytest.approx(np.full(3, whole.beyond(limit)), rel=1e-4)
+    assert all(path["strain_rate"].shape == (len(TIMES),) for path in paths)
 
 
 def test_a_change_is_that_of_the_model_resumed_with_the_other_value():
@@ -67,8 +64,8 @@ def test_a_change_is_that_of_the_model_resumed_with_the_other_value():
         (after,) = bubble.resumed(at[None], np.array([COLLAPSE]), TIMES[None])
         later = TIMES > COLLAPSE
         assert paths[i]["R"][later] == pytest.approx(after["R"][later], rel=1e-12)
-        assert paths["mu"][i] == pytest.approx(np.where(later, 0.1 * factor, 0.1))
-    assert np.array_equal(paths["R"][0, ~later], paths["R"][1, ~later])
+        assert paths[i]["mu"] == pytest.approx(np.where(later, 0.1 * factor, 0.1))
+    assert np.array_equal(paths[0]["R"][~later], paths[1]["R"][~later])
 
 
 def test_alternatives_vary_too():

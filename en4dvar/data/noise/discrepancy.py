@@ -25,6 +25,7 @@ from en4dvar.data.noise.correlated import CorrelatedNoise, Correlation, SharedEr
 from en4dvar.data.noise.gaussian import Linearisation, Noise, Predicted
 from en4dvar.data.noise.state_space import innovations
 from en4dvar.model.state import Array
+from en4dvar.priors.dependence import KERNELS
 
 AT_ONCE = 1 << 15  # elements of covariance matrices in one call: they stay in the processor's cache
 BORDER = 1e300  # beside it every square of a whitened residual is nothing
@@ -43,9 +44,7 @@ class Kernel:
     early or late errs most where that is fast; g = 1 by default. Source: Rasmussen & Williams (2006), Gaussian
     Processes for Machine Learning, § 4.2.1.
 
-    Raises
-    ------
-    ValueError: another ν, or ``grows_beyond`` not positive.
+    Raises ValueError: another ν, or ``grows_beyond`` not positive.
     """
 
     times: Array
@@ -80,12 +79,8 @@ class Kernel:
 
     def correlation(self, length: Array) -> Array:
         """k (…, K, K) for lengths ℓ (…,), with the :data:`NUGGET` where k is smooth."""
-        x = math.sqrt(2 * self.smoothness) * self.lags / length[..., None, None]
-        k = np.exp(-x)
-        if self.smoothness == 1.5:
-            k *= 1 + x
-        elif self.smoothness == 2.5:
-            k *= 1 + x + x * x / 3
+        (kernel,) = (KERNELS[name] for name, nu in SMOOTHNESS.items() if nu == self.smoothness)
+        k = kernel(self.lags / length[..., None, None])
         diagonal = np.arange(len(self.times))
         k[..., diagonal, diagonal] = 1 + self.nugget
         return np.asarray(k)
@@ -115,6 +110,10 @@ class Direction:
     discrepancy: Array
     coordinates: Array
 
+    def change(self, light: Array | float) -> Array:
+        """∂(R/w + A) (K, K) where readings count by w, ``light`` (K,) or one number."""
+        return np.asarray(self.errors / np.reshape(light, (-1, 1)) + self.discrepancy)
+
 
 @dataclass(frozen=True)
 class DiscrepancyNoise(Noise):
@@ -125,6 +124,7 @@ class DiscrepancyNoise(Noise):
 
     discrepant: ClassVar[bool] = True
     independent = False
+    expected_light = 1.0  # E[ρ'']
 
     def check(self, weights: Array) -> None:
         super().check(weights)
@@ -190,7 +190,7 @@ class DiscrepancyNoise(Noise):
     def explained(self, values: Array, predicted: Predicted) -> tuple[Array, Array]:
         """Mean and std (K,) of δ given the residual at one prediction."""
         covariance = self.covariance_of_discrepancy(predicted)
-        root = np.linalg.cholesky(self.covariance(predicted))
+        root = np.linalg.cholesky(self.covariance(predicted, self._light(values, predicted)))
         both = np.column_stack([values - predicted.values, covariance])
         mean, *gain = (covariance @ cho_solve((root, True), both)).T
         variance = np.diag(covariance) - np.diag(np.array(gain))
@@ -237,16 +237,18 @@ class DiscrepancyNoise(Noise):
         return np.asarray(self._in_parts(predicted, 1, conditional)[0])
 
     def whiten(self, values: Array, weights: Array, at: Linearisation) -> tuple[Array, Array]:
-        root = np.asarray(np.linalg.cholesky(self.covariance(at.prediction)), dtype=float)
-        residual = values - at.prediction.values
-        white = solve_triangular(root, np.column_stack([residual, at.anomalies.T]), lower=True)
-        v, directions = white[:, 0], self._directions(at)
-        changes = [both_sides(root, direction.errors + direction.discrepancy) for direction in directions]
-        score = np.array([0.5 * (v @ change @ v - np.trace(change)) for change in changes])
-        return augmented(weights, white, directions, changes, score)
+        p, light = at.prediction, self._light(values, at.prediction)
+        covariances = np.stack([self.covariance(p, w) for w in (light, self.expected_light)])
+        root, expected = np.asarray(np.linalg.cholesky(covariances), dtype=float)
+        white = solve_triangular(root, np.column_stack([values - p.values, at.anomalies.T]), lower=True)
+        u, directions = solve_triangular(root, white[:, 0], lower=True, trans="T"), self._directions(at)
+        changes = [both_sides(expected, direction.change(self.expected_light)) for direction in directions]
+        of_each = zip(directions, changes, strict=True)
+        score = [0.5 * (u @ direction.change(light) @ u - np.trace(change)) for direction, change in of_each]
+        return augmented(weights, white, directions, changes, np.array(score))
 
     def precision_times(self, values: Array, weights: Array, at: Predicted, vectors: Array) -> Array:
-        root = np.linalg.cholesky(self.covariance(at))
+        root = np.linalg.cholesky(self.covariance(at, self._light(values, at)))
         return np.asarray(weights[0] * cho_solve((root, True), vectors.T).T)
 
     def whitened_columns(self, columns: Array, predicted: Predicted) -> tuple[Array, Array]:
@@ -269,14 +271,16 @@ class DiscrepancyNoise(Noise):
             raise ValueError("predictions lack amplitude and length of the discrepancy")
         return np.asarray(predicted.discrepancy[..., 0]), np.asarray(predicted.discrepancy[..., 1])
 
-    def covariance(self, predicted: Predicted) -> Array:
-        """R + A (…, K, K)."""
-        return self.covariance_of_errors(predicted) + self.covariance_of_discrepancy(predicted)
+    def _light(self, values: Array, predicted: Predicted) -> Array:
+        return np.ones(predicted.values.shape)
+
+    def covariance(self, predicted: Predicted, light: Array | float = 1.0) -> Array:
+        """R/w + A (…, K, K), w how much readings count: ``light`` (…, K), or one number."""
+        errors = self.covariance_of_errors(predicted) / np.expand_dims(light, -1)
+        return np.asarray(errors + self.covariance_of_discrepancy(predicted))
 
     def _directions(self, at: Linearisation) -> list[Direction]:
-        """Directions in which the covariance changes: the parameters of the errors, and the rates of each of the N
-        coordinates.
-        """
+        """Directions in which the covariance changes: the parameters of the errors, and those of each coordinate."""
         p = at.prediction
         errors, discrepancy = self.covariance_of_errors(p), self.covariance_of_discrepancy(p)
         directions, nothing = [], np.zeros_like(errors)
@@ -307,12 +311,13 @@ class DiscrepancyNoise(Noise):
         return joined.reshape(arrays, *predicted.values.shape)
 
     def _innovations(self, values: Array, predicted: Predicted) -> Array:
-        """v and the diagonal of L (2, …, K); NaN where a prediction is not finite or R + A is all but singular."""
+        """v and the diagonal of L (2, …, K); NaN where a prediction is not finite or R/w + A is all but singular."""
         if self.correlation is not None:
             return self._in_parts(predicted, 2, lambda runs: whitened(values - runs.values, self.covariance(runs)))
         with np.errstate(over="ignore", invalid="ignore"):
             residual, s, a, length = self._in_time(values, predicted)
-            return self._filtered(residual, s**2, a, length).reshape(2, *predicted.values.shape)
+            variance = s**2 / self._light(values, predicted).reshape(s.shape)
+            return self._filtered(residual, variance, a, length).reshape(2, *predicted.values.shape)
 
     def _in_time(self, values: Array, predicted: Predicted) -> tuple[Array, Array, Array, Array]:
         """y − m, s and a g (B, K) of the runs, and ℓ (B,)."""

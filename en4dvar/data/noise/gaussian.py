@@ -208,8 +208,11 @@ class Noise:
 
     def down_weights(self, values: Array, predicted: Predicted) -> Array | None:
         """:meth:`influence` (K,) at a prediction; None where every observation counts in full in any case."""
-        robust = math.isfinite(self.counts_within)
-        return self.influence(self.whitened_residual(values, predicted)) if robust else None
+        return self._light(values, predicted) if math.isfinite(self.counts_within) else None
+
+    def _light(self, values: Array, predicted: Predicted) -> Array:
+        """How much of a Gaussian observation each counts (…, K)."""
+        return self.influence(self.whitened_residual(values, predicted))
 
     def explained(self, values: Array, predicted: Predicted) -> tuple[Array, Array] | None:
         """Mean and std (K,) of the discrepancy given the residual at one prediction; None where there is none."""

@@ -247,9 +247,8 @@ def joint_noise(times: Sequence[Array], noises: Sequence[Noise], between: Array)
     and none else. Where both are correlated in time they need the same times and the same correlation C, and have
     ρ_ij C (a Kronecker product). What is not correlated takes no memory.
 
-    Raises
-    ------
-    ValueError: that is not so; ``between`` is no correlation; a robust cost, or a discrepancy, beside a correlation.
+    Raises ValueError: that is not so; ``between`` is no correlation; a robust cost, or a discrepancy, beside a
+    correlation.
     """
     Correlation(between)
     matrices = [correlation_of(noise) for noise in noises]

@@ -15,11 +15,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import cho_solve, solve_triangular
 
-from en4dvar.data.noise.correlated import CorrelatedNoise
-from en4dvar.data.noise.discrepancy import DiscrepancyNoise, augmented, both_sides
-from en4dvar.data.noise.gaussian import Linearisation, Predicted
+from en4dvar.data.noise.discrepancy import DiscrepancyNoise
+from en4dvar.data.noise.gaussian import Predicted
 from en4dvar.data.noise.losses import HuberNoise
 from en4dvar.data.noise.state_space import boxed
 from en4dvar.model.state import Array
@@ -48,32 +46,28 @@ class RobustDiscrepancyNoise(DiscrepancyNoise):
     def counts_within(self) -> float:
         return self.threshold
 
+    @property
+    def expected_light(self) -> float:  # type: ignore[override]
+        return self.huber.expected_curvature
+
     def attributes(self) -> dict[str, float]:
         return {**self.huber.attributes(), **super().attributes()}
 
-    def frozen(self, predicted: Predicted) -> CorrelatedNoise:
-        raise NotImplementedError("a robust cost is never frozen: its scheme searches")
-
     def gaussian_at(self, values: Array, predicted: Predicted) -> DiscrepancyNoise:
-        root = np.sqrt(self._solved(values, predicted)[1])
+        root = np.sqrt(self._light(values, predicted))
         return DiscrepancyNoise(self.std / root, self.time_std / root, self.kernel)
 
-    def down_weights(self, values: Array, predicted: Predicted) -> Array:
-        return self._solved(values, predicted)[1]
-
-    def explained(self, values: Array, predicted: Predicted) -> tuple[Array, Array]:
-        u, weights = self._solved(values, predicted)
-        covariance = self.covariance_of_discrepancy(predicted)
-        total = covariance + np.diag(self.error_std(predicted) ** 2 / weights)
-        variance = np.diag(covariance) - np.sum(covariance * np.linalg.solve(total, covariance), axis=0)
-        return covariance @ u, np.sqrt(np.maximum(variance, 0.0))
+    def _light(self, values: Array, predicted: Predicted) -> Array:
+        _, errors, s, *_ = self._at_mode(values, predicted)
+        most = self.threshold * s
+        return np.asarray(most / np.maximum(np.abs(errors), most))
 
     def _more_variance(self, values: Array, predicted: Predicted) -> Array:
         first = slice(len(values))
         kernel = replace(self.kernel, times=self.kernel.times[first])
         within = replace(self, std=self.std[first], time_std=self.time_std[first], kernel=kernel)
         there = predicted.among(first)
-        return np.asarray(within.error_std(there) ** 2 * (1 / within.down_weights(values, there) - 1))
+        return np.asarray(within.error_std(there) ** 2 * (1 / within._light(values, there) - 1))
 
     def cost(self, values: Array, weights: Array, predicted: Predicted) -> Array:
         terms = self._terms(values, predicted)
@@ -88,57 +82,23 @@ class RobustDiscrepancyNoise(DiscrepancyNoise):
     def log_conditional(self, values: Array, predicted: Predicted) -> None:
         """None: the joint density is an approximation that knows no reading by itself."""
 
-    def whiten(self, values: Array, weights: Array, at: Linearisation) -> tuple[Array, Array]:
-        p = at.prediction
-        u, light = self._solved(values, p)
-        s, discrepancy, kappa = self.error_std(p), self.covariance_of_discrepancy(p), self.huber.expected_curvature
-        root = np.linalg.cholesky(np.diag(s**2 / light) + discrepancy)
-        expected = np.asarray(np.linalg.cholesky(np.diag(s**2 / kappa) + discrepancy), dtype=float)
-        white = solve_triangular(root, np.column_stack([values - p.values, at.anomalies.T]), lower=True)
-        directions = self._directions(at)
-        changes = [both_sides(expected, direction.errors / kappa + direction.discrepancy) for direction in directions]
-        # u² s²/w is vρ'(v); half of the diagonal of ∂R over s² is ∂ln s
-        score = [
-            0.5 * (u @ direction.discrepancy @ u + u**2 / light @ np.diag(direction.errors) - np.trace(change))
-            for direction, change in zip(directions, changes, strict=True)
-        ]
-        return augmented(weights, white, directions, changes, np.array(score))
-
-    def precision_times(self, values: Array, weights: Array, at: Predicted, vectors: Array) -> Array:
-        _, light = self._solved(values, at)
-        total = np.diag(self.error_std(at) ** 2 / light) + self.covariance_of_discrepancy(at)
-        return np.asarray(weights[0] * cho_solve((np.linalg.cholesky(total), True), vectors.T).T)
-
     def _white(self, stream: np.random.Generator, shape: tuple[int, ...]) -> Array:
         return self.huber._white(stream, shape)
 
     def _log_norm(self) -> float:
         return self.huber._log_norm()
 
-    def _solved(self, values: Array, predicted: Predicted) -> tuple[Array, Array]:
-        """u and w (…, K)."""
-        u, errors, s, *_ = self._at_mode(values, predicted)
-        most = self.threshold * s
-        return u, np.asarray(most / np.maximum(np.abs(errors), most))
-
-    def whitened_residual(self, values: Array, predicted: Predicted) -> Array:
-        """(S²/w + A)^{-1/2}(y − m) (…, K)."""
-        with np.errstate(over="ignore", invalid="ignore"):
-            residual, s, a, length = self._in_time(values, predicted)
-            light = np.reshape(self._solved(values, predicted)[1], s.shape)
-            return np.reshape(self._filtered(residual, s**2 / light, a, length)[0], predicted.values.shape)
-
     def _terms(self, values: Array, predicted: Predicted) -> Array:
         """Terms of J_o (…, K), β and ln std apart; NaN where a prediction is not finite."""
         with np.errstate(over="ignore", invalid="ignore"):
             u, errors, s, delta, roots = self._at_mode(values, predicted)
             terms = self.huber._loss(errors / s) + 0.5 * u * delta + np.log(roots)
-            return np.asarray(terms + 0.5 * math.log(self.huber.expected_curvature))
+            return np.asarray(terms + 0.5 * math.log(self.expected_light))
 
     def _at_mode(self, values: Array, predicted: Predicted) -> Array:
         """u, r − δ, s and δ at the mode in δ, and the diagonal of the root of S²/κ + A (5, …, K)."""
         with np.errstate(over="ignore", invalid="ignore"):
             k, (residual, s, a, length) = self.kernel, self._in_time(values, predicted)
             u, delta = boxed(residual, s, k.nugget * a**2, a, length, k.steps, k.smoothness, self.threshold)
-            _, roots = self._filtered(residual, s**2 / self.huber.expected_curvature, a, length)
+            _, roots = self._filtered(residual, s**2 / self.expected_light, a, length)
             return np.reshape([u, residual - delta, s, delta, roots], (5, *predicted.values.shape))

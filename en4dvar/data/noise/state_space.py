@@ -191,21 +191,14 @@ def _ahead(
     for k in range(len(r)):
         if k > 0:
             f = moves[which[k - 1]]
-            if order < 3:  # two states at most
-                f00, f01, f10, f11 = f[0], f[1], f[3], f[4]
-                m0, m1 = f00 * m0 + f01 * m1, f10 * m0 + f11 * m1
-                a00, a01 = f00 * p00 + f01 * p01, f00 * p01 + f01 * p11
-                a10, a11 = f10 * p00 + f11 * p01, f10 * p01 + f11 * p11
-                p00, p01, p11 = a00 * f00 + a01 * f01, a00 * f10 + a01 * f11, a10 * f10 + a11 * f11
-            else:
-                f0, f1, f2 = (f[0], f[1], f[2]), (f[3], f[4], f[5]), (f[6], f[7], f[8])
-                mean, p0, p1, p2 = (m0, m1, m2), (p00, p01, p02), (p01, p11, p12), (p02, p12, p22)
-                m0, m1, m2 = _dot(f0, mean), _dot(f1, mean), _dot(f2, mean)
-                a0 = _dot(f0, p0), _dot(f0, p1), _dot(f0, p2)
-                a1 = _dot(f1, p0), _dot(f1, p1), _dot(f1, p2)
-                a2 = _dot(f2, p0), _dot(f2, p1), _dot(f2, p2)
-                p00, p01, p02 = _dot(a0, f0), _dot(a0, f1), _dot(a0, f2)
-                p11, p12, p22 = _dot(a1, f1), _dot(a1, f2), _dot(a2, f2)
+            f0, f1, f2 = (f[0], f[1], f[2]), (f[3], f[4], f[5]), (f[6], f[7], f[8])
+            mean, p0, p1, p2 = (m0, m1, m2), (p00, p01, p02), (p01, p11, p12), (p02, p12, p22)
+            m0, m1, m2 = _dot(f0, mean), _dot(f1, mean), _dot(f2, mean)
+            a0 = _dot(f0, p0), _dot(f0, p1), _dot(f0, p2)
+            a1 = _dot(f1, p0), _dot(f1, p1), _dot(f1, p2)
+            a2 = _dot(f2, p0), _dot(f2, p1), _dot(f2, p2)
+            p00, p01, p02 = _dot(a0, f0), _dot(a0, f1), _dot(a0, f2)
+            p11, p12, p22 = _dot(a1, f1), _dot(a1, f2), _dot(a2, f2)
         t0, t1, t2 = a[k] * (1.0 + p00), a[k] * p01, a[k] * (joint + p02)
         expected, precision, new = a[k] * m0, 0.0, force[k]
         if np.isnan(new):

@@ -9,17 +9,8 @@ from types import MappingProxyType
 import numpy as np
 import numpy.typing as npt
 
+from en4dvar.diagnosis import diagnostics as diag
 from en4dvar.diagnosis.analysis import Analysis
-from en4dvar.diagnosis.diagnostics import (
-    EMULATED_ENOUGH,
-    HARDLY_INFORMED,
-    MEAN_OFF,
-    SPREAD_OFF,
-    active_members,
-    chi2_interval,
-    common_reasons,
-    is_non_gaussian,
-)
 from en4dvar.model.forward import ValidityLimit
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.caution import Caution, Severity, caution
@@ -42,7 +33,7 @@ UNREAD = "no action is needed where the field's own spread says so, cell by cell
 MANY = 0.1  # share of members whose loss is serious
 SEPARATED = 3.0  # standard deviations of the rank sum beyond which a parameter tells lost members from others
 FAR = 1.5  # prior standard deviations from the prior mean that are worth naming for one or two members
-MOST_NAMED = 3
+MOST_NAMED, MOST_LISTED = 3, 6
 NONE: Mapping[str, str] = MappingProxyType({})
 Mask = npt.NDArray[np.bool_]
 Findings = Iterator[Caution]
@@ -69,7 +60,7 @@ def fit(chi2: float, n_observations: int, total_dfs: float) -> Findings:
     At the minimum its expectation is K − DFS, not K (Talagrand 1999): the fit has absorbed DFS of the noise.
     """
     degrees = max(1.0, n_observations - total_dfs)
-    low, high = chi2_interval(degrees)
+    low, high = diag.chi2_interval(degrees)
     words = f"χ² of the residuals is {chi2:.3g} where about {degrees:.3g} is expected"
     if not chi2 <= high:
         yield caution("misfit", f"{words}: the model does not explain the data within the stated observation error")
@@ -156,7 +147,7 @@ def _chance(probability: float) -> str:
 def conflict(prior: Prior, centre: Array) -> Findings:
     """A posterior centre (n,) far from the prior: 2 J_b beyond the 99.95 % point of χ²_n."""
     z, white = (centre - prior.mean) / prior.std, prior.white(centre)
-    if float(white @ white) <= chi2_interval(len(z))[1]:
+    if float(white @ white) <= diag.chi2_interval(len(z))[1]:
         return
     worst = np.argsort(-np.abs(z))
     far = [j for j in worst if abs(z[j]) > 2] or worst[:1]
@@ -241,7 +232,7 @@ def information(
     of_fields: dict[str, list[str]] = {}
     moved = np.abs(posterior.mean(axis=0) - prior.mean) / prior.std
     for name, value, far in zip(prior.names, per_parameter, moved, strict=True):
-        if name not in silent and -WIDENED < value < HARDLY_INFORMED and far < MOVED:
+        if name not in silent and -WIDENED < value < diag.HARDLY_INFORMED and far < MOVED:
             if name in modes:
                 of_fields.setdefault(modes[name], []).append(name)
                 continue
@@ -260,12 +251,12 @@ def gaussian(prior: Prior, members: Array, shape: Mapping[str, float], approxima
     posterior by an emulator or by weights. The finding is about the parameters that are off, and serious where one is
     off by much. ``approximate``: what a scheme does that is no posterior even where this is Gaussian.
     """
-    if not is_non_gaussian(shape):
+    if not diag.is_non_gaussian(shape):
         return
     sizes, off, severity = [], [], None
     why = f"the scheme {approximate}" if approximate else "the posterior is far from Gaussian"
     words = f"{why}: mean and spread of the ensemble are not the posterior's"
-    by = "emulated" if shape.get("emulator_fit", 0.0) >= EMULATED_ENOUGH else "tail"
+    by = "emulated" if shape.get("emulator_fit", 0.0) >= diag.EMULATED_ENOUGH else "tail"
     told = [(j, p) for j, p in enumerate(prior.parameters) if f"{by}_mean_{p.name}" in shape]
     if not told:
         words = (
@@ -276,7 +267,7 @@ def gaussian(prior: Prior, members: Array, shape: Mapping[str, float], approxima
         std = shape[f"{by}_std_{p.name}"]
         shift = (float(members[:, j].mean()) - shape[f"{by}_mean_{p.name}"]) / std
         ratio = float(members[:, j].std(ddof=1)) / std
-        if by == "tail" or abs(shift) > MEAN_OFF or abs(ratio - 1) > SPREAD_OFF:
+        if by == "tail" or abs(shift) > diag.MEAN_OFF or abs(ratio - 1) > diag.SPREAD_OFF:
             off.append(p.name)
             sizes.append(_both(p, members[:, j], shape, by))
             if abs(shift) > 1 or not 0.5 < ratio < 2:
@@ -293,15 +284,15 @@ def _both(p: Parameter, members: Array, shape: Mapping[str, float], by: str) -> 
     return f"{p.name} = {mean:.2g} ± {std:.2g}{unit} where it should be about {estimate:.2g} ± {spread:.2g}{unit}"
 
 
-def down_weighted(analysis: Analysis, most: int = 6) -> Findings:
-    """Observations that a robust cost counts less; ``most`` of them are listed."""
+def down_weighted(analysis: Analysis) -> Findings:
+    """Observations that a robust cost counts less; :data:`MOST_LISTED` of them are listed."""
     weights = analysis.down_weights
     if weights is None or not np.any(weights < 1):
         return
     lighter, moment, within = np.flatnonzero(weights < 1), moments(analysis), analysis.observations.noise.counts_within
     worst = lighter[np.argsort(weights[lighter], kind="stable")]
-    listed = ", ".join(f"{moment[k]} (weight {weights[k]:.2g})" for k in worst[:most])
-    more = f" and {len(worst) - most} more" if len(worst) > most else ""
+    listed = ", ".join(f"{moment[k]} (weight {weights[k]:.2g})" for k in worst[:MOST_LISTED])
+    more = f" and {len(worst) - MOST_LISTED} more" if len(worst) > MOST_LISTED else ""
     words = (
         f"{len(worst)} of {len(weights)} observations lie beyond {within:g} standard deviations and "
         f"were down-weighted (Huber): {listed}{more}"
@@ -325,10 +316,10 @@ def loss(stage: str, failures: Sequence[str], prior: Prior, members: Array | Non
 
     ``members`` (N, n), transformed, are where they were run, if that tells anything.
     """
-    lost = ~active_members(failures)
+    lost = ~diag.active_members(failures)
     if not lost.any():
         return
-    words = f"{lost.sum()} of {len(lost)} members failed in the {stage}: {common_reasons(failures)}"
+    words = f"{lost.sum()} of {len(lost)} members failed in the {stage}: {diag.common_reasons(failures)}"
     if members is not None:
         words = f"{words}; {where_lost(prior, members, lost)}"
     yield caution("members-lost", words, "serious" if lost.mean() > MANY else None)
@@ -343,10 +334,12 @@ def where_lost(prior: Prior, members: Array, lost: Mask) -> str:
     n_lost, n_alive = int(lost.sum()), int((~lost).sum())
     if n_lost < 3 or n_alive < 3:
         return _one_by_one(prior, members[lost]) if n_lost < 3 else "no parameter tells them from the few others"
+    from scipy.stats import ranksums  # where members are lost: its import takes long
+
     sides: list[tuple[float, str]] = []
     for j in range(members.shape[1]):
         values = members[:, j]
-        score = _rank_score(values, lost)
+        score = float(ranksums(values[lost], values[~lost]).statistic)
         if abs(score) < SEPARATED:
             continue
         mirrored = values if score > 0 else -values
@@ -371,14 +364,6 @@ def _one_by_one(prior: Prior, members: Array) -> str:
         places = ", ".join(f"{prior.names[j]} = {_shown(prior, j, row[j])} ({z[j]:+.1f} prior std)" for j in far)
         described.append(f"at {places}" if places else "near the centre of the prior")
     return f"lost {' and '.join(dict.fromkeys(described))}"
-
-
-def _rank_score(values: Array, lost: Mask) -> float:
-    """Standardised rank sum of the lost members: positive where their values are large."""
-    ranks = 1 + np.argsort(np.argsort(values, kind="stable"))
-    n, m = int(lost.sum()), int((~lost).sum())
-    expected, variance = n * (n + m + 1) / 2, n * m * (n + m + 1) / 12
-    return float((ranks[lost].sum() - expected) / math.sqrt(variance))
 
 
 def _shown(prior: Prior, j: int, x: float) -> str:

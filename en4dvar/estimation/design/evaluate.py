@@ -82,9 +82,7 @@ class Evaluated:
 
     @property
     def worth(self) -> float:
-        """The measure by which designs are ranked, nats: information about the law where that is asked, else
-        :attr:`gain`.
-        """
+        """What designs are ranked by, nats: information about the law where that is asked, else :attr:`gain`."""
         return self.decision.information if self.decision else self.gain
 
     @property
@@ -113,9 +111,8 @@ def evaluate(
     ``wanted``: name → std to which it is to be known, in its unit, or relative to the value where true; what the others
     must be known to for it is found by linearisation.
 
-    Raises
-    ------
-    ConfigError: a name that is not estimated; a choice that is not possible. TooFewMembersError: the model fails.
+    Raises ConfigError: a name that is not estimated; a choice that is not possible. TooFewMembersError: the model
+    fails.
     """
     before = 0
     if choice is not None:  # on draws of its own
@@ -238,9 +235,8 @@ def _largest(measure: Callable[[float], float], wanted: float, most: float) -> f
 def choose(planned: Planned, u: Array, count: int, apart: float = 0.0) -> Indices:
     """The ``count`` readings that tell most, each ``apart`` from the others in time, from draws (R, n) of the prior.
 
-    Raises
-    ------
-    ConfigError: errors that are correlated; no such choice is possible. TooFewMembersError: the model mostly fails.
+    Raises ConfigError: errors that are correlated; no such choice is possible. TooFewMembersError: the model mostly
+    fails.
     """
     observations = planned.problem.observations
     if not observations.noise.independent:

@@ -38,9 +38,7 @@ class Planned:
     order (asked, common, others), so that the first ``asked`` of them are those of what is asked for, whatever the
     others are, and the first ``shared`` those of what experiments share.
 
-    Raises
-    ------
-    ConfigError: a name that is not estimated, or twice; weights other than 0 and 1, which are not Bayesian.
+    Raises ConfigError: a name that is not estimated, or twice; weights other than 0 and 1, which are not Bayesian.
     """
 
     def __init__(self, problem: InverseProblem, about: Sequence[str] = (), common: Sequence[str] = ()):

@@ -19,10 +19,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import gammaln, logsumexp
 
+from en4dvar.ensemble.linalg import effective_number, resampled, shares_of
 from en4dvar.estimation.joint.descent import ArrowSystem, Experiment, Place
 from en4dvar.model.state import Array
 from en4dvar.priors.prior import member_stream
-from en4dvar.sampling.mixture import effective_number, resampled
 
 DRAWS, INNER = 192, 12  # of what is shared, and of the own quantities for each of them
 STEPS = 2  # linearisations that the own quantities given what is shared are sought by
@@ -73,7 +73,7 @@ def sampled(experiments: Sequence[Experiment], at: ArrowSystem, seed: int, count
         border, log_weights, *pairs = (np.concatenate(parts) for parts in zip(*rounds, strict=True))
         if not np.isfinite(log_weights).any():
             return None
-        weights = np.exp(log_weights - logsumexp(log_weights))
+        weights = shares_of(log_weights)
         effective = effective_number(weights)
         if effective >= FEWEST:
             break
@@ -82,7 +82,7 @@ def sampled(experiments: Sequence[Experiment], at: ArrowSystem, seed: int, count
     order = np.argsort(border[:, 0], kind="stable") if border.shape[1] else np.arange(len(border))
     taken = order[resampled(weights[order], count, stream)]
     own_members = tuple(
-        np.stack([_one(own[i], log[i], stream) for i in taken])
+        np.concatenate([own[i, resampled(shares_of(log[i]), 1, stream)] for i in taken])  # one each, by their weights
         for own, log in zip(pairs[::2], pairs[1::2], strict=True)
     )
     evidence = float(logsumexp(log_weights)) - float(np.log(len(border)))
@@ -135,12 +135,6 @@ def _given(experiment: Experiment, at: ArrowSystem, border: Array) -> tuple[Arra
     mean = at.place.own[e] - np.linalg.solve(block, arrow.edges[e].T @ (border - at.place.border).T).T
     mean, precision, _ = experiment.settled(border, mean, precision, STEPS)
     return mean, precision
-
-
-def _one(own: Array, log: Array, stream: np.random.Generator) -> Array:
-    """One of the draws (INNER, n_e), by their weights."""
-    shares = np.cumsum(np.exp(log - logsumexp(log)))
-    return np.asarray(own[min(int(np.searchsorted(shares, stream.random())), len(own) - 1)])
 
 
 def challenger(experiments: Sequence[Experiment], at: ArrowSystem, seed: int) -> Place | None:

@@ -37,10 +37,8 @@ class JointProblem:
     Parameters of one name and one group have one value; it has a single prior, which must be the same in all
     experiments of the group. Models, windows, errors and the parameters of their own may differ.
 
-    Raises
-    ------
-    ConfigError: fewer than two experiments, two of one name, a shared parameter that an experiment does not estimate,
-        nothing shared, or priors that differ or are correlated.
+    Raises ConfigError: fewer than two experiments, two of one name, a shared parameter that an experiment does not
+    estimate, nothing shared, or priors that differ or are correlated.
     """
 
     experiments: tuple[InverseProblem, ...]

@@ -17,6 +17,7 @@ import numpy as np
 import scipy  # its trees where they are used: a twentieth of what every command imports
 
 from en4dvar.ensemble.forecast import check_problem
+from en4dvar.ensemble.linalg import effective_number, resampled, shares_of
 from en4dvar.estimation.population.hierarchy import Effort, Hierarchy, HierarchyDraws, HyperPrior, named
 from en4dvar.estimation.population.own import Empirical, OwnDraws, OwnLikelihood, empirical, own_draws, own_likelihoods
 from en4dvar.executor import Executor, one_blas_thread
@@ -25,7 +26,6 @@ from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.hints import suggest
 from en4dvar.priors.prior import PriorTerm, member_stream
 from en4dvar.problem import InverseProblem
-from en4dvar.sampling.mixture import effective_number, resampled
 
 DETERMINED = 0.9  # of the hyperprior's variance, taken away by the data
 IN_IT = 0.2  # of the largest exponent: a parameter that is part of a combination
@@ -127,10 +127,10 @@ class Population:
         """
         d, h = self.posterior, self.hyper
         logs = 0.5 * np.sum((d.nu / h.mean_std) ** 2 + (d.tau / h.spread) ** 2, axis=1)
-        weights = np.exp(logs - logs.max())
-        taken = resampled(weights / weights.sum(), len(weights), member_stream(seed, "without hyperprior"))
+        shares = shares_of(logs)
+        taken = resampled(shares, len(shares), member_stream(seed, "without hyperprior"))
         kept = Draws(*(getattr(d, field.name)[taken] for field in fields(Draws)))
-        return kept, effective_number(weights) / len(weights) * self.size
+        return kept, effective_number(shares) / len(shares) * self.size
 
     def combinations(self) -> tuple[Combination, ...]:
         """Combinations of the means that the data determine where they do not determine each mean by itself."""

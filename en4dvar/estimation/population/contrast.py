@@ -22,10 +22,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
+from en4dvar.ensemble.linalg import effective_number, resampled, shares_of
 from en4dvar.estimation.population.campaign import FEWEST
 from en4dvar.model.state import Array
 from en4dvar.priors.prior import member_stream
-from en4dvar.sampling.mixture import effective_number, resampled
 
 
 @dataclass(frozen=True)
@@ -50,13 +50,12 @@ def without_pull(
 
     ``known``: columns of ``nu`` with value and standard deviation from elsewhere, by a rheometer for instance.
     """
-    logs = 0.5 * np.sum((nu / mean_std) ** 2, axis=1)
-    weights = np.exp(logs - logs.max())
-    pulled = effective_number(weights) / len(weights) * draws < FEWEST
+    shares = shares_of(0.5 * np.sum((nu / mean_std) ** 2, axis=1))
+    pulled = effective_number(shares) / len(shares) * draws < FEWEST
     both = np.hstack([nu, theta])
     if not pulled:
         stream = member_stream(seed, "without the pull of the hyperprior")
-        both = both[resampled(weights / weights.sum(), len(weights), stream)]
+        both = both[resampled(shares, len(shares), stream)]
     for column, value, std in known:
         both = knowing(both, column, value, std, seed)
     return Centre(both[:, at], both[:, nu.shape[1] :], common, pulled)

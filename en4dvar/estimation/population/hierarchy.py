@@ -31,11 +31,12 @@ from typing import Annotated
 import numpy as np
 from annotated_types import Ge, Gt, Lt
 
+from en4dvar.ensemble.linalg import effective_number, resampled, shares_of
 from en4dvar.estimation.population.own import Mixture, OwnLikelihood, condition, draw_conditioned, log_marginal
 from en4dvar.model.state import Array
 from en4dvar.plumbing.compiled import kernel
 from en4dvar.priors.prior import member_stream
-from en4dvar.sampling.mixture import StudentMixture, effective_number, resampled
+from en4dvar.sampling.mixture import StudentMixture
 from en4dvar.sampling.walkers import walked
 
 SPREADS = (1e-3, 10.0)  # of τ; smaller ones are indistinguishable, and lost to rounding in the marginals
@@ -161,19 +162,18 @@ class Hierarchy:
         """Deterministic in ``seed``. Raises :class:`ValueError`: no population that was tried explains the data."""
         stream = member_stream(seed, "population")
         h, logs = self._weighed(self._walked(stream, effort), stream, effort)
-        if effective_number(_weights(logs)) < effort.effective:  # once more, from what the weights say
-            weights = _weights(logs)
-            again = h[resampled(weights / weights.sum(), FIT, stream)]
+        if effective_number(shares_of(logs)) < effort.effective:  # once more, from what the weights say
+            again = h[resampled(shares_of(logs), FIT, stream)]
             second, its_logs = self._weighed(again, stream, effort)
-            if effective_number(_weights(its_logs)) > effective_number(weights):
+            if effective_number(shares_of(its_logs)) > effective_number(shares_of(logs)):
                 h, logs = second, its_logs
-        weights = _weights(logs)
-        taken = h[resampled(weights / weights.sum(), effort.draws, stream)]
+        shares = shares_of(logs)
+        taken = h[resampled(shares, effort.draws, stream)]
         belongs, p = self.belongs(taken), self.p
-        evidence = float(logs.max()) + math.log(float(weights.mean()))
+        evidence = float(np.logaddexp.reduce(logs)) - math.log(len(logs))
         nu, tau, theta = taken[:, :p], np.exp(taken[:, p : 2 * p]), taken[:, 2 * p :]
         x = self._given(taken, belongs, stream)
-        return HierarchyDraws(nu, tau, theta, x, belongs[..., 0].mean(axis=0), effective_number(weights), evidence)
+        return HierarchyDraws(nu, tau, theta, x, belongs[..., 0].mean(axis=0), effective_number(shares), evidence)
 
     def _walked(self, stream: np.random.Generator, effort: Effort) -> Array:
         """(D, 2p + c) positions of walkers, the first third left out."""
@@ -208,10 +208,6 @@ class Hierarchy:
             numbers, uniform = stream.standard_normal((len(h), self.p)), stream.uniform(size=len(h))
             _draw(likelihood.mixture, middle, spread, numbers, uniform, x[:, s])
         return x
-
-
-def _weights(logs: Array) -> Array:
-    return np.asarray(np.exp(logs - logs.max()))
 
 
 @kernel

@@ -28,6 +28,7 @@ from scipy.special import ndtri, stdtrit
 
 from en4dvar.descent.minima import Minimum
 from en4dvar.ensemble.forecast import Composite, costs
+from en4dvar.ensemble.linalg import resampled
 from en4dvar.ensemble.missing import Beside
 from en4dvar.executor import Executor
 from en4dvar.model.state import Array
@@ -35,7 +36,7 @@ from en4dvar.plumbing.compiled import kernel
 from en4dvar.priors.prior import PriorTerm, member_stream, own_seed
 from en4dvar.problem import InverseProblem
 from en4dvar.sampling.emulated_draws import RecordedRuns
-from en4dvar.sampling.mixture import fit_gaussians, resampled
+from en4dvar.sampling.mixture import fit_gaussians, log_gaussians
 from en4dvar.sampling.modes import sample_modes
 
 ENOUGH = 500.0  # effective draws that are asked for: they know a mean to 4 % of its std
@@ -202,9 +203,7 @@ def _worth(count: int, effective: float) -> float:
 def own_likelihoods(
     drawn: Sequence[OwnDraws], varying: Sequence[int], common: Sequence[int], seed: int, names: Sequence[str]
 ) -> list[OwnLikelihood]:
-    """The likelihoods in the coordinates ``varying`` given those in ``common``; ``seed`` and the data sets' ``names``
-    name the streams.
-    """
+    """Likelihoods in coordinates ``varying`` given ``common``; ``seed`` and the sets' ``names`` name the streams."""
     each = [(draws.z[:, list(varying)], draws.z[:, list(common)]) for draws in drawn]
     slopes = pooled_slopes(
         *zip(*(_slopes(*both, draws.effective) for both, draws in zip(each, drawn, strict=True)), strict=True)
@@ -253,19 +252,12 @@ def _fitted(x: Array, effective: float, stream: np.random.Generator) -> tuple[Ar
         kept = share > 1e-6
         share, centre, covariance = share[kept] / share[kept].sum(), centre[kept], covariance[kept]
         numbers = parts * (1 + p + p * (p + 1) / 2) - 1
-        criterion = -effective * _log_density(x, share, centre, covariance).mean() + 0.5 * numbers * math.log(effective)
+        logs = np.logaddexp.reduce(log_gaussians(x, share, centre, covariance), axis=0)
+        criterion = -effective * (logs.mean() - 0.5 * p * math.log(2 * math.pi)) + 0.5 * numbers * math.log(effective)
         if criterion < lowest:
             best, lowest = (share, centre, covariance), criterion
     assert best is not None
     return best
-
-
-def _log_density(x: Array, share: Array, centre: Array, covariance: Array) -> Array:
-    """(D,) of a Gaussian mixture at points (D, p)."""
-    root = np.linalg.cholesky(covariance)
-    z = np.linalg.solve(root, (x - centre[:, None]).transpose(0, 2, 1))
-    logs = np.log(share) - np.log(np.einsum("mii->mi", root)).sum(axis=1) - 0.5 * x.shape[1] * math.log(2 * math.pi)
-    return np.asarray(np.logaddexp.reduce(logs[:, None] - 0.5 * np.sum(z**2, axis=1), axis=0))
 
 
 @dataclass(frozen=True)

@@ -76,19 +76,14 @@ class RandomWalk:
         return self.parameter.name
 
     @property
-    def pieces_name(self) -> str:
-        """Name of the values of all pieces, in the state and in result files."""
-        return f"{self.name}_pieces"
-
-    @property
     def label(self) -> str:
         """The varying quantity in words."""
         return self.parameter.label
 
     @property
     def own(self) -> Field:
-        """Where the state of a run keeps the values of the pieces."""
-        return Field(self.pieces_name, len(self.knots) + 1, self.parameter.unit)
+        """Where the state of a run, and a result file, keep the values of the pieces."""
+        return Field(f"{self.name}_pieces", len(self.knots) + 1, self.parameter.unit)
 
     def values(self, theta: Mapping[str, Array]) -> Array:
         """:meth:`pieces`. Raises ValueError where one lies outside of the parameter's bounds."""

@@ -5,23 +5,24 @@ state carries the parameter, and that can be resumed from a state, can be run li
 """
 
 import math
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from en4dvar.model.forward import Alternative, Batch, Failure, ForwardModel, Trajectory, ValidityLimit
 from en4dvar.model.state import Array, StateLayout
-from en4dvar.plumbing.caution import Caution
 from en4dvar.priors.varying.changes import RandomWalk, StateChanges
 
 ATTRIBUTES = (
     "observables", "time_unit", "time_display_unit", "batch", "compiled", "dense", "validity", "path_quantities",
+    "doubts",
 )  # fmt: skip
 
 Outcomes = Sequence[Trajectory | Failure]
+Part = tuple[Trajectory, npt.NDArray[np.bool_]]
 Varying = RandomWalk | StateChanges
 
 
@@ -31,30 +32,18 @@ def can_vary(model: ForwardModel, name: str) -> bool:
     return model.resumable and acts and any(f.name == name and f.size == 1 for f in model.layout)
 
 
-@dataclass(frozen=True)
-class PieceRun:
-    """The run of ``members`` (N',) over one piece; their runs end with an instant that is not asked for.
-
-    ``columns``: which of the instants (K,) the others are; ``within`` (N, C): those that lie within the piece.
-    """
-
-    outcomes: Outcomes
-    members: npt.NDArray[np.intp]
-    columns: slice
-    within: npt.NDArray[np.bool_]
-
-
 @dataclass
 class Walk:
     """Members on their way from piece to piece: initial states ``x`` (N, n_state), instants ``times`` (N, K).
 
-    ``layout`` is that of ``x``, whose last fields are no part of the state that is integrated.
+    ``layout`` is that of ``x``, whose last fields are no part of the state that is integrated; ``parts`` are the paths
+    of each member over the pieces, and which of their instants are asked for.
     """
 
     x: Array
     times: Array
     layout: StateLayout
-    runs: list[PieceRun] = field(default_factory=list)
+    parts: Mapping[int, list[Part]] = field(default_factory=lambda: defaultdict(list))
     failures: dict[int, Failure] = field(default_factory=dict)
 
     @property
@@ -72,116 +61,59 @@ class Walk:
         columns = slice(int(met[0]), int(met[-1]) + 1) if len(met) else slice(0, 0)
         asked = np.column_stack([self.times[:, columns], self.times[:, -1]])
         outcomes = integrate(members, np.minimum(asked, end)[members])
-        self.runs.append(PieceRun(outcomes, members, columns, inside[:, columns]))
+        asked_for = np.pad(inside[:, columns], ((0, 0), (0, 1)))  # but for the end
+        for i, outcome in zip(members.tolist(), outcomes, strict=True):
+            if isinstance(outcome, Failure):
+                self.failures[i] = outcome
+            else:
+                self.parts[i].append((outcome, asked_for[i]))
         if isinstance(outcomes, Batch) and outcomes.whole:
             return outcomes.last
-        pairs = zip(members.tolist(), outcomes, strict=True)
-        self.failures |= {i: outcome for i, outcome in pairs if isinstance(outcome, Failure)}
         return np.array([path.states[-1] for path in outcomes if isinstance(path, Trajectory)])
 
     def outcomes(self) -> Outcomes:
-        """The whole paths: a batch where all are well and were run in batches."""
-        if not self.failures and all(isinstance(run.outcomes, Batch) for run in self.runs):
-            return JoinedBatch(self)
-        return [self.failures.get(i) or self.path(i) for i in range(len(self.x))]
-
-    def path(self, i: int) -> "JoinedTrajectory":
-        """The path of a member that has not failed."""
-        parts = []
-        for run in self.runs:
-            path = run.outcomes[int(np.searchsorted(run.members, i))]
-            assert isinstance(path, Trajectory)
-            parts.append((path, np.append(run.within[i], False)))
-        return JoinedTrajectory(self.times[i], self.x[i], self.layout, parts)
+        """The whole paths."""
+        return [
+            self.failures.get(i) or JoinedTrajectory(times, x, self.layout, self.parts[i])
+            for i, (times, x) in enumerate(zip(self.times, self.x, strict=True))
+        ]
 
 
-class Joined:
-    """Paths over pieces seen as one, of a member or of all: ``times`` (…, K), initial states ``_x`` (…, n_state)."""
+class JoinedTrajectory(Trajectory):
+    """The whole path of a member that began at ``x`` (n_state,), with its ``parts`` as of :class:`Walk`."""
 
-    times: Array
-    layout: StateLayout
     _x: Array
+    _parts: Sequence[Part]
 
-    def _pieces(self) -> Sequence[Any]:
-        """The paths over the pieces, or batches of them."""
-        raise NotImplementedError
-
-    def _joined(self, values: Sequence[Array]) -> Array:
-        """Values along each of the pieces as one array (…, K, …)."""
-        raise NotImplementedError
-
-    def _constant(self, values: Array) -> Array:
-        """(…, K, …) of what is no part of the state that is integrated."""
-        along = self.times.ndim - 1
-        return np.repeat(np.expand_dims(values, along), self.times.shape[-1], axis=along)
-
-    def _field(self, name: str) -> Array:
-        pieces = self._pieces()
-        if name in self.layout.slices and name not in pieces[0].layout.slices:
-            return self._constant(self.layout.part(self._x, name))
-        return self._joined([piece[name] for piece in pieces])
-
-    def largest(self, name: str) -> Any:
-        """The largest of all pieces."""
-        return np.max([piece.largest(name) for piece in self._pieces()], axis=0)
-
-    def beyond(self, limit: ValidityLimit) -> Any:
-        """The earliest of all pieces."""
-        return np.min([piece.beyond(limit) for piece in self._pieces()], axis=0)
-
-    @property
-    def states(self) -> Any:
-        """(…, K, n_state)."""
-        inner = self._joined([piece.states for piece in self._pieces()])
-        return np.concatenate([inner, self._constant(self._x[..., inner.shape[-1] :])], axis=-1)
-
-
-class JoinedTrajectory(Joined, Trajectory):
-    """One member: ``parts`` are its paths over the pieces, and which of their instants are asked for."""
-
-    _parts: Sequence[tuple[Trajectory, Array]]
-
-    def __init__(self, times: Array, x: Array, layout: StateLayout, parts: Sequence[tuple[Trajectory, Array]]):
+    def __init__(self, times: Array, x: Array, layout: StateLayout, parts: Sequence[Part]):
         self.__dict__.update(times=times, layout=layout, _x=x, _parts=parts)  # the dataclass is frozen
 
     def __getitem__(self, name: str) -> Array:
-        return self._field(name)
+        if name in self.layout.slices and name not in self._parts[0][0].layout.slices:
+            return self._constant(self.layout.part(self._x, name))
+        return self._joined(lambda path: path[name])
 
-    def _pieces(self) -> Sequence[Trajectory]:
-        return [path for path, _ in self._parts]
+    def largest(self, name: str) -> float:
+        """The largest of all pieces."""
+        return max(path.largest(name) for path, _ in self._parts)
 
-    def _joined(self, values: Sequence[Array]) -> Array:
-        return np.concatenate([value[asked] for value, (_, asked) in zip(values, self._parts, strict=True)])
+    def beyond(self, limit: ValidityLimit) -> float:
+        """The earliest of all pieces."""
+        return min(path.beyond(limit) for path, _ in self._parts)
 
+    @property
+    def states(self) -> Array:
+        """(K, n_state)."""
+        inner = self._joined(lambda path: path.states)
+        return np.hstack([inner, self._constant(self._x[inner.shape[1] :])])
 
-class JoinedBatch(Joined, Batch):  # type: ignore[override]
-    """Members none of which failed, run in batches over all pieces."""
+    def _joined(self, read: Callable[[Trajectory], Array]) -> Array:
+        """(K, …) of what is read along each of the pieces."""
+        return np.concatenate([read(path)[asked] for path, asked in self._parts])
 
-    def __init__(self, walk: Walk):
-        self.walk, self.times, self.layout, self._x, self.whole = walk, walk.times, walk.layout, walk.x, True
-        self._fields: dict[str, Array] = {}
-
-    def __len__(self) -> int:
-        return len(self.times)
-
-    def __getitem__(self, index: Any) -> Any:
-        if isinstance(index, slice):
-            return [self.walk.path(i) for i in range(*index.indices(len(self)))]
-        if not isinstance(index, str):
-            return self.walk.path(range(len(self))[index])
-        if index not in self._fields:  # (N, K) or (N, K, size)
-            self._fields[index] = self._field(index)
-        return self._fields[index]
-
-    def _pieces(self) -> Sequence[Outcomes]:
-        return [run.outcomes for run in self.walk.runs]
-
-    def _joined(self, values: Sequence[Array]) -> Array:
-        """Values (N, C + 1, …) of the pieces as one array (N, K, …)."""
-        joined = np.empty((*self.times.shape, *values[0].shape[2:]))
-        for run, part in zip(self.walk.runs, values, strict=True):
-            joined[:, run.columns][run.within] = part[:, :-1][run.within]
-        return joined
+    def _constant(self, values: Array) -> Array:
+        """(K, …) of what is no part of the state that is integrated."""
+        return np.repeat(np.expand_dims(values, 0), len(self.times), axis=0)
 
 
 class PiecewiseModel(ForwardModel):
@@ -230,12 +162,6 @@ class PiecewiseModel(ForwardModel):
         inner = self.model.layout.size
         return np.hstack([self.model.changed(name, x[:, :inner], change), x[:, inner:]])
 
-    def doubts(
-        self, observable: str, times: Array, values: Array, predicted: Array, members: Mapping[str, Array]
-    ) -> Sequence[str | Caution]:
-        """Those of the model."""
-        return self.model.doubts(observable, times, values, predicted, members)
-
     def step(self, x: Array, t0: float, t1: float) -> Array:
         """Raises RuntimeError with the model's reason where it fails."""
         (path,) = self.resumed(x[None], np.array([t0]), np.array([[t1]]))
@@ -254,7 +180,7 @@ class PiecewiseModel(ForwardModel):
                 break
             for change in self.walks:
                 piece = int(np.searchsorted(change.knots, begin, side="right"))
-                inner[:, self.model.layout[change.name]] = x[:, [self.layout[change.pieces_name].start + piece]]
+                inner[:, self.model.layout[change.name]] = x[:, [self.layout[change.own.name].start + piece]]
             since = np.maximum(start, begin)
 
             def integrate(members: npt.NDArray[np.intp], asked: Array, since: Array = since) -> Outcomes:
