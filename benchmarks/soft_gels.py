@@ -4,7 +4,7 @@
 
 A pressure or a scale that is off adds as many pascals to every modulus (Python numbers below: 0.75 kPa). Synthetic, and
 exact but for what is tested: median and spread of G are drawn from the hyperprior of ``init``'s configurations (median
-of the prior 2.6 kPa, log_std 2), what is common from its prior; each bubble reads G + 0.75 θ kPa to 0.2 kPa, and its
+of the prior 2.6 kPa, log_std 2), what is common from its prior; each bubble reads G + 0.75 θ kPa to 0.2 kPa and 5 % of G, and its
 posterior over (ln G, θ) on a grid is drawn from. All behind these draws is the program's.
 """
 
@@ -20,9 +20,9 @@ from en4dvar.estimation.population import Effort, HyperPrior
 from en4dvar.estimation.population.hierarchy import Hierarchy
 from en4dvar.estimation.population.own import KEPT, OwnDraws, own_likelihoods
 
-MEDIAN, LOG_STD, ADDED, ERROR = 2.6, 2.0, 0.75, 0.2  # kPa but for the second
+MEDIAN, LOG_STD, ADDED, ERROR = 2.6, 2.0, 0.75, (0.2, 0.05)  # kPa but for the second, and a share
 HYPER = HyperPrior(1.0, 0.25, odd=0.0)
-X, THETA = np.linspace(-4.0, 3.5, 451), np.linspace(-4.0, 4.0, 121)
+X, THETA = np.linspace(-4.5, 4.5, 541), np.linspace(-4.0, 4.0, 121)
 OF_X, OF_THETA = np.meshgrid(X, THETA, indexing="ij")
 READ = MEDIAN * np.exp(LOG_STD * OF_X) + ADDED * OF_THETA
 PRIOR = norm.pdf(OF_X) * norm.pdf(OF_THETA)
@@ -35,8 +35,9 @@ def rank_of(bubbles: int, seed: int) -> tuple[float, float, float]:
     nu, tau, theta = rng.standard_normal(), HYPER.spread * abs(rng.standard_normal()), rng.standard_normal()
     modulus = MEDIAN * np.exp(LOG_STD * (nu + tau * rng.standard_normal(bubbles)))
     sets = []
-    for reading in modulus + ADDED * theta + ERROR * rng.standard_normal(bubbles):
-        shares = (norm.pdf(reading, READ, ERROR) * PRIOR).ravel()
+    errors = np.hypot(ERROR[0], ERROR[1] * modulus)
+    for reading, error in zip(modulus + ADDED * theta + errors * rng.standard_normal(bubbles), errors, strict=True):
+        shares = (norm.pdf(reading, READ, error) * PRIOR).ravel()
         taken = rng.choice(OF_X.size, size=KEPT, p=shares / shares.sum())
         within = np.array([X[1] - X[0], THETA[1] - THETA[0]]) * rng.uniform(-0.5, 0.5, (KEPT, 2))
         z = np.stack([OF_X.ravel()[taken], OF_THETA.ravel()[taken]], axis=1) + within
