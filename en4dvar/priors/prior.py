@@ -79,6 +79,11 @@ class PriorTerm:
     def _require(self, condition: bool, message: str) -> None:
         _require(self.parameter, condition, message)
 
+    @property
+    def log_std(self) -> float:
+        """The standard deviation of the logarithm where that is normal, else 0."""
+        return self.std if self.transform == "lognormal" else 0.0
+
     @classmethod
     def normal(cls, parameter: Parameter, mean: float, std: float) -> PriorTerm:
         """θ ~ N(mean, std²), both in the parameter's unit."""

@@ -189,7 +189,7 @@ def _centre(
     attributes = s.tree.attrs
     return without_pull(
         s.names.index(name), nu, theta, keys, float(attributes["hyperprior_mean_std"]),
-        float(attributes["effective_draws"]), seed, [*_known(s, values)],
+        float(attributes["effective_draws"]), seed, [*_known(s, values)], s.prior_of(name).log_std,
     )  # fmt: skip
 
 

@@ -12,6 +12,7 @@ from toys import Vectorised, make_problem, with_discrepancy
 from en4dvar.data.noise import noise_of
 from en4dvar.estimation.population import Effort, HyperPrior
 from en4dvar.estimation.population.campaign import _empirical, population_of
+from en4dvar.estimation.population.following import Following
 from en4dvar.estimation.population.hierarchy import Hierarchy, named
 from en4dvar.estimation.population.own import (
     Mixture,
@@ -149,7 +150,7 @@ def test_one_that_is_odd_in_one_parameter_alone_is_named():
     likelihoods = [
         OwnLikelihood(
             Mixture.divided(left / error**2 * row[None], left * np.eye(2)[None], np.zeros(1), np.ones(2)),
-            np.zeros((2, 0)),
+            Following(np.zeros((2, 0)), np.zeros(2)),
             row + error * rng.standard_normal((400, 2)),
         )
         for row in y
@@ -196,7 +197,7 @@ def test_slopes_that_differ_with_what_varies_tell_nothing_of_what_is_common():
             jitter = np.array([0.01, 0.1]) * rng.uniform(-0.5, 0.5, (2000, 2))
             sets.append(OwnDraws(np.stack([z.ravel()[taken], u.ravel()[taken]], axis=1) + jitter, 0.0, 2000.0, 0))
         hyper = HyperPrior(1.0, 0.5, odd=0.0)
-        likelihoods = own_likelihoods(sets, [0], [1], trial, [f"set{s}" for s in range(count)])
+        likelihoods = own_likelihoods(sets, [0], [1], trial, [f"set{s}" for s in range(count)], np.zeros(1))
         found = Hierarchy(likelihoods, hyper).sampled(trial, Effort())
         mean, std = by_quadrature(np.array(likely), z, hyper)
         far.append((found.nu.mean() - mean) / std)
@@ -252,7 +253,7 @@ def test_the_median_one_by_one_of_sets_that_only_what_is_common_makes_uncertain(
     """Their members scatter by chance less than the common quantity alone would say; what is their own is 0.01."""
     rng, count = np.random.default_rng(1), 12
     theta, own = rng.standard_normal((400, 1)), 0.01 * rng.standard_normal((count, 400, 1))
-    likelihoods = [OwnLikelihood(None, np.array([[0.5]]), z) for z in own]
+    likelihoods = [OwnLikelihood(None, Following(np.array([[0.5]]), np.zeros(1)), z) for z in own]
     sets = [0.9 * (0.5 * theta + z) for z in own]
     (median,) = _empirical([PriorTerm.normal(A, 0.0, 1.0)], sets, likelihoods, 1)
     assert median.common == pytest.approx(0.5, rel=1e-6)

@@ -202,4 +202,4 @@ def test_same_bits_with_any_executor():
 
 
 def test_resumed_from_any_iteration():
-    assert_cut_anywhere(problem(), SETTINGS, 1)
+    assert_cut_anywhere(problem(), SETTINGS, 1, cuts=6)

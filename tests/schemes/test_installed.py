@@ -49,8 +49,11 @@ def called(*words, environment, folder):
 
 
 def test_it_runs_by_its_name_and_its_keys_are_checked(package, tmp_path):
+    """Those that cannot be loaded are told and left out."""
     done = called("-m", "en4dvar.cli", "run", "own.yaml", environment=package, folder=tmp_path)
     assert done.returncode == 0, done.stderr
+    assert "scheme 'lost' (nowhere:Lost) cannot be loaded: ModuleNotFoundError" in done.stderr
+    assert "scheme 'number' (math:pi) cannot be loaded: TypeError: it is not a subclass" in done.stderr
     resolved = yaml.safe_load((tmp_path / "runs" / "quickstart" / "config.resolved.yaml").read_text())
     assert resolved["assimilation"]["scheme"] == "patient"
     assert resolved["assimilation"]["patience"] == 4
@@ -62,13 +65,6 @@ def test_it_runs_by_its_name_and_its_keys_are_checked(package, tmp_path):
     (tmp_path / "own.yaml").write_text(text.replace("scheme: patient", "scheme: etkf"))
     refused = called("-m", "en4dvar.cli", "validate", "own.yaml", environment=package, folder=tmp_path)
     assert "scheme etkf does not read it; it is a key of patient" in refused.stderr  # not replaced
-
-
-def test_one_that_cannot_be_loaded_is_told_and_left_out(package, tmp_path):
-    done = called("-m", "en4dvar.cli", "validate", "own.yaml", environment=package, folder=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert "scheme 'lost' (nowhere:Lost) cannot be loaded: ModuleNotFoundError" in done.stderr
-    assert "scheme 'number' (math:pi) cannot be loaded: TypeError: it is not a subclass" in done.stderr
 
 
 @pytest.mark.slow

@@ -287,7 +287,8 @@ def population_from(
     common = common_to(problems, names)
     varying, shared = [columns.index(name) for name in names], [columns.index(name) for name in common]
     sets = [problem.observations.name for problem in problems]
-    likelihoods = own_likelihoods(list(drawn.values()), varying, shared, seed, sets)
+    logs = np.array([term.log_std for term in terms])
+    likelihoods = own_likelihoods(list(drawn.values()), varying, shared, seed, sets, logs)
     estimated = Hierarchy(likelihoods, scales).sampled(seed, effort)
     stream = member_stream(seed, "hyperprior")
     nu, tau = stream.standard_normal(estimated.nu.shape), np.abs(stream.standard_normal(estimated.nu.shape))
@@ -318,7 +319,7 @@ def _empirical(
     """The median over data sets of each parameter, from members (N_i, p) of each."""
     middle = np.array([np.median(z, axis=0) for z in members])
     std = np.array([likelihood.adjusted.std(axis=0) for likelihood in likelihoods])  # without what all have in common
-    shared = np.sqrt(np.sum(likelihoods[0].slopes ** 2, axis=1))
+    shared = likelihoods[0].following.spread(np.median(middle, axis=0))
     return tuple(empirical(term, middle[:, j], std[:, j], float(shared[j]), seed) for j, term in enumerate(terms))
 
 
@@ -327,7 +328,7 @@ def _sets(
     shared: Sequence[int], stream: np.random.Generator,
 ) -> list[Array]:  # fmt: skip
     """Control vectors (M, n) of each data set given all, white: what is neither of the population nor common is as
-    in one of the data set's own draws whose x − Bθ is nearest.
+    in one of the data set's own draws whose y is nearest.
     """
     z = []
     for s, (draws, likelihood) in enumerate(zip(drawn, likelihoods, strict=True)):
@@ -335,7 +336,7 @@ def _sets(
         _, near = scipy.spatial.cKDTree(likelihood.adjusted / scale).query(estimated.x[:, s] / scale, k=NEAR)
         chosen = near[np.arange(len(near)), stream.integers(NEAR, size=len(near))]
         own = draws.z[chosen]
-        own[:, list(varying)] = estimated.x[:, s] + estimated.theta @ likelihood.slopes.T
+        own[:, list(varying)] = likelihood.following.together(estimated.x[:, s], estimated.theta)
         own[:, list(shared)] = estimated.theta
         z.append(own)
     return z

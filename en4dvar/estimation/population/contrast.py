@@ -1,9 +1,10 @@
 r"""Centres of several populations drawn together, so that what they have in common cancels in their differences.
 
 Each population k has by itself draws of its centre x_k (the transformed median) and of common quantities θ ~ N(0, I),
-white. With Gaussian θ and a regression of x_k on θ they say
+white. With Gaussian θ and a regression of x_k on θ, or of its exponential
+(:mod:`~en4dvar.estimation.population.following`), they say
 
-    p(x_k, θ | data_k) = N(θ; m_k, S_k) · [x_k = x̄_k + c_k (θ − m_k) + r_k],
+    p(x_k, θ | data_k) = N(θ; m_k, S_k) · [x_k = c_k θ + r_k],
 
 with the r_k as they were drawn. Quantities that several populations share have one value in all of them, their prior
 counts once, and the populations' information about them adds:
@@ -24,6 +25,7 @@ from scipy.stats import chi2
 
 from en4dvar.ensemble.linalg import effective_number, resampled, shares_of
 from en4dvar.estimation.population.campaign import FEWEST
+from en4dvar.estimation.population.following import following_of
 from en4dvar.model.state import Array
 from en4dvar.priors.prior import member_stream
 
@@ -32,18 +34,19 @@ from en4dvar.priors.prior import member_stream
 class Centre:
     """What one population says by itself: draws ``x`` (M,) of its transformed median and ``theta`` (M, c) of its common
     quantities, white; ``common`` (c,) tells these apart: equal ones are one quantity. ``x`` has a flat prior unless
-    ``pulled`` by its hyperprior.
+    ``pulled`` by its hyperprior; it is ``log`` times less than the logarithm of a positive parameter, 0 of others.
     """
 
     x: Array
     theta: Array
     common: tuple[Hashable, ...]
     pulled: bool = False
+    log: float = 0.0
 
 
 def without_pull(
     at: int, nu: Array, theta: Array, common: tuple[Hashable, ...], mean_std: float, draws: float, seed: int,
-    known: Sequence[tuple[int, float, float]] = (),
+    known: Sequence[tuple[int, float, float]] = (), log: float = 0.0,
 ) -> Centre:  # fmt: skip
     """The centre in column ``at`` of the draws ``nu`` (M, p) without their hyperprior N(0, ``mean_std``²), which pulls
     populations together; with it where fewer than a hundred of the effective ``draws`` would count.
@@ -58,7 +61,7 @@ def without_pull(
         both = both[resampled(shares, len(shares), stream)]
     for column, value, std in known:
         both = knowing(both, column, value, std, seed)
-    return Centre(both[:, at], both[:, nu.shape[1] :], common, pulled)
+    return Centre(both[:, at], both[:, nu.shape[1] :], common, pulled, log)
 
 
 def knowing(draws: Array, column: int, value: float, std: float, seed: int) -> Array:
@@ -86,13 +89,20 @@ def drawn_together(centres: Sequence[Centre], seed: int) -> Array:
     stream, count = member_stream(seed, "populations together"), len(centres[0].x)
     root = np.linalg.cholesky(np.linalg.inv(precision))
     theta = np.linalg.solve(precision, information) + stream.standard_normal((count, len(known))) @ root.T
-    columns = []
+    columns, possible = [], np.full(count, True)
     for centre in centres:
-        mean, centred = centre.theta.mean(axis=0), centre.theta - centre.theta.mean(axis=0)
-        slope = np.linalg.lstsq(centred, centre.x - centre.x.mean(), rcond=None)[0]
-        rest = (centre.x - centred @ slope)[stream.integers(len(centre.x), size=count)]
-        columns.append(rest + (theta[:, [known.index(name) for name in centre.common]] - mean) @ slope)
-    return np.stack(columns, axis=1)
+        x, centred = centre.x[:, None], centre.theta - centre.theta.mean(axis=0)
+
+        def slopes(of: Sequence[Array], centred: Array = centred) -> Array:
+            return np.asarray(np.linalg.lstsq(centred, of[0] - of[0].mean(axis=0), rcond=None)[0].T)
+
+        following = following_of([x], [centre.theta], np.array([centre.log]), slopes)
+        rest = following.own(x, centre.theta)[stream.integers(len(x), size=count)]
+        common = theta[:, [known.index(name) for name in centre.common]]
+        columns.append(following.together(rest, common))
+        possible &= np.isclose(following.own(columns[-1], common), rest)[:, 0]  # nothing positive is taken away whole
+    together = np.hstack(columns)
+    return together if possible.all() else together[possible][stream.integers(np.sum(possible), size=count)]
 
 
 @dataclass(frozen=True)

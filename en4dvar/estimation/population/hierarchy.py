@@ -1,7 +1,7 @@
 r"""Mean ν and spread τ of a population from the likelihoods of its data sets, with common quantities and odd ones.
 
     x_i ~ (1 − ε) N(ν, diag τ²) + ε/2 π(x) + ε/2p Σ_j N(ν, diag τ² + σ² e_j e_jᵀ),
-    θ ~ N(0, I),     data_i ~ L_i(x_i − B θ)
+    θ ~ N(0, I),     data_i ~ L_i(y_i),     y_i = x_i − B θ, say
 
 in white coordinates of the prior π. A data set is odd with probability ε (Hogg, Bovy & Lang 2010, arXiv:1008.4686):
 then its parameters are drawn from the prior as if it belonged to no population, or one of them alone lies elsewhere, by
@@ -13,9 +13,10 @@ uncertainty therefore no number of data sets averages out.
 
 With L_i in units of its evidence (:mod:`~en4dvar.estimation.population.own`) the density of h = (ν, ln τ, θ) is
 
-    p(h) Π_i [ (1 − ε) ∫ L_i(x) N(x; ν − B θ, τ²) dx + ε/2 + ε/2p Σ_j … ],
+    p(h) Π_i [ (1 − ε) ∫ L_i(y) N(y; ν − B θ, τ²) dy + ε/2 + ε/2p Σ_j … ],
 
-every integral in closed form. Walkers find where it is; a mixture of Student t distributions fitted to them is the
+every integral in closed form; where y is another function of x (:mod:`~en4dvar.estimation.population.following`), with
+mean and variance of y. Walkers find where it is; a mixture of Student t distributions fitted to them is the
 proposal, whose weighted draws are independent and give the evidence (adaptive importance sampling: Cappé et al. 2008,
 Stat. Comput. 18, 447). A walker left behind in a secondary mode moves the proposal a little; the weights know what it
 is worth.
@@ -107,7 +108,7 @@ def named(belongs: Array, odd: float) -> tuple[int, ...]:
 
 @dataclass(frozen=True)
 class HierarchyDraws:
-    """Draws of ν and τ (M, p), θ (M, c), and of x_i − B θ (M, S, p) given them; ``belongs`` (S,) the probabilities
+    """Draws of ν and τ (M, p), θ (M, c), and of y_i (M, S, p) given them; ``belongs`` (S,) the probabilities
     that the data sets are of the population; ``effective`` draws and ``log_evidence`` in units of the sets' own.
     """
 
@@ -125,7 +126,8 @@ class Hierarchy:
 
     def __init__(self, likelihoods: Sequence[OwnLikelihood], scales: HyperPrior):
         self.likelihoods, odd = likelihoods, scales.odd
-        self.p, self.c = likelihoods[0].slopes.shape
+        self.following = likelihoods[0].following
+        self.p, self.c = self.following.slopes.shape
         self.hyper = scales
         self.shares = np.array([1 - odd, odd / 2, *[odd / 2 / self.p] * self.p])[: None if odd else 1]
         self.wider = scales.mean_std**2 * np.vstack([np.zeros((2, self.p)), np.eye(self.p)])
@@ -137,11 +139,11 @@ class Hierarchy:
         mean, variance = h[:, : self.p], np.exp(2 * h[:, self.p : 2 * self.p])
         theta = h[:, 2 * self.p :]
         parts = np.zeros((len(h), len(self.likelihoods), len(self.shares)))
-        for s, likelihood in enumerate(self.likelihoods):
-            middle = mean - theta @ likelihood.slopes.T
-            for k in range(len(self.shares)):
-                if k != 1:
-                    parts[:, s, k] = log_marginal(likelihood.mixture, middle, variance + self.wider[k])
+        for k in range(len(self.shares)):
+            if k != 1:
+                of_y = self.following.moments(mean, variance + self.wider[k], theta)
+                for s, likelihood in enumerate(self.likelihoods):
+                    parts[:, s, k] = log_marginal(likelihood.mixture, *of_y)
         return np.asarray(parts + np.log(self.shares))
 
     def log_density(self, h: Array) -> Array:
@@ -197,14 +199,14 @@ class Hierarchy:
         return h, logs
 
     def _given(self, h: Array, belongs: Array, stream: np.random.Generator) -> Array:
-        """Draws (M, S, p) of x_i − B θ given h and the data: of the population, or odd as ``belongs`` (M, S, K)."""
+        """Draws (M, S, p) of y_i given h and the data: of the population, or odd as ``belongs`` (M, S, K)."""
         mean, variance = h[:, : self.p], np.exp(2 * h[:, self.p : 2 * self.p])
         theta, x = h[:, 2 * self.p :], np.empty((len(h), len(self.likelihoods), self.p))
         for s, likelihood in enumerate(self.likelihoods):
             chosen = np.sum(stream.uniform(size=(len(h), 1)) > np.cumsum(belongs[:, s, :-1], axis=1), axis=1)
             own = chosen[:, None] == 1
-            middle = np.where(own, 0.0, mean) - theta @ likelihood.slopes.T
-            spread = np.where(own, 1.0, variance + self.wider[chosen])
+            of_x = np.where(own, 0.0, mean), np.where(own, 1.0, variance + self.wider[chosen])
+            middle, spread = self.following.moments(*of_x, theta)
             numbers, uniform = stream.standard_normal((len(h), self.p)), stream.uniform(size=len(h))
             _draw(likelihood.mixture, middle, spread, numbers, uniform, x[:, s])
         return x

@@ -6,13 +6,12 @@ it is: the scale of the errors and a discrepancy are further parameters of the d
 by its own estimate, the draws are those that this has kept.
 
 Of the coordinates x that vary and the quantities θ that all data sets have in common (a density, a scale) the draws
-tell how x moves with θ, to first order: the likelihood is one of x − Bθ, which gives the regression of x on θ in the
-posterior the slopes (I − C) B, where C is the covariance of x given θ and the prior of x is N(0, I). A Gaussian mixture
-describes x − Bθ; dividing by the prior N(0, I + BBᵀ) leaves the likelihood of the data set, with which
-:mod:`~en4dvar.estimation.population.hierarchy` works. What the data tell of θ itself is left aside: it keeps its prior,
-and therefore all data sets of a population have the same B. Slopes of their own would tell of θ, and falsely: where a
-pressure adds as many pascals to every modulus, soft gels have the steeper slopes in ln G, and a θ that makes all of
-them stiffer would make them more alike.
+tell how x follows θ (:mod:`~en4dvar.estimation.population.following`): the likelihood is one of y, such as x − Bθ,
+which gives the regression of x on θ in the posterior the slopes (I − C) B, where C is the covariance of x given θ and
+the prior of x is N(0, I). A Gaussian mixture describes y; dividing by its prior leaves the likelihood of the data set,
+with which :mod:`~en4dvar.estimation.population.hierarchy` works. What the data tell of θ itself is left aside: it keeps
+its prior, and therefore all data sets of a population have the same slopes. Their own would tell of θ, and falsely:
+those of ln G are steeper for a soft gel, and a θ that makes all of them stiffer would make them more alike.
 """
 
 from __future__ import annotations
@@ -28,8 +27,9 @@ from scipy.special import ndtri, stdtrit
 
 from en4dvar.descent.minima import Minimum
 from en4dvar.ensemble.forecast import Composite, costs
-from en4dvar.ensemble.linalg import resampled
+from en4dvar.ensemble.linalg import effective_number, resampled, shares_of
 from en4dvar.ensemble.missing import Beside
+from en4dvar.estimation.population.following import Following, following_of
 from en4dvar.executor import Executor
 from en4dvar.model.state import Array
 from en4dvar.plumbing.compiled import kernel
@@ -169,11 +169,11 @@ class OwnDraws:
 class OwnLikelihood:
     """The likelihood of one data set in p coordinates x given c common quantities θ, in units of its evidence.
 
-    ``mixture``: of x − ``slopes`` θ, with slopes (p, c), the same in all; ``adjusted`` (D, p): the draws of x − Bθ.
+    ``mixture``: of y, as ``following`` has it, the same in all; ``adjusted`` (D, p): the draws of y.
     """
 
     mixture: Mixture
-    slopes: Array
+    following: Following
     adjusted: Array
 
 
@@ -201,34 +201,50 @@ def _worth(count: int, effective: float) -> float:
 
 
 def own_likelihoods(
-    drawn: Sequence[OwnDraws], varying: Sequence[int], common: Sequence[int], seed: int, names: Sequence[str]
-) -> list[OwnLikelihood]:
-    """Likelihoods in coordinates ``varying`` given ``common``; ``seed`` and the sets' ``names`` name the streams."""
-    each = [(draws.z[:, list(varying)], draws.z[:, list(common)]) for draws in drawn]
-    slopes = pooled_slopes(
-        *zip(*(_slopes(*both, draws.effective) for both, draws in zip(each, drawn, strict=True)), strict=True)
-    )
+    drawn: Sequence[OwnDraws], varying: Sequence[int], common: Sequence[int], seed: int, names: Sequence[str],
+    logs: Array,
+) -> list[OwnLikelihood]:  # fmt: skip
+    """The likelihoods in the coordinates ``varying`` given those in ``common``; ``seed`` and the data sets' ``names``
+    name the streams; ``logs`` (p,): the prior standard deviation of the logarithm of a positive parameter, else 0.
+    """
+    x, theta = ([draws.z[:, list(columns)] for draws in drawn] for columns in (varying, common))
+
+    def slopes(coordinates: Sequence[Array]) -> Array:
+        each = zip(x, coordinates, theta, drawn, strict=True)
+        return pooled_slopes(*zip(*(_slopes(z, u, t, draws.effective) for z, u, t, draws in each), strict=True))
+
+    following = following_of(x, theta, logs, slopes)
     streams = (member_stream(own_seed(seed, name), "population: mixture") for name in names)
-    std, likelihoods = np.sqrt(1 + np.sum(slopes**2, axis=1)), []
-    for (x, theta), draws, stream in zip(each, drawn, streams, strict=True):
-        adjusted = x - theta @ slopes.T
-        share, centre, covariance = _fitted(adjusted, draws.effective, stream)
-        mixture = Mixture.divided(centre, covariance, np.log(share), std)
-        likelihoods.append(OwnLikelihood(mixture, slopes, adjusted))
+    likelihoods = []
+    for z, t, draws, stream in zip(x, theta, drawn, streams, strict=True):
+        adjusted, effective = following.own(z, t), draws.effective
+        std, beyond = following.prior(adjusted)
+        constant, as_drawn = float(np.logaddexp.reduce(beyond)) - math.log(len(beyond)), adjusted
+        if following.logs.any():
+            shares = shares_of(beyond)
+            as_drawn = adjusted[resampled(shares, len(shares), stream)]
+            effective *= effective_number(shares) / len(shares)
+        share, centre, covariance = _fitted(as_drawn, effective, stream)
+        mixture = Mixture.divided(centre, covariance, np.log(share) + constant, std)
+        likelihoods.append(OwnLikelihood(mixture, following, adjusted))
     return likelihoods
 
 
-def _slopes(x: Array, theta: Array, effective: float) -> tuple[Array, Array]:
-    """B (p, c) of posterior draws x (D, p) and θ (D, c), and the variances (p, c) of its elements."""
+def _slopes(x: Array, u: Array, theta: Array, effective: float) -> tuple[Array, Array]:
+    """Slopes (p, c) with θ of the likelihood's coordinates ``u``, functions of x, from posterior draws x and u (D, p)
+    and θ (D, c), and the variances (p, c) of these slopes.
+    """
     if not theta.shape[1]:
         return np.zeros((x.shape[1], 0)), np.zeros((x.shape[1], 0))
     apart, centred = x - x.mean(axis=0), theta - theta.mean(axis=0)
+    along = np.sum(apart * (u - u.mean(axis=0)), axis=0) / np.sum(apart**2, axis=0)  # du/dx, 1 of x itself
+    apart = (u - u.mean(axis=0)) / along
     of_posterior = np.linalg.lstsq(centred, apart, rcond=None)[0].T
     left = np.atleast_2d(np.cov((apart - centred @ of_posterior.T).T))
     values, vectors = np.linalg.eigh(np.eye(len(left)) - left)
     undone = vectors @ (vectors.T / np.maximum(values, INFORMED)[:, None])
     variance = np.outer(np.diag(undone @ left @ undone.T), 1 / centred.var(axis=0)) / effective
-    return np.asarray(undone @ of_posterior), variance
+    return np.asarray(along[:, None] * (undone @ of_posterior)), np.asarray(along[:, None] ** 2 * variance)
 
 
 def pooled_slopes(slopes: Sequence[Array], variances: Sequence[Array]) -> Array:

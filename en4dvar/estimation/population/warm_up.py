@@ -19,6 +19,6 @@ def _hierarchy() -> None:
     """Two parameters that vary, and one in common."""
     draws = np.random.default_rng(0).standard_normal((4, 200, 3)) * [0.1, 0.2, 1.0]
     drawn = [OwnDraws(z, 0.0, 100.0, 0) for z in draws]
-    likelihoods = own_likelihoods(drawn, [0, 1], [2], 0, "abcd")
+    likelihoods = own_likelihoods(drawn, [0, 1], [2], 0, "abcd", np.zeros(2))
     effort = Effort(draws=100, hyper_walkers=16, hyper_rounds=6, hyper_components=2)
     Hierarchy(likelihoods, HyperPrior()).sampled(0, effort)
