@@ -62,6 +62,14 @@ def quantiles(values, shares):
     return np.interp([0.05, 0.5, 0.95], np.cumsum(ordered) - 0.5 * ordered, values.ravel()[order])
 
 
+def test_where_what_is_common_is_all_there_is():
+    """e^{sx} of a very soft gel is nothing beside it: y has a value, and the density of such a population is one."""
+    sets = [drawn(like, s) for s, like in enumerate(likelihoods_on_grid(0.5, 6))]
+    likelihoods = own_likelihoods(sets, [0], [1], 1, [f"set{s}" for s in range(SETS)], np.array([LOG_STD]))
+    h = np.array([[-40.0, np.log(2e-3), 2.0], [-40.0, np.log(2e-3), -2.0]])
+    assert np.isfinite(Hierarchy(likelihoods, HYPER).log_density(h)).all()
+
+
 @pytest.mark.parametrize(("level", "seed"), [(0.25, 1), (3.0, 3)])
 def test_what_adds_to_a_positive_parameter_is_that_of_quadrature(level, seed):
     """The common quantity is as large as the softest level: with slopes of ln G its 95 % would be twice as large."""

@@ -24,6 +24,7 @@ from en4dvar.model.state import Array
 LEAST = 0.01  # of a positive parameter is left where what is common would take away more
 NODES, NODE_WEIGHTS = np.array([-math.sqrt(3.0), 0.0, math.sqrt(3.0)]), np.array([1.0, 4.0, 1.0]) / 6
 TINY = np.finfo(float).tiny
+NARROWEST = 1e-12  # variance of y, where what is common decides it alone
 LEVELS = ndtri((np.arange(200) + 0.5) / 200)  # equally likely values of a normal quantity
 
 
@@ -52,7 +53,7 @@ class Following:
         """Mean and variance (B, p) of y where x is normal, of three nodes (Gauss and Hermite): exact for y = x − Bθ."""
         y = np.stack([self.own(mean + node * np.sqrt(variance), theta) for node in NODES])
         centre = np.tensordot(NODE_WEIGHTS, y, 1)
-        return centre, np.tensordot(NODE_WEIGHTS, (y - centre) ** 2, 1)
+        return centre, np.tensordot(NODE_WEIGHTS, (y - centre) ** 2, 1) + NARROWEST
 
     def spread(self, x: Array) -> Array:
         """(p,): the standard deviation that what is common adds to coordinates x (p,)."""
