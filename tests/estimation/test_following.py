@@ -66,7 +66,7 @@ def test_where_what_is_common_is_all_there_is():
     """e^{sx} of a very soft gel is nothing beside it: y has a value, and the density of such a population is one."""
     sets = [drawn(like, s) for s, like in enumerate(likelihoods_on_grid(0.5, 6))]
     likelihoods = own_likelihoods(sets, [0], [1], 1, [f"set{s}" for s in range(SETS)], np.array([LOG_STD]))
-    h = np.array([[-40.0, np.log(2e-3), 2.0], [-40.0, np.log(2e-3), -2.0]])
+    h = np.array([[-40.0, np.log(2e-3), theta] for theta in np.linspace(-3.0, 3.0, 61)])
     assert np.isfinite(Hierarchy(likelihoods, HYPER).log_density(h)).all()
 
 
