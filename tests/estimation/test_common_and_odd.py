@@ -286,7 +286,7 @@ def test_the_median_of_data_sets_holds_the_truth_as_often_as_it_says(count):
     for trial in range(300):
         std = 0.3 * rng.uniform(0.5, 1.5, count)
         middle = 0.5 * rng.standard_normal(count) + std * rng.standard_normal(count) + 0.4 * rng.standard_normal()
-        low, _, high = empirical(term, middle, std, 0.4, trial).quantiles
+        low, _, high = empirical(term, middle, std, Following(np.array([[0.4]]), np.zeros(1)), trial).quantiles
         inside.append(low < 1000.0 < high)
     assert 0.84 < np.mean(inside) < 0.98
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import norm
@@ -10,7 +12,9 @@ from en4dvar.estimation.population import Effort, HyperPrior
 from en4dvar.estimation.population.contrast import Centre, drawn_together
 from en4dvar.estimation.population.following import Following
 from en4dvar.estimation.population.hierarchy import Hierarchy
-from en4dvar.estimation.population.own import OwnDraws, own_likelihoods
+from en4dvar.estimation.population.own import OwnDraws, empirical, own_likelihoods
+from en4dvar.model.state import Parameter
+from en4dvar.priors.prior import PriorTerm
 
 LOG_STD, ADDED, ERROR, SETS = 1.5, 0.25, 0.05, 6  # e^{sx} has the median 1
 HYPER = HyperPrior(1.0, 0.25, odd=0.0)
@@ -108,6 +112,18 @@ def test_there_and_back():
     np.testing.assert_allclose(following.together(y, theta)[kept], x[kept], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(y[:, 0], x[:, 0] - theta @ following.slopes[0])
     np.testing.assert_allclose(np.exp(1.2 * (y - x)[~kept, 1]), 0.01)
+
+
+def test_the_median_one_by_one_of_soft_gels_reaches_as_far_as_what_is_common():
+    """Level 0.5, of which what is common may take or add 0.25 for a standard deviation, or all of it."""
+    term = PriorTerm.lognormal(Parameter("G", "Pa"), 1.0, LOG_STD)
+    following = Following(np.array([[-ADDED]]), np.array([LOG_STD]))
+    middle = np.log(0.5) / LOG_STD + 1e-3 * np.arange(-3, 4)
+    low, level, high = empirical(term, middle, np.full(7, 1e-3), following, 1).quantiles
+    assert (low, level, high) == pytest.approx((0.5 - 1.645 * ADDED, 0.5, 0.5 + 1.645 * ADDED), abs=0.01)
+    assert (
+        empirical(term, middle, np.full(7, 1e-3), replace(following, slopes=3 * following.slopes), 1).quantiles[0] > 0
+    )
 
 
 def test_moments_and_prior_are_those_of_draws():

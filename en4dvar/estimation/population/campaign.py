@@ -18,6 +18,7 @@ import scipy  # its trees where they are used: a twentieth of what every command
 
 from en4dvar.ensemble.forecast import check_problem
 from en4dvar.ensemble.linalg import effective_number, resampled, shares_of
+from en4dvar.estimation.population.following import Following
 from en4dvar.estimation.population.hierarchy import Effort, Hierarchy, HierarchyDraws, HyperPrior, named
 from en4dvar.estimation.population.own import Empirical, OwnDraws, OwnLikelihood, empirical, own_draws, own_likelihoods
 from en4dvar.executor import Executor, one_blas_thread
@@ -319,8 +320,10 @@ def _empirical(
     """The median over data sets of each parameter, from members (N_i, p) of each."""
     middle = np.array([np.median(z, axis=0) for z in members])
     std = np.array([likelihood.adjusted.std(axis=0) for likelihood in likelihoods])  # without what all have in common
-    shared = likelihoods[0].following.spread(np.median(middle, axis=0))
-    return tuple(empirical(term, middle[:, j], std[:, j], float(shared[j]), seed) for j, term in enumerate(terms))
+    slopes, logs = likelihoods[0].following.slopes, likelihoods[0].following.logs
+    each = (Following(slopes[j : j + 1], logs[j : j + 1]) for j in range(len(terms)))
+    pairs = zip(terms, middle.T, std.T, each, strict=True)
+    return tuple(empirical(term, m, s, following, seed) for term, m, s, following in pairs)
 
 
 def _sets(

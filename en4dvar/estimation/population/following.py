@@ -55,11 +55,16 @@ class Following:
         centre = np.tensordot(NODE_WEIGHTS, y, 1)
         return centre, np.tensordot(NODE_WEIGHTS, (y - centre) ** 2, 1) + NARROWEST
 
-    def spread(self, x: Array) -> Array:
-        """(p,): the standard deviation that what is common adds to coordinates x (p,)."""
-        size = np.sqrt(np.sum(self.slopes**2, axis=1))
-        local = np.where(self.logs > 0, self.logs * np.exp(self.logs * x), 1.0)
-        return np.asarray(size / local)
+    def around(self, x: float, own: float, common: float) -> Array:
+        """(3,): a coordinate x, where there is one, less and more by ``own`` and, independently, by so many standard
+        deviations of what is common.
+        """
+        sides, size, s = np.array([-1.0, 0.0, 1.0]), common * float(np.linalg.norm(self.slopes)), float(self.logs[0])
+        if not s:
+            return x + sides * math.hypot(own, size)
+        whole = np.exp(s * (x + sides * own))
+        moved = whole[1] + sides * np.hypot(whole - whole[1], size)
+        return np.asarray(np.log(np.maximum(moved, LEAST * whole)) / s)
 
     def prior(self, y: Array) -> tuple[Array, Array]:
         """Standard deviations (p,) of a normal density about zero, and ln (D,) of how many times it is the prior's of

@@ -287,9 +287,9 @@ class Empirical:
     common: float
 
 
-def empirical(term: PriorTerm, middle: Array, std: Array, common: float, seed: int) -> Empirical:
+def empirical(term: PriorTerm, middle: Array, std: Array, following: Following, seed: int) -> Empirical:
     """The median of data sets one by one, with its interval from their scatter: an answer that needs no model of them,
-    of their medians and standard deviations (S,) in white coordinates; ``common``: the standard deviation they share.
+    of their medians and standard deviations (S,) in white coordinates; ``following``: of this coordinate alone.
 
     It stands beside that of the hierarchy as a check, and alone where there is no other. Each data set counts by
     1/(s² + T²), s the standard deviation of its own posterior without what all have in common, and T² how much they
@@ -301,15 +301,13 @@ def empirical(term: PriorTerm, middle: Array, std: Array, common: float, seed: i
     centre, spread = median_of(middle, std, member_stream(seed, f"empirical {term.parameter.name}"))
     factor = float(stdtrit(len(middle) - 1, 1 - TAIL) / ndtri(1 - TAIL))
 
-    def physical(z: float) -> float:
-        return float(term.to_physical(np.array([term.mean + term.std * z]))[0])
+    def physical(own: float, common: float) -> Array:
+        around = following.around(centre, own * factor * spread, common)
+        return np.asarray(term.to_physical(term.mean + term.std * around))
 
-    def half_width(size: float) -> float:
-        return (physical(centre + size) - physical(centre - size)) / 2
-
-    z = float(ndtri(1 - TAIL)) * float(np.hypot(factor * spread, common))
-    quantiles = np.array([physical(centre + shift) for shift in (-z, 0.0, z)])
-    return Empirical(quantiles, half_width(factor * spread), half_width(common))
+    between, shared = (np.ptp(physical(*size)) / 2 for size in ((1.0, 0.0), (0.0, 1.0)))
+    z = float(ndtri(1 - TAIL))
+    return Empirical(physical(z, z), float(between), float(shared))
 
 
 def median_of(middle: Array, std: Array, stream: np.random.Generator) -> tuple[float, float]:
