@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from toys import Decay, Fragile, Linear, Vectorised, Wave, make_observations
+from toys import Decay, Fragile, Linear, Vectorised, Wave, make_observations, make_problem, with_discrepancy
 
 from en4dvar.estimation.joint import estimate, members
 from en4dvar.estimation.joint.descent import Arrow, Experiment, JointDescent, JointObjective, Place
@@ -163,15 +163,24 @@ class Bent(Vectorised):
         return [Trajectory(t, s, self.layout) for t, s in zip(own, states, strict=True)]
 
 
-def test_own_quantities_that_follow_what_is_shared_on_a_bent_line():
-    """Against the integral: p(a) ∝ N(a; 0, 1) Π_e N(y_e − 0.8 (exp(a) − 1); 0, 1)."""
-    model, y = Bent(names=("a", "c"), compiled=True), np.array([0.3, -0.4, 0.1])
+class Steep(Bent):
+    """y = exp(c + 0.8 (exp(a) − 1)), so that steps in c from afar overshoot."""
+
+    def trajectories(self, x, times):
+        return [replace(t, states=np.exp(t.states)) for t in super().trajectories(x, times)]
+
+
+@pytest.mark.parametrize("kind", [Bent, Steep])
+def test_own_quantities_that_follow_what_is_shared_on_a_bent_line(kind):
+    """Against the integral: p(a) ∝ N(a; 0, 1) Π_e N(y_e − 0.8 (exp(a) − 1); 0, 1), y_e or ln y_e the reading."""
+    model, y = kind(names=("a", "c"), compiled=True), np.array([0.3, -0.4, 0.1])
+    readings = y if kind is Bent else np.exp(y)
     prior = Prior(tuple(PriorTerm.normal(p, 0.0, 1.0) for p in model.parameters))
     problems = [
         InverseProblem(
             model, model.observables[0], make_observations([1.0, 2.0, 3.0], [value] * 3, std=0.01, name=f"{e}"), prior
         )
-        for e, value in enumerate(y)
+        for e, value in enumerate(readings)
     ]
     settings = replace(SETTINGS, refine="auto", members=500)
     found = estimate.estimate_jointly(sharing(problems, ("a",)), settings, seed=3)
@@ -347,3 +356,17 @@ def test_a_model_is_asked_for_the_observations_alone_unless_more_is_free(tmp_pat
     band = load_joint(tmp_path / "joint.nc").group("fit")["band"].values
     assert np.isfinite(band[0]).all(axis=1).sum() == len(problems[0].observations)
     assert np.isfinite(band[1]).all()
+
+
+def test_a_step_to_where_the_size_of_a_discrepancy_overflows_is_halved():
+    """Far from the readings Gauss and Newton ask for a discrepancy of exp(10^4): J is infinite there, and so told."""
+    problem = with_discrepancy(make_problem(Vectorised(names=("a", "b")), (1.0, 0.5), std=1e-3), length=(0.3, 0.7))
+    joint = JointProblem((problem,), ({"a": ""},))
+    experiment, border = Experiment(joint, 0, 1e-3, SerialExecutor()), np.array([[4.0], [-3.0]])
+    start = np.zeros((2, 3))
+    start[:, 1] = -8.0  # the discrepancy
+    mean, precision, lowest = experiment.settled(border, start, np.tile(np.eye(3), (2, 1, 1)), 12)
+    assert np.isfinite(lowest).all()
+    assert np.isfinite(mean).all()
+    assert np.linalg.eigvalsh(precision).min() >= 1 - 1e-9
+    assert (experiment.linearise_own(np.full((1, 4), 600.0), [1, 2, 3])[0] == np.inf).all()

@@ -4,7 +4,7 @@ What is shared, s, is drawn from Student's t about the mode; given s each experi
 
     p(s | y) ∝ p(s) Π_e L_e(s),      L_e(s) = ∫ p(y_e | s, v) p(v) dv ≈ mean_k p(y_e | s, v_k) p(v_k) / q(v_k | s)
 
-with v_k from a Gaussian about where J is low given s, widened. The estimate of L_e is unbiased, and with it the
+with v_k from Student's t about where J is lowest given s. The estimate of L_e is unbiased, and with it the
 weights of s and the choice of one v_k for each member are those of the exact posterior (Andrieu & Roberts 2009,
 Ann. Stat. 37, 697).
 
@@ -24,8 +24,8 @@ from en4dvar.model.state import Array
 from en4dvar.priors.prior import member_stream
 from en4dvar.sampling.mixture import effective_number, resampled
 
-DRAWS, INNER = 192, 12  # of what is shared, and of the own quantities for each of them
-STEPS = 2  # linearisations that the own quantities given what is shared are sought by
+DRAWS, INNER = 192, 36  # of what is shared, and of the own quantities for each of them
+STAGES, STEPS = 4, 8  # on the way to what is shared; linearisations at each that own quantities given it are sought by
 FREEDOM = 7.0  # degrees of freedom of Student's t
 WIDER = 1.2  # the proposals than the Gaussian
 ROUNDS = 4  # of such draws at most, where fewer leave
@@ -91,49 +91,55 @@ def sampled(experiments: Sequence[Experiment], at: ArrowSystem, seed: int, count
 
 def _proposed(at: ArrowSystem, stream: np.random.Generator) -> tuple[Array, Array]:
     """Draws (M, c) of what is shared, and ln p(s) − ln q(s) (M,)."""
-    c = len(at.place.border)
-    root = np.linalg.cholesky(at.arrow.schur)
-    z = stream.standard_normal((DRAWS, c))
-    tails = np.sqrt(FREEDOM / stream.chisquare(FREEDOM, DRAWS))[:, None]
-    scaled = WIDER * tails * z
-    border = at.place.border + np.linalg.solve(root.T, scaled.T).T
-    squares = np.sum((scaled / WIDER) ** 2, axis=1)
-    log_q = (
-        gammaln((FREEDOM + c) / 2) - gammaln(FREEDOM / 2) - 0.5 * c * np.log(FREEDOM * np.pi)
-        + float(np.log(np.diag(root)).sum()) - c * np.log(WIDER)
-        - 0.5 * (FREEDOM + c) * np.log1p(squares / FREEDOM)
-    )  # fmt: skip
-    log_p = -0.5 * np.sum(border**2, axis=1) - 0.5 * c * np.log(2 * np.pi)
+    step, log_q = _student(at.arrow.schur, (DRAWS,), stream)
+    border = at.place.border + step
+    log_p = -0.5 * np.sum(border**2, axis=1) - 0.5 * border.shape[1] * np.log(2 * np.pi)
     return border, log_p - log_q
+
+
+def _student(precision: Array, shape: tuple[int, ...], stream: np.random.Generator) -> tuple[Array, Array]:
+    """Draws (*shape, n) of Student's t about zero, for a ``precision`` (…, n, n), and ln q (*shape)."""
+    n, roots = precision.shape[-1], np.linalg.cholesky(precision)
+    z = stream.standard_normal((*shape, n))
+    scaled = WIDER * np.sqrt(FREEDOM / stream.chisquare(FREEDOM, shape))[..., None] * z
+    log_q = (
+        gammaln((FREEDOM + n) / 2) - gammaln(FREEDOM / 2) - 0.5 * n * np.log(FREEDOM * np.pi) - n * np.log(WIDER)
+        + np.log(np.diagonal(roots, axis1=-2, axis2=-1)).sum(axis=-1)
+        - 0.5 * (FREEDOM + n) * np.log1p(np.sum((scaled / WIDER) ** 2, axis=-1) / FREEDOM)
+    )  # fmt: skip
+    return np.asarray(np.linalg.solve(np.swapaxes(roots, -1, -2), scaled[..., None])[..., 0]), np.asarray(log_q)
 
 
 def _own(experiment: Experiment, at: ArrowSystem, border: Array, stream: np.random.Generator) -> tuple[Array, Array]:
     """Own quantities (M, INNER, n_e) of an experiment given border (M, c), and ln p(y, v)/q(v) (M, INNER)."""
     e, n = experiment.e, len(at.place.own[experiment.e])
     means, precisions = _given(experiment, at, border)
-    roots = np.linalg.cholesky(precisions)
-    z = stream.standard_normal((len(border), INNER, n))
-    own = means[:, None] + WIDER * np.linalg.solve(np.swapaxes(roots, 1, 2)[:, None], z[..., None])[..., 0]
-    logs = np.log(np.diagonal(roots, axis1=1, axis2=2)).sum(axis=1)[:, None]
-    log_q = logs - 0.5 * np.sum(z**2, axis=2) - n * np.log(WIDER)
+    step, log_q = _student(precisions[:, None], (len(border), INNER), stream)
+    own = means[:, None] + step
     points = experiment.joint.standard(e, np.repeat(border, INNER, axis=0), own.reshape(-1, n))
     costs = experiment.costs(points).reshape(len(border), INNER)
-    return own, -costs - 0.5 * np.sum(own**2, axis=2) - log_q
+    log_p = -0.5 * np.sum(own**2, axis=2) - 0.5 * n * np.log(2 * np.pi)
+    return own, log_p - costs - log_q
 
 
 def _given(experiment: Experiment, at: ArrowSystem, border: Array) -> tuple[Array, Array]:
     """The Gaussian of an experiment's own quantities given border (M, c): mean (M, n_e), precision (M, n_e, n_e).
 
-    That of the arrow, moved by a step of Gauss and Newton where J is lower there: what one experiment knows much better
-    alone than what is shared, as a time shift, is off the arrow's straight line by many of its standard deviations.
+    Followed from the mode in stages, each by Gauss–Newton from where the line through the last two leads: what one
+    experiment knows much better alone than what is shared, as a time shift, is off the arrow's straight line by many of
+    its standard deviations, and from there a descent may end in another minimum.
     """
     e, arrow = experiment.e, at.arrow
     block = arrow.blocks[e]
     precision = np.broadcast_to(block, (len(border), *block.shape))
     if not experiment.joint.columns(e)[1]:
         return np.zeros((len(border), 0)), precision
-    mean = at.place.own[e] - np.linalg.solve(block, arrow.edges[e].T @ (border - at.place.border).T).T
-    mean, precision, _ = experiment.settled(border, mean, precision, STEPS)
+    step = (border - at.place.border) / STAGES
+    mean, ahead = at.place.own[e], -np.linalg.solve(block, arrow.edges[e].T @ step.T).T
+    for stage in range(1, STAGES + 1):
+        before, there = mean, at.place.border + stage * step
+        mean, precision, _ = experiment.settled(there, mean + ahead, precision, STEPS)
+        ahead = mean - before
     return mean, precision
 
 
