@@ -111,7 +111,7 @@ def reference_value(text: str, unit: str) -> tuple[float, float]:
     return value, parse_quantity(f"{match[2]} {match[3]}".strip(), unit) if match[2] else math.nan
 
 
-ALL = "all"
+ALL, NONE = "all", "none"
 Patterns = str | tuple[str, ...]
 Groups = dict[Name, Annotated[dict[GroupName, Patterns], Field(min_length=1)]]
 
@@ -152,7 +152,7 @@ def sharing_of(
     document: Document,
 ) -> Sharing:
     """The parameters that a file asks to be shared. Raises :class:`ConfigError`: every entry that cannot be."""
-    asked = {e.parameter.name: e for e in entries if isinstance(e, Uncertain) and e.spec.shared is not None}
+    asked = {e.parameter.name: e for e in entries if isinstance(e, Uncertain) and e.spec.shared not in (None, NONE)}
     kinds = {name: str(entry.spec.shared) for name, entry in asked.items()}
     faults = [fault for name, entry in asked.items() for fault in _faults(name, entry, groups, document)]
     if kinds:
@@ -174,7 +174,7 @@ def sharing_of(
 def _faults(name: str, entry: Uncertain, groups: Mapping[str, object], document: Document) -> Iterator[Fault]:
     where, kind = ("parameters", name, "shared"), str(entry.spec.shared)
     if kind != ALL and kind not in groups:
-        known = [ALL, *groups]
+        known = [ALL, NONE, *groups]
         yield document.fault(where, f"no kind of 'groups:' is called {shown(kind)}{suggest(kind, known)}")
     if entry.needs_data:
         yield document.fault(where, "its prior depends on the data set ('maximum'), but what is shared has one prior")
