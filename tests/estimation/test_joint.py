@@ -131,7 +131,7 @@ def test_importance_gives_the_same_posterior_and_evidence():
 
 def test_more_draws_where_one_round_leaves_too_few(monkeypatch):
     problems = _experiments(kind=Vectorised, compiled=True)
-    monkeypatch.setattr(members, "FEWEST", members.DRAWS + 1)
+    monkeypatch.setattr(members, "ENOUGH", members.DRAWS + 1)
     found = estimate.estimate_jointly(_joint(problems), replace(SETTINGS, refine="auto", members=500), seed=3)
     assert found.members.effective > members.DRAWS
     assert found.log_evidence == pytest.approx(_exact(problems)[2], abs=0.15)
@@ -192,6 +192,21 @@ def test_own_quantities_that_follow_what_is_shared_on_a_bent_line(kind):
     assert found.members.effective > 50
     assert abs(found.shared.mean() - mean) < 0.2 * std
     assert 0.85 < found.shared.std() / std < 1.15
+
+
+def test_what_is_shared_on_a_bent_line_by_experiments_without_own_quantities():
+    """Against the integral over (a, c): one straight proposal finds two thirds of the width of a."""
+    model, y, std = Bent(names=("a", "c"), compiled=True), 0.3, 0.5
+    prior = Prior(tuple(PriorTerm.normal(p, 0.0, 1.0) for p in model.parameters))
+    data = [make_observations([1.0, 2.0, 3.0], [y] * 3, std=std, name=f"{e}") for e in range(3)]
+    joint = sharing([InverseProblem(model, model.observables[0], each, prior) for each in data], ("a", "c"))
+    a, c = np.linspace(-5, 4, 901)[:, None], np.linspace(-5, 5, 1001)
+    density = np.exp(-0.5 * (a**2 + c**2 + 9 * ((y - c - 0.8 * np.expm1(a)) / std) ** 2)).sum(axis=1)
+    weights = density / density.sum()
+    exact = np.sqrt(weights @ (a[:, 0] - weights @ a[:, 0]) ** 2)
+    settings = replace(SETTINGS, refine="auto", members=500)
+    found = [estimate.estimate_jointly(joint, settings, seed).shared[:, 0].std() for seed in (3, 4, 5)]
+    assert 0.8 < np.mean(found) / exact < 1.1
 
 
 class Folded(Vectorised):

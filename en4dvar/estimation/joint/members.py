@@ -1,6 +1,7 @@
 r"""The posterior ensemble of a joint problem: Gaussian about the mode, and corrected by importance for cheap models.
 
-What is shared, s, is drawn from Student's t about the mode; given s each experiment is on its own, so that
+What is shared, s, is drawn from Student's t about the mode, then about what was found; given s experiments are on
+their own, so that
 
     p(s | y) ∝ p(s) Π_e L_e(s),      L_e(s) = ∫ p(y_e | s, v) p(v) dv ≈ mean_k p(y_e | s, v_k) p(v_k) / q(v_k | s)
 
@@ -28,8 +29,8 @@ DRAWS, INNER = 192, 36  # of what is shared, and of the own quantities for each 
 STAGES, STEPS = 4, 8  # on the way to what is shared; linearisations at each that own quantities given it are sought by
 FREEDOM = 7.0  # degrees of freedom of Student's t
 WIDER = 1.2  # the proposals than the Gaussian
-ROUNDS = 4  # of such draws at most, where fewer leave
-FEWEST = 24.0  # effective draws below which the weights say nothing
+ROUNDS = 6  # of such draws at most
+ENOUGH, FEWEST = 96.0, 24.0  # effective draws that end the rounds; below which the weights say nothing
 OF_PRIOR, DEEPEST, DESCENTS = 48, 4, 8  # of the prior; of which are descended from; and with so many linearisations
 LOWER = 0.5  # of J
 
@@ -62,22 +63,35 @@ def gaussian(at: ArrowSystem, seed: int, count: int) -> JointMembers:
 
 
 def sampled(experiments: Sequence[Experiment], at: ArrowSystem, seed: int, count: int) -> JointMembers | None:
-    """By importance, in rounds until enough are effective; None where the proposal does not reach the posterior."""
-    stream, rounds = member_stream(seed, "joint importance"), list[list[Array]]()
+    """By importance, in rounds until enough are effective; None where the proposals do not reach the posterior.
+
+    Each further round draws about where the rounds before it have found the posterior, which may be bent, √2 times as
+    wide, and all draws are weighed by the mixture of the proposals (Cornuet et al. 2012, Scand. J. Stat. 39, 798).
+    """
+    stream, rounds, proposals = member_stream(seed, "joint importance"), list[list[Array]](), list[Proposal]()
+    proposal = Proposal(at.place.border, at.arrow.schur)
     for _ in range(ROUNDS):
-        border, log_weights = _proposed(at, stream)
+        proposals.append(proposal)
+        border = proposal.drawn((DRAWS,), stream)
+        log_target = -0.5 * np.sum(border**2, axis=1) - 0.5 * border.shape[1] * np.log(2 * np.pi)
         drawn = [_own(experiment, at, border, stream) for experiment in experiments]
         for _, log_ratio in drawn:
-            log_weights = log_weights + logsumexp(log_ratio, axis=1) - np.log(INNER)
-        rounds.append([border, log_weights, *(part for pair in drawn for part in pair)])
-        border, log_weights, *pairs = (np.concatenate(parts) for parts in zip(*rounds, strict=True))
+            log_target = log_target + logsumexp(log_ratio, axis=1) - np.log(INNER)
+        rounds.append([border, log_target, *(part for pair in drawn for part in pair)])
+        border, log_target, *pairs = (np.concatenate(parts) for parts in zip(*rounds, strict=True))
+        log_weights = (
+            log_target - logsumexp([p.log_density(border) for p in proposals], axis=0) + np.log(len(proposals))
+        )
         if not np.isfinite(log_weights).any():
             return None
         weights = np.exp(log_weights - logsumexp(log_weights))
         effective = effective_number(weights)
-        if effective >= FEWEST:
+        if effective >= ENOUGH or not border.shape[1]:
             break
-    else:
+        capped = np.minimum(weights, len(weights) ** -0.5)  # Ionides 2008, J. Comput. Graph. Stat. 17, 295
+        covariance = np.atleast_2d(np.cov(border.T, aweights=capped))
+        proposal = Proposal(np.average(border, axis=0, weights=capped), np.asarray(np.linalg.inv(2 * covariance)))
+    if effective < FEWEST:
         return None
     order = np.argsort(border[:, 0], kind="stable") if border.shape[1] else np.arange(len(border))
     taken = order[resampled(weights[order], count, stream)]
@@ -89,37 +103,41 @@ def sampled(experiments: Sequence[Experiment], at: ArrowSystem, seed: int, count
     return JointMembers(border[taken], own_members, effective, evidence)
 
 
-def _proposed(at: ArrowSystem, stream: np.random.Generator) -> tuple[Array, Array]:
-    """Draws (M, c) of what is shared, and ln p(s) − ln q(s) (M,)."""
-    step, log_q = _student(at.arrow.schur, (DRAWS,), stream)
-    border = at.place.border + step
-    log_p = -0.5 * np.sum(border**2, axis=1) - 0.5 * border.shape[1] * np.log(2 * np.pi)
-    return border, log_p - log_q
+@dataclass(frozen=True)
+class Proposal:
+    """Student's t about ``centre`` (…, n) with ``precision`` (…, n, n), widened."""
 
+    centre: Array
+    precision: Array
 
-def _student(precision: Array, shape: tuple[int, ...], stream: np.random.Generator) -> tuple[Array, Array]:
-    """Draws (*shape, n) of Student's t about zero, for a ``precision`` (…, n, n), and ln q (*shape)."""
-    n, roots = precision.shape[-1], np.linalg.cholesky(precision)
-    z = stream.standard_normal((*shape, n))
-    scaled = WIDER * np.sqrt(FREEDOM / stream.chisquare(FREEDOM, shape))[..., None] * z
-    log_q = (
-        gammaln((FREEDOM + n) / 2) - gammaln(FREEDOM / 2) - 0.5 * n * np.log(FREEDOM * np.pi) - n * np.log(WIDER)
-        + np.log(np.diagonal(roots, axis1=-2, axis2=-1)).sum(axis=-1)
-        - 0.5 * (FREEDOM + n) * np.log1p(np.sum((scaled / WIDER) ** 2, axis=-1) / FREEDOM)
-    )  # fmt: skip
-    return np.asarray(np.linalg.solve(np.swapaxes(roots, -1, -2), scaled[..., None])[..., 0]), np.asarray(log_q)
+    def drawn(self, shape: tuple[int, ...], stream: np.random.Generator) -> Array:
+        """(*shape, n)."""
+        z = WIDER * stream.standard_normal((*shape, self.centre.shape[-1]))
+        scaled = np.sqrt(FREEDOM / stream.chisquare(FREEDOM, shape))[..., None] * z
+        root = np.swapaxes(np.linalg.cholesky(self.precision), -1, -2)
+        return np.asarray(self.centre + np.linalg.solve(root, scaled[..., None])[..., 0])
+
+    def log_density(self, at: Array) -> Array:
+        """(…,) of points (…, n)."""
+        n, root = self.centre.shape[-1], np.linalg.cholesky(self.precision)
+        scaled = np.einsum("...ji,...j->...i", root, at - self.centre) / WIDER
+        return np.asarray(
+            gammaln((FREEDOM + n) / 2) - gammaln(FREEDOM / 2) - 0.5 * n * np.log(FREEDOM * np.pi) - n * np.log(WIDER)
+            + np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(axis=-1)
+            - 0.5 * (FREEDOM + n) * np.log1p(np.sum(scaled**2, axis=-1) / FREEDOM)
+        )  # fmt: skip
 
 
 def _own(experiment: Experiment, at: ArrowSystem, border: Array, stream: np.random.Generator) -> tuple[Array, Array]:
     """Own quantities (M, INNER, n_e) of an experiment given border (M, c), and ln p(y, v)/q(v) (M, INNER)."""
     e, n = experiment.e, len(at.place.own[experiment.e])
     means, precisions = _given(experiment, at, border)
-    step, log_q = _student(precisions[:, None], (len(border), INNER), stream)
-    own = means[:, None] + step
-    points = experiment.joint.standard(e, np.repeat(border, INNER, axis=0), own.reshape(-1, n))
+    proposal = Proposal(means[:, None], precisions[:, None])
+    own = proposal.drawn((len(border), INNER), stream)
+    points = experiment.joint.standard(e, np.repeat(border, INNER, axis=0), own.reshape(len(border) * INNER, n))
     costs = experiment.costs(points).reshape(len(border), INNER)
     log_p = -0.5 * np.sum(own**2, axis=2) - 0.5 * n * np.log(2 * np.pi)
-    return own, log_p - costs - log_q
+    return own, log_p - costs - proposal.log_density(own)
 
 
 def _given(experiment: Experiment, at: ArrowSystem, border: Array) -> tuple[Array, Array]:
