@@ -19,7 +19,9 @@ from en4dvar.model.state import Parameter
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem, common_to
+from en4dvar.report.joint import write_joint
 from en4dvar.results.joint_file import load_joint
+from en4dvar.results.netcdf import read_groups, to_bytes
 from en4dvar.runs.runner import run_campaign
 from en4dvar.schemes.settings import AssimilationSettings
 
@@ -125,7 +127,7 @@ def test_the_terminal_and_the_page_say_what_is_shared_unasked(oscillators, tmp_p
     run_campaign(configuration(oscillators, tmp_path / "run"))
     shared, output, page = told(tmp_path / "run", "--share", "k")
     assert shared == ("k", "reading_scale")
-    assert "but for --apart NAME: reading_scale\n" in output
+    assert "(unless --apart NAME): reading_scale\n" in output
     assert "as constants of one medium and one camera: reading_scale" in page
     shared, output, page = told(tmp_path / "run", "--share", "k", "--apart", "reading_scale")
     assert shared == ("k",)
@@ -133,6 +135,16 @@ def test_the_terminal_and_the_page_say_what_is_shared_unasked(oscillators, tmp_p
     shared, _, page = told(tmp_path / "run", "--share", "k", "--share", "reading_scale")
     assert shared == ("k", "reading_scale")
     assert "without having been asked" not in page
+
+
+def test_a_file_of_an_earlier_version_has_a_page(oscillators, tmp_path):
+    run_campaign(configuration(oscillators, tmp_path / "run"))
+    told(tmp_path / "run", "--share", "k", "--apart", "reading_scale")
+    folder = tmp_path / "joint_k_reading_scale"
+    groups = read_groups(folder / "joint.nc")
+    del groups["/"].attrs["common"]
+    to_bytes(groups).write(folder / "joint.nc")
+    assert "without having been asked" not in write_joint(folder).read_text()
 
 
 def test_a_configuration_says_so_too(oscillators, tmp_path):
