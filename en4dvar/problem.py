@@ -1,6 +1,6 @@
 """What is asked of an assimilation: the inverse problem of one data set."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import accumulate
 from typing import Any
@@ -11,7 +11,7 @@ from en4dvar.model.forward import Alternative, ForwardModel, Observable
 from en4dvar.model.state import DISCREPANCY, NOISE_SCALE, READING_OFFSET, READING_SCALE, Parameter
 from en4dvar.plumbing.moved import former_name
 from en4dvar.priors.field_prior import FieldPrior
-from en4dvar.priors.prior import Prior
+from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.priors.varying import PiecewiseModel, RandomWalk, Varying
 
 
@@ -162,4 +162,21 @@ def discrepancy_parameters(model: ForwardModel, observable: Observable) -> tuple
     return (
         replace(amplitude, unit=observable.unit, display_unit=observable.display_unit),
         replace(length, unit=model.time_unit, display_unit=model.time_display_unit),
+    )
+
+
+def common_to(problems: Sequence[InverseProblem], names: Collection[str]) -> tuple[str, ...]:
+    """Parameters with one value in all data sets that estimate them, two at least: those that are declared so
+    (:attr:`Parameter.common`), not of ``names``, and have the same uncorrelated prior in all.
+    """
+    correlated, terms = (
+        {n for p in problems for block in p.prior.blocks for n in block.names},
+        dict[str, list[PriorTerm]](),
+    )
+    for term in (term for problem in problems for term in problem.prior.terms):
+        terms.setdefault(term.parameter.name, []).append(term)
+    return tuple(
+        name
+        for name, (first, *others) in terms.items()
+        if first.parameter.common and name not in {*names, *correlated} and others and all(o == first for o in others)
     )

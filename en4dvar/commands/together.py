@@ -52,12 +52,19 @@ def several_runs(command: Callable[..., Told]) -> Callable[..., None]:
     "--share", "names", multiple=True, metavar="NAME",
     help="A parameter that has one value in all data sets, e.g. G; default: what their configurations share.",
 )  # fmt: skip
+@click.option(
+    "--apart", multiple=True, metavar="NAME",
+    help="A constant of medium or camera of which each data set has a value of its own, e.g. p_inf; any number.",
+)  # fmt: skip
 @several_runs
-def joint(runs: tuple[Path, ...], out: Path, how: dict[str, Any], names: tuple[str, ...]) -> Told:
+def joint(
+    runs: tuple[Path, ...], out: Path, how: dict[str, Any], names: tuple[str, ...], apart: tuple[str, ...]
+) -> Told:
     """Estimate data sets together that share parameters: samples of one material, records of one instrument.
 
     Takes finished runs, any of which may be a campaign; their models, windows and errors may differ.
-    Each data set has its own values of what is not shared. Writes joint.nc, joint.csv and a page.
+    Constants of the medium and of the camera that are estimated have one value in all, but for those --apart; each
+    data set has its own values of what is not shared. Writes joint.nc, joint.csv and a page.
 
     \b
     Example:
@@ -66,7 +73,7 @@ def joint(runs: tuple[Path, ...], out: Path, how: dict[str, Any], names: tuple[s
     from en4dvar.report.joint import joint_table
     from en4dvar.runs.together import join
 
-    result, page = join(runs, names, out, **how)
+    result, page = join(runs, names, out, apart=apart, **how)
     return joint_table(result), result.cautions, page
 
 

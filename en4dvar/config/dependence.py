@@ -305,7 +305,7 @@ def reference_value(text: str, unit: str) -> tuple[float, float]:
     return value, parse_quantity(f"{match[2]} {match[3]}".strip(), unit) if match[2] else math.nan
 
 
-ALL = "all"
+ALL, NONE = "all", "none"
 Patterns = str | tuple[str, ...]
 Groups = dict[Name, Annotated[dict[GroupName, Patterns], Field(min_length=1)]]
 
@@ -343,11 +343,11 @@ def sharing_of(
     document: Document,
 ) -> Sharing:
     """The parameters that a file asks to be shared. Raises :class:`ConfigError`: every entry that cannot be."""
-    asked = {e.parameter.name: e for e in entries if isinstance(e, Uncertain) and e.spec.shared is not None}
+    asked = {e.parameter.name: e for e in entries if isinstance(e, Uncertain) and e.spec.shared not in (None, NONE)}
     kinds = {name: str(entry.spec.shared) for name, entry in asked.items()}
     faults = list[Fault]()
     for name, kind in kinds.items():
-        where, known = ("parameters", name, "shared"), [ALL, *groups]
+        where, known = ("parameters", name, "shared"), [ALL, NONE, *groups]
         if kind not in known:
             faults.append(document.fault(where, f"no kind of 'groups:' is called {shown(kind)}{suggest(kind, known)}"))
         if asked[name].needs_data:

@@ -123,7 +123,8 @@ class PriorSection(Section):
     """The parameter varies in time; the prior is that of its first piece."""
     shared: Annotated[str | None, Field(min_length=1)] = None
     """The data sets have one value of it, estimated together after each by itself: ``all`` of them, or those of one
-    group of a kind in ``groups:``, e.g. batch."""
+    group of a kind in ``groups:``, e.g. batch. ``none``: each has a value of its own, of a constant of medium or camera
+    too, which otherwise has one value in all."""
 
 
 class TiedSection(Section):
@@ -281,7 +282,8 @@ def _entry(written: Any, context: Context) -> Entry:
     if "tied" in written:
         tied = TiedSection.model_validate(written, context=context)
         return Tied(parameter, tied.tied, tied.factor)
-    entry = Uncertain(parameter, PriorSection.model_validate(written, context=context))
+    spec = PriorSection.model_validate(written, context=context)
+    entry = Uncertain(replace(parameter, common=parameter.common and spec.shared != "none"), spec)
     if entry.spec.varies is not None and not can_vary(context.model, parameter.name):
         raise ConfigError(f"{parameter.name} cannot vary: {_why_not(context.model, parameter)}", "varies")
     entry.check()

@@ -133,7 +133,8 @@ def _of_sets(stored: StoredPopulation, centre: ParameterSummary) -> str:
     std = (high - low) / 3.29
     words = (
         f"the median of {len(stored.datasets)} data sets one by one is {centre.name} = "
-        f"{number_like(middle, std)}{unit_behind(centre.unit)} (5–95 %: {range_words(low, high, std)})"
+        f"{number_like(middle, std)}{unit_behind(centre.unit)} (5–95 %: {range_words(low, high, std)}), where each "
+        "counts by the share of its prior's variance that its data took away"
     )
     parts = _in_parts(stored, centre, of, std).removesuffix(".") if centre.untrusted and stored.common else ""
     return f"{words}. {parts}" if parts else words

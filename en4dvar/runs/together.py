@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 from en4dvar.config import Config
 from en4dvar.config.dependence import SOURCE, reference_value
 from en4dvar.diagnosis.diagnostics import HARDLY_INFORMED
-from en4dvar.estimation.joint import JointEstimate, Single, estimate_jointly
+from en4dvar.estimation.joint import JointEstimate, Single, estimate_jointly, with_common
 from en4dvar.estimation.joint.problem import JointProblem, sharing
 from en4dvar.estimation.population import Effort, HyperPrior
 from en4dvar.estimation.population import campaign as of_campaign
@@ -127,23 +127,26 @@ class TogetherKind(Kind, ABC):
         run.directory.remove(under_way)
 
 
-def join(run_dirs: Sequence[Path], names: Sequence[str], out: Path, **how: Any) -> tuple[StoredJoint, Path]:
+def join(
+    run_dirs: Sequence[Path], names: Sequence[str], out: Path, *, apart: Sequence[str] = (), **how: Any
+) -> tuple[StoredJoint, Path]:
     """Estimate the data sets of finished runs together, with the parameters ``names`` in common, or what their
-    configurations say where there are none; writes ``joint.nc``, ``joint.csv`` and ``joint.html`` to ``out``. Returns
-    what was found and the path of the page.
+    configurations say where there are none, and with what is common to all data sets of a campaign
+    (:attr:`Parameter.common`) but for that named ``apart``; writes ``joint.nc``, ``joint.csv`` and ``joint.html`` to
+    ``out``. Returns what was found and the path of the page.
 
     Settings of the ensemble and the seed are those of the first run; ``how`` as of :meth:`TogetherKind.of_runs`.
 
     Raises :class:`RefusedError`, :class:`OutputError`: as of :meth:`TogetherKind.of_runs`. :class:`ConfigError`: the
     data sets cannot share these parameters. :class:`TooFewMembersError`: the ensemble is lost.
     """
-    file, page = JointKind(tuple(names)).of_runs(run_dirs, out, **how)
+    file, page = JointKind(tuple(names), tuple(apart)).of_runs(run_dirs, out, **how)
     return load_joint(file), page
 
 
 @dataclass(frozen=True)
 class JointKind(TogetherKind):
-    """With ``names`` in common, or what the configurations share."""
+    """With ``names`` in common, or what the configurations share; ``apart``: what is each data set's own."""
 
     name = "joint"
     what = "joint estimate"
@@ -155,6 +158,7 @@ class JointKind(TogetherKind):
     writer = "en4dvar.report.joint:write_joint"
 
     names: Sequence[str] = ()
+    apart: Sequence[str] = ()
 
     def estimate(
         self, sets: Sequence[Finished], config: Config, executor: Executor, attributes: Mapping[str, Any], path: Path,
@@ -164,13 +168,21 @@ class JointKind(TogetherKind):
             raise ConfigError("nothing is shared: give --share NAME, or 'shared:' in the configurations of the runs")
         problems = tuple(dataset.problem for dataset in sets)
         groups = tuple(dataset.groups for dataset in sets)
-        joint = sharing(problems, self.names) if self.names else JointProblem(problems, groups)
+        joint = (
+            sharing(problems, self.names, self.apart)
+            if self.names
+            else JointProblem(problems, with_common(problems, groups, self.apart))
+        )
+        asked = self.names or {name for of_it in groups for name in of_it}
+        common = ", ".join(name for name, _ in joint.shared if name not in asked)
+        if common:
+            tell(f"one value in all data sets too, as constants of medium and camera (unless --apart NAME): {common}")
         singles = [Single.of_physical(dataset.problem.prior, dataset.members, dataset.centre) for dataset in sets]
         estimated = estimate_jointly(joint, config.assimilation, config.seed, executor, singles, tell)
         estimated = _with_carried(estimated, sets)
         alone = [dataset.members for dataset in sets]
         shared = " ".join(dict.fromkeys(name for name, _ in joint.shared))
-        save_joint(path, estimated, alone, {**attributes, "seed": config.seed, "shared": shared})
+        save_joint(path, estimated, alone, {**attributes, "seed": config.seed, "shared": shared, "common": common})
 
 
 def _with_carried(estimate: JointEstimate, sets: Sequence[Finished]) -> JointEstimate:

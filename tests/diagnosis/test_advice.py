@@ -20,6 +20,7 @@ from diagnosis.provoked import (
     replace_std,
     run,
     turned,
+    waved,
 )
 from diagnosis.provoked_by_several import OF_SEVERAL
 from estimation.test_agreement import joint
@@ -27,7 +28,7 @@ from toys import Vectorised, make_observations, make_problem, with_discrepancy, 
 
 from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.estimation.assimilate import assimilate
-from en4dvar.model.forward import ValidityLimit
+from en4dvar.model.forward import Alternative, ValidityLimit
 from en4dvar.model.state import Parameter
 from en4dvar.plumbing.caution import CATALOGUE, Caution
 from en4dvar.priors.prior import Prior, PriorTerm
@@ -236,6 +237,23 @@ def test_what_is_set_already_is_not_advised():
     """The size of errors that is estimated beside a discrepancy."""
     scaled = run(with_discrepancy(bent(), sigma=0.5, amplitude=(0.05, 1.0), length=(0.3, 0.7)))
     assert "parameters.sigma" not in " ".join(c.advice for c in scaled.cautions)
+
+
+class Assuming(Vectorised):
+    """Can say what would be if its first parameter were larger."""
+
+    alternatives = (Alternative("a", "a were 10 % larger", parameters={"a": 1.1}),)
+
+
+def test_a_table_that_is_not_there_is_asked_for_and_one_that_cannot_be_is_not_named():
+    problem = waved(3.0)
+    assert "what-if" not in told(run(problem), "discrepancy-found").advice
+    assuming = replace(problem, model=Assuming(TWO))
+    asked = told(run(assuming, what_if=False), "discrepancy-found").advice
+    assert "ask for the what-if table (--set assimilation.what_if=true) and compare other models" in asked
+    there = run(assuming, what_if=True)
+    assert there.what_if
+    assert "look at the what-if table and compare other models" in told(there, "discrepancy-found").advice
 
 
 def test_every_code_of_the_catalogue_is_followed_somewhere():

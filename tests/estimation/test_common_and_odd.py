@@ -305,6 +305,28 @@ def test_a_few_that_are_sure_do_not_outweigh_many_others():
     assert median_of(middle, std, member_stream(1, "a"))[0] < 0.6
 
 
+def test_the_median_of_soft_gels_is_not_pulled_to_the_stiffest():
+    """A modulus of 2.5 ± 0.7 kPa and a wide prior of its logarithm: low values have wide posteriors of it."""
+    rng, grid, inside = np.random.default_rng(3), np.linspace(-6, 5, 800), []
+    for trial in range(100):
+        truths = 2.5 * np.exp(0.4 * rng.standard_normal(24))
+        seen = truths + 0.7 * rng.standard_normal(24)
+        log = -0.5 * ((seen[:, None] - np.exp(grid)) / 0.7) ** 2 - 0.5 * ((grid - 1) / 2) ** 2
+        weights = np.exp(log - log.max(axis=1, keepdims=True))
+        weights /= weights.sum(axis=1, keepdims=True)
+        middle = np.array([np.interp(0.5, np.cumsum(row), grid) for row in weights])
+        std = np.sqrt(weights @ grid**2 - (weights @ grid) ** 2)
+        term = PriorTerm.lognormal(Parameter("G", "kPa"), np.e, 2.0)
+        low, _, high = empirical(term, (middle - 1) / 2, std / 2, Following(np.zeros((1, 0)), np.zeros(1)), trial).quantiles
+        inside.append(low < 2.5 < high)
+    assert np.mean(inside) > 0.82  # of 0.9; by weights 1/(s² + T²) of T² how much they differ 0.33
+
+
+def test_a_data_set_that_tells_nothing_does_not_count():
+    middle, std = np.array([2.0, 2.1, 2.2, 0.0, 0.0, 0.0, 0.0]), np.array([0.1] * 3 + [1.0] * 4)
+    assert median_of(middle, std, member_stream(1, "a"))[0] == pytest.approx(2.1, abs=0.05)
+
+
 def test_data_sets_known_exactly_have_their_median():
     for x in ([0.0, 1.0, 2.0], [0.1, 0.2, 0.7, 0.9, 1.3], [3.0, 3.0, 3.0]):
         middle, spread = median_of(np.array(x), np.zeros(len(x)), member_stream(1, "a"))

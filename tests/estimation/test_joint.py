@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from toys import Decay, Fragile, Linear, Vectorised, Wave, make_observations
+from toys import Decay, Fragile, Linear, Vectorised, Wave, make_observations, make_problem, with_discrepancy
 
 from en4dvar.estimation.joint import estimate, members
 from en4dvar.estimation.joint.descent import Arrow, Experiment, JointDescent, JointObjective, Place
@@ -131,7 +131,7 @@ def test_importance_gives_the_same_posterior_and_evidence():
 
 def test_more_draws_where_one_round_leaves_too_few(monkeypatch):
     problems = _experiments(kind=Vectorised, compiled=True)
-    monkeypatch.setattr(members, "FEWEST", members.DRAWS + 1)
+    monkeypatch.setattr(members, "ENOUGH", members.DRAWS + 1)
     found = estimate.estimate_jointly(_joint(problems), replace(SETTINGS, refine="auto", members=500), seed=3)
     assert found.members.effective > members.DRAWS
     assert found.log_evidence == pytest.approx(_exact(problems)[2], abs=0.15)
@@ -163,15 +163,24 @@ class Bent(Vectorised):
         return [Trajectory(t, s, self.layout) for t, s in zip(own, states, strict=True)]
 
 
-def test_own_quantities_that_follow_what_is_shared_on_a_bent_line():
-    """Against the integral: p(a) ∝ N(a; 0, 1) Π_e N(y_e − 0.8 (exp(a) − 1); 0, 1)."""
-    model, y = Bent(names=("a", "c"), compiled=True), np.array([0.3, -0.4, 0.1])
+class Steep(Bent):
+    """y = exp(c + 0.8 (exp(a) − 1)), so that steps in c from afar overshoot."""
+
+    def trajectories(self, x, times):
+        return [replace(t, states=np.exp(t.states)) for t in super().trajectories(x, times)]
+
+
+@pytest.mark.parametrize("kind", [Bent, Steep])
+def test_own_quantities_that_follow_what_is_shared_on_a_bent_line(kind):
+    """Against the integral: p(a) ∝ N(a; 0, 1) Π_e N(y_e − 0.8 (exp(a) − 1); 0, 1), y_e or ln y_e the reading."""
+    model, y = kind(names=("a", "c"), compiled=True), np.array([0.3, -0.4, 0.1])
+    readings = y if kind is Bent else np.exp(y)
     prior = Prior(tuple(PriorTerm.normal(p, 0.0, 1.0) for p in model.parameters))
     problems = [
         InverseProblem(
             model, model.observables[0], make_observations([1.0, 2.0, 3.0], [value] * 3, std=0.01, name=f"{e}"), prior
         )
-        for e, value in enumerate(y)
+        for e, value in enumerate(readings)
     ]
     settings = replace(SETTINGS, refine="auto", members=500)
     found = estimate.estimate_jointly(sharing(problems, ("a",)), settings, seed=3)
@@ -183,6 +192,21 @@ def test_own_quantities_that_follow_what_is_shared_on_a_bent_line():
     assert found.members.effective > 50
     assert abs(found.shared.mean() - mean) < 0.2 * std
     assert 0.85 < found.shared.std() / std < 1.15
+
+
+def test_what_is_shared_on_a_bent_line_by_experiments_without_own_quantities():
+    """Against the integral over (a, c): one straight proposal finds two thirds of the width of a."""
+    model, y, std = Bent(names=("a", "c"), compiled=True), 0.3, 0.5
+    prior = Prior(tuple(PriorTerm.normal(p, 0.0, 1.0) for p in model.parameters))
+    data = [make_observations([1.0, 2.0, 3.0], [y] * 3, std=std, name=f"{e}") for e in range(3)]
+    joint = sharing([InverseProblem(model, model.observables[0], each, prior) for each in data], ("a", "c"))
+    a, c = np.linspace(-5, 4, 901)[:, None], np.linspace(-5, 5, 1001)
+    density = np.exp(-0.5 * (a**2 + c**2 + 9 * ((y - c - 0.8 * np.expm1(a)) / std) ** 2)).sum(axis=1)
+    weights = density / density.sum()
+    exact = np.sqrt(weights @ (a[:, 0] - weights @ a[:, 0]) ** 2)
+    settings = replace(SETTINGS, refine="auto", members=500)
+    found = [estimate.estimate_jointly(joint, settings, seed).shared[:, 0].std() for seed in (3, 4, 5)]
+    assert 0.8 < np.mean(found) / exact < 1.1
 
 
 class Folded(Vectorised):
@@ -347,3 +371,17 @@ def test_a_model_is_asked_for_the_observations_alone_unless_more_is_free(tmp_pat
     band = load_joint(tmp_path / "joint.nc").group("fit")["band"].values
     assert np.isfinite(band[0]).all(axis=1).sum() == len(problems[0].observations)
     assert np.isfinite(band[1]).all()
+
+
+def test_a_step_to_where_the_size_of_a_discrepancy_overflows_is_halved():
+    """Far from the readings Gauss and Newton ask for a discrepancy of exp(10^4): J is infinite there, and so told."""
+    problem = with_discrepancy(make_problem(Vectorised(names=("a", "b")), (1.0, 0.5), std=1e-3), length=(0.3, 0.7))
+    joint = JointProblem((problem,), ({"a": ""},))
+    experiment, border = Experiment(joint, 0, 1e-3, SerialExecutor()), np.array([[4.0], [-3.0]])
+    start = np.zeros((2, 3))
+    start[:, 1] = -8.0  # the discrepancy
+    mean, precision, lowest = experiment.settled(border, start, np.tile(np.eye(3), (2, 1, 1)), 12)
+    assert np.isfinite(lowest).all()
+    assert np.isfinite(mean).all()
+    assert np.linalg.eigvalsh(precision).min() >= 1 - 1e-9
+    assert (experiment.linearise_own(np.full((1, 4), 600.0), [1, 2, 3])[0] == np.inf).all()

@@ -146,7 +146,12 @@ def _structure(case: Case) -> str:
 
 def _missed(case: Case) -> str:
     if case.caution.severity != "serious":
-        return CATALOGUE["discrepancy-found"][1]
+        advice, table = CATALOGUE["discrepancy-found"][1], ""
+        if case.a.what_if:
+            table = "look at the what-if table and "
+        elif case.a.problem.alternatives and not case.a.settings.what_if:
+            table = "ask for the what-if table (--set assimilation.what_if=true) and "
+        return advice.replace("compare", f"{table}compare", 1)
     return (
         "quote nothing of this fit: look at the prior over the readings (en4dvar validate --plot); check units and "
         "columns (data), how the history starts, the law and the medium (model), and values that are fixed (parameters)"

@@ -8,6 +8,6 @@ shares what), ``descent`` (the linear algebra, an experiment's runs, and J), ``m
 """
 
 from en4dvar.estimation.joint.estimate import JointEstimate, estimate_jointly
-from en4dvar.estimation.joint.problem import JointProblem, Single, sharing
+from en4dvar.estimation.joint.problem import JointProblem, Single, sharing, with_common
 
-__all__ = ["JointEstimate", "JointProblem", "Single", "estimate_jointly", "sharing"]
+__all__ = ["JointEstimate", "JointProblem", "Single", "estimate_jointly", "sharing", "with_common"]

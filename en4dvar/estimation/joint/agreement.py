@@ -93,10 +93,15 @@ def agreement(joint: JointProblem, said: Sequence[Statement], rest: Collection[i
     squares, freedom = _squares(said, rest)
     scatter, degrees = _scatter(said, rest)
     chances = np.array([_chance(z, k, scatter, degrees) for z, k in zip(squares, freedom, strict=True)])
-    shared = len({j for e in rest for j in joint.of_border(e)})
-    more = max(1, sum(len(joint.of_border(e)) for e in rest) - shared)
-    together = float(chdtrc(more, deviances[list(rest)].sum()))
+    each = np.array([said[e].precision for e in rest])
+    more = sum(map(_learnt, each)) - _learnt(each.sum(axis=0))  # a direction that nobody learns of adds no deviance
+    together = float(chdtrc(max(1.0, more), deviances[list(rest)].sum()))
     return Agreement(squares, freedom, chances, together, float(np.sqrt(scatter)), degrees)
+
+
+def _learnt(precision: Array) -> float:
+    """How many of the prior's directions a likelihood of this precision (c, c) tells of: tr Λ (I + Λ)⁻¹."""
+    return float(np.trace(np.linalg.solve(np.eye(len(precision)) + precision, precision)))
 
 
 def oddest(said: Sequence[Statement]) -> int | None:
@@ -177,7 +182,9 @@ def doubts(
             f"the data sets differ{by} (probability {_in_figures(agreed.chance)} if they share one value): the "
             "interval of one shared value is too narrow"
         )
-        of = " ".join(dict.fromkeys(f"--of {name}" for name, _ in joint.shared))
+        named = zip(joint.shared, joint.terms, strict=True)  # what varies is hardly a constant of medium or camera
+        varying = [name for (name, _), term in named if not term.parameter.common] or [name for name, _ in joint.shared]
+        of = " ".join(dict.fromkeys(f"--of {name}" for name in varying))
         advice = f"ask how much they vary and not for one value (en4dvar population {of})"
         if agreed.degrees:
             advice += f", or, where errors were stated too small, state them {agreed.scatter:.1f} times as large"

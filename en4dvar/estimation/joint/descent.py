@@ -23,6 +23,7 @@ from en4dvar.priors.prior import whiten_sample
 from en4dvar.schemes.base import Minimiser
 
 LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.03, 0.01)  # of a step, tried in turn until J falls
+CLOSE = 0.3  # posterior standard deviations: own quantities that a step moves no further have settled
 LONGEST = 40.0  # step in prior standard deviations of one experiment, as of a data set alone (step_control.py)
 
 
@@ -160,12 +161,13 @@ class Experiment:
         beside = z[:, None] + size * np.vstack([np.zeros(z.shape[1]), np.eye(z.shape[1])[columns]])
         run = self.run(beside.reshape(-1, z.shape[1]))
         stacked = run.predicted.stacked.reshape(len(z), k + 1, -1)
+        cost = observations.cost(run.predicted)[:: k + 1]
         gradient, hessian = np.full((len(z), k), np.nan), np.full((len(z), k, k), np.nan)
-        for i in np.flatnonzero(np.isfinite(stacked).all(axis=(1, 2))).tolist():
+        for i in np.flatnonzero(np.isfinite(cost) & np.isfinite(stacked).all(axis=(1, 2))).tolist():
             change = (stacked[i, 1:] - stacked[i, 0]) / size
             d, S = observations.whiten(Linearisation.of_stacked(run.predicted[i * (k + 1)], stacked[i, 0], change))
             gradient[i], hessian[i] = -S.T @ d, S.T @ S
-        return observations.cost(run.predicted)[:: k + 1], gradient, hessian
+        return cost, gradient, hessian
 
     def settled(self, border: Array, start: Array, precision: Array, steps: int) -> tuple[Array, Array, Array]:
         """The own quantities that J is low at, given what is shared (M, c): Gauss–Newton from ``start`` (M, n_e).
@@ -173,17 +175,21 @@ class Experiment:
         Where J has not fallen the step is halved. Returns the lowest places (M, n_e), their precision (M, n_e, n_e), or
         the one given where no run lives, and J_o + J_b of the own quantities (M,) there, +inf where no run lives.
         """
-        columns = self.joint.columns(self.e)[1]
-        lowest, mean, there, step = np.full(len(start), np.inf), start, start, np.zeros_like(start)
-        for _ in range(steps):
-            cost, gradient, hessian = self.linearise_own(self.joint.standard(self.e, border, there), columns)
+        columns, going = self.joint.columns(self.e)[1], np.arange(len(start))
+        lowest, mean, step = np.full(len(start), np.inf), start.copy(), np.zeros_like(start)
+        precision = precision.copy()
+        while steps and len(going):
+            steps, there = steps - 1, mean[going] - step[going]
+            z = self.joint.standard(self.e, border[going], there)
+            cost, gradient, hessian = self.linearise_own(z, columns)
             cost = cost + 0.5 * np.sum(there**2, axis=1)
-            lower = (cost < lowest) & np.isfinite(gradient).all(axis=1)
-            lowest, mean = np.where(lower, cost, lowest), np.where(lower[:, None], there, mean)
-            precision = np.where(lower[:, None, None], np.eye(len(columns)) + hessian, precision)
-            newton = np.linalg.solve(precision, (mean + gradient)[..., None])[..., 0]
-            step = np.where(lower[:, None], newton, 0.5 * step)
-            there = mean - step
+            lower = (cost < lowest[going]) & np.isfinite(gradient).all(axis=1)
+            at, slope = going[lower], (there + gradient)[lower]
+            lowest[at], mean[at], precision[at] = cost[lower], there[lower], np.eye(len(columns)) + hessian[lower]
+            step[going[~lower]] *= 0.5
+            step[at] = np.linalg.solve(precision[at], slope[..., None])[..., 0]
+            step *= LONGEST / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), LONGEST)
+            going = going[np.einsum("mi,mij,mj->m", step, precision, step)[going] > CLOSE**2]
         return mean, precision, lowest
 
 

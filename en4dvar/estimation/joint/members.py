@@ -1,10 +1,11 @@
 r"""The posterior ensemble of a joint problem: Gaussian about the mode, and corrected by importance for cheap models.
 
-What is shared, s, is drawn from Student's t about the mode; given s each experiment is on its own, so that
+What is shared, s, is drawn from Student's t about the mode, then about what was found; given s experiments are on
+their own, so that
 
     p(s | y) ∝ p(s) Π_e L_e(s),      L_e(s) = ∫ p(y_e | s, v) p(v) dv ≈ mean_k p(y_e | s, v_k) p(v_k) / q(v_k | s)
 
-with v_k from a Gaussian about where J is low given s, widened. The estimate of L_e is unbiased, and with it the
+with v_k from Student's t about where J is lowest given s. The estimate of L_e is unbiased, and with it the
 weights of s and the choice of one v_k for each member are those of the exact posterior (Andrieu & Roberts 2009,
 Ann. Stat. 37, 697).
 
@@ -24,12 +25,12 @@ from en4dvar.estimation.joint.descent import ArrowSystem, Experiment, Place
 from en4dvar.model.state import Array
 from en4dvar.priors.prior import member_stream
 
-DRAWS, INNER = 192, 12  # of what is shared, and of the own quantities for each of them
-STEPS = 2  # linearisations that the own quantities given what is shared are sought by
+DRAWS, INNER = 192, 36  # of what is shared, and of the own quantities for each of them
+STAGES, STEPS = 4, 8  # on the way to what is shared; linearisations at each that own quantities given it are sought by
 FREEDOM = 7.0  # degrees of freedom of Student's t
 WIDER = 1.2  # the proposals than the Gaussian
-ROUNDS = 4  # of such draws at most, where fewer leave
-FEWEST = 24.0  # effective draws below which the weights say nothing
+ROUNDS = 6  # of such draws at most
+ENOUGH, FEWEST = 96.0, 24.0  # effective draws that end the rounds; below which the weights say nothing
 OF_PRIOR, DEEPEST, DESCENTS = 48, 4, 8  # of the prior; of which are descended from; and with so many linearisations
 LOWER = 0.5  # of J
 
@@ -62,22 +63,35 @@ def gaussian(at: ArrowSystem, seed: int, count: int) -> JointMembers:
 
 
 def sampled(experiments: Sequence[Experiment], at: ArrowSystem, seed: int, count: int) -> JointMembers | None:
-    """By importance, in rounds until enough are effective; None where the proposal does not reach the posterior."""
-    stream, rounds = member_stream(seed, "joint importance"), list[list[Array]]()
+    """By importance, in rounds until enough are effective; None where the proposals do not reach the posterior.
+
+    Each further round draws about where the rounds before it have found the posterior, which may be bent, √2 times as
+    wide, and all draws are weighed by the mixture of the proposals (Cornuet et al. 2012, Scand. J. Stat. 39, 798).
+    """
+    stream, rounds, proposals = member_stream(seed, "joint importance"), list[list[Array]](), list[Proposal]()
+    proposal = Proposal(at.place.border, at.arrow.schur)
     for _ in range(ROUNDS):
-        border, log_weights = _proposed(at, stream)
+        proposals.append(proposal)
+        border = proposal.drawn((DRAWS,), stream)
+        log_target = -0.5 * np.sum(border**2, axis=1) - 0.5 * border.shape[1] * np.log(2 * np.pi)
         drawn = [_own(experiment, at, border, stream) for experiment in experiments]
         for _, log_ratio in drawn:
-            log_weights = log_weights + logsumexp(log_ratio, axis=1) - np.log(INNER)
-        rounds.append([border, log_weights, *(part for pair in drawn for part in pair)])
-        border, log_weights, *pairs = (np.concatenate(parts) for parts in zip(*rounds, strict=True))
+            log_target = log_target + logsumexp(log_ratio, axis=1) - np.log(INNER)
+        rounds.append([border, log_target, *(part for pair in drawn for part in pair)])
+        border, log_target, *pairs = (np.concatenate(parts) for parts in zip(*rounds, strict=True))
+        log_weights = (
+            log_target - logsumexp([p.log_density(border) for p in proposals], axis=0) + np.log(len(proposals))
+        )
         if not np.isfinite(log_weights).any():
             return None
         weights = shares_of(log_weights)
         effective = effective_number(weights)
-        if effective >= FEWEST:
+        if effective >= ENOUGH or not border.shape[1]:
             break
-    else:
+        capped = np.minimum(weights, len(weights) ** -0.5)  # Ionides 2008, J. Comput. Graph. Stat. 17, 295
+        covariance = np.atleast_2d(np.cov(border.T, aweights=capped))
+        proposal = Proposal(np.average(border, axis=0, weights=capped), np.asarray(np.linalg.inv(2 * covariance)))
+    if effective < FEWEST:
         return None
     order = np.argsort(border[:, 0], kind="stable") if border.shape[1] else np.arange(len(border))
     taken = order[resampled(weights[order], count, stream)]
@@ -89,51 +103,61 @@ def sampled(experiments: Sequence[Experiment], at: ArrowSystem, seed: int, count
     return JointMembers(border[taken], own_members, effective, evidence)
 
 
-def _proposed(at: ArrowSystem, stream: np.random.Generator) -> tuple[Array, Array]:
-    """Draws (M, c) of what is shared, and ln p(s) − ln q(s) (M,)."""
-    c = len(at.place.border)
-    root = np.linalg.cholesky(at.arrow.schur)
-    z = stream.standard_normal((DRAWS, c))
-    tails = np.sqrt(FREEDOM / stream.chisquare(FREEDOM, DRAWS))[:, None]
-    scaled = WIDER * tails * z
-    border = at.place.border + np.linalg.solve(root.T, scaled.T).T
-    squares = np.sum((scaled / WIDER) ** 2, axis=1)
-    log_q = (
-        gammaln((FREEDOM + c) / 2) - gammaln(FREEDOM / 2) - 0.5 * c * np.log(FREEDOM * np.pi)
-        + float(np.log(np.diag(root)).sum()) - c * np.log(WIDER)
-        - 0.5 * (FREEDOM + c) * np.log1p(squares / FREEDOM)
-    )  # fmt: skip
-    log_p = -0.5 * np.sum(border**2, axis=1) - 0.5 * c * np.log(2 * np.pi)
-    return border, log_p - log_q
+@dataclass(frozen=True)
+class Proposal:
+    """Student's t about ``centre`` (…, n) with ``precision`` (…, n, n), widened."""
+
+    centre: Array
+    precision: Array
+
+    def drawn(self, shape: tuple[int, ...], stream: np.random.Generator) -> Array:
+        """(*shape, n)."""
+        z = WIDER * stream.standard_normal((*shape, self.centre.shape[-1]))
+        scaled = np.sqrt(FREEDOM / stream.chisquare(FREEDOM, shape))[..., None] * z
+        root = np.swapaxes(np.linalg.cholesky(self.precision), -1, -2)
+        return np.asarray(self.centre + np.linalg.solve(root, scaled[..., None])[..., 0])
+
+    def log_density(self, at: Array) -> Array:
+        """(…,) of points (…, n)."""
+        n, root = self.centre.shape[-1], np.linalg.cholesky(self.precision)
+        scaled = np.einsum("...ji,...j->...i", root, at - self.centre) / WIDER
+        return np.asarray(
+            gammaln((FREEDOM + n) / 2) - gammaln(FREEDOM / 2) - 0.5 * n * np.log(FREEDOM * np.pi) - n * np.log(WIDER)
+            + np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(axis=-1)
+            - 0.5 * (FREEDOM + n) * np.log1p(np.sum(scaled**2, axis=-1) / FREEDOM)
+        )  # fmt: skip
 
 
 def _own(experiment: Experiment, at: ArrowSystem, border: Array, stream: np.random.Generator) -> tuple[Array, Array]:
     """Own quantities (M, INNER, n_e) of an experiment given border (M, c), and ln p(y, v)/q(v) (M, INNER)."""
     e, n = experiment.e, len(at.place.own[experiment.e])
     means, precisions = _given(experiment, at, border)
-    roots = np.linalg.cholesky(precisions)
-    z = stream.standard_normal((len(border), INNER, n))
-    own = means[:, None] + WIDER * np.linalg.solve(np.swapaxes(roots, 1, 2)[:, None], z[..., None])[..., 0]
-    logs = np.log(np.diagonal(roots, axis1=1, axis2=2)).sum(axis=1)[:, None]
-    log_q = logs - 0.5 * np.sum(z**2, axis=2) - n * np.log(WIDER)
-    points = experiment.joint.standard(e, np.repeat(border, INNER, axis=0), own.reshape(-1, n))
+    proposal = Proposal(means[:, None], precisions[:, None])
+    own = proposal.drawn((len(border), INNER), stream)
+    points = experiment.joint.standard(e, np.repeat(border, INNER, axis=0), own.reshape(len(border) * INNER, n))
     costs = experiment.costs(points).reshape(len(border), INNER)
-    return own, -costs - 0.5 * np.sum(own**2, axis=2) - log_q
+    log_p = -0.5 * np.sum(own**2, axis=2) - 0.5 * n * np.log(2 * np.pi)
+    return own, log_p - costs - proposal.log_density(own)
 
 
 def _given(experiment: Experiment, at: ArrowSystem, border: Array) -> tuple[Array, Array]:
     """The Gaussian of an experiment's own quantities given border (M, c): mean (M, n_e), precision (M, n_e, n_e).
 
-    That of the arrow, moved by a step of Gauss and Newton where J is lower there: what one experiment knows much better
-    alone than what is shared, as a time shift, is off the arrow's straight line by many of its standard deviations.
+    Followed from the mode in stages, each by Gauss–Newton from where the line through the last two leads: what one
+    experiment knows much better alone than what is shared, as a time shift, is off the arrow's straight line by many of
+    its standard deviations, and from there a descent may end in another minimum.
     """
     e, arrow = experiment.e, at.arrow
     block = arrow.blocks[e]
     precision = np.broadcast_to(block, (len(border), *block.shape))
     if not experiment.joint.columns(e)[1]:
         return np.zeros((len(border), 0)), precision
-    mean = at.place.own[e] - np.linalg.solve(block, arrow.edges[e].T @ (border - at.place.border).T).T
-    mean, precision, _ = experiment.settled(border, mean, precision, STEPS)
+    step = (border - at.place.border) / STAGES
+    mean, ahead = at.place.own[e], -np.linalg.solve(block, arrow.edges[e].T @ step.T).T
+    for stage in range(1, STAGES + 1):
+        before, there = mean, at.place.border + stage * step
+        mean, precision, _ = experiment.settled(there, mean + ahead, precision, STEPS)
+        ahead = mean - before
     return mean, precision
 
 

@@ -11,7 +11,7 @@ from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.hints import suggest
 from en4dvar.priors.prior import Prior, PriorTerm
-from en4dvar.problem import InverseProblem
+from en4dvar.problem import InverseProblem, common_to
 
 EVERYONE = ""  # the group of a quantity that all experiments share
 
@@ -118,8 +118,9 @@ class JointProblem:
         return terms
 
 
-def sharing(experiments: Sequence[InverseProblem], names: Sequence[str]) -> JointProblem:
-    """Experiments of which those that estimate one of the parameters ``names`` have it in common.
+def sharing(experiments: Sequence[InverseProblem], names: Sequence[str], apart: Sequence[str] = ()) -> JointProblem:
+    """Experiments of which those that estimate one of the parameters ``names`` have it in common, and what is
+    :func:`with_common` but for that named ``apart``.
 
     Raises :class:`ConfigError`, also where fewer than two do.
     """
@@ -130,4 +131,22 @@ def sharing(experiments: Sequence[InverseProblem], names: Sequence[str]) -> Join
             known = sorted({name for problem in experiments for name in problem.prior.names})
             raise ConfigError(f"{name}: cannot be shared, for no two data sets estimate it{suggest(name, known)}")
     groups = tuple({name: EVERYONE for name in names if name in problem.prior.names} for problem in experiments)
-    return JointProblem(tuple(experiments), groups)
+    return JointProblem(tuple(experiments), with_common(experiments, groups, apart))
+
+
+def with_common(
+    experiments: Sequence[InverseProblem], groups: Sequence[Mapping[str, str]], apart: Sequence[str] = ()
+) -> tuple[Mapping[str, str], ...]:
+    """``groups`` of each experiment, and what is not of them and common to the experiments
+    (:func:`~en4dvar.problem.common_to`), with everyone: an error that all have alike does not average out.
+
+    Raises :class:`ConfigError`: of ``apart`` a name that is not common.
+    """
+    if not any(groups):
+        raise ConfigError("a joint estimate shares at least one parameter")
+    common = common_to(experiments, {name for shared in groups for name in shared})
+    if wrong := [name for name in apart if name not in common]:
+        raise ConfigError(f"{wrong[0]}: apart, but not shared unless it is asked for{suggest(wrong[0], common)}")
+    everyone = {name: EVERYONE for name in common if name not in apart}
+    each = zip(experiments, groups, strict=True)
+    return tuple({**shared, **{n: g for n, g in everyone.items() if n in p.prior.names}} for p, shared in each)

@@ -26,7 +26,7 @@ from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.hints import suggest
 from en4dvar.priors.prior import PriorTerm, member_stream
-from en4dvar.problem import InverseProblem
+from en4dvar.problem import InverseProblem, common_to
 
 DETERMINED = 0.9  # of the hyperprior's variance, taken away by the data
 IN_IT = 0.2  # of the largest exponent: a parameter that is part of a combination
@@ -186,21 +186,6 @@ def require_population(problems: Sequence[InverseProblem], names: Sequence[str])
             raise ConfigError(f"{name}: a population needs parameters that do not vary in time or space")
         if correlated := [n for block in problem.prior.blocks for n in block.names if n in names]:
             raise ConfigError(f"{name}: {correlated[0]}: a population needs a prior that is not correlated")
-
-
-def common_to(problems: Sequence[InverseProblem], names: Sequence[str]) -> tuple[str, ...]:
-    """Parameters with one value in all data sets: those that are declared so (:attr:`Parameter.common`), not of
-    ``names``, and have the same uncorrelated prior in all.
-    """
-    first = problems[0].prior
-    correlated = {name for problem in problems for block in problem.prior.blocks for name in block.names}
-    return tuple(
-        term.parameter.name
-        for j, term in enumerate(first.terms)
-        if term.parameter.common
-        and term.parameter.name not in {*names, *correlated}
-        and all(problem.prior.terms[j] == term for problem in problems)
-    )
 
 
 def population_of(

@@ -44,9 +44,10 @@ NARROWEST = 0.03  # standard deviation of the first draws about members, in unit
 KEPT = 2000  # equally likely draws of each data set
 MOST_PARTS, ROUNDS = 4, 60  # components of a mixture; rounds of expectation maximisation
 BESIDE = 1e-3  # prior standard deviations that runs for readings that one lacks are apart
-SMALLEST = 1e-12  # variance that every slope is taken to have, and every data set
+SMALLEST = 1e-12  # variance that every slope is taken to have
 INFORMED = 0.1  # least share of the prior's variance that the data take away, for a slope to be read from draws
 RESAMPLED = 2000  # campaigns behind the interval of the median of data sets one by one
+LEAST = 1e-3  # weight of a data set that tells nothing
 TAIL = 0.05  # beyond each end of that interval
 
 
@@ -291,12 +292,12 @@ def empirical(term: PriorTerm, middle: Array, std: Array, following: Following, 
     """The median of data sets one by one, with its interval from their scatter: an answer that needs no model of them,
     of their medians and standard deviations (S,) in white coordinates; ``following``: of this coordinate alone.
 
-    It stands beside that of the hierarchy as a check, and alone where there is no other. Each data set counts by
-    1/(s² + T²), s the standard deviation of its own posterior without what all have in common, and T² how much they
-    differ beyond the s² (Paule & Mandel 1982, J. Res. NBS 87, 377): a few that are sure of themselves do not outweigh
-    many others where they disagree with them. The interval is that of Student's t with the standard deviation of the
-    weighted median under resampling of the data sets (Efron 1979, Ann. Stat. 7, 1), which is not taken to be smaller
-    than the standard error of the weighted mean.
+    It stands beside that of the hierarchy as a check, and alone where there is no other. Each data set counts by the
+    share of its prior's variance that its data took away, 1 − s², s the standard deviation of its own posterior without
+    what all have in common: one that tells nothing has the prior's median. Weights 1/s² would pull the median up, where
+    the posterior of a logarithm is the wider the lower its value, as of soft gels. The interval is that of Student's t
+    with the standard deviation of the weighted median under resampling of the data sets (Efron 1979, Ann. Stat. 7, 1),
+    which is not taken to be smaller than the standard error of the weighted mean of data sets that agree.
     """
     centre, spread = median_of(middle, std, member_stream(seed, f"empirical {term.parameter.name}"))
     factor = float(stdtrit(len(middle) - 1, 1 - TAIL) / ndtri(1 - TAIL))
@@ -312,19 +313,10 @@ def empirical(term: PriorTerm, middle: Array, std: Array, following: Following, 
 
 def median_of(middle: Array, std: Array, stream: np.random.Generator) -> tuple[float, float]:
     """The weighted median of data sets (S,), and its standard deviation."""
-    from scipy.optimize import brentq  # where it is used: every start would take longer
-
-    variance = np.maximum(std**2, SMALLEST)
-
-    def beyond(between: float) -> float:
-        weights = 1 / (variance + between)
-        return float(weights @ (middle - np.average(middle, weights=weights)) ** 2) - (len(middle) - 1)
-
-    between = brentq(beyond, 0.0, 2 * middle.var(ddof=1)) if beyond(0.0) > 0 else 0.0
-    weights = 1 / (variance + between)
+    weights = np.maximum(1 - std**2, LEAST)
     chosen = stream.integers(len(middle), size=(RESAMPLED, len(middle)))
     medians = _weighted_medians(middle[chosen], weights[chosen])
-    spread = max(float(medians.std()), float(weights.sum() ** -0.5))
+    spread = max(float(medians.std()), float(np.linalg.norm(weights * std) / weights.sum()))
     return float(_weighted_medians(middle[None], weights[None])[0]), spread
 
 
