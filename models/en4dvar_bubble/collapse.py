@@ -143,10 +143,12 @@ def _falling(radius: Array, lowest: float) -> slice:
     largest, after = radius[top], radius[top + 1 :]
     rising = np.flatnonzero(radius[:top] <= 0.95 * largest)
     following = np.minimum(after, np.append(after[1:], np.inf))  # one reading alone may be high
-    below, rises = after <= lowest * largest, following > np.minimum.accumulate(radius[top:-1]) + 0.1 * largest
+    least = np.minimum.accumulate(radius[top:-1])
+    least = np.where(least < LOWEST[-1] * largest, least, radius[top:-1])  # where it is flat only noise adds up
+    below, rises = after <= lowest * largest, following > least + 0.1 * largest
     ends = np.flatnonzero(below | rises)
     first, last = (rising[-1] + 1 if len(rising) else 0), top + (ends[0] if len(ends) else len(after))
-    if not (len(ends) and below[ends[0]]):
+    if len(ends) and not below[ends[0]]:
         last = top + int(np.argmin(radius[top : last + 1]))
     return slice(int(first), int(last) + 1)
 
