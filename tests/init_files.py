@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 from click.testing import CliRunner, Result
+from scipy.integrate import solve_ivp
 
 from en4dvar.assembly.build import build
 from en4dvar.cli import main
@@ -51,3 +52,14 @@ def write(path: Path, header: str = "t_us,R_um", scale: float = 1.0) -> Path:
     radius = np.where(times < 18.2, 195 * np.clip(1 - (times / 18.5) ** 2, 0, 1) ** 0.4, np.maximum(rebound, 22))
     path.write_text("\n".join([header, *(f"{t:g},{scale * r:g}" for t, r in zip(times, radius, strict=True)), ""]))
     return path
+
+
+def rebounding(step: float, offset: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """A bubble of polytropic gas that rebounds, integrated here, in R_max and in Rayleigh's R_max √(ρ/p∞), top at 0."""
+
+    def rhs(_: float, y: np.ndarray) -> list[float]:
+        return [y[1], (0.002 * y[0] ** -4.2 - 1 - 0.05 * y[1] / y[0] - 1.5 * y[1] ** 2) / y[0]]
+
+    path = solve_ivp(rhs, (0, 3), [1.0, 0.0], dense_output=True, rtol=1e-9)
+    t = np.arange(-0.5 + offset, 3, step)
+    return t, path.sol(np.abs(t))[0]

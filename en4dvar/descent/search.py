@@ -9,6 +9,7 @@ a descent starts where all readings together lead.
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -174,14 +175,19 @@ class Search:
 
 
 def lower(window: DataWindow, rival: Descent, outcome: Outcome) -> Outcome:
-    """After the rest of the ``rival``, if it ends lower than the lowest minimum; else as before."""
-    try:
+    """After the rest of the ``rival``, if it ends lower than the lowest minimum; else as before.
+
+    What the window tells last are the iterations of the lowest descent, from the first on.
+    """
+    for record in rival.records:
+        window.tell(record)
+    with suppress(TooFewMembersError):  # the model does not run about it
         minimise(window, [rival])
-    except TooFewMembersError:  # the model does not run about it
-        return outcome
-    if rival.cost > outcome.descent.cost - SAME_COST:
-        return outcome
-    return replace(outcome, descent=rival, minima=merged([Minimum.of(window.space, rival), *outcome.minima]))
+        if rival.cost <= outcome.descent.cost - SAME_COST:
+            return replace(outcome, descent=rival, minima=merged([Minimum.of(window.space, rival), *outcome.minima]))
+    for record in outcome.descent.records:
+        window.tell(record)
+    return outcome
 
 
 def from_draw(space: WeightSpace, outcome: Outcome, x: Array, tell: Callable[[Record], None]) -> Outcome:

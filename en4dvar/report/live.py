@@ -42,8 +42,9 @@ def standings(log: str) -> dict[str, Standing]:
         else:
             standing.at, standing.estimate = " ".join(kind.split()), rest or standing.estimate
         for parameter, middle, low, high, unit in BAND.findall(intervals or ""):
-            band = standing.bands.setdefault((parameter, unit), {})
-            band[int(words.split()[1])] = float(low), float(middle), float(high)
+            step, band = int(words.split()[1]), standing.bands.get((parameter, unit), {})
+            before = {k: told for k, told in band.items() if k < step}  # what follows is of a descent that was given up
+            standing.bands[parameter, unit] = {**before, step: (float(low), float(middle), float(high))}
     return sets
 
 

@@ -3,7 +3,7 @@
 import math
 import sys
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -94,9 +94,11 @@ def render_overview(
     )
 
 
-def estimates(sets: Sequence[SetSummary]) -> Chart:
-    """Mean and 5–95 % of every data set, one panel a parameter; with many data sets sorted by the mean, as a band."""
-    names, few = _parameters(sets), len(sets) <= NAMED
+def estimates(sets: Sequence[SetSummary], names: Sequence[str] = ()) -> Chart:
+    """Mean and 5–95 % of every data set, a panel for each of ``names``, where there are none for each parameter; with
+    many data sets sorted by the mean, as a band.
+    """
+    names, few = names or _parameters(sets), len(sets) <= NAMED
     panels = [_estimates(name, sets, few) for name in names]
     rows = [Row(3.0 * POINTS, [panel]) for panel in panels]
     if few:
@@ -113,14 +115,23 @@ def _estimates(name: str, sets: Sequence[SetSummary], few: bool) -> Panel:
     trusted = np.array([not row.untrusted for row in rows], dtype=bool)
     low, high = (np.where(trusted, bound, np.nan) for bound in (low, high))
     panel = Panel(ylabel=with_unit(rows[0].symbol, rows[0].unit), yticks=4, x_numbers=False)
-    panel.span(rows[0].prior_mean - rows[0].prior_std, rows[0].prior_mean + rows[0].prior_std, "prior", 0.2)
+    order = np.argsort(mean)
+    means, stds = np.array([(row.prior_mean, row.prior_std) for row in rows]).T
+    least, most = means - stds, means + stds
+    if np.ptp(means) <= 0.5 * stds.min() and stds.max() <= 2 * stds.min():  # as two sets of members of a prior are
+        panel.span(float(least[0]), float(most[0]), "prior", 0.2)
+    elif few:
+        for at, bottom, top in zip(x, least, most, strict=True):
+            panel.band((at - 0.5, at + 0.5), (bottom, bottom), (top, top), "prior", 0.2)
+    else:
+        panel.band(np.arange(len(x)), least[order], most[order], "prior", 0.2)
     if few:
         panel.xlim, panel.xticks = (-0.6, len(sets) - 0.4), range(len(sets))
         panel.bars(x, low, high, "posterior", 1.4, 0.6)
         panel.dots(x, mean, "posterior", 3.0)
         panel.dots(x[~trusted], mean[~trusted], "centre", 5.5, kind="rings")
     else:
-        order, ranks = np.argsort(mean), np.arange(len(mean))
+        ranks = np.arange(len(mean))
         panel.xlabel, panel.xticks = f"{len(order)} data sets, sorted", ()
         panel.band(ranks, low[order], high[order], "posterior", 0.3)
         panel.line(ranks, mean[order], "posterior", 0.9)
@@ -131,15 +142,19 @@ def _estimates(name: str, sets: Sequence[SetSummary], few: bool) -> Panel:
     return panel
 
 
-def overview_figures(sets: Sequence[SetSummary]) -> list[Captioned]:
+def overview_figures(sets: Sequence[SetSummary], population: Collection[str] = ()) -> list[Captioned]:
+    """The estimates; where there is a ``population``, those of its parameters first and the others by themselves."""
     caption = (
-        "Each data set by itself: posterior mean and 5–95 % (blue), prior mean ± std (grey band; of the first data set "
-        "where priors depend on the data). Orange rings without a bar: not to be trusted, for their warnings."
+        "Each data set by itself: posterior mean and 5–95 % (blue), prior mean ± std (grey, each data set's own where "
+        "they differ clearly). Orange rings without a bar: not to be trusted, for their warnings."
         if len(sets) <= NAMED
         else "Data sets sorted by the posterior mean, with 5–95 % (blue, none where it is not to be trusted); prior "
-        "mean ± std (grey band; of the first data set where priors depend on the data)."
+        "mean ± std (grey, each data set's own where they differ clearly)."
     )
-    return [("estimates", caption, estimates(sets))] if _parameters(sets) else []
+    names = _parameters(sets)
+    first = [name for name in names if name in population] or names
+    parts = {"estimates": first, "others": [name for name in names if name not in first]}
+    return [(name, caption, estimates(sets, of)) for name, of in parts.items() if of]
 
 
 def _parameters(sets: Sequence[SetSummary]) -> list[str]:
@@ -148,7 +163,7 @@ def _parameters(sets: Sequence[SetSummary]) -> list[str]:
 
 def _parameter(name: str, sets: Sequence[SetSummary]) -> dict[str, Any]:
     rows = [dataset.rows[name] for dataset in sets if name in dataset.rows]
-    means = np.array([row.mean for row in rows if math.isfinite(row.mean)])
+    means = np.array([row.mean for row in rows if math.isfinite(row.mean) and not row.untrusted])
     quartiles = np.quantile(means, (0.25, 0.5, 0.75)).tolist() if means.size else (math.nan,) * 3
     precision = float(np.nanmedian([row.std for row in rows])) if means.size else math.nan
     numbers = {key: number_like(x, precision) for key, x in zip(("low", "median", "high"), quartiles, strict=True)}

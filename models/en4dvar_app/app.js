@@ -55,11 +55,13 @@ function link(page, words) {
 }
 
 function show(now) {
+  const first = !state;
   state = now;
   $("folder").textContent = now.folder;
   for (const [id, names, empty] of [["movie", now.movies, now.movies.length ? undefined : "no movie in this folder"],
     ["table", now.tables, "choose"], ["config", now.configs, "choose"]])
     if (options($(id), names, empty)) changed(id);
+  if (first) resumeLast().catch((error) => say(error.message));
   for (const button of document.querySelectorAll("button[data-step]")) button.disabled = !!runs(...Object.keys(MINE).filter((s) => s !== "validate"));
   $("cancel").disabled = !runs(...Object.keys(MINE));
   const last = {};
@@ -71,6 +73,15 @@ function show(now) {
   showRuns(now.runs);
   const pages = now.pages.filter((p) => p.startsWith("comparisons/"));
   $("pages").replaceChildren(...pages.map((p) => item(link(p, p))));
+}
+
+// A page that is loaded again shows the last run and its configuration, which the server knows.
+async function resumeLast() {
+  const last = state.jobs.findLast((job) => ["run", "resume"].includes(job.step));
+  if (!state.configs.includes(last?.subject)) return;
+  $("config").value = last.subject;
+  await readConfig();
+  $("run").value = last.out.replace("runs/", "");
 }
 
 const runs = (...steps) => state?.jobs.find((job) => job.state === "running" && steps.includes(job.step));

@@ -41,7 +41,7 @@ def existing(root: Path, fields: Fields, key: str) -> str:
     """The name of a file or folder of ``root``, which holds no link that leads out of it."""
     name = fields.get(key, "")
     if not name:
-        raise FieldError(f"choose a {key} first")
+        raise FieldError(f"choose a {'configuration' if key == 'config' else key} first")
     path = below(root, name)
     if not path.exists():
         raise FieldError(f"{name}: is not in the folder any more")

@@ -7,7 +7,8 @@ E 85, 066303, for an empty bubble in a liquid:
 
 so that R^{5/2} is a parabola in t: three numbers by linear least squares from the samples between the maximum and 40 %
 of it, less far down where a thick gel lets it creep, whether the collapse itself was seen or fell between two frames
-(2 % late, as Rayleigh's exact solution tells).
+(2 % late, as Rayleigh's exact solution tells). Where the lowest reading lies above 40 %, it may be the first of the
+rebound: it is left out where it is later than the collapse that those before it tell.
 
 In a gel the ratio r = t_c/(0.9147 R_max √(ρ/p_∞)) differs from one: elasticity and surface tension shorten the
 collapse, viscosity, gas and vapour prolong it. The energy of an incompressible liquid bounds it from below: a
@@ -85,15 +86,15 @@ def lobe(times: Array, radius: Array, with_margin: bool = True) -> Lobe:
     turning = None
     for lowest in LOWEST:
         where = _falling(radius, lowest)
-        if where.stop - where.start < 4:
+        count = where.stop - where.start
+        if count < 4:
             break
-        t, r = times[where], radius[where]
-        scale = max(float(np.ptp(t)), 1e-300)
-        z, y = (t - times[int(np.argmax(radius))]) / scale, np.clip(r / radius.max(), 1e-3, None)
-        c, b, a = np.polyfit(z, y**2.5, 2, w=y**-1.5)  # an error of R is one of 5/2 R^{3/2} in R^{5/2}
-        near = c < 0 and -b / (2 * c) > z[0] - BEFORE
-        if near or (c < 0 and turning is None):
-            turning = z, y, scale, c, b, a
+        view, near = _fitted(times, radius, where, with_margin)
+        if count > 4 and not np.any(radius[where.stop : where.stop + 1] <= lowest * radius.max()):
+            before, turns = _fitted(times, radius, slice(where.start, where.stop - 1), with_margin)
+            if before is not None and times[where.stop - 1] > before.t_max + before.t_c:
+                view, near = before, turns  # the lowest reading is one of the rebound
+        turning = view if near else turning or view
         if near:
             break
     if turning is None:
@@ -106,12 +107,21 @@ def lobe(times: Array, radius: Array, with_margin: bool = True) -> Lobe:
             "the true maximum make up for each other; give the readings before it as well, or, where there are none, "
             f"{KNOWN}"
         )
-    z, y, scale, c, b, a = turning
-    middle = -b / (2 * c)
-    peak = a - b**2 / (4 * c)
-    t_max = times[int(np.argmax(radius))] + scale * middle
-    margin = _margin(z, y, np.array([c, b, a])) if with_margin else 0.0
-    return Lobe(float(radius.max() * peak**0.4), float(t_max), float(scale * np.sqrt(-peak / c)), margin)
+    return turning
+
+
+def _fitted(times: Array, radius: Array, where: slice, with_margin: bool) -> tuple[Lobe | None, bool]:
+    """What the parabola through the readings ``where`` tells, None without a maximum; whether that is near them."""
+    begun, r = times[int(np.argmax(radius))], radius[where]
+    scale = max(float(np.ptp(times[where])), 1e-300)
+    z, y = (times[where] - begun) / scale, np.clip(r / radius.max(), 1e-3, None)
+    c, b, a = fit = np.polyfit(z, y**2.5, 2, w=y**-1.5)  # an error of R is one of 5/2 R^{3/2} in R^{5/2}
+    if not c < 0:
+        return None, False
+    middle, peak = -b / (2 * c), a - b**2 / (4 * c)
+    margin = _margin(z, y, fit) if with_margin else 0.0
+    times_of = float(begun + scale * middle), float(scale * np.sqrt(-peak / c))
+    return Lobe(float(radius.max() * peak**0.4), *times_of, margin), middle > z[0] - BEFORE
 
 
 def _margin(z: Array, y: Array, fit: Array) -> float:
@@ -128,13 +138,18 @@ def _margin(z: Array, y: Array, fit: Array) -> float:
 
 
 def _falling(radius: Array, lowest: float) -> slice:
-    """From just before the maximum down to ``lowest`` of it, or to the end of the descent."""
+    """From just before the maximum down to ``lowest`` of it, or to the lowest reading before the radius rises."""
     top = int(np.argmax(radius))
     largest, after = radius[top], radius[top + 1 :]
     rising = np.flatnonzero(radius[:top] <= 0.95 * largest)
     following = np.minimum(after, np.append(after[1:], np.inf))  # one reading alone may be high
-    ends = np.flatnonzero((after <= lowest * largest) | (following > radius[top:-1] + 0.1 * largest))
+    least = np.minimum.accumulate(radius[top:-1])
+    least = np.where(least < LOWEST[-1] * largest, least, radius[top:-1])  # where it is flat only noise adds up
+    below, rises = after <= lowest * largest, following > least + 0.1 * largest
+    ends = np.flatnonzero(below | rises)
     first, last = (rising[-1] + 1 if len(rising) else 0), top + (ends[0] if len(ends) else len(after))
+    if len(ends) and not below[ends[0]]:
+        last = top + int(np.argmin(radius[top : last + 1]))
     return slice(int(first), int(last) + 1)
 
 

@@ -54,6 +54,8 @@ def test_a_german_table_to_an_interval(visit, serve, german, tmp_path):
 def test_cancelled_and_resumed_after_the_window_and_the_server_are_gone(visit, serve, german, tmp_path):
     server = serve(german)
     page = visit(server)
+    page.click("button[data-step=resume]")
+    until(page, "message.innerText.includes('choose a configuration first')")
     units = {"time_column": "Zeit", "radius_column": "Radius", "time_unit": "us", "radius_unit": "um"}
     proposed(page, "messung.csv", **units)
     page.click("button[data-step=run]")
@@ -63,12 +65,16 @@ def test_cancelled_and_resumed_after_the_window_and_the_server_are_gone(visit, s
     page.wait_for_selector("#job-run.stopped", timeout=LONG)
     before = (german / "runs" / "messung" / "run.log").read_text(encoding="utf-8")
     assert "converged" not in before
-    page.fill("#run", "messung")
+    page.reload()
+    until(page, "document.getElementById('run').value === 'messung'")
     page.click("button[data-step=resume]")
     page.wait_for_selector("#job-run.running", timeout=LONG)
     page.close()
     server.end()
     page = visit(serve(german))
+    until(page, "document.getElementById('run').value === 'messung'")
+    assert page.input_value("#config") == "messung.yaml"
+    assert page.input_value("#text") == (german / "messung.yaml").read_text(encoding="utf-8")
     page.wait_for_selector("#job-run.done", timeout=LONG)
     until(page, "document.getElementById('log').hidden")
     told = standings((german / "runs" / "messung" / "run.log").read_text(encoding="utf-8"))["messung"]

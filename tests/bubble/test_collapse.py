@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from init_files import rebounding
 from scipy.io import loadmat
 
 from en4dvar_bubble import BubbleModel, collapse
@@ -176,3 +177,17 @@ def test_a_gel_stiffer_than_usual_is_told_and_its_estimate_printed() -> None:
     assert "a gel of 20 kPa allows no less than 0.82" in doubt_of_wide.words
     (impossible,) = doubts(t, path(0.45), wide, members, WATER_25C)
     assert impossible.severity == "serious"
+
+
+@pytest.mark.parametrize("step", [0.03, 0.07, 0.15])
+@pytest.mark.parametrize("lost", [(0, 1), (0, 2), (-1, 1), (-1, 2)])
+def test_a_collapse_that_no_frame_shows_has_its_time(step: float, lost: tuple[int, int]) -> None:
+    """The frame of the minimum, and those beside it, are not there: the readings behind the gap are the rebound's."""
+    for offset in np.linspace(0, step, 7):
+        t, R = rebounding(step, offset)
+        least = int(np.argmin(np.where(t < 1.3, R, 1.0)))
+        gap = slice(least + lost[0], least + lost[1])
+        with_gap = np.delete(t, gap), np.delete(R, gap)
+        assert lobe(*with_gap).t_c == pytest.approx(RAYLEIGH, rel=0.06)
+        behind = int(np.searchsorted(with_gap[0], t[least])) + 1
+        assert lobe(*(it[:behind] for it in with_gap)).t_c == pytest.approx(RAYLEIGH, rel=0.06)  # it ends there

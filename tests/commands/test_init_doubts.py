@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from init_files import UNITS, call, proposed, simulate, write
+from init_files import UNITS, call, proposed, rebounding, simulate, write
 from scipy.io import savemat
 
 from en4dvar.assembly.build import build
@@ -285,6 +285,25 @@ def test_a_scale_that_cannot_be_is_told_and_no_prior_is_taken_from_it(tmp_path: 
     written = Path("none.yaml").read_text()
     assert "# MIND: the collapse takes 0.4" in written
     assert "doubted" not in written
+
+
+def test_a_rebound_that_no_gel_gives_is_named_and_not_the_collapse(tmp_path: Path) -> None:
+    """A polytropic gas loses no heat. Without the frame of the collapse, or with a blank in it, all is the same."""
+    t, R = rebounding(0.07)
+    rows = [f"{13.8 * a:.4f},{140 * b:.4f}" for a, b in zip(t, R, strict=True)]
+    least = int(np.argmin(np.where(t < 1.3, R, 1.0)))
+    blank, missing = rows.copy(), rows[:least] + rows[least + 1 :]
+    blank[least] = f"{13.8 * t[least]:.4f},"
+    for name, lines in (("whole", rows), ("blank", blank), ("missing", missing)):
+        (tmp_path / f"{name}.csv").write_text("\n".join(["t_us,R_um", *lines, ""]))
+        done = call("init", "--data", f"{name}.csv", *UNITS)
+        assert re.search(r"R_max 140 um, collapse 12\.\d us later, (0.99|1.00|1.01) of the Rayleigh time", done.stdout)
+        told = next(line for line in done.stderr.splitlines() if "no G and mu" in line)
+        assert re.search(r"give this rebound to 0\.\d\d R_max: is 17 um its radius at rest \(R_eq\)", told)
+        assert "model.gas" in told
+        assert "frame rate" not in told
+    (problem,) = build(proposed(Path("missing.yaml")))
+    assert len(problem.observations.times) > 20  # to the second minimum
 
 
 def test_a_rate_that_the_times_contradict_is_told(tmp_path: Path) -> None:

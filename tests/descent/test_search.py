@@ -7,8 +7,9 @@ from toys import Decay, Wave, make_observations, make_problem, with_discrepancy
 from varying_models import Ramp
 from wells import Parting, UnlikeWells, Wells, hidden_well, mass_of_positive, parted, two_wells
 
+from en4dvar.descent import search
 from en4dvar.descent.search import Search
-from en4dvar.diagnosis.analysis import Descents, StartRecord
+from en4dvar.diagnosis.analysis import Descents, IterationRecord, StartRecord
 from en4dvar.estimation import stages
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.estimation.stages import Stages
@@ -170,6 +171,31 @@ def test_from_a_draw_below_all_minima_another_descent_starts(monkeypatch):
     assert "starts-disagree" not in {c.code for c in analysis.cautions}
     assert [record.further for record in heard if isinstance(record, StartRecord)] == [1]
     assert [record for record in heard if isinstance(record, Descents)][-1] == told
+
+
+def told_last(heard):
+    """Costs of the iterations that were told from the last first one on, and how many were first ones."""
+    told = [record for record in heard if isinstance(record, IterationRecord)]
+    begins = [n for n, record in enumerate(told) if record.iteration == 0]
+    return [record.cost for record in told[begins[-1] :]], len(begins)
+
+
+@pytest.mark.parametrize("accepted", [True, False])
+def test_the_iterations_told_last_are_those_of_the_accepted_descent(monkeypatch, accepted):
+    """Also where the other descent is given up, which is told as well."""
+    problem, settings = in_the_wrong_well(monkeypatch)
+    if not accepted:
+        monkeypatch.setattr(search, "SAME_COST", np.inf)
+    heard = []
+    analysis = assimilate(problem, settings, 1, progress=lambda _, record: heard.append(record))
+    assert told_last(heard) == ([r.cost for r in analysis.iterations], 3 - accepted)
+    assert (analysis.iterations[-1].centre[0] > 0) == accepted
+
+
+def test_the_iterations_of_a_descent_that_a_round_began_are_told_from_the_first_on():
+    heard = []
+    analysis = assimilate(hidden(0), AssimilationSettings(), 0, progress=lambda _, record: heard.append(record))
+    assert told_last(heard) == ([r.cost for r in analysis.iterations], 2)
 
 
 def test_a_draw_that_leads_nowhere_is_told(monkeypatch):

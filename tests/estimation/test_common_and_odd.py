@@ -317,7 +317,8 @@ def test_the_median_of_soft_gels_is_not_pulled_to_the_stiffest():
         middle = np.array([np.interp(0.5, np.cumsum(row), grid) for row in weights])
         std = np.sqrt(weights @ grid**2 - (weights @ grid) ** 2)
         term = PriorTerm.lognormal(Parameter("G", "kPa"), np.e, 2.0)
-        low, _, high = empirical(term, (middle - 1) / 2, std / 2, Following(np.zeros((1, 0)), np.zeros(1)), trial).quantiles
+        alone = Following(np.zeros((1, 0)), np.zeros(1))
+        low, _, high = empirical(term, (middle - 1) / 2, std / 2, alone, trial).quantiles
         inside.append(low < 2.5 < high)
     assert np.mean(inside) > 0.82  # of 0.9; by weights 1/(s² + T²) of T² how much they differ 0.33
 

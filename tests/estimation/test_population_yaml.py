@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 
 import numpy as np
@@ -77,6 +78,10 @@ def test_it_is_what_the_command_says_and_has_a_page(finished, tmp_path):
     assert page.index("<h1>") < page.index("the median (geometric mean) of the population") < page.index("<svg")
     assert page.index("Reference: k = 1.90 ± 0.10 N/m, balance") < page.index("Each data set by itself")
     assert 'href="population.html"' in page
+    warned = re.search("posteriors come with|No warnings in any", page).start()
+    assert page.index("balance") < warned < page.index("<svg")
+    folded = page.index("<summary>The other parameters of each data set")
+    assert page.index('id="estimates"') < folded < page.index('id="others"') < page.index("<h2>Data sets</h2>")
     assert within.reference == {"k": (1.9, 0.1)}
     listed = (run / ".en4dvar-files").read_text()
     assert all(name in listed for name in ("population.nc", "population.html", "population.csv", "population.tex"))

@@ -64,3 +64,9 @@ def test_the_log_of_a_run_at_work_says_how_far_it_is(runs):
     assert standings("2026-11-25T04:19:09+00:00 done\n: x\n") == {}
     failed = standings("t a: b: iteration  2  J 1\nt a: b: failed: no member lives: F\n")["a: b"]
     assert (failed.at, failed.estimate) == ("failed", "no member lives: F")
+
+
+def test_a_descent_that_is_told_after_another_takes_its_place():
+    lines = [f"t a: iteration {k:2d}  90 %: G {k + 5 * n} (1 to 9) kPa" for n in (0, 1) for k in range(4 - 2 * n)]
+    band = standings("\n".join(lines))["a"].bands["G", "kPa"]
+    assert {step: middle for step, (_, middle, _) in band.items()} == {0: 5.0, 1: 6.0}

@@ -36,14 +36,16 @@ POINTS = 400
 @dataclass(frozen=True)
 class Guess:
     """``values`` SI by name; ``log_std`` how far the nodes that fit are spread (std of ln); ``misfit`` of the best
-    node in units of s; ``source``, where the values are from. Empty where the law has neither ``G`` nor ``mu`` or no
-    node could be run.
+    node in units of s; ``source``, where the values are from; ``unmatched``, the observed numbers that no node comes
+    close to, each by itself, all of them where each can be had without the others. Empty where the law has neither
+    ``G`` nor ``mu`` or no node could be run.
     """
 
     values: Mapping[str, float]
     log_std: Mapping[str, float]
     misfit: float
     source: str = ""
+    unmatched: tuple[str, ...] = ()
 
     def common(self) -> "Guess":
         """No stiffer or thicker than half of what common gels are at most: for a history that is doubted."""
@@ -79,14 +81,16 @@ def first_guess(model: BubbleModel, fixed: Mapping[str, float], observed: Mappin
     keys = [
         k for k in ("R_max" if model.start == "acoustic" else "rebound", "t_c") if np.isfinite(observed.get(k, np.nan))
     ]
-    misfit = np.full(len(nodes), np.inf)
+    misfit, off = np.full(len(nodes), np.inf), np.full(len(keys), np.inf)
     for i, path in enumerate(paths):
         if isinstance(path, Trajectory):
             seen = _features(times, path["R"])
             terms = [np.log(seen[k] / observed[k]) / TOLERANCE[k] for k in keys]
             misfit[i] = float(np.sum(np.square(terms))) if np.all(np.isfinite(terms)) else np.inf
+            off = np.fmin(off, np.abs(terms))
+    unmatched = tuple(k for k, least in zip(keys, off, strict=True) if least > FAR) or tuple(keys)
     if not np.any(np.isfinite(misfit)):
-        return Guess({}, {}, float("inf"))
+        return Guess({}, {}, float("inf"), unmatched=unmatched)
     logs, known = np.log(nodes), np.zeros(len(nodes))
     if "G" in names:
         known = sum(((logs[:, i] - np.log(OF_GELS[n][0])) / OF_GELS[n][1]) ** 2 for i, n in enumerate(names))
@@ -100,6 +104,7 @@ def first_guess(model: BubbleModel, fixed: Mapping[str, float], observed: Mappin
         {name: float(s) for name, s in zip(names, spread, strict=True)},
         float(np.sqrt(misfit.min())),
         f"first guess from {told}",
+        unmatched,
     )
 
 

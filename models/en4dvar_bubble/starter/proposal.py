@@ -143,10 +143,7 @@ def propose(
     elif words := _implausible(look):
         warnings.append(words)
     elif guess.far:
-        warnings.append(
-            f"no G and mu of {model.law.name} give this {'R_max and ' if chosen == 'acoustic' else ''}collapse time: "
-            + ("is the driving that of your experiment?" if chosen == "acoustic" else "are scale and frame rate right?")
-        )
+        warnings.append(_unmatched(guess.unmatched, look, model))
     wall: tuple[tuple[Entry, ...], tuple[Entry, ...]] = (), ()
     slow = elsewhere.SLOW[0] < ratio < elsewhere.SLOW[1]
     if slow and _in_a_liquid(model):
@@ -174,6 +171,20 @@ def _ends_with(groups: Grouped) -> str:
         return "the run ends with what they say of one gel together"
     told = ", ".join(f"{name} ({len(names)})" for name, names in groups.of.items())
     return f"the run ends with the numbers of each {groups.kind}, and compares them: {told}"
+
+
+def _unmatched(names: Sequence[str], look: Look, model: BubbleModel) -> str:
+    """Which of the observed numbers no gel gives, and what may be wrong then."""
+    rest = _text(_rest(look), "m", "um")
+    told = {"R_max": "R_max", "t_c": "collapse time", "rebound": f"rebound to {look.rebound:.2f} R_max"}
+    asked = {
+        "t_c": "are scale and frame rate right?",
+        "rebound": f"is {rest} its radius at rest (R_eq), and does its gas lose heat as the model's does (model.gas)?",
+    }
+    questions = [asked[name] for name in names if name in asked]
+    if model.start == "acoustic":
+        questions = ["is the driving that of your experiment?"]
+    return f"no G and mu of {model.law.name} give this {' and '.join(told[n] for n in names)}: {' '.join(questions)}"
 
 
 def _implausible(look: Look) -> str:
