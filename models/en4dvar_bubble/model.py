@@ -114,11 +114,11 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
 
     def changed(self, name: str, x: Array, change: Array) -> Array:
         """See :meth:`ForwardModel.changed`; ``gas`` changes at the temperature and the vapour pressure that it has,
-        ``viscosity`` is every viscosity of the law.
+        ``viscosity`` is every viscosity of the law, and consistency index (Pa s^n).
         """
         if name == "viscosity":
             for p in self.law.parameters:
-                x = super().changed(p.name, x, change) if p.unit == "Pa s" else x
+                x = super().changed(p.name, x, change) if p.unit.startswith("Pa s") else x
             return x
         return with_gas(self, x, np.exp(change)) if name == "gas" else super().changed(name, x, change)
 

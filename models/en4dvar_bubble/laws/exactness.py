@@ -47,7 +47,7 @@ def refine(function: Callable[[Array], Array], slope: bool) -> Refined:
     points = _GAUSS if slope else _SPREAD
     fit = np.linalg.inv(points[:, None] ** _POWERS[: len(points)])
     asked, to_checked = np.append(points, _CHECKED), (_CHECKED[:, None] ** _POWERS[: len(points)]).T
-    begins = left = GRID.origin + GRID.step * np.arange(GRID.cells)
+    begins = left = np.asarray(GRID.origin + GRID.step * np.arange(GRID.cells), dtype=float)
     places, records, inexact = np.arange(GRID.cells), np.zeros((GRID.cells, 8)), []
     central = floor = 0.0
     for level in range(HALVINGS + 1):
