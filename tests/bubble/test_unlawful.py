@@ -120,3 +120,19 @@ class Coated(NeoHookeanKelvinVoigt):
 @pytest.mark.parametrize("kind", [Energy, Coated])
 def test_a_law_runs_also_with_a_tension_at_rest(kind):
     assert not simulate(kind(), {"G": 1e3, "mu": 0.1, "R0": 1e-6}, np.linspace(0, 1e-6, 3)).status.any()
+
+
+class OfOneMember(Energy):
+    r"""$W$ of a class whose method takes one member alone."""
+
+    def strain_energy_rate(self, stretch, p):
+        if len(p.G) > 1:
+            raise ValueError("one member at a time")
+        return super().strain_energy_rate(stretch, p) + 0 / (stretch != 1)
+
+
+def test_what_a_method_raises_is_told_by_who_calls_it():
+    parameters = {"mu": 0.1, "R0": 1e-6}
+    assert not simulate(OfOneMember(), parameters | {"G": 1e3}, np.linspace(0, 1e-6, 3)).status.any()
+    with pytest.raises(ValueError, match="one member at a time"):
+        simulate(OfOneMember(), parameters | {"G": [1e3, 2e3]}, np.linspace(0, 1e-6, 3))

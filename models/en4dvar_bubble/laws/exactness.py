@@ -163,28 +163,33 @@ _AROUND = np.array([0.9, 1.0, 1.1])
 _RATES = np.logspace(-2, 12, 15)
 
 
+class UnfitError(ValueError):
+    """A class is no law; unlike another :class:`ValueError`, which its methods may raise."""
+
+
 def _elastic(law: Any) -> tuple[str, Array, int]:
     """What an author writes, J or W′, at :data:`_AROUND` in Pa, and its sign where it pushes the wall outwards."""
     what, function, outwards = ("J", law.stress, 1) if law.closed_form else ("W′", law.strain_energy_rate, -1)
-    return what, np.broadcast_to(function(_AROUND, columns(law.example_values())), (1, 3))[0], outwards
+    with np.errstate(all="ignore"):
+        return what, np.broadcast_to(function(_AROUND, columns(law.example_values())), (1, 3))[0], outwards
 
 
 def refuse_stress_at_rest(law: Any, tolerance: float = ERROR) -> None:
-    """Raise ValueError where J or W′ is not zero at λ = 1, memory relaxed: J of such a W′ is infinite there."""
+    """Raise :class:`UnfitError` where J or W′ is not zero at λ = 1 and at rest: J of such a W′ is infinite."""
     what, elastic, _ = _elastic(law)
     memory = sum(float(np.ravel(v.equilibrium_at(_AROUND[1:2]))[0]) for v in law.memory(columns(law.example_values())))
     if abs(elastic[1] + memory) > tolerance * np.max(np.abs(elastic)):
-        raise ValueError(
-            f"{law.name}: a stress without strain: with its memory relaxed, {what} is {elastic[1] + memory:.3g} Pa at "
-            "λ = 1. It must be zero there: check signs and exponents, or subtract it"
+        raise UnfitError(
+            f"{law.name}: a stress without strain: at rest, {what} is {elastic[1] + memory:.3g} Pa at λ = 1. It must "
+            "be zero there: check signs and exponents, or subtract it"
         )
 
 
 def refuse_wrong_sign(law: Any) -> None:
-    """Raise ValueError where the elastic stress drives the wall away from λ = 1 on both sides."""
+    """Raise :class:`UnfitError` where the elastic stress drives the wall away from λ = 1 on both sides."""
     what, elastic, outwards = _elastic(law)
     if elastic[0] * outwards < 0 < elastic[2] * outwards:
-        raise ValueError(
+        raise UnfitError(
             f"{law.name}: its elastic stress drives the wall away from its rest, {what} being {elastic[0]:.3g} Pa at "
             f"λ = 0.9 and {elastic[2]:.3g} Pa at λ = 1.1. Change its sign: J is below zero where the medium pulls the "
             "wall inwards, and W′ is above zero where λ > 1"
@@ -192,7 +197,7 @@ def refuse_wrong_sign(law: Any) -> None:
 
 
 def refuse_mixed_members(law: Any) -> None:
-    """Raise ValueError where the numbers of a member depend on those beside it."""
+    """Raise :class:`UnfitError` where the numbers of a member depend on those beside it."""
     bounds = {p.name: p.bounds for p in law.parameters}
     alone = law.example_values()
     other = {name: np.clip(1.3 * v, *bounds.get(name, (0, np.inf))) for name, v in alone.items()}
@@ -202,7 +207,7 @@ def refuse_mixed_members(law: Any) -> None:
     for member, numbers in enumerate(single):
         for what, own in numbers.items():
             if not np.allclose(both[what][member], own[0], rtol=1e-9, atol=0, equal_nan=True):
-                raise ValueError(
+                raise UnfitError(
                     f"{law.name}: {what} of a member depends on the members beside it: every p.name is a column "
                     "(N, 1), one row for each member; write each row of the result from its own row alone"
                 )
@@ -233,7 +238,7 @@ def refuse_unfit(kind: type[Any]) -> None:
                 refuse_stress_at_rest(law)
             refuse_wrong_sign(law)
             refuse_mixed_members(law)
-        except ValueError:
+        except UnfitError:
             raise
         except Exception:  # what is wrong with the methods is told by those who call them
             return
