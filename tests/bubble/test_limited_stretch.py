@@ -10,6 +10,7 @@ from en4dvar_bubble.laws import get_law
 from en4dvar_bubble.laws.kelvin_voigt import J_M, GentKelvinVoigt, NeoHookeanKelvinVoigt
 from en4dvar_bubble.laws.parameters import MU, G
 from en4dvar_bubble.medium import Medium
+from en4dvar_bubble.model import BubbleModel
 
 MEDIUM = Medium(rho=998.0, c=1484.0, p_inf=101325.0, S=0.072, kappa=1.4)
 R_EQ, R_MAX, MODULUS, VISCOSITY = 35e-6, 250e-6, 5e3, 0.1
@@ -114,6 +115,22 @@ def test_laws_of_users_are_followed_as_far(kind, largest):
     values = {name: v[0] for name, v in kind().example_values().items()} | {"R_eq": R_EQ, "R_max": largest * R_EQ}
     found = simulate(kind(), values, np.linspace(0, 1e-6, 3), start="laser", gas="polytropic", medium=MEDIUM)
     assert not found.status.any(), found.reason.values
+
+
+def test_members_that_are_run_again_do_not_depend_on_those_beside_them():
+    model = BubbleModel(law=GentKelvinVoigt(), start="laser", gas="polytropic", medium=MEDIUM)
+    J_m = np.array([150.0, 230.0, 300.0, 1e3, 215.0])
+    numbers = {"G": MODULUS, "mu": VISCOSITY, "R_max": R_MAX, "R_eq": R_EQ}
+    x = model.initial_states({"J_m": J_m} | {name: np.full(5, value) for name, value in numbers.items()})
+    times = np.tile(np.linspace(-25e-6, 30e-6, 56), (5, 1))  # before R_max, too
+    together = model.integrate(x, times)
+    assert [status == 0 for status in together.solution.status] == [False, True, True, True, True]
+    for i in range(5):
+        alone = model.integrate(x[i : i + 1], times[:1])
+        assert alone.solution.reason(0) == together.solution.reason(i)
+        for name in ("R", "Rdot", "S") if i else ():
+            np.testing.assert_array_equal(alone[name][0], together[name][i], name)
+            assert np.isfinite(together[name][i]).all()
 
 
 def test_nobody_else_is_run_again(monkeypatch):
