@@ -17,7 +17,7 @@ MODES, STEP, NOISE = 24, 0.05, 1.0
 class Chaotic(ForwardModel):
     """ẋ = Lorenz-96 of 24 variables with the forcing F, read as r x: parameters F, r and the initial x_i."""
 
-    time_unit = time_display_unit = "1"
+    time_unit = "1"
     compiled = True
 
     def __init__(self):

@@ -28,7 +28,7 @@ class Kuramoto(ForwardModel):
     parameters = (Parameter("nu", "1", bounds=(0.3, 3.0)),)
     layout = StateLayout((Field("u", CELLS, coordinates=PLACES), Field("nu")))
     observables = (Observable("u", "1", StateField("u")), Observable("energy", "1", Energy()))
-    time_unit = time_display_unit = "1"
+    time_unit = "1"
     batch = 1000
 
     def initial_state(self, theta):

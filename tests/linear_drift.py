@@ -13,7 +13,7 @@ class Drift(ForwardModel):
     parameters = (Parameter("c", "1", label="rate"),)
     layout = StateLayout((Field("x"), Field("c")))
     observables = (Observable("x", "1", StateField("x")),)
-    time_unit = time_display_unit = "1"
+    time_unit = "1"
 
     def initial_state(self, theta):
         return np.array([0.0, theta["c"]])

@@ -23,7 +23,7 @@ class Ring(ForwardModel):
     layout = StateLayout((Field("x", 6), Field("v", 6)))
     observables = (Observable("x", "1", StateField("x")),)
     autonomous = True
-    time_unit = time_display_unit = "1"
+    time_unit = "1"
     pause = float(os.environ.get("EN4DVAR_TEST_PAUSE", "0"))
     stop_at = calls = 0
     Settings = RingSettings

@@ -19,6 +19,7 @@ from en4dvar.plumbing.files import PathError
 from en4dvar.plumbing.hints import shown, suggest
 from en4dvar.plumbing.installed import installed
 from en4dvar.plumbing.tables import table
+from en4dvar.plumbing.units import UnitError, convert
 from en4dvar.plumbing.user_code import RefusedError, imported, loading
 
 GREEK = (
@@ -110,7 +111,16 @@ def build_model(kind: type[ForwardModel], settings: BaseModel) -> ForwardModel:
             if hasattr(kind, "from_settings"):
                 raise
             raise ConfigError(f"{error}; a class that takes arguments needs Settings and from_settings") from error
-        observables = model.observables
+        return checked(model)
+
+
+def checked(model: ForwardModel) -> ForwardModel:
+    """The model itself. Raises :class:`ConfigError` where what it declares does not fit together."""
+    observables = model.observables
+    units = [(thing.name, thing.unit, thing.display_unit) for thing in (*model.parameters, *observables)]
+    for what, unit, display_unit in (("its times", model.time_unit, model.time_display_unit), *units):
+        with retold(UnitError, ConfigError, f"{type(model).__name__}: unit and display unit of {what}: "):
+            convert(1.0, unit, display_unit)
     for thing in (*model.parameters, *observables):
         for what, text in (("symbol", thing.symbol), ("label", thing.label)):
             if reason := symbol_fault(text):

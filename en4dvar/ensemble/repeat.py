@@ -37,7 +37,7 @@ def check_repeats(
     Raises
     ------
     ConfigError: they differ: at all where the model runs members one by one, by more than rounding where it runs
-        batches.
+        batches. Of these it says whether one alone gives the same twice: then the model mixes members.
     """
     alive = [i for i, reason in enumerate(failures) if not reason]
     again = list(dict.fromkeys((alive[-1], alive[0]))) if alive else []
@@ -56,6 +56,13 @@ def check_repeats(
                 continue
             difference = f"differs by up to {apart / largest if largest else apart:.2g} of its largest value"
         where = f"{name}: " if name else ""
+        beside = not reason and _in_batches(model)
+        if beside and np.array_equal(run_again([i])[0], run_again([i])[0], equal_nan=True):
+            raise ConfigError(
+                f"{where}the model mixes the members of a batch: beside other members, member {i + 1} {difference}, "
+                "and alone it gives the same again. Write each row of what trajectories and initial_states return from "
+                "the same row of what they get, or accept it with assimilation: {stochastic_model: true}"
+            )
         raise ConfigError(
             f"{where}the model gives other numbers when a member is run again (member {i + 1} {difference}); noise or "
             "a state that it keeps makes posteriors wrong and results different each time. Seed it in each member and "

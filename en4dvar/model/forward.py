@@ -197,13 +197,21 @@ class Shared:
     results: Callable[[], Sequence[Trajectory | Failure]]
 
 
+class _TimeUnit:
+    """The time unit of a model; what a class or an instance sets instead goes before it."""
+
+    def __get__(self, model: "ForwardModel | None", kind: "type[ForwardModel]") -> str:
+        return (model or kind).time_unit
+
+
 class ForwardModel(ABC):
     """F. Subclasses set ``parameters``, ``layout`` and ``observables`` (the first is the default).
 
-    ``time_unit`` / ``time_display_unit`` label the time axis of observations. ``batch`` is the number of members the
-    fast path likes to get at once (executors cut chunks at multiples of it); ``compiled`` says that ``trajectories``
-    releases the interpreter lock, so that threads serve it. ``autonomous`` says that F depends on elapsed time alone:
-    sequential schemes may start ``trajectories`` at any instant, where otherwise they repeat ``step``. ``validity``
+    ``time_unit`` is the unit of all times, ``time_display_unit``, by default the same, that of plots. ``batch`` is the
+    number of members the fast path likes to get at once (executors cut chunks at multiples of it); ``compiled`` says
+    that ``trajectories`` releases the interpreter lock, so that threads serve it. ``autonomous`` says that F depends on
+    elapsed time alone: sequential schemes may start ``trajectories`` at any instant, where otherwise they repeat
+    ``step``. ``validity``
     names quantities and the limits beyond which the equations do not hold; :meth:`doubts` judges observations before a
     run. ``alternatives`` are assumptions that could
     be otherwise, for :mod:`en4dvar.diagnosis.response.what_if`; ``path_quantities`` and ``path_parameters``, names
@@ -228,7 +236,7 @@ class ForwardModel(ABC):
     observables: tuple[Observable, ...]
     defaults: Mapping[str, float] = MappingProxyType({})
     time_unit: str = "s"
-    time_display_unit: str = "s"
+    time_display_unit: str = _TimeUnit()  # type: ignore[assignment]
     batch: int = 1
     compiled: bool = False
     autonomous: ClassVar[bool] = False

@@ -67,7 +67,7 @@ class FunctionModel(ForwardModel):
         self.function, self.parameters, self._cheap = function, tuple(parameters), cheap
         self.jacobian, self.members, self.batch = jacobian, members, members or 1
         self.observables = tuple(Observable(name, unit, Returned(name), fewest=1) for name, unit in observables.items())
-        self.time_unit = self.time_display_unit = time_unit
+        self.time_unit = time_unit
         self.dense = dense
         self.layout = StateLayout((Field("theta", len(self.parameters)),))
         self._path = StateLayout(tuple(Field(observable.name, unit=observable.unit) for observable in self.observables))

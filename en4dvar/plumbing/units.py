@@ -1,7 +1,8 @@
 """Units: the few dozen symbols that data files and settings need, SI prefixes, products, quotients and powers.
 
 A unit is a factor to SI and a vector of exponents of the base dimensions. Factors are exact rationals: ``"1.4 um"`` is
-the same double as ``1.4e-6``. Temperatures in °C are not units of this kind (they have an offset) and are refused.
+the same double as ``1.4e-6``. A power may be a decimal, as in ``"Pa s^0.6"`` of a consistency index. Temperatures in °C
+are not units of this kind (they have an offset) and are refused.
 """
 
 from __future__ import annotations
@@ -39,13 +40,13 @@ class Unit:
     """``factor`` converts to SI; ``powers`` are the exponents of m, kg, s, K, A, mol."""
 
     factor: Fraction
-    powers: tuple[int, ...]
+    powers: tuple[int | Fraction, ...]
 
     def __mul__(self, other: Unit) -> Unit:
         return Unit(self.factor * other.factor, tuple(a + b for a, b in zip(self.powers, other.powers, strict=True)))
 
-    def __pow__(self, exponent: int) -> Unit:
-        return Unit(self.factor**exponent, tuple(p * exponent for p in self.powers))
+    def __pow__(self, exponent: int | Fraction) -> Unit:
+        return Unit(Fraction(self.factor**exponent), tuple(p * exponent for p in self.powers))
 
 
 ONE = Unit(Fraction(1), (0,) * len(BASE))
@@ -88,7 +89,7 @@ LARGEST_POWER, LONGEST = 12, 100  # of a symbol; characters of a unit
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?(?![\d.])")
 _TOKEN = re.compile(
     r"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)(?=\s*\*\s*[A-Za-z%(])|"
-    r"(?P<symbol>[A-Za-z%]+|1(?![\d.]))(?:(?:\^|\*\*)?(?P<power>[+-]?\d+))?|(?P<op>[*/()]))\s*"
+    r"(?P<symbol>[A-Za-z%]+|1(?![\d.]))(?:(?:\^|\*\*)?(?P<power>(?<=[\^*])[+-]?\d+\.\d+|[+-]?\d+))?|(?P<op>[*/()]))\s*"
 )
 _SUPERSCRIPT = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
 
@@ -114,7 +115,7 @@ def _did_you_mean(name: str) -> str:
 
 @lru_cache(maxsize=1024)
 def parse_unit(text: str) -> Unit:
-    """The unit written as ``text``: ``"Pa s"``, ``"W/(m K^2)"``, ``"1/us"``, ``"m s-1"``, ``"%"``, ``"1"``.
+    """The unit written as ``text``: ``"Pa s"``, ``"W/(m K^2)"``, ``"1/us"``, ``"m s-1"``, ``"s^0.6"``, ``"%"``.
 
     ``"2.76*um"`` is a unit as well, such as a pixel, and ``"1/(270*kHz)"``, the time between two frames.
 
@@ -179,9 +180,9 @@ def _product(tokens: Iterator[re.Match[str]], text: str, closing: str = "") -> U
             factor = _product(tokens, text, ")")
         else:
             power = token["power"] or "1"
-            if len(power) > 3 or abs(int(power)) > LARGEST_POWER:
+            if len(power) > (7 if "." in power else 3) or abs(Fraction(power)) > LARGEST_POWER:
                 raise UnitError(f"cannot read unit {text!r}: no unit has the power {power}")
-            factor = _symbol(token["symbol"]) ** int(power)
+            factor = _symbol(token["symbol"]) ** Fraction(power)
         if divided and operator != "/":
             raise UnitError(f"ambiguous unit {text!r}: write brackets, as in 'W/(m K)'")
         divided = divided or operator == "/"

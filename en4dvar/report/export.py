@@ -257,7 +257,7 @@ def latex_unit(unit: str) -> str:
     if unit == "1":
         return ""
     text = escaped(unit).replace("\\^{}", "^")
-    text = re.sub(r"(?<=[A-Za-z])(?:\^|\*\*)?(-?\d+)", r"$^{\1}$", text)
+    text = re.sub(r"(?<=[A-Za-z])(?:\^|\*\*)?(-?\d+(?:\.\d+)?)", r"$^{\1}$", text)
     text = re.sub(r"(?<![A-Za-z\\])u(?=[A-Za-z])", r"$\\mu$", text)
     return re.sub(r"\s*\*\s*|\s+", r"\\,", text)
 

@@ -35,13 +35,13 @@ def upper_first(words: str) -> str:
 def pretty_unit(unit: str) -> str:
     """``"um"`` → ``"µm"``, ``"Pa s"`` → ``"Pa·s"``, ``"J/m^2"`` → ``"J/m²"``, ``"1"`` → ``""``.
 
-    >>> pretty_unit("um"), pretty_unit("Pa s"), pretty_unit("J/m^2"), pretty_unit("1"), pretty_unit("m s-1")
-    ('µm', 'Pa·s', 'J/m²', '', 'm·s⁻¹')
+    >>> pretty_unit("um"), pretty_unit("Pa s^0.6"), pretty_unit("J/m^2"), pretty_unit("1"), pretty_unit("m s-1")
+    ('µm', 'Pa·s^0.6', 'J/m²', '', 'm·s⁻¹')
     """
     if unit == "1":
         return ""
     text = re.sub(r"(?<![A-Za-z])u(?=[A-Za-z])", "µ", unit.strip())
-    text = re.sub(r"(?<=[A-Za-zµ])(?:\^|\*\*)?(-?\d+)", lambda m: m[1].translate(_SUPERSCRIPT), text)
+    text = re.sub(r"(?<=[A-Za-zµ])(?:\^|\*\*)?(-?\d+)(?![\d.])", lambda m: m[1].translate(_SUPERSCRIPT), text)
     return re.sub(r"\s*\*\s*|\s+", "·", text)
 
 

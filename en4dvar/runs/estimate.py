@@ -18,7 +18,7 @@ from en4dvar.config import Config, SequenceConfig
 from en4dvar.config.document import Document, document_of
 from en4dvar.config.kinds import resolve_sequence
 from en4dvar.config.load import resolve
-from en4dvar.config.models import HANDED, read_model
+from en4dvar.config.models import HANDED, checked, read_model
 from en4dvar.diagnosis.analysis import Progress
 from en4dvar.inputs.arrays import TIME, VALUE, columns_of, csv_of, require_columns, stacked, tables_of
 from en4dvar.model.forward import ForwardModel, Observable
@@ -405,7 +405,7 @@ class Given:
         if isinstance(model, type) and issubclass(model, ForwardModel):
             model = model()
         if isinstance(model, ForwardModel):
-            return model, {"name": HANDED, "object": name_of(type(model)), "digest": _digest_of_model(model)}
+            return checked(model), {"name": HANDED, "object": name_of(type(model)), "digest": _digest_of_model(model)}
         if not callable(model):
             raise ConfigError(f"model: {type(model).__name__} is neither a function nor a model; {MODELS}")
         section = {

@@ -17,6 +17,7 @@ from en4dvar.plumbing.errors import En4dvarError, retold
 from en4dvar.plumbing.hints import suggest
 from en4dvar.plumbing.units import parse_unit
 from en4dvar.plumbing.user_code import reason_of
+from en4dvar_bubble.laws import exactness
 from en4dvar_bubble.laws.base import ConstitutiveLaw
 from en4dvar_bubble.laws.exactness import TABLE_ERROR, is_sharp, refuse_inexact, slope_error
 from en4dvar_bubble.laws.parameters import columns
@@ -135,21 +136,26 @@ def documented(law: ConstitutiveLaw) -> None:
 
 
 def no_stress_without_strain(law: ConstitutiveLaw) -> None:
-    """No stress without strain: J(λ = 1, at rest) = 0."""
-    values = law.example_values()
-    unit = np.ones((1, 1))
-    J = law.elastic_stress(unit, values)[0, 0] + law.relaxed(unit[:, 0], values).sum()
-    near = law.elastic_stress(np.array([[0.9, 1.1]]), values)
-    assert abs(J) <= 1e-9 * np.max(np.abs(near)), f"J = {J:.3g} Pa at λ = 1 ({_at(values)})"
+    """No stress without strain: J, or W′, is zero at λ = 1, at rest."""
+    with retold(ValueError, AssertionError):
+        exactness.refuse_stress_at_rest(law, 1e-9)
 
 
 def stress_falls_with_stretch(law: ConstitutiveLaw) -> None:
     """The elastic stress opposes the strain: J falls as λ grows (where the law claims it: monotone)."""
+    with retold(ValueError, AssertionError):
+        exactness.refuse_wrong_sign(law)
     stretch, J = _elastic(law)
     if not law.monotone or not np.any(J):
         return
     rise = np.diff(J) >= 0
     assert not np.any(rise), f"J rises with λ at λ = {stretch[:-1][rise][0]:.4g} ({_at(law.example_values())})"
+
+
+def members_are_apart(law: ConstitutiveLaw) -> None:
+    """Two members beside each other have the numbers that each has alone."""
+    with retold(ValueError, AssertionError):
+        exactness.refuse_mixed_members(law)
 
 
 def finite(law: ConstitutiveLaw) -> None:
@@ -219,6 +225,7 @@ CHECKS: tuple[Check, ...] = (
     table_has_the_slope_of_the_law,
     limits_hold,
     dissipates,
+    members_are_apart,
 )
 
 

@@ -27,11 +27,14 @@ from en4dvar_bubble.dynamics import MACH_LIMITS, Dynamics, Wall
 from en4dvar_bubble.emission import OBSERVABLE
 from en4dvar_bubble.events import OBSERVABLES
 from en4dvar_bubble.laws import get_law
+from en4dvar_bubble.laws.tabulate import GRID, ends
 from en4dvar_bubble.numbers import NAMES
 from en4dvar_bubble.packing import pack, with_gas
 from en4dvar_bubble.paths import Paths
 from en4dvar_bubble.settings import BubbleSettings
+from en4dvar_bubble.solver.arrays import Members
 from en4dvar_bubble.solver.driver import Solution
+from en4dvar_bubble.solver.integrate import NON_FINITE
 
 _LIKE_KEYS = "gas", "start", "radial", "vapour", "medium_heat", "hydrophone", "gas_change", "viscosity_change"
 
@@ -111,11 +114,11 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
 
     def changed(self, name: str, x: Array, change: Array) -> Array:
         """See :meth:`ForwardModel.changed`; ``gas`` changes at the temperature and the vapour pressure that it has,
-        ``viscosity`` is every viscosity of the law.
+        ``viscosity`` is every viscosity of the law, and consistency index (Pa s^n).
         """
         if name == "viscosity":
             for p in self.law.parameters:
-                x = super().changed(p.name, x, change) if p.unit == "Pa s" else x
+                x = super().changed(p.name, x, change) if p.unit.startswith("Pa s") else x
             return x
         return with_gas(self, x, np.exp(change)) if name == "gas" else super().changed(name, x, change)
 
@@ -152,17 +155,18 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
         return self.integrate(np.asarray(x, dtype=float), times, start)
 
     def prepared(
-        self, x: Array, times: Array, t0: Array | float = 0.0
+        self, x: Array, times: Array, t0: Array | float = 0.0, halved: bool = False
     ) -> tuple[Callable[[], object], Callable[[], Paths]]:
         """:meth:`integrate` of states (N, n_state) in two: the work, without the interpreter, which threads can share,
-        and its result.
+        and its result. Members that come to where a table ends are run again with ``halved`` cells, which end where
+        the law does.
         """
         micro = times * 1e6
         mirror = self.start == "laser" and not np.any(t0) and bool(np.any(times < 0))
         order = np.argsort(np.abs(micro), axis=1, kind="stable") if mirror else None
         if order is not None:
             micro = np.take_along_axis(np.abs(micro), order, axis=1)
-        packed = pack(self, x, t0 * 1e6, micro)
+        packed = pack(self, x, t0 * 1e6, micro, halved)
         kernel, solved = self.solver.prepared(packed.members, packed.memory, packed.viscous, packed.pulse)
         once = Lock()
 
@@ -178,6 +182,24 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
                 states = solution.states[np.arange(len(x))[:, None], back]
                 states[:, :, -2] *= np.where(times < 0, -1.0, 1.0)
                 solution = Solution(states, solution.status, solution.record)
-            return Paths(self, x, times, solution, packed.members.parameters, t0)
+            return self._followed(Paths(self, x, times, solution, packed.members.parameters, t0), packed.members)
 
         return work, finish
+
+    def _followed(self, paths: Paths, members: Members) -> Paths:
+        """The same, with members run again that left their tables where the law still may have values."""
+        solution, tables = paths.solution, members.tables
+        lost = np.flatnonzero(solution.status == NON_FINITE)
+        unknown = np.isnan((tables if len(tables) else members.samples)[lost])
+        lost = lost[unknown.any(axis=tuple(range(1, unknown.ndim)))]
+        if tables.shape[1] > GRID.cells:
+            solution.ends.update(zip(lost, ends(tables[lost]), strict=True))
+        elif len(lost):
+            start = np.broadcast_to(paths.start, len(paths))[lost]
+            work, finish = self.prepared(paths.initial[lost], paths.times[lost], start, halved=True)
+            work()
+            again = finish().solution
+            solution.states[lost], solution.status[lost] = again.states, again.status
+            solution.record[lost] = again.record
+            solution.ends.update({lost[i]: words for i, words in again.ends.items()})
+        return paths

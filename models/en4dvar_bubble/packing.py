@@ -42,8 +42,10 @@ class Packed(NamedTuple):
     complete: Callable[[], None]
 
 
-def pack(model: Dynamics, x: Array, start: Array | float, times: Array) -> Packed:
-    """States (N, n_state) at ``start`` (µs, one or (N,)), to be integrated to ``times`` (N, K) in µs."""
+def pack(model: Dynamics, x: Array, start: Array | float, times: Array, halved: bool = False) -> Packed:
+    """States (N, n_state) at ``start`` (µs, one or (N,)), to be integrated to ``times`` (N, K) in µs. ``halved``: with
+    halved cells in the elastic tables, whatever the law.
+    """
     law, system, values = model.law, model.system, model.law_values(x)
     own = model.parameter_values(x)
     rho = model.medium_of(own).rho
@@ -72,9 +74,9 @@ def pack(model: Dynamics, x: Array, start: Array | float, times: Array) -> Packe
         tabulated = law.samples({name: value[which] for name, value in values.items()})
         return tabulated * (1 / np.asarray(rho)[which])[:, None] if tabulated is not None and own_density else tabulated
 
-    some = sampled(first)
+    some = None if halved else sampled(first)
     if some is None:
-        elastic = law.table(values)
+        elastic = law.table(values, halved)
         elastic[..., :6] /= model.medium_of(own, 2).rho  # not what tells of halved cells
     else:
         samples = np.empty((n_members, some.shape[1]))

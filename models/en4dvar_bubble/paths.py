@@ -10,12 +10,10 @@ from en4dvar.model.forward import Batch, Failure, Trajectory, ValidityLimit
 from en4dvar.model.state import Array, StateLayout
 from en4dvar_bubble.dynamics import Dynamics
 from en4dvar_bubble.gas import from_kirchhoff, mass_fraction, saturated_vapour_pressure
-from en4dvar_bubble.laws.tabulate import GRID
 from en4dvar_bubble.medium import Medium
 from en4dvar_bubble.solver import rows
 from en4dvar_bubble.solver.driver import Solution
 from en4dvar_bubble.solver.integrate import BEYOND, END_TIME, MAX_MACH
-from en4dvar_bubble.tables import evaluate
 
 THETA, MOLE_FRACTION = "temperature of the gas over that far away", "mole fraction of vapour"
 
@@ -162,7 +160,7 @@ class Paths(Batch):
         V = self.solution.states[:, :, -2]
         log_stretch = self.solution.states[:, :, -1] - self.par[:, None, rows.LOG_R0]
         values = self.model.law_values(self.initial)
-        stress = evaluate(self.model.law.table(values), GRID.span, log_stretch) / rho
+        stress = self.model.law.elastic_stress(np.exp(log_stretch), values) / rho
         if system.memory:
             stress = stress + self.solution.states[:, :, system.first_memory : -2].sum(axis=2)
         if system.shear or system.strain:

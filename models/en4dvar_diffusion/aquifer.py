@@ -43,7 +43,7 @@ class Aquifer(ForwardModel):
     )
     defaults: Mapping[str, float] = {"recharge": 0.01, "storage": 0.1}
     observables = (Observable("head", "1", StateField("head"), "$h$", label="head"),)
-    time_unit = time_display_unit = "1"
+    time_unit = "1"
 
     def __init__(self, shape: tuple[int, int], step: float = 2.0):
         self.shape, self.longest, self.size = shape, step, shape[0] * shape[1]

@@ -13,7 +13,6 @@ class Autonomous(ForwardModel):
     """dx/dt = f(x, θ). A subclass gives ``integrate`` (states (N, n), times (N, K), longest step) → (N, K, n)."""
 
     time_unit = "1"
-    time_display_unit = "1"
     compiled = True
     autonomous = True
     defaults: Mapping[str, float] = {}

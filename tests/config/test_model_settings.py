@@ -9,10 +9,12 @@ import pytest
 import toy_models
 from pydantic import BaseModel
 
+from en4dvar import estimate
 from en4dvar.config import load_twin
 from en4dvar.model.forward import ForwardModel, Observable, StateField
-from en4dvar.model.state import Field, StateLayout
+from en4dvar.model.state import Field, Parameter, StateLayout
 from en4dvar.plumbing.errors import ConfigError
+from en4dvar.report.result import load_result
 
 TWIN = """\
 name: bare
@@ -51,6 +53,43 @@ class Blind(Bare):
 
 class Rateless(Bare):
     observables = (Observable("x", "1", StateField("x", rate_of="v")),)
+
+
+class Apart(Bare):
+    time_unit, time_display_unit = "1", "s"
+
+
+class Miscast(Bare):
+    observables = (Observable("x", "1", StateField("x"), display_unit="m"),)
+
+
+class Drift(Bare):
+    """A slope that may change, in times without a unit."""
+
+    parameters = (Parameter("slope", "1"),)
+    layout = StateLayout((Field("x"), Field("slope")))
+    time_unit = "1"
+
+    def initial_state(self, theta):
+        return np.array([0.0, theta["slope"]])
+
+    def step(self, x, t0, t1):
+        return x + np.array([x[1] * (t1 - t0), 0])
+
+
+def test_times_are_shown_in_the_unit_of_the_model_unless_it_says_another(tmp_path):
+    model = Drift()
+    assert (model.time_display_unit, Bare().time_display_unit) == ("1", "s")
+    model.time_unit = "min"
+    assert model.time_display_unit == "min"
+    t = np.arange(1.0, 7)
+    slope = {"prior": "normal", "mean": 1, "std": 1, "varies": {"at": [2.5], "std": 0.3}}
+    result = estimate(Drift(), (t, t), {"slope": slope}, error=0.1)
+    result = load_result(result.save(tmp_path / "drift.nc"))
+    times = result.dataset("prior_predictive")["time"]
+    assert (times.attrs["units"], times.attrs["display_units"]) == ("1", "1")
+    with pytest.raises(ConfigError, match="Apart: unit and display unit of its times: unit '1' cannot be converted"):
+        estimate(Apart(), (t, t), {}, error=0.1)
 
 
 def load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: type[ForwardModel], more: str = ""):
@@ -102,6 +141,8 @@ def test_a_field_on_a_grid_is_localised_in_cells(tmp_path, monkeypatch):
         (Sized, "", "missing 1 required positional argument: 'size'; a class that takes arguments needs Settings and"),
         (Half, "", "Settings and from_settings go together, it lacks from_settings"),
         (Blind, "", "the observable 'x' reads 'x_1', which is not in the layout; known: x"),
+        (Apart, "", "Apart: unit and display unit of its times: unit '1' cannot be converted to 's'"),
+        (Miscast, "", "Miscast: unit and display unit of x: unit '1' cannot be converted to 'm'"),
         (Rateless, "", "the observable 'x' reads 'v', which is not in the layout"),
     ],
 )

@@ -77,7 +77,8 @@ class TestYaml:
             "from toy_models import Oscillator\n"
             "class Pair(Oscillator):\n"
             "    defaults = {}\n"
-            "    parameters = (*Oscillator.parameters[:2], replace(Oscillator.parameters[2], unit='N/m'))\n"
+            "    c = replace(Oscillator.parameters[2], unit='N/m', display_unit='N/m')\n"
+            "    parameters = (*Oscillator.parameters[:2], c)\n"
         )
         return write_toy(folder, ("name: toy_models:Oscillator", "name: pair.py:Pair"), ("c: 0.02 N s/m", entry))
 

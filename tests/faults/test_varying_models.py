@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import toy_models
 import twin_models
 from faulty_models import Counts, Fails, Remembers
 from rows import row
@@ -55,6 +56,19 @@ def test_it_is_told_before_anything_is_estimated(tmp_path, model, executor):
     assert "differs by up to" in str(told.value)
     assert "assimilation: {stochastic_model: true}" in str(told.value)
     assert not (tmp_path / "run" / "posterior.nc").exists()
+
+
+class Mixed(toy_models.Oscillator):
+    """All members of a batch have the start of its first one."""
+
+    def trajectories(self, x, times):
+        return super().trajectories(np.where(np.arange(x.shape[1]) == 0, x[0], x), times)
+
+
+def test_a_model_that_mixes_members_is_told_as_such(tmp_path):
+    path = write_toy(tmp_path, ("toy_models:Oscillator", "test_varying_models:Mixed"))
+    with pytest.raises(ConfigError, match=r"toy: the model mixes the members of a batch: .* member 8 differs by up to"):
+        run(configuration(path, tmp_path / "run", executor="serial"))
 
 
 @pytest.mark.fault("model-varies")

@@ -32,6 +32,10 @@ from en4dvar.plumbing.units import Quantity, UnitError, as_unit, convert, parse_
         ("0.03", "1", 0.03),
         (3, "1", 3.0),
         ("1 atm", "bar", 1.01325),
+        ("5 Pa s^0.6", "kg/(m s^1.4)", 5.0),
+        ("5 kPa s**0.6", "Pa s^+0.6", 5000.0),
+        ("4 kPa^0.5", "Pa^0.5", 4 * 10**1.5),
+        ("2 ms^-0.5 ms^-0.5", "kHz", 2.0),
     ],
 )
 def test_quantity(text: str, unit: str, value: float) -> None:
@@ -57,6 +61,10 @@ def test_quantity(text: str, unit: str, value: float) -> None:
         ("1 W/(m K", "W/(m K)", "unbalanced"),
         ("1 W/", "W", "a unit is missing"),
         ("1 $", "W", "cannot read unit"),
+        ("1 Pa s^0.6", "Pa s^0.61", "cannot be converted to 'Pa s"),
+        ("1 Pa s0.6", "Pa s^0.6", "cannot read unit"),
+        ("1 Pa s^12.5", "Pa s", "no unit has the power 12.5"),
+        ("1 Pa s^0.12345678", "Pa s", "no unit has the power 0.12345678"),
     ],
 )
 def test_refused(text: str, unit: str, message: str) -> None:

@@ -7,6 +7,7 @@ import pytest
 from same_bits import assert_same_bits
 from wells import UnlikeWells, Wells, mass_of_positive, two_wells
 
+from en4dvar import estimate
 from en4dvar.descent.minima import Minimum
 from en4dvar.diagnosis.analysis import Mode
 from en4dvar.estimation.assimilate import assimilate, log_posterior
@@ -41,6 +42,17 @@ def test_weights_are_the_masses_of_the_wells(kind, mean):
     a, b = summarise(analysis)
     assert (a.modal, b.modal) == (True, False)
     assert a.q05 < 0 < a.q95
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_two_narrow_modes_as_far_apart_as_the_prior_is_wide_are_no_silent_data(seed):
+    """Of x² the data tell |x| to 3 %, and the variance of both modes together is that of the prior."""
+    prior, t = {"prior": "normal", "mean": 0.3, "std": 1}, np.array([1.0, 2.0, 3.0])
+    squared = lambda p, t: p["x"] ** 2 * t  # noqa: E731
+    result = estimate(squared, (t, [1.0, 2.2, 2.9]), {"x": prior}, error=0.1, cheap=True, seed=seed, progress=False)
+    assert np.abs(result.sample_stats["dfs"].values).max() < 0.1
+    (told,) = result.warnings
+    assert told.startswith("the posterior has 2 modes")
 
 
 @pytest.mark.parametrize("case", CASES[::2])

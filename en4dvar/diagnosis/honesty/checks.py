@@ -226,8 +226,8 @@ def information(
     """Parameters of which the data say little: neither spread nor mean of the posterior (N, n) differ from the prior's.
 
     ``per_parameter`` (n,) is 1 − posterior over prior variance. Nothing is said of ``silent`` names: their members
-    may not be the posterior, or they need not be informed. ``modes`` says of which field a name is a mode: those of a
-    field are counted in one finding.
+    may not be the posterior, or come from modes apart, or they need not be informed. ``modes`` says of which field a
+    name is a mode: those of a field are counted in one finding.
     """
     of_fields: dict[str, list[str]] = {}
     moved = np.abs(posterior.mean(axis=0) - prior.mean) / prior.std

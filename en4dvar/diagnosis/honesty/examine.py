@@ -12,7 +12,7 @@ from en4dvar.diagnosis.diagnostics import UNSEEN, active_members
 from en4dvar.diagnosis.honesty import checks
 from en4dvar.diagnosis.honesty.advice import advised
 from en4dvar.model.state import Array
-from en4dvar.plumbing.caution import Caution, caution, untrusted, worst_first
+from en4dvar.plumbing.caution import Caution, caution, of_several_modes, untrusted, worst_first
 from en4dvar.priors.prior import Prior
 from en4dvar.problem import InverseProblem
 
@@ -69,7 +69,7 @@ def examine(
         *_allowed(a, _validity(a, alive)),
         *checks.gaussian(prior, members, a.shape, a.settings.own.approximate),
     )
-    silent = {name for name in prior.names if untrusted(warnings, name)} | _beside(a)
+    silent = {n for n in prior.names if untrusted(warnings, n) or of_several_modes(warnings, n)} | _beside(a)
     silent |= {term.parameter.name for change in a.problem.varying for term in change.terms}  # data may say little
     modes = {p.parameter.name: p.of.field.name for p in a.problem.perturbations if p.of is not None}
     little = checks.information(prior, control.posterior[alive], a.dfs_per_parameter, silent, modes)

@@ -153,15 +153,16 @@ class ConstitutiveLaw:
                 samples[some] = self.stress(STRETCH, columns({name: v[some] for name, v in values.items()}))
         return samples
 
-    def table(self, values: Mapping[str, Array]) -> Array:
+    def table(self, values: Mapping[str, Array], halved: bool = False) -> Array:
         """J_e against ln λ for N members: (N, cells, 8) coefficients on :data:`GRID`, Pa. ``values``: name → (N,).
 
-        Of a :attr:`sharp` law, halved cells follow those of the grid, as many as the member takes that takes most.
+        Of a :attr:`sharp` law, or where asked for, halved cells follow those of the grid, as many as the member takes
+        that takes most. A table without them ends up to a tenth of λ before the law does.
         """
-        samples = self.samples(values)
+        samples = None if halved else self.samples(values)
         if samples is not None:
             return from_values(samples)
-        if self.sharp:
+        if halved or self.sharp:
             return _kept(self, tuple(values), np.stack([*values.values()], dtype=float).tobytes()).copy()
         p = columns(values)
         with np.errstate(all="ignore"):
@@ -206,7 +207,13 @@ class ConstitutiveLaw:
 
     def elastic_stress(self, stretch: Array, values: Mapping[str, Array]) -> Array:
         """J_e at ``stretch`` (N, K) for N members, Pa, from the same table the solver uses."""
-        return np.asarray(evaluate(self.table(values), GRID.span, np.log(stretch)))
+        x, table = np.log(stretch), self.table(values)
+        stress = np.asarray(evaluate(table, GRID.span, x))
+        ended = np.flatnonzero((np.isnan(stress) & np.isfinite(x)).any(axis=1))
+        if len(ended) and not self.sharp:
+            finer = self.table({name: v[ended] for name, v in values.items()}, halved=True)
+            stress[ended] = np.where(np.isnan(stress[ended]), evaluate(finer, GRID.span, x[ended]), stress[ended])
+        return stress
 
     def mean_viscosity(self, rate: Array, values: Mapping[str, Array], stretch: float | Array = 1.0) -> Array:
         """μ̄ at |V| = ``rate`` (N, K) in 1/s and ``stretch`` for N members, Pa s, from the table the solver uses."""

@@ -1,8 +1,8 @@
-"""Whether the table of a law is the law. That of one with kinks or features narrower than the cells of the grid has
-cells halved where it takes; what cannot be tabulated is refused, by name.
+"""Whether a law is one, and its table the law. That of one with kinks or features narrower than the cells of the grid
+has cells halved where it takes; what cannot be tabulated is refused, by name.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache
 from typing import Any, NamedTuple, TypeVar, cast
 
@@ -23,6 +23,8 @@ _SPREAD = (1 - np.cos(np.linspace(0, np.pi, 6))) / 2
 _GAUSS = (np.polynomial.legendre.leggauss(5)[0] + 1) / 2
 _CHECKED = np.array([1e-3, 0.04, 0.2, 0.41, 0.5, 0.59, 0.8, 0.96, 0.999])
 _POWERS = np.arange(6)
+_TO_THE_END = 12  # halvings of the cell where a function ends: to 1e-5 of λ
+_BESIDE = np.array([-64, 64])  # cells: so near the end of a function it may grow without bound
 
 
 class Refined(NamedTuple):
@@ -39,12 +41,13 @@ def refine(function: Callable[[Array], Array], slope: bool) -> Refined:
     ln λ = 0.
 
     Each cell is compared with the function at nine points that it was not made from. What lies between them, at first
-    1/160 apart, is not seen. Cells in which the function is not finite are not halved.
+    1/160 apart, is not seen. Cells in which the function is finite at some points and not at others are halved, so
+    that the table ends where the function does, to 1e-5.
     """
     points = _GAUSS if slope else _SPREAD
     fit = np.linalg.inv(points[:, None] ** _POWERS[: len(points)])
     asked, to_checked = np.append(points, _CHECKED), (_CHECKED[:, None] ** _POWERS[: len(points)]).T
-    left = GRID.origin + GRID.step * np.arange(GRID.cells)
+    begins = left = np.asarray(GRID.origin + GRID.step * np.arange(GRID.cells), dtype=float)
     places, records, inexact = np.arange(GRID.cells), np.zeros((GRID.cells, 8)), []
     central = floor = 0.0
     for level in range(HALVINGS + 1):
@@ -53,12 +56,14 @@ def refine(function: Callable[[Array], Array], slope: bool) -> Refined:
         values, exact = both[:, : len(points)], both[:, len(points) :]
         made = values @ fit.T
         difference = made @ to_checked - exact
-        error, size = np.abs(difference).max(axis=1), np.abs(exact).max(axis=1)
+        known = np.isfinite(both)
+        error = np.abs(difference).max(axis=1)
+        size = np.abs(exact).max(axis=1, where=known[:, len(points) :], initial=0.0)
         if level == 0:
             middle = size[np.abs(left) < np.log(2)]
-            central = float(np.max(middle, where=np.isfinite(middle), initial=0.0))
+            central = float(np.max(middle, initial=0.0))
             floor = central * (np.log(2) if slope else 1.0)
-        scale = np.maximum(floor, size)
+            scale = np.maximum(floor, size)  # halves keep it: what grows without bound is not held
         if slope:
             wrong_slope, error = error, error * width
             largest_slope = np.maximum(size, 1e-3 * central)
@@ -68,13 +73,15 @@ def refine(function: Callable[[Array], Array], slope: bool) -> Refined:
         with np.errstate(invalid="ignore"):
             halved = (error > 0.01 * ERROR * scale) | (wrong_slope > 1e-5 * largest_slope) & (error > 1e-13 * scale)
             bad = error > ERROR * scale
-        records[places, :6] = np.pad(made, ((0, 0), (int(slope), 0))) if slope else made
-        if slope:
-            records[places, 1:6] = made * width / np.arange(1, 6)
+        if level < _TO_THE_END:
+            halved |= known.any(axis=1) & ~known.all(axis=1)
+        records[places, int(slope) : 6] = made * width / np.arange(1, 6) if slope else made
         records[places, 6] = 2.0**level
         if level == HALVINGS or halved.sum() > _MOST:
             records[places[bad], :6] = np.nan
             inexact = left[bad] + width / 2
+            beside = inexact[:, None] + _BESIDE * width
+            inexact = inexact[np.isfinite(np.reshape(function(beside.ravel()), beside.shape)).all(axis=1)]
             break
         if not halved.any():
             break
@@ -82,27 +89,20 @@ def refine(function: Callable[[Array], Array], slope: bool) -> Refined:
         records[places[halved], 7] = children
         records = np.concatenate([records, np.zeros((2 * len(children), 8))])
         places = np.stack([children, children + 1], axis=1).ravel()
-        left = (left[halved][:, None] + [0.0, width / 2]).ravel()
+        left, scale = (left[halved][:, None] + [0.0, width / 2]).ravel(), np.repeat(scale[halved], 2)
+        begins = np.concatenate([begins, left])
     if slope:
-        _add_up(records)
+        _add_up(records, begins)
     return Refined(np.concatenate([records, np.zeros((1, 8))]), np.asarray(inexact, dtype=float))
 
 
-def _add_up(records: Array) -> None:
-    """Give each cell of an antiderivative its value on the left: in the order of ln λ, from zero at ln λ = 0."""
-    leaves: list[int] = []
-    unstretched = 0
-    for cell in range(GRID.cells):
-        if cell == round(-GRID.origin / GRID.step):
-            unstretched = len(leaves)
-        waiting = [cell]
-        while waiting:
-            at = waiting.pop()
-            half = int(records[at, 7])
-            if half:
-                waiting += [half + 1, half]
-            else:
-                leaves.append(at)
+def _add_up(records: Array, begins: Array) -> None:
+    """Give each cell of an antiderivative its value on the left: in the order of ln λ, from zero at ln λ = 0.
+    ``begins``: where the cells begin.
+    """
+    leaves = np.flatnonzero(records[:, 7] == 0)
+    leaves = leaves[np.argsort(begins[leaves])]
+    unstretched = np.searchsorted(begins[leaves], 0.0)
     rise = records[leaves, 1:6].sum(axis=1)
     records[leaves[unstretched:], 0] = np.cumsum(rise[unstretched:]) - rise[unstretched:]
     records[leaves[:unstretched], 0] = -np.cumsum(rise[:unstretched][::-1])[::-1]
@@ -159,6 +159,92 @@ def is_sharp(kind: type[Any]) -> bool:
         return False
 
 
+_AROUND = np.array([0.9, 1.0, 1.1])
+_RATES = np.logspace(-2, 12, 15)
+
+
+class UnfitError(ValueError):
+    """A class is no law; unlike another :class:`ValueError`, which its methods may raise."""
+
+
+def _elastic(law: Any) -> tuple[str, Array, int]:
+    """What an author writes, J or W′, at :data:`_AROUND` in Pa, and its sign where it pushes the wall outwards."""
+    what, function, outwards = ("J", law.stress, 1) if law.closed_form else ("W′", law.strain_energy_rate, -1)
+    with np.errstate(all="ignore"):
+        return what, np.broadcast_to(function(_AROUND, columns(law.example_values())), (1, 3))[0], outwards
+
+
+def refuse_stress_at_rest(law: Any, tolerance: float = ERROR) -> None:
+    """Raise :class:`UnfitError` where J or W′ is not zero at λ = 1 and at rest: J of such a W′ is infinite."""
+    what, elastic, _ = _elastic(law)
+    memory = sum(float(np.ravel(v.equilibrium_at(_AROUND[1:2]))[0]) for v in law.memory(columns(law.example_values())))
+    if abs(elastic[1] + memory) > tolerance * np.max(np.abs(elastic)):
+        raise UnfitError(
+            f"{law.name}: a stress without strain: at rest, {what} is {elastic[1] + memory:.3g} Pa at λ = 1. It must "
+            "be zero there: check signs and exponents, or subtract it"
+        )
+
+
+def refuse_wrong_sign(law: Any) -> None:
+    """Raise :class:`UnfitError` where the elastic stress drives the wall away from λ = 1 on both sides."""
+    what, elastic, outwards = _elastic(law)
+    if elastic[0] * outwards < 0 < elastic[2] * outwards:
+        raise UnfitError(
+            f"{law.name}: its elastic stress drives the wall away from its rest, {what} being {elastic[0]:.3g} Pa at "
+            f"λ = 0.9 and {elastic[2]:.3g} Pa at λ = 1.1. Change its sign: J is below zero where the medium pulls the "
+            "wall inwards, and W′ is above zero where λ > 1"
+        )
+
+
+def refuse_mixed_members(law: Any) -> None:
+    """Raise :class:`UnfitError` where the numbers of a member depend on those beside it."""
+    bounds = {p.name: p.bounds for p in law.parameters}
+    alone = law.example_values()
+    other = {name: np.clip(1.3 * v, *bounds.get(name, (0, np.inf))) for name, v in alone.items()}
+    together = {name: np.append(v, other[name]) for name, v in alone.items()}
+    with np.errstate(all="ignore"):
+        both, *single = (_numbers(law, values) for values in (together, alone, other))
+    for member, numbers in enumerate(single):
+        for what, own in numbers.items():
+            if not np.allclose(both[what][member], own[0], rtol=1e-9, atol=0, equal_nan=True):
+                raise UnfitError(
+                    f"{law.name}: {what} of a member depends on the members beside it: every p.name is a column "
+                    "(N, 1), one row for each member; write each row of the result from its own row alone"
+                )
+
+
+def _numbers(law: Any, values: Mapping[str, Array]) -> dict[str, Array]:
+    """What the solver reads of N members, (N, …) each, by name."""
+    n, memory, (lowest, highest) = len(next(iter(values.values()))), law.memory_tables(values), law.stretch_range
+    stretch = np.broadcast_to(np.geomspace(lowest, highest, 15), (n, 15))
+    return {
+        "the elastic stress": law.elastic_stress(stretch, values),
+        "the viscosity": law.mean_viscosity(np.broadcast_to(_RATES, (n, 15)), values, stretch),
+        "the memory": np.concatenate(
+            [part.reshape(n, -1) for part in (memory.relaxation_time, memory.stiffness, memory.equilibrium)], axis=1
+        ),
+    }
+
+
+@_once
+def refuse_unfit(kind: type[Any]) -> None:
+    """Raise ValueError for a user's class that is no law at its example values (tests hold those of the package to it),
+    and for one that :func:`refuse_inexact` refuses.
+    """
+    law = kind()
+    if not kind.__module__.startswith(_PACKAGE):
+        try:
+            if not law.closed_form:  # a coating may have a tension at rest
+                refuse_stress_at_rest(law)
+            refuse_wrong_sign(law)
+            refuse_mixed_members(law)
+        except UnfitError:
+            raise
+        except Exception:  # what is wrong with the methods is told by those who call them
+            return
+    refuse_inexact(kind)
+
+
 @_once
 def refuse_inexact(kind: type[Any]) -> None:
     """Raise ValueError for a sharp law whose stress jumps, or is too rough for cells however narrow, and for one whose
@@ -176,8 +262,9 @@ def refuse_inexact(kind: type[Any]) -> None:
         raise ValueError(
             f"{law.name}: its stress changes too sharply for the table that the solver reads: at λ = {inexact[0]:.6g} "
             f"it jumps, or is too rough for cells of {GRID.step * 0.5**HALVINGS:.0e} in ln λ to hold it to {ERROR:g} "
-            "of its size. Make it continuous there (a kink does no harm), or narrow stretch_range to where it is "
-            "continuous, if bubbles stay inside (en4dvar laws --check says more)"
+            "of its size. Make it continuous there (a kink does no harm), return NaN from where on the law has no "
+            "values, or narrow stretch_range to where it is continuous, if bubbles stay inside (en4dvar laws --check "
+            "says more)"
         )
 
 

@@ -92,8 +92,9 @@ J_M = positive("J_m", "1", "limit of I₁ − 3", "$J_m$", "Gent (1996)")
 
 
 class GentKelvinVoigt(ConstitutiveLaw):
-    r"""$W = -\tfrac{GJ_m}2\ln\left[1-(I_1-3)/J_m\right]$ (Gent 1996), with a dashpot. A member whose wall comes within
-    10 % of the locking stretch, about $\sqrt{J_m/2}$, fails as non-finite.
+    r"""$W = -\tfrac{GJ_m}2\ln\left[1-(I_1-3)/J_m\right]$ (Gent 1996), with a dashpot. It has values as long as
+    $I_1-3 < J_m$, at stretches from about $J_m^{-1/4}$ to $\sqrt{J_m/2}$; a member whose wall gets beyond fails as
+    non-finite.
     """
 
     name = "gent-kelvin-voigt"

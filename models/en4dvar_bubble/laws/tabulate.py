@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from en4dvar.model.state import Array
-from en4dvar_bubble.tables import HALO, Grid, from_slopes, from_values
+from en4dvar_bubble.tables import HALO, Grid, evaluate, from_slopes, from_values
 
 Function = Callable[[Array], float | Array]
 
@@ -59,6 +59,15 @@ def differentiate(table: Array) -> Array:
     out[..., :5] = table[..., 1:6] * np.arange(1, 6) / GRID.step * np.maximum(table[..., 6:7], 1.0)
     out[..., 6:] = table[..., 6:]
     return out
+
+
+def ends(tables: Array) -> list[str]:
+    """For each of tables (N, cells, 8) of J_e, in words, between which stretches it has values, to half a per cent."""
+    x, words = np.arange(GRID.origin, GRID.span[1], GRID.step / 8), []
+    for known in np.isfinite(evaluate(tables, GRID.span, np.tile(x, (len(tables), 1)))):
+        low, high = np.max(x[~known & (x <= 0)], initial=x[0]), np.min(x[~known & (x >= 0)], initial=x[-1])
+        words.append(f": the law has values at stretches between {np.exp(low):.3g} and {np.exp(high):.3g} alone")
+    return words
 
 
 def from_viscosity(viscosity: Function, n: int) -> Array:

@@ -1,7 +1,7 @@
 """The NumPy side of the solver: accuracy, the arrays a system of equations needs, failure reasons."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -170,12 +170,14 @@ class Solution:
 
     ``status`` (N,) integers, ``record`` (N, 8): steps, rejected steps, largest wall Mach number, largest τ at the
     innermost node, smallest ln(R/µm), end time (µs), since when (µs) the wall is faster than the equations bear,
-    numerical diffusivity of the vapour over R |Ṙ| (0 but for violent collapses).
+    numerical diffusivity of the vapour over R |Ṙ| (0 but for violent collapses). ``ends``: of members that are not
+    finite, between which stretches their law is.
     """
 
     states: Array
     status: np.ndarray
     record: Array
+    ends: dict[int, str] = field(default_factory=dict)
 
     def reason(self, member: int) -> str:
         """Why a member failed, in words; "" where it did not."""
@@ -190,7 +192,7 @@ class Solution:
             integrate.WALL_LIMIT: "model validity: wall above the critical temperature of water",
             integrate.TIME_LIMIT: "time limit reached",
         }
-        return f"{words[status]} at t = {record[integrate.END_TIME]:.4g} µs"
+        return f"{words[status]} at t = {record[integrate.END_TIME]:.4g} µs{self.ends.get(member, '')}"
 
 
 @dataclass(frozen=True, eq=False)
