@@ -91,7 +91,8 @@ def track(
 
     def look(number: int, frame: Frame) -> Look:
         if number in movie.damaged:
-            return Look(number, (), "the file is damaged here")
+            words = "the frame is missing in the folder" if movie.path.is_dir() else "the file is damaged here"
+            return Look(number, (), words)
         start = fixed[number].start if number in fixed else None
         return look_at(number, frame, background, optics, start, len(flashes))
 
