@@ -14,6 +14,7 @@ from scipy import ndimage
 
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import DataError
+from en4dvar_movie.drifting import drift_of, shift_at
 from en4dvar_movie.fitting import fit_outline
 from en4dvar_movie.frames import Frame, Movie
 from en4dvar_movie.outline import TILE, Circle, Optics, circle_through, labelled, locate, rim
@@ -58,6 +59,7 @@ class Background:
     Where the gain is NaN nothing is looked at: writing that changes, black or saturated parts, what the user masks.
 
     ``noise`` is the std of a pixel so normalised; ``frames`` how many the level is made of, 0 where none is empty.
+    ``drift`` is that of :func:`en4dvar_movie.drifting.drift_of`.
     """
 
     level: Array
@@ -65,6 +67,17 @@ class Background:
     noise: float
     frames: int
     relative: bool = True
+    drift: Array | None = None
+
+    def behind(self, number: int) -> Background:
+        """The background as a frame shows it, where the camera drifts."""
+        if self.drift is None:
+            return self
+        down, across = shift_at(self.drift, number)
+        level, gain = (np.roll(part, (down, across), (0, 1)) for part in (self.level, self.gain))
+        gain[: max(down, 0)] = gain[:, : max(across, 0)] = np.nan
+        gain[len(gain) + min(down, 0) :] = gain[:, gain.shape[1] + min(across, 0) :] = np.nan
+        return replace(self, level=level, gain=gain)
 
     def normalised(self, frame: Frame) -> tuple[Array, Array]:
         """The image (H, W) and its tiles, without what the lamp flickers."""
@@ -106,14 +119,22 @@ def find_background(
     ------
     DataError: no frame can be read or shows a bubble.
     """
-    leading, samples = _look(movie)
+    leading, samples, numbers = _look(movie)
     first = leading[0].astype(np.float32)
     if not any(float(np.ptp(frame)) > 0 for frame in (*leading, *samples)):
         words = "black" if not np.any(first) else "white" if _is_white(leading[0]) else "of one brightness"
         raise DataError(f"{movie.path}: every frame is {words}; no bubble can be seen")
+    drift = drift_of(samples, numbers)
+    unseen = np.zeros(first.shape, dtype=bool)  # at the border, of what only some frames show
+    if drift is not None:
+        leading = [np.roll(f, np.negative(shift_at(drift, n)), (0, 1)) for n, f in enumerate(leading)]
+        samples = [np.roll(f, np.negative(shift_at(drift, n)), (0, 1)) for n, f in zip(numbers, samples, strict=True)]
+        height, width = first.shape
+        (up, left), (down, right) = drift[:, 1:].min(axis=0).astype(int), drift[:, 1:].max(axis=0).astype(int)
+        unseen[max(height - down, 0) :] = unseen[:, max(width - right, 0) :] = unseen[:-up] = unseen[:, :-left] = True
     unit = _grey_level(samples)
     noise = pixel_noise(first, unit)
-    blind = _writing(leading, noise) | _outside(samples)
+    blind = _writing(leading, noise) | _outside(samples) | unseen
     if watched is not None:
         blind |= ~watched
     empty = 0 if _begins_with_a_bubble(first, samples, noise, blind, unit) else _quiet(leading, first, noise, blind)
@@ -124,11 +145,11 @@ def find_background(
     background = _with_sign(level, samples, noise, empty, blind, unit)
     if empty:
         background = _refined(background, samples)
-    return background, _optics(background, samples, movie, circles)
+    return replace(background, drift=drift), _optics(background, samples, movie, circles)
 
 
-def _look(movie: Movie) -> tuple[list[Frame], list[Frame]]:
-    """The leading frames, and some along the movie: every n-th, n doubled whenever there are too many."""
+def _look(movie: Movie) -> tuple[list[Frame], list[Frame], range]:
+    """The leading frames, and some along the movie with their numbers: every n-th, n doubled where there are many."""
     leading: list[Frame] = []
     samples: list[Frame] = []
     every = 1
@@ -139,7 +160,7 @@ def _look(movie: Movie) -> tuple[list[Frame], list[Frame]]:
             samples.append(frame)
             if len(samples) == 2 * SAMPLES:
                 samples, every = samples[::2], 2 * every
-    return leading, samples
+    return leading, samples, range(0, every * len(samples), every)
 
 
 def _grey_level(frames: Sequence[Frame]) -> float:
