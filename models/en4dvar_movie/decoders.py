@@ -22,6 +22,7 @@ from en4dvar.plumbing.errors import DataError
 MOST_PIXELS = 64_000_000  # of a frame
 SQUARE = 0.001  # of a pixel's side: by which the other may differ
 MOST_COLOURS = 3  # of a frame
+WITHOUT_LOSS = "High 4:4:4 Predictive"  # the profile of H.264 that may have none
 PREFIXES = {
     "m": 1e-3,
     "milli": 1e-3,
@@ -179,10 +180,12 @@ def image(path: Path) -> Iterator[Any]:
         yield np.asarray(opened if told else opened.convert("RGB"))  # a palette's numbers are no brightness
 
 
-def video_count(path: Path) -> Iterator[int]:
-    """How many frames the file says that it holds; 0 where it does not."""
+def video_about(path: Path) -> Iterator[tuple[int, str]]:
+    """How many frames the file says that it holds, 0 where it does not; the codec where it is one that loses light."""
     with library("av").open(str(path)) as file:
-        yield int(file.streams.video[0].frames) if file.streams.video else 0
+        stream = next(iter(file.streams.video), None)
+        lossy = stream is not None and stream.codec_context.codec.lossy and stream.profile != WITHOUT_LOSS
+        yield (stream.frames if stream else 0), (stream.codec_context.name if stream and lossy else "")
 
 
 def video_frames(path: Path) -> Iterator[Any]:

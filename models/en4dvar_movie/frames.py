@@ -20,7 +20,7 @@ from en4dvar.plumbing.decoding import Allowed, DecodeError, decoded, decoded_who
 from en4dvar.plumbing.errors import DataError, En4dvarError, retold
 from en4dvar.plumbing.files import open_plain
 from en4dvar.plumbing.hints import no_such_file
-from en4dvar_movie.decoders import check_size, image, library, tiff_about, tiff_frames, video_count, video_frames
+from en4dvar_movie.decoders import check_size, image, library, tiff_about, tiff_frames, video_about, video_frames
 from en4dvar_movie.numbering import in_order
 
 Frame = npt.NDArray[Any]
@@ -185,14 +185,19 @@ def _video(path: Path) -> Movie:
     def read() -> Iterator[Frame]:
         for value in decoded(video_frames, path, allowed=MOVIES):
             if isinstance(value, str):
-                notes[:] = [value]
+                notes.extend([value] * (value not in notes))
             elif isinstance(value, int):
                 damaged.add(value)
             else:
                 yield value
 
     with retold(DecodeError, DataError, f"{path}: cannot be read as a movie: "):
-        count = decoded_whole(video_count, path, allowed=MOVIES)
+        count, codec = decoded_whole(video_about, path, allowed=MOVIES)
+    if codec:
+        notes.append(
+            f"{path}: compressed with loss ({codec}): R_std does not hold what that does to whole outlines, and may be "
+            "several times too small where few bits are left; take the frames that the camera saved, if there are any"
+        )
     return Movie(path, read, count, notes=notes, damaged=damaged)
 
 
@@ -278,7 +283,8 @@ def _write_video(path: Path, first: Frame, others: Iterator[Frame]) -> None:
         stream = file.add_stream("libx264", rate=PLAYED)
         stream.height, stream.width = first.shape[:2]
         stream.pix_fmt = "yuv420p" if colour else "gray"
-        stream.options = {} if colour else {"qp": "0"}
+        if not colour:
+            stream.options, stream.color_range = {"qp": "0"}, 2  # of all grey levels; else they would be read stretched
         for frame in chain([first], others):
             file.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24" if colour else "gray")))
         file.mux(stream.encode())
