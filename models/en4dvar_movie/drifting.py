@@ -44,7 +44,7 @@ def drift_of(frames: Sequence[Frame], numbers: Sequence[int]) -> Array | None:
         shifts.append((number, down, across))
         moved += bool(down or across)
     drift = np.array(shifts, dtype=float)
-    if moved < OFTEN * len(others):
+    if not moved or moved < OFTEN * len(others):
         return None
     between = [np.interp(drift[1:-1, 0], drift[::2, 0], drift[::2, k]) for k in (1, 2)]
     uneven = np.max(np.abs(np.transpose(between) - drift[1:-1, 1:]), initial=0) > UNEVEN

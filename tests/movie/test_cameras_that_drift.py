@@ -54,3 +54,4 @@ def test_a_bubble_that_moves_before_a_background_at_rest_is_no_drift(structure, 
         shown = list(np.random.default_rng(1).normal(shown, 20.0))
     assert drift_of(shown, range(len(shown))) is None
     assert drift_of(shown[BEFORE:], range(len(RADII))) is None
+    assert drift_of(shown[:1], range(1)) is None
