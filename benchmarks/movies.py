@@ -3,6 +3,7 @@
 python benchmarks/movies.py real          needs ../shared/data
 python benchmarks/movies.py rendered 60 0 bias and coverage of 60 movies a class, from seed 0 on (and names of classes)
 python benchmarks/movies.py nasty 20 0    what trips a tracker, 20 movies a kind (nasty_movies.py; and names of kinds)
+python benchmarks/movies.py compressed 12 0 lossy video, 12 movies a codec
 python benchmarks/movies.py speed         1000 frames of 512 × 512
 """
 
@@ -14,7 +15,7 @@ import tempfile
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from itertools import groupby
+from itertools import groupby, product
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +41,7 @@ CLASSES = {
     "three flashes, 3 to 8 px apart": {},
     "three flashes, 0 to 3 px apart": {},
 }
+CODECS = [("mpeg4",), ("mjpeg",), *(("libx264", ("crf", str(crf))) for crf in (30, 23, 18))]
 FRAMES = 12  # of a movie; of ellipsoids, one a movie, fewer in more movies
 ELLIPSES = 3
 
@@ -156,6 +158,33 @@ def tell_nasty(movies: int, first: int, kinds: Iterable[str]) -> None:
     print(f"{used} frames used, {bad} ({bad / used:.2%}) beyond 5 std and 2 px; {kept / good:.1%} of good frames kept")
 
 
+def tell_compressed(movies: int, first: int) -> None:
+    """The std of z of a collapse and its rebounds, of noise of 1.5 and 4 of 150 grey levels, and the size of a file."""
+    import av
+
+    radii = 5 + 30 * np.abs(np.cos(np.arange(40) * np.pi / 26)) ** 0.7
+    with tempfile.TemporaryDirectory() as folder:
+        for (codec, *options), noise in product(CODECS, (1.5, 4.0)):
+            path = Path(folder) / f"m{'.mp4' if codec == 'libx264' else '.avi'}"
+            scores, bits = [], 0.0
+            for number in range(first, first + movies):
+                frames = list(render(radii[:, None], Scene(noise=noise), np.random.default_rng(number)))
+                with av.open(str(path), "w") as file:
+                    stream = file.add_stream(codec, rate=25, options=dict(options))
+                    stream.height, stream.width = frames[0].shape
+                    stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+                    for frame in frames:
+                        file.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="gray")))
+                    file.mux(stream.encode())
+                bits += 8 * path.stat().st_size / (len(frames) * frames[0].size * movies)
+                read = track(open_movie(path), 2).readings[Scene.before :]
+                scores += [(r.radius - R) / r.errors.std for r, R in zip(read, radii, strict=True)]
+            z = np.array(scores)[np.isfinite(scores)]
+            held = np.mean(np.abs(z) < 1.6449)
+            name = " ".join((codec, *map(" ".join, options)))
+            print(f"{name:16} noise {noise}: {bits:.2f} bit a pixel, std of z {z.std():.2f}, 90 % hold {held:.0%}")
+
+
 def tell_speed(count: int = 1000) -> None:
     import tifffile
 
@@ -184,6 +213,8 @@ if __name__ == "__main__":
         print(f"within 1 px {np.mean(size < 1):.1%}, within 2 px {np.mean(size < 2):.2%}, worst {size.max():.1f} px")
     elif what == "speed":
         tell_speed()
+    elif what == "compressed":
+        tell_compressed(*map(int, sys.argv[2:4] or ("12", "0")))
     elif what == "nasty":
         movies, first = (*map(int, sys.argv[2:4]), *(20, 0)[len(sys.argv[2:4]) :])
         tell_nasty(movies, first, sys.argv[4:] or KINDS)

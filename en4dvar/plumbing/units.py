@@ -224,7 +224,7 @@ def parse_quantity(value: str | float, unit: str, usual: str = "") -> float:
     """A quantity such as ``"0.42 kPa"`` or ``"2.5 µs"``, expressed in ``unit``.
 
     A number without unit is accepted only where ``unit`` is dimensionless. Raises :class:`UnitError`, which proposes
-    the ``usual`` unit, by default ``unit``.
+    the ``usual`` unit for numbers from 0.001 to 1000, and else ``unit``.
 
     >>> parse_quantity("0.42 kPa", "Pa"), parse_quantity("1 %", "1"), parse_quantity(3, "1")
     (420.0, 0.01, 3.0)
@@ -237,7 +237,10 @@ def parse_quantity(value: str | float, unit: str, usual: str = "") -> float:
     if len(number) > LONGEST:
         raise UnitError(f"{shown(value)}: a number of {len(number)} characters")
     if not symbol and parse_unit(unit).powers != ONE.powers:
-        raise UnitError(f"{text} has no unit; write e.g. '{text} {usual or unit}'")
+        small = (
+            usual if 1e-3 <= abs(float(number)) < 1e3 else ""
+        )  # beyond, a number is one of the unit without a prefix
+        raise UnitError(f"{text} has no unit; write e.g. '{text} {small or unit}'")
     with retold(UnitError, UnitError, f"{shown(text)}: "):
         factor = _factor(symbol or "1", unit)
     try:

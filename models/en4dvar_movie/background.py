@@ -14,6 +14,7 @@ from scipy import ndimage
 
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import DataError
+from en4dvar_movie.drifting import drift_of, shift_at
 from en4dvar_movie.fitting import fit_outline
 from en4dvar_movie.frames import Frame, Movie
 from en4dvar_movie.outline import TILE, Circle, Optics, circle_through, labelled, locate, rim
@@ -48,6 +49,8 @@ SURELY = 1.4  # variances of noise beyond which the scatter in such a square is 
 BRIGHT = 0.25  # of the contrast: how much brighter a flash is
 STEADY = 10_000  # tiles that say how bright a frame is
 CHANGED = 0.3  # share of tiles that a flash changes
+DIM, FIELD = 0.3, 95  # of the light that most pixels (per cent) have at most: what the field of view's outside has
+APERTURE = (2, 6)  # pixels beside such an outside: where the light is blurred, and where it tells that it ends there
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,7 @@ class Background:
     Where the gain is NaN nothing is looked at: writing that changes, black or saturated parts, what the user masks.
 
     ``noise`` is the std of a pixel so normalised; ``frames`` how many the level is made of, 0 where none is empty.
+    ``drift`` is that of :func:`en4dvar_movie.drifting.drift_of`.
     """
 
     level: Array
@@ -63,6 +67,17 @@ class Background:
     noise: float
     frames: int
     relative: bool = True
+    drift: Array | None = None
+
+    def behind(self, number: int) -> Background:
+        """The background as a frame shows it, where the camera drifts."""
+        if self.drift is None:
+            return self
+        down, across = shift_at(self.drift, number)
+        level, gain = (np.roll(part, (down, across), (0, 1)) for part in (self.level, self.gain))
+        gain[: max(down, 0)] = gain[:, : max(across, 0)] = np.nan
+        gain[len(gain) + min(down, 0) :] = gain[:, gain.shape[1] + min(across, 0) :] = np.nan
+        return replace(self, level=level, gain=gain)
 
     def normalised(self, frame: Frame) -> tuple[Array, Array]:
         """The image (H, W) and its tiles, without what the lamp flickers."""
@@ -102,27 +117,37 @@ def find_background(
     ------
     DataError: no frame can be read or shows a bubble.
     """
-    leading, samples = _look(movie)
+    leading, samples, numbers = _look(movie)
     first = leading[0].astype(np.float32)
     if not any(float(np.ptp(frame)) > 0 for frame in (*leading, *samples)):
         words = "black" if not np.any(first) else "white" if _is_white(leading[0]) else "of one brightness"
         raise DataError(f"{movie.path}: every frame is {words}; no bubble can be seen")
-    noise = pixel_noise(first)
-    blind = _writing(leading, noise)
+    drift = drift_of(samples, numbers)
+    unseen = np.zeros(first.shape, dtype=bool)  # at the border, of what only some frames show
+    if drift is not None:
+        leading = [np.roll(f, np.negative(shift_at(drift, n)), (0, 1)) for n, f in enumerate(leading)]
+        samples = [np.roll(f, np.negative(shift_at(drift, n)), (0, 1)) for n, f in zip(numbers, samples, strict=True)]
+        height, width = first.shape
+        (up, left), (down, right) = drift[:, 1:].min(axis=0).astype(int), drift[:, 1:].max(axis=0).astype(int)
+        unseen[max(height - down, 0) :] = unseen[:, max(width - right, 0) :] = unseen[:-up] = unseen[:, :-left] = True
+    unit = _grey_level(samples)
+    noise = pixel_noise(first, unit)
+    blind = _writing(leading, noise) | _outside(samples) | unseen
     if watched is not None:
         blind |= ~watched
-    empty = 0 if _begins_with_a_bubble(first, samples, noise, blind) else _quiet(leading, first, noise, blind)
-    level = _without_specks(leading[:empty], noise) if empty else smooth_surface(samples)
+    empty = 0 if _begins_with_a_bubble(first, samples, noise, blind, unit) else _quiet(leading, first, noise, blind)
+    level = _without_specks(leading[:empty], noise) if empty else smooth_surface(samples, blind, unit)
     if empty > 2:
-        noise = pixel_noise(np.array([f - level for f in leading[:empty]])) * float(np.sqrt(empty / (empty - 1)))
-    background = _with_sign(level, samples, noise, empty, blind)
+        steady = pixel_noise(np.array([f - level for f in leading[:empty]]), unit)
+        noise = steady * float(np.sqrt(empty / (empty - 1)))
+    background = _with_sign(level, samples, noise, empty, blind, unit)
     if empty:
         background = _refined(background, samples)
-    return background, _optics(background, samples, movie, circles)
+    return replace(background, drift=drift), _optics(background, samples, movie, circles)
 
 
-def _look(movie: Movie) -> tuple[list[Frame], list[Frame]]:
-    """The leading frames, and some along the movie: every n-th, n doubled whenever there are too many."""
+def _look(movie: Movie) -> tuple[list[Frame], list[Frame], range]:
+    """The leading frames, and some along the movie with their numbers: every n-th, n doubled where there are many."""
     leading: list[Frame] = []
     samples: list[Frame] = []
     every = 1
@@ -133,33 +158,53 @@ def _look(movie: Movie) -> tuple[list[Frame], list[Frame]]:
             samples.append(frame)
             if len(samples) == 2 * SAMPLES:
                 samples, every = samples[::2], 2 * every
-    return leading, samples
+    return leading, samples, range(0, every * len(samples), every)
 
 
-def pixel_noise(image: Image) -> float:
-    """Std of the noise of an image (H, W) or of numbers (n,): robust, of differences between neighbours."""
-    return max(1.4826 * float(np.median(np.abs(np.diff(image)))) / math.sqrt(2), 0.3)
+def _grey_level(frames: Sequence[Frame]) -> float:
+    """The step between grey levels; of frames of any floats, such as shares of the light, as if they had 8 bit."""
+    return 1.0 if frames[0].dtype.kind in "ui" else max(float(np.nanmax(np.abs(f))) for f in frames) / 255
+
+
+def pixel_noise(image: Image, unit: float = 1.0) -> float:
+    """Std of the noise of an image (H, W): robust, of differences between neighbours. ``unit``: a grey level."""
+    return max(1.4826 * float(np.median(np.abs(np.diff(image)))) / math.sqrt(2), 0.3 * unit)
+
+
+def _outside(frames: Sequence[Frame]) -> npt.NDArray[np.bool_]:
+    """The outside of a field of view (H, W), such as a round aperture: dark in two corners of the frames at least, and
+    beside it are always light and no wall that moves.
+    """
+    usual = ndimage.uniform_filter(np.median(np.array(frames, dtype=np.float32), axis=0), 5)
+    labels, _ = ndimage.label(usual < DIM * np.percentile(usual, FIELD))
+    corners = labels[[0, 0, -1, -1], [0, -1, 0, -1]]
+    dark = np.isin(labels, corners[corners > 0])
+    if np.sum(corners > 0) < 2:
+        return np.zeros_like(dark)
+    blurred, beside = (ndimage.binary_dilation(dark, iterations=n) for n in APERTURE)
+    least = np.min(np.array([ndimage.uniform_filter(f.astype(np.float32), 5) for f in frames]), axis=0)
+    steady = np.mean((least > 0.5 * usual)[beside & ~blurred] if (beside & ~blurred).any() else 0)
+    return np.asarray(blurred & (steady > 1 - LIVELY))
 
 
 def _is_white(frame: Frame) -> bool:
     return bool(frame.dtype.kind in "ui" and frame.flat[0] == np.iinfo(frame.dtype).max)
 
 
-def smooth_surface(frames: Sequence[Frame]) -> Array:
-    """A quadratic surface (H, W) through the background of frames that all hold a bubble."""
+def smooth_surface(frames: Sequence[Frame], blind: npt.NDArray[np.bool_], unit: float) -> Array:
+    """A quadratic surface (H, W) through the background of frames that all hold a bubble, where it is not ``blind``."""
     typical = np.median(np.array(frames, dtype=np.float32), axis=0)
     y, x = np.mgrid[-1 : 1 : typical.shape[0] * 1j, -1 : 1 : typical.shape[1] * 1j]
     terms = np.stack([np.ones_like(x), x, y, x * y, x * x, y * y]).reshape(6, -1)
     values = typical.ravel().astype(float)
-    border = np.ones(typical.shape, dtype=bool)
-    rim = max(2, min(typical.shape) // 10)
-    border[rim:-rim, rim:-rim] = False
-    kept = border.ravel()
+    field, rim = ~blind, max(2, min(typical.shape) // 10)
+    kept = (field & ~ndimage.minimum_filter(field, 2 * rim + 1, mode="constant")).ravel()
     for _ in range(8):
         chosen = terms * kept
         fitted = np.linalg.solve(chosen @ terms.T, chosen @ values)  # of terms within ±1, so that squares lose little
         off = values - fitted @ terms
-        kept = np.abs(off) <= 3 * max(1.4826 * float(np.median(np.abs(off[kept]))), 0.5)
+        near = np.abs(off) <= 3 * max(1.4826 * float(np.median(np.abs(off[kept]))), 0.5 * unit)
+        kept = near & field.ravel()
     return np.asarray((fitted @ terms).reshape(typical.shape).astype(np.float32))
 
 
@@ -207,10 +252,13 @@ def _one_way(frames: Sequence[Image], changes: Sequence[Image], box: tuple[slice
     return float(np.median(mixed or [0.0])) < 0.15
 
 
-def _begins_with_a_bubble(first: Image, samples: Sequence[Frame], noise: float, blind: npt.NDArray[np.bool_]) -> bool:
+def _begins_with_a_bubble(
+    first: Image, samples: Sequence[Frame], noise: float, blind: npt.NDArray[np.bool_], unit: float
+) -> bool:
     """True if the first frame differs from a smooth surface in large patches whose rims other frames show elsewhere."""
-    surface = smooth_surface([first])
-    far = np.abs(ndimage.uniform_filter(first - surface, 5)) > max(4 * noise, 0.25 * float(np.median(np.abs(surface))))
+    surface = smooth_surface([first], blind, unit)
+    usual = float(np.median(np.abs(surface[~blind])))
+    far = np.abs(ndimage.uniform_filter(first - surface, 5)) > max(4 * noise, 0.25 * usual)
     labels, sizes = labelled(far & ~blind)
     large = [n for n in range(1, len(sizes)) if sizes[n] > max(BLOB, 2e-4 * first.size) and _is_round(labels == n)]
     if not large:
@@ -259,7 +307,7 @@ def _without_specks(empty: Sequence[Frame], noise: float) -> Array:
 
 
 def _with_sign(
-    level: Array, samples: Sequence[Frame], noise: float, empty: int, blind: npt.NDArray[np.bool_]
+    level: Array, samples: Sequence[Frame], noise: float, empty: int, blind: npt.NDArray[np.bool_], unit: float
 ) -> Background:
     """Dark on bright, relative to the background; or bright on dark, as it is: by what differs most in most frames."""
     votes = [
@@ -267,11 +315,13 @@ def _with_sign(
         for d in ((_lit_as(f, level) - level)[~blind] for f in samples)
     ]
     if float(np.median([v for v in votes if abs(v) > 4 * noise] or [-1.0])) > 0:
-        full = max(float(np.median([np.percentile(f - level, 99.5) for f in samples])), 1.0)
+        full = max(float(np.median([np.percentile(f - level, 99.5) for f in samples])), unit)
         gain = np.full_like(level, -1.0 / full)
         return Background(level, np.where(blind, np.float32(np.nan), gain), noise / full, empty, relative=False)
-    smooth = ndimage.gaussian_filter(ndimage.median_filter(level, HALO), SMOOTH)  # the light itself, without dirt
-    smooth = np.maximum(smooth, max(float(np.median(smooth)) * 0.05, 1.0))
+    nearest = tuple(ndimage.distance_transform_edt(blind, return_distances=False, return_indices=True))
+    lit = ndimage.median_filter(level[nearest], HALO)  # what is not looked at tells nothing of the light beside it
+    smooth = ndimage.gaussian_filter(lit, SMOOTH)  # the light itself, without dirt
+    smooth = np.maximum(smooth, max(float(np.median(smooth)) * 0.05, unit))
     if empty:  # what stands still is in the level, and a bubble takes its share of that light
         sharp = ndimage.gaussian_filter(level, 1.0)
         full = np.iinfo(samples[0].dtype).max if samples[0].dtype.kind in "ui" else np.inf
@@ -326,7 +376,10 @@ def _optics(background: Background, samples: Sequence[Frame], movie: Movie, circ
         if outlines is not None and outlines[0].seen > 0.15 and outlines[0].contrast < 0:
             optics.append(outlines[0])
     if not optics:
-        raise DataError(f"{movie.path}: no frame shows a bubble that differs from the background")
+        raise DataError(
+            f"{movie.path}: no frame shows a bubble that differs from the background; where the frames show more than "
+            "the field about it, such as a holder or a screen, leave that out with --region or --mask"
+        )
     contrasts = np.array([o.contrast for o in optics])
     clear = np.array([o.circle.R / o.width for o in optics])
     weights = np.minimum(clear, np.percentile(clear, LARGE)) ** FULL

@@ -51,6 +51,7 @@ def look_at(
     number: int, frame: Frame, background: Background, optics: Optics, start: Circle | None = None, circles: int = 1
 ) -> Look:
     """The candidates of a frame, or the outlines near ``start`` alone."""
+    background = background.behind(number)
     image, tiles = background.normalised(frame)
     spot = _spot(tiles, background.noise / TILE)
     if start is not None:

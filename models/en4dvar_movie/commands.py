@@ -10,6 +10,8 @@ import click
 
 from en4dvar.commands.common import echo
 
+PIXELS = (1e-9, 1e-3)  # m
+
 if TYPE_CHECKING:
     from en4dvar_movie.frames import Movie
     from en4dvar_movie.table import Scale
@@ -117,7 +119,10 @@ def _scaled(
             raise click.UsageError(f"{option} must be positive")
         return value
 
-    movie = with_scale(movie, quantity(pixel, "m", "um", "--pixel"), quantity(frame_rate, "1/s", "kHz", "--frame-rate"))
+    size, rate = quantity(pixel, "m", "um", "--pixel"), quantity(frame_rate, "Hz", "kHz", "--frame-rate")
+    if size and not PIXELS[0] <= size <= PIXELS[1]:
+        raise click.UsageError(f"--pixel {pixel}: pixels of 1 nm to 1 mm are read; is the unit right?")
+    movie = with_scale(movie, size, rate)
     shutter = quantity(exposure, "s", "us", "--exposure")
     instants = parse_flashes(flashes) if flashes else (0.0,)
     between = f"the {1e6 / movie.rate:g} us between two frames"

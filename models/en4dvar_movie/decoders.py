@@ -15,10 +15,26 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from en4dvar.plumbing.errors import DataError
 
 MOST_PIXELS = 64_000_000  # of a frame
+SQUARE = 0.001  # of a pixel's side: by which the other may differ
+MOST_COLOURS = 3  # of a frame
+WITHOUT_LOSS = "High 4:4:4 Predictive"  # the profile of H.264 that may have none
+PREFIXES = {
+    "m": 1e-3,
+    "milli": 1e-3,
+    **dict.fromkeys(("u", "µ", "μ", "\\u00B5", "micro"), 1e-6),
+    "n": 1e-9,
+    "nano": 1e-9,
+}
+LENGTHS = {prefix + word: size for prefix, size in PREFIXES.items() for word in ("m", "meter", "metre")}
+LENGTHS |= {"micron": 1e-6, "microns": 1e-6, "cm": 1e-2}
+TIMES = {
+    prefix + word: size for prefix, size in {"": 1.0, **PREFIXES}.items() for word in ("s", "sec", "second", "seconds")
+}
 
 
 @dataclass(frozen=True)
@@ -26,7 +42,8 @@ class TiffAbout:
     """What a TIFF file says of itself: ``pixel`` (m) and ``rate`` (1/s) are NaN where it says nothing.
 
     ``count`` frames of ``shape`` in ``pages``; those of a ``plain`` file begin at byte ``start`` and have ``frame``
-    bytes of ``kind``. ``broken``: the directory of pages leads nowhere.
+    bytes of ``kind``. ``broken``: the directory of pages leads nowhere. Each frame has ``colours`` pages. ``notes`` are
+    why something that the file says is not used.
     """
 
     pages: int
@@ -39,6 +56,8 @@ class TiffAbout:
     pixel: float
     rate: float
     broken: bool
+    colours: int
+    notes: tuple[str, ...]
 
 
 def library(name: str) -> ModuleType:
@@ -71,9 +90,11 @@ def tiff_about(path: Path) -> Iterator[TiffAbout]:
     tifffile = library("tifffile")
     try:
         with _overheard("tifffile") as faults, tifffile.TiffFile(path) as file:
-            pages = len(file.pages)
+            pages, frames = len(file.pages), _pages(file, path)
             about = dict(file.imagej_metadata or {})
             first = file.pages[0]
+            pixel, of_pixel = _tiff_pixel(about, first.tags)
+            rate, of_rate = _tiff_rate(about)
             yield TiffAbout(
                 pages,
                 int(about.get("images", pages)),
@@ -82,29 +103,73 @@ def tiff_about(path: Path) -> Iterator[TiffAbout]:
                 first.dataoffsets[0],
                 first.nbytes,
                 bool(first.compression == 1),
-                _tiff_pixel(about, first.tags.get("XResolution")),
-                1 / float(about["finterval"]) if about.get("finterval") else float("nan"),
+                pixel,
+                rate,
                 any("invalid page offset" in fault or "circular" in fault for fault in faults),
+                frames.shape[1],
+                tuple(f"{path}: {words}" for words in (of_pixel, of_rate) if words),
             )
+    except DataError:
+        raise
     except Exception as error:  # tifffile believes what a damaged file says of itself
         raise DataError(f"{path}: cannot be read as TIFF, it is damaged: {error}") from None
 
 
 def tiff_frames(path: Path) -> Iterator[Any]:
+    """Frames; the channels of one along its last axis, three as of a coloured picture."""
     with _overheard("tifffile"), library("tifffile").TiffFile(path) as file:
-        for page in file.pages:
-            check_size(page.shape, path)
-            yield page.asarray()
+        for numbers in _pages(file, path):
+            check_size(file.pages[int(numbers[0])].shape, path)
+            planes = [file.pages[int(number)].asarray() for number in numbers]
+            dark = [np.zeros_like(planes[0])] * (MOST_COLOURS - len(planes))
+            yield np.stack([*planes, *dark], axis=-1) if len(planes) > 1 else planes[0]
 
 
-def _tiff_pixel(about: dict[str, Any], resolution: Any) -> float:
-    """Size of a pixel that ImageJ wrote, m."""
-    units = {"micron": 1e-6, "um": 1e-6, "µm": 1e-6, "\\u00B5m": 1e-6, "mm": 1e-3, "nm": 1e-9}
-    unit = units.get(str(about.get("unit", "")))
-    if unit is None or resolution is None:
-        return float("nan")
-    pixels, length = resolution.value
-    return unit * length / pixels if pixels else float("nan")
+def _pages(file: Any, path: Path) -> npt.NDArray[np.int64]:
+    """The pages (frames, colours) of each frame, by the axes that ImageJ, OME or tifffile has written.
+
+    Raises :class:`DataError` where a frame has slices in depth, or more channels than colours.
+    """
+    series = file.series[0] if file.is_imagej or file.is_ome or file.is_shaped else None
+    sizes = dict(zip(series.axes, series.shape, strict=True)) if series else {}
+    sizes = {axis: n for axis, n in sizes.items() if axis not in "YXS" and n > 1}
+    colours = sizes.get("C", 1) if len(sizes) > 1 else 1  # a stack of one axis is a movie, whatever its name
+    for axis, words in {"Z": "slices in depth", "C": "channels"}.items():
+        if {"T", "Z"} <= sizes.keys() if axis == "Z" else colours > MOST_COLOURS:
+            raise DataError(
+                f"{path}: each frame has {sizes[axis]} {words}; save the one that shows the bubble best "
+                "(in ImageJ: Image > Duplicate…)"
+            )
+    pages = np.arange(len(file.pages))
+    if colours == 1:
+        return pages[:, None]
+    if math.prod(sizes.values()) != len(pages):
+        words = "the file is damaged or cut off, or holds more than 4 GB; save the channel with most light alone"
+        raise DataError(f"{path}: the {colours} channels of its frames are not all there: {words}")
+    return np.moveaxis(pages.reshape(tuple(sizes.values())), list(sizes).index("C"), -1).reshape(-1, colours)
+
+
+def _tiff_pixel(about: dict[str, Any], tags: Any) -> tuple[float, str]:
+    """Size of a pixel that ImageJ wrote, m, or NaN and why it is not used."""
+    unit = LENGTHS.get(str(about.get("unit", "")))
+    across, down = (tags.get(name) for name in ("XResolution", "YResolution"))
+    if unit is None or across is None or not across.value[0]:
+        return float("nan"), ""
+    width, height = (unit * tag.value[1] / tag.value[0] if tag and tag.value[0] else 0 for tag in (across, down))
+    if height and abs(width - height) > SQUARE * width:
+        words = f"pixels of {1e6 * width:g} × {1e6 * height:g} um are no squares; scale its frames until they are, or "
+        return float("nan"), f"{words}give the --pixel that both sides have"
+    return width, ""
+
+
+def _tiff_rate(about: dict[str, Any]) -> tuple[float, str]:
+    """Frame rate by the interval that ImageJ wrote, 1/s, or NaN and why it is not used."""
+    interval, name = float(about.get("finterval") or 0), str(about.get("tunit") or "sec")
+    if not interval:
+        return float("nan"), ""
+    if name not in TIMES:
+        return float("nan"), f"its frames are {interval:g} {name} apart, which is no known unit of time"
+    return 1 / (interval * TIMES[name]), ""
 
 
 def image(path: Path) -> Iterator[Any]:
@@ -115,10 +180,12 @@ def image(path: Path) -> Iterator[Any]:
         yield np.asarray(opened if told else opened.convert("RGB"))  # a palette's numbers are no brightness
 
 
-def video_count(path: Path) -> Iterator[int]:
-    """How many frames the file says that it holds; 0 where it does not."""
+def video_about(path: Path) -> Iterator[tuple[int, str]]:
+    """How many frames the file says that it holds, 0 where it does not; the codec where it is one that loses light."""
     with library("av").open(str(path)) as file:
-        yield int(file.streams.video[0].frames) if file.streams.video else 0
+        stream = next(iter(file.streams.video), None)
+        lossy = stream is not None and stream.codec_context.codec.lossy and stream.profile != WITHOUT_LOSS
+        yield (stream.frames if stream else 0), (stream.codec_context.name if stream and lossy else "")
 
 
 def video_frames(path: Path) -> Iterator[Any]:

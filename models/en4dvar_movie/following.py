@@ -167,7 +167,9 @@ def _touching(bubble: Chain, others: Sequence[Chain]) -> dict[int, str]:
             c = candidate.circle
             apart = np.hypot(circles[near, 0] - c.x, circles[near, 1] - c.y) - circles[near, 2] - c.R
             if np.any(apart < TOUCH):
-                result[candidate.frame] = "two bubbles: the outline of another touches this one's"
+                result[candidate.frame] = (
+                    "two bubbles: the outline of another, or of something else as dark, touches it"
+                )
     return result
 
 

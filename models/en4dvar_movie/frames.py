@@ -19,8 +19,9 @@ import numpy.typing as npt
 from en4dvar.plumbing.decoding import Allowed, DecodeError, decoded, decoded_whole, require_plain
 from en4dvar.plumbing.errors import DataError, En4dvarError, retold
 from en4dvar.plumbing.files import open_plain
-from en4dvar.plumbing.hints import natural, no_such_file
-from en4dvar_movie.decoders import check_size, image, library, tiff_about, tiff_frames, video_count, video_frames
+from en4dvar.plumbing.hints import no_such_file
+from en4dvar_movie.decoders import check_size, image, library, tiff_about, tiff_frames, video_about, video_frames
+from en4dvar_movie.numbering import in_order
 
 Frame = npt.NDArray[Any]
 TIFF, VIDEO = (".tif", ".tiff"), (".mp4", ".avi", ".mov", ".mkv")
@@ -37,7 +38,8 @@ class Movie:
     """``open`` runs through the frames from the first; ``count`` is 0 where only reading tells.
 
     ``pixel`` (m) and ``rate`` (1/s) are what the file itself says, NaN where it says nothing. ``notes`` are what
-    reading showed that a user should know, ``damaged`` the frames of which it showed that they are not whole.
+    reading showed that a user should know, ``damaged`` the frames of which it showed that they are not whole, or not
+    there; ``within`` is the name of the file that is being read of a folder.
     """
 
     path: Path
@@ -47,6 +49,7 @@ class Movie:
     rate: float = float("nan")
     notes: list[str] = field(default_factory=list)
     damaged: set[int] = field(default_factory=set)
+    within: list[str] = field(default_factory=list)
 
     def frames(self) -> Iterator[Frame]:
         """Frames (H, W), all of one shape. Raises :class:`DataError`, which names the frame."""
@@ -60,18 +63,22 @@ class Movie:
                     words = f"{self.path}: frames are in colour; the channel with most light, {name}, is used"
                     if coloured and words not in self.notes:
                         self.notes.append(words)
-                frame = _grey(read, channel, f"{self.path}: frame {number}")
+                where = self._where(number)
+                frame = _grey(read, channel, where)
                 shape = shape or frame.shape
                 if frame.shape != shape:
-                    raise DataError(f"{self.path}: frame {number} is {_size(frame.shape)}, the first {_size(shape)}")
+                    raise DataError(f"{where} is {_size(frame.shape)}, the first {_size(shape)}")
                 yield frame
         except En4dvarError:
             raise
         except Exception as error:  # whatever the libraries stumble over in a damaged file
             words = " ".join(str(error).split()) or type(error).__name__
-            raise DataError(f"{self.path}: frame {number + 1} cannot be read: {words}") from None
+            raise DataError(f"{self._where(number + 1)} cannot be read: {words}") from None
         if number < 0:
             raise DataError(f"{self.path}: the movie holds no frame")
+
+    def _where(self, number: int) -> str:
+        return f"{self.path}: frame {number}{''.join(f' ({name})' for name in self.within)}"
 
 
 def open_movie(path: str | Path, raw: str | None = None) -> Movie:
@@ -129,14 +136,14 @@ def _size(shape: tuple[int, ...]) -> str:
 
 def _tiff(path: Path) -> Movie:
     about = decoded_whole(tiff_about, path, allowed=MOVIES)
-    start, count, shape = about.start, about.count, about.shape
+    start, count, shape, scale = about.start, about.count, about.shape, (about.pixel, about.rate, list(about.notes))
     check_size(shape, path)
     if about.pages == 1 < count and about.plain and path.stat().st_size >= start + count * about.frame:
         kind = np.dtype(about.kind)  # ImageJ's way beyond 4 GB
-        return Movie(path, lambda: _blocks(path, start, count, kind, shape), count, about.pixel, about.rate)
+        return Movie(path, lambda: _blocks(path, start, count, kind, shape), count, *scale)
     if about.pages < count or about.broken:
         raise DataError(f"{path}: the file is damaged or cut off: not all of its frames are there")
-    return Movie(path, lambda: decoded(tiff_frames, path, allowed=MOVIES), about.pages, about.pixel, about.rate)
+    return Movie(path, lambda: decoded(tiff_frames, path, allowed=MOVIES), about.pages // about.colours, *scale)
 
 
 def open_picture(path: Path) -> Any:
@@ -152,13 +159,23 @@ def _folder(path: Path) -> Movie:
     files = [p for p in path.iterdir() if p.suffix.lower() in (*TIFF, *IMAGES) and not p.name.startswith(".")]
     if not files:
         raise DataError(f"{path}: the folder holds no frame ({', '.join((*TIFF, *IMAGES))})")
-    files.sort(key=natural)
+    files, missing, notes = in_order(path, files)
+    movie = Movie(path, lambda: read(), len(files) + sum(missing), notes=notes)
 
     def read() -> Iterator[Frame]:
-        for file in files:
-            yield from _tiff(file).open() if file.suffix.lower() in TIFF else decoded(image, file, allowed=MOVIES)
+        number = 0
+        for file, gap in zip(files, missing, strict=True):
+            movie.within[:] = [file.name]
+            first = number
+            for frame in _tiff(file).open() if file.suffix.lower() in TIFF else decoded(image, file, allowed=MOVIES):
+                yield frame
+                number += 1
+            for _ in range(gap * (number - first)):  # the last one stands for those that are missing
+                movie.damaged.add(number)
+                yield frame
+                number += 1
 
-    return Movie(path, read, len(files))
+    return movie
 
 
 def _video(path: Path) -> Movie:
@@ -168,14 +185,19 @@ def _video(path: Path) -> Movie:
     def read() -> Iterator[Frame]:
         for value in decoded(video_frames, path, allowed=MOVIES):
             if isinstance(value, str):
-                notes[:] = [value]
+                notes.extend([value] * (value not in notes))
             elif isinstance(value, int):
                 damaged.add(value)
             else:
                 yield value
 
     with retold(DecodeError, DataError, f"{path}: cannot be read as a movie: "):
-        count = decoded_whole(video_count, path, allowed=MOVIES)
+        count, codec = decoded_whole(video_about, path, allowed=MOVIES)
+    if codec:
+        notes.append(
+            f"{path}: compressed with loss ({codec}): R_std does not hold what that does to whole outlines, and may be "
+            "several times too small where few bits are left; take the frames that the camera saved, if there are any"
+        )
     return Movie(path, read, count, notes=notes, damaged=damaged)
 
 
@@ -212,6 +234,7 @@ def with_scale(movie: Movie, pixel: float | None, rate: float | None) -> Movie:
     if missing:
         raise DataError(
             f"{movie.path}: the file does not state its scale, which is never guessed: add {' '.join(missing)}"
+            + "".join(f"; {note.removeprefix(f'{movie.path}: ')}" for note in movie.notes)
         )
     return replace(movie, pixel=pixel, rate=rate)
 
@@ -260,7 +283,8 @@ def _write_video(path: Path, first: Frame, others: Iterator[Frame]) -> None:
         stream = file.add_stream("libx264", rate=PLAYED)
         stream.height, stream.width = first.shape[:2]
         stream.pix_fmt = "yuv420p" if colour else "gray"
-        stream.options = {} if colour else {"qp": "0"}
+        if not colour:
+            stream.options, stream.color_range = {"qp": "0"}, 2  # of all grey levels; else they would be read stretched
         for frame in chain([first], others):
             file.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24" if colour else "gray")))
         file.mux(stream.encode())

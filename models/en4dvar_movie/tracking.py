@@ -14,6 +14,7 @@ from en4dvar.plumbing.errors import DataError
 from en4dvar_movie.background import Background, find_background
 from en4dvar_movie.candidates import Look, look_at
 from en4dvar_movie.choice import Correction
+from en4dvar_movie.drifting import shift_at
 from en4dvar_movie.flashes import in_time
 from en4dvar_movie.following import Chain, chains, doubts, reasons, target
 from en4dvar_movie.frames import Frame, Movie
@@ -84,7 +85,8 @@ def track(
 
     def look(number: int, frame: Frame) -> Look:
         if number in movie.damaged:
-            return Look(number, (), "the file is damaged here")
+            words = "the frame is missing in the folder" if movie.path.is_dir() else "the file is damaged here"
+            return Look(number, (), words)
         start = fixed[number].start if number in fixed else None
         return look_at(number, frame, background, optics, start, len(flashes))
 
@@ -101,6 +103,12 @@ def track(
         chosen, note = target(bubbles, looks, point, by_hand)
         bubbles.insert(0, bubbles.pop(chosen))
         notes = [note] * bool(note)
+    if background.drift is not None:
+        down, across = shift_at(background.drift, looks[-1].frame)
+        notes.append(
+            f"the camera drifts: the last frame shows the background {across} pixels to the right and {down} down of "
+            "where the first does; a region or mask is that of the first frame and moves with it, x and y do not"
+        )
     if point is not None and (not bubbles or bubbles[0].distance(*point)[0] > AWAY):
         raise DataError(f"{movie.path}: no bubble is seen near {point[0]:g},{point[1]:g} in any frame")
     share = exposure * movie.rate if len(flashes) == 1 else 0.0

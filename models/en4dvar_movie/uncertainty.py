@@ -1,7 +1,7 @@
 """The errors of readings: errors of each frame, from its own outline and from what neighbouring frames say.
 
 Independent part, per frame: pixel noise through the fit, times the factor by which sectors of the outline scatter more
-than pixels do (compression, jagged outlines), averaged over neighbouring frames of like sharpness.
+than pixels do (jagged outlines, a part of what compression does), averaged over neighbouring frames of like sharpness.
 
 Shape: a bubble's extent along the line of sight is not seen. Were its outline an isotropic random surface of degree 2,
 the mean radius over the sphere would differ from that over the outline by a normal error of variance a²/6, where a is

@@ -39,7 +39,11 @@ def test_sixteen_bits(tmp_path):
 def test_frames_of_a_folder_come_in_the_order_of_their_numbers(tmp_path):
     for k in (1, 2, 10):
         Image.fromarray(FRAMES[0] * 0 + k).save(tmp_path / f"²{k}.png")
-    assert read(tmp_path)[:, 0, 0].tolist() == [1, 2, 10]
+    assert read(tmp_path)[:, 0, 0].tolist() == [
+        1,
+        *[2] * 8,
+        10,
+    ]  # the last one before stands for those that are missing
 
 
 @pytest.mark.slow
@@ -157,6 +161,12 @@ def test_a_stack_of_one_page_that_announces_many(tmp_path):
     assert found.dtype.isnative
 
 
+@pytest.mark.parametrize("suffix", [".mp4", ".avi", ".mkv"])
+def test_a_grey_video_is_written_without_loss(tmp_path, suffix):
+    write_movie(tmp_path / f"m{suffix}", iter(FRAMES), 4, 1e-6, 1e5)
+    assert np.array_equal(read(tmp_path / f"m{suffix}"), FRAMES)
+
+
 def test_a_video_that_is_cut_off_says_what_is_missing_and_which_frame_is_damaged(tmp_path):
     write_movie(tmp_path / "m.avi", iter(np.tile(FRAMES, (5, 1, 1))), 20, 1e-6, 1e5)
     whole = (tmp_path / "m.avi").read_bytes()
@@ -170,6 +180,29 @@ def test_a_video_that_is_cut_off_says_what_is_missing_and_which_frame_is_damaged
         f"{tmp_path / 'cut.avi'}: the file is cut off: it says that it holds 20 frames, {there} are there"
     ]
     assert not open_movie(tmp_path / "m.avi").damaged
+
+
+@pytest.mark.parametrize(
+    ("name", "codec", "kind", "options", "told"),
+    [
+        ("m.avi", "mpeg4", "yuv420p", {}, "mpeg4"),
+        ("m.avi", "mjpeg", "yuvj420p", {}, "mjpeg"),
+        ("m.mp4", "libx264", "yuv420p", {"crf": "30"}, "h264"),
+        ("m.mp4", "libx264", "gray", {"qp": "0"}, ""),
+        ("m.mkv", "ffv1", "gray", {}, ""),
+    ],
+)
+def test_a_video_that_has_lost_light_is_told(tmp_path, name, codec, kind, options, told):
+    import av
+
+    with av.open(str(tmp_path / name), "w") as file:
+        stream = file.add_stream(codec, rate=25, options=options)
+        stream.height, stream.width, stream.pix_fmt = 32, 48, kind
+        for frame in FRAMES:
+            file.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="gray").reformat(format=kind)))
+        file.mux(stream.encode())
+    words = "".join(open_movie(tmp_path / name).notes)
+    assert f"compressed with loss ({told}): R_std" in words if told else not words
 
 
 def test_an_interlaced_movie(tmp_path):

@@ -116,6 +116,10 @@ def test_nothing_is_replaced_and_the_scale_is_asked_for(tmp_path, monkeypatch):
         (["--flashes", "0 us, 2.6 us"], "more than the 2.5 us between two frames"),
         (["--flashes", "1 us, 0 us"], "in the order of time"),
         (["--pixel", "-1 um"], "--pixel must be positive"),
+        (["--pixel", "4 m"], "--pixel 4 m: pixels of 1 nm to 1 mm are read; is the unit right?"),
+        (["--pixel", "2.76e-6"], "2.76e-6 has no unit; write e.g. '2.76e-6 m'"),
+        (["--frame-rate", "1e6"], "1e6 has no unit; write e.g. '1e6 Hz'"),
+        (["--frame-rate", "270"], "270 has no unit; write e.g. '270 kHz'"),
         (["--outlined", "seen.gif"], "seen.gif: not a movie by its suffix"),
     ],
 )

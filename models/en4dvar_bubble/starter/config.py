@@ -139,7 +139,7 @@ def _times(source: Source) -> Column | TimeStep:
         return TimeStep(Column(source.time_step or "", source.step_unit, "s"))
     if source.time_step:
         return TimeStep(value=parse_quantity(source.time_step, "s", "us"))
-    rate = None if source.rate is None else parse_quantity(source.rate, "1/s", "kHz")
+    rate = None if source.rate is None else parse_quantity(source.rate, "Hz", "kHz")
     return Column(*(source.time or ("", "s")), "s", rate=rate)
 
 

@@ -1,0 +1,63 @@
+"""Bubbles behind a round aperture, and frames of floats, whose grey levels are shares of the light."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from movies import movie_of
+
+from en4dvar.plumbing.errors import DataError
+from en4dvar_movie.scene import Scene, render
+from en4dvar_movie.tracking import track
+
+RADII = np.array([12.3, 20.0, 31.7, 35.2, 25.5, 9.1])
+
+
+def frames(seed=1, **scene):
+    return list(render(RADII[:, None], Scene(**{"noise": 2.0, "uneven": 0.0, **scene}), np.random.default_rng(seed)))
+
+
+def behind(aperture, shown, outside):
+    j, i = np.indices(shown[0].shape)
+    dark = np.hypot(i - aperture[0], j - aperture[1]) > aperture[2]
+    return [np.where(dark, np.random.default_rng(k).poisson(outside, dark.shape), f) for k, f in enumerate(shown)]
+
+
+@pytest.mark.parametrize("outside", [2, 10, 30])
+@pytest.mark.parametrize("before", [0, 3])
+@pytest.mark.parametrize("aperture", [(63.5, 63.5, 58), (60.0, 68.0, 45)])
+def test_a_bubble_is_read_behind_a_round_aperture(outside, before, aperture):
+    found = track(movie_of(behind(aperture, frames(before=before), outside)))
+    off = np.array([r.radius for r in found.readings[before:]]) - RADII
+    assert np.abs(off).max() < 0.1
+
+
+def test_a_bubble_is_read_where_an_aperture_cuts_it():
+    found = track(movie_of(behind((75.0, 75.0, 50), frames(), 10)))
+    off = np.array([r.radius for r in found.readings[3:]]) - RADII
+    assert np.abs(off).max() < 0.2
+
+
+def test_a_bright_bubble_in_the_middle_is_no_field_of_view():
+    for before in (0, 3):
+        found = track(movie_of([255 - frame for frame in frames(before=before, contrast=0.9, level=230.0)]))
+        off = np.array([r.radius for r in found.readings[before:]]) - RADII
+        assert np.abs(off).max() < 0.2
+
+
+@pytest.mark.parametrize("light", [1.0, 1e-6, 1e4])
+@pytest.mark.parametrize("before", [0, 3])
+@pytest.mark.parametrize("bright", [False, True])
+def test_frames_of_floats_are_read_as_those_of_grey_levels(light, before, bright):
+    grey = [255 - frame if bright else frame for frame in frames(before=before)]
+    radii = [
+        np.array([r.radius for r in track(movie_of(shown)).readings])
+        for shown in (grey, [(light * frame / 255).astype(np.float32) for frame in grey])
+    ]
+    np.testing.assert_allclose(*radii, atol=0.02)
+    assert np.isfinite(radii[0][before:]).all()
+
+
+def test_what_leaves_the_surround_out_is_told_where_no_bubble_is_seen():
+    with pytest.raises(DataError, match="leave that out with --region or --mask"):
+        track(movie_of(frames(contrast=0.01)))
