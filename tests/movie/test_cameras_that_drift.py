@@ -43,7 +43,7 @@ def test_radii_are_read_before_a_background_that_drifts(across, down):
     (note,) = found.notes
     told = [int(number) for number in re.findall(r"-?\d+", note)]
     np.testing.assert_allclose(told, np.multiply([across, down], len(RADII) + BEFORE - 1), atol=1)
-    x = [r.sighting.outline.circle.x for r in found.readings[BEFORE:]]
+    x = [r.outline.circle.x for r in found.readings[BEFORE:]]
     np.testing.assert_allclose(x, 52.0 + across * np.arange(len(RADII)), atol=0.2)  # of the frame, not of the scene
 
 
