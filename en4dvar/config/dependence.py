@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import numpy as np
 from pydantic import Field
@@ -227,7 +227,15 @@ def term_of_members(parameter: Parameter, values: Array, kind: str | None) -> tu
 GroupName = Annotated[str, Field(pattern=r"^[^\s\x00-\x1f\x7f][^\x00-\x1f\x7f]*$", max_length=100)]
 
 
-class PopulationSection(section_of(HyperPrior)):  # type: ignore[misc]
+if TYPE_CHECKING:
+
+    class _HyperPrior(HyperPrior, Section): ...
+
+else:
+    _HyperPrior = section_of(HyperPrior)
+
+
+class PopulationSection(_HyperPrior):
     """Mean and spread of parameters over the data sets of the run, estimated at its end."""
 
     of: Annotated[tuple[str, ...], Field(min_length=1)]

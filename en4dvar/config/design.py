@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping
 from itertools import product
 from math import prod
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -124,7 +124,15 @@ class Within(Section):
         return "; ".join(f"{text}: more than design.within.{key} = {most:g}" for key, most, text in over)
 
 
-class Design(section_of(SampleSizes)):  # type: ignore[misc]
+if TYPE_CHECKING:
+
+    class _SampleSizes(SampleSizes, Section): ...
+
+else:
+    _SampleSizes = section_of(SampleSizes)
+
+
+class Design(_SampleSizes):
     """Which experiments ``en4dvar design`` compares, and about what."""
 
     about: tuple[str, ...] = ()

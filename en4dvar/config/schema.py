@@ -286,11 +286,13 @@ def or_in_a_file(schema: dict[str, Any]) -> None:
 
 if TYPE_CHECKING:
     OnAWindow = str
+    _Settings = OfScheme
 else:
     OnAWindow = Literal[tuple(ON_A_WINDOW)]
+    _Settings = keys_of_schemes(ON_A_WINDOW, AssimilationSettings)
 
 
-class Assimilation(keys_of_schemes(ON_A_WINDOW, AssimilationSettings)):  # type: ignore[misc]
+class Assimilation(_Settings):
     """The settings of the scheme, declared at :class:`AssimilationSettings`, and how observations count."""
 
     scheme: Annotated[OnAWindow, Field(description=listed(ON_A_WINDOW), json_schema_extra=or_in_a_file)] = (

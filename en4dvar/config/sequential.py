@@ -100,7 +100,13 @@ class _Scheme(OfScheme):
     """Ensemble size N."""
 
 
-class Sequential(keys_of_schemes(ON_A_SERIES, base=_Scheme)):  # type: ignore[misc]
+if TYPE_CHECKING:
+    _OnASeries = _Scheme
+else:
+    _OnASeries = keys_of_schemes(ON_A_SERIES, base=_Scheme)
+
+
+class Sequential(_OnASeries):
     """The scheme and what it does to the ensemble."""
 
     inflation: Annotated[float, Field(gt=0)] = 1.0

@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import ClassVar, Protocol, Self, overload, runtime_checkable
+from typing import ClassVar, Protocol, Self, cast, overload, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -236,7 +236,7 @@ class ForwardModel(ABC):
     observables: tuple[Observable, ...]
     defaults: Mapping[str, float] = MappingProxyType({})
     time_unit: str = "s"
-    time_display_unit: str = _TimeUnit()  # type: ignore[assignment]
+    time_display_unit: str = cast("str", _TimeUnit())
     batch: int = 1
     compiled: bool = False
     autonomous: ClassVar[bool] = False

@@ -12,6 +12,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from pkgutil import resolve_name
+from types import GenericAlias
 from typing import Any, ClassVar, Generic, TypeVar
 
 from en4dvar.executor import Executor, ExecutorError, choose_executor, one_blas_thread
@@ -217,7 +218,8 @@ class KeptUnits(Generic[S]):
     """What is ``done`` of the units of work of a run, in the order of their ends; kept as by :meth:`Session.kept`."""
 
     def __init__(self, run: Session, file: str, fingerprint: str, kind: type[S], otherwise: str):
-        before, self.keeper = run.kept(file, fingerprint, tuple[kind, ...], otherwise)  # type: ignore[valid-type]
+        kinds: Any = GenericAlias(tuple, (kind, ...))
+        before, self.keeper = run.kept(file, fingerprint, kinds, otherwise)
         self.log = run.log
         self.done: list[S] = [*(before or ())]
 
