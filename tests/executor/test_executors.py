@@ -24,7 +24,7 @@ def problems():
     )
 
 
-@pytest.mark.parametrize("workers", [1, 2, 3])
+@pytest.mark.parametrize("workers", [1, 2, pytest.param(3, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", [ThreadsExecutor, ProcessesExecutor])
 def test_same_bits_for_any_executor(kind, workers):
     with kind(workers) as executor:
