@@ -168,12 +168,12 @@ main()
 @pytest.mark.slow
 @pytest.mark.fault("kill-commands")
 def test_a_killed_sweep_is_resumed_to_the_same_numbers(tmp_path):
-    words = ["sweep", str(CONFIGS / "agarose_03_nh.yaml"), "--trajectories", "8192", "--out"]
+    words = ["sweep", str(CONFIGS / "agarose_03_nh.yaml"), "--trajectories", "16384", "--out"]  # eight chunks
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     assert CliRunner().invoke(main, [*words, str(whole)]).exit_code == 0
     process = subprocess.run([sys.executable, "-c", DIES_AFTER_THREE_CHUNKS, *words, str(killed)], capture_output=True)
     assert process.returncode == -signal.SIGKILL
-    assert len(list(killed.glob("chunks/*.npz"))) == 3
+    assert 3 <= len(list(killed.glob("chunks/*.npz"))) < 8  # another thread may end one while it dies
     assert CliRunner().invoke(main, [*words, str(killed), "--resume"]).exit_code == 0
     assert (killed / "sweep.csv").read_bytes() == (whole / "sweep.csv").read_bytes()
 
