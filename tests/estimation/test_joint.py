@@ -132,8 +132,10 @@ def test_importance_gives_the_same_posterior_and_evidence():
 def test_more_draws_where_one_round_leaves_too_few(monkeypatch):
     problems = _experiments(kind=Vectorised, compiled=True)
     monkeypatch.setattr(members, "ENOUGH", members.DRAWS + 1)
-    found = estimate.estimate_jointly(_joint(problems), replace(SETTINGS, refine="auto", members=500), seed=3)
+    told, settings = list[str](), replace(SETTINGS, refine="auto", members=500)
+    found = estimate.estimate_jointly(_joint(problems), settings, seed=3, tell=told.append)
     assert found.members.effective > members.DRAWS
+    assert "effective draws after 2 of at most 6 rounds, 193 are wanted" in told[-1]
     assert found.log_evidence == pytest.approx(_exact(problems)[2], abs=0.15)
 
 

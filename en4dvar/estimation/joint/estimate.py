@@ -248,7 +248,7 @@ class _Estimate:
         laplace = gaussian(lowest.at, self.seed, self.settings.members)
         if self.settings.refine == "none" or not all(problem.model.cheap for problem in self.joint.experiments):
             return laplace, []
-        members = sampled(self.experiments, lowest.at, self.seed, self.settings.members)
+        members = sampled(self.experiments, lowest.at, self.seed, self.settings.members, self.tell)
         if members is not None:
             return members, []
         words = "the joint posterior is far from Gaussian, and importance sampling did not reach it"

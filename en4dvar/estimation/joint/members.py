@@ -14,7 +14,7 @@ by their phase and not by their height. The others then keep what is shared abou
 (:func:`challenger`) it is enough to look at one experiment after the other.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,7 +62,10 @@ def gaussian(at: ArrowSystem, seed: int, count: int) -> JointMembers:
     return JointMembers(at.place.border + x, own_members, np.nan, evidence)
 
 
-def sampled(experiments: Sequence[Experiment], at: ArrowSystem, seed: int, count: int) -> JointMembers | None:
+def sampled(
+    experiments: Sequence[Experiment], at: ArrowSystem, seed: int, count: int,
+    tell: Callable[[str], None] = lambda words: None,
+) -> JointMembers | None:  # fmt: skip
     """By importance, in rounds until enough are effective; None where the proposals do not reach the posterior.
 
     Each further round draws about where the rounds before it have found the posterior, which may be bent, √2 times as
@@ -70,7 +73,7 @@ def sampled(experiments: Sequence[Experiment], at: ArrowSystem, seed: int, count
     """
     stream, rounds, proposals = member_stream(seed, "joint importance"), list[list[Array]](), list[Proposal]()
     proposal = Proposal(at.place.border, at.arrow.schur)
-    for _ in range(ROUNDS):
+    for number in range(ROUNDS):
         proposals.append(proposal)
         border = proposal.drawn((DRAWS,), stream)
         log_target = -0.5 * np.sum(border**2, axis=1) - 0.5 * border.shape[1] * np.log(2 * np.pi)
@@ -86,6 +89,7 @@ def sampled(experiments: Sequence[Experiment], at: ArrowSystem, seed: int, count
             return None
         weights = shares_of(log_weights)
         effective = effective_number(weights)
+        tell(f"{effective:.0f} effective draws after {number + 1} of at most {ROUNDS} rounds, {ENOUGH:.0f} are wanted")
         if effective >= ENOUGH or not border.shape[1]:
             break
         capped = np.minimum(weights, len(weights) ** -0.5)  # Ionides 2008, J. Comput. Graph. Stat. 17, 295
