@@ -92,9 +92,9 @@ def _shares(prior: Prior, minima: Sequence[Minimum], draws: np.ndarray) -> np.nd
 
 def minima_of(case: Case) -> Sequence[Minimum]:
     """Those that count, which say to which mode a draw belongs."""
-    stages = Stages(*case, SerialExecutor(), None, None)
-    prior_run, start, descent = stages.descend()
-    found, _ = stages.searched(start, descent, prior_run)
+    stages = Stages(*case, SerialExecutor())
+    prior_run, start = stages.descend()
+    found, _ = stages.searched(start, prior_run)
     return that_count(found.minima, case.problem.prior)
 
 

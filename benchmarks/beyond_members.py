@@ -38,9 +38,9 @@ def searched(problem: InverseProblem, seed: int, above: float) -> tuple[float, i
     """J of the lowest minimum, forward runs and processor seconds, with draws where J is ``above`` so much."""
     begin = time.process_time()
     with mock.patch("en4dvar.descent.search.highest_plausible", return_value=above), one_blas_thread():
-        stages = Stages(problem, AssimilationSettings(), seed, SerialExecutor(), None, None)
-        prior_run, start, descent = stages.descend()
-        found, _ = stages.searched(start, descent, prior_run)
+        stages = Stages(problem, AssimilationSettings(), seed, SerialExecutor())
+        prior_run, start = stages.descend()
+        found, _ = stages.searched(start, prior_run)
     return found.minima[0].cost, stages.space.forward_runs, time.process_time() - begin, stages
 
 

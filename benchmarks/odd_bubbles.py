@@ -119,7 +119,7 @@ def odd(seed: int, size: int, spread: float, liquid: bool, key: str) -> Record:
         changes |= {"output.report": False, "output.directory": str(Path(name) / "run"), "population": None}
         changes |= {"assimilation.what_if": False}
         en4dvar.run_campaign(config, overrides=changes)
-        return populations(Path(name) / "run", gel, spread, seed, population.hyper)
+        return populations(Path(name) / "run", gel, spread, seed, population.part(HyperPrior))
 
 
 def populations(run_dir: Path, gel: dict[str, float], spread: float, seed: int, hyper: HyperPrior) -> Record:

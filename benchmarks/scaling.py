@@ -23,10 +23,9 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from cheap_model import write_campaign
@@ -127,9 +126,7 @@ class Stopwatch:
 
 def profile() -> list[str]:
     """One worker's time by what it is spent on, without and with the examination of the posterior's shape."""
-    config = load_config(STUDY)
-    plain = spent(config, "off")
-    whole = spent(config, "auto")
+    plain, whole = (spent(load_config(STUDY, {"assimilation.emulator": emulator})) for emulator in ("off", "auto"))
     labels = (
         "reading the data file",
         "forecast: F and H of all members",
@@ -143,9 +140,9 @@ def profile() -> list[str]:
     ]
 
 
-def spent(config: Config, emulator: Literal["off", "auto"]) -> list[float]:
+def spent(config: Config) -> list[float]:
     """Milliseconds a data set: reading, forecast, analysis and bookkeeping, making the result, writing it."""
-    work = [replace(job, settings=replace(job.settings, emulator=emulator)) for job in jobs(config)]
+    work = jobs(config)
     contents = [estimate(job).content for job in work]
     clock, rows = time.thread_time, []
     forward = (BubbleModel, "initial_states"), (SerialExecutor, "trajectories"), (Reading, "observe")

@@ -132,7 +132,7 @@ def halves(run_dir: Path, splits: int) -> None:
     config, sets = finished([run_dir], True, None)
     assert config.population is not None
     names, problems, start = config.population.of, [s.problem for s in sets], [s.white for s in sets]
-    hyper = config.population.hyper
+    hyper = config.population.part(HyperPrior)
     kept = [s.drawn for s in sets]
     drawn, left_out = sampled_sets(problems, start, config.seed, None, lambda words: print(words, flush=True), kept)
     rng, usable, z = np.random.default_rng(config.seed), sorted(drawn), []
@@ -184,7 +184,7 @@ def twins(run_dir: Path, count: int, seed: int) -> None:
     """How far bubbles that have one value are from each other, beside the measured ones."""
     config, sets = finished([run_dir], True, None)
     assert config.population is not None
-    names, hyper = config.population.of, config.population.hyper
+    names, hyper = config.population.of, config.population.part(HyperPrior)
     problems, start = [s.problem for s in sets], [s.white for s in sets]
     drawn, _ = sampled_sets(problems, start, config.seed, None, lambda words: None, [s.drawn for s in sets])
     nu = scatter("measured", drawn, problems, start, names, config.seed, hyper).posterior.nu
