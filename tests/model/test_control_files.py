@@ -72,6 +72,7 @@ def test_a_control_file_says_what_to_estimate_from_what(control):
     )
 
 
+@pytest.mark.slow
 def test_several_commands_run_in_order(control):
     """As PEST++ does: the second command turns what the first one writes; without it, or before it, nothing is read."""
     turn = "import sys; print(open('raw.out').read().replace('x', ''), end='', file=open('line.out', 'w'))"
@@ -87,6 +88,7 @@ def test_several_commands_run_in_order(control):
         en4dvar.estimate(**from_pest(control, ["line.py", "turn.py"]), progress=False, assimilation={"members": 8})
 
 
+@pytest.mark.slow
 def test_groups_of_inequalities_are_bounds(control):
     """h1 = a + b + 2 is 3.5, h2 = 2 a + b + 2 at most 4.2, far below 4.5; h3 = 3 a + b + 2 at least 4.4."""
     text = control.read_text().replace("h2 4.5 10.0 og", "h2 4.2 10.0 less_h").replace("h3 5.5 5.0 og", "h3 4.4 50 <@h")
