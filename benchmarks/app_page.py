@@ -215,6 +215,7 @@ def main(given: str, width: int = 1280) -> None:
             elif Path(given).is_file():
                 timed(page, address)
             else:
+                Path(given).mkdir(parents=True, exist_ok=True)
                 walk(page, address, Path(given))
             browser.close()
         server.terminate()
