@@ -187,7 +187,7 @@ def picture(page: Any, part: str, path: Path) -> None:
     """A part of the page, at two thirds of its size and in 64 colours: small files."""
     shot = Image.open(io.BytesIO(page.locator(part).screenshot())).convert("RGB")
     small = shot.resize((2 * shot.width // 3, 2 * shot.height // 3), Image.Resampling.LANCZOS)
-    small.quantize(64).save(path, optimize=True)
+    small.quantize(48).save(path, optimize=True)
 
 
 def main(given: str, width: int = 1280) -> None:
