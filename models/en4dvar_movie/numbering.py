@@ -74,7 +74,7 @@ def in_order(path: Path, files: Sequence[Path]) -> tuple[list[Path], list[int], 
 
 
 def _decimal(files: Sequence[Path]) -> bool:
-    """Whether a point in names is that of decimals: 0.5 before 0.75, but 1.9 before 1.10 counts within 1."""
+    """True if a point in names is that of decimals: 0.5 before 0.75, but 1.9 before 1.10 counts within 1."""
     digits = [part.split(".")[1] for file in files for part in re.findall(BROKEN, file.stem) if "." in part]
     return len({len(part) for part in digits}) == 1 or not any(part.endswith("0") for part in digits)
 

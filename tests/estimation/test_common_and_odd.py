@@ -320,7 +320,7 @@ def test_the_median_of_soft_gels_is_not_pulled_to_the_stiffest():
         alone = Following(np.zeros((1, 0)), np.zeros(1))
         low, _, high = empirical(term, (middle - 1) / 2, std / 2, alone, trial).quantiles
         inside.append(low < 2.5 < high)
-    assert np.mean(inside) > 0.82  # of 0.9; by weights 1/(s² + T²) of T² how much they differ 0.33
+    assert 0.82 < np.mean(inside) < 0.98  # of 0.9; by weights 1/(s² + T²) of T² how much they differ 0.33
 
 
 def test_a_data_set_that_tells_nothing_does_not_count():

@@ -34,7 +34,7 @@ from en4dvar.priors.prior import member_stream
 class Centre:
     """What one population says by itself: draws ``x`` (M,) of its transformed median and ``theta`` (M, c) of its common
     quantities, white; ``common`` (c,) tells these apart: equal ones are one quantity. ``x`` has a flat prior unless
-    ``pulled`` by its hyperprior; it is ``log`` times less than the logarithm of a positive parameter, 0 of others.
+    ``pulled`` by its hyperprior. ``log``: the prior standard deviation of the logarithm of a positive parameter, or 0.
     """
 
     x: Array
@@ -102,7 +102,8 @@ def drawn_together(centres: Sequence[Centre], seed: int) -> Array:
         columns.append(following.together(rest, common))
         possible &= np.isclose(following.own(columns[-1], common), rest)[:, 0]  # nothing positive is taken away whole
     together = np.hstack(columns)
-    return together if possible.all() else together[possible][stream.integers(np.sum(possible), size=count)]
+    some = 0 < np.sum(possible) < count
+    return together[possible][stream.integers(np.sum(possible), size=count)] if some else together
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,7 @@ BESIDE = 1e-3  # prior standard deviations that runs for readings that one lacks
 SMALLEST = 1e-12  # variance that every slope is taken to have
 INFORMED = 0.1  # least share of the prior's variance that the data take away, for a slope to be read from draws
 RESAMPLED = 2000  # campaigns behind the interval of the median of data sets one by one
-LEAST = 1e-3  # weight of a data set that tells nothing
+SILENT = 1e-3  # weight of a data set that tells nothing
 TAIL = 0.05  # beyond each end of that interval
 
 
@@ -313,7 +313,7 @@ def empirical(term: PriorTerm, middle: Array, std: Array, following: Following, 
 
 def median_of(middle: Array, std: Array, stream: np.random.Generator) -> tuple[float, float]:
     """The weighted median of data sets (S,), and its standard deviation."""
-    weights = np.maximum(1 - std**2, LEAST)
+    weights = np.maximum(1 - std**2, SILENT)
     chosen = stream.integers(len(middle), size=(RESAMPLED, len(middle)))
     medians = _weighted_medians(middle[chosen], weights[chosen])
     spread = max(float(medians.std()), float(np.linalg.norm(weights * std) / weights.sum()))
