@@ -279,7 +279,8 @@ def main() -> None:
     parser.add_argument("--only", default="", help="cases whose name contains this, e.g. 'L96 N=25'")
     arguments = parser.parse_args()
     for system in (L63, L96):  # compile
-        ours(warm := Case(system, 4, 1), *draw(warm, 2, 0), 0)
+        warm = Case(system, 4, 1)
+        ours(warm, *draw(warm, 2, 0), seed=0)
     print("| " + " | ".join(HEAD) + " |\n|" + "---|" * len(HEAD), flush=True)
     for case in CASES:
         if arguments.only in case.name:

@@ -19,11 +19,11 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / "tests" / "faults"), str(ROOT / "tests"), str(ROOT / "tests" / "fuzz")]
 
 import fuzz  # noqa: E402
-from children import Task, attempt  # noqa: E402
+from children import Children, Task  # noqa: E402
 from first_starts import start_together  # noqa: E402
 from fuzz_targets import TARGETS  # noqa: E402
 from killing import survive  # noqa: E402
-from many import estimate_many  # noqa: E402
+from many_sets import estimate_many  # noqa: E402
 from mat_damage import survive as survive_mats  # noqa: E402
 from run_files import make_campaign  # noqa: E402
 from soak import soak  # noqa: E402
@@ -74,7 +74,7 @@ def kills(quick: bool, seed: int) -> int:
     return total
 
 
-def disks(quick: bool) -> None:
+def disks(quick: bool, children: Children) -> None:
     """Commands that met a disk that was full or failed, and said so in words."""
     told = given = 0
     faults = [{"limit": 0}, {"fails": "fsync", "error": "EIO"}]
@@ -82,14 +82,14 @@ def disks(quick: bool) -> None:
         faults += [{"limit": n} for n in (300, 3000, 9000, 30_000, 100_000)]
         faults += [{"fails": f, "error": e} for f in ("fsync", "replace") for e in ("ENOSPC", "EDQUOT")]
     with tempfile.TemporaryDirectory() as folder:
-        quiet = prepare(Path(folder))
+        quiet = prepare(Path(folder), children)
         for fault in faults:
             tasks = []
             for number, name in enumerate(calls(quiet, "")):
                 words, before = calls(quiet, f"{folder}/out{number}")[name]
                 if name != "study" or fault == {"limit": 0}:
                     tasks.append(Task(words, before, f"{folder}/out{number}", **fault))
-            for task, found in zip(tasks, attempt(tasks, HOUR), strict=True):
+            for task, found in zip(tasks, children.attempt(tasks, HOUR), strict=True):
                 given += 1
                 if found.code:
                     assert found.code == 2, (task.words, found.told)
@@ -125,14 +125,14 @@ def main() -> None:
             f"first starts at once, same bits {start_together(Path(folder), 3 if given.quick else 20):26}", flush=True
         )
     print(f"kills survived {'in all, the same bits after each':37} {kills(given.quick, given.seed):6}")
-    disks(given.quick)
+    children = Children()
+    disks(given.quick, children)
+    children.close()
     foreign()
     sets = 200 if given.quick else 10_000
     with tempfile.TemporaryDirectory() as folder:
         early, late, first = estimate_many(Path(folder), sets, "processes")
-    print(
-        f"sets completed of one folder {sets:29}   first after {first:.1f} s, peak memory {early:.0f} MB after a tenth,"
-    )
+    print(f"sets completed of one folder {sets:29}   first after {first:.1f} s,")
     print(f"{'':60} peak memory {early:.0f} MB after a tenth, {late:.0f} MB at the end")
     for name, value in soak(200 if given.quick else 2000, 10.0, given.seed).items():
         print(f"soak: {name:55} {value}")

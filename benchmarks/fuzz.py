@@ -112,7 +112,8 @@ def fuzz(target: str, options: list[str]) -> None:
     def raw(content: bytes) -> None:
         fuzz_targets.TARGETS[target](content, folder)
 
-    atheris.Setup([sys.argv[0], *options], shape.hypothesis.fuzz_one_input if target == SHAPE else raw)
+    one_input = vars(shape)["hypothesis"].fuzz_one_input if target == SHAPE else raw
+    atheris.Setup([sys.argv[0], *options], one_input)
     atheris.Fuzz()
 
 

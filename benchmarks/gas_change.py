@@ -27,6 +27,7 @@ from en4dvar.diagnosis.withheld import Withheld, predict_withheld
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.executor import SerialExecutor
 from en4dvar.schemes.settings import AssimilationSettings
+from en4dvar_bubble.model import BubbleModel
 
 VALUES = (0.0, 0.25, 0.5, 0.6, 0.7, 0.8, 1.0)
 BEYOND = 2 / 0.1  # of the interval score of 90 % bands
@@ -41,6 +42,7 @@ def bubble(path: Path) -> Callable[[str], Record]:
         problem = problem_of((path / f"{key}.csv").read_text(), ["--law", group.law, "--medium", group.medium])
         if problem is None or problem.observations.continued is None:
             return {"reason": "no readings after the window"}
+        assert isinstance(problem.model, BubbleModel)
         within = problem.observations.values
         members = problem.prior.from_physical(assimilate(problem, AssimilationSettings(what_if=False), 1).posterior)
         found: Record = {"commit": commit()}

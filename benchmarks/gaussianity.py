@@ -168,7 +168,8 @@ def main() -> None:
     chains = fill(options.records / "mixed.jsonl", keys, chain_of, options.minutes)
     usable = {key: chain for key, chain in chains.items() if chain.get("mcmc_converged")}
     print(f"seeds {seeds.start} to {seeds.stop - 1}, {len(chains)} chains, {len(usable)} converged")
-    settings = replace(SETTINGS, linearisation=options.linearisation, step_control=options.step_control)
+    steps = {"linearisation": options.linearisation, "step_control": options.step_control}
+    settings = AssimilationSettings(refine="none", **steps)
     found = {key: judged(key, chain, settings) for key, chain in usable.items()}
     table({key: found[key] for key in sorted(found, key=lambda k: [*DESIGNS].index(k.rsplit("/", 1)[0]))})
     if options.list:

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -30,14 +29,20 @@ from en4dvar.sampling import mcmc
 from en4dvar.schemes.settings import AssimilationSettings
 
 PLAIN = "best member (plain)"
-COUNTED = AssimilationSettings(emulator="off", refine="none", what_if=False)  # without what follows the descents
+
+
+def counted(**keys: object) -> AssimilationSettings:
+    """Settings without what follows the descents."""
+    return AssimilationSettings(emulator="off", refine="none", what_if=False, **keys)
+
+
 WAYS = {
-    "prior mean": replace(COUNTED, start="prior-mean"),
-    PLAIN: replace(COUNTED, starts=1),
-    "2 starts": COUNTED,
-    "3 starts": replace(COUNTED, starts=3),
-    "8 starts": replace(COUNTED, starts=8),
-    "2 starts, Levenberg-Marquardt": replace(COUNTED, step_control="levenberg-marquardt"),
+    "prior mean": counted(start="prior-mean"),
+    PLAIN: counted(starts=1),
+    "2 starts": counted(),
+    "3 starts": counted(starts=3),
+    "8 starts": counted(starts=8),
+    "2 starts, Levenberg-Marquardt": counted(step_control="levenberg-marquardt"),
     "default": AssimilationSettings(what_if=False),
 }
 TOLERANCE = 0.1  # of J: closer ends are the same minimum
@@ -65,7 +70,7 @@ def experiment(seed: int, twin: Callable[[int], Twin]) -> Record:
 
 def reference(problem: InverseProblem, seed: int) -> Record:
     """Lowest J of twenty starts of a random ensemble, and of a Markov chain from where they end."""
-    settings = replace(COUNTED, starts=20, members=120, sampling="random")
+    settings = counted(starts=20, members=120, sampling="random")
     end = assimilate(problem, settings, 10_000 + seed)
     x = problem.prior.from_physical(end.posterior)
     chain = mcmc.sample(lambda z: log_posterior(problem, z), x[:48], seed, max_steps=CHAIN_STEPS)

@@ -94,7 +94,11 @@ def relaxing(settings: Settings) -> None:
 
 
 def both(one: Change, other: Change) -> Change:
-    return lambda settings: (one(settings), other(settings))[0]
+    def change(settings: Settings) -> None:
+        one(settings)
+        other(settings)
+
+    return change
 
 
 PHYSICS: Mapping[str, Change] = {

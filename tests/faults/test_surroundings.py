@@ -16,7 +16,7 @@ import xarray as xr
 from cheap_model import write_campaign
 from first_starts import start_together
 from growth import measured
-from many import estimate_many
+from many_sets import estimate_many
 from rows import row
 from run_files import assert_same_results, command, configuration, environment, make_campaign, run_cli
 from toy_config import csv_text, write_toy
