@@ -22,6 +22,7 @@ from en4dvar.plumbing.errors import DataError
 MOST_PIXELS = 64_000_000  # of a frame
 SQUARE = 0.001  # of a pixel's side: by which the other may differ
 MOST_COLOURS = 3  # of a frame
+CINE = "cine"  # the format of Phantom cameras
 WITHOUT_LOSS = "High 4:4:4 Predictive"  # the profile of H.264 that may have none
 PREFIXES = {
     "m": 1e-3,
@@ -180,12 +181,18 @@ def image(path: Path) -> Iterator[Any]:
         yield np.asarray(opened if told else opened.convert("RGB"))  # a palette's numbers are no brightness
 
 
-def video_about(path: Path) -> Iterator[tuple[int, str]]:
-    """How many frames the file says that it holds, 0 where it does not; the codec where it is one that loses light."""
+def video_about(path: Path) -> Iterator[tuple[int, str, float]]:
+    """How many frames the file says that it holds, 0 where it does not; the codec where it is one that loses light;
+    the rate of the camera, 1/s, which only a Phantom cine states: NaN of others, which state one to play them at.
+    """
     with library("av").open(str(path)) as file:
         stream = next(iter(file.streams.video), None)
-        lossy = stream is not None and stream.codec_context.codec.lossy and stream.profile != WITHOUT_LOSS
-        yield (stream.frames if stream else 0), (stream.codec_context.name if stream and lossy else "")
+        if stream is None:
+            yield 0, "", float("nan")
+            return
+        lossy = stream.codec_context.codec.lossy and stream.profile != WITHOUT_LOSS
+        rate = float(1 / stream.time_base) if file.format.name == CINE and stream.time_base else float("nan")
+        yield _count(file, stream), stream.codec_context.name if lossy else "", rate
 
 
 def video_frames(path: Path) -> Iterator[Any]:
@@ -195,19 +202,28 @@ def video_frames(path: Path) -> Iterator[Any]:
             raise DataError(f"{path}: holds no video")
         stream = file.streams.video[0]
         stream.thread_type = "AUTO"
-        number = -1
-        for number, frame in enumerate(file.decode(stream)):
-            if frame.interlaced_frame:
-                raise DataError(f"{path}: the movie is interlaced; save whole frames (ffmpeg -vf yadif)")
-            if frame.is_corrupt:
-                yield number
-            check_size((frame.height, frame.width), path)
-            deep = max(part.bits for part in frame.format.components) > 8
-            grey = frame.format.name.startswith("gray")
-            yield frame.to_ndarray(format=("gray16le" if deep else "gray") if grey else "rgb48le" if deep else "rgb24")
-        if number + 1 < stream.frames:
-            said = f"it says that it holds {stream.frames} frames, {number + 1} are there"
-            yield f"{path}: the file is cut off: {said}"
+        told, number = _count(file, stream), -1
+        try:
+            for number, frame in enumerate(file.decode(stream)):
+                if frame.interlaced_frame:
+                    raise DataError(f"{path}: the movie is interlaced; save whole frames (ffmpeg -vf yadif)")
+                if frame.is_corrupt:
+                    yield number
+                check_size((frame.height, frame.width), path)
+                deep = max(part.bits for part in frame.format.components) > 8
+                coloured = "rgb48le" if deep else "rgb24"
+                grey = frame.format.name.startswith("gray")
+                yield frame.to_ndarray(format=("gray16le" if deep else "gray") if grey else coloured)
+        except library("av").FFmpegError:  # of a frame that is not whole; those before it are
+            if not 0 <= number < told - 1:
+                raise
+        if number + 1 < told:
+            yield f"{path}: the file is cut off: it says that it holds {told} frames, {number + 1} are there"
+
+
+def _count(file: Any, stream: Any) -> int:
+    """How many frames a file says that it holds; 0 where it does not. A Phantom cine counts time in frames."""
+    return int((stream.duration if file.format.name == CINE else stream.frames) or 0)
 
 
 def check_size(shape: tuple[int, ...], path: Path) -> None:

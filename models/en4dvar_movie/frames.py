@@ -1,4 +1,4 @@
-"""Reading movies frame by frame: TIFF stacks, folders of pictures, mp4, avi, gif, raw files of a stated shape.
+"""Reading movies frame by frame: TIFF stacks, folders of pictures, cine, mp4, avi, gif, raw files of a stated shape.
 
 Frames are (H, W) arrays of brightness, 8 or 16 bit. Nothing is held: a movie is a way to run through its frames.
 Movies are written frame by frame as well: TIFF with its scale, or a video.
@@ -25,7 +25,7 @@ from en4dvar_movie.numbering import in_order
 
 Frame = npt.NDArray[Any]
 TIFF, VIDEO = (".tif", ".tiff"), (".mp4", ".avi", ".mov", ".mkv")
-MOVING = (*TIFF, *VIDEO, ".gif")  # which are read; a gif is not written
+MOVING = (*TIFF, *VIDEO, ".gif", ".cine")  # which are read; the last two are not written
 IMAGES = (".png", ".bmp", ".jpg", ".jpeg")
 LEAST_SIDE = 16
 PLAYED = 30  # frames a second, of a video that is written
@@ -192,13 +192,13 @@ def _video(path: Path) -> Movie:
                 yield value
 
     with retold(DecodeError, DataError, f"{path}: cannot be read as a movie: "):
-        count, codec = decoded_whole(video_about, path, allowed=MOVIES)
+        count, codec, rate = decoded_whole(video_about, path, allowed=MOVIES)
     if codec:
         notes.append(
             f"{path}: compressed with loss ({codec}): R_std does not hold what that does to whole outlines, and may be "
             "several times too small where few bits are left; take the frames that the camera saved, if there are any"
         )
-    return Movie(path, read, count, notes=notes, damaged=damaged)
+    return Movie(path, read, count, rate=rate, notes=notes, damaged=damaged)
 
 
 def _raw(path: Path, raw: str) -> Movie:
