@@ -59,12 +59,23 @@ def budget(a: Analysis, name: str) -> Mapping[str, float]:
     return dict(sorted(shares.items(), key=lambda source: -source[1]))
 
 
+def largest(shares: Mapping[str, float], members: int) -> list[str]:
+    """The largest share, and those that ``members`` do not tell from it.
+
+    A share is a squared correlation ρ², of standard error 2 |ρ| (1 − ρ²) / √N; two errors of a difference are doubt.
+    """
+    spread = {source: 2 * share**0.5 * (1 - share) / members**0.5 for source, share in shares.items()}
+    first = next(iter(shares))
+    return [s for s in shares if shares[first] - shares[s] <= 2 * np.hypot(spread[first], spread[s]) or s == first]
+
+
 def budget_words(a: Analysis, name: str) -> str:
     """The budget of a parameter in a line, and which number to know better first; "" where there is none."""
-    sources = budget(a, name)
-    named = [f"{share:.0%} {source}" for source, share in sources.items() if share >= TOLD]
-    if not named:
+    sources = {source: share for source, share in budget(a, name).items() if share >= TOLD}
+    if not sources:
         return ""
-    line = f"variance of {name}: {', '.join(named)}"
-    first = next(iter(sources))
-    return f"{line}; know {first} better first" if first in a.problem.prior.names else line
+    line = f"variance of {name}: {', '.join(f'{share:.0%} {source}' for source, share in sources.items())}"
+    first = largest(sources, int(active_members(a.posterior_failures).sum()))
+    if any(source not in a.problem.prior.names for source in first):
+        return line
+    return f"{line}; know {' or '.join(first)} better first"
