@@ -84,14 +84,16 @@ def film(kind: str, number: int) -> tuple[Array, list[Frame]]:
 
 
 def rendered(kind: str, number: int) -> tuple[Array, Array]:
-    """Errors of the radii of one rendered movie in stated std, and in pixels; NaN where a frame was not read."""
+    """Errors of the radii of one rendered movie in stated std, that of a lasting shape included, and in pixels; NaN
+    where a frame was not read."""
     truth, frames = film(kind, number)
     flashes = (0.0, 0.25, 0.5) if truth.ndim == 2 else (0.0,)
     found = track(replace(movie_of(frames), rate=1.0), flashes=flashes)
     readings = [sorted(f, key=lambda r: r.radius) for _, f in groupby(found.readings, key=lambda r: r.frame)]
     read = [f if len(f) == len(flashes) else f * len(flashes) for f in readings[Scene.before :]]
     wrong = np.array([[r.radius for r in f] for f in read]) - np.sort(truth.reshape(len(truth), -1), axis=1)
-    return (wrong / np.array([[r.errors.std for r in f] for f in read])).ravel(), wrong.ravel()
+    stated = np.array([[np.hypot(r.errors.std, r.errors.factor * r.radius) for r in f] for f in read])
+    return (wrong / stated).ravel(), wrong.ravel()
 
 
 def tell_rendered(movies: int, first: int, kinds: Iterable[str]) -> None:

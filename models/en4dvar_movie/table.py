@@ -14,9 +14,9 @@ from en4dvar_movie.tracking import Reading
 MODES = (2, 3, 4)  # whose amplitudes are columns
 SHAPE = ("eccentricity", "angle_deg", *(f"mode_{n}_um" for n in MODES), "mode_std_um")
 COLUMNS = ("frame", "t_us", "R_um", "R_std_um", "t_std_us", "x_um", "y_um", *SHAPE, "used", "reason")
-COMMON = "R_common_um"
+COMMON, SHAPED = "R_common_um", "R_shape_common"
 STEADY = 0.1  # of the exposure: where its light may be centred
-UNKNOWN = 0.05  # of the step between frames, where no exposure is given
+UNKNOWN = 0.01  # of the step between frames, where no exposure is given
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,7 @@ class Scale:
 def to_csv(readings: Sequence[Reading], scale: Scale, movie: str, command: str) -> str:
     """The table with its comment. Radii of frames that are left out stay blank, so that no reader takes them."""
     common = [r.errors.common for r in readings if r.used]
+    factor = max((r.errors.factor for r in readings if r.used), default=0.0)
     exposure = f"{1e6 * scale.exposure:g} us" if scale.exposure > 0 else "not given"
     head = [
         f"en4dvar track, version {version('en4dvar')}: {command}",
@@ -48,6 +49,11 @@ def to_csv(readings: Sequence[Reading], scale: Scale, movie: str, command: str) 
         + (f"; flashes: {', '.join(f'{1e6 * t:g} us' for t in scale.flashes)}" if len(scale.flashes) > 1 else ""),
         "R_std_um is independent from frame to frame; a pixel's size moves all radii together, the edge's level by",
         *[f"{COMMON} = {1e6 * scale.pixel * float(np.median(common or [0])):.2g}"] * bool(common),
+        *[
+            "and what a lasting shape hides along the line of sight, by a factor of which the std is",
+            f"{SHAPED} = {factor:.2g}",
+        ]
+        * (factor > 0),
     ]
     comment = "".join(f"# {' '.join(line.split())}\n" for line in head)
     return comment + csv_text([COLUMNS, *(_row(reading, scale) for reading in readings)])

@@ -8,7 +8,8 @@ the mean radius over the sphere would differ from that over the outline by a nor
 the amplitude of mode 2 (the mean of a degree-2 harmonic over a great circle has variance σ²/4, mode 2 itself the rest,
 3σ²/4 = a²/2). Two numbers tell a², so that 90 % intervals take Student's t with 2 degrees of freedom. Where a frame's
 own a does not stand out of its noise, that of neighbouring frames together may, of which one that does (a speck of
-dirt at its edge, say) counts no more than the least that would.
+dirt at its edge, say) counts no more than the least that would. What mode 2 has in common in all frames, as a share of
+the radius and with its direction, moves all radii alike by one factor; a is what is left of it.
 
 Exposure: over an exposure of length T the mean radius lies T² R̈/24 from that in its middle, R̈ as three frames show it;
 or, where the edge is blurred more than the steps to its neighbours explain, as its speed differs from theirs over half
@@ -27,9 +28,10 @@ the exposure, which has no such shift.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from en4dvar.model.state import Array
 from en4dvar_movie.outline import Optics, Outline
@@ -51,13 +53,15 @@ THRESHOLD = 0.05  # of the contrast: what the level of the edge can be off by in
 @dataclass(frozen=True)
 class Errors:
     """In pixels: the corrected ``radius``, its independent std, how far all radii move together by the edge's level;
-    ``mode_std`` is the std of A_n and B_n of a mode of the shape."""
+    ``mode_std`` is the std of A_n and B_n of a mode of the shape. ``factor`` is the std of the factor, unlike 1, by
+    which the lasting shape moves all radii."""
 
     radius: float
     std: float
     common: float
     words: str = ""
     mode_std: float = float("nan")
+    factor: float = 0.0
 
 
 NOTHING = Errors(float("nan"), float("nan"), float("nan"))
@@ -66,9 +70,10 @@ NOTHING = Errors(float("nan"), float("nan"), float("nan"))
 def errors_of(outlines: Sequence[Outline | None], optics: Optics, exposure: float = 0.0) -> list[Errors]:
     """Errors of each frame, of which the exposure takes a share; of those without an outline :data:`NOTHING`."""
     ratios, turns = _smoothed(outlines), _turns(outlines)
-    beside = _hidden(outlines, ratios) + _bent(outlines, ratios, turns, optics, exposure)
+    hidden, factor = _hidden(outlines, ratios)
+    beside = hidden + _bent(outlines, ratios, turns, optics, exposure)
     return [
-        _errors(o, ratio, variance, turned, optics) if o is not None else NOTHING
+        replace(_errors(o, ratio, variance, turned, optics), factor=factor) if o is not None else NOTHING
         for o, ratio, variance, turned in zip(outlines, ratios, beside, turns, strict=True)
     ]
 
@@ -149,15 +154,20 @@ def _errors(outline: Outline, ratio: float, hidden: float, turned: bool, optics:
     return Errors(radius, float(np.sqrt(variance)), common, words, outline.mode_std * float(np.sqrt(ratio)))
 
 
-def _hidden(outlines: Sequence[Outline | None], ratios: Array) -> Array:
-    """Variance of the radius for the extent along the line of sight (K,): of the own mode 2, or the neighbours'."""
+def _hidden(outlines: Sequence[Outline | None], ratios: Array) -> tuple[Array, float]:
+    """For the extent along the line of sight: the variance of each radius (K,), by what its own mode 2 or that of its
+    neighbours has beside the one that all frames share, and the std of the factor of all radii, by the latter.
+    """
     where = [k for k, o in enumerate(outlines) if o is not None and o.amplitude(2) >= 0 and o.mode_std > 0]
-    known = [o for k in where if (o := outlines[k]) is not None]
+    known, hidden = [o for k in where if (o := outlines[k]) is not None], np.zeros(len(outlines))
+    if not known:
+        return hidden, 0.0
     radii = np.array([o.circle.R for o in known])
     noise = 2 * np.array([o.mode_std**2 for o in known]) * ratios[where]  # mean and std of a² where there is no mode 2
     noise /= radii**2
-    excess = np.array([o.amplitude(2) ** 2 for o in known]) / radii**2 - noise
-    hidden = np.zeros(len(outlines))
+    shape = np.array([o.modes[:, 0] @ (1, 1j) for o in known]) / radii
+    lasting, factor = _lasting(shape, noise)
+    excess = np.abs(shape - lasting) ** 2 - noise
     bar = (SIGNIFICANT**2 / 2 - 1) * noise
     for n, k in enumerate(where):
         near = slice(max(0, n - NEIGHBOURS), n + NEIGHBOURS + 1)
@@ -168,4 +178,17 @@ def _hidden(outlines: Sequence[Outline | None], ratios: Array) -> Array:
         elif together > SIGNIFICANT / np.sqrt(weights.sum()):
             hidden[k] = together
         hidden[k] *= STUDENT**2 * radii[n] ** 2 / 6
-    return hidden
+    return hidden, STUDENT * factor / 6**0.5
+
+
+def _lasting(shape: npt.NDArray[np.complex128], noise: Array) -> tuple[complex, float]:
+    """The mode 2 (A + iB over R) that frames share and its amplitude; 0 where it does not stand out of their scatter.
+
+    ``shape`` (K,) with the variances ``noise`` (K,) of a frame's own.
+    """
+    shares = 1 / noise / np.sum(1 / noise)
+    mean = complex(shares @ shape)
+    of_mean = float(shares**2 @ np.maximum(np.abs(shape - mean) ** 2, noise))
+    if abs(mean) ** 2 <= SIGNIFICANT**2 / 2 * of_mean:
+        return 0.0, 0.0
+    return mean, (abs(mean) ** 2 - of_mean) ** 0.5

@@ -47,7 +47,7 @@ def test_from_the_movie_to_observations(tmp_path, monkeypatch):
     count = len(problem.observations.times)
     np.testing.assert_allclose(problem.observations.values, readings[:count, 0])
     np.testing.assert_allclose(problem.observations.noise.std, readings[:count, 1])
-    np.testing.assert_allclose(problem.observations.noise.time_std, 0.05 / RATE)
+    np.testing.assert_allclose(problem.observations.noise.time_std, 0.01 / RATE)
     (offset,) = (term for term in problem.prior.terms if term.parameter.name == "reading_offset")
     edge = 0.05 * np.sqrt(2 * np.pi) * 1.25  # px: 5 % of the contrast at the edge of this movie, 1.2 px and the pixel's
     np.testing.assert_allclose([offset.mean, offset.std], [0, 1e-6 * PIXEL * edge], atol=1e-8)

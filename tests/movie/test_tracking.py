@@ -136,6 +136,18 @@ def test_stated_errors_of_a_small_bubble_are_at_most_twice_the_real_ones():
     assert 0.5 < np.median(np.abs(scores)) / 0.674 < 1.3
 
 
+def test_what_a_lasting_shape_hides_is_one_factor_of_all_radii():
+    """Ellipsoids that keep their shape: what is not seen of them is no scatter, and their readings do not scatter."""
+    off, scatter = [], []
+    for seed in range(60, 72):
+        read = track(movie_of(frames(Scene(noise=4.0, ellipticity=0.03), seed=seed))).readings[Scene.before :]
+        relative = np.array([r.radius for r in read]) / RADII - 1
+        off.append(np.median(relative) / read[0].errors.factor)
+        scatter += list((relative - np.median(relative)) * RADII / [r.errors.std for r in read])
+    assert 0.2 < np.sqrt(np.mean(np.square(off))) < 1.5
+    assert 0.5 < np.sqrt(np.mean(np.square(scatter))) < 1.5
+
+
 def test_a_bubble_that_turns_within_the_exposure_has_an_error_to_match():
     """The largest disc of the exposure casts some shade, the smallest is where the bubble is at its middle."""
     still = np.array([34.0, 27.0, 21.0, 0.0, 21.0, 27.0, 34.0])

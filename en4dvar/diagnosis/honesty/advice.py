@@ -202,6 +202,12 @@ def _conflict(case: Case) -> str:
     z = np.abs(x - prior.mean) / prior.std
     j = int(np.argmax(z))
     factor = math.ceil(z[j] / 2)
+    if prior.names[j] == NOISE_SCALE.name and x[j] < prior.mean[j]:
+        return (
+            "state in data.error what a reading has of its own: these scatter far less than is stated. What all of "
+            "them share is no error of each, but a parameter (reading_scale, reading_offset); of a movie, give its "
+            "--exposure to en4dvar track"
+        )
     return (
         f"check units and data; if both are right, make the prior of {prior.names[j]} about {factor} times as wide "
         f"(parameters.{prior.names[j]}) and say so"

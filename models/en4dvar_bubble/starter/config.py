@@ -23,7 +23,7 @@ from en4dvar.plumbing.units import UnitError, convert, parse_quantity, parse_uni
 from en4dvar_bubble.starter.elsewhere import known
 from en4dvar_bubble.starter.grouped import grouped
 from en4dvar_bubble.starter.look import Start, usable
-from en4dvar_bubble.starter.page import TRACKED_COMMON, Source, quoted, yaml_text
+from en4dvar_bubble.starter.page import TRACKED_COMMON, TRACKED_SHAPE, Source, quoted, yaml_text
 from en4dvar_bubble.starter.proposal import Entry, Proposal, propose, with_columns
 
 _UNIT = re.compile(r"(?:[ _]*[(\[/] *|[ _])([µμ]?[A-Za-z]+) *[)\]]?$")
@@ -108,8 +108,10 @@ def propose_config(
         source = replace(source, layout=replace(layout, outliers="leave out"))
     proposal = _with_rest(proposal, readings, source.radius[1])
     if errors:
-        common = max(series.scalars.get(TRACKED_COMMON, 0.0) for series in readings.values())
-        proposal = with_columns(proposal, errors, f"{common:g} {source.radius[1]}" if common > 0 else "")
+        common, factor = (
+            max(series.scalars.get(key, 0.0) for series in readings.values()) for key in (TRACKED_COMMON, TRACKED_SHAPE)
+        )
+        proposal = with_columns(proposal, errors, f"{common:g} {source.radius[1]}" if common > 0 else "", factor)
     told = (*proposal.warnings, *odd, *doubts(source), *scales(readings, source), *_steps(readings, source), *unusable)
     proposal = replace(proposal, warnings=told)
     name = name or run_name(str(data))

@@ -55,6 +55,7 @@ class Source:
 # the table that 'en4dvar track' writes: its columns say their units
 TRACKED = Source("", ("t_us", "us"), None, ("R_um", "um"), errors=("R_std_um", "t_std_us"))
 TRACKED_COMMON = "R_common_um"  # the scalar that holds the std of what moves all radii alike
+TRACKED_SHAPE = "R_shape_common"  # and that of the factor by which a lasting shape does
 
 
 def quoted(text: str) -> str:

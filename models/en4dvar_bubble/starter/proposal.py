@@ -221,9 +221,9 @@ def starter(start: Start, law: str | None) -> Proposal:
     return Proposal(tuple(data), _model(law_name, model, None), tuple(lines), SIMPLER[start])
 
 
-def with_columns(proposal: Proposal, errors: Sequence[str], common: str) -> Proposal:
+def with_columns(proposal: Proposal, errors: Sequence[str], common: str, factor: float) -> Proposal:
     """The proposal with the errors that the data file states: columns of the std of radii and of times, and the
-    ``common`` std of what moves all radii alike, "" where the file states none."""
+    ``common`` std of what moves all radii alike, "" where the file states none; and that of a ``factor`` which does."""
     own = {
         "radius_std": Entry("  radius_std", f"{{column: {errors[0]}}}", "each reading's own"),
         "time_std": Entry("  time_std", f"{{column: {errors[1]}}}", "of the exposure"),
@@ -232,7 +232,12 @@ def with_columns(proposal: Proposal, errors: Sequence[str], common: str) -> Prop
     alike = Entry(
         "reading_offset", f"{{prior: normal, mean: 0 um, std: {common}}}", "the level of the edge, of all alike"
     )
-    return replace(proposal, data=data, parameters=(*proposal.parameters, *[alike] * bool(common)))
+    parameters = [entry for entry in proposal.parameters if not factor or entry.key != elsewhere.SCALE.key]
+    if factor:
+        std = float(f"{math.hypot(elsewhere.SCALE.log_std, factor):.2g}")
+        of_shape = f"{elsewhere.SCALE.source}; a shape that lasts hides {100 * factor:.2g} % along the line of sight"
+        parameters.append(_of_known(replace(elsewhere.SCALE, log_std=std, source=of_shape)))
+    return replace(proposal, data=data, parameters=(*parameters, *[alike] * bool(common)))
 
 
 def built(start: Start, law: str | None) -> tuple[BubbleModel, str]:
@@ -414,10 +419,11 @@ def _parameters(model: BubbleModel, look: Look, guess: Guess, top: Tops, medium:
 
 def known_elsewhere(medium: str, more: str = "") -> tuple[Entry, ...]:
     """Priors of what is known from elsewhere than from the data; ``more`` is what else stands in each."""
-    return tuple(
-        Entry(k.key, f"{{prior: lognormal, median: {k.median}, log_std: {k.log_std:g}{more}}}", k.source)
-        for k in elsewhere.known(medium)
-    )
+    return tuple(_of_known(k, more) for k in elsewhere.known(medium))
+
+
+def _of_known(k: elsewhere.Known, more: str = "") -> Entry:
+    return Entry(k.key, f"{{prior: lognormal, median: {k.median}, log_std: {k.log_std:g}{more}}}", k.source)
 
 
 def example(p: Parameter, model: BubbleModel) -> Entry:
