@@ -74,7 +74,7 @@ MOVED |= {f"en4dvar_movie.{old}": f"en4dvar_movie.{new}" for old, new in {
 }.items()}  # fmt: skip
 MOVED |= {f"en4dvar_bubble.{old}": f"en4dvar_bubble.{new}" for old, new in {
     "laws.zener": "laws.maxwell", "laws.refined": "laws.exactness", "laws.response": "battery",
-    "solver.parts": "solver.lanes",
+    "solver.parts": "solver.lanes", "solver.lookup": "solver.lanes", "solver.arrow": "solver.general",
 }.items()}  # fmt: skip
 
 # names that moved by themselves, with what they are called today

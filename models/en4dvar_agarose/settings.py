@@ -73,6 +73,11 @@ class StudyPlan:
     configs: dict[str, dict[Model, Config]]
     text: str
 
+    @property
+    def named(self) -> dict[str, Config]:
+        """The configurations by gel and model, in words."""
+        return {f"{gel}, {model}": config for gel, models in self.configs.items() for model, config in models.items()}
+
 
 def load_study(path: str | Path, overrides: dict[str, Any] | None = None) -> StudyPlan:
     """Read a study and every configuration it names; paths are relative to its folder. Raises :class:`ConfigError`."""

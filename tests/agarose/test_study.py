@@ -132,14 +132,19 @@ def test_a_file_of_the_user_is_not_taken_for_one_of_the_study(small, tmp_path, m
 def test_what_decides_the_numbers_of_a_study(tmp_path):
     shutil.copytree(CONFIGS, tmp_path / "configs")
     file = tmp_path / "configs" / "agarose_study.yaml"
-    before = identity_of(load_study(file))
+
+    def now():
+        plan = load_study(file)
+        return identity_of(plan.seed, plan.sweep, plan.named)
+
+    before = now()
     file.write_text(file.read_text().replace("name: agarose_study", "name: other # and a comment"))
-    assert identity_of(load_study(file)).difference(before, frozenset()) == ""
+    assert now().difference(before, frozenset()) == ""
     reading = tmp_path / "configs" / "data" / "agarose_twin" / "agarose_03_02.csv"
     reading.write_text(reading.read_text() + "\n")
     config = tmp_path / "configs" / "agarose_10_nh.yaml"
     config.write_text(config.read_text().replace("members: 48", "members: 49"))
-    changed = identity_of(load_study(file)).difference(before, frozenset()).splitlines()[2:]
+    changed = now().difference(before, frozenset()).splitlines()[2:]
     told = [line.partition(":")[0].replace(" ", "") for line in changed if line[0] in "+-"]
     assert told == ["-members", "+members"] + [
         f"{sign}0.3%,{model},agarose_03_02" for model in ("nh", "qs", "qlkv") for sign in "-+"

@@ -19,10 +19,9 @@ from en4dvar_bubble.laws.tabulate import GRID, VISCOUS_GRID
 from en4dvar_bubble.solver import integrate, rodas5p, rows
 from en4dvar_bubble.solver.apart import address
 from en4dvar_bubble.solver.arrays import Control, Dims, Equations, Members, Output, Scratch, Shared
-from en4dvar_bubble.solver.arrow import tiles
 from en4dvar_bubble.solver.collocation import Grid, ball, exterior
 from en4dvar_bubble.solver.fields import scratch_rows
-from en4dvar_bubble.solver.general import sums
+from en4dvar_bubble.solver.general import sums, tiles
 from en4dvar_bubble.solver.lanes import WIDTH
 from en4dvar_bubble.solver.tiles import AREA, EDGE, kept_tiles
 
