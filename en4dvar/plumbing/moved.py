@@ -73,7 +73,9 @@ MOVED |= {f"en4dvar_movie.{old}": f"en4dvar_movie.{new}" for old, new in {
     "corrections": "choice", "locate": "outline", "outlined": "page", "writing": "frames",
 }.items()}  # fmt: skip
 MOVED |= {f"en4dvar_bubble.{old}": f"en4dvar_bubble.{new}" for old, new in {
-    "laws.zener": "laws.maxwell", "laws.refined": "laws.exactness", "laws.response": "battery",
+    "laws.zener": "laws.maxwell", "laws.refined": "laws.exactness", "laws.response": "battery", "media": "medium",
+    "emission": "events", "packing": "paths", "alternatives": "model", "starter.page": "starter.config",
+    "starter.top": "starter.look", "laws.softening": "laws.kelvin_voigt", "driving.tabulated": "driving.pulses",
     "solver.parts": "solver.lanes", "solver.lookup": "solver.lanes", "solver.arrow": "solver.general",
 }.items()}  # fmt: skip
 

@@ -65,14 +65,14 @@ class StudyCheckpoints:
 
     def sweep(self, *words: str) -> Path:
         """The folder of a sweep's chunks."""
-        folder = self.directory.folder(f"{FOLDER}/{_file('sweep', *words)}")
+        folder = self.directory.folder(f"{FOLDER}/{named('sweep', *words)}")
         for partial in folder.glob(".*.tmp"):  # of a process that was killed
             partial.unlink()
         return folder
 
     def of(self, kind: type[D], compute: Callable[[], D], *words: str) -> D:
         """The dataclass kept under ``words``, or what ``compute`` gives, then kept."""
-        path = self.directory.at(f"{FOLDER}/{_file(kind.__name__, *words)}")
+        path = self.directory.at(f"{FOLDER}/{named(kind.__name__, *words)}")
         try:
             result = read_checkpoint(path, self.key, kind)
         except CheckpointError:  # damaged: computed again
@@ -100,5 +100,6 @@ def identity_of(seed: int, sweep: SweepSettings, configs: Mapping[str, Config]) 
     return Identity(yaml.safe_dump(settings, sort_keys=False, allow_unicode=True, width=120), tuple(data))
 
 
-def _file(*words: str) -> str:
+def named(*words: str) -> str:
+    """Words as part of a file's name."""
     return re.sub(r"[^A-Za-z0-9]+", "_", " ".join(words)).strip("_").lower()

@@ -7,6 +7,7 @@ import numpy as np
 from en4dvar.model.state import Array
 from en4dvar.report.chart import COLUMN, PAGE, Chart, Panel, Row, in_columns
 from en4dvar.report.svg import Captioned
+from en4dvar_agarose.checkpoints import named
 from en4dvar_agarose.fits import LEVELS, Fit, Study
 from en4dvar_agarose.paper import NAMES, QUANTITIES, Quantity, Route
 from en4dvar_bubble.model import BubbleModel
@@ -34,7 +35,7 @@ def _figures(study: Study) -> Iterator[Captioned]:
         caption = (
             f"Radius against time, {fit.gel} gel; line: best {NAMES[fit.model]} fit of the filled set (IMR sweep)."
         )
-        yield f"dimensional_{gel_key(fit.gel)}_{fit.model}", caption, dimensional(fit)
+        yield f"dimensional_{named(fit.gel)}_{fit.model}", caption, dimensional(fit)
     routes: dict[Route, str] = {"sweep": "IMR sweep", "en4dvar": "En4D-Var, ensemble means"}
     for route, words in routes.items():
         caption = f"Distributions of shear modulus, stiffening, viscosity, stress-free radius; {words}."
@@ -43,20 +44,15 @@ def _figures(study: Study) -> Iterator[Captioned]:
     for fit in (fit for fit in study.every_fit if fit.model == "qlkv"):
         members = len(fit.members("mu"))
         caption = f"Combined final ensembles of all sets, {members} members; {fit.gel} gel, general QLKV."
-        yield f"members_{gel_key(fit.gel)}", caption, combined(study, fit)
+        yield f"members_{named(fit.gel)}", caption, combined(study, fit)
         caption = f"Iterative estimates, one line a data set; {fit.gel} gel, general QLKV."
-        yield f"iterations_{gel_key(fit.gel)}", caption, iterations(fit)
+        yield f"iterations_{named(fit.gel)}", caption, iterations(fit)
     if study.populations:
         caption = "Population mean (95 % interval) by the hierarchical step and mean of the stacked ensembles"
         yield "population", f"{caption}{', with the truths' if study.truth else ''}.", population(study)
     if study.comparisons:
         caption = "Log-evidence of the quadratic over the neo-Hookean law; shaded: undecidable."
         yield "evidence", caption, evidence(study)
-
-
-def gel_key(gel: str) -> str:
-    """A gel's label as part of a file name."""
-    return "".join(c if c.isalnum() else "_" for c in gel.replace("%", "")).strip("_")
 
 
 def collapse(times: Array, radius: Array) -> tuple[float, float, float]:

@@ -62,8 +62,6 @@ def run_study(plan: StudyPlan, workers: int = 1, say: Say | None = None, keep: S
 
 @dataclass(frozen=True)
 class _Parts:
-    """The parts of a study."""
-
     plan: StudyPlan
     executor: Executor
     workers: int

@@ -89,18 +89,9 @@ def simulate(
         raise ConfigError(f"workers: at least 1, not {workers}")
     chosen = get_law(law) if isinstance(law, str) else law
     with retold(ValueError, ConfigError):
+        usual, fine = cast(Driving, driving), cast(Accuracy, accuracy)  # None and names are completed
         model = BubbleModel(
-            law=chosen,
-            gas=gas,
-            start=start,
-            driving=cast(Driving, driving),
-            reading=driving_read,
-            medium=_medium(medium),
-            radial=radial,
-            vapour=vapour,
-            medium_heat=medium_heat,
-            wall=wall,
-            accuracy=cast(Accuracy, accuracy),
+            chosen, gas, start, usual, driving_read, _medium(medium), fine, radial, vapour, medium_heat, wall=wall
         )
     model = model.with_parameters(dict(parameters or {}))
     theta = _members(model, dict(parameters or {}))

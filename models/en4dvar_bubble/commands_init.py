@@ -116,8 +116,7 @@ def init(
     from en4dvar.config.json_schema import schema_text
     from en4dvar.plumbing.errors import OutputError
     from en4dvar.plumbing.files import write_text
-    from en4dvar_bubble.starter.config import propose_config, run_name
-    from en4dvar_bubble.starter.page import SCHEMA_FILE, Source, yaml_text
+    from en4dvar_bubble.starter.config import SCHEMA_FILE, Source, propose_config, run_name, yaml_text
     from en4dvar_bubble.starter.proposal import starter
     from en4dvar_bubble.starter.summaries import propose_from_times, source_of
 
@@ -232,7 +231,7 @@ def _write_example(name: str, force: bool) -> None:
     from en4dvar.config.json_schema import schema_text
     from en4dvar.plumbing.files import write_text
     from en4dvar_bubble.examples import write_example
-    from en4dvar_bubble.starter.page import SCHEMA_FILE
+    from en4dvar_bubble.starter.config import SCHEMA_FILE
 
     file = write_example(name, Path(), force)
     write_text(Path(SCHEMA_FILE), schema_text())  # that the first line of the configuration names

@@ -25,8 +25,7 @@ from en4dvar_bubble.dynamics import R0, R_EQ, R_MAX, Gas, Heat, Start, Vapour
 from en4dvar_bubble.gas import saturated_vapour_pressure
 from en4dvar_bubble.laws import REGISTRY
 from en4dvar_bubble.laws.loading import qualified
-from en4dvar_bubble.media import KnownMedium, known_medium
-from en4dvar_bubble.medium import CONSTANT_SETS, CONSTANTS, UNITS, WATER_25C, Medium
+from en4dvar_bubble.medium import CONSTANT_SETS, CONSTANTS, UNITS, WATER_25C, KnownMedium, Medium, known_medium
 from en4dvar_bubble.numbers import ALL
 from en4dvar_bubble.solver.driver import Accuracy, AccuracyName, Radial, preset
 

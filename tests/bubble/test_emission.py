@@ -15,7 +15,7 @@ from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
 from en4dvar.schemes.settings import AssimilationSettings
 from en4dvar_bubble import Accuracy, BubbleModel, NeoHookeanKelvinVoigt
-from en4dvar_bubble.emission import OBSERVABLE, emitted
+from en4dvar_bubble.events import OBSERVABLE, emitted
 
 RELEASED = BubbleModel(law=NeoHookeanKelvinVoigt(), start="laser", gas="polytropic", accuracy=Accuracy(rtol=1e-10))
 DRIVEN = BubbleModel(law=NeoHookeanKelvinVoigt(), gas="polytropic", accuracy=Accuracy(rtol=1e-10))

@@ -8,12 +8,11 @@ from typing import Annotated, Any, ClassVar, Literal, Union, get_type_hints
 from pydantic import ConfigDict, Field, ValidationInfo, create_model, field_validator, model_validator
 
 from en4dvar.inputs.parts import Format
-from en4dvar.plumbing.described import Described
+from en4dvar.plumbing.described import Described, text_for
 from en4dvar.plumbing.errors import En4dvarError, retold
 from en4dvar.plumbing.units import Quantity, convert
 from en4dvar_bubble.driving.base import MOST_KNOTS, Driving, with_knots
-from en4dvar_bubble.driving.pulses import PULSES
-from en4dvar_bubble.driving.tabulated import from_file
+from en4dvar_bubble.driving.pulses import PULSES, from_file
 
 
 class Section(Described):
@@ -60,29 +59,22 @@ def _section(kind: str, function: Callable[..., Driving]) -> type[_Kind]:
 
 
 class _Column(Section):
-    dimension: ClassVar[str]
     name: Annotated[str, Field(min_length=1)]
     """Header of the column (CSV) or name of the field (.mat)."""
     unit: str
     """Unit of the numbers in the file; required, never guessed."""
 
-    @field_validator("unit")
-    @classmethod
-    def _unit(cls, unit: str) -> str:
-        convert(1.0, unit, cls.dimension)
-        return unit
-
 
 class TimeOfRecord(_Column):
     """Column of times; the unit is required."""
 
-    dimension = "s"
+    unit: Annotated[str, text_for(lambda unit: convert(1.0, unit, "s"))]
 
 
 class PressureOfRecord(_Column):
     """Column of pressures; the unit is required."""
 
-    dimension = "Pa"
+    unit: Annotated[str, text_for(lambda unit: convert(1.0, unit, "Pa"))]
 
 
 class Columns(Section):

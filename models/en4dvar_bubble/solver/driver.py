@@ -229,14 +229,14 @@ class Solver:
         if system.general:
             general = medium, memory, viscous, _ELASTIC_SPAN if system.strain else _VISCOUS_SPAN
         gas, reading = system.ball.rows if system.gas else _NO_ROWS, get_args(Reading).index(self.reading)
-        shared = gas, _REFINED_SPAN if halved else _ELASTIC_SPAN, pulse, driving.span
+        shared = gas, _REFINED_SPAN if halved else _ELASTIC_SPAN, pulse, driving.grid.span
         nodes, size, where, places = self._arrangement
         return Equations(nodes, size, system.dims, *shared, reading, *general, where, places)
 
     @cached_property
     def control(self) -> Control:
         """How the compiled integration chooses its steps, and when it gives a member up."""
-        accuracy, (begin, end) = self.accuracy, self.driving.span[:2]
+        accuracy, (begin, end) = self.accuracy, self.driving.grid.span[:2]
         return Control(
             breaks=self.driving.breaks,
             tolerances=self.system.tolerances(accuracy.rtol),

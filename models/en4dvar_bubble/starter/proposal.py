@@ -20,7 +20,7 @@ from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.settings import BubbleSettings
 from en4dvar_bubble.starter import elsewhere
 from en4dvar_bubble.starter.grouped import NO_GROUPS, Grouped
-from en4dvar_bubble.starter.guess import OF_GELS, Guess, first_guess
+from en4dvar_bubble.starter.guess import FAR, OF_GELS, Guess, first_guess
 from en4dvar_bubble.starter.look import Look, Start, look, typical, usable
 
 LAWS: Mapping[Start, str] = {"acoustic": "quadratic-kelvin-voigt", "laser": "neo-hookean-kelvin-voigt"}
@@ -142,7 +142,7 @@ def propose(
         believed = guess.common() if possible else Guess({}, {}, 0.0)
     elif words := _implausible(look):
         warnings.append(words)
-    elif guess.far:
+    elif guess.misfit > FAR:  # no node comes close to what was observed
         warnings.append(_unmatched(guess.unmatched, look, model))
     wall: tuple[tuple[Entry, ...], tuple[Entry, ...]] = (), ()
     slow = elsewhere.SLOW[0] < ratio < elsewhere.SLOW[1]
