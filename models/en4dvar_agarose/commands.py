@@ -44,8 +44,7 @@ def sweep(
     from en4dvar.plumbing.units import UnitError, parse_quantity
     from en4dvar.runs.progress import counted
     from en4dvar.sampling.sweep import SweepSettings, run_sweep
-    from en4dvar_agarose.checkpoints import StudyCheckpoints, identity_of
-    from en4dvar_agarose.run import earliest_reading, one_model
+    from en4dvar_agarose.run import StudyCheckpoints, earliest_reading, identity_of, one_model
     from en4dvar_agarose.tables import sweep_csv, sweep_text
 
     loaded = [Source(Path(config), data, settings).load() for config in configs]
@@ -93,9 +92,8 @@ def study(
       en4dvar study configs/agarose_study.yaml
     """
     from en4dvar.executor import available_cores
-    from en4dvar_agarose.checkpoints import StudyCheckpoints, identity_of
     from en4dvar_agarose.report import FILES, write_study
-    from en4dvar_agarose.run import run_study
+    from en4dvar_agarose.run import StudyCheckpoints, identity_of, run_study
     from en4dvar_agarose.settings import load_study
 
     plan = load_study(config, Source(Path(config), None, settings).overrides())

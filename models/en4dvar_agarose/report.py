@@ -11,11 +11,10 @@ import numpy as np
 
 from en4dvar.estimation.population import Population
 from en4dvar.model.state import Array, Parameter
-from en4dvar.plumbing.files import inside, make_folder, write_text
+from en4dvar.plumbing.files import inside, write_text
 from en4dvar.report.chart import COLUMN
 from en4dvar.report.html import render
-from en4dvar.report.paper import save_chart
-from en4dvar.report.svg import svg
+from en4dvar.report.svg import draw
 from en4dvar.results.netcdf import Group, Variable, to_bytes, variable
 from en4dvar.results.seal import SealedBytes
 from en4dvar_agarose import paper, tables
@@ -23,7 +22,6 @@ from en4dvar_agarose.figures import all_figures
 from en4dvar_agarose.fits import DECISIVE, HYPER, LEVELS, MISFIT, Fit, Study, probability, verdict
 from en4dvar_agarose.paper import LABELS, NAMES, QUANTITIES, ROUTES, Route
 
-ROUTE_KEYS: tuple[Route, ...] = ("sweep", "en4dvar")
 Cells = Iterator[list[str]]
 TABLES = tuple(f"table{number}.{suffix}" for number in (1, 2) for suffix in ("csv", "md", "tex"))
 FILES = (  # of a study; ``*`` stands for any text
@@ -34,8 +32,7 @@ FILES = (  # of a study; ``*`` stands for any text
 
 def write_study(study: Study, directory: Path) -> Path:
     """Write everything; returns the page. Raises :class:`OutputError`."""
-    figures_folder = make_folder(inside(directory, "figures"))
-    for number, route in enumerate(ROUTE_KEYS, 1):
+    for number, route in enumerate(ROUTES, 1):
         rows = tables.table(study, route)
         write_text(directory / f"table{number}.csv", tables.as_csv(study, rows, route))
         write_text(directory / f"table{number}.md", tables.as_markdown(study, rows, route))
@@ -43,16 +40,9 @@ def write_study(study: Study, directory: Path) -> Path:
     write_text(directory / "sets.csv", tables.per_set_csv(study))
     write_text(directory / "study.yaml", study.plan.text)
     study_netcdf(study).write(directory / "study.nc")
-    figures = []
-    for name, caption, chart in all_figures(study):
-        save_chart(chart, figures_folder, name)
-        wide = chart.width > 1.5 * COLUMN
-        figures.append({"name": name, "caption": caption, "svg": svg(chart, name, caption), "wide": wide})
-    return write_text(directory / "study.html", _page(study, figures))
-
-
-def _page(study: Study, figures: list[dict[str, Any]]) -> str:
-    return render(
+    note = " Synthetic twin, no measurement." if study.plan.synthetic else ""
+    figures = [(name, f"{caption}{note}", chart) for name, caption, chart in all_figures(study)]
+    page = render(
         "page.html.j2",
         "en4dvar_agarose",
         plan=study.plan,
@@ -64,7 +54,7 @@ def _page(study: Study, figures: list[dict[str, Any]]) -> str:
         members=study.every_fit[0].analyses[0].settings.members,
         sets=sum(len(study.any_fit(gel).problems) for gel in study.fits),
         findings=findings(study),
-        tables=[(tables.TITLES[route], tables.table(study, route)) for route in ROUTE_KEYS],
+        tables=[(tables.TITLES[route], tables.table(study, route)) for route in ROUTES],
         sources=tables.sources(study),
         labels=LABELS,
         disagreements=tables.disagreements(study),
@@ -77,15 +67,17 @@ def _page(study: Study, figures: list[dict[str, Any]]) -> str:
         effective=_effective(study),
         comparison=_comparison(study),
         judged=_judged(study),
-        figures=figures,
+        figures=draw(figures, folder=inside(directory, "figures")),
+        wide=[name for name, _, chart in figures if chart.width > 1.5 * COLUMN],
     )
+    return write_text(directory / "study.html", page)
 
 
 def findings(study: Study) -> list[str]:
     """The paper's qualitative findings, in numbers of this study."""
     sentences = []
     for gel, models in study.fits.items():
-        for route in ROUTE_KEYS:
+        for route in ROUTES:
             if {"nh", "qlkv"} <= set(models):
                 nh, general = (models[m].summary(route, "G")[0] for m in ("nh", "qlkv"))
                 mu = {m: models[m].summary(route, "mu")[0] for m in models}
@@ -95,7 +87,7 @@ def findings(study: Study) -> list[str]:
                     f"quadratic law; μ hardly depends on the model ({viscosities} Pa s)."
                 )
     sentences += [words_of for gel in study.fits if (words_of := _apparent_modulus(study, gel))]
-    for route in ROUTE_KEYS:
+    for route in ROUTES:
         each = {m: [fit.nrmse(route) for fit in study.every_fit if fit.model == m] for m in NAMES}
         scores = {m: np.concatenate(values) for m, values in each.items() if values}
         words = ", ".join(f"{LABELS[m]} {v.min():.3f} to {v.max():.3f}, mean {v.mean():.3f}" for m, v in scores.items())

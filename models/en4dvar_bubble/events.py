@@ -104,21 +104,6 @@ def _numbered(name: str, k: int) -> str:
     return name if k == 1 else f"{name}_{k}"
 
 
-OF_WHOLE["turning points"] = events
-OBSERVABLES = (
-    _observable("largest_radius", r"$R_\mathrm{max}$", "largest radius", "radius", 0),
-    *(
-        _observable(_numbered("collapse_time", k), f"$t_{{c{k}}}$", f"time of collapse {k}", "time", 2 * k - 1)
-        for k in range(1, COLLAPSES + 1)
-    ),
-    *(
-        _observable(_numbered("rebound_radius", k), f"$R_{{r{k}}}$", f"height of rebound {k}", "radius", 2 * k)
-        for k in range(1, COLLAPSES)
-    ),
-    _observable("period", "$T$", "time from first to second collapse", "time", 3, since=1),
-)
-
-
 def emitted(paths: Paths) -> Array:
     """(N, K) Pa at the model's hydrophone, at the instants at which it arrives there; the paths are run again, at the
     instants (s) when it was sent. Raises ValueError: they do not start where the model does.
@@ -130,28 +115,27 @@ def emitted(paths: Paths) -> Array:
     if model.start == "acoustic":  # at rest before time zero
         sent = np.maximum(sent, 0.0)
     run = model.integrate(paths.initial, sent)
-    medium, R, Rdot = run.medium(1), run["R"], run["Rdot"]
-    excess = run["p_b"] - 2 * medium.S / R + run["S"] - medium.p_inf - _driving(run)
-    nearby = 1 + R * np.reshape(model.image(model.parameter_values(run.initial)), (-1, 1))  # the image's pressure
+    medium, R, Rdot, own = run.medium(1), run["R"], run["Rdot"], model.parameter_values(run.initial)
+    driven = model.driving.of_each(sent + (0.0 if model.reading == "instantaneous" else R / medium.c), own)
+    excess = run["p_b"] - 2 * medium.S / R + run["S"] - medium.p_inf - driven
+    nearby = 1 + R * np.reshape(model.image(own), (-1, 1))  # the image's pressure
     source = R * (excess + 0.5 * medium.rho * Rdot**2) / nearby
     return np.where((run.solution.status != 0)[:, None], np.nan, source / model.hydrophone)
 
 
-OBSERVABLE = Observable(
-    "acoustic_pressure",
-    "Pa",
-    OfPath("pressure sent out"),
-    r"$p_\mathrm{ac}$",
-    "kPa",
-    "pressure that the bubble sends out",
+SENT = "pressure that the bubble sends out"
+HEARD = Observable("acoustic_pressure", "Pa", OfPath(SENT), r"$p_\mathrm{ac}$", "kPa", SENT)
+OF_WHOLE.update({"turning points": events, SENT: emitted})
+OBSERVABLES = (
+    _observable("largest_radius", r"$R_\mathrm{max}$", "largest radius", "radius", 0),
+    *(
+        _observable(_numbered("collapse_time", k), f"$t_{{c{k}}}$", f"time of collapse {k}", "time", 2 * k - 1)
+        for k in range(1, COLLAPSES + 1)
+    ),
+    *(
+        _observable(_numbered("rebound_radius", k), f"$R_{{r{k}}}$", f"height of rebound {k}", "radius", 2 * k)
+        for k in range(1, COLLAPSES)
+    ),
+    _observable("period", "$T$", "time from first to second collapse", "time", 3, since=1),
+    HEARD,
 )
-OF_WHOLE["pressure sent out"] = emitted
-
-
-def _driving(run: Paths) -> Array:
-    """p_f in Pa at the bubble, (N, K), as the equation of motion reads it; 0 where there is none."""
-    model: Any = run.model
-    if model.driving.silent:
-        return np.zeros(1)
-    when = run.times + (0.0 if model.reading == "instantaneous" else run["R"] / run.medium(1).c)
-    return np.asarray(model.driving.of_each(when, model.parameter_values(run.initial)))

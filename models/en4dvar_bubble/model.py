@@ -32,7 +32,7 @@ from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution
 from en4dvar_bubble.collapse import doubts
 from en4dvar_bubble.dynamics import MACH_LIMITS, Dynamics, Wall
-from en4dvar_bubble.events import OBSERVABLE, OBSERVABLES
+from en4dvar_bubble.events import OBSERVABLES
 from en4dvar_bubble.gas import saturated_vapour_pressure
 from en4dvar_bubble.laws import get_law
 from en4dvar_bubble.laws.tabulate import GRID, ends
@@ -58,17 +58,8 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
     batch = 8
     compiled = True
     observables = (
-        Observable(
-            "radius",
-            "m",
-            StateField("R", rate_of="Rdot"),
-            symbol="R",
-            display_unit="um",
-            label="bubble radius",
-            positive=True,
-        ),
+        Observable("radius", "m", StateField("R", rate_of="Rdot"), "R", "um", "bubble radius", positive=True),
         *OBSERVABLES,
-        OBSERVABLE,
     )
 
     known_by = MappingProxyType({"medium": ("rho", "c")})

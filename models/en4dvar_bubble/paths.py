@@ -47,6 +47,11 @@ class Paths(Batch):
     _fields: dict[str, Any] = field(default_factory=dict)
 
     @property
+    def raw(self) -> Array:
+        """(N, K, n) of the solver."""
+        return self.solution.states
+
+    @property
     def whole(self) -> bool:  # type: ignore[override]
         """True if no member failed."""
         return not self.solution.status.any()
@@ -68,8 +73,8 @@ class Paths(Batch):
             return self.failure(name) if self.solution.status[name] else BubbleTrajectory(self, name)
         if name not in self._fields:
             estimated = name in {p.name for p in self.model.parameters}
-            compute: Any = OF_WHOLE.get(name) or getattr(type(self), f"_{name}", None)
-            self._fields[name] = self._constant(name) if estimated or compute is None else compute(self)
+            compute = None if estimated else OF_WHOLE.get(name)
+            self._fields[name] = compute(self) if compute else self._constant(name)
         return self._fields[name]
 
     def failure(self, member: int) -> Failure:
@@ -110,51 +115,23 @@ class Paths(Batch):
     def _constant(self, name: str) -> Array:
         return np.broadcast_to(self.initial[:, self.model.layout[name].start, None], self.times.shape)
 
-    def _R(self) -> Array:
-        return np.exp(self.solution.states[:, :, -1]) * 1e-6
-
-    def _Rdot(self) -> Array:
-        radius: Array = self["R"]
-        return radius * self.solution.states[:, :, -2] * 1e6
-
-    def _strain_rate(self) -> Array:
-        return np.abs(self.solution.states[:, :, -2]) * 1e6
-
-    def _stretch(self) -> Array:
-        return np.exp(self.solution.states[:, :, -1] - self.par[:, None, rows.LOG_R0])
-
     def _theta(self) -> Array:
         """Temperature of the gas over that far away."""
         system = self.model.system
-        tau = self.solution.states[:, :, : system.gas]
+        tau = self.raw[:, :, : system.gas]
         if system.wall:
-            tau = np.concatenate([tau, self.solution.states[:, :, system.wall_row, None]], axis=2)
+            tau = np.concatenate([tau, self.raw[:, :, system.wall_row, None]], axis=2)
         return from_kirchhoff(tau, self.medium(2))
-
-    def _T(self) -> Array:
-        theta: Array = self[THETA]
-        return theta * self.medium(2).T_inf
 
     def _chi(self) -> Array:
         system = self.model.system
-        gas = self.solution.states[:, :, system.gas : system.first_medium]
+        gas = self.raw[:, :, system.gas : system.first_medium]
         if system.kinetic:
-            gas = np.concatenate([gas, self.solution.states[:, :, system.first_memory - 1, None]], axis=2)
+            gas = np.concatenate([gas, self.raw[:, :, system.first_memory - 1, None]], axis=2)
         return 1 - gas
 
-    def _C(self) -> Array:
-        return mass_fraction(self[MOLE_FRACTION], self.medium(2))
-
-    def _T_m(self) -> Array:
-        system = self.model.system
-        return (1 + self.solution.states[:, :, system.first_medium : system.wall_row]) * self.medium(2).T_inf
-
-    def _Z(self) -> Array:
-        return self.solution.states[:, :, self.model.system.first_memory : -2] * self.medium(2).rho
-
     def _p_b(self) -> Array:
-        medium, system = self.medium(1), self.model.system
-        log_R = self.solution.states[:, :, -1]
+        medium, system, log_R = self.medium(1), self.model.system, self.raw[:, :, -1]
         gas = self.par[:, None, rows.LOG_GAS]
         if not system.gas:
             return np.asarray(np.exp(gas - 3 * self.model.exponent(medium) * log_R) * medium.rho + medium.p_v)
@@ -162,22 +139,36 @@ class Paths(Batch):
         return np.asarray((np.exp(gas - 3 * log_R) * medium.rho + outside) / total + medium.p_v)
 
     def _S(self) -> Array:
-        system, rho = self.model.system, self.medium(1).rho
-        V = self.solution.states[:, :, -2]
-        log_stretch = self.solution.states[:, :, -1] - self.par[:, None, rows.LOG_R0]
+        system, rho, V = self.model.system, self.medium(1).rho, self.raw[:, :, -2]
+        law, stretch = self.model.law, OF_WHOLE["stretch"](self)  # a law may have a parameter of that name
         values = self.model.law_values(self.model.parameter_values(self.initial))
-        stress = self.model.law.elastic_stress(np.exp(log_stretch), values) / rho
+        stress = law.elastic_stress(stretch, values) / rho
         if system.memory:
-            stress = stress + self.solution.states[:, :, system.first_memory : -2].sum(axis=2)
+            stress = stress + self.raw[:, :, system.first_memory : -2].sum(axis=2)
         if system.shear or system.strain:
-            nu = self.model.law.mean_viscosity(np.abs(V) * 1e6, values, np.exp(log_stretch)) / rho * 1e6
+            nu = law.mean_viscosity(np.abs(V) * 1e6, values, stretch) / rho * 1e6
         else:
             nu = self.par[:, None, rows.VISCOSITY]
         return np.asarray((stress - 4 * nu * V) * rho)
 
 
-OF_WHOLE: dict[str, Callable[[Paths], Any]] = {THETA: Paths._theta, MOLE_FRACTION: Paths._chi}
-"""What is computed once from the paths as a whole, by words, which no parameter has for its name."""
+OF_WHOLE: dict[str, Callable[[Paths], Any]] = {
+    "R": lambda p: np.exp(p.raw[:, :, -1]) * 1e-6,
+    "Rdot": lambda p: p["R"] * p.raw[:, :, -2] * 1e6,
+    "strain_rate": lambda p: np.abs(p.raw[:, :, -2]) * 1e6,
+    "stretch": lambda p: np.exp(p.raw[:, :, -1] - p.par[:, None, rows.LOG_R0]),
+    THETA: Paths._theta,
+    MOLE_FRACTION: Paths._chi,
+    "T": lambda p: p[THETA] * p.medium(2).T_inf,
+    "C": lambda p: mass_fraction(p[MOLE_FRACTION], p.medium(2)),
+    "T_m": lambda p: (1 + p.raw[:, :, p.model.system.first_medium : p.model.system.wall_row]) * p.medium(2).T_inf,
+    "Z": lambda p: p.raw[:, :, p.model.system.first_memory : -2] * p.medium(2).rho,
+    "p_b": Paths._p_b,
+    "S": Paths._S,
+}
+"""What is computed once from the paths as a whole: fields of the state, and by words, which no parameter has for its
+name, what else is read.
+"""
 
 
 @dataclass(frozen=True)

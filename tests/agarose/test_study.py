@@ -19,12 +19,11 @@ from run_files import assert_same_results, command, environment, resumed_until_d
 
 from en4dvar.plumbing.errors import ConfigError, OutputError
 from en4dvar_agarose import report, tables
-from en4dvar_agarose.checkpoints import identity_of
 from en4dvar_agarose.commands import study as study_command
 from en4dvar_agarose.figures import all_figures, collapse
 from en4dvar_agarose.fits import OneGel, probability, verdict
 from en4dvar_agarose.paper import QUANTITIES, TABLE_1, TABLE_2
-from en4dvar_agarose.run import COMPARED, _Parts, run_study
+from en4dvar_agarose.run import COMPARED, _Parts, identity_of, run_study
 from en4dvar_agarose.settings import load_study
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"

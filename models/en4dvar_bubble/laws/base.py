@@ -124,8 +124,7 @@ class ConstitutiveLaw:
     @property
     def memory_count(self) -> int:
         """Number of memory variables."""
-        has_memory = type(self).memory is not ConstitutiveLaw.memory
-        return len(self.memory(columns(self.example_values()))) if has_memory else 0
+        return len(self.memory(columns(self.example_values())))
 
     @property
     def sharp(self) -> bool:

@@ -29,12 +29,7 @@ def check_law(kind: Any, name: str) -> ConstitutiveLaw:
         raise ConfigError(f"{name}: not a subclass of en4dvar_bubble.ConstitutiveLaw")
     _check_elastic(kind, name)
     _check_parameters(kind, name)
-    try:
-        law = kind()
-    except TypeError as error:
-        raise ConfigError(f"{name}: cannot be created without arguments: {error}") from error
-    except BaseException as error:
-        raise ConfigError(f"{name}: cannot be created: {reason_of(error)}") from error
+    law: ConstitutiveLaw = _run(kind, f"{name}: cannot be created without arguments")
     _probe(law, name)
     return law
 

@@ -23,14 +23,13 @@ from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.files import expanded
 from en4dvar.plumbing.units import UnitError, convert, parse_quantity, parse_unit
 from en4dvar_bubble.starter.elsewhere import known
-from en4dvar_bubble.starter.grouped import grouped
+from en4dvar_bubble.starter.grouped import grouped, parted
 from en4dvar_bubble.starter.look import Start, usable
 from en4dvar_bubble.starter.proposal import Entry, Proposal, propose, with_columns
 
 SCHEMA_FILE = "en4dvar.schema.json"
 _PLAIN = re.compile(r"[A-Za-z_./][\w ./*-]*[\w./*]|[A-Za-z_]")
 _WORDS = ("true", "false", "null", "yes", "no", "on", "off")
-_UNIT = re.compile(r"(?:[ _]*[(\[/] *|[ _])([µμ]?[A-Za-z]+) *[)\]]?$")
 FRAMES = re.compile(r"(?i)(frame|bild|image|index|#|n$|nr).*")
 _DIAMETER = re.compile(r"(?i)(d|diam\w*|durchmesser)([ _(\[].*)?$")
 _REST = re.compile(r"(?i)(.*\.)?r_?eq")
@@ -165,23 +164,11 @@ class Proposed:
 
 
 def propose_config(
-    data: str | Path,
-    *,
-    radius: tuple[str, str],
-    time: tuple[str, str] | None = None,
-    time_step: str | None = None,
-    layout: Layout = ANY,
-    start: Start | None = None,
-    law: str | None = None,
-    folder: str | Path = ".",
-    name: str | None = None,
-    errors: tuple[str, ...] = (),
-    command: str = "en4dvar_bubble.starter.propose_config",
-    step_unit: str | None = None,
-    rate: str | None = None,
-    medium: str = "gel",
-    groups: str | None = None,
-) -> Proposed:
+    data: str | Path, *, radius: tuple[str, str], time: tuple[str, str] | None = None, time_step: str | None = None,
+    layout: Layout = ANY, start: Start | None = None, law: str | None = None, folder: str | Path = ".",
+    name: str | None = None, errors: tuple[str, ...] = (), command: str = "en4dvar_bubble.starter.propose_config",
+    step_unit: str | None = None, rate: str | None = None, medium: str = "gel", groups: str | None = None,
+) -> Proposed:  # fmt: skip
     """A commented configuration for radius histories that loads and whose data can be read.
 
     Parameters
@@ -346,9 +333,9 @@ def doubts(source: Source) -> list[str]:
 
 def unit_in(name: str | None, kind: str) -> str | None:
     """The unit of such a kind that a column's name ends in, as ``t_us``, ``R [um]``; None where it names none."""
-    ending = _UNIT.search((name or "").rpartition(".")[2])
+    ending = parted((name or "").rpartition(".")[2])[1]
     try:
-        return ending[1] if ending and convert(1.0, ending[1], kind) else None
+        return ending if ending and convert(1.0, ending, kind) else None
     except UnitError:
         return None
 
@@ -356,7 +343,7 @@ def unit_in(name: str | None, kind: str) -> str | None:
 def without_unit(name: str) -> str:
     """A column's name without what :func:`unit_in` reads."""
     last = name.rpartition(".")[2]
-    return _UNIT.sub("", last) if unit_in(name, "m") else last
+    return parted(last)[0] if unit_in(name, "m") else last
 
 
 def path_from(folder: Path, data: str) -> str:

@@ -185,7 +185,7 @@ def look(times: Array, radius: Array, start: Start | None = None) -> Look:
     peak = lobe(times, radius)
     highest = top(times, radius, scatter if np.isfinite(scatter) else UNKNOWN * float(radius.max()))
     largest = highest.reading
-    prominence, after = _minima(radius[largest:], scatter)
+    prominence, n_minima = _minima(radius[largest:], scatter)
     rebound = second_maximum(radius)
     begins = _begins(radius, largest)
     first = float(radius[begins] / radius[largest])
@@ -199,22 +199,11 @@ def look(times: Array, radius: Array, start: Start | None = None) -> Look:
             f"the first {begins} readings are small beside the bubble, which appears at {when}: ultrasound makes it "
             f"grow from there; leave out what is before (data.since: '{when}')"
         )
+    step, descent = float(np.median(np.diff(times))), _end_of_descent(times, radius)
     return Look(
-        begin=float(times[0]),
-        lobe=peak,
-        top=highest,
-        step=float(np.median(np.diff(times))),
-        noise=scatter,
-        rebound=rebound,
-        rest=rest,
-        drift=drift,
-        n_minima=after,
-        prominence=prominence,
-        descent=_end_of_descent(times, radius),
-        start=chosen,
-        reason=reason,
-        clear=clear,
-    )
+        float(times[0]), peak, highest, step, scatter, rebound, rest, drift, n_minima, prominence, descent, chosen,
+        reason, clear,
+    )  # fmt: skip
 
 
 def _begins(radius: Array, largest: int) -> int:

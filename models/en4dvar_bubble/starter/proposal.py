@@ -57,6 +57,7 @@ WIDTHS: Mapping[Start, Mapping[str, tuple[float, float]]] = {
 }
 BETWEEN = 1.645  # standard deviations from the median to 5 and 95 %
 SAME_CLOCK = 2e-6  # s: what a first guess can be off by
+EACH_ALONE = "of each bubble alone, which the gel's numbers do not use; 'true' takes up to twice the time"
 BUBBLES = (1e-7, 0.1)  # m: between these radii
 SEEN = (3e-6, 50e-9, 1e-4)  # m, s, m: one below is not read in shorter steps; radius of a usual bubble
 
@@ -93,11 +94,6 @@ class Proposal:
         Entry("members", "48"),
         Entry("draws", "400", "effective ones where the posterior is sampled: its mean is known to 5 % of its std"),
     )
-
-
-EACH_ALONE = Entry(
-    "what_if", "false", "of each bubble alone, which the gel's numbers do not use; 'true' takes up to twice the time"
-)
 
 
 def propose(
@@ -162,7 +158,7 @@ def propose(
         together,
         chosen == "laser" and not _in_a_liquid(model) and float(np.median([v.n_minima for v in views])) > 2,
         tuple(looks),
-        (*Proposal.assimilation, *[EACH_ALONE] * bool(together)),
+        (*Proposal.assimilation, *[Entry("what_if", "false", EACH_ALONE)] * bool(together)),
     )
 
 
