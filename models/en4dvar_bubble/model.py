@@ -215,16 +215,15 @@ MEDIUM = (  # parameter, unless it is one that is named; alternative, factor, wo
 
 
 @lru_cache(maxsize=4)  # the data sets of a campaign share their model; not in the model, which is sent to workers
-def alternatives(model: ForwardModel) -> tuple[Alternative, ...]:
+def alternatives(model: Dynamics) -> tuple[Alternative, ...]:
     """Those of a bubble: pulse, medium, wall, gas, vapour, radius at rest, scale, time step.
 
     None in whose equations a parameter of the model has no place.
     """
-    assert isinstance(model, Dynamics)
     return tuple(a for a in _alternatives(model) if a.model is None or _names(a.model) == _names(model))
 
 
-def _names(model: ForwardModel) -> list[str]:
+def _names(model: ForwardModel | Dynamics) -> list[str]:
     return [p.name for p in model.parameters if p.name != WALL_DISTANCE.name]  # stated with the wall itself
 
 
