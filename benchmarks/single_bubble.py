@@ -15,13 +15,13 @@ import numpy as np
 
 from en4dvar_bubble import BubbleModel
 from en4dvar_bubble.laws.tabulate import GRID
-from en4dvar_bubble.packing import pack
+from en4dvar_bubble.paths import pack
 from en4dvar_bubble.solver.arrays import Loaded
 from en4dvar_bubble.solver.integrate import groups
 from en4dvar_bubble.solver.lanes import WIDTH, load, store
 from en4dvar_bubble.solver.rows import SMEARED, TABLE
 from en4dvar_bubble.solver.step import _rhs
-from en4dvar_bubble.tables import fill
+from en4dvar_bubble.tables import from_values
 
 Array = np.ndarray
 RELAXATION = 1e-7
@@ -73,7 +73,7 @@ class Bubble:
         par[SMEARED] = smeared
         par[TABLE] = np.arange(WIDTH) * scratch.elastic[0].size
         if len(members.samples):
-            fill(np.repeat(members.samples[i : i + 1], WIDTH, axis=0), members.factor, scratch.elastic)
+            scratch.elastic[:] = from_values(members.factor * np.repeat(members.samples[i : i + 1], WIDTH, axis=0))
         else:
             scratch.elastic[:] = members.tables[i]
         equations = solver.equations(packed.memory, packed.viscous, packed.pulse, cells > GRID.cells)

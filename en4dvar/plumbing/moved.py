@@ -68,13 +68,18 @@ MOVED |= {f"en4dvar.{old}": f"en4dvar.{new}" for new, several in {
     "results.checkpoint": "results.codec",
 }.items() for old in several.split()}  # fmt: skip
 MOVED |= {"en4dvar.cycling": "en4dvar.series", "en4dvar.storage": "en4dvar.results"}
-MOVED |= {"en4dvar_agarose.summary": "en4dvar_agarose.tables", "en4dvar_agarose.evidence": "en4dvar_agarose.fits"}
+MOVED |= {f"en4dvar_agarose.{old}": f"en4dvar_agarose.{new}" for old, new in {
+    "summary": "tables", "evidence": "fits", "store": "report", "checkpoints": "run",
+}.items()}  # fmt: skip
 MOVED |= {f"en4dvar_movie.{old}": f"en4dvar_movie.{new}" for old, new in {
     "corrections": "choice", "locate": "outline", "outlined": "page", "writing": "frames",
 }.items()}  # fmt: skip
 MOVED |= {f"en4dvar_bubble.{old}": f"en4dvar_bubble.{new}" for old, new in {
-    "laws.zener": "laws.maxwell", "laws.refined": "laws.exactness", "laws.response": "battery",
-    "solver.parts": "solver.lanes",
+    "laws.zener": "laws.maxwell", "laws.refined": "laws.exactness", "laws.response": "battery", "media": "medium",
+    "emission": "events", "packing": "paths", "alternatives": "model", "starter.page": "starter.config",
+    "starter.top": "starter.look", "laws.softening": "laws.kelvin_voigt", "driving.tabulated": "driving.pulses",
+    "driving.settings": "settings",
+    "solver.parts": "solver.lanes", "solver.lookup": "solver.lanes", "solver.arrow": "solver.general",
 }.items()}  # fmt: skip
 
 # names that moved by themselves, with what they are called today

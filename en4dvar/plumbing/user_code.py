@@ -89,12 +89,12 @@ def loading(what: str) -> Iterator[None]:
         except (En4dvarError, ValueError):
             raise
         except BaseException as error:
-            line = _line(error)
+            line = line_of(error)
             plain = isinstance(error, ImportError | AttributeError) and not line  # nobody's code was reached
             raise ConfigError(f"{what}: {error if plain else reason_of(error)}{line}") from error
 
 
-def _line(error: BaseException) -> str:
+def line_of(error: BaseException) -> str:
     """The last line of the user's that the error went through; "" where it reached none."""
     files = [(f.filename, f.lineno) for f in traceback.extract_tb(error.__traceback__)]
     own = [(name, line) for name, line in files if not name.startswith(("<", *_NOT_THE_USERS))]

@@ -38,21 +38,15 @@ def sweep(
       en4dvar sweep configs/agarose_03_qlkv.yaml --refine 4
       en4dvar sweep configs/agarose_03_qlkv.yaml configs/agarose_10_qlkv.yaml --trajectories 200000
     """
-    import hashlib
-
     from en4dvar.assembly.build import build
     from en4dvar.executor import choose_executor
-    from en4dvar.plumbing.files import inside, write_text
+    from en4dvar.plumbing.files import write_text
     from en4dvar.plumbing.units import UnitError, parse_quantity
-    from en4dvar.runs.interrupt import tell_interrupt, terminate_as_interrupt
     from en4dvar.runs.progress import counted
     from en4dvar.sampling.sweep import SweepSettings, run_sweep
-    from en4dvar_agarose.checkpoints import prepare_folder
-    from en4dvar_agarose.run import earliest_reading, one_model
+    from en4dvar_agarose.run import StudyCheckpoints, earliest_reading, identity_of, one_model
     from en4dvar_agarose.tables import sweep_csv, sweep_text
 
-    if force and resume:
-        raise click.UsageError("--force and --resume exclude each other")
     loaded = [Source(Path(config), data, settings).load() for config in configs]
     problems = one_model([problem for config in loaded for problem in build(config)])
     try:
@@ -63,19 +57,18 @@ def sweep(
         raise click.UsageError("--shift must not be negative, --step and --width must be positive")
     chosen = SweepSettings(trajectories, within, grid, width, rounds=refine)
     folder = out or Path("runs") / f"{loaded[0].name}_sweep"
-    readings = b"".join(p.observations.times.tobytes() + p.observations.values.tobytes() for p in problems)
-    key = hashlib.sha256(f"{[c.resolved for c in loaded]}{chosen}".encode() + readings).hexdigest()
-    chunks = prepare_folder(inside(folder, "chunks"), key, "force" if force else "resume" if resume else "new")
+    who = identity_of(loaded[0].seed, chosen, {f"{i} {config.name}": config for i, config in enumerate(loaded, 1)})
+    files = "sweep.csv", "checkpoints/*", "checkpoints/sweep/*"
+    note_beginning(folder, resume)
     with (
         continuable(),
-        terminate_as_interrupt(),
-        tell_interrupt(lambda: f"finished chunks are kept in {chunks}"),
+        StudyCheckpoints.open(folder, force, resume, who, files) as keep,
         counted("trajectories") as progress,
         choose_executor(problems[0].model, workers=workers) as executor,
     ):
         earliest = earliest_reading(problems[0].model)
-        result = run_sweep(problems, chosen, loaded[0].seed, executor, chunks, progress, earliest)
-    write_text(folder / "sweep.csv", sweep_csv(result))
+        result = run_sweep(problems, chosen, loaded[0].seed, executor, keep.sweep(), progress, earliest)
+        write_text(keep.directory.at("sweep.csv"), sweep_csv(result))
     click.echo(sweep_text(result))
     click.echo(f"best fits: {folder / 'sweep.csv'}")
 
@@ -99,29 +92,17 @@ def study(
       en4dvar study configs/agarose_study.yaml
     """
     from en4dvar.executor import available_cores
-    from en4dvar.runs.engine import directory_mode
-    from en4dvar.runs.interrupt import tell_interrupt, terminate_as_interrupt
-    from en4dvar.runs.rundir import RunDirectory
-    from en4dvar_agarose.checkpoints import StudyCheckpoints
     from en4dvar_agarose.report import FILES, write_study
-    from en4dvar_agarose.run import run_study
+    from en4dvar_agarose.run import StudyCheckpoints, identity_of, run_study
     from en4dvar_agarose.settings import load_study
 
-    if force and resume:
-        raise click.UsageError("--force and --resume exclude each other")
     plan = load_study(config, Source(Path(config), None, settings).overrides())
     folder = out or Path("runs") / plan.name
     note_beginning(folder, resume)
-    with (
-        continuable(),
-        terminate_as_interrupt(),
-        RunDirectory.open(folder, directory_mode(force, resume), FILES) as directory,
-        tell_interrupt(lambda: f"finished parts are kept in {folder}"),
-    ):
-        keep = StudyCheckpoints.open(directory, plan, FILES)
+    who = identity_of(plan.seed, plan.sweep, plan.named)
+    with continuable(), StudyCheckpoints.open(folder, force, resume, who, FILES) as keep:
         result = run_study(plan, workers or available_cores(), lambda message: click.echo(message, err=True), keep)
-        page = write_study(result, directory.work)
-        directory.publish()
+        page = write_study(result, keep.directory.work)
     for gel, comparison in result.comparisons.items():
         click.echo(f"{gel}: {comparison.undecidable} of {len(comparison.single)} data sets cannot tell the laws apart")
     click.echo(f"report: {folder / page.name}" + (" (synthetic twin, no measurement)" if plan.synthetic else ""))

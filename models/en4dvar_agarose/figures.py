@@ -9,6 +9,7 @@ from en4dvar.report.chart import COLUMN, PAGE, Chart, Panel, Row, in_columns
 from en4dvar.report.svg import Captioned
 from en4dvar_agarose.fits import LEVELS, Fit, Study
 from en4dvar_agarose.paper import NAMES, QUANTITIES, Quantity, Route
+from en4dvar_agarose.run import named
 from en4dvar_bubble.model import BubbleModel
 
 # line styles tell the same as colours, for print without colour
@@ -21,20 +22,14 @@ FARTHEST = 30.0  # difference of log-evidences that the axis shows
 
 
 def all_figures(study: Study) -> Iterator[Captioned]:
-    """Every figure; captions say where data are synthetic."""
-    note = " Synthetic twin, no measurement." if study.plan.synthetic else ""
-    for name, caption, chart in _figures(study):
-        yield name, caption + note, chart
-
-
-def _figures(study: Study) -> Iterator[Captioned]:
+    """Every figure."""
     count = "; ".join(f"{len(study.any_fit(gel).problems)} in {gel} gel" for gel in study.fits)
     yield "scaled", f"Scaled radius against time, R/R_max against t/t_c: {count}.", scaled_data(study)
     for fit in study.every_fit:
         caption = (
             f"Radius against time, {fit.gel} gel; line: best {NAMES[fit.model]} fit of the filled set (IMR sweep)."
         )
-        yield f"dimensional_{gel_key(fit.gel)}_{fit.model}", caption, dimensional(fit)
+        yield f"dimensional_{named(fit.gel)}_{fit.model}", caption, dimensional(fit)
     routes: dict[Route, str] = {"sweep": "IMR sweep", "en4dvar": "En4D-Var, ensemble means"}
     for route, words in routes.items():
         caption = f"Distributions of shear modulus, stiffening, viscosity, stress-free radius; {words}."
@@ -43,20 +38,15 @@ def _figures(study: Study) -> Iterator[Captioned]:
     for fit in (fit for fit in study.every_fit if fit.model == "qlkv"):
         members = len(fit.members("mu"))
         caption = f"Combined final ensembles of all sets, {members} members; {fit.gel} gel, general QLKV."
-        yield f"members_{gel_key(fit.gel)}", caption, combined(study, fit)
+        yield f"members_{named(fit.gel)}", caption, combined(study, fit)
         caption = f"Iterative estimates, one line a data set; {fit.gel} gel, general QLKV."
-        yield f"iterations_{gel_key(fit.gel)}", caption, iterations(fit)
+        yield f"iterations_{named(fit.gel)}", caption, iterations(fit)
     if study.populations:
         caption = "Population mean (95 % interval) by the hierarchical step and mean of the stacked ensembles"
         yield "population", f"{caption}{', with the truths' if study.truth else ''}.", population(study)
     if study.comparisons:
         caption = "Log-evidence of the quadratic over the neo-Hookean law; shaded: undecidable."
         yield "evidence", caption, evidence(study)
-
-
-def gel_key(gel: str) -> str:
-    """A gel's label as part of a file name."""
-    return "".join(c if c.isalnum() else "_" for c in gel.replace("%", "")).strip("_")
 
 
 def collapse(times: Array, radius: Array) -> tuple[float, float, float]:
@@ -91,7 +81,8 @@ def dimensional(fit: Fit) -> Chart:
     """All readings; the set of median NRMSE filled, with its best fit of the sweep."""
     chosen = int(np.argsort(fit.sweep.nrmse)[len(fit.sweep.nrmse) // 2])
     values = {p.name: fit.sweep.theta[chosen, j] for j, p in enumerate(fit.sweep.parameters)}
-    numbers = [f"{q.latex} = {values[q.name] * q.factor:.3g} {_unit(q)}" for q in QUANTITIES if q.name in values]
+    units = {q.name: "× 10⁻²" if q.unit == "10⁻²" else q.unit for q in QUANTITIES if q.name in values}
+    numbers = [f"{q.latex} = {values[q.name] * q.factor:.3g} {units[q.name]}" for q in QUANTITIES if q.name in units]
     title = ", ".join([*numbers, f"NRMSE = {fit.sweep.nrmse[chosen]:.3f}"])
     panel = Panel("time (µs)", "radius (µm)", title=title)
     for i, problem in enumerate(fit.problems):
@@ -114,10 +105,6 @@ def _trace(fit: Fit, chosen: int, grid: Array) -> Array:
     state = model.initial_state({**{k: v for k, v in problem.fixed.items() if k != "t_s"}, **theta})
     at = grid + fit.sweep.shift[chosen]
     return np.asarray(model.integrate(state[None], np.maximum(at, 0.0)[None])["R"][0])
-
-
-def _unit(q: Quantity) -> str:
-    return "× 10⁻²" if q.unit == "10⁻²" else q.unit
 
 
 def _label(q: Quantity) -> str:

@@ -138,15 +138,15 @@ class Study:
         """(S,) true values of a gel's data sets, SI; empty where there is no truth."""
         return np.array([self.truth[n][name] for n in self.any_fit(gel).names if n in self.truth])
 
-    def coverage(self, gel: str, model: Model, name: str, level: float = 0.9) -> float:
-        """Share of the data sets whose central posterior interval holds the truth; NaN without a truth."""
-        fit, tail = self.fits[gel][model], (1 - level) / 2
+    def coverage(self, gel: str, model: Model, name: str) -> float:
+        """Share of the data sets whose central 90 % posterior interval holds the truth; NaN without a truth."""
+        fit = self.fits[gel][model]
         j = fit.prior.names.index(name)
         inside = [
             low <= self.truth[a.name][name] <= high
             for a in fit.analyses
             if a.name in self.truth
-            for low, high in [np.nanquantile(a.posterior[:, j], (tail, 1 - tail))]
+            for low, high in [np.nanquantile(a.posterior[:, j], (0.05, 0.95))]
         ]
         return float(np.mean(inside)) if inside else float("nan")
 

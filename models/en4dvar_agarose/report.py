@@ -1,23 +1,27 @@
-"""One self-contained page, the tables in three formats, the figures as PDF and PNG."""
+"""One self-contained page, the tables in three formats, the figures as PDF and PNG, and a study as one netCDF file: a
+group a gel and model with both routes, and a population's draws.
+"""
 
 from collections.abc import Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from en4dvar.plumbing.files import inside, make_folder, write_text
+from en4dvar.estimation.population import Population
+from en4dvar.model.state import Array, Parameter
+from en4dvar.plumbing.files import inside, write_text
 from en4dvar.report.chart import COLUMN
 from en4dvar.report.html import render
-from en4dvar.report.paper import save_chart
-from en4dvar.report.svg import svg
+from en4dvar.report.svg import draw
+from en4dvar.results.netcdf import Group, Variable, to_bytes, variable
+from en4dvar.results.seal import SealedBytes
 from en4dvar_agarose import paper, tables
 from en4dvar_agarose.figures import all_figures
-from en4dvar_agarose.fits import DECISIVE, HYPER, LEVELS, MISFIT, Study, probability, verdict
+from en4dvar_agarose.fits import DECISIVE, HYPER, LEVELS, MISFIT, Fit, Study, probability, verdict
 from en4dvar_agarose.paper import LABELS, NAMES, QUANTITIES, ROUTES, Route
-from en4dvar_agarose.store import study_netcdf
 
-ROUTE_KEYS: tuple[Route, ...] = ("sweep", "en4dvar")
 Cells = Iterator[list[str]]
 TABLES = tuple(f"table{number}.{suffix}" for number in (1, 2) for suffix in ("csv", "md", "tex"))
 FILES = (  # of a study; ``*`` stands for any text
@@ -28,8 +32,7 @@ FILES = (  # of a study; ``*`` stands for any text
 
 def write_study(study: Study, directory: Path) -> Path:
     """Write everything; returns the page. Raises :class:`OutputError`."""
-    figures_folder = make_folder(inside(directory, "figures"))
-    for number, route in enumerate(ROUTE_KEYS, 1):
+    for number, route in enumerate(ROUTES, 1):
         rows = tables.table(study, route)
         write_text(directory / f"table{number}.csv", tables.as_csv(study, rows, route))
         write_text(directory / f"table{number}.md", tables.as_markdown(study, rows, route))
@@ -37,16 +40,9 @@ def write_study(study: Study, directory: Path) -> Path:
     write_text(directory / "sets.csv", tables.per_set_csv(study))
     write_text(directory / "study.yaml", study.plan.text)
     study_netcdf(study).write(directory / "study.nc")
-    figures = []
-    for name, caption, chart in all_figures(study):
-        save_chart(chart, figures_folder, name)
-        wide = chart.width > 1.5 * COLUMN
-        figures.append({"name": name, "caption": caption, "svg": svg(chart, name, caption), "wide": wide})
-    return write_text(directory / "study.html", _page(study, figures))
-
-
-def _page(study: Study, figures: list[dict[str, Any]]) -> str:
-    return render(
+    note = " Synthetic twin, no measurement." if study.plan.synthetic else ""
+    figures = [(name, f"{caption}{note}", chart) for name, caption, chart in all_figures(study)]
+    page = render(
         "page.html.j2",
         "en4dvar_agarose",
         plan=study.plan,
@@ -58,7 +54,7 @@ def _page(study: Study, figures: list[dict[str, Any]]) -> str:
         members=study.every_fit[0].analyses[0].settings.members,
         sets=sum(len(study.any_fit(gel).problems) for gel in study.fits),
         findings=findings(study),
-        tables=[(tables.TITLES[route], tables.table(study, route)) for route in ROUTE_KEYS],
+        tables=[(tables.TITLES[route], tables.table(study, route)) for route in ROUTES],
         sources=tables.sources(study),
         labels=LABELS,
         disagreements=tables.disagreements(study),
@@ -71,15 +67,17 @@ def _page(study: Study, figures: list[dict[str, Any]]) -> str:
         effective=_effective(study),
         comparison=_comparison(study),
         judged=_judged(study),
-        figures=figures,
+        figures=draw(figures, folder=inside(directory, "figures")),
+        wide=[name for name, _, chart in figures if chart.width > 1.5 * COLUMN],
     )
+    return write_text(directory / "study.html", page)
 
 
 def findings(study: Study) -> list[str]:
     """The paper's qualitative findings, in numbers of this study."""
     sentences = []
     for gel, models in study.fits.items():
-        for route in ROUTE_KEYS:
+        for route in ROUTES:
             if {"nh", "qlkv"} <= set(models):
                 nh, general = (models[m].summary(route, "G")[0] for m in ("nh", "qlkv"))
                 mu = {m: models[m].summary(route, "mu")[0] for m in models}
@@ -89,7 +87,7 @@ def findings(study: Study) -> list[str]:
                     f"quadratic law; μ hardly depends on the model ({viscosities} Pa s)."
                 )
     sentences += [words_of for gel in study.fits if (words_of := _apparent_modulus(study, gel))]
-    for route in ROUTE_KEYS:
+    for route in ROUTES:
         each = {m: [fit.nrmse(route) for fit in study.every_fit if fit.model == m] for m in NAMES}
         scores = {m: np.concatenate(values) for m, values in each.items() if values}
         words = ", ".join(f"{LABELS[m]} {v.min():.3f} to {v.max():.3f}, mean {v.mean():.3f}" for m, v in scores.items())
@@ -183,3 +181,70 @@ def _judged(study: Study) -> dict[str, Any]:
         "undecided": sum(c.undecidable for c in study.comparisons.values()),
         "total": sum(len(c.single) for c in study.comparisons.values()),
     }
+
+
+def study_netcdf(study: Study) -> SealedBytes:
+    """Groups ``/<gel>/<model>``: ``sweep_<parameter>`` (dataset), ``<parameter>`` (dataset, draw) of the posterior
+    ensembles, NRMSE, log-evidence, DFS, ``truth_<parameter>``; ``/<gel>/population``: draws of mean and spread. SI.
+    """
+    about = {
+        "Conventions": "CF-1.8",
+        "title": f"Acoustic cavitation rheometry: {study.plan.name}"
+        + (" (SYNTHETIC twin, no measurement)" if study.plan.synthetic else ""),
+        "source": "en4dvar study; after Mancia et al. (2021), Acoustic Cavitation Rheometry",
+        "history": f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ} written by en4dvar study",
+        "configuration": study.plan.text,
+    }
+    groups = {"/": Group(attrs=about)}
+    for gel, models in study.fits.items():
+        name = gel.replace("/", "_")
+        groups[f"/{name}"] = Group(attrs={"gel": gel})
+        for model, fit in models.items():
+            groups[f"/{name}/{model}"] = _fit(study, fit)
+        if gel in study.populations:
+            groups[f"/{name}/population"] = _draws(study.populations[gel])
+    return to_bytes(groups)
+
+
+def _fit(study: Study, fit: Fit) -> Group:
+    variables: dict[str, Variable] = {}
+    for j, p in enumerate(fit.prior.parameters):
+        variables[p.name] = _of(p, ("dataset", "draw"), np.stack([a.posterior[:, j] for a in fit.analyses]))
+        dfs = [a.dfs_per_parameter[j] for a in fit.analyses]
+        variables[f"dfs_{p.name}"] = variable("dataset", dfs, "1", f"DFS of {p.name}")
+        truths = np.array([study.truth.get(name, {}).get(p.name, np.nan) for name in fit.names])
+        if study.truth and np.isfinite(truths).any():
+            variables[f"truth_{p.name}"] = _of(p, "dataset", truths)
+    for j, p in enumerate(fit.sweep.parameters):
+        variables[f"sweep_{p.name}"] = _of(p, "dataset", fit.sweep.theta[:, j])
+    variables["sweep_t_s"] = variable("dataset", fit.sweep.shift, "s", "time shift")
+    of_routes: dict[Route, str] = {"sweep": "best fit of the sweep", "en4dvar": "centre of the posterior"}
+    for route, words in of_routes.items():
+        variables[f"nrmse_{route}"] = variable("dataset", fit.nrmse(route), "1", f"NRMSE, {words}")
+    words = "log-evidence, adaptive importance sampling"
+    variables["log_evidence"] = variable("dataset", fit.log_evidence, "1", words)
+    if fit.sampled:
+        words, effective = "effective number of draws of the log-evidence", [draws.effective for draws in fit.sampled]
+        variables["evidence_draws"] = variable("dataset", effective, "1", words)
+    coords = {"dataset": Variable(("dataset",), np.array(fit.names, dtype=object), {"long_name": "data set"})}
+    return Group(variables, coords)
+
+
+def _draws(population: Population) -> Group:
+    variables: dict[str, Variable] = {}
+    for j, term in enumerate(population.terms):
+        p = term.parameter
+        variables[f"mean_{p.name}"] = _of(p, "draw", population.posterior.mean[:, j])
+        variables[f"spread_{p.name}"] = _of(p, "draw", population.posterior.between[:, j])
+    judged = {
+        "effective_draws": population.size,
+        "effective_draws_hierarchy": population.effective[0],
+        "effective_draws_data_sets": population.effective[1],
+        "log_evidence": population.log_evidence,
+        "forward_runs": population.forward_runs,
+    }
+    return Group(variables, attrs=judged)
+
+
+def _of(p: Parameter, dims: str | tuple[str, ...], values: Array) -> Variable:
+    return variable(dims, values, p.unit, p.label, display_units=p.display_unit)

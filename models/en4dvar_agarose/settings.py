@@ -9,9 +9,9 @@ from pydantic import Field
 from en4dvar.config import Config, load_config
 from en4dvar.config.context import check
 from en4dvar.config.document import Document, override, read_document
-from en4dvar.config.schema import Name, QuantityText, Section
+from en4dvar.config.schema import Name, Section
 from en4dvar.plumbing.errors import ConfigError, Fault
-from en4dvar.plumbing.units import UnitError, parse_quantity
+from en4dvar.plumbing.units import Quantity
 from en4dvar.sampling.sweep import SweepSettings
 from en4dvar_agarose.paper import Model
 
@@ -23,9 +23,9 @@ class Sweep(Section):
 
     trajectories: Annotated[int, Field(ge=2, le=10_000_000)] = 50_000
     """Size of the design."""
-    shift: QuantityText = "0.8 us"
+    shift: Annotated[float, Quantity("s"), Field(ge=0)] = 0.8e-6
     """Largest time shift."""
-    step: QuantityText = "0.025 us"
+    step: Annotated[float, Quantity("s"), Field(gt=0)] = 0.025e-6
     """Step of the time grid and of the shifts."""
     width: Annotated[float, Field(gt=0, le=10)] = SweepSettings.width
     """Range searched, in prior standard deviations."""
@@ -33,13 +33,6 @@ class Sweep(Section):
     """Rounds of local refinement."""
     local: Annotated[int, Field(ge=1)] = SweepSettings.local
     """Trajectories a data set in each round of refinement."""
-
-    def built(self) -> SweepSettings:
-        """In seconds. Raises :class:`UnitError`."""
-        shift, step = parse_quantity(self.shift, "s"), parse_quantity(self.step, "s")
-        if shift < 0 or step <= 0:
-            raise UnitError("the shift must not be negative and the step must be positive")
-        return SweepSettings(self.trajectories, shift, step, self.width, rounds=self.rounds, local=self.local)
 
 
 class StudySchema(Section):
@@ -73,6 +66,11 @@ class StudyPlan:
     configs: dict[str, dict[Model, Config]]
     text: str
 
+    @property
+    def named(self) -> dict[str, Config]:
+        """The configurations by gel and model, in words."""
+        return {f"{gel}, {model}": config for gel, models in self.configs.items() for model, config in models.items()}
+
 
 def load_study(path: str | Path, overrides: dict[str, Any] | None = None) -> StudyPlan:
     """Read a study and every configuration it names; paths are relative to its folder. Raises :class:`ConfigError`."""
@@ -82,11 +80,6 @@ def load_study(path: str | Path, overrides: dict[str, Any] | None = None) -> Stu
     top = check(StudySchema, document.data, (), document, faults)
     if top is None:
         raise ConfigError(faults)
-    sweep = None
-    try:
-        sweep = top.sweep.built()
-    except UnitError as error:
-        faults.append(document.fault(("sweep",), str(error)))
     base = path.resolve().parent
     configs = {gel: _configs(gel, files, base, document, faults) for gel, files in top.gels.items()}
     if top.truth and not top.synthetic:
@@ -94,8 +87,9 @@ def load_study(path: str | Path, overrides: dict[str, Any] | None = None) -> Stu
     truth = base / top.truth if top.truth else None
     if truth and not truth.is_file():
         faults.append(document.fault(("truth",), f"{truth}: no such file"))
-    if faults or sweep is None:
+    if faults:
         raise ConfigError(faults)
+    sweep = SweepSettings(**top.sweep.model_dump())
     return StudyPlan(top.name, top.seed, top.synthetic, truth, sweep, configs, document.text)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from en4dvar.plumbing.tables import csv_text
 from en4dvar.plumbing.units import convert
 from en4dvar.report import text
-from en4dvar.report.export import escaped
+from en4dvar.report.export import column_name, escaped
 from en4dvar.sampling.sweep import SweepResult
 from en4dvar_agarose.fits import Study
 from en4dvar_agarose.paper import LABELS, QUANTITIES, ROUTES, TABLES, Model, Quantity, Route
@@ -179,26 +179,20 @@ def per_set_csv(study: Study) -> str:
 
 def sweep_csv(result: SweepResult) -> str:
     """One line a data set: best fit, time shift, NRMSE."""
-    heads = [p.name if p.unit == "1" else f"{p.name} ({p.display_unit or p.unit})" for p in result.parameters]
-    lines = [["dataset", *heads, "t_s (us)", "NRMSE"]]
-    for i, name in enumerate(result.names):
-        values = [
-            convert(float(v), p.unit, p.display_unit or p.unit)
-            for v, p in zip(result.theta[i], result.parameters, strict=True)
-        ]
-        lines.append([name, *(f"{v:.6g}" for v in values), f"{result.shift[i] * 1e6:.4g}", f"{result.nrmse[i]:.6f}"])
-    return csv_text(lines)
+    heads = [column_name(p.name, p.display_unit) for p in result.parameters]
+    fits = [convert(result.theta[:, j], p.unit, p.display_unit) for j, p in enumerate(result.parameters)]
+    columns = result.names, *([f"{v:.6g}" for v in values] for values in fits)
+    told = [f"{shift * 1e6:.4g}" for shift in result.shift], [f"{fit:.6f}" for fit in result.nrmse]
+    return csv_text([["dataset", *heads, "t_s (us)", "NRMSE"], *zip(*columns, *told, strict=True)])
 
 
 def sweep_text(result: SweepResult) -> str:
     """NRMSE-weighted mean ± standard deviation of every parameter, and the range of NRMSE."""
     lines = [f"{len(result.names)} data set(s), {result.trajectories} trajectories"]
-    for p, mean, std in zip(result.parameters, result.mean, result.std, strict=True):
-        unit = p.display_unit or p.unit
-        values = [convert(float(v), p.unit, unit) for v in (mean, std)]
-        shown = "" if unit == "1" else f" {unit}"
-        lines.append(
-            f"  {p.label}: {p.name} = {values[0]:.4g}{f' ± {values[1]:.2g}' if len(result.names) > 1 else ''}{shown}"
-        )
+    for p, *moments in zip(result.parameters, result.mean, result.std, strict=True):
+        mean, std = (convert(float(v), p.unit, p.display_unit) for v in moments)
+        spread = f" ± {std:.2g}" if len(result.names) > 1 else ""
+        shown = "" if p.display_unit == "1" else f" {p.display_unit}"
+        lines.append(f"  {p.label}: {p.name} = {mean:.4g}{spread}{shown}")
     fits = result.nrmse
     return "\n".join([*lines, f"  NRMSE {fits.min():.4f} to {fits.max():.4f}, mean {fits.mean():.4f}"])

@@ -41,22 +41,12 @@ _FIELDS = {
 
 
 def simulate(
-    law: str | ConstitutiveLaw = "quadratic-kelvin-voigt",
-    parameters: Mapping[str, npt.ArrayLike] | None = None,
-    times: npt.ArrayLike | None = None,
-    *,
-    start: Start = "acoustic",
-    gas: Gas = "heat",
-    driving: Driving | None = None,
-    driving_read: Reading = "instantaneous",
-    medium: Medium | str = WATER_25C,
-    radial: Radial = "keller-miksis",
-    vapour: Vapour = "none",
-    medium_heat: Heat = "cold",
-    wall: Wall | None = None,
-    accuracy: AccuracyName | Accuracy = "standard",
-    workers: int = 1,
-) -> xr.Dataset:
+    law: str | ConstitutiveLaw = "quadratic-kelvin-voigt", parameters: Mapping[str, npt.ArrayLike] | None = None,
+    times: npt.ArrayLike | None = None, *, start: Start = "acoustic", gas: Gas = "heat", driving: Driving | None = None,
+    driving_read: Reading = "instantaneous", medium: Medium | str = WATER_25C, radial: Radial = "keller-miksis",
+    vapour: Vapour = "none", medium_heat: Heat = "cold", wall: Wall | None = None,
+    accuracy: AccuracyName | Accuracy = "standard", workers: int = 1,
+) -> xr.Dataset:  # fmt: skip
     """Integrate one bubble or an ensemble.
 
     Parameters
@@ -89,18 +79,9 @@ def simulate(
         raise ConfigError(f"workers: at least 1, not {workers}")
     chosen = get_law(law) if isinstance(law, str) else law
     with retold(ValueError, ConfigError):
+        usual, fine = cast(Driving, driving), cast(Accuracy, accuracy)  # None and names are completed
         model = BubbleModel(
-            law=chosen,
-            gas=gas,
-            start=start,
-            driving=cast(Driving, driving),
-            reading=driving_read,
-            medium=_medium(medium),
-            radial=radial,
-            vapour=vapour,
-            medium_heat=medium_heat,
-            wall=wall,
-            accuracy=cast(Accuracy, accuracy),
+            chosen, gas, start, usual, driving_read, _medium(medium), fine, radial, vapour, medium_heat, wall=wall
         )
     model = model.with_parameters(dict(parameters or {}))
     theta = _members(model, dict(parameters or {}))
@@ -153,28 +134,14 @@ def _dataset(
     data["steps"] = ("member", record[:, STEPS].astype(int), {"long_name": "accepted time steps"})
     data["max_wall_mach"] = ("member", record[:, MAX_MACH], {"units": "1", "long_name": "largest wall Mach number"})
     if model.system.gas:
-        own = model.medium_of(theta)
-        hottest = own.T_inf * from_kirchhoff(record[:, MAX_THETA], own)
-        data["max_temperature"] = (
-            "member",
-            hottest,
-            {"units": "K", "long_name": "highest temperature near the centre"},
-        )
+        own, about = model.medium_of(theta), {"units": "K", "long_name": "highest temperature near the centre"}
+        data["max_temperature"] = ("member", own.T_inf * from_kirchhoff(record[:, MAX_THETA], own), about)
     coordinates: dict[str, Any] = {"time": ("time", t, {"units": "s", "long_name": "time"})}
     for p in model.parameters:
         coordinates[p.name] = ("member", theta[p.name], {"units": p.unit, "long_name": p.label})
-    attributes = {
-        "law": model.law.name,
-        "start": model.start,
-        "gas": model.gas,
-        "driving_read": model.reading,
-        "radial": model.radial,
-        "vapour": model.vapour,
-        "medium_heat": model.medium_heat,
-        "wall": str(model.wall) if model.wall else "none",
-        "constants": model.medium.json,
-    }
-    return xr.Dataset(data, coords=coordinates, attrs=attributes)
+    attributes = {name: getattr(model, name) for name in ("start", "gas", "radial", "vapour", "medium_heat")}
+    attributes |= {"law": model.law.name, "driving_read": model.reading, "wall": str(model.wall or "none")}
+    return xr.Dataset(data, coords=coordinates, attrs={**attributes, "constants": model.medium.json})
 
 
 def _medium(medium: Medium | str) -> Medium:

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from en4dvar.commands.common import echo
+from en4dvar.commands.common import Failed, command_line, echo
+from en4dvar.plumbing.errors import En4dvarError, OutputError, retold
 from en4dvar_bubble.commands import completed_law
 
 if TYPE_CHECKING:
@@ -112,12 +113,9 @@ def init(
             raise click.UsageError("--example comes with its own data, start, law and file names")
         _write_example(example, force)
         return
-    from en4dvar.commands.common import command_line
     from en4dvar.config.json_schema import schema_text
-    from en4dvar.plumbing.errors import OutputError
     from en4dvar.plumbing.files import write_text
-    from en4dvar_bubble.starter.config import propose_config, run_name
-    from en4dvar_bubble.starter.page import SCHEMA_FILE, Source, yaml_text
+    from en4dvar_bubble.starter.config import SCHEMA_FILE, Source, propose_config, run_name, yaml_text
     from en4dvar_bubble.starter.proposal import starter
     from en4dvar_bubble.starter.summaries import propose_from_times, source_of
 
@@ -169,7 +167,6 @@ def _layout(options: Mapping[str, str | None]) -> Layout:
     """How the data are laid out. Raises :class:`UnitError`: ``--since`` is no instant."""
     from en4dvar.inputs.parts import Layout
     from en4dvar.inputs.window import parse_instant
-    from en4dvar.plumbing.errors import retold
     from en4dvar.plumbing.units import UnitError
 
     told: dict[str, Any] = {key: it for key in _OF_LAYOUT if (it := options[key]) is not None}
@@ -182,9 +179,6 @@ def _layout(options: Mapping[str, str | None]) -> Layout:
 @contextmanager
 def _in_words_of_options() -> Iterator[None]:
     """Within, an error names options of this command where it names keys of a configuration, and what to type next."""
-    from en4dvar.commands.common import Failed, command_line
-    from en4dvar.plumbing.errors import En4dvarError
-
     try:
         yield
     except En4dvarError as error:
@@ -217,7 +211,6 @@ def _tracked(movie: Path, target: Path, options: Mapping[str, str], force: bool)
 
 def _table_beside(target: Path, data: str, text: str, force: bool) -> str:
     """Write the table of the bubbles beside the configuration ``target``; its name. Raises :class:`OutputError`."""
-    from en4dvar.plumbing.errors import OutputError
     from en4dvar.plumbing.files import write_text
 
     table = target.with_name(f"{target.stem}_bubbles.csv")
@@ -232,7 +225,7 @@ def _write_example(name: str, force: bool) -> None:
     from en4dvar.config.json_schema import schema_text
     from en4dvar.plumbing.files import write_text
     from en4dvar_bubble.examples import write_example
-    from en4dvar_bubble.starter.page import SCHEMA_FILE
+    from en4dvar_bubble.starter.config import SCHEMA_FILE
 
     file = write_example(name, Path(), force)
     write_text(Path(SCHEMA_FILE), schema_text())  # that the first line of the configuration names
@@ -264,8 +257,6 @@ def _columns_of(data: str, options: Mapping[str, str | None], layout: Layout) ->
     if _interactive() and asked.needed():
         asked = _answered(asked)
     if needed := asked.needed():
-        from en4dvar.commands.common import command_line
-
         again = command_line(also=tuple(word for option, value, _ in needed for word in (option, value)))
         raise asked.incomplete(first, f"next: {again}")
     for words in asked.unused:

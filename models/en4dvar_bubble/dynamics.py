@@ -125,7 +125,7 @@ class Dynamics:
     vapour: Vapour = "none"
     medium_heat: Heat = "cold"
     hydrophone: float = 1.0
-    """Its distance from the bubble, m (:mod:`emission`)."""
+    """Its distance from the bubble, m (:mod:`events`)."""
     wall: Wall | None = None
     """A plane whose image of the bubble, taken to move at the same instant, adds its pressure."""
     gas_change: float = 0.0
@@ -288,7 +288,7 @@ class Dynamics:
         x = np.empty((len(rest), layout.size))
         Rdot = values.get(RDOT_START.name, 0.0)
         fields = {"R": R, "Rdot": Rdot, "p_b": gas + p_v, "T": medium.T_inf, "T_m": medium.T_inf, **values}
-        law_values = self._of_law(values)
+        law_values = self.law_values(values)
         relaxed = self.law.relaxed(R / rest, law_values)
         fields["Z"] = relaxed
         fields["S"] = relaxed.sum(axis=1)
@@ -305,11 +305,8 @@ class Dynamics:
         """All parameters, name → (N,), of states (N, n_state)."""
         return {p.name: x[:, self.layout[p.name].start] for p in self.parameters}
 
-    def law_values(self, x: Array) -> dict[str, Array]:
-        """The law's parameters, name → (N,), of states (N, n_state)."""
-        return self._of_law({name: x[:, where.start] for name, where in self.layout.slices.items()})
-
-    def _of_law(self, values: Mapping[str, Array]) -> dict[str, Array]:
+    def law_values(self, values: Mapping[str, Array]) -> dict[str, Array]:
+        """What the law reads of all parameters name → (N,)."""
         own = {p.name: values[p.name] for p in self.law.parameters}
         if self.law.sized:
             own["R0"] = values[self.stress_free_radius]

@@ -1,12 +1,22 @@
-r"""The turning points of a bubble: largest radius, collapses, rebounds; observables that need no camera.
+r"""Observables that need no camera: the turning points of a bubble, and the pressure that it sends out.
 
-An event is where the wall stands still, Ṙ = 0: functionals of the path, the same whatever instant they are read at. The
-largest maximum comes first (a released bubble starts there), then collapses and rebounds in turn. The time of an event
-is counted from the start of the model, which a released bubble's R_max is; the time between two does not depend on it.
+Largest radius, collapses, rebounds. An event is where the wall stands still, Ṙ = 0: functionals of the path, the same
+whatever instant they are read at. The largest maximum comes first (a released bubble starts there), then collapses and
+rebounds in turn. The time of an event is counted from the start of the model, which a released bubble's R_max is; the
+time between two does not depend on it. Paths are followed to :data:`HORIZON` times the last reading, on a grid; each
+bracket of Ṙ = 0 is then divided twice by running the members again at instants of their own, and Ṙ is taken for linear
+in the last. A bubble of 300 µs has its collapse to better than 0.1 ns (tests/bubble/test_events.py). A member that has
+no such event fails.
 
-Paths are followed to :data:`HORIZON` times the last reading, on a grid; each bracket of Ṙ = 0 is then divided twice by
-running the members again at instants of their own, and Ṙ is taken for linear in the last. A bubble of 300 µs
-has its collapse to better than 0.1 ns (tests/bubble/test_events.py). A member that has no such event fails.
+A hydrophone far away. Near the bubble the liquid is incompressible, far from it the wave is φ = −F(t − r/c)/r (Keller &
+Miksis 1980, J. Acoust. Soc. Am. 68, 628). Bernoulli's equation at the wall then gives
+
+    r p(r, t + r/c) = ρ F′ = R (p_L − p_∞ − p_f + ρ Ṙ²/2),        p_L = p_b − 2S/R + J − 4μ Ṙ/R,
+
+with the stress integral J of the medium: what the path knows, without a derivative of it. In an incompressible liquid
+this is ρ (R² R̈ + 2 R Ṙ²), the second derivative of the volume times ρ/4π. Near a plane the pressure of the image,
+±ρF′/(2h), belongs to the right-hand side; the wave that the plane reflects is left out. The pulse itself, which the
+hydrophone meets too, is not in it, nor are steepening and absorption on the way.
 """
 
 from collections.abc import Mapping
@@ -94,7 +104,28 @@ def _numbered(name: str, k: int) -> str:
     return name if k == 1 else f"{name}_{k}"
 
 
-OF_WHOLE["turning points"] = events
+def emitted(paths: Paths) -> Array:
+    """(N, K) Pa at the model's hydrophone, at the instants at which it arrives there; the paths are run again, at the
+    instants (s) when it was sent. Raises ValueError: they do not start where the model does.
+    """
+    if np.any(paths.start):
+        raise ValueError("what the bubble sent out before is read from whole paths, which a resumed one is not")
+    model: Any = paths.model
+    sent = paths.times - model.hydrophone / paths.medium(1).c
+    if model.start == "acoustic":  # at rest before time zero
+        sent = np.maximum(sent, 0.0)
+    run = model.integrate(paths.initial, sent)
+    medium, R, Rdot, own = run.medium(1), run["R"], run["Rdot"], model.parameter_values(run.initial)
+    driven = model.driving.of_each(sent + (0.0 if model.reading == "instantaneous" else R / medium.c), own)
+    excess = run["p_b"] - 2 * medium.S / R + run["S"] - medium.p_inf - driven
+    nearby = 1 + R * np.reshape(model.image(own), (-1, 1))  # the image's pressure
+    source = R * (excess + 0.5 * medium.rho * Rdot**2) / nearby
+    return np.where((run.solution.status != 0)[:, None], np.nan, source / model.hydrophone)
+
+
+SENT = "pressure that the bubble sends out"
+HEARD = Observable("acoustic_pressure", "Pa", OfPath(SENT), r"$p_\mathrm{ac}$", "kPa", SENT)
+OF_WHOLE.update({"turning points": events, SENT: emitted})
 OBSERVABLES = (
     _observable("largest_radius", r"$R_\mathrm{max}$", "largest radius", "radius", 0),
     *(
@@ -106,4 +137,5 @@ OBSERVABLES = (
         for k in range(1, COLLAPSES)
     ),
     _observable("period", "$T$", "time from first to second collapse", "time", 3, since=1),
+    HEARD,
 )

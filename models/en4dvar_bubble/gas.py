@@ -13,19 +13,18 @@ CRITICAL_TEMPERATURE = 647.096
 """K, of water (IAPWS-95)."""
 
 
+SATURATION, SATURATION_TEMPERATURE = 1.17e11, 5200.0
+"""Pa and K: p_sat(T) = SATURATION · exp(−SATURATION_TEMPERATURE/T), fit of the rheometry codes (Estrada 2018)."""
+
+
 @overload
 def saturated_vapour_pressure(temperature: float) -> float: ...
 @overload
 def saturated_vapour_pressure(temperature: Array) -> Array: ...
 def saturated_vapour_pressure(temperature: float | Array) -> float | Array:
-    """p_sat(T) = 1.17e11 exp(−5200/T) Pa, the fit of the rheometry codes (Estrada 2018); 3.1 kPa at 25 °C."""
-    pressure = 1.17e11 * np.exp(-5200.0 / np.asarray(temperature))
+    """p_sat(T) in Pa; 3.1 kPa at 25 °C."""
+    pressure = SATURATION * np.exp(-SATURATION_TEMPERATURE / np.asarray(temperature))
     return np.asarray(pressure) if np.ndim(temperature) else float(pressure)
-
-
-SATURATION = saturated_vapour_pressure(np.inf)
-SATURATION_TEMPERATURE = -298.15 * float(np.log(saturated_vapour_pressure(298.15) / SATURATION))
-"""p_sat = SATURATION · exp(−SATURATION_TEMPERATURE/T), the same fit; in Pa and K."""
 
 
 def mole_fraction(C: Array, medium: Medium) -> Array:

@@ -1,10 +1,19 @@
-"""The bubble as a forward model: state vector {R, Ṙ, p_b, S, T, C, …, parameters}, observed through its radius."""
+"""The bubble as a forward model: state vector {R, Ṙ, p_b, S, T, C, …, parameters}, observed through its radius; and
+what about an experiment could be otherwise than assumed, each by as much as laboratories differ.
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+Sizes: a hydrophone states the amplitude within 5 to 10 %; weather moves the ambient pressure by 2 % about its mean,
+1000 m of height by 11 %; the rheometry codes take 0.056 to 0.072 N/m for the surface tension of water in a gel; a
+calibration target gives the scale of the picture within about 1 %; the density of a gel is water's or up to 6 % more,
+its speed of sound that of water or 3 % more; the walls of a dish or of the holder of a gel are millimetres away, and
+one three times the largest radius away makes a collapse 7 % longer (Rattray: 0.205 R_max/h).
+"""
+
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from threading import Lock
 from types import MappingProxyType
-from typing import ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 
@@ -21,16 +30,14 @@ from en4dvar.model.forward import (
 )
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution
-from en4dvar_bubble.alternatives import alternatives
 from en4dvar_bubble.collapse import doubts
 from en4dvar_bubble.dynamics import MACH_LIMITS, Dynamics, Wall
-from en4dvar_bubble.emission import OBSERVABLE
 from en4dvar_bubble.events import OBSERVABLES
+from en4dvar_bubble.gas import saturated_vapour_pressure
 from en4dvar_bubble.laws import get_law
 from en4dvar_bubble.laws.tabulate import GRID, ends
-from en4dvar_bubble.numbers import NAMES
-from en4dvar_bubble.packing import pack, with_gas
-from en4dvar_bubble.paths import Paths
+from en4dvar_bubble.numbers import NAMES, WALL_DISTANCE
+from en4dvar_bubble.paths import Paths, pack, with_gas
 from en4dvar_bubble.settings import BubbleSettings
 from en4dvar_bubble.solver.arrays import Members
 from en4dvar_bubble.solver.driver import Solution
@@ -51,17 +58,8 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
     batch = 8
     compiled = True
     observables = (
-        Observable(
-            "radius",
-            "m",
-            StateField("R", rate_of="Rdot"),
-            symbol="R",
-            display_unit="um",
-            label="bubble radius",
-            positive=True,
-        ),
+        Observable("radius", "m", StateField("R", rate_of="Rdot"), "R", "um", "bubble radius", positive=True),
         *OBSERVABLES,
-        OBSERVABLE,
     )
 
     known_by = MappingProxyType({"medium": ("rho", "c")})
@@ -102,7 +100,7 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
 
     @property
     def alternatives(self) -> tuple[Alternative, ...]:  # type: ignore[override]
-        """See :mod:`en4dvar_bubble.alternatives`."""
+        """See :mod:`en4dvar_bubble.model`."""
         return alternatives(self)
 
     @property
@@ -203,3 +201,63 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
             solution.record[lost] = again.record
             solution.ends.update({lost[i]: words for i, words in again.ends.items()})
         return paths
+
+
+PULSE, REST, SCALE, CLOCK = 1.05, 1.1, 1.01, 1.01
+NEARBY = Wall(3.0, relative=True), "three times R_max"
+NEARBY_DRIVEN = Wall(3e-3), "3 mm"
+MEDIUM = (  # parameter, unless it is one that is named; alternative, factor, words
+    ("p_inf", "ambient_pressure", 1.02, "the ambient pressure were 2 % higher"),
+    ("rho", "density", 1.03, "the medium were 3 % denser"),
+    ("c", "sound_speed", 1.03, "sound were 3 % faster in the medium"),
+    ("surface_tension", "surface_tension", 0.8, "the surface tension were 20 % lower"),
+)
+
+
+@lru_cache(maxsize=4)  # the data sets of a campaign share their model; not in the model, which is sent to workers
+def alternatives(model: Dynamics) -> tuple[Alternative, ...]:
+    """Those of a bubble: pulse, medium, wall, gas, vapour, radius at rest, scale, time step.
+
+    None in whose equations a parameter of the model has no place.
+    """
+    return tuple(a for a in _alternatives(model) if a.model is None or _names(a.model) == _names(model))
+
+
+def _names(model: ForwardModel | Dynamics) -> list[str]:
+    return [p.name for p in model.parameters if p.name != WALL_DISTANCE.name]  # stated with the wall itself
+
+
+def _alternatives(model: Dynamics) -> Iterator[Alternative]:
+    def changed(name: str, words: str, **options: Any) -> Alternative:
+        return Alternative(name, words, replace(cast(Any, model), **options))
+
+    medium, driving, rest = model.medium, model.driving, model.stress_free_radius
+    saturated = replace(medium, p_v=saturated_vapour_pressure(medium.T_inf))
+    if not driving.silent and "p_A" not in model.named:  # what is a parameter has its own uncertainty
+        stronger = replace(driving, amplitude=PULSE * driving.amplitude)
+        yield changed("pulse_amplitude", "the pulse were 5 % stronger", driving=stronger)
+    for name, key, factor, words in MEDIUM:
+        if name not in model.named and (name != "surface_tension" or not model.law.rest_tension):
+            of = "S" if name == "surface_tension" else name
+            yield changed(key, words, medium=replace(medium, **{of: factor * getattr(medium, of)}))
+    if model.wall is None:
+        wall, far = NEARBY if model.start == "laser" else NEARBY_DRIVEN
+        yield changed("wall", f"a rigid wall were {far} away", wall=wall)
+    if model.gas != "heat":
+        yield changed("gas_model", "the gas conducted heat to the wall (gas: heat)", gas="heat")
+    else:
+        cold = replace(model, medium_heat="cold")
+        simple = replace(cold, vapour="none", medium=saturated) if model.vapour == "transport" else cold
+        words = "the gas were polytropic (gas: polytropic)"
+        yield Alternative("gas_model", words, replace(cast(Any, simple), gas="polytropic"))
+    if model.medium_heat == "conducting":
+        yield changed("medium_heat", "the gel stayed cold at the wall (medium_heat: cold)", medium_heat="cold")
+    if medium.p_v and "p_v" not in model.named:
+        yield changed("vapour", "there were no vapour in the bubble", medium=replace(medium, p_v=0.0))
+    elif model.vapour != "none":  # and p_v is no parameter
+        yield changed("vapour", "there were no vapour in the bubble (vapour: none)", vapour="none")
+    elif "p_v" not in model.named:
+        yield changed("vapour", "vapour filled the bubble (vapour_pressure: saturated)", medium=saturated)
+    yield Alternative("radius_at_rest", f"{rest} were 10 % larger", parameters={rest: REST})
+    yield Alternative("length_scale", "all radii were 1 % larger (µm per pixel)", values=SCALE, observable="radius")
+    yield Alternative("time_scale", "the time between frames were 1 % longer", times=CLOCK, observable="radius")

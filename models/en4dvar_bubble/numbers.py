@@ -12,8 +12,7 @@ import numpy as np
 
 from en4dvar.model.state import Parameter
 from en4dvar_bubble.driving.base import KNOTS
-from en4dvar_bubble.driving.pulses import PULSES, numbers_of
-from en4dvar_bubble.driving.tabulated import OF_RECORD
+from en4dvar_bubble.driving.pulses import OF_RECORD, PULSES, numbers_of
 from en4dvar_bubble.medium import CONSTANTS
 
 

@@ -1,19 +1,35 @@
-"""Integrated members as trajectories: fields of the state vector, computed from the raw solution when asked for."""
+"""From state vectors to the arrays of the compiled solver, and back: integrated members as trajectories, whose fields
+of the state vector are computed from the raw solution when they are asked for.
+"""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar, NamedTuple, cast
 
 import numpy as np
+import numpy.typing as npt
 
 from en4dvar.model.forward import Batch, Failure, Trajectory, ValidityLimit
 from en4dvar.model.state import Array, StateLayout
 from en4dvar_bubble.dynamics import Dynamics
-from en4dvar_bubble.gas import from_kirchhoff, mass_fraction, saturated_vapour_pressure
+from en4dvar_bubble.gas import (
+    GAS_CONSTANT,
+    SATURATION,
+    SATURATION_TEMPERATURE,
+    from_kirchhoff,
+    kirchhoff,
+    mass_fraction,
+    mole_fraction,
+    saturated_vapour_pressure,
+)
+from en4dvar_bubble.laws.tabulate import GRID
 from en4dvar_bubble.medium import Medium
+from en4dvar_bubble.numbers import ACCOMMODATION, P_A
 from en4dvar_bubble.solver import rows
-from en4dvar_bubble.solver.driver import Solution
+from en4dvar_bubble.solver.arrays import Members
+from en4dvar_bubble.solver.driver import Solution, System
 from en4dvar_bubble.solver.integrate import BEYOND, END_TIME, MAX_MACH
+from en4dvar_bubble.solver.lanes import WIDTH
 
 THETA, MOLE_FRACTION = "temperature of the gas over that far away", "mole fraction of vapour"
 
@@ -29,6 +45,11 @@ class Paths(Batch):
     par: Array
     start: Array | float = 0.0
     _fields: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def raw(self) -> Array:
+        """(N, K, n) of the solver."""
+        return self.solution.states
 
     @property
     def whole(self) -> bool:  # type: ignore[override]
@@ -52,8 +73,8 @@ class Paths(Batch):
             return self.failure(name) if self.solution.status[name] else BubbleTrajectory(self, name)
         if name not in self._fields:
             estimated = name in {p.name for p in self.model.parameters}
-            compute: Any = OF_WHOLE.get(name) or getattr(type(self), f"_{name}", None)
-            self._fields[name] = self._constant(name) if estimated or compute is None else compute(self)
+            compute = None if estimated else OF_WHOLE.get(name)
+            self._fields[name] = compute(self) if compute else self._constant(name)
         return self._fields[name]
 
     def failure(self, member: int) -> Failure:
@@ -94,84 +115,60 @@ class Paths(Batch):
     def _constant(self, name: str) -> Array:
         return np.broadcast_to(self.initial[:, self.model.layout[name].start, None], self.times.shape)
 
-    def _R(self) -> Array:
-        return np.exp(self.solution.states[:, :, -1]) * 1e-6
-
-    def _Rdot(self) -> Array:
-        radius: Array = self["R"]
-        return radius * self.solution.states[:, :, -2] * 1e6
-
-    def _strain_rate(self) -> Array:
-        return np.abs(self.solution.states[:, :, -2]) * 1e6
-
-    def _stretch(self) -> Array:
-        return np.exp(self.solution.states[:, :, -1] - self.par[:, None, rows.LOG_R0])
-
     def _theta(self) -> Array:
         """Temperature of the gas over that far away."""
         system = self.model.system
-        tau = self.solution.states[:, :, : system.gas]
+        tau = self.raw[:, :, : system.gas]
         if system.wall:
-            tau = np.concatenate([tau, self.solution.states[:, :, system.wall_row, None]], axis=2)
+            tau = np.concatenate([tau, self.raw[:, :, system.wall_row, None]], axis=2)
         return from_kirchhoff(tau, self.medium(2))
-
-    def _T(self) -> Array:
-        theta: Array = self[THETA]
-        return theta * self.medium(2).T_inf
 
     def _chi(self) -> Array:
         system = self.model.system
-        gas = self.solution.states[:, :, system.gas : system.first_medium]
+        gas = self.raw[:, :, system.gas : system.first_medium]
         if system.kinetic:
-            gas = np.concatenate([gas, self.solution.states[:, :, system.first_memory - 1, None]], axis=2)
+            gas = np.concatenate([gas, self.raw[:, :, system.first_memory - 1, None]], axis=2)
         return 1 - gas
 
-    def _C(self) -> Array:
-        return mass_fraction(self[MOLE_FRACTION], self.medium(2))
-
-    def _T_m(self) -> Array:
-        system = self.model.system
-        return (1 + self.solution.states[:, :, system.first_medium : system.wall_row]) * self.medium(2).T_inf
-
-    def _Z(self) -> Array:
-        return self.solution.states[:, :, self.model.system.first_memory : -2] * self.medium(2).rho
-
     def _p_b(self) -> Array:
-        medium, system = self.medium(1), self.model.system
-        log_R = self.solution.states[:, :, -1]
+        medium, system, log_R = self.medium(1), self.model.system, self.raw[:, :, -1]
         gas = self.par[:, None, rows.LOG_GAS]
         if not system.gas:
             return np.asarray(np.exp(gas - 3 * self.model.exponent(medium) * log_R) * medium.rho + medium.p_v)
-        m, weights, theta = system.gas, system.ball.weights, self[THETA]
-        share = 1 / theta[:, :, :m]
-        wall = theta[:, :, m] if system.wall else np.ones(1)
-        at_wall = weights[m] / wall
-        content = np.exp(gas - 3 * log_R) * medium.rho
-        if system.vapour:
-            share = share * (1 - self[MOLE_FRACTION][:, :, :m])
-        if system.kinetic:
-            at_wall = at_wall * (1 - self[MOLE_FRACTION][:, :, m])
-        elif system.vapour:
-            content = content + saturated_vapour_pressure(wall * medium.T_inf) * at_wall
-        return np.asarray(content / (share @ weights[:m] + at_wall) + medium.p_v)
+        total, outside = _weighed(system, medium, self[THETA], 1 - self[MOLE_FRACTION] if system.vapour else None)
+        return np.asarray((np.exp(gas - 3 * log_R) * medium.rho + outside) / total + medium.p_v)
 
     def _S(self) -> Array:
-        system, rho = self.model.system, self.medium(1).rho
-        V = self.solution.states[:, :, -2]
-        log_stretch = self.solution.states[:, :, -1] - self.par[:, None, rows.LOG_R0]
-        values = self.model.law_values(self.initial)
-        stress = self.model.law.elastic_stress(np.exp(log_stretch), values) / rho
+        system, rho, V = self.model.system, self.medium(1).rho, self.raw[:, :, -2]
+        law, stretch = self.model.law, OF_WHOLE["stretch"](self)  # a law may have a parameter of that name
+        values = self.model.law_values(self.model.parameter_values(self.initial))
+        stress = law.elastic_stress(stretch, values) / rho
         if system.memory:
-            stress = stress + self.solution.states[:, :, system.first_memory : -2].sum(axis=2)
+            stress = stress + self.raw[:, :, system.first_memory : -2].sum(axis=2)
         if system.shear or system.strain:
-            nu = self.model.law.mean_viscosity(np.abs(V) * 1e6, values, np.exp(log_stretch)) / rho * 1e6
+            nu = law.mean_viscosity(np.abs(V) * 1e6, values, stretch) / rho * 1e6
         else:
             nu = self.par[:, None, rows.VISCOSITY]
         return np.asarray((stress - 4 * nu * V) * rho)
 
 
-OF_WHOLE: dict[str, Callable[[Paths], Any]] = {THETA: Paths._theta, MOLE_FRACTION: Paths._chi}
-"""What is computed once from the paths as a whole, by words, which no parameter has for its name."""
+OF_WHOLE: dict[str, Callable[[Paths], Any]] = {
+    "R": lambda p: np.exp(p.raw[:, :, -1]) * 1e-6,
+    "Rdot": lambda p: p["R"] * p.raw[:, :, -2] * 1e6,
+    "strain_rate": lambda p: np.abs(p.raw[:, :, -2]) * 1e6,
+    "stretch": lambda p: np.exp(p.raw[:, :, -1] - p.par[:, None, rows.LOG_R0]),
+    THETA: Paths._theta,
+    MOLE_FRACTION: Paths._chi,
+    "T": lambda p: p[THETA] * p.medium(2).T_inf,
+    "C": lambda p: mass_fraction(p[MOLE_FRACTION], p.medium(2)),
+    "T_m": lambda p: (1 + p.raw[:, :, p.model.system.first_medium : p.model.system.wall_row]) * p.medium(2).T_inf,
+    "Z": lambda p: p.raw[:, :, p.model.system.first_memory : -2] * p.medium(2).rho,
+    "p_b": Paths._p_b,
+    "S": Paths._S,
+}
+"""What is computed once from the paths as a whole: fields of the state, and by words, which no parameter has for its
+name, what else is read.
+"""
 
 
 @dataclass(frozen=True)
@@ -191,16 +188,8 @@ class BubbleTrajectory(Trajectory):
     paths: Paths
     member: int
 
-    def __init__(self, paths: Paths, member: int):
-        self.__dict__.update(paths=paths, member=member)  # the dataclass is frozen
-
-    @property
-    def times(self) -> Array:
-        return np.asarray(self.paths.times[self.member])
-
-    @property
-    def layout(self) -> StateLayout:
-        return self.paths.model.layout
+    def __init__(self, paths: Paths, member: int):  # the dataclass is frozen
+        self.__dict__.update(paths=paths, member=member, times=paths.times[member], layout=paths.layout)
 
     def __getitem__(self, name: str) -> Array:
         return cast(Array, self.paths[name][self.member])
@@ -216,3 +205,209 @@ class BubbleTrajectory(Trajectory):
     @property
     def states(self) -> Array:
         return np.asarray(self.paths.states[self.member])
+
+
+_NO_TABLE = np.zeros((0, GRID.cells, 8))
+_NO_SAMPLES = np.zeros((0, len(GRID.nodes)))
+
+
+class Packed(NamedTuple):
+    """N members in the kernel's units and what their laws add to the equations; a call that completes them.
+
+    The elastic parts of the first members in the queue are sampled at once; they can be integrated while the call
+    samples the others, which it then makes available.
+    """
+
+    members: Members
+    memory: Array
+    viscous: Array
+    pulse: Array
+    complete: Callable[[], None]
+
+
+def pack(model: Dynamics, x: Array, start: Array | float, times: Array, halved: bool = False) -> Packed:
+    """States (N, n_state) at ``start`` (µs, one or (N,)), to be integrated to ``times`` (N, K) in µs. ``halved``: with
+    halved cells in the elastic tables, whatever the law.
+    """
+    law, system, own = model.law, model.system, model.parameter_values(x)
+    values = model.law_values(own)
+    rho = model.medium_of(own).rho
+    initial, par = _states(model, x, own)
+    n_members = len(x)
+    clocks = model.driving.of_members(own)
+    par[:, rows.PULSE_SHIFT], par[:, rows.PULSE_RATE], par[:, rows.PULSE_TABLE] = clocks[:3]
+    memory = viscous = _NO_TABLE
+    if system.memory:
+        memory = _memory(model, values, initial, par, x, model.medium_of(own, 1).rho)
+    if system.shear or system.strain:
+        viscous = law.viscous_table(values) / model.medium_of(own, 2).rho * 1e6
+        par[:, rows.VISCOUS_TABLE] = np.arange(n_members, dtype=float) * (viscous.shape[1] * 8)
+    elif "mu" in values:
+        par[:, rows.VISCOSITY] = values["mu"] / rho * 1e6
+
+    # Least damped, hence longest ringing, first, so that the lanes run dry together.
+    order = np.argsort(par[:, rows.VISCOSITY], kind="stable")
+    first, others = order[:WIDTH], order[WIDTH:]
+    available = np.full(1, n_members, dtype=np.int64)
+    samples, elastic = _NO_SAMPLES, _NO_TABLE
+    own_density = np.ndim(rho) > 0
+
+    def sampled(which: npt.NDArray[np.intp]) -> Array | None:
+        """Of some members; the kernel divides by one density, those of their own are divided by here."""
+        tabulated = law.samples({name: value[which] for name, value in values.items()})
+        return tabulated * (1 / np.asarray(rho)[which])[:, None] if tabulated is not None and own_density else tabulated
+
+    some = None if halved else sampled(first)
+    if some is None:
+        elastic = law.table(values, halved)
+        elastic[..., :6] /= model.medium_of(own, 2).rho  # not what tells of halved cells
+    else:
+        samples = np.empty((n_members, some.shape[1]))
+        samples[first] = some
+        available[0] = len(first)
+
+    def complete() -> None:
+        try:
+            if available[0] < n_members:
+                rest = sampled(others)
+                samples[others] = np.nan if rest is None else rest
+        finally:  # threads may be waiting
+            available[0] = n_members
+
+    members = Members(
+        counter=np.zeros(1, dtype=np.int64),
+        available=available,
+        order=order,
+        initial=initial,
+        parameters=par,
+        start=np.full(n_members, start, dtype=float),
+        times=np.ascontiguousarray(times),
+        samples=samples,
+        factor=1.0 if own_density else 1 / rho,
+        tables=elastic,
+    )
+    return Packed(members, memory, viscous, clocks.table, complete)
+
+
+def _states(model: Dynamics, x: Array, own: Mapping[str, Array]) -> tuple[Array, Array]:
+    """Initial values (N, n) and parameters (N, rows) of states (N, n_state), without what the law adds to both."""
+    medium, layout, system = model.medium_of(own), model.layout, model.system
+    column = {name: x[:, s.start] for name, s in layout.slices.items()}
+    log_R = np.log(column["R"] * 1e6)
+    initial = np.zeros((len(x), system.size))
+    initial[:, -2] = column["Rdot"] / column["R"] * 1e-6
+    initial[:, -1] = log_R
+    par = _constants(model, medium, own, len(x))
+    gas = (column["p_b"] - medium.p_v) / medium.rho
+    if system.gas:
+        m = system.gas
+        around = model.medium_of(own, 1)
+        theta = x[:, layout["T"]] / around.T_inf
+        initial[:, :m] = kirchhoff(theta[:, :m], around)
+        wall = theta[:, m] if system.wall else np.ones(len(x))
+        fractions = None
+        if system.vapour:
+            fractions = 1 - mole_fraction(x[:, layout["C"]], around)
+            initial[:, m : 2 * m] = fractions[:, :m]
+            if system.kinetic:
+                fractions[:, m] = _gas_at_wall(model, par, column, wall, fractions[:, :m])
+                initial[:, system.first_memory - 1] = fractions[:, m]
+        total, outside = _weighed(system, medium, theta, fractions)
+        par[:, rows.LOG_GAS] = np.log(gas * total - outside / medium.rho) + 3 * log_R
+        if system.wall:
+            initial[:, system.first_medium : system.wall_row] = x[:, layout["T_m"]] / around.T_inf - 1
+            initial[:, system.wall_row] = kirchhoff(wall, medium)
+    else:
+        par[:, rows.LOG_GAS] = np.log(gas) + 3 * model.exponent(medium) * log_R
+    par[:, rows.LOG_R0] = np.log(column[model.stress_free_radius] * 1e6)
+    return initial, par
+
+
+def _weighed(system: System, medium: Medium, theta: Array, gas: Array | None) -> tuple[Array, Array]:
+    """⟨Y/θ⟩ of temperatures θ and fractions Y of gas (…, nodes), and what the vapour at the wall adds to it, in Pa."""
+    m, weights = system.gas, system.ball.weights
+    wall = theta[..., m] if system.wall else np.ones(theta.shape[:-1])
+    shares, at_wall, outside = weights[:m] / theta[..., :m], weights[m] / wall, np.zeros_like(wall)
+    if gas is not None:
+        shares = shares * gas[..., :m]
+        if system.kinetic:
+            at_wall = at_wall * gas[..., m]
+        else:
+            outside = saturated_vapour_pressure(wall * medium.T_inf) * at_wall
+    return shares.sum(axis=-1) + at_wall, outside
+
+
+def _gas_at_wall(model: Dynamics, par: Array, column: Mapping[str, Array], theta: Array, gas_fraction: Array) -> Array:
+    """The positive Y_w (N,) of the finite rate in :mod:`solver.general`, which a changed state need not hold."""
+    p, R, slope = column["p_b"], column["R"] * 1e6, model.system.ball.derivative[-1]
+    power = par[:, rows.DIFFUSION_P], par[:, rows.DIFFUSION_T]
+    rho = model.medium_of(column).rho
+    diffusion = par[:, rows.DIFFUSION] * (par[:, rows.AMBIENT] * rho / p) ** power[0] * theta ** power[1]
+    crossing = par[:, rows.CROSSING] * np.sqrt(theta) * R / diffusion
+    saturation = par[:, rows.SATURATION] * rho * np.exp(-par[:, rows.SATURATION_T] / theta)
+    half, inside = (crossing * (saturation / p - 1) + slope[-1]) / 2, (gas_fraction * slope[:-1]).sum(axis=1)
+    root = np.sqrt(np.maximum(half**2 - crossing * inside, 0.0))
+    return np.asarray(np.where(half > 0, -inside / (half + root), (root - half) / np.maximum(crossing, 1e-300)))
+
+
+def with_gas(model: Dynamics, x: Array, factor: Array) -> Array:
+    """States (N, n_state) with ``factor`` (N,) times the gas of ``x``, and its temperatures and pressure of vapour."""
+    own, layout, changed = model.parameter_values(x), model.layout, np.array(x)
+    medium, around = model.medium_of(own), model.medium_of(own, 1)
+    before = x[:, layout["p_b"].start]
+    vapour: float | Array = medium.p_v
+    if model.system.kinetic:
+        vapour = mole_fraction(x[:, layout["C"].stop - 1], medium) * before
+    elif model.system.vapour:
+        vapour = saturated_vapour_pressure(x[:, layout["T"].stop - 1] if model.system.wall else medium.T_inf)
+    after = vapour + factor * (before - vapour)
+    changed[:, layout["p_b"].start] = after
+    if model.system.vapour:
+        gas = (1 - mole_fraction(x[:, layout["C"]], around)) * (factor * before / after)[:, None]
+        changed[:, layout["C"]] = mass_fraction(np.maximum(1 - gas, 0.0), around)
+    return changed
+
+
+def _memory(
+    model: Dynamics, values: Mapping[str, Array], initial: Array, par: Array, x: Array, rho: float | Array
+) -> Array:
+    """Tables of the memory variables; writes their initial values and parameters. ``rho`` is one density, or (N, 1)."""
+    system = model.system
+    initial[:, system.first_memory : -2] = x[:, model.layout["Z"]] / rho
+    memory = model.law.memory_tables(values)
+    member = np.arange(len(x), dtype=float)
+    for j in range(system.memory):
+        at = rows.MEMORY + rows.PER_MEMORY * j
+        par[:, at], par[:, at + 1] = memory.relaxation_time[:, j] * 1e6, memory.convection[j]
+        par[:, at + 2] = (member * system.memory + j) * (2 * GRID.cells * 8)
+    tables = np.stack([memory.stiffness, memory.equilibrium], axis=2)
+    return np.asarray((tables / np.reshape(rho, (-1, 1, 1, 1, 1))).reshape(-1, 1, 8))
+
+
+def _constants(model: Dynamics, medium: Medium, own: Mapping[str, Array], n_members: int) -> Array:
+    """The parameters (N, rows) of the solver that come from the medium and the driving; zeros elsewhere."""
+    system = model.system
+    par = np.zeros((n_members, rows.PARAMETERS + rows.PER_MEMORY * system.memory))
+    par[:, rows.VAPOUR] = medium.p_v / medium.rho
+    par[:, rows.AMBIENT] = medium.p_inf / medium.rho
+    par[:, rows.SURFACE] = 2 * medium.S / medium.rho * 1e6
+    par[:, rows.INVERSE_C] = 0.0 if system.radial == "rayleigh-plesset" else 1 / medium.c
+    par[:, rows.CONDUCTION] = medium.K_inf * medium.T_inf / medium.rho * 1e6
+    par[:, rows.KAPPA] = medium.kappa if system.gas else model.exponent(medium)
+    par[:, rows.SLOPE] = medium.conduction_slope
+    par[:, rows.AMPLITUDE] = own.get(P_A.name, model.driving.amplitude) / medium.rho
+    par[:, rows.TAIT_B] = medium.tait_B / medium.rho
+    par[:, rows.TAIT_N] = medium.tait_n
+    par[:, rows.DIFFUSION] = medium.D_v * 1e6
+    par[:, rows.DIFFUSION_P] = medium.D_p
+    par[:, rows.DIFFUSION_T] = medium.D_T
+    par[:, rows.SATURATION] = SATURATION / medium.rho
+    par[:, rows.SATURATION_T] = SATURATION_TEMPERATURE / medium.T_inf
+    par[:, rows.IMAGE] = model.image(own) * 1e-6
+    R_v = GAS_CONSTANT / medium.M_v
+    par[:, rows.CROSSING] = own.get(ACCOMMODATION.name, 0.0) * np.sqrt(R_v * medium.T_inf / (2 * np.pi))
+    par[:, rows.LATENT] = medium.L_v / (R_v * medium.T_inf) * medium.D_v * medium.rho / (medium.K_inf * medium.T_inf)
+    par[:, rows.MEDIUM_K] = medium.K_m / medium.K_inf
+    par[:, rows.MEDIUM_D] = medium.K_m / (medium.rho * medium.c_m) * 1e6
+    par[:, rows.HEATING] = 12 / (medium.c_m * medium.T_inf)
+    return par

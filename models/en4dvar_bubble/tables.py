@@ -56,23 +56,18 @@ def quintic(out, i, cell, a, da, dda, b, db, ddb):
     out[i, cell, 7] = 0.0
 
 
+@kernel
 def from_values(samples: Array) -> Array:
     """Coefficients (N, cells, 8) from samples (N, cells + 1 + 2·HALO) of the function."""
     out = np.empty((len(samples), samples.shape[1] - 1 - 2 * HALO, 8))
-    fill(samples, 1.0, out)
-    return out
-
-
-@kernel
-def fill(samples, factor, out):
-    """Write the coefficients of :func:`from_values`, of ``factor`` times the samples, to ``out`` (N, cells, 8)."""
     for i in range(len(samples)):
-        fill_one(samples, i, factor, out, i)
+        fill_one(samples, i, 1.0, out, i)
+    return out
 
 
 @called
 def fill_one(samples, member, factor, out, at):
-    """Those of one member's row of samples, to ``out[at]``."""
+    """Write those of ``factor`` times one member's row of samples to ``out[at]``."""
     cells = samples.shape[1] - 1 - 2 * HALO
     a = da = dda = 0.0
     for j in range(cells + 1):

@@ -19,12 +19,11 @@ from run_files import assert_same_results, command, environment, resumed_until_d
 
 from en4dvar.plumbing.errors import ConfigError, OutputError
 from en4dvar_agarose import report, tables
-from en4dvar_agarose.checkpoints import identity_of
 from en4dvar_agarose.commands import study as study_command
 from en4dvar_agarose.figures import all_figures, collapse
 from en4dvar_agarose.fits import OneGel, probability, verdict
 from en4dvar_agarose.paper import QUANTITIES, TABLE_1, TABLE_2
-from en4dvar_agarose.run import COMPARED, _Parts, run_study
+from en4dvar_agarose.run import COMPARED, _Parts, identity_of, run_study
 from en4dvar_agarose.settings import load_study
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
@@ -132,14 +131,19 @@ def test_a_file_of_the_user_is_not_taken_for_one_of_the_study(small, tmp_path, m
 def test_what_decides_the_numbers_of_a_study(tmp_path):
     shutil.copytree(CONFIGS, tmp_path / "configs")
     file = tmp_path / "configs" / "agarose_study.yaml"
-    before = identity_of(load_study(file))
+
+    def now():
+        plan = load_study(file)
+        return identity_of(plan.seed, plan.sweep, plan.named)
+
+    before = now()
     file.write_text(file.read_text().replace("name: agarose_study", "name: other # and a comment"))
-    assert identity_of(load_study(file)).difference(before, frozenset()) == ""
+    assert now().difference(before, frozenset()) == ""
     reading = tmp_path / "configs" / "data" / "agarose_twin" / "agarose_03_02.csv"
     reading.write_text(reading.read_text() + "\n")
     config = tmp_path / "configs" / "agarose_10_nh.yaml"
     config.write_text(config.read_text().replace("members: 48", "members: 49"))
-    changed = identity_of(load_study(file)).difference(before, frozenset()).splitlines()[2:]
+    changed = now().difference(before, frozenset()).splitlines()[2:]
     told = [line.partition(":")[0].replace(" ", "") for line in changed if line[0] in "+-"]
     assert told == ["-members", "+members"] + [
         f"{sign}0.3%,{model},agarose_03_02" for model in ("nh", "qs", "qlkv") for sign in "-+"

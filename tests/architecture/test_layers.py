@@ -21,9 +21,8 @@ FLOOR = {name: floor for floor, name in enumerate(LAYERS)}
 
 # the same inside the bubble, as the docstring of its package states
 BUBBLE = (
-    "tables", "medium", "media", "collapse", "gas", "driving", "numbers", "laws", "solver", "dynamics", "alternatives",
-    "packing", "paths", "events", "emission", "settings", "model", "api", "battery", "starter", "examples", "commands",
-    "commands_init", "warm_up",
+    "tables", "medium", "collapse", "gas", "driving", "numbers", "laws", "solver", "dynamics", "paths", "events",
+    "settings", "model", "api", "battery", "starter", "examples", "commands", "commands_init", "warm_up",
 )  # fmt: skip
 
 

@@ -6,9 +6,8 @@ import numba as nb
 import numpy as np
 import pytest
 
-from en4dvar_bubble.solver.arrow import pattern, places, tiles
 from en4dvar_bubble.solver.driver import System
-from en4dvar_bubble.solver.general import sums
+from en4dvar_bubble.solver.general import pattern, places, sums, tiles
 from en4dvar_bubble.solver.lanes import WIDTH
 from en4dvar_bubble.solver.rodas5p import GAMMA
 from en4dvar_bubble.solver.tiles import AREA, EDGE, factorise, place, solve

@@ -15,7 +15,7 @@ from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
 from en4dvar.schemes.settings import AssimilationSettings
 from en4dvar_bubble import Accuracy, BubbleModel, NeoHookeanKelvinVoigt
-from en4dvar_bubble.emission import OBSERVABLE, emitted
+from en4dvar_bubble.events import HEARD, emitted
 
 RELEASED = BubbleModel(law=NeoHookeanKelvinVoigt(), start="laser", gas="polytropic", accuracy=Accuracy(rtol=1e-10))
 DRIVEN = BubbleModel(law=NeoHookeanKelvinVoigt(), gas="polytropic", accuracy=Accuracy(rtol=1e-10))
@@ -67,7 +67,7 @@ def test_distance_and_arrival():
     early = replace(DRIVEN, hydrophone=R).integrate(x, np.tile([1e-6, 0.9 * R / C], (2, 1)))
     np.testing.assert_allclose(emitted(early), 0.0, atol=1e-6)  # nothing has arrived
     path = replace(RELEASED, hydrophone=R).integrate(RELEASED.initial_states(THETA), times + R / C)
-    np.testing.assert_array_equal(OBSERVABLE.operator(path[1]), OBSERVABLE.operator(path)[1])
+    np.testing.assert_array_equal(HEARD.operator(path[1]), HEARD.operator(path)[1])
 
 
 def test_the_largest_is_sent_at_the_collapse():
@@ -95,7 +95,7 @@ def test_a_camera_and_a_hydrophone_together():
     truth = model.initial_states({k: v[:1] for k, v in THETA.items()})
     frames, heard = np.linspace(1e-6, 1.4e-5, 6), R / C + np.linspace(1e-6, 2.1e-5, 15)
     told = []
-    for seen, times, std in ((radius, frames, 2e-6), (OBSERVABLE, heard, 40.0)):
+    for seen, times, std in ((radius, frames, 2e-6), (HEARD, heard, 40.0)):
         values = seen.operator(model.integrate(truth, times[None]))[0]
         told.append(Series(seen, times, values, noise_of(np.full(len(times), std))))
     spreads = []

@@ -53,9 +53,9 @@ class TestAgreementWithThePaperEquations:
         assert float(np.abs(conducting.R - laser().R).max()) < 1e-4 * 230e-6
 
     def test_vapour_of_vanishing_pressure_is_none(self, monkeypatch):
-        monkeypatch.setattr("en4dvar_bubble.packing.SATURATION", 1.0)
+        monkeypatch.setattr("en4dvar_bubble.paths.SATURATION", 1.0)
         monkeypatch.setattr("en4dvar_bubble.dynamics.saturated_vapour_pressure", lambda T: 1e-6)
-        monkeypatch.setattr("en4dvar_bubble.packing.saturated_vapour_pressure", lambda T: 0 * T + 1e-6)
+        monkeypatch.setattr("en4dvar_bubble.paths.saturated_vapour_pressure", lambda T: 0 * T + 1e-6)
         tight = Accuracy(nodes=12, rtol=1e-8)
         assert float(np.abs(laser(tight, vapour="transport").R - laser(tight).R).max()) < 1e-6 * 230e-6
 

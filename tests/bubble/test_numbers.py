@@ -11,7 +11,7 @@ from en4dvar.config import load_config
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar_bubble import WATER_25C, BubbleModel, NeoHookeanKelvinVoigt, get_law, histotripsy, silence, simulate
 from en4dvar_bubble.numbers import ALL, OF_MEDIUM
-from en4dvar_bubble.packing import pack
+from en4dvar_bubble.paths import pack
 
 BASE = {"G": 2e3, "mu": 0.05, "R0": 5e-6}
 TIMES = np.linspace(0, 40e-6, 41)

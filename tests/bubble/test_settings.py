@@ -12,8 +12,7 @@ from en4dvar.config.document import parse_document
 from en4dvar.config.load import resolve
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar_bubble import BubbleModel
-from en4dvar_bubble.media import MEDIA, known_medium
-from en4dvar_bubble.medium import CONSTANT_SETS, UNITS
+from en4dvar_bubble.medium import CONSTANT_SETS, MEDIA, UNITS, known_medium
 from en4dvar_bubble.settings import BubbleSettings, ConstantsSettings, MediumName
 
 HEAD = "name: x\nmodel:\n  name: bubble\n"

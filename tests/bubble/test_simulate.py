@@ -11,8 +11,7 @@ import pytest
 import en4dvar_bubble
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar_bubble import api
-from en4dvar_bubble.media import known_medium
-from en4dvar_bubble.medium import CONSTANT_SETS, UNITS, WATER_25C
+from en4dvar_bubble.medium import CONSTANT_SETS, UNITS, WATER_25C, known_medium
 
 GEL = {"G": 6900.0, "alpha": 0.025, "mu": 0.15, "R0": 1.3e-6}
 TIMES = np.linspace(5e-6, 30e-6, 7)

@@ -9,8 +9,7 @@ from scipy.integrate import solve_ivp
 from en4dvar.inputs.implausible import outlying, scatter_of
 from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.settings import BubbleSettings
-from en4dvar_bubble.starter.look import look
-from en4dvar_bubble.starter.top import Top, top
+from en4dvar_bubble.starter.look import Top, look, top
 
 _PATH = solve_ivp(
     lambda _, y: [y[1], (-1 - 1.5 * y[1] ** 2) / y[0]], (0, 0.9), [1.0, 0.0], dense_output=True, rtol=1e-10

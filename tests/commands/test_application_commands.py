@@ -37,7 +37,7 @@ def test_an_interrupted_sweep_says_how_to_continue(tmp_path: Path, monkeypatch: 
     done = CliRunner().invoke(main, call)
     assert done.exit_code == 130
     assert done.stderr.splitlines() == [
-        f"interrupted; finished chunks are kept in {tmp_path / 'sweep' / 'chunks'}",
+        f"interrupted; finished parts are kept in {tmp_path / 'sweep'}",
         f"to continue: en4dvar {' '.join(call[:-1])} --resume",
     ]
     monkeypatch.undo()

@@ -14,7 +14,7 @@ from en4dvar.config import load_config
 from en4dvar.config.document import parse_document
 from en4dvar.runs.together import groups_of
 from en4dvar_bubble import commands_init
-from en4dvar_bubble.starter.page import quoted
+from en4dvar_bubble.starter.config import quoted
 
 pytestmark = pytest.mark.usefixtures("own_folder")
 

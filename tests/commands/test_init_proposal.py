@@ -23,9 +23,9 @@ from en4dvar.plumbing.errors import ConfigError, DataError
 from en4dvar.report.result import load_result
 from en4dvar_bubble.collapse import RAYLEIGH, lobe
 from en4dvar_bubble.laws import REGISTRY
-from en4dvar_bubble.media import known_medium
+from en4dvar_bubble.medium import known_medium
+from en4dvar_bubble.starter.config import Source, yaml_text
 from en4dvar_bubble.starter.look import look
-from en4dvar_bubble.starter.page import Source, yaml_text
 from en4dvar_bubble.starter.proposal import starter
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -158,7 +158,7 @@ from en4dvar.cli import main
 replace, chunks = os.replace, itertools.count(1)
 def dies(source, target, **places):
     replace(source, target, **places)
-    if str(target).endswith(".npz") and "chunks" in str(target) and next(chunks) == 3:
+    if str(target).endswith(".npz") and "checkpoints" in str(target) and next(chunks) == 3:
         os.kill(os.getpid(), signal.SIGKILL)
 os.replace = dies
 main()
@@ -173,7 +173,7 @@ def test_a_killed_sweep_is_resumed_to_the_same_numbers(tmp_path):
     assert CliRunner().invoke(main, [*words, str(whole)]).exit_code == 0
     process = subprocess.run([sys.executable, "-c", DIES_AFTER_THREE_CHUNKS, *words, str(killed)], capture_output=True)
     assert process.returncode == -signal.SIGKILL
-    assert 3 <= len(list(killed.glob("chunks/*.npz"))) < 8  # another thread may end one while it dies
+    assert 3 <= len(list(killed.glob("checkpoints/sweep/*.npz"))) < 8  # another thread may end one while it dies
     assert CliRunner().invoke(main, [*words, str(killed), "--resume"]).exit_code == 0
     assert (killed / "sweep.csv").read_bytes() == (whole / "sweep.csv").read_bytes()
 

@@ -135,11 +135,6 @@ class Driving:
         return Clocks(shift, clocks.rate * stretch, np.asarray(8.0 * self.cells * which), table)
 
     @cached_property
-    def span(self) -> Array:
-        """(begin, end, cells per µs, cells) of the table."""
-        return self.grid.span
-
-    @cached_property
     def breaks(self) -> Array:
         """Instants (µs, increasing) at which a time step must end: the stops and both ends; none when silent."""
         if self.silent:
@@ -153,9 +148,10 @@ class Driving:
         clocks = self.of_members(values)
         shift, rate, offset = (np.reshape(of, (-1, 1)) for of in clocks[:3])
         read = (t * 1e6 - shift) * rate
-        inside = (read >= self.span[0]) & (read <= self.span[1])
+        span = self.grid.span
+        inside = (read >= span[0]) & (read <= span[1])
         table = np.broadcast_to(offset[:, 0].astype(int) // (8 * self.cells), len(t))
-        shape = evaluate(clocks.table.reshape(-1, self.cells, 8)[table], self.span, read)
+        shape = evaluate(clocks.table.reshape(-1, self.cells, 8)[table], span, read)
         amplitude = np.reshape(values.get("p_A", self.amplitude), (-1, 1))
         return np.where(inside, amplitude * shape, 0.0)
 

@@ -12,11 +12,6 @@ for _module in iter_modules(__path__):
     import_module(f"{__name__}.{_module.name}")
 
 __all__ = [
-    "REGISTRY",
-    "ConstitutiveLaw",
-    "Liquid",
-    "MemoryVariable",
-    "NeoHookeanKelvinVoigt",
-    "QuadraticKelvinVoigt",
+    "REGISTRY", "ConstitutiveLaw", "Liquid", "MemoryVariable", "NeoHookeanKelvinVoigt", "QuadraticKelvinVoigt",
     "get_law",
-]
+]  # fmt: skip

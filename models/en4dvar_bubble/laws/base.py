@@ -20,14 +20,7 @@ from en4dvar.plumbing.user_file import is_from_file
 from en4dvar_bubble.laws.exactness import Refined, is_sharp, refine
 from en4dvar_bubble.laws.memory import MemoryTables, MemoryVariable
 from en4dvar_bubble.laws.parameters import MU, Values, columns
-from en4dvar_bubble.laws.tabulate import (
-    GRID,
-    STRETCH,
-    VISCOUS_GRID,
-    from_function,
-    from_strain_energy,
-    from_viscosity,
-)
+from en4dvar_bubble.laws.tabulate import GRID, STRETCH, VISCOUS_GRID, from_function, from_strain_energy, from_viscosity
 from en4dvar_bubble.tables import evaluate, from_values
 
 REGISTRY: "dict[str, type[ConstitutiveLaw]]" = {}
@@ -131,8 +124,7 @@ class ConstitutiveLaw:
     @property
     def memory_count(self) -> int:
         """Number of memory variables."""
-        has_memory = type(self).memory is not ConstitutiveLaw.memory
-        return len(self.memory(columns(self.example_values()))) if has_memory else 0
+        return len(self.memory(columns(self.example_values())))
 
     @property
     def sharp(self) -> bool:

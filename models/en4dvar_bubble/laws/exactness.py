@@ -142,9 +142,7 @@ def slope_error(law: Any) -> tuple[float, float]:
     return float(error[worst]), float(stretch[worst])
 
 
-def _once(function: F) -> F:
-    """:func:`functools.cache` for functions of a class, which mypy takes for unhashable."""
-    return cast(F, cache(function))
+_once: Callable[[F], F] = cast(Any, cache)  # for functions of a class, which mypy takes for unhashable
 
 
 @_once
@@ -228,8 +226,8 @@ def _numbers(law: Any, values: Mapping[str, Array]) -> dict[str, Array]:
 
 @_once
 def refuse_unfit(kind: type[Any]) -> None:
-    """Raise ValueError for a user's class that is no law at its example values (tests hold those of the package to it),
-    and for one that :func:`refuse_inexact` refuses.
+    """Raise :class:`UnfitError` for a user's class that is no law at its example values (tests hold those of the
+    package to it), and for one that :func:`refuse_inexact` refuses.
     """
     law = kind()
     if not kind.__module__.startswith(_PACKAGE):
@@ -247,8 +245,8 @@ def refuse_unfit(kind: type[Any]) -> None:
 
 @_once
 def refuse_inexact(kind: type[Any]) -> None:
-    """Raise ValueError for a sharp law whose stress jumps, or is too rough for cells however narrow, and for one whose
-    other functions of the stretch, for which no cells are halved, a uniform table does not hold.
+    """Raise :class:`UnfitError` for a sharp law whose stress jumps, or is too rough for cells however narrow, and for
+    one whose other functions of the stretch, for which no cells are halved, a uniform table does not hold.
     """
     law = kind()
     if law.strain_dependent or law.memory_count:
@@ -259,7 +257,7 @@ def refuse_inexact(kind: type[Any]) -> None:
     inexact = np.exp(law.refined(law.example_values()).x)
     inexact = inexact[(inexact > lowest) & (inexact < highest)]
     if len(inexact):
-        raise ValueError(
+        raise UnfitError(
             f"{law.name}: its stress changes too sharply for the table that the solver reads: at λ = {inexact[0]:.6g} "
             f"it jumps, or is too rough for cells of {GRID.step * 0.5**HALVINGS:.0e} in ln λ to hold it to {ERROR:g} "
             "of its size. Make it continuous there (a kink does no harm), return NaN from where on the law has no "
@@ -269,7 +267,7 @@ def refuse_inexact(kind: type[Any]) -> None:
 
 
 def _refuse_rough(law: Any) -> None:
-    """Raise ValueError where a table errs by 1e-6 of a viscosity or memory function, or of its largest near λ = 1."""
+    """Raise :class:`UnfitError` where a table is 1e-6 off a viscosity or memory function, or its largest near λ = 1."""
     p, (lowest, highest) = columns(law.example_values()), np.log(law.stretch_range)
     x = np.arange(lowest, highest, GRID.step / _POINTS_IN_CELL)
     functions: dict[str, Function] = {}
@@ -285,7 +283,7 @@ def _refuse_rough(law: Any) -> None:
             allowed = TABLE_ERROR * np.maximum(np.abs(exact), np.max(np.abs(exact[np.abs(x) < np.log(2)]), initial=0.0))
         if np.any(error > allowed):
             where = np.exp(x[np.argmax(error - allowed)])
-            raise ValueError(
+            raise UnfitError(
                 f"{law.name}: {what} changes too sharply near λ = {where:.3g} for the table that the solver reads, "
                 f"whose cells are {GRID.step:g} wide in ln λ: make it smoother there, or narrow stretch_range to where "
                 "it is smooth, if bubbles stay inside"

@@ -1,7 +1,6 @@
 """Finding a law: built in, an entry point, a class of an installed package, or a class in a file of
 the user's own, and whether that class can serve as one."""
 
-import traceback
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,7 +13,7 @@ from en4dvar.plumbing import user_file
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.hints import suggest
 from en4dvar.plumbing.installed import installed
-from en4dvar.plumbing.user_code import imported, loading, reason_of
+from en4dvar.plumbing.user_code import imported, line_of, loading, reason_of
 from en4dvar_bubble.laws.base import REGISTRY, ConstitutiveLaw
 from en4dvar_bubble.laws.memory import MemoryVariable
 from en4dvar_bubble.laws.parameters import columns
@@ -30,12 +29,7 @@ def check_law(kind: Any, name: str) -> ConstitutiveLaw:
         raise ConfigError(f"{name}: not a subclass of en4dvar_bubble.ConstitutiveLaw")
     _check_elastic(kind, name)
     _check_parameters(kind, name)
-    try:
-        law = kind()
-    except TypeError as error:
-        raise ConfigError(f"{name}: cannot be created without arguments: {error}") from error
-    except BaseException as error:
-        raise ConfigError(f"{name}: cannot be created: {reason_of(error)}") from error
+    law: ConstitutiveLaw = _run(kind, f"{name}: cannot be created without arguments")
     _probe(law, name)
     return law
 
@@ -112,14 +106,12 @@ def _run(call: Callable[[], Any], where: str) -> Any:
         with np.errstate(all="ignore"):
             return call()
     except BaseException as error:
-        reason = reason_of(error)
-        frame = traceback.extract_tb(error.__traceback__)[-1]
         hint = ""
         if isinstance(error, AttributeError) and isinstance(error.obj, SimpleNamespace):
             hint = f"; p has no {error.name!r}{suggest(error.name, vars(error.obj))}"
         elif isinstance(error, ValueError) and "truth value" in str(error):
             hint = "; the arguments are arrays: write np.where instead of if, np.minimum instead of min"
-        raise ConfigError(f"{where}: {reason}{hint} ({frame.filename}:{frame.lineno})") from error
+        raise ConfigError(f"{where}: {reason_of(error)}{hint}{line_of(error)}") from error
 
 
 GROUP = "en4dvar_bubble.laws"

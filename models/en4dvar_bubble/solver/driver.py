@@ -19,10 +19,9 @@ from en4dvar_bubble.laws.tabulate import GRID, VISCOUS_GRID
 from en4dvar_bubble.solver import integrate, rodas5p, rows
 from en4dvar_bubble.solver.apart import address
 from en4dvar_bubble.solver.arrays import Control, Dims, Equations, Members, Output, Scratch, Shared
-from en4dvar_bubble.solver.arrow import tiles
 from en4dvar_bubble.solver.collocation import Grid, ball, exterior
 from en4dvar_bubble.solver.fields import scratch_rows
-from en4dvar_bubble.solver.general import sums
+from en4dvar_bubble.solver.general import sums, tiles
 from en4dvar_bubble.solver.lanes import WIDTH
 from en4dvar_bubble.solver.tiles import AREA, EDGE, kept_tiles
 
@@ -230,14 +229,14 @@ class Solver:
         if system.general:
             general = medium, memory, viscous, _ELASTIC_SPAN if system.strain else _VISCOUS_SPAN
         gas, reading = system.ball.rows if system.gas else _NO_ROWS, get_args(Reading).index(self.reading)
-        shared = gas, _REFINED_SPAN if halved else _ELASTIC_SPAN, pulse, driving.span
+        shared = gas, _REFINED_SPAN if halved else _ELASTIC_SPAN, pulse, driving.grid.span
         nodes, size, where, places = self._arrangement
         return Equations(nodes, size, system.dims, *shared, reading, *general, where, places)
 
     @cached_property
     def control(self) -> Control:
         """How the compiled integration chooses its steps, and when it gives a member up."""
-        accuracy, (begin, end) = self.accuracy, self.driving.span[:2]
+        accuracy, (begin, end) = self.accuracy, self.driving.grid.span[:2]
         return Control(
             breaks=self.driving.breaks,
             tolerances=self.system.tolerances(accuracy.rtol),

@@ -21,8 +21,7 @@ Radial motion (Keller & Miksis 1980; the paper's eq. 1), Mach number m = Ṙ/c:
 
 from en4dvar.plumbing.compiled import inlined
 from en4dvar_bubble.solver import rows
-from en4dvar_bubble.solver.lanes import exp, load, maximum, splat, sqrt, store
-from en4dvar_bubble.solver.lookup import driving, lookup
+from en4dvar_bubble.solver.lanes import driving, exp, load, lookup, maximum, splat, sqrt, store
 
 
 @inlined
@@ -80,65 +79,12 @@ def _gas(y, nodes, par, ops, work):
     return p, rate, E, wall
 
 
-def rhs(y, t, eq, loaded, w):
-    """Write dy/dt (n, 8) to ``f`` of the workspace."""
-    nodes, par, ops, reading, work, out = eq.nodes, loaded.par, eq.gas, eq.reading, w.work, w.f
-    m = len(nodes)
-    p, rate, E, _wall = _gas(y, nodes, par, ops, work)
-    V = load(y, m)
-    u = load(y, m + 1)
-    kappa = load(par, rows.KAPPA)
-    k1 = (kappa - 1.0) / kappa
-    for i in range(m):
-        first = load(work, 2 * m + i)
-        conduct = k1 * load(work, i) * load(work, m + i)
-        radius = ops[2 * m + 1, i]
-        drift = first * radius
-        dtau = drift * V + E * (conduct * load(work, 3 * m + 1 + i) - k1 * first * first)
-        store(out, i, dtau + (conduct + drift / (kappa * 3.0)) * rate)
-    R = exp(u)
-    ic = load(par, rows.INVERSE_C)
-    mach = R * V * ic
-    Ric = R * ic
-    when = load(t, 0)
-    if reading != rows.INSTANTANEOUS:
-        when = when + Ric
-    f, g, _ = driving(when, eq, par)
-    J, Jx, _ = lookup(loaded.elastic, load(par, rows.TABLE), eq.elastic_span, u - load(par, rows.LOG_R0))
-    surface = load(par, rows.SURFACE) / R
-    nu4 = load(par, rows.VISCOSITY) * 4.0
-    P = p + load(par, rows.VAPOUR) - load(par, rows.AMBIENT) - f - surface + J - nu4 * V
-    slope = p * rate + (surface + Jx) * V
-    if reading == rows.INSTANTANEOUS:
-        slope = slope - g
-    elif reading == rows.AS_PRINTED:
-        slope = slope - g * (mach + 1.0)
-    Rdot2 = R * R * V * V
-    numerator = Rdot2 * (mach * 1.5 - 2.5) + (mach + 1.0) * P + Ric * slope
-    store(out, m, numerator / (R * R * (1.0 - mach) + nu4 * Ric))
-    store(out, m + 1, V)
-
-
 @inlined
-def jacobian(y, t, eq, loaded, w):
-    """Write dy/dt to ``f`` of the workspace, ∂f/∂y to ``jac`` (row i·n+j) and ∂f_V/∂t, the only nonzero one, to ``dt``.
-
-    It is one long function because a split changes which multiply–adds are fused, and with them the last digit.
+def _motion(V, u, t, eq, loaded, p, rate):
+    """V̇ and, for its derivatives: one over its factor, R, Ṙ/c, R/c; dp_f/dt, d²p_f/dt²; J_e' and J_e'' by ln λ; σ/R,
+    4ν, P, dP/dt.
     """
-    nodes, par, ops, reading = eq.nodes, loaded.par, eq.gas, eq.reading
-    work, out, jac, dt = w.work, w.f, w.jac, w.dt
-    m = len(nodes)
-    n = m + 2
-    p, rate, E, wall = _gas(y, nodes, par, ops, work)
-    V = load(y, m)
-    u = load(y, m + 1)
-    kappa = load(par, rows.KAPPA)
-    k1 = (kappa - 1.0) / kappa
-    heat = (kappa - 1.0) * 3.0 * E
-    rate_u = heat * wall
-    rate_V = kappa * (-3.0)
-    zero = splat(0.0)
-
+    par, reading = loaded.par, eq.reading
     R = exp(u)
     ic = load(par, rows.INVERSE_C)
     mach = R * V * ic
@@ -152,6 +98,53 @@ def jacobian(y, t, eq, loaded, w):
     nu4 = load(par, rows.VISCOSITY) * 4.0
     P = p + load(par, rows.VAPOUR) - load(par, rows.AMBIENT) - f - surface + J - nu4 * V
     slope = p * rate + (surface + Jx) * V
+    if reading == rows.INSTANTANEOUS:
+        slope = slope - g
+    elif reading == rows.AS_PRINTED:
+        slope = slope - g * (mach + 1.0)
+    numerator = R * R * V * V * (mach * 1.5 - 2.5) + (mach + 1.0) * P + Ric * slope
+    inverse = 1.0 / (R * R * (1.0 - mach) + nu4 * Ric)
+    return numerator * inverse, inverse, R, mach, Ric, g, h, Jx, Jxx, surface, nu4, P, slope
+
+
+def rhs(y, t, eq, loaded, w):
+    """Write dy/dt (n, 8) to ``f`` of the workspace."""
+    nodes, par, ops, work, out = eq.nodes, loaded.par, eq.gas, w.work, w.f
+    m = len(nodes)
+    p, rate, E, _wall = _gas(y, nodes, par, ops, work)
+    V = load(y, m)
+    u = load(y, m + 1)
+    kappa = load(par, rows.KAPPA)
+    k1 = (kappa - 1.0) / kappa
+    for i in range(m):
+        first = load(work, 2 * m + i)
+        conduct = k1 * load(work, i) * load(work, m + i)
+        radius = ops[2 * m + 1, i]
+        drift = first * radius
+        dtau = drift * V + E * (conduct * load(work, 3 * m + 1 + i) - k1 * first * first)
+        store(out, i, dtau + (conduct + drift / (kappa * 3.0)) * rate)
+    acceleration = _motion(V, u, t, eq, loaded, p, rate)[0]
+    store(out, m, acceleration)
+    store(out, m + 1, V)
+
+
+@inlined
+def jacobian(y, t, eq, loaded, w):
+    """Write dy/dt to ``f`` of the workspace, ∂f/∂y to ``jac`` (row i·n+j) and ∂f_V/∂t, the only nonzero, to ``dt``."""
+    nodes, par, ops, reading = eq.nodes, loaded.par, eq.gas, eq.reading
+    work, out, jac, dt = w.work, w.f, w.jac, w.dt
+    m = len(nodes)
+    n = m + 2
+    p, rate, E, wall = _gas(y, nodes, par, ops, work)
+    V = load(y, m)
+    u = load(y, m + 1)
+    kappa = load(par, rows.KAPPA)
+    k1 = (kappa - 1.0) / kappa
+    heat = (kappa - 1.0) * 3.0 * E
+    rate_u = heat * wall
+    rate_V = kappa * (-3.0)
+    zero = splat(0.0)
+    acceleration, inverse, R, mach, Ric, g, h, Jx, Jxx, surface, nu4, P, slope = _motion(V, u, t, eq, loaded, p, rate)
     pressure_u = p * (-3.0)
     if m == 0:
         pressure_u = p * rate_V
@@ -162,20 +155,14 @@ def jacobian(y, t, eq, loaded, w):
     ahead = mach + 1.0
     numerator_t = -(ahead * g)
     if reading == rows.INSTANTANEOUS:
-        slope = slope - g
         numerator_t = numerator_t - Ric * h
-    elif reading == rows.RETARDED:
-        P_u = P_u - g * Ric
     else:
-        slope = slope - g * ahead
         P_u = P_u - g * Ric
+    if reading == rows.AS_PRINTED:
         slope_u = slope_u - h * Ric * ahead - g * mach
         slope_V = slope_V - g * Ric
         numerator_t = numerator_t - Ric * h * ahead
     Rdot2 = R * R * V * V
-    numerator = Rdot2 * (mach * 1.5 - 2.5) + ahead * P + Ric * slope
-    inverse = 1.0 / (R * R * (1.0 - mach) + nu4 * Ric)
-    acceleration = numerator * inverse
     numerator_u = Rdot2 * (mach * 4.5 - 5.0) + mach * P + ahead * P_u + Ric * (slope + slope_u)
     numerator_V = R * R * V * (mach * 4.5 - 5.0) + Ric * P - ahead * nu4 + Ric * slope_V
     denominator_u = R * R * (2.0 - mach * 3.0) + nu4 * Ric

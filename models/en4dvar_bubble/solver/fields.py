@@ -9,9 +9,8 @@ import numba as nb
 
 from en4dvar.plumbing.compiled import called, inlined
 from en4dvar_bubble.solver import rows
-from en4dvar_bubble.solver.arrow import begins
 from en4dvar_bubble.solver.equations import products
-from en4dvar_bubble.solver.general import border_rates, sums
+from en4dvar_bubble.solver.general import begins, border_rates, sums
 from en4dvar_bubble.solver.lanes import absolute, any_lane, exp, load, log, maximum, splat, sqrt, store
 from en4dvar_bubble.solver.tiles import EDGE, place
 
@@ -215,7 +214,7 @@ def _border_column(column, eq, par, change, w):
 
 @called
 def general_jacobian(y, t, eq, loaded, w):
-    """Write dy/dt to ``f`` of the workspace, minus its derivatives in the extended form of :mod:`arrow` to ``tiles``
+    """Write dy/dt to ``f`` of the workspace, minus its derivatives in the extended form of :mod:`general` to ``tiles``
     and ∂f_V/∂t to ``dt``. Those with respect to the border are one-sided differences.
     """
     kept, par, own, where = sums(eq.dims), loaded.par, len(w.border), eq.where

@@ -185,7 +185,6 @@ def _accept(lane, shared, lanes, w):
 
 @called
 def _reject(lane, shared, lanes, w):
-    """Shorten a lane's step."""
     lanes.rejected[lane] = 1.0
     shared.out.record[lanes.member[lane], REJECTED] += 1
     if math.isfinite(w.norm[0, lane]):

@@ -123,20 +123,11 @@ def _choose_rhs(y, t, eq, loaded, w):
     return rhs
 
 
+@inlined
 def _algebraic_rows(eq):
     """First and last + 1 of the rows of the wall's temperature and gas, which have algebraic equations."""
-
-
-@overload(_algebraic_rows)
-def _choose_rows(eq):
-    if not _is_general(eq):
-        return lambda eq: (0, 0)
-
-    def rows(eq):
-        first = eq.dims.gas + eq.dims.vapour + eq.dims.medium
-        return first, first + eq.dims.wall + eq.dims.kinetic
-
-    return rows
+    first = eq.dims.gas + eq.dims.vapour + eq.dims.medium
+    return first, first + eq.dims.wall + eq.dims.kinetic
 
 
 @nb.njit(inline="always")

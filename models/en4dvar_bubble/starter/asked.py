@@ -11,8 +11,7 @@ import numpy as np
 from en4dvar.inputs.parts import Contents, Layout, read_contents
 from en4dvar.plumbing.errors import ConfigError, DataError
 from en4dvar.plumbing.units import as_unit, convert
-from en4dvar_bubble.starter.config import FRAMES, PIXELS, unit_in, without_unit
-from en4dvar_bubble.starter.page import TRACKED, quoted
+from en4dvar_bubble.starter.config import FRAMES, PIXELS, TRACKED, quoted, unit_in, without_unit
 
 _TIME = re.compile(r"(?i)t|time|t[ _(\[].*|time[ _(\[].*")
 _STEP = re.compile(r"(?i)delta_?t|dt|t_?step|time_?step")

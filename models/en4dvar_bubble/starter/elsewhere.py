@@ -17,7 +17,7 @@ from en4dvar.model.state import READING_SCALE
 from en4dvar.plumbing.errors import ConfigError, retold
 from en4dvar.plumbing.hints import shown, suggest
 from en4dvar.plumbing.units import UnitError, parse_quantity
-from en4dvar_bubble.media import MEDIA, known_medium
+from en4dvar_bubble.medium import MEDIA, known_medium
 from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.starter.grouped import NO_GROUPS, Grouped
 

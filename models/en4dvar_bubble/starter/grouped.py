@@ -13,7 +13,7 @@ from en4dvar.plumbing.hints import listed, shown
 from en4dvar.plumbing.units import is_unit
 
 FOLDER = "folder"
-_UNIT = re.compile(r"(.+?)[ _]*[\[( _] *([^\W\d_]+|%) *[\])]?")
+_UNIT = re.compile(r"(.+?)[ _]*[\[(/ _] *([^\W\d_]+|%) *[\])]?")
 _NUMBER = re.compile(r"\d+([.,]\d+)?")
 
 
@@ -45,7 +45,7 @@ def grouped(files: Mapping[str, DataFile], data: str | Path, asked: str | None, 
         raise DataError(f"{path}: no such table of groups")
     else:
         kind, each = asked, {name: _in_data(file, asked, layout) for name, file in files.items()}
-    title, unit = _unit_of(kind)
+    title, unit = parted(kind) if is_unit(parted(kind)[1]) else (kind, "")
     of: dict[str, list[str]] = {}
     for name, group in each.items():
         of.setdefault(f"{group} {unit}" if unit and _NUMBER.fullmatch(group) else group, []).append(name)
@@ -64,10 +64,10 @@ def _by_folder(files: Mapping[str, DataFile], data: str | Path) -> Grouped:
     return Grouped(FOLDER, groups) if len(groups) > 1 else NO_GROUPS
 
 
-def _unit_of(column: str) -> tuple[str, str]:
-    """A column's name without the unit that it ends with, and this: of ``G [kPa]`` or ``conc_%``."""
+def parted(column: str) -> tuple[str, str]:
+    """A column's name without what may be the unit that it ends with, and this: of ``G [kPa]`` or ``conc_%``."""
     match = _UNIT.fullmatch(column)
-    return (match[1], match[2]) if match and is_unit(match[2]) else (column, "")
+    return (match[1], match[2]) if match else (column, "")
 
 
 def _by_table(files: Mapping[str, DataFile], path: Path, column: str) -> tuple[str, dict[str, str]]:

@@ -53,11 +53,6 @@ class Guess:
         values = {name: min(value, 0.5 * most.get(name, np.inf)) for name, value in self.values.items()}
         return replace(self, values=values, source="within what gels usually are, for the collapse is doubted")
 
-    @property
-    def far(self) -> bool:
-        """Whether no node comes close to what was observed."""
-        return self.misfit > FAR
-
 
 def first_guess(model: BubbleModel, fixed: Mapping[str, float], observed: Mapping[str, float]) -> Guess:
     """Guesses of those of G and μ that the law has.

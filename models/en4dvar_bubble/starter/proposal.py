@@ -20,7 +20,7 @@ from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.settings import BubbleSettings
 from en4dvar_bubble.starter import elsewhere
 from en4dvar_bubble.starter.grouped import NO_GROUPS, Grouped
-from en4dvar_bubble.starter.guess import OF_GELS, Guess, first_guess
+from en4dvar_bubble.starter.guess import FAR, OF_GELS, Guess, first_guess
 from en4dvar_bubble.starter.look import Look, Start, look, typical, usable
 
 LAWS: Mapping[Start, str] = {"acoustic": "quadratic-kelvin-voigt", "laser": "neo-hookean-kelvin-voigt"}
@@ -57,6 +57,7 @@ WIDTHS: Mapping[Start, Mapping[str, tuple[float, float]]] = {
 }
 BETWEEN = 1.645  # standard deviations from the median to 5 and 95 %
 SAME_CLOCK = 2e-6  # s: what a first guess can be off by
+EACH_ALONE = "of each bubble alone, which the gel's numbers do not use; 'true' takes up to twice the time"
 BUBBLES = (1e-7, 0.1)  # m: between these radii
 SEEN = (3e-6, 50e-9, 1e-4)  # m, s, m: one below is not read in shorter steps; radius of a usual bubble
 
@@ -93,11 +94,6 @@ class Proposal:
         Entry("members", "48"),
         Entry("draws", "400", "effective ones where the posterior is sampled: its mean is known to 5 % of its std"),
     )
-
-
-EACH_ALONE = Entry(
-    "what_if", "false", "of each bubble alone, which the gel's numbers do not use; 'true' takes up to twice the time"
-)
 
 
 def propose(
@@ -142,7 +138,7 @@ def propose(
         believed = guess.common() if possible else Guess({}, {}, 0.0)
     elif words := _implausible(look):
         warnings.append(words)
-    elif guess.far:
+    elif guess.misfit > FAR:  # no node comes close to what was observed
         warnings.append(_unmatched(guess.unmatched, look, model))
     wall: tuple[tuple[Entry, ...], tuple[Entry, ...]] = (), ()
     slow = elsewhere.SLOW[0] < ratio < elsewhere.SLOW[1]
@@ -162,7 +158,7 @@ def propose(
         together,
         chosen == "laser" and not _in_a_liquid(model) and float(np.median([v.n_minima for v in views])) > 2,
         tuple(looks),
-        (*Proposal.assimilation, *[EACH_ALONE] * bool(together)),
+        (*Proposal.assimilation, *[Entry("what_if", "false", EACH_ALONE)] * bool(together)),
     )
 
 

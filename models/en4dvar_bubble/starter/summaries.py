@@ -16,7 +16,7 @@ from en4dvar.model.state import Array
 from en4dvar.plumbing.tables import csv_text
 from en4dvar_bubble.collapse import RAYLEIGH
 from en4dvar_bubble.medium import Medium
-from en4dvar_bubble.starter.page import Source
+from en4dvar_bubble.starter.config import Source
 from en4dvar_bubble.starter.proposal import WHY, Entry, Proposal, built, example, known_elsewhere
 
 RADII = (1e-6, 0.1)  # m
