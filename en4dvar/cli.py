@@ -19,8 +19,7 @@ from en4dvar.commands.installation import models, schema, warm_up
 from en4dvar.commands.plugins import COMMANDS, PluginCommand
 from en4dvar.commands.results import compare, export, report, rerun
 from en4dvar.commands.run import run
-from en4dvar.commands.simulate import simulate
-from en4dvar.commands.synthetic import calibrate, design, sweep_twin
+from en4dvar.commands.synthetic import calibrate, design, simulate, sweep_twin
 from en4dvar.commands.together import joint, population
 from en4dvar.commands.validate import validate
 from en4dvar.plumbing.errors import En4dvarError

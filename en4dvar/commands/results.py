@@ -156,9 +156,9 @@ def _populations(
     can be, or options ask for it.
     """
     from en4dvar.report.populations import compare_populations, medians_table, sentences
-    from en4dvar.results.population_file import FILE
+    from en4dvar.results.together import POPULATION
 
-    held = all((run_dir / FILE).is_file() for run_dir in run_dirs)
+    held = all((run_dir / POPULATION).is_file() for run_dir in run_dirs)
     asked = (held and alone) or against or apart or known
     if not (asked or held):
         return None
@@ -206,7 +206,7 @@ def export(run_dir: Path, kind: Literal["csv", "latex", "members", "netcdf"], ou
         return
     try:
         if cycles:
-            from en4dvar.report.cycles import cycles_table
+            from en4dvar.report.sequence import cycles_table
 
             text = cycles_table(cycles, kind)
         else:

@@ -131,19 +131,18 @@ def _tell(campaign: Campaign, with_report: bool) -> None:
 
 def _tell_what_sets_share(directory: Path, warnings: _Warnings) -> None:
     """The joint estimate and the population of a run on standard output, where there are; their warnings are added."""
-    from en4dvar.results import joint_file
-    from en4dvar.results.population_file import populations_of
+    from en4dvar.results.together import JOINT, load_joint, populations_of
 
-    if (directory / joint_file.FILE).exists():
-        from en4dvar.report.joint import joint_table
+    if (directory / JOINT).exists():
+        from en4dvar.report.together import joint_table
 
-        together = joint_file.load_joint(directory / joint_file.FILE)
+        together = load_joint(directory / JOINT)
         echo(f"\n{joint_table(together)}")
         warnings.joint = True
         warnings.add("all together", together.cautions, whole=True)
     for n, (name, (_, of)) in enumerate(populations_of(directory).items()):
-        from en4dvar.report.population import population_lines
         from en4dvar.report.populations import group_lines
+        from en4dvar.report.together import population_lines
 
         if name and n == 0:
             echo("\n" + "\n".join(group_lines(directory)))

@@ -16,20 +16,18 @@ from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.files import inside, make_folder, write_text
 from en4dvar.plumbing.hints import suggest
 from en4dvar.plumbing.tables import write_csv
-from en4dvar.report.figures import all_figures
+from en4dvar.report.figures import PIECE_COLUMNS, all_figures, stored_walks
 from en4dvar.report.history import WITHHELD_COLUMNS, withheld_lines
 from en4dvar.report.overview import Headline, SetSummary, overview_figures, render_overview
 from en4dvar.report.page import IDENTIFIERS, render_set
 from en4dvar.report.responses import ENTRY_COLUMNS, SHIFT_COLUMNS, stored_ledger, stored_shifts
 from en4dvar.report.svg import draw, svg
 from en4dvar.report.text import upper_first
-from en4dvar.report.varying import PIECE_COLUMNS, stored_walks
 from en4dvar.results.campaign_file import failed_datasets
-from en4dvar.results.joint_file import FILE, load_joint
 from en4dvar.results.pack import PACK
-from en4dvar.results.population_file import populations_of
 from en4dvar.results.run_results import RunResults
 from en4dvar.results.store import StoredResult, load_stored
+from en4dvar.results.together import JOINT, load_joint, populations_of
 
 PAGES = 40  # data sets of a campaign with a page from the start
 SHARE = 20  # pages that are worth the start of a process
@@ -124,7 +122,7 @@ def _write_campaign(
 
 def _headlines(run_dir: Path) -> list[Headline]:
     """What the data sets say together, where the run estimated it; the tables of its groups are written."""
-    from en4dvar.report import joint, population, populations  # with the estimates, which other pages do not need
+    from en4dvar.report import populations, together  # with the estimates, which other pages do not need
 
     headlines, groups = [], populations.groups_compared(run_dir)
     if isinstance(groups, str):
@@ -136,13 +134,15 @@ def _headlines(run_dir: Path) -> list[Headline]:
         headlines.append(Headline("differences.csv", "The differences", told, drawn, caption))
     for name, (folder, of) in populations_of(run_dir).items():
         words = f"The population of {name}" if name else "The population behind them"
-        told = [f"{name}: {line}" if name else upper_first(line) for line in population.sentences(of)]
+        told = [f"{name}: {line}" if name else upper_first(line) for line in together.sentences(of)]
         address = quote((folder / "population.html").relative_to(run_dir).as_posix())
-        headlines.append(Headline(address, words, told, population.figure(of), population.caption(of)))
-    if (run_dir / FILE).exists():
-        shared = load_joint(run_dir / FILE)
-        lines = [upper_first(line) for line in joint.joint_lines(shared)]
-        headlines.append(Headline("joint.html", "All of them together", lines, joint.figure(shared), joint.CAPTION))
+        headlines.append(Headline(address, words, told, together.population_figure(of), together.caption(of)))
+    if (run_dir / JOINT).exists():
+        shared = load_joint(run_dir / JOINT)
+        lines = [upper_first(line) for line in together.joint_lines(shared)]
+        headlines.append(
+            Headline("joint.html", "All of them together", lines, together.joint_figure(shared), together.SHARED)
+        )
     return headlines
 
 

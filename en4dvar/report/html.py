@@ -12,7 +12,7 @@ from markupsafe import Markup
 
 from en4dvar.plumbing.files import write_text
 from en4dvar.report import responses, text
-from en4dvar.report.palette import DARK, LIGHT
+from en4dvar.report.chart import DARK, LIGHT
 
 WRITERS = (  # what templates call
     text.estimate, text.fixed, text.number_like, text.percent, text.plain_number, text.plus_minus,

@@ -10,14 +10,13 @@ from en4dvar.diagnosis.honesty.checks import MOVED
 from en4dvar.estimation.summary import AS_WIDE, ParameterSummary
 from en4dvar.plumbing.caution import worst_first
 from en4dvar.plumbing.units import convert
-from en4dvar.report import readings
-from en4dvar.report.figures import neighbours
+from en4dvar.report import responses
+from en4dvar.report.figures import neighbours, stored_walks, verdict
 from en4dvar.report.history import withheld_words
 from en4dvar.report.html import render
 from en4dvar.report.responses import exceeding, stored_ledger, stored_shifts
 from en4dvar.report.svg import Drawing
 from en4dvar.report.text import number_like, plain_number, shown
-from en4dvar.report.varying import stored_walks, verdict
 from en4dvar.results.store import StoredResult
 from en4dvar.results.variables import ITERATIONS, SHARES
 
@@ -52,7 +51,7 @@ def render_set(
         exceeding=exceeding(what_if),
         what_if_added=_recorded(result).get("what_if") == "added",
         entries=stored_ledger(result),
-        readings=readings.reading_words(result),
+        readings=responses.reading_words(result),
         withheld=withheld_words(result),
         walks=stored_walks(result),
         verdict=verdict(result),
@@ -87,7 +86,7 @@ def trust(result: StoredResult) -> str:
 
 def _neighbours_words(result: StoredResult) -> str:
     """Whether neighbouring residuals are related more than independent errors are in 95 of 100 data sets."""
-    correlation, limit = neighbours(readings.whitened(result))
+    correlation, limit = neighbours(responses.whitened(result))
     if not len(correlation) or abs(correlation[0]) <= limit:
         return " and neighbouring residuals are unrelated" if len(correlation) else ""
     alike = "resemble each other" if correlation[0] > 0 else "alternate in sign"

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from en4dvar.plumbing.files import write_bytes
-from en4dvar.report.chart import Chart, Mark, Panel, labelled
-from en4dvar.report.palette import LIGHT
+from en4dvar.report.chart import LIGHT, Chart, Mark, Panel, labelled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

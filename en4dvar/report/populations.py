@@ -30,9 +30,8 @@ from en4dvar.report.html import write_page
 from en4dvar.report.paper import on_paper
 from en4dvar.report.svg import draw
 from en4dvar.report.text import figure_text, number_like, plain_number, range_words, unit_behind, with_unit
-from en4dvar.results.joint_file import QUANTILES
 from en4dvar.results.netcdf import understood
-from en4dvar.results.population_file import FILE, StoredPopulation, load_groups_of, load_population
+from en4dvar.results.together import POPULATION, QUANTILES, StoredPopulation, load_groups_of, load_population
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -255,7 +254,7 @@ def _three(values: Array) -> tuple[float, float, float]:
 
 
 def _stored(folder: Path) -> StoredPopulation:
-    path = folder / FILE
+    path = folder / POPULATION
     if not path.is_file():
         words = (
             "a run whose configuration has 'population:' ends with one, 'en4dvar population' makes one of finished runs"

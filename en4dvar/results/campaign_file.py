@@ -29,8 +29,7 @@ from en4dvar.results.netcdf import (
     opened_netcdf,
     read_sealed,
 )
-from en4dvar.results.pack import Pack
-from en4dvar.results.packed import Alike, Content, PackedLayout, opened, unpacked, unpacked_together
+from en4dvar.results.pack import Alike, Content, Pack, PackedLayout, opened, unpacked, unpacked_together
 
 GROUPS = (
     "prior", "posterior", "prior_predictive", "posterior_predictive", "observed_data", "observation_errors",

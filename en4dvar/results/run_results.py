@@ -10,8 +10,8 @@ from pathlib import Path
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.results.campaign_file import datasets_in
 from en4dvar.results.checkpoint import CheckpointError, read_checkpoint
-from en4dvar.results.fingerprint import IDENTITY, Identity
 from en4dvar.results.pack import PACK, Pack, file_names, known_pack, read_result, results_of
+from en4dvar.results.provenance import IDENTITY, Identity
 from en4dvar.results.store import StoredResult, load_stored, require_settled
 
 MOST_NAMES = 20

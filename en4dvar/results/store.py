@@ -30,8 +30,7 @@ from en4dvar.plumbing.errors import OutputError, retold
 from en4dvar.plumbing.units import UnitError, convert
 from en4dvar.results.declared import MEMBER, Axis, Declared, attributes_of, axes_of, group_of, lay_out, parameter_of
 from en4dvar.results.netcdf import Group, Groups, Variable, read_groups, understood
-from en4dvar.results.pack import PACK, read_result
-from en4dvar.results.packed import unpacked
+from en4dvar.results.pack import PACK, read_result, unpacked
 from en4dvar.results.scalars import ATTRIBUTES, SCALAR
 from en4dvar.results.variables import COORDINATES, GROUPS, OPTIONAL, SCOPES
 
@@ -200,7 +199,7 @@ def load_stored(path: str | Path) -> StoredResult:
     """Read ``posterior.nc`` into memory and close it, or what is at an address in a pack.
 
     Raises :class:`OutputError`: it is no result, of another version, cut short or altered (see
-    :mod:`en4dvar.results.seal`).
+    :mod:`en4dvar.results.netcdf`).
     """
     path = Path(path)
     with retold(ValueError, OutputError, f"{path}: not a result of en4dvar: "):  # anybody can write a checksum

@@ -17,7 +17,7 @@ from en4dvar.assembly.build import data_files, inverse_plan
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.files import inside, read_plain, refused, write_text
 from en4dvar.results.checkpoint import FOLDER, CheckpointError, digest, read_checkpoint, write_checkpoint
-from en4dvar.results.fingerprint import Identity, identity, source_digest
+from en4dvar.results.provenance import Identity, identity, source_digest
 from en4dvar.runs.rundir import RunDirectory
 from en4dvar_agarose.settings import StudyPlan
 

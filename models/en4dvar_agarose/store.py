@@ -6,8 +6,7 @@ import numpy as np
 
 from en4dvar.estimation.population import Population
 from en4dvar.model.state import Array, Parameter
-from en4dvar.results.netcdf import Group, Variable, to_bytes, variable
-from en4dvar.results.seal import SealedBytes
+from en4dvar.results.netcdf import Group, SealedBytes, Variable, to_bytes, variable
 from en4dvar_agarose.fits import Fit, Study
 from en4dvar_agarose.paper import Route
 

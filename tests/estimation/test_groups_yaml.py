@@ -19,7 +19,7 @@ from en4dvar.model.state import Parameter
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.report import populations
 from en4dvar.report.populations import compare_populations, numbers_of
-from en4dvar.results.population_file import load_groups_of, load_population
+from en4dvar.results.together import load_groups_of, load_population
 from en4dvar.runs.engine import write_report
 from en4dvar.runs.runner import run_campaign
 
