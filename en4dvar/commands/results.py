@@ -9,17 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
-from en4dvar.commands.common import (
-    Failed,
-    ask,
-    deliver,
-    echo,
-    folder_of,
-    from_here,
-    tell,
-    trust_option,
-    workers_option,
-)
+from en4dvar.commands.common import Failed, ask, deliver, echo, folder_of, from_here, tell, trust_option, workers_option
 from en4dvar.plumbing.errors import OutputError
 
 if TYPE_CHECKING:

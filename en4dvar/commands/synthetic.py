@@ -19,6 +19,7 @@ from en4dvar.commands.common import (
     note_beginning,
     parted,
     refuse_to_replace,
+    tell,
     workers_option,
 )
 from en4dvar.commands.plugins import WithForms, asked, write_form
@@ -101,9 +102,7 @@ def _simulate_campaign(source: Source, out: Path | None, seed: int | None, force
 @click.option("--force", is_flag=True, help="Replace an earlier calibration, once this one is complete.")
 @click.option("--resume", is_flag=True, help="Go on with an interrupted one, or with more sets.")
 @workers_option
-def calibrate(
-    source: Source, sets: int, made: tuple[str, ...], out: Path | None, force: bool, resume: bool, workers: int | None
-) -> None:
+def calibrate(source: Source, sets: int, made: tuple[str, ...], workers: int | None, **how: Any) -> None:
     """Make synthetic data sets by the configuration itself, estimate them, and test the ranks of the truths.
 
     Truths are drawn from the priors, readings from the model with the errors of the file, at the times of its data. Of
@@ -117,17 +116,13 @@ def calibrate(
     from en4dvar.runs.calibration_run import calibrate as conduct
     from en4dvar.runs.progress import counted
 
-    if out is not None:
-        note_beginning(out, resume)
-    overrides = source.overrides(**{"execution.workers": workers})
+    note_beginning(how["out"], how["resume"])
+    how |= {"overrides": source.overrides(**{"execution.workers": workers}), "made_with": parted(made, "--made-with")}
     with continuable(), counted("sets") as progress:
-        result = conduct(
-            source.path, sets, overrides=overrides, made_with=parted(made, "--made-with"), out=out, force=force,
-            resume=resume, progress=progress, command=command_line(),
-        )  # fmt: skip
+        result = conduct(source.path, sets, progress=progress, command=command_line(), **how)
     echo(str(result))
     for remark in result.remarks:
-        echo(f"note: {remark}", err=True)
+        tell(f"note: {remark}")
     echo(f"report: {result.directory / 'calibration.html'}")
 
 
@@ -139,7 +134,7 @@ def calibrate(
 @click.option("--out", type=click.Path(path_type=Path), help="Directory of the result; default runs/<name>_design.")
 @click.option("--force", is_flag=True, help="Replace an earlier result in the directory.")
 @click.option("--resume", is_flag=True, help="Go on with an interrupted comparison; the numbers are the same.")
-def design(source: Source, after: Path | None, out: Path | None, force: bool, resume: bool) -> None:
+def design(source: Source, **how: Any) -> None:
     """Compare planned experiments by the information they are expected to give.
 
     The configuration is that of 'run'; its data file need not exist. A 'design:' section says when readings are
@@ -154,14 +149,12 @@ def design(source: Source, after: Path | None, out: Path | None, force: bool, re
     from en4dvar.runs.design_run import run_design
     from en4dvar.runs.progress import counted
 
+    how |= {"overrides": source.overrides(), "command": command_line()}
     with continuable(), counted("designs") as on_design:
-        plan, directory = run_design(
-            source.path, overrides=source.overrides(), after=after, out=out, force=force, resume=resume,
-            on_design=on_design, command=command_line(),
-        )  # fmt: skip
+        plan, directory = run_design(source.path, on_design=on_design, **how)
     echo(design_table(plan))
     for remark in remarks(plan):
-        echo(f"note: {remark}", err=True)
+        tell(f"note: {remark}")
     echo(f"report: {directory / 'design.html'}")
 
 
@@ -179,10 +172,7 @@ def design(source: Source, after: Path | None, out: Path | None, force: bool, re
 @click.option("--force", is_flag=True, help="Replace an earlier sweep, once this one is complete.")
 @click.option("--resume", is_flag=True, help="Take over finished runs; seeds and values may be added at the end.")
 @workers_option
-def sweep_twin(
-    source: Source, varied: tuple[str, ...], seeds: int, out: Path | None, force: bool, resume: bool,
-    workers: int | None,
-) -> None:  # fmt: skip
+def sweep_twin(source: Source, varied: tuple[str, ...], seeds: int, **how: Any) -> None:
     """Compare settings in twin experiments: RMSE and spread, mean ± standard error over seeds.
 
     All settings see the same truths and observations. Writes sweep.csv and, with every run, runs.csv.
@@ -193,18 +183,12 @@ def sweep_twin(
     """
     from en4dvar.runs.twin_sweep import sweep_twin as sweep
 
-    def tell(done: int, of: int) -> None:
-        echo(f"{done} of {of} runs", err=True)
-
     vary = parted(varied, "--vary")
-    if out is not None:
-        note_beginning(out, resume)
+    note_beginning(how["out"], how["resume"])
+    how |= {"overrides": source.overrides(), "command": command_line()}
     with continuable():
-        result = sweep(
-            source.path, vary, seeds, overrides=source.overrides(), out=out, workers=workers, force=force,
-            resume=resume, progress=tell, command=command_line(),
-        )  # fmt: skip
+        result = sweep(source.path, vary, seeds, progress=lambda done, of: tell(f"{done} of {of} runs"), **how)
     echo(str(result))
     for reason in dict.fromkeys(run.failure for runs in result.runs for run in runs if run.failure):
-        echo(f"failed: {reason}", err=True)
+        tell(f"failed: {reason}")
     echo(f"averages: {result.directory / 'sweep.csv'}")
