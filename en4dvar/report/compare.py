@@ -39,6 +39,7 @@ from en4dvar.results.store import StoredResult, load_stored
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+S = TypeVar("S", bound=Any)
 T = TypeVar("T")
 MOST_WARNINGS = 12  # on the terminal
 UNDECIDABLE = 1.0  # difference of log-evidence
@@ -193,10 +194,10 @@ def _judged(scores: Sequence[ModelScore], datasets: Sequence[str]) -> tuple[Mode
     of_each: dict[str, list[ModelScore]] = {name: [] for name in datasets}
     for score in scores:
         of_each[score.dataset].append(score)
-    ranked = list(map(_ranked, of_each.values()))
+    every = list(map(ranked, of_each.values()))
     if len(datasets) > 1:
-        ranked.append(_ranked([_total(run) for run in zip(*ranked, strict=True)]))
-    return tuple(score for of_dataset in ranked for score in of_dataset)
+        every.append(ranked([_total(run) for run in zip(*every, strict=True)]))
+    return tuple(score for of_dataset in every for score in of_dataset)
 
 
 def _difference(results: Mapping[str, Mapping[str, StoredResult]]) -> str:
@@ -370,7 +371,8 @@ def _total(scores: Sequence[ModelScore]) -> ModelScore:
     return replace(scores[0], dataset=ALL, **joined, stored=any(of_all("stored")))
 
 
-def _ranked(scores: Sequence[ModelScore]) -> list[ModelScore]:
+def ranked(scores: Sequence[S]) -> list[S]:
+    """The scores with the difference of their log-evidence from the best one, and their probabilities."""
     evidence = np.array([s.log_evidence for s in scores])
     return [
         replace(s, difference=float(s.log_evidence - evidence.max()), probability=float(p))

@@ -230,10 +230,8 @@ def _discrepancy(result: StoredResult, time: Array, label: str) -> Panel:
 def neighbours(white: Array) -> tuple[Array, float]:
     """Correlation of residuals (K,) that lie 1, 2, … apart, and what 95 % of independent ones do not exceed."""
     lags = max(1, min(15, len(white) // 3)) if len(white) > 1 else 0
-    size = float(white @ white) or 1.0
-    return np.array([float(white[lag:] @ white[:-lag]) / size for lag in range(1, lags + 1)]), 1.96 / math.sqrt(
-        len(white) or 1
-    )
+    size, limit = float(white @ white) or 1.0, 1.96 / math.sqrt(len(white) or 1)
+    return np.array([float(white[lag:] @ white[:-lag]) / size for lag in range(1, lags + 1)]), limit
 
 
 def _autocorrelation(white: Array) -> Panel:

@@ -19,6 +19,8 @@ from en4dvar.results.store import StoredResult
 
 NAMED = 40  # data sets whose names fit below a figure
 LISTED = 2000  # data sets in the table: a browser shows as many at once
+Headline = tuple[str, str, Sequence[str], str, str]
+"""What data sets say together: the address of a page and words for it, lines of the answer, a figure (SVG), caption."""
 
 
 @dataclass(frozen=True)
@@ -55,17 +57,6 @@ class SetSummary:
     @property
     def codes(self) -> str:
         return ", ".join(codes(self.cautions))
-
-
-@dataclass(frozen=True)
-class Headline:
-    """What data sets say together: ``lines`` of the answer, a figure (SVG), ``words`` for the page at ``address``."""
-
-    address: str
-    words: str
-    lines: Sequence[str]
-    figure: str
-    caption: str
 
 
 def render_overview(

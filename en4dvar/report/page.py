@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from en4dvar.diagnosis.diagnostics import chi2_interval
@@ -11,11 +12,11 @@ from en4dvar.estimation.summary import AS_WIDE, ParameterSummary
 from en4dvar.plumbing.caution import worst_first
 from en4dvar.plumbing.units import convert
 from en4dvar.report import responses
-from en4dvar.report.figures import neighbours, stored_walks, verdict
+from en4dvar.report.figures import all_figures, neighbours, stored_walks, verdict
 from en4dvar.report.history import withheld_words
 from en4dvar.report.html import render
 from en4dvar.report.responses import exceeding, stored_ledger, stored_shifts
-from en4dvar.report.svg import Drawing
+from en4dvar.report.svg import draw
 from en4dvar.report.text import number_like, plain_number, shown
 from en4dvar.results.store import StoredResult
 from en4dvar.results.variables import ITERATIONS, SHARES
@@ -28,18 +29,18 @@ IDENTIFIERS = "d0-"  # begin those of figures, which are addresses
 
 
 def render_set(
-    result: StoredResult, figures: Sequence[Drawing], trail: Sequence[tuple[str, str]] = (), copies: bool = True
+    result: StoredResult, trail: Sequence[tuple[str, str]] = (), folder: Path | None = None, begin: str = ""
 ) -> str:
-    """The page of one data set as HTML text.
+    """The page of one data set as HTML text; ``trail``: links (words, address) above it.
 
-    ``trail``: links (words, address) above it; ``copies``: whether the figures are also kept as PDF and PNG.
+    ``folder``: where its figures are kept as PDF and PNG too, if anywhere, under names with ``begin``.
     """
     judged = result.group("sample_stats")
     return render(
         "set.html.j2",
         result=result,
         trail=trail,
-        copies=copies,
+        copies=folder is not None,
         stats=judged.attrs,
         rows=result.rows,
         stated=[row.label for row in result.rows if _as_stated(row)],
@@ -56,7 +57,7 @@ def render_set(
         walks=stored_walks(result),
         verdict=verdict(result),
         identifiers=IDENTIFIERS,
-        drawn={name: (caption, svg) for name, caption, svg in figures},
+        drawn={name: (caption, svg) for name, caption, svg in draw(all_figures(result), IDENTIFIERS, folder, begin)},
         modes=_modes(result),
         lost=[(i, str(reason)) for i, reason in enumerate(judged["failure_reason"].values.ravel()) if reason],
         iterations=_iterations(result),

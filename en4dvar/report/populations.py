@@ -135,7 +135,9 @@ def compare_populations(
     logarithmic = frozenset(name for name in names if all(t.transform == "lognormal" for t in terms[name]))
     medians: dict[str, Array] = {}
     lines: dict[str, StraightLine] = {}
-    differences, notes = [], [*_other_priors(every_common, common, apart)]
+    differences, notes = [], []
+    if own := [name for name in every_common if name not in (*common, *apart)]:
+        notes.append(f"{', '.join(own)}: of one population alone, or with other priors: taken as each population's own")
     for name in names:
         centres = {label: _centre(name, s, keys[label], seed, values[label]) for label, s in stored.items()}
         alone = [replace(c, common=tuple((label, key) for key in c.common)) for label, c in centres.items()]
@@ -150,7 +152,7 @@ def compare_populations(
             unit, more = terms[name][0].parameter.display_unit, _three(x - y)
             greater = float(np.mean(x > y))
             differences.append(Difference(name, a, b, unit, ratio, more, greater, by_itself, " ".join(doubts)))
-        notes += _calibrated(name, stored, values, terms[name][0].parameter, common, medians[name], independent)
+        notes += _calibrated(name, stored, values, medians[name], independent if common else None)
         if held := [label for label, c in centres.items() if c.pulled]:
             notes.append(f"{name}: the data of {', '.join(held)} leave its median open: the hyperprior holds it")
         if numbers:
@@ -222,19 +224,15 @@ def _known(s: StoredPopulation, values: Values) -> Iterator[tuple[int, float, fl
 
 
 def _calibrated(
-    name: str,
-    stored: Mapping[str, StoredPopulation],
-    values: Mapping[str, Values],
-    parameter: Parameter,
-    common: Sequence[str],
-    together: Array,
-    alone: Array,
+    name: str, stored: Mapping[str, StoredPopulation], values: Mapping[str, Values], median: Array, alone: Array | None
 ) -> Iterator[str]:
-    """What groups that are known from elsewhere do to the median (M, K) of a parameter in the others."""
+    """What groups that are known from elsewhere do to the median (M, K) of a parameter in the others; ``alone``: the
+    same were nothing common, None where nothing is.
+    """
     known = [label for label, of_it in values.items() if of_it]
-    unit = unit_behind(parameter.display_unit)
     for k, (label, s) in enumerate(stored.items()):
-        now, before = (_range(_three(draws[:, k]), plain=True) for draws in (together, alone))
+        parameter = s.prior_of(name).parameter
+        unit = unit_behind(parameter.display_unit)
         if name in values[label]:
             value, std = (convert(number, parameter.unit, parameter.display_unit) for number in values[label][name])
             draws = s.group("posterior")[f"{name}_{s.headline}"].values
@@ -242,9 +240,10 @@ def _calibrated(
             off = (value - float(np.median(x))) / float(np.hypot(x.std(), std))
             words = f"{name} of {label} is known, {number_like(value, std)} ± {number_like(std, std)}{unit}"
             yield words + (f"; its own data say otherwise, {abs(off):.1f} std away" if abs(off) > FAR else "")
-            if not common:
+            if alone is None:
                 yield "Nothing is common to the groups that this could calibrate"
-        elif known and common and label not in known:
+        elif known and alone is not None and label not in known:
+            now, before = (_range(_three(draws[:, k]), plain=True) for draws in (median, alone))
             yield f"{name} of {label} is {now}{unit}, calibrated by {', '.join(known)}; without, {before}{unit}"
 
 
@@ -256,10 +255,10 @@ def _three(values: Array) -> tuple[float, float, float]:
 def _stored(folder: Path) -> StoredPopulation:
     path = folder / POPULATION
     if not path.is_file():
-        words = (
-            "a run whose configuration has 'population:' ends with one, 'en4dvar population' makes one of finished runs"
+        raise OutputError(
+            f"{folder}: holds no population; a run whose configuration has 'population:' ends with one, 'en4dvar "
+            "population' makes one of finished runs"
         )
-        raise OutputError(f"{folder}: holds no population; {words}")
     stored = load_population(path)
     with understood(path):
         if "white" not in stored.tree.children:
@@ -275,12 +274,6 @@ def _common(s: StoredPopulation, apart: Sequence[str], label: str) -> tuple[tupl
     """Of each common quantity what makes it the same in two populations."""
     priors = {name: str(s.group("white")[name].attrs["prior"]) for name in s.common}
     return tuple((name, label if name in apart else prior) for name, prior in priors.items())
-
-
-def _other_priors(known: Sequence[str], common: Sequence[str], apart: Sequence[str]) -> Iterator[str]:
-    own = [name for name in known if name not in common and name not in apart]
-    if own:
-        yield f"{', '.join(own)}: of one population alone, or with other priors: taken as each population's own"
 
 
 def sentences(c: PopulationsCompared) -> Iterator[str]:

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import softmax
 from scipy.stats import binom
 
 from en4dvar.model.state import Array
@@ -26,7 +25,7 @@ from en4dvar.plumbing.files import inside
 from en4dvar.plumbing.tables import csv_text, table
 from en4dvar.plumbing.units import convert
 from en4dvar.report.chart import PAGE, POINTS, Chart, Panel, Row, interval, stacked
-from en4dvar.report.compare import named, preferred
+from en4dvar.report.compare import named, preferred, ranked
 from en4dvar.report.export import Kind, Notes, column_name, escaped, latex_unit, plus_minus, tabular
 from en4dvar.report.html import write_page
 from en4dvar.report.page import provenance_rows
@@ -317,13 +316,12 @@ def compare_sequences(run_dirs: Sequence[Path]) -> tuple[SequenceScore, ...]:
     for name, other in others:
         if not all(_same(reference, other, key) for key in READINGS):
             raise OutputError(f"{name} and {first} hold other readings or errors: their evidences cannot be compared")
-    evidence = np.array([float(data.attrs["log_evidence"]) for data in runs.values()])
-    sizes = [np.sqrt(np.nanmean(data["normalised_innovation"].values ** 2)) for data in runs.values()]
-    each = zip(evidence, evidence - evidence.max(), softmax(evidence), sizes, strict=True)
-    return tuple(
-        SequenceScore(run, str(data.attrs["scheme"]), *map(float, numbers))
-        for (run, data), numbers in zip(runs.items(), each, strict=True)
-    )
+    sizes = [float(np.sqrt(np.nanmean(data["normalised_innovation"].values ** 2))) for data in runs.values()]
+    scores = [
+        SequenceScore(run, str(data.attrs["scheme"]), float(data.attrs["log_evidence"]), np.nan, np.nan, size)
+        for (run, data), size in zip(runs.items(), sizes, strict=True)
+    ]
+    return tuple(ranked(scores))
 
 
 def sequences_table(scores: Sequence[SequenceScore]) -> str:

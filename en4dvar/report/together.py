@@ -3,7 +3,7 @@ population (the mean, how much the data sets vary, the next one, and each given 
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from en4dvar.diagnosis.honesty.checks import MOVED
 from en4dvar.estimation.population.campaign import DETERMINED, FEWEST, Combination
 from en4dvar.estimation.population.hierarchy import named
 from en4dvar.estimation.summary import ParameterSummary, estimate_cells, results_table, summary_rows
-from en4dvar.plumbing.caution import Caution, untrusted
+from en4dvar.plumbing.caution import Caution, parsed, untrusted
 from en4dvar.plumbing.files import write_text
 from en4dvar.plumbing.tables import table, write_csv
 from en4dvar.report.chart import COLUMN, PAGE, POINTS, Chart, Panel, in_columns
@@ -68,16 +68,17 @@ def estimates(joint: StoredJoint) -> tuple[JointRow, ...]:
     posterior, odd, rows = joint.group("posterior"), ", ".join(joint.odd), []
     for name, values in posterior.data_vars.items():
         if "dataset" not in values.dims:
-            row = _estimate(joint.cautions, str(name), values)
-            rows.append(replace(row, stated=not row.untrusted and _as_stated(joint, str(name))))
+            row = _row(joint.cautions, str(name), values)
+            rows.append(JointRow(**vars(row), stated=not row.untrusted and _as_stated(joint, str(name))))
             continue
         for dataset in joint.datasets:
             own = values.sel(dataset=dataset)
             if np.isfinite(own.values).any():
-                rows.append(_estimate(joint.cautions, str(name), own, dataset))
+                rows.append(JointRow(**vars(_row(joint.cautions, str(name), own)), dataset=dataset))
     if odd:
-        rest = joint.group("without").data_vars.items()
-        rows += [_estimate(joint.cautions_without, str(name), values, without=odd) for name, values in rest]
+        doubts = parsed(joint.group("without").attrs["warnings"])
+        rest = (_row(doubts, str(name), values) for name, values in joint.group("without").data_vars.items())
+        rows += [JointRow(**vars(row), without=odd) for row in rest]
     shared = list(joint.shared)
     return tuple(sorted(rows, key=lambda row: (1,) if row.dataset else (0, row.stated, shared.index(row.name))))
 
@@ -89,13 +90,12 @@ def _as_stated(joint: StoredJoint, name: str) -> bool:
     return bool(draws.std() > np.sqrt(1 - HARDLY_INFORMED) * std and abs(np.median(draws) - middle) < MOVED * std)
 
 
-def _estimate(
-    cautions: Sequence[Caution], name: str, values: xr.DataArray, dataset: str = "", without: str = ""
-) -> JointRow:
-    row = ParameterSummary.of(
-        parameter_of(name, values.attrs), NOTHING, shown(values).ravel(), np.nan, np.nan, cautions
-    )
-    return JointRow(**vars(row), dataset=dataset, without=without)
+def _row(
+    cautions: Sequence[Caution], name: str, draws: xr.DataArray, prior: xr.DataArray | None = None
+) -> ParameterSummary:
+    before = NOTHING if prior is None else shown(prior).ravel()
+    centre, learned = float(np.median(draws.values)), float(draws.attrs.get("learned", np.nan))
+    return ParameterSummary.of(parameter_of(name, draws.attrs), before, shown(draws).ravel(), centre, learned, cautions)
 
 
 def joint_lines(joint: StoredJoint) -> list[str]:
@@ -213,22 +213,15 @@ def summaries(stored: StoredPopulation, group: str = "posterior") -> list[Found]
     posterior, prior = stored.group(group), stored.group("prior")
     rows: list[Found] = []
     for what, words in stored.words.items():
-        of_it = [_row(stored, name, posterior[f"{name}_{what}"], prior[f"{name}_{what}"]) for name in stored.names]
+        columns = {name: f"{name}_{what}" for name in stored.names}
+        of_it = [_row(stored.cautions, name, posterior[key], prior[key]) for name, key in columns.items()]
         rows.append((words, tuple(of_it), stored.cautions))
     if group != "posterior":
         return rows
-    nothing = xr.DataArray(NOTHING)
     for dataset in stored.datasets:
         of_set = (v.sel(dataset=dataset) for v in posterior.data_vars.values() if "dataset" in v.dims)
-        rows.append((dataset, tuple(_row(stored, str(v.name), v, nothing) for v in of_set), stored.cautions))
+        rows.append((dataset, tuple(_row(stored.cautions, str(v.name), v) for v in of_set), stored.cautions))
     return rows
-
-
-def _row(stored: StoredPopulation, name: str, posterior: xr.DataArray, prior: xr.DataArray) -> ParameterSummary:
-    before = shown(prior).ravel() if "units" in prior.attrs else prior.values
-    centre, learned = float(np.median(posterior.values)), float(posterior.attrs.get("learned", np.nan))
-    of = parameter_of(name, posterior.attrs)
-    return ParameterSummary.of(of, before, shown(posterior).ravel(), centre, learned, stored.cautions)
 
 
 def sentences(stored: StoredPopulation) -> tuple[str, ...]:

@@ -202,11 +202,6 @@ class StoredJoint(StoredGroups):
         odd = fit["odd"].values if "odd" in fit else np.zeros(len(self.datasets))
         return tuple(name for name, is_odd in zip(self.datasets, odd, strict=True) if is_odd)
 
-    @property
-    def cautions_without(self) -> tuple[Caution, ...]:
-        """Warnings of the estimate without the odd data sets."""
-        return parsed(self.group("without").attrs["warnings"])
-
 
 def load_joint(path: Path) -> StoredJoint:
     """Read the file into memory. Raises :class:`OutputError`: it is none, cut short or altered."""
