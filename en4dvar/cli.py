@@ -26,13 +26,8 @@ from en4dvar.plumbing.errors import En4dvarError
 from en4dvar.plumbing.installed import installed
 from en4dvar.runs.interrupt import heeded
 
-OF_THE_DEVICE = (
-    errno.ENOSPC,
-    errno.EDQUOT,
-    errno.EFBIG,
-    errno.EIO,
-    errno.EROFS,
-)  # told by what writes; here is what is left
+# Told by what writes; here is what is left
+OF_THE_DEVICE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
 
 
 class Commands(click.Group):

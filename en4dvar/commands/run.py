@@ -78,9 +78,7 @@ def run(
     if isinstance(config, Config):
         _estimate(config, force, resume)
     elif scheduler:
-        raise click.UsageError(
-            "--scheduler cannot be used for a series: its cycles are too short to be sent to other machines"
-        )
+        raise click.UsageError("--scheduler is not for a series: its cycles are too short to be sent to other machines")
     else:
         _follow(config, force, resume)
 

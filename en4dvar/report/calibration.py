@@ -7,6 +7,7 @@ from __future__ import annotations
 import csv
 import io
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -169,12 +170,9 @@ class Calibration:
         for reason in dict.fromkeys(judged.failure for judged in self.sets if judged.failure):
             count = sum(judged.failure == reason for judged in self.sets)
             told.append(f"{count} of {len(self.sets)} sets have no posterior: {reason}")
-        codes = [code for judged in self.good for code in judged.cautions]
-        told += [
-            f"{codes.count(code)} of {len(self.good)} sets have the serious warning '{code}'"
-            for code in dict.fromkeys(codes)
-        ]
-        return told
+        counts = Counter(code for judged in self.good for code in judged.cautions)
+        of = f"of {len(self.good)} sets have the serious warning"
+        return told + [f"{count} {of} '{code}'" for code, count in counts.items()]
 
     def column(self, what: str, j: int) -> np.ndarray:
         """``truth``, ``z`` or another of the numbers (S,) of a quantity over the good sets."""

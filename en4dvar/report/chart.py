@@ -205,11 +205,6 @@ def stacked(panels: Sequence[Panel], height: float, xlabel: str, width: float = 
     return Chart([Row(float(h), [panel]) for h, panel in zip(heights, panels, strict=True)], width)
 
 
-def steps(edges: Array, values: Array) -> tuple[Array, Array]:
-    """A line (2 m,) through m values, each constant between two of the m + 1 ``edges``."""
-    return np.repeat(edges, 2)[1:-1], np.repeat(values, 2)
-
-
 def interval(mean: Array, std: Array, reach: float, positive: bool) -> tuple[Array, Array]:
     """Mean ± ``reach`` std, of what is positive by the lognormal of the same mean and standard deviation."""
     if not positive:

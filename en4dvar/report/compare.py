@@ -148,10 +148,9 @@ class Comparison:
             raise ConfigError(f"verdict: no data set {shown(dataset)}{suggest(dataset, self.datasets)}")
         best, second = sorted(self.of(dataset), key=lambda score: -score.log_evidence)[:2]
         words = preferred(best.run, second.run, -second.difference)
-        doubts = [f"{score.run} ({score.doubted})" for score in (best, second) if score.doubted]
-        return (
-            f"{words}; not to be trusted before the warnings of {' and '.join(doubts)} are settled" if doubts else words
-        )
+        if doubts := [f"{score.run} ({score.doubted})" for score in (best, second) if score.doubted]:
+            words += f"; not to be trusted before the warnings of {' and '.join(doubts)} are settled"
+        return words
 
 
 def compare_runs(runs: Sequence[str | Path] | Mapping[str, str | Path | StoredResult]) -> Comparison:
@@ -244,10 +243,7 @@ def comparison_table(comparison: Comparison) -> str:
 
 
 def estimates_table(comparison: Comparison) -> str:
-    """Posterior mean, std and 5–95 % of every parameter, runs below each other, in display units.
-
-    Where these are not to be trusted the last column says why.
-    """
+    """Mean, std and 5–95 % of every parameter, in display units; where not to be trusted the last column says why."""
     every = comparison.by_parameter
     doubted = any(e.summary.untrusted for e in every)
     header = ("parameter", "unit", "data set", "run", "mean", "std", "5 %", "95 %", *["not to be trusted"] * doubted)

@@ -193,13 +193,11 @@ def prices(designs: Designs) -> Chart:
 
 def fans(designs: Designs) -> Chart:
     """What would be seen with the best designs, and the file's own."""
-    rows = {
-        row.number: row
-        for row in reversed([*ranked(designs)[:DRAWN], *(r for r in designs.rows if r.number == 0 and r.result)])
-    }
+    rows = [row for row in ranked(designs)[:DRAWN] if row.number]
+    rows += [row for row in designs.rows if row.number == 0 and row.result]
     time, value = designs.asked.axes
     panels = []
-    for row in reversed(list(rows.values())):
+    for row in rows:
         result = row.evaluated
         t, taken = convert(result.grid, *time), convert(result.times, *time)
         low, lower, middle, upper, high = convert(result.fan, *value)
@@ -217,10 +215,7 @@ def fans(designs: Designs) -> Chart:
 
 
 def write_design(folder: Path) -> Path:
-    """Write ``design.html`` and ``designs.csv`` from ``design.nc``; returns the path of the page.
-
-    Raises :class:`OutputError`.
-    """
+    """Write ``design.html`` and ``designs.csv`` from ``design.nc``; returns the page. Raises :class:`OutputError`."""
     designs = load_designs(folder / FILE)
     write_csv(folder / "designs.csv", _cells(designs))
     rows, best = ranked(designs), {id(row) for row in front(designs)}
@@ -280,10 +275,7 @@ def _cells(designs: Designs) -> list[list[Any]]:
 
 
 def _positions(values: Sequence[Any]) -> tuple[Array, list[str], str]:
-    """Where values of a knob lie on an axis: at their numbers, which have one unit, or beside each other with labels.
-
-    Returns the places, the labels, and the unit in brackets.
-    """
+    """Where a knob's values lie on an axis, at numbers of one unit or side by side; labels; the unit in brackets."""
     texts = list(map(str, values))
     numbers = [match for match in map(NUMBER.match, texts) if match]
     units = {match.string[match.end() :] for match in numbers}

@@ -14,20 +14,7 @@ from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import untrusted
 from en4dvar.priors.field_prior import regular_grid
 from en4dvar.report import responses
-from en4dvar.report.chart import (
-    COLUMN,
-    GREYS,
-    PAGE,
-    POINTS,
-    VIRIDIS,
-    Chart,
-    Panel,
-    Row,
-    in_columns,
-    interval,
-    ramp,
-    steps,
-)
+from en4dvar.report.chart import COLUMN, GREYS, PAGE, POINTS, VIRIDIS, Chart, Panel, Row, in_columns, interval, ramp
 from en4dvar.report.history import WITHHELD, expected, history
 from en4dvar.report.svg import Captioned
 from en4dvar.report.text import axis_label, estimate, shown, unit_behind, with_unit
@@ -89,9 +76,8 @@ def residuals(result: StoredResult) -> Chart:
     """Whitened residuals in time, their autocorrelation, normal quantiles, leverages; the discrepancy if any."""
     time, label = responses.times(result), responses.time_label(result)
     observed = result.group("observed_data")
-    white, studentised, leverage = (
-        result.of_readings("sample_stats", key) for key in ("whitened_residual", "studentised", "leverage")
-    )
+    keys = "whitened_residual", "studentised", "leverage"
+    white, studentised, leverage = (result.of_readings("sample_stats", key) for key in keys)
     counts = np.isfinite(white)
     top = Panel(label, "residual / std", legend=len(result.axes) > 1)
     top.rule(0)
@@ -256,9 +242,7 @@ def _quantiles(values: Array) -> Panel:
 
 
 def _reach(prior: Array, posterior: Array) -> tuple[float, float] | None:
-    """Limits that hold the posterior and 90 % of the prior, as far as that is not many times wider: a prior that knew
-    little, or its long tail, does not flatten the picture.
-    """
+    """Limits that hold the posterior and 90 % of the prior, cut where a vague prior would flatten the picture."""
     ends = list(posterior)
     if prior.size:
         known = np.quantile(prior, (0.05, 0.95))
@@ -330,10 +314,8 @@ def _stored_walk(result: StoredResult, name: str) -> StoredWalk:
         values = np.asarray(result.groups[f"/{group}"].variables[name + PIECES].values[0], dtype=float)
         values = values[result.alive] if group == "posterior" else values
         values = values[np.isfinite(values).all(axis=1)]
-        levels = (
-            member_quantiles(values, (0.05, 0.5, 0.95), axis=0) if len(values) else np.full((3, len(begins)), np.nan)
-        )
-        return shown(pieces, levels)
+        there = values if len(values) else np.full((1, len(begins)), np.nan)
+        return shown(pieces, member_quantiles(there, (0.05, 0.5, 0.95), axis=0))
 
     after = quantiles("posterior")
     if untrusted(result.cautions, name):
@@ -351,19 +333,23 @@ def verdict(result: StoredResult) -> str:
     return change_words(str(stats["varying"]), float(stats["log_evidence_change"]))
 
 
+def _steps(edges: Array, values: Array) -> tuple[Array, Array]:
+    """A line (2 m,) through m values, each constant between two of the m + 1 ``edges``."""
+    return np.repeat(edges, 2)[1:-1], np.repeat(values, 2)
+
+
 def bands(result: StoredResult) -> Chart:
     """Median and 5–95 % of each parameter that varies, over the prior's."""
     rows = []
     for walk in stored_walks(result):
         least, most = float(np.nanmin(walk.posterior)), float(np.nanmax(walk.prior))
         steep = least > 0 and math.isfinite(most) and most > 5 * least
-        panel = Panel(
-            with_unit("time", walk.time_unit), with_unit(walk.symbol, walk.unit), logarithmic=steep, legend=True
-        )
+        labels = with_unit("time", walk.time_unit), with_unit(walk.symbol, walk.unit)
+        panel = Panel(*labels, logarithmic=steep, legend=True)
         for quantiles, colour, alpha in ((walk.prior, "prior", 0.3), (walk.posterior, "posterior", 0.35)):
-            (x, low), (_, high) = (steps(walk.edges, quantiles[i]) for i in (0, 2))
+            (x, low), (_, high) = (_steps(walk.edges, quantiles[i]) for i in (0, 2))
             panel.band(x, low, high, colour, alpha, colour)
-        panel.line(*steps(walk.edges, walk.posterior[1]), "posterior", label="median")
+        panel.line(*_steps(walk.edges, walk.posterior[1]), "posterior", label="median")
         rows.append(Row(5.0 * POINTS, [panel]))
     return Chart(rows)
 

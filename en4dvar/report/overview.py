@@ -86,9 +86,7 @@ def render_overview(
 
 
 def estimates(sets: Sequence[SetSummary], names: Sequence[str] = ()) -> Chart:
-    """Mean and 5–95 % of every data set, a panel for each of ``names``, where there are none for each parameter; with
-    many data sets sorted by the mean, as a band.
-    """
+    """Mean and 5–95 % of every data set, a panel a name (default: each parameter); many are sorted, as a band."""
     names, few = names or _parameters(sets), len(sets) <= NAMED
     panels = [_estimates(name, sets, few) for name in names]
     rows = [Row(3.0 * POINTS, [panel]) for panel in panels]

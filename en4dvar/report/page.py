@@ -125,10 +125,7 @@ def _tiles(result: StoredResult) -> list[tuple[str, str, str, bool]]:
 
 
 def judge_chi2(chi2: float, n_observations: int, dfs: float, structured: bool = False) -> tuple[str, bool]:
-    """What χ² per observation says in plain words, and whether it needs attention (as warnings of the run do).
-
-    ``structured``: the residuals have a structure, which their size does not show.
-    """
+    """What χ² per observation says, whether it needs attention; ``structured``: neighbouring residuals are related."""
     if not math.isfinite(chi2):
         return "cannot be told", True
     low, high = chi2_interval(max(1.0, n_observations - dfs))

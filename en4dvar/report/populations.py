@@ -41,9 +41,7 @@ SURE = 0.999  # no number of draws says more
 FAR = 2.5  # standard deviations between what is known and what the data say
 _NUMBER = re.compile(r"(?<![^\W_])(?<!\.)(\d+(?:\.\d+)?)[ _]?(%|[^\W\d_]+)(?![^\W_])")  # with a unit, in a name
 OFF_THE_LINE = 0.05  # probability below which populations differ by more than a line says
-CAPTION = (
-    "Median and 5–95 % of the median of each population, given the data of all; what is common moves them together."
-)
+CAPTION = "Median and 5–95 % of each population's median, given the data of all; what is common moves them together."
 
 
 @dataclass(frozen=True)
@@ -262,9 +260,7 @@ def _stored(folder: Path) -> StoredPopulation:
     stored = load_population(path)
     with understood(path):
         if "white" not in stored.tree.children:
-            raise OutputError(
-                f"{path}: written by an earlier version of en4dvar; make the population again to compare it"
-            )
+            raise OutputError(f"{path}: written by an earlier version of en4dvar; make it again to compare it")
         for name in (*stored.names, *stored.common):
             _ = stored.white(name), stored.prior_of(name)
     return stored
@@ -354,10 +350,7 @@ def figure(c: PopulationsCompared) -> Chart:
 
 
 def write_populations(c: PopulationsCompared, out: str | Path) -> Path:
-    """Write ``compare.html``, ``populations.png`` and ``.pdf`` and the tables to a folder; returns the page.
-
-    Raises :class:`OutputError`.
-    """
+    """Write ``compare.html``, ``populations.png``, ``.pdf``, tables; returns the page. Raises :class:`OutputError`."""
     out = make_folder(out)
     ((_, _, drawn),) = draw([("populations", CAPTION, figure(c))], folder=out)
     write_tables(c, out)
@@ -369,10 +362,8 @@ def write_tables(c: PopulationsCompared, folder: Path) -> None:
     """``differences.csv`` and, with numbers, ``lines.csv``. Raises :class:`OutputError`."""
     three = [f"{what}_{q}" for what in ("ratio", "difference", "apart") for q in ("q05", "q50", "q95")]
     head = ["parameter", "first", "second", "unit", *three, "greater", "untrusted"]
-    rows = [
-        [d.parameter, d.first, d.second, d.unit, *d.ratio, *d.difference, *d.apart, d.greater, d.untrusted]
-        for d in c.differences
-    ]
+    of_each = ((d, (*d.ratio, *d.difference, *d.apart)) for d in c.differences)
+    rows = ([d.parameter, d.first, d.second, d.unit, *numbers, d.greater, d.untrusted] for d, numbers in of_each)
     write_csv(folder / "differences.csv", [head, *rows])
     if c.lines:
         three = [f"{what}_{q}" for what in ("slope", "level") for q in ("q05", "q50", "q95")]
@@ -396,9 +387,7 @@ def numbers_of(names: Sequence[str]) -> tuple[tuple[float, ...], str]:
 
 
 def groups_compared(run_dir: Path) -> PopulationsCompared | str | None:
-    """The groups of a run side by side; why not, where their data are the same; None where fewer than two have a
-    population.
-    """
+    """The groups of a run side by side; why not, where they share data; None with fewer than two populations."""
     folders = {name: folder for name, (folder, _) in load_groups_of(run_dir).items()}
     if len(folders) < 2:
         return None

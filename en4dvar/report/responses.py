@@ -87,9 +87,8 @@ def stored_shifts(result: StoredResult) -> tuple[tuple[StoredShift, ...], ...]:
     if "what_if_change" not in stats.variables:
         return ()
     of = {key: stats.variables[f"what_if_{key}"].values for key in ("words", "cost_change", "reason")}
-    change, relative, in_std = (
-        stats.variables[f"what_if_{key}"].values for key in ("change", "relative_change", "change_in_std")
-    )
+    keys = "change", "relative_change", "change_in_std"
+    change, relative, in_std = (stats.variables[f"what_if_{key}"].values for key in keys)
     parameters, alternatives = result.parameters, stats.coords["alternative"].values
 
     def shift(i: int, j: int, name: str) -> StoredShift:
@@ -104,10 +103,7 @@ def stored_shifts(result: StoredResult) -> tuple[tuple[StoredShift, ...], ...]:
 
 
 def shift_text(shift: StoredShift) -> str:
-    """``"+15 %"``, or in the parameter's unit where its value may be negative, as fine as its error bar is.
-
-    An en dash where it is not known.
-    """
+    """``"+15 %"``, or in the parameter's unit where its value may be negative; an en dash where it is not known."""
     value, unit = shift.change, pretty_unit(shift.unit)
     if math.isfinite(shift.relative):
         value, unit = 100 * shift.relative, "%"
@@ -224,9 +220,8 @@ def reading_words(result: StoredResult) -> list[Markup]:
 
 
 def _most_moving(result: StoredResult) -> Markup:
-    in_std, change, how = (
-        result.of_readings("sample_stats", f"influence_{key}", shared=True) for key in ("in_std", "change", "how")
-    )
+    keys = "influence_in_std", "influence_change", "influence_how"
+    in_std, change, how = (result.of_readings("sample_stats", key, shared=True) for key in keys)
     if not np.isfinite(in_std).any():
         return Markup("Each reading decides so much that only a fit without it tells what it changes.")
     j, k = np.unravel_index(int(np.nanargmax(np.abs(in_std))), in_std.shape)

@@ -114,9 +114,7 @@ def cycles_table(file: Path, kind: Kind) -> str:
     """
     data = read_groups(file)["/"]
     if kind == "members" and "members" not in data:
-        raise OutputError(
-            f"{file}: a twin experiment keeps no members; --csv has mean and std of each variable in time"
-        )
+        raise OutputError(f"{file}: a twin experiment keeps no members; --csv has each variable's mean and std in time")
     with understood(file):
         if kind == "latex":
             return _last_analysis(data)
@@ -147,10 +145,8 @@ def _factors(data: Group) -> Array:
 
 
 def _last_analysis(data: Group) -> str:
-    lines = [
-        f"{escaped(name)} & {latex_unit(unit) or '--'} & {plus_minus(mean, std)}"
-        for name, mean, std, unit in last_analysis(data)
-    ]
+    last = ((escaped(name), latex_unit(unit), plus_minus(mean, std)) for name, mean, std, unit in last_analysis(data))
+    lines = [f"{name} & {unit or '--'} & {value}" for name, unit, value in last]
     head = "% en4dvar export: mean and standard deviation of the last analysis; needs \\usepackage{booktabs}"
     return "\n".join([head, *tabular("llr", "variable & unit & analysis", lines, Notes())]) + "\n"
 
@@ -191,10 +187,7 @@ class SequenceOutcome(SeriesResult):
 
 
 def write_sequence_report(run_dir: Path, files: bool = False) -> Path:
-    """Write ``report.html`` from ``sequence.nc``, with ``files`` also its figures as PDF and PNG; returns its path.
-
-    Raises :class:`OutputError`: there is nothing to read, or the directory cannot be written.
-    """
+    """Write ``report.html`` from ``sequence.nc``, with ``files`` also PDF and PNG. Raises :class:`OutputError`."""
     data = read_groups(run_dir / "sequence.nc")["/"]
     readings = int(np.isfinite(data["observations"].values).sum())
     words = (

@@ -211,9 +211,8 @@ def _spans(text: str, size: float) -> str:
         dy = f' dy="{wanted - shift:.2g}"' if wanted != shift else ""
         small = f' font-size="{0.72 * size:.3g}"' if mark in "_^" and mark else ""
         slant = ' font-style="italic"' if mark == "i" else ""
-        parts.append(
-            f"<tspan{dy}{small}{slant}>{escape(piece)}</tspan>" if dy or small or slant else str(escape(piece))
-        )
+        how = f"{dy}{small}{slant}"
+        parts.append(f"<tspan{how}>{escape(piece)}</tspan>" if how else str(escape(piece)))
         shift = wanted
     return "".join(parts)
 

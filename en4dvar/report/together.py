@@ -180,10 +180,7 @@ def fits(joint: StoredJoint) -> Chart | None:
 
 
 def write_joint(folder: Path) -> Path:
-    """Write ``joint.html`` and ``joint.csv`` from ``joint.nc``; returns the path of the page.
-
-    Raises :class:`OutputError`.
-    """
+    """Write ``joint.html`` and ``joint.csv`` from ``joint.nc``; returns the page. Raises :class:`OutputError`."""
     joint = load_joint(folder / JOINT)
     rows, fit, absent = estimates(joint), joint.group("fit"), np.full(len(joint.datasets), np.nan)
     # of each data set under the shared values the misfit per reading, and how far it is from all others alone
@@ -353,10 +350,7 @@ def caption(stored: StoredPopulation) -> str:
 
 
 def write_population(folder: Path) -> Path:
-    """Write ``population.html``, ``.csv`` and ``.tex`` from ``population.nc``; returns the path of the page.
-
-    Raises :class:`OutputError`.
-    """
+    """Write ``population.html``, ``.csv``, ``.tex`` from its file; returns the page. Raises :class:`OutputError`."""
     stored = load_population(folder / POPULATION)
     rows = summaries(stored)
     write_csv(folder / "population.csv", summary_rows(rows, {}))

@@ -60,10 +60,7 @@ class TwinOutcome(TwinResult):
 
 
 def write_twin_report(run_dir: Path, files: bool = False) -> Path:
-    """Write ``report.html`` from ``twin.nc``, with ``files`` also its figures as PDF and PNG; returns its path.
-
-    Raises :class:`OutputError`: there is nothing to read, or the directory cannot be written.
-    """
+    """Write ``report.html`` from ``twin.nc``, with ``files`` also PDF and PNG. Raises :class:`OutputError`."""
     data = read_groups(run_dir / "twin.nc")["/"]
     burn_in = int(data.attrs["burn_in"])
     columns = ["estimate", with_unit("RMSE", _unit(data)), with_unit("spread", _unit(data)), "spread / RMSE"]
@@ -156,9 +153,8 @@ def truth_ranks(data: Group) -> Chart:
         ranked = _counted(data, data[f"{kind}_rank"].values)
         count, _ = np.histogram(ranked, edges)
         relative = count / (np.diff(edges) * max(1, len(ranked)))
-        panel = Panel(
-            ylabel="frequency", title=kind, xlim=(0.0, 1.0), ylim=(0.0, 1.05 * max(1.0, float(relative.max())))
-        )
+        top = 1.05 * max(1.0, float(relative.max()))
+        panel = Panel(ylabel="frequency", title=kind, xlim=(0.0, 1.0), ylim=(0.0, top))
         panel.stairs(edges, relative, colour, 0.6)
         panel.line([0, 1], [1, 1], "ink", 0.8, "--")
         panels.append(panel)

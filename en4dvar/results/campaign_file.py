@@ -150,7 +150,7 @@ def said_in(path: Path) -> Iterator[tuple[str, Any]]:
 
 
 def _define(target: netCDF4.Dataset, layout: _Layout, n_datasets: int) -> None:
-    """netcdf.Groups, dimensions, variables and coordinates, as of the widest data set, and the scalars of all."""
+    """Groups, dimensions, variables and coordinates, as of the widest data set, and the scalars of all."""
     for name in GROUPS:
         source, group = layout.widest[f"/{name}"], target.createGroup(name)
         group.createDimension("dataset", n_datasets)

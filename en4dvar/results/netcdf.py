@@ -112,9 +112,7 @@ class Group:
         return {dim: size for v in self.every.values() for dim, size in zip(v.dims, v.values.shape, strict=True)}
 
     def check(self) -> None:
-        """Raise :class:`ValueError`, as xarray does, where variables do not agree on the length of a dimension, or
-        where a name is that of a variable and of a coordinate.
-        """
+        """Raise :class:`ValueError` where variables disagree on a dimension's length, or one is a coordinate too."""
         if both := self.variables.keys() & self.coords.keys():
             raise ValueError(f"{', '.join(sorted(both))}: both a variable and a coordinate")
         sizes = self.sizes
@@ -175,11 +173,7 @@ def _write(variable: Any, values: np.ndarray[Any, Any]) -> None:
 
 
 def read_groups(path: Path) -> dict[str, Group]:
-    """The groups of a sealed file by their paths, in memory; the file can be replaced while they are in use.
-
-    Raises :class:`OutputError`: it is none of ours, cut short or altered (see :mod:`en4dvar.results.netcdf`), or its
-    variables do not agree with each other.
-    """
+    """The groups of a sealed file by path, in memory. Raises :class:`OutputError`: not ours, cut short or altered."""
     return dict(read_sealed(groups_in, path))
 
 
@@ -247,10 +241,7 @@ def _read_variable(variable: Any) -> tuple[Variable, str]:
 
 @contextmanager
 def netcdf_file(path: Path) -> Iterator[Path]:
-    """A partial file to be written through the netCDF library; on leaving it is sealed and takes its place.
-
-    Raises :class:`OutputError` as :func:`~en4dvar.plumbing.files.atomic_path`.
-    """
+    """A partial file for the netCDF library; on leaving it is sealed and put in place. Raises :class:`OutputError`."""
     with atomic_path(path) as partial:
         try:
             yield partial
@@ -360,11 +351,7 @@ def seal_file(path: Path) -> None:
 
 
 def check_seal(path: Path) -> bool:
-    """Read the whole file once and compare; returns whether this process has written it.
-
-    Raises :class:`OutputError`: the file cannot be read, is not one of ours, is of another version, cut short or
-    altered.
-    """
+    """Compare a whole file with its seal; returns whether this process has written it. Raises :class:`OutputError`."""
     try:
         with open_plain(path) as file:
             line, digest = _last_line(file, path), hashlib.sha256()

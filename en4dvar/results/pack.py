@@ -63,10 +63,7 @@ class Entry:
 
 
 class Pack:
-    """The pack of a run at work, the only one that writes to it; ``whole``: there is nothing in it but records.
-
-    Raises :class:`OutputError` where the file cannot be read, or is none.
-    """
+    """The pack of a run at work, its only writer; ``whole``: nothing in it but records. Raises :class:`OutputError`."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -318,9 +315,7 @@ def unpacked(content: bytes, wanted: Collection[str] | None = None) -> dict[str,
 
 
 def unpacked_together(contents: Sequence[Content], wanted: Collection[str]) -> list[Alike]:
-    """The groups ``wanted`` of contents, those alike at once: what is done for one is done for all. Raises
-    :class:`ValueError`.
-    """
+    """The groups ``wanted``; what is done for one is done for all that are alike. Raises :class:`ValueError`."""
     places_of: dict[Any, list[int]] = {}
     for i, content in enumerate(contents):
         places_of.setdefault((content.layout, *(tuple(content.words[k]) for k in content.layout.named)), []).append(i)

@@ -85,9 +85,8 @@ def git_commit(path: Path) -> str:
 
 def _git(folder: Path, *arguments: str) -> str:
     try:
-        done = subprocess.run(
-            ["git", "-C", str(folder), *arguments], capture_output=True, text=True, timeout=10, check=True
-        )
+        words = ["git", "-C", str(folder), *arguments]
+        done = subprocess.run(words, capture_output=True, text=True, timeout=10, check=True)
     except (OSError, subprocess.SubprocessError):
         return ""
     return done.stdout.strip()
@@ -143,12 +142,13 @@ def identity(resolved: str, model: ForwardModel, data: Mapping[str, DataFile]) -
     software = {"python": f"{sys.version_info.major}.{sys.version_info.minor}", **package_versions(NUMERICAL)}
     section = content.get("data") or {}
     stated = [part.get(key) for part in (section, *section.get("series", {}).values()) for key in ("error", "weights")]
-    sources = {"en4dvar": source_digest("en4dvar"), **_packages_of(model)}
+    defining = (kind.__module__.partition(".")[0] for kind in type(model).__mro__ if inspect.getmodule(kind))
+    tops = dict.fromkeys(("en4dvar", *(top for top in defining if top not in ("builtins", "abc", "typing"))))
+    sources = {top: source_digest(top) for top in tops}
     named = [content["model"], stated, *(content.get(key) for key in _PRIOR_FILES)]
     sources |= {str(path): file_digest(path) for path in _paths(named)}
-    text = yaml.safe_dump(
-        {**settings, "software": software, "sources": sources}, sort_keys=False, allow_unicode=True, width=120
-    )
+    settings |= {"software": software, "sources": sources}
+    text = yaml.safe_dump(settings, sort_keys=False, allow_unicode=True, width=120)
     return Identity(text, tuple((name, digest_of(file.paths)) for name, file in data.items()))
 
 
@@ -166,12 +166,6 @@ def source_digest(module: str) -> str:
         files = sorted(file for folder in top.__path__ for file in Path(folder).rglob("*.py"))
         return digest("\n".join(f"{file.name} {file_digest(file)}" for file in files).encode())
     return file_digest(Path(getattr(top, "__file__", None) or ""))
-
-
-def _packages_of(model: ForwardModel) -> dict[str, str]:
-    """Top-level package (or module) → digest of what defines the model's class and its bases outside the framework."""
-    tops = (kind.__module__.partition(".")[0] for kind in type(model).__mro__ if inspect.getmodule(kind))
-    return {top: source_digest(top) for top in tops if top not in ("en4dvar", "builtins", "abc", "typing")}
 
 
 def _paths(value: Any) -> Iterator[Path]:

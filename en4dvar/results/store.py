@@ -104,10 +104,8 @@ class StoredResult:
     def of_readings(self, group: str, name: str, shared: bool = False) -> Array:
         """(…, K) of all readings, one series after the other: the variables ``<series>_<name>``, or of a single series
         ``name`` where that is ``shared``, as ``weights`` are."""
-        held = self.group(group)
-        return np.concatenate(
-            [held[axis.own(name) if shared else f"{axis.name}_{name}"].values for axis in self.axes], axis=-1
-        )
+        held, names = self.group(group), [a.own(name) if shared else f"{a.name}_{name}" for a in self.axes]
+        return np.concatenate([held[name].values for name in names], axis=-1)
 
     def of_parameter(self, variable: str, name: str) -> float:
         """What ``variable`` of ``sample_stats`` is for a parameter, SI."""
@@ -196,11 +194,7 @@ def require_settled(run_dir: Path) -> None:
 
 
 def load_stored(path: str | Path) -> StoredResult:
-    """Read ``posterior.nc`` into memory and close it, or what is at an address in a pack.
-
-    Raises :class:`OutputError`: it is no result, of another version, cut short or altered (see
-    :mod:`en4dvar.results.netcdf`).
-    """
+    """Read ``posterior.nc``, or an address in a pack. Raises :class:`OutputError`: no result, cut short or altered."""
     path = Path(path)
     with retold(ValueError, OutputError, f"{path}: not a result of en4dvar: "):  # anybody can write a checksum
         groups = unpacked(read_result(path)) if path.parent.name == PACK else read_groups(path)
@@ -268,13 +262,13 @@ def _faults(nodes: Groups) -> Iterator[str]:
     declared = _declared(*held, tuple(of_members(nodes["/posterior"])))
     for path in required:
         content = nodes[path]
-        needed = {dim for variable in content.variables.values() for dim in variable.dims} & declared[
-            "coordinates"
-        ].keys()
-        needed |= {name for name, d in declared[path].items() if d.needed}
+        dims = {dim for variable in content.variables.values() for dim in variable.dims}
+        needed = dims & declared["coordinates"].keys() | {name for name, d in declared[path].items() if d.needed}
         if missing := sorted(name for name in needed if name not in content):
             yield f"{path} has no variable {', '.join(missing)}"
-        yield from _curve_faults(path, content, nodes)
+        for name in nodes["/log_likelihood"].variables if path.endswith("_predictive") else ():
+            if f"{name}_path" not in content and f"{name}_place" not in nodes["/observed_data"]:
+                yield f"{path} has no variable {name}_path"  # which each series has but one of a field
         yield from _label_faults(path, content, declared["coordinates"] | declared[path])
 
 
@@ -297,13 +291,6 @@ def _declared(
         path: {d.name.format(**of_item): d for d in table for of_item in names.get(d.scope, ())}
         for path, table in tables.items()
     }
-
-
-def _curve_faults(path: str, group: Group, nodes: Groups) -> Iterator[str]:
-    """Each series has a curve along the path, except one of a field."""
-    for name in nodes["/log_likelihood"].variables if path.endswith("_predictive") else ():
-        if f"{name}_path" not in group and f"{name}_place" not in nodes["/observed_data"]:
-            yield f"{path} has no variable {name}_path"
 
 
 def _label_faults(path: str, group: Group, declared: Mapping[str, Declared]) -> Iterator[str]:

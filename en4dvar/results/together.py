@@ -36,10 +36,7 @@ DRAWS = ("chain", "draw")
 
 
 def save_joint(path: Path, estimate: JointEstimate, alone: Sequence[Array], attributes: Mapping[str, Any]) -> Path:
-    """Write the file; it appears complete or not at all. ``alone``: physical members (N_i, n_i) of each data set.
-
-    Raises :class:`OutputError`.
-    """
+    """Write the file. ``alone``: physical members (N_i, n_i) of each data set. Raises :class:`OutputError`."""
     names = [experiment.observations.name for experiment in estimate.joint.experiments]
     datasets = {"dataset": variable("dataset", text(names), "", "data set")}
     root = {
@@ -129,9 +126,7 @@ def _prior(estimate: JointEstimate) -> dict[str, Variable]:
 
 
 def _fit(estimate: JointEstimate, names: Sequence[str]) -> dict[str, Variable]:
-    """Observations and predictive bands of each data set, padded with NaN, in display units; and each data set against
-    all others, as the estimate without the odd ones has it.
-    """
+    """Observations and bands of each data set, padded with NaN, in display units; and each against all others."""
     experiments, agreed = estimate.joint.experiments, estimate.agreement
     most = max(len(experiment.observations) for experiment in experiments)
     times, values = np.full((2, len(experiments), most), np.nan)
@@ -233,10 +228,7 @@ def save_population(
     path: Path, population: Population, alone: Sequence[Array], cautions: Sequence[Caution],
     attributes: Mapping[str, Any],
 ) -> Path:  # fmt: skip
-    """Write the file; it appears complete or not at all. ``alone``: physical members (N_i, n) of each data set.
-
-    Raises :class:`OutputError`.
-    """
+    """Write the file. ``alone``: physical members (N_i, n) of each data set. Raises :class:`OutputError`."""
     observed = [problem.observations for problem in population.problems]
     datasets = {"dataset": variable("dataset", text(o.name for o in observed), "", "data set")}
     free, effective = population.without_hyperprior(int(attributes["seed"]))
@@ -408,10 +400,7 @@ def load_population(path: Path) -> StoredPopulation:
 
 
 def load_groups_of(run_dir: Path) -> dict[str, tuple[Path, StoredPopulation]]:
-    """Group of data sets of a run → the folder of its population, and this; in the order of the configuration.
-
-    Raises :class:`OutputError`, see :func:`load_population`.
-    """
+    """Group of data sets → the folder of its population, and this, as configured. Raises :class:`OutputError`."""
     folders = sorted((file.parent for file in (run_dir / GROUPS).glob(f"*/{POPULATION}")), key=natural)
     stored = [(folder, load_population(folder / POPULATION)) for folder in folders]
     return {str(of.tree.attrs.get("group", folder.name)): (folder, of) for folder, of in stored}
