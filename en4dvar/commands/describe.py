@@ -125,7 +125,6 @@ def _prior_rows(problem: InverseProblem) -> list[tuple[str, ...]]:
 
 
 def _correlation_rows(problem: InverseProblem) -> list[tuple[str, ...]]:
-    """The pairs that are most correlated."""
     pairs = [
         (block.matrix[i, j], f"{block.names[i]}, {block.names[j]}")
         for block in problem.prior.blocks

@@ -119,9 +119,7 @@ def compare(
         echo(f"report: {page if out else from_here(page)}")
 
 
-def _compared(
-    run_dirs: tuple[Path, ...], stored: bool, workers: int | None, trust: bool
-) -> Callable[[Path], Path]:  # fmt: skip
+def _compared(run_dirs: tuple[Path, ...], stored: bool, workers: int | None, trust: bool) -> Callable[[Path], Path]:
     """What writes the page of the runs side by side, which are told on standard output."""
     from en4dvar.report import compare as side_by_side
 

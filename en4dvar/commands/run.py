@@ -43,16 +43,7 @@ MOST_NAMED = 3  # data sets of a warning
 @click.option("--with-what-if", is_flag=True, help="Let the intervals hold the assumptions of the what-if table too.")
 @workers_option
 @click.option("--scheduler", metavar="ADDRESS", help="Work on a dask cluster, e.g. tcp://10.0.0.1:8786.")
-def run(
-    source: Source,
-    out: Path | None,
-    force: bool,
-    resume: bool,
-    no_report: bool,
-    with_what_if: bool,
-    workers: int | None,
-    scheduler: str | None,
-) -> None:
+def run(source: Source, force: bool, resume: bool, workers: int | None, scheduler: str | None, **asked: Any) -> None:
     """Estimate the parameters; write posterior and report to the run directory.
 
     Several data files (a list, a pattern or a folder) are a campaign; a file that cannot be used does not stop it.
@@ -66,9 +57,9 @@ def run(
     from en4dvar.config import Config, load_any
 
     special = {
-        "output.directory": str(out) if out else None,
-        "output.report": False if no_report else None,
-        "assimilation.what_if": "added" if with_what_if else None,
+        "output.directory": str(asked["out"]) if asked["out"] else None,
+        "output.report": False if asked["no_report"] else None,
+        "assimilation.what_if": "added" if asked["with_what_if"] else None,
         "execution.workers": workers,
         "execution.address": scheduler,
     }

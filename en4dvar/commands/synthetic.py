@@ -22,7 +22,8 @@ from en4dvar.commands.common import (
     tell,
     workers_option,
 )
-from en4dvar.commands.plugins import WithForms, asked, write_form
+from en4dvar.commands.plugins import FORMS, WithForms, asked, loaded
+from en4dvar.plumbing.installed import installed
 
 
 @click.command(cls=WithForms)
@@ -63,7 +64,8 @@ def simulate(
     instants = parse_times(times, config.model.time_unit) if times else None
     seed = config.seed if seed is None else seed
     for name, (path, settings) in others.items():
-        echo(write_form(name, config, instants, path, settings, seed))
+        write_form = loaded(installed(FORMS)[name], f"--{name}")
+        echo(write_form(config, instants, path, settings, seed))
     if others and out is None:  # the table was not asked for
         return
     simulation = simulate(config, instants)

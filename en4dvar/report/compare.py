@@ -297,7 +297,6 @@ def _panel(estimates: Sequence[ComparedEstimate], runs: Sequence[str]) -> Panel:
 
 
 def _members(estimates: Sequence[ComparedEstimate], unit: str) -> Array:
-    """Members of all data sets of a run in ``unit``."""
     words = f"the runs mean different quantities by {estimates[0].summary.name}: " if estimates else ""
     with retold(UnitError, OutputError, words):
         parts = [convert(e.members, e.summary.unit, unit) for e in estimates]
@@ -321,7 +320,6 @@ def named(runs: Sequence[str | Path] | Mapping[str, T]) -> Mapping[str, T | Path
 
 
 def _results(run: str | Path | StoredResult) -> dict[str, StoredResult]:
-    """Data set → result of a run."""
     if isinstance(run, StoredResult):
         return {run.name: run}
     files = [Path(run)] if Path(run).suffix == ".nc" else result_files(Path(run))

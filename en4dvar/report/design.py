@@ -59,7 +59,6 @@ def words(designs: Designs, row: DesignRow) -> str:
 
 
 def _law(decision: Decision) -> str:
-    """How surely the law will be known."""
     if decision.decided < RARELY:
         return f"the law hardly (probability {decision.probability:.2f})"
     return f"the law in {100 * decision.decided:.0f} ± {100 * decision.decided_error:.0f} % of experiments"

@@ -110,7 +110,6 @@ def _readings(panel: Panel, x: Array, data: Array, std: Array) -> None:
 
 
 def _size(x: Array) -> float:
-    """Of a dot."""
     return 2.2 if len(x) <= FEW else 1.2
 
 

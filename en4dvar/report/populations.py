@@ -180,9 +180,7 @@ def same_readings(stored: Mapping[str, StoredPopulation]) -> str:
     return ""
 
 
-def _centre(
-    name: str, s: StoredPopulation, keys: tuple[tuple[str, str], ...], seed: int, values: Values
-) -> Centre:  # fmt: skip
+def _centre(name: str, s: StoredPopulation, keys: tuple[tuple[str, str], ...], seed: int, values: Values) -> Centre:
     nu = np.stack([s.white(n) for n in s.names], axis=1)
     theta = np.stack([s.white(n) for n in s.common], axis=1) if s.common else np.empty((len(nu), 0))
     attributes = s.tree.attrs

@@ -50,7 +50,6 @@ class Frame:
 
 
 def _share(values: Array, limits: tuple[float, float], logarithmic: bool) -> Array:
-    """The share of the way between two limits."""
     low, high = limits
     with np.errstate(divide="ignore", invalid="ignore"):
         share = np.log(values / low) / math.log(high / low) if logarithmic else (values - low) / (high - low)
@@ -135,7 +134,6 @@ def _below(panel: Panel) -> float:
 
 
 def _axes(panel: Panel, place: Frame, below: float) -> Iterator[str]:
-    """Lines, ticks, numbers and labels."""
     base, left, far = place.y + place.height, place.x, place.x + place.width
     along = labelled(place.xlim, panel.xticks, panel.names, logarithmic=panel.x_logarithmic, whole=panel.whole)
     lines, words = [f"M{left:.1f} {base:.1f}H{far:.1f}"], []
@@ -158,7 +156,6 @@ def _axes(panel: Panel, place: Frame, below: float) -> Iterator[str]:
 
 
 def _placed(ticks: list[tuple[float, str]], along: Callable[[Array], Array]) -> Iterator[tuple[float, str]]:
-    """Ticks at their places in the drawing."""
     places = along(np.array([value for value, _ in ticks]))
     return zip(places.tolist(), (text for _, text in ticks), strict=True)
 

@@ -279,7 +279,6 @@ def _sentence(
 
 
 def _compared(stored: StoredPopulation, centre: ParameterSummary) -> Iterator[str]:
-    """The value of others that the configuration gives."""
     if centre.name not in stored.reference:
         return
     posterior = stored.group("posterior")[f"{centre.name}_{stored.headline}"]

@@ -94,17 +94,11 @@ def twin_figures(data: Group) -> Iterator[Captioned]:
     yield "scores", f"RMSE against the truth (line) and spread (dashed) of each estimate in time.{words}", scores(data)
     shown = f"Error of the analysis within two standard deviations, last {min(LAST, data.sizes['time'])} cycles"
     yield "errors", f"{shown}, some variables of the state. A reliable ensemble has 95 % within.", errors(data)
-    yield (
-        "truth_ranks",
-        "Rank of the truth among the members, over all cycles and variables that count, relative to a flat histogram.",
-        truth_ranks(data),
-    )
-    yield (
-        "reliability",
-        f"RMSE of the values in {GROUPS} groups of the same size, by their spread, against that spread. A reliable "
-        "ensemble lies on the diagonal: where it is spread wide, its error is large.",
-        reliability(data),
-    )
+    among = "Rank of the truth among the members, over all cycles and variables that count"
+    yield "truth_ranks", f"{among}, relative to a flat histogram.", truth_ranks(data)
+    words = f"RMSE of the values in {GROUPS} groups of the same size, by their spread, against that spread."
+    lies = "A reliable ensemble lies on the diagonal: where it is spread wide, its error is large."
+    yield "reliability", f"{words} {lies}", reliability(data)
     yield "ranks", sequence.RANKS, sequence.ranks(data["rank"].values[burn_in:], int(data.attrs["members"]))
 
 
@@ -184,7 +178,6 @@ def _counted(data: Group, values: np.ndarray) -> np.ndarray:
 
 
 def _kinds(data: Group) -> list[tuple[str, str]]:
-    """Each kind of estimate and its colour."""
     return [(kind, colour) for kind, colour in COLOURS.items() if f"{kind}_rmse" in data]
 
 

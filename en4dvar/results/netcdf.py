@@ -213,7 +213,6 @@ def groups_in(path: Path) -> Iterator[tuple[str, Group]]:
 
 
 def _read(group: Any) -> Iterator[tuple[str, Group]]:
-    """A group of a file and those in it, by path."""
     attributes = Said(group.__dict__)
     listed = [str(attributes.pop("coordinates", ""))]  # xarray lists here those that are no dimension
     held = {}

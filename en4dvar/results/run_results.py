@@ -4,8 +4,9 @@ What a campaign ought to hold is known from three places: the lines of its pack,
 ``checkpoints/run``, and those in ``posterior.nc``. Whichever is damaged, no data set vanishes without a word.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TypeVar
 
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.results.campaign_file import datasets_in
@@ -14,6 +15,7 @@ from en4dvar.results.pack import PACK, Pack, file_names, known_pack, read_result
 from en4dvar.results.provenance import IDENTITY, Identity
 from en4dvar.results.store import StoredResult, load_stored, require_settled
 
+R = TypeVar("R")
 MOST_NAMES = 20
 ABSENT = "not there: lost, or not estimated yet"
 NAMELESS = "some data set"
@@ -72,28 +74,23 @@ class RunResults:
 
     def __iter__(self) -> Iterator[tuple[Path, StoredResult]]:
         """Each is read when its turn comes. Raises :class:`OutputError` of a single data set."""
+        for path, result in self._each(load_stored):
+            self._read = True
+            yield path, result
+
+    def _each(self, read: Callable[[Path], R]) -> Iterator[tuple[Path, R]]:
         for path in self.files:
             try:
-                result = load_stored(path)
+                yield path, read(path)
             except OutputError as error:
-                self._lack(path, error)
-            else:
-                self._read = True
-                yield path, result
-
-    def _lack(self, path: Path, error: OutputError) -> None:
-        if path == self.whole:
-            raise error
-        self.lacking[self._names.get(path.name, path.name)] = str(error).removeprefix(f"{path}: ")
+                if path == self.whole:
+                    raise
+                self.lacking[self._names.get(path.name, path.name)] = str(error).removeprefix(f"{path}: ")
 
     def check(self) -> None:
         """Compare every result with its checksum. Raises :class:`LackingError` where one cannot be read."""
-        for path in self.files:
-            if path != self.whole:
-                try:
-                    read_result(path)
-                except OutputError as error:
-                    self._lack(path, error)
+        if self.files != [self.whole]:
+            list(self._each(read_result))
         self.require()
 
     def require(self, rest: str | Path | None = None) -> None:

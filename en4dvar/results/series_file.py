@@ -53,7 +53,6 @@ def _states(r: Any) -> list[tuple[str, str]]:
 
 
 def _kinds(r: Any) -> Iterator[Item]:
-    """The kinds of estimates."""
     kinds = {"forecast": r.run.forecast, "analysis": r.run.analysis, "smoothed": r.run.smoothed}
     smooths = "smoothed" in r.scores if isinstance(r, TwinResult) else r.problem.settings.smooths
     for kind, moments in kinds.items():
@@ -133,7 +132,6 @@ def _state_read(observable: Observable, model: ForwardModel) -> str:
 
 
 def _display_units(r: SeriesResult) -> list[str]:
-    """Of the variables of the state."""
     model = r.problem.start.model
     shown = {p.name: p.display_unit for p in model.parameters}
     shown |= {name: o.display_unit for o in _columns(r) if (name := _state_read(o, model))}

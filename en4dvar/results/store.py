@@ -202,7 +202,8 @@ def load_stored(path: str | Path) -> StoredResult:
             group.check()
             joined(groups, path_in_file).check()
     with understood(path):
-        check_complete(path, groups)
+        for fault in _faults({path_in_file: joined(groups, path_in_file) for path_in_file in groups}):
+            raise OutputError(f"{path}: not a result of en4dvar: {fault}")
     return StoredResult(groups)
 
 
@@ -236,12 +237,6 @@ def joined(groups: Groups, path: str) -> Group:
 
 
 _OPTIONAL = OPTIONAL | {*(f"/{name}" for name in BESIDE.values())}
-
-
-def check_complete(path: Path, groups: Groups) -> None:
-    """Check the groups of a file. Raises :class:`OutputError`, which names what is missing."""
-    for fault in _faults({path: joined(groups, path) for path in groups}):
-        raise OutputError(f"{path}: not a result of en4dvar: {fault}")
 
 
 def of_members(group: Group) -> dict[str, Variable]:
@@ -317,7 +312,6 @@ def _label_faults(path: str, group: Group, declared: Mapping[str, Declared]) -> 
 
 
 def _continued(data: Group, later: Group, series: str, name: str) -> Observations:
-    """The readings of the window and those after it."""
 
     def both(of_window: str, after: str = "") -> Array:
         return np.concatenate([data[of_window].values, later[after or of_window].values])

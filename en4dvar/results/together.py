@@ -117,7 +117,6 @@ def _own(estimate: JointEstimate, names: Sequence[str]) -> dict[str, Variable]:
 
 
 def _prior(estimate: JointEstimate) -> dict[str, Variable]:
-    """Quantiles (quantile,) of the priors of what is shared."""
     z = np.array([-1.6448536, 0.0, 1.6448536])
     return {
         shared_name(key): variable("quantile", term.to_physical(term.mean + term.std * z), term.parameter.unit, "prior")

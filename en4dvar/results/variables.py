@@ -120,7 +120,6 @@ def of_series(values: Callable[[Any], Any]) -> Callable[[Analysis, Item], Array]
 
 
 def _parameters(members: Callable[[Analysis], Array]) -> Table:
-    """Physical values of members (N, n)."""
     return (
         Declared("{parameter}", MEMBER, "{label}", lambda a, i: members(a)[None, :, i.held], OWN, needed=True),
         Declared("{walk}_pieces", f"{MEMBER} {{walk}}_piece", "{label}, over the pieces of time",
@@ -129,7 +128,6 @@ def _parameters(members: Callable[[Analysis], Array]) -> Table:
 
 
 def _predictive(members: Callable[[Analysis], Array]) -> Table:
-    """Predictions of members (N, K)."""
     return (
         Declared("{series}", f"{MEMBER} {{time}}", "{label}, noise-free prediction at the observations",
                  of_series(lambda a: members(a)[None]), OWN, needed=True),
