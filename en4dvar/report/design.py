@@ -79,9 +79,7 @@ def _spread(std: float, relative: float, unit: str, shown: str) -> str:
 
 
 def needs(designs: Designs, row: DesignRow) -> list[str]:
-    """What the other parameters must be known to for what is wanted: "G to ± 5 % if reading_scale were known to 0.3 %",
-    a sentence for each that is wanted.
-    """
+    """What others must be known to for what is wanted, a sentence each: "G to ± 5 % if scale were known to 0.3 %"."""
     result = row.evaluated
     if result.needed is None or result.others is None:
         return []

@@ -270,9 +270,8 @@ def _pair(i: int, j: int, x: Array, y: Array) -> Panel:
 
 @dataclass(frozen=True)
 class StoredWalk:
-    """A parameter over m + 1 pieces in display units: ``edges`` (m + 2,) of the pieces, quantiles (3, m + 1).
-
-    Where the interval of the parameter is not to be trusted, the posterior has no outer quantiles (NaN).
+    """A parameter over m + 1 pieces in display units: ``edges`` (m + 2,), quantiles (3, m + 1), of the posterior no
+    outer ones (NaN) where the interval is not to be trusted.
     """
 
     name: str

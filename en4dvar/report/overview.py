@@ -66,10 +66,8 @@ def render_overview(
     figures: Sequence[Drawing],
     headlines: Sequence[Headline] = (),
 ) -> str:
-    """The page as HTML.
-
-    ``headlines``: what all data sets say together, where that was estimated. ``pages``: stem of a data set → address
-    of its page, for those that have one; ``failures``: name of a data set without a posterior → reason.
+    """The page as HTML. ``headlines``: what all data sets say together; ``pages``: stem of a data set → address of its
+    page, for those that have one; ``failures``: name of a data set without a posterior → reason.
     """
     listed = set(map(id, sorted(sets, key=lambda s: -s.gravity)[:LISTED]))
     return render(

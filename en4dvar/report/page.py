@@ -31,9 +31,8 @@ IDENTIFIERS = "d0-"  # begin those of figures, which are addresses
 def render_set(
     result: StoredResult, trail: Sequence[tuple[str, str]] = (), folder: Path | None = None, begin: str = ""
 ) -> str:
-    """The page of one data set as HTML text; ``trail``: links (words, address) above it.
-
-    ``folder``: where its figures are kept as PDF and PNG too, if anywhere, under names with ``begin``.
+    """The page of one data set as HTML text; ``trail``: links (words, address) above it. ``folder``: where its figures
+    are kept as PDF and PNG too, if anywhere, under names with ``begin``.
     """
     judged = result.group("sample_stats")
     return render(

@@ -373,9 +373,7 @@ def write_tables(c: PopulationsCompared, folder: Path) -> None:
 
 
 def numbers_of(names: Sequence[str]) -> tuple[tuple[float, ...], str]:
-    """The number in each of the names and their unit, as of ``gel_5kPa`` and ``gel_8kPa``; nothing where a name has
-    none or several, units differ, or all numbers are the same.
-    """
+    """The numbers in names such as ``gel_5kPa``, and their unit; nothing where one has not one, or units differ."""
     of_names = [[(number, unit) for number, unit in _NUMBER.findall(name) if is_unit(unit)] for name in names]
     units = {unit for of_name in of_names for _, unit in of_name}
     if any(len(of_name) != 1 for of_name in of_names) or len(units) != 1:

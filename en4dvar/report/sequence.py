@@ -300,10 +300,7 @@ class SequenceScore:
 
 
 def compare_sequences(run_dirs: Sequence[Path]) -> tuple[SequenceScore, ...]:
-    """Score sequences, in the order given.
-
-    Raises :class:`OutputError`: fewer than two, one of them no sequence, without an evidence, or of other readings.
-    """
+    """Score sequences, in the order given. Raises :class:`OutputError`: fewer than two, or why they do not compare."""
     runs = {name: _sequence(run_dir) for name, run_dir in named(run_dirs).items()}
     (first, reference), *others = runs.items()
     for name, other in others:

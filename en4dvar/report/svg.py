@@ -226,10 +226,8 @@ def _pieces(text: str) -> Iterator[tuple[str, str]]:
 def draw(
     figures: Iterable[Captioned], identifiers: str = "", folder: Path | None = None, begin: str = ""
 ) -> list[Drawing]:
-    """Each chart as an SVG element; ``identifiers`` begins the names of its elements.
-
-    ``folder``: where they are kept as PDF and PNG too, if anywhere, under names with ``begin``. Raises
-    :class:`OutputError`.
+    """Each chart as SVG, its identifiers begin with ``identifiers``; in a ``folder`` also as PDF and PNG, under names
+    with ``begin``. Raises :class:`OutputError`.
     """
     drawings = []
     for name, caption, chart in figures:

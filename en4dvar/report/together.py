@@ -133,8 +133,7 @@ def forest(
     reference: Mapping[str, tuple[float, float]] | None = None,
 ) -> Chart:  # fmt: skip
     """Each data set alone, and the draws of what is ``common``, one panel each; of some a ``reference`` of others.
-
-    Where the posterior has the parameter for each data set too, that is drawn below what the data set says alone.
+    Where the posterior has the parameter for each data set too, that is drawn below.
     """
     alone, posterior, count = groups.group("alone"), groups.group("posterior"), len(datasets)
     named = count <= 60

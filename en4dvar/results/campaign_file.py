@@ -74,10 +74,9 @@ class _Layout:
 def save_campaign(
     path: Path, pack: Pack, sources: Mapping[str, str], attributes: Mapping[str, Any], failures: Mapping[str, str]
 ) -> Path:
-    """Write the campaign's file; one that is there already, of the same results, is left as it is.
-
-    ``sources``: name of the data set → its name in the ``pack``, in order; not empty. ``attributes``: of the root.
-    ``failures``: name of the data set without a posterior → reason.
+    """Write the campaign's file; one that is there already, of the same results, is left as it is. ``sources``: name of
+    the data set → its name in the ``pack``, in order, not empty; ``failures``: name of one without a posterior →
+    reason.
 
     Raises :class:`DamagedError`: results cannot be read. :class:`OutputError`: the file cannot be written.
     """

@@ -270,10 +270,8 @@ class Content:
 
 @dataclass(frozen=True)
 class Alike:
-    """Contents that differ in numbers and attributes only: ``places`` says which of those given these are.
-
-    Variables of ``groups`` have the contents along a first axis of their values; ``attributes`` are, content by
-    content, those of each group.
+    """Contents that differ in numbers and attributes only: ``places`` among those given, ``groups`` of which values
+    have the contents along a first axis, and ``attributes``, content by content, of each group.
     """
 
     places: list[int]
@@ -377,10 +375,7 @@ def _place(v: Variable, numbers: bytearray, words: list[Any]) -> list[Any]:
 
 
 def _restored(every: Sequence[Content], lead: tuple[int, ...], wanted: Collection[str] | None) -> dict[str, Group]:
-    """The groups of contents of one layout, whose values have the ``lead``ing axis (n,), or none of a single one.
-
-    Attributes are those of the first.
-    """
+    """The groups of contents of one layout, values with the ``lead``ing axis (n,) or none; attributes of the first."""
 
     def variable(
         dims: tuple[str, ...], shape: list[int], fill: bool, attributes: dict[str, Any], kind: str, where: int

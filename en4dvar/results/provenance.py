@@ -32,10 +32,8 @@ PACKAGES = ("en4dvar", "numpy", "scipy", "numba", "xarray", "netCDF4", "pydantic
 
 
 def provenance(config_text: str, config_path: str | Path | None = None, command: str = "") -> dict[str, str]:
-    """ACDD and provenance attributes for :meth:`en4dvar.report.result.Result.from_analysis`.
-
-    ``config_text``: the configuration, verbatim. ``config_path``: the file it was read from; the commit of the
-    repository that tracks it is recorded. ``command``: what the user typed, for ``history``.
+    """ACDD and provenance attributes of a result. ``config_text``: the configuration, verbatim; ``config_path``: its
+    file, of which the commit is recorded; ``command``: what the user typed, for ``history``.
 
     Nothing here fails: what cannot be found out (no git, an installed package) is left as an empty string.
     """

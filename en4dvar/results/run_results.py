@@ -33,14 +33,9 @@ class LackingError(OutputError):
 
 
 class RunResults:
-    """The results of a run directory, in the order of their names; of a single data set ``posterior.nc``, which need
-    not exist.
-
-    ``files``: where they are. ``lacking``: data sets of a campaign that cannot be read → why; those whose content is
-    damaged are added as they are read.
-
-    Raises :class:`OutputError` as :func:`~en4dvar.results.store.require_settled`, and of a campaign of an earlier
-    version.
+    """The results of a run directory, by name; of a single data set ``posterior.nc``, which need not exist. ``files``:
+    where they are; ``lacking``: data sets of a campaign that cannot be read → why, those whose content is damaged as
+    they are read. Raises :class:`OutputError`: a run was killed as it replaced another, or is of an earlier version.
     """
 
     def __init__(self, run_dir: Path):
@@ -108,11 +103,8 @@ class RunResults:
 
 
 def result_files(run_dir: Path) -> list[Path]:
-    """Where the results of a run directory's data sets are, by name; of a single one ``posterior.nc``, which need not
-    exist.
-
-    Raises :class:`OutputError` as :class:`RunResults`; :class:`LackingError` where one that ought to be there cannot be
-    read.
+    """Where the results of a run directory's data sets are, as of :class:`RunResults`. Raises :class:`OutputError`;
+    :class:`LackingError` where one that ought to be there cannot be read.
     """
     results = RunResults(run_dir)
     results.check()

@@ -26,9 +26,7 @@ def series_file(run_dir: Path) -> Path | None:
 
 
 def series_group(result: SeriesResult | TwinResult, attributes: Mapping[str, Any]) -> Group:
-    """Estimates over (time, state), observations and innovations over (time, observation); members of a sequence, truth
-    and scores of a twin experiment.
-    """
+    """Estimates, observations and innovations in time; members of a sequence, truth and scores of a twin experiment."""
     file = "twin.nc" if isinstance(result, TwinResult) else "sequence.nc"
     root = netcdf_attributes({**attributes_of(ATTRIBUTES[file], result), **attributes})
     return Group(lay_out(TABLES[file], result, SCOPES), lay_out(COORDINATES[file], result, SCOPES), root)
@@ -110,7 +108,6 @@ STATE_COORDINATES: Table = (
 
 
 # Of data
-
 
 CLOCK = UnitRule(
     "time of the model", lambda r, _: {"units": _model(r).time_unit, "display_units": _model(r).time_display_unit}

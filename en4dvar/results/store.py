@@ -220,7 +220,6 @@ def build_groups(a: Analysis, attributes: Mapping[str, Any]) -> dict[str, Group]
 
 # The check of what is read
 
-
 BESIDE: Mapping[str, str] = {
     "observed_data": "observation_errors",
     "prior_predictive": "prior_paths",
