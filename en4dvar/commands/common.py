@@ -193,12 +193,13 @@ def to_continue(kept: object) -> Failed:
 
 
 @contextmanager
-def continuable() -> Iterator[None]:
-    """Within, an interrupt says what is kept of the run and what to type next."""
+def continuable(run_dir: Path | None = None, resume: bool = False) -> Iterator[str]:
+    """Within, an interrupt says what is kept of the run and what to type next; gives the command as typed."""
     from en4dvar.runs.interrupt import begun
 
+    note_beginning(run_dir, resume)
     try:
-        yield
+        yield command_line()
     except KeyboardInterrupt as interrupt:
         if kept := begun(interrupt):
             raise to_continue(kept) from None

@@ -10,16 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from en4dvar.commands.common import (
-    Failed,
-    Source,
-    command_line,
-    config_options,
-    continuable,
-    echo,
-    note_beginning,
-    workers_option,
-)  # fmt: skip
+from en4dvar.commands.common import Failed, Source, config_options, continuable, echo, workers_option
 
 if TYPE_CHECKING:
     from en4dvar.config import Config, SequenceConfig, TwinConfig
@@ -65,7 +56,6 @@ def run(source: Source, force: bool, resume: bool, workers: int | None, schedule
     }
     with chdir("."):  # own code of a configuration may leave this folder, which --out refers to
         config = load_any(source.path, source.overrides(**special))
-    note_beginning(config.directory, resume)
     if isinstance(config, Config):
         _estimate(config, force, resume)
     elif scheduler:
@@ -79,9 +69,9 @@ def _estimate(config: Config, force: bool, resume: bool) -> None:
     from en4dvar.runs.progress import terminal_progress
     from en4dvar.runs.runner import run_campaign
 
-    with continuable(), terminal_progress() as progress:
+    with continuable(config.directory, resume) as command, terminal_progress() as progress:
         campaign = run_campaign(
-            config, force=force, resume=resume, progress=progress, command=command_line(),
+            config, force=force, resume=resume, progress=progress, command=command,
             report_workers=config.execution.workers or available_cores(),
         )  # fmt: skip
     _tell(campaign, with_report=config.report)
@@ -200,9 +190,9 @@ def _follow(config: TwinConfig | SequenceConfig, force: bool, resume: bool) -> N
     else:
         own = SequenceKind(config), run_sequence, config.assimilation.members
     kind, conduct, members = own
-    with continuable(), counted("cycles") as tell:
+    with continuable(config.directory, resume) as command, counted("cycles") as tell:
         on_cycle = (lambda cycle: tell(cycle + 1, kind.cycles)) if tell else None
-        result = conduct(config, force=force, resume=resume, on_cycle=on_cycle, command=command_line())
+        result = conduct(config, force=force, resume=resume, on_cycle=on_cycle, command=command)
     echo(result.table())
     if result.run.failures:
         lost = f"{len(result.run.failures)} of {members} members lost"

@@ -16,7 +16,6 @@ from en4dvar.commands.common import (
     continuable,
     deliver,
     echo,
-    note_beginning,
     parted,
     refuse_to_replace,
     tell,
@@ -118,10 +117,9 @@ def calibrate(source: Source, sets: int, made: tuple[str, ...], workers: int | N
     from en4dvar.runs.calibration_run import calibrate as conduct
     from en4dvar.runs.progress import counted
 
-    note_beginning(how["out"], how["resume"])
     how |= {"overrides": source.overrides(**{"execution.workers": workers}), "made_with": parted(made, "--made-with")}
-    with continuable(), counted("sets") as progress:
-        result = conduct(source.path, sets, progress=progress, command=command_line(), **how)
+    with continuable(how["out"], how["resume"]) as command, counted("sets") as progress:
+        result = conduct(source.path, sets, progress=progress, command=command, **how)
     echo(str(result))
     for remark in result.remarks:
         tell(f"note: {remark}")
@@ -151,9 +149,10 @@ def design(source: Source, **how: Any) -> None:
     from en4dvar.runs.design_run import run_design
     from en4dvar.runs.progress import counted
 
-    how |= {"overrides": source.overrides(), "command": command_line()}
-    with continuable(), counted("designs") as on_design:
-        plan, directory = run_design(source.path, on_design=on_design, **how)
+    with continuable() as command, counted("designs") as on_design:
+        plan, directory = run_design(
+            source.path, overrides=source.overrides(), on_design=on_design, command=command, **how
+        )
     echo(design_table(plan))
     for remark in remarks(plan):
         tell(f"note: {remark}")
@@ -186,10 +185,9 @@ def sweep_twin(source: Source, varied: tuple[str, ...], seeds: int, **how: Any) 
     from en4dvar.runs.twin_sweep import sweep_twin as sweep
 
     vary = parted(varied, "--vary")
-    note_beginning(how["out"], how["resume"])
-    how |= {"overrides": source.overrides(), "command": command_line()}
-    with continuable():
-        result = sweep(source.path, vary, seeds, progress=lambda done, of: tell(f"{done} of {of} runs"), **how)
+    how |= {"overrides": source.overrides(), "progress": lambda done, of: tell(f"{done} of {of} runs")}
+    with continuable(how["out"], how["resume"]) as command:
+        result = sweep(source.path, vary, seeds, command=command, **how)
     echo(str(result))
     for reason in dict.fromkeys(run.failure for runs in result.runs for run in runs if run.failure):
         tell(f"failed: {reason}")

@@ -34,16 +34,7 @@ from en4dvar.report.text import (
     with_unit,
 )
 from en4dvar.results.declared import parameter_of
-from en4dvar.results.together import (
-    JOINT,
-    POPULATION,
-    QUANTILES,
-    StoredGroups,
-    StoredJoint,
-    StoredPopulation,
-    load_joint,
-    load_population,
-)
+from en4dvar.results.together import JOINT, POPULATION, QUANTILES, StoredGroups, StoredJoint, StoredPopulation
 
 MOST_FITS = 12  # panels of the figure
 NOTHING = np.full(1, np.nan)
@@ -180,7 +171,7 @@ def fits(joint: StoredJoint) -> Chart | None:
 
 def write_joint(folder: Path) -> Path:
     """Write ``joint.html`` and ``joint.csv`` from ``joint.nc``; returns the page. Raises :class:`OutputError`."""
-    joint = load_joint(folder / JOINT)
+    joint = StoredJoint.load(folder / JOINT)
     rows, fit, absent = estimates(joint), joint.group("fit"), np.full(len(joint.datasets), np.nan)
     # of each data set under the shared values the misfit per reading, and how far it is from all others alone
     fitted = [fit[c].values if c in fit else absent for c in ("chi2_per_observation", "distance", "chance")]
@@ -349,7 +340,7 @@ def caption(stored: StoredPopulation) -> str:
 
 def write_population(folder: Path) -> Path:
     """Write ``population.html``, ``.csv``, ``.tex`` from its file; returns the page. Raises :class:`OutputError`."""
-    stored = load_population(folder / POPULATION)
+    stored = StoredPopulation.load(folder / POPULATION)
     rows = summaries(stored)
     write_csv(folder / "population.csv", summary_rows(rows, {}))
     write_text(folder / "population.tex", latex_table(rows))

@@ -8,7 +8,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
@@ -48,14 +48,16 @@ def save_joint(path: Path, estimate: JointEstimate, alone: Sequence[Array], attr
         "effective_draws": estimate.members.effective,
         "warnings": _lines(estimate.cautions),
     }
-    of_each = {}
+    prior, of_each = {}, {}
     for key, term in zip(estimate.joint.shared, estimate.joint.terms, strict=True):
         own = [m if of.get(key[0]) == key[1] else None for m, of in zip(alone, estimate.joint.groups, strict=True)]
         of_each[shared_name(key)] = _alone(term.parameter, estimate.joint.experiments, own)
+        quantiles = term.to_physical(term.mean + term.std * np.array([-1.6448536, 0.0, 1.6448536]))
+        prior[shared_name(key)] = variable("quantile", quantiles, term.parameter.unit, "prior")
     groups = {
         "/": Group(attrs=root),
         "/posterior": Group(_shared(estimate) | _own(estimate, names), datasets),
-        "/prior": Group(_prior(estimate)),
+        "/prior": Group(prior),
         "/alone": Group(of_each, datasets),
         "/fit": Group(_fit(estimate, names), datasets),
     }
@@ -116,14 +118,6 @@ def _own(estimate: JointEstimate, names: Sequence[str]) -> dict[str, Variable]:
     }
 
 
-def _prior(estimate: JointEstimate) -> dict[str, Variable]:
-    z = np.array([-1.6448536, 0.0, 1.6448536])
-    return {
-        shared_name(key): variable("quantile", term.to_physical(term.mean + term.std * z), term.parameter.unit, "prior")
-        for key, term in zip(estimate.joint.shared, estimate.joint.terms, strict=True)
-    }
-
-
 def _fit(estimate: JointEstimate, names: Sequence[str]) -> dict[str, Variable]:
     """Observations and bands of each data set, padded with NaN, in display units; and each against all others."""
     experiments, agreed = estimate.joint.experiments, estimate.agreement
@@ -164,6 +158,9 @@ class StoredGroups:
     """A file about several data sets together: a thin view of ``tree``."""
 
     tree: xr.DataTree
+    what: ClassVar[str]
+    needed: ClassVar[tuple[str, ...]]  # groups
+    read: ClassVar[tuple[str, ...]]  # what is looked at as the file is read
 
     @property
     def datasets(self) -> tuple[str, ...]:
@@ -179,10 +176,26 @@ class StoredGroups:
         """The variables of a group."""
         return self.tree.children[name].to_dataset()
 
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read the file into memory. Raises :class:`OutputError`: it is none, cut short or altered."""
+        held = read_groups(path)
+        if {f"/{group}" for group in cls.needed} - set(held):
+            raise OutputError(f"{path}: not {cls.what}")
+        with understood(path):
+            stored = cls(tree_of(held))
+            for key in ("datasets", "cautions", *cls.read):
+                getattr(stored, key)
+        return stored
+
 
 @dataclass(frozen=True)
 class StoredJoint(StoredGroups):
-    """A file of :func:`save_joint`: groups posterior, prior, alone, fit, and, without odd data sets, without."""
+    """A file of :func:`save_joint`: the groups ``needed`` and, without odd data sets, ``without``."""
+
+    what = "a joint estimate"
+    needed = ("posterior", "prior", "alone", "fit")
+    read = ("odd",)
 
     @property
     def shared(self) -> tuple[str, ...]:
@@ -197,21 +210,7 @@ class StoredJoint(StoredGroups):
         return tuple(name for name, is_odd in zip(self.datasets, odd, strict=True) if is_odd)
 
 
-def load_joint(path: Path) -> StoredJoint:
-    """Read the file into memory. Raises :class:`OutputError`: it is none, cut short or altered."""
-    joint = StoredJoint(load_groups(path, ("posterior", "prior", "alone", "fit"), "a joint estimate"))
-    with understood(path):
-        _ = joint.datasets, joint.cautions, joint.odd
-    return joint
-
-
-def load_groups(path: Path, groups: Sequence[str], what: str) -> xr.DataTree:
-    """A file with ``groups`` in memory. Raises :class:`OutputError`: it is not ``what``, cut short or altered."""
-    held = read_groups(path)
-    if {f"/{group}" for group in groups} - set(held):
-        raise OutputError(f"{path}: not {what}")
-    with understood(path):
-        return tree_of(held)
+load_joint = StoredJoint.load
 
 
 WORDS = {
@@ -318,7 +317,11 @@ def _sets(population: Population) -> dict[str, Variable]:
 
 @dataclass(frozen=True)
 class StoredPopulation(StoredGroups):
-    """A file of :func:`save_population`: a thin view of ``tree``."""
+    """A file of :func:`save_population`."""
+
+    what = "a population"
+    needed = ("posterior", "prior", "without_hyperprior", "alone")
+    read = ("names", "combinations")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -389,13 +392,7 @@ class StoredPopulation(StoredGroups):
         return tuple(combinations)
 
 
-def load_population(path: Path) -> StoredPopulation:
-    """Read the file into memory. Raises :class:`OutputError`: it is none, cut short or altered."""
-    groups = ("posterior", "prior", "without_hyperprior", "alone")
-    population = StoredPopulation(load_groups(path, groups, "a population"))
-    with understood(path):
-        _ = population.datasets, population.names, population.combinations, population.cautions
-    return population
+load_population = StoredPopulation.load
 
 
 def load_groups_of(run_dir: Path) -> dict[str, tuple[Path, StoredPopulation]]:
