@@ -87,13 +87,13 @@ def _options(entry: EntryPoint) -> list[click.Option]:
     ]
 
 
-def asked(options: Mapping[str, Any]) -> dict[str, tuple[Path, dict[str, str]]]:
-    """Form → file and settings. Raises :class:`click.UsageError`: settings without a file, or not KEY=VALUE."""
+def asked(options: Mapping[str, Any]) -> dict[str, tuple[EntryPoint, Path, dict[str, str]]]:
+    """Form → what writes it, file and settings. Raises :class:`click.UsageError`: settings without a file, or not KEY=VALUE."""
     answers = {}
-    for name in installed(FORMS):
+    for name, entry in installed(FORMS).items():
         out, texts = options.get(name), options.get(f"{name}_set", ())
         if texts and out is None:
             raise click.UsageError(f"--{name}-set needs --{name} FILE")
         if out is not None:
-            answers[name] = out, {key: value.strip() for key, value in parted(texts, f"--{name}-set").items()}
+            answers[name] = entry, out, {key: value.strip() for key, value in parted(texts, f"--{name}-set").items()}
     return answers

@@ -21,8 +21,7 @@ from en4dvar.commands.common import (
     tell,
     workers_option,
 )
-from en4dvar.commands.plugins import FORMS, WithForms, asked, loaded
-from en4dvar.plumbing.installed import installed
+from en4dvar.commands.plugins import WithForms, asked, loaded
 
 
 @click.command(cls=WithForms)
@@ -58,13 +57,12 @@ def simulate(
         _simulate_campaign(source, out, seed, force)
         return
     config = source.load()
-    for path in (out, *(path for path, _ in others.values())):
+    for path in (out, *(path for _, path, _ in others.values())):
         refuse_to_replace(path, force)
     instants = parse_times(times, config.model.time_unit) if times else None
     seed = config.seed if seed is None else seed
-    for name, (path, settings) in others.items():
-        write_form = loaded(installed(FORMS)[name], f"--{name}")
-        echo(write_form(config, instants, path, settings, seed))
+    for name, (entry, path, settings) in others.items():
+        echo(loaded(entry, f"--{name}")(config, instants, path, settings, seed))
     if others and out is None:  # the table was not asked for
         return
     simulation = simulate(config, instants)

@@ -332,7 +332,7 @@ def verdict(result: StoredResult) -> str:
     return change_words(str(stats["varying"]), float(stats["log_evidence_change"]))
 
 
-def _steps(edges: Array, values: Array) -> tuple[Array, Array]:
+def steps(edges: Array, values: Array) -> tuple[Array, Array]:
     """A line (2 m,) through m values, each constant between two of the m + 1 ``edges``."""
     return np.repeat(edges, 2)[1:-1], np.repeat(values, 2)
 
@@ -346,9 +346,9 @@ def bands(result: StoredResult) -> Chart:
         labels = with_unit("time", walk.time_unit), with_unit(walk.symbol, walk.unit)
         panel = Panel(*labels, logarithmic=steep, legend=True)
         for quantiles, colour, alpha in ((walk.prior, "prior", 0.3), (walk.posterior, "posterior", 0.35)):
-            (x, low), (_, high) = (_steps(walk.edges, quantiles[i]) for i in (0, 2))
+            (x, low), (_, high) = (steps(walk.edges, quantiles[i]) for i in (0, 2))
             panel.band(x, low, high, colour, alpha, colour)
-        panel.line(*_steps(walk.edges, walk.posterior[1]), "posterior", label="median")
+        panel.line(*steps(walk.edges, walk.posterior[1]), "posterior", label="median")
         rows.append(Row(5.0 * POINTS, [panel]))
     return Chart(rows)
 
