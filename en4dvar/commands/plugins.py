@@ -88,7 +88,7 @@ def _options(entry: EntryPoint) -> list[click.Option]:
 
 
 def asked(options: Mapping[str, Any]) -> dict[str, tuple[EntryPoint, Path, dict[str, str]]]:
-    """Form → what writes it, file and settings. Raises :class:`click.UsageError`: settings without a file, or not KEY=VALUE."""
+    """Form → its writer, file, settings. Raises :class:`click.UsageError`: settings without file, or not KEY=VALUE."""
     answers = {}
     for name, entry in installed(FORMS).items():
         out, texts = options.get(name), options.get(f"{name}_set", ())

@@ -181,24 +181,18 @@ def export(run_dir: Path, kind: Literal["csv", "latex", "members", "netcdf"], ou
       en4dvar export runs/quickstart --latex --out table.tex
     """
     from en4dvar.report.export import export_table, posterior_file
+    from en4dvar.report.sequence import cycles_table
     from en4dvar.results.run_results import LackingError
     from en4dvar.results.series_file import series_file
 
     cycles = series_file(run_dir)
-    if kind == "netcdf" and cycles:
-        echo(f"{cycles} is netCDF as it is: xarray.open_dataset({str(cycles)!r}); nothing to export")
-        return
     if kind == "netcdf":
-        path = posterior_file(run_dir)
-        echo(f"{path} follows the ArviZ schema as it is: arviz.from_netcdf({str(path)!r}); nothing to export")
+        path = cycles or posterior_file(run_dir)
+        known = ("is netCDF", "xarray.open_dataset") if cycles else ("follows the ArviZ schema", "arviz.from_netcdf")
+        echo(f"{path} {known[0]} as it is: {known[1]}({str(path)!r}); nothing to export")
         return
     try:
-        if cycles:
-            from en4dvar.report.sequence import cycles_table
-
-            text = cycles_table(cycles, kind)
-        else:
-            text = export_table(run_dir, kind)
+        text = cycles_table(cycles, kind) if cycles else export_table(run_dir, kind)
     except LackingError as error:
         if isinstance(error.rest, str):
             deliver(error.rest, out, "table", force)

@@ -44,17 +44,29 @@ def simulate(
       en4dvar simulate configs/quickstart.yaml --set parameters.G='0.5 kPa' \\
           --times '0 us:60 us:1 us' --noise '1.4 um' --out synthetic.csv
     """
-    from en4dvar.config.document import read_document
-    from en4dvar.runs.simulation import noise_level, parse_times, simulate, to_csv
+    from en4dvar.config.document import override, read_document
+    from en4dvar.config.kinds import resolve_campaign
+    from en4dvar.plumbing.files import inside
+    from en4dvar.runs.simulation import draw_campaign, noise_level, parse_times, simulate, to_csv, write_campaign
 
     others = asked(forms)
     if others and noise and out is None:
         raise click.UsageError("--noise applies to the table: name its file with --out")
-    if "campaign" in read_document(source.path).data:
+    document = read_document(source.path)
+    if "campaign" in document.data:
         if source.data or times or noise or others:
             words = ", ".join(["--data", "--times", *(f"--{name}" for name in others)])
             raise click.UsageError(f"{words} and --noise do not apply to a configuration with a 'campaign:'")
-        _simulate_campaign(source, out, seed, force)
+        base = source.path.resolve().parent
+        plan = resolve_campaign(override(document, source.overrides(seed=seed)), base)
+        if out:
+            plan = replace(plan, directory=out)
+        else:  # a folder that came with the configuration may be a link
+            inside(base, os.path.relpath(plan.directory, base))
+        sets = draw_campaign(plan)
+        truth = write_campaign(plan, sets, command_line(), force)
+        fits = [s.nrmse for s in sets]
+        echo(f"{len(sets)} synthetic data sets, NRMSE of the truth {min(fits):.3f} to {max(fits):.3f}; truth: {truth}")
         return
     config = source.load()
     for path in (out, *(path for _, path, _ in others.values())):
@@ -69,25 +81,6 @@ def simulate(
     if noise:
         simulation = simulation.with_noise(noise_level(noise, config, simulation), seed)
     deliver(to_csv(simulation, config, command_line()), out, "")
-
-
-def _simulate_campaign(source: Source, out: Path | None, seed: int | None, force: bool) -> None:
-    from en4dvar.config.document import override, read_document
-    from en4dvar.config.kinds import resolve_campaign
-    from en4dvar.plumbing.files import inside
-    from en4dvar.runs.simulation import draw_campaign, write_campaign
-
-    document = override(read_document(source.path), source.overrides(seed=seed))
-    base = source.path.resolve().parent
-    plan = resolve_campaign(document, base)
-    if out:
-        plan = replace(plan, directory=out)
-    else:  # a folder that came with the configuration may be a link
-        inside(base, os.path.relpath(plan.directory, base))
-    sets = draw_campaign(plan)
-    truth = write_campaign(plan, sets, command_line(), force)
-    fits = [s.nrmse for s in sets]
-    echo(f"{len(sets)} synthetic data sets, NRMSE of the truth {min(fits):.3f} to {max(fits):.3f}; truth: {truth}")
 
 
 @click.command()

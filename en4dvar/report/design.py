@@ -221,21 +221,14 @@ def write_design(folder: Path) -> Path:
         figures.insert(0, ("prices", FRONT, prices(designs)))
     if designs.asked.knobs or len({row.evaluated.alike for row in rows}) > 1:
         figures.insert(0, ("gains", GAINS, gains(designs)))
+    told = {id(row): "; ".join([words(designs, row), *needs(designs, row)]) for row in front(designs)}
     return write_page(
         folder / "design.html",
         "design.html.j2",
         designs=designs,
         by=by,
         rows=[(settings_text(row), row, words(designs, row), id(row) in best) for row in rows],
-        lab=[
-            (
-                settings_text(row),
-                readings_text(designs, row),
-                row,
-                "; ".join([words(designs, row), *needs(designs, row)]),
-            )
-            for row in front(designs)
-        ],
+        lab=[(settings_text(row), readings_text(designs, row), row, told[id(row)]) for row in front(designs)],
         remarks=remarks(designs),
         drawings=draw(figures),
     )

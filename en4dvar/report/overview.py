@@ -162,9 +162,7 @@ def _tally(sets: Sequence[SetSummary]) -> list[dict[str, Any]]:
     """One line a code: in how many data sets, with the words of the first of them."""
     every = [(c, dataset.name) for dataset in sets for c in dataset.cautions]
     count = Counter(key for dataset in sets for key in {(c.severity, c.code) for c in dataset.cautions})
-    first: dict[tuple[str, str], tuple[Caution, str]] = {}
-    for c, name in every:
-        first.setdefault((c.severity, c.code), (c, name))
+    first = {(c.severity, c.code): (c, name) for c, name in reversed(every)}
     return [
         {"severity": c.severity, "code": c.code, "count": count[c.severity, c.code], "advice": c.advice,
          "example": f"e.g. {first[c.severity, c.code][1]}: {c.words}"}

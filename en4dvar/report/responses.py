@@ -24,10 +24,8 @@ ENTRY_COLUMNS = ("parameter", "quantity", "unit", "q05", "q50", "q95")
 
 
 class StoredShift(NamedTuple):
-    """What one parameter would do under one alternative: ``change`` in ``unit``, the display unit.
-
-    ``relative``: of the value, NaN where that may be negative. ``reason``: why linear response does not tell, or "".
-    Behind the cells of :data:`SHIFT_COLUMNS`, the symbol of the parameter.
+    """What one parameter would do under an alternative, in its display unit; ``relative``: of the value, NaN where that
+    may be negative; ``reason``: why linear response does not tell, or "". Cells of :data:`SHIFT_COLUMNS`, and a symbol.
     """
 
     alternative: str
@@ -48,9 +46,8 @@ class StoredShift(NamedTuple):
 
 
 class StoredEntry(NamedTuple):
-    """Where on the path one parameter was informed, in one quantity: ``low``, ``median``, ``high`` are 5, 50, 95 %.
-
-    Behind the cells of :data:`ENTRY_COLUMNS`, the symbol of the parameter and the label of the quantity.
+    """Where on the path one parameter was informed, in one quantity: cells of :data:`ENTRY_COLUMNS`, then the symbol
+    of the parameter and the label of the quantity.
     """
 
     parameter: str

@@ -8,9 +8,8 @@ sees the same. A file is made in memory: a worker far away can do it, and a file
 :func:`tree_of` and :func:`dataset_of` show them through it.
 
 The last line of a file is its seal: format, version and SHA-256 of everything before it. HDF5 has no checksum of its
-own: of files with one flipped bit most are read without a word, and some send its library into an endless loop. The
-line stands behind the end of the HDF5 file, where every reader of netCDF ignores it; it is checked before the library
-gets to see the file.
+own: of files with one flipped bit most are read without a word, and some send its library into an endless loop. So the
+line, which every reader of netCDF ignores, is checked before the library gets to see the file.
 """
 
 from __future__ import annotations

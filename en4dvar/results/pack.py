@@ -3,9 +3,7 @@
 A record is a line (format, checksum of the rest of the line, name, fingerprint, sizes and SHA-256 of what follows),
 then how the data set ended, then its groups. What is there is known from the lines alone: a record that was cut short
 by a kill or a full disk is the last one and is overwritten, and damage ends at the next line that can be read. Of
-several records of a name the last one counts. What ought to be there is known elsewhere
-(:mod:`~en4dvar.results.run_results`). The result of a data set has an address like that of a file:
-``datasets.pack/<name>``.
+several records of a name the last one counts. The result of a data set has an address: ``datasets.pack/<name>``.
 
 Groups are two JSON texts, then the numbers: ten times faster to write and to read than a netCDF file of them, of which
 the definitions are most of the work. The first text says which variables there are, and is the same for most data sets

@@ -361,9 +361,7 @@ class StoredPopulation(StoredGroups):
     def belongs(self) -> dict[str, float]:
         """Data set → probability that it is of the population; empty in files of version 1.0."""
         alone = self.group("alone")
-        if "belongs" not in alone:
-            return {}
-        return dict(zip(self.datasets, map(float, alone["belongs"].values), strict=True))
+        return dict(zip(self.datasets, map(float, alone["belongs"].values), strict=True)) if "belongs" in alone else {}
 
     @property
     def readings(self) -> dict[str, str]:
