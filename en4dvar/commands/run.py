@@ -13,7 +13,7 @@ import click
 from en4dvar.commands.common import Failed, Source, config_options, continuable, echo, workers_option
 
 if TYPE_CHECKING:
-    from en4dvar.config import Config, SequenceConfig, TwinConfig
+    from en4dvar.config import SequenceConfig, TwinConfig
     from en4dvar.plumbing.caution import Caution
     from en4dvar.runs.campaign import Campaign
 
@@ -57,24 +57,20 @@ def run(source: Source, force: bool, resume: bool, workers: int | None, schedule
     with chdir("."):  # own code of a configuration may leave this folder, which --out refers to
         config = load_any(source.path, source.overrides(**special))
     if isinstance(config, Config):
-        _estimate(config, force, resume)
+        from en4dvar.executor import available_cores
+        from en4dvar.runs.progress import terminal_progress
+        from en4dvar.runs.runner import run_campaign
+
+        with continuable(config.directory, resume) as command, terminal_progress() as progress:
+            campaign = run_campaign(
+                config, force=force, resume=resume, progress=progress, command=command,
+                report_workers=config.execution.workers or available_cores(),
+            )  # fmt: skip
+        _tell(campaign, with_report=config.report)
     elif scheduler:
         raise click.UsageError("--scheduler is not for a series: its cycles are too short to be sent to other machines")
     else:
         _follow(config, force, resume)
-
-
-def _estimate(config: Config, force: bool, resume: bool) -> None:
-    from en4dvar.executor import available_cores
-    from en4dvar.runs.progress import terminal_progress
-    from en4dvar.runs.runner import run_campaign
-
-    with continuable(config.directory, resume) as command, terminal_progress() as progress:
-        campaign = run_campaign(
-            config, force=force, resume=resume, progress=progress, command=command,
-            report_workers=config.execution.workers or available_cores(),
-        )  # fmt: skip
-    _tell(campaign, with_report=config.report)
 
 
 def _tell(campaign: Campaign, with_report: bool) -> None:

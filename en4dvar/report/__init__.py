@@ -117,7 +117,8 @@ def _write_campaign(
     of_gel = {name for _, of in populations_of(run_dir).values() for name in of.names}
     figures = draw(overview_figures(sets, of_gel), folder=inside(run_dir, "figures") if files else None)
     pages = {s.stem: quote(f"pages/{s.stem}.html") for s in paged}
-    return write_text(run_dir / "report.html", render_overview(sets, pages, failures, figures, _headlines(run_dir)))
+    shown = {"pages": pages, "failures": failures, "figures": figures, "headlines": _headlines(run_dir)}
+    return write_text(run_dir / "report.html", render_overview(sets, **shown))
 
 
 def _headlines(run_dir: Path) -> list[Headline]:

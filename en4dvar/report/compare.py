@@ -256,10 +256,7 @@ def estimates_table(comparison: Comparison) -> str:
 
 
 def write_comparison(comparison: Comparison, out: str | Path) -> Path:
-    """Write ``compare.html``, ``posteriors.png`` and ``.pdf``, ``estimates.csv`` and ``evidence.csv`` to a folder.
-
-    Files of an earlier comparison there are replaced. Returns the path of the page. Raises :class:`OutputError`.
-    """
+    """Write ``compare.html``, ``posteriors.png``, ``.pdf``, tables; returns the page. Raises :class:`OutputError`."""
     out = make_folder(out)
     ((_, _, figure),) = draw([("posteriors", CAPTION, overlay(comparison))], folder=out)
     warned = {(s.run, s.dataset): s.warnings for s in comparison.scores}
@@ -286,21 +283,17 @@ def _panel(estimates: Sequence[ComparedEstimate], runs: Sequence[str]) -> Panel:
     for i, run in enumerate(runs):
         colour = COLOURS[i % len(COLOURS)]
         panel.line([], [], colour, label=figure_text(run))
-        values = _members([e for e in estimates if e.run == run], row.unit)
+        own = [e for e in estimates if e.run == run]
+        with retold(UnitError, OutputError, f"the runs mean different quantities by {row.name}: "):
+            parts = [convert(e.members, e.summary.unit, row.unit) for e in own]
+        values = np.concatenate([np.empty(0), *parts])
         if values.size < 2 or np.ptp(values) == 0:
             continue
         panel.histogram(values, colour, alpha=0.25)
-        if not any(e.summary.untrusted for e in estimates if e.run == run):
+        if not any(e.summary.untrusted for e in own):
             low, high = member_quantiles(values, (0.05, 0.95))
             panel.line([low, high], np.full(2, 1.08 + 0.09 * i), colour, 2.0)
     return panel
-
-
-def _members(estimates: Sequence[ComparedEstimate], unit: str) -> Array:
-    words = f"the runs mean different quantities by {estimates[0].summary.name}: " if estimates else ""
-    with retold(UnitError, OutputError, words):
-        parts = [convert(e.members, e.summary.unit, unit) for e in estimates]
-    return np.concatenate(parts) if parts else np.empty(0)
 
 
 def named(runs: Sequence[str | Path] | Mapping[str, T]) -> Mapping[str, T | Path]:

@@ -220,10 +220,7 @@ def _tex(number: str) -> str:
 
 
 def latex_symbol(row: ParameterSummary) -> str:
-    r"""Matplotlib's mathtext is LaTeX as far as it is letters, indices and known commands; anything else is text.
-
-    A result file may come from anybody, and LaTeX reads and writes files for who asks (``\input``).
-    """
+    r"""Known commands of mathtext as they are, else text: LaTeX reads and writes files for who asks (``\input``)."""
     return row.symbol if is_math(row.symbol) else escaped(row.symbol)
 
 

@@ -55,10 +55,7 @@ def histograms(result: StoredResult) -> Chart:
 
 
 def _prior_density(result: StoredResult, name: str) -> tuple[Array, Array, Array] | None:
-    """Of the prior itself: values, zeros and density there, scaled to its peak; None where the file lacks it.
-
-    The probability of each step between stored values over its width is exact whatever the parameter's map is.
-    """
+    """Of the prior itself, whatever its map: values, zeros and density, scaled to its peak; None where not stored."""
     stats = result.group("sample_stats")
     if "prior_value" not in stats:
         return None

@@ -13,7 +13,7 @@ from en4dvar.estimation.summary import ParameterSummary
 from en4dvar.plumbing.caution import Caution, codes, gravity, worst_first
 from en4dvar.report.chart import COLUMN, PAGE, POINTS, Chart, Panel, Row
 from en4dvar.report.html import render
-from en4dvar.report.svg import Captioned, Drawing
+from en4dvar.report.svg import Captioned
 from en4dvar.report.text import figure_text, number_like, pretty_unit, symbol_html, with_unit
 from en4dvar.results.store import StoredResult
 
@@ -59,28 +59,13 @@ class SetSummary:
         return ", ".join(codes(self.cautions))
 
 
-def render_overview(
-    sets: Sequence[SetSummary],
-    pages: Mapping[str, str],
-    failures: Mapping[str, str],
-    figures: Sequence[Drawing],
-    headlines: Sequence[Headline] = (),
-) -> str:
-    """The page as HTML. ``headlines``: what all data sets say together; ``pages``: stem of a data set → address of its
-    page, for those that have one; ``failures``: name of a data set without a posterior → reason.
+def render_overview(sets: Sequence[SetSummary], **shown: Any) -> str:
+    """The page as HTML. Also shown: ``pages``, stem of a data set → address of its page, for those that have one;
+    ``failures``, name of one without a posterior → reason; drawn ``figures``; ``headlines`` (:data:`Headline`).
     """
-    listed = set(map(id, sorted(sets, key=lambda s: -s.gravity)[:LISTED]))
-    return render(
-        "campaign.html.j2",
-        parameters=[_parameter(name, sets) for name in _parameters(sets)],
-        failures=failures,
-        sets=sets,
-        listed=[dataset for dataset in sets if id(dataset) in listed],
-        pages=pages,
-        headlines=headlines,
-        tally=_tally(sets),
-        figures=figures,
-    )
+    worst = set(map(id, sorted(sets, key=lambda s: -s.gravity)[:LISTED]))
+    listed, parameters = [s for s in sets if id(s) in worst], [_parameter(name, sets) for name in _parameters(sets)]
+    return render("campaign.html.j2", sets=sets, listed=listed, parameters=parameters, tally=_tally(sets), **shown)
 
 
 def estimates(sets: Sequence[SetSummary], names: Sequence[str] = ()) -> Chart:
@@ -162,7 +147,9 @@ def _tally(sets: Sequence[SetSummary]) -> list[dict[str, Any]]:
     """One line a code: in how many data sets, with the words of the first of them."""
     every = [(c, dataset.name) for dataset in sets for c in dataset.cautions]
     count = Counter(key for dataset in sets for key in {(c.severity, c.code) for c in dataset.cautions})
-    first = {(c.severity, c.code): (c, name) for c, name in reversed(every)}
+    first: dict[tuple[str, str], tuple[Caution, str]] = {}
+    for c, name in every:
+        first.setdefault((c.severity, c.code), (c, name))
     return [
         {"severity": c.severity, "code": c.code, "count": count[c.severity, c.code], "advice": c.advice,
          "example": f"e.g. {first[c.severity, c.code][1]}: {c.words}"}

@@ -34,7 +34,9 @@ def render_set(
     """The page of one data set as HTML text; ``trail``: links (words, address) above it. ``folder``: where its figures
     are kept as PDF and PNG too, if anywhere, under names with ``begin``.
     """
-    judged = result.group("sample_stats")
+    judged, recorded = result.group("sample_stats"), json.loads(str(result.attributes["assimilation_settings"]))
+    weights = result.of_readings("observed_data", "weights", shared=True)
+    total = f"{len(weights)} observations, weights sum to {plain_number(float(weights.sum()))}"
     return render(
         "set.html.j2",
         result=result,
@@ -49,7 +51,7 @@ def render_set(
         shares=_shares(result),
         what_if=(what_if := stored_shifts(result)),
         exceeding=exceeding(what_if),
-        what_if_added=_recorded(result).get("what_if") == "added",
+        what_if_added=recorded.get("what_if") == "added",
         entries=stored_ledger(result),
         readings=responses.reading_words(result),
         withheld=withheld_words(result),
@@ -61,7 +63,7 @@ def render_set(
         lost=[(i, str(reason)) for i, reason in enumerate(judged["failure_reason"].values.ravel()) if reason],
         iterations=_iterations(result),
         fixed_values=_fixed(result),
-        settings=_settings(result),
+        settings=[*((key.replace("_", " "), str(value)) for key, value in recorded.items()), ("observations", total)],
         provenance=provenance_rows(result.attributes),
     )
 
@@ -190,18 +192,6 @@ def _iterations(result: StoredResult) -> list[tuple[str, ...]]:
         [str(int(n)) for n in table["active"].values],
     ]
     return list(zip(*columns, strict=True))
-
-
-def _recorded(result: StoredResult) -> dict[str, Any]:
-    return dict(json.loads(str(result.attributes["assimilation_settings"])))
-
-
-def _settings(result: StoredResult) -> list[tuple[str, str]]:
-    """The scheme's settings and how observations are weighted."""
-    recorded = _recorded(result)
-    weights = result.of_readings("observed_data", "weights", shared=True)
-    total = f"{len(weights)} observations, weights sum to {plain_number(float(weights.sum()))}"
-    return [*((key.replace("_", " "), str(value)) for key, value in recorded.items()), ("observations", total)]
 
 
 def provenance_rows(attributes: Mapping[Any, Any]) -> list[tuple[str, str]]:

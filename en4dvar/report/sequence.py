@@ -104,13 +104,10 @@ def last_analysis(data: Group) -> Iterator[tuple[str, float, float, str]]:
 
 
 def cycles_table(file: Path, kind: Kind) -> str:
-    """A table of the result file of a sequence or a twin experiment as text, in display units.
-
-    ``kind``: ``csv``: a line for each time and variable of the state, mean and std of each estimate (and the truth of a
-    twin experiment); ``members``: a line for each member and time that is kept; ``latex``: rows of a table (package
-    booktabs), mean and std of the last analysis.
-
-    Raises :class:`OutputError`: there is no result, it is damaged, or it holds no members (a twin experiment).
+    """A table of the result file of a sequence or a twin experiment as text, in display units. ``csv``: a line for each
+    time and variable of the state, mean and std of each estimate, and the truth; ``members``: for each member and time
+    that is kept; ``latex``: for each variable of the last analysis. Raises :class:`OutputError`: it is damaged, or
+    holds no members (a twin experiment).
     """
     data = read_groups(file)["/"]
     if kind == "members" and "members" not in data:

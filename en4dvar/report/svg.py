@@ -59,7 +59,11 @@ def _share(values: Array, limits: tuple[float, float], logarithmic: bool) -> Arr
 def svg(chart: Chart, name: str, description: str) -> Markup:
     """The drawing; its identifiers begin with ``name``, ``description`` is what a screen reader says."""
     parts, top = [], 0.0
-    margins = _left_margins(chart)
+    margins: dict[tuple[int, int], float] = {}  # of (panels of the row, place in it), one for the first of all rows
+    for row in chart.rows:
+        for j, panel in enumerate(row.panels):
+            key = (len(row.panels) if j else 0, j)
+            margins[key] = max(margins.get(key, 0.0), _left(panel))
     for i, row in enumerate(chart.rows):
         lefts = [margins[len(row.panels) if j else 0, j] for j in range(len(row.panels))]
         x, width = 0.0, (chart.width - sum(lefts) - len(lefts) * GAP) / len(lefts)
@@ -85,16 +89,6 @@ def _left(panel: Panel) -> float:
     labels = [text for _, text in _y_ticks(panel)] if panel.y_numbers else []
     widest = max(map(len, labels), default=0) * WIDEST * SMALL
     return widest + 4.5 + (FONT + 5 if panel.ylabel else 0)
-
-
-def _left_margins(chart: Chart) -> dict[tuple[int, int], float]:
-    """(panels of the row, place in it) → margin; the first places of all rows have one."""
-    margins: dict[tuple[int, int], float] = {}
-    for row in chart.rows:
-        for j, panel in enumerate(row.panels):
-            key = (len(row.panels) if j else 0, j)
-            margins[key] = max(margins.get(key, 0.0), _left(panel))
-    return margins
 
 
 def _panel(panel: Panel, row: Row, top: float, x: float, width: float, name: str) -> list[str]:

@@ -293,7 +293,7 @@ def test_overview_of_many_data_sets_stays_small(analysis):
     one = SetSummary.of(Result.from_analysis(analysis, provenance("name: test\n")), "set")
     sets = [replace(one, name=f"set {i:04d}", stem=f"set_{i:04d}", cautions=()) for i in range(20_000)]
     sets[7_777] = replace(sets[7_777], cautions=one.cautions)
-    html = render_overview(sets, {}, {}, draw(overview_figures(sets)))
+    html = render_overview(sets, pages={}, failures={}, headlines=(), figures=draw(overview_figures(sets)))
     assert len(html.encode()) < 3e6
     assert html.count("<tr>") == LISTED + 1 + 4  # the heading, and the numbers of four parameters
     assert '<th scope="row">set 7777</th>' in html
@@ -321,7 +321,7 @@ def test_half_of_the_data_sets_is_half_of_those_to_be_trusted(analysis):
     name, row = next(iter(one.rows.items()))
     rows = [replace(row, mean=value, std=0.1, untrusted=("misfit",) * (value > 5)) for value in (1.0, 2.0, 3.0, 70.0)]
     sets = [replace(one, rows={name: own}) for own in rows]
-    html = render_overview(sets, {}, {}, draw(overview_figures(sets)))
+    html = render_overview(sets, pages={}, failures={}, headlines=(), figures=draw(overview_figures(sets)))
     assert "half of the data sets: 1.50 to 2.50" in html
     assert html.index("posteriors come with") < html.index('<figure class="wide" id="estimates"')
 
