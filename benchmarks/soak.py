@@ -23,8 +23,7 @@ import netCDF4
 import numpy as np
 from cheap_model import write_campaign
 
-from en4dvar.results.pack import read_result
-from en4dvar.results.packed import unpacked
+from en4dvar.results.pack import read_result, unpacked
 from en4dvar.results.provenance import cpu_model, git_commit
 from en4dvar.results.run_results import result_files
 

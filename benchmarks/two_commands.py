@@ -47,8 +47,8 @@ from en4dvar.estimation.population.campaign import FEWEST_SETS, Population, popu
 from en4dvar.estimation.population.own import OwnDraws
 from en4dvar.model.state import Array
 from en4dvar.problem import InverseProblem
-from en4dvar.report.population import summaries
-from en4dvar.results.population_file import FILE, load_population
+from en4dvar.report.together import summaries
+from en4dvar.results.together import POPULATION, load_population
 from en4dvar.runs.finished import finished
 
 COMMAND = [sys.executable, "-c", "from en4dvar.cli import main; main()"]
@@ -82,9 +82,9 @@ def two_commands(folder: Path, out: Path, changed: Sequence[str], medium: str, s
         ["run", str(config), *(word for value in changed for word in ("--set", value)), "--out", str(out / "run")],
         out / "run.log",
     )
-    if not (out / "run" / FILE).is_file():
+    if not (out / "run" / POPULATION).is_file():
         return {**record, "failed": (out / "run.log").read_text().splitlines()[-1]}
-    stored = load_population(out / "run" / FILE)
+    stored = load_population(out / "run" / POPULATION)
     of = dict(zip(stored.words, (rows for _, rows, _ in summaries(stored)), strict=False))
     for row in of[stored.headline]:
         record[row.name] = [row.q50, row.q05, row.q95]

@@ -19,21 +19,15 @@ from en4dvar.commands.installation import models, schema, warm_up
 from en4dvar.commands.plugins import COMMANDS, PluginCommand
 from en4dvar.commands.results import compare, export, report, rerun
 from en4dvar.commands.run import run
-from en4dvar.commands.simulate import simulate
-from en4dvar.commands.synthetic import calibrate, design, sweep_twin
+from en4dvar.commands.synthetic import calibrate, design, simulate, sweep_twin
 from en4dvar.commands.together import joint, population
 from en4dvar.commands.validate import validate
 from en4dvar.plumbing.errors import En4dvarError
 from en4dvar.plumbing.installed import installed
 from en4dvar.runs.interrupt import heeded
 
-OF_THE_DEVICE = (
-    errno.ENOSPC,
-    errno.EDQUOT,
-    errno.EFBIG,
-    errno.EIO,
-    errno.EROFS,
-)  # told by what writes; here is what is left
+# Told by what writes; here is what is left
+OF_THE_DEVICE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
 
 
 class Commands(click.Group):

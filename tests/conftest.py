@@ -20,7 +20,6 @@ from chromium import browser  # noqa: F401  a fixture: one for all, since Playwr
 from parts_by_day import is_of_day
 from threadpoolctl import threadpool_limits
 
-from en4dvar import report
 from en4dvar.data.noise import noise_of
 from en4dvar.data.observations import Observations
 from en4dvar.diagnosis.analysis import Analysis, Descents, IterationRecord, Mode
@@ -212,4 +211,4 @@ def analysis() -> Analysis:
 @pytest.fixture
 def one_figure(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reports of this process draw the first of their figures only: enough where a test asks for files and pages."""
-    monkeypatch.setattr(report, "all_figures", lambda result: islice(all_figures(result), 1))
+    monkeypatch.setattr("en4dvar.report.page.all_figures", lambda result: islice(all_figures(result), 1))

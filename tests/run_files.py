@@ -19,8 +19,7 @@ from toy_config import csv_text, write_toy
 from en4dvar.config import Config, load_config
 from en4dvar.report.result import Result, load_result
 from en4dvar.results.checkpoint import digest
-from en4dvar.results.pack import PACK, Pack, results_of
-from en4dvar.results.packed import packed
+from en4dvar.results.pack import PACK, Pack, packed, results_of
 from en4dvar.runs.interrupt import Interrupted
 from en4dvar.runs.runner import run_campaign
 

@@ -178,12 +178,12 @@ def command_line(without: tuple[str, ...] = (), also: tuple[str, ...] = ()) -> s
     return shlex.join(["en4dvar", *(word for word in sys.argv[1:] if word not in without), *also])
 
 
-def note_beginning(run_dir: Path, resume: bool) -> None:
+def note_beginning(run_dir: Path | None, resume: bool) -> None:
     """Say that there is nothing to resume, as for a batch job that was killed before it began."""
     from en4dvar.runs.rundir import holds_run
 
-    if resume and not holds_run(run_dir):
-        echo(f"note: {run_dir} holds no run yet; this one begins", err=True)
+    if run_dir is not None and resume and not holds_run(run_dir):
+        tell(f"note: {run_dir} holds no run yet; this one begins")
 
 
 def to_continue(kept: object) -> Failed:
@@ -193,12 +193,13 @@ def to_continue(kept: object) -> Failed:
 
 
 @contextmanager
-def continuable() -> Iterator[None]:
-    """Within, an interrupt says what is kept of the run and what to type next."""
+def continuable(run_dir: Path | None = None, resume: bool = False) -> Iterator[str]:
+    """Within, an interrupt says what is kept of the run and what to type next; gives the command as typed."""
     from en4dvar.runs.interrupt import begun
 
+    note_beginning(run_dir, resume)
     try:
-        yield
+        yield command_line()
     except KeyboardInterrupt as interrupt:
         if kept := begun(interrupt):
             raise to_continue(kept) from None

@@ -84,9 +84,8 @@ def cost_summary(config: Config, preview: Preview, count: int) -> str:
         sampled = round(RUNS_A_DRAW * (config.assimilation.draws or ENOUGH))
         took = _seconds(sampled * preview.seconds)
         more = f"; a posterior that leaves a doubt is sampled by some {sampled} more, {took}"
-        more += ", and minima that are hard to find, with what if, can take ten times all this" * bool(
-            config.assimilation.what_if
-        )
+        if config.assimilation.what_if:
+            more += ", and minima that are hard to find, with what if, can take ten times all this"
     took = f"{_seconds(preview.seconds)} each: {_seconds(total * preview.seconds)} on one thread"
     return f"cost: {runs}, {took}, plus some seconds for files and report{more}"
 
@@ -126,7 +125,6 @@ def _prior_rows(problem: InverseProblem) -> list[tuple[str, ...]]:
 
 
 def _correlation_rows(problem: InverseProblem) -> list[tuple[str, ...]]:
-    """The pairs that are most correlated."""
     pairs = [
         (block.matrix[i, j], f"{block.names[i]}, {block.names[j]}")
         for block in problem.prior.blocks

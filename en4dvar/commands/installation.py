@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from en4dvar.commands.common import deliver, echo
+from en4dvar.commands.plugins import loaded
 from en4dvar.plumbing.installed import installed
 
 WARM_UP = "en4dvar.warm_up"
@@ -65,10 +66,5 @@ def warm_up() -> None:
 
 def examples() -> Iterator[tuple[str, Callable[[], object]]]:
     """Names of kernels, each with a call that compiles it. Raises :class:`En4dvarError`: a package is at fault."""
-    from en4dvar.plumbing.errors import En4dvarError, retold
-
     for name, entry in installed(WARM_UP).items():
-        words = f"warm-up of {name!r} ({entry.value}) cannot be loaded: "
-        with retold((ImportError, AttributeError), En4dvarError, words):
-            examples_of_package = entry.load()()
-        yield from examples_of_package.items()
+        yield from loaded(entry, f"warm-up of {name!r}")().items()

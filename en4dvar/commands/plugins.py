@@ -8,24 +8,18 @@ of ``movie(config, times, out, settings, seed)``, which writes FILE and returns 
 before such an option is used.
 """
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Mapping
 from importlib.metadata import EntryPoint
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from en4dvar.commands.common import parted
 from en4dvar.plumbing.errors import En4dvarError, retold
 from en4dvar.plumbing.installed import installed
-
-if TYPE_CHECKING:
-    from en4dvar.config import Config
-    from en4dvar.model.state import Array
 
 COMMANDS = "en4dvar.commands"
 FORMS = "en4dvar.simulate"
@@ -93,22 +87,13 @@ def _options(entry: EntryPoint) -> list[click.Option]:
     ]
 
 
-def asked(options: Mapping[str, Any]) -> dict[str, tuple[Path, dict[str, str]]]:
-    """Form → file and settings. Raises :class:`click.UsageError`: settings without a file, or not KEY=VALUE."""
+def asked(options: Mapping[str, Any]) -> dict[str, tuple[EntryPoint, Path, dict[str, str]]]:
+    """Form → its writer, file, settings. Raises :class:`click.UsageError`: settings without file, or not KEY=VALUE."""
     answers = {}
-    for name in installed(FORMS):
+    for name, entry in installed(FORMS).items():
         out, texts = options.get(name), options.get(f"{name}_set", ())
         if texts and out is None:
             raise click.UsageError(f"--{name}-set needs --{name} FILE")
         if out is not None:
-            answers[name] = out, {key: value.strip() for key, value in parted(texts, f"--{name}-set").items()}
+            answers[name] = entry, out, {key: value.strip() for key, value in parted(texts, f"--{name}-set").items()}
     return answers
-
-
-def write_form(
-    name: str, config: Config, times: Array | None, out: Path, settings: Mapping[str, str], seed: int
-) -> str:
-    """Write a form and return the sentence about its file. Raises :class:`En4dvarError`: the form cannot be loaded, or
-    refuses.
-    """
-    return str(loaded(installed(FORMS)[name], f"--{name}")(config, times, out, settings, seed))

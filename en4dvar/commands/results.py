@@ -9,17 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
-from en4dvar.commands.common import (
-    Failed,
-    ask,
-    deliver,
-    echo,
-    folder_of,
-    from_here,
-    tell,
-    trust_option,
-    workers_option,
-)
+from en4dvar.commands.common import Failed, ask, deliver, echo, folder_of, from_here, tell, trust_option, workers_option
 from en4dvar.plumbing.errors import OutputError
 
 if TYPE_CHECKING:
@@ -129,9 +119,7 @@ def compare(
         echo(f"report: {page if out else from_here(page)}")
 
 
-def _compared(
-    run_dirs: tuple[Path, ...], stored: bool, workers: int | None, trust: bool
-) -> Callable[[Path], Path]:  # fmt: skip
+def _compared(run_dirs: tuple[Path, ...], stored: bool, workers: int | None, trust: bool) -> Callable[[Path], Path]:
     """What writes the page of the runs side by side, which are told on standard output."""
     from en4dvar.report import compare as side_by_side
 
@@ -156,9 +144,9 @@ def _populations(
     can be, or options ask for it.
     """
     from en4dvar.report.populations import compare_populations, medians_table, sentences
-    from en4dvar.results.population_file import FILE
+    from en4dvar.results.together import POPULATION
 
-    held = all((run_dir / FILE).is_file() for run_dir in run_dirs)
+    held = all((run_dir / POPULATION).is_file() for run_dir in run_dirs)
     asked = (held and alone) or against or apart or known
     if not (asked or held):
         return None
@@ -193,24 +181,18 @@ def export(run_dir: Path, kind: Literal["csv", "latex", "members", "netcdf"], ou
       en4dvar export runs/quickstart --latex --out table.tex
     """
     from en4dvar.report.export import export_table, posterior_file
+    from en4dvar.report.sequence import cycles_table
     from en4dvar.results.run_results import LackingError
     from en4dvar.results.series_file import series_file
 
     cycles = series_file(run_dir)
-    if kind == "netcdf" and cycles:
-        echo(f"{cycles} is netCDF as it is: xarray.open_dataset({str(cycles)!r}); nothing to export")
-        return
     if kind == "netcdf":
-        path = posterior_file(run_dir)
-        echo(f"{path} follows the ArviZ schema as it is: arviz.from_netcdf({str(path)!r}); nothing to export")
+        path = cycles or posterior_file(run_dir)
+        known = ("is netCDF", "xarray.open_dataset") if cycles else ("follows the ArviZ schema", "arviz.from_netcdf")
+        echo(f"{path} {known[0]} as it is: {known[1]}({str(path)!r}); nothing to export")
         return
     try:
-        if cycles:
-            from en4dvar.report.cycles import cycles_table
-
-            text = cycles_table(cycles, kind)
-        else:
-            text = export_table(run_dir, kind)
+        text = cycles_table(cycles, kind) if cycles else export_table(run_dir, kind)
     except LackingError as error:
         if isinstance(error.rest, str):
             deliver(error.rest, out, "table", force)

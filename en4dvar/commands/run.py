@@ -10,19 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from en4dvar.commands.common import (
-    Failed,
-    Source,
-    command_line,
-    config_options,
-    continuable,
-    echo,
-    note_beginning,
-    workers_option,
-)  # fmt: skip
+from en4dvar.commands.common import Failed, Source, config_options, continuable, echo, workers_option
 
 if TYPE_CHECKING:
-    from en4dvar.config import Config, SequenceConfig, TwinConfig
+    from en4dvar.config import SequenceConfig, TwinConfig
     from en4dvar.plumbing.caution import Caution
     from en4dvar.runs.campaign import Campaign
 
@@ -43,16 +34,7 @@ MOST_NAMED = 3  # data sets of a warning
 @click.option("--with-what-if", is_flag=True, help="Let the intervals hold the assumptions of the what-if table too.")
 @workers_option
 @click.option("--scheduler", metavar="ADDRESS", help="Work on a dask cluster, e.g. tcp://10.0.0.1:8786.")
-def run(
-    source: Source,
-    out: Path | None,
-    force: bool,
-    resume: bool,
-    no_report: bool,
-    with_what_if: bool,
-    workers: int | None,
-    scheduler: str | None,
-) -> None:
+def run(source: Source, force: bool, resume: bool, workers: int | None, scheduler: str | None, **asked: Any) -> None:
     """Estimate the parameters; write posterior and report to the run directory.
 
     Several data files (a list, a pattern or a folder) are a campaign; a file that cannot be used does not stop it.
@@ -66,36 +48,29 @@ def run(
     from en4dvar.config import Config, load_any
 
     special = {
-        "output.directory": str(out) if out else None,
-        "output.report": False if no_report else None,
-        "assimilation.what_if": "added" if with_what_if else None,
+        "output.directory": str(asked["out"]) if asked["out"] else None,
+        "output.report": False if asked["no_report"] else None,
+        "assimilation.what_if": "added" if asked["with_what_if"] else None,
         "execution.workers": workers,
         "execution.address": scheduler,
     }
     with chdir("."):  # own code of a configuration may leave this folder, which --out refers to
         config = load_any(source.path, source.overrides(**special))
-    note_beginning(config.directory, resume)
     if isinstance(config, Config):
-        _estimate(config, force, resume)
+        from en4dvar.executor import available_cores
+        from en4dvar.runs.progress import terminal_progress
+        from en4dvar.runs.runner import run_campaign
+
+        with continuable(config.directory, resume) as command, terminal_progress() as progress:
+            campaign = run_campaign(
+                config, force=force, resume=resume, progress=progress, command=command,
+                report_workers=config.execution.workers or available_cores(),
+            )  # fmt: skip
+        _tell(campaign, with_report=config.report)
     elif scheduler:
-        raise click.UsageError(
-            "--scheduler cannot be used for a series: its cycles are too short to be sent to other machines"
-        )
+        raise click.UsageError("--scheduler is not for a series: its cycles are too short to be sent to other machines")
     else:
         _follow(config, force, resume)
-
-
-def _estimate(config: Config, force: bool, resume: bool) -> None:
-    from en4dvar.executor import available_cores
-    from en4dvar.runs.progress import terminal_progress
-    from en4dvar.runs.runner import run_campaign
-
-    with continuable(), terminal_progress() as progress:
-        campaign = run_campaign(
-            config, force=force, resume=resume, progress=progress, command=command_line(),
-            report_workers=config.execution.workers or available_cores(),
-        )  # fmt: skip
-    _tell(campaign, with_report=config.report)
 
 
 def _tell(campaign: Campaign, with_report: bool) -> None:
@@ -131,19 +106,18 @@ def _tell(campaign: Campaign, with_report: bool) -> None:
 
 def _tell_what_sets_share(directory: Path, warnings: _Warnings) -> None:
     """The joint estimate and the population of a run on standard output, where there are; their warnings are added."""
-    from en4dvar.results import joint_file
-    from en4dvar.results.population_file import populations_of
+    from en4dvar.results.together import JOINT, load_joint, populations_of
 
-    if (directory / joint_file.FILE).exists():
-        from en4dvar.report.joint import joint_table
+    if (directory / JOINT).exists():
+        from en4dvar.report.together import joint_table
 
-        together = joint_file.load_joint(directory / joint_file.FILE)
+        together = load_joint(directory / JOINT)
         echo(f"\n{joint_table(together)}")
         warnings.joint = True
         warnings.add("all together", together.cautions, whole=True)
     for n, (name, (_, of)) in enumerate(populations_of(directory).items()):
-        from en4dvar.report.population import population_lines
         from en4dvar.report.populations import group_lines
+        from en4dvar.report.together import population_lines
 
         if name and n == 0:
             echo("\n" + "\n".join(group_lines(directory)))
@@ -212,9 +186,9 @@ def _follow(config: TwinConfig | SequenceConfig, force: bool, resume: bool) -> N
     else:
         own = SequenceKind(config), run_sequence, config.assimilation.members
     kind, conduct, members = own
-    with continuable(), counted("cycles") as tell:
+    with continuable(config.directory, resume) as command, counted("cycles") as tell:
         on_cycle = (lambda cycle: tell(cycle + 1, kind.cycles)) if tell else None
-        result = conduct(config, force=force, resume=resume, on_cycle=on_cycle, command=command_line())
+        result = conduct(config, force=force, resume=resume, on_cycle=on_cycle, command=command)
     echo(result.table())
     if result.run.failures:
         lost = f"{len(result.run.failures)} of {members} members lost"

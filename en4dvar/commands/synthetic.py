@@ -1,6 +1,11 @@
-"""Commands that try what could be, from one configuration: ``en4dvar calibrate``, ``design`` and ``sweep-twin``."""
+"""Commands that try what could be, from one configuration: ``en4dvar simulate`` (one forward run, or the data sets of a
+synthetic campaign), ``calibrate``, ``design`` and ``sweep-twin``.
+"""
 
+import os
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -9,11 +14,73 @@ from en4dvar.commands.common import (
     command_line,
     config_options,
     continuable,
+    deliver,
     echo,
-    note_beginning,
     parted,
+    refuse_to_replace,
+    tell,
     workers_option,
-)  # fmt: skip
+)
+from en4dvar.commands.plugins import WithForms, asked, loaded
+
+
+@click.command(cls=WithForms)
+@config_options
+@click.option("--out", type=click.Path(path_type=Path), help="CSV file to write; default standard output.")
+@click.option("--times", metavar="FROM:TO:STEP", help="Instants, e.g. '0 us:60 us:1 us'.")
+@click.option("--noise", metavar="STD", help="Add Gaussian noise, e.g. '1.4 um' or '1 % of maximum'.")
+@click.option("--seed", type=click.IntRange(min=0), help="Seed of the noise; default the configuration's.")
+@click.option("--force", is_flag=True, help="Replace the files.")
+def simulate(
+    source: Source, out: Path | None, times: str | None, noise: str | None, seed: int | None, force: bool, **forms: Any
+) -> None:
+    """Run the model once and write the observable as CSV: at fixed values and prior medians.
+
+    Set parameters with --set; the columns are those of the configuration's data section.
+    A configuration with a 'campaign:' section instead draws truths and writes a folder of data sets.
+
+    \b
+    Example:
+      en4dvar simulate configs/quickstart.yaml --set parameters.G='0.5 kPa' \\
+          --times '0 us:60 us:1 us' --noise '1.4 um' --out synthetic.csv
+    """
+    from en4dvar.config.document import override, read_document
+    from en4dvar.config.kinds import resolve_campaign
+    from en4dvar.plumbing.files import inside
+    from en4dvar.runs.simulation import draw_campaign, noise_level, parse_times, simulate, to_csv, write_campaign
+
+    others = asked(forms)
+    if others and noise and out is None:
+        raise click.UsageError("--noise applies to the table: name its file with --out")
+    document = read_document(source.path)
+    if "campaign" in document.data:
+        if source.data or times or noise or others:
+            words = ", ".join(["--data", "--times", *(f"--{name}" for name in others)])
+            raise click.UsageError(f"{words} and --noise do not apply to a configuration with a 'campaign:'")
+        base = source.path.resolve().parent
+        plan = resolve_campaign(override(document, source.overrides(seed=seed)), base)
+        if out:
+            plan = replace(plan, directory=out)
+        else:  # a folder that came with the configuration may be a link
+            inside(base, os.path.relpath(plan.directory, base))
+        sets = draw_campaign(plan)
+        truth = write_campaign(plan, sets, command_line(), force)
+        fits = [s.nrmse for s in sets]
+        echo(f"{len(sets)} synthetic data sets, NRMSE of the truth {min(fits):.3f} to {max(fits):.3f}; truth: {truth}")
+        return
+    config = source.load()
+    for path in (out, *(path for _, path, _ in others.values())):
+        refuse_to_replace(path, force)
+    instants = parse_times(times, config.model.time_unit) if times else None
+    seed = config.seed if seed is None else seed
+    for name, (entry, path, settings) in others.items():
+        echo(loaded(entry, f"--{name}")(config, instants, path, settings, seed))
+    if others and out is None:  # the table was not asked for
+        return
+    simulation = simulate(config, instants)
+    if noise:
+        simulation = simulation.with_noise(noise_level(noise, config, simulation), seed)
+    deliver(to_csv(simulation, config, command_line()), out, "")
 
 
 @click.command()
@@ -27,9 +94,7 @@ from en4dvar.commands.common import (
 @click.option("--force", is_flag=True, help="Replace an earlier calibration, once this one is complete.")
 @click.option("--resume", is_flag=True, help="Go on with an interrupted one, or with more sets.")
 @workers_option
-def calibrate(
-    source: Source, sets: int, made: tuple[str, ...], out: Path | None, force: bool, resume: bool, workers: int | None
-) -> None:
+def calibrate(source: Source, sets: int, made: tuple[str, ...], workers: int | None, **how: Any) -> None:
     """Make synthetic data sets by the configuration itself, estimate them, and test the ranks of the truths.
 
     Truths are drawn from the priors, readings from the model with the errors of the file, at the times of its data. Of
@@ -43,17 +108,12 @@ def calibrate(
     from en4dvar.runs.calibration_run import calibrate as conduct
     from en4dvar.runs.progress import counted
 
-    if out is not None:
-        note_beginning(out, resume)
-    overrides = source.overrides(**{"execution.workers": workers})
-    with continuable(), counted("sets") as progress:
-        result = conduct(
-            source.path, sets, overrides=overrides, made_with=parted(made, "--made-with"), out=out, force=force,
-            resume=resume, progress=progress, command=command_line(),
-        )  # fmt: skip
+    how |= {"overrides": source.overrides(**{"execution.workers": workers}), "made_with": parted(made, "--made-with")}
+    with continuable(how["out"], how["resume"]) as command, counted("sets") as progress:
+        result = conduct(source.path, sets, progress=progress, command=command, **how)
     echo(str(result))
     for remark in result.remarks:
-        echo(f"note: {remark}", err=True)
+        tell(f"note: {remark}")
     echo(f"report: {result.directory / 'calibration.html'}")
 
 
@@ -65,7 +125,7 @@ def calibrate(
 @click.option("--out", type=click.Path(path_type=Path), help="Directory of the result; default runs/<name>_design.")
 @click.option("--force", is_flag=True, help="Replace an earlier result in the directory.")
 @click.option("--resume", is_flag=True, help="Go on with an interrupted comparison; the numbers are the same.")
-def design(source: Source, after: Path | None, out: Path | None, force: bool, resume: bool) -> None:
+def design(source: Source, **how: Any) -> None:
     """Compare planned experiments by the information they are expected to give.
 
     The configuration is that of 'run'; its data file need not exist. A 'design:' section says when readings are
@@ -80,14 +140,13 @@ def design(source: Source, after: Path | None, out: Path | None, force: bool, re
     from en4dvar.runs.design_run import run_design
     from en4dvar.runs.progress import counted
 
-    with continuable(), counted("designs") as on_design:
+    with continuable() as command, counted("designs") as on_design:
         plan, directory = run_design(
-            source.path, overrides=source.overrides(), after=after, out=out, force=force, resume=resume,
-            on_design=on_design, command=command_line(),
-        )  # fmt: skip
+            source.path, overrides=source.overrides(), on_design=on_design, command=command, **how
+        )
     echo(design_table(plan))
     for remark in remarks(plan):
-        echo(f"note: {remark}", err=True)
+        tell(f"note: {remark}")
     echo(f"report: {directory / 'design.html'}")
 
 
@@ -105,10 +164,7 @@ def design(source: Source, after: Path | None, out: Path | None, force: bool, re
 @click.option("--force", is_flag=True, help="Replace an earlier sweep, once this one is complete.")
 @click.option("--resume", is_flag=True, help="Take over finished runs; seeds and values may be added at the end.")
 @workers_option
-def sweep_twin(
-    source: Source, varied: tuple[str, ...], seeds: int, out: Path | None, force: bool, resume: bool,
-    workers: int | None,
-) -> None:  # fmt: skip
+def sweep_twin(source: Source, varied: tuple[str, ...], seeds: int, **how: Any) -> None:
     """Compare settings in twin experiments: RMSE and spread, mean ± standard error over seeds.
 
     All settings see the same truths and observations. Writes sweep.csv and, with every run, runs.csv.
@@ -119,18 +175,11 @@ def sweep_twin(
     """
     from en4dvar.runs.twin_sweep import sweep_twin as sweep
 
-    def tell(done: int, of: int) -> None:
-        echo(f"{done} of {of} runs", err=True)
-
     vary = parted(varied, "--vary")
-    if out is not None:
-        note_beginning(out, resume)
-    with continuable():
-        result = sweep(
-            source.path, vary, seeds, overrides=source.overrides(), out=out, workers=workers, force=force,
-            resume=resume, progress=tell, command=command_line(),
-        )  # fmt: skip
+    how |= {"overrides": source.overrides(), "progress": lambda done, of: tell(f"{done} of {of} runs")}
+    with continuable(how["out"], how["resume"]) as command:
+        result = sweep(source.path, vary, seeds, command=command, **how)
     echo(str(result))
     for reason in dict.fromkeys(run.failure for runs in result.runs for run in runs if run.failure):
-        echo(f"failed: {reason}", err=True)
+        tell(f"failed: {reason}")
     echo(f"averages: {result.directory / 'sweep.csv'}")

@@ -70,7 +70,7 @@ def joint(
     Example:
       en4dvar joint runs/twelve_bubbles --share G --share mu
     """
-    from en4dvar.report.joint import joint_table
+    from en4dvar.report.together import joint_table
     from en4dvar.runs.together import join
 
     result, page = join(runs, names, out, apart=apart, **how)
@@ -108,7 +108,7 @@ def population(
     Example:
       en4dvar population runs/twelve_bubbles --of G --of mu
     """
-    from en4dvar.report.population import population_lines
+    from en4dvar.report.together import population_lines
     from en4dvar.runs.together import population as estimate
 
     changed = {name: value for name, value in hyper.items() if value is not None}

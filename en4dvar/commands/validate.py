@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
@@ -11,9 +9,7 @@ import click
 from en4dvar.commands.common import Source, config_options, echo
 
 if TYPE_CHECKING:
-    from en4dvar.config import Config
     from en4dvar.descent.preview import Preview
-    from en4dvar.problem import InverseProblem
 
 
 @click.command()
@@ -50,7 +46,9 @@ def validate(source: Source, plot: bool) -> None:
     echo(problem_summary(loaded, problems))
     chosen = problems[:1]
     if plot:
-        from en4dvar.report.history import PANELS
+        from en4dvar.plumbing.files import make_folder
+        from en4dvar.report.history import PANELS, prior_predictive
+        from en4dvar.report.paper import save_chart
 
         chosen = problems[:PANELS]
     seeds = [own_seed(loaded.seed, problem.observations.name) for problem in chosen]
@@ -59,7 +57,10 @@ def validate(source: Source, plot: bool) -> None:
     for shown in previews:
         _warn(shown)
     if plot:
-        echo(f"prior predictive: {_draw(loaded, previews, problems)}")
+        folder, name = make_folder(loaded.directory.parent), f"{loaded.directory.name}_prior"
+        save_chart(prior_predictive(previews), folder, name)
+        left = f" ({len(previews)} of {len(problems)} data sets)" if len(previews) < len(problems) else ""
+        echo(f"prior predictive: {folder / name}.png and .pdf{left}")
 
 
 def _warn(preview: Preview) -> None:
@@ -76,14 +77,3 @@ def _warn(preview: Preview) -> None:
     if preview.outside > 0.1:
         share = f"{100 * preview.outside:.0f} % of the observations lie outside everything the prior expects"
         echo(f"warning: {name}: {share}; check units, clock and window (--plot shows them)", err=True)
-
-
-def _draw(config: Config, previews: Sequence[Preview], problems: Sequence[InverseProblem]) -> str:
-    from en4dvar.plumbing.files import make_folder
-    from en4dvar.report.history import prior_predictive
-    from en4dvar.report.paper import save_chart
-
-    folder, name = make_folder(config.directory.parent), f"{config.directory.name}_prior"
-    save_chart(prior_predictive(previews), folder, name)
-    left = f" ({len(previews)} of {len(problems)} data sets)" if len(previews) < len(problems) else ""
-    return f"{Path(folder) / name}.png and .pdf{left}"

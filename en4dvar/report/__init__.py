@@ -16,20 +16,18 @@ from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.files import inside, make_folder, write_text
 from en4dvar.plumbing.hints import suggest
 from en4dvar.plumbing.tables import write_csv
-from en4dvar.report.figures import all_figures
+from en4dvar.report.figures import PIECE_COLUMNS, stored_walks
 from en4dvar.report.history import WITHHELD_COLUMNS, withheld_lines
 from en4dvar.report.overview import Headline, SetSummary, overview_figures, render_overview
-from en4dvar.report.page import IDENTIFIERS, render_set
+from en4dvar.report.page import render_set
 from en4dvar.report.responses import ENTRY_COLUMNS, SHIFT_COLUMNS, stored_ledger, stored_shifts
 from en4dvar.report.svg import draw, svg
 from en4dvar.report.text import upper_first
-from en4dvar.report.varying import PIECE_COLUMNS, stored_walks
 from en4dvar.results.campaign_file import failed_datasets
-from en4dvar.results.joint_file import FILE, load_joint
 from en4dvar.results.pack import PACK
-from en4dvar.results.population_file import populations_of
 from en4dvar.results.run_results import RunResults
 from en4dvar.results.store import StoredResult, load_stored
+from en4dvar.results.together import JOINT, load_joint, populations_of
 
 PAGES = 40  # data sets of a campaign with a page from the start
 SHARE = 20  # pages that are worth the start of a process
@@ -63,8 +61,8 @@ def write_pages(run_dir: str | Path, datasets: Sequence[str] = (), workers: int 
         result = load_stored(whole)
         write_csv(run_dir / "summary.csv", summary_rows([(result.name, result.rows, result.cautions)], {}))
         _write_tables(run_dir, [_lines(result)])
-        figures = draw(all_figures(result), IDENTIFIERS, inside(run_dir, "figures") if files else None)
-        return write_text(run_dir / "report.html", render_set(result, figures, copies=files))
+        folder = inside(run_dir, "figures") if files else None
+        return write_text(run_dir / "report.html", render_set(result, folder=folder))
     sets, lines = [], []
     for path, result in stored:
         sets.append(SetSummary.of(result, path.name))
@@ -119,30 +117,33 @@ def _write_campaign(
     of_gel = {name for _, of in populations_of(run_dir).values() for name in of.names}
     figures = draw(overview_figures(sets, of_gel), folder=inside(run_dir, "figures") if files else None)
     pages = {s.stem: quote(f"pages/{s.stem}.html") for s in paged}
-    return write_text(run_dir / "report.html", render_overview(sets, pages, failures, figures, _headlines(run_dir)))
+    shown = {"pages": pages, "failures": failures, "figures": figures, "headlines": _headlines(run_dir)}
+    return write_text(run_dir / "report.html", render_overview(sets, **shown))
 
 
 def _headlines(run_dir: Path) -> list[Headline]:
     """What the data sets say together, where the run estimated it; the tables of its groups are written."""
-    from en4dvar.report import joint, population, populations  # with the estimates, which other pages do not need
+    from en4dvar.report import populations, together  # with the estimates, which other pages do not need
 
-    headlines, groups = [], populations.groups_compared(run_dir)
+    headlines: list[Headline] = []
+    groups = populations.groups_compared(run_dir)
     if isinstance(groups, str):
-        headlines.append(Headline("summary.csv", "All data sets", [groups], "", ""))
+        headlines.append(("summary.csv", "All data sets", [groups], "", ""))
     elif groups is not None:
         populations.write_tables(groups, run_dir)
         drawn, caption = svg(populations.figure(groups), "populations", populations.CAPTION), populations.CAPTION
         told = [*populations.group_sentences(groups)]
-        headlines.append(Headline("differences.csv", "The differences", told, drawn, caption))
+        headlines.append(("differences.csv", "The differences", told, drawn, caption))
     for name, (folder, of) in populations_of(run_dir).items():
         words = f"The population of {name}" if name else "The population behind them"
-        told = [f"{name}: {line}" if name else upper_first(line) for line in population.sentences(of)]
+        told = [f"{name}: {line}" if name else upper_first(line) for line in together.sentences(of)]
         address = quote((folder / "population.html").relative_to(run_dir).as_posix())
-        headlines.append(Headline(address, words, told, population.figure(of), population.caption(of)))
-    if (run_dir / FILE).exists():
-        shared = load_joint(run_dir / FILE)
-        lines = [upper_first(line) for line in joint.joint_lines(shared)]
-        headlines.append(Headline("joint.html", "All of them together", lines, joint.figure(shared), joint.CAPTION))
+        headlines.append((address, words, told, together.population_figure(of), together.caption(of)))
+    if (run_dir / JOINT).exists():
+        shared = load_joint(run_dir / JOINT)
+        lines = [upper_first(line) for line in together.joint_lines(shared)]
+        figure = together.joint_figure(shared)
+        headlines.append(("joint.html", "All of them together", lines, figure, together.SHARED))
     return headlines
 
 
@@ -150,5 +151,4 @@ def _write_page(run_dir: Path, stem: str, copies: str | None, trail: Sequence[tu
     """The page of one data set of a campaign; ``copies``: prefix of its figures as PDF and PNG, None for none."""
     result = load_stored(run_dir / PACK / stem)
     folder = None if copies is None else inside(run_dir, "figures")
-    figures = draw(all_figures(result), IDENTIFIERS, folder, copies or "")
-    write_text(inside(run_dir, f"pages/{stem}.html"), render_set(result, figures, trail, copies is not None))
+    write_text(inside(run_dir, f"pages/{stem}.html"), render_set(result, trail, folder, copies or ""))

@@ -1,10 +1,15 @@
-"""Is the posterior calibrated? What the ranks of many truths among posterior members say: table, figure, page."""
+"""Is the posterior calibrated? What the ranks of many truths among posterior members say: table, figure, page; and
+``calibration.csv``, what came of each synthetic data set, a line a quantity.
+"""
 
 from __future__ import annotations
 
+import csv
+import io
 import re
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,18 +18,82 @@ import numpy as np
 from scipy.stats import binomtest
 
 from en4dvar.diagnosis.ranks import BAND, Uniform, uniform_ranks
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.files import read_text
-from en4dvar.plumbing.tables import table
+from en4dvar.plumbing.tables import table, write_csv
 from en4dvar.report.chart import PAGE, POINTS, Chart, Panel, in_columns
 from en4dvar.report.html import write_page
 from en4dvar.report.paper import on_paper
 from en4dvar.report.svg import draw
 from en4dvar.report.text import figure_text
-from en4dvar.results.calibration_file import ERRORS, FIT, NUMBERS, Judged, read_sets
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
+
+FIT, ERRORS = "fit", "errors"  # J_o, half the sum of squares of the readings: at the truth, among that at members, and
+# among that of readings which are drawn at each member
+LEVELS = (0.05, 0.25, 0.75, 0.95)
+LONGEST = 1_000_000_000  # bytes of the table
+NUMBERS = ("truth", "q05", "q25", "q75", "q95", "z", "rank")
+COLUMNS = ("set", "data_set", "quantity", "unit", *NUMBERS, "members", "cautions", "failure")
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What came of one set: of Q quantities, the parameters and the fit of the readings, ``numbers`` (Q, 7).
+
+    A row holds :data:`NUMBERS`: truth and quantiles of :data:`LEVELS` in display units; the distance z of the truth
+    from the mean in standard deviations, in the prior's own transform; its rank among the ``members``. All are
+    NaN where there is no truth. ``cautions``: codes of the serious ones. ``failure``: why there is no posterior.
+    """
+
+    number: int
+    data_set: str
+    numbers: Array = field(default_factory=lambda: np.empty((0, len(NUMBERS))))
+    members: int = 0
+    cautions: tuple[str, ...] = ()
+    failure: str = ""
+
+
+def write_sets(path: Path, quantities: Sequence[tuple[str, str]], sets: Sequence[Judged]) -> Path:
+    """Write the table of quantities (name, unit). Raises :class:`OutputError`."""
+    lines: list[Sequence[object]] = [COLUMNS]
+    for judged in sets:
+        head, tail = (judged.number, judged.data_set), (judged.members, " ".join(judged.cautions), "")
+        if judged.failure:
+            lines.append([*head, *[""] * (len(COLUMNS) - 3), judged.failure])
+        of_each = zip(quantities, judged.numbers.tolist(), strict=not judged.failure)
+        lines += [[*head, *quantity, *numbers, *tail] for quantity, numbers in of_each]
+    return write_csv(path, lines)
+
+
+def read_sets(path: Path) -> tuple[tuple[tuple[str, str], ...], tuple[Judged, ...]]:
+    """The quantities (name, unit) and the sets of a table. Raises :class:`OutputError` where it is none."""
+    try:
+        by_set: dict[int, list[dict[str, str]]] = {}
+        for line in csv.DictReader(io.StringIO(read_text(path, LONGEST))):
+            by_set.setdefault(int(line["set"]), []).append(line)
+        sets = tuple(_set(number, lines) for number, lines in by_set.items())
+        known = next((lines for lines in by_set.values() if not lines[0]["failure"]), [])
+        quantities = tuple((line["quantity"], line["unit"]) for line in known)
+        if not sets or any(not s.failure and len(s.numbers) != len(quantities) for s in sets):
+            raise ValueError
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be read: {error.strerror}") from None
+    except (KeyError, TypeError, ValueError, csv.Error):
+        raise OutputError(f"{path}: not a table of 'en4dvar calibrate', or damaged; conduct it again") from None
+    return quantities, sets
+
+
+def _set(number: int, lines: Sequence[dict[str, str]]) -> Judged:
+    first = lines[0]
+    if first["failure"]:
+        return Judged(number, first["data_set"], failure=first["failure"])
+    numbers = np.array([[float(line[name]) for name in NUMBERS] for line in lines])
+    return Judged(number, first["data_set"], numbers, int(first["members"]), tuple(first["cautions"].split()))
+
 
 LEVEL = 0.01  # of the tests of all quantities together, by Holm's rule
 APART, WIDTH = 0.2, 0.1  # mean of z, and std of z from 1, by which what is off is told
@@ -101,12 +170,9 @@ class Calibration:
         for reason in dict.fromkeys(judged.failure for judged in self.sets if judged.failure):
             count = sum(judged.failure == reason for judged in self.sets)
             told.append(f"{count} of {len(self.sets)} sets have no posterior: {reason}")
-        codes = [code for judged in self.good for code in judged.cautions]
-        told += [
-            f"{codes.count(code)} of {len(self.good)} sets have the serious warning '{code}'"
-            for code in dict.fromkeys(codes)
-        ]
-        return told
+        counts = Counter(code for judged in self.good for code in judged.cautions)
+        of = f"of {len(self.good)} sets have the serious warning"
+        return told + [f"{count} {of} '{code}'" for code, count in counts.items()]
 
     def column(self, what: str, j: int) -> np.ndarray:
         """``truth``, ``z`` or another of the numbers (S,) of a quantity over the good sets."""

@@ -1,8 +1,8 @@
-"""What a figure shows, free of how it is drawn: panels in rows, marks in panels, and round numbers for the axes.
+"""What a figure shows, free of how it is drawn: panels in rows, marks in panels, round numbers for the axes, colours.
 
 One description serves the page (:mod:`en4dvar.report.svg`, in milliseconds) and paper (:mod:`en4dvar.report.paper`,
 PDF and PNG by matplotlib, whose import and layout would take longer than the estimate). Colours are names of
-:data:`~en4dvar.report.palette.LIGHT` or hexadecimal, lengths points (1/72 inch), labels text with mathtext symbols.
+:data:`LIGHT` or hexadecimal, lengths points (1/72 inch), labels text with mathtext symbols.
 """
 
 import math
@@ -205,11 +205,6 @@ def stacked(panels: Sequence[Panel], height: float, xlabel: str, width: float = 
     return Chart([Row(float(h), [panel]) for h, panel in zip(heights, panels, strict=True)], width)
 
 
-def steps(edges: Array, values: Array) -> tuple[Array, Array]:
-    """A line (2 m,) through m values, each constant between two of the m + 1 ``edges``."""
-    return np.repeat(edges, 2)[1:-1], np.repeat(values, 2)
-
-
 def interval(mean: Array, std: Array, reach: float, positive: bool) -> tuple[Array, Array]:
     """Mean ± ``reach`` std, of what is positive by the lognormal of the same mean and standard deviation."""
     if not positive:
@@ -276,3 +271,31 @@ def numbers(values: Sequence[float]) -> list[str]:
         return [plain_number(v, 3) for v in values]
     places = next((n for n in range(7) if all(abs(v - round(v, n)) < 1e-6 * step for v in values)), 7)
     return [f"{v:.{places}f}".replace("-", "−") if round(v, places) else "0" for v in values]
+
+
+_BOTH = {  # on light, on dark ground
+    "paper": ("#ffffff", "#16161a"),
+    "ink": ("#1b1b1f", "#ececf0"),
+    "muted": ("#63636c", "#a9a9b4"),
+    "grid": ("#dcdce2", "#3b3b44"),
+    "prior": ("#85858f", "#9c9ca8"),
+    "posterior": ("#0072b2", "#56b4e9"),
+    "centre": ("#d55e00", "#ff9f5a"),
+    "background": ("#009e73", "#2fd0a2"),
+}
+LIGHT, DARK = ({name: colours[k] for name, colours in _BOTH.items()} for k in (0, 1))
+VIRIDIS = ("#440154", "#3b528b", "#21918c", "#5ec962", "#fde725")
+GREYS = ("#ffffff", "#bdbdbd", "#636363", "#000000")
+
+
+def ramp(anchors: Sequence[str], share: float) -> str:
+    """The colour at a ``share`` of the way along ``anchors``.
+
+    >>> ramp(GREYS, 0.0), ramp(GREYS, 1.0)
+    ('#ffffff', '#000000')
+    """
+    place = min(max(share, 0.0), 1.0) * (len(anchors) - 1)
+    first = min(int(place), len(anchors) - 2)
+    low, high = (bytes.fromhex(code[1:]) for code in anchors[first : first + 2])
+    mixed = bytes(round(a + (b - a) * (place - first)) for a, b in zip(low, high, strict=True))
+    return f"#{mixed.hex()}"

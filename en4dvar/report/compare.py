@@ -39,6 +39,7 @@ from en4dvar.results.store import StoredResult, load_stored
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+S = TypeVar("S", bound=Any)
 T = TypeVar("T")
 MOST_WARNINGS = 12  # on the terminal
 UNDECIDABLE = 1.0  # difference of log-evidence
@@ -147,10 +148,9 @@ class Comparison:
             raise ConfigError(f"verdict: no data set {shown(dataset)}{suggest(dataset, self.datasets)}")
         best, second = sorted(self.of(dataset), key=lambda score: -score.log_evidence)[:2]
         words = preferred(best.run, second.run, -second.difference)
-        doubts = [f"{score.run} ({score.doubted})" for score in (best, second) if score.doubted]
-        return (
-            f"{words}; not to be trusted before the warnings of {' and '.join(doubts)} are settled" if doubts else words
-        )
+        if doubts := [f"{score.run} ({score.doubted})" for score in (best, second) if score.doubted]:
+            words += f"; not to be trusted before the warnings of {' and '.join(doubts)} are settled"
+        return words
 
 
 def compare_runs(runs: Sequence[str | Path] | Mapping[str, str | Path | StoredResult]) -> Comparison:
@@ -193,10 +193,10 @@ def _judged(scores: Sequence[ModelScore], datasets: Sequence[str]) -> tuple[Mode
     of_each: dict[str, list[ModelScore]] = {name: [] for name in datasets}
     for score in scores:
         of_each[score.dataset].append(score)
-    ranked = list(map(_ranked, of_each.values()))
+    every = list(map(ranked, of_each.values()))
     if len(datasets) > 1:
-        ranked.append(_ranked([_total(run) for run in zip(*ranked, strict=True)]))
-    return tuple(score for of_dataset in ranked for score in of_dataset)
+        every.append(ranked([_total(run) for run in zip(*every, strict=True)]))
+    return tuple(score for of_dataset in every for score in of_dataset)
 
 
 def _difference(results: Mapping[str, Mapping[str, StoredResult]]) -> str:
@@ -243,10 +243,7 @@ def comparison_table(comparison: Comparison) -> str:
 
 
 def estimates_table(comparison: Comparison) -> str:
-    """Posterior mean, std and 5–95 % of every parameter, runs below each other, in display units.
-
-    Where these are not to be trusted the last column says why.
-    """
+    """Mean, std and 5–95 % of every parameter, in display units; where not to be trusted the last column says why."""
     every = comparison.by_parameter
     doubted = any(e.summary.untrusted for e in every)
     header = ("parameter", "unit", "data set", "run", "mean", "std", "5 %", "95 %", *["not to be trusted"] * doubted)
@@ -259,10 +256,7 @@ def estimates_table(comparison: Comparison) -> str:
 
 
 def write_comparison(comparison: Comparison, out: str | Path) -> Path:
-    """Write ``compare.html``, ``posteriors.png`` and ``.pdf``, ``estimates.csv`` and ``evidence.csv`` to a folder.
-
-    Files of an earlier comparison there are replaced. Returns the path of the page. Raises :class:`OutputError`.
-    """
+    """Write ``compare.html``, ``posteriors.png``, ``.pdf``, tables; returns the page. Raises :class:`OutputError`."""
     out = make_folder(out)
     ((_, _, figure),) = draw([("posteriors", CAPTION, overlay(comparison))], folder=out)
     warned = {(s.run, s.dataset): s.warnings for s in comparison.scores}
@@ -289,22 +283,17 @@ def _panel(estimates: Sequence[ComparedEstimate], runs: Sequence[str]) -> Panel:
     for i, run in enumerate(runs):
         colour = COLOURS[i % len(COLOURS)]
         panel.line([], [], colour, label=figure_text(run))
-        values = _members([e for e in estimates if e.run == run], row.unit)
+        own = [e for e in estimates if e.run == run]
+        with retold(UnitError, OutputError, f"the runs mean different quantities by {row.name}: "):
+            parts = [convert(e.members, e.summary.unit, row.unit) for e in own]
+        values = np.concatenate([np.empty(0), *parts])
         if values.size < 2 or np.ptp(values) == 0:
             continue
         panel.histogram(values, colour, alpha=0.25)
-        if not any(e.summary.untrusted for e in estimates if e.run == run):
+        if not any(e.summary.untrusted for e in own):
             low, high = member_quantiles(values, (0.05, 0.95))
             panel.line([low, high], np.full(2, 1.08 + 0.09 * i), colour, 2.0)
     return panel
-
-
-def _members(estimates: Sequence[ComparedEstimate], unit: str) -> Array:
-    """Members of all data sets of a run in ``unit``."""
-    words = f"the runs mean different quantities by {estimates[0].summary.name}: " if estimates else ""
-    with retold(UnitError, OutputError, words):
-        parts = [convert(e.members, e.summary.unit, unit) for e in estimates]
-    return np.concatenate(parts) if parts else np.empty(0)
 
 
 def named(runs: Sequence[str | Path] | Mapping[str, T]) -> Mapping[str, T | Path]:
@@ -324,7 +313,6 @@ def named(runs: Sequence[str | Path] | Mapping[str, T]) -> Mapping[str, T | Path
 
 
 def _results(run: str | Path | StoredResult) -> dict[str, StoredResult]:
-    """Data set → result of a run."""
     if isinstance(run, StoredResult):
         return {run.name: run}
     files = [Path(run)] if Path(run).suffix == ".nc" else result_files(Path(run))
@@ -370,7 +358,8 @@ def _total(scores: Sequence[ModelScore]) -> ModelScore:
     return replace(scores[0], dataset=ALL, **joined, stored=any(of_all("stored")))
 
 
-def _ranked(scores: Sequence[ModelScore]) -> list[ModelScore]:
+def ranked(scores: Sequence[S]) -> list[S]:
+    """The scores with the difference of their log-evidence from the best one, and their probabilities."""
     evidence = np.array([s.log_evidence for s in scores])
     return [
         replace(s, difference=float(s.log_evidence - evidence.max()), probability=float(p))

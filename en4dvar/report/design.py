@@ -59,7 +59,6 @@ def words(designs: Designs, row: DesignRow) -> str:
 
 
 def _law(decision: Decision) -> str:
-    """How surely the law will be known."""
     if decision.decided < RARELY:
         return f"the law hardly (probability {decision.probability:.2f})"
     return f"the law in {100 * decision.decided:.0f} ± {100 * decision.decided_error:.0f} % of experiments"
@@ -80,9 +79,7 @@ def _spread(std: float, relative: float, unit: str, shown: str) -> str:
 
 
 def needs(designs: Designs, row: DesignRow) -> list[str]:
-    """What the other parameters must be known to for what is wanted: "G to ± 5 % if reading_scale were known to 0.3 %",
-    a sentence for each that is wanted.
-    """
+    """What others must be known to for what is wanted, a sentence each: "G to ± 5 % if scale were known to 0.3 %"."""
     result = row.evaluated
     if result.needed is None or result.others is None:
         return []
@@ -193,13 +190,11 @@ def prices(designs: Designs) -> Chart:
 
 def fans(designs: Designs) -> Chart:
     """What would be seen with the best designs, and the file's own."""
-    rows = {
-        row.number: row
-        for row in reversed([*ranked(designs)[:DRAWN], *(r for r in designs.rows if r.number == 0 and r.result)])
-    }
+    rows = [row for row in ranked(designs)[:DRAWN] if row.number]
+    rows += [row for row in designs.rows if row.number == 0 and row.result]
     time, value = designs.asked.axes
     panels = []
-    for row in reversed(list(rows.values())):
+    for row in rows:
         result = row.evaluated
         t, taken = convert(result.grid, *time), convert(result.times, *time)
         low, lower, middle, upper, high = convert(result.fan, *value)
@@ -217,10 +212,7 @@ def fans(designs: Designs) -> Chart:
 
 
 def write_design(folder: Path) -> Path:
-    """Write ``design.html`` and ``designs.csv`` from ``design.nc``; returns the path of the page.
-
-    Raises :class:`OutputError`.
-    """
+    """Write ``design.html`` and ``designs.csv`` from ``design.nc``; returns the page. Raises :class:`OutputError`."""
     designs = load_designs(folder / FILE)
     write_csv(folder / "designs.csv", _cells(designs))
     rows, best = ranked(designs), {id(row) for row in front(designs)}
@@ -229,21 +221,14 @@ def write_design(folder: Path) -> Path:
         figures.insert(0, ("prices", FRONT, prices(designs)))
     if designs.asked.knobs or len({row.evaluated.alike for row in rows}) > 1:
         figures.insert(0, ("gains", GAINS, gains(designs)))
+    told = {id(row): "; ".join([words(designs, row), *needs(designs, row)]) for row in front(designs)}
     return write_page(
         folder / "design.html",
         "design.html.j2",
         designs=designs,
         by=by,
         rows=[(settings_text(row), row, words(designs, row), id(row) in best) for row in rows],
-        lab=[
-            (
-                settings_text(row),
-                readings_text(designs, row),
-                row,
-                "; ".join([words(designs, row), *needs(designs, row)]),
-            )
-            for row in front(designs)
-        ],
+        lab=[(settings_text(row), readings_text(designs, row), row, told[id(row)]) for row in front(designs)],
         remarks=remarks(designs),
         drawings=draw(figures),
     )
@@ -280,10 +265,7 @@ def _cells(designs: Designs) -> list[list[Any]]:
 
 
 def _positions(values: Sequence[Any]) -> tuple[Array, list[str], str]:
-    """Where values of a knob lie on an axis: at their numbers, which have one unit, or beside each other with labels.
-
-    Returns the places, the labels, and the unit in brackets.
-    """
+    """Where a knob's values lie on an axis, at numbers of one unit or side by side; labels; the unit in brackets."""
     texts = list(map(str, values))
     numbers = [match for match in map(NUMBER.match, texts) if match]
     units = {match.string[match.end() :] for match in numbers}

@@ -92,9 +92,7 @@ def _members_csv(results: Iterable[StoredResult]) -> str:
         values = {name: result.members("posterior", name) for name in result.parameters}
         for i, member in enumerate(np.flatnonzero(result.alive)):
             lines.append((result.name, member, {name: of[i] for name, of in values.items()}, warned))
-    rows = (
-        [dataset, member, *(own.get(name, "") for name in header), warned] for dataset, member, own, warned in lines
-    )
+    rows = ([name, member, *(own.get(key, "") for key in header), warned] for name, member, own, warned in lines)
     return csv_text([["dataset", "member", *header.values(), "warnings"], *rows])
 
 
@@ -145,10 +143,8 @@ class Notes:
 
     def lines(self, columns: int) -> list[str]:
         """Rows below the table."""
-        start = f"  \\multicolumn{{{columns}}}{{p{{0.9\\linewidth}}}}{{\\footnotesize "
-        return [
-            f"{start}\\textsuperscript{{{letter}}} {escaped(words)}}} \\\\" for words, letter in self._letters.items()
-        ]
+        start = f"  \\multicolumn{{{columns}}}{{p{{0.9\\linewidth}}}}{{\\footnotesize \\textsuperscript"
+        return [f"{start}{{{letter}}} {escaped(words)}}} \\\\" for words, letter in self._letters.items()]
 
 
 def _one_set(dataset: Found, notes: Notes) -> list[str]:
@@ -165,10 +161,8 @@ def _one_set(dataset: Found, notes: Notes) -> list[str]:
 def _many_sets(sets: Sequence[Found], notes: Notes) -> list[str]:
     first = {row.name: row for _, rows, _ in sets for row in reversed(rows)}
     names = list(dict.fromkeys(row.name for _, rows, _ in sets for row in rows))
-    units = {n: latex_unit(first[n].unit) for n in names}
-    head = " & ".join(
-        ["data set", *(f"{latex_symbol(first[n])}" + (f" ({units[n]})" if units[n] else "") for n in names)]
-    )
+    heads = [column_name(latex_symbol(first[n]), latex_unit(first[n].unit) or "1") for n in names]
+    head = " & ".join(["data set", *heads])
     lines = []
     for dataset, rows, cautions in sets:
         own, named = {row.name: row for row in rows}, f"{escaped(dataset)}{notes.warn(cautions)}"
@@ -193,9 +187,8 @@ def _estimate(row: ParameterSummary, cautions: Sequence[Caution], notes: Notes) 
     elif row.untrusted:
         value = f"${_tex(plain_number(row.mean, 3))}$"
     elif skewed(row):
-        middle, above, below = (
-            _tex(number_like(value, row.std)) for value in (row.q50, row.q95 - row.q50, row.q50 - row.q05)
-        )
+        parts = row.q50, row.q95 - row.q50, row.q50 - row.q05
+        middle, above, below = (_tex(number_like(part, row.std)) for part in parts)
         value = f"${middle}^{{+{above}}}_{{-{below}}}$"
     else:
         value = plus_minus(row.mean, row.std)
@@ -227,10 +220,7 @@ def _tex(number: str) -> str:
 
 
 def latex_symbol(row: ParameterSummary) -> str:
-    r"""Matplotlib's mathtext is LaTeX as far as it is letters, indices and known commands; anything else is text.
-
-    A result file may come from anybody, and LaTeX reads and writes files for who asks (``\input``).
-    """
+    r"""Known commands of mathtext as they are, else text: LaTeX reads and writes files for who asks (``\input``)."""
     return row.symbol if is_math(row.symbol) else escaped(row.symbol)
 
 

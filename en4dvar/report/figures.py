@@ -1,17 +1,21 @@
-"""The figures of a report: pure functions from a stored result to a chart in display units, 8.5 cm wide."""
+"""The figures of a report: pure functions from a stored result to a chart in display units, 8.5 cm wide; with them what
+varies in time: rows of a table, and what the evidence says of a change.
+"""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from en4dvar.diagnosis.diagnostics import change_words, member_quantiles
 from en4dvar.model.state import Array
+from en4dvar.plumbing.caution import untrusted
 from en4dvar.priors.field_prior import regular_grid
-from en4dvar.report import readings, varying
-from en4dvar.report.chart import COLUMN, PAGE, POINTS, Chart, Panel, Row, in_columns, interval
+from en4dvar.report import responses
+from en4dvar.report.chart import COLUMN, GREYS, PAGE, POINTS, VIRIDIS, Chart, Panel, Row, in_columns, interval, ramp
 from en4dvar.report.history import WITHHELD, expected, history
-from en4dvar.report.palette import GREYS, VIRIDIS, ramp
 from en4dvar.report.svg import Captioned
 from en4dvar.report.text import axis_label, estimate, shown, unit_behind, with_unit
 from en4dvar.results.netcdf import Group
@@ -20,6 +24,9 @@ from en4dvar.results.store import StoredResult
 MAX_PAIRS = 6
 WIDER = 3  # spans of the posterior by which the prior is seen to either side of it
 LEVELS = 32  # colours of a map
+BAND = (0.05, 0.5, 0.95)
+PIECES, PIECE = "_pieces", "_piece"  # end the names of the values and of their dimension
+PIECE_COLUMNS = ("parameter", "time_unit", "begin", "end", "unit", "q05", "q50", "q95", "prior_q05", "prior_q95")
 
 
 def histograms(result: StoredResult) -> Chart:
@@ -48,10 +55,7 @@ def histograms(result: StoredResult) -> Chart:
 
 
 def _prior_density(result: StoredResult, name: str) -> tuple[Array, Array, Array] | None:
-    """Of the prior itself: values, zeros and density there, scaled to its peak; None where the file lacks it.
-
-    The probability of each step between stored values over its width is exact whatever the parameter's map is.
-    """
+    """Of the prior itself, whatever its map: values, zeros and density, scaled to its peak; None where not stored."""
     stats = result.group("sample_stats")
     if "prior_value" not in stats:
         return None
@@ -67,15 +71,14 @@ def _prior_density(result: StoredResult, name: str) -> tuple[Array, Array, Array
 
 def residuals(result: StoredResult) -> Chart:
     """Whitened residuals in time, their autocorrelation, normal quantiles, leverages; the discrepancy if any."""
-    time, label = readings.times(result), readings.time_label(result)
+    time, label = responses.times(result), responses.time_label(result)
     observed = result.group("observed_data")
-    white, studentised, leverage = (
-        result.of_readings("sample_stats", key) for key in ("whitened_residual", "studentised", "leverage")
-    )
+    keys = "whitened_residual", "studentised", "leverage"
+    white, studentised, leverage = (result.of_readings("sample_stats", key) for key in keys)
     counts = np.isfinite(white)
     top = Panel(label, "residual / std", legend=len(result.axes) > 1)
     top.rule(0)
-    for axis, (series, colour) in zip(result.axes, readings.each_series(result), strict=True):
+    for axis, (series, colour) in zip(result.axes, responses.each_series(result), strict=True):
         chosen = series[counts[series]]
         if f"{axis.name}_place" not in observed:
             top.line(time[chosen], white[chosen], "muted", 0.5)
@@ -84,7 +87,7 @@ def residuals(result: StoredResult) -> Chart:
     if f"{result.observable}_discrepancy" in result.group("sample_stats"):
         rows.append(Row(4.4 * POINTS, [_discrepancy(result, time, label)]))
     levers = Panel(label, "leverage", xticks=3, ylim=(0.0, 1.05 * float(np.nanmax(leverage, initial=1e-3))))
-    for series, colour in readings.each_series(result, "posterior"):
+    for series, colour in responses.each_series(result, "posterior"):
         chosen = series[counts[series]]
         levers.bars(time[chosen], 0, leverage[chosen], colour, 0.9)
     below = [_autocorrelation(white[counts]), _quantiles(studentised[counts]), levers]
@@ -210,10 +213,8 @@ def _discrepancy(result: StoredResult, time: Array, label: str) -> Panel:
 def neighbours(white: Array) -> tuple[Array, float]:
     """Correlation of residuals (K,) that lie 1, 2, … apart, and what 95 % of independent ones do not exceed."""
     lags = max(1, min(15, len(white) // 3)) if len(white) > 1 else 0
-    size = float(white @ white) or 1.0
-    return np.array([float(white[lag:] @ white[:-lag]) / size for lag in range(1, lags + 1)]), 1.96 / math.sqrt(
-        len(white) or 1
-    )
+    size, limit = float(white @ white) or 1.0, 1.96 / math.sqrt(len(white) or 1)
+    return np.array([float(white[lag:] @ white[:-lag]) / size for lag in range(1, lags + 1)]), limit
 
 
 def _autocorrelation(white: Array) -> Panel:
@@ -238,9 +239,7 @@ def _quantiles(values: Array) -> Panel:
 
 
 def _reach(prior: Array, posterior: Array) -> tuple[float, float] | None:
-    """Limits that hold the posterior and 90 % of the prior, as far as that is not many times wider: a prior that knew
-    little, or its long tail, does not flatten the picture.
-    """
+    """Limits that hold the posterior and 90 % of the prior, cut where a vague prior would flatten the picture."""
     ends = list(posterior)
     if prior.size:
         known = np.quantile(prior, (0.05, 0.95))
@@ -266,6 +265,91 @@ def _pair(i: int, j: int, x: Array, y: Array) -> Panel:
     return panel
 
 
+@dataclass(frozen=True)
+class StoredWalk:
+    """A parameter over m + 1 pieces in display units: ``edges`` (m + 2,), quantiles (3, m + 1), of the posterior no
+    outer ones (NaN) where the interval is not to be trusted.
+    """
+
+    name: str
+    label: str
+    symbol: str
+    unit: str
+    time_unit: str
+    edges: Array
+    posterior: Array
+    prior: Array
+
+    @property
+    def cells(self) -> list[tuple[object, ...]]:
+        """A line a piece, in the order of :data:`PIECE_COLUMNS`."""
+        rows = zip(self.edges, self.edges[1:], self.posterior.T, self.prior[[0, 2]].T, strict=False)
+        return [
+            (self.name, self.time_unit, float(begin), float(end), self.unit, *map(float, after), *map(float, before))
+            for begin, end, after, before in rows
+        ]
+
+
+def stored_walks(result: StoredResult) -> tuple[StoredWalk, ...]:
+    """The parameters that vary."""
+    return tuple(
+        _stored_walk(result, name.removesuffix(PIECES))
+        for name, variable in result.groups["/posterior"].variables.items()
+        if variable.dims[2:] == (f"{name.removesuffix(PIECES)}{PIECE}",)
+    )
+
+
+def _stored_walk(result: StoredResult, name: str) -> StoredWalk:
+    posterior, observed = result.groups["/posterior"], result.groups["/observed_data"].every
+    pieces, time = posterior.variables[name + PIECES], posterior.coords[name + PIECE]
+    begins = np.asarray(time.values, dtype=float)
+    last = max(float(observed[axis.time].values[-1]) for axis in result.axes)
+    edges = np.append(begins, max(last, begins[-1] + 0.02 * (begins[-1] - begins[0])))
+
+    def quantiles(group: str) -> Array:
+        values = np.asarray(result.groups[f"/{group}"].variables[name + PIECES].values[0], dtype=float)
+        values = values[result.alive] if group == "posterior" else values
+        values = values[np.isfinite(values).all(axis=1)]
+        there = values if len(values) else np.full((1, len(begins)), np.nan)
+        return shown(pieces, member_quantiles(there, (0.05, 0.5, 0.95), axis=0))
+
+    after = quantiles("posterior")
+    if untrusted(result.cautions, name):
+        after[[0, 2]] = np.nan  # the interval
+    label = str(posterior.variables[name].attrs["long_name"])
+    units = pieces.attrs["display_units"], time.attrs["display_units"]
+    return StoredWalk(name, label, pieces.attrs["symbol"], *units, shown(time, edges), after, quantiles("prior"))
+
+
+def verdict(result: StoredResult) -> str:
+    """What the evidence says of all that varies, in a sentence; "" where nothing does."""
+    stats = result.group("sample_stats").attrs
+    if "log_evidence_change" not in stats:
+        return ""
+    return change_words(str(stats["varying"]), float(stats["log_evidence_change"]))
+
+
+def steps(edges: Array, values: Array) -> tuple[Array, Array]:
+    """A line (2 m,) through m values, each constant between two of the m + 1 ``edges``."""
+    return np.repeat(edges, 2)[1:-1], np.repeat(values, 2)
+
+
+def bands(result: StoredResult) -> Chart:
+    """Median and 5–95 % of each parameter that varies, over the prior's."""
+    rows = []
+    for walk in stored_walks(result):
+        least, most = float(np.nanmin(walk.posterior)), float(np.nanmax(walk.prior))
+        steep = least > 0 and math.isfinite(most) and most > 5 * least
+        labels = with_unit("time", walk.time_unit), with_unit(walk.symbol, walk.unit)
+        panel = Panel(*labels, logarithmic=steep, legend=True)
+        for quantiles, colour, alpha in ((walk.prior, "prior", 0.3), (walk.posterior, "posterior", 0.35)):
+            (x, low), (_, high) = (steps(walk.edges, quantiles[i]) for i in (0, 2))
+            panel.band(x, low, high, colour, alpha, colour)
+        panel.line(*steps(walk.edges, walk.posterior[1]), "posterior", label="median")
+        rows.append(Row(5.0 * POINTS, [panel]))
+    return Chart(rows)
+
+
 # name, caption, where there is enough to draw it, and what does; ``{several}`` is said of several series
 FIGURES: tuple[tuple[str, str, Callable[[StoredResult], Any], Callable[[StoredResult], Chart]], ...] = (
     ("posterior",
@@ -285,15 +369,15 @@ FIGURES: tuple[tuple[str, str, Callable[[StoredResult], Any], Callable[[StoredRe
      lambda result: True, history),
     ("withheld", WITHHELD, lambda result: "/withheld" in result.groups, expected),
     ("varying", "What varies in time: median and 5–95 % of the posterior (blue) over 5–95 % of the prior (grey).",
-     varying.stored_walks, varying.bands),
+     stored_walks, bands),
     ("residuals",
      "Residuals of the best fit, in standard deviations and freed of the correlation of their errors "
      "(whitened): in time (below it a discrepancy, mean ± std); their correlation with those 1, 2, … readings "
      "later (band: 95 % of independent numbers); against normal quantiles; leverage, the share of each "
      "reading in its own prediction.",
-     lambda result: len(readings.whitened(result)), residuals),
-    ("influence", readings.CAPTION,
-     lambda result: f"{result.observable}_prior_distance" in result.group("sample_stats"), readings.influence),
+     lambda result: len(responses.whitened(result)), residuals),
+    ("influence", responses.CAPTION,
+     lambda result: f"{result.observable}_prior_distance" in result.group("sample_stats"), responses.influence),
     ("cost", "The cost J and its two terms at the iterate that starts each iteration.",
      lambda result: np.isfinite(result.group("iterations")["J"].values).any(), cost),
     ("iterations", "Parameters over the iterations: ensemble mean and middle 68 % (blue), centre (dashed).",

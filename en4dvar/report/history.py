@@ -4,7 +4,6 @@ read; by the prior alone (``en4dvar validate --plot``); and the readings after t
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
@@ -92,10 +91,14 @@ def _predictions(panel: Panel, result: StoredResult, name: str, x: Array, centre
             panel.band(shown(held["path_time"])[seen], low, high, colour, alpha, label)
         else:
             panel.bars(x, low, high, colour, 4.0 if len(x) <= FEW else 2.0, alpha, label)
+    _middle(panel, x, centre, "centre", "best fit", curve)
+
+
+def _middle(panel: Panel, x: Array, y: Array, colour: str, label: str, curve: bool) -> None:
     if curve:
-        panel.line(x, centre, "centre", 0.9, label="best fit")
+        panel.line(x, y, colour, 0.9, label=label)
     else:
-        panel.dots(x, centre, "centre", 5.0, label="best fit", kind="dashes")
+        panel.dots(x, y, colour, 5.0, label=label, kind="dashes")
 
 
 def _readings(panel: Panel, x: Array, data: Array, std: Array) -> None:
@@ -107,7 +110,6 @@ def _readings(panel: Panel, x: Array, data: Array, std: Array) -> None:
 
 
 def _size(x: Array) -> float:
-    """Of a dot."""
     return 2.2 if len(x) <= FEW else 1.2
 
 
@@ -130,12 +132,14 @@ def _data_range(data: Array, std: Array) -> tuple[float, float]:
 
 
 def prior_predictive(previews: Sequence[Preview]) -> Chart:
-    """Data ± std over the prior ensemble's paths (bands hold 50 and 90 % of the members).
-
-    One panel a data set and series, in display units; at most :data:`PANELS` panels are drawn.
-    """
-    drawn = [(preview, part, path) for preview in previews for part, path in _curves(preview)][:PANELS]
-    panels = []
+    """Data ± std over 50 and 90 % of the prior's paths, a panel a series of a data set, :data:`PANELS` at most."""
+    drawn, panels = [], []
+    for preview in previews:
+        width, at = len(preview.grid), 0
+        for part in preview.problem.parts:  # with its paths (N, M) along the grid, but for one that has several places
+            drawn.append((preview, part, preview.run.path[:, at : at + width] if part.has_path else None))
+            at += width * part.has_path
+    del drawn[PANELS:]
     for preview, part, path in drawn:
         panel = _prior(preview, part, path)
         if len(drawn) > 1:
@@ -146,23 +150,14 @@ def prior_predictive(previews: Sequence[Preview]) -> Chart:
     return in_columns(panels, 6.5 * POINTS, width=COLUMN * min(2, len(drawn)))
 
 
-def _curves(preview: Preview) -> Iterator[tuple[Part, Array | None]]:
-    """The series of a data set, each with its paths (N, M) along the grid; None of one that has several places."""
-    width, curves = len(preview.grid), itertools.count()
-    for part in preview.problem.parts:
-        first = width * next(curves) if part.has_path else 0
-        yield part, preview.run.path[:, first : first + width] if part.has_path else None
-
-
 def _prior(preview: Preview, part: Part, path: Array | None) -> Panel:
     model, y, observable = preview.problem.model, preview.problem.observations, part.observable
     unit, shown_unit, own = observable.unit, observable.display_unit, part.where
     grid, times = (convert(t, model.time_unit, model.time_display_unit) for t in (preview.grid, y.times[own]))
     members = (preview.run.predictions[:, own] if path is None else path)[preview.run.active]
     paths, data, std = (convert(v, unit, shown_unit) for v in (members, y.values[own], y.std[own]))
-    label = observable.label
-    if label != observable.symbol:
-        symbol = observable.symbol
+    label, symbol = observable.label, observable.symbol
+    if label != symbol:
         label = f"{label} {symbol}" if "$" in symbol or len(symbol) > 1 else f"{label} ${symbol}$"
     panel = Panel(with_unit("time", model.time_display_unit), with_unit(label, shown_unit))
     if len(paths) > 1:
@@ -172,10 +167,7 @@ def _prior(preview: Preview, part: Part, path: Array | None) -> Panel:
                 panel.bars(times, low, high, "prior", 3.0, alpha, words)
             else:
                 panel.band(grid, low, high, "prior", alpha, words)
-        if path is None:
-            panel.dots(times, np.median(paths, axis=0), "prior", 5.0, label="median", kind="dashes")
-        else:
-            panel.line(grid, np.median(paths, axis=0), "prior", 0.9, label="median")
+        _middle(panel, times if path is None else grid, np.median(paths, axis=0), "prior", "median", path is not None)
     _readings(panel, times, data, std)
     top = max(float(data.max()), float(np.quantile(paths, 0.95)) if len(paths) else 0.0)
     bottom = min(float(data.min()), float(np.quantile(paths, 0.05)) if len(paths) else 0.0)

@@ -12,7 +12,7 @@ from markupsafe import Markup
 
 from en4dvar.plumbing.files import write_text
 from en4dvar.report import responses, text
-from en4dvar.report.palette import DARK, LIGHT
+from en4dvar.report.chart import DARK, LIGHT
 
 WRITERS = (  # what templates call
     text.estimate, text.fixed, text.number_like, text.percent, text.plain_number, text.plus_minus,
@@ -41,13 +41,8 @@ def render(template: str, package: str = "en4dvar.report", /, **content: Any) ->
 
 @cache
 def _environment(package: str) -> Environment:
-    environment = Environment(
-        loader=PackageLoader(package, "."),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    environment = Environment(loader=PackageLoader(package, "."), autoescape=True, undefined=StrictUndefined)
+    environment.trim_blocks = environment.lstrip_blocks = True
     environment.filters["upper_first"] = text.upper_first
     script = _text("table.js") + _text("chart.js")
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()

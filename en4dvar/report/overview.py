@@ -13,12 +13,14 @@ from en4dvar.estimation.summary import ParameterSummary
 from en4dvar.plumbing.caution import Caution, codes, gravity, worst_first
 from en4dvar.report.chart import COLUMN, PAGE, POINTS, Chart, Panel, Row
 from en4dvar.report.html import render
-from en4dvar.report.svg import Captioned, Drawing
+from en4dvar.report.svg import Captioned
 from en4dvar.report.text import figure_text, number_like, pretty_unit, symbol_html, with_unit
 from en4dvar.results.store import StoredResult
 
 NAMED = 40  # data sets whose names fit below a figure
 LISTED = 2000  # data sets in the table: a browser shows as many at once
+Headline = tuple[str, str, Sequence[str], str, str]
+"""What data sets say together: the address of a page and words for it, lines of the answer, a figure (SVG), caption."""
 
 
 @dataclass(frozen=True)
@@ -57,47 +59,17 @@ class SetSummary:
         return ", ".join(codes(self.cautions))
 
 
-@dataclass(frozen=True)
-class Headline:
-    """What data sets say together: ``lines`` of the answer, a figure (SVG), ``words`` for the page at ``address``."""
-
-    address: str
-    words: str
-    lines: Sequence[str]
-    figure: str
-    caption: str
-
-
-def render_overview(
-    sets: Sequence[SetSummary],
-    pages: Mapping[str, str],
-    failures: Mapping[str, str],
-    figures: Sequence[Drawing],
-    headlines: Sequence[Headline] = (),
-) -> str:
-    """The page as HTML.
-
-    ``headlines``: what all data sets say together, where that was estimated. ``pages``: stem of a data set → address
-    of its page, for those that have one; ``failures``: name of a data set without a posterior → reason.
+def render_overview(sets: Sequence[SetSummary], **shown: Any) -> str:
+    """The page as HTML. Also shown: ``pages``, stem of a data set → address of its page, for those that have one;
+    ``failures``, name of one without a posterior → reason; drawn ``figures``; ``headlines`` (:data:`Headline`).
     """
-    listed = set(map(id, sorted(sets, key=lambda s: -s.gravity)[:LISTED]))
-    return render(
-        "campaign.html.j2",
-        parameters=[_parameter(name, sets) for name in _parameters(sets)],
-        failures=failures,
-        sets=sets,
-        listed=[dataset for dataset in sets if id(dataset) in listed],
-        pages=pages,
-        headlines=headlines,
-        tally=_tally(sets),
-        figures=figures,
-    )
+    worst = set(map(id, sorted(sets, key=lambda s: -s.gravity)[:LISTED]))
+    listed, parameters = [s for s in sets if id(s) in worst], [_parameter(name, sets) for name in _parameters(sets)]
+    return render("campaign.html.j2", sets=sets, listed=listed, parameters=parameters, tally=_tally(sets), **shown)
 
 
 def estimates(sets: Sequence[SetSummary], names: Sequence[str] = ()) -> Chart:
-    """Mean and 5–95 % of every data set, a panel for each of ``names``, where there are none for each parameter; with
-    many data sets sorted by the mean, as a band.
-    """
+    """Mean and 5–95 % of every data set, a panel a name (default: each parameter); many are sorted, as a band."""
     names, few = names or _parameters(sets), len(sets) <= NAMED
     panels = [_estimates(name, sets, few) for name in names]
     rows = [Row(3.0 * POINTS, [panel]) for panel in panels]

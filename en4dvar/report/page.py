@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from en4dvar.diagnosis.diagnostics import chi2_interval
@@ -10,14 +11,13 @@ from en4dvar.diagnosis.honesty.checks import MOVED
 from en4dvar.estimation.summary import AS_WIDE, ParameterSummary
 from en4dvar.plumbing.caution import worst_first
 from en4dvar.plumbing.units import convert
-from en4dvar.report import readings
-from en4dvar.report.figures import neighbours
+from en4dvar.report import responses
+from en4dvar.report.figures import all_figures, neighbours, stored_walks, verdict
 from en4dvar.report.history import withheld_words
 from en4dvar.report.html import render
 from en4dvar.report.responses import exceeding, stored_ledger, stored_shifts
-from en4dvar.report.svg import Drawing
+from en4dvar.report.svg import draw
 from en4dvar.report.text import number_like, plain_number, shown
-from en4dvar.report.varying import stored_walks, verdict
 from en4dvar.results.store import StoredResult
 from en4dvar.results.variables import ITERATIONS, SHARES
 
@@ -29,18 +29,19 @@ IDENTIFIERS = "d0-"  # begin those of figures, which are addresses
 
 
 def render_set(
-    result: StoredResult, figures: Sequence[Drawing], trail: Sequence[tuple[str, str]] = (), copies: bool = True
+    result: StoredResult, trail: Sequence[tuple[str, str]] = (), folder: Path | None = None, begin: str = ""
 ) -> str:
-    """The page of one data set as HTML text.
-
-    ``trail``: links (words, address) above it; ``copies``: whether the figures are also kept as PDF and PNG.
+    """The page of one data set as HTML text; ``trail``: links (words, address) above it. ``folder``: where its figures
+    are kept as PDF and PNG too, if anywhere, under names with ``begin``.
     """
-    judged = result.group("sample_stats")
+    judged, recorded = result.group("sample_stats"), json.loads(str(result.attributes["assimilation_settings"]))
+    weights = result.of_readings("observed_data", "weights", shared=True)
+    total = f"{len(weights)} observations, weights sum to {plain_number(float(weights.sum()))}"
     return render(
         "set.html.j2",
         result=result,
         trail=trail,
-        copies=copies,
+        copies=folder is not None,
         stats=judged.attrs,
         rows=result.rows,
         stated=[row.label for row in result.rows if _as_stated(row)],
@@ -50,19 +51,19 @@ def render_set(
         shares=_shares(result),
         what_if=(what_if := stored_shifts(result)),
         exceeding=exceeding(what_if),
-        what_if_added=_recorded(result).get("what_if") == "added",
+        what_if_added=recorded.get("what_if") == "added",
         entries=stored_ledger(result),
-        readings=readings.reading_words(result),
+        readings=responses.reading_words(result),
         withheld=withheld_words(result),
         walks=stored_walks(result),
         verdict=verdict(result),
         identifiers=IDENTIFIERS,
-        drawn={name: (caption, svg) for name, caption, svg in figures},
+        drawn={name: (caption, svg) for name, caption, svg in draw(all_figures(result), IDENTIFIERS, folder, begin)},
         modes=_modes(result),
         lost=[(i, str(reason)) for i, reason in enumerate(judged["failure_reason"].values.ravel()) if reason],
         iterations=_iterations(result),
         fixed_values=_fixed(result),
-        settings=_settings(result),
+        settings=[*((key.replace("_", " "), str(value)) for key, value in recorded.items()), ("observations", total)],
         provenance=provenance_rows(result.attributes),
     )
 
@@ -87,7 +88,7 @@ def trust(result: StoredResult) -> str:
 
 def _neighbours_words(result: StoredResult) -> str:
     """Whether neighbouring residuals are related more than independent errors are in 95 of 100 data sets."""
-    correlation, limit = neighbours(readings.whitened(result))
+    correlation, limit = neighbours(responses.whitened(result))
     if not len(correlation) or abs(correlation[0]) <= limit:
         return " and neighbouring residuals are unrelated" if len(correlation) else ""
     alike = "resemble each other" if correlation[0] > 0 else "alternate in sign"
@@ -125,10 +126,7 @@ def _tiles(result: StoredResult) -> list[tuple[str, str, str, bool]]:
 
 
 def judge_chi2(chi2: float, n_observations: int, dfs: float, structured: bool = False) -> tuple[str, bool]:
-    """What χ² per observation says in plain words, and whether it needs attention (as warnings of the run do).
-
-    ``structured``: the residuals have a structure, which their size does not show.
-    """
+    """What χ² per observation says, whether it needs attention; ``structured``: neighbouring residuals are related."""
     if not math.isfinite(chi2):
         return "cannot be told", True
     low, high = chi2_interval(max(1.0, n_observations - dfs))
@@ -194,18 +192,6 @@ def _iterations(result: StoredResult) -> list[tuple[str, ...]]:
         [str(int(n)) for n in table["active"].values],
     ]
     return list(zip(*columns, strict=True))
-
-
-def _recorded(result: StoredResult) -> dict[str, Any]:
-    return dict(json.loads(str(result.attributes["assimilation_settings"])))
-
-
-def _settings(result: StoredResult) -> list[tuple[str, str]]:
-    """The scheme's settings and how observations are weighted."""
-    recorded = _recorded(result)
-    weights = result.of_readings("observed_data", "weights", shared=True)
-    total = f"{len(weights)} observations, weights sum to {plain_number(float(weights.sum()))}"
-    return [*((key.replace("_", " "), str(value)) for key, value in recorded.items()), ("observations", total)]
 
 
 def provenance_rows(attributes: Mapping[Any, Any]) -> list[tuple[str, str]]:

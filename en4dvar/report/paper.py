@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from en4dvar.plumbing.files import write_bytes
-from en4dvar.report.chart import Chart, Mark, Panel, labelled
-from en4dvar.report.palette import LIGHT
+from en4dvar.report.chart import LIGHT, Chart, Mark, Panel, labelled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -59,10 +58,7 @@ def on_paper(chart: Chart) -> Figure:
 
 
 def save_chart(chart: Chart, folder: Path, name: str) -> None:
-    """``folder/name.pdf`` (vectors) and ``folder/name.png`` (200 dots an inch), undated, each by atomic rename.
-
-    Raises :class:`OutputError`.
-    """
+    """``folder/name.pdf`` (vectors) and ``.png`` (200 dots an inch), undated. Raises :class:`OutputError`."""
     from matplotlib import style
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.backends.backend_pdf import FigureCanvasPdf
@@ -136,11 +132,8 @@ def _ticks(axis: Axis, ticks: Sequence[tuple[float, str]], rotation: float = 0) 
 def _mark(ax: Axes, mark: Mark) -> None:
     from matplotlib.collections import PolyCollection
 
-    how: dict[str, Any] = {
-        "color": LIGHT.get(mark.colour, mark.colour),
-        "alpha": mark.alpha,
-        "label": mark.label or None,
-    }
+    colour = LIGHT.get(mark.colour, mark.colour)
+    how: dict[str, Any] = {"color": colour, "alpha": mark.alpha, "label": mark.label or None}
     many = len(mark.x) > MANY
     if mark.kind == "line":
         ax.plot(mark.x, mark.y, mark.dash or "-", lw=mark.size, rasterized=many, **how)

@@ -30,9 +30,8 @@ from en4dvar.report.html import write_page
 from en4dvar.report.paper import on_paper
 from en4dvar.report.svg import draw
 from en4dvar.report.text import figure_text, number_like, plain_number, range_words, unit_behind, with_unit
-from en4dvar.results.joint_file import QUANTILES
 from en4dvar.results.netcdf import understood
-from en4dvar.results.population_file import FILE, StoredPopulation, load_groups_of, load_population
+from en4dvar.results.together import POPULATION, QUANTILES, StoredPopulation, load_groups_of, load_population
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -42,9 +41,7 @@ SURE = 0.999  # no number of draws says more
 FAR = 2.5  # standard deviations between what is known and what the data say
 _NUMBER = re.compile(r"(?<![^\W_])(?<!\.)(\d+(?:\.\d+)?)[ _]?(%|[^\W\d_]+)(?![^\W_])")  # with a unit, in a name
 OFF_THE_LINE = 0.05  # probability below which populations differ by more than a line says
-CAPTION = (
-    "Median and 5–95 % of the median of each population, given the data of all; what is common moves them together."
-)
+CAPTION = "Median and 5–95 % of each population's median, given the data of all; what is common moves them together."
 
 
 @dataclass(frozen=True)
@@ -136,7 +133,9 @@ def compare_populations(
     logarithmic = frozenset(name for name in names if all(t.transform == "lognormal" for t in terms[name]))
     medians: dict[str, Array] = {}
     lines: dict[str, StraightLine] = {}
-    differences, notes = [], [*_other_priors(every_common, common, apart)]
+    differences, notes = [], []
+    if own := [name for name in every_common if name not in (*common, *apart)]:
+        notes.append(f"{', '.join(own)}: of one population alone, or with other priors: taken as each population's own")
     for name in names:
         centres = {label: _centre(name, s, keys[label], seed, values[label]) for label, s in stored.items()}
         alone = [replace(c, common=tuple((label, key) for key in c.common)) for label, c in centres.items()]
@@ -151,7 +150,7 @@ def compare_populations(
             unit, more = terms[name][0].parameter.display_unit, _three(x - y)
             greater = float(np.mean(x > y))
             differences.append(Difference(name, a, b, unit, ratio, more, greater, by_itself, " ".join(doubts)))
-        notes += _calibrated(name, stored, values, terms[name][0].parameter, common, medians[name], independent)
+        notes += _calibrated(name, stored, values, medians[name], independent if common else None)
         if held := [label for label, c in centres.items() if c.pulled]:
             notes.append(f"{name}: the data of {', '.join(held)} leave its median open: the hyperprior holds it")
         if numbers:
@@ -181,9 +180,7 @@ def same_readings(stored: Mapping[str, StoredPopulation]) -> str:
     return ""
 
 
-def _centre(
-    name: str, s: StoredPopulation, keys: tuple[tuple[str, str], ...], seed: int, values: Values
-) -> Centre:  # fmt: skip
+def _centre(name: str, s: StoredPopulation, keys: tuple[tuple[str, str], ...], seed: int, values: Values) -> Centre:
     nu = np.stack([s.white(n) for n in s.names], axis=1)
     theta = np.stack([s.white(n) for n in s.common], axis=1) if s.common else np.empty((len(nu), 0))
     attributes = s.tree.attrs
@@ -223,19 +220,15 @@ def _known(s: StoredPopulation, values: Values) -> Iterator[tuple[int, float, fl
 
 
 def _calibrated(
-    name: str,
-    stored: Mapping[str, StoredPopulation],
-    values: Mapping[str, Values],
-    parameter: Parameter,
-    common: Sequence[str],
-    together: Array,
-    alone: Array,
+    name: str, stored: Mapping[str, StoredPopulation], values: Mapping[str, Values], median: Array, alone: Array | None
 ) -> Iterator[str]:
-    """What groups that are known from elsewhere do to the median (M, K) of a parameter in the others."""
+    """What groups that are known from elsewhere do to the median (M, K) of a parameter in the others; ``alone``: the
+    same were nothing common, None where nothing is.
+    """
     known = [label for label, of_it in values.items() if of_it]
-    unit = unit_behind(parameter.display_unit)
     for k, (label, s) in enumerate(stored.items()):
-        now, before = (_range(_three(draws[:, k]), plain=True) for draws in (together, alone))
+        parameter = s.prior_of(name).parameter
+        unit = unit_behind(parameter.display_unit)
         if name in values[label]:
             value, std = (convert(number, parameter.unit, parameter.display_unit) for number in values[label][name])
             draws = s.group("posterior")[f"{name}_{s.headline}"].values
@@ -243,9 +236,10 @@ def _calibrated(
             off = (value - float(np.median(x))) / float(np.hypot(x.std(), std))
             words = f"{name} of {label} is known, {number_like(value, std)} ± {number_like(std, std)}{unit}"
             yield words + (f"; its own data say otherwise, {abs(off):.1f} std away" if abs(off) > FAR else "")
-            if not common:
+            if alone is None:
                 yield "Nothing is common to the groups that this could calibrate"
-        elif known and common and label not in known:
+        elif known and alone is not None and label not in known:
+            now, before = (_range(_three(draws[:, k]), plain=True) for draws in (median, alone))
             yield f"{name} of {label} is {now}{unit}, calibrated by {', '.join(known)}; without, {before}{unit}"
 
 
@@ -255,18 +249,16 @@ def _three(values: Array) -> tuple[float, float, float]:
 
 
 def _stored(folder: Path) -> StoredPopulation:
-    path = folder / FILE
+    path = folder / POPULATION
     if not path.is_file():
-        words = (
-            "a run whose configuration has 'population:' ends with one, 'en4dvar population' makes one of finished runs"
+        raise OutputError(
+            f"{folder}: holds no population; a run whose configuration has 'population:' ends with one, 'en4dvar "
+            "population' makes one of finished runs"
         )
-        raise OutputError(f"{folder}: holds no population; {words}")
     stored = load_population(path)
     with understood(path):
         if "white" not in stored.tree.children:
-            raise OutputError(
-                f"{path}: written by an earlier version of en4dvar; make the population again to compare it"
-            )
+            raise OutputError(f"{path}: written by an earlier version of en4dvar; make it again to compare it")
         for name in (*stored.names, *stored.common):
             _ = stored.white(name), stored.prior_of(name)
     return stored
@@ -276,12 +268,6 @@ def _common(s: StoredPopulation, apart: Sequence[str], label: str) -> tuple[tupl
     """Of each common quantity what makes it the same in two populations."""
     priors = {name: str(s.group("white")[name].attrs["prior"]) for name in s.common}
     return tuple((name, label if name in apart else prior) for name, prior in priors.items())
-
-
-def _other_priors(known: Sequence[str], common: Sequence[str], apart: Sequence[str]) -> Iterator[str]:
-    own = [name for name in known if name not in common and name not in apart]
-    if own:
-        yield f"{', '.join(own)}: of one population alone, or with other priors: taken as each population's own"
 
 
 def sentences(c: PopulationsCompared) -> Iterator[str]:
@@ -362,10 +348,7 @@ def figure(c: PopulationsCompared) -> Chart:
 
 
 def write_populations(c: PopulationsCompared, out: str | Path) -> Path:
-    """Write ``compare.html``, ``populations.png`` and ``.pdf`` and the tables to a folder; returns the page.
-
-    Raises :class:`OutputError`.
-    """
+    """Write ``compare.html``, ``populations.png``, ``.pdf``, tables; returns the page. Raises :class:`OutputError`."""
     out = make_folder(out)
     ((_, _, drawn),) = draw([("populations", CAPTION, figure(c))], folder=out)
     write_tables(c, out)
@@ -377,10 +360,8 @@ def write_tables(c: PopulationsCompared, folder: Path) -> None:
     """``differences.csv`` and, with numbers, ``lines.csv``. Raises :class:`OutputError`."""
     three = [f"{what}_{q}" for what in ("ratio", "difference", "apart") for q in ("q05", "q50", "q95")]
     head = ["parameter", "first", "second", "unit", *three, "greater", "untrusted"]
-    rows = [
-        [d.parameter, d.first, d.second, d.unit, *d.ratio, *d.difference, *d.apart, d.greater, d.untrusted]
-        for d in c.differences
-    ]
+    of_each = ((d, (*d.ratio, *d.difference, *d.apart)) for d in c.differences)
+    rows = ([d.parameter, d.first, d.second, d.unit, *numbers, d.greater, d.untrusted] for d, numbers in of_each)
     write_csv(folder / "differences.csv", [head, *rows])
     if c.lines:
         three = [f"{what}_{q}" for what in ("slope", "level") for q in ("q05", "q50", "q95")]
@@ -392,9 +373,7 @@ def write_tables(c: PopulationsCompared, folder: Path) -> None:
 
 
 def numbers_of(names: Sequence[str]) -> tuple[tuple[float, ...], str]:
-    """The number in each of the names and their unit, as of ``gel_5kPa`` and ``gel_8kPa``; nothing where a name has
-    none or several, units differ, or all numbers are the same.
-    """
+    """The numbers in names such as ``gel_5kPa``, and their unit; nothing where one has not one, or units differ."""
     of_names = [[(number, unit) for number, unit in _NUMBER.findall(name) if is_unit(unit)] for name in names]
     units = {unit for of_name in of_names for _, unit in of_name}
     if any(len(of_name) != 1 for of_name in of_names) or len(units) != 1:
@@ -404,9 +383,7 @@ def numbers_of(names: Sequence[str]) -> tuple[tuple[float, ...], str]:
 
 
 def groups_compared(run_dir: Path) -> PopulationsCompared | str | None:
-    """The groups of a run side by side; why not, where their data are the same; None where fewer than two have a
-    population.
-    """
+    """The groups of a run side by side; why not, where they share data; None with fewer than two populations."""
     folders = {name: folder for name, (folder, _) in load_groups_of(run_dir).items()}
     if len(folders) < 2:
         return None

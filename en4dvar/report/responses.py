@@ -1,13 +1,19 @@
-"""How a posterior responds to its assumptions, read from a result: rows of tables, sentences of the page."""
+"""How a posterior responds to its assumptions and to each reading, read from a result: rows of tables, sentences of the
+page, and a figure.
+"""
 
 import math
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from markupsafe import Markup
 
-from en4dvar.report.text import fixed, number_like, pretty_unit, shown, symbol_html
+from en4dvar.diagnosis.influence import UNKNOWN
+from en4dvar.model.state import Array
+from en4dvar.report.chart import POINTS, Chart, Panel, Row
+from en4dvar.report.text import axis_label, fixed, number_like, plain_number, pretty_unit, shown, signed, symbol_html
 from en4dvar.results.store import StoredResult
 
 SHIFT_COLUMNS = (
@@ -18,10 +24,8 @@ ENTRY_COLUMNS = ("parameter", "quantity", "unit", "q05", "q50", "q95")
 
 
 class StoredShift(NamedTuple):
-    """What one parameter would do under one alternative: ``change`` in ``unit``, the display unit.
-
-    ``relative``: of the value, NaN where that may be negative. ``reason``: why linear response does not tell, or "".
-    Behind the cells of :data:`SHIFT_COLUMNS`, the symbol of the parameter.
+    """What one parameter would do under an alternative, in its display unit; ``relative``: of the value, NaN where that
+    may be negative; ``reason``: why linear response does not tell, or "". Cells of :data:`SHIFT_COLUMNS`, and a symbol.
     """
 
     alternative: str
@@ -42,9 +46,8 @@ class StoredShift(NamedTuple):
 
 
 class StoredEntry(NamedTuple):
-    """Where on the path one parameter was informed, in one quantity: ``low``, ``median``, ``high`` are 5, 50, 95 %.
-
-    Behind the cells of :data:`ENTRY_COLUMNS`, the symbol of the parameter and the label of the quantity.
+    """Where on the path one parameter was informed, in one quantity: cells of :data:`ENTRY_COLUMNS`, then the symbol
+    of the parameter and the label of the quantity.
     """
 
     parameter: str
@@ -81,9 +84,8 @@ def stored_shifts(result: StoredResult) -> tuple[tuple[StoredShift, ...], ...]:
     if "what_if_change" not in stats.variables:
         return ()
     of = {key: stats.variables[f"what_if_{key}"].values for key in ("words", "cost_change", "reason")}
-    change, relative, in_std = (
-        stats.variables[f"what_if_{key}"].values for key in ("change", "relative_change", "change_in_std")
-    )
+    keys = "change", "relative_change", "change_in_std"
+    change, relative, in_std = (stats.variables[f"what_if_{key}"].values for key in keys)
     parameters, alternatives = result.parameters, stats.coords["alternative"].values
 
     def shift(i: int, j: int, name: str) -> StoredShift:
@@ -98,10 +100,7 @@ def stored_shifts(result: StoredResult) -> tuple[tuple[StoredShift, ...], ...]:
 
 
 def shift_text(shift: StoredShift) -> str:
-    """``"+15 %"``, or in the parameter's unit where its value may be negative, as fine as its error bar is.
-
-    An en dash where it is not known.
-    """
+    """``"+15 %"``, or in the parameter's unit where its value may be negative; an en dash where it is not known."""
     value, unit = shift.change, pretty_unit(shift.unit)
     if math.isfinite(shift.relative):
         value, unit = 100 * shift.relative, "%"
@@ -132,3 +131,129 @@ def sentence(shifts: Sequence[StoredShift]) -> str:
 def exceeding(rows: Iterable[Sequence[StoredShift]]) -> list[Sequence[StoredShift]]:
     """The alternatives that move a parameter beyond its error bar, or may."""
     return [row for row in rows if row[0].reason or any(shift.exceeds for shift in row)]
+
+
+CAPTION = (
+    "What each reading does. Above, one panel a parameter: change of the posterior mean, in posterior standard "
+    "deviations, if that reading alone is left out; nothing is drawn where that takes a fit without it. Below: "
+    "distance of the reading from what the prior predicts, in the standard deviation of both; beyond 3 they are in "
+    "conflict."
+)
+FAR = 3.0  # std between a reading and the prior that are told
+
+
+COLOURS = ("ink", "posterior", "centre", "background", "muted")  # of several series, in their order
+
+
+def has_influence(result: StoredResult) -> bool:
+    """Whether the file says what leaving out a reading would change."""
+    return result.axes[0].own("influence_in_std") in result.group("sample_stats")
+
+
+def times(result: StoredResult) -> Array:
+    """(K,) of all readings, in the display unit."""
+    observed = result.group("observed_data")
+    return np.concatenate([shown(observed[axis.time]) for axis in result.axes])
+
+
+def time_label(result: StoredResult) -> str:
+    """Of an axis of :func:`times`."""
+    return axis_label(result.group("observed_data")[result.axes[0].time], "time")
+
+
+def whitened(result: StoredResult) -> Array:
+    """(K',) residuals of the readings that count, whitened; none of a result whose readings are few or of a field."""
+    if f"{result.observable}_whitened_residual" not in result.group("sample_stats"):
+        return np.empty(0)
+    white = result.of_readings("sample_stats", "whitened_residual")
+    return white[np.isfinite(white)]
+
+
+def each_series(result: StoredResult, alone: str = "ink") -> list[tuple[npt.NDArray[np.intp], str]]:
+    """Places among all readings of each series, and its colour; ``alone``: that of a single one."""
+    observed = result.group("observed_data")
+    sizes = [len(observed[axis.name].values) for axis in result.axes]
+    parts = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
+    names = [alone] if len(parts) == 1 else [COLOURS[i % len(COLOURS)] for i in range(len(parts))]
+    return list(zip(parts, names, strict=True))
+
+
+def influence(result: StoredResult) -> Chart:
+    """Change of each parameter without each reading, and the distance of the readings from the prior, over time."""
+    rows = result.rows if has_influence(result) else ()
+    in_std = result.of_readings("sample_stats", "influence_in_std", shared=True) if rows else np.empty(0)
+    panels = []
+    for row, change in zip(rows, in_std, strict=False):
+        reach = 1.15 * max(0.1, float(np.nanmax(np.abs(change), initial=0.0)))
+        panel = Panel(ylabel=row.symbol, ylim=(-reach, reach), yticks=3, x_numbers=False)
+        _stems(panel, result, change, "posterior")
+        panels.append(panel)
+    last = Panel(time_label(result), "prior distance", yticks=4)
+    last.span(-FAR, FAR, "prior", 0.16)
+    _stems(last, result, result.of_readings("sample_stats", "prior_distance"), "ink")
+    panels.append(last)
+    panels[0].legend = len(result.axes) > 1
+    heights = [1.7] * len(rows) + [3.0]
+    heights[0] += 0.5 if panels[0].legend else 0.0
+    return Chart([Row(height * POINTS, [panel]) for height, panel in zip(heights, panels, strict=True)])
+
+
+def _stems(panel: Panel, result: StoredResult, values: Array, alone: str) -> None:
+    time = times(result)
+    many = len(time) > 500
+    panel.rule(0)
+    for axis, (own, colour) in zip(result.axes, each_series(result, alone), strict=True):
+        if not many:
+            panel.bars(time[own], 0, values[own], colour, label=axis.name)
+        panel.dots(time[own], values[own], colour, 1.2 if many else 2.6, label=axis.name)
+
+
+def reading_words(result: StoredResult) -> list[Markup]:
+    """The reading that moves a parameter most, the one farthest from the prior; or why that is not told."""
+    reason = str(result.group("sample_stats").attrs.get("influence_reason", ""))
+    not_told = Markup("What leaving out a reading would change is not told: {}.").format(reason) if reason else Markup()
+    sentences = [_most_moving(result) if has_influence(result) else not_told, _farthest(result)]
+    return [words for words in sentences if words]
+
+
+def _most_moving(result: StoredResult) -> Markup:
+    keys = "influence_in_std", "influence_change", "influence_how"
+    in_std, change, how = (result.of_readings("sample_stats", key, shared=True) for key in keys)
+    if not np.isfinite(in_std).any():
+        return Markup("Each reading decides so much that only a fit without it tells what it changes.")
+    j, k = np.unravel_index(int(np.nanargmax(np.abs(in_std))), in_std.shape)
+    row = result.rows[int(j)]
+    size = float(shown(result.parameters[row.name], change[j, k]))
+    words = Markup(
+        "Without the reading at {} {} would change most: by {} {}, {} posterior standard deviations."
+    ).format(
+        _time(result, int(k)), symbol_html(row.symbol), signed(size), pretty_unit(row.unit), fixed(abs(in_std[j, k]), 1)
+    )
+    blank = int(np.sum(how == UNKNOWN))
+    return words + (f" For {blank} of {in_std.shape[1]} readings it takes a fit without them to tell." if blank else "")
+
+
+def _farthest(result: StoredResult) -> Markup:
+    distance = result.of_readings("sample_stats", "prior_distance")
+    if not np.isfinite(distance).any():
+        return Markup("")
+    k, beyond = int(np.nanargmax(np.abs(distance))), int(np.sum(np.abs(distance) > FAR))
+    count = f"{beyond} of {len(distance)} readings lie" if beyond else "No reading lies"
+    return Markup("{} more than {} standard deviations from what the prior predicts; the farthest, at {}, {}.").format(
+        count, plain_number(FAR), _time(result, k), signed(float(distance[k]))
+    )
+
+
+def _time(result: StoredResult, k: int) -> str:
+    """When a reading was taken, of several series of which, of a field where."""
+    observed = result.group("observed_data")
+    for axis in result.axes:
+        time = observed[axis.time]
+        if k < len(time.values):
+            break
+        k -= len(time.values)
+    words = f"{plain_number(float(shown(time)[k]))} {pretty_unit(time.attrs['display_units'])}".strip()
+    if f"{axis.name}_place" in observed:
+        place = observed[f"{axis.name}_place"]
+        words += f", place {plain_number(float(place.values[k]))} {pretty_unit(str(place.attrs['units']))}".rstrip()
+    return words if axis.alone else f"{words} ({axis.name})"

@@ -16,9 +16,8 @@ from en4dvar.plumbing.files import write_text
 from en4dvar.plumbing.units import convert
 from en4dvar.report import figures
 from en4dvar.report.history import history
-from en4dvar.report.page import IDENTIFIERS, render_set
+from en4dvar.report.page import render_set
 from en4dvar.report.paper import on_paper
-from en4dvar.report.svg import draw
 from en4dvar.results.netcdf import dataset_of, to_bytes, tree_of
 from en4dvar.results.store import StoredResult, load_stored, of_members
 
@@ -111,8 +110,7 @@ class Result(StoredResult):
         """Write the page of the result as one HTML file. Raises :class:`OutputError`."""
         if Path(path).suffix != ".html":
             raise OutputError(f"{path}: name a file that ends in .html")
-        drawn = draw(figures.all_figures(self), IDENTIFIERS)
-        return write_text(Path(path), render_set(self, drawn, copies=False))
+        return write_text(Path(path), render_set(self))
 
     def to_inference_data(self, units: Literal["SI", "display"] = "SI", chains: int = 1) -> Any:
         """What ArviZ works with: the groups as its ``InferenceData``; from version 1 on that is a DataTree.

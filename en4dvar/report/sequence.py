@@ -1,5 +1,6 @@
-"""Page and figures of a sequence, from ``sequence.nc`` alone: state, parameters, innovations in time, and ranks; what
-a session gets of it; and sequences of the same readings side by side, by the forecasts of their observations.
+"""Page and figures of a sequence, from ``sequence.nc`` alone: state, parameters, innovations in time, and ranks; what a
+session gets of it; sequences of the same readings side by side, by the forecasts of their observations. First, what it
+has in common with a twin experiment: the page, the rank histogram, and tables for other programs.
 
 ln p(y) = Σ_k ln p(y_k | y_1 … y_{k−1}), each the density of N(H x̄, P + R) of the forecast: exact for a linear model and
 an ensemble of enough members, as in a Kalman filter. Source: Schweppe (1965), IEEE Trans. Inf. Theory 11, 61; for
@@ -8,32 +9,144 @@ model selection by ensembles: Carrassi, Bocquet, Hannart & Ghil (2017), Q. J. R.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import softmax
+from scipy.stats import binom
 
+from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import OutputError
-from en4dvar.plumbing.tables import table
+from en4dvar.plumbing.files import inside
+from en4dvar.plumbing.tables import csv_text, table
 from en4dvar.plumbing.units import convert
-from en4dvar.report import cycles
-from en4dvar.report.chart import PAGE, POINTS, Chart, Panel, interval, stacked
-from en4dvar.report.compare import named, preferred
+from en4dvar.report.chart import PAGE, POINTS, Chart, Panel, Row, interval, stacked
+from en4dvar.report.compare import named, preferred, ranked
+from en4dvar.report.export import Kind, Notes, column_name, escaped, latex_unit, plus_minus, tabular
+from en4dvar.report.html import write_page
+from en4dvar.report.page import provenance_rows
 from en4dvar.report.paper import on_paper
-from en4dvar.report.svg import Captioned
+from en4dvar.report.svg import Captioned, draw
 from en4dvar.report.text import plain_number, pretty_unit, shown, with_unit
-from en4dvar.results.netcdf import Group, read_groups
+from en4dvar.results.netcdf import Group, read_groups, understood
 from en4dvar.results.series_file import estimates, series_file, series_group
 from en4dvar.series.problem import SeriesResult
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
+
+Table = tuple[str, Sequence[str], Sequence[Sequence[str]], str]  # heading, columns, rows, words below it
+KINDS = ("forecast", "analysis", "smoothed")  # of estimates in time
+BINS = 10
+CERTAIN = 1e-9  # of its size: the spread of what is known
+RANKS = (
+    "Rank histogram: where each observation fell among the forecast members, errors of the observations added. A "
+    "reliable ensemble has flat bars, 95 % of them inside the band; a valley is too little spread, a hill too much."
+)
+
+
+def write_cycles_page(run_dir: Path, data: Group, figures: Iterable[Captioned], files: bool, **about: Any) -> Path:
+    """Write ``report.html``, with ``files`` also figures as PDF and PNG; returns the path of the page.
+
+    ``about``: the ``kind`` of run and ``what`` it is, ``iterations``: forecasts of the window a ``cycle``, on average;
+    ``facts`` (quantity, value, in words) for the tiles on top, beside those of scheme, members and forward runs;
+    ``tables`` as of :data:`Table`.
+    """
+    drawn = draw(figures, folder=inside(run_dir, "figures") if files else None)
+    about |= {"attributes": data.attrs, "provenance": provenance_rows(data.attrs), "figures": drawn, "copies": files}
+    return write_page(run_dir / "report.html", "cycles.html.j2", **about)
+
+
+def span_of(time: Array) -> tuple[float, float] | None:
+    """Limits of an axis of time without margins."""
+    return (float(time[0]), float(time[-1])) if time[-1] > time[0] else None
+
+
+def time_label(data: Group) -> str:
+    """Of an axis of time."""
+    about = data["time"].attrs
+    return with_unit("time", str(about.get("display_units", about["units"])))
+
+
+def ranks(ranked: Array, members: int) -> Chart:
+    """The rank histogram of all observations, with the band that holds 95 % of the bars of a reliable ensemble."""
+    known = ranked[np.isfinite(ranked)]
+    placed = (members * known + 0.5) / (members + 1)  # of the N + 1 places among N members
+    counts, edges = np.histogram(placed, BINS, (0, 1))
+    low, high = binom.ppf([0.025, 0.975], len(known), 1 / BINS) / max(1, len(known))
+    shares = counts / max(1, len(known))
+    panel = Panel("rank of the observation, 0 to 1", f"share of {len(known)}", xlim=(0.0, 1.0))
+    panel.ylim = 0.0, 1.05 * max(float(shares.max()), float(high), 1e-3)
+    panel.span(low, high, "grid", 0.6)
+    panel.stairs(edges, shares, "prior", 0.7)
+    panel.rule(1 / BINS, "ink")
+    return Chart([Row(5.0 * POINTS, [panel])])
+
+
+def variables(data: Group) -> list[tuple[str, str, str]]:
+    """Name, unit and the unit shown of each variable of the state."""
+    columns = "state", "units", "display_units" if "display_units" in data else "units"
+    return list(zip(*(map(str, data[column].values) for column in columns), strict=True))
+
+
+def last_analysis(data: Group) -> Iterator[tuple[str, float, float, str]]:
+    """Name, mean, std and the unit they are shown in of the variables that are uncertain at the end."""
+    last = (data[f"analysis_{what}"].values[-1].tolist() for what in ("mean", "std"))
+    for (name, unit, display), *numbers in zip(variables(data), *last, strict=True):
+        mean, std = (float(convert(number, unit, display)) for number in numbers)
+        if std > CERTAIN * abs(mean):
+            yield name, mean, std, display
+
+
+def cycles_table(file: Path, kind: Kind) -> str:
+    """A table of the result file of a sequence or a twin experiment as text, in display units. ``csv``: a line for each
+    time and variable of the state, mean and std of each estimate, and the truth; ``members``: for each member and time
+    that is kept; ``latex``: for each variable of the last analysis. Raises :class:`OutputError`: it is damaged, or
+    holds no members (a twin experiment).
+    """
+    data = read_groups(file)["/"]
+    if kind == "members" and "members" not in data:
+        raise OutputError(f"{file}: a twin experiment keeps no members; --csv has each variable's mean and std in time")
+    with understood(file):
+        if kind == "latex":
+            return _last_analysis(data)
+        return csv_text(_state_members(data) if kind == "members" else _in_time(data))
+
+
+def _in_time(data: Group) -> Iterator[list[str]]:
+    state, every = variables(data), [f"{kind}_{what}" for kind in KINDS for what in ("mean", "std")]
+    columns = [column for column in (*every, "truth") if column in data]
+    yield ["time", "variable", "unit", *columns]
+    values = np.stack([data[column].values * _factors(data) for column in columns], axis=-1)
+    for time, at in zip(data["time"].values, values, strict=True):
+        for (name, _, unit), row in zip(state, at, strict=True):
+            yield [repr(float(time)), name, unit, *(f"{x:.10g}" if np.isfinite(x) else "" for x in row)]
+
+
+def _state_members(data: Group) -> Iterator[list[str]]:
+    yield ["time", "member", *(column_name(name, unit) for name, _, unit in variables(data))]
+    for time, members in zip(data["member_time"].values, data["members"].values * _factors(data), strict=True):
+        for i, member in enumerate(members):
+            if np.isfinite(member).all():  # the others were lost
+                yield [repr(float(time)), str(i), *(f"{x:.10g}" for x in member)]
+
+
+def _factors(data: Group) -> Array:
+    """(n,) of the variables of the state, to the units that they are shown in."""
+    return np.array([float(convert(1.0, unit, display)) for _, unit, display in variables(data)])
+
+
+def _last_analysis(data: Group) -> str:
+    last = ((escaped(name), latex_unit(unit), plus_minus(mean, std)) for name, mean, std, unit in last_analysis(data))
+    lines = [f"{name} & {unit or '--'} & {value}" for name, unit, value in last]
+    head = "% en4dvar export: mean and standard deviation of the last analysis; needs \\usepackage{booktabs}"
+    return "\n".join([head, *tabular("llr", "variable & unit & analysis", lines, Notes())]) + "\n"
+
 
 SHOWN = 5  # variables or observations in a figure
 LISTED = 40  # in a table
@@ -71,10 +184,7 @@ class SequenceOutcome(SeriesResult):
 
 
 def write_sequence_report(run_dir: Path, files: bool = False) -> Path:
-    """Write ``report.html`` from ``sequence.nc``, with ``files`` also its figures as PDF and PNG; returns its path.
-
-    Raises :class:`OutputError`: there is nothing to read, or the directory cannot be written.
-    """
+    """Write ``report.html`` from ``sequence.nc``, with ``files`` also PDF and PNG. Raises :class:`OutputError`."""
     data = read_groups(run_dir / "sequence.nc")["/"]
     readings = int(np.isfinite(data["observations"].values).sum())
     words = (
@@ -85,7 +195,7 @@ def write_sequence_report(run_dir: Path, files: bool = False) -> Path:
     last = "The analysis at the last observation time, given all observations."
     at_end = [
         (name, plain_number(mean, 4), plain_number(std, 2), pretty_unit(unit))
-        for name, mean, std, unit in islice(cycles.last_analysis(data), LISTED)
+        for name, mean, std, unit in islice(last_analysis(data), LISTED)
     ]
     rows = []
     for i, name in enumerate(data["observation"].values[:LISTED]):
@@ -94,7 +204,7 @@ def write_sequence_report(run_dir: Path, files: bool = False) -> Path:
         size = plain_number(float(np.sqrt(np.mean(innovations**2))), 3) if len(innovations) else "–"
         share = f"{100 * np.mean(np.abs(innovations) <= 2):.0f} %" if len(innovations) else "–"
         rows.append((str(name), str(len(innovations)), size, share))
-    return cycles.write_cycles_page(
+    return write_cycles_page(
         run_dir,
         data,
         sequence_figures(data),
@@ -120,7 +230,7 @@ def sequence_figures(data: Group) -> Iterator[Captioned]:
     parameters, state = str(data.attrs["parameters"]).split(", "), list(map(str, data["state"].values))
     held = np.array([state.index(name) for name in parameters if name in state], dtype=np.intp)
     spread = data[f"{best}_std"].values.max(axis=0)
-    uncertain = np.flatnonzero(spread > cycles.CERTAIN * np.abs(data[f"{best}_mean"].values).max(axis=0))
+    uncertain = np.flatnonzero(spread > CERTAIN * np.abs(data[f"{best}_mean"].values).max(axis=0))
     dynamic = np.array([i for i in uncertain if i not in held], dtype=np.intp)
     if len(dynamic):
         words = "" if len(dynamic) <= SHOWN else f" {SHOWN} of {len(dynamic)} variables."
@@ -131,7 +241,7 @@ def sequence_figures(data: Group) -> Iterator[Captioned]:
         yield "parameters", caption, in_time(data, "analysis", held[:SHOWN])
     caption = "Innovations, the readings minus their forecasts, within two of their expected standard deviations."
     yield "innovations", caption, innovations(data)
-    yield "ranks", cycles.RANKS, cycles.ranks(data["rank"].values, int(data.attrs["members"]))
+    yield "ranks", RANKS, ranks(data["rank"].values, int(data.attrs["members"]))
 
 
 def in_time(data: Group, kind: str, chosen: npt.NDArray[np.intp]) -> Chart:
@@ -139,16 +249,16 @@ def in_time(data: Group, kind: str, chosen: npt.NDArray[np.intp]) -> Chart:
     time, read_as = shown(data["time"]), list(data["observation_state"].values)
     panels = []
     for i in chosen:
-        name, unit, display = cycles.variables(data)[i]
+        name, unit, display = variables(data)[i]
         mean, std = (convert(data[f"{kind}_{what}"].values[:, i], unit, display) for what in ("mean", "std"))
-        panel = Panel(ylabel=with_unit(name, display), xlim=cycles.span_of(time))
+        panel = Panel(ylabel=with_unit(name, display), xlim=span_of(time))
         panel.band(time, *interval(mean, std, 2, bool(data["positive"].values[i])), "posterior", 0.25, "± 2 std")
         panel.line(time, mean, "posterior", 0.9, label=kind)
         if name in read_as:
             readings = convert(data["observations"].values[:, read_as.index(name)], unit, display)
             panel.dots(time, readings, "ink", 1.6, label="readings")
         panels.append(panel)
-    return stacked(panels, 2.8 * POINTS, cycles.time_label(data), PAGE)
+    return stacked(panels, 2.8 * POINTS, time_label(data), PAGE)
 
 
 def innovations(data: Group) -> Chart:
@@ -161,12 +271,12 @@ def innovations(data: Group) -> Chart:
         unit, display = (str(data[f"observation_{kind}"].values[i]) for kind in ("units", "display_units"))
         there = np.isfinite(innovation[:, i])
         at, width = time[there], 2 * convert(expected[there, i], unit, display)
-        panel = Panel(ylabel=with_unit(str(data["observation"].values[i]), display), xlim=cycles.span_of(time))
+        panel = Panel(ylabel=with_unit(str(data["observation"].values[i]), display), xlim=span_of(time))
         panel.band(at, -width, width, "prior", 0.3, "± 2 expected std")
         panel.rule(0, size=0.5)
         panel.dots(at, convert(innovation[there, i], unit, display), "ink", 1.6, label="innovation")
         panels.append(panel)
-    return stacked(panels, 2.6 * POINTS, cycles.time_label(data), PAGE)
+    return stacked(panels, 2.6 * POINTS, time_label(data), PAGE)
 
 
 def _some(places: npt.NDArray[np.intp], most: int) -> npt.NDArray[np.intp]:
@@ -187,22 +297,18 @@ class SequenceScore:
 
 
 def compare_sequences(run_dirs: Sequence[Path]) -> tuple[SequenceScore, ...]:
-    """Score sequences, in the order given.
-
-    Raises :class:`OutputError`: fewer than two, one of them no sequence, without an evidence, or of other readings.
-    """
+    """Score sequences, in the order given. Raises :class:`OutputError`: fewer than two, or why they do not compare."""
     runs = {name: _sequence(run_dir) for name, run_dir in named(run_dirs).items()}
     (first, reference), *others = runs.items()
     for name, other in others:
         if not all(_same(reference, other, key) for key in READINGS):
             raise OutputError(f"{name} and {first} hold other readings or errors: their evidences cannot be compared")
-    evidence = np.array([float(data.attrs["log_evidence"]) for data in runs.values()])
-    sizes = [np.sqrt(np.nanmean(data["normalised_innovation"].values ** 2)) for data in runs.values()]
-    each = zip(evidence, evidence - evidence.max(), softmax(evidence), sizes, strict=True)
-    return tuple(
-        SequenceScore(run, str(data.attrs["scheme"]), *map(float, numbers))
-        for (run, data), numbers in zip(runs.items(), each, strict=True)
-    )
+    sizes = [float(np.sqrt(np.nanmean(data["normalised_innovation"].values ** 2))) for data in runs.values()]
+    scores = [
+        SequenceScore(run, str(data.attrs["scheme"]), float(data.attrs["log_evidence"]), np.nan, np.nan, size)
+        for (run, data), size in zip(runs.items(), sizes, strict=True)
+    ]
+    return tuple(ranked(scores))
 
 
 def sequences_table(scores: Sequence[SequenceScore]) -> str:

@@ -50,7 +50,6 @@ class Frame:
 
 
 def _share(values: Array, limits: tuple[float, float], logarithmic: bool) -> Array:
-    """The share of the way between two limits."""
     low, high = limits
     with np.errstate(divide="ignore", invalid="ignore"):
         share = np.log(values / low) / math.log(high / low) if logarithmic else (values - low) / (high - low)
@@ -60,7 +59,11 @@ def _share(values: Array, limits: tuple[float, float], logarithmic: bool) -> Arr
 def svg(chart: Chart, name: str, description: str) -> Markup:
     """The drawing; its identifiers begin with ``name``, ``description`` is what a screen reader says."""
     parts, top = [], 0.0
-    margins = _left_margins(chart)
+    margins: dict[tuple[int, int], float] = {}  # of (panels of the row, place in it), one for the first of all rows
+    for row in chart.rows:
+        for j, panel in enumerate(row.panels):
+            key = (len(row.panels) if j else 0, j)
+            margins[key] = max(margins.get(key, 0.0), _left(panel))
     for i, row in enumerate(chart.rows):
         lefts = [margins[len(row.panels) if j else 0, j] for j in range(len(row.panels))]
         x, width = 0.0, (chart.width - sum(lefts) - len(lefts) * GAP) / len(lefts)
@@ -86,16 +89,6 @@ def _left(panel: Panel) -> float:
     labels = [text for _, text in _y_ticks(panel)] if panel.y_numbers else []
     widest = max(map(len, labels), default=0) * WIDEST * SMALL
     return widest + 4.5 + (FONT + 5 if panel.ylabel else 0)
-
-
-def _left_margins(chart: Chart) -> dict[tuple[int, int], float]:
-    """(panels of the row, place in it) → margin; the first places of all rows have one."""
-    margins: dict[tuple[int, int], float] = {}
-    for row in chart.rows:
-        for j, panel in enumerate(row.panels):
-            key = (len(row.panels) if j else 0, j)
-            margins[key] = max(margins.get(key, 0.0), _left(panel))
-    return margins
 
 
 def _panel(panel: Panel, row: Row, top: float, x: float, width: float, name: str) -> list[str]:
@@ -135,7 +128,6 @@ def _below(panel: Panel) -> float:
 
 
 def _axes(panel: Panel, place: Frame, below: float) -> Iterator[str]:
-    """Lines, ticks, numbers and labels."""
     base, left, far = place.y + place.height, place.x, place.x + place.width
     along = labelled(place.xlim, panel.xticks, panel.names, logarithmic=panel.x_logarithmic, whole=panel.whole)
     lines, words = [f"M{left:.1f} {base:.1f}H{far:.1f}"], []
@@ -158,7 +150,6 @@ def _axes(panel: Panel, place: Frame, below: float) -> Iterator[str]:
 
 
 def _placed(ticks: list[tuple[float, str]], along: Callable[[Array], Array]) -> Iterator[tuple[float, str]]:
-    """Ticks at their places in the drawing."""
     places = along(np.array([value for value, _ in ticks]))
     return zip(places.tolist(), (text for _, text in ticks), strict=True)
 
@@ -211,9 +202,8 @@ def _spans(text: str, size: float) -> str:
         dy = f' dy="{wanted - shift:.2g}"' if wanted != shift else ""
         small = f' font-size="{0.72 * size:.3g}"' if mark in "_^" and mark else ""
         slant = ' font-style="italic"' if mark == "i" else ""
-        parts.append(
-            f"<tspan{dy}{small}{slant}>{escape(piece)}</tspan>" if dy or small or slant else str(escape(piece))
-        )
+        how = f"{dy}{small}{slant}"
+        parts.append(f"<tspan{how}>{escape(piece)}</tspan>" if how else str(escape(piece)))
         shift = wanted
     return "".join(parts)
 
@@ -230,10 +220,8 @@ def _pieces(text: str) -> Iterator[tuple[str, str]]:
 def draw(
     figures: Iterable[Captioned], identifiers: str = "", folder: Path | None = None, begin: str = ""
 ) -> list[Drawing]:
-    """Each chart as an SVG element; ``identifiers`` begins the names of its elements.
-
-    ``folder``: where they are kept as PDF and PNG too, if anywhere, under names with ``begin``. Raises
-    :class:`OutputError`.
+    """Each chart as SVG, its identifiers begin with ``identifiers``; in a ``folder`` also as PDF and PNG, under names
+    with ``begin``. Raises :class:`OutputError`.
     """
     drawings = []
     for name, caption, chart in figures:

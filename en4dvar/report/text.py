@@ -164,9 +164,8 @@ def symbol_html(symbol: str) -> Markup:
     if not (len(symbol) > 2 and symbol.startswith("$") and symbol.endswith("$")):
         return escape(symbol)
     tags = {"_": "sub", "^": "sup", "": "i"}
-    return Markup("").join(
-        Markup(f"<{tags[mark]}>{{}}</{tags[mark]}>").format(piece) for mark, piece in math_pieces(symbol[1:-1])
-    )
+    pieces = ((tags[mark], piece) for mark, piece in math_pieces(symbol[1:-1]))
+    return Markup("").join(Markup(f"<{tag}>{{}}</{tag}>").format(piece) for tag, piece in pieces)
 
 
 def math_pieces(body: str) -> list[tuple[str, str]]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from en4dvar.plumbing.tables import table
-from en4dvar.report import cycles
+from en4dvar.report import sequence
 from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, Row, stacked
 from en4dvar.report.paper import on_paper
 from en4dvar.report.svg import Captioned
@@ -60,10 +60,7 @@ class TwinOutcome(TwinResult):
 
 
 def write_twin_report(run_dir: Path, files: bool = False) -> Path:
-    """Write ``report.html`` from ``twin.nc``, with ``files`` also its figures as PDF and PNG; returns its path.
-
-    Raises :class:`OutputError`: there is nothing to read, or the directory cannot be written.
-    """
+    """Write ``report.html`` from ``twin.nc``, with ``files`` also PDF and PNG. Raises :class:`OutputError`."""
     data = read_groups(run_dir / "twin.nc")["/"]
     burn_in = int(data.attrs["burn_in"])
     columns = ["estimate", with_unit("RMSE", _unit(data)), with_unit("spread", _unit(data)), "spread / RMSE"]
@@ -73,7 +70,7 @@ def write_twin_report(run_dir: Path, files: bool = False) -> Path:
     for kind, _ in _kinds(data):
         rmse, spread = (float(data[f"{kind}_{what}"].attrs[MEAN]) for what in ("rmse", "spread"))
         rows.append((kind, plain_number(rmse, 4), plain_number(spread, 4), plain_number(spread / rmse, 3)))
-    return cycles.write_cycles_page(
+    return sequence.write_cycles_page(
         run_dir,
         data,
         twin_figures(data),
@@ -97,18 +94,12 @@ def twin_figures(data: Group) -> Iterator[Captioned]:
     yield "scores", f"RMSE against the truth (line) and spread (dashed) of each estimate in time.{words}", scores(data)
     shown = f"Error of the analysis within two standard deviations, last {min(LAST, data.sizes['time'])} cycles"
     yield "errors", f"{shown}, some variables of the state. A reliable ensemble has 95 % within.", errors(data)
-    yield (
-        "truth_ranks",
-        "Rank of the truth among the members, over all cycles and variables that count, relative to a flat histogram.",
-        truth_ranks(data),
-    )
-    yield (
-        "reliability",
-        f"RMSE of the values in {GROUPS} groups of the same size, by their spread, against that spread. A reliable "
-        "ensemble lies on the diagonal: where it is spread wide, its error is large.",
-        reliability(data),
-    )
-    yield "ranks", cycles.RANKS, cycles.ranks(data["rank"].values[burn_in:], int(data.attrs["members"]))
+    among = "Rank of the truth among the members, over all cycles and variables that count"
+    yield "truth_ranks", f"{among}, relative to a flat histogram.", truth_ranks(data)
+    words = f"RMSE of the values in {GROUPS} groups of the same size, by their spread, against that spread."
+    lies = "A reliable ensemble lies on the diagonal: where it is spread wide, its error is large."
+    yield "reliability", f"{words} {lies}", reliability(data)
+    yield "ranks", sequence.RANKS, sequence.ranks(data["rank"].values[burn_in:], int(data.attrs["members"]))
 
 
 def scores(data: Group) -> Chart:
@@ -118,14 +109,14 @@ def scores(data: Group) -> Chart:
         rmse, spread = data[f"{kind}_rmse"], data[f"{kind}_spread"]
         average, top = float(rmse.attrs[MEAN]), _upper(rmse.values, spread.values)
         title = f"{kind}: RMSE {plain_number(average, 3)}"
-        panel = Panel(ylabel=with_unit("error", _unit(data)), title=title, xlim=cycles.span_of(time), ylim=(0.0, top))
+        panel = Panel(ylabel=with_unit("error", _unit(data)), title=title, xlim=sequence.span_of(time), ylim=(0.0, top))
         if burn_in := int(data.attrs["burn_in"]):
             panel.band(time[[0, burn_in - 1]], [0, 0], [top, top], "grid", 0.5)
         panel.line(time, rmse.values, colour, 0.7, label="RMSE")
         panel.line(time, spread.values, "centre", 0.7, "--", label="spread")
         panel.rule(average, colour)
         panels.append(panel)
-    return stacked(panels, 3.0 * POINTS, cycles.time_label(data))
+    return stacked(panels, 3.0 * POINTS, sequence.time_label(data))
 
 
 def errors(data: Group) -> Chart:
@@ -139,12 +130,12 @@ def errors(data: Group) -> Chart:
     for i in chosen:
         width = 2 * std[-LAST:, i]
         title = f"{data['state'].values[i]}: {100 * inside[i]:.0f} % within 2 std"
-        panel = Panel(ylabel=with_unit("error", str(data["units"].values[i])), title=title, xlim=cycles.span_of(time))
+        panel = Panel(ylabel=with_unit("error", str(data["units"].values[i])), title=title, xlim=sequence.span_of(time))
         panel.band(time, -width, width, "posterior", 0.25, "± 2 std")
         panel.rule(0, size=0.5)
         panel.line(time, error[-LAST:, i], "ink", 0.8, label="analysis − truth")
         panels.append(panel)
-    return stacked(panels, 2.8 * POINTS, cycles.time_label(data))
+    return stacked(panels, 2.8 * POINTS, sequence.time_label(data))
 
 
 def truth_ranks(data: Group) -> Chart:
@@ -156,9 +147,8 @@ def truth_ranks(data: Group) -> Chart:
         ranked = _counted(data, data[f"{kind}_rank"].values)
         count, _ = np.histogram(ranked, edges)
         relative = count / (np.diff(edges) * max(1, len(ranked)))
-        panel = Panel(
-            ylabel="frequency", title=kind, xlim=(0.0, 1.0), ylim=(0.0, 1.05 * max(1.0, float(relative.max())))
-        )
+        top = 1.05 * max(1.0, float(relative.max()))
+        panel = Panel(ylabel="frequency", title=kind, xlim=(0.0, 1.0), ylim=(0.0, top))
         panel.stairs(edges, relative, colour, 0.6)
         panel.line([0, 1], [1, 1], "ink", 0.8, "--")
         panels.append(panel)
@@ -188,7 +178,6 @@ def _counted(data: Group, values: np.ndarray) -> np.ndarray:
 
 
 def _kinds(data: Group) -> list[tuple[str, str]]:
-    """Each kind of estimate and its colour."""
     return [(kind, colour) for kind, colour in COLOURS.items() if f"{kind}_rmse" in data]
 
 

@@ -19,18 +19,9 @@ import netCDF4
 import numpy as np
 
 from en4dvar.plumbing.errors import OutputError
+from en4dvar.results import netcdf
 from en4dvar.results.checkpoint import digest
-from en4dvar.results.netcdf import (
-    Groups,
-    Variable,
-    attributes_of,
-    define_variable,
-    netcdf_file,
-    opened_netcdf,
-    read_sealed,
-)
-from en4dvar.results.pack import Pack
-from en4dvar.results.packed import Alike, Content, PackedLayout, opened, unpacked, unpacked_together
+from en4dvar.results.pack import Alike, Content, Pack, PackedLayout, opened, unpacked, unpacked_together
 
 GROUPS = (
     "prior", "posterior", "prior_predictive", "posterior_predictive", "observed_data", "observation_errors",
@@ -57,7 +48,7 @@ class DamagedError(OutputError):
 class _Layout:
     """What the file must have room for: the results as a whole, of which one is in memory at a time."""
 
-    widest: Groups = field(default_factory=dict)  # the (first) data set with most parameters
+    widest: netcdf.Groups = field(default_factory=dict)  # the (first) data set with most parameters
     n_parameters: int = -1
     n_observations: int = 0
     scalars: dict[str, dict[str, Any]] = field(default_factory=lambda: {group: {} for group in GROUPS})
@@ -83,20 +74,19 @@ class _Layout:
 def save_campaign(
     path: Path, pack: Pack, sources: Mapping[str, str], attributes: Mapping[str, Any], failures: Mapping[str, str]
 ) -> Path:
-    """Write the campaign's file; one that is there already, of the same results, is left as it is.
-
-    ``sources``: name of the data set → its name in the ``pack``, in order; not empty. ``attributes``: of the root.
-    ``failures``: name of the data set without a posterior → reason.
+    """Write the campaign's file; one that is there already, of the same results, is left as it is. ``sources``: name of
+    the data set → its name in the ``pack``, in order, not empty; ``failures``: name of one without a posterior →
+    reason.
 
     Raises :class:`DamagedError`: results cannot be read. :class:`OutputError`: the file cannot be written.
     """
     digests = [pack.entries[stem].content_digest for stem in sources.values()]
     made_of = digest(json.dumps([digests, [*sources], failures]).encode())
-    if _holds(path, made_of):
+    if _said(path, damaged=True).get(MADE_OF) == made_of:
         return path
     layout = _layout(pack, sources)
     told = {FAILURES: json.dumps(failures, ensure_ascii=False), MADE_OF: made_of}
-    with netcdf_file(path) as partial, netCDF4.Dataset(partial, "w", format="NETCDF4") as target:
+    with netcdf.netcdf_file(path) as partial, netCDF4.Dataset(partial, "w", format="NETCDF4") as target:
         target.setncatts({**attributes, **told})
         _define(target, layout, len(sources))
         for begin, names, contents in _blocks(pack, sources):
@@ -104,13 +94,6 @@ def save_campaign(
             for group in GROUPS:
                 _write(target[group], begin, names, alike)
     return path
-
-
-def _holds(path: Path, made_of: str) -> bool:
-    try:
-        return path.exists() and _said(path).get(MADE_OF) == made_of
-    except OutputError:  # damaged: it is written anew
-        return False
 
 
 def _layout(pack: Pack, sources: Mapping[str, str]) -> _Layout:
@@ -138,27 +121,29 @@ def _blocks(pack: Pack, sources: Mapping[str, str]) -> Iterator[tuple[int, list[
 
 def failed_datasets(path: Path) -> dict[str, str]:
     """Name of the data set without a posterior → reason, from a campaign's file; empty where there is no such file."""
-    if not path.is_file():
-        return {}
     return {str(k): str(v) for k, v in json.loads(_said(path).get(FAILURES) or "{}").items()}
 
 
 def datasets_in(path: Path) -> list[str]:
     """The data sets in a campaign's file, in order; none where there is no such file, or it cannot be read."""
+    return list(_said(path, damaged=True).get("dataset", ()))
+
+
+def _said(path: Path, damaged: bool = False) -> dict[str, Any]:
+    """Attributes of the root, and the names of the data sets; nothing where there is no file or, if it may be
+    ``damaged``, where it cannot be read. Raises :class:`OutputError`.
+    """
     try:
-        return _said(path)["dataset"] if path.is_file() else []
+        return dict(netcdf.read_sealed(said_in, path)) if path.is_file() else {}
     except OutputError:
-        return []
-
-
-def _said(path: Path) -> Any:
-    """Attributes of the root, and the names of the data sets. Raises :class:`OutputError`."""
-    return dict(read_sealed(said_in, path))
+        if not damaged:
+            raise
+        return {}
 
 
 def said_in(path: Path) -> Iterator[tuple[str, Any]]:
     """As they are read."""
-    with opened_netcdf(path) as file:
+    with netcdf.opened_netcdf(path) as file:
         yield from ((name, str(getattr(file, name))) for name in file.ncattrs())
         yield "dataset", list(map(str, file["posterior"]["dataset"][...].tolist()))
 
@@ -172,18 +157,18 @@ def _define(target: netCDF4.Dataset, layout: _Layout, n_datasets: int) -> None:
         for dim in sorted({dim for variable in kept.values() for dim in variable.dims}):
             group.createDimension(RENAMED.get(dim, dim), layout.n_observations if dim in RENAMED else source.sizes[dim])
         about = {"units": "1", "long_name": "data set"}
-        define_variable(group, "dataset", np.dtype(object), ("dataset",), about, missing=False)
+        netcdf.define_variable(group, "dataset", np.dtype(object), ("dataset",), about, missing=False)
         for key, variable in kept.items():
             own = key not in variable.dims or key == "time"  # of each data set
             dims = tuple(RENAMED.get(dim, dim) for dim in variable.dims)
             kind, dims = variable.values.dtype, ("dataset", *dims) if own else dims
-            made = define_variable(group, key, kind, dims, attributes_of(variable), missing=own)
+            made = netcdf.define_variable(group, key, kind, dims, netcdf.attributes_of(variable), missing=own)
             if not own:
                 made[...] = variable.values
         for key, kind in layout.scalars[name].items():
             variable_name = f"{key}_total" if key in group.variables else key  # a parameter's share keeps its name
             about = {"units": "1", "long_name": key.replace("_", " "), "attribute": key}
-            define_variable(group, variable_name, np.dtype(kind), ("dataset",), about, missing=True)
+            netcdf.define_variable(group, variable_name, np.dtype(kind), ("dataset",), about, missing=True)
 
 
 def _write(group: netCDF4.Group, begin: int, names: Sequence[str], block: Sequence[Alike]) -> None:
@@ -212,7 +197,7 @@ def _write(group: netCDF4.Group, begin: int, names: Sequence[str], block: Sequen
             variable[begin : begin + len(names)] = rows
 
 
-def _place(rows: np.ndarray[Any, Any], which: list[int], variable: Variable, places: list[int] | None) -> None:
+def _place(rows: np.ndarray[Any, Any], which: list[int], variable: netcdf.Variable, places: list[int] | None) -> None:
     """Put the values of data sets that are alike into their rows of a variable, each parameter in its place."""
     if rows.shape[1:] == variable.values.shape[1:] and (places is None or PARAMETER not in variable.dims):
         rows[which] = variable.values
@@ -232,7 +217,7 @@ def _missing(variable: netCDF4.Variable[Any]) -> Any:
     return getattr(variable, "_FillValue", netCDF4.default_fillvals[np.dtype(variable.dtype).str[1:]])
 
 
-def _places(names: list[str], source: Mapping[str, Variable]) -> list[int] | None:
+def _places(names: list[str], source: Mapping[str, netcdf.Variable]) -> list[int] | None:
     """Where the parameters of a data set stand among those of the campaign, None where they are the same."""
     own = source[PARAMETER].values[0].tolist() if PARAMETER in source else names
     return None if own == names else [names.index(name) for name in own]

@@ -46,10 +46,7 @@ class CheckpointError(OutputError):
 
 
 def write_checkpoint(path: Path, fingerprint: str, content: object) -> None:
-    """Write a dataclass; it appears complete or not at all, also after a loss of power.
-
-    Raises :class:`OutputError`: the file cannot be written.
-    """
+    """Write a dataclass, all of it or nothing, also after a loss of power. Raises :class:`OutputError`."""
     payload = encode(content)
     head = " ".join((FORMAT, VERSION, type(content).__name__, fingerprint, digest(payload)))
     with atomic_path(path) as partial:
@@ -59,10 +56,8 @@ def write_checkpoint(path: Path, fingerprint: str, content: object) -> None:
 @dataclass
 class Keeper:
     """Keeps the latest state of a computation in a file, flushed to the disk: neither a kill nor a loss of power takes
-    more than what was done since.
-
-    A state is written at most every ``every`` seconds, and so seldom that writing takes a twentieth of the time; with
-    ``every`` 0 each one is.
+    more than what was done since. It is written at most every ``every`` seconds, and so seldom that writing takes a
+    twentieth of the time; with ``every`` 0 each one is.
     """
 
     path: Path
@@ -88,11 +83,7 @@ class Keeper:
 
 
 def read_checkpoint(path: Path, fingerprint: str, kind: type[D]) -> D | None:
-    """The dataclass in ``path``, or None where there is no such file.
-
-    Raises :class:`CheckpointError`: the file is not a checkpoint, incomplete, altered, or of another version, run or
-    kind.
-    """
+    """The dataclass in ``path``, None without a file. Raises :class:`CheckpointError`: it cannot be used, and why."""
     try:
         with open_plain(path) as file:
             head, _, payload = read_at_most(file, LONGEST).partition(b"\n")
@@ -145,9 +136,7 @@ def encode_text(value: Any) -> bytes:
 
 
 def decode(content: bytes, kind: type[D]) -> D:
-    """The dataclass of :func:`encode` or :func:`encode_text`. Raises :class:`ValueError` where the bytes are not one of
-    ``kind``.
-    """
+    """The dataclass of :func:`encode` or :func:`encode_text`. Raises :class:`ValueError`: it is not of ``kind``."""
     with retold((KeyError, TypeError, ValueError, struct.error), ValueError, f"not a {kind.__name__}: "):
         text, numbers = content, bytearray()
         if not content.startswith(b"{"):

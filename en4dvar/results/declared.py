@@ -25,10 +25,9 @@ _PLACEHOLDER = re.compile(r"\{(\w+)\}")
 
 @dataclass(frozen=True)
 class Item:
-    """A parameter, a series or the like for which variables are declared.
-
-    ``held``: the object that its values are taken from; ``names``: what takes the place of each placeholder; ``label``:
-    its name in prose; ``about``: its ``units``, ``display_units``, ``symbol`` and so on.
+    """A parameter, a series or the like that has variables: ``held``, the object that their values are taken from;
+    ``names`` in place of placeholders; ``label``, in prose; ``about``: ``units``, ``display_units``, ``symbol`` and so
+    on.
     """
 
     held: Any
@@ -44,10 +43,8 @@ Scopes = Mapping[str, Callable[[Any], Iterable[Item]]]
 
 @dataclass(frozen=True)
 class UnitRule:
-    """A rule for the unit of a variable, and for how it is shown.
-
-    ``words`` tell it in the reference page; ``attributes`` are those of a subject and an item; ``keys`` of them are in
-    every file.
+    """A rule for the unit of a variable and how it is shown: ``words`` for the reference page, the ``attributes`` of a
+    subject and an item, and ``keys`` of them that are in every file.
     """
 
     words: str

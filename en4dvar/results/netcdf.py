@@ -6,25 +6,29 @@ sees the same. A file is made in memory: a worker far away can do it, and a file
 
 :class:`Group` and :class:`Variable` are what the program works with: the import of xarray takes as long as an estimate.
 :func:`tree_of` and :func:`dataset_of` show them through it.
+
+The last line of a file is its seal: format, version and SHA-256 of everything before it. HDF5 has no checksum of its
+own: of files with one flipped bit most are read without a word, and some send its library into an endless loop. So the
+line, which every reader of netCDF ignores, is checked before the library gets to see the file.
 """
 
 from __future__ import annotations
 
+import hashlib
 import os
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO, Self
 
 import netCDF4
 import numpy as np
 
 from en4dvar.plumbing.decoding import Allowed, DecodeError, decoded, require_whole
 from en4dvar.plumbing.errors import DataError, OutputError, retold
-from en4dvar.plumbing.files import atomic_path
-from en4dvar.results.seal import SealedBytes, check_seal, seal_file
+from en4dvar.plumbing.files import atomic_path, open_plain
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -107,9 +111,7 @@ class Group:
         return {dim: size for v in self.every.values() for dim, size in zip(v.dims, v.values.shape, strict=True)}
 
     def check(self) -> None:
-        """Raise :class:`ValueError`, as xarray does, where variables do not agree on the length of a dimension, or
-        where a name is that of a variable and of a coordinate.
-        """
+        """Raise :class:`ValueError` where variables disagree on a dimension's length, or one is a coordinate too."""
         if both := self.variables.keys() & self.coords.keys():
             raise ValueError(f"{', '.join(sorted(both))}: both a variable and a coordinate")
         sizes = self.sizes
@@ -170,11 +172,7 @@ def _write(variable: Any, values: np.ndarray[Any, Any]) -> None:
 
 
 def read_groups(path: Path) -> dict[str, Group]:
-    """The groups of a sealed file by their paths, in memory; the file can be replaced while they are in use.
-
-    Raises :class:`OutputError`: it is none of ours, cut short or altered (see :mod:`en4dvar.results.seal`), or its
-    variables do not agree with each other.
-    """
+    """The groups of a sealed file by path, in memory. Raises :class:`OutputError`: not ours, cut short or altered."""
     return dict(read_sealed(groups_in, path))
 
 
@@ -214,7 +212,6 @@ def groups_in(path: Path) -> Iterator[tuple[str, Group]]:
 
 
 def _read(group: Any) -> Iterator[tuple[str, Group]]:
-    """A group of a file and those in it, by path."""
     attributes = Said(group.__dict__)
     listed = [str(attributes.pop("coordinates", ""))]  # xarray lists here those that are no dimension
     held = {}
@@ -242,10 +239,7 @@ def _read_variable(variable: Any) -> tuple[Variable, str]:
 
 @contextmanager
 def netcdf_file(path: Path) -> Iterator[Path]:
-    """A partial file to be written through the netCDF library; on leaving it is sealed and takes its place.
-
-    Raises :class:`OutputError` as :func:`~en4dvar.plumbing.files.atomic_path`.
-    """
+    """A partial file for the netCDF library; on leaving it is sealed and put in place. Raises :class:`OutputError`."""
     with atomic_path(path) as partial:
         try:
             yield partial
@@ -307,3 +301,85 @@ def dataset_of(group: Group) -> xr.Dataset:
 
     variables, coords = ({name: shown(v) for name, v in part.items()} for part in (group.variables, group.coords))
     return xr.Dataset(variables, coords, group.attrs)
+
+
+FORMAT = "en4dvar-result"
+VERSION = "1"
+WRITTEN: set[str] = set()
+"""Last words of the files that this process has sealed itself."""
+_LENGTH = len(f"\n{FORMAT} {VERSION} sha256 {'0' * 64}\n")
+
+
+@dataclass(frozen=True)
+class SealedBytes:
+    """A result file in memory: ``content``, which may be large and is never copied, and its last line."""
+
+    content: bytes | memoryview
+    line: bytes
+    sha256: str
+
+    @classmethod
+    def of(cls, content: bytes | memoryview) -> Self:
+        """``content`` with its last line, and the digest of both."""
+        digest = hashlib.sha256(content)
+        line = _line(digest.hexdigest())
+        digest.update(line)
+        return cls(content, line, digest.hexdigest())
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (bytes(self.content), self.line, self.sha256)
+
+    def write(self, path: Path) -> Path:
+        """Write the file atomically. Raises :class:`OutputError`."""
+        WRITTEN.add(self.line.decode("ascii"))
+        with atomic_path(path) as partial:
+            partial.write_bytes(self.content)
+            with partial.open("ab") as file:
+                file.write(self.line)
+        return path
+
+
+def seal_file(path: Path) -> None:
+    """Add the last line to a file that is written piece by piece. Raises :class:`OSError`."""
+    with path.open("r+b") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+        file.seek(0, os.SEEK_END)
+        file.write(_line(digest))
+        WRITTEN.add(_line(digest).decode("ascii"))
+
+
+def check_seal(path: Path) -> bool:
+    """Compare a whole file with its seal; returns whether this process has written it. Raises :class:`OutputError`."""
+    try:
+        with open_plain(path) as file:
+            line, digest = _last_line(file, path), hashlib.sha256()
+            left = file.tell() - _LENGTH
+            file.seek(0)
+            while left > 0 and (block := file.read(min(left, 1 << 20))):
+                digest.update(block)
+                left -= len(block)
+    except FileNotFoundError:
+        raise OutputError(f"{path}: no such file") from None
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be read: {error.strerror or error}") from None
+    if line != _line(digest.hexdigest()):
+        raise OutputError(f"{path}: damaged or altered since it was written (its checksum does not match)")
+    return line.decode("ascii") in WRITTEN
+
+
+def _last_line(file: BinaryIO, path: Path) -> bytes:
+    """The line of a result; it is looked at first, for what has none may be a terabyte long."""
+    file.seek(max(file.seek(0, os.SEEK_END) - _LENGTH, 0))
+    line = file.read()
+    words = line.decode("ascii", "replace").split()
+    if words[:1] != [FORMAT] or len(words) != 4:
+        raise OutputError(
+            f"{path}: not a complete result of en4dvar: it is cut short, was altered, or comes from an older version"
+        )
+    if words[1] != VERSION:
+        raise OutputError(f"{path}: result format {words[1]}; this version of en4dvar reads {VERSION}")
+    return line
+
+
+def _line(digest: str) -> bytes:
+    return f"\n{FORMAT} {VERSION} sha256 {digest}\n".encode("ascii")

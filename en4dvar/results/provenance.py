@@ -1,23 +1,39 @@
-"""Where a result comes from: versions, platform, commit, configuration; as attributes of the file that holds it."""
+"""Where a result comes from: versions, platform, commit, configuration, as attributes of the file that holds it; and
+what decides the numbers of a run, as text that can be compared: a run is continued only where it agrees.
 
+The latter: configuration (without ``execution`` and ``output``, which never change the numbers), versions of the
+numerical packages, sources of the framework and of the model, files that the model's settings name, content of the data
+files.
+"""
+
+import difflib
+import functools
+import inspect
 import os
 import platform
 import subprocess
-from collections.abc import Iterable
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache
 from importlib import metadata
 from pathlib import Path
+from typing import Any
+
+import yaml
+
+from en4dvar.inputs.parts import DataFile
+from en4dvar.model.forward import ForwardModel
+from en4dvar.results.checkpoint import FOLDER, digest, file_digest
 
 PACKAGES = ("en4dvar", "numpy", "scipy", "numba", "xarray", "netCDF4", "pydantic", "matplotlib")
 
 
 def provenance(config_text: str, config_path: str | Path | None = None, command: str = "") -> dict[str, str]:
-    """ACDD and provenance attributes for :meth:`en4dvar.report.result.Result.from_analysis`.
-
-    ``config_text``: the configuration, verbatim. ``config_path``: the file it was read from; the commit of the
-    repository that tracks it is recorded. ``command``: what the user typed, for ``history``.
+    """ACDD and provenance attributes of a result. ``config_text``: the configuration, verbatim; ``config_path``: its
+    file, of which the commit is recorded; ``command``: what the user typed, for ``history``.
 
     Nothing here fails: what cannot be found out (no git, an installed package) is left as an empty string.
     """
@@ -67,9 +83,8 @@ def git_commit(path: Path) -> str:
 
 def _git(folder: Path, *arguments: str) -> str:
     try:
-        done = subprocess.run(
-            ["git", "-C", str(folder), *arguments], capture_output=True, text=True, timeout=10, check=True
-        )
+        words = ["git", "-C", str(folder), *arguments]
+        done = subprocess.run(words, capture_output=True, text=True, timeout=10, check=True)
     except (OSError, subprocess.SubprocessError):
         return ""
     return done.stdout.strip()
@@ -82,3 +97,85 @@ def cpu_model() -> str:
             if line.startswith("model name"):
                 return line.partition(":")[2].strip()
     return platform.processor() or platform.machine()
+
+
+IDENTITY = f"{FOLDER}/run"  # in a run directory
+NUMERICAL = ("en4dvar", "numpy", "scipy", "numba", "llvmlite")
+_NO_NUMBERS = ("execution", "output")
+_PRIOR_FILES = ("prior", "prior_correlation")  # sections that name files
+
+
+@dataclass(frozen=True)
+class Identity:
+    """``settings``: all but the data, as YAML; ``data``: name of the data set → SHA-256 of its file."""
+
+    settings: str
+    data: tuple[tuple[str, str], ...]
+
+    def of_dataset(self, name: str) -> str:
+        """Fingerprint of one data set's result."""
+        return digest(f"{self.settings}\n{name}: {self.content[name]}".encode())
+
+    @functools.cached_property
+    def content(self) -> Mapping[str, str]:
+        """``data`` by name."""
+        return dict(self.data)
+
+    def difference(self, earlier: "Identity", retried: frozenset[str]) -> str:
+        """Unified diff from ``earlier`` to this, "" where they agree. Files of ``retried`` data sets may differ."""
+        if self == earlier:
+            return ""
+
+        def lines(identity: Identity) -> list[str]:
+            data = [f"{name}: {'' if name in retried else content}" for name, content in identity.data]
+            return [*identity.settings.splitlines(), "data files:", *data]
+
+        return "\n".join(difflib.unified_diff(lines(earlier), lines(self), "earlier run", "now", lineterm="", n=1))
+
+
+def identity(resolved: str, model: ForwardModel, data: Mapping[str, DataFile]) -> Identity:
+    """The identity of a run of the resolved configuration (YAML) on ``data`` (name → where it is)."""
+    content = yaml.safe_load(resolved)
+    settings = {key: value for key, value in content.items() if key not in _NO_NUMBERS}
+    software = {"python": f"{sys.version_info.major}.{sys.version_info.minor}", **package_versions(NUMERICAL)}
+    section = content.get("data") or {}
+    stated = [part.get(key) for part in (section, *section.get("series", {}).values()) for key in ("error", "weights")]
+    defining = (kind.__module__.partition(".")[0] for kind in type(model).__mro__ if inspect.getmodule(kind))
+    tops = dict.fromkeys(("en4dvar", *(top for top in defining if top not in ("builtins", "abc", "typing"))))
+    sources = {top: source_digest(top) for top in tops}
+    named = [content["model"], stated, *(content.get(key) for key in _PRIOR_FILES)]
+    sources |= {str(path): file_digest(path) for path in _paths(named)}
+    settings |= {"software": software, "sources": sources}
+    text = yaml.safe_dump(settings, sort_keys=False, allow_unicode=True, width=120)
+    return Identity(text, tuple((name, digest_of(file.paths)) for name, file in data.items()))
+
+
+def digest_of(paths: Sequence[Path]) -> str:
+    """SHA-256 of a file, of several that of their digests."""
+    digests = list(map(file_digest, paths))
+    return digests[0] if len(digests) == 1 else digest("\n".join(digests).encode())
+
+
+@functools.cache  # the code that runs is that of the first import
+def source_digest(module: str) -> str:
+    """SHA-256 over the Python files of the package (or the file of the module) that holds ``module``."""
+    top = sys.modules[module.partition(".")[0]]
+    if hasattr(top, "__path__"):
+        files = sorted(file for folder in top.__path__ for file in Path(folder).rglob("*.py"))
+        return digest("\n".join(f"{file.name} {file_digest(file)}" for file in files).encode())
+    return file_digest(Path(getattr(top, "__file__", None) or ""))
+
+
+def _paths(value: Any) -> Iterator[Path]:
+    """Files named anywhere in a section, e.g. a tabulated pressure or the file of a user's own law."""
+    if isinstance(value, Mapping):
+        value = [*value.values()]
+    if isinstance(value, list):
+        for item in value:
+            yield from _paths(item)
+    elif isinstance(value, str):
+        for text in (value, value.rpartition(":")[0]):  # also file:object
+            if os.path.isfile(text):
+                yield Path(text)
+        if " " in value:  # a command
+            yield from (Path(word) for word in value.split() if os.path.isabs(word) and os.path.isfile(word))

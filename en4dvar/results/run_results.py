@@ -4,16 +4,18 @@ What a campaign ought to hold is known from three places: the lines of its pack,
 ``checkpoints/run``, and those in ``posterior.nc``. Whichever is damaged, no data set vanishes without a word.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TypeVar
 
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.results.campaign_file import datasets_in
 from en4dvar.results.checkpoint import CheckpointError, read_checkpoint
-from en4dvar.results.fingerprint import IDENTITY, Identity
 from en4dvar.results.pack import PACK, Pack, file_names, known_pack, read_result, results_of
+from en4dvar.results.provenance import IDENTITY, Identity
 from en4dvar.results.store import StoredResult, load_stored, require_settled
 
+R = TypeVar("R")
 MOST_NAMES = 20
 ABSENT = "not there: lost, or not estimated yet"
 NAMELESS = "some data set"
@@ -31,14 +33,9 @@ class LackingError(OutputError):
 
 
 class RunResults:
-    """The results of a run directory, in the order of their names; of a single data set ``posterior.nc``, which need
-    not exist.
-
-    ``files``: where they are. ``lacking``: data sets of a campaign that cannot be read → why; those whose content is
-    damaged are added as they are read.
-
-    Raises :class:`OutputError` as :func:`~en4dvar.results.store.require_settled`, and of a campaign of an earlier
-    version.
+    """The results of a run directory, by name; of a single data set ``posterior.nc``, which need not exist. ``files``:
+    where they are; ``lacking``: data sets of a campaign that cannot be read → why, those whose content is damaged as
+    they are read. Raises :class:`OutputError`: a run was killed as it replaced another, or is of an earlier version.
     """
 
     def __init__(self, run_dir: Path):
@@ -72,28 +69,23 @@ class RunResults:
 
     def __iter__(self) -> Iterator[tuple[Path, StoredResult]]:
         """Each is read when its turn comes. Raises :class:`OutputError` of a single data set."""
+        for path, result in self._each(load_stored):
+            self._read = True
+            yield path, result
+
+    def _each(self, read: Callable[[Path], R]) -> Iterator[tuple[Path, R]]:
         for path in self.files:
             try:
-                result = load_stored(path)
+                yield path, read(path)
             except OutputError as error:
-                self._lack(path, error)
-            else:
-                self._read = True
-                yield path, result
-
-    def _lack(self, path: Path, error: OutputError) -> None:
-        if path == self.whole:
-            raise error
-        self.lacking[self._names.get(path.name, path.name)] = str(error).removeprefix(f"{path}: ")
+                if path == self.whole:
+                    raise
+                self.lacking[self._names.get(path.name, path.name)] = str(error).removeprefix(f"{path}: ")
 
     def check(self) -> None:
         """Compare every result with its checksum. Raises :class:`LackingError` where one cannot be read."""
-        for path in self.files:
-            if path != self.whole:
-                try:
-                    read_result(path)
-                except OutputError as error:
-                    self._lack(path, error)
+        if self.files != [self.whole]:
+            list(self._each(read_result))
         self.require()
 
     def require(self, rest: str | Path | None = None) -> None:
@@ -111,11 +103,8 @@ class RunResults:
 
 
 def result_files(run_dir: Path) -> list[Path]:
-    """Where the results of a run directory's data sets are, by name; of a single one ``posterior.nc``, which need not
-    exist.
-
-    Raises :class:`OutputError` as :class:`RunResults`; :class:`LackingError` where one that ought to be there cannot be
-    read.
+    """Where the results of a run directory's data sets are, as of :class:`RunResults`. Raises :class:`OutputError`;
+    :class:`LackingError` where one that ought to be there cannot be read.
     """
     results = RunResults(run_dir)
     results.check()

@@ -26,9 +26,7 @@ def series_file(run_dir: Path) -> Path | None:
 
 
 def series_group(result: SeriesResult | TwinResult, attributes: Mapping[str, Any]) -> Group:
-    """Estimates over (time, state), observations and innovations over (time, observation); members of a sequence, truth
-    and scores of a twin experiment.
-    """
+    """Estimates, observations and innovations in time; members of a sequence, truth and scores of a twin experiment."""
     file = "twin.nc" if isinstance(result, TwinResult) else "sequence.nc"
     root = netcdf_attributes({**attributes_of(ATTRIBUTES[file], result), **attributes})
     return Group(lay_out(TABLES[file], result, SCOPES), lay_out(COORDINATES[file], result, SCOPES), root)
@@ -53,7 +51,6 @@ def _states(r: Any) -> list[tuple[str, str]]:
 
 
 def _kinds(r: Any) -> Iterator[Item]:
-    """The kinds of estimates."""
     kinds = {"forecast": r.run.forecast, "analysis": r.run.analysis, "smoothed": r.run.smoothed}
     smooths = "smoothed" in r.scores if isinstance(r, TwinResult) else r.problem.settings.smooths
     for kind, moments in kinds.items():
@@ -112,7 +109,6 @@ STATE_COORDINATES: Table = (
 
 # Of data
 
-
 CLOCK = UnitRule(
     "time of the model", lambda r, _: {"units": _model(r).time_unit, "display_units": _model(r).time_display_unit}
 )
@@ -133,7 +129,6 @@ def _state_read(observable: Observable, model: ForwardModel) -> str:
 
 
 def _display_units(r: SeriesResult) -> list[str]:
-    """Of the variables of the state."""
     model = r.problem.start.model
     shown = {p.name: p.display_unit for p in model.parameters}
     shown |= {name: o.display_unit for o in _columns(r) if (name := _state_read(o, model))}

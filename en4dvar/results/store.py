@@ -30,8 +30,7 @@ from en4dvar.plumbing.errors import OutputError, retold
 from en4dvar.plumbing.units import UnitError, convert
 from en4dvar.results.declared import MEMBER, Axis, Declared, attributes_of, axes_of, group_of, lay_out, parameter_of
 from en4dvar.results.netcdf import Group, Groups, Variable, read_groups, understood
-from en4dvar.results.pack import PACK, read_result
-from en4dvar.results.packed import unpacked
+from en4dvar.results.pack import PACK, read_result, unpacked
 from en4dvar.results.scalars import ATTRIBUTES, SCALAR
 from en4dvar.results.variables import COORDINATES, GROUPS, OPTIONAL, SCOPES
 
@@ -105,10 +104,8 @@ class StoredResult:
     def of_readings(self, group: str, name: str, shared: bool = False) -> Array:
         """(…, K) of all readings, one series after the other: the variables ``<series>_<name>``, or of a single series
         ``name`` where that is ``shared``, as ``weights`` are."""
-        held = self.group(group)
-        return np.concatenate(
-            [held[axis.own(name) if shared else f"{axis.name}_{name}"].values for axis in self.axes], axis=-1
-        )
+        held, names = self.group(group), [a.own(name) if shared else f"{a.name}_{name}" for a in self.axes]
+        return np.concatenate([held[name].values for name in names], axis=-1)
 
     def of_parameter(self, variable: str, name: str) -> float:
         """What ``variable`` of ``sample_stats`` is for a parameter, SI."""
@@ -197,11 +194,7 @@ def require_settled(run_dir: Path) -> None:
 
 
 def load_stored(path: str | Path) -> StoredResult:
-    """Read ``posterior.nc`` into memory and close it, or what is at an address in a pack.
-
-    Raises :class:`OutputError`: it is no result, of another version, cut short or altered (see
-    :mod:`en4dvar.results.seal`).
-    """
+    """Read ``posterior.nc``, or an address in a pack. Raises :class:`OutputError`: no result, cut short or altered."""
     path = Path(path)
     with retold(ValueError, OutputError, f"{path}: not a result of en4dvar: "):  # anybody can write a checksum
         groups = unpacked(read_result(path)) if path.parent.name == PACK else read_groups(path)
@@ -209,7 +202,8 @@ def load_stored(path: str | Path) -> StoredResult:
             group.check()
             joined(groups, path_in_file).check()
     with understood(path):
-        check_complete(path, groups)
+        for fault in _faults({path_in_file: joined(groups, path_in_file) for path_in_file in groups}):
+            raise OutputError(f"{path}: not a result of en4dvar: {fault}")
     return StoredResult(groups)
 
 
@@ -225,7 +219,6 @@ def build_groups(a: Analysis, attributes: Mapping[str, Any]) -> dict[str, Group]
 
 
 # The check of what is read
-
 
 BESIDE: Mapping[str, str] = {
     "observed_data": "observation_errors",
@@ -243,12 +236,6 @@ def joined(groups: Groups, path: str) -> Group:
 
 
 _OPTIONAL = OPTIONAL | {*(f"/{name}" for name in BESIDE.values())}
-
-
-def check_complete(path: Path, groups: Groups) -> None:
-    """Check the groups of a file. Raises :class:`OutputError`, which names what is missing."""
-    for fault in _faults({path: joined(groups, path) for path in groups}):
-        raise OutputError(f"{path}: not a result of en4dvar: {fault}")
 
 
 def of_members(group: Group) -> dict[str, Variable]:
@@ -269,13 +256,13 @@ def _faults(nodes: Groups) -> Iterator[str]:
     declared = _declared(*held, tuple(of_members(nodes["/posterior"])))
     for path in required:
         content = nodes[path]
-        needed = {dim for variable in content.variables.values() for dim in variable.dims} & declared[
-            "coordinates"
-        ].keys()
-        needed |= {name for name, d in declared[path].items() if d.needed}
+        dims = {dim for variable in content.variables.values() for dim in variable.dims}
+        needed = dims & declared["coordinates"].keys() | {name for name, d in declared[path].items() if d.needed}
         if missing := sorted(name for name in needed if name not in content):
             yield f"{path} has no variable {', '.join(missing)}"
-        yield from _curve_faults(path, content, nodes)
+        for name in nodes["/log_likelihood"].variables if path.endswith("_predictive") else ():
+            if f"{name}_path" not in content and f"{name}_place" not in nodes["/observed_data"]:
+                yield f"{path} has no variable {name}_path"  # which each series has but one of a field
         yield from _label_faults(path, content, declared["coordinates"] | declared[path])
 
 
@@ -298,13 +285,6 @@ def _declared(
         path: {d.name.format(**of_item): d for d in table for of_item in names.get(d.scope, ())}
         for path, table in tables.items()
     }
-
-
-def _curve_faults(path: str, group: Group, nodes: Groups) -> Iterator[str]:
-    """Each series has a curve along the path, except one of a field."""
-    for name in nodes["/log_likelihood"].variables if path.endswith("_predictive") else ():
-        if f"{name}_path" not in group and f"{name}_place" not in nodes["/observed_data"]:
-            yield f"{path} has no variable {name}_path"
 
 
 def _label_faults(path: str, group: Group, declared: Mapping[str, Declared]) -> Iterator[str]:
@@ -331,7 +311,6 @@ def _label_faults(path: str, group: Group, declared: Mapping[str, Declared]) -> 
 
 
 def _continued(data: Group, later: Group, series: str, name: str) -> Observations:
-    """The readings of the window and those after it."""
 
     def both(of_window: str, after: str = "") -> Array:
         return np.concatenate([data[of_window].values, later[after or of_window].values])

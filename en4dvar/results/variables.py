@@ -22,20 +22,7 @@ from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.priors.prior import Prior
 from en4dvar.problem import InverseProblem
-from en4dvar.results.declared import (
-    ALWAYS,
-    MEMBER,
-    NUMBER,
-    OWN,
-    Declared,
-    Item,
-    Table,
-    UnitRule,
-    When,
-    axes_of,
-    shown_as,
-    text,
-)
+from en4dvar.results.declared import MEMBER, OWN, Declared, Item, Table, UnitRule, When, axes_of, shown_as, text
 
 SCORES = np.linspace(-4.0, 4.0, 81)  # standard scores at which a prior is kept
 SHARES = ("errors", "discrepancy", "prior")
@@ -133,7 +120,6 @@ def of_series(values: Callable[[Any], Any]) -> Callable[[Analysis, Item], Array]
 
 
 def _parameters(members: Callable[[Analysis], Array]) -> Table:
-    """Physical values of members (N, n)."""
     return (
         Declared("{parameter}", MEMBER, "{label}", lambda a, i: members(a)[None, :, i.held], OWN, needed=True),
         Declared("{walk}_pieces", f"{MEMBER} {{walk}}_piece", "{label}, over the pieces of time",
@@ -142,7 +128,6 @@ def _parameters(members: Callable[[Analysis], Array]) -> Table:
 
 
 def _predictive(members: Callable[[Analysis], Array]) -> Table:
-    """Predictions of members (N, K)."""
     return (
         Declared("{series}", f"{MEMBER} {{time}}", "{label}, noise-free prediction at the observations",
                  of_series(lambda a: members(a)[None]), OWN, needed=True),
@@ -155,17 +140,13 @@ def _paths(members: Callable[[Analysis], Array]) -> Table:
     def path(a: Analysis, item: Item) -> Array | npt.NDArray[np.float32]:
         width = len(a.trajectory_times)
         place = [part.name for part in a.problem.parts if part.has_path].index(item.held.name)
-        return _to_draw(members(a)[None, :, place * width : (place + 1) * width])
+        curves = members(a)[None, :, place * width : (place + 1) * width]
+        with np.errstate(over="ignore", under="ignore"):
+            single = curves.astype(np.float32)  # unless that cannot hold a value: curves are most of what a result is
+        return single if np.allclose(single, curves, rtol=1e-6, atol=0.0, equal_nan=True) else curves
 
     dims = f"{MEMBER} path_time"
     return (Declared("{series}_path", dims, "{label}, noise-free prediction along the path", path, OWN, PATH),)
-
-
-def _to_draw(path: Array) -> Array | npt.NDArray[np.float32]:
-    """In single precision, unless that cannot hold a value: curves are for figures, and most of what a result is."""
-    with np.errstate(over="ignore", under="ignore"):
-        single = path.astype(np.float32)
-    return single if np.allclose(single, path, rtol=1e-6, atol=0.0, equal_nan=True) else path
 
 
 OBSERVED = (
@@ -389,21 +370,21 @@ WHAT_IF = (
 )  # fmt: skip
 
 
-def _ledger(name: str, dims: str, meaning: str, values: Callable[..., Any], unit: UnitRule = NUMBER) -> Declared:
-    return Declared(name, dims, meaning, values, unit, LEDGER)
+def _ledger(name: str, dims: str, meaning: str, values: Callable[..., Any], **how: Any) -> Declared:
+    return Declared(name, dims, meaning, values, when=LEDGER, **how)
 
 
 LEDGERS = (
     _ledger("ledger_time", "path_cell path_edge", "begin and end of the cell",
-            lambda a: np.column_stack([a.ledger.edges[:-1], a.ledger.edges[1:]]), CELL_TIME),
+            lambda a: np.column_stack([a.ledger.edges[:-1], a.ledger.edges[1:]]), unit=CELL_TIME),
     _ledger("ledger_weight", "path_parameter path_cell", "share of the cell in what informed the parameter",
             lambda a: a.ledger.weights),
     _ledger("ledger_kernel", "path_parameter path_cell", "averaging kernel of the estimate over the cell",
             lambda a: a.ledger.kernel),
     _ledger("ledger_{quantity}", "path_cell", "{label}, mean size in the cell", lambda a, i: a.ledger.values[i.held],
-            OWN),
+            unit=OWN),
     _ledger("ledger_{quantity}_quantiles", "path_parameter quantile", "{label}",
-            lambda a, i: a.ledger.quantiles[:, i.held], OWN),
+            lambda a, i: a.ledger.quantiles[:, i.held], unit=OWN),
 )  # fmt: skip
 
 SAMPLE_STATS = (*MEMBERS, *READINGS, *MODES, *WHAT_IF, *LEDGERS)
@@ -470,4 +451,4 @@ def require_free_names(problem: InverseProblem) -> None:
                 if name in taken:
                     whose = f"the {declared.scope} {item.names[declared.scope]!r} needs another name"
                     raise ConfigError(f"{whose}: the result has another {name!r} in its group {path[1:]}")
-                taken |= {name} if declared.when is ALWAYS else set()
+                taken |= set() if declared.when.words else {name}

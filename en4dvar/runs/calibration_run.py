@@ -32,8 +32,7 @@ from en4dvar.plumbing.errors import ConfigError, DataError, En4dvarError
 from en4dvar.plumbing.units import convert
 from en4dvar.priors.prior import member_stream, own_seed
 from en4dvar.problem import InverseProblem
-from en4dvar.report.calibration import Calibration, load_calibration
-from en4dvar.results.calibration_file import ERRORS, FIT, LEVELS, Judged, write_sets
+from en4dvar.report.calibration import ERRORS, FIT, LEVELS, Calibration, Judged, load_calibration, write_sets
 from en4dvar.results.checkpoint import FOLDER, digest
 from en4dvar.runs.engine import KeptUnits, RunKind, Session, Tell, conduct_run
 

@@ -23,9 +23,8 @@ from en4dvar.plumbing.errors import ConfigError, OutputError
 from en4dvar.plumbing.files import write_text
 from en4dvar.plumbing.user_code import reason_of
 from en4dvar.results.checkpoint import FOLDER, CheckpointError, Keeper, read_checkpoint, write_checkpoint
-from en4dvar.results.fingerprint import IDENTITY, Identity, identity
 from en4dvar.results.netcdf import understood
-from en4dvar.results.provenance import provenance
+from en4dvar.results.provenance import IDENTITY, Identity, identity, provenance
 from en4dvar.runs.interrupt import Interrupted, tell_interrupt, terminate_as_interrupt
 from en4dvar.runs.progress import RunLog
 from en4dvar.runs.rundir import LOG, OF_EVERY_RUN, Mode, RunDirectory

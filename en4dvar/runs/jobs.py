@@ -22,9 +22,8 @@ from en4dvar.priors.prior import own_seed
 from en4dvar.problem import InverseProblem
 from en4dvar.results.checkpoint import Keeper, digest, encode_text
 from en4dvar.results.journal import Journal, KnownRuns
-from en4dvar.results.netcdf import to_bytes
-from en4dvar.results.packed import packed
-from en4dvar.results.seal import SealedBytes
+from en4dvar.results.netcdf import SealedBytes, to_bytes
+from en4dvar.results.pack import packed
 from en4dvar.results.store import build_groups
 from en4dvar.runs.campaign import DatasetOutcome
 from en4dvar.runs.progress import describe

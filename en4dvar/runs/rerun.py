@@ -19,9 +19,8 @@ from en4dvar.estimation.assimilate import assimilate
 from en4dvar.executor import choose_executor, one_blas_thread
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.results.campaign_file import failed_datasets
-from en4dvar.results.fingerprint import Identity, digest_of, identity
 from en4dvar.results.netcdf import read_groups
-from en4dvar.results.provenance import provenance
+from en4dvar.results.provenance import Identity, digest_of, identity, provenance
 from en4dvar.results.run_results import result_files
 from en4dvar.results.series_file import series_file
 from en4dvar.results.store import StoredResult, load_stored

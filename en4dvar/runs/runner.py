@@ -16,7 +16,7 @@ from en4dvar.inputs.parts import DataFile
 from en4dvar.plumbing.errors import ConfigError, DataError, Fault
 from en4dvar.results.campaign_file import DamagedError, save_campaign
 from en4dvar.results.pack import PACK
-from en4dvar.results.population_file import GROUPS, load_groups_of
+from en4dvar.results.together import GROUPS, load_groups_of
 from en4dvar.runs.campaign import Campaign
 from en4dvar.runs.checks import checked_problem
 from en4dvar.runs.engine import FIGURES, REPORT, RunKind, Session, conduct_run

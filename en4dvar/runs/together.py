@@ -24,13 +24,21 @@ from en4dvar.executor import Executor, choose_executor
 from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.errors import ConfigError, TooFewMembersError, retold
 from en4dvar.problem import InverseProblem
-from en4dvar.results import joint_file, population_file
 from en4dvar.results.checkpoint import FOLDER, digest, file_digest, write_checkpoint
-from en4dvar.results.joint_file import StoredJoint, load_joint, save_joint
 from en4dvar.results.journal import Journal, KnownRuns
-from en4dvar.results.population_file import GROUPS, StoredPopulation, load_population, save_population
 from en4dvar.results.provenance import provenance
 from en4dvar.results.store import load_stored
+from en4dvar.results.together import (
+    GROUPS,
+    JOINT,
+    POPULATION,
+    StoredJoint,
+    StoredPopulation,
+    load_joint,
+    load_population,
+    save_joint,
+    save_population,
+)
 from en4dvar.runs.engine import Kind
 from en4dvar.runs.finished import Finished, carried, finished, finished_set
 from en4dvar.runs.rundir import RunDirectory
@@ -151,11 +159,11 @@ class JointKind(TogetherKind):
     name = "joint"
     what = "joint estimate"
     fewest = 2
-    result = joint_file.FILE
+    result = JOINT
     files = (result,)
     records = (f"{FOLDER}/joint",)
     pages = ("joint.html", "joint.csv")
-    writer = "en4dvar.report.joint:write_joint"
+    writer = "en4dvar.report.together:write_joint"
 
     names: Sequence[str] = ()
     apart: Sequence[str] = ()
@@ -224,11 +232,11 @@ class PopulationKind(TogetherKind):
     name = "population"
     what = "population"
     fewest = FEWEST_SETS
-    result = population_file.FILE
+    result = POPULATION
     files = (result,)
     records = (f"{FOLDER}/population", f"{FOLDER}/population_groups_*")
     pages = ("population.html", "population.csv", "population.tex")
-    writer = "en4dvar.report.population:write_population"
+    writer = "en4dvar.report.together:write_population"
 
     names: Sequence[str] = ()
     hyper: HyperPrior | Mapping[str, float] | None = None

@@ -23,7 +23,7 @@ from en4dvar.plumbing.tables import table, write_csv
 from en4dvar.report.chart import POINTS, Chart, Panel, Row
 from en4dvar.report.paper import on_paper
 from en4dvar.results.checkpoint import FOLDER, digest, write_checkpoint
-from en4dvar.results.fingerprint import identity
+from en4dvar.results.provenance import identity
 from en4dvar.runs.engine import RunKind, Session, conduct_run
 from en4dvar.series.twin import TwinExperiment, conduct
 

@@ -19,8 +19,8 @@ from en4dvar.plumbing.tables import csv_text
 from en4dvar.problem import InverseProblem
 from en4dvar.results.checkpoint import FOLDER, Keeper, decode, encode_text, file_digest
 from en4dvar.results.journal import KnownRuns
+from en4dvar.results.netcdf import SealedBytes
 from en4dvar.results.pack import PACK, Entry, Pack, file_names, read_outcome
-from en4dvar.results.seal import SealedBytes
 from en4dvar.runs.campaign import Campaign, DatasetOutcome, Outcomes
 from en4dvar.runs.engine import Session
 from en4dvar.runs.jobs import Common, Estimate, Job, Told, estimate, estimate_and_tell

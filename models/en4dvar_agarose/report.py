@@ -15,8 +15,7 @@ from en4dvar.plumbing.files import inside, write_text
 from en4dvar.report.chart import COLUMN
 from en4dvar.report.html import render
 from en4dvar.report.svg import draw
-from en4dvar.results.netcdf import Group, Variable, to_bytes, variable
-from en4dvar.results.seal import SealedBytes
+from en4dvar.results.netcdf import Group, SealedBytes, Variable, to_bytes, variable
 from en4dvar_agarose import paper, tables
 from en4dvar_agarose.figures import all_figures
 from en4dvar_agarose.fits import DECISIVE, HYPER, LEVELS, MISFIT, Fit, Study, probability, verdict

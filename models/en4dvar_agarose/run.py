@@ -32,7 +32,7 @@ from en4dvar.plumbing.errors import OutputError, TooFewMembersError, retold
 from en4dvar.priors.prior import Prior, own_seed
 from en4dvar.problem import InverseProblem
 from en4dvar.results.checkpoint import FOLDER, CheckpointError, digest, read_checkpoint, write_checkpoint
-from en4dvar.results.fingerprint import Identity, identity, source_digest
+from en4dvar.results.provenance import Identity, identity, source_digest
 from en4dvar.runs.engine import directory_mode
 from en4dvar.runs.interrupt import tell_interrupt, terminate_as_interrupt
 from en4dvar.runs.rundir import RunDirectory

@@ -12,7 +12,6 @@ from typing import Any
 import pytest
 from run_files import add_to_pack
 
-from en4dvar import report
 from en4dvar.plumbing.caution import caution
 from en4dvar.report import write_pages
 from en4dvar.report.compare import compare_runs, write_comparison
@@ -77,7 +76,7 @@ def _write_pages(analysis: Any, renamed: Any, folder: Path) -> dict[str, Path]:
         one = replace(renamed(calm, name), posterior=(1 + 0.2 * i) * calm.posterior, cautions=notes[:i])
         add_to_pack(campaign, stem, Result.from_analysis(one, provenance("name: test\n")))
     with pytest.MonkeyPatch.context() as patch:  # two figures on each page tell as much as five
-        patch.setattr(report, "all_figures", lambda result: islice(all_figures(result), 2))
+        patch.setattr("en4dvar.report.page.all_figures", lambda result: islice(all_figures(result), 2))
         found["campaign"] = write_pages(campaign)
     found["set"] = campaign / "pages" / "c.html"
     return found

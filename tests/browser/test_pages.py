@@ -86,7 +86,10 @@ def test_a_page_of_20000_data_sets_is_as_small_as_one_of_2000(opened, pages, tmp
     one = SetSummary.of(load_stored(pages["campaign"].parent / PACK / "a"), "a")
     sets = [replace(one, name=f"set{i}", stem=f"set{i}") for i in range(20_000)]
     path = tmp_path / "report.html"
-    path.write_text(render_overview(sets, {}, {}, draw(overview_figures(sets))), encoding="utf-8")
+    path.write_text(
+        render_overview(sets, pages={}, failures={}, headlines=(), figures=draw(overview_figures(sets))),
+        encoding="utf-8",
+    )
     seen = opened(path)
     assert seen.complaints == []
     assert seen.page.locator("table.sets tbody tr").count() == LISTED

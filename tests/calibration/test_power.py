@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import binomtest
 
 import en4dvar
-from en4dvar.results.calibration_file import ERRORS
+from en4dvar.report.calibration import ERRORS
 
 SETS, REPEATS = 100, 60
 CONFIG = {

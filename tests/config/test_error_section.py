@@ -13,7 +13,7 @@ from en4dvar.config import load_config
 from en4dvar.data.noise import CorrelatedNoise
 from en4dvar.plumbing.errors import ConfigError, DataError
 from en4dvar.report.result import load_result
-from en4dvar.results.fingerprint import identity
+from en4dvar.results.provenance import identity
 
 ERROR = "position_std: 2 um"
 CORRELATED = (ERROR, "position_std: 2 um, correlation_time: 20 ms, time_std: 10 us")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import en4dvar
-from en4dvar.results.joint_file import load_joint
+from en4dvar.results.together import load_joint
 from en4dvar.runs.runner import run_campaign
 from en4dvar.runs.together import join
 from en4dvar_diffusion.synthetic import truth

@@ -19,7 +19,7 @@ from en4dvar.model.state import Parameter
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.report import populations
 from en4dvar.report.populations import compare_populations, numbers_of
-from en4dvar.results.population_file import load_groups_of, load_population
+from en4dvar.results.together import load_groups_of, load_population
 from en4dvar.runs.engine import write_report
 from en4dvar.runs.runner import run_campaign
 
@@ -115,9 +115,10 @@ def test_what_a_known_group_does_to_the_others_is_told():
     stored = {"a": SimpleNamespace(), "ref": SimpleNamespace(headline="median")}
     stored["ref"].group = lambda of: {"k_median": draws}
     together, alone = (np.column_stack([5 + s * np.linspace(-1, 1, 101), draws]) for s in (0.1, 0.5))
-    k = Parameter("k", "N/m")
+    for of_it in stored.values():
+        of_it.prior_of = lambda name: SimpleNamespace(parameter=Parameter(name, "N/m"))
     values = {"a": {}, "ref": {"k": (9.0, 0.1)}}
-    told = [*populations._calibrated("k", stored, values, k, ["scale"], together, alone)]
+    told = [*populations._calibrated("k", stored, values, together, alone)]
     assert told[0] == "k of a is 5.000 (4.909 … 5.091) N/m, calibrated by ref; without, 5.00 (4.54 … 5.46) N/m"
     assert re.fullmatch(r"k of ref is known, 9.00 ± 0.10 N/m; its own data say otherwise, 8.\d std away", told[1])
     assert len(told) == 2

@@ -17,7 +17,7 @@ from en4dvar.plumbing.errors import ConfigError
 from en4dvar.priors.dependence import Dependence
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
-from en4dvar.results.joint_file import load_joint, save_joint
+from en4dvar.results.together import load_joint, save_joint
 from en4dvar.schemes.settings import AssimilationSettings
 
 MEAN, STD = np.array([0.5, -0.5, 0.2]), np.array([0.8, 1.2, 0.9])

@@ -19,9 +19,9 @@ from en4dvar.model.state import Parameter
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem, common_to
-from en4dvar.report.joint import write_joint
-from en4dvar.results.joint_file import load_joint
+from en4dvar.report.together import write_joint
 from en4dvar.results.netcdf import read_groups, to_bytes
+from en4dvar.results.together import load_joint
 from en4dvar.runs.runner import run_campaign
 from en4dvar.schemes.settings import AssimilationSettings
 

@@ -10,7 +10,7 @@ from toy_config import csv_text, write_toy
 
 from en4dvar.cli import main
 from en4dvar.plumbing.errors import ConfigError, OutputError
-from en4dvar.results.joint_file import load_joint
+from en4dvar.results.together import load_joint
 from en4dvar.runs.runner import run_campaign
 from en4dvar.runs.together import join
 

@@ -12,7 +12,7 @@ from en4dvar.model.function_model import FunctionModel
 from en4dvar.model.state import Parameter
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
-from en4dvar.results.population_file import load_population
+from en4dvar.results.together import load_population
 from en4dvar.runs.finished import finished
 from en4dvar.runs.runner import run_campaign
 from en4dvar.schemes.settings import AssimilationSettings

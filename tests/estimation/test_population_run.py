@@ -22,8 +22,8 @@ from en4dvar.plumbing.errors import ConfigError, OutputError
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.priors.varying import RandomWalk, StateChanges
 from en4dvar.problem import InverseProblem
-from en4dvar.report.population import sentences
-from en4dvar.results.population_file import load_population
+from en4dvar.report.together import sentences
+from en4dvar.results.together import load_population
 from en4dvar.runs.runner import run_campaign
 from en4dvar.runs.together import population
 

@@ -14,7 +14,7 @@ from run_files import assert_same_results, configuration, interrupt, make_campai
 from en4dvar.cli import main
 from en4dvar.estimation.population import Effort
 from en4dvar.plumbing.errors import ConfigError
-from en4dvar.results.population_file import load_population
+from en4dvar.results.together import load_population
 from en4dvar.runs.engine import write_report
 from en4dvar.runs.runner import run_campaign
 from en4dvar.runs.together import population

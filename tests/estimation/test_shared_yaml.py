@@ -15,8 +15,8 @@ from toy_config import csv_text
 from en4dvar.cli import main
 from en4dvar.config import load_config
 from en4dvar.plumbing.errors import ConfigError
-from en4dvar.report.joint import joint_lines
-from en4dvar.results.joint_file import load_joint
+from en4dvar.report.together import joint_lines
+from en4dvar.results.together import load_joint
 from en4dvar.runs.engine import write_report
 from en4dvar.runs.runner import run_campaign
 from en4dvar.runs.together import join

@@ -215,11 +215,12 @@ def _of_few(draw: Callable[..., Any]) -> Callable[..., Any]:
 
 def _import_everything() -> None:
     """What the commands import as they go as well: half of the time of a child was that."""
-    import en4dvar.report.cycles
+    import en4dvar.report.page
+    import en4dvar.report.sequence
     import en4dvar_agarose
     import en4dvar_bubble
     import en4dvar_lorenz
-    from en4dvar.results.fingerprint import source_digest
+    from en4dvar.results.provenance import source_digest
 
     for name in USED_LATER:
         import_module(name)
@@ -227,7 +228,7 @@ def _import_everything() -> None:
         for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
             import_module(found.name)
     source_digest("en4dvar")
-    for module in (en4dvar.report, en4dvar.report.cycles):
+    for module in (en4dvar.report, en4dvar.report.page, en4dvar.report.sequence):
         module.draw = _of_few(module.draw)  # type: ignore[attr-defined]
 
 

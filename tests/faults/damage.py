@@ -16,7 +16,7 @@ import numpy as np
 from mat_damage import TAGS
 
 from en4dvar.results.checkpoint import digest
-from en4dvar.results.seal import FORMAT, seal_file
+from en4dvar.results.netcdf import FORMAT, seal_file
 
 Rng = np.random.Generator
 ODD_WORDS = (

@@ -210,7 +210,7 @@ def main() -> None:
     sys.path.insert(0, str(TESTS))
     import en4dvar.report
     import en4dvar.runs.runner  # noqa: F401
-    from en4dvar.results.fingerprint import source_digest
+    from en4dvar.results.provenance import source_digest
 
     source_digest("en4dvar")  # once for all children
     with tempfile.TemporaryDirectory() as folder:

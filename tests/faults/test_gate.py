@@ -32,10 +32,9 @@ from en4dvar.plumbing.decoding import Allowed, decoded_whole
 from en4dvar.plumbing.errors import DataError, En4dvarError, OutputError
 from en4dvar.plumbing.user_file import load
 from en4dvar.report.result import load_result
-from en4dvar.results import netcdf, seal
+from en4dvar.results import netcdf
 from en4dvar.results.checkpoint import read_checkpoint
-from en4dvar.results.netcdf import read_sealed
-from en4dvar.results.seal import seal_file
+from en4dvar.results.netcdf import read_sealed, seal_file
 from en4dvar.runs.runner import run, run_campaign
 from en4dvar_movie.choice import read_corrections
 from en4dvar_movie.frames import open_movie
@@ -303,7 +302,7 @@ def test_a_sealed_file_that_takes_its_library_down(twin: Path, tmp_path: Path, m
     """Unless this process has written it itself, another one reads it."""
     file = Path(shutil.copy(twin / "twin.nc", tmp_path))
     assert read_sealed(who_reads, file) == [os.getpid()]
-    monkeypatch.setattr(seal, "WRITTEN", set())
+    monkeypatch.setattr(netcdf, "WRITTEN", set())
     assert read_sealed(who_reads, file) != [os.getpid()]
     monkeypatch.setattr(netcdf, "Allowed", lambda *_: Allowed(seconds=1))
     with pytest.raises(OutputError) as error:

@@ -13,8 +13,8 @@ from run_files import assert_same_results, configuration, make_campaign, run_cli
 from en4dvar import report
 from en4dvar.report.compare import compare_runs
 from en4dvar.report.export import export_table
-from en4dvar.results.fingerprint import IDENTITY
 from en4dvar.results.pack import PACK, Pack
+from en4dvar.results.provenance import IDENTITY
 from en4dvar.results.run_results import MOST_NAMES, LackingError
 from en4dvar.runs.engine import write_report
 from en4dvar.runs.finished import finished

@@ -35,7 +35,7 @@ from en4dvar.report import write_pages
 from en4dvar.report.export import latex_symbol
 from en4dvar.report.result import Result as Posterior
 from en4dvar.report.result import load_result
-from en4dvar.results.seal import seal_file
+from en4dvar.results.netcdf import seal_file
 from en4dvar.runs.lock import LOCK, locked
 from en4dvar.schemes.settings import AssimilationSettings
 

@@ -14,10 +14,10 @@ from en4dvar.config import load_config
 from en4dvar.descent.preview import preview
 from en4dvar.plumbing.caution import caution
 from en4dvar.plumbing.errors import ConfigError
+from en4dvar.report.figures import bands as varying_figure
+from en4dvar.report.figures import stored_walks, verdict
 from en4dvar.report.page import render_set
 from en4dvar.report.result import load_result
-from en4dvar.report.varying import bands as varying_figure
-from en4dvar.report.varying import stored_walks, verdict
 from en4dvar.results.pack import PACK
 from en4dvar.runs.checks import validate
 from en4dvar.runs.engine import write_report

@@ -7,7 +7,8 @@ import re
 import numpy as np
 import pytest
 
-from en4dvar.report.chart import PAGE, Chart, Panel, Row, numbers, powers, stacked, steps, ticks
+from en4dvar.report.chart import PAGE, Chart, Panel, Row, numbers, powers, stacked, ticks
+from en4dvar.report.figures import steps
 from en4dvar.report.paper import on_paper, save_chart
 from en4dvar.report.svg import SHOWN, svg
 

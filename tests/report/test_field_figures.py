@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from en4dvar.plumbing.errors import OutputError
+from en4dvar.report.chart import VIRIDIS
 from en4dvar.report.figures import maps
-from en4dvar.report.palette import VIRIDIS
 from en4dvar.report.result import Result
 from en4dvar.results.netcdf import Group, Variable
 from en4dvar.results.store import StoredResult

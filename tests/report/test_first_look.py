@@ -13,10 +13,9 @@ from en4dvar.diagnosis.diagnostics import HARDLY_INFORMED
 from en4dvar.model.state import Parameter
 from en4dvar.plumbing.caution import caution
 from en4dvar.priors.prior import Prior, PriorTerm
-from en4dvar.report.figures import all_figures, histograms, neighbours
+from en4dvar.report.figures import histograms, neighbours
 from en4dvar.report.page import render_set, trust
 from en4dvar.report.result import Result
-from en4dvar.report.svg import draw
 
 JARGON = ("whitened", "leverage", "descent", "members alive", "DFS", "NRMSE", "χ²")
 
@@ -73,7 +72,7 @@ def test_a_prior_that_knew_little_does_not_flatten_the_posterior(analysis, wide)
 
 def page_of(analysis):
     result = Result.from_analysis(analysis, {})
-    return render_set(result, draw(all_figures(result)), copies=False)
+    return render_set(result)
 
 
 def test_the_page_answers_in_the_order_of_the_questions(analysis):

@@ -17,7 +17,7 @@ from en4dvar.cli import main
 from en4dvar.estimation.population import Effort
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.report.populations import Difference, _sentence
-from en4dvar.results.population_file import load_population
+from en4dvar.results.together import load_population
 from en4dvar.runs.runner import run_campaign
 from en4dvar.runs.together import population
 

@@ -23,7 +23,7 @@ from en4dvar.plumbing.caution import caution
 from en4dvar.report import write_pages
 from en4dvar.report.compare import compare_runs, comparison_table, estimates_table, write_comparison
 from en4dvar.report.export import export_table
-from en4dvar.report.readings import influence, reading_words
+from en4dvar.report.responses import influence, reading_words
 from en4dvar.report.result import Result
 from en4dvar.report.text import number_like, plus_minus
 from en4dvar.results.provenance import provenance

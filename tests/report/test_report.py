@@ -190,7 +190,7 @@ def campaign_dir(analysis, renamed, tmp_path_factory):
         result = Result.from_analysis(renamed(analysis, name), provenance("name: test\n"))
         add_to_pack(folder, file, result)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(report, "all_figures", first_figure)
+        patch.setattr("en4dvar.report.page.all_figures", first_figure)
         write_pages(folder)
     return folder
 
@@ -230,7 +230,7 @@ def test_the_script_that_runs_is_the_one_the_policy_names(campaign_dir):
 @pytest.mark.slow
 def test_large_campaign_gets_pages_on_demand(campaign_dir, tmp_path, monkeypatch):
     shutil.copy(campaign_dir / PACK, tmp_path)
-    monkeypatch.setattr(report, "all_figures", first_figure)
+    monkeypatch.setattr("en4dvar.report.page.all_figures", first_figure)
     monkeypatch.setattr(report, "PAGES", 1)
     html = write_pages(tmp_path).read_text(encoding="utf-8")
     assert [p.stem for p in (tmp_path / "pages").iterdir()] == ["one"]
@@ -246,7 +246,7 @@ def test_large_campaign_gets_pages_on_demand(campaign_dir, tmp_path, monkeypatch
 
 def test_the_table_has_the_digits_of_the_run(campaign_dir, tmp_path, monkeypatch):
     shutil.copy(campaign_dir / PACK, tmp_path)
-    monkeypatch.setattr(report, "all_figures", first_figure)
+    monkeypatch.setattr("en4dvar.report.page.all_figures", first_figure)
     write_pages(tmp_path)
     assert (tmp_path / "summary.csv").read_bytes() == (campaign_dir / "summary.csv").read_bytes()
 
@@ -282,7 +282,8 @@ def test_the_page_of_a_process_that_dies_is_drawn_here(campaign_dir, tmp_path, m
             return ((i, WorkerLostError("killed") if i == 1 else function(*call)) for i, call in enumerate(calls))
 
     shutil.copy(campaign_dir / PACK, tmp_path)
-    for name, value in {"SHARE": 1, "all_figures": first_figure, "ProcessesExecutor": Deadly}.items():
+    monkeypatch.setattr("en4dvar.report.page.all_figures", first_figure)
+    for name, value in {"SHARE": 1, "ProcessesExecutor": Deadly}.items():
         monkeypatch.setattr(report, name, value)
     write_pages(tmp_path, workers=2)
     assert len(list((tmp_path / "pages").iterdir())) == 3
@@ -292,7 +293,7 @@ def test_overview_of_many_data_sets_stays_small(analysis):
     one = SetSummary.of(Result.from_analysis(analysis, provenance("name: test\n")), "set")
     sets = [replace(one, name=f"set {i:04d}", stem=f"set_{i:04d}", cautions=()) for i in range(20_000)]
     sets[7_777] = replace(sets[7_777], cautions=one.cautions)
-    html = render_overview(sets, {}, {}, draw(overview_figures(sets)))
+    html = render_overview(sets, pages={}, failures={}, headlines=(), figures=draw(overview_figures(sets)))
     assert len(html.encode()) < 3e6
     assert html.count("<tr>") == LISTED + 1 + 4  # the heading, and the numbers of four parameters
     assert '<th scope="row">set 7777</th>' in html
@@ -320,7 +321,7 @@ def test_half_of_the_data_sets_is_half_of_those_to_be_trusted(analysis):
     name, row = next(iter(one.rows.items()))
     rows = [replace(row, mean=value, std=0.1, untrusted=("misfit",) * (value > 5)) for value in (1.0, 2.0, 3.0, 70.0)]
     sets = [replace(one, rows={name: own}) for own in rows]
-    html = render_overview(sets, {}, {}, draw(overview_figures(sets)))
+    html = render_overview(sets, pages={}, failures={}, headlines=(), figures=draw(overview_figures(sets)))
     assert "half of the data sets: 1.50 to 2.50" in html
     assert html.index("posteriors come with") < html.index('<figure class="wide" id="estimates"')
 

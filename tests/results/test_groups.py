@@ -12,8 +12,7 @@ import xarray as xr
 from en4dvar.estimation.summary import summarise
 from en4dvar.report.result import Result
 from en4dvar.results import netcdf
-from en4dvar.results.netcdf import Group, Variable, read_groups, to_bytes, tree_of
-from en4dvar.results.seal import seal_file
+from en4dvar.results.netcdf import Group, Variable, read_groups, seal_file, to_bytes, tree_of
 from en4dvar.results.store import build_groups
 
 

@@ -9,8 +9,7 @@ import pytest
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.results.checkpoint import digest
 from en4dvar.results.netcdf import Group, Variable
-from en4dvar.results.pack import PACK, Pack, read_result, results_of
-from en4dvar.results.packed import opened, packed, unpacked, unpacked_together
+from en4dvar.results.pack import PACK, Pack, opened, packed, read_result, results_of, unpacked, unpacked_together
 from en4dvar.results.store import load_stored
 
 

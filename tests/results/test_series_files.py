@@ -86,7 +86,7 @@ def test_a_panel_for_each_series(result):
     figures = {name: figure for name, _, figure in all_figures(result)}
     titles = [panel.title for row in figures["history"].rows for panel in row.panels]
     assert titles == ["p", "", "q", "", "f", ""]
-    page = render_set(result, [])
+    page = render_set(result)
     assert "18 observations, weights sum to 16" not in page
     assert "16 observations, weights sum to 16" in page
 

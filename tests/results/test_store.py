@@ -13,8 +13,8 @@ import xarray as xr
 from en4dvar.diagnosis.diagnostics import member_quantiles
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.report.result import Result, load_result
+from en4dvar.results.netcdf import SealedBytes
 from en4dvar.results.provenance import git_commit, provenance
-from en4dvar.results.seal import SealedBytes
 from en4dvar.results.store import BESIDE
 
 FAILED = 3

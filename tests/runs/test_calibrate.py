@@ -14,8 +14,7 @@ import en4dvar
 from en4dvar.cli import main
 from en4dvar.config import load_config
 from en4dvar.plumbing.errors import ConfigError, DataError, OutputError
-from en4dvar.report.calibration import load_calibration
-from en4dvar.results.calibration_file import ERRORS, FIT, Judged
+from en4dvar.report.calibration import ERRORS, FIT, Judged, load_calibration
 
 QUIET = {"output.report": False, "assimilation.members": 24}
 

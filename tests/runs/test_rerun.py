@@ -57,7 +57,7 @@ def test_what_differs_is_named(campaign):
 
 
 def test_what_has_changed_is_told(campaign, monkeypatch):
-    monkeypatch.setattr("en4dvar.results.fingerprint.source_digest", lambda module: f"another {module}")
+    monkeypatch.setattr("en4dvar.results.provenance.source_digest", lambda module: f"another {module}")
     monkeypatch.setattr("en4dvar.results.provenance.cpu_model", lambda: "another processor")
     found = rerun(campaign / "run")
     assert found.same

@@ -140,7 +140,7 @@ def test_a_changed_run_is_refused_with_the_difference(tmp_path, change):
 def test_other_sources_are_refused(tmp_path, monkeypatch):
     path, out = make_campaign(tmp_path, 2, "execution_models:Stops"), tmp_path / "run"
     interrupt(path, out, 9)
-    monkeypatch.setattr("en4dvar.results.fingerprint.source_digest", lambda module: f"another {module}")
+    monkeypatch.setattr("en4dvar.results.provenance.source_digest", lambda module: f"another {module}")
     with pytest.raises(OutputError, match=r"\+  toy_models: another toy_models") as refused:
         run_campaign(configuration(path, out), resume=True)
     assert "+  en4dvar: another en4dvar" in str(refused.value)

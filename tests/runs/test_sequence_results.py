@@ -18,8 +18,7 @@ from scipy.stats import multivariate_normal
 
 from en4dvar.data.noise import Correlation
 from en4dvar.plumbing.errors import DataError, OutputError
-from en4dvar.report.cycles import cycles_table
-from en4dvar.report.sequence import compare_sequences, sequences_table
+from en4dvar.report.sequence import compare_sequences, cycles_table, sequences_table
 from en4dvar.runs.cycles import run_sequence
 from en4dvar.runs.rerun import rerun
 from en4dvar.series.moments import log_evidence

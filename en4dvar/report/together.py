@@ -1,0 +1,356 @@
+"""The pages of estimates of several data sets: a joint one (what they share, each says alone, and is fitted) and a
+population (the mean, how much the data sets vary, the next one, and each given all of them).
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from en4dvar.diagnosis.diagnostics import HARDLY_INFORMED, member_quantiles
+from en4dvar.diagnosis.honesty.checks import MOVED
+from en4dvar.estimation.population.campaign import DETERMINED, FEWEST, Combination
+from en4dvar.estimation.population.hierarchy import named
+from en4dvar.estimation.summary import ParameterSummary, estimate_cells, results_table, summary_rows
+from en4dvar.plumbing.caution import Caution, parsed, untrusted
+from en4dvar.plumbing.files import write_text
+from en4dvar.plumbing.tables import table, write_csv
+from en4dvar.report.chart import COLUMN, PAGE, POINTS, Chart, Panel, in_columns
+from en4dvar.report.export import Found, latex_table
+from en4dvar.report.html import write_page
+from en4dvar.report.svg import svg
+from en4dvar.report.text import (
+    axis_label,
+    figure_text,
+    number_like,
+    percent,
+    plain_number,
+    plus_minus,
+    range_words,
+    shown,
+    unit_behind,
+    with_unit,
+)
+from en4dvar.results.declared import parameter_of
+from en4dvar.results.together import JOINT, POPULATION, QUANTILES, StoredGroups, StoredJoint, StoredPopulation
+
+MOST_FITS = 12  # panels of the figure
+NOTHING = np.full(1, np.nan)
+NINETY = 3.2897073  # std of a normal distribution between its 5 and 95 %
+SHARED = "Median and 5–95 % of what is shared, as each data set has it alone (grey) and as all have it together."
+FITS = "Observations and 5–95 % of the joint posterior's predictions."
+
+
+@dataclass(frozen=True)
+class JointRow(ParameterSummary):
+    """One number of the joint estimate; ``dataset`` "" for what is shared, ``without`` the names of the odd data sets
+    where they are left out. ``stated``: the data have neither narrowed nor moved what is shared.
+    """
+
+    dataset: str = ""
+    without: str = ""
+    stated: bool = False
+
+
+def estimates(joint: StoredJoint) -> tuple[JointRow, ...]:
+    """What is shared, without the odd data sets too, then what is each data set's own."""
+    posterior, odd, rows = joint.group("posterior"), ", ".join(joint.odd), []
+    for name, values in posterior.data_vars.items():
+        if "dataset" not in values.dims:
+            row = _row(joint.cautions, str(name), values)
+            rows.append(JointRow(**vars(row), stated=not row.untrusted and _as_stated(joint, str(name))))
+            continue
+        for dataset in joint.datasets:
+            own = values.sel(dataset=dataset)
+            if np.isfinite(own.values).any():
+                rows.append(JointRow(**vars(_row(joint.cautions, str(name), own)), dataset=dataset))
+    if odd:
+        doubts = parsed(joint.group("without").attrs["warnings"])
+        rest = (_row(doubts, str(name), values) for name, values in joint.group("without").data_vars.items())
+        rows += [JointRow(**vars(row), without=odd) for row in rest]
+    shared = list(joint.shared)
+    return tuple(sorted(rows, key=lambda row: (1,) if row.dataset else (0, row.stated, shared.index(row.name))))
+
+
+def _as_stated(joint: StoredJoint, name: str) -> bool:
+    """Whether the posterior of what is shared has the mean and the width of its prior."""
+    draws, (low, middle, high) = joint.group("posterior")[name].values, joint.group("prior")[name].values
+    std = (high - low) / NINETY
+    return bool(draws.std() > np.sqrt(1 - HARDLY_INFORMED) * std and abs(np.median(draws) - middle) < MOVED * std)
+
+
+def _row(
+    cautions: Sequence[Caution], name: str, draws: xr.DataArray, prior: xr.DataArray | None = None
+) -> ParameterSummary:
+    before = NOTHING if prior is None else shown(prior).ravel()
+    centre, learned = float(np.median(draws.values)), float(draws.attrs.get("learned", np.nan))
+    return ParameterSummary.of(parameter_of(name, draws.attrs), before, shown(draws).ravel(), centre, learned, cautions)
+
+
+def joint_lines(joint: StoredJoint) -> list[str]:
+    """What is shared, a line each, for the page of the campaign; one line for what the data leave as it was stated."""
+    lines, shared = [], [e for e in estimates(joint) if not e.dataset]
+    for e in (e for e in shared if not e.stated):
+        without = f" without {e.without}" if e.without else f", one value in {len(joint.datasets)} data sets"
+        interval = f"5–95 %: {range_words(e.q05, e.q95, e.std, e.unit)}"
+        doubt = f"not to be trusted: {', '.join(e.untrusted)}" if e.untrusted else interval
+        lines.append(f"{e.label} {e.name} = {number_like(e.q50, e.std)}{unit_behind(e.unit)} ({doubt}){without}")
+    if stated := [e.label for e in shared if e.stated]:
+        lines.append(f"left as stated beforehand, for the data say nothing new of them: {', '.join(stated)}")
+    return lines
+
+
+def joint_figure(joint: StoredJoint) -> str:
+    """All data sets over what they share, as SVG; without what the data leave as it was stated, where there is more."""
+    names = [name for name in joint.shared if not _as_stated(joint, name)] or joint.shared
+    shared = {name: joint.group("posterior")[name] for name in names}
+    return svg(forest(joint, joint.datasets, shared), "forest", SHARED)
+
+
+def joint_table(joint: StoredJoint) -> str:
+    """What is shared, for the terminal."""
+    rows = [
+        (f"{e.name} without {e.without}" if e.without else e.name, e.unit, *estimate_cells(e))
+        for e in estimates(joint)
+        if not e.dataset
+    ]
+    return table([("shared", "unit", "mean", "std", "5 %", "50 %", "95 %"), *rows])
+
+
+def forest(
+    groups: StoredGroups, datasets: Sequence[str], common: Mapping[str, xr.DataArray],
+    reference: Mapping[str, tuple[float, float]] | None = None,
+) -> Chart:  # fmt: skip
+    """Each data set alone, and the draws of what is ``common``, one panel each; of some a ``reference`` of others.
+    Where the posterior has the parameter for each data set too, that is drawn below.
+    """
+    alone, posterior, count = groups.group("alone"), groups.group("posterior"), len(datasets)
+    named = count <= 60
+    panels = []
+    for name, draws in common.items():
+        low, middle, high = shown(draws, member_quantiles(draws.values, QUANTILES))
+        panel = Panel(axis_label(draws), ylim=(-float(count), 1.0))
+        panel.yticks, panel.y_names = (range(0, -count, -1), [figure_text(d) for d in datasets]) if named else ((), ())
+        if not untrusted(groups.cautions, name):
+            panel.band([low, high], np.full(2, -count), np.ones(2), "posterior", 0.2)
+        panel.line([middle, middle], [-count, 1], "posterior")
+        if reference and name in reference:
+            value = float(shown(draws, reference[name][0]))
+            panel.line([value, value], [-count, 1], "ink", dash=":")
+        rows = shown(draws, alone[name].values)
+        has = np.flatnonzero(np.isfinite(rows[:, 1]))
+        panel.intervals(rows[has, 0], rows[has, 2], -has, "prior")
+        panel.dots(rows[has, 1], -has, "prior", 3.0)
+        if "dataset" in posterior.get(name, draws).dims:
+            low, middle, high = shown(draws, member_quantiles(posterior[name].values[0], QUANTILES, axis=0))
+            panel.intervals(low[has], high[has], -has - 0.3, "posterior")
+            panel.dots(middle[has], -has - 0.3, "posterior", 2.0)
+        panel.x_logarithmic = bool(np.all(rows[has] > 0) and rows[has].max() > 20 * rows[has].min())
+        panels.append(panel)
+    height = (2.0 + 0.36 * min(count, 60)) * POINTS
+    return in_columns(panels, height, width=COLUMN * (2 if len(common) > 1 else 1))
+
+
+def fits(joint: StoredJoint) -> Chart | None:
+    """Observations and bands of the first data sets that have several; no panel where a set is one number."""
+    fit, panels = joint.group("fit"), []
+    followed = [name for name in joint.datasets if np.isfinite(fit["time"].sel(dataset=name).values).sum() > 1]
+    for name in followed[:MOST_FITS]:
+        curve = fit.sel(dataset=name)
+        times, low, middle, high = curve["band"].values.T
+        label = with_unit(str(curve["observable"].item()), str(curve["unit"].item()))
+        panel = Panel(with_unit("time", str(curve["time_unit"].item())), label, title=figure_text(name))
+        panel.band(times, low, high, "posterior", 0.25)
+        panel.line(times, middle, "posterior")
+        panel.dots(curve["time"].values, curve["value"].values, "ink", 1.8)
+        panels.append(panel)
+    return in_columns(panels, 3.6 * POINTS, width=PAGE) if panels else None
+
+
+def write_joint(folder: Path) -> Path:
+    """Write ``joint.html`` and ``joint.csv`` from ``joint.nc``; returns the page. Raises :class:`OutputError`."""
+    joint = StoredJoint.load(folder / JOINT)
+    rows, fit, absent = estimates(joint), joint.group("fit"), np.full(len(joint.datasets), np.nan)
+    # of each data set under the shared values the misfit per reading, and how far it is from all others alone
+    fitted = [fit[c].values if c in fit else absent for c in ("chi2_per_observation", "distance", "chance")]
+    columns = ("name", "dataset", "without", "mean", "std", "q05", "q50", "q95", "unit")
+    cells = [[getattr(e, c) for c in columns] + [" ".join(e.untrusted)] for e in rows]
+    write_csv(folder / "joint.csv", [[*columns, "warnings"], *cells])
+    return write_page(
+        folder / "joint.html",
+        "joint.html.j2",
+        joint=joint,
+        shared=[e for e in rows if not e.dataset],
+        own=[e for e in rows if e.dataset],
+        forest=joint_figure(joint),
+        caption=SHARED,
+        fits=svg(drawn, "fits", FITS) if (drawn := fits(joint)) else "",
+        fits_caption=FITS + (f" The first {MOST_FITS}." if len(joint.datasets) > MOST_FITS else ""),
+        sets=[*zip(joint.datasets, *fitted, strict=True)],
+    )
+
+
+CAPTION = "Median and 5–95 % of each data set alone (grey) and given all (below it); band: the {} of the population{}."
+
+
+def summaries(stored: StoredPopulation, group: str = "posterior") -> list[Found]:
+    """Median, mean, spread and the next one; of the posterior also each data set, given all of them."""
+    posterior, prior = stored.group(group), stored.group("prior")
+    rows: list[Found] = []
+    for what, words in stored.words.items():
+        columns = {name: f"{name}_{what}" for name in stored.names}
+        of_it = [_row(stored.cautions, name, posterior[key], prior[key]) for name, key in columns.items()]
+        rows.append((words, tuple(of_it), stored.cautions))
+    if group != "posterior":
+        return rows
+    for dataset in stored.datasets:
+        of_set = (v.sel(dataset=dataset) for v in posterior.data_vars.values() if "dataset" in v.dims)
+        rows.append((dataset, tuple(_row(stored.cautions, str(v.name), v) for v in of_set), stored.cautions))
+    return rows
+
+
+def sentences(stored: StoredPopulation) -> tuple[str, ...]:
+    """The answer: one sentence a parameter, and what the data determine together only."""
+    of = dict(zip(stored.words, (rows for _, rows, _ in summaries(stored)), strict=False))
+    free_of = dict(zip(stored.words, (rows for _, rows, _ in summaries(stored, "without_hyperprior")), strict=True))
+    centres, free_centres, free_spreads = of[stored.headline], free_of[stored.headline], free_of["between"]
+    lines = []
+    for centre, mean, spread in zip(centres, of["mean"], of["between"], strict=True):
+        lines.append(_sentence(stored, centre, mean, spread))
+        if stored.common and not centre.untrusted:
+            of_it = stored.group("posterior")[f"{centre.name}_{stored.headline}"]
+            lines.append(_in_parts(stored, centre, of_it, centre.std))
+        lines += _compared(stored, centre)
+    odd = named(np.array([*stored.belongs.values()]), float(stored.tree.attrs.get("hyperprior_odd", 0)))
+    if odd:
+        names = ", ".join(stored.datasets[i] for i in odd)
+        lines.append(f"Perhaps not of the population, and as far as not, no part of these numbers: {names}.")
+    if "empirical" in stored.tree.children:
+        checked = [_of_sets(stored, centre) for centre in centres if not centre.untrusted]
+        lines += [f"Check without a model of the population: {words}." for words in checked]
+    lines += [_together(stored, combination) for combination in stored.combinations]
+    effective = float(stored.tree.attrs["effective_draws_without_hyperprior"])
+    if effective < FEWEST:
+        words = f"the data leave {stored.headline} or spread open, or lie in its tail"
+        return (*lines, f"What would hold without the hyperprior cannot be told from it: {words}.")
+    free = (f"{m.name} {_range(m)}, spread {_range(s)}" for m, s in zip(free_centres, free_spreads, strict=True))
+    words = f"{stored.headline} and spread equally likely everywhere"
+    return (*lines, f"Without the hyperprior ({words}): {'; '.join(free)}.")
+
+
+def _range(row: ParameterSummary) -> str:
+    return range_words(row.q05, row.q95, row.std, row.unit)
+
+
+def _sentence(
+    stored: StoredPopulation, centre: ParameterSummary, mean: ParameterSummary, between: ParameterSummary
+) -> str:
+    """The population's median (its geometric mean where it is lognormal) with its interval, mean and spread beside."""
+    if centre.untrusted and "empirical" in stored.tree.children:
+        words = f"the draws of the population are not to be trusted ({', '.join(centre.untrusted)}): see the warnings"
+        return f"{centre.label}: {_of_sets(stored, centre)}; {words}."
+    unit = unit_behind(centre.unit)
+    spread = f"{number_like(between.q50, between.std)}{unit} ({_range(between)})"
+    draws = [stored.group("posterior")[f"{centre.name}_{what}"] for what in ("mean", "between")]
+    logarithmic = _logarithmic(draws[0])
+    if logarithmic:
+        low, middle, high = map(percent, np.quantile(draws[1].values / draws[0].values, (0.05, 0.5, 0.95)))
+        spread = f"{middle} ({low} … {high})"
+    what = "median (geometric mean)" if logarithmic and stored.headline == "median" else stored.headline
+    words = f"{centre.label} {centre.name} = {number_like(centre.q50, centre.std)}{unit} (5–95 %: {_range(centre)}), "
+    words += f"the {what} of the population; from data set to data set it varies by {spread}"
+    if logarithmic and stored.headline == "median":
+        words += f"; its arithmetic mean is {number_like(mean.q50, mean.std)}{unit} ({_range(mean)})"
+    if centre.untrusted:
+        return f"{words}; not to be trusted: see the warnings."
+    return words + (f"; the median is {centre.informed}." if centre.dfs < DETERMINED and centre.informed else ".")
+
+
+def _compared(stored: StoredPopulation, centre: ParameterSummary) -> Iterator[str]:
+    if centre.name not in stored.reference:
+        return
+    posterior = stored.group("posterior")[f"{centre.name}_{stored.headline}"]
+    value, std = map(float, shown(posterior, stored.reference[centre.name]))
+    source = str(stored.tree.attrs.get("reference_source", ""))
+    stated = plus_minus(value, std) if std == std else plain_number(value, 4)
+    below = float(np.mean(shown(posterior) < value))
+    words = f"reference: {centre.name} = {stated}{unit_behind(centre.unit)}{f', {source}' if source else ''}"
+    side, chance = ("below", below) if below > 0.5 else ("above", 1 - below)
+    yield f"{words}; the estimate lies {side} it with probability {chance:.2f}."
+
+
+def _in_parts(stored: StoredPopulation, mean: ParameterSummary, of: xr.DataArray, std: float) -> str:
+    """What the interval is made of, where data sets have anything in common."""
+    between, common = map(float, shown(of, [of.attrs["std_between"], of.attrs["std_common"]]))
+    unit, shared = unit_behind(mean.unit), ", ".join(stored.common)
+    return (
+        f"Of it ± {number_like(between, std)}{unit} is from the data sets and how they differ, and ± "
+        f"{number_like(common, std)}{unit} from what they have in common ({shared}), which more of them do not reduce."
+    )
+
+
+def _of_sets(stored: StoredPopulation, centre: ParameterSummary) -> str:
+    """The median over the data sets one by one, which needs no model of how they vary."""
+    of = stored.group("empirical")[centre.name]
+    low, middle, high = shown(of)
+    std = (high - low) / 3.29
+    words = (
+        f"the median of {len(stored.datasets)} data sets one by one is {centre.name} = "
+        f"{number_like(middle, std)}{unit_behind(centre.unit)} (5–95 %: {range_words(low, high, std)}), where each "
+        "counts by the share of its prior's variance that its data took away"
+    )
+    parts = _in_parts(stored, centre, of, std).removesuffix(".") if centre.untrusted and stored.common else ""
+    return f"{words}. {parts}" if parts else words
+
+
+def _together(stored: StoredPopulation, combination: Combination) -> str:
+    """What is sharp: a product of powers where all are logarithms."""
+    names = " and ".join(name for name, _ in combination.parts)
+    if not all(_logarithmic(stored.group("posterior")[f"{name}_mean"]) for name, _ in combination.parts):
+        return f"{names}: the data determine a combination of them, and less of each."
+    powers = ((name, number_like(exponent, 0.1)) for name, exponent in combination.parts)
+    product = " · ".join(name if power == "1.00" else f"{name}^{power}" for name, power in powers)
+    return f"{names}: the data determine {product}, to {percent(combination.std)}, and less of each."
+
+
+def _logarithmic(draws: xr.DataArray) -> bool:
+    return bool(draws.attrs["transform"] == "lognormal")
+
+
+def population_lines(stored: StoredPopulation) -> Iterator[str]:
+    """What the terminal shows."""
+    yield results_table({words: rows for words, rows, _ in summaries(stored)[: len(stored.words)]})
+    yield ""
+    yield from sentences(stored)
+
+
+def population_figure(stored: StoredPopulation) -> str:
+    """All data sets over the population, as SVG."""
+    posterior = stored.group("posterior")
+    centres = {name: posterior[f"{name}_{stored.headline}"] for name in stored.names}
+    return svg(forest(stored, stored.datasets, centres, stored.reference), "forest", caption(stored))
+
+
+def caption(stored: StoredPopulation) -> str:
+    """Of the figure."""
+    return CAPTION.format(stored.headline, "; dotted: the reference" if stored.reference else "")
+
+
+def write_population(folder: Path) -> Path:
+    """Write ``population.html``, ``.csv``, ``.tex`` from its file; returns the page. Raises :class:`OutputError`."""
+    stored = StoredPopulation.load(folder / POPULATION)
+    rows = summaries(stored)
+    write_csv(folder / "population.csv", summary_rows(rows, {}))
+    write_text(folder / "population.tex", latex_table(rows))
+    return write_page(
+        folder / "population.html",
+        "population.html.j2",
+        stored=stored,
+        sentences=sentences(stored),
+        population=rows[: len(stored.words)],
+        sets=rows[len(stored.words) :],
+        forest=population_figure(stored),
+        caption=caption(stored),
+    )
