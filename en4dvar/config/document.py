@@ -18,9 +18,9 @@ from typing import Any, cast
 import yaml
 
 from en4dvar.inputs.parts import SUFFIXES
-from en4dvar.plumbing.errors import ConfigError, DataError, Fault
+from en4dvar.plumbing.errors import ConfigError, DataError, Fault, retold
 from en4dvar.plumbing.files import open_plain
-from en4dvar.plumbing.hints import brief, no_such_file, shown
+from en4dvar.plumbing.hints import brief, shown
 from en4dvar.plumbing.units import UnitError
 
 Key = tuple[str | int, ...]
@@ -106,17 +106,16 @@ class Document:
 
 def read_document(path: Path) -> Document:
     """Read and parse a YAML file. Raises :class:`ConfigError` listing every fault found."""
+    if os.path.isdir(path):
+        raise ConfigError(_propose("a folder", path))
+    with retold(OSError, ConfigError, f"{path}: "), open_plain(path) as file:
+        content = file.read(LONGEST + 1)
     try:
-        with open_plain(path) as file:
-            content = file.read(LONGEST + 1)
         if len(content) > LONGEST:
             words = f"longer than {LONGEST / 1e6:g} MB, which no configuration is; numbers belong into data files"
             raise ConfigError([Fault(words, file=str(path))])
         text = content.decode("utf-8-sig")
         return parse_document(text, str(path))
-    except OSError as error:
-        missing = no_such_file(path) if isinstance(error, FileNotFoundError) else f"{path}: {error.strerror}"
-        raise ConfigError(_propose("a folder", path) if path.is_dir() else missing) from None
     except UnicodeDecodeError as error:
         fault = ConfigError([Fault(f"not UTF-8 text ({error.reason} at byte {error.start})", file=str(path))])
     except ConfigError as error:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from en4dvar.inputs.parts import Layout, Matrix, opened, read_contents, require_file
+from en4dvar.inputs.parts import Layout, Matrix, opened, read_contents, readable
 from en4dvar.inputs.text_table import cells_of, delimiter_of, number_in, numbered_lines
 from en4dvar.model.state import Array
 from en4dvar.plumbing.decoding import Allowed, DecodeError, ForeignDataError, decoded_whole, require_whole
@@ -68,7 +68,6 @@ def read_members(path: Path, units: Mapping[str, tuple[str, str]]) -> dict[str, 
     ------
     DataError: the file cannot be read, lacks a name or a unit, or holds numbers that are not finite.
     """
-    require_file(path)
     columns = _of_netcdf(path, units) if path.suffix.lower() in NETCDF else _of_table(path, units)
     lengths = {name: len(values) for name, (values, _) in columns.items()}
     if len(set(lengths.values())) != 1:
@@ -90,8 +89,8 @@ def read_centres(path: Path, units: Mapping[str, str]) -> dict[str, dict[str, fl
     """
     if path.suffix.lower() != ".csv":
         return {}
-    require_file(path)
-    rows = csv.DictReader(line for _, line in numbered_lines(path))
+    with readable(path):
+        rows = csv.DictReader(line for _, line in numbered_lines(path))
     if not {"dataset", "name", "unit", "centre"} <= {*(rows.fieldnames or ())}:
         return {}
     sets: dict[str, dict[str, float]] = {}

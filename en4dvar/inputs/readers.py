@@ -86,13 +86,12 @@ def read_series(
     """
     if part and layout.by is None and "*" in value.name:
         value = replace(value, name=part)
-    wanted = [c.name for c in (value, time, *errors) if isinstance(c, Column)]
+    asked = [column for column in (value, time, *errors) if isinstance(column, Column)]
+    wanted = [column.name for column in asked]
     columns, scalars, lines = columns_of(path, layout, wanted, part)
-    values = convert(columns[value.name], value.unit, value.target)
-    if isinstance(time, Column):
-        times = convert(columns[time.name], time.unit, time.target)
-    else:
-        times = np.asarray(_step(time, scalars, path) * np.arange(len(values)), dtype=float)
+    converted = {column: convert(columns[column.name], column.unit, column.target) for column in asked}
+    values = converted[value]
+    times = converted[time] if isinstance(time, Column) else _step(time, scalars, path) * np.arange(float(len(values)))
     if not len(values):
         raise DataError(f"{path}: {value.name!r} is empty")
     if len(times) != len(values):
@@ -106,7 +105,7 @@ def read_series(
     _check(times[kept], values[kept], value.name, path, fewest, zero)
     if repeats:
         kept = kept[np.argsort(times[kept], kind="stable")]
-    stated = {column.name: _stds(columns[column.name], column, kept, len(values), path) for column in errors}
+    stated = {c.name: _stds(c, converted[c], columns[c.name], kept, len(values), path) for c in errors}
     if isinstance(time, Column) and not repeats:
         written = columns[time.name][kept]
         InFile(path, layout, kept, lines, written, time.unit, wanted).require_order(times[kept], values[kept])
@@ -148,11 +147,11 @@ def _kept(read: Readings, which: slice | npt.NDArray[np.bool_]) -> Readings:
     return replace(read, times=read.times[which], values=read.values[which], errors=errors, rows=rows)
 
 
-def _stds(written: Array, column: Column, kept: Rows, count: int, path: Path) -> Array:
+def _stds(column: Column, every: Array, written: Array, kept: Rows, count: int, path: Path) -> Array:
     """Standard deviations, weights or places of the kept readings; one missing or of a wrong sign raises DataError."""
-    if len(written) != count:
-        raise DataError(f"{path}: {len(written)} values of {column.name!r} but {count} readings")
-    stds = np.asarray(convert(written[kept], column.unit, column.target))
+    if len(every) != count:
+        raise DataError(f"{path}: {len(every)} values of {column.name!r} but {count} readings")
+    stds = every[kept]
     fits, wrong_sign = {
         "std": (stds > 0, "not positive"),
         "weight": (stds >= 0, "negative"),

@@ -198,12 +198,12 @@ def number_in(cell: str, name: str, path: Path, line: int, decimal: Decimal | No
     """A cell as a number, NaN where it is blank; ``decimal`` None: a point, without a word on the setting."""
     if cell.lower() in BLANK:
         return float("nan")
-    text = cell.replace(",", ".") if decimal == "," and "." not in cell else cell
-    if not is_number(text):
-        comma = decimal != "," and "," in cell and is_number(cell.replace(",", "."))
-        hint = "; write a decimal point" + (", or data.decimal: ','" if decimal else "") if comma else ""
-        raise DataError(f"{path}:{line}: {short(cell)!r} in column {short(name)!r} is not a number{hint}")
-    return float(text)
+    try:
+        return float(cell.replace(",", ".") if decimal == "," and "." not in cell else cell)
+    except ValueError:
+        comma = decimal != "," and "," in cell and _holds_number([cell])
+    hint = "; write a decimal point" + (", or data.decimal: ','" if decimal else "") if comma else ""
+    raise DataError(f"{path}:{line}: {short(cell)!r} in column {short(name)!r} is not a number{hint}")
 
 
 if TYPE_CHECKING:

@@ -90,16 +90,14 @@ def own_file(path: Path) -> int:
 
 
 def open_plain(path: Path) -> io.BufferedReader:
-    """Open a file for reading. Raises :class:`OSError`, also for a pipe or a device, whose reading may never end."""
+    """Open a file for reading. Raises :class:`OSError`, also for a folder, a pipe, a device, that may never end."""
     if "\0" in str(path):
         raise OSError(errno.EINVAL, "a null byte in its name", str(path))
     handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     mode = os.fstat(handle).st_mode
     if not stat.S_ISREG(mode):
         os.close(handle)
-        if stat.S_ISDIR(mode):
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-        raise OSError(errno.EINVAL, f"not a plain file but {kind_of(mode)}", str(path))
+        raise OSError(errno.EINVAL, f"is {kind_of(mode)}, not a file", str(path))
     return open(path, "rb", opener=lambda *_: handle)
 
 

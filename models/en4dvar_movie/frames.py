@@ -19,7 +19,7 @@ import numpy.typing as npt
 from en4dvar.plumbing.decoding import Allowed, DecodeError, decoded, decoded_whole, require_plain
 from en4dvar.plumbing.errors import DataError, En4dvarError, retold
 from en4dvar.plumbing.files import open_plain
-from en4dvar.plumbing.hints import no_such_file
+from en4dvar.plumbing.hints import beside
 from en4dvar_movie.decoders import check_size, image, library, tiff_about, tiff_frames, video_about, video_frames
 from en4dvar_movie.numbering import in_order
 
@@ -90,7 +90,7 @@ def open_movie(path: str | Path, raw: str | None = None) -> Movie:
     """
     path = Path(path).expanduser()
     if not path.exists():
-        raise DataError(no_such_file(path))
+        raise DataError(f"{path}: {beside(path)}")
     if raw is not None:
         return _raw(path, raw)
     if path.is_dir():

@@ -21,7 +21,7 @@ from en4dvar.model.programs.languages import TIMES, ProgramError, check_template
 from en4dvar.plumbing.described import Described, text_for
 from en4dvar.plumbing.errors import retold
 from en4dvar.plumbing.files import POSIX, expanded, read_text
-from en4dvar.plumbing.hints import no_such_file, suggest
+from en4dvar.plumbing.hints import beside, suggest
 from en4dvar.plumbing.units import Quantity, parse_unit
 
 OUTPUT = "output"  # the file that {output} names
@@ -63,7 +63,7 @@ def _file(text: Any, info: ValidationInfo) -> Any:
         return text
     path = _base(info) / expanded(str(text))
     if not path.is_file():
-        raise ValueError(no_such_file(path))
+        raise ValueError(f"{path}: {beside(path)}")
     return path.absolute()
 
 
@@ -190,7 +190,7 @@ def _placed(command: str, info: ValidationInfo) -> str:
     if Path(first).name != first:
         path = base / expanded(first)
         if not path.is_file():
-            raise ValueError(no_such_file(path))
+            raise ValueError(f"{path}: {beside(path)}")
         if not os.access(path, os.X_OK):
             raise ValueError(f"{path}: is not executable; chmod +x it, or begin with the program that runs it")
         first = str(path.absolute())
