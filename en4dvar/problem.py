@@ -8,7 +8,7 @@ from typing import Any
 from en4dvar.data.observations import Observations
 from en4dvar.data.series import Part
 from en4dvar.model.forward import Alternative, ForwardModel, Observable
-from en4dvar.model.state import DISCREPANCY, NOISE_SCALE, READING_OFFSET, READING_SCALE, Parameter
+from en4dvar.model.state import DISCREPANCY, NOISE_SCALE, Parameter
 from en4dvar.plumbing.moved import former_name
 from en4dvar.priors.field_prior import FieldPrior
 from en4dvar.priors.prior import Prior, PriorTerm
@@ -87,22 +87,8 @@ class InverseProblem:
         observed = {part.observable.name for part in self.parts}
         return tuple(a for a in self.model.alternatives if not a.observable or observed == {a.observable})
 
-    @property
-    def has_noise_scale(self) -> bool:
-        """Whether ``sigma`` is given and scales the observation errors (rather than being the model's own)."""
-        return self._has(NOISE_SCALE)
-
-    @property
-    def has_reading_scale(self) -> bool:
-        """Whether ``reading_scale`` is given and scales the predictions (rather than being the model's own)."""
-        return self._has(READING_SCALE)
-
-    @property
-    def has_reading_offset(self) -> bool:
-        """Whether ``reading_offset`` is given and is added to the predictions (rather than being the model's own)."""
-        return self._has(READING_OFFSET)
-
-    def _has(self, parameter: Parameter) -> bool:
+    def has(self, parameter: Parameter) -> bool:
+        """Whether ``sigma``, ``reading_scale`` or ``reading_offset`` is given, rather than being the model's own."""
         stated = parameter.name in self.prior.names or parameter.name in self.fixed
         return stated and all(p.name != parameter.name for p in self.model.parameters)
 
@@ -121,7 +107,7 @@ class InverseProblem:
     @property
     def of_errors(self) -> frozenset[str]:
         """Names of the parameters of R: its scale, amplitude and length of a discrepancy."""
-        scale = (NOISE_SCALE,) if self.has_noise_scale else ()
+        scale = (NOISE_SCALE,) if self.has(NOISE_SCALE) else ()
         return frozenset(p.name for p in (*self.discrepancy, *scale))
 
     @property
@@ -142,9 +128,8 @@ class InverseProblem:
     def varied(self, varying: Sequence[Varying]) -> "InverseProblem":
         """The same with what varies; the changes join the control vector at its end."""
         changes = (term for variation in varying for term in variation.terms)
-        return replace(
-            self, model=PiecewiseModel(self.model, varying), prior=self.prior.of((*self.prior.terms, *changes))
-        )
+        prior = self.prior.of((*self.prior.terms, *changes))
+        return replace(self, model=PiecewiseModel(self.model, varying), prior=prior)
 
     @property
     def constant(self) -> "InverseProblem":
@@ -169,10 +154,8 @@ def common_to(problems: Sequence[InverseProblem], names: Collection[str]) -> tup
     """Parameters with one value in all data sets that estimate them, two at least: those that are declared so
     (:attr:`Parameter.common`), not of ``names``, and have the same uncorrelated prior in all.
     """
-    correlated, terms = (
-        {n for p in problems for block in p.prior.blocks for n in block.names},
-        dict[str, list[PriorTerm]](),
-    )
+    correlated = {name for problem in problems for block in problem.prior.blocks for name in block.names}
+    terms: dict[str, list[PriorTerm]] = {}
     for term in (term for problem in problems for term in problem.prior.terms):
         terms.setdefault(term.parameter.name, []).append(term)
     return tuple(

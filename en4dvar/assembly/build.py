@@ -79,9 +79,8 @@ def problem_of(config: Config, observations: Observations) -> InverseProblem:
         fields = ()
     terms = (*terms, *(start.term for start in perturbed), *discrepancy_terms(config, observations))
     estimated = {term.parameter.name for term in terms}
-    tied = tuple(
-        Tie(e.parameter, e.to, e.factor) for e in config.parameters if isinstance(e, Tied) and e.to in estimated
-    )
+    following = (entry for entry in config.parameters if isinstance(entry, Tied) and entry.to in estimated)
+    tied = tuple(Tie(entry.parameter, entry.to, entry.factor) for entry in following)
     perturbations = tuple(start.perturbation for start in perturbed)
     varying = _varying(config, observations, terms)
     count, localised = len(terms) + sum(len(change.terms) for change in varying), asked.localisation is not None
@@ -165,10 +164,8 @@ def _files_of(series: SeriesPlan) -> dict[str, DataFile]:
     data = series.data
     with retold(DataError, DataError, "", series.name):
         files = find_files(data.path.base, data.path.texts)
-    time = data.columns.time
-    return with_parts(
-        files, data.columns.observable, data.part(Layout), time.name if isinstance(time, Column) else None
-    )
+    time = data.columns.time.name if isinstance(data.columns.time, Column) else None
+    return with_parts(files, data.columns.observable, data.part(Layout), time)
 
 
 def resolve_parameters(

@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar, get_args
 
@@ -244,16 +245,9 @@ def _known(thing: T | None) -> T:
 Unit = Callable[[Context], str]
 
 
-def time_unit(context: Context) -> str:
-    return context.units.time_unit
-
-
-def observable_unit(context: Context) -> str:
-    return context.observable.unit
-
-
-def subject_unit(context: Context) -> str:
-    return str(context.subject.unit)
+time_unit: Unit = attrgetter("units.time_unit")
+observable_unit: Unit = attrgetter("observable.unit")
+subject_unit: Unit = attrgetter("subject.unit")
 
 
 @dataclass(frozen=True, eq=False)

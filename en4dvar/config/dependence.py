@@ -30,6 +30,8 @@ from en4dvar.priors.dependence import Dependence, KernelName, correlation_of_pla
 from en4dvar.priors.prior import PriorTerm
 
 KINDS = ("correlation", "matrix", "file", "kernel")
+Patterns = str | tuple[str, ...]
+Grouped = Mapping[str, Mapping[str, Patterns]]  # kind → group → patterns of names
 
 A_FILE = Made(lambda text, context: context.path(text), Annotated[str, Field(min_length=1)], {"type": "string"})
 Position = float | tuple[float, ...]
@@ -72,9 +74,8 @@ class PriorCorrelation(Section):
         if self.kernel is not None:
             places = [np.atleast_1d(np.asarray(place, dtype=float)) for place in self.at or ()]
             if len(places) != len(self.between) or len({len(place) for place in places}) != 1:
-                raise ConfigError(
-                    f"at: give {len(self.between)} places, one per parameter, all with the same number of coordinates"
-                )
+                count = len(self.between)
+                raise ConfigError(f"at: give {count} places, one a parameter, all with the same number of coordinates")
             return correlation_of_places(self.kernel or "", np.stack(places), self.length or 1.0)
         rows = self.matrix or ()
         if len({len(row) for row in rows}) != 1:
@@ -169,9 +170,8 @@ def _of_ensemble(
 ) -> tuple[tuple[Dependence, ...], dict[str, Entry]]:
     """The Gaussian of the members' mean and covariance in transformed space. Raises :class:`ConfigError` with paths."""
     if ensemble is None:
-        raise ConfigError(
-            "no ensemble is given; write 'prior: {ensemble: FILE}'", f"parameters.{asking[0].parameter.name}"
-        )
+        first = asking[0].parameter.name
+        raise ConfigError("no ensemble is given; write 'prior: {ensemble: FILE}'", f"parameters.{first}")
     if not asking:
         raise ConfigError("no parameter takes its prior from it; write e.g. 'G: {prior: ensemble}'", "prior")
     for entry in asking:
@@ -249,9 +249,7 @@ class PopulationSection(_HyperPrior):
     have in common, such as scale and density."""
 
 
-def check_population(
-    section: PopulationSection, entries: Sequence[Entry], groups: Mapping[str, Mapping[str, object]], document: Document
-) -> None:
+def check_population(section: PopulationSection, entries: Sequence[Entry], groups: Grouped, document: Document) -> None:
     """Raises :class:`ConfigError`: every parameter that is not estimated, or whose prior depends on the data set; an
     unknown kind of group.
     """
@@ -314,7 +312,6 @@ def reference_value(text: str, unit: str) -> tuple[float, float]:
 
 
 ALL, NONE = "all", "none"
-Patterns = str | tuple[str, ...]
 Groups = dict[Name, Annotated[dict[GroupName, Patterns], Field(min_length=1)]]
 
 
@@ -323,7 +320,7 @@ class Sharing:
     """``kinds``: shared parameter → kind of group, or ``all``; ``groups``: kind → group → patterns of names."""
 
     kinds: Mapping[str, str]
-    groups: Mapping[str, Mapping[str, Patterns]]
+    groups: Grouped
     document: Document
 
     def of_dataset(self, name: str) -> dict[str, str]:
@@ -344,11 +341,7 @@ class Sharing:
 
 
 def sharing_of(
-    entries: Sequence[Entry],
-    groups: Mapping[str, Mapping[str, Patterns]],
-    correlated: bool,
-    several_series: bool,
-    document: Document,
+    entries: Sequence[Entry], groups: Grouped, correlated: bool, several_series: bool, document: Document
 ) -> Sharing:
     """The parameters that a file asks to be shared. Raises :class:`ConfigError`: every entry that cannot be."""
     asked = {e.parameter.name: e for e in entries if isinstance(e, Uncertain) and e.spec.shared not in (None, NONE)}

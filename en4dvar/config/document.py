@@ -25,6 +25,7 @@ from en4dvar.plumbing.units import UnitError
 
 Key = tuple[str | int, ...]
 Mark = tuple[int, int]  # line and column, from 1
+Source = str | Path | Mapping[str, Any]  # of a configuration
 
 LONGEST = 1_000_000  # bytes of a file, some ten seconds to read: the paths of 10 000 data sets and more
 
@@ -167,7 +168,7 @@ def parse_document(text: str, file: str = "") -> Document:
     return replace(document, data=data)
 
 
-def document_from(source: str | Path | Mapping[str, Any]) -> tuple[Document, Path]:
+def document_from(source: Source) -> tuple[Document, Path]:
     """A YAML file, or a dict of the same, and the folder where its relative paths start: the file's, or this one.
 
     Raises :class:`ConfigError`.
@@ -196,9 +197,8 @@ def override(document: Document, overrides: Mapping[str, Any], option: str = "--
         for n, part in enumerate(path[:-1], 1):
             node = node.setdefault(part, {})
             if not isinstance(node, dict):
-                faults.append(
-                    Fault(f"{'.'.join(path[:n])!r} is a single value; nothing can be set inside it", file=origin)
-                )
+                single = f"{'.'.join(path[:n])!r} is a single value; nothing can be set inside it"
+                faults.append(Fault(single, file=origin))
                 break
         else:
             if not all(path):

@@ -8,7 +8,7 @@ further kinds of files (group ``en4dvar.schemas``: the key that marks the kind â
 
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from functools import cache
 from typing import Any
 
@@ -122,26 +122,18 @@ def _models(definitions: Json) -> Iterator[str]:
             kind: Any = find_model(name)
         except En4dvarError:
             continue
-        settings = _of(settings_of(kind).model_json_schema())
-        settings["properties"] = {
-            "name": {"const": name, "description": "Name of the model."},
-            **settings["properties"],
-        }
+        section: Any = settings_of(kind)
+        settings = _of(section.model_json_schema())
+        own = {"const": name, "description": "Name of the model."}
+        settings["properties"] = {"name": own, **settings["properties"]}
         definitions[f"model_{name}"] = settings
-        definitions[f"parameters_{name}"] = _parameters(_possible_parameters(kind))
+        fixed = getattr(kind, "parameters", ())  # where they depend on its settings, a property, and these tell
+        possible = section.possible_parameters() if hasattr(section, "possible_parameters") else fixed
+        definitions[f"parameters_{name}"] = _parameters(possible if isinstance(possible, Collection) else ())
         yield name
 
 
-def _possible_parameters(kind: Any) -> tuple[Parameter, ...]:
-    """Every parameter that a model may have; where they depend on its settings, these tell."""
-    settings: Any = settings_of(kind)
-    if hasattr(settings, "possible_parameters"):
-        return tuple(settings.possible_parameters())
-    fixed = getattr(kind, "parameters", ())
-    return fixed if isinstance(fixed, tuple) else ()
-
-
-def _parameters(known: tuple[Parameter, ...]) -> Json:
+def _parameters(known: Collection[Parameter]) -> Json:
     """The ``parameters`` section: names that an editor can offer; others are a matter of the model's settings."""
     named = {p.name: p for p in (*known, *OF_READINGS)}
     entry = {"$ref": "#/$defs/parameter"}

@@ -32,10 +32,6 @@ from en4dvar.series.start import EnsembleCoordinates
 from en4dvar.series.twin import TwinExperiment
 
 
-def _observation_stds(model: ForwardModel) -> dict[str, Observable]:
-    return {f"{observable.name}_std": observable for observable in model.observables}
-
-
 def _correlation(path: str, context: Context) -> tuple[str, Correlation]:
     """The absolute path and the matrix."""
     with retold((DataError, ValueError), ConfigError):
@@ -52,7 +48,7 @@ class Twin(Section):
     """Cycles at the beginning that are left out of the scores."""
     interval: Annotated[float, quantity(time_unit, "positive")]
     """Time between two observations, in the model's unit of time."""
-    error: Annotated[dict[str, float], stds(_observation_stds)]
+    error: Annotated[dict[str, float], stds(lambda model: {f"{o.name}_std": o for o in model.observables})]
     """Std of the observation errors, by observable: ``<observable>_std``."""
     error_correlation: (
         Annotated[tuple[str, Correlation], Made(_correlation, Annotated[str, Field(min_length=1)])] | None
@@ -283,10 +279,6 @@ class GroupSection(Section):
     """What their truths are drawn from: a prior (drawn for each) or a quantity (common to all)."""
 
 
-def _end(text: Any, context: Context) -> float:
-    return 0.0 if text == 0 and text is not False else parse_quantity(text, time_unit(context))
-
-
 def _ascending(written: Any, validate: ValidatorFunctionWrapHandler) -> tuple[float, float]:
     low, high = validate(written)
     if low is not None and low > high:
@@ -300,7 +292,8 @@ def _positive(pair: tuple[float, float]) -> tuple[float, float]:
     return pair
 
 
-End = Annotated[float, Made(_end)]
+NOUGHT = ("0", "0.0")  # needs no unit
+End = Annotated[float, Made(lambda text, c: 0.0 if str(text) in NOUGHT else parse_quantity(text, time_unit(c)))]
 Interval = Annotated[tuple[End, End], WrapValidator(_ascending)]
 
 

@@ -21,7 +21,7 @@ from en4dvar.config.dependence import (
     sharing_of,
 )
 from en4dvar.config.design import Design, Times, read_times
-from en4dvar.config.document import Document, document_from, override, parse_document
+from en4dvar.config.document import Document, Source, document_from, override, parse_document
 from en4dvar.config.models import read_model
 from en4dvar.config.parameters import Entry, Fixed, Uncertain, entries
 from en4dvar.config.schema import Assimilation, Execution, File, GivenStart, Output, Section
@@ -116,7 +116,7 @@ class Config(Validated):
     population: PopulationSection | None = None
 
 
-def load_config(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> Config:
+def load_config(source: Source, overrides: Mapping[str, Any] | None = None) -> Config:
     """Read and validate a configuration.
 
     Parameters
@@ -255,9 +255,7 @@ def in_order(faults: Iterable[Fault]) -> list[Fault]:
     return sorted(dict.fromkeys(faults), key=lambda fault: (fault.file, fault.line, fault.column))
 
 
-def values_of(
-    start: GivenStart, entries: Sequence[Entry], document: Document
-) -> Mapping[str, float | Mapping[str, float]]:
+def values_of(start: GivenStart, entries: Sequence[Entry], document: Document) -> Mapping[str, Any]:
     """The value of each parameter that the start names, or of all where it is a file, in the parameters' units; of a
     summary of data sets, by their names.
 

@@ -86,10 +86,6 @@ def or_column(read: Callable[[Any, Context], Any], unit: Unit) -> Callable[[Any,
 read_error_std = or_column(read_spread, observable_unit)
 
 
-class MarkColumn(OfReadings):
-    """A column of 1 where a reading is a bound and 0 where it is none."""
-
-
 def _shared(written: Any, context: Context) -> tuple[Spread | Column, ...]:
     parts = [read_error_std(part, context) for part in (written if isinstance(written, list) else [written])]
     return tuple(replace(part, kind="shared") if isinstance(part, Column) else part for part in parts)
@@ -97,11 +93,15 @@ def _shared(written: Any, context: Context) -> tuple[Spread | Column, ...]:
 
 MARKS = Made(
     lambda mark, context: mark if isinstance(mark, bool) else Column(mark.column, "1", "1", kind="mark"),
-    bool | MarkColumn,
+    bool | OfReadings,
 )
 QUANTITY_OR_COLUMN = {"anyOf": [TEXT, ErrorColumn.model_json_schema()]}
 
 LogStd = Annotated[float, Field(gt=0)]
+
+
+def rate_unit(context: Context) -> str:
+    return f"({observable_unit(context)})/({time_unit(context)})"
 
 
 class AmplitudeSection(Section):
@@ -133,9 +133,7 @@ class DiscrepancySection(Section):
     """Prior of ``discrepancy_length``, its correlation time."""
     kernel: Literal["exponential", "matern-3/2", "matern-5/2"] = "exponential"
     """Correlation in time: exponential (rough paths), or Matérn's with one or two derivatives."""
-    grows_beyond: Annotated[
-        float | None, quantity(lambda c: f"({observable_unit(c)})/({time_unit(c)})", "positive")
-    ] = None
+    grows_beyond: Annotated[float | None, quantity(rate_unit, "positive")] = None
     """Rate of the observable beyond which the amplitude grows in proportion to it, e.g. 20 m/s; default: constant."""
 
     def kernel_at(self, times: Array) -> Kernel:
@@ -260,10 +258,6 @@ class Error(Section):
 NUMBERS = TypeAdapter(list[Annotated[float, Field(ge=0, allow_inf_nan=False)]])
 
 
-class WeightColumn(OfReadings):
-    """A column of weights, one per reading; the numbers have no unit."""
-
-
 class WeightFunction(Section):
     """A function in a file of your own."""
 
@@ -317,7 +311,7 @@ def weighing(written: Any, context: Context) -> Weighing:
         numbers = np.array(NUMBERS.validate_python(written), dtype=float)
         return Weighing(of=lambda times, values, prominence: numbers)
     if "column" in keys:
-        column = WeightColumn.model_validate(written, context=context).column
+        column = OfReadings.model_validate(written, context=context).column
         return Weighing(column=Column(column, "1", "1", kind="weight"))
     if "zero_near_minima" in keys:
         reach = AwayFromMinima.model_validate(written, context=context).zero_near_minima
@@ -357,7 +351,7 @@ def _of_function(name: str, base: Path) -> Weighing:
     return Weighing(of=of, stated={"function": reference})
 
 
-SECTIONS = WeightColumn, AwayFromMinima, WeightFunction
+SECTIONS = OfReadings, AwayFromMinima, WeightFunction
 WEIGHTS = Made(weighing, json={"oneOf": [NUMBERS.json_schema(), *(kind.model_json_schema() for kind in SECTIONS)]})
 
 

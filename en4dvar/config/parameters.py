@@ -73,9 +73,8 @@ class Scalar:
     def value(self, scalars: Mapping[str, float], source: str) -> float:
         """The value in the parameter's unit. Raises :class:`ConfigError` when the file does not hold it."""
         if self.name not in scalars:
-            raise ConfigError(
-                f"{source}: no scalar {self.name!r} for {self.parameter.name}{suggest(self.name, scalars)}"
-            )
+            hint = suggest(self.name, scalars)
+            raise ConfigError(f"{source}: no scalar {self.name!r} for {self.parameter.name}{hint}")
         return _bounded(f"{scalars[self.name]!r} {self.unit}", self.parameter)
 
 
@@ -242,12 +241,10 @@ class Uncertain:
 
         Raises :class:`ConfigError`, its path the faulty key of ``varies``.
         """
-        varies = self.spec.varies
-        if varies is None:
+        if (varies := self.spec.varies) is None:
             return None
-        return RandomWalk.of(
-            model, term, varies.knots(observations), varies.std_of(term), isinstance(varies.std, Estimated)
-        )
+        estimated = isinstance(varies.std, Estimated)
+        return RandomWalk.of(model, term, varies.knots(observations), varies.std_of(term), estimated)
 
     def _location(self, key: Literal["mean", "median"], of_data: Callable[[str | Scalar], float] | None) -> float:
         value: float | str | Scalar | None = getattr(self.spec, key)

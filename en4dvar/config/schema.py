@@ -153,9 +153,7 @@ class Execution(Section):
     @model_validator(mode="after")
     def _belongs_to_the_executor(self) -> Self:
         if self.limits and self.executor in ("serial", "threads"):
-            raise ValueError(
-                f"only a process can be ended at its limit; write executor: processes, not {self.executor}"
-            )
+            raise ValueError(f"only a process is ended at its limit; write executor: processes, not {self.executor}")
         if self.address is not None and self.executor not in (None, "dask"):
             raise ValueError(f"address is for a dask scheduler only; write executor: dask, not {self.executor}")
         return self
@@ -295,9 +293,7 @@ else:
 class Assimilation(_Settings):
     """The settings of the scheme, declared at :class:`AssimilationSettings`, and how observations count."""
 
-    scheme: Annotated[OnAWindow, Field(description=listed(ON_A_WINDOW), json_schema_extra=or_in_a_file)] = (
-        AssimilationSettings.scheme
-    )
+    scheme: Annotated[OnAWindow, Field(description=listed(ON_A_WINDOW), json_schema_extra=or_in_a_file)] = DEFAULT
     weights: Literal["sum", "mean", "balanced"] = "sum"
     """sum: every observation counts (the Bayesian posterior); mean: β = 1/K, as in the published code; balanced: every
     series, or group of series, counts as if it had as many readings as the others. The latter two are not Bayesian."""

@@ -83,9 +83,8 @@ class Smoothing(Section):
 
     def as_written(self, section: Mapping[str, Any]) -> dict[str, Any]:
         """As given, without what the method does not take."""
-        return {
-            key: value for key, value in super().as_written(section).items() if self.method == "enks" or key != "lag"
-        }
+        written = super().as_written(section)
+        return {key: value for key, value in written.items() if self.method == "enks" or key != "lag"}
 
 
 if TYPE_CHECKING:
@@ -188,9 +187,8 @@ def error_rates(model: ForwardModel, errors: Sequence[ErrorOf], positive: Collec
 def per_time(spec: Knots, std: float, path: str) -> float:
     """Variance per unit of time. Raises :class:`ConfigError`."""
     if spec.every is None:
-        raise ConfigError(
-            "give every, the time in which the model error reaches std: in a series it grows with time", path
-        )
+        words = "give every, the time in which the model error reaches std: in a series it grows with time"
+        raise ConfigError(words, path)
     try:
         return std**2 / spec.every
     except OverflowError:

@@ -152,6 +152,9 @@ class Estimated(Spread):
     """A standard deviation that is estimated, by that of its half-normal prior."""
 
 
+HALF = Estimated(0.5, relative=True)
+
+
 class Knots(Section):
     """When something changes: at regular knots, or at given ones."""
 
@@ -194,14 +197,10 @@ class Knots(Section):
         return instants
 
 
-def _change_std(text: Any, context: Context) -> Spread:
-    return Estimated(0.5, relative=True) if text == "estimated" else parse_spread(text, subject_unit(context))
-
-
 class VariesSection(Knots):
     """A parameter that varies in time: constant pieces, and at each knot between two a random change."""
 
-    std: Annotated[Spread, Made(_change_std)]
+    std: Annotated[Spread, Made(lambda t, c: HALF if t == "estimated" else parse_spread(t, subject_unit(c)))]
     """Standard deviation of each change: in % of the value (lognormal: of its logarithm), or in the parameter's
     unit, which holds at the centre of the prior; or ``estimated``, with a half-normal prior of 50 %."""
 

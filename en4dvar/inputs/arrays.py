@@ -70,9 +70,8 @@ def _coordinate(data: Any, time: str) -> dict[str, Any]:
 def _numbers(name: str, column: Any) -> Array:
     values = np.asarray(column)
     if values.dtype.kind in "Mm":
-        raise DataError(
-            f"{name!r} holds dates; give elapsed time as numbers, e.g. (t - t[0]) / np.timedelta64(1, 's') for seconds"
-        )
+        seconds = "(t - t[0]) / np.timedelta64(1, 's')"
+        raise DataError(f"{name!r} holds dates; give elapsed time as numbers, e.g. {seconds} for seconds")
     try:
         numbers = np.asarray(values, dtype=float)
     except (TypeError, ValueError):

@@ -170,9 +170,8 @@ def _stds(column: Column, every: Array, written: Array, kept: Rows, count: int, 
 def _check(times: Array, values: Array, name: str, path: Path, fewest: int, zero: bool) -> None:
     """Raise :class:`DataError` where readings are of no use; ``zero``: all of them may be."""
     if not len(values) or not (zero or np.any(values)):
-        raise DataError(
-            f"{path}: {name!r} holds no usable value (all NaN{', or blank' if zero else ', blank, or not above zero'})"
-        )
+        none = "blank" if zero else "blank, or not above zero"
+        raise DataError(f"{path}: {name!r} holds no usable value (all NaN, or {none})")
     if not (np.all(np.isfinite(times)) and np.all(np.isfinite(values))):
         raise DataError(f"{path}: infinite values")
     if len(values) < fewest:

@@ -170,12 +170,8 @@ def _names_and_numbers(head: Sequence[Sequence[str]], wanted: Sequence[str]) -> 
     if _holds_number(head[first]) and (first == 0 or (wanted and all(map(_NAMELESS.fullmatch, wanted)))):
         return None, first
     top = max(first - 1, 0)
-    if (
-        top
-        and _words(head[top - 1])
-        and len(head[top - 1]) == len(head[top])
-        and all(is_unit(cell.strip("[]()")) for cell in head[top])
-    ):
+    above = head[top - 1] if top else []
+    if _words(above) and len(above) == len(head[top]) and all(is_unit(cell.strip("[]()")) for cell in head[top]):
         top -= 1
     if len(head[top]) == 1 < len(head[first]):
         return None, first
@@ -223,23 +219,17 @@ def sheet_lines(path: Path, asked: str) -> Lines:
 
     Raises :class:`DataError`.
     """
-    return decoded_whole(lines_of_workbook, path, asked, allowed=WORKBOOK)
+    return decoded_whole(lines_of_workbook, path, asked, allowed=WORKBOOK, kind="a workbook (save it as CSV)")
 
 
 def lines_of_workbook(path: Path, asked: str) -> Iterator[Lines]:
     """As :func:`sheet_lines`, in the child that decodes."""
     name, area = _parts(asked)
     _check(path)
-    try:
-        stored = _rows(path, name, area, formulas=False)
-        rows = [(number, _texts(cells)) for number, cells in stored]
-        if any(None in cells for _, cells in stored):
-            _refuse_formulas(path, stored, _rows(path, name, area, formulas=True))
-    except (DataError, MemoryError):
-        raise
-    except Exception as error:  # whatever openpyxl stumbles over: it trusts what is in the archive
-        raise DataError(f"{path}: not a workbook that can be read ({type(error).__name__}); save it as CSV") from None
-    yield [(number, cells) for number, cells in rows if cells]
+    stored = _rows(path, name, area, formulas=False)
+    if any(None in cells for _, cells in stored):
+        _refuse_formulas(path, stored, _rows(path, name, area, formulas=True))
+    yield [(number, texts) for number, cells in stored if (texts := _texts(cells))]
 
 
 def _parts(asked: str) -> tuple[str, str]:
@@ -251,21 +241,16 @@ def _parts(asked: str) -> tuple[str, str]:
 
 
 def _check(path: Path) -> None:
-    """Raise :class:`DataError` where the archive is none, or not to be unpacked."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            parts = archive.infolist()
-            size = sum(part.file_size for part in parts)
-            if size > LARGEST or len(parts) > MOST_PARTS:
-                raise DataError(f"{path}: {len(parts)} parts that unpack to {size / 2**20:.0f} MiB; save it as CSV")
-            for part in parts:
-                xml = archive.read(part) if part.filename.endswith((".xml", ".rels")) else b""
-                if any(sign in xml for sign in DECLARATION):
-                    raise DataError(f"{path}: {part.filename} declares entities, as no workbook does")
-    except DataError:
-        raise
-    except Exception as error:  # BadZipFile, zlib.error and whatever else a damaged archive gives
-        raise DataError(f"{path}: not an Excel workbook ({error})") from None
+    """Raise :class:`DataError` where the archive is not to be unpacked; what zipfile raises where it is none."""
+    with zipfile.ZipFile(path) as archive:
+        parts = archive.infolist()
+        size = sum(part.file_size for part in parts)
+        if size > LARGEST or len(parts) > MOST_PARTS:
+            raise DataError(f"{path}: {len(parts)} parts that unpack to {size / 2**20:.0f} MiB; save it as CSV")
+        for part in parts:
+            xml = archive.read(part) if part.filename.endswith((".xml", ".rels")) else b""
+            if any(sign in xml for sign in DECLARATION):
+                raise DataError(f"{path}: {part.filename} declares entities, as no workbook does")
 
 
 def _rows(path: Path, name: str, area: str, formulas: bool) -> list[tuple[int, tuple[Any, ...]]]:

@@ -56,10 +56,7 @@ def parse_instant(text: str | float, time_unit: str, symbols: Collection[str] = 
         return Instant("minimum" if numbered[1] == "minimum" else "trough", int(numbered[2] or 1))
     if word[:1].isdigit() or word[:1] in "+-.":
         return Instant("time", time=parse_quantity(text, time_unit))
-    raise UnitError(
-        f"{shown(text)} is not an instant; write start, end, maximum, top, 'minimum 2', 'trough 2', or a time "
-        "such as '3 us'"
-    )
+    raise UnitError(f"{shown(text)} is not an instant: start, end, maximum, top, 'minimum 2', 'trough 2', or '3 us'")
 
 
 def select(times: Array, values: Array, start: Instant, end: Instant, prominence: float = 0.1) -> slice:

@@ -83,9 +83,8 @@ def _temporary_folder() -> Path:
     try:
         folder = _own_folder(Path(tempfile.gettempdir()))
     except OSError as error:
-        raise OutputError(
-            f"no folder can be written to keep compiled code in ({error.strerror}); set {CACHE} to one"
-        ) from None
+        words = f"no folder can be written to keep compiled code in ({error.strerror}); set {CACHE} to one"
+        raise OutputError(words) from None
     asked = os.environ.get(CACHE)
     os.environ[CACHE] = str(folder)
     numba.config.reload_config()

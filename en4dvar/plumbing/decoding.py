@@ -93,10 +93,13 @@ def decoded(decoder: Decoder, path: Path, *arguments: Any, allowed: Allowed = Al
             child.kept = done
 
 
-def decoded_whole(decoder: Callable[..., Iterator[T]], path: Path, *arguments: Any, allowed: Allowed = Allowed()) -> T:
-    """The only value of a decoder. Raises as :func:`decoded`."""
+def decoded_whole(
+    decoder: Callable[..., Iterator[T]], path: Path, *arguments: Any, allowed: Allowed = Allowed(), kind: str = "a file"
+) -> T:
+    """The only value of a decoder. Raises :class:`DataError`, also for what its library says of a file of the kind."""
     value: T
-    (value,) = decoded(decoder, path, *arguments, allowed=allowed)
+    with retold(DecodeError, DataError, f"{path}: cannot be read as {kind}: "):
+        (value,) = decoded(decoder, path, *arguments, allowed=allowed)
     return value
 
 

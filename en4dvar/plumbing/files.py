@@ -152,7 +152,7 @@ def atomic_path(path: str | Path, durable: bool = True) -> Iterator[Path]:
     path = Path(path)
     partial = path.with_name(f".{path.name}.{owner()}.tmp")
     try:
-        _remove_leftovers(path.parent, _PARTIAL)
+        _remove_leftovers(os.path.abspath(path.parent), _PARTIAL)
         partial.unlink(missing_ok=True)  # it may be a link
         # an unwritable place gives the system's reason here, not a library's guess later
         os.close(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
@@ -173,7 +173,7 @@ def atomic_path(path: str | Path, durable: bool = True) -> Iterator[Path]:
 def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
     """A folder in ``parent``, by default the system's, that is removed on leaving; after a kill, by who comes next."""
     parent = Path(tempfile.gettempdir()) if parent is None else parent
-    _remove_leftovers(parent, _FOLDER)
+    _remove_leftovers(os.path.abspath(parent), _FOLDER)
     folder = Path(tempfile.mkdtemp(prefix=f"en4dvar-{owner()}-", dir=parent))
     try:
         yield folder
@@ -201,14 +201,9 @@ def _machine() -> str:
     return f"{int.from_bytes(digest[:8], 'big') % 10**6:06d}"
 
 
-_looked: set[tuple[str, re.Pattern[str]]] = set()
-
-
-def _remove_leftovers(folder: Path, names: re.Pattern[str]) -> None:
+@cache
+def _remove_leftovers(folder: str, names: re.Pattern[str]) -> None:
     """Remove what processes of this machine that are gone have left in a folder; looked for once."""
-    if (key := (os.path.abspath(folder), names)) in _looked:
-        return
-    _looked.add(key)
     with suppress(OSError):
         for entry in list(os.scandir(folder)):
             match = names.fullmatch(entry.name)

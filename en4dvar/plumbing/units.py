@@ -237,9 +237,8 @@ def parse_quantity(value: str | float, unit: str, usual: str = "") -> float:
     if len(number) > LONGEST:
         raise UnitError(f"{shown(value)}: a number of {len(number)} characters")
     if not symbol and parse_unit(unit).powers != ONE.powers:
-        small = (
-            usual if 1e-3 <= abs(float(number)) < 1e3 else ""
-        )  # beyond, a number is one of the unit without a prefix
+        # beyond, a number is one of the unit without a prefix
+        small = usual if 1e-3 <= abs(float(number)) < 1e3 else ""
         raise UnitError(f"{text} has no unit; write e.g. '{text} {small or unit}'")
     with retold(UnitError, UnitError, f"{shown(text)}: "):
         factor = _factor(symbol or "1", unit)

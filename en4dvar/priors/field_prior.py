@@ -47,10 +47,8 @@ class FieldPrior:
         if self.field.coordinates is None:
             raise ConfigError(f"the model gives no coordinates for {self.field.name}, so that no distance is known")
         if self.grid is None and self.field.size > MOST_CORRELATED:
-            raise ConfigError(
-                f"{self.field.name} has {self.field.size} cells on no regular grid; at most {MOST_CORRELATED} can be "
-                "drawn from a matrix"
-            )
+            cells = f"{self.field.name} has {self.field.size} cells on no regular grid"
+            raise ConfigError(f"{cells}; at most {MOST_CORRELATED} can be drawn from a matrix")
 
     @cached_property
     def places(self) -> Array:
@@ -82,10 +80,8 @@ class FieldPrior:
         """
         name, size = self.field.name, self.field.size
         if size > MOST_CELLS:
-            raise ConfigError(
-                f"{name} has {size} cells; more than {MOST_CELLS} need a localised gain, e.g. {{radius: 10}}",
-                "assimilation.localisation",
-            )
+            words = f"{name} has {size} cells; more than {MOST_CELLS} need a localised gain, e.g. {{radius: 10}}"
+            raise ConfigError(words, "assimilation.localisation")
         values, vectors = np.linalg.eigh(correlation_of_places(self.kernel, self.places, self.length))
         values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
         left = 1 - np.cumsum(values) / values.sum()

@@ -30,7 +30,7 @@ from en4dvar.model.state import Array, Parameter, TransformName
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.priors import parameter_map
 from en4dvar.priors.dependence import Dependence
-from en4dvar.priors.parameter_map import QUANTILE_MAPS
+from en4dvar.priors.parameter_map import QUANTILE_MAPS, Bounds, Numbers
 
 Sampling = Literal["exact", "random"]
 LARGEST = 1e150  # its square is a number still
@@ -55,8 +55,8 @@ class PriorTerm:
     transform: TransformName
     mean: float
     std: float
-    bounds: tuple[float, float] = (-math.inf, math.inf)
-    shape: tuple[float, ...] = ()
+    bounds: Bounds = (-math.inf, math.inf)
+    shape: Numbers = ()
 
     def __post_init__(self) -> None:
         self._require(math.isfinite(self.mean), "the mean must be finite")
@@ -64,10 +64,8 @@ class PriorTerm:
         self._require(positive, f"the standard deviation must be positive, not {self.std:g}")
         # The ensemble must spread by more than rounding, its squares and physical values must be numbers
         around = abs(self.mean) if self.transform == "normal" else max(1.0, abs(self.mean))
-        self._require(
-            self.std > max(1 / LARGEST, RESOLVED * around),
-            f"the standard deviation {self.std:g} is too small to be told from rounding",
-        )
+        resolved = self.std > max(1 / LARGEST, RESOLVED * around)
+        self._require(resolved, f"the standard deviation {self.std:g} is too small to be told from rounding")
         largest = LARGEST if self.transform == "normal" else LARGEST_LOG
         self._require(self.std < largest, f"the standard deviation {self.std:g} is too large; less than {largest:g}")
         self._require(abs(self.mean) < LARGEST, f"{self.mean:g} is too large; less than {LARGEST:g}")
@@ -110,7 +108,7 @@ class PriorTerm:
         return cls(parameter, "lognormal", log_mean - variance / 2, math.sqrt(variance))
 
     @classmethod
-    def logit(cls, parameter: Parameter, bounds: tuple[float, float], median: float, logit_std: float) -> PriorTerm:
+    def logit(cls, parameter: Parameter, bounds: Bounds, median: float, logit_std: float) -> PriorTerm:
         """logit((θ − a)/(b − a)) ~ N(logit of the median, logit_std²); ``bounds`` and ``median`` physical."""
         low, high = bounds
         inside = -math.inf < low < median < high < math.inf
@@ -118,7 +116,7 @@ class PriorTerm:
         return cls(parameter, "logit", math.log((median - low) / (high - median)), logit_std, (low, high))
 
     @classmethod
-    def uniform(cls, parameter: Parameter, bounds: tuple[float, float]) -> PriorTerm:
+    def uniform(cls, parameter: Parameter, bounds: Bounds) -> PriorTerm:
         """θ equally likely everywhere between finite physical ``bounds``."""
         return cls._by_quantiles(parameter, "uniform", bounds, ())
 
@@ -131,7 +129,7 @@ class PriorTerm:
         return term
 
     @classmethod
-    def beta(cls, parameter: Parameter, bounds: tuple[float, float], alpha: float, beta: float) -> PriorTerm:
+    def beta(cls, parameter: Parameter, bounds: Bounds, alpha: float, beta: float) -> PriorTerm:
         """(θ − a)/(b − a) ~ Beta(alpha, beta) between finite physical ``bounds`` (a, b)."""
         for name, value in (("alpha", alpha), ("beta", beta)):
             words = f"{name} must lie between {SHAPES[0]:g} and {SHAPES[1]:g}, not {value:g}"
@@ -140,9 +138,8 @@ class PriorTerm:
 
     @classmethod
     def bounded(
-        cls, parameter: Parameter, kind: Literal["normal", "lognormal"], mean: float, std: float,
-        bounds: tuple[float, float],
-    ) -> PriorTerm:  # fmt: skip
+        cls, parameter: Parameter, kind: Literal["normal", "lognormal"], mean: float, std: float, bounds: Bounds
+    ) -> PriorTerm:
         """:meth:`normal` of ``mean`` and ``std``, or :meth:`lognormal` of median and log_std, between ``bounds``."""
         whole = cls.normal(parameter, mean, std) if kind == "normal" else cls.lognormal(parameter, mean, std)
         low, high = bounds
@@ -152,14 +149,11 @@ class PriorTerm:
         shape = ((a - whole.mean) / std, (b - whole.mean) / std, *((b - a,) if kind == "lognormal" else ()))
         wide = shape[1] - shape[0] > 1e-6 and shape[-1] < LARGEST_LOG
         whole._require(wide, f"the bounds {bounds} do not suit the standard deviation {std:g}; use a uniform prior")
-        return cls._by_quantiles(
-            parameter, "bounded-normal" if kind == "normal" else "bounded-lognormal", bounds, shape
-        )
+        name: TransformName = "bounded-normal" if kind == "normal" else "bounded-lognormal"
+        return cls._by_quantiles(parameter, name, bounds, shape)
 
     @classmethod
-    def _by_quantiles(
-        cls, parameter: Parameter, kind: TransformName, bounds: tuple[float, float], shape: tuple[float, ...]
-    ) -> PriorTerm:
+    def _by_quantiles(cls, parameter: Parameter, kind: TransformName, bounds: Bounds, shape: Numbers) -> PriorTerm:
         (low, high), term = bounds, cls(parameter, kind, 0.0, 1.0, bounds, shape)
         finite = math.isfinite(low) and (math.isfinite(high) or kind == "half-normal")
         term._require(finite and low < high, f"{kind} needs finite bounds, low < high, not {bounds}")

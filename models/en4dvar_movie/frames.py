@@ -135,7 +135,7 @@ def _size(shape: tuple[int, ...]) -> str:
 
 
 def _tiff(path: Path) -> Movie:
-    about = decoded_whole(tiff_about, path, allowed=MOVIES)
+    about = decoded_whole(tiff_about, path, allowed=MOVIES, kind="a TIFF")
     start, count, shape, scale = about.start, about.count, about.shape, (about.pixel, about.rate, list(about.notes))
     check_size(shape, path)
     if about.pages == 1 < count and about.plain and path.stat().st_size >= start + count * about.frame:
@@ -191,8 +191,7 @@ def _video(path: Path) -> Movie:
             else:
                 yield value
 
-    with retold(DecodeError, DataError, f"{path}: cannot be read as a movie: "):
-        count, codec = decoded_whole(video_about, path, allowed=MOVIES)
+    count, codec = decoded_whole(video_about, path, allowed=MOVIES, kind="a movie")
     if codec:
         notes.append(
             f"{path}: compressed with loss ({codec}): R_std does not hold what that does to whole outlines, and may be "

@@ -95,10 +95,9 @@ class Linearisation:
 
     def among(self, where: Where) -> "Linearisation":
         """The same of some of the readings."""
-        rates = None if self.rate_anomalies is None else self.rate_anomalies[:, where]
-        return replace(
-            self, prediction=self.prediction.among(where), anomalies=self.anomalies[:, where], rate_anomalies=rates
-        )
+        rates, prediction = self.rate_anomalies, self.prediction.among(where)
+        rates = None if rates is None else rates[:, where]
+        return replace(self, prediction=prediction, anomalies=self.anomalies[:, where], rate_anomalies=rates)
 
 
 @dataclass(frozen=True)

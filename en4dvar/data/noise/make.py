@@ -290,8 +290,6 @@ def _across(times: Array, others: Array, own: csr_array, of_others: csr_array) -
         at = csr_array((np.ones(len(label)), (np.arange(len(label)), label)), shape=(len(label), len(instants)))
         return csr_array(at[: len(times)] @ at[len(times) :].T)
     if not np.array_equal(times, others) or (own != of_others).nnz:
-        raise ValueError(
-            "two series with errors correlated in time need the same times and the same correlation in time to be "
-            "correlated with each other"
-        )
+        words = "two series with errors correlated in time need the same times and the same correlation in time"
+        raise ValueError(f"{words} to be correlated with each other")
     return own

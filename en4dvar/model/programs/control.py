@@ -29,7 +29,7 @@ from en4dvar.model.programs.control_file import (
     read_control,
     text_of,
 )
-from en4dvar.model.programs.languages import identifier, is_instructions
+from en4dvar.model.programs.languages import identifier, is_pest
 from en4dvar.plumbing.errors import ConfigError
 
 RANGE = 4.0  # standard deviations between the bounds: PEST++ (White et al. 2020), option par_sigma_range
@@ -83,9 +83,8 @@ def from_pest(path: str | Path, files: Sequence[str] = (), *, prior_information:
     parents = {row.word("parnme"): row.word("partrans") for row in rows if len(row.cells) == 2}
     equations = _equations(control, parameters) if prior_information else []
     informed = {reading.group for reading in equations}
-    if reasons := dict.fromkeys(
-        [*_refused(control, bool(informed)), *_refused_rows(control, rows, observed, informed)]
-    ):
+    refused = [*_refused(control, bool(informed)), *_refused_rows(control, rows, observed, informed)]
+    if reasons := dict.fromkeys(refused):
         raise ConfigError(f"{control.path}: {'; '.join(reasons)}")
     observations = [reading for row in observed for reading in _observations(row)]
     readings, names = [*observations, *equations], [reading.name for reading in observations]
@@ -261,7 +260,7 @@ def _files(control: ControlFile) -> tuple[dict[str, str], dict[str, list[str]]]:
             file = str(path)
             if path.is_absolute() or ".." in path.parts:
                 raise ConfigError(f"{row.where}: {file} lies outside of the folder that the model runs in")
-            if section == "model output" or (section != "model input" and is_instructions(text_of(own))):
+            if section == "model output" or (section != "model input" and is_pest(text_of(own), "if")):
                 instructions.setdefault(file, []).append(str(own))
             elif file in templates:
                 raise ConfigError(f"{control.path}: two templates become {file}")

@@ -355,9 +355,7 @@ def _check_draws(draws: NamedMatrix, observations: Sequence[tuple[str, float, fl
         mean, spread = float(own.mean()), float(own.std(ddof=1)) if count > 1 else math.inf
         off = abs(mean - value) / std * math.sqrt(count), abs(spread / std - 1) * math.sqrt(2 * count)
         if max(off) > CHANCE:
-            words = (
-                f"{name} has the mean {mean:g} and the std {spread:g} there, and {value:g} and {std:g} by its weight"
-            )
+            words = f"{name} has the mean {mean:g} and std {spread:g} there, and {value:g} and {std:g} by its weight"
             raise ConfigError(f"{draws.path}: {words}; errors are drawn from the weights here: leave the file out")
 
 

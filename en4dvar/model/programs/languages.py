@@ -16,7 +16,7 @@ import math
 import re
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from jinja2 import StrictUndefined, TemplateError
 from jinja2.meta import find_undeclared_variables
@@ -37,14 +37,9 @@ class ProgramError(Exception):
     """A program ended badly, or what it left cannot be read; the words are the reason of a member that failed."""
 
 
-def is_template(text: str) -> bool:
-    """Whether the first line says that this is a template of PEST, with a sign, which delimits what follows."""
-    return re.match(r"[pj]tf \S", text, re.IGNORECASE) is not None
-
-
-def is_instructions(text: str) -> bool:
-    """Whether the first line says that these are instructions of PEST, with a sign likewise."""
-    return re.match(r"[pj]if \S", text, re.IGNORECASE) is not None
+def is_pest(text: str, kind: Literal["tf", "if"]) -> bool:
+    """Whether the first line says that this is a template or instructions of PEST, with a sign, the delimiter."""
+    return re.match(rf"[pj]{kind} \S", text, re.IGNORECASE) is not None
 
 
 def identifier(name: str) -> str:
@@ -263,7 +258,7 @@ def input_name(template: Path) -> str:
 def check_template(template: Path, names: Collection[str]) -> None:
     """Raise ValueError, in words, where a template cannot be read or names an unknown parameter."""
     text = text_of(template)
-    if is_template(text):
+    if is_pest(text, "tf"):
         names = {identifier(name) for name in names}
         with retold(ProgramError, ValueError, f"{template}: "):
             wanted: Collection[str] = parameters_of(text)
@@ -281,7 +276,7 @@ def check_template(template: Path, names: Collection[str]) -> None:
 def filled(template: Path, parameters: Mapping[str, float], times: Array) -> str:
     """The input file of a member; ``times`` (K,) are where it is observed. Raises :class:`ProgramError`."""
     text = text_of(template)
-    if is_template(text):
+    if is_pest(text, "tf"):
         return spaces_filled(text, parameters)
     values: dict[str, Any] = {name: float(value) for name, value in parameters.items()}
     parts, left = list[str](), LONGEST

@@ -157,7 +157,7 @@ class OutputOf(_Section):
         for path in itertools.chain.from_iterable(self.instruction_files.values()):
             with retold(OSError, ValueError, f"{path}: "):
                 text = read_text(path)
-            if not languages.is_instructions(text):
+            if not languages.is_pest(text, "if"):
                 raise ValueError(f"{path}: the first line of PEST's instructions is pif and a sign, e.g. pif @")
             with retold(ProgramError, ValueError):
                 names += languages.observations_of(text, str(path))
@@ -177,6 +177,9 @@ class OutputOf(_Section):
 
 def _with_unit(text: Any) -> Any:
     return {"unit": text} if isinstance(text, str) else text
+
+
+UnitOrSection = Annotated[ParameterOf, BeforeValidator(_with_unit, json_schema_input_type=str | ParameterOf)]
 
 
 def _placed(command: str, info: ValidationInfo) -> str:
@@ -221,11 +224,7 @@ class CommandSettings(_Section):
     command: Annotated[str, Field(min_length=1), AfterValidator(_placed)]
     """Program and arguments, split as by a shell but run without one. {input} and {output} are names of files, {NAME} a
     parameter, {here} the folder of this file, {python} this Python. It runs in a scratch directory of its own."""
-    parameters: Annotated[
-        dict[str, Annotated[ParameterOf, BeforeValidator(_with_unit, json_schema_input_type=str | ParameterOf)]],
-        Field(min_length=1),
-        AfterValidator(_named_well),
-    ]
+    parameters: Annotated[dict[str, UnitOrSection], Field(min_length=1), AfterValidator(_named_well)]
     """Name → unit, or a section: what is filled in."""
     outputs: Annotated[dict[str, OutputOf], Field(min_length=1)]
     """Observable → where its values are."""

@@ -14,7 +14,7 @@ is multiplied by exp(c), or c is added to it, c ~ N(0, q²); these changes are p
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -120,9 +120,7 @@ class StateChanges:
     changes: tuple[PriorTerm, ...]
 
     @classmethod
-    def of(
-        cls, model: ForwardModel, field: Field, knots: Sequence[float], std: float, relative: bool
-    ) -> "StateChanges":
+    def of(cls, model: ForwardModel, field: Field, knots: Sequence[float], std: float, relative: bool) -> Self:
         """Changes N(0, std²), in the field's unit or of its logarithm. Raises :class:`ConfigError`."""
         what, unit = (f"ln {field.name}", "1") if relative else (field.name, field.unit)
 
