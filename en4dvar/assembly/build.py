@@ -150,10 +150,9 @@ def data_files(plan: DataPlan) -> dict[str, DataFile]:
     for series, files in zip(plan.series[1:], others, strict=True):
         if len(files) != len(first) or (len(first) > 1 and files.keys() != first.keys()):
             rest = [name for name in (*first, *files) if (name in first) != (name in files)]
-            raise DataError(
-                f"series {series.name} has {len(files)} data sets, {plan.series[0].name} has {len(first)}; each data "
-                f"set needs a file of the same name in every series{f'; not so {rest[0]}' if rest else ''}"
-            )
+            counts = f"series {series.name} has {len(files)} data sets, {plan.series[0].name} has {len(first)}"
+            lacking = f"; not so {rest[0]}" if rest else ""
+            raise DataError(f"{counts}; each data set needs a file of the same name in every series{lacking}")
     return {
         name: replace(file, others=tuple(files.get(name) or next(iter(files.values())) for files in others))
         for name, file in first.items()

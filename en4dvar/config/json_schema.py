@@ -8,7 +8,7 @@ further kinds of files (group ``en4dvar.schemas``: the key that marks the kind â
 
 import json
 import math
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from functools import cache
 from typing import Any
 
@@ -80,7 +80,11 @@ def _resolve(node: Json, inner: Json) -> Json:
     if "$ref" in node:
         target = _resolve(inner[node["$ref"].rpartition("/")[2]], inner)
         return {**target, **{k: _each(v, _resolve, inner) for k, v in node.items() if k != "$ref"}}
-    return {k: _each(v, _resolve, inner) for k, v in node.items() if k != "discriminator"}
+    resolved = {k: _each(v, _resolve, inner) for k, v in node.items() if k != "discriminator"}
+    match resolved.get("anyOf"):
+        case [{"description": words}, {"type": "null"}]:  # of a section that may be left out
+            resolved.setdefault("description", words)
+    return resolved
 
 
 def _each(node: Any, change: Callable[..., Json], *more: Any) -> Any:
@@ -122,18 +126,24 @@ def _models(definitions: Json) -> Iterator[str]:
             kind: Any = find_model(name)
         except En4dvarError:
             continue
-        section: Any = settings_of(kind)
-        settings = _of(section.model_json_schema())
+        settings = _of(settings_of(kind).model_json_schema())
         own = {"const": name, "description": "Name of the model."}
         settings["properties"] = {"name": own, **settings["properties"]}
         definitions[f"model_{name}"] = settings
-        fixed = getattr(kind, "parameters", ())  # where they depend on its settings, a property, and these tell
-        possible = section.possible_parameters() if hasattr(section, "possible_parameters") else fixed
-        definitions[f"parameters_{name}"] = _parameters(possible if isinstance(possible, Collection) else ())
+        definitions[f"parameters_{name}"] = _parameters(_possible_parameters(kind))
         yield name
 
 
-def _parameters(known: Collection[Parameter]) -> Json:
+def _possible_parameters(kind: Any) -> tuple[Parameter, ...]:
+    """Every parameter that a model may have; where they depend on its settings, these tell."""
+    settings: Any = settings_of(kind)
+    if hasattr(settings, "possible_parameters"):
+        return tuple(settings.possible_parameters())
+    fixed = getattr(kind, "parameters", ())
+    return fixed if isinstance(fixed, tuple) else ()
+
+
+def _parameters(known: tuple[Parameter, ...]) -> Json:
     """The ``parameters`` section: names that an editor can offer; others are a matter of the model's settings."""
     named = {p.name: p for p in (*known, *OF_READINGS)}
     entry = {"$ref": "#/$defs/parameter"}

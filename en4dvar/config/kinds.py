@@ -76,16 +76,12 @@ class TwinFile(File):
     parameters: Annotated[tuple[Entry, ...], entries("a twin experiment")] = Field({}, validate_default=True)
     """Parameters to estimate (a prior) or to change from the model's default (a quantity)."""
     twin: Twin
-    """How the truth is made and observed."""
     model_error: Annotated[tuple[ErrorOf, ...], MODEL_ERROR] | None = None
     """Fields of the state that the model misses in part, of the truth as well: each changes at random between two
     observations, its variance growing by ``std`` squared in a time of ``every``."""
     assimilation: Sequential
-    """The scheme and what it does to the ensemble."""
     execution: Workers = Workers()
-    """Where members are integrated; never changes the numbers."""
     output: Output = Output()
-    """Where results go."""
 
     @classmethod
     def rules(cls, keys: Mapping[str, Any], context: Context, faults: Faults) -> None:
@@ -147,7 +143,6 @@ APART = ("time_std", "correlation_time", "shared", "covariance", "robust", "disc
 
 
 def _known_fields(names: tuple[str, ...], context: Context) -> tuple[str, ...]:
-    """Names of fields of the state."""
     known = dynamic_fields(context.model)
     with Faults() as faults:
         for k, name in enumerate(names):
@@ -176,16 +171,12 @@ class SequenceFile(File):
     parameters: Annotated[tuple[Entry, ...], entries()] = Field({}, validate_default=True)
     """For each parameter a prior (estimated beside the state), a quantity or a scalar of the data file (fixed)."""
     sequence: Sequence
-    """What is known of the state at time zero, and what is kept."""
     model_error: Annotated[tuple[ErrorOf, ...], MODEL_ERROR] | None = None
     """Fields of the state that the model misses in part: each changes at random between two observations, its variance
     growing by ``std`` squared in a time of ``every``."""
     assimilation: Sequential
-    """The scheme and what it does to the ensemble."""
     execution: Workers = Workers()
-    """Where members are integrated; never changes the numbers."""
     output: Output = Output()
-    """Where results go."""
 
     @classmethod
     def rules(cls, keys: Mapping[str, Any], context: Context, faults: Faults) -> None:
@@ -341,7 +332,6 @@ class CampaignFile(File):
     name: Name
     """Name of the campaign."""
     campaign: CampaignSection
-    """How truths are drawn and observed."""
 
 
 @dataclass(frozen=True)

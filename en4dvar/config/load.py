@@ -56,9 +56,7 @@ class Estimation(File):
     """What data sets have in common, e.g. ``batch: {first: 'a_*', second: [b_*, c_01]}``: under each kind of group the
     groups, with patterns of the names of their data sets."""
     population: PopulationSection | None = None
-    """Mean and spread of parameters over the data sets, estimated at the end of the run."""
     prior: PriorFile | None = None
-    """A file of members, for the parameters with ``{prior: ensemble}``."""
     prior_correlation: tuple[PriorCorrelation, ...] | None = None
     """Which parameters are correlated in the prior, and how."""
     initial_state: Annotated[tuple[Initial, ...], PERTURBED] | None = None
@@ -67,15 +65,10 @@ class Estimation(File):
     model_error: Annotated[tuple[ErrorOf, ...], MODEL_ERROR] | None = None
     """Fields of the state that change at knots, by something the model does not know, each with its ``std``."""
     assimilation: Assimilation = Assimilation()
-    """Scheme, ensemble size and stopping rules; the defaults are the recommended ones."""
     execution: Execution = Execution()
-    """Where the work is done; never changes the numbers."""
     output: Output = Output()
-    """Where results go."""
     simulate: Simulate | None = None
-    """Settings of ``en4dvar simulate``."""
     design: Design | None = None
-    """Which experiments ``en4dvar design`` compares, and about what."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -105,7 +105,7 @@ def rate_unit(context: Context) -> str:
 
 
 class AmplitudeSection(Section):
-    """Lognormal prior of the discrepancy's standard deviation."""
+    """Lognormal prior of ``discrepancy_amplitude``, the discrepancy's standard deviation."""
 
     median: Annotated[Spread, Made(read_spread)] = Field("0.5 % of maximum", validate_default=True)
     """A quantity in the observable's unit, or e.g. '2 % of maximum'."""
@@ -114,7 +114,7 @@ class AmplitudeSection(Section):
 
 
 class LengthSection(Section):
-    """Lognormal prior of the time over which the discrepancy forgets itself."""
+    """Lognormal prior of ``discrepancy_length``, the time over which the discrepancy forgets itself."""
 
     median: Annotated[Spread, Made(partial(read_spread, unit=time_unit, whole="window"))] = Field(
         "10 % of window", validate_default=True
@@ -128,9 +128,7 @@ class DiscrepancySection(Section):
     """The discrepancy of the model: a Gaussian process beside the errors whose amplitude and length are estimated."""
 
     amplitude: AmplitudeSection = Field({}, validate_default=True)
-    """Prior of ``discrepancy_amplitude``, its standard deviation."""
     length: LengthSection = Field({}, validate_default=True)
-    """Prior of ``discrepancy_length``, its correlation time."""
     kernel: Literal["exponential", "matern-3/2", "matern-5/2"] = "exponential"
     """Correlation in time: exponential (rough paths), or Matérn's with one or two derivatives."""
     grows_beyond: Annotated[float | None, quantity(rate_unit, "positive")] = None

@@ -291,7 +291,7 @@ else:
 
 
 class Assimilation(_Settings):
-    """The settings of the scheme, declared at :class:`AssimilationSettings`, and how observations count."""
+    """Scheme, ensemble size and stopping rules, and how observations count; the defaults are the recommended ones."""
 
     scheme: Annotated[OnAWindow, Field(description=listed(ON_A_WINDOW), json_schema_extra=or_in_a_file)] = DEFAULT
     weights: Literal["sum", "mean", "balanced"] = "sum"

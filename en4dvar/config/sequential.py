@@ -118,9 +118,7 @@ class Sequential(_OnASeries):
     """How a model error enters the ensemble of a filter: drawn, or by a square root in the space of the ensemble (not
     with smoother enks)."""
     localisation: SeriesLocalisation | None = None
-    """Gaspari–Cohn taper over the indices of the observed field."""
     smoother: Smoothing | None = None
-    """What smooths the states behind a filter."""
     stochastic_model: bool = False
     """true: accept a model that gives other numbers when a member is run again; by default that is an error."""
 

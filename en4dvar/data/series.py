@@ -50,7 +50,6 @@ class Places:
         return cls(indices, np.stack([1 - share, share], axis=1), asked, unit)
 
     def __getitem__(self, which: slice | npt.NDArray[np.intp] | npt.NDArray[np.bool_]) -> Self:
-        """The places of some of the readings."""
         return type(self)(self.indices[which], self.shares[which], self.positions[which], self.unit)
 
     @property

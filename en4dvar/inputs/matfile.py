@@ -233,7 +233,6 @@ class _Hdf(_Reader):
                     yield from self._child(self.file, name, name, 0)
 
     def _child(self, group: Any, key: str, name: str, depth: int) -> Found:
-        """What stands under ``key`` of a group."""
         import h5py
 
         if isinstance(group.get(key, getlink=True), h5py.HardLink):

@@ -67,7 +67,11 @@ def read_members(path: Path, units: Mapping[str, tuple[str, str]]) -> dict[str, 
     ------
     DataError: the file cannot be read, lacks a name or a unit, or holds numbers that are not finite.
     """
-    columns = _of_netcdf(path, units) if path.suffix.lower() in NETCDF else _of_table(path, units)
+    if path.suffix.lower() in NETCDF:
+        allowed = Allowed(60, 4_000_000_000, LARGEST)
+        columns = decoded_whole(netcdf_members, path, list(units), allowed=allowed, kind="netCDF")
+    else:
+        columns = _of_table(path, units)
     lengths = {name: len(values) for name, (values, _) in columns.items()}
     if len(set(lengths.values())) != 1:
         raise DataError(f"{path}: unequal numbers of members: {listed([f'{k} {n}' for k, n in lengths.items()])}")
@@ -118,12 +122,6 @@ def _of_table(path: Path, names: Mapping[str, Any]) -> dict[str, tuple[Array, st
         if name not in contents.columns:
             raise DataError(contents.others.get(name) or f"{path}: no column {name!r}{suggest(name, contents.columns)}")
     return {name: (contents.columns[name], "") for name in names}
-
-
-def _of_netcdf(path: Path, names: Mapping[str, Any]) -> dict[str, tuple[Array, str]]:
-    """As a process of its own reads it."""
-    allowed = Allowed(60, 4_000_000_000, LARGEST)
-    return decoded_whole(netcdf_members, path, list(names), allowed=allowed, kind="netCDF")
 
 
 def netcdf_members(path: Path, names: Sequence[str]) -> Iterator[dict[str, tuple[Array, str]]]:

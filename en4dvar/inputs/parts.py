@@ -214,7 +214,6 @@ def _of_table(table: Table, wanted: Sequence[str]) -> dict[str, Array]:
 
 
 def _of_mat(variables: Variables, name: str, path: Path) -> Array:
-    """A vector by its name. Raises :class:`DataError`."""
     vector = variables.vector(name)
     if vector is not None:
         return np.asarray(vector, dtype=float)

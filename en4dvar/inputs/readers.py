@@ -58,10 +58,8 @@ class Readings:
         for every in (np.arange(self.count), self.usable, np.sort(rows)):
             if len(every) == size:
                 return np.searchsorted(every, rows)
-        raise DataError(
-            f"{size} rows, but {number} observations are used, of {len(self.usable)} usable ones in {self.count} rows "
-            "of data; give a row to each of one of these"
-        )
+        counts = f"{number} observations are used, of {len(self.usable)} usable ones in {self.count} rows of data"
+        raise DataError(f"{size} rows, but {counts}; give a row to each of one of these")
 
 
 def read_series(

@@ -125,10 +125,8 @@ class Table:
             return alike[0]
         if self.nameless:
             proposed = ("t_us", "R_um", *self.names[2:])[: len(self.names)]
-            raise DataError(
-                f"{self.path}: no line above the numbers names the columns: put one such as {','.join(proposed)!r} "
-                f"there, or call them {listed(self.names, 4)}"
-            )
+            hint = f"put one such as {','.join(proposed)!r} there, or call them {listed(self.names, 4)}"
+            raise DataError(f"{self.path}: no line above the numbers names the columns: {hint}")
         fault = "more than one column" if alike else "no column"
         raise DataError(f"{self.path}: {fault} {name!r}; the columns are: {listed(self.names)}")
 
@@ -254,7 +252,6 @@ def _check(path: Path) -> None:
 
 
 def _rows(path: Path, name: str, area: str, formulas: bool) -> list[tuple[int, tuple[Any, ...]]]:
-    """Numbered rows of cells."""
     try:
         from openpyxl import load_workbook
         from openpyxl.utils import range_boundaries
@@ -311,7 +308,5 @@ def _refuse_formulas(path: Path, stored: Any, written: Any) -> None:
         for i, (value, text) in enumerate(zip(values, texts, strict=False)):
             if value is None and isinstance(text, str) and text.startswith("="):
                 where = f"{get_column_letter(i + 1)}{number}"
-                raise DataError(
-                    f"{path}:{number}: cell {where} holds a formula without a stored value, and none is evaluated; "
-                    "open and save the workbook in Excel or LibreOffice, or save the sheet as CSV"
-                )
+                words = f"cell {where} holds a formula without a stored value, and none is evaluated; open and save"
+                raise DataError(f"{path}:{number}: {words} the workbook in Excel or LibreOffice, or save it as CSV")

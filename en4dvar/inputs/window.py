@@ -95,11 +95,9 @@ def index_of(
         return int(np.searchsorted(times, _top(times[first:], values[first:])))
     indices = minima(values[first:], prominence)
     if instant.number > len(indices):
-        raise DataError(
-            f"asks for minimum {instant.number}, but only {len(indices)} minima with a prominence of "
-            f"{prominence:.0%} of the range follow its start; end it elsewhere ('to: end', or at a time), or lower its "
-            "prominence"
-        )
+        few = f"only {len(indices)} minima with a prominence of {prominence:.0%} of the range follow its start"
+        advice = "end it elsewhere ('to: end', or at a time), or lower its prominence"
+        raise DataError(f"asks for minimum {instant.number}, but {few}; {advice}")
     index = int(indices[instant.number - 1])
     if instant.kind == "trough":
         begin, _, end = np.concatenate([[0], indices, [len(values) - first - 1]])[instant.number - 1 :][:3]

@@ -140,7 +140,6 @@ class _Child(Child):
 
 @atexit.register
 def _end_idle() -> None:
-    """End the children that wait for the next file."""
     while _idle:
         with _idle.pop():
             pass

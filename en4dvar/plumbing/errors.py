@@ -70,11 +70,11 @@ def retold(
     caught: type[Exception] | tuple[type[Exception], ...], kind: type[Exception], words: str = "", *more: str
 ) -> Iterator[None]:
     """Raise what is ``caught`` in the block as ``kind(words + message, *more)``, of system errors the reason alone, and
-    of a file that is not there what lies beside it."""
+    of a file to be read that is not there what lies beside it."""
     try:
         yield
     except caught as error:
         reason = getattr(error, "strerror", None) or error
-        if isinstance(error, FileNotFoundError) and error.filename:
+        if isinstance(error, FileNotFoundError) and error.filename and not issubclass(kind, OutputError):
             reason = beside(Path(error.filename))
         raise kind(f"{words}{reason}", *more) from None

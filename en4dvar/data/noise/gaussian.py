@@ -32,7 +32,6 @@ class Predicted:
     discrepancy: Array | None = None
 
     def __getitem__(self, runs: int | slice) -> "Predicted":
-        """The same of some of the runs."""
         return self.each(lambda part: part[runs])
 
     def among(self, where: Where) -> "Predicted":
@@ -280,7 +279,6 @@ class Noise:
         return {}
 
     def _white(self, stream: np.random.Generator, shape: tuple[int, ...]) -> Array:
-        """Draws of v."""
         return stream.standard_normal(shape)
 
     def _correlated(self, v: Array) -> Array:

@@ -18,10 +18,9 @@ import numpy.typing as npt
 from scipy.sparse import block_array, csr_array, eye_array
 
 from en4dvar.data.noise.correlated import SHARED, CorrelatedNoise, Correlation, SharedErrors
-from en4dvar.data.noise.discrepancy import DiscrepancyNoise, Kernel
+from en4dvar.data.noise.discrepancy import DiscrepancyNoise, Kernel, RobustDiscrepancyNoise
 from en4dvar.data.noise.gaussian import Linearisation, Noise, Predicted, ScaleSkewness
 from en4dvar.data.noise.losses import SIDES, BoundNoise, HuberNoise, record_of, sides_of
-from en4dvar.data.noise.robust_discrepancy import RobustDiscrepancyNoise
 from en4dvar.model.state import Array
 
 Indices = npt.NDArray[np.intp]

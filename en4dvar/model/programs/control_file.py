@@ -277,7 +277,6 @@ def _uncertainty(path: Path) -> Read:
 
 
 def _blocks(path: Path) -> Iterator[tuple[str, list[list[str]]]]:
-    """Kind and lines of each START … END."""
     lines = [line.split("#")[0].split() for line in text_of(path).splitlines()]
     kind, own = "", list[list[str]]()
     for words in filter(None, lines):
@@ -360,7 +359,6 @@ def _check_draws(draws: NamedMatrix, observations: Sequence[tuple[str, float, fl
 
 
 def _file(control: ControlFile, options: Sequence[str]) -> NamedMatrix | None:
-    """The matrix that one of the options names."""
     for name in options:
         if (text := control.options.get(name, "")).lower() not in OFF:
             with retold(ConfigError, ConfigError, f"{control.path}: option {name}: "):

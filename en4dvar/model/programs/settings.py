@@ -53,7 +53,6 @@ def _inside(name: str) -> str:
 
 
 def _base(info: ValidationInfo) -> Path:
-    """The folder of the configuration."""
     return Path((info.context or {}).get("base", Path.cwd())).absolute()
 
 
