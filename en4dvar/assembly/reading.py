@@ -14,8 +14,8 @@ from typing import cast
 
 import numpy as np
 
-from en4dvar.config.context import Spread
 from en4dvar.config.data import Data, DataPlan, SeriesPlan
+from en4dvar.config.quantities import Spread
 from en4dvar.data.noise import Noise, SharedErrors, noise_of
 from en4dvar.data.observations import Observations
 from en4dvar.data.series import Series, balanced

@@ -7,19 +7,9 @@ from typing import Annotated, Any, Literal, Self, cast
 
 from pydantic import BeforeValidator, ConfigDict, Discriminator, Field, Tag, WithJsonSchema, model_validator
 
-from en4dvar.config.context import (
-    PLACEHOLDER,
-    Context,
-    Faults,
-    Made,
-    OfObservable,
-    Place,
-    observable_unit,
-    quantity,
-    time_unit,
-    unit_of,
-)
+from en4dvar.config.context import PLACEHOLDER, Context, Faults, Made, OfObservable, Place
 from en4dvar.config.of_readings import PLACES, WEIGHTS, Error, Placing, Weighing
+from en4dvar.config.quantities import observable_unit, quantity, time_unit, unit_of
 from en4dvar.config.schema import Name, QuantityText, Section
 from en4dvar.inputs.parts import Column, Disorder, Format, Outliers, Repeated, TimeStep
 from en4dvar.inputs.text_table import Decimal

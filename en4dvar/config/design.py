@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from en4dvar.config.context import Context, Faults, Made, quantity, time_unit
+from en4dvar.config.context import Context, Faults, Made
+from en4dvar.config.quantities import quantity, time_unit
 from en4dvar.config.schema import QuantityText, Section, section_of
 from en4dvar.estimation.design.evaluate import SampleSizes
 from en4dvar.model.state import Array

@@ -12,11 +12,12 @@ from typing import Annotated, Any, Self
 
 from pydantic import AfterValidator, Field, ValidatorFunctionWrapHandler, WrapValidator, model_validator
 
-from en4dvar.config.context import Context, Faults, Made, Spread, quantity, time_unit
+from en4dvar.config.context import Context, Faults, Made
 from en4dvar.config.data import DATA, DataPlan
 from en4dvar.config.document import Document
 from en4dvar.config.load import Read, Validated, read_file
 from en4dvar.config.parameters import Entry, Fixed, Tied, Uncertain, entries
+from en4dvar.config.quantities import Spread, quantity, time_unit
 from en4dvar.config.schema import File, Name, Output, Section
 from en4dvar.config.sequential import Sequential, Workers, error_rates, localisation_of, stds
 from en4dvar.config.varies import MODEL_ERROR, ErrorOf, Estimated, dynamic_fields

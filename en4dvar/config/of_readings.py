@@ -3,7 +3,6 @@
 """
 
 import math
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -13,20 +12,8 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BeforeValidator, ConfigDict, Field, TypeAdapter
 
-from en4dvar.config.context import (
-    PLACEHOLDER,
-    TEXT,
-    Context,
-    Faults,
-    Made,
-    Spread,
-    Unit,
-    observable_unit,
-    quantity,
-    require_sign,
-    time_unit,
-    unit_of,
-)
+from en4dvar.config.context import PLACEHOLDER, TEXT, Context, Faults, Made
+from en4dvar.config.quantities import Spread, Unit, observable_unit, quantity, read_spread, time_unit, unit_of
 from en4dvar.config.schema import OfReadings, Section
 from en4dvar.data.noise import SMOOTHNESS, Kernel
 from en4dvar.data.series import Places
@@ -39,21 +26,9 @@ from en4dvar.plumbing import user_file
 from en4dvar.plumbing.errors import ConfigError, DataError, retold
 from en4dvar.plumbing.files import PathError, expanded
 from en4dvar.plumbing.hints import shown
-from en4dvar.plumbing.units import UnitError, convert, parse_quantity, split_quantity
+from en4dvar.plumbing.units import UnitError, convert, parse_quantity
 from en4dvar.plumbing.user_code import loading, reason_of
 from en4dvar.priors.prior import PriorTerm
-
-
-def parse_error_std(text: Any, unit: str, whole: str = "maximum") -> Spread:
-    """``"1.4 um"``, or ``"1 % of maximum"`` or of another ``whole``. Raises :class:`UnitError`."""
-    word = str(text).strip()
-    if relative := re.fullmatch(rf"(.*%)\s+of\s+(?:the\s+)?{whole}", word):
-        return Spread(parse_quantity(relative[1], "1"), relative=True)
-    try:
-        return Spread(parse_quantity(text, unit), unit=split_quantity(word)[1])
-    except UnitError as error:
-        hint = f"; write '{word} of {whole}'" if word.endswith("%") else ""
-        raise UnitError(f"{error}{hint}") from None
 
 
 class ErrorColumn(OfReadings):
@@ -61,12 +36,6 @@ class ErrorColumn(OfReadings):
 
     unit: str | None = None
     """Unit of the numbers in it; default: that of the readings' own column."""
-
-
-def read_spread(text: Any, context: Context, unit: Unit = observable_unit, whole: str = "maximum") -> Spread:
-    spread = parse_error_std(text, unit(context), whole)
-    require_sign(spread.value, "positive", text)
-    return spread
 
 
 def or_column(read: Callable[[Any, Context], Any], unit: Unit) -> Callable[[Any, Context], Any]:

@@ -6,7 +6,8 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from en4dvar.config.context import SPREAD, Context, Faults, Made, Spread, read_each, subject_unit, unit_of
+from en4dvar.config.context import Context, Faults, Made, read_each
+from en4dvar.config.quantities import SPREAD, Spread, subject_unit, unit_of
 from en4dvar.config.schema import Section
 from en4dvar.config.varies import Estimated, VariesSection
 from en4dvar.data.observations import Observations

@@ -14,7 +14,8 @@ from pydantic import ConfigDict, Discriminator, Field, Tag, WithJsonSchema, crea
 from pydantic.functional_validators import ModelWrapValidatorHandler
 from pydantic_core import from_json, to_json
 
-from en4dvar.config.context import Context, Faults, Made, Unknown, quantity
+from en4dvar.config.context import Context, Faults, Made, Unknown
+from en4dvar.config.quantities import quantity
 from en4dvar.executor.limits import Limits, parse_bytes
 from en4dvar.plumbing import user_file
 from en4dvar.plumbing.described import Described, text_for

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from en4dvar.config.context import SPREAD, TEXT, Context, Faults, Made, quantity, read_each, subject_unit
+from en4dvar.config.context import TEXT, Context, Faults, Made, read_each
+from en4dvar.config.quantities import SPREAD, quantity, subject_unit
 from en4dvar.config.schema import OfScheme, Section, keys_of_schemes, listed, or_in_a_file
 from en4dvar.config.varies import ErrorOf, Knots, dynamic_fields
 from en4dvar.model.forward import ForwardModel

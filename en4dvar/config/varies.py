@@ -12,18 +12,8 @@ import numpy as np
 from annotated_types import Ge
 from pydantic import model_validator
 
-from en4dvar.config.context import (
-    SPREAD,
-    Context,
-    Faults,
-    Made,
-    Spread,
-    parse_spread,
-    quantity,
-    read_each,
-    subject_unit,
-    time_unit,
-)
+from en4dvar.config.context import Context, Faults, Made, read_each
+from en4dvar.config.quantities import SPREAD, Spread, parse_spread, quantity, subject_unit, time_unit
 from en4dvar.config.schema import Section
 from en4dvar.data.observations import Observations
 from en4dvar.inputs.window import maxima
@@ -237,6 +227,4 @@ class ErrorOf:
         return StateChanges.of(model, self.field, self.spec.knots(observations), std.value, std.relative)
 
 
-MODEL_ERROR = of_fields(
-    ModelErrorSection, "write varies behind its prior", lambda section, field: ErrorOf(field, section), changes=True
-)
+MODEL_ERROR = of_fields(ModelErrorSection, "write varies behind its prior", lambda s, f: ErrorOf(f, s), changes=True)

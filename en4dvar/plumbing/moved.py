@@ -28,14 +28,15 @@ MOVED |= {f"en4dvar.{old}": f"en4dvar.{new}" for new, several in {
     "model.forward": "batch", "model.programs.model": "model.programs.process model.programs.outputs",
     "model.programs.languages": "model.programs.errors model.programs.pest model.programs.template",
     "series.moments": "series.outcome", "config.design": "config.times", "assembly.build": "config.build_sequence",
-    "config.of_readings": "config.weights config.places config.error config.error_std config.discrepancy",
+    "config.of_readings": "config.weights config.places config.error config.discrepancy",
     "assembly.reading": "config.find_files", "commands.synthetic": "commands.design commands.sweep_twin",
     "commands.together": "commands.joint commands.population", "commands.installation": "commands.listings",
     "commands.plugins": "commands.forms commands.plugin_commands", "series.window": "series.moving",
     "data.noise.discrepancy": "data.noise.kernel data.noise.robust_discrepancy",
     "data.noise.gaussian": "data.noise.predicted", "data.noise.losses": "data.noise.huber",
     "series.series": "series.aligned", "series.start": "series.coordinates", "config.context": "config.validate",
-    "inputs.readers": "inputs.order", "results.store": "results.groups results.beside results.complete results.record",
+    "config.quantities": "config.error_std", "inputs.readers": "inputs.order",
+    "results.store": "results.groups results.beside results.complete results.record",
     "report.result": "report.notebook", "report.svg": "report.words report.drawing report.paths",
     "report.chart": "report.ticks", "report.history": "report.predictive", "report.figures": "report.fields",
     "runs.finished": "runs.evidence_run", "estimation.joint.members": "estimation.joint.challenge",
@@ -62,9 +63,10 @@ MOVED |= {"en4dvar_agarose.summary": "en4dvar_agarose.tables", "en4dvar_agarose.
 MOVED |= {f"en4dvar_movie.{old}": f"en4dvar_movie.{new}" for old, new in {
     "corrections": "choice", "locate": "outline", "outlined": "page", "writing": "frames",
 }.items()}  # fmt: skip
-MOVED |= {f"en4dvar_bubble.{old}": f"en4dvar_bubble.{new}" for old, new in {
-    "laws.zener": "laws.maxwell", "laws.response": "battery",
-}.items()}  # fmt: skip
+MOVED |= {
+    "en4dvar_bubble.laws.zener": "en4dvar_bubble.laws.maxwell",
+    "en4dvar_bubble.laws.response": "en4dvar_bubble.battery",
+}
 
 # names that moved by themselves, with what they are called today
 NAMES = {
