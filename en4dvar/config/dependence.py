@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any, Self, cast
 
 import numpy as np
 from pydantic import Field
@@ -248,51 +248,48 @@ class PopulationSection(_HyperPrior):
     """Medians that a group is known to have, e.g. {standard: {k: 7.7 ± 0.2 N/m}}: they calibrate what all groups
     have in common, such as scale and density."""
 
+    def check(self, entries: Sequence[Entry], groups: Grouped, document: Document) -> None:
+        """Raises :class:`ConfigError`: a parameter that is not estimated, or of which each data set has a prior; an
+        unknown kind of group."""
+        faults: list[Fault] = []
+        estimated = {e.parameter.name: e for e in entries if isinstance(e, Uncertain)}
+        for i, name in enumerate(self.of):
+            with document.collecting(faults, "population", "of", i):
+                if name not in estimated:
+                    raise ConfigError(f"{name}: not estimated, it has no prior{suggest(name, estimated)}")
+                if estimated[name].needs_data:
+                    raise ConfigError(f"{name}: its prior depends on the data set ('maximum'), a population has one")
+        of_kind = groups.get(self.by or "", {})
+        for group in self.known:
+            with document.collecting(faults, "population", "known", *([group] if self.by else [])):
+                if self.by is None:
+                    raise ConfigError("of groups, which need 'by'")
+                if self.by in groups and group not in of_kind:
+                    raise ConfigError(f"no such group{suggest(group, of_kind)}")
+        if self.by is not None and self.by not in groups:
+            words = f"no kind of 'groups:' is called {shown(self.by)}{suggest(self.by, groups)}"
+            faults.append(document.fault(("population", "by"), words))
+        stated = [("reference", (), self.reference), *(("known", (g,), values) for g, values in self.known.items())]
+        for key, above, values in stated:
+            for name, text in values.items():
+                with document.collecting(faults, "population", key, *above, name):
+                    self._check_value(name, text, estimated, key)
+        if faults:
+            raise ConfigError(faults)
 
-def check_population(section: PopulationSection, entries: Sequence[Entry], groups: Grouped, document: Document) -> None:
-    """Raises :class:`ConfigError`: every parameter that is not estimated, or whose prior depends on the data set; an
-    unknown kind of group.
-    """
-    faults: list[Fault] = []
-    estimated = {e.parameter.name: e for e in entries if isinstance(e, Uncertain)}
-    for i, name in enumerate(section.of):
-        with document.collecting(faults, "population", "of", i):
-            if name not in estimated:
-                raise ConfigError(f"{name}: not estimated, it has no prior{suggest(name, estimated)}")
-            if estimated[name].needs_data:
-                raise ConfigError(f"{name}: its prior depends on the data set ('maximum'), a population has one")
-    of_kind = groups.get(section.by or "", {})
-    for group in section.known:
-        with document.collecting(faults, "population", "known", *([group] if section.by else [])):
-            if section.by is None:
-                raise ConfigError("of groups, which need 'by'")
-            if section.by in groups and group not in of_kind:
-                raise ConfigError(f"no such group{suggest(group, of_kind)}")
-    if section.by is not None and section.by not in groups:
-        words = f"no kind of 'groups:' is called {shown(section.by)}{suggest(section.by, groups)}"
-        faults.append(document.fault(("population", "by"), words))
-    stated = [("reference", (), section.reference), *(("known", (g,), values) for g, values in section.known.items())]
-    for key, above, values in stated:
-        for name, text in values.items():
-            with document.collecting(faults, "population", key, *above, name):
-                _check_value(name, text, section, estimated, key)
-    if faults:
-        raise ConfigError(faults)
-
-
-def _check_value(name: str, text: str, section: PopulationSection, estimated: Mapping[str, Entry], key: str) -> None:
-    """Raises :class:`ConfigError`, :class:`UnitError`: what is said of a parameter as ``reference`` or as ``known``."""
-    if name not in section.of and (key, name) != ("reference", SOURCE):
-        neither = "neither 'source' nor" if key == "reference" else "not"
-        raise ConfigError(f"{shown(name)}: {neither} among 'of'{suggest(name, section.of)}")
-    if name not in estimated:
-        return
-    value, std = reference_value(text, estimated[name].parameter.unit)
-    low, high = estimated[name].parameter.bounds
-    if key == "known" and not std > 0:
-        raise ConfigError(f"{shown(text)}: how well is it known? as '7.7 ± 0.2 kPa'")
-    if key == "known" and not low < value < high:
-        raise ConfigError(f"{shown(text)}: beyond the bounds of {name}")
+    def _check_value(self, name: str, text: str, estimated: Mapping[str, Entry], key: str) -> None:
+        """Raises :class:`ConfigError`, :class:`UnitError`: what ``reference`` or ``known`` says of a parameter."""
+        if name not in self.of and (key, name) != ("reference", SOURCE):
+            neither = "neither 'source' nor" if key == "reference" else "not"
+            raise ConfigError(f"{shown(name)}: {neither} among 'of'{suggest(name, self.of)}")
+        if name not in estimated:
+            return
+        value, std = reference_value(text, estimated[name].parameter.unit)
+        low, high = estimated[name].parameter.bounds
+        if key == "known" and not std > 0:
+            raise ConfigError(f"{shown(text)}: how well is it known? as '7.7 ± 0.2 kPa'")
+        if key == "known" and not low < value < high:
+            raise ConfigError(f"{shown(text)}: beyond the bounds of {name}")
 
 
 SOURCE = "source"  # of a reference: where it is from
@@ -323,6 +320,31 @@ class Sharing:
     groups: Grouped
     document: Document
 
+    @classmethod
+    def of(
+        cls, entries: Sequence[Entry], groups: Grouped, correlated: bool, several_series: bool, document: Document
+    ) -> Self:
+        """The parameters that a file asks to be shared. Raises :class:`ConfigError`: every entry that cannot be."""
+        asked = {e.parameter.name: e for e in entries if isinstance(e, Uncertain) and e.spec.shared not in (None, NONE)}
+        kinds = {name: str(entry.spec.shared) for name, entry in asked.items()}
+        wrong: list[tuple[str, str, str]] = []
+        for name, kind in kinds.items():
+            if kind not in (known := [ALL, NONE, *groups]):
+                wrong.append((name, "shared", f"no kind of 'groups:' is called {shown(kind)}{suggest(kind, known)}"))
+            if asked[name].needs_data:
+                words = "its prior depends on the data set ('maximum'), but what is shared has one prior"
+                wrong.append((name, "shared", words))
+        if kinds:
+            first = next(iter(kinds))
+            varying = [e.parameter.name for e in entries if isinstance(e, Uncertain) and e.spec.varies is not None]
+            wrong += [(name, "varies", "not where parameters are shared by data sets") for name in varying]
+            wrong += [(first, "shared", "not with correlated priors")] * correlated
+            words = "not where a data set has several series: a joint estimate takes one series of each"
+            wrong += [(first, "shared", words)] * several_series
+        if wrong:
+            raise ConfigError([document.fault(("parameters", name, key), words) for name, key, words in wrong])
+        return cls(kinds, groups, document)
+
     def of_dataset(self, name: str) -> dict[str, str]:
         """Shared parameter → group of a data set, "" for all. Raises :class:`ConfigError`: it is in none or several."""
         return {parameter: "" if kind == ALL else self.group_of(kind, name) for parameter, kind in self.kinds.items()}
@@ -338,33 +360,3 @@ class Sharing:
             return groups[0]
         where = f"in several of them: {', '.join(groups)}" if groups else "in none of them"
         raise ConfigError([self.document.fault(("groups", kind), f"data set {name!r} is {where}")])
-
-
-def sharing_of(
-    entries: Sequence[Entry], groups: Grouped, correlated: bool, several_series: bool, document: Document
-) -> Sharing:
-    """The parameters that a file asks to be shared. Raises :class:`ConfigError`: every entry that cannot be."""
-    asked = {e.parameter.name: e for e in entries if isinstance(e, Uncertain) and e.spec.shared not in (None, NONE)}
-    kinds = {name: str(entry.spec.shared) for name, entry in asked.items()}
-    faults = list[Fault]()
-    for name, kind in kinds.items():
-        where, known = ("parameters", name, "shared"), [ALL, NONE, *groups]
-        if kind not in known:
-            faults.append(document.fault(where, f"no kind of 'groups:' is called {shown(kind)}{suggest(kind, known)}"))
-        if asked[name].needs_data:
-            words = "its prior depends on the data set ('maximum'), but what is shared has one prior"
-            faults.append(document.fault(where, words))
-    if kinds:
-        faults += [
-            document.fault(("parameters", e.parameter.name, "varies"), "not where parameters are shared by data sets")
-            for e in entries
-            if isinstance(e, Uncertain) and e.spec.varies is not None
-        ]
-    if kinds and correlated:
-        faults.append(document.fault(("parameters", next(iter(kinds)), "shared"), "not with correlated priors"))
-    if kinds and several_series:
-        words = "not where a data set has several series: a joint estimate takes one series of each"
-        faults.append(document.fault(("parameters", next(iter(kinds)), "shared"), words))
-    if faults:
-        raise ConfigError(faults)
-    return Sharing(kinds, groups, document)

@@ -10,16 +10,7 @@ import yaml
 
 from en4dvar.config.context import Context, Made, check
 from en4dvar.config.data import DATA, DataPlan
-from en4dvar.config.dependence import (
-    Groups,
-    PopulationSection,
-    PriorCorrelation,
-    PriorFile,
-    Sharing,
-    check_population,
-    resolved,
-    sharing_of,
-)
+from en4dvar.config.dependence import Groups, PopulationSection, PriorCorrelation, PriorFile, Sharing, resolved
 from en4dvar.config.design import Design, Times, read_times
 from en4dvar.config.document import Document, Source, document_from, override, parse_document
 from en4dvar.config.models import read_model
@@ -153,7 +144,7 @@ def resolve(document: Document, base: Path, model: ForwardModel | None = None) -
     others = [initial.term.parameter.name for initial in file.initial_state or () if isinstance(initial, Perturbed)]
     parameters, blocks = resolved(file.parameters, file.prior, file.prior_correlation or (), others, apart, document)
     if file.population is not None:
-        check_population(file.population, parameters, file.groups or {}, document)
+        file.population.check(parameters, file.groups or {}, document)
     several = file.data is not None and len(file.data.series) > 1
     settings = file.assimilation.settings
     minimiser = settings.own.minimiser
@@ -167,7 +158,7 @@ def resolve(document: Document, base: Path, model: ForwardModel | None = None) -
         assimilation=settings,
         weights=file.assimilation.weights,
         simulate_times=file.simulate.times if file.simulate else None,
-        sharing=sharing_of(parameters, file.groups or {}, bool(blocks), several, document),
+        sharing=Sharing.of(parameters, file.groups or {}, bool(blocks), several, document),
         initial_state=file.initial_state or (),
         model_error=file.model_error or (),
         dependence=blocks,

@@ -303,8 +303,6 @@ class JoinedTrajectory(Trajectory):
 class PiecewiseModel(ForwardModel):
     """``model`` with what varies; the changes are parameters of its own, and its state carries their values along."""
 
-    dense = False
-
     def __init__(self, model: ForwardModel, varying: Sequence[Varying]):
         self.model, self.varying = model, tuple(varying)
         self.walks = tuple(change for change in self.varying if isinstance(change, RandomWalk))
