@@ -34,10 +34,8 @@ from en4dvar.series.start import EnsembleCoordinates, InitialEnsemble
 def build(config: Config) -> tuple[InverseProblem, ...]:
     """One inverse problem a data set, in the order of the paths (of a glob: sorted).
 
-    Raises
-    ------
-    ConfigError: there is no ``data:`` section, nothing is estimated, or a prior does not suit the data.
-    DataError: data files cannot be used; names every one of them.
+    Raises :class:`ConfigError`: there is no ``data:`` section, nothing is estimated, or a prior does not suit the data.
+    :class:`DataError`: data files cannot be used; names every one of them.
     """
     plan = inverse_plan(config)
     problems: list[InverseProblem] = []
@@ -137,9 +135,7 @@ def data_files(plan: DataPlan) -> dict[str, DataFile]:
     Several series name as many files each: of one data set the first series gives the name, of several they have the
     same names in every series.
 
-    Raises
-    ------
-    DataError: no file matches a pattern, or a file is named twice; series that do not go together.
+    Raises :class:`DataError`: no file matches a pattern, or a file is named twice; series that do not go together.
     """
     files_of_series = [_files_of(series) for series in plan.series]
     first, *others = files_of_series
@@ -172,9 +168,7 @@ def resolve_parameters(
 ) -> tuple[tuple[PriorTerm, ...], dict[str, float]]:
     """Prior terms and fixed values, evaluated on the data where they refer to them.
 
-    Raises
-    ------
-    ConfigError: every entry that cannot be evaluated, located in the file.
+    Raises :class:`ConfigError`: every entry that cannot be evaluated, located in the file.
     """
     terms: list[PriorTerm] = []
     fixed: dict[str, float] = {}

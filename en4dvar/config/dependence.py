@@ -93,9 +93,7 @@ class PriorFile(Section):
 def joined(blocks: Sequence[tuple[tuple[str, ...], Array]]) -> tuple[Dependence, ...]:
     """Blocks of correlations between some names each; what shares a name is one block, zero where nothing is said.
 
-    Raises
-    ------
-    ConfigError: a pair of which two say something, or no correlation matrix.
+    Raises :class:`ConfigError`: a pair of which two say something, or no correlation matrix.
     """
     groups: list[list[int]] = []
     for k, (names, _) in enumerate(blocks):
@@ -132,13 +130,8 @@ def resolved(
 ) -> tuple[tuple[Entry, ...], tuple[Dependence, ...]]:
     """The entries with the priors that an ensemble makes, and what the priors have to do with each other.
 
-    Parameters
-    ----------
-    others: names that are estimated besides the entries. apart: why a parameter can be correlated with no other.
-
-    Raises
-    ------
-    ConfigError: every fault, located in the file.
+    ``others``: names that are estimated besides the entries; ``apart``: why a parameter can be correlated with no other.
+    Raises :class:`ConfigError`: every fault, located in the file.
     """
     faults: list[Fault] = []
     asking = [e for e in entries if isinstance(e, Uncertain) and e.spec.prior == "ensemble"]
@@ -204,9 +197,7 @@ def _of_ensemble(
 def term_of_members(parameter: Parameter, values: Array, kind: str | None) -> tuple[PriorTerm, Array]:
     """The Gaussian of members (N,) in the coordinate ``kind``, and the members standardised (N,).
 
-    Raises
-    ------
-    ConfigError: members outside of the parameter's bounds or of the range of its map, or all alike.
+    Raises :class:`ConfigError`: members outside of the parameter's bounds or of the range of its map, or all alike.
     """
     low, high = parameter.bounds
     kind = kind or parameter.transform

@@ -22,14 +22,9 @@ FORMS = "(times, values), a dict of columns, a pandas Series or DataFrame, or an
 def columns_of(data: Any, time: str = TIME, value: str = VALUE) -> dict[str, Array]:
     """Columns by name, that of the times first and called :data:`TIME`, all of one length; NaN is a missing reading.
 
-    Parameters
-    ----------
-    data: one of :data:`FORMS`. time: name of the column, coordinate or index of times. value: what a series without a
-        name is called.
-
-    Raises
-    ------
-    DataError: it is none of these, has no times, or columns differ in length or are no numbers.
+    ``data``: one of :data:`FORMS`; ``time``: name of the column, coordinate or index of times; ``value``: what a series
+    without a name is called.
+    Raises :class:`DataError`: it is none of these, has no times, or columns differ in length or are no numbers.
     """
     columns = _columns(data, time, value)
     times = columns.pop(time, None)

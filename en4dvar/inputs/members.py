@@ -59,13 +59,8 @@ LARGEST = 256_000_000_000  # bytes of a file
 def read_members(path: Path, units: Mapping[str, tuple[str, str]]) -> dict[str, Array]:
     """Members (N,) of each parameter by name, in its own unit.
 
-    Parameters
-    ----------
-    units: for each name the unit that is wanted and, "" where the file tells it, the one in the file.
-
-    Raises
-    ------
-    DataError: the file cannot be read, lacks a name or a unit, or holds numbers that are not finite.
+    ``units``: for each name the unit that is wanted and, "" where the file tells it, the one in the file.
+    Raises :class:`DataError`: the file cannot be read, lacks a name or a unit, or holds numbers that are not finite.
     """
     if path.suffix.lower() in NETCDF:
         allowed = Allowed(60, 4_000_000_000, LARGEST)

@@ -78,9 +78,7 @@ def read_series(
     ``part``: see :func:`parts_of`. ``repeats``: there may be several readings at a time, in any order of times.
     ``fewest`` usable readings are needed.
 
-    Raises
-    ------
-    DataError: the file cannot be used.
+    Raises :class:`DataError`: the file cannot be used.
     """
     if part and layout.by is None and "*" in value.name:
         value = replace(value, name=part)

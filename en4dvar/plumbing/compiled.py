@@ -55,9 +55,7 @@ class SignatureFiles(IndexDataCacheFile):
 def kernel_folder() -> Path:
     """The folder of compiled kernels of this version of numba and this processor; it exists and can be written.
 
-    Raises
-    ------
-    OutputError: compiled code can be kept nowhere.
+    Raises :class:`OutputError`: compiled code can be kept nowhere.
     """
     asked = os.environ.get(CACHE)
     folder = (Path(asked) if asked else user_cache_path("en4dvar", appauthor=False)) / _target()
@@ -166,9 +164,7 @@ def keep(dispatcher: Any) -> None:
 
     Of processes that need it for the same arguments, one compiles, and the others load what it kept.
 
-    Raises
-    ------
-    OutputError: compiled code can be kept nowhere.
+    Raises :class:`OutputError`: compiled code can be kept nowhere.
     """
     dispatcher._cache = KernelCache(dispatcher.py_func)
     compile_: Callable[[Any], Any] = dispatcher.compile
@@ -206,9 +202,7 @@ KERNELS: list[Any] = []
 def _kernels(**options: Any) -> Callable[[F], F]:
     """Functions compiled by numba with these options, kept on disk, without the interpreter's lock.
 
-    Raises
-    ------
-    OutputError: nowhere can compiled code be kept.
+    Raises :class:`OutputError`: nowhere can compiled code be kept.
     """
 
     def compiled(function: F) -> F:

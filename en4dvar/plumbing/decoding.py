@@ -64,10 +64,8 @@ def require_plain(path: Path, size: int) -> None:
 def decoded(decoder: Decoder, path: Path, *arguments: Any, allowed: Allowed = Allowed()) -> Iterator[Any]:
     """The values of ``decoder(path, *arguments)``, a function of a module that gives them one by one, in a child.
 
-    Raises
-    ------
-    DataError: the file is none, or takes more than it may, or ends the process that decodes it; and what the decoder
-        raises as such. DecodeError: anything else that it raises, in words.
+    Raises :class:`DataError`: the file is none, or takes more than it may, or ends the process that decodes it; and
+    what the decoder raises as such. :class:`DecodeError`: anything else that it raises, in words.
     """
     require_plain(path, allowed.size)
     with _changing:

@@ -48,10 +48,8 @@ def load(name: str, what: str) -> Any:
 
     The file is opened once: what is asked about is what runs.
 
-    Raises
-    ------
-    ConfigError: no such file, it cannot be executed (with the line), or it holds no such class. RefusedError: it may
-        not be loaded, see :func:`~en4dvar.plumbing.user_code.require_permission`.
+    Raises :class:`ConfigError`: no such file, it cannot be executed (with the line), or it holds no such class.
+    :class:`RefusedError`: it may not be loaded, see :func:`~en4dvar.plumbing.user_code.require_permission`.
     """
     where, _, attribute = name.rpartition(":")
     path = Path(os.path.realpath(where))

@@ -31,9 +31,8 @@ class FieldPrior:
     ``length`` is in the unit of the field's coordinates. ``modes``: how many of them tell the field where nothing is
     localised, by default all but :data:`LEFT_OUT` of the variance.
 
-    Raises
-    ------
-    ConfigError: a field without coordinates, or more cells than a matrix holds that are on no regular grid.
+    Raises :class:`ConfigError`: a field without coordinates, or more cells than a matrix holds that are on no regular
+    grid.
     """
 
     field: Field

@@ -46,9 +46,7 @@ class PriorTerm:
     Use the constructors, which take physical values. ``bounds`` (a, b) belong to ``logit`` and to the kinds of
     :mod:`en4dvar.priors.parameter_map`, and are physical; ``shape`` holds the other numbers of the latter.
 
-    Raises
-    ------
-    ConfigError: a value that defines no proper prior (std ≤ 0, median outside the bounds, …).
+    Raises :class:`ConfigError`: a value that defines no proper prior (std ≤ 0, median outside the bounds, …).
     """
 
     parameter: Parameter
@@ -200,9 +198,7 @@ class PriorTerm:
     def from_physical(self, theta: Array) -> Array:
         """x for physical values ``theta`` of any shape.
 
-        Raises
-        ------
-        ValueError: a value outside the range of the transform.
+        Raises ValueError: a value outside the range of the transform.
         """
         theta = np.asarray(theta, dtype=float)
         if self.transform == "normal":
@@ -336,9 +332,7 @@ class Prior:
         draws of its parameters where it has N members. The correction is a Gram–Schmidt process in the order of the
         parameters: one added at the end leaves the others as they were, but growing N moves every member.
 
-        Raises
-        ------
-        ConfigError: fewer than 2 members, or ``exact`` with fewer than n + 1.
+        Raises :class:`ConfigError`: fewer than 2 members, or ``exact`` with fewer than n + 1.
         """
         n = len(self.terms)
         needed = n + 1 if method == "exact" else 2

@@ -199,10 +199,8 @@ def noise_of(
     Any of them may stand beside a ``discrepancy`` of the model; its amplitude and length are then parameters
     (:data:`~en4dvar.model.state.DISCREPANCY`). ``sides`` (K,): readings that are upper (1) or lower (−1) bounds.
 
-    Raises
-    ------
-    ValueError: both a correlation and a robust cost, either or a discrepancy beside bounds, or a matrix that is no
-        correlation.
+    Raises ValueError: both a correlation and a robust cost, either or a discrepancy beside bounds, or a matrix that is
+    no correlation.
     """
     std = np.asarray(std, dtype=float)
     time_std = np.zeros_like(std) if time_std is None else np.asarray(time_std, dtype=float)
