@@ -1,11 +1,9 @@
 """How a series is assimilated, of a twin experiment and of data: scheme, inflation, localisation, model error."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence, Set
 from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -56,7 +54,7 @@ class SeriesLocalisation(Section):
     cells of this grid. Default: the indices lie on a line."""
 
     @model_validator(mode="after")
-    def _one_cell_each(self) -> SeriesLocalisation:
+    def _one_cell_each(self) -> Self:
         if self.shape and self.block_size > 1:
             raise ValueError("block_size: only without shape")
         return self
@@ -72,7 +70,7 @@ class Smoothing(Section):
     """enks: cycles that an observation acts back on."""
 
     @model_validator(mode="after")
-    def _lag_of_enks(self) -> Smoothing:
+    def _lag_of_enks(self) -> Self:
         if self.method == "enrts" and "lag" in self.model_fields_set:
             raise ValueError("lag: only with method enks; enrts smooths by all later observations")
         return self
@@ -124,7 +122,7 @@ class Sequential(_OnASeries):
     """true: accept a model that gives other numbers when a member is run again; by default that is an error."""
 
     @model_validator(mode="after")
-    def _belongs_together(self) -> Sequential:
+    def _belongs_together(self) -> Self:
         if type(self).unread({key: getattr(self, key) for key in self.model_fields_set}):
             return self  # told already
         # settings that do not go together are told here, in their place

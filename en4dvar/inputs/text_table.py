@@ -8,8 +8,6 @@ at. A workbook is a zip archive from anybody: what it unpacks to is bounded, and
 before openpyxl sees it.
 """
 
-from __future__ import annotations
-
 import csv
 import fnmatch
 import re
@@ -276,7 +274,7 @@ def _rows(path: Path, name: str, area: str, formulas: bool) -> list[tuple[int, t
             book.close()
 
 
-def _sheet(book: Any, name: str, path: Path) -> ReadOnlyWorksheet:
+def _sheet(book: Any, name: str, path: Path) -> "ReadOnlyWorksheet":
     """The sheet of a name, or the only one with anything in it. Raises :class:`DataError`."""
     sheets = {sheet.title: sheet for sheet in book.worksheets}
     if name:

@@ -5,8 +5,6 @@ the same double as ``1.4e-6``. A power may be a decimal, as in ``"Pa s^0.6"`` of
 are not units of this kind (they have an offset) and are refused.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -42,10 +40,10 @@ class Unit:
     factor: Fraction
     powers: tuple[int | Fraction, ...]
 
-    def __mul__(self, other: Unit) -> Unit:
+    def __mul__(self, other: "Unit") -> "Unit":
         return Unit(self.factor * other.factor, tuple(a + b for a, b in zip(self.powers, other.powers, strict=True)))
 
-    def __pow__(self, exponent: int | Fraction) -> Unit:
+    def __pow__(self, exponent: int | Fraction) -> "Unit":
         return Unit(Fraction(self.factor**exponent), tuple(p * exponent for p in self.powers))
 
 
@@ -206,8 +204,8 @@ def _factor(from_unit: str, to_unit: str) -> Fraction:
 @overload
 def convert(value: float, from_unit: str, to_unit: str) -> float: ...
 @overload
-def convert(value: Array, from_unit: str, to_unit: str) -> Array: ...
-def convert(value: float | Array, from_unit: str, to_unit: str) -> float | Array:
+def convert(value: "Array", from_unit: str, to_unit: str) -> "Array": ...
+def convert(value: "float | Array", from_unit: str, to_unit: str) -> "float | Array":
     """``value`` (a number or an array) of ``from_unit``, expressed in ``to_unit``. Raises :class:`UnitError`."""
     factor = _factor(from_unit, to_unit)
     # Dividing by 1e6 rounds once, multiplying by 1e-6 twice.

@@ -15,14 +15,12 @@ Random numbers are counter-based (Philox; Salmon et al. 2011, "Parallel random n
 parameter leaves the others' draws as they were. Each data set of a run has a seed of its own, :func:`own_seed`.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 import unicodedata
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 
@@ -81,17 +79,17 @@ class PriorTerm:
         return self.std if self.transform == "lognormal" else 0.0
 
     @classmethod
-    def normal(cls, parameter: Parameter, mean: float, std: float) -> PriorTerm:
+    def normal(cls, parameter: Parameter, mean: float, std: float) -> Self:
         """θ ~ N(mean, std²), both in the parameter's unit."""
         return cls(parameter, "normal", mean, std)
 
     @classmethod
-    def lognormal(cls, parameter: Parameter, median: float, log_std: float) -> PriorTerm:
+    def lognormal(cls, parameter: Parameter, median: float, log_std: float) -> Self:
         """ln θ ~ N(ln median, log_std²); ``median`` in the parameter's unit, ``log_std`` dimensionless."""
         return cls(parameter, "lognormal", _log(parameter, "median", median), log_std)
 
     @classmethod
-    def lognormal_moments(cls, parameter: Parameter, mean: float, std: float) -> PriorTerm:
+    def lognormal_moments(cls, parameter: Parameter, mean: float, std: float) -> Self:
         """The lognormal whose physical mean and standard deviation are ``mean`` and ``std``.
 
         >>> term = PriorTerm.lognormal_moments(Parameter("G", "Pa"), mean=2.0, std=1.0)
@@ -106,7 +104,7 @@ class PriorTerm:
         return cls(parameter, "lognormal", log_mean - variance / 2, math.sqrt(variance))
 
     @classmethod
-    def logit(cls, parameter: Parameter, bounds: Bounds, median: float, logit_std: float) -> PriorTerm:
+    def logit(cls, parameter: Parameter, bounds: Bounds, median: float, logit_std: float) -> Self:
         """logit((θ − a)/(b − a)) ~ N(logit of the median, logit_std²); ``bounds`` and ``median`` physical."""
         low, high = bounds
         inside = -math.inf < low < median < high < math.inf
@@ -114,12 +112,12 @@ class PriorTerm:
         return cls(parameter, "logit", math.log((median - low) / (high - median)), logit_std, (low, high))
 
     @classmethod
-    def uniform(cls, parameter: Parameter, bounds: Bounds) -> PriorTerm:
+    def uniform(cls, parameter: Parameter, bounds: Bounds) -> Self:
         """θ equally likely everywhere between finite physical ``bounds``."""
         return cls._by_quantiles(parameter, "uniform", bounds, ())
 
     @classmethod
-    def half_normal(cls, parameter: Parameter, std: float, low: float = 0.0) -> PriorTerm:
+    def half_normal(cls, parameter: Parameter, std: float, low: float = 0.0) -> Self:
         """θ = low + |N(0, std²)|, in the parameter's unit; ``std`` is that of the whole Gaussian."""
         term = cls._by_quantiles(parameter, "half-normal", (low, math.inf), (std,))
         around = max(abs(low), 1 / LARGEST)
@@ -127,7 +125,7 @@ class PriorTerm:
         return term
 
     @classmethod
-    def beta(cls, parameter: Parameter, bounds: Bounds, alpha: float, beta: float) -> PriorTerm:
+    def beta(cls, parameter: Parameter, bounds: Bounds, alpha: float, beta: float) -> Self:
         """(θ − a)/(b − a) ~ Beta(alpha, beta) between finite physical ``bounds`` (a, b)."""
         for name, value in (("alpha", alpha), ("beta", beta)):
             words = f"{name} must lie between {SHAPES[0]:g} and {SHAPES[1]:g}, not {value:g}"
@@ -137,7 +135,7 @@ class PriorTerm:
     @classmethod
     def bounded(
         cls, parameter: Parameter, kind: Literal["normal", "lognormal"], mean: float, std: float, bounds: Bounds
-    ) -> PriorTerm:
+    ) -> Self:
         """:meth:`normal` of ``mean`` and ``std``, or :meth:`lognormal` of median and log_std, between ``bounds``."""
         whole = cls.normal(parameter, mean, std) if kind == "normal" else cls.lognormal(parameter, mean, std)
         low, high = bounds
@@ -151,7 +149,7 @@ class PriorTerm:
         return cls._by_quantiles(parameter, name, bounds, shape)
 
     @classmethod
-    def _by_quantiles(cls, parameter: Parameter, kind: TransformName, bounds: Bounds, shape: Numbers) -> PriorTerm:
+    def _by_quantiles(cls, parameter: Parameter, kind: TransformName, bounds: Bounds, shape: Numbers) -> Self:
         (low, high), term = bounds, cls(parameter, kind, 0.0, 1.0, bounds, shape)
         finite = math.isfinite(low) and (math.isfinite(high) or kind == "half-normal")
         term._require(finite and low < high, f"{kind} needs finite bounds, low < high, not {bounds}")
@@ -230,7 +228,7 @@ class Prior:
         if missing := set(correlated) - set(self.names):
             raise ConfigError(f"prior: {', '.join(sorted(missing))} is correlated, but not estimated")
 
-    def of(self, terms: tuple[PriorTerm, ...]) -> Prior:
+    def of(self, terms: tuple[PriorTerm, ...]) -> "Prior":
         """The prior of other ``terms``, with the correlations that this prior has between those it knows."""
         names = {term.parameter.name for term in terms}
         return Prior(terms, tuple(kept for block in self.blocks if (kept := block.among(tuple(names)))))

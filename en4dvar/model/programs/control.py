@@ -7,8 +7,6 @@ observations of groups that hold inequalities are bounds. Files of covariances a
 bounds and weights. What it asks for that would change the estimate and is not done here is an error that names it.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence

@@ -7,8 +7,6 @@ dense one), ``.csv``, ``.unc`` (PEST's uncertainty file); any other is PEST's ma
 (2020), Approaches to highly parameterized inversion: PEST++, USGS Techniques and Methods 7-C26, appendix B.
 """
 
-from __future__ import annotations
-
 import csv
 import re
 from collections import defaultdict

@@ -9,8 +9,6 @@ its delimiters say, and holds as many digits as fit. The instructions are ``ln``
 is an error.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 import re

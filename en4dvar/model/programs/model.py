@@ -4,8 +4,6 @@ A run has a scratch directory of its own, its input files, the process, and the 
 out of them by a column, a key of JSON, a pattern, or PEST's instructions.
 """
 
-from __future__ import annotations
-
 import csv
 import json
 import math
@@ -18,7 +16,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 import numpy as np
 
@@ -226,6 +224,6 @@ class CommandModel(FunctionModel):
         super().__init__(Program(words, settings), parameters, units, settings.time_unit)
 
     @classmethod
-    def from_settings(cls, settings: CommandSettings) -> CommandModel:
+    def from_settings(cls, settings: CommandSettings) -> Self:
         """Raises :class:`~en4dvar.plumbing.user_code.RefusedError` where the program may not be run."""
         return cls(settings)

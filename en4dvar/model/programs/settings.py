@@ -1,7 +1,5 @@
 """The section ``model: {command: "./solver {input} {output}", …}``: how a program is called, what goes in and out."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import os
