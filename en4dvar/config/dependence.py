@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Self, cast
+from typing import Annotated, Any, Self, cast
 
 import numpy as np
 from pydantic import Field
@@ -19,7 +19,7 @@ from pydantic import Field
 from en4dvar.config.context import Context, Faults, Made
 from en4dvar.config.document import Document
 from en4dvar.config.parameters import Entry, Uncertain
-from en4dvar.config.schema import Name, Section, section_of
+from en4dvar.config.schema import Name, Section
 from en4dvar.estimation.population import HyperPrior
 from en4dvar.inputs.members import read_members, read_square
 from en4dvar.model.state import Array, Parameter, TransformName
@@ -214,15 +214,7 @@ def term_of_members(parameter: Parameter, values: Array, kind: str | None) -> tu
 GroupName = Annotated[str, Field(pattern=r"^[^\s\x00-\x1f\x7f][^\x00-\x1f\x7f]*$", max_length=100)]
 
 
-if TYPE_CHECKING:
-
-    class _HyperPrior(HyperPrior, Section): ...
-
-else:
-    _HyperPrior = section_of(HyperPrior)
-
-
-class PopulationSection(_HyperPrior):
+class PopulationSection(Section, HyperPrior):
     """Mean and spread of parameters over the data sets of the run, estimated at its end."""
 
     of: Annotated[tuple[str, ...], Field(min_length=1)]

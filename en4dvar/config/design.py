@@ -3,14 +3,14 @@
 from collections.abc import Iterator, Mapping
 from itertools import product
 from math import prod
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
 
 from en4dvar.config.context import Context, Faults, Made
 from en4dvar.config.quantities import quantity, time_unit
-from en4dvar.config.schema import QuantityText, Section, section_of
+from en4dvar.config.schema import QuantityText, Section
 from en4dvar.estimation.design.evaluate import SampleSizes
 from en4dvar.model.state import Array
 from en4dvar.plumbing.units import UnitError, parse_quantity
@@ -124,15 +124,7 @@ class Within(Section):
         return "; ".join(f"{text}: more than design.within.{key} = {most:g}" for key, most, text in over)
 
 
-if TYPE_CHECKING:
-
-    class _SampleSizes(SampleSizes, Section): ...
-
-else:
-    _SampleSizes = section_of(SampleSizes)
-
-
-class Design(_SampleSizes):
+class Design(Section, SampleSizes):
     """Which experiments ``en4dvar design`` compares, and about what."""
 
     about: tuple[str, ...] = ()
