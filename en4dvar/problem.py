@@ -8,7 +8,7 @@ from typing import Any
 from en4dvar.data.observations import Observations
 from en4dvar.data.series import Part
 from en4dvar.model.forward import Alternative, ForwardModel, Observable
-from en4dvar.model.state import DISCREPANCY, NOISE_SCALE, Parameter
+from en4dvar.model.state import DISCREPANCY, NOISE_SCALE, READING_OFFSET, READING_SCALE, Parameter
 from en4dvar.plumbing.moved import former_name
 from en4dvar.priors.field_prior import FieldPrior
 from en4dvar.priors.prior import Prior, PriorTerm
@@ -87,8 +87,22 @@ class InverseProblem:
         observed = {part.observable.name for part in self.parts}
         return tuple(a for a in self.model.alternatives if not a.observable or observed == {a.observable})
 
-    def has(self, parameter: Parameter) -> bool:
-        """Whether ``sigma``, ``reading_scale`` or ``reading_offset`` is given, rather than being the model's own."""
+    @property
+    def has_noise_scale(self) -> bool:
+        """Whether ``sigma`` is given and scales the observation errors (rather than being the model's own)."""
+        return self._has(NOISE_SCALE)
+
+    @property
+    def has_reading_scale(self) -> bool:
+        """Whether ``reading_scale`` is given and scales the predictions (rather than being the model's own)."""
+        return self._has(READING_SCALE)
+
+    @property
+    def has_reading_offset(self) -> bool:
+        """Whether ``reading_offset`` is given and is added to the predictions (rather than being the model's own)."""
+        return self._has(READING_OFFSET)
+
+    def _has(self, parameter: Parameter) -> bool:
         stated = parameter.name in self.prior.names or parameter.name in self.fixed
         return stated and all(p.name != parameter.name for p in self.model.parameters)
 
@@ -107,7 +121,7 @@ class InverseProblem:
     @property
     def of_errors(self) -> frozenset[str]:
         """Names of the parameters of R: its scale, amplitude and length of a discrepancy."""
-        scale = (NOISE_SCALE,) if self.has(NOISE_SCALE) else ()
+        scale = (NOISE_SCALE,) if self.has_noise_scale else ()
         return frozenset(p.name for p in (*self.discrepancy, *scale))
 
     @property

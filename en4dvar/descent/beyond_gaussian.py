@@ -88,7 +88,7 @@ def _given(
     predicted = Predicted(
         np.tile(at.values, (count, 1)),
         None if at.rates is None else np.tile(at.rates, (count, 1)),
-        of_framework(problem, physical, NOISE_SCALE, 1.0) if problem.has(NOISE_SCALE) else None,
+        of_framework(problem, physical, NOISE_SCALE, 1.0) if problem.has_noise_scale else None,
         np.stack([of_framework(problem, physical, p, 1.0) for p in problem.discrepancy], axis=1),
     )
     log_density, means, covariances = [], [], []
@@ -177,7 +177,7 @@ def mean_beyond_mode(problem: InverseProblem, mode: Array, posterior: Array, dfs
         ½ C e_x [ g' (r_m tr MC + r_u tr UC) − 3 (g''/g') tr UC − g''' ∂_u J C_xx ].
     """
     prior, name = problem.prior, NOISE_SCALE.name
-    if name not in prior.names or not problem.has(NOISE_SCALE) or problem.discrepancy:
+    if name not in prior.names or not problem.has_noise_scale or problem.discrepancy:
         return np.zeros(len(mode))
     column = prior.names.index(name)
     anomalies = posterior - posterior.mean(axis=0)

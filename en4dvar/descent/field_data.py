@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from en4dvar.model.forward import field_of
-from en4dvar.model.state import NOISE_SCALE, Array
+from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError, En4dvarError
 from en4dvar.priors.field_prior import places_of
 from en4dvar.priors.prior import member_stream
@@ -122,7 +122,7 @@ def gain_of(problem: InverseProblem, settings: AssimilationSettings) -> Gain:
         raise ConfigError("a field estimated cell by cell needs a localised gain, e.g. {radius: 10}")
     if settings.scheme not in LOCALISED:
         raise ConfigError(f"a scheme for data that can be localised is {' or '.join(LOCALISED)}")
-    if not problem.observations.noise.plain or problem.has(NOISE_SCALE):
+    if not problem.observations.noise.plain or problem.has_noise_scale:
         raise ConfigError(
             "takes independent Gaussian errors of known std: no covariance, correlation time, shared or timing error, "
             "robust cost, discrepancy or sigma"

@@ -140,7 +140,7 @@ class Composite:
         self._initial_states = InitialStates(problem)
         self._operators = _operators(problem)
         self._batched = batched(problem)
-        self._scaled, self._discrepancy = problem.has(NOISE_SCALE), problem.discrepancy
+        self._scaled, self._discrepancy = problem.has_noise_scale, problem.discrepancy
         self._spread = spread_rates(problem)
 
     def __call__(self, x: Array, extra_times: Array = NO_TIMES) -> Forecast:
@@ -278,13 +278,13 @@ def check_problem(problem: InverseProblem) -> tuple[Parameter, ...]:
         if names:
             raise ConfigError(f"{', '.join(sorted(names))}: {message}")
     for uncertain, parameter in (
-        (problem.has(READING_SCALE), READING_SCALE),
-        (problem.has(READING_OFFSET), READING_OFFSET),
+        (problem.has_reading_scale, READING_SCALE),
+        (problem.has_reading_offset, READING_OFFSET),
     ):
         if uncertain and problem.observations.parts:
             where = f"parameters.{parameter.name}"
             raise ConfigError("cannot be one number for several series or for readings at places", where)
-    if problem.has(NOISE_SCALE) and np.any(sides_of(problem.observations.noise)):
+    if problem.has_noise_scale and np.any(sides_of(problem.observations.noise)):
         raise ConfigError("bounds (at_most, at_least) tell no scale of errors; leave sigma out", "parameters.sigma")
     _operators(problem)
     return tuple(known[name] for name in problem.fixed)
@@ -299,9 +299,9 @@ def _operators(problem: InverseProblem) -> list[tuple[Callable[[Any], Array], ..
 
 def as_read(problem: InverseProblem, physical: Array, observed: Array) -> Array:
     """Readings of an observable, and of its rates, (Q, B, M): times ``reading_scale``, plus ``reading_offset``."""
-    if problem.has(READING_SCALE):
+    if problem.has_reading_scale:
         observed = observed * of_framework(problem, physical, READING_SCALE, 1.0)[:, None]
-    if problem.has(READING_OFFSET):
+    if problem.has_reading_offset:
         read = observed[0] + of_framework(problem, physical, READING_OFFSET, 0.0)[:, None]
         observed = np.concatenate([read[None], observed[1:]])
     return observed

@@ -20,7 +20,7 @@ from en4dvar.diagnosis.withheld import Withheld, predict_withheld
 from en4dvar.ensemble.forecast import Forecast, check_problem, plotting_times
 from en4dvar.ensemble.repeat import check_forecast_repeats
 from en4dvar.executor import Executor
-from en4dvar.model.state import NOISE_SCALE, Array
+from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.problem import InverseProblem
 from en4dvar.sampling.refine import (
@@ -77,7 +77,7 @@ class Stages:
         problem, settings = self.problem, self.settings
         self.fixed_parameters = check_problem(problem)
         self.minimiser = settings.own.minimiser
-        plain = problem.observations.noise.quadratic and not problem.has(NOISE_SCALE)
+        plain = problem.observations.noise.quadratic and not problem.has_noise_scale
         if self.minimiser is None and (problem.estimates_discrepancy or not plain):
             raise ConfigError(
                 f"{settings.scheme} takes Gaussian errors of known covariance: no sigma, robust cost, bounds or "

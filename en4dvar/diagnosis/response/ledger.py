@@ -92,7 +92,7 @@ def _ledger(problem: InverseProblem, response: LinearResponse, std: Array, names
     physical = prior.to_physical(response.at)
     alive, start, _ = InitialStates(problem)(physical[None])
     shift = float(of_framework(problem, physical[None], TIME_SHIFT, 0.0)[0])
-    scale = float(of_framework(problem, physical[None], READING_SCALE, 1.0)[0]) if problem.has(READING_SCALE) else 1.0
+    scale = float(of_framework(problem, physical[None], READING_SCALE, 1.0)[0]) if problem.has_reading_scale else 1.0
     times = problem.observations.times + shift
     path = None if alive is not EVERYONE else _path(problem, start, float(times.max()))
     if path is None:

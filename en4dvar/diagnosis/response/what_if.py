@@ -26,7 +26,7 @@ from en4dvar.diagnosis.influence import ReadingTangent
 from en4dvar.ensemble.forecast import Composite
 from en4dvar.executor import Executor
 from en4dvar.model.forward import Alternative
-from en4dvar.model.state import READING_SCALE, Array
+from en4dvar.model.state import Array
 from en4dvar.priors.prior import member_stream, whiten_sample
 from en4dvar.problem import InverseProblem
 
@@ -158,7 +158,7 @@ def what_if(
     offered = [
         alternative
         for alternative in problem.alternatives
-        if alternative.values == 1.0 or not problem.has(READING_SCALE)
+        if alternative.values == 1.0 or not problem.has_reading_scale
     ]
     shifts = [_shift(problem, response, std, cost, executor, fitted, alternative) for alternative in offered]
     return tuple(sorted(shifts, key=lambda shift: -shift.largest))
