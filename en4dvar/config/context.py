@@ -26,12 +26,9 @@ Place = tuple[str | int, ...]
 
 _KIND = re.compile(r"\w+_(type|parsing|parsing_size|from_float)|finite_number")  # verdicts on what a value is
 _NOT = ", not "
-_SECTION = "expected 'key: value' lines"
 _MESSAGES = {
     "missing": "required, but not given",
-    "dict_type": _SECTION,
-    "model_type": _SECTION,
-    "model_attributes_type": _SECTION,
+    **dict.fromkeys(("dict_type", "model_type", "model_attributes_type"), "expected 'key: value' lines"),
     "string_too_short": "must not be empty",
     "tuple_type": "expected a list, e.g. [1, 2]",
     "string_type": "expected text; put it in quotes",

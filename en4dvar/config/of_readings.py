@@ -185,20 +185,17 @@ class Error(Section):
 
     @classmethod
     def rules(cls, keys: Mapping[str, Any], context: Context, faults: Faults) -> None:
-        std = f"{PLACEHOLDER}_std"
-        for name, other, reason in (
-            ("covariance", std, "the file holds the variances"),
-            ("covariance", "model_std", "the file holds the variances"),
-            ("covariance", "correlation_time", "the file holds the correlations"),
-            ("covariance", "shared", "the file holds the correlations"),
-            ("shared", "correlation_time", "give R as a file, covariance: {path: …}"),
-            ("robust", "shared", "a robust cost needs independent observation errors"),
-            ("robust", "correlation_time", "a robust cost needs independent observation errors"),
-            ("robust", "covariance", "a robust cost needs independent observation errors"),
-            *((bound, other, "bounds need independent errors of known std") for bound in BOUNDS for other in BESIDE),
+        std, correlated = f"{PLACEHOLDER}_std", ("shared", "correlation_time")
+        for name, others, reason in (
+            ("covariance", (std, "model_std"), "the file holds the variances"),
+            ("covariance", correlated, "the file holds the correlations"),
+            ("shared", ("correlation_time",), "give R as a file, covariance: {path: …}"),
+            ("robust", (*correlated, "covariance"), "a robust cost needs independent observation errors"),
+            *((bound, BESIDE, "bounds need independent errors of known std") for bound in BOUNDS),
         ):
-            if name in keys and other in keys:
-                faults.add((name,), f"not together with {other}: {reason}", at_key=True)
+            for other in others if name in keys else ():
+                if other in keys:
+                    faults.add((name,), f"not together with {other}: {reason}", at_key=True)
         if "threshold" in keys and "robust" not in keys:
             faults.add(("threshold",), "is that of the robust cost; write robust: huber as well", at_key=True)
         if context.observed and not keys.keys() & {std, "covariance"}:

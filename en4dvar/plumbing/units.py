@@ -54,13 +54,8 @@ def _unit(factor: str, **powers: int) -> Unit:
     return Unit(Fraction(factor), tuple(powers.get(b, 0) for b in BASE))
 
 
-PREFIXED = {
-    "m": _unit("1", m=1),
+PREFIXED = {name: _unit("1", **{name: 1}) for name in BASE if name != "kg"} | {
     "g": _unit("1e-3", kg=1),
-    "s": _unit("1", s=1),
-    "K": _unit("1", K=1),
-    "A": _unit("1", A=1),
-    "mol": _unit("1", mol=1),
     "Hz": _unit("1", s=-1),
     "fps": _unit("1", s=-1),
     "N": _unit("1", m=1, kg=1, s=-2),
