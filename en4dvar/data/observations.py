@@ -45,7 +45,7 @@ class Observations:
 
     Raises
     ------
-    DataError: shapes do not fit, fewer than 3 observations, or one of the above does not hold.
+    DataError: shapes do not fit, there is no observation, or one of the above does not hold.
     """
 
     times: Array
