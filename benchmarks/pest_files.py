@@ -21,8 +21,8 @@ from pathlib import Path
 import numpy as np
 
 import en4dvar
-from en4dvar.model.programs.control import from_pest
-from en4dvar.model.programs.control_file import PARAMETERS, read_control
+from en4dvar.model.programs.control import PARAMETERS, from_pest
+from en4dvar.model.programs.control_file import read_control
 from en4dvar.model.programs.languages import identifier
 
 MISSING = re.compile(r"(\S*): No such file or directory")

@@ -142,9 +142,8 @@ class InverseProblem:
     def varied(self, varying: Sequence[Varying]) -> "InverseProblem":
         """The same with what varies; the changes join the control vector at its end."""
         changes = (term for variation in varying for term in variation.terms)
-        return replace(
-            self, model=PiecewiseModel(self.model, varying), prior=self.prior.of((*self.prior.terms, *changes))
-        )
+        prior = self.prior.of((*self.prior.terms, *changes))
+        return replace(self, model=PiecewiseModel(self.model, varying), prior=prior)
 
     @property
     def constant(self) -> "InverseProblem":
@@ -169,10 +168,8 @@ def common_to(problems: Sequence[InverseProblem], names: Collection[str]) -> tup
     """Parameters with one value in all data sets that estimate them, two at least: those that are declared so
     (:attr:`Parameter.common`), not of ``names``, and have the same uncorrelated prior in all.
     """
-    correlated, terms = (
-        {n for p in problems for block in p.prior.blocks for n in block.names},
-        dict[str, list[PriorTerm]](),
-    )
+    correlated = {name for problem in problems for block in problem.prior.blocks for name in block.names}
+    terms: dict[str, list[PriorTerm]] = {}
     for term in (term for problem in problems for term in problem.prior.terms):
         terms.setdefault(term.parameter.name, []).append(term)
     return tuple(

@@ -32,13 +32,9 @@ from en4dvar.series.start import EnsembleCoordinates, InitialEnsemble
 
 
 def build(config: Config) -> tuple[InverseProblem, ...]:
-    """One inverse problem a data set, in the order of the paths (of a glob: sorted).
-
-    Raises
-    ------
-    ConfigError: there is no ``data:`` section, nothing is estimated, or a prior does not suit the data.
-    DataError: data files cannot be used; names every one of them.
-    """
+    """One inverse problem a data set, in the order of the paths (of a glob: sorted). Raises :class:`ConfigError`: there
+    is no ``data:`` section, nothing is estimated, or a prior does not suit the data. :class:`DataError`: data files
+    cannot be used; names every one of them."""
     plan = inverse_plan(config)
     problems: list[InverseProblem] = []
     unusable: list[DataError] = []
@@ -79,9 +75,8 @@ def problem_of(config: Config, observations: Observations) -> InverseProblem:
         fields = ()
     terms = (*terms, *(start.term for start in perturbed), *discrepancy_terms(config, observations))
     estimated = {term.parameter.name for term in terms}
-    tied = tuple(
-        Tie(e.parameter, e.to, e.factor) for e in config.parameters if isinstance(e, Tied) and e.to in estimated
-    )
+    following = (entry for entry in config.parameters if isinstance(entry, Tied) and entry.to in estimated)
+    tied = tuple(Tie(entry.parameter, entry.to, entry.factor) for entry in following)
     perturbations = tuple(start.perturbation for start in perturbed)
     varying = _varying(config, observations, terms)
     count, localised = len(terms) + sum(len(change.terms) for change in varying), asked.localisation is not None
@@ -138,9 +133,7 @@ def data_files(plan: DataPlan) -> dict[str, DataFile]:
     Several series name as many files each: of one data set the first series gives the name, of several they have the
     same names in every series.
 
-    Raises
-    ------
-    DataError: no file matches a pattern, or a file is named twice; series that do not go together.
+    Raises :class:`DataError`: no file matches a pattern, or a file is named twice; series that do not go together.
     """
     files_of_series = [_files_of(series) for series in plan.series]
     first, *others = files_of_series
@@ -151,10 +144,9 @@ def data_files(plan: DataPlan) -> dict[str, DataFile]:
     for series, files in zip(plan.series[1:], others, strict=True):
         if len(files) != len(first) or (len(first) > 1 and files.keys() != first.keys()):
             rest = [name for name in (*first, *files) if (name in first) != (name in files)]
-            raise DataError(
-                f"series {series.name} has {len(files)} data sets, {plan.series[0].name} has {len(first)}; each data "
-                f"set needs a file of the same name in every series{f'; not so {rest[0]}' if rest else ''}"
-            )
+            counts = f"series {series.name} has {len(files)} data sets, {plan.series[0].name} has {len(first)}"
+            lacking = f"; not so {rest[0]}" if rest else ""
+            raise DataError(f"{counts}; each data set needs a file of the same name in every series{lacking}")
     return {
         name: replace(file, others=tuple(files.get(name) or next(iter(files.values())) for files in others))
         for name, file in first.items()
@@ -165,21 +157,15 @@ def _files_of(series: SeriesPlan) -> dict[str, DataFile]:
     data = series.data
     with retold(DataError, DataError, "", series.name):
         files = find_files(data.path.base, data.path.texts)
-    time = data.columns.time
-    return with_parts(
-        files, data.columns.observable, data.part(Layout), time.name if isinstance(time, Column) else None
-    )
+    time = data.columns.time.name if isinstance(data.columns.time, Column) else None
+    return with_parts(files, data.columns.observable, data.part(Layout), time)
 
 
 def resolve_parameters(
     config: Config | SequenceConfig, observations: Observations | None
 ) -> tuple[tuple[PriorTerm, ...], dict[str, float]]:
-    """Prior terms and fixed values, evaluated on the data where they refer to them.
-
-    Raises
-    ------
-    ConfigError: every entry that cannot be evaluated, located in the file.
-    """
+    """Prior terms and fixed values, evaluated on the data where they refer to them. Raises :class:`ConfigError`: every
+    entry that cannot be evaluated, located in the file."""
     terms: list[PriorTerm] = []
     fixed: dict[str, float] = {}
     faults: list[Fault] = []

@@ -14,8 +14,8 @@ from typing import cast
 
 import numpy as np
 
-from en4dvar.config.context import Spread
 from en4dvar.config.data import Data, DataPlan, SeriesPlan
+from en4dvar.config.quantities import Spread
 from en4dvar.data.noise import Noise, SharedErrors, noise_of
 from en4dvar.data.observations import Observations
 from en4dvar.data.series import Series, balanced
@@ -134,10 +134,8 @@ def read_one(plan: SeriesPlan, file: DataFile, fewest: int) -> Series:
         early, unit = -times[0], ""
         if isinstance(clock, Column):
             early, unit = convert(early, clock.target, clock.unit), f" {clock.unit}"
-        raise DataError(
-            f"{path}: the first observation used lies {early:g}{unit} before time zero, where the model's "
-            "clock starts; put it earlier (data.time_zero), or begin the window later (data.window.from)"
-        )
+        words = f"the first observation used lies {early:g}{unit} before time zero, where the model's clock starts"
+        raise DataError(f"{path}: {words}; put it earlier (data.time_zero), or begin later (data.window.from)")
 
     def beside(column: Column | None) -> Array | None:
         return read.errors[column.name][window] if column else None

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from en4dvar.config.design import time_grid
-from en4dvar.config.document import Document, document_from, override
+from en4dvar.config.document import Document, Source, document_from, override
 from en4dvar.config.kinds import SequenceConfig, TwinConfig, resolve_sequence, resolve_twin
 from en4dvar.config.load import Config, load_config, resolve
 from en4dvar.plumbing.errors import ConfigError, Fault
@@ -19,7 +19,7 @@ Loaded = TypeVar("Loaded", Config, TwinConfig, SequenceConfig)
 AnyConfig = Config | TwinConfig | SequenceConfig
 
 
-def load_any(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> AnyConfig:
+def load_any(source: Source, overrides: Mapping[str, Any] | None = None) -> AnyConfig:
     """A twin experiment or a sequence where the file has a section ``twin:`` or ``sequence:``, else an estimation."""
     document, base = document_from(source)
     return resolve_any(override(document, overrides or {}), base)
@@ -32,12 +32,12 @@ def resolve_any(document: Document, base: Path) -> AnyConfig:
     return resolve_twin(document, base) if "twin" in document.data else resolve(document, base)
 
 
-def load_twin(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> TwinConfig:
+def load_twin(source: Source, overrides: Mapping[str, Any] | None = None) -> TwinConfig:
     """The counterpart of :func:`load_config` for a twin experiment. Raises :class:`ConfigError`."""
     return _of_kind(TwinConfig, load_any(source, overrides), "not a twin experiment: it has no twin: section")
 
 
-def load_sequence(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> SequenceConfig:
+def load_sequence(source: Source, overrides: Mapping[str, Any] | None = None) -> SequenceConfig:
     """The counterpart of :func:`load_config` for a sequence. Raises :class:`ConfigError`."""
     return _of_kind(SequenceConfig, load_any(source, overrides), "not a sequence: it has no sequence: section")
 
@@ -48,9 +48,7 @@ def _of_kind(kind: type[Loaded], config: AnyConfig, otherwise: str) -> Loaded:
     return config
 
 
-def loaded(
-    config: Loaded | str | Path | Mapping[str, Any], load: Callable[..., Loaded], overrides: Mapping[str, Any] | None
-) -> Loaded:
+def loaded(config: Loaded | Source, load: Callable[..., Loaded], overrides: Mapping[str, Any] | None) -> Loaded:
     """A configuration that is loaded already, or by ``load`` with ``overrides``. Raises :class:`ConfigError`: both."""
     if isinstance(config, str | Path | Mapping):
         return load(config, overrides)

@@ -10,30 +10,25 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeVar, get_args
+from typing import Any, Self, TypeVar, get_args
 
 from pydantic import BaseModel, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationError
 from pydantic_core import CoreSchema, InitErrorDetails, PydanticCustomError, core_schema
 
 from en4dvar.config.document import Document
 from en4dvar.model.forward import ForwardModel, Observable
-from en4dvar.plumbing.described import text_for
 from en4dvar.plumbing.errors import ConfigError, Fault
 from en4dvar.plumbing.files import expanded
-from en4dvar.plumbing.hints import brief, shown, suggest
-from en4dvar.plumbing.units import convert, parse_quantity, parse_unit
+from en4dvar.plumbing.hints import shown, suggest
 
 M = TypeVar("M", bound=BaseModel)
 Place = tuple[str | int, ...]
 
 _KIND = re.compile(r"\w+_(type|parsing|parsing_size|from_float)|finite_number")  # verdicts on what a value is
 _NOT = ", not "
-_SECTION = "expected 'key: value' lines"
 _MESSAGES = {
     "missing": "required, but not given",
-    "dict_type": _SECTION,
-    "model_type": _SECTION,
-    "model_attributes_type": _SECTION,
+    **dict.fromkeys(("dict_type", "model_type", "model_attributes_type"), "expected 'key: value' lines"),
     "string_too_short": "must not be empty",
     "tuple_type": "expected a list, e.g. [1, 2]",
     "string_type": "expected text; put it in quotes",
@@ -241,21 +236,6 @@ def _known(thing: T | None) -> T:
     return thing
 
 
-Unit = Callable[[Context], str]
-
-
-def time_unit(context: Context) -> str:
-    return context.units.time_unit
-
-
-def observable_unit(context: Context) -> str:
-    return context.observable.unit
-
-
-def subject_unit(context: Context) -> str:
-    return str(context.subject.unit)
-
-
 @dataclass(frozen=True, eq=False)
 class Made:
     """Pydantic annotation: the file gives an ``entry`` of this type, and the field holds ``make(it, context)``, or
@@ -281,60 +261,6 @@ class Made:
         with Faults() as faults, faults.at(), suppress(Unknown):
             return self.make(value, info.context)
         return None
-
-
-def quantity(unit: Unit, sign: Literal["positive", "not negative"]) -> Made:
-    """A number in ``unit``, given with a unit of its own."""
-
-    def read(text: Any, context: Context) -> float:
-        value = parse_quantity(text, unit(context))
-        require_sign(value, sign, text)
-        return value
-
-    return Made(read)
-
-
-def require_sign(value: float, sign: Literal["positive", "not negative"], text: object) -> None:
-    """Raises :class:`ConfigError` for a value of another sign."""
-    if sign == "positive" and not value > 0:
-        raise ConfigError(f"must be positive, not {brief(str(text), 80)}")
-    if value < 0:
-        raise ConfigError(f"must not be negative, not {brief(str(text), 80)}")
-
-
-@dataclass(frozen=True)
-class Spread:
-    """A standard deviation: ``value`` in a unit, or a share of something known later."""
-
-    value: float
-    relative: bool = False
-    unit: str = ""  # as it is written
-
-    def absolute(self, whole: float) -> float:
-        """The standard deviation in the unit of ``whole``."""
-        return self.value * abs(whole) if self.relative else self.value
-
-
-def parse_spread(text: Any, unit: str, usual: str = "") -> Spread:
-    """``"0.1 kPa"``, or relative, ``"5 %"``; positive. Raises :class:`ConfigError`, :class:`UnitError`."""
-    relative = str(text).strip().endswith("%") and unit != "%"
-    spread = Spread(parse_quantity(text, "1" if relative else unit, usual), relative)
-    require_sign(spread.value, "positive", text)
-    return spread
-
-
-SPREAD = Made(lambda text, context: parse_spread(text, subject_unit(context), context.subject.display_unit))
-"""A :class:`Spread` of what the entry of a section is about."""
-
-
-def unit_of(target: Unit) -> Made:
-    """The text of a unit that can be converted to ``target``."""
-
-    def fits(unit: str, context: Context) -> str:
-        convert(1.0, unit, target(context))
-        return unit
-
-    return Made(fits, Annotated[str, text_for(parse_unit)])
 
 
 def read_each(

@@ -7,19 +7,9 @@ from typing import Annotated, Any, Literal, Self, cast
 
 from pydantic import BeforeValidator, ConfigDict, Discriminator, Field, Tag, WithJsonSchema, model_validator
 
-from en4dvar.config.context import (
-    PLACEHOLDER,
-    Context,
-    Faults,
-    Made,
-    OfObservable,
-    Place,
-    observable_unit,
-    quantity,
-    time_unit,
-    unit_of,
-)
+from en4dvar.config.context import PLACEHOLDER, Context, Faults, Made, OfObservable, Place
 from en4dvar.config.of_readings import PLACES, WEIGHTS, Error, Placing, Weighing
+from en4dvar.config.quantities import observable_unit, quantity, time_unit, unit_of
 from en4dvar.config.schema import Name, QuantityText, Section
 from en4dvar.inputs.parts import Column, Disorder, Format, Outliers, Repeated, TimeStep
 from en4dvar.inputs.text_table import Decimal
@@ -108,7 +98,7 @@ def _values(section: ValueColumn, context: Context) -> Column:
 
 
 class Columns(Section):
-    """Which columns hold the time and the observable, each with its unit."""
+    """Which columns hold the time and the observable, each with its unit: ``time: {name: t, unit: us}``."""
 
     model_config = ConfigDict(json_schema_extra={"required": ["time"]}, populate_by_name=False)
     time: Annotated[Column | TimeStep, Made(_times, TimeColumn)] = cast(Any, None)  # a rule says what is missing
@@ -137,8 +127,8 @@ def _prominence(text: Any, context: Context) -> float:
 
 
 class WindowSection(Section):
-    """First and last observation used: ``top``, ``trough 2``, ``maximum``, ``minimum 2``, a time, or ``start``/``end``
-    of the file."""
+    """First and last observation used (the assimilation window): ``top``, ``trough 2``, ``maximum``, ``minimum 2``, a
+    time, or ``start``/``end`` of the file; default: all."""
 
     start: Annotated[Instant, Made(_instant)] = Field("start", alias="from", validate_default=True)
     """First observation: start, top, maximum (also written x_max), trough N, minimum N, or a time on the
@@ -201,9 +191,7 @@ class Data(Section):
     """First reading that is looked at, as if the file began with it: an instant as in ``window``, such as ``trough 1``,
     seen in the whole file."""
     columns: Annotated[Columns, OfObservable("column role")]
-    """Which columns hold the time and the observable, each with its unit: ``time: {name: t, unit: us}``."""
     window: WindowSection = Field({}, validate_default=True)
-    """Which observations are used (the assimilation window); default: all."""
     time_zero: Annotated[Literal["file", "window"] | float, Made(read_time_zero)] = Field("file", validate_default=True)
     """Where the model's clock starts: file (the file's own zero), window (the first observation used), or a time."""
     weights: Annotated[Weighing | None, WEIGHTS] = None
@@ -213,8 +201,6 @@ class Data(Section):
     """Where on an observed field: an index, a coordinate such as 3 m, a list of them, or ``{column: NAME}``, with
     ``unit`` for coordinates. There may then be several readings at a time."""
     error: Annotated[Error, OfObservable()]
-    """Observation errors: ``<observable>_std``, ``time_std``, ``correlation_time``, ``covariance``, ``robust``,
-    ``discrepancy``."""
 
     @classmethod
     def rules(cls, keys: Mapping[str, Any], context: Context, faults: Faults) -> None:
@@ -316,13 +302,8 @@ def _common(keys: Mapping[str, Any]) -> dict[str, Any]:
 
 def _merged(common: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
     """The keys of a series over those that hold for all; sections are merged key by key."""
-    return {
-        **common,
-        **{
-            key: {**common[key], **value} if isinstance(value, dict) and isinstance(common.get(key), dict) else value
-            for key, value in own.items()
-        },
-    }
+    sections = [key for key, value in own.items() if isinstance(value, dict) and isinstance(common.get(key), dict)]
+    return {**common, **own, **{key: {**common[key], **own[key]} for key in sections}}
 
 
 def _plan(section: DataOfSeries, context: Context) -> DataPlan:

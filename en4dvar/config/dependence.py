@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import Annotated, Any, Self, cast
 
 import numpy as np
 from pydantic import Field
@@ -19,7 +19,7 @@ from pydantic import Field
 from en4dvar.config.context import Context, Faults, Made
 from en4dvar.config.document import Document
 from en4dvar.config.parameters import Entry, Uncertain
-from en4dvar.config.schema import Name, Section, section_of
+from en4dvar.config.schema import Name, Section
 from en4dvar.estimation.population import HyperPrior
 from en4dvar.inputs.members import read_members, read_square
 from en4dvar.model.state import Array, Parameter, TransformName
@@ -30,6 +30,8 @@ from en4dvar.priors.dependence import Dependence, KernelName, correlation_of_pla
 from en4dvar.priors.prior import PriorTerm
 
 KINDS = ("correlation", "matrix", "file", "kernel")
+Patterns = str | tuple[str, ...]
+Grouped = Mapping[str, Mapping[str, Patterns]]  # kind → group → patterns of names
 
 A_FILE = Made(lambda text, context: context.path(text), Annotated[str, Field(min_length=1)], {"type": "string"})
 Position = float | tuple[float, ...]
@@ -72,9 +74,8 @@ class PriorCorrelation(Section):
         if self.kernel is not None:
             places = [np.atleast_1d(np.asarray(place, dtype=float)) for place in self.at or ()]
             if len(places) != len(self.between) or len({len(place) for place in places}) != 1:
-                raise ConfigError(
-                    f"at: give {len(self.between)} places, one per parameter, all with the same number of coordinates"
-                )
+                count = len(self.between)
+                raise ConfigError(f"at: give {count} places, one a parameter, all with the same number of coordinates")
             return correlation_of_places(self.kernel or "", np.stack(places), self.length or 1.0)
         rows = self.matrix or ()
         if len({len(row) for row in rows}) != 1:
@@ -91,11 +92,7 @@ class PriorFile(Section):
 
 def joined(blocks: Sequence[tuple[tuple[str, ...], Array]]) -> tuple[Dependence, ...]:
     """Blocks of correlations between some names each; what shares a name is one block, zero where nothing is said.
-
-    Raises
-    ------
-    ConfigError: a pair of which two say something, or no correlation matrix.
-    """
+    Raises :class:`ConfigError`: a pair of which two say something, or no correlation matrix."""
     groups: list[list[int]] = []
     for k, (names, _) in enumerate(blocks):
         touching = [group for group in groups if any({*names} & {*blocks[i][0]} for i in group)]
@@ -131,13 +128,8 @@ def resolved(
 ) -> tuple[tuple[Entry, ...], tuple[Dependence, ...]]:
     """The entries with the priors that an ensemble makes, and what the priors have to do with each other.
 
-    Parameters
-    ----------
-    others: names that are estimated besides the entries. apart: why a parameter can be correlated with no other.
-
-    Raises
-    ------
-    ConfigError: every fault, located in the file.
+    ``others``: names that are estimated besides the entries; ``apart``: why a parameter is correlated with no other.
+    Raises :class:`ConfigError`: every fault, located in the file.
     """
     faults: list[Fault] = []
     asking = [e for e in entries if isinstance(e, Uncertain) and e.spec.prior == "ensemble"]
@@ -169,9 +161,8 @@ def _of_ensemble(
 ) -> tuple[tuple[Dependence, ...], dict[str, Entry]]:
     """The Gaussian of the members' mean and covariance in transformed space. Raises :class:`ConfigError` with paths."""
     if ensemble is None:
-        raise ConfigError(
-            "no ensemble is given; write 'prior: {ensemble: FILE}'", f"parameters.{asking[0].parameter.name}"
-        )
+        first = asking[0].parameter.name
+        raise ConfigError("no ensemble is given; write 'prior: {ensemble: FILE}'", f"parameters.{first}")
     if not asking:
         raise ConfigError("no parameter takes its prior from it; write e.g. 'G: {prior: ensemble}'", "prior")
     for entry in asking:
@@ -202,12 +193,8 @@ def _of_ensemble(
 
 
 def term_of_members(parameter: Parameter, values: Array, kind: str | None) -> tuple[PriorTerm, Array]:
-    """The Gaussian of members (N,) in the coordinate ``kind``, and the members standardised (N,).
-
-    Raises
-    ------
-    ConfigError: members outside of the parameter's bounds or of the range of its map, or all alike.
-    """
+    """The Gaussian of members (N,) in the coordinate ``kind``, and the members standardised (N,). Raises
+    :class:`ConfigError`: members outside of the parameter's bounds or of the range of its map, or all alike."""
     low, high = parameter.bounds
     kind = kind or parameter.transform
     outside = (values < low) | (values > high)
@@ -227,15 +214,7 @@ def term_of_members(parameter: Parameter, values: Array, kind: str | None) -> tu
 GroupName = Annotated[str, Field(pattern=r"^[^\s\x00-\x1f\x7f][^\x00-\x1f\x7f]*$", max_length=100)]
 
 
-if TYPE_CHECKING:
-
-    class _HyperPrior(HyperPrior, Section): ...
-
-else:
-    _HyperPrior = section_of(HyperPrior)
-
-
-class PopulationSection(_HyperPrior):
+class PopulationSection(Section, HyperPrior):
     """Mean and spread of parameters over the data sets of the run, estimated at its end."""
 
     of: Annotated[tuple[str, ...], Field(min_length=1)]
@@ -248,53 +227,48 @@ class PopulationSection(_HyperPrior):
     """Medians that a group is known to have, e.g. {standard: {k: 7.7 ± 0.2 N/m}}: they calibrate what all groups
     have in common, such as scale and density."""
 
+    def check(self, entries: Sequence[Entry], groups: Grouped, document: Document) -> None:
+        """Raises :class:`ConfigError`: a parameter that is not estimated, or of which each data set has a prior; an
+        unknown kind of group."""
+        faults: list[Fault] = []
+        estimated = {e.parameter.name: e for e in entries if isinstance(e, Uncertain)}
+        for i, name in enumerate(self.of):
+            with document.collecting(faults, "population", "of", i):
+                if name not in estimated:
+                    raise ConfigError(f"{name}: not estimated, it has no prior{suggest(name, estimated)}")
+                if estimated[name].needs_data:
+                    raise ConfigError(f"{name}: its prior depends on the data set ('maximum'), a population has one")
+        of_kind = groups.get(self.by or "", {})
+        for group in self.known:
+            with document.collecting(faults, "population", "known", *([group] if self.by else [])):
+                if self.by is None:
+                    raise ConfigError("of groups, which need 'by'")
+                if self.by in groups and group not in of_kind:
+                    raise ConfigError(f"no such group{suggest(group, of_kind)}")
+        if self.by is not None and self.by not in groups:
+            words = f"no kind of 'groups:' is called {shown(self.by)}{suggest(self.by, groups)}"
+            faults.append(document.fault(("population", "by"), words))
+        stated = [("reference", (), self.reference), *(("known", (g,), values) for g, values in self.known.items())]
+        for key, above, values in stated:
+            for name, text in values.items():
+                with document.collecting(faults, "population", key, *above, name):
+                    self._check_value(name, text, estimated, key)
+        if faults:
+            raise ConfigError(faults)
 
-def check_population(
-    section: PopulationSection, entries: Sequence[Entry], groups: Mapping[str, Mapping[str, object]], document: Document
-) -> None:
-    """Raises :class:`ConfigError`: every parameter that is not estimated, or whose prior depends on the data set; an
-    unknown kind of group.
-    """
-    faults: list[Fault] = []
-    estimated = {e.parameter.name: e for e in entries if isinstance(e, Uncertain)}
-    for i, name in enumerate(section.of):
-        with document.collecting(faults, "population", "of", i):
-            if name not in estimated:
-                raise ConfigError(f"{name}: not estimated, it has no prior{suggest(name, estimated)}")
-            if estimated[name].needs_data:
-                raise ConfigError(f"{name}: its prior depends on the data set ('maximum'), a population has one")
-    of_kind = groups.get(section.by or "", {})
-    for group in section.known:
-        with document.collecting(faults, "population", "known", *([group] if section.by else [])):
-            if section.by is None:
-                raise ConfigError("of groups, which need 'by'")
-            if section.by in groups and group not in of_kind:
-                raise ConfigError(f"no such group{suggest(group, of_kind)}")
-    if section.by is not None and section.by not in groups:
-        words = f"no kind of 'groups:' is called {shown(section.by)}{suggest(section.by, groups)}"
-        faults.append(document.fault(("population", "by"), words))
-    stated = [("reference", (), section.reference), *(("known", (g,), values) for g, values in section.known.items())]
-    for key, above, values in stated:
-        for name, text in values.items():
-            with document.collecting(faults, "population", key, *above, name):
-                _check_value(name, text, section, estimated, key)
-    if faults:
-        raise ConfigError(faults)
-
-
-def _check_value(name: str, text: str, section: PopulationSection, estimated: Mapping[str, Entry], key: str) -> None:
-    """Raises :class:`ConfigError`, :class:`UnitError`: what is said of a parameter as ``reference`` or as ``known``."""
-    if name not in section.of and (key, name) != ("reference", SOURCE):
-        neither = "neither 'source' nor" if key == "reference" else "not"
-        raise ConfigError(f"{shown(name)}: {neither} among 'of'{suggest(name, section.of)}")
-    if name not in estimated:
-        return
-    value, std = reference_value(text, estimated[name].parameter.unit)
-    low, high = estimated[name].parameter.bounds
-    if key == "known" and not std > 0:
-        raise ConfigError(f"{shown(text)}: how well is it known? as '7.7 ± 0.2 kPa'")
-    if key == "known" and not low < value < high:
-        raise ConfigError(f"{shown(text)}: beyond the bounds of {name}")
+    def _check_value(self, name: str, text: str, estimated: Mapping[str, Entry], key: str) -> None:
+        """Raises :class:`ConfigError`, :class:`UnitError`: what ``reference`` or ``known`` says of a parameter."""
+        if name not in self.of and (key, name) != ("reference", SOURCE):
+            neither = "neither 'source' nor" if key == "reference" else "not"
+            raise ConfigError(f"{shown(name)}: {neither} among 'of'{suggest(name, self.of)}")
+        if name not in estimated:
+            return
+        value, std = reference_value(text, estimated[name].parameter.unit)
+        low, high = estimated[name].parameter.bounds
+        if key == "known" and not std > 0:
+            raise ConfigError(f"{shown(text)}: how well is it known? as '7.7 ± 0.2 kPa'")
+        if key == "known" and not low < value < high:
+            raise ConfigError(f"{shown(text)}: beyond the bounds of {name}")
 
 
 SOURCE = "source"  # of a reference: where it is from
@@ -302,10 +276,8 @@ _REFERENCE = re.compile(r"\s*([-+.\deE]+)\s*(?:(?:±|\+/?-)\s*([.\deE+-]+))?\s*(
 
 
 def reference_value(text: str, unit: str) -> tuple[float, float]:
-    """Value and std in ``unit`` of a text such as ``7.7 ± 1.1 kPa``; NaN where no std is stated.
-
-    Raises :class:`UnitError`.
-    """
+    """Value and std in ``unit`` of a text such as ``7.7 ± 1.1 kPa``; NaN where no std is stated. Raises
+    :class:`UnitError`."""
     match = _REFERENCE.fullmatch(text)
     if match is None:
         raise UnitError(f"{shown(text)} is no value such as '7.7 ± 1.1 kPa'")
@@ -314,7 +286,6 @@ def reference_value(text: str, unit: str) -> tuple[float, float]:
 
 
 ALL, NONE = "all", "none"
-Patterns = str | tuple[str, ...]
 Groups = dict[Name, Annotated[dict[GroupName, Patterns], Field(min_length=1)]]
 
 
@@ -323,8 +294,33 @@ class Sharing:
     """``kinds``: shared parameter → kind of group, or ``all``; ``groups``: kind → group → patterns of names."""
 
     kinds: Mapping[str, str]
-    groups: Mapping[str, Mapping[str, Patterns]]
+    groups: Grouped
     document: Document
+
+    @classmethod
+    def of(
+        cls, entries: Sequence[Entry], groups: Grouped, correlated: bool, several_series: bool, document: Document
+    ) -> Self:
+        """The parameters that a file asks to be shared. Raises :class:`ConfigError`: every entry that cannot be."""
+        asked = {e.parameter.name: e for e in entries if isinstance(e, Uncertain) and e.spec.shared not in (None, NONE)}
+        kinds = {name: str(entry.spec.shared) for name, entry in asked.items()}
+        wrong: list[tuple[str, str, str]] = []
+        for name, kind in kinds.items():
+            if kind not in (known := [ALL, NONE, *groups]):
+                wrong.append((name, "shared", f"no kind of 'groups:' is called {shown(kind)}{suggest(kind, known)}"))
+            if asked[name].needs_data:
+                words = "its prior depends on the data set ('maximum'), but what is shared has one prior"
+                wrong.append((name, "shared", words))
+        if kinds:
+            first = next(iter(kinds))
+            varying = [e.parameter.name for e in entries if isinstance(e, Uncertain) and e.spec.varies is not None]
+            wrong += [(name, "varies", "not where parameters are shared by data sets") for name in varying]
+            wrong += [(first, "shared", "not with correlated priors")] * correlated
+            words = "not where a data set has several series: a joint estimate takes one series of each"
+            wrong += [(first, "shared", words)] * several_series
+        if wrong:
+            raise ConfigError([document.fault(("parameters", name, key), words) for name, key, words in wrong])
+        return cls(kinds, groups, document)
 
     def of_dataset(self, name: str) -> dict[str, str]:
         """Shared parameter → group of a data set, "" for all. Raises :class:`ConfigError`: it is in none or several."""
@@ -341,37 +337,3 @@ class Sharing:
             return groups[0]
         where = f"in several of them: {', '.join(groups)}" if groups else "in none of them"
         raise ConfigError([self.document.fault(("groups", kind), f"data set {name!r} is {where}")])
-
-
-def sharing_of(
-    entries: Sequence[Entry],
-    groups: Mapping[str, Mapping[str, Patterns]],
-    correlated: bool,
-    several_series: bool,
-    document: Document,
-) -> Sharing:
-    """The parameters that a file asks to be shared. Raises :class:`ConfigError`: every entry that cannot be."""
-    asked = {e.parameter.name: e for e in entries if isinstance(e, Uncertain) and e.spec.shared not in (None, NONE)}
-    kinds = {name: str(entry.spec.shared) for name, entry in asked.items()}
-    faults = list[Fault]()
-    for name, kind in kinds.items():
-        where, known = ("parameters", name, "shared"), [ALL, NONE, *groups]
-        if kind not in known:
-            faults.append(document.fault(where, f"no kind of 'groups:' is called {shown(kind)}{suggest(kind, known)}"))
-        if asked[name].needs_data:
-            words = "its prior depends on the data set ('maximum'), but what is shared has one prior"
-            faults.append(document.fault(where, words))
-    if kinds:
-        faults += [
-            document.fault(("parameters", e.parameter.name, "varies"), "not where parameters are shared by data sets")
-            for e in entries
-            if isinstance(e, Uncertain) and e.spec.varies is not None
-        ]
-    if kinds and correlated:
-        faults.append(document.fault(("parameters", next(iter(kinds)), "shared"), "not with correlated priors"))
-    if kinds and several_series:
-        words = "not where a data set has several series: a joint estimate takes one series of each"
-        faults.append(document.fault(("parameters", next(iter(kinds)), "shared"), words))
-    if faults:
-        raise ConfigError(faults)
-    return Sharing(kinds, groups, document)

@@ -3,13 +3,14 @@
 from collections.abc import Iterator, Mapping
 from itertools import product
 from math import prod
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
 
-from en4dvar.config.context import Context, Faults, Made, quantity, time_unit
-from en4dvar.config.schema import QuantityText, Section, section_of
+from en4dvar.config.context import Context, Faults, Made
+from en4dvar.config.quantities import quantity, time_unit
+from en4dvar.config.schema import QuantityText, Section
 from en4dvar.estimation.design.evaluate import SampleSizes
 from en4dvar.model.state import Array
 from en4dvar.plumbing.units import UnitError, parse_quantity
@@ -57,7 +58,7 @@ class Knob(Section):
 
 
 class Later(Section):
-    """The rate from there on."""
+    """Another rate, of a camera that changes it: after ``to``."""
 
     end: Annotated[QuantityText, Field(alias="to")]
     """Last instant with its unit."""
@@ -69,7 +70,6 @@ class Rates(Times):
     """Instants at one rate or at two, one after the other."""
 
     then: Later | None = None
-    """Another rate, of a camera that changes it: after ``to``."""
 
 
 def _read_rates(times: Rates, context: Context) -> Array:
@@ -90,7 +90,7 @@ class Choice(Section):
 
 
 class Price(Section):
-    """The price of an experiment, in any unit."""
+    """What an experiment costs, in any unit: information is compared with it."""
 
     reading: Annotated[float, Field(ge=0)] = 1.0
     """Of a reading."""
@@ -124,15 +124,7 @@ class Within(Section):
         return "; ".join(f"{text}: more than design.within.{key} = {most:g}" for key, most, text in over)
 
 
-if TYPE_CHECKING:
-
-    class _SampleSizes(SampleSizes, Section): ...
-
-else:
-    _SampleSizes = section_of(SampleSizes)
-
-
-class Design(_SampleSizes):
+class Design(Section, SampleSizes):
     """Which experiments ``en4dvar design`` compares, and about what."""
 
     about: tuple[str, ...] = ()
@@ -147,13 +139,10 @@ class Design(_SampleSizes):
     knobs: dict[str, Knob] = Field({})
     """Name → a key of this file and the values that are tried; every combination is a design."""
     choose: Choice | None = None
-    """Take only the most informative readings."""
     experiments: Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(min_length=1)] = (1,)
     """How many equal experiments are made, of one sample; they share the parameters asked for."""
     price: Price = Price()
-    """What an experiment costs: information is compared with it."""
     within: Within = Within()
-    """What a design must keep to."""
     enough: Annotated[float, Field(ge=0)] = 0.1
     """Information in nats below which no experiment is worth making; a message says if the best design tells less."""
     laws: dict[str, dict[str, Any]] = Field({})

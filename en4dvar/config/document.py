@@ -18,13 +18,14 @@ from typing import Any, cast
 import yaml
 
 from en4dvar.inputs.parts import SUFFIXES
-from en4dvar.plumbing.errors import ConfigError, DataError, Fault
+from en4dvar.plumbing.errors import ConfigError, DataError, Fault, retold
 from en4dvar.plumbing.files import open_plain
-from en4dvar.plumbing.hints import brief, no_such_file, shown
+from en4dvar.plumbing.hints import brief, shown
 from en4dvar.plumbing.units import UnitError
 
 Key = tuple[str | int, ...]
 Mark = tuple[int, int]  # line and column, from 1
+Source = str | Path | Mapping[str, Any]  # of a configuration
 
 LONGEST = 1_000_000  # bytes of a file, some ten seconds to read: the paths of 10 000 data sets and more
 
@@ -106,17 +107,16 @@ class Document:
 
 def read_document(path: Path) -> Document:
     """Read and parse a YAML file. Raises :class:`ConfigError` listing every fault found."""
+    if os.path.isdir(path):
+        raise ConfigError(_propose("a folder", path))
+    with retold(OSError, ConfigError, f"{path}: "), open_plain(path) as file:
+        content = file.read(LONGEST + 1)
     try:
-        with open_plain(path) as file:
-            content = file.read(LONGEST + 1)
         if len(content) > LONGEST:
             words = f"longer than {LONGEST / 1e6:g} MB, which no configuration is; numbers belong into data files"
             raise ConfigError([Fault(words, file=str(path))])
         text = content.decode("utf-8-sig")
         return parse_document(text, str(path))
-    except OSError as error:
-        missing = no_such_file(path) if isinstance(error, FileNotFoundError) else f"{path}: {error.strerror}"
-        raise ConfigError(_propose("a folder", path) if path.is_dir() else missing) from None
     except UnicodeDecodeError as error:
         fault = ConfigError([Fault(f"not UTF-8 text ({error.reason} at byte {error.start})", file=str(path))])
     except ConfigError as error:
@@ -168,11 +168,9 @@ def parse_document(text: str, file: str = "") -> Document:
     return replace(document, data=data)
 
 
-def document_from(source: str | Path | Mapping[str, Any]) -> tuple[Document, Path]:
+def document_from(source: Source) -> tuple[Document, Path]:
     """A YAML file, or a dict of the same, and the folder where its relative paths start: the file's, or this one.
-
-    Raises :class:`ConfigError`.
-    """
+    Raises :class:`ConfigError`."""
     if isinstance(source, Mapping):
         return document_of(source), Path.cwd()
     path = Path(source)
@@ -180,10 +178,8 @@ def document_from(source: str | Path | Mapping[str, Any]) -> tuple[Document, Pat
 
 
 def override(document: Document, overrides: Mapping[str, Any], option: str = "--set") -> Document:
-    """Set values at dotted paths; text is parsed as YAML.
-
-    Raises :class:`ConfigError`, which names the ``option`` that they were given with.
-    """
+    """Set values at dotted paths; text is parsed as YAML. Raises :class:`ConfigError`, which names the ``option`` that
+    they were given with."""
     data = copy.deepcopy(document.data)
     origins = dict(document.origins)
     faults: list[Fault] = []
@@ -197,9 +193,8 @@ def override(document: Document, overrides: Mapping[str, Any], option: str = "--
         for n, part in enumerate(path[:-1], 1):
             node = node.setdefault(part, {})
             if not isinstance(node, dict):
-                faults.append(
-                    Fault(f"{'.'.join(path[:n])!r} is a single value; nothing can be set inside it", file=origin)
-                )
+                single = f"{'.'.join(path[:n])!r} is a single value; nothing can be set inside it"
+                faults.append(Fault(single, file=origin))
                 break
         else:
             if not all(path):

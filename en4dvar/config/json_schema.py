@@ -80,7 +80,11 @@ def _resolve(node: Json, inner: Json) -> Json:
     if "$ref" in node:
         target = _resolve(inner[node["$ref"].rpartition("/")[2]], inner)
         return {**target, **{k: _each(v, _resolve, inner) for k, v in node.items() if k != "$ref"}}
-    return {k: _each(v, _resolve, inner) for k, v in node.items() if k != "discriminator"}
+    resolved = {k: _each(v, _resolve, inner) for k, v in node.items() if k != "discriminator"}
+    match resolved.get("anyOf"):
+        case [{"description": words}, {"type": "null"}]:  # of a section that may be left out
+            resolved.setdefault("description", words)
+    return resolved
 
 
 def _each(node: Any, change: Callable[..., Json], *more: Any) -> Any:
@@ -123,10 +127,8 @@ def _models(definitions: Json) -> Iterator[str]:
         except En4dvarError:
             continue
         settings = _of(settings_of(kind).model_json_schema())
-        settings["properties"] = {
-            "name": {"const": name, "description": "Name of the model."},
-            **settings["properties"],
-        }
+        own = {"const": name, "description": "Name of the model."}
+        settings["properties"] = {"name": own, **settings["properties"]}
         definitions[f"model_{name}"] = settings
         definitions[f"parameters_{name}"] = _parameters(_possible_parameters(kind))
         yield name

@@ -12,11 +12,12 @@ from typing import Annotated, Any, Self
 
 from pydantic import AfterValidator, Field, ValidatorFunctionWrapHandler, WrapValidator, model_validator
 
-from en4dvar.config.context import Context, Faults, Made, Spread, quantity, time_unit
+from en4dvar.config.context import Context, Faults, Made
 from en4dvar.config.data import DATA, DataPlan
 from en4dvar.config.document import Document
 from en4dvar.config.load import Read, Validated, read_file
 from en4dvar.config.parameters import Entry, Fixed, Tied, Uncertain, entries
+from en4dvar.config.quantities import Spread, quantity, time_unit
 from en4dvar.config.schema import File, Name, Output, Section
 from en4dvar.config.sequential import Sequential, Workers, error_rates, localisation_of, stds
 from en4dvar.config.varies import MODEL_ERROR, ErrorOf, Estimated, dynamic_fields
@@ -30,10 +31,6 @@ from en4dvar.plumbing.units import parse_quantity
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.series.start import EnsembleCoordinates
 from en4dvar.series.twin import TwinExperiment
-
-
-def _observation_stds(model: ForwardModel) -> dict[str, Observable]:
-    return {f"{observable.name}_std": observable for observable in model.observables}
 
 
 def _correlation(path: str, context: Context) -> tuple[str, Correlation]:
@@ -52,7 +49,7 @@ class Twin(Section):
     """Cycles at the beginning that are left out of the scores."""
     interval: Annotated[float, quantity(time_unit, "positive")]
     """Time between two observations, in the model's unit of time."""
-    error: Annotated[dict[str, float], stds(_observation_stds)]
+    error: Annotated[dict[str, float], stds(lambda model: {f"{o.name}_std": o for o in model.observables})]
     """Std of the observation errors, by observable: ``<observable>_std``."""
     error_correlation: (
         Annotated[tuple[str, Correlation], Made(_correlation, Annotated[str, Field(min_length=1)])] | None
@@ -80,16 +77,12 @@ class TwinFile(File):
     parameters: Annotated[tuple[Entry, ...], entries("a twin experiment")] = Field({}, validate_default=True)
     """Parameters to estimate (a prior) or to change from the model's default (a quantity)."""
     twin: Twin
-    """How the truth is made and observed."""
     model_error: Annotated[tuple[ErrorOf, ...], MODEL_ERROR] | None = None
     """Fields of the state that the model misses in part, of the truth as well: each changes at random between two
     observations, its variance growing by ``std`` squared in a time of ``every``."""
     assimilation: Sequential
-    """The scheme and what it does to the ensemble."""
     execution: Workers = Workers()
-    """Where members are integrated; never changes the numbers."""
     output: Output = Output()
-    """Where results go."""
 
     @classmethod
     def rules(cls, keys: Mapping[str, Any], context: Context, faults: Faults) -> None:
@@ -151,7 +144,6 @@ APART = ("time_std", "correlation_time", "shared", "covariance", "robust", "disc
 
 
 def _known_fields(names: tuple[str, ...], context: Context) -> tuple[str, ...]:
-    """Names of fields of the state."""
     known = dynamic_fields(context.model)
     with Faults() as faults:
         for k, name in enumerate(names):
@@ -180,16 +172,12 @@ class SequenceFile(File):
     parameters: Annotated[tuple[Entry, ...], entries()] = Field({}, validate_default=True)
     """For each parameter a prior (estimated beside the state), a quantity or a scalar of the data file (fixed)."""
     sequence: Sequence
-    """What is known of the state at time zero, and what is kept."""
     model_error: Annotated[tuple[ErrorOf, ...], MODEL_ERROR] | None = None
     """Fields of the state that the model misses in part: each changes at random between two observations, its variance
     growing by ``std`` squared in a time of ``every``."""
     assimilation: Sequential
-    """The scheme and what it does to the ensemble."""
     execution: Workers = Workers()
-    """Where members are integrated; never changes the numbers."""
     output: Output = Output()
-    """Where results go."""
 
     @classmethod
     def rules(cls, keys: Mapping[str, Any], context: Context, faults: Faults) -> None:
@@ -283,10 +271,6 @@ class GroupSection(Section):
     """What their truths are drawn from: a prior (drawn for each) or a quantity (common to all)."""
 
 
-def _end(text: Any, context: Context) -> float:
-    return 0.0 if text == 0 and text is not False else parse_quantity(text, time_unit(context))
-
-
 def _ascending(written: Any, validate: ValidatorFunctionWrapHandler) -> tuple[float, float]:
     low, high = validate(written)
     if low is not None and low > high:
@@ -300,7 +284,8 @@ def _positive(pair: tuple[float, float]) -> tuple[float, float]:
     return pair
 
 
-End = Annotated[float, Made(_end)]
+NOUGHT = ("0", "0.0")  # needs no unit
+End = Annotated[float, Made(lambda text, c: 0.0 if str(text) in NOUGHT else parse_quantity(text, time_unit(c)))]
 Interval = Annotated[tuple[End, End], WrapValidator(_ascending)]
 
 
@@ -348,7 +333,6 @@ class CampaignFile(File):
     name: Name
     """Name of the campaign."""
     campaign: CampaignSection
-    """How truths are drawn and observed."""
 
 
 @dataclass(frozen=True)

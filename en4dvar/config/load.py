@@ -10,18 +10,9 @@ import yaml
 
 from en4dvar.config.context import Context, Made, check
 from en4dvar.config.data import DATA, DataPlan
-from en4dvar.config.dependence import (
-    Groups,
-    PopulationSection,
-    PriorCorrelation,
-    PriorFile,
-    Sharing,
-    check_population,
-    resolved,
-    sharing_of,
-)
+from en4dvar.config.dependence import Groups, PopulationSection, PriorCorrelation, PriorFile, Sharing, resolved
 from en4dvar.config.design import Design, Times, read_times
-from en4dvar.config.document import Document, document_from, override, parse_document
+from en4dvar.config.document import Document, Source, document_from, override, parse_document
 from en4dvar.config.models import read_model
 from en4dvar.config.parameters import Entry, Fixed, Uncertain, entries
 from en4dvar.config.schema import Assimilation, Execution, File, GivenStart, Output, Section
@@ -56,9 +47,7 @@ class Estimation(File):
     """What data sets have in common, e.g. ``batch: {first: 'a_*', second: [b_*, c_01]}``: under each kind of group the
     groups, with patterns of the names of their data sets."""
     population: PopulationSection | None = None
-    """Mean and spread of parameters over the data sets, estimated at the end of the run."""
     prior: PriorFile | None = None
-    """A file of members, for the parameters with ``{prior: ensemble}``."""
     prior_correlation: tuple[PriorCorrelation, ...] | None = None
     """Which parameters are correlated in the prior, and how."""
     initial_state: Annotated[tuple[Initial, ...], PERTURBED] | None = None
@@ -67,15 +56,10 @@ class Estimation(File):
     model_error: Annotated[tuple[ErrorOf, ...], MODEL_ERROR] | None = None
     """Fields of the state that change at knots, by something the model does not know, each with its ``std``."""
     assimilation: Assimilation = Assimilation()
-    """Scheme, ensemble size and stopping rules; the defaults are the recommended ones."""
     execution: Execution = Execution()
-    """Where the work is done; never changes the numbers."""
     output: Output = Output()
-    """Where results go."""
     simulate: Simulate | None = None
-    """Settings of ``en4dvar simulate``."""
     design: Design | None = None
-    """Which experiments ``en4dvar design`` compares, and about what."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,7 +100,7 @@ class Config(Validated):
     population: PopulationSection | None = None
 
 
-def load_config(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> Config:
+def load_config(source: Source, overrides: Mapping[str, Any] | None = None) -> Config:
     """Read and validate a configuration.
 
     Parameters
@@ -160,7 +144,7 @@ def resolve(document: Document, base: Path, model: ForwardModel | None = None) -
     others = [initial.term.parameter.name for initial in file.initial_state or () if isinstance(initial, Perturbed)]
     parameters, blocks = resolved(file.parameters, file.prior, file.prior_correlation or (), others, apart, document)
     if file.population is not None:
-        check_population(file.population, parameters, file.groups or {}, document)
+        file.population.check(parameters, file.groups or {}, document)
     several = file.data is not None and len(file.data.series) > 1
     settings = file.assimilation.settings
     minimiser = settings.own.minimiser
@@ -174,7 +158,7 @@ def resolve(document: Document, base: Path, model: ForwardModel | None = None) -
         assimilation=settings,
         weights=file.assimilation.weights,
         simulate_times=file.simulate.times if file.simulate else None,
-        sharing=sharing_of(parameters, file.groups or {}, bool(blocks), several, document),
+        sharing=Sharing.of(parameters, file.groups or {}, bool(blocks), several, document),
         initial_state=file.initial_state or (),
         model_error=file.model_error or (),
         dependence=blocks,
@@ -216,10 +200,8 @@ class Read(Generic[S]):
 
 
 def read_file(kind: type[S], document: Document, base: Path, model: ForwardModel | None = None) -> Read[S]:
-    """Validate a document of one kind, for a ``model`` that is there already or else is read from it.
-
-    Raises :class:`ConfigError`: every fault, in the order of the file.
-    """
+    """Validate a document of one kind, for a ``model`` that is there already or else is read from it. Raises
+    :class:`ConfigError`: every fault, in the order of the file."""
     faults: list[Fault] = []
     section = document.data.get("model")
     built = (model, dict(section or {})) if model else read_model(section, base, document, faults)
@@ -255,9 +237,7 @@ def in_order(faults: Iterable[Fault]) -> list[Fault]:
     return sorted(dict.fromkeys(faults), key=lambda fault: (fault.file, fault.line, fault.column))
 
 
-def values_of(
-    start: GivenStart, entries: Sequence[Entry], document: Document
-) -> Mapping[str, float | Mapping[str, float]]:
+def values_of(start: GivenStart, entries: Sequence[Entry], document: Document) -> Mapping[str, Any]:
     """The value of each parameter that the start names, or of all where it is a file, in the parameters' units; of a
     summary of data sets, by their names.
 

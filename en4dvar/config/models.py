@@ -67,10 +67,8 @@ class NoSettings(BaseModel):
 
 
 def find_model(name: str) -> type[ForwardModel]:
-    """The model class called ``name``: registered, ``package:Class`` or ``/path/file.py:Class``.
-
-    Raises :class:`ConfigError`.
-    """
+    """The model class called ``name``: registered, ``package:Class`` or ``/path/file.py:Class``. Raises
+    :class:`ConfigError`."""
     model: Any
     try:
         with loading(f"model {shown(name)} cannot be loaded"):
@@ -90,9 +88,7 @@ def find_model(name: str) -> type[ForwardModel]:
         raise ConfigError(f"{shown(name)} is not a subclass of en4dvar.ForwardModel")
     if hasattr(model, "Settings") != hasattr(model, "from_settings"):
         lacking = "from_settings" if hasattr(model, "Settings") else "Settings"
-        raise ConfigError(
-            f"{name!r} cannot be used from YAML: Settings and from_settings go together, it lacks {lacking}"
-        )
+        raise ConfigError(f"{name!r} cannot come from YAML: Settings and from_settings go together, it lacks {lacking}")
     return model
 
 
@@ -129,16 +125,15 @@ def checked(model: ForwardModel) -> ForwardModel:
         if isinstance(observable.operator, StateField):
             for field in (observable.operator.name, observable.operator.rate_of):
                 if field is not None and field not in model.layout.names:
-                    raise ConfigError(
-                        f"the observable {observable.name!r} reads {field!r}, which is not in the layout"
-                        f"{suggest(field, model.layout.names)}"
-                    )
+                    words = f"the observable {observable.name!r} reads {field!r}, which is not in the layout"
+                    raise ConfigError(f"{words}{suggest(field, model.layout.names)}")
     return model
 
 
-def read_model(
-    raw: Any, base: Path, document: Document, faults: list[Fault]
-) -> tuple[ForwardModel, dict[str, Any]] | None:
+Built = tuple[ForwardModel, dict[str, Any]]
+
+
+def read_model(raw: Any, base: Path, document: Document, faults: list[Fault]) -> Built | None:
     """The model and its resolved section (defaults filled in), or None with the faults appended.
 
     Paths in a model's settings are relative to ``base``, given to pydantic as validation context ``{"base": base}``.

@@ -3,7 +3,6 @@
 """
 
 import math
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -13,20 +12,8 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BeforeValidator, ConfigDict, Field, TypeAdapter
 
-from en4dvar.config.context import (
-    PLACEHOLDER,
-    TEXT,
-    Context,
-    Faults,
-    Made,
-    Spread,
-    Unit,
-    observable_unit,
-    quantity,
-    require_sign,
-    time_unit,
-    unit_of,
-)
+from en4dvar.config.context import PLACEHOLDER, TEXT, Context, Faults, Made
+from en4dvar.config.quantities import Spread, Unit, observable_unit, quantity, read_spread, time_unit, unit_of
 from en4dvar.config.schema import OfReadings, Section
 from en4dvar.data.noise import SMOOTHNESS, Kernel
 from en4dvar.data.series import Places
@@ -39,21 +26,9 @@ from en4dvar.plumbing import user_file
 from en4dvar.plumbing.errors import ConfigError, DataError, retold
 from en4dvar.plumbing.files import PathError, expanded
 from en4dvar.plumbing.hints import shown
-from en4dvar.plumbing.units import UnitError, convert, parse_quantity, split_quantity
+from en4dvar.plumbing.units import UnitError, convert, parse_quantity
 from en4dvar.plumbing.user_code import loading, reason_of
 from en4dvar.priors.prior import PriorTerm
-
-
-def parse_error_std(text: Any, unit: str, whole: str = "maximum") -> Spread:
-    """``"1.4 um"``, or ``"1 % of maximum"`` or of another ``whole``. Raises :class:`UnitError`."""
-    word = str(text).strip()
-    if relative := re.fullmatch(rf"(.*%)\s+of\s+(?:the\s+)?{whole}", word):
-        return Spread(parse_quantity(relative[1], "1"), relative=True)
-    try:
-        return Spread(parse_quantity(text, unit), unit=split_quantity(word)[1])
-    except UnitError as error:
-        hint = f"; write '{word} of {whole}'" if word.endswith("%") else ""
-        raise UnitError(f"{error}{hint}") from None
 
 
 class ErrorColumn(OfReadings):
@@ -61,12 +36,6 @@ class ErrorColumn(OfReadings):
 
     unit: str | None = None
     """Unit of the numbers in it; default: that of the readings' own column."""
-
-
-def read_spread(text: Any, context: Context, unit: Unit = observable_unit, whole: str = "maximum") -> Spread:
-    spread = parse_error_std(text, unit(context), whole)
-    require_sign(spread.value, "positive", text)
-    return spread
 
 
 def or_column(read: Callable[[Any, Context], Any], unit: Unit) -> Callable[[Any, Context], Any]:
@@ -86,10 +55,6 @@ def or_column(read: Callable[[Any, Context], Any], unit: Unit) -> Callable[[Any,
 read_error_std = or_column(read_spread, observable_unit)
 
 
-class MarkColumn(OfReadings):
-    """A column of 1 where a reading is a bound and 0 where it is none."""
-
-
 def _shared(written: Any, context: Context) -> tuple[Spread | Column, ...]:
     parts = [read_error_std(part, context) for part in (written if isinstance(written, list) else [written])]
     return tuple(replace(part, kind="shared") if isinstance(part, Column) else part for part in parts)
@@ -97,15 +62,19 @@ def _shared(written: Any, context: Context) -> tuple[Spread | Column, ...]:
 
 MARKS = Made(
     lambda mark, context: mark if isinstance(mark, bool) else Column(mark.column, "1", "1", kind="mark"),
-    bool | MarkColumn,
+    bool | OfReadings,
 )
 QUANTITY_OR_COLUMN = {"anyOf": [TEXT, ErrorColumn.model_json_schema()]}
 
 LogStd = Annotated[float, Field(gt=0)]
 
 
+def rate_unit(context: Context) -> str:
+    return f"({observable_unit(context)})/({time_unit(context)})"
+
+
 class AmplitudeSection(Section):
-    """Lognormal prior of the discrepancy's standard deviation."""
+    """Lognormal prior of ``discrepancy_amplitude``, the discrepancy's standard deviation."""
 
     median: Annotated[Spread, Made(read_spread)] = Field("0.5 % of maximum", validate_default=True)
     """A quantity in the observable's unit, or e.g. '2 % of maximum'."""
@@ -114,7 +83,7 @@ class AmplitudeSection(Section):
 
 
 class LengthSection(Section):
-    """Lognormal prior of the time over which the discrepancy forgets itself."""
+    """Lognormal prior of ``discrepancy_length``, the time over which the discrepancy forgets itself."""
 
     median: Annotated[Spread, Made(partial(read_spread, unit=time_unit, whole="window"))] = Field(
         "10 % of window", validate_default=True
@@ -128,14 +97,10 @@ class DiscrepancySection(Section):
     """The discrepancy of the model: a Gaussian process beside the errors whose amplitude and length are estimated."""
 
     amplitude: AmplitudeSection = Field({}, validate_default=True)
-    """Prior of ``discrepancy_amplitude``, its standard deviation."""
     length: LengthSection = Field({}, validate_default=True)
-    """Prior of ``discrepancy_length``, its correlation time."""
     kernel: Literal["exponential", "matern-3/2", "matern-5/2"] = "exponential"
     """Correlation in time: exponential (rough paths), or Matérn's with one or two derivatives."""
-    grows_beyond: Annotated[
-        float | None, quantity(lambda c: f"({observable_unit(c)})/({time_unit(c)})", "positive")
-    ] = None
+    grows_beyond: Annotated[float | None, quantity(rate_unit, "positive")] = None
     """Rate of the observable beyond which the amplitude grows in proportion to it, e.g. 20 m/s; default: constant."""
 
     def kernel_at(self, times: Array) -> Kernel:
@@ -220,20 +185,17 @@ class Error(Section):
 
     @classmethod
     def rules(cls, keys: Mapping[str, Any], context: Context, faults: Faults) -> None:
-        std = f"{PLACEHOLDER}_std"
-        for name, other, reason in (
-            ("covariance", std, "the file holds the variances"),
-            ("covariance", "model_std", "the file holds the variances"),
-            ("covariance", "correlation_time", "the file holds the correlations"),
-            ("covariance", "shared", "the file holds the correlations"),
-            ("shared", "correlation_time", "give R as a file, covariance: {path: …}"),
-            ("robust", "shared", "a robust cost needs independent observation errors"),
-            ("robust", "correlation_time", "a robust cost needs independent observation errors"),
-            ("robust", "covariance", "a robust cost needs independent observation errors"),
-            *((bound, other, "bounds need independent errors of known std") for bound in BOUNDS for other in BESIDE),
+        std, correlated = f"{PLACEHOLDER}_std", ("shared", "correlation_time")
+        for name, others, reason in (
+            ("covariance", (std, "model_std"), "the file holds the variances"),
+            ("covariance", correlated, "the file holds the correlations"),
+            ("shared", ("correlation_time",), "give R as a file, covariance: {path: …}"),
+            ("robust", (*correlated, "covariance"), "a robust cost needs independent observation errors"),
+            *((bound, BESIDE, "bounds need independent errors of known std") for bound in BOUNDS),
         ):
-            if name in keys and other in keys:
-                faults.add((name,), f"not together with {other}: {reason}", at_key=True)
+            for other in others if name in keys else ():
+                if other in keys:
+                    faults.add((name,), f"not together with {other}: {reason}", at_key=True)
         if "threshold" in keys and "robust" not in keys:
             faults.add(("threshold",), "is that of the robust cost; write robust: huber as well", at_key=True)
         if context.observed and not keys.keys() & {std, "covariance"}:
@@ -258,10 +220,6 @@ class Error(Section):
 
 
 NUMBERS = TypeAdapter(list[Annotated[float, Field(ge=0, allow_inf_nan=False)]])
-
-
-class WeightColumn(OfReadings):
-    """A column of weights, one per reading; the numbers have no unit."""
 
 
 class WeightFunction(Section):
@@ -290,10 +248,8 @@ class Weighing:
     stated: Any = None
 
     def weights(self, times: Array, values: Array, prominence: float, read: Array | None) -> Array:
-        """β (K,) of the observations of a window; ``read`` (K,) are those of the column.
-
-        Raises :class:`DataError` where they are not as many as the observations, negative or not finite.
-        """
+        """β (K,) of the observations of a window; ``read`` (K,) are those of the column. Raises :class:`DataError`
+        where they are not as many as the observations, negative or not finite."""
         weights = read if read is not None else np.ones(len(times))
         if self.of is not None:
             weights = np.asarray(self.of(times, values, prominence))
@@ -317,7 +273,7 @@ def weighing(written: Any, context: Context) -> Weighing:
         numbers = np.array(NUMBERS.validate_python(written), dtype=float)
         return Weighing(of=lambda times, values, prominence: numbers)
     if "column" in keys:
-        column = WeightColumn.model_validate(written, context=context).column
+        column = OfReadings.model_validate(written, context=context).column
         return Weighing(column=Column(column, "1", "1", kind="weight"))
     if "zero_near_minima" in keys:
         reach = AwayFromMinima.model_validate(written, context=context).zero_near_minima
@@ -357,7 +313,7 @@ def _of_function(name: str, base: Path) -> Weighing:
     return Weighing(of=of, stated={"function": reference})
 
 
-SECTIONS = WeightColumn, AwayFromMinima, WeightFunction
+SECTIONS = OfReadings, AwayFromMinima, WeightFunction
 WEIGHTS = Made(weighing, json={"oneOf": [NUMBERS.json_schema(), *(kind.model_json_schema() for kind in SECTIONS)]})
 
 

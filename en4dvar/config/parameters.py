@@ -6,7 +6,8 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from en4dvar.config.context import SPREAD, Context, Faults, Made, Spread, read_each, subject_unit, unit_of
+from en4dvar.config.context import Context, Faults, Made, read_each
+from en4dvar.config.quantities import SPREAD, Spread, subject_unit, unit_of
 from en4dvar.config.schema import Section
 from en4dvar.config.varies import Estimated, VariesSection
 from en4dvar.data.observations import Observations
@@ -73,9 +74,8 @@ class Scalar:
     def value(self, scalars: Mapping[str, float], source: str) -> float:
         """The value in the parameter's unit. Raises :class:`ConfigError` when the file does not hold it."""
         if self.name not in scalars:
-            raise ConfigError(
-                f"{source}: no scalar {self.name!r} for {self.parameter.name}{suggest(self.name, scalars)}"
-            )
+            hint = suggest(self.name, scalars)
+            raise ConfigError(f"{source}: no scalar {self.name!r} for {self.parameter.name}{hint}")
         return _bounded(f"{scalars[self.name]!r} {self.unit}", self.parameter)
 
 
@@ -187,10 +187,8 @@ class Uncertain:
         return any(isinstance(where, str | Scalar) for where in (self.spec.mean, self.spec.median))
 
     def term(self, of_data: Callable[[str | Scalar], float] | None = None) -> PriorTerm:
-        """The prior; ``of_data`` says what ``maximum`` or a scalar of the file is, in the parameter's unit.
-
-        Raises :class:`ConfigError`, its path the faulty key.
-        """
+        """The prior; ``of_data`` says what ``maximum`` or a scalar of the file is, in the parameter's unit. Raises
+        :class:`ConfigError`, its path the faulty key."""
         try:
             return self._term(self._location("mean", of_data), self._location("median", of_data))
         except ConfigError as error:
@@ -238,16 +236,12 @@ class Uncertain:
             self.term(lambda where: 1.0)  # the other values do not wait for the data
 
     def walk(self, model: ForwardModel, term: PriorTerm, observations: Observations) -> RandomWalk | None:
-        """How it varies over a window of observations; None where it does not.
-
-        Raises :class:`ConfigError`, its path the faulty key of ``varies``.
-        """
-        varies = self.spec.varies
-        if varies is None:
+        """How it varies over a window of observations; None where it does not. Raises :class:`ConfigError`, its path
+        the faulty key of ``varies``."""
+        if (varies := self.spec.varies) is None:
             return None
-        return RandomWalk.of(
-            model, term, varies.knots(observations), varies.std_of(term), isinstance(varies.std, Estimated)
-        )
+        estimated = isinstance(varies.std, Estimated)
+        return RandomWalk.of(model, term, varies.knots(observations), varies.std_of(term), estimated)
 
     def _location(self, key: Literal["mean", "median"], of_data: Callable[[str | Scalar], float] | None) -> float:
         value: float | str | Scalar | None = getattr(self.spec, key)

@@ -14,7 +14,8 @@ from pydantic import ConfigDict, Discriminator, Field, Tag, WithJsonSchema, crea
 from pydantic.functional_validators import ModelWrapValidatorHandler
 from pydantic_core import from_json, to_json
 
-from en4dvar.config.context import Context, Faults, Made, Unknown, quantity
+from en4dvar.config.context import Context, Faults, Made, Unknown
+from en4dvar.config.quantities import quantity
 from en4dvar.executor.limits import Limits, parse_bytes
 from en4dvar.plumbing import user_file
 from en4dvar.plumbing.described import Described, text_for
@@ -153,9 +154,7 @@ class Execution(Section):
     @model_validator(mode="after")
     def _belongs_to_the_executor(self) -> Self:
         if self.limits and self.executor in ("serial", "threads"):
-            raise ValueError(
-                f"only a process can be ended at its limit; write executor: processes, not {self.executor}"
-            )
+            raise ValueError(f"only a process is ended at its limit; write executor: processes, not {self.executor}")
         if self.address is not None and self.executor not in (None, "dask"):
             raise ValueError(f"address is for a dask scheduler only; write executor: dask, not {self.executor}")
         return self
@@ -293,11 +292,9 @@ else:
 
 
 class Assimilation(_Settings):
-    """The settings of the scheme, declared at :class:`AssimilationSettings`, and how observations count."""
+    """Scheme, ensemble size and stopping rules, and how observations count; the defaults are the recommended ones."""
 
-    scheme: Annotated[OnAWindow, Field(description=listed(ON_A_WINDOW), json_schema_extra=or_in_a_file)] = (
-        AssimilationSettings.scheme
-    )
+    scheme: Annotated[OnAWindow, Field(description=listed(ON_A_WINDOW), json_schema_extra=or_in_a_file)] = DEFAULT
     weights: Literal["sum", "mean", "balanced"] = "sum"
     """sum: every observation counts (the Bayesian posterior); mean: β = 1/K, as in the published code; balanced: every
     series, or group of series, counts as if it had as many readings as the others. The latter two are not Bayesian."""

@@ -1,16 +1,15 @@
 """How a series is assimilated, of a twin experiment and of data: scheme, inflation, localisation, model error."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence, Set
 from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from en4dvar.config.context import SPREAD, TEXT, Context, Faults, Made, quantity, read_each, subject_unit
+from en4dvar.config.context import TEXT, Context, Faults, Made, read_each
+from en4dvar.config.quantities import SPREAD, quantity, subject_unit
 from en4dvar.config.schema import OfScheme, Section, keys_of_schemes, listed, or_in_a_file
 from en4dvar.config.varies import ErrorOf, Knots, dynamic_fields
 from en4dvar.model.forward import ForwardModel
@@ -55,7 +54,7 @@ class SeriesLocalisation(Section):
     cells of this grid. Default: the indices lie on a line."""
 
     @model_validator(mode="after")
-    def _one_cell_each(self) -> SeriesLocalisation:
+    def _one_cell_each(self) -> Self:
         if self.shape and self.block_size > 1:
             raise ValueError("block_size: only without shape")
         return self
@@ -71,7 +70,7 @@ class Smoothing(Section):
     """enks: cycles that an observation acts back on."""
 
     @model_validator(mode="after")
-    def _lag_of_enks(self) -> Smoothing:
+    def _lag_of_enks(self) -> Self:
         if self.method == "enrts" and "lag" in self.model_fields_set:
             raise ValueError("lag: only with method enks; enrts smooths by all later observations")
         return self
@@ -83,9 +82,8 @@ class Smoothing(Section):
 
     def as_written(self, section: Mapping[str, Any]) -> dict[str, Any]:
         """As given, without what the method does not take."""
-        return {
-            key: value for key, value in super().as_written(section).items() if self.method == "enks" or key != "lag"
-        }
+        written = super().as_written(section)
+        return {key: value for key, value in written.items() if self.method == "enks" or key != "lag"}
 
 
 if TYPE_CHECKING:
@@ -119,14 +117,12 @@ class Sequential(_OnASeries):
     """How a model error enters the ensemble of a filter: drawn, or by a square root in the space of the ensemble (not
     with smoother enks)."""
     localisation: SeriesLocalisation | None = None
-    """Gaspari–Cohn taper over the indices of the observed field."""
     smoother: Smoothing | None = None
-    """What smooths the states behind a filter."""
     stochastic_model: bool = False
     """true: accept a model that gives other numbers when a member is run again; by default that is an error."""
 
     @model_validator(mode="after")
-    def _belongs_together(self) -> Sequential:
+    def _belongs_together(self) -> Self:
         if type(self).unread({key: getattr(self, key) for key in self.model_fields_set}):
             return self  # told already
         # settings that do not go together are told here, in their place
@@ -188,9 +184,8 @@ def error_rates(model: ForwardModel, errors: Sequence[ErrorOf], positive: Collec
 def per_time(spec: Knots, std: float, path: str) -> float:
     """Variance per unit of time. Raises :class:`ConfigError`."""
     if spec.every is None:
-        raise ConfigError(
-            "give every, the time in which the model error reaches std: in a series it grows with time", path
-        )
+        words = "give every, the time in which the model error reaches std: in a series it grows with time"
+        raise ConfigError(words, path)
     try:
         return std**2 / spec.every
     except OverflowError:

@@ -12,18 +12,8 @@ import numpy as np
 from annotated_types import Ge
 from pydantic import model_validator
 
-from en4dvar.config.context import (
-    SPREAD,
-    Context,
-    Faults,
-    Made,
-    Spread,
-    parse_spread,
-    quantity,
-    read_each,
-    subject_unit,
-    time_unit,
-)
+from en4dvar.config.context import Context, Faults, Made, read_each
+from en4dvar.config.quantities import SPREAD, Spread, parse_spread, quantity, subject_unit, time_unit
 from en4dvar.config.schema import Section
 from en4dvar.data.observations import Observations
 from en4dvar.inputs.window import maxima
@@ -62,12 +52,8 @@ def modes_of(prior: FieldPrior) -> list[Perturbed]:
 
 
 def perturbation(field: Field, std: str | float | Spread) -> Perturbed:
-    """N(0, std²) added to the field, or, for a std in %, a factor whose logarithm is N(0, std²).
-
-    Raises
-    ------
-    UnitError: a unit that is not the field's. ConfigError: a std that is not positive.
-    """
+    """N(0, std²) added to the field, or, for a std in %, a factor whose logarithm is N(0, std²). Raises
+    :class:`UnitError`: a unit that is not the field's. :class:`ConfigError`: a std that is not positive."""
     name, spread = f"initial_{field.name}", std if isinstance(std, Spread) else parse_spread(std, field.unit)
     if spread.relative:
         label = f"initial {field.name} relative to the model's"
@@ -152,6 +138,9 @@ class Estimated(Spread):
     """A standard deviation that is estimated, by that of its half-normal prior."""
 
 
+HALF = Estimated(0.5, relative=True)
+
+
 class Knots(Section):
     """When something changes: at regular knots, or at given ones."""
 
@@ -194,22 +183,16 @@ class Knots(Section):
         return instants
 
 
-def _change_std(text: Any, context: Context) -> Spread:
-    return Estimated(0.5, relative=True) if text == "estimated" else parse_spread(text, subject_unit(context))
-
-
 class VariesSection(Knots):
     """A parameter that varies in time: constant pieces, and at each knot between two a random change."""
 
-    std: Annotated[Spread, Made(_change_std)]
+    std: Annotated[Spread, Made(lambda t, c: HALF if t == "estimated" else parse_spread(t, subject_unit(c)))]
     """Standard deviation of each change: in % of the value (lognormal: of its logarithm), or in the parameter's
     unit, which holds at the centre of the prior; or ``estimated``, with a half-normal prior of 50 %."""
 
     def std_of(self, term: PriorTerm) -> float:
-        """Standard deviation of each change in the coordinate of the prior of its parameter.
-
-        Raises :class:`ConfigError`, its path the key: a share of a mean that is zero.
-        """
+        """Standard deviation of each change in the coordinate of the prior of its parameter. Raises
+        :class:`ConfigError`, its path the key: a share of a mean that is zero."""
         centre = float(term.to_physical(np.array(term.mean)))
         if self.std.relative and centre == 0:
             raise ConfigError(f"relative to the mean, which is zero; give it in {term.parameter.unit}", "std")
@@ -238,6 +221,4 @@ class ErrorOf:
         return StateChanges.of(model, self.field, self.spec.knots(observations), std.value, std.relative)
 
 
-MODEL_ERROR = of_fields(
-    ModelErrorSection, "write varies behind its prior", lambda section, field: ErrorOf(field, section), changes=True
-)
+MODEL_ERROR = of_fields(ModelErrorSection, "write varies behind its prior", lambda s, f: ErrorOf(f, s), changes=True)

@@ -45,7 +45,7 @@ class Observations:
 
     Raises
     ------
-    DataError: shapes do not fit, fewer than 3 observations, or one of the above does not hold.
+    DataError: shapes do not fit, there is no observation, or one of the above does not hold.
     """
 
     times: Array
@@ -137,10 +137,8 @@ class Observations:
             self.noise.check(self.weights)
         smallest, std = float(self.std.min()), float(self.std.max())
         if not (std < LARGEST and largest < LARGEST * smallest and smallest * LARGEST > 1):
-            raise DataError(
-                f"{where}: an error std of {smallest if std < LARGEST else std:g} beside observations up to "
-                f"{largest:g}: their ratio is too large; is the unit right?"
-            )
+            beside = f"an error std of {smallest if std < LARGEST else std:g} beside observations up to {largest:g}"
+            raise DataError(f"{where}: {beside}: their ratio is too large; is the unit right?")
 
     @cached_property
     def instants(self) -> tuple[Array, npt.NDArray[np.intp] | slice]:

@@ -36,9 +36,7 @@ class Places:
     @classmethod
     def at_coordinates(cls, positions: npt.ArrayLike, coordinates: Array, unit: str = "1") -> Self:
         """Linear interpolation between components at ``coordinates`` (n,), in any order; ``positions`` (K,) within.
-
-        Raises :class:`DataError` for a position outside.
-        """
+        Raises :class:`DataError` for a position outside."""
         asked, order = np.asarray(positions, dtype=float), np.argsort(coordinates, kind="stable")
         along = coordinates[order]
         outside = np.flatnonzero(~((asked >= along[0]) & (asked <= along[-1])))
@@ -50,7 +48,6 @@ class Places:
         return cls(indices, np.stack([1 - share, share], axis=1), asked, unit)
 
     def __getitem__(self, which: slice | npt.NDArray[np.intp] | npt.NDArray[np.bool_]) -> Self:
-        """The places of some of the readings."""
         return type(self)(self.indices[which], self.shares[which], self.positions[which], self.unit)
 
     @property

@@ -25,7 +25,7 @@ from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.errors import TooFewMembersError
 from en4dvar.priors.prior import Prior
 from en4dvar.priors.varying import PiecewiseModel
-from en4dvar.priors.varying.changes import clock
+from en4dvar.priors.varying.model import clock
 from en4dvar.problem import InverseProblem
 from en4dvar.sampling.refine import mode_cautions, that_count
 from en4dvar.schemes.settings import AssimilationSettings

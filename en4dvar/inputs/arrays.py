@@ -22,14 +22,9 @@ FORMS = "(times, values), a dict of columns, a pandas Series or DataFrame, or an
 def columns_of(data: Any, time: str = TIME, value: str = VALUE) -> dict[str, Array]:
     """Columns by name, that of the times first and called :data:`TIME`, all of one length; NaN is a missing reading.
 
-    Parameters
-    ----------
-    data: one of :data:`FORMS`. time: name of the column, coordinate or index of times. value: what a series without a
-        name is called.
-
-    Raises
-    ------
-    DataError: it is none of these, has no times, or columns differ in length or are no numbers.
+    ``data``: one of :data:`FORMS`; ``time``: name of the column, coordinate or index of times; ``value``: what a series
+    without a name is called.
+    Raises :class:`DataError`: it is none of these, has no times, or columns differ in length or are no numbers.
     """
     columns = _columns(data, time, value)
     times = columns.pop(time, None)
@@ -70,9 +65,8 @@ def _coordinate(data: Any, time: str) -> dict[str, Any]:
 def _numbers(name: str, column: Any) -> Array:
     values = np.asarray(column)
     if values.dtype.kind in "Mm":
-        raise DataError(
-            f"{name!r} holds dates; give elapsed time as numbers, e.g. (t - t[0]) / np.timedelta64(1, 's') for seconds"
-        )
+        seconds = "(t - t[0]) / np.timedelta64(1, 's')"
+        raise DataError(f"{name!r} holds dates; give elapsed time as numbers, e.g. {seconds} for seconds")
     try:
         numbers = np.asarray(values, dtype=float)
     except (TypeError, ValueError):

@@ -165,10 +165,8 @@ class InFile:
         if not len(wrong):
             return
         before, after = order[wrong[0] : wrong[0] + 2]
-        apart = (
-            "give each a file of its own"
-            + bool(self.lines) * ", or a column that says whose each row is, and name it by data.by"
-        )
+        apart = "give each a file of its own"
+        apart += bool(self.lines) * ", or a column that says whose each row is, and name it by data.by"
         ends = np.flatnonzero(np.diff(times) < 0)
         if column := self._telling_apart(times):
             name = column if column.isidentifier() else repr(column)

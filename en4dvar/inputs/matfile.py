@@ -13,10 +13,11 @@ MathWorks, *MAT-File Format* (R2019b), *MAT-File Versions*; the layout of HDF5 i
 import fnmatch
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -26,7 +27,6 @@ from en4dvar.plumbing.decoding import Allowed, decoded_whole, require_plain
 from en4dvar.plumbing.errors import DataError
 from en4dvar.plumbing.files import open_plain
 
-T = TypeVar("T")
 MAT = Allowed(seconds=60, memory=8_000_000_000, size=256_000_000_000)
 LONGEST = 4_000_000_000  # bytes of a file of version 5, which is read whole
 HEADER = 128  # bytes
@@ -46,15 +46,30 @@ Found = Iterator[tuple[str, Array | str]]
 
 @dataclass(frozen=True)
 class Variables:
-    """Real ``vectors`` (K,) and ``matrices`` (n, m), finite ``scalars``, and in words what else there is.
+    """What a file holds, by name: real vectors (K,) and matrices (n, m), and in words what else there is."""
 
-    A matrix is among the ``others`` too, and a scalar among the vectors.
-    """
+    elements: Mapping[str, Array | str]
 
-    vectors: Mapping[str, Array]
-    matrices: Mapping[str, Array]
-    scalars: Mapping[str, float]
-    others: Mapping[str, str]
+    @cached_property
+    def vectors(self) -> dict[str, Array]:
+        """(K,) each."""
+        return {name: it for name, it in self.elements.items() if not isinstance(it, str) and it.ndim == 1}
+
+    @cached_property
+    def matrices(self) -> dict[str, Array]:
+        """(n, m) each."""
+        return {name: it for name, it in self.elements.items() if not isinstance(it, str) and it.ndim == 2}
+
+    @property
+    def scalars(self) -> dict[str, float]:
+        """Finite vectors of one number."""
+        return {name: float(it[0]) for name, it in self.vectors.items() if it.size == 1 and np.isfinite(it[0])}
+
+    @property
+    def others(self) -> dict[str, str]:
+        """In words what is no vector."""
+        words = {name: it for name, it in self.elements.items() if isinstance(it, str)}
+        return words | {name: array_words(matrix.shape) for name, matrix in self.matrices.items()}
 
     def vector(self, name: str) -> Array | None:
         """A vector by its name, also of a matrix; None where there is none."""
@@ -76,11 +91,15 @@ class Variables:
 
     def of(self, part: str) -> "Variables":
         """What is not inside an array, and of arrays the element ``part`` under names without the index."""
-        return Variables(*(_element(getattr(self, kind.name), part) for kind in fields(self)))
+        named = ((*indexed(name), it) for name, it in self.elements.items())
+        return Variables({**self.elements, **{name: it for name, i, it in named if i and i == part}})
 
     def of_first(self) -> "Variables":
         """Each array by its first element, under names without the index."""
-        return Variables(*(_first(getattr(self, kind.name)) for kind in fields(self)))
+        kept: dict[str, Array | str] = {}
+        for name, it in self.elements.items():
+            kept.setdefault(indexed(name)[0], it)
+        return Variables(kept)
 
     def columns(self) -> dict[str, Array]:
         """Vectors of more than one number, the columns of narrow matrices, and the rows of flat ones."""
@@ -98,38 +117,15 @@ def array_words(shape: Sequence[int]) -> str:
     return f"an array of {' x '.join(map(str, shape))}"
 
 
-def gathered(elements: Iterable[tuple[str, Array | str]]) -> Variables:
-    """Variables of named vectors and matrices, or words in their place; of two with one name the last."""
-    every = dict(elements)
-    numbers = {name: it for name, it in every.items() if not isinstance(it, str)}
-    vectors = {name: it for name, it in numbers.items() if it.ndim == 1}
-    matrices = {name: it for name, it in numbers.items() if it.ndim == 2}
-    scalars = {name: float(it[0]) for name, it in vectors.items() if it.size == 1 and np.isfinite(it[0])}
-    words = {name: it for name, it in every.items() if isinstance(it, str)}
-    return Variables(vectors, matrices, scalars, words | {name: array_words(m.shape) for name, m in matrices.items()})
-
-
 def indexed(name: str) -> tuple[str, str]:
     """``expts(2).R`` as ``expts.R`` and ``2``, ``C{3}`` as ``C`` and ``3``; by the first index, "" without one."""
     match = _INDEX.search(name)
     return (name[: match.start()] + name[match.end() :], match[1] or match[2]) if match else (name, "")
 
 
-def _element(elements: Mapping[str, T], part: str) -> dict[str, T]:
-    inside = {name: value for whole, value in elements.items() for name, i in (indexed(whole),) if i and i == part}
-    return {**elements, **inside}
-
-
-def _first(elements: Mapping[str, T]) -> dict[str, T]:
-    kept: dict[str, T] = {}
-    for whole, value in elements.items():
-        kept.setdefault(indexed(whole)[0], value)
-    return kept
-
-
 def mat_variables(path: Path) -> Variables:
     """What a ``.mat`` file holds. Raises :class:`DataError`."""
-    return decoded_whole(variables_of, path, allowed=MAT)
+    return decoded_whole(variables_of, path, allowed=MAT, kind="a MATLAB file")
 
 
 def variables_of(path: Path) -> Iterator[Variables]:
@@ -139,14 +135,7 @@ def variables_of(path: Path) -> Iterator[Variables]:
     if not head.startswith((b"MATLAB 5.0", b"MATLAB 7.3")):
         raise DataError(f"{path}: not a MATLAB v5 file (no such header); save it in MATLAB with save(..., '-v7')")
     hdf = head.startswith(b"MATLAB 7.3") or head[124:] in (b"\x00\x02IM", b"\x02\x00MI")
-    try:
-        variables = gathered((_Hdf if hdf else _Classic)(path).variables())
-    except (DataError, MemoryError):
-        raise
-    except Exception as error:  # the libraries tell damage by OSError, RuntimeError, KeyError, ValueError, …
-        words = " ".join(str(error).split())[:200]
-        raise DataError(f"{path}: not a MATLAB {'v7.3' if hdf else 'v5'} file that can be read ({words})") from None
-    yield variables
+    yield Variables(dict((_Hdf if hdf else _Classic)(path).variables()))
 
 
 class _Reader:
@@ -244,7 +233,6 @@ class _Hdf(_Reader):
                     yield from self._child(self.file, name, name, 0)
 
     def _child(self, group: Any, key: str, name: str, depth: int) -> Found:
-        """What stands under ``key`` of a group."""
         import h5py
 
         if isinstance(group.get(key, getlink=True), h5py.HardLink):

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from en4dvar.inputs.parts import Layout, Matrix, opened, read_contents, require_file
+from en4dvar.inputs.parts import Layout, Matrix, opened, read_contents, readable
 from en4dvar.inputs.text_table import cells_of, delimiter_of, number_in, numbered_lines
 from en4dvar.model.state import Array
-from en4dvar.plumbing.decoding import Allowed, DecodeError, ForeignDataError, decoded_whole, require_whole
+from en4dvar.plumbing.decoding import Allowed, decoded_whole, require_whole
 from en4dvar.plumbing.errors import DataError, retold
 from en4dvar.plumbing.hints import listed, suggest
 from en4dvar.plumbing.tables import is_number
@@ -29,9 +29,8 @@ def read_covariance(matrix: Matrix) -> Array:
     unequal = np.argwhere(np.abs(values - values.T) > 1e-9 * scale)
     if len(unequal):
         i, j = unequal[0]
-        raise DataError(
-            f"{path}: not symmetric: {values[i, j]:g} in row {i + 1}, column {j + 1}, {values[j, i]:g} across"
-        )
+        place = f"row {i + 1}, column {j + 1}"
+        raise DataError(f"{path}: not symmetric: {values[i, j]:g} in {place}, {values[j, i]:g} across")
     return np.asarray(convert(0.5 * (values + values.T), matrix.unit, matrix.target))
 
 
@@ -60,38 +59,32 @@ LARGEST = 256_000_000_000  # bytes of a file
 def read_members(path: Path, units: Mapping[str, tuple[str, str]]) -> dict[str, Array]:
     """Members (N,) of each parameter by name, in its own unit.
 
-    Parameters
-    ----------
-    units: for each name the unit that is wanted and, "" where the file tells it, the one in the file.
-
-    Raises
-    ------
-    DataError: the file cannot be read, lacks a name or a unit, or holds numbers that are not finite.
+    ``units``: for each name the unit that is wanted and, "" where the file tells it, the one in the file.
+    Raises :class:`DataError`: the file cannot be read, lacks a name or a unit, or holds numbers that are not finite.
     """
-    require_file(path)
-    columns = _of_netcdf(path, units) if path.suffix.lower() in NETCDF else _of_table(path, units)
+    if path.suffix.lower() in NETCDF:
+        allowed = Allowed(60, 4_000_000_000, LARGEST)
+        columns = decoded_whole(netcdf_members, path, list(units), allowed=allowed, kind="netCDF")
+    else:
+        columns = _of_table(path, units)
     lengths = {name: len(values) for name, (values, _) in columns.items()}
     if len(set(lengths.values())) != 1:
         raise DataError(f"{path}: unequal numbers of members: {listed([f'{k} {n}' for k, n in lengths.items()])}")
     members = {}
     for name, (values, unit) in columns.items():
-        if not np.all(np.isfinite(values)):
-            raise DataError(
-                f"{path}: {name} has {int(np.sum(~np.isfinite(values)))} members that are not finite numbers"
-            )
+        if count := int(np.sum(~np.isfinite(values))):
+            raise DataError(f"{path}: {name} has {count} members that are not finite numbers")
         members[name] = _converted(path, name, values, unit, units[name])
     return members
 
 
 def read_centres(path: Path, units: Mapping[str, str]) -> dict[str, dict[str, float]]:
-    """Of a ``summary.csv`` of a run, data set → parameter → centre, in ``units``; nothing of another file.
-
-    Raises :class:`DataError`: no data set has any of the parameters, or a number is none.
-    """
+    """Of a ``summary.csv`` of a run, data set → parameter → centre, in ``units``; nothing of another file. Raises
+    :class:`DataError`: no data set has any of the parameters, or a number is none."""
     if path.suffix.lower() != ".csv":
         return {}
-    require_file(path)
-    rows = csv.DictReader(line for _, line in numbered_lines(path))
+    with readable(path):
+        rows = csv.DictReader(line for _, line in numbered_lines(path))
     if not {"dataset", "name", "unit", "centre"} <= {*(rows.fieldnames or ())}:
         return {}
     sets: dict[str, dict[str, float]] = {}
@@ -124,34 +117,26 @@ def _of_table(path: Path, names: Mapping[str, Any]) -> dict[str, tuple[Array, st
     return {name: (contents.columns[name], "") for name in names}
 
 
-def _of_netcdf(path: Path, names: Mapping[str, Any]) -> dict[str, tuple[Array, str]]:
-    """As a process of its own reads it."""
-    allowed = Allowed(60, 4_000_000_000, LARGEST)
-    with retold(DecodeError, DataError, f"{path}: cannot be read as netCDF: "):
-        return decoded_whole(netcdf_members, path, list(names), allowed=allowed)
-
-
 def netcdf_members(path: Path, names: Sequence[str]) -> Iterator[dict[str, tuple[Array, str]]]:
     """The numbers of each name, with their unit. Raises :class:`DataError`."""
     import netCDF4  # a tenth of a second that other files do not need
 
-    with retold((OSError, RuntimeError, ForeignDataError), DataError, f"{path}: cannot be read as netCDF: "):
-        require_whole(path)
-        with netCDF4.Dataset(path) as file:
-            group = file.groups.get("posterior", file)
-            stats = file.groups.get("sample_stats") if group is not file else None
-            alive = None
-            if stats is not None and "active" in stats.variables:
-                alive = _numbers(path, stats.variables["active"]) > 0
-            members = {}
-            for name in names:
-                if name not in group.variables:
-                    raise DataError(f"{path}: no variable {name!r}{suggest(name, group.variables)}")
-                variable = group.variables[name]
-                values = _numbers(path, variable)
-                values = values[alive] if alive is not None and len(alive) == len(values) else values
-                members[name] = values, str(getattr(variable, "units", ""))
-            yield members
+    require_whole(path)
+    with netCDF4.Dataset(path) as file:
+        group = file.groups.get("posterior", file)
+        stats = file.groups.get("sample_stats") if group is not file else None
+        alive = None
+        if stats is not None and "active" in stats.variables:
+            alive = _numbers(path, stats.variables["active"]) > 0
+        members = {}
+        for name in names:
+            if name not in group.variables:
+                raise DataError(f"{path}: no variable {name!r}{suggest(name, group.variables)}")
+            variable = group.variables[name]
+            values = _numbers(path, variable)
+            values = values[alive] if alive is not None and len(alive) == len(values) else values
+            members[name] = values, str(getattr(variable, "units", ""))
+        yield members
 
 
 def _numbers(path: Path, variable: Any) -> Array:

@@ -20,8 +20,7 @@ from en4dvar.inputs.text_table import Decimal, Table, matches, scalars_in, sheet
 from en4dvar.inputs.window import BY_NAME, Instant
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import DataError, retold
-from en4dvar.plumbing.files import kind_of
-from en4dvar.plumbing.hints import listed, no_such_file
+from en4dvar.plumbing.hints import listed
 
 Format = Literal["csv", "mat", "xlsx"]
 Disorder = Literal["refuse", "sort"]
@@ -105,17 +104,13 @@ ANY = Layout()
 @contextmanager
 def opened(path: Path, layout: Layout) -> Iterator[Format]:
     """The format of a file that is there. Raises :class:`DataError`, also where reading inside fails."""
-    require_file(path)
     kind = format_of(path, layout)
-    if kind is None:
-        hint = (
-            "save the sheet as CSV"
-            if path.suffix.lower() in SHEETS
-            else f"say what it is (data.format: {', '.join(get_args(Format))})"
-        )
+    if kind is None and os.path.isfile(path):  # Path.is_file raises for a name that is too long, or in a closed folder
+        said = f"say what it is (data.format: {', '.join(get_args(Format))})"
+        hint = "save the sheet as CSV" if path.suffix.lower() in SHEETS else said
         raise DataError(f"{path}: the format cannot be told from the suffix {path.suffix!r}; {hint}")
     with readable(path):
-        yield kind
+        yield kind or "csv"  # to open it tells what is there instead of a file
 
 
 def format_of(path: Path, layout: Layout) -> Format | None:
@@ -126,14 +121,6 @@ def format_of(path: Path, layout: Layout) -> Format | None:
 def readable(path: Path) -> AbstractContextManager[None]:
     """Whatever goes wrong in the system or in the csv module as :class:`DataError`."""
     return retold((OSError, csv.Error), DataError, f"{path}: ")
-
-
-def require_file(path: Path) -> None:
-    """Raises :class:`DataError` where there is no plain file: nothing, a directory, a pipe, a device."""
-    if not os.path.isfile(path):  # Path.is_file raises for a name that is too long, or in a closed folder
-        with suppress(OSError):
-            raise DataError(f"{path}: is {kind_of(os.stat(path).st_mode)}, not a file")
-        raise DataError(no_such_file(path))
 
 
 def columns_of(
@@ -227,7 +214,6 @@ def _of_table(table: Table, wanted: Sequence[str]) -> dict[str, Array]:
 
 
 def _of_mat(variables: Variables, name: str, path: Path) -> Array:
-    """A vector by its name. Raises :class:`DataError`."""
     vector = variables.vector(name)
     if vector is not None:
         return np.asarray(vector, dtype=float)

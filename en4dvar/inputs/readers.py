@@ -58,10 +58,8 @@ class Readings:
         for every in (np.arange(self.count), self.usable, np.sort(rows)):
             if len(every) == size:
                 return np.searchsorted(every, rows)
-        raise DataError(
-            f"{size} rows, but {number} observations are used, of {len(self.usable)} usable ones in {self.count} rows "
-            "of data; give a row to each of one of these"
-        )
+        counts = f"{number} observations are used, of {len(self.usable)} usable ones in {self.count} rows of data"
+        raise DataError(f"{size} rows, but {counts}; give a row to each of one of these")
 
 
 def read_series(
@@ -80,19 +78,16 @@ def read_series(
     ``part``: see :func:`parts_of`. ``repeats``: there may be several readings at a time, in any order of times.
     ``fewest`` usable readings are needed.
 
-    Raises
-    ------
-    DataError: the file cannot be used.
+    Raises :class:`DataError`: the file cannot be used.
     """
     if part and layout.by is None and "*" in value.name:
         value = replace(value, name=part)
-    wanted = [c.name for c in (value, time, *errors) if isinstance(c, Column)]
+    asked = [column for column in (value, time, *errors) if isinstance(column, Column)]
+    wanted = [column.name for column in asked]
     columns, scalars, lines = columns_of(path, layout, wanted, part)
-    values = convert(columns[value.name], value.unit, value.target)
-    if isinstance(time, Column):
-        times = convert(columns[time.name], time.unit, time.target)
-    else:
-        times = np.asarray(_step(time, scalars, path) * np.arange(len(values)), dtype=float)
+    converted = {column: convert(columns[column.name], column.unit, column.target) for column in asked}
+    values = converted[value]
+    times = converted[time] if isinstance(time, Column) else _step(time, scalars, path) * np.arange(float(len(values)))
     if not len(values):
         raise DataError(f"{path}: {value.name!r} is empty")
     if len(times) != len(values):
@@ -106,7 +101,7 @@ def read_series(
     _check(times[kept], values[kept], value.name, path, fewest, zero)
     if repeats:
         kept = kept[np.argsort(times[kept], kind="stable")]
-    stated = {column.name: _stds(columns[column.name], column, kept, len(values), path) for column in errors}
+    stated = {c.name: _stds(c, converted[c], columns[c.name], kept, len(values), path) for c in errors}
     if isinstance(time, Column) and not repeats:
         written = columns[time.name][kept]
         InFile(path, layout, kept, lines, written, time.unit, wanted).require_order(times[kept], values[kept])
@@ -148,11 +143,11 @@ def _kept(read: Readings, which: slice | npt.NDArray[np.bool_]) -> Readings:
     return replace(read, times=read.times[which], values=read.values[which], errors=errors, rows=rows)
 
 
-def _stds(written: Array, column: Column, kept: Rows, count: int, path: Path) -> Array:
+def _stds(column: Column, every: Array, written: Array, kept: Rows, count: int, path: Path) -> Array:
     """Standard deviations, weights or places of the kept readings; one missing or of a wrong sign raises DataError."""
-    if len(written) != count:
-        raise DataError(f"{path}: {len(written)} values of {column.name!r} but {count} readings")
-    stds = np.asarray(convert(written[kept], column.unit, column.target))
+    if len(every) != count:
+        raise DataError(f"{path}: {len(every)} values of {column.name!r} but {count} readings")
+    stds = every[kept]
     fits, wrong_sign = {
         "std": (stds > 0, "not positive"),
         "weight": (stds >= 0, "negative"),
@@ -171,9 +166,8 @@ def _stds(written: Array, column: Column, kept: Rows, count: int, path: Path) ->
 def _check(times: Array, values: Array, name: str, path: Path, fewest: int, zero: bool) -> None:
     """Raise :class:`DataError` where readings are of no use; ``zero``: all of them may be."""
     if not len(values) or not (zero or np.any(values)):
-        raise DataError(
-            f"{path}: {name!r} holds no usable value (all NaN{', or blank' if zero else ', blank, or not above zero'})"
-        )
+        none = "blank" if zero else "blank, or not above zero"
+        raise DataError(f"{path}: {name!r} holds no usable value (all NaN, or {none})")
     if not (np.all(np.isfinite(times)) and np.all(np.isfinite(values))):
         raise DataError(f"{path}: infinite values")
     if len(values) < fewest:

@@ -8,8 +8,6 @@ at. A workbook is a zip archive from anybody: what it unpacks to is bounded, and
 before openpyxl sees it.
 """
 
-from __future__ import annotations
-
 import csv
 import fnmatch
 import re
@@ -125,10 +123,8 @@ class Table:
             return alike[0]
         if self.nameless:
             proposed = ("t_us", "R_um", *self.names[2:])[: len(self.names)]
-            raise DataError(
-                f"{self.path}: no line above the numbers names the columns: put one such as {','.join(proposed)!r} "
-                f"there, or call them {listed(self.names, 4)}"
-            )
+            hint = f"put one such as {','.join(proposed)!r} there, or call them {listed(self.names, 4)}"
+            raise DataError(f"{self.path}: no line above the numbers names the columns: {hint}")
         fault = "more than one column" if alike else "no column"
         raise DataError(f"{self.path}: {fault} {name!r}; the columns are: {listed(self.names)}")
 
@@ -170,12 +166,8 @@ def _names_and_numbers(head: Sequence[Sequence[str]], wanted: Sequence[str]) -> 
     if _holds_number(head[first]) and (first == 0 or (wanted and all(map(_NAMELESS.fullmatch, wanted)))):
         return None, first
     top = max(first - 1, 0)
-    if (
-        top
-        and _words(head[top - 1])
-        and len(head[top - 1]) == len(head[top])
-        and all(is_unit(cell.strip("[]()")) for cell in head[top])
-    ):
+    above = head[top - 1] if top else []
+    if _words(above) and len(above) == len(head[top]) and all(is_unit(cell.strip("[]()")) for cell in head[top]):
         top -= 1
     if len(head[top]) == 1 < len(head[first]):
         return None, first
@@ -198,12 +190,12 @@ def number_in(cell: str, name: str, path: Path, line: int, decimal: Decimal | No
     """A cell as a number, NaN where it is blank; ``decimal`` None: a point, without a word on the setting."""
     if cell.lower() in BLANK:
         return float("nan")
-    text = cell.replace(",", ".") if decimal == "," and "." not in cell else cell
-    if not is_number(text):
-        comma = decimal != "," and "," in cell and is_number(cell.replace(",", "."))
-        hint = "; write a decimal point" + (", or data.decimal: ','" if decimal else "") if comma else ""
-        raise DataError(f"{path}:{line}: {short(cell)!r} in column {short(name)!r} is not a number{hint}")
-    return float(text)
+    try:
+        return float(cell.replace(",", ".") if decimal == "," and "." not in cell else cell)
+    except ValueError:
+        comma = decimal != "," and "," in cell and _holds_number([cell])
+    hint = "; write a decimal point" + (", or data.decimal: ','" if decimal else "") if comma else ""
+    raise DataError(f"{path}:{line}: {short(cell)!r} in column {short(name)!r} is not a number{hint}")
 
 
 if TYPE_CHECKING:
@@ -220,26 +212,18 @@ _RANGE = re.compile(r"\$?[A-Za-z]{1,3}\$?[1-9]\d{0,6}(:\$?[A-Za-z]{1,3}\$?[1-9]\
 
 def sheet_lines(path: Path, asked: str) -> Lines:
     """Rows of a sheet that are not blank, with their numbers; ``asked`` is a sheet, ``Sheet!A3:D40`` or ``A3:D40``.
-
-    Raises :class:`DataError`.
-    """
-    return decoded_whole(lines_of_workbook, path, asked, allowed=WORKBOOK)
+    Raises :class:`DataError`."""
+    return decoded_whole(lines_of_workbook, path, asked, allowed=WORKBOOK, kind="a workbook (save it as CSV)")
 
 
 def lines_of_workbook(path: Path, asked: str) -> Iterator[Lines]:
     """As :func:`sheet_lines`, in the child that decodes."""
     name, area = _parts(asked)
     _check(path)
-    try:
-        stored = _rows(path, name, area, formulas=False)
-        rows = [(number, _texts(cells)) for number, cells in stored]
-        if any(None in cells for _, cells in stored):
-            _refuse_formulas(path, stored, _rows(path, name, area, formulas=True))
-    except (DataError, MemoryError):
-        raise
-    except Exception as error:  # whatever openpyxl stumbles over: it trusts what is in the archive
-        raise DataError(f"{path}: not a workbook that can be read ({type(error).__name__}); save it as CSV") from None
-    yield [(number, cells) for number, cells in rows if cells]
+    stored = _rows(path, name, area, formulas=False)
+    if any(None in cells for _, cells in stored):
+        _refuse_formulas(path, stored, _rows(path, name, area, formulas=True))
+    yield [(number, texts) for number, cells in stored if (texts := _texts(cells))]
 
 
 def _parts(asked: str) -> tuple[str, str]:
@@ -251,25 +235,19 @@ def _parts(asked: str) -> tuple[str, str]:
 
 
 def _check(path: Path) -> None:
-    """Raise :class:`DataError` where the archive is none, or not to be unpacked."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            parts = archive.infolist()
-            size = sum(part.file_size for part in parts)
-            if size > LARGEST or len(parts) > MOST_PARTS:
-                raise DataError(f"{path}: {len(parts)} parts that unpack to {size / 2**20:.0f} MiB; save it as CSV")
-            for part in parts:
-                xml = archive.read(part) if part.filename.endswith((".xml", ".rels")) else b""
-                if any(sign in xml for sign in DECLARATION):
-                    raise DataError(f"{path}: {part.filename} declares entities, as no workbook does")
-    except DataError:
-        raise
-    except Exception as error:  # BadZipFile, zlib.error and whatever else a damaged archive gives
-        raise DataError(f"{path}: not an Excel workbook ({error})") from None
+    """Raise :class:`DataError` where the archive is not to be unpacked; what zipfile raises where it is none."""
+    with zipfile.ZipFile(path) as archive:
+        parts = archive.infolist()
+        size = sum(part.file_size for part in parts)
+        if size > LARGEST or len(parts) > MOST_PARTS:
+            raise DataError(f"{path}: {len(parts)} parts that unpack to {size / 2**20:.0f} MiB; save it as CSV")
+        for part in parts:
+            xml = archive.read(part) if part.filename.endswith((".xml", ".rels")) else b""
+            if any(sign in xml for sign in DECLARATION):
+                raise DataError(f"{path}: {part.filename} declares entities, as no workbook does")
 
 
 def _rows(path: Path, name: str, area: str, formulas: bool) -> list[tuple[int, tuple[Any, ...]]]:
-    """Numbered rows of cells."""
     try:
         from openpyxl import load_workbook
         from openpyxl.utils import range_boundaries
@@ -296,7 +274,7 @@ def _rows(path: Path, name: str, area: str, formulas: bool) -> list[tuple[int, t
             book.close()
 
 
-def _sheet(book: Any, name: str, path: Path) -> ReadOnlyWorksheet:
+def _sheet(book: Any, name: str, path: Path) -> "ReadOnlyWorksheet":
     """The sheet of a name, or the only one with anything in it. Raises :class:`DataError`."""
     sheets = {sheet.title: sheet for sheet in book.worksheets}
     if name:
@@ -326,7 +304,5 @@ def _refuse_formulas(path: Path, stored: Any, written: Any) -> None:
         for i, (value, text) in enumerate(zip(values, texts, strict=False)):
             if value is None and isinstance(text, str) and text.startswith("="):
                 where = f"{get_column_letter(i + 1)}{number}"
-                raise DataError(
-                    f"{path}:{number}: cell {where} holds a formula without a stored value, and none is evaluated; "
-                    "open and save the workbook in Excel or LibreOffice, or save the sheet as CSV"
-                )
+                words = f"cell {where} holds a formula without a stored value, and none is evaluated; open and save"
+                raise DataError(f"{path}:{number}: {words} the workbook in Excel or LibreOffice, or save it as CSV")

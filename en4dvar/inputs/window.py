@@ -56,17 +56,12 @@ def parse_instant(text: str | float, time_unit: str, symbols: Collection[str] = 
         return Instant("minimum" if numbered[1] == "minimum" else "trough", int(numbered[2] or 1))
     if word[:1].isdigit() or word[:1] in "+-.":
         return Instant("time", time=parse_quantity(text, time_unit))
-    raise UnitError(
-        f"{shown(text)} is not an instant; write start, end, maximum, top, 'minimum 2', 'trough 2', or a time "
-        "such as '3 us'"
-    )
+    raise UnitError(f"{shown(text)} is not an instant: start, end, maximum, top, 'minimum 2', 'trough 2', or '3 us'")
 
 
 def select(times: Array, values: Array, start: Instant, end: Instant, prominence: float = 0.1) -> slice:
-    """The window as a slice of the series ``times`` (K,), ``values`` (K,), both ends included.
-
-    Raises :class:`DataError` when an extremum is not there or the window is empty.
-    """
+    """The window as a slice of the series ``times`` (K,), ``values`` (K,), both ends included. Raises
+    :class:`DataError` when an extremum is not there or the window is empty."""
     with retold(DataError, DataError, "the window "):
         first = index_of(times, values, start, 0, prominence)
         last = index_of(times, values, end, first, prominence, last=True)
@@ -98,11 +93,9 @@ def index_of(
         return int(np.searchsorted(times, _top(times[first:], values[first:])))
     indices = minima(values[first:], prominence)
     if instant.number > len(indices):
-        raise DataError(
-            f"asks for minimum {instant.number}, but only {len(indices)} minima with a prominence of "
-            f"{prominence:.0%} of the range follow its start; end it elsewhere ('to: end', or at a time), or lower its "
-            "prominence"
-        )
+        few = f"only {len(indices)} minima with a prominence of {prominence:.0%} of the range follow its start"
+        advice = "end it elsewhere ('to: end', or at a time), or lower its prominence"
+        raise DataError(f"asks for minimum {instant.number}, but {few}; {advice}")
     index = int(indices[instant.number - 1])
     if instant.kind == "trough":
         begin, _, end = np.concatenate([[0], indices, [len(values) - first - 1]])[instant.number - 1 :][:3]

@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import ClassVar, Protocol, Self, cast, overload, runtime_checkable
+from typing import Any, ClassVar, Protocol, Self, cast, overload, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -197,11 +197,14 @@ class Shared:
     results: Callable[[], Sequence[Trajectory | Failure]]
 
 
-class _TimeUnit:
-    """The time unit of a model; what a class or an instance sets instead goes before it."""
+class _SameAs:
+    """Another attribute of a model; what a class or an instance sets instead goes before it."""
 
-    def __get__(self, model: "ForwardModel | None", kind: "type[ForwardModel]") -> str:
-        return (model or kind).time_unit
+    def __init__(self, name: str):
+        self.name = name
+
+    def __get__(self, model: "ForwardModel | None", kind: "type[ForwardModel]") -> Any:
+        return getattr(model or kind, self.name)
 
 
 class ForwardModel(ABC):
@@ -209,13 +212,14 @@ class ForwardModel(ABC):
 
     ``time_unit`` is the unit of all times, ``time_display_unit``, by default the same, that of plots. ``batch`` is the
     number of members the fast path likes to get at once (executors cut chunks at multiples of it); ``compiled`` says
-    that ``trajectories`` releases the interpreter lock, so that threads serve it. ``autonomous`` says that F depends on
-    elapsed time alone: sequential schemes may start ``trajectories`` at any instant, where otherwise they repeat
-    ``step``. ``validity``
-    names quantities and the limits beyond which the equations do not hold; :meth:`doubts` judges observations before a
-    run. ``alternatives`` are assumptions that could
-    be otherwise, for :mod:`en4dvar.diagnosis.response.what_if`; ``path_quantities`` and ``path_parameters``, names
-    of fields of the state that act along the path and not only at its start, are for
+    that ``trajectories`` releases the interpreter lock. Such models, unless they say otherwise, are ``threaded``
+    (threads serve them), ``dense`` (a path may be asked for between the observations at next to no cost, for smooth
+    curves in plots, not at the observations alone) and ``cheap`` (ten thousand runs take seconds, so that a doubt about
+    a posterior is settled by sampling it). ``autonomous`` says that F depends on elapsed time alone: sequential schemes
+    may start ``trajectories`` at any instant, where otherwise they repeat ``step``. ``validity`` names quantities and
+    the limits beyond which the equations do not hold; :meth:`doubts` judges observations before a run. ``alternatives``
+    are assumptions that could be otherwise, for :mod:`en4dvar.diagnosis.response.what_if`; ``path_quantities`` and
+    ``path_parameters``, names of fields of the state that act along the path and not only at its start, are for
     :mod:`en4dvar.diagnosis.response.ledger`. ``optional_parameters`` are numbers that are known unless
     ``parameters:`` names them: :meth:`with_parameters` is the model in which they are parameters too; a setting in
     ``known_by`` says nothing but the numbers of these names, and is refused beside parameters for all of them.
@@ -236,9 +240,12 @@ class ForwardModel(ABC):
     observables: tuple[Observable, ...]
     defaults: Mapping[str, float] = MappingProxyType({})
     time_unit: str = "s"
-    time_display_unit: str = cast("str", _TimeUnit())
+    time_display_unit: str = cast(Any, _SameAs("time_unit"))
     batch: int = 1
     compiled: bool = False
+    threaded: bool = cast(Any, _SameAs("compiled"))
+    dense: bool = cast(Any, _SameAs("compiled"))
+    cheap: bool = cast(Any, _SameAs("compiled"))
     autonomous: ClassVar[bool] = False
     validity: tuple[ValidityLimit, ...] = ()
     alternatives: tuple[Alternative, ...] = ()
@@ -274,27 +281,6 @@ class ForwardModel(ABC):
         """True if a member can go on from its state at any instant."""
         kind = type(self)
         return kind.step is not ForwardModel.step or kind.resumed is not ForwardModel.resumed
-
-    @property
-    def threaded(self) -> bool:
-        """True if threads serve it, since ``trajectories`` releases the interpreter lock. True of compiled models."""
-        return self.compiled
-
-    @property
-    def dense(self) -> bool:
-        """True if a path may be asked for between the observations at next to no cost, for smooth curves in plots.
-
-        Otherwise it is asked for at the observations alone. True of compiled models unless they say otherwise.
-        """
-        return self.compiled
-
-    @property
-    def cheap(self) -> bool:
-        """True if ten thousand runs take seconds, so that a doubt about a posterior is settled by sampling it.
-
-        True of compiled models unless they say otherwise.
-        """
-        return self.compiled
 
     @abstractmethod
     def initial_state(self, theta: Mapping[str, float]) -> Array:

@@ -51,8 +51,6 @@ class FunctionModel(ForwardModel):
     cheap: whether ten thousand calls take seconds, so that a doubt about a posterior is settled by sampling it.
     """
 
-    dense = False
-
     def __init__(
         self,
         function: Function,
@@ -64,18 +62,13 @@ class FunctionModel(ForwardModel):
         members: int | None = None,
         cheap: bool = False,
     ):
-        self.function, self.parameters, self._cheap = function, tuple(parameters), cheap
+        self.function, self.parameters, self.cheap = function, tuple(parameters), cheap or self.compiled
         self.jacobian, self.members, self.batch = jacobian, members, members or 1
         self.observables = tuple(Observable(name, unit, Returned(name), fewest=1) for name, unit in observables.items())
         self.time_unit = time_unit
         self.dense = dense
         self.layout = StateLayout((Field("theta", len(self.parameters)),))
         self._path = StateLayout(tuple(Field(observable.name, unit=observable.unit) for observable in self.observables))
-
-    @property
-    def cheap(self) -> bool:
-        """Whether somebody said so."""
-        return self._cheap or super().cheap
 
     @property
     def differentiable(self) -> bool:

@@ -53,12 +53,8 @@ class SignatureFiles(IndexDataCacheFile):
 
 @cache
 def kernel_folder() -> Path:
-    """The folder of compiled kernels of this version of numba and this processor; it exists and can be written.
-
-    Raises
-    ------
-    OutputError: compiled code can be kept nowhere.
-    """
+    """The folder of compiled kernels of this version of numba and this processor; it exists and can be written. Raises
+    :class:`OutputError`: compiled code can be kept nowhere."""
     asked = os.environ.get(CACHE)
     folder = (Path(asked) if asked else user_cache_path("en4dvar", appauthor=False)) / _target()
     try:
@@ -83,9 +79,8 @@ def _temporary_folder() -> Path:
     try:
         folder = _own_folder(Path(tempfile.gettempdir()))
     except OSError as error:
-        raise OutputError(
-            f"no folder can be written to keep compiled code in ({error.strerror}); set {CACHE} to one"
-        ) from None
+        words = f"no folder can be written to keep compiled code in ({error.strerror}); set {CACHE} to one"
+        raise OutputError(words) from None
     asked = os.environ.get(CACHE)
     os.environ[CACHE] = str(folder)
     numba.config.reload_config()
@@ -167,9 +162,7 @@ def keep(dispatcher: Any) -> None:
 
     Of processes that need it for the same arguments, one compiles, and the others load what it kept.
 
-    Raises
-    ------
-    OutputError: compiled code can be kept nowhere.
+    Raises :class:`OutputError`: compiled code can be kept nowhere.
     """
     dispatcher._cache = KernelCache(dispatcher.py_func)
     compile_: Callable[[Any], Any] = dispatcher.compile
@@ -205,12 +198,8 @@ KERNELS: list[Any] = []
 
 
 def _kernels(**options: Any) -> Callable[[F], F]:
-    """Functions compiled by numba with these options, kept on disk, without the interpreter's lock.
-
-    Raises
-    ------
-    OutputError: nowhere can compiled code be kept.
-    """
+    """Functions compiled by numba with these options, kept on disk, without the interpreter's lock. Raises
+    :class:`OutputError`: nowhere can compiled code be kept."""
 
     def compiled(function: F) -> F:
         if getattr(numba.config, "DISABLE_JIT", 0):

@@ -3,6 +3,9 @@
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
+
+from en4dvar.plumbing.hints import beside
 
 
 class En4dvarError(Exception):
@@ -66,8 +69,12 @@ class TooFewMembersError(En4dvarError):
 def retold(
     caught: type[Exception] | tuple[type[Exception], ...], kind: type[Exception], words: str = "", *more: str
 ) -> Iterator[None]:
-    """Raise what is ``caught`` in the block as ``kind(words + message, *more)``, of system errors the reason alone."""
+    """Raise what is ``caught`` in the block as ``kind(words + message, *more)``, of system errors the reason alone, and
+    of a file to be read that is not there what lies beside it."""
     try:
         yield
     except caught as error:
-        raise kind(f"{words}{getattr(error, 'strerror', None) or error}", *more) from None
+        reason = getattr(error, "strerror", None) or error
+        if isinstance(error, FileNotFoundError) and error.filename and not issubclass(kind, OutputError):
+            reason = beside(Path(error.filename))
+        raise kind(f"{words}{reason}", *more) from None

@@ -50,13 +50,9 @@ def refused(path: str | Path, what: str) -> AbstractContextManager[None]:
 
 
 def inside(root: str | Path, name: str | Path) -> Path:
-    """``root/name`` where that lies in ``root``; ``root`` itself may be a link, for the user has named it.
-
-    Raises
-    ------
-    OutputError: ``name`` is absolute, empty or holds ``..``; a part of it is there as a link, a pipe, a socket or a
-        device, through which something else would be read or written.
-    """
+    """``root/name`` where that lies in ``root``; ``root`` itself may be a link, for the user has named it. Raises
+    :class:`OutputError`: ``name`` is absolute, empty or holds ``..``; a part of it is there as a link, a pipe, a socket
+    or a device, through which something else would be read or written."""
     relative, path = Path(name), os.fspath(root)
     if relative.anchor or not relative.parts or ".." in relative.parts or "\0" in str(name):
         raise OutputError(f"{root}: {str(name)!r} is not the name of a file in this directory")
@@ -74,12 +70,9 @@ def inside(root: str | Path, name: str | Path) -> Path:
 
 
 def own_file(path: Path) -> int:
-    """Descriptor of a file that is written in place: to read, and to append to; it is made where it is missing.
-
-    Raises
-    ------
-    OutputError: the file is no plain one, or has other names, under which something else would be written. OSError.
-    """
+    """Descriptor of a file that is written in place: to read, and to append to; it is made where it is missing. Raises
+    :class:`OutputError`: the file is no plain one, or has other names, under which something else would be written.
+    OSError."""
     handle = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT | _CAREFUL, 0o666)
     status = os.fstat(handle)
     if stat.S_ISREG(status.st_mode) and status.st_nlink <= 1:
@@ -90,16 +83,14 @@ def own_file(path: Path) -> int:
 
 
 def open_plain(path: Path) -> io.BufferedReader:
-    """Open a file for reading. Raises :class:`OSError`, also for a pipe or a device, whose reading may never end."""
+    """Open a file for reading. Raises :class:`OSError`, also for a folder, a pipe, a device, that may never end."""
     if "\0" in str(path):
         raise OSError(errno.EINVAL, "a null byte in its name", str(path))
     handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     mode = os.fstat(handle).st_mode
     if not stat.S_ISREG(mode):
         os.close(handle)
-        if stat.S_ISDIR(mode):
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-        raise OSError(errno.EINVAL, f"not a plain file but {kind_of(mode)}", str(path))
+        raise OSError(errno.EINVAL, f"is {kind_of(mode)}, not a file", str(path))
     return open(path, "rb", opener=lambda *_: handle)
 
 
@@ -154,7 +145,7 @@ def atomic_path(path: str | Path, durable: bool = True) -> Iterator[Path]:
     path = Path(path)
     partial = path.with_name(f".{path.name}.{owner()}.tmp")
     try:
-        _remove_leftovers(path.parent, _PARTIAL)
+        _remove_leftovers(os.path.abspath(path.parent), _PARTIAL)
         partial.unlink(missing_ok=True)  # it may be a link
         # an unwritable place gives the system's reason here, not a library's guess later
         os.close(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
@@ -175,7 +166,7 @@ def atomic_path(path: str | Path, durable: bool = True) -> Iterator[Path]:
 def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
     """A folder in ``parent``, by default the system's, that is removed on leaving; after a kill, by who comes next."""
     parent = Path(tempfile.gettempdir()) if parent is None else parent
-    _remove_leftovers(parent, _FOLDER)
+    _remove_leftovers(os.path.abspath(parent), _FOLDER)
     folder = Path(tempfile.mkdtemp(prefix=f"en4dvar-{owner()}-", dir=parent))
     try:
         yield folder
@@ -203,14 +194,9 @@ def _machine() -> str:
     return f"{int.from_bytes(digest[:8], 'big') % 10**6:06d}"
 
 
-_looked: set[tuple[str, re.Pattern[str]]] = set()
-
-
-def _remove_leftovers(folder: Path, names: re.Pattern[str]) -> None:
+@cache
+def _remove_leftovers(folder: str, names: re.Pattern[str]) -> None:
     """Remove what processes of this machine that are gone have left in a folder; looked for once."""
-    if (key := (os.path.abspath(folder), names)) in _looked:
-        return
-    _looked.add(key)
     with suppress(OSError):
         for entry in list(os.scandir(folder)):
             match = names.fullmatch(entry.name)

@@ -98,11 +98,11 @@ def listed(names: Iterable[str], most: int = 30) -> str:
     return f"{', '.join(known[:most])}{more}"
 
 
-def no_such_file(path: Path) -> str:
-    """``"<path>: no such file"`` and what lies beside it: similar names, else files of the same kind."""
+def beside(path: Path) -> str:
+    """``"no such file"`` and what lies in its place: similar names, else files of the same kind."""
     try:
-        beside = sorted(p.name for p in path.parent.iterdir() if p.is_file())
+        names = sorted(p.name for p in path.parent.iterdir() if p.is_file())
     except OSError:
-        return brief(f"{path}: no such file; the folder {path.parent} cannot be read")
-    close = get_close_matches(path.name, beside, 3, 0.6) or [b for b in beside if Path(b).suffix == path.suffix][:5]
-    return f"{path}: no such file; the folder holds {', '.join(close)}" if close else brief(f"{path}: no such file")
+        return brief(f"no such file; the folder {path.parent} cannot be read")
+    close = get_close_matches(path.name, names, 3, 0.6) or [b for b in names if Path(b).suffix == path.suffix][:5]
+    return f"no such file; the folder holds {', '.join(close)}" if close else "no such file"

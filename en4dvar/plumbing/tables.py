@@ -37,9 +37,8 @@ def write_csv(path: Path, rows: Iterable[Sequence[object]]) -> Path:
 
 
 def _write(file: IO[str], rows: Iterable[Sequence[object]]) -> None:
-    csv.writer(file, lineterminator="\n").writerows(
-        [_plain(cell) if isinstance(cell, str) else cell for cell in row] for row in rows
-    )
+    plain = ([_plain(cell) if isinstance(cell, str) else cell for cell in row] for row in rows)
+    csv.writer(file, lineterminator="\n").writerows(plain)
 
 
 def without_control(text: str) -> str:

@@ -5,8 +5,6 @@ the same double as ``1.4e-6``. A power may be a decimal, as in ``"Pa s^0.6"`` of
 are not units of this kind (they have an offset) and are refused.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -42,10 +40,10 @@ class Unit:
     factor: Fraction
     powers: tuple[int | Fraction, ...]
 
-    def __mul__(self, other: Unit) -> Unit:
+    def __mul__(self, other: "Unit") -> "Unit":
         return Unit(self.factor * other.factor, tuple(a + b for a, b in zip(self.powers, other.powers, strict=True)))
 
-    def __pow__(self, exponent: int | Fraction) -> Unit:
+    def __pow__(self, exponent: int | Fraction) -> "Unit":
         return Unit(Fraction(self.factor**exponent), tuple(p * exponent for p in self.powers))
 
 
@@ -56,13 +54,8 @@ def _unit(factor: str, **powers: int) -> Unit:
     return Unit(Fraction(factor), tuple(powers.get(b, 0) for b in BASE))
 
 
-PREFIXED = {
-    "m": _unit("1", m=1),
+PREFIXED = {name: _unit("1", **{name: 1}) for name in BASE if name != "kg"} | {
     "g": _unit("1e-3", kg=1),
-    "s": _unit("1", s=1),
-    "K": _unit("1", K=1),
-    "A": _unit("1", A=1),
-    "mol": _unit("1", mol=1),
     "Hz": _unit("1", s=-1),
     "fps": _unit("1", s=-1),
     "N": _unit("1", m=1, kg=1, s=-2),
@@ -206,8 +199,8 @@ def _factor(from_unit: str, to_unit: str) -> Fraction:
 @overload
 def convert(value: float, from_unit: str, to_unit: str) -> float: ...
 @overload
-def convert(value: Array, from_unit: str, to_unit: str) -> Array: ...
-def convert(value: float | Array, from_unit: str, to_unit: str) -> float | Array:
+def convert(value: "Array", from_unit: str, to_unit: str) -> "Array": ...
+def convert(value: "float | Array", from_unit: str, to_unit: str) -> "float | Array":
     """``value`` (a number or an array) of ``from_unit``, expressed in ``to_unit``. Raises :class:`UnitError`."""
     factor = _factor(from_unit, to_unit)
     # Dividing by 1e6 rounds once, multiplying by 1e-6 twice.
@@ -237,9 +230,8 @@ def parse_quantity(value: str | float, unit: str, usual: str = "") -> float:
     if len(number) > LONGEST:
         raise UnitError(f"{shown(value)}: a number of {len(number)} characters")
     if not symbol and parse_unit(unit).powers != ONE.powers:
-        small = (
-            usual if 1e-3 <= abs(float(number)) < 1e3 else ""
-        )  # beyond, a number is one of the unit without a prefix
+        # beyond, a number is one of the unit without a prefix
+        small = usual if 1e-3 <= abs(float(number)) < 1e3 else ""
         raise UnitError(f"{text} has no unit; write e.g. '{text} {small or unit}'")
     with retold(UnitError, UnitError, f"{shown(text)}: "):
         factor = _factor(symbol or "1", unit)

@@ -15,9 +15,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, cast
 
-from en4dvar.plumbing.errors import ConfigError
+from en4dvar.plumbing.errors import ConfigError, retold
 from en4dvar.plumbing.files import expanded, read_plain
-from en4dvar.plumbing.hints import no_such_file, suggest
+from en4dvar.plumbing.hints import suggest
 from en4dvar.plumbing.user_code import Code, kept_apart, reason_of, require_permission
 
 __path__: list[str] = []  # modules can be imported from below this one
@@ -48,10 +48,8 @@ def load(name: str, what: str) -> Any:
 
     The file is opened once: what is asked about is what runs.
 
-    Raises
-    ------
-    ConfigError: no such file, it cannot be executed (with the line), or it holds no such class. RefusedError: it may
-        not be loaded, see :func:`~en4dvar.plumbing.user_code.require_permission`.
+    Raises :class:`ConfigError`: no such file, it cannot be executed (with the line), or it holds no such class.
+    :class:`RefusedError`: it may not be loaded, see :func:`~en4dvar.plumbing.user_code.require_permission`.
     """
     where, _, attribute = name.rpartition(":")
     path = Path(os.path.realpath(where))
@@ -101,12 +99,8 @@ class _Files(MetaPathFinder, Loader):
 
 
 def _source(path: Path) -> bytes:
-    try:
+    with retold((OSError, ValueError), ConfigError, f"{path}: "):
         return read_plain(path, LONGEST)
-    except FileNotFoundError:
-        raise ConfigError(no_such_file(path)) from None
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
 
 
 def _line(error: BaseException, path: Path) -> str:

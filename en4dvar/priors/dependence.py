@@ -45,9 +45,7 @@ class Dependence:
     ``members`` (N, m): the standardised members of an ensemble whose correlation the matrix is. A prior ensemble of N
     members consists of these.
 
-    Raises
-    ------
-    ConfigError: no correlation matrix, singular, or too large.
+    Raises :class:`ConfigError`: no correlation matrix, singular, or too large.
     """
 
     names: tuple[str, ...]

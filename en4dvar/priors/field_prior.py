@@ -31,9 +31,8 @@ class FieldPrior:
     ``length`` is in the unit of the field's coordinates. ``modes``: how many of them tell the field where nothing is
     localised, by default all but :data:`LEFT_OUT` of the variance.
 
-    Raises
-    ------
-    ConfigError: a field without coordinates, or more cells than a matrix holds that are on no regular grid.
+    Raises :class:`ConfigError`: a field without coordinates, or more cells than a matrix holds that are on no regular
+    grid.
     """
 
     field: Field
@@ -47,10 +46,8 @@ class FieldPrior:
         if self.field.coordinates is None:
             raise ConfigError(f"the model gives no coordinates for {self.field.name}, so that no distance is known")
         if self.grid is None and self.field.size > MOST_CORRELATED:
-            raise ConfigError(
-                f"{self.field.name} has {self.field.size} cells on no regular grid; at most {MOST_CORRELATED} can be "
-                "drawn from a matrix"
-            )
+            cells = f"{self.field.name} has {self.field.size} cells on no regular grid"
+            raise ConfigError(f"{cells}; at most {MOST_CORRELATED} can be drawn from a matrix")
 
     @cached_property
     def places(self) -> Array:
@@ -82,10 +79,8 @@ class FieldPrior:
         """
         name, size = self.field.name, self.field.size
         if size > MOST_CELLS:
-            raise ConfigError(
-                f"{name} has {size} cells; more than {MOST_CELLS} need a localised gain, e.g. {{radius: 10}}",
-                "assimilation.localisation",
-            )
+            words = f"{name} has {size} cells; more than {MOST_CELLS} need a localised gain, e.g. {{radius: 10}}"
+            raise ConfigError(words, "assimilation.localisation")
         values, vectors = np.linalg.eigh(correlation_of_places(self.kernel, self.places, self.length))
         values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
         left = 1 - np.cumsum(values) / values.sum()

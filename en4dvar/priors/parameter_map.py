@@ -20,6 +20,7 @@ from scipy.special import betainc, betaincinv, betaln, erf, erfinv, log_ndtr, nd
 from en4dvar.model.state import Array
 
 Numbers = tuple[float, ...]
+Bounds = tuple[float, float]
 NEAR = 1e-5  # of a std from a bound: there the second order of a cut Gaussian is exact to 1e-10
 LOG_ROOT_2PI = 0.5 * math.log(2 * math.pi)
 
@@ -125,7 +126,7 @@ QUANTILE_MAPS: Mapping[str, QuantileMap] = {
 }
 
 
-def value(kind: str, x: Array, bounds: tuple[float, float], shape: Numbers) -> Array:
+def value(kind: str, x: Array, bounds: Bounds, shape: Numbers) -> Array:
     """θ of scores ``x`` of any shape; ``shape`` is (s,) of a half-normal, (α, β) of a beta, () of a uniform,
     (α, β) of a bounded normal, the bounds in std from m, and (α, β, ln b/a) of a bounded lognormal.
     """
@@ -136,14 +137,14 @@ def value(kind: str, x: Array, bounds: tuple[float, float], shape: Numbers) -> A
     return np.asarray(np.where(x < 0, below, low + above if math.isinf(high) else high - above))
 
 
-def score(kind: str, theta: Array, bounds: tuple[float, float], shape: Numbers) -> Array:
+def score(kind: str, theta: Array, bounds: Bounds, shape: Numbers) -> Array:
     """x of values strictly inside of the bounds."""
     (low, high), scale = bounds, _scale(bounds, shape)
     rest = np.zeros_like(theta) if math.isinf(high) else (high - theta) / scale
     return np.asarray(QUANTILE_MAPS[kind].score((theta - low) / scale, rest, shape))
 
 
-def slope(kind: str, x: float, bounds: tuple[float, float], shape: Numbers) -> float:
+def slope(kind: str, x: float, bounds: Bounds, shape: Numbers) -> float:
     """dθ/dx = φ(x)/f(θ)."""
     (low, high), scale = bounds, _scale(bounds, shape)
     theta = float(value(kind, np.array(x), bounds, shape))
@@ -152,6 +153,6 @@ def slope(kind: str, x: float, bounds: tuple[float, float], shape: Numbers) -> f
     return scale * math.exp(-LOG_ROOT_2PI - 0.5 * x * x - log_density)
 
 
-def _scale(bounds: tuple[float, float], shape: Numbers) -> float:
+def _scale(bounds: Bounds, shape: Numbers) -> float:
     low, high = bounds
     return shape[0] if math.isinf(high) else high - low

@@ -15,14 +15,12 @@ Random numbers are counter-based (Philox; Salmon et al. 2011, "Parallel random n
 parameter leaves the others' draws as they were. Each data set of a run has a seed of its own, :func:`own_seed`.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 import unicodedata
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 
@@ -30,7 +28,7 @@ from en4dvar.model.state import Array, Parameter, TransformName
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.priors import parameter_map
 from en4dvar.priors.dependence import Dependence
-from en4dvar.priors.parameter_map import QUANTILE_MAPS
+from en4dvar.priors.parameter_map import QUANTILE_MAPS, Bounds, Numbers
 
 Sampling = Literal["exact", "random"]
 LARGEST = 1e150  # its square is a number still
@@ -46,17 +44,15 @@ class PriorTerm:
     Use the constructors, which take physical values. ``bounds`` (a, b) belong to ``logit`` and to the kinds of
     :mod:`en4dvar.priors.parameter_map`, and are physical; ``shape`` holds the other numbers of the latter.
 
-    Raises
-    ------
-    ConfigError: a value that defines no proper prior (std ≤ 0, median outside the bounds, …).
+    Raises :class:`ConfigError`: a value that defines no proper prior (std ≤ 0, median outside the bounds, …).
     """
 
     parameter: Parameter
     transform: TransformName
     mean: float
     std: float
-    bounds: tuple[float, float] = (-math.inf, math.inf)
-    shape: tuple[float, ...] = ()
+    bounds: Bounds = (-math.inf, math.inf)
+    shape: Numbers = ()
 
     def __post_init__(self) -> None:
         self._require(math.isfinite(self.mean), "the mean must be finite")
@@ -64,10 +60,8 @@ class PriorTerm:
         self._require(positive, f"the standard deviation must be positive, not {self.std:g}")
         # The ensemble must spread by more than rounding, its squares and physical values must be numbers
         around = abs(self.mean) if self.transform == "normal" else max(1.0, abs(self.mean))
-        self._require(
-            self.std > max(1 / LARGEST, RESOLVED * around),
-            f"the standard deviation {self.std:g} is too small to be told from rounding",
-        )
+        resolved = self.std > max(1 / LARGEST, RESOLVED * around)
+        self._require(resolved, f"the standard deviation {self.std:g} is too small to be told from rounding")
         largest = LARGEST if self.transform == "normal" else LARGEST_LOG
         self._require(self.std < largest, f"the standard deviation {self.std:g} is too large; less than {largest:g}")
         self._require(abs(self.mean) < LARGEST, f"{self.mean:g} is too large; less than {LARGEST:g}")
@@ -85,17 +79,17 @@ class PriorTerm:
         return self.std if self.transform == "lognormal" else 0.0
 
     @classmethod
-    def normal(cls, parameter: Parameter, mean: float, std: float) -> PriorTerm:
+    def normal(cls, parameter: Parameter, mean: float, std: float) -> Self:
         """θ ~ N(mean, std²), both in the parameter's unit."""
         return cls(parameter, "normal", mean, std)
 
     @classmethod
-    def lognormal(cls, parameter: Parameter, median: float, log_std: float) -> PriorTerm:
+    def lognormal(cls, parameter: Parameter, median: float, log_std: float) -> Self:
         """ln θ ~ N(ln median, log_std²); ``median`` in the parameter's unit, ``log_std`` dimensionless."""
         return cls(parameter, "lognormal", _log(parameter, "median", median), log_std)
 
     @classmethod
-    def lognormal_moments(cls, parameter: Parameter, mean: float, std: float) -> PriorTerm:
+    def lognormal_moments(cls, parameter: Parameter, mean: float, std: float) -> Self:
         """The lognormal whose physical mean and standard deviation are ``mean`` and ``std``.
 
         >>> term = PriorTerm.lognormal_moments(Parameter("G", "Pa"), mean=2.0, std=1.0)
@@ -110,7 +104,7 @@ class PriorTerm:
         return cls(parameter, "lognormal", log_mean - variance / 2, math.sqrt(variance))
 
     @classmethod
-    def logit(cls, parameter: Parameter, bounds: tuple[float, float], median: float, logit_std: float) -> PriorTerm:
+    def logit(cls, parameter: Parameter, bounds: Bounds, median: float, logit_std: float) -> Self:
         """logit((θ − a)/(b − a)) ~ N(logit of the median, logit_std²); ``bounds`` and ``median`` physical."""
         low, high = bounds
         inside = -math.inf < low < median < high < math.inf
@@ -118,12 +112,12 @@ class PriorTerm:
         return cls(parameter, "logit", math.log((median - low) / (high - median)), logit_std, (low, high))
 
     @classmethod
-    def uniform(cls, parameter: Parameter, bounds: tuple[float, float]) -> PriorTerm:
+    def uniform(cls, parameter: Parameter, bounds: Bounds) -> Self:
         """θ equally likely everywhere between finite physical ``bounds``."""
         return cls._by_quantiles(parameter, "uniform", bounds, ())
 
     @classmethod
-    def half_normal(cls, parameter: Parameter, std: float, low: float = 0.0) -> PriorTerm:
+    def half_normal(cls, parameter: Parameter, std: float, low: float = 0.0) -> Self:
         """θ = low + |N(0, std²)|, in the parameter's unit; ``std`` is that of the whole Gaussian."""
         term = cls._by_quantiles(parameter, "half-normal", (low, math.inf), (std,))
         around = max(abs(low), 1 / LARGEST)
@@ -131,7 +125,7 @@ class PriorTerm:
         return term
 
     @classmethod
-    def beta(cls, parameter: Parameter, bounds: tuple[float, float], alpha: float, beta: float) -> PriorTerm:
+    def beta(cls, parameter: Parameter, bounds: Bounds, alpha: float, beta: float) -> Self:
         """(θ − a)/(b − a) ~ Beta(alpha, beta) between finite physical ``bounds`` (a, b)."""
         for name, value in (("alpha", alpha), ("beta", beta)):
             words = f"{name} must lie between {SHAPES[0]:g} and {SHAPES[1]:g}, not {value:g}"
@@ -140,9 +134,8 @@ class PriorTerm:
 
     @classmethod
     def bounded(
-        cls, parameter: Parameter, kind: Literal["normal", "lognormal"], mean: float, std: float,
-        bounds: tuple[float, float],
-    ) -> PriorTerm:  # fmt: skip
+        cls, parameter: Parameter, kind: Literal["normal", "lognormal"], mean: float, std: float, bounds: Bounds
+    ) -> Self:
         """:meth:`normal` of ``mean`` and ``std``, or :meth:`lognormal` of median and log_std, between ``bounds``."""
         whole = cls.normal(parameter, mean, std) if kind == "normal" else cls.lognormal(parameter, mean, std)
         low, high = bounds
@@ -152,14 +145,11 @@ class PriorTerm:
         shape = ((a - whole.mean) / std, (b - whole.mean) / std, *((b - a,) if kind == "lognormal" else ()))
         wide = shape[1] - shape[0] > 1e-6 and shape[-1] < LARGEST_LOG
         whole._require(wide, f"the bounds {bounds} do not suit the standard deviation {std:g}; use a uniform prior")
-        return cls._by_quantiles(
-            parameter, "bounded-normal" if kind == "normal" else "bounded-lognormal", bounds, shape
-        )
+        name: TransformName = "bounded-normal" if kind == "normal" else "bounded-lognormal"
+        return cls._by_quantiles(parameter, name, bounds, shape)
 
     @classmethod
-    def _by_quantiles(
-        cls, parameter: Parameter, kind: TransformName, bounds: tuple[float, float], shape: tuple[float, ...]
-    ) -> PriorTerm:
+    def _by_quantiles(cls, parameter: Parameter, kind: TransformName, bounds: Bounds, shape: Numbers) -> Self:
         (low, high), term = bounds, cls(parameter, kind, 0.0, 1.0, bounds, shape)
         finite = math.isfinite(low) and (math.isfinite(high) or kind == "half-normal")
         term._require(finite and low < high, f"{kind} needs finite bounds, low < high, not {bounds}")
@@ -206,9 +196,7 @@ class PriorTerm:
     def from_physical(self, theta: Array) -> Array:
         """x for physical values ``theta`` of any shape.
 
-        Raises
-        ------
-        ValueError: a value outside the range of the transform.
+        Raises ValueError: a value outside the range of the transform.
         """
         theta = np.asarray(theta, dtype=float)
         if self.transform == "normal":
@@ -240,7 +228,7 @@ class Prior:
         if missing := set(correlated) - set(self.names):
             raise ConfigError(f"prior: {', '.join(sorted(missing))} is correlated, but not estimated")
 
-    def of(self, terms: tuple[PriorTerm, ...]) -> Prior:
+    def of(self, terms: tuple[PriorTerm, ...]) -> "Prior":
         """The prior of other ``terms``, with the correlations that this prior has between those it knows."""
         names = {term.parameter.name for term in terms}
         return Prior(terms, tuple(kept for block in self.blocks if (kept := block.among(tuple(names)))))
@@ -342,9 +330,7 @@ class Prior:
         draws of its parameters where it has N members. The correction is a Gram–Schmidt process in the order of the
         parameters: one added at the end leaves the others as they were, but growing N moves every member.
 
-        Raises
-        ------
-        ConfigError: fewer than 2 members, or ``exact`` with fewer than n + 1.
+        Raises :class:`ConfigError`: fewer than 2 members, or ``exact`` with fewer than n + 1.
         """
         n = len(self.terms)
         needed = n + 1 if method == "exact" else 2

@@ -11,10 +11,10 @@ import numpy as np
 from en4dvar.assembly.build import data_files, discrepancy_terms, inverse_plan, problem_of
 from en4dvar.assembly.reading import errors_of, read_observations
 from en4dvar.config import Config, resolve
-from en4dvar.config.context import parse_spread
 from en4dvar.config.design import Value
 from en4dvar.config.document import Document, document_from, override
 from en4dvar.config.parameters import Uncertain
+from en4dvar.config.quantities import parse_spread
 from en4dvar.data.noise import noise_of
 from en4dvar.data.observations import Observations
 from en4dvar.data.series import Series

@@ -18,8 +18,8 @@ from en4dvar.assembly.reading import read_observations
 from en4dvar.config import Config, time_grid
 from en4dvar.config.data import SeriesPlan
 from en4dvar.config.kinds import CampaignPlan, GroupSection, terms_and_fixed
-from en4dvar.config.of_readings import parse_error_std
 from en4dvar.config.parameters import Tied
+from en4dvar.config.quantities import parse_error_std
 from en4dvar.data.series import Places
 from en4dvar.diagnosis.diagnostics import nrmse
 from en4dvar.executor import run_chunk

@@ -36,11 +36,7 @@ class _Started(ForwardModel):
     def __init__(self, model: ForwardModel, start: float):
         self.model, self.start = model, start
         self.parameters, self.layout, self.observables = model.parameters, model.layout, model.observables
-        self.batch, self.compiled = model.batch, model.compiled
-
-    @property
-    def threaded(self) -> bool:
-        return self.model.threaded
+        self.batch, self.compiled, self.threaded = model.batch, model.compiled, model.threaded
 
     def initial_state(self, theta: object) -> Array:
         raise NotImplementedError("the ensemble is already under way")

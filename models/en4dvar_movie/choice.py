@@ -16,10 +16,11 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.inputs.parts import readable, require_file
+from en4dvar.inputs.parts import readable
 from en4dvar.inputs.text_table import numbered_lines
+from en4dvar.plumbing.decoding import require_plain
 from en4dvar.plumbing.errors import DataError
-from en4dvar_movie.frames import Movie, open_picture
+from en4dvar_movie.frames import MOVIES, Movie, open_picture
 from en4dvar_movie.outline import Circle
 
 
@@ -35,7 +36,6 @@ class Correction:
 
 def read_corrections(path: Path) -> dict[int, Correction]:
     """Frame → correction. Raises :class:`DataError` that names the line."""
-    require_file(path)
     with readable(path):
         lines = numbered_lines(path)
     corrections: dict[int, Correction] = {}
@@ -93,7 +93,7 @@ def watched(movie: Movie, region: str | None, mask: Path | None) -> npt.NDArray[
         part[:] = False
         part[y : y + h, x : x + w] = True
     if mask is not None:
-        require_file(mask)
+        require_plain(mask, MOVIES.size)
         light = np.asarray(open_picture(mask))
         if light.shape[:2] != part.shape:
             raise DataError(f"{mask}: {light.shape[1]} × {light.shape[0]} pixels, the frames have {width} × {height}")

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from en4dvar.plumbing.decoding import Allowed, DecodeError, decoded, decoded_whole, require_plain
 from en4dvar.plumbing.errors import DataError, En4dvarError, retold
 from en4dvar.plumbing.files import open_plain
-from en4dvar.plumbing.hints import no_such_file
+from en4dvar.plumbing.hints import beside
 from en4dvar_movie.decoders import check_size, image, library, tiff_about, tiff_frames, video_about, video_frames
 from en4dvar_movie.numbering import in_order
 
@@ -90,7 +90,7 @@ def open_movie(path: str | Path, raw: str | None = None) -> Movie:
     """
     path = Path(path).expanduser()
     if not path.exists():
-        raise DataError(no_such_file(path))
+        raise DataError(f"{path}: {beside(path)}")
     if raw is not None:
         return _raw(path, raw)
     if path.is_dir():
@@ -135,7 +135,7 @@ def _size(shape: tuple[int, ...]) -> str:
 
 
 def _tiff(path: Path) -> Movie:
-    about = decoded_whole(tiff_about, path, allowed=MOVIES)
+    about = decoded_whole(tiff_about, path, allowed=MOVIES, kind="a TIFF")
     start, count, shape, scale = about.start, about.count, about.shape, (about.pixel, about.rate, list(about.notes))
     check_size(shape, path)
     if about.pages == 1 < count and about.plain and path.stat().st_size >= start + count * about.frame:
@@ -191,8 +191,7 @@ def _video(path: Path) -> Movie:
             else:
                 yield value
 
-    with retold(DecodeError, DataError, f"{path}: cannot be read as a movie: "):
-        count, codec, rate = decoded_whole(video_about, path, allowed=MOVIES)
+    count, codec, rate = decoded_whole(video_about, path, allowed=MOVIES, kind="a movie")
     if codec:
         notes.append(
             f"{path}: compressed with loss ({codec}): R_std does not hold what that does to whole outlines, and may be "

@@ -169,7 +169,7 @@ ROWS = tuple(
         ("many-members", "10 000 members", "", "0",
          "time and memory in proportion to their number (En4D-Var with a bundle, the default)"),
         ("mat-damaged", "a `.mat` file is damaged",
-         "not a MATLAB v5 file that can be read ({what scipy says of it})", "2",
+         "{file}: cannot be read as a MATLAB file: {what scipy says of it}", "2",
          "everything; a process of its own reads it, and is ended"),
         ("bomb", "a file that is small until it is read, or has no end: a configuration of 100 MB, `.mat` that unpacks "
          "to terabytes", "longer than 1 MB, which no configuration is; numbers belong into data files", "2",

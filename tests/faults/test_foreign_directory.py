@@ -201,7 +201,7 @@ def test_a_result_that_is_a_pipe_is_refused(foreign: tuple[Path, Path, Path]) ->
     os.mkfifo(run / PACK)
     told = call("export", run)
     assert told.exit_code == 2
-    assert "datasets.pack: cannot be read: not a plain file but a pipe" in told.stderr
+    assert "datasets.pack: cannot be read: is a pipe, not a file" in told.stderr
 
 
 def test_a_linked_folder_for_a_comparison_is_not_followed(foreign: tuple[Path, Path, Path]) -> None:

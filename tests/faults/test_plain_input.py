@@ -168,7 +168,11 @@ def test_a_file_that_raises_as_it_is_imported(tmp_path: Path) -> None:
     (tmp_path / "own.py").write_text(MODEL, encoding="utf-8")
     message = refused(write_toy(tmp_path, ("toy_models:Oscillator", "./own.py:Owm")))
     assert "no class 'Owm'; did you mean 'Own'?" in message
-    for name, reason in (("./gone.py:Own", "no such file"), ("..:Own", "cannot be loaded"), ("/dev:X", "cannot be")):
+    for name, reason in (
+        ("./gone.py:Own", "no such file"),
+        ("..:Own", "cannot be loaded"),
+        ("/dev:X", "is a directory"),
+    ):
         assert reason in refused(write_toy(tmp_path, ("toy_models:Oscillator", name)))
 
 

@@ -210,11 +210,11 @@ def test_bad_mat(tmp_path: Path) -> None:
         read_series(tmp_path / "text.mat", TIME, RADIUS)
     header = b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM"
     (tmp_path / "hdf.mat").write_bytes(header + b"\x00" * 400 + b"\x89HDF\r\n\x1a\n")
-    with pytest.raises(DataError, match=r"v7\.3"):
+    with pytest.raises(DataError, match="cannot be read as a MATLAB file"):
         read_series(tmp_path / "hdf.mat", TIME, RADIUS)
     whole = (tmp_path / "a.mat").read_bytes()
     (tmp_path / "cut.mat").write_bytes(whole[: len(whole) - 60])
-    with pytest.raises(DataError, match="not a MATLAB v5 file"):
+    with pytest.raises(DataError, match="cannot be read as a MATLAB file"):
         read_series(tmp_path / "cut.mat", TIME, RADIUS)
 
 

@@ -254,7 +254,7 @@ def test_one_observation_is_enough_and_bounds_hold(rich):
         ("restart estimation", "restart pareto", "mode pareto is not known here"),
         ("2.0 0.5 10.0 pg -1.0 10.0 1", "2.0 0.5 10.0 pg -1.0 10.0 2", "hk:1-a has a model command of its own"),
         ("++par", "++parcov(prior.cov) par", "option parcov: "),
-        ("++par", "++ies_par_en(prior.jcb) par", "prior.jcb: No such file or directory"),
+        ("++par", "++ies_par_en(prior.jcb) par", "prior.jcb: no such file"),
         ("++par", "++ies_no_noise(true) par", "option ies_no_noise: errors are drawn here"),
         ("++par", "++obscov(noise.cov) par", "option obscov"),
         (
@@ -392,7 +392,7 @@ def test_chen_and_oliver_have_the_posterior_of_quadrature(tmp_path):
         ("* model command line", "* command", "line.pst:19: no section of a control file is called 'command'"),
         ("* model command line", "* svd assist", "line.pst: no section '* model command line'"),
         ("line.ins line.out", "", "line.pst: no instruction file"),
-        ("line.tpl", "none.tpl", "none.tpl: No such file or directory"),
+        ("line.tpl", "none.tpl", "none.tpl: no such file; the folder holds line.tpl"),
         ("A log factor 1.0 0.1", "A log factor 1.0 0", "line.pst:9: a is log, but its lower bound 0 is not above 0"),
     ],
 )

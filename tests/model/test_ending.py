@@ -85,9 +85,9 @@ def test_no_child_survives_its_program(tmp_path: Path, way: str) -> None:
 @pytest.mark.parametrize(
     ("line", "told"),
     [
-        ("mkfifo out", "out: not a plain file but a pipe"),
-        ("ln -s /dev/zero out", "out: not a plain file but a device"),
-        ("mkdir out", "out: Is a directory"),
+        ("mkfifo out", "out: is a pipe, not a file"),
+        ("ln -s /dev/zero out", "out: is a device, not a file"),
+        ("mkdir out", "out: is a directory, not a file"),
         ("truncate -s 1T out", "out: 1.1 TB; at most 256 MB are read"),
     ],
 )

@@ -115,7 +115,7 @@ def test_a_program_that_goes_wrong_is_a_lost_member_with_its_reason(folder):
     assert failure(folder, "fails") == "ProgramError: the program ended with exit status 1: no convergence"
     assert re.search(r"ended by signal SIGABRT.*retries: 2 runs it again", failure(folder, "crashes"))
     assert "retries" not in failure(folder, "crashes", retries=1)
-    assert failure(folder, "nothing") == "ProgramError: no output file output: No such file or directory"
+    assert failure(folder, "nothing") == "ProgramError: no output file output: no such file; the folder holds stdout"
     assert failure(folder, "garbage") == "ProgramError: output: 'n/a' is no number"
     assert "output: 11 values for 12 times; name the column of times" in failure(
         folder, "short", outputs={"y": {"column": "y"}}

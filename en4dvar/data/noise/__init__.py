@@ -27,11 +27,10 @@ A discrepancy of the model (:mod:`en4dvar.data.noise.discrepancy`) adds a Gaussi
 """
 
 from en4dvar.data.noise.correlated import SHARED, CorrelatedNoise, Correlation, SharedErrors
-from en4dvar.data.noise.discrepancy import SMOOTHNESS, DiscrepancyNoise, Kernel
+from en4dvar.data.noise.discrepancy import SMOOTHNESS, DiscrepancyNoise, Kernel, RobustDiscrepancyNoise
 from en4dvar.data.noise.gaussian import Linearisation, Noise, Predicted, ScaleSkewness
 from en4dvar.data.noise.losses import SIDES, BoundNoise, HuberNoise, sides_of
 from en4dvar.data.noise.make import BlockNoise, joint_noise, noise_of, noise_of_readings, noise_of_record
-from en4dvar.data.noise.robust_discrepancy import RobustDiscrepancyNoise
 
 __all__ = [
     "SHARED", "SIDES", "SMOOTHNESS", "BlockNoise", "BoundNoise", "CorrelatedNoise", "Correlation", "DiscrepancyNoise",

@@ -32,7 +32,6 @@ class Predicted:
     discrepancy: Array | None = None
 
     def __getitem__(self, runs: int | slice) -> "Predicted":
-        """The same of some of the runs."""
         return self.each(lambda part: part[runs])
 
     def among(self, where: Where) -> "Predicted":
@@ -95,10 +94,9 @@ class Linearisation:
 
     def among(self, where: Where) -> "Linearisation":
         """The same of some of the readings."""
-        rates = None if self.rate_anomalies is None else self.rate_anomalies[:, where]
-        return replace(
-            self, prediction=self.prediction.among(where), anomalies=self.anomalies[:, where], rate_anomalies=rates
-        )
+        rates, prediction = self.rate_anomalies, self.prediction.among(where)
+        rates = None if rates is None else rates[:, where]
+        return replace(self, prediction=prediction, anomalies=self.anomalies[:, where], rate_anomalies=rates)
 
 
 @dataclass(frozen=True)
@@ -281,7 +279,6 @@ class Noise:
         return {}
 
     def _white(self, stream: np.random.Generator, shape: tuple[int, ...]) -> Array:
-        """Draws of v."""
         return stream.standard_normal(shape)
 
     def _correlated(self, v: Array) -> Array:

@@ -61,9 +61,8 @@ class HuberNoise(Noise):
         at_edge = 2 * edge / norm  # E[vψ''] = −c · at_edge, E[v³ψ''] = −c³ · at_edge: ψ' drops to 0 at ±c
         weight = slope + 2 * c * edge * float(exp1(c * c)) * math.exp(c * c) / norm  # E[ψ/v]
         information = 1 + square  # E[v²ψ²] − 1 = E[vψ + v²ψ'], for E[vψ] = 1
-        return ScaleSkewness(
-            (2 * slope - c * at_edge) / weight, (1 + 3 * square - c**3 * at_edge) / information, information
-        )
+        of_scale = (1 + 3 * square - c**3 * at_edge) / information
+        return ScaleSkewness((2 * slope - c * at_edge) / weight, of_scale, information)
 
     def _white(self, stream: np.random.Generator, shape: tuple[int, ...]) -> Array:
         """Within the threshold of a Gaussian cut there, beyond it exponential."""

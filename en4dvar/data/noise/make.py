@@ -18,10 +18,9 @@ import numpy.typing as npt
 from scipy.sparse import block_array, csr_array, eye_array
 
 from en4dvar.data.noise.correlated import SHARED, CorrelatedNoise, Correlation, SharedErrors
-from en4dvar.data.noise.discrepancy import DiscrepancyNoise, Kernel
+from en4dvar.data.noise.discrepancy import DiscrepancyNoise, Kernel, RobustDiscrepancyNoise
 from en4dvar.data.noise.gaussian import Linearisation, Noise, Predicted, ScaleSkewness
 from en4dvar.data.noise.losses import SIDES, BoundNoise, HuberNoise, record_of, sides_of
-from en4dvar.data.noise.robust_discrepancy import RobustDiscrepancyNoise
 from en4dvar.model.state import Array
 
 Indices = npt.NDArray[np.intp]
@@ -200,10 +199,8 @@ def noise_of(
     Any of them may stand beside a ``discrepancy`` of the model; its amplitude and length are then parameters
     (:data:`~en4dvar.model.state.DISCREPANCY`). ``sides`` (K,): readings that are upper (1) or lower (−1) bounds.
 
-    Raises
-    ------
-    ValueError: both a correlation and a robust cost, either or a discrepancy beside bounds, or a matrix that is no
-        correlation.
+    Raises ValueError: both a correlation and a robust cost, either or a discrepancy beside bounds, or a matrix that is
+    no correlation.
     """
     std = np.asarray(std, dtype=float)
     time_std = np.zeros_like(std) if time_std is None else np.asarray(time_std, dtype=float)
@@ -290,8 +287,6 @@ def _across(times: Array, others: Array, own: csr_array, of_others: csr_array) -
         at = csr_array((np.ones(len(label)), (np.arange(len(label)), label)), shape=(len(label), len(instants)))
         return csr_array(at[: len(times)] @ at[len(times) :].T)
     if not np.array_equal(times, others) or (own != of_others).nnz:
-        raise ValueError(
-            "two series with errors correlated in time need the same times and the same correlation in time to be "
-            "correlated with each other"
-        )
+        words = "two series with errors correlated in time need the same times and the same correlation in time"
+        raise ValueError(f"{words} to be correlated with each other")
     return own

@@ -24,8 +24,6 @@ Indices = npt.NDArray[np.intp]
 def innovations(residuals: Array, errors: Array, amplitudes: Array, lengths: Array, steps: Array, nu: float) -> Array:
     """v and the diagonal of L (2, B, K) of B runs; NaN where R + A is singular to rounding, as a dense factor would be.
 
-    Parameters
-    ----------
     residuals: (B, K) y − m. errors: (B, K) variances of ε. amplitudes: (B, K) a g.
     lengths: (B,) ℓ. steps: (K − 1,) ≥ 0 between readings. nu: ½, 3/2 or 5/2.
     """
@@ -72,8 +70,6 @@ def boxed(
 ) -> Array:
     """u = ρ'(ε/s)/s and δ (2, B, K) of B runs at the mode of Huber's loss and the process; NaN where r is not finite.
 
-    Parameters
-    ----------
     residuals: (B, K) y − m. std: (B, K) s of ε. own: (B, K) variances of what in δ each reading has of its own.
     amplitudes: (B, K) a g. lengths: (B,) ℓ. steps: (K − 1,) ≥ 0 between readings. nu: ½, 3/2 or 5/2. c: threshold.
     """

@@ -9,14 +9,12 @@ its delimiters say, and holds as many digits as fit. The instructions are ``ln``
 is an error.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 import re
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from jinja2 import StrictUndefined, TemplateError
 from jinja2.meta import find_undeclared_variables
@@ -37,14 +35,9 @@ class ProgramError(Exception):
     """A program ended badly, or what it left cannot be read; the words are the reason of a member that failed."""
 
 
-def is_template(text: str) -> bool:
-    """Whether the first line says that this is a template of PEST, with a sign, which delimits what follows."""
-    return re.match(r"[pj]tf \S", text, re.IGNORECASE) is not None
-
-
-def is_instructions(text: str) -> bool:
-    """Whether the first line says that these are instructions of PEST, with a sign likewise."""
-    return re.match(r"[pj]if \S", text, re.IGNORECASE) is not None
+def is_pest(text: str, kind: Literal["tf", "if"]) -> bool:
+    """Whether the first line says that this is a template or instructions of PEST, with a sign, the delimiter."""
+    return re.match(rf"[pj]{kind} \S", text, re.IGNORECASE) is not None
 
 
 def identifier(name: str) -> str:
@@ -107,9 +100,7 @@ def _sign(text: str) -> str:
 @functools.lru_cache(maxsize=64)
 def parsed(instructions: str, source: str = "instructions") -> tuple[list[re.Match[str]], ...]:
     """The items of each line of an instruction file, ``source`` by name, with those of the lines that continue it.
-
-    Raises :class:`ProgramError` at what is no instruction.
-    """
+    Raises :class:`ProgramError` at what is no instruction."""
     sign = re.escape(_sign(instructions))
     words = re.compile(f"{sign}[^{sign}]*{sign}|[^\\s{sign}]+|{sign}.*")
     known = re.compile(f"{_ITEM}|{sign}(?P<marker>[^{sign}]+){sign}")
@@ -212,10 +203,8 @@ class _Cursor:
         raise ProgramError(f"{self.where}: no {marker!r} below line {self.row + 1}")
 
     def moved(self, item: re.Match[str]) -> bool:
-        """Along the line, by ``w``, ``tn`` or a secondary marker, False where there is none.
-
-        Raises :class:`ProgramError`.
-        """
+        """Along the line, by ``w``, ``tn`` or a secondary marker, False where there is none. Raises
+        :class:`ProgramError`."""
         line = self.lines[self.row]
         if item["blank"]:
             blank = self.blank.search(line, self.column)
@@ -263,7 +252,7 @@ def input_name(template: Path) -> str:
 def check_template(template: Path, names: Collection[str]) -> None:
     """Raise ValueError, in words, where a template cannot be read or names an unknown parameter."""
     text = text_of(template)
-    if is_template(text):
+    if is_pest(text, "tf"):
         names = {identifier(name) for name in names}
         with retold(ProgramError, ValueError, f"{template}: "):
             wanted: Collection[str] = parameters_of(text)
@@ -281,7 +270,7 @@ def check_template(template: Path, names: Collection[str]) -> None:
 def filled(template: Path, parameters: Mapping[str, float], times: Array) -> str:
     """The input file of a member; ``times`` (K,) are where it is observed. Raises :class:`ProgramError`."""
     text = text_of(template)
-    if is_template(text):
+    if is_pest(text, "tf"):
         return spaces_filled(text, parameters)
     values: dict[str, Any] = {name: float(value) for name, value in parameters.items()}
     parts, left = list[str](), LONGEST

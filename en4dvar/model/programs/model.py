@@ -4,8 +4,6 @@ A run has a scratch directory of its own, its input files, the process, and the 
 out of them by a column, a key of JSON, a pattern, or PEST's instructions.
 """
 
-from __future__ import annotations
-
 import csv
 import json
 import math
@@ -18,7 +16,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 import numpy as np
 
@@ -28,7 +26,7 @@ from en4dvar.model.programs.languages import ProgramError
 from en4dvar.model.programs.settings import LOGARITHM, OUTPUT, STDOUT, CommandSettings, OutputOf, fill, split
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.children import Child, TimeLimitError, require_going_on, scratch, status_named, within
-from en4dvar.plumbing.decoding import LONGEST_TEXT, Allowed, DecodeError, decoded_whole, matches, text_of
+from en4dvar.plumbing.decoding import LONGEST_TEXT, Allowed, decoded_whole, matches, text_of
 from en4dvar.plumbing.errors import DataError, retold
 from en4dvar.plumbing.files import POSIX
 from en4dvar.plumbing.hints import listed, short
@@ -78,9 +76,8 @@ def _at(times: Array, own: Array, values: Array, file: str) -> Array:
         raise ProgramError(f"{file}: {len(own)} times for {len(values)} values, or times that do not increase")
     slack = 1e-9 * max(abs(own[0]), abs(own[-1]))
     if times[0] < own[0] - slack or times[-1] > own[-1] + slack:
-        raise ProgramError(
-            f"{file}: times from {own[0]:g} to {own[-1]:g}, but {times[0]:g} to {times[-1]:g} are needed"
-        )
+        needed = f"{times[0]:g} to {times[-1]:g} are needed"
+        raise ProgramError(f"{file}: times from {own[0]:g} to {own[-1]:g}, but {needed}")
     return np.asarray(np.interp(times, own, values))
 
 
@@ -151,9 +148,7 @@ class Program:
         as they are estimated, name or log10(name) → factor, stand behind those that the program gives.
         """
         require_going_on()
-        inputs = {
-            name: entry.scale * parameters[name] + entry.offset for name, entry in self.settings.parameters.items()
-        }
+        inputs = {name: of.scale * parameters[name] + of.offset for name, of in self.settings.parameters.items()}
         more = {
             name: np.array([sum(factor * _term(key, parameters) for key, factor in terms.items()) for terms in several])
             for name, several in ((name, output.combinations) for name, output in self.settings.outputs.items())
@@ -171,7 +166,7 @@ class Program:
                 outputs, limit = self.settings.outputs.items(), self.settings.time_limit
                 values = within_limit(lambda: {n: read(output, folder, times, limit) for n, output in outputs})
                 return {name: np.concatenate([values[name], more[name]]) for name in values}
-        except (DataError, DecodeError) as error:
+        except DataError as error:
             raise ProgramError(str(error).replace(f"{folder}{os.sep}", "")) from None
         except OSError as error:
             raise ProgramError(f"{error.filename or 'scratch folder'}: {error.strerror}") from None
@@ -223,14 +218,12 @@ class CommandModel(FunctionModel):
         words = split(settings.command, settings.shell)
         program = "/bin/sh" if settings.shell else shutil.which(words[0]) or words[0]
         require_permission(Code(f"model command {settings.command!r}", (Path(program),)))
-        parameters = [
-            Parameter(name, entry.unit, bounds=(entry.lower, entry.upper), label=entry.label)
-            for name, entry in settings.parameters.items()
-        ]
+        own = settings.parameters.items()
+        parameters = [Parameter(name, of.unit, bounds=(of.lower, of.upper), label=of.label) for name, of in own]
         units = {name: entry.unit for name, entry in settings.outputs.items()}
         super().__init__(Program(words, settings), parameters, units, settings.time_unit)
 
     @classmethod
-    def from_settings(cls, settings: CommandSettings) -> CommandModel:
+    def from_settings(cls, settings: CommandSettings) -> Self:
         """Raises :class:`~en4dvar.plumbing.user_code.RefusedError` where the program may not be run."""
         return cls(settings)

@@ -1,7 +1,5 @@
 """The section ``model: {command: "./solver {input} {output}", …}``: how a program is called, what goes in and out."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import os
@@ -21,7 +19,7 @@ from en4dvar.model.programs.languages import TIMES, ProgramError, check_template
 from en4dvar.plumbing.described import Described, text_for
 from en4dvar.plumbing.errors import retold
 from en4dvar.plumbing.files import POSIX, expanded, read_text
-from en4dvar.plumbing.hints import no_such_file, suggest
+from en4dvar.plumbing.hints import beside, suggest
 from en4dvar.plumbing.units import Quantity, parse_unit
 
 OUTPUT = "output"  # the file that {output} names
@@ -53,7 +51,6 @@ def _inside(name: str) -> str:
 
 
 def _base(info: ValidationInfo) -> Path:
-    """The folder of the configuration."""
     return Path((info.context or {}).get("base", Path.cwd())).absolute()
 
 
@@ -63,7 +60,7 @@ def _file(text: Any, info: ValidationInfo) -> Any:
         return text
     path = _base(info) / expanded(str(text))
     if not path.is_file():
-        raise ValueError(no_such_file(path))
+        raise ValueError(f"{path}: {beside(path)}")
     return path.absolute()
 
 
@@ -157,7 +154,7 @@ class OutputOf(_Section):
         for path in itertools.chain.from_iterable(self.instruction_files.values()):
             with retold(OSError, ValueError, f"{path}: "):
                 text = read_text(path)
-            if not languages.is_instructions(text):
+            if not languages.is_pest(text, "if"):
                 raise ValueError(f"{path}: the first line of PEST's instructions is pif and a sign, e.g. pif @")
             with retold(ProgramError, ValueError):
                 names += languages.observations_of(text, str(path))
@@ -179,6 +176,9 @@ def _with_unit(text: Any) -> Any:
     return {"unit": text} if isinstance(text, str) else text
 
 
+UnitOrSection = Annotated[ParameterOf, BeforeValidator(_with_unit, json_schema_input_type=str | ParameterOf)]
+
+
 def _placed(command: str, info: ValidationInfo) -> str:
     """The command with absolute paths of what lies beside the configuration. Raises ValueError: no such program."""
     base, shell = _base(info), bool(info.data.get("shell"))
@@ -190,7 +190,7 @@ def _placed(command: str, info: ValidationInfo) -> str:
     if Path(first).name != first:
         path = base / expanded(first)
         if not path.is_file():
-            raise ValueError(no_such_file(path))
+            raise ValueError(f"{path}: {beside(path)}")
         if not os.access(path, os.X_OK):
             raise ValueError(f"{path}: is not executable; chmod +x it, or begin with the program that runs it")
         first = str(path.absolute())
@@ -221,11 +221,7 @@ class CommandSettings(_Section):
     command: Annotated[str, Field(min_length=1), AfterValidator(_placed)]
     """Program and arguments, split as by a shell but run without one. {input} and {output} are names of files, {NAME} a
     parameter, {here} the folder of this file, {python} this Python. It runs in a scratch directory of its own."""
-    parameters: Annotated[
-        dict[str, Annotated[ParameterOf, BeforeValidator(_with_unit, json_schema_input_type=str | ParameterOf)]],
-        Field(min_length=1),
-        AfterValidator(_named_well),
-    ]
+    parameters: Annotated[dict[str, UnitOrSection], Field(min_length=1), AfterValidator(_named_well)]
     """Name → unit, or a section: what is filled in."""
     outputs: Annotated[dict[str, OutputOf], Field(min_length=1)]
     """Observable → where its values are."""

@@ -1,0 +1,90 @@
+"""Quantities in the units of the model: numbers, spreads, and the units of numbers that stand elsewhere."""
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from operator import attrgetter
+from typing import Annotated, Any, Literal
+
+from en4dvar.config.context import Context, Made
+from en4dvar.plumbing.described import text_for
+from en4dvar.plumbing.errors import ConfigError
+from en4dvar.plumbing.hints import brief
+from en4dvar.plumbing.units import UnitError, convert, parse_quantity, parse_unit, split_quantity
+
+Unit = Callable[[Context], str]
+time_unit: Unit = attrgetter("units.time_unit")
+observable_unit: Unit = attrgetter("observable.unit")
+subject_unit: Unit = attrgetter("subject.unit")
+
+
+def quantity(unit: Unit, sign: Literal["positive", "not negative"]) -> Made:
+    """A number in ``unit``, given with a unit of its own."""
+
+    def read(text: Any, context: Context) -> float:
+        value = parse_quantity(text, unit(context))
+        require_sign(value, sign, text)
+        return value
+
+    return Made(read)
+
+
+def require_sign(value: float, sign: Literal["positive", "not negative"], text: object) -> None:
+    """Raises :class:`ConfigError` for a value of another sign."""
+    if sign == "positive" and not value > 0:
+        raise ConfigError(f"must be positive, not {brief(str(text), 80)}")
+    if value < 0:
+        raise ConfigError(f"must not be negative, not {brief(str(text), 80)}")
+
+
+@dataclass(frozen=True)
+class Spread:
+    """A standard deviation: ``value`` in a unit, or a share of something known later."""
+
+    value: float
+    relative: bool = False
+    unit: str = ""  # as it is written
+
+    def absolute(self, whole: float) -> float:
+        """The standard deviation in the unit of ``whole``."""
+        return self.value * abs(whole) if self.relative else self.value
+
+
+def parse_spread(text: Any, unit: str, usual: str = "") -> Spread:
+    """``"0.1 kPa"``, or relative, ``"5 %"``; positive. Raises :class:`ConfigError`, :class:`UnitError`."""
+    relative = str(text).strip().endswith("%") and unit != "%"
+    spread = Spread(parse_quantity(text, "1" if relative else unit, usual), relative)
+    require_sign(spread.value, "positive", text)
+    return spread
+
+
+SPREAD = Made(lambda text, context: parse_spread(text, subject_unit(context), context.subject.display_unit))
+"""A :class:`Spread` of what the entry of a section is about."""
+
+
+def unit_of(target: Unit) -> Made:
+    """The text of a unit that can be converted to ``target``."""
+
+    def fits(unit: str, context: Context) -> str:
+        convert(1.0, unit, target(context))
+        return unit
+
+    return Made(fits, Annotated[str, text_for(parse_unit)])
+
+
+def parse_error_std(text: Any, unit: str, whole: str = "maximum") -> Spread:
+    """``"1.4 um"``, or ``"1 % of maximum"`` or of another ``whole``. Raises :class:`UnitError`."""
+    word = str(text).strip()
+    if relative := re.fullmatch(rf"(.*%)\s+of\s+(?:the\s+)?{whole}", word):
+        return Spread(parse_quantity(relative[1], "1"), relative=True)
+    try:
+        return Spread(parse_quantity(text, unit), unit=split_quantity(word)[1])
+    except UnitError as error:
+        hint = f"; write '{word} of {whole}'" if word.endswith("%") else ""
+        raise UnitError(f"{error}{hint}") from None
+
+
+def read_spread(text: Any, context: Context, unit: Unit = observable_unit, whole: str = "maximum") -> Spread:
+    spread = parse_error_std(text, unit(context), whole)
+    require_sign(spread.value, "positive", text)
+    return spread
