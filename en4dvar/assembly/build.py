@@ -32,9 +32,11 @@ from en4dvar.series.start import EnsembleCoordinates, InitialEnsemble
 
 
 def build(config: Config) -> tuple[InverseProblem, ...]:
-    """One inverse problem a data set, in the order of the paths (of a glob: sorted). Raises :class:`ConfigError`: there
-    is no ``data:`` section, nothing is estimated, or a prior does not suit the data. :class:`DataError`: data files
-    cannot be used; names every one of them."""
+    """One inverse problem a data set, in the order of the paths (of a glob: sorted).
+
+    Raises :class:`ConfigError`: there is no ``data:`` section, nothing is estimated, or a prior does not suit the data.
+    :class:`DataError`: data files cannot be used; names every one of them.
+    """
     plan = inverse_plan(config)
     problems: list[InverseProblem] = []
     unusable: list[DataError] = []
@@ -164,8 +166,10 @@ def _files_of(series: SeriesPlan) -> dict[str, DataFile]:
 def resolve_parameters(
     config: Config | SequenceConfig, observations: Observations | None
 ) -> tuple[tuple[PriorTerm, ...], dict[str, float]]:
-    """Prior terms and fixed values, evaluated on the data where they refer to them. Raises :class:`ConfigError`: every
-    entry that cannot be evaluated, located in the file."""
+    """Prior terms and fixed values, evaluated on the data where they refer to them.
+
+    Raises :class:`ConfigError`: every entry that cannot be evaluated, located in the file.
+    """
     terms: list[PriorTerm] = []
     fixed: dict[str, float] = {}
     faults: list[Fault] = []

@@ -92,7 +92,9 @@ class PriorFile(Section):
 
 def joined(blocks: Sequence[tuple[tuple[str, ...], Array]]) -> tuple[Dependence, ...]:
     """Blocks of correlations between some names each; what shares a name is one block, zero where nothing is said.
-    Raises :class:`ConfigError`: a pair of which two say something, or no correlation matrix."""
+
+    Raises :class:`ConfigError`: a pair of which two say something, or no correlation matrix.
+    """
     groups: list[list[int]] = []
     for k, (names, _) in enumerate(blocks):
         touching = [group for group in groups if any({*names} & {*blocks[i][0]} for i in group)]
@@ -128,7 +130,7 @@ def resolved(
 ) -> tuple[tuple[Entry, ...], tuple[Dependence, ...]]:
     """The entries with the priors that an ensemble makes, and what the priors have to do with each other.
 
-    ``others``: names that are estimated besides the entries; ``apart``: why a parameter is correlated with no other.
+    ``others``: names that are estimated besides the entries; ``apart``: why a parameter can be correlated with no other.
     Raises :class:`ConfigError`: every fault, located in the file.
     """
     faults: list[Fault] = []
@@ -193,8 +195,10 @@ def _of_ensemble(
 
 
 def term_of_members(parameter: Parameter, values: Array, kind: str | None) -> tuple[PriorTerm, Array]:
-    """The Gaussian of members (N,) in the coordinate ``kind``, and the members standardised (N,). Raises
-    :class:`ConfigError`: members outside of the parameter's bounds or of the range of its map, or all alike."""
+    """The Gaussian of members (N,) in the coordinate ``kind``, and the members standardised (N,).
+
+    Raises :class:`ConfigError`: members outside of the parameter's bounds or of the range of its map, or all alike.
+    """
     low, high = parameter.bounds
     kind = kind or parameter.transform
     outside = (values < low) | (values > high)
@@ -276,8 +280,10 @@ _REFERENCE = re.compile(r"\s*([-+.\deE]+)\s*(?:(?:±|\+/?-)\s*([.\deE+-]+))?\s*(
 
 
 def reference_value(text: str, unit: str) -> tuple[float, float]:
-    """Value and std in ``unit`` of a text such as ``7.7 ± 1.1 kPa``; NaN where no std is stated. Raises
-    :class:`UnitError`."""
+    """Value and std in ``unit`` of a text such as ``7.7 ± 1.1 kPa``; NaN where no std is stated.
+
+    Raises :class:`UnitError`.
+    """
     match = _REFERENCE.fullmatch(text)
     if match is None:
         raise UnitError(f"{shown(text)} is no value such as '7.7 ± 1.1 kPa'")

@@ -170,7 +170,9 @@ def parse_document(text: str, file: str = "") -> Document:
 
 def document_from(source: Source) -> tuple[Document, Path]:
     """A YAML file, or a dict of the same, and the folder where its relative paths start: the file's, or this one.
-    Raises :class:`ConfigError`."""
+
+    Raises :class:`ConfigError`.
+    """
     if isinstance(source, Mapping):
         return document_of(source), Path.cwd()
     path = Path(source)
@@ -178,8 +180,10 @@ def document_from(source: Source) -> tuple[Document, Path]:
 
 
 def override(document: Document, overrides: Mapping[str, Any], option: str = "--set") -> Document:
-    """Set values at dotted paths; text is parsed as YAML. Raises :class:`ConfigError`, which names the ``option`` that
-    they were given with."""
+    """Set values at dotted paths; text is parsed as YAML.
+
+    Raises :class:`ConfigError`, which names the ``option`` that they were given with.
+    """
     data = copy.deepcopy(document.data)
     origins = dict(document.origins)
     faults: list[Fault] = []

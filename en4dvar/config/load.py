@@ -200,8 +200,10 @@ class Read(Generic[S]):
 
 
 def read_file(kind: type[S], document: Document, base: Path, model: ForwardModel | None = None) -> Read[S]:
-    """Validate a document of one kind, for a ``model`` that is there already or else is read from it. Raises
-    :class:`ConfigError`: every fault, in the order of the file."""
+    """Validate a document of one kind, for a ``model`` that is there already or else is read from it.
+
+    Raises :class:`ConfigError`: every fault, in the order of the file.
+    """
     faults: list[Fault] = []
     section = document.data.get("model")
     built = (model, dict(section or {})) if model else read_model(section, base, document, faults)

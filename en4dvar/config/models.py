@@ -67,8 +67,10 @@ class NoSettings(BaseModel):
 
 
 def find_model(name: str) -> type[ForwardModel]:
-    """The model class called ``name``: registered, ``package:Class`` or ``/path/file.py:Class``. Raises
-    :class:`ConfigError`."""
+    """The model class called ``name``: registered, ``package:Class`` or ``/path/file.py:Class``.
+
+    Raises :class:`ConfigError`.
+    """
     model: Any
     try:
         with loading(f"model {shown(name)} cannot be loaded"):

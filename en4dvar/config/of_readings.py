@@ -248,8 +248,10 @@ class Weighing:
     stated: Any = None
 
     def weights(self, times: Array, values: Array, prominence: float, read: Array | None) -> Array:
-        """β (K,) of the observations of a window; ``read`` (K,) are those of the column. Raises :class:`DataError`
-        where they are not as many as the observations, negative or not finite."""
+        """β (K,) of the observations of a window; ``read`` (K,) are those of the column.
+
+        Raises :class:`DataError` where they are not as many as the observations, negative or not finite.
+        """
         weights = read if read is not None else np.ones(len(times))
         if self.of is not None:
             weights = np.asarray(self.of(times, values, prominence))

@@ -187,8 +187,10 @@ class Uncertain:
         return any(isinstance(where, str | Scalar) for where in (self.spec.mean, self.spec.median))
 
     def term(self, of_data: Callable[[str | Scalar], float] | None = None) -> PriorTerm:
-        """The prior; ``of_data`` says what ``maximum`` or a scalar of the file is, in the parameter's unit. Raises
-        :class:`ConfigError`, its path the faulty key."""
+        """The prior; ``of_data`` says what ``maximum`` or a scalar of the file is, in the parameter's unit.
+
+        Raises :class:`ConfigError`, its path the faulty key.
+        """
         try:
             return self._term(self._location("mean", of_data), self._location("median", of_data))
         except ConfigError as error:
@@ -236,8 +238,10 @@ class Uncertain:
             self.term(lambda where: 1.0)  # the other values do not wait for the data
 
     def walk(self, model: ForwardModel, term: PriorTerm, observations: Observations) -> RandomWalk | None:
-        """How it varies over a window of observations; None where it does not. Raises :class:`ConfigError`, its path
-        the faulty key of ``varies``."""
+        """How it varies over a window of observations; None where it does not.
+
+        Raises :class:`ConfigError`, its path the faulty key of ``varies``.
+        """
         if (varies := self.spec.varies) is None:
             return None
         estimated = isinstance(varies.std, Estimated)

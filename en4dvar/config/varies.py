@@ -52,8 +52,10 @@ def modes_of(prior: FieldPrior) -> list[Perturbed]:
 
 
 def perturbation(field: Field, std: str | float | Spread) -> Perturbed:
-    """N(0, std²) added to the field, or, for a std in %, a factor whose logarithm is N(0, std²). Raises
-    :class:`UnitError`: a unit that is not the field's. :class:`ConfigError`: a std that is not positive."""
+    """N(0, std²) added to the field, or, for a std in %, a factor whose logarithm is N(0, std²).
+
+    Raises :class:`UnitError`: a unit that is not the field's. :class:`ConfigError`: a std that is not positive.
+    """
     name, spread = f"initial_{field.name}", std if isinstance(std, Spread) else parse_spread(std, field.unit)
     if spread.relative:
         label = f"initial {field.name} relative to the model's"
@@ -191,8 +193,10 @@ class VariesSection(Knots):
     unit, which holds at the centre of the prior; or ``estimated``, with a half-normal prior of 50 %."""
 
     def std_of(self, term: PriorTerm) -> float:
-        """Standard deviation of each change in the coordinate of the prior of its parameter. Raises
-        :class:`ConfigError`, its path the key: a share of a mean that is zero."""
+        """Standard deviation of each change in the coordinate of the prior of its parameter.
+
+        Raises :class:`ConfigError`, its path the key: a share of a mean that is zero.
+        """
         centre = float(term.to_physical(np.array(term.mean)))
         if self.std.relative and centre == 0:
             raise ConfigError(f"relative to the mean, which is zero; give it in {term.parameter.unit}", "std")

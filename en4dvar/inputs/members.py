@@ -79,8 +79,10 @@ def read_members(path: Path, units: Mapping[str, tuple[str, str]]) -> dict[str, 
 
 
 def read_centres(path: Path, units: Mapping[str, str]) -> dict[str, dict[str, float]]:
-    """Of a ``summary.csv`` of a run, data set → parameter → centre, in ``units``; nothing of another file. Raises
-    :class:`DataError`: no data set has any of the parameters, or a number is none."""
+    """Of a ``summary.csv`` of a run, data set → parameter → centre, in ``units``; nothing of another file.
+
+    Raises :class:`DataError`: no data set has any of the parameters, or a number is none.
+    """
     if path.suffix.lower() != ".csv":
         return {}
     with readable(path):

@@ -212,7 +212,9 @@ _RANGE = re.compile(r"\$?[A-Za-z]{1,3}\$?[1-9]\d{0,6}(:\$?[A-Za-z]{1,3}\$?[1-9]\
 
 def sheet_lines(path: Path, asked: str) -> Lines:
     """Rows of a sheet that are not blank, with their numbers; ``asked`` is a sheet, ``Sheet!A3:D40`` or ``A3:D40``.
-    Raises :class:`DataError`."""
+
+    Raises :class:`DataError`.
+    """
     return decoded_whole(lines_of_workbook, path, asked, allowed=WORKBOOK, kind="a workbook (save it as CSV)")
 
 

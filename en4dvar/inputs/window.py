@@ -60,8 +60,10 @@ def parse_instant(text: str | float, time_unit: str, symbols: Collection[str] = 
 
 
 def select(times: Array, values: Array, start: Instant, end: Instant, prominence: float = 0.1) -> slice:
-    """The window as a slice of the series ``times`` (K,), ``values`` (K,), both ends included. Raises
-    :class:`DataError` when an extremum is not there or the window is empty."""
+    """The window as a slice of the series ``times`` (K,), ``values`` (K,), both ends included.
+
+    Raises :class:`DataError` when an extremum is not there or the window is empty.
+    """
     with retold(DataError, DataError, "the window "):
         first = index_of(times, values, start, 0, prominence)
         last = index_of(times, values, end, first, prominence, last=True)

@@ -18,8 +18,10 @@ TransformName = Literal[
 
 
 def hold_floats(whole: object, *keys: str) -> None:
-    """Make the attributes ``keys`` of ``whole``, even one that is frozen, arrays of float64. Raises TypeError,
-    ValueError for what is no real numbers."""
+    """Make the attributes ``keys`` of ``whole``, even one that is frozen, arrays of float64.
+
+    Raises TypeError, ValueError for what is no real numbers.
+    """
     for key in keys:
         if np.iscomplexobj(value := getattr(whole, key)):
             raise TypeError(f"{key}: complex numbers")

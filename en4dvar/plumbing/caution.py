@@ -68,8 +68,10 @@ class Caution:
 
 
 def caution(code: str, words: str, severity: Severity | None = None, parameters: tuple[str, ...] = ()) -> Caution:
-    """A warning of the catalogue; ``severity`` replaces the catalogue's where the finding is graver or milder. Raises
-    KeyError: the code is not in :data:`CATALOGUE`."""
+    """A warning of the catalogue; ``severity`` replaces the catalogue's where the finding is graver or milder.
+
+    Raises KeyError: the code is not in :data:`CATALOGUE`.
+    """
     usual, advice = CATALOGUE[code]
     return Caution(code, severity or usual, words, advice, parameters)
 

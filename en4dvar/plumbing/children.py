@@ -102,8 +102,10 @@ class Child:
             os.close(self.alive)
 
     def wait(self, seconds: float | None) -> int:
-        """Its exit status. It is not yet forgotten by the system, so that its session cannot be anybody else's. Raises
-        :class:`subprocess.TimeoutExpired`."""
+        """Its exit status. It is not yet forgotten by the system, so that its session cannot be anybody else's.
+
+        Raises :class:`subprocess.TimeoutExpired`.
+        """
         if not hasattr(os, "pidfd_open"):
             return self.process.wait(seconds)
         handle = os.pidfd_open(self.process.pid)

@@ -53,8 +53,10 @@ class SignatureFiles(IndexDataCacheFile):
 
 @cache
 def kernel_folder() -> Path:
-    """The folder of compiled kernels of this version of numba and this processor; it exists and can be written. Raises
-    :class:`OutputError`: compiled code can be kept nowhere."""
+    """The folder of compiled kernels of this version of numba and this processor; it exists and can be written.
+
+    Raises :class:`OutputError`: compiled code can be kept nowhere.
+    """
     asked = os.environ.get(CACHE)
     folder = (Path(asked) if asked else user_cache_path("en4dvar", appauthor=False)) / _target()
     try:
@@ -198,8 +200,10 @@ KERNELS: list[Any] = []
 
 
 def _kernels(**options: Any) -> Callable[[F], F]:
-    """Functions compiled by numba with these options, kept on disk, without the interpreter's lock. Raises
-    :class:`OutputError`: nowhere can compiled code be kept."""
+    """Functions compiled by numba with these options, kept on disk, without the interpreter's lock.
+
+    Raises :class:`OutputError`: nowhere can compiled code be kept.
+    """
 
     def compiled(function: F) -> F:
         if getattr(numba.config, "DISABLE_JIT", 0):

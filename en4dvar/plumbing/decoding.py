@@ -63,8 +63,10 @@ def require_plain(path: Path, size: int) -> None:
 
 def decoded(decoder: Decoder, path: Path, *arguments: Any, allowed: Allowed = Allowed()) -> Iterator[Any]:
     """The values of ``decoder(path, *arguments)``, a function of a module that gives them one by one, in a child.
+
     Raises :class:`DataError`: the file is none, or takes more than it may, or ends the process that decodes it; and
-    what the decoder raises as such. :class:`DecodeError`: anything else that it raises, in words."""
+    what the decoder raises as such. :class:`DecodeError`: anything else that it raises, in words.
+    """
     require_plain(path, allowed.size)
     with _changing:
         child = _idle.pop() if _idle else None
@@ -180,14 +182,18 @@ def _served(name: str, arguments: tuple[Any, ...], allowed: Allowed, answers: IO
 
 
 def matches(path: Path, pattern: str) -> Iterator[list[str]]:
-    """What a regular expression with one group finds in a file; a decoder. Raises :class:`DataError` as
-    :func:`text_of`."""
+    """What a regular expression with one group finds in a file; a decoder.
+
+    Raises :class:`DataError` as :func:`text_of`.
+    """
     yield re.findall(pattern, text_of(path), re.MULTILINE)
 
 
 def text_of(path: Path) -> str:
-    """What a program has written, its lines ended by ``\\n``; bytes that are no UTF-8 are replaced. Raises
-    :class:`DataError` where it cannot be read, or is longer than :data:`LONGEST_TEXT`."""
+    """What a program has written, its lines ended by ``\\n``; bytes that are no UTF-8 are replaced.
+
+    Raises :class:`DataError` where it cannot be read, or is longer than :data:`LONGEST_TEXT`.
+    """
     with retold(OSError, DataError, f"no output file {path}: "):
         return read_plain(path, LONGEST_TEXT).decode("utf-8", errors="replace").replace("\r\n", "\n")
 
@@ -202,7 +208,9 @@ class ForeignDataError(ValueError):
 
 def require_whole(path: Path) -> None:
     """Raises :class:`ForeignDataError` where something of an HDF5 file lies in another one; files that are none pass.
-    Raises :class:`OSError`, :class:`RuntimeError` where it is damaged."""
+
+    Raises :class:`OSError`, :class:`RuntimeError` where it is damaged.
+    """
     import h5py
     from h5py import h5d, h5g, h5l, h5o
 

@@ -50,9 +50,11 @@ def refused(path: str | Path, what: str) -> AbstractContextManager[None]:
 
 
 def inside(root: str | Path, name: str | Path) -> Path:
-    """``root/name`` where that lies in ``root``; ``root`` itself may be a link, for the user has named it. Raises
-    :class:`OutputError`: ``name`` is absolute, empty or holds ``..``; a part of it is there as a link, a pipe, a socket
-    or a device, through which something else would be read or written."""
+    """``root/name`` where that lies in ``root``; ``root`` itself may be a link, for the user has named it.
+
+    Raises :class:`OutputError`: ``name`` is absolute, empty or holds ``..``; a part of it is there as a link, a pipe, a
+    socket or a device, through which something else would be read or written.
+    """
     relative, path = Path(name), os.fspath(root)
     if relative.anchor or not relative.parts or ".." in relative.parts or "\0" in str(name):
         raise OutputError(f"{root}: {str(name)!r} is not the name of a file in this directory")
@@ -70,9 +72,11 @@ def inside(root: str | Path, name: str | Path) -> Path:
 
 
 def own_file(path: Path) -> int:
-    """Descriptor of a file that is written in place: to read, and to append to; it is made where it is missing. Raises
-    :class:`OutputError`: the file is no plain one, or has other names, under which something else would be written.
-    OSError."""
+    """Descriptor of a file that is written in place: to read, and to append to; it is made where it is missing.
+
+    Raises :class:`OutputError`: the file is no plain one, or has other names, under which something else would be
+    written. OSError.
+    """
     handle = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT | _CAREFUL, 0o666)
     status = os.fstat(handle)
     if stat.S_ISREG(status.st_mode) and status.st_nlink <= 1:
