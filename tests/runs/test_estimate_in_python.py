@@ -165,7 +165,7 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "odd unit": ({"units": {"c": "m"}}, "units: 'c' is neither a parameter in priors nor a column"),
     "name of a prior": ({"priors": {"a b": 1.0}}, "priors: 'a b' cannot be the name of a parameter"),
-    "nothing estimated": ({"priors": {"a": 1.0, "b": 2.0}}, "no parameter has a prior; nothing to estimate"),
+    "nothing estimated": ({"priors": {"a": 1.0, "b": 2.0}}, "nor is there initial_state or model_error; nothing"),
     "an object": ({"priors": {"a": {"prior": object}}}, "priors.a.prior: <class 'object'> is neither number, text"),
     "a null byte": ({"priors": {"a": {"prior": "no\0rmal"}}}, "priors.a.prior: a null byte"),
     "odd section": ({"asimilation": {}}, "asimilation: unknown key 'asimilation'; did you mean 'assimilation'?"),

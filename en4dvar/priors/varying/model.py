@@ -12,7 +12,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.model.forward import Alternative, Batch, Failure, ForwardModel, Trajectory, ValidityLimit
+from en4dvar.model.forward import (
+    Alternative,
+    Batch,
+    Failure,
+    ForwardModel,
+    Trajectory,
+    ValidityLimit,
+    initial_states,
+)
 from en4dvar.model.state import Array, StateLayout
 from en4dvar.priors.varying.changes import RandomWalk, StateChanges
 
@@ -154,7 +162,8 @@ class PiecewiseModel(ForwardModel):
         """Initial states of the model with the varying parameters appended. Raises ValueError where a piece lies
         outside of the parameter's bounds.
         """
-        inner = self.model.initial_states({p.name: theta[p.name] for p in self.model.parameters})
+        n_members = len(next(iter(theta.values())))
+        inner = initial_states(self.model, {p.name: theta[p.name] for p in self.model.parameters}, n_members)
         return np.hstack([inner, *(change.values(theta) for change in self.varying)])
 
     def changed(self, name: str, x: Array, change: Array) -> Array:
