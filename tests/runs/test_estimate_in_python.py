@@ -79,6 +79,20 @@ IN_METRES = {
 }
 
 
+def test_files_are_named_from_the_working_directory(tmp_path, monkeypatch, result):
+    monkeypatch.chdir(tmp_path)
+    np.savetxt("R.csv", NOISE**2 * np.eye(len(TIMES)), delimiter=",", fmt="%.17g")
+    told = fit(error={"covariance": {"path": "R.csv", "unit": "1"}}).summary()
+    np.testing.assert_allclose(told["mean"], result.summary()["mean"], rtol=1e-6)
+    np.savetxt(
+        "members.csv", np.random.default_rng(3).standard_normal((50, 2)), delimiter=",", header="a,b", comments=""
+    )
+    (tmp_path / "own.py").write_text("from en4dvar.schemes.etkf import ETKF as Own\n", encoding="utf-8")
+    priors = {name: {"prior": "ensemble", "map": "normal"} for name in "ab"}
+    of_members = fit(priors=priors, prior={"ensemble": "members.csv"}, assimilation={"scheme": "./own.py:Own"})
+    assert of_members.summary()["mean"].to_numpy() == pytest.approx(told["mean"].to_numpy(), abs=0.3)
+
+
 def test_a_function_may_return_names_and_a_model_is_as_good(result):
     by_name = fit(lambda p, t: {"y": line(p, t), "other": t})
     assert by_name.posterior.identical(result.posterior)
