@@ -137,7 +137,12 @@ class InverseProblem:
     @property
     def in_question(self) -> bool:
         """Whether the data are asked if something varies: not of what the model says may change unforeseen."""
-        return any(change.name not in self.model.unforeseen for change in self.varying)
+        return self.has_constant and any(change.name not in self.model.unforeseen for change in self.varying)
+
+    @property
+    def has_constant(self) -> bool:
+        """Whether something varies, and more is estimated than its changes: that much the :attr:`constant` one asks."""
+        return self.constant is not self and bool(self.constant.prior.terms)
 
     def varied(self, varying: Sequence[Varying]) -> "InverseProblem":
         """The same with what varies; the changes join the control vector at its end."""

@@ -54,8 +54,10 @@ def inverse_plan(config: Config) -> DataPlan:
     """How the observations are read. Raises :class:`ConfigError` without data or without anything to estimate."""
     if config.data is None:
         raise ConfigError([Fault("required: it says where the observations are", "data", config.document.file)])
-    if not config.initial_state and not any(isinstance(entry, Uncertain) for entry in config.parameters):
-        raise ConfigError([config.document.fault(("parameters",), "no parameter has a prior; nothing to estimate")])
+    uncertain = any(isinstance(entry, Uncertain) for entry in config.parameters)
+    if not (uncertain or config.initial_state or config.model_error):
+        message = "no parameter has a prior, nor is there initial_state or model_error; nothing to estimate"
+        raise ConfigError([config.document.fault(("parameters",), message)])
     return config.data
 
 

@@ -182,17 +182,14 @@ def _follow(config: TwinConfig | SequenceConfig, force: bool, resume: bool) -> N
     from en4dvar.runs.progress import counted
 
     if isinstance(config, TwinConfig):
-        own: Any = TwinKind(config), run_twin, config.experiment.members
+        own: Any = TwinKind(config), run_twin
     else:
-        own = SequenceKind(config), run_sequence, config.assimilation.members
-    kind, conduct, members = own
+        own = SequenceKind(config), run_sequence
+    kind, conduct = own
     with continuable(config.directory, resume) as command, counted("cycles") as tell:
         on_cycle = (lambda cycle: tell(cycle + 1, kind.cycles)) if tell else None
         result = conduct(config, force=force, resume=resume, on_cycle=on_cycle, command=command)
     echo(result.table())
-    if result.run.failures:
-        lost = f"{len(result.run.failures)} of {members} members lost"
-        echo(f"warning: {config.name}: {lost}, the last: {result.run.failures[-1]}", err=True)
     for warning in result.warnings:
         echo(f"warning: {config.name}: {warning}", err=True)
     echo(f"result: {config.directory / kind.result}")

@@ -44,7 +44,7 @@ def check(
     try:
         return schema.model_validate(value, context=context)
     except ValidationError as error:
-        findings = [(_written(finding, path, document), finding) for finding in _tell(error, schema)]
+        findings = [(_written(finding, path, document, schema), finding) for finding in _tell(error, schema)]
         for place, finding in _one_each(findings):
             fault = document.fault(place, finding.message, at_key=finding.at_key)
             if fault not in faults:
@@ -143,11 +143,12 @@ def _one_each(findings: Sequence[tuple[Place, _Finding]]) -> Iterator[tuple[Plac
         yield place, finding
 
 
-def _written(finding: _Finding, path: Sequence[str | int], document: Document) -> Place:
+def _written(finding: _Finding, path: Sequence[str | int], document: Document, schema: type[BaseModel]) -> Place:
     """Pydantic puts names of union branches into the place; the document decides what is a path."""
     real = tuple(path)
     for n, part in enumerate(finding.place, 1):
-        if document.has((*real, part)) or (finding.absent and n == len(finding.place)):
+        default = n == 1 and part in schema.model_fields
+        if default or document.has((*real, part)) or (finding.absent and n == len(finding.place)):
             real = (*real, part)
     return real
 

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Generic, Literal, TypeVar
 
 import numpy as np
 import yaml
+from pydantic import Field
 
 from en4dvar.config.context import Context, Made, check
 from en4dvar.config.data import DATA, DataPlan
@@ -41,7 +42,7 @@ class Estimation(File):
 
     data: DATA | None = None
     """Where the observations are, what they mean and how well they are known."""
-    parameters: Annotated[tuple[Entry, ...], entries()]
+    parameters: Annotated[tuple[Entry, ...], entries()] = Field({}, validate_default=True)
     """For each parameter a prior (estimated), a quantity (fixed), or a scalar of the data file (fixed)."""
     groups: Groups | None = None
     """What data sets have in common, e.g. ``batch: {first: 'a_*', second: [b_*, c_01]}``: under each kind of group the

@@ -89,7 +89,8 @@ def section_of(*kinds: Any, base: type[Section] = Section) -> Any:
     for kind in kinds:
         hints = get_type_hints(kind, include_extras=True)
         for field in fields(kind):
-            if field.name == "own":  # the scheme, whose keys are a section's as well
+            # the scheme, whose keys are a section's as well; what _require_free refuses
+            if field.name == "own" or hasattr(base, field.name):
                 continue
             words = [text for text in getattr(hints[field.name], "__metadata__", ()) if isinstance(text, str)]
             declared[field.name] = (hints[field.name], Field(field.default, description=" ".join(words) or None))
@@ -227,6 +228,8 @@ class OfScheme(Section):
         name = section.get("scheme") if isinstance(section, dict) else None
         known = cls.model_fields["scheme"].annotation is str
         if known or not (isinstance(name, str) and user_file.is_file_reference(name)):
+            with Faults() as faults, faults.at("scheme"):
+                cls._require_free(cls.kinds.get(name, Scheme) if isinstance(name, str) and not known else Scheme)
             return validate(section)
         reference = user_file.absolute(name, info.context.base)
         with Faults() as faults, faults.at("scheme"):
@@ -234,6 +237,7 @@ class OfScheme(Section):
             kind = user_file.load(reference, f"scheme {shown(reference)}")
             if not (isinstance(kind, type) and issubclass(kind, Scheme)):
                 raise ConfigError(f"{shown(reference)} is not a subclass of en4dvar.schemes.Scheme")
+            cls._require_free(kind)
             cls.kinds[reference] = kind
         own = cast(Any, create_model(cls.__name__, __base__=section_of(cls.kinds[reference], base=cls), scheme=str))
         made: Self = own.model_validate({**section, "scheme": reference}, context=info.context)
@@ -243,6 +247,15 @@ class OfScheme(Section):
     def rules(cls, section: Mapping[str, Any], context: Context, faults: Faults) -> None:
         for key, message in cls.unread(section).items():
             faults.add((key,), message, at_key=True)
+
+    @classmethod
+    def _require_free(cls, kind: type[Scheme]) -> None:
+        """Raise :class:`ConfigError` where a key of the scheme has a name that means something else in the section."""
+        own = cls.model_fields.keys() - frozenset().union(*map(keys_of, cls.kinds.values()))
+        names = [key.name for key in fields(kind)]
+        if taken := [name for name in names if name in own or hasattr(cls, name) or name.startswith("_")]:
+            why = f"{shown(taken[0])} cannot be the name of a key, since it is that of something else in this section"
+            raise ConfigError(f"{why}; give the field of {kind.__name__} another name")
 
     @classmethod
     def unread(cls, section: Mapping[str, Any]) -> dict[str, str]:

@@ -108,6 +108,6 @@ def expected_runs(space: WeightSpace) -> int:
     starts = scheme.starts if scheme.start == "best-member" and economical else 1
     challenger = CHALLENGER if scheme.searches and economical else 0.0
     held = 1 + starts + challenger if challenger and problem.estimates_discrepancy and not problem.model.cheap else 0.0
-    steady = starts + challenger if challenger and problem.constant is not problem else 0.0
+    steady = starts + challenger if challenger and problem.has_constant else 0.0
     iterations = (starts + challenger + held + steady + scheme.lengthen - 1) * min(ITERATIONS, scheme.max_iterations)
     return 2 * (n_members + 1) + round(iterations * (tangent + SEARCH))

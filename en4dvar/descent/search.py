@@ -88,8 +88,7 @@ class Search:
 
     def unchanging(self, outcome: Outcome) -> Outcome:
         """After a descent from :attr:`steady`, where something changes along the path."""
-        constant = self.space.problem.constant is self.space.problem
-        return outcome if constant else self._from(outcome, self.last + 1)
+        return self._from(outcome, self.last + 1) if self.space.problem.has_constant else outcome
 
     def _from(self, outcome: Outcome, number: int) -> Outcome:
         """After a descent from the minimum of another problem."""

@@ -21,6 +21,7 @@ from en4dvar.schemes.base import Minimiser, Weights
 from en4dvar.schemes.settings import AssimilationSettings
 
 NOT_READ: Array = np.empty((0, 0))
+SHOWN = 3  # readings that a message names
 
 
 class WeightSpace:
@@ -156,16 +157,34 @@ class WeightSpace:
             run = replace(run, predicted=run.predicted.unstacked(stacked))
         return Trials(diag.background_cost(w) + self.problem.observations.cost(run.predicted), run.predictions)
 
-    def require_members(self, failures: Sequence[str], stage: str) -> None:
+    def require_members(self, run: Forecast, stage: str) -> None:
         """Raise :class:`TooFewMembersError` unless enough members are active for a regression on the control vector."""
-        require_members(self.problem, failures, self.needed_members, stage)
+        require_members(self.problem, run, self.needed_members, stage)
 
 
-def require_members(problem: InverseProblem, failures: Sequence[str], needed: int, stage: str) -> None:
+def require_members(problem: InverseProblem, run: Forecast, needed: int, stage: str) -> None:
     """Raise :class:`TooFewMembersError` where fewer than ``needed`` members survive a forecast."""
-    lost = sum(map(bool, failures))
-    if len(failures) - lost < needed:
+    lost = sum(map(bool, run.failures))
+    if len(run) - lost < needed:
         raise TooFewMembersError(
-            f"{problem.observations.name}: {lost} of {len(failures)} members failed in the {stage}; at least {needed} "
-            f"must survive. Most frequent reasons: {diag.common_reasons(failures)}"
+            f"{problem.observations.name}: {lost} of {len(run)} members failed in the {stage}; at least {needed} "
+            f"must survive. Most frequent reasons: {diag.common_reasons(run.failures)}{_lacking(problem, run.lacking)}"
         )
+
+
+def _lacking(problem: InverseProblem, readings: Sequence[int]) -> str:
+    """Which readings too few members have, and what to do."""
+    if not readings:
+        return ""
+    parts, times = problem.parts, problem.observations.times
+    of = [next(part for part in parts if k < part.end) for k in readings[:SHOWN]]
+    unit = "" if problem.model.time_unit == "1" else f" {problem.model.time_unit}"
+    told = [
+        f"reading {k - part.begin + 1} of {part.name} (at {times[k]:.6g}{unit})"
+        for k, part in zip(readings, of, strict=False)
+    ]
+    more = f" and {len(readings) - SHOWN} more" if len(readings) > SHOWN else ""
+    return (
+        f". Too few of them, if any, have a number for {', '.join(told)}{more}: leave such readings out (an empty cell "
+        "of the table, NaN in Python), or narrow the priors to where the model has one"
+    )

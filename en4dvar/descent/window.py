@@ -344,5 +344,5 @@ class DataWindow(Objective[Descent]):
         if descent.step is not None or (descent.stop and self._informing(at) >= self.space.needed_members):
             return
         stage = f"forecast of iteration {descent.iteration + 1}"
-        self.space.require_members(at.members.failures, stage)
+        self.space.require_members(at.members, stage)
         raise TooFewMembersError(f"{self.observations.name}: the centre cannot be run in the {stage}")

@@ -82,7 +82,7 @@ class Forecast:
     the observations that have one value at a time (P = 1 of a single observable), ``failures`` (B,) reasons, "" for
     members alive, ``extremes`` (B, V) what the members reached of the model's V limits of validity, ``beyond`` (B, V)
     since when they exceed these, on the clock of the observations (both empty without extra times). ``filled`` is the
-    share of the readings that :func:`en4dvar.ensemble.missing.filled` has put in.
+    share of the readings that :func:`en4dvar.ensemble.missing.filled` has put in, ``lacking`` are those it could not.
     """
 
     predicted: Predicted
@@ -91,6 +91,7 @@ class Forecast:
     extremes: Array = field(default_factory=lambda: np.empty((0, 0)))
     beyond: Array = field(default_factory=lambda: np.empty((0, 0)))
     filled: float = 0.0
+    lacking: tuple[int, ...] = ()
 
     @property
     def predictions(self) -> Array:

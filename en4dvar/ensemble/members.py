@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from en4dvar.data.series import Part
 from en4dvar.executor import Outcome
-from en4dvar.model.forward import Batch, Failure, RateOperator, ValidityLimit
+from en4dvar.model.forward import Batch, Failure, RateOperator, ValidityLimit, initial_states
 from en4dvar.model.state import Array, Field
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.user_code import own_fault, reason_of
@@ -76,7 +76,7 @@ class InitialStates:
         theta = {name: physical[:, j] for name, j in self.estimated}
         theta |= {name: np.full(len(physical), value) for name, value in self.fixed}
         theta |= {tie.parameter.name: _followed(tie, physical[:, j]) for tie, j in self.tied}
-        states = np.asarray(self.problem.model.initial_states(theta), dtype=float)
+        states = np.asarray(initial_states(self.problem.model, theta, len(physical)), dtype=float)
         if states.shape != (len(physical), self.size):
             raise ValueError("misshapen initial state")
         if self.perturbed or self.problem.fields:

@@ -41,6 +41,7 @@ def _completed(run: Forecast, partial: Array, fill: Callable[[Array], Array]) ->
     values = np.hstack([predicted.values, rates, run.path])
     values[runs] = fill(np.where(runs[:, None], values, np.nan))[runs]
     whole = np.logical_and(partial, np.isfinite(values).all(axis=1))
+    lacking = np.flatnonzero(np.isnan(values[runs, :k]).any(axis=0))
     values[np.logical_and(partial, ~whole)] = np.nan
     return replace(
         run,
@@ -50,6 +51,7 @@ def _completed(run: Forecast, partial: Array, fill: Callable[[Array], Array]) ->
         path=values[:, values.shape[1] - run.path.shape[1] :],
         failures=tuple("" if full else reason for full, reason in zip(whole, run.failures, strict=True)),
         filled=float(np.isnan(run.predictions[whole]).sum() / max(run.predictions[runs].size, 1)),
+        lacking=tuple(lacking.tolist()),
     )
 
 

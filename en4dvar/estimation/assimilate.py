@@ -88,7 +88,7 @@ def _through(stages: Stages) -> Analysis:
             break
         looking, outcome, ends = after is not outcome, after, beside
     ends = sampled.ends
-    space.require_members(ends.run.failures, "posterior forecast")
+    space.require_members(ends.run, "posterior forecast")
     control = ControlEnsembles(
         space.members,
         ends.members,

@@ -66,7 +66,7 @@ class Localised:
         base = self._base(prior_mean[:n])
         moments = [self._moments(prior_field, columns, base) for prior_field, columns in self.fields]
         prior_run = filled(self.forecast(ensemble, self.grid), ensemble)
-        require_members(problem, prior_run.failures, self.fewest, "prior forecast")
+        require_members(problem, prior_run, self.fewest, "prior forecast")
         if not self.settings.stochastic_model:
             check_forecast_repeats(problem, prior_run, lambda some: self.forecast(ensemble[some], self.grid))
         variance = self._variance()
@@ -77,7 +77,7 @@ class Localised:
             both = np.vstack([centre, ensemble]), np.vstack([central.predictions, run.predictions])
             central = replace(central, predicted=Predicted(fitted(*both)[:1]), failures=("",))
         run = replace(run, failures=tuple(reason or lost[i] for i, reason in enumerate(run.failures)))
-        require_members(problem, run.failures, self.fewest, "posterior forecast")
+        require_members(problem, run, self.fewest, "posterior forecast")
         self._end(run, central, centre, variance)
         after = ensemble[:, :n].copy()
         fields = [

@@ -91,7 +91,7 @@ class Stages:
         """The prior forecast, and where the iterations started; its descent has ended."""
         space = self.space
         prior_run = space.whole(np.vstack([space.members, space.mean]), self.grid)
-        space.require_members(prior_run[:-1].failures, "prior forecast")
+        space.require_members(prior_run[:-1], "prior forecast")
         if not self.settings.stochastic_model:
             again = partial(space.forecast, extra_times=self.grid)
             check_forecast_repeats(self.problem, prior_run[:-1], lambda some: again(space.members[some]))

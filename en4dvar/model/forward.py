@@ -370,6 +370,11 @@ class ForwardModel(ABC):
         return Trajectory(np.asarray(times, dtype=float), states, self.layout)
 
 
+def initial_states(model: ForwardModel, theta: Mapping[str, Array], n_members: int) -> Array:
+    """Initial states (N, n_state) of ``n_members`` members with parameters name → (N,), which may be none."""
+    return model.initial_states(theta) if theta else np.array([model.initial_state({})] * n_members)
+
+
 def field_of(model: ForwardModel, observable: Observable) -> Field | None:
     """The field of the state that an observable reads, where it reads one as it is."""
     if not isinstance(observable.operator, StateField):

@@ -25,8 +25,9 @@ from en4dvar.model.forward import ForwardModel, Observable
 from en4dvar.model.function_model import FunctionModel, digest_of, name_of
 from en4dvar.model.state import OF_READINGS, Array, Parameter
 from en4dvar.plumbing.errors import ConfigError, DataError, Fault, OutputError, retold
-from en4dvar.plumbing.files import make_folder, temporary_folder, write_text
+from en4dvar.plumbing.files import expanded, make_folder, temporary_folder, write_text
 from en4dvar.plumbing.hints import listed, suggest
+from en4dvar.plumbing.user_file import absolute, is_file_reference
 from en4dvar.report.result import Result
 from en4dvar.report.sequence import SequenceOutcome
 from en4dvar.results.checkpoint import digest
@@ -45,6 +46,7 @@ ARGUMENTS = {
     ("sequence", "initial_std"): "initial_std",
 }
 ARRAYS = "arrays of a script"
+FILES = ("path", "ensemble", "from")  # keys of files
 C = TypeVar("C", Config, SequenceConfig)
 
 
@@ -84,6 +86,7 @@ def estimate(
         parameter. ``t_s`` is a time shift, ``sigma`` the noise scale, ``reading_scale`` that of the predictions.
     error: std of the readings: a number, one a reading, text such as ``"1 % of maximum"``, or a dict as ``data.error``
         of a file, in which an array is one number a reading, and of ``covariance`` the matrix (K, K) of all readings.
+        Files are named from the working directory.
     units: of a function's parameters, values (by name) and of ``"time"``; by default none has one.
     time: name of the column, index or coordinate of times.
     observable: what the values are, by its name in the model or the column; by default the only one there is. A list:
@@ -105,6 +108,7 @@ def estimate(
     ConfigError, DataError: says which argument, and what to do. Others as of :func:`en4dvar.run`.
     """
     call = Given(model, data, time, observable, error, units or {}, priors, series or {}, correlation)
+    sections = _from_here(sections)
     if "prior" in sections:
         sections["prior"] = call.prior(sections["prior"])
     ready, content = call.content(model, name, seed, cheap, **({"window": window} if window else {}))
@@ -154,7 +158,7 @@ def estimate_sequence(
     call = Given(model, data, time, observable, error, {}, priors or {}, series or {}, correlation)
     ready, content = call.content(model, name, seed)
     content |= {"sequence": {"initial_std": initial_std or {}}}
-    content |= {"output": {"report": report and directory is not None}, **sections}
+    content |= {"output": {"report": report and directory is not None}, **_from_here(sections)}
     with _configured(resolve_sequence, content, ready, call, directory, resume or force) as config:
         return run_sequence(config, force=force, resume=resume, command="en4dvar.estimate_sequence")
 
@@ -180,6 +184,15 @@ def _configured(
             yield replace(config, directory=where)
         except DataError as error:
             raise DataError(call.words(str(error), where)) from None
+
+
+def _from_here(value: Any, key: Any = "") -> Any:
+    """The same, with absolute paths of the files that it names from the working directory."""
+    if isinstance(value, Mapping):
+        return {name: _from_here(part, name) for name, part in value.items()}
+    if isinstance(value, str) and is_file_reference(value):
+        return absolute(value)
+    return str(expanded(value).absolute()) if isinstance(value, str) and key in FILES else value
 
 
 def _argument(path: str) -> str:
@@ -325,6 +338,7 @@ class Given:
         units: Mapping[str, str], priors: Mapping[str, Any], series: Mapping[str, Any], correlation: Any,
     ):  # fmt: skip
         self.units, self.priors, self.correlation = units, priors, correlation
+        error, series = _from_here(error), _from_here(series)
         self.beside: dict[str, str] = {}
         with retold(DataError, DataError, "data: "):
             tables = tables_of(data, time, None if isinstance(observable, str) else observable)

@@ -214,8 +214,9 @@ def mode_cautions(
         words = f"a draw has J = {result.lowest:.1f}, lower than the lowest minimum that descents found, {lowest:.1f}"
         yield caution("starts-disagree", words)
     elif result is None and not agree:
-        costs = ", ".join(f"{m.cost:.1f}" for m in minima[1:]) or "elsewhere"
-        words = f"only one descent ended in the lowest minimum, J = {lowest:.1f}; others ended at {costs}"
+        costs = ", ".join(f"{m.cost:.1f}" for m in minima[1:])
+        others = f"others ended at {costs}" if costs else "the others came to no minimum"
+        words = f"only one descent ended in the lowest minimum, J = {lowest:.1f}; {others}"
         yield caution("starts-disagree", words)
     seen = [m for m in modes if m.weight >= SEEN]
     if len(seen) < 2:

@@ -1,12 +1,13 @@
 """A series to assimilate: what is known at time zero, what was observed, and how it is assimilated."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from en4dvar.data.observations import Observations
 from en4dvar.data.series import Part, Series
+from en4dvar.diagnosis.diagnostics import common_reasons
 from en4dvar.executor import Executor
 from en4dvar.model.forward import Observable
 from en4dvar.model.state import Array
@@ -91,16 +92,40 @@ class SeriesResult:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Reasons not to trust the spread."""
+        told = [*members_lost(self.run, self.problem.members), *self._too_few()]
         squares = self.normalised[np.isfinite(self.normalised)] ** 2
         size = float(np.sqrt(squares.mean())) if len(squares) else 1.0
         if size > UNEXPECTED:
-            return (
+            told.append(
                 f"innovations are {size:.2g} times as large as forecast and errors say: the ensemble is too sure of "
-                "itself; give model_error, inflation or larger errors",
+                "itself; give model_error, inflation or larger errors"
             )
         if size < 1 / UNEXPECTED:
-            return (f"innovations are only {size:.2g} times what forecast and errors say: these are too large",)
-        return ()
+            told.append(f"innovations are only {size:.2g} times what forecast and errors say: these are too large")
+        return tuple(told)
+
+    def _too_few(self) -> Iterator[str]:
+        """Where members are fewer than what a window estimates, state and model error, and one more."""
+        problem, settings, times = self.problem, self.problem.settings, len(self.problem.series.times)
+        lag, error = min(settings.scheme.lag, times), settings.model_error
+        if not lag or error is None or settings.localisation is not None:
+            return
+        size = sum(field.size for field in problem.start.model.layout if field.name not in problem.start.fixed)
+        if problem.members < (needed := size + lag * len(error.where) + 1):
+            yield (
+                f"{problem.members} members are fewer than the {needed} that a window of {lag} times with model error "
+                f"needs ({size} for the state, {len(error.where)} a time, and one): the spread may be far too small; "
+                "give more members, or a shorter lag"
+            )
+
+
+def members_lost(run: SequentialResult, members: int) -> Iterator[str]:
+    """Where some were: of how many, why and when, and what to do."""
+    if run.failures:
+        yield (
+            f"{len(run.failures)} of {members} members were lost: {common_reasons(run.failures)}; the result holds "
+            "only where the model runs: narrow what is uncertain at the start, or find out why the model fails"
+        )
 
 
 def normalised_innovations(series: CycleSeries, run: SequentialResult) -> Array:

@@ -331,7 +331,9 @@ class _Run:
 
     def survivors(self, rows: Rows, failed: Sequence[str]) -> Rows:
         """Those of ``rows`` that did not fail. Raises :class:`TooFewMembersError`."""
-        self.failures += [reason for reason in failed if reason]
+        newest = min(self.done + self.scheme.shift, len(self.series.times))
+        since, until = (self.flow.times[k] for k in (min(self.start, self.done), newest))
+        self.failures += [f"{reason} (t = {since:.6g} to {until:.6g})" for reason in failed if reason]
         left = self.initial_members - len(self.failures)
         needed = max(2, int(np.ceil(self.settings.min_active_fraction * self.initial_members)))
         if left < needed:

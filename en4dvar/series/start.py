@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from en4dvar.model.forward import ForwardModel
+from en4dvar.model.forward import ForwardModel, initial_states
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import En4dvarError
 from en4dvar.plumbing.user_code import reason_of
@@ -110,9 +110,7 @@ class InitialEnsemble:
         theta = {name: np.full(n_members, value) for name, value in self.fixed.items()}
         theta |= dict(zip(prior.names, prior.to_physical(x).T, strict=True))
         try:
-            states = np.array(
-                model.initial_states(theta) if theta else [model.initial_state({})] * n_members, dtype=float
-            )
+            states = np.array(initial_states(model, theta, n_members), dtype=float)
         except BaseException as error:  # a model may fail in any way
             raise En4dvarError(f"the initial state cannot be made: {reason_of(error)}") from error
         if states.shape != (n_members, model.layout.size):

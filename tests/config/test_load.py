@@ -84,7 +84,6 @@ def test_defaults_of_the_model_and_the_time_shift(tmp_path: Path) -> None:
         ("name: toy", "name: ../toy/up", "toy.yaml:1:7: name: "),
         ("name: toy", "name: no", ""),
         ("mass: 2 g", "mass: 2 g\n  mass: 3 g", "toy.yaml:12:3: model: duplicate key 'mass', first given on line 11"),
-        (YAML[YAML.index("parameters") :], "", "toy.yaml:1:1: parameters: required, but not given"),
         ("  k: {prior: lognormal, median: 3 N/m, log_std: 0.3}\n", "", "toy.yaml:12:1: parameters.k: stiffness 'k'"),
     ],
 )  # fmt: skip
@@ -109,6 +108,8 @@ def test_all_faults_at_once_in_the_order_of_the_file(tmp_path: Path) -> None:
     assert [f.split(": ")[0] for f in found] == [
         f"toy.yaml:{place}" for place in ("2:7", "7:34", "8:25", "14:54", "15:6", "17:12")
     ]
+    found = faults(tmp_path, (YAML[YAML.index("parameters") :], ""))
+    assert [f.split(" ")[1] for f in found] == ["parameters.A:", "parameters.k:"]
     found = faults(tmp_path, ("seed: 3", "seed: x"), ("mass: 2 g", "mas: 2 g"), ("members: 8", "members: 1"))
     assert [f.split(": ")[1] for f in found] == ["seed", "model.mas", "assimilation.members"]
 

@@ -129,3 +129,23 @@ def test_what_the_others_do_not_determine_stays_missing():
     assert done[:, 0] == pytest.approx([1.0, 3.0, 5.0, 4.0])
     assert np.isnan(done[3, 1])
     assert np.isnan(done[:, 2]).all()
+
+
+@pytest.mark.parametrize("most", [-np.inf, 0.0])
+def test_a_run_that_ends_for_a_reading_that_too_few_members_have_names_it(most):
+    """No member has it, or those on the other side of the prior mean than the minimum."""
+
+    def lacking(path):
+        y = np.array(path["y"], dtype=float)
+        y[3] = np.where(path["theta"][0, 0] > most, np.nan, y[3])
+        return y
+
+    _, problem = patchy(Linear(NAMES), TRUTH, operator=lacking)
+    time = problem.observations.times[3]
+    with pytest.raises(
+        TooFewMembersError, match=rf"if any, have a number for reading 4 of y \(at {time:.6g} s\): leave"
+    ):
+        assimilate(problem, settings(), 1)
+    problem = replace(problem, observable=Observable("y", "m", lambda path: np.full(len(path["y"]), np.nan)))
+    with pytest.raises(TooFewMembersError, match=r"non-finite prediction \(40×\)$"):
+        assimilate(problem, settings(), 1)

@@ -28,11 +28,11 @@ if what == "garbage":
     values = ["n/a" for _ in values]
 if what == "gaps" and int(1e7 * given["a"]) % 4 == 0:
     values[4] = "n/a"
+if what in ("fortran", "bare"):
+    values = [f"{y:.16E}".replace("E", "D") for y in values]
 if what == "short":
     values = values[1:]
-rows = "".join(
-    f"{t!r}\t{y!r}\n" if y != "n/a" else f"{t!r}\tn/a\n" for t, y in zip(given["times"], values, strict=False)
-)
-Path(target).write_text("t\ty\n" + rows, encoding="utf-8")
+rows = "".join(f"{t}\t{y}\n" for t, y in zip(given["times"], values, strict=False))
+Path(target).write_text(rows if what == "bare" else "t\ty\n" + rows, encoding="utf-8")
 Path("out.json").write_text(json.dumps({"run": {"t": given["times"], "y": values}}), encoding="utf-8")
 print("".join(f"y = {y}\n" for y in values))

@@ -127,6 +127,13 @@ def test_a_program_that_goes_wrong_is_a_lost_member_with_its_reason(folder):
     assert "not JSON" in failure(folder, outputs={"y": {"key": "run"}})
 
 
+@pytest.mark.parametrize(("what", "way"), [*(("fortran", way) for way in OUTPUTS), ("bare", "number of a column")])
+def test_exponents_may_be_those_of_fortran(what, way, folder):
+    """1.03D+00; a table may have no header."""
+    (path,) = model_of(folder, what, outputs={"y": OUTPUTS[way]}).trajectories(np.array([[1.0, 0.5]]), TIMES)
+    np.testing.assert_array_equal(path["y"], curve({"a": 1.0, "b": 0.5}, TIMES.tolist()))
+
+
 @pytest.mark.parametrize("way", OUTPUTS)
 def test_a_value_that_is_missing_is_lost_alone(way, folder):
     model = model_of(folder, "gaps", outputs={"y": OUTPUTS[way]})

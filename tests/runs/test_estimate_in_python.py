@@ -79,6 +79,20 @@ IN_METRES = {
 }
 
 
+def test_files_are_named_from_the_working_directory(tmp_path, monkeypatch, result):
+    monkeypatch.chdir(tmp_path)
+    np.savetxt("R.csv", NOISE**2 * np.eye(len(TIMES)), delimiter=",", fmt="%.17g")
+    told = fit(error={"covariance": {"path": "R.csv", "unit": "1"}}).summary()
+    np.testing.assert_allclose(told["mean"], result.summary()["mean"], rtol=1e-6)
+    np.savetxt(
+        "members.csv", np.random.default_rng(3).standard_normal((50, 2)), delimiter=",", header="a,b", comments=""
+    )
+    (tmp_path / "own.py").write_text("from en4dvar.schemes.etkf import ETKF as Own\n", encoding="utf-8")
+    priors = {name: {"prior": "ensemble", "map": "normal"} for name in "ab"}
+    of_members = fit(priors=priors, prior={"ensemble": "members.csv"}, assimilation={"scheme": "./own.py:Own"})
+    assert of_members.summary()["mean"].to_numpy() == pytest.approx(told["mean"].to_numpy(), abs=0.3)
+
+
 def test_a_function_may_return_names_and_a_model_is_as_good(result):
     by_name = fit(lambda p, t: {"y": line(p, t), "other": t})
     assert by_name.posterior.identical(result.posterior)
@@ -165,7 +179,7 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "odd unit": ({"units": {"c": "m"}}, "units: 'c' is neither a parameter in priors nor a column"),
     "name of a prior": ({"priors": {"a b": 1.0}}, "priors: 'a b' cannot be the name of a parameter"),
-    "nothing estimated": ({"priors": {"a": 1.0, "b": 2.0}}, "no parameter has a prior; nothing to estimate"),
+    "nothing estimated": ({"priors": {"a": 1.0, "b": 2.0}}, "nor is there initial_state or model_error; nothing"),
     "an object": ({"priors": {"a": {"prior": object}}}, "priors.a.prior: <class 'object'> is neither number, text"),
     "a null byte": ({"priors": {"a": {"prior": "no\0rmal"}}}, "priors.a.prior: a null byte"),
     "odd section": ({"asimilation": {}}, "asimilation: unknown key 'asimilation'; did you mean 'assimilation'?"),

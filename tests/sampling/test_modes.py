@@ -158,6 +158,14 @@ def test_modes_that_overlap_are_only_worth_knowing(apart: float, severity: str) 
     assert told.severity == "serious"
 
 
+@pytest.mark.parametrize(("others", "words"), [(1, "others ended at 9.0"), (0, "the others came to no minimum")])
+def test_where_descents_disagree_it_is_told_where_the_others_ended(others, words):
+    prior = Prior((PriorTerm.normal(Parameter("a", "1"), 0.0, 1.0),))
+    minima = [Minimum(np.array([x]), np.eye(1), x, (0,)) for x in (3.0, 9.0)][: 1 + others]
+    (told,) = mode_cautions(prior, minima, [], False, None)
+    assert told.words.endswith(f"J = 3.0; {words}")
+
+
 def test_the_tail_of_a_posterior_that_is_bent_is_sampled() -> None:
     """The logarithm of a modulus that readings tell only with a pressure: flat where the modulus is small.
 

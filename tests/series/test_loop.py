@@ -68,7 +68,7 @@ def test_lost_members_leave_an_ensemble_of_the_survivors(scheme):
     result = run_sequential(model, model.observables, start, series(), SequentialSettings(scheme))
     alone = run_sequential(Forced(), model.observables, start[~lost], series(), SequentialSettings(scheme))
     assert result.members == pytest.approx(alone.members, abs=1e-12)
-    assert result.failures == ("ArithmeticError: too stiff",) * int(lost.sum())
+    assert result.failures == ("ArithmeticError: too stiff (t = 0 to 1)",) * int(lost.sum())
     assert alone.failures == ()
 
 
@@ -88,7 +88,7 @@ def test_failures_may_be_values():
             return results
 
     result = run_sequential(Failing(), Forced.observables, members(), series(), SequentialSettings(ETKF()))
-    assert result.failures == ("first",)
+    assert result.failures == ("first (t = 0 to 1)",)
     assert len(result.members) == 9
 
 
@@ -119,7 +119,7 @@ def test_an_infinite_prediction_loses_its_member(scheme):
     observed = (Forced.observables[0], Observable("wall", "1", wall))
     blind = series(std=1e9)  # so that no other member is moved into it
     result = run_sequential(Forced(), observed, start, blind, SequentialSettings(scheme))
-    assert result.failures == ("non-finite prediction",)
+    assert result.failures == ("non-finite prediction (t = 0 to 1)",)
     assert result.members[:, 1] == pytest.approx(start[~lost, 1], abs=1e-9)
 
 

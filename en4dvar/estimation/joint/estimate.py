@@ -133,7 +133,7 @@ class _Estimate:
         )
         for problem, run in zip(joint.experiments, forecasts, strict=True):
             needed = math.ceil(self.settings.min_active_fraction * (len(run) - 1))
-            require_members(problem, run.failures[:-1], needed, "forecast of the joint posterior")
+            require_members(problem, run[:-1], needed, "forecast of the joint posterior")
         cautions += missing_readings(max(forecast.filled for forecast in forecasts))
         if not lowest.converged:
             advice = "make the runs again with a larger assimilation.max_iterations (that of the first counts)"

@@ -35,6 +35,20 @@ class ProgramError(Exception):
     """A program ended badly, or what it left cannot be read; the words are the reason of a member that failed."""
 
 
+def _number(text: str) -> re.Match[str] | None:
+    return _NUMBER.fullmatch(text.strip()) or _NO_LETTER.fullmatch(text.strip())
+
+
+def plain(text: str) -> str:
+    """A number as Python writes it; any other text as it is.
+
+    >>> plain("1.5D-01"), plain("1.5-101"), plain("no number")
+    ('1.5e-01', '1.5e-101', 'no number')
+    """
+    number = _number(text)
+    return f"{number[1]}e{number[2] or 0}" if number else text
+
+
 def is_pest(text: str, kind: Literal["tf", "if"]) -> bool:
     """Whether the first line says that this is a template or instructions of PEST, with a sign, the delimiter."""
     return re.match(rf"[pj]{kind} \S", text, re.IGNORECASE) is not None
@@ -156,8 +170,8 @@ def read(
             if item["free"] or item["fixed"]:
                 text = cursor.observed(item, following[0]["marker"] if following else None)
                 if name := _named(item):
-                    number = _NUMBER.fullmatch(text.strip()) or _NO_LETTER.fullmatch(text.strip())
-                    values[name] = math.nan if number is None else float(f"{number[1]}e{number[2] or 0}")
+                    number = _number(text)
+                    values[name] = math.nan if number is None else float(plain(text))
                     wrong = wrong or f"{cursor.place}: {text.strip() or 'nothing'!r} is not a number for {name}"
             elif not cursor.moved(item):
                 if not all(before["marker"] for before in items[:k]):

@@ -89,7 +89,7 @@ def _column(text: str, column: str | int | None, file: str) -> Array:
     rows = list(csv.reader(lines, delimiter=delimiter)) if delimiter in lines[0] else [line.split() for line in lines]
     header = [cell.strip() for cell in rows[0]]
     if isinstance(column, int):
-        at, first = column - 1, 0 if is_number(header[min(column, len(header)) - 1]) else 1
+        at, first = column - 1, 0 if is_number(languages.plain(header[min(column, len(header)) - 1])) else 1
     elif column in header:
         at, first = header.index(column), 1
     else:
@@ -112,7 +112,8 @@ def _key(text: str, key: str | int | None, file: str) -> Array:
 
 def _numbers(texts: list[Any], file: str) -> Array:
     """What is no number is NaN, a reading that is missing. Raises :class:`ProgramError` where none is a number."""
-    values = np.array([float(value) if is_number(value) else math.nan for value in texts])
+    plain = [languages.plain(text) if isinstance(text, str) else text for text in texts]
+    values = np.array([float(value) if is_number(value) else math.nan for value in plain])
     if len(texts) and np.isnan(values).all():
         raise ProgramError(f"{file}: {short(str(texts[0]))!r} is no number")
     return values

@@ -332,7 +332,8 @@ class PiecewiseModel(ForwardModel):
         """Initial states of the model with the varying parameters appended. Raises ValueError where a piece lies
         outside of the parameter's bounds.
         """
-        inner = self.model.initial_states({p.name: theta[p.name] for p in self.model.parameters})
+        n_members = len(next(iter(theta.values())))
+        inner = initial_states(self.model, {p.name: theta[p.name] for p in self.model.parameters}, n_members)
         return np.hstack([inner, *(change.values(theta) for change in self.varying)])
 
     def changed(self, name: str, x: Array, change: Array) -> Array:

@@ -1,0 +1,63 @@
+"""What the result of a series says of members that were lost, and of too few for a window with model error."""
+
+import numpy as np
+import pytest
+import xarray as xr
+from scipy.linalg import expm
+
+import en4dvar
+from en4dvar import Field, ForwardModel, Observable, StateField, StateLayout
+
+SLOPE = np.array([[0.0, 1.0], [-2.0, -0.15]])
+TIMES = np.arange(1.0, 9.0) / 2
+READ = np.array([(expm(SLOPE * t) @ [1.1, 0.2])[0] for t in TIMES])
+
+
+class Swing(ForwardModel):
+    parameters = ()
+    layout = StateLayout((Field("x", unit="m"), Field("v", unit="m/s")))
+    observables = (Observable("x", "m", StateField("x")),)
+
+    def initial_state(self, theta):
+        return np.array([1.0, 0.0])
+
+    def step(self, x, t0, t1):
+        return expm(SLOPE * (t1 - t0)) @ x
+
+
+class Breaking(Swing):
+    def step(self, x, t0, t1):
+        if x[0] > 1.2 and t0 < 0.2:
+            raise RuntimeError("breaks")
+        return super().step(x, t0, t1)
+
+
+def followed(model, scheme, members, directory=None, **sections):
+    return en4dvar.estimate_sequence(
+        model, {"x": (TIMES, READ)}, error={"x": 0.1}, initial_std={"x": "0.5 m", "v": "0.4 m/s"},
+        assimilation={"scheme": scheme, "members": members, **sections.pop("keys", {})}, directory=directory,
+        **sections,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("keys", [{"scheme": "etkf"}, {"scheme": "ienks", "keys": {"lag": 2}}])
+def test_members_lost_are_told_once_with_why_and_when(keys, tmp_path):
+    result = followed(Breaking, members=40, directory=tmp_path / "run", **keys)
+    lost = len(result.run.failures)
+    assert lost > 2
+    (words,) = [words for words in result.warnings if "lost" in words]
+    assert words.startswith(f"{lost} of 40 members were lost: RuntimeError: breaks (t = 0 to 0.5) (")
+    assert "\n".join(result.warnings) == xr.open_dataset(tmp_path / "run" / "sequence.nc").attrs["warnings"]
+    assert not [words for words in followed(Swing, members=40, **keys).warnings if "lost" in words]
+
+
+@pytest.mark.parametrize(("lag", "needed"), [(3, 2 + 3 + 1), (40, 2 + 8 + 1)])
+def test_a_window_says_how_many_members_its_model_error_needs(lag, needed):
+    """With as many its spread is that of many; one fewer and it is told."""
+    keys = {"keys": {"lag": lag}, "model_error": {"v": {"std": "0.5 m/s", "every": "2 s"}}}
+    few, enough, many = (followed(Swing, "ienks", n, **keys) for n in (needed - 1, needed, 60))
+    np.testing.assert_allclose(enough.run.smoothed.std, many.run.smoothed.std, rtol=1e-9)
+    assert np.max(np.abs(few.run.smoothed.std / many.run.smoothed.std - 1)) > 0.01
+    words = f"{needed - 1} members are fewer than the {needed} that a window of {min(lag, 8)} times with model error"
+    assert few.warnings[0].startswith(words)
+    assert not [words for words in enough.warnings if "fewer" in words]
