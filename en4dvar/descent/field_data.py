@@ -2,8 +2,6 @@
 localised gain of a problem, by where its readings and unknowns are.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A posterior in a few numbers, in display units: for the terminal, ``summary.csv`` and the pages."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -70,7 +68,7 @@ class ParameterSummary:
     @classmethod
     def of(
         cls, p: Parameter, prior: Array, posterior: Array, centre: float, dfs: float, cautions: Sequence[Caution]
-    ) -> ParameterSummary:
+    ) -> "ParameterSummary":
         """Of members (N',) alive, in the display unit; the centre is SI, ``cautions`` are those of the run."""
         prior_mean, prior_std = _moments(prior)
         mean, std = _moments(posterior)
@@ -248,7 +246,7 @@ def csv_cells(row: ParameterSummary) -> list[object]:
     return list((cells | {"untrusted": " ".join(row.untrusted)}).values())
 
 
-def frame(summaries: Mapping[str, Iterable[ParameterSummary]]) -> pd.DataFrame:
+def frame(summaries: Mapping[str, Iterable[ParameterSummary]]) -> "pd.DataFrame":
     """A row a data set and parameter, in display units; NaN where a number is not to be quoted."""
     import pandas as pd  # takes long to import
 

@@ -8,8 +8,6 @@ Workers need the packages of this machine in the same versions; they need none o
 reads while it runs. Dask repeats the calls of a worker that dies; a worker that joins later takes part.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import itertools
@@ -93,7 +91,7 @@ class DaskExecutor(FuturesExecutor):
             message = "has no worker; start some with: dask worker" if connected else "cannot be reached"
             raise ExecutorError(f"dask scheduler {address or ''}: {message} ({error})") from None
 
-    def _submit(self, function: Callable[..., T], call: Call, tell: Tell | None) -> Future[Any]:
+    def _submit(self, function: Callable[..., T], call: Call, tell: Tell | None) -> "Future[Any]":
         if self._client is None or self._client.status != "running":
             raise self._lost()
         key = f"en4dvar-{self._client.id}-{next(self._calls)}"
@@ -117,12 +115,12 @@ class DaskExecutor(FuturesExecutor):
             except queue.Empty:
                 self._require_worker()
 
-    def _give_up(self, futures: Collection[Future[Any]]) -> None:
+    def _give_up(self, futures: "Collection[Future[Any]]") -> None:
         for future in futures:
             self._listening.pop(str(future.key), None)
             future.release()
 
-    def _value(self, future: Future[Any]) -> Any:
+    def _value(self, future: "Future[Any]") -> Any:
         """What the call gave or raised. Waits where the value was lost with its worker and is computed again.
 
         Raises :class:`ExecutorError` where the cluster is gone.

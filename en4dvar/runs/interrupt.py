@@ -5,8 +5,6 @@ command line a thread therefore waits for signals as well (:func:`heeded`): what
 so that the process may end wherever it stands.
 """
 
-from __future__ import annotations
-
 import _thread
 import os
 import signal

@@ -1,7 +1,5 @@
 """Fields of the page → the words of one command, whose files all lie in the folder."""
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Callable, Mapping

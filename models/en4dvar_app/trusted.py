@@ -1,7 +1,5 @@
 """What a configuration of somebody else may not do from the page: run code, and read files outside of the folder."""
 
-from __future__ import annotations
-
 import glob
 import os
 from collections.abc import Iterator

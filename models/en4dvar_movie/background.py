@@ -1,7 +1,5 @@
 """The background of a movie, and the properties that its frames share: sign, noise, contrast, sharpness."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -69,7 +67,7 @@ class Background:
     relative: bool = True
     drift: Array | None = None
 
-    def behind(self, number: int) -> Background:
+    def behind(self, number: int) -> "Background":
         """The background as a frame shows it, where the camera drifts."""
         if self.drift is None:
             return self

@@ -8,8 +8,6 @@ These are a small text file, a line a frame.
 19       270.5 64.0 28.0   start here: x, y and radius in pixels
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

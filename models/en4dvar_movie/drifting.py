@@ -1,7 +1,5 @@
 """A camera that drifts over a background with structure: by how many pixels frames along a movie show it elsewhere."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -3,8 +3,6 @@
 The settings are the fields of :class:`Camera` and of :class:`Scene`, which hold their words and defaults.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -39,7 +37,7 @@ class Camera:
     flashes: Annotated[Instants, "flashes of a frame after its instant, such as 0 us, 2 us"] = (0.0,)
 
 
-def film(config: Config, times: Array | None, out: Path, settings: Mapping[str, str], seed: int) -> str:
+def film(config: "Config", times: Array | None, out: Path, settings: Mapping[str, str], seed: int) -> str:
     """Also write a movie of the bubble (.tif, .mp4 or .avi) with one frame per instant.
 
     Parameters

@@ -1,7 +1,5 @@
 """Several flashes in one exposure: which of the nested circles of a frame belongs to which flash."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise, permutations
 

@@ -4,8 +4,6 @@ Frames are (H, W) arrays of brightness, 8 or 16 bit. Nothing is held: a movie is
 Movies are written frame by frame as well: TIFF with its scale, or a video.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace

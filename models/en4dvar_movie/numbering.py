@@ -1,7 +1,5 @@
 """The order of a folder's frames, and what is missing among them, by the numbers in their names."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Sequence

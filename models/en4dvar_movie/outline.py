@@ -1,7 +1,5 @@
 """Bubbles in one image: where they may be, roughly, and the outline of one, a circle, its modes, what is known."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

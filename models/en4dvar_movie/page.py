@@ -1,7 +1,5 @@
 """What shows the work: the movie with its outlines, and a page with a strip of frames, radius and shape in time."""
 
-from __future__ import annotations
-
 import base64
 import io
 from collections.abc import Iterator, Sequence

@@ -1,8 +1,6 @@
 """From a movie to readings: candidates of every frame by itself, in any order, then the bubble that continues through
 them, then what neighbouring frames say of the errors."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 

@@ -13,8 +13,6 @@ is submodular (Krause & Guestrin 2005, UAI), as it is of independent readings ab
 choice that no single exchange improves.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial

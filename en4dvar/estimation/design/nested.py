@@ -26,8 +26,6 @@ too large, by the same amount to second order; I is their mean. E[P(k | y)] of t
 P, is the probability that it will have: 1/L where readings tell nothing, 1 where they decide.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -205,7 +203,7 @@ class Decision:
     thin: float
 
     @classmethod
-    def of(cls, logs: Sequence[Array], thin: float = 0.0) -> Decision:
+    def of(cls, logs: Sequence[Array], thin: float = 0.0) -> "Decision":
         """From log-evidences (R, L) of readings simulated with each of the L laws, in their order."""
         told, holds = [], []
         for k, log in enumerate(logs):

@@ -11,8 +11,6 @@ experiments alike share s, what is asked and what is common to them, such as a s
 common is left out at the end, I ≈ E[½ ln det (I + n (M_s − I))_a].
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -79,7 +77,7 @@ class Planned:
         """J_o (B,) of readings (K,) for runs; +inf where one has failed."""
         return replace(self.problem.observations, values=values).cost(run.predicted)
 
-    def tangents(self, u: Array, run: Forecast | None = None) -> Tangents:
+    def tangents(self, u: Array, run: Forecast | None = None) -> "Tangents":
         """At points (R, n), by n runs beside each; those where one fails are left out."""
         count, n = u.shape
         run = run or self.run(u)
@@ -99,7 +97,7 @@ class Tangents:
     u: Array
     at: tuple[Linearisation, ...]
 
-    def some(self, which: Sequence[int]) -> Tangents:
+    def some(self, which: Sequence[int]) -> "Tangents":
         """At some of the points."""
         chosen = list(which)
         return Tangents(self.alive[chosen], self.u[chosen], tuple(self.at[k] for k in chosen))

@@ -7,8 +7,6 @@ in each. Each data set is sampled by itself (:mod:`~en4dvar.estimation.populatio
 population enters the hierarchy (:mod:`~en4dvar.estimation.population.hierarchy`) as a likelihood.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -133,7 +131,7 @@ class Population:
         kept = Draws(*(getattr(d, field.name)[taken] for field in fields(Draws)))
         return kept, effective_number(shares) / len(shares) * self.size
 
-    def combinations(self) -> tuple[Combination, ...]:
+    def combinations(self) -> "tuple[Combination, ...]":
         """Combinations of the means that the data determine where they do not determine each mean by itself."""
         if np.all(self.learned[0] >= DETERMINED):
             return ()

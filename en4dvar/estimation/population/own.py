@@ -14,8 +14,6 @@ its prior, and therefore all data sets of a population have the same slopes. The
 those of ln G are steeper for a soft gel, and a θ that makes all of them stiffer would make them more alike.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -70,7 +68,7 @@ class Mixture(NamedTuple):
     constant: Array
 
     @classmethod
-    def divided(cls, mean: Array, covariance: Array, log_share: Array, prior_std: Array) -> Mixture:
+    def divided(cls, mean: Array, covariance: Array, log_share: Array, prior_std: Array) -> "Mixture":
         """Components of the posterior, means (M, n) and covariances (M, n, n), with the prior N(0, diag prior_std²)
         divided out. ``log_share`` (M,): ln of the components' shares.
         """
@@ -158,7 +156,7 @@ class OwnDraws:
     forward_runs: int
 
     @classmethod
-    def kept(cls, problem: InverseProblem, draws: Array, effective: float, log_evidence: float) -> OwnDraws:
+    def kept(cls, problem: InverseProblem, draws: Array, effective: float, log_evidence: float) -> "OwnDraws":
         """What the estimate of a data set has kept: ``draws`` (D, n), physical, taken from others that are worth
         ``effective`` of them, and ln p(y). Raises :class:`ValueError` for a draw that the prior excludes.
         """

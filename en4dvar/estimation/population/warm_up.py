@@ -1,7 +1,5 @@
 """The compiled loops of this package, each used once."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
