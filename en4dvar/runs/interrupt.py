@@ -82,7 +82,7 @@ def heeded(end: Callable[[str], object]) -> Iterator[None]:
     _answered.clear()
     tell_ignored, tell_error = sys.unraisablehook, sys.excepthook
 
-    def once_more(ignored: sys.UnraisableHookArgs) -> None:
+    def once_more(ignored: "sys.UnraisableHookArgs") -> None:
         if issubclass(ignored.exc_type, KeyboardInterrupt):
             threading.Timer(AGAIN, _thread.interrupt_main).start()
         else:
