@@ -7,7 +7,6 @@ from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -16,7 +15,7 @@ from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.diagnosis.diagnostics import HARDLY_INFORMED, active_members, change_words, member_quantiles
 from en4dvar.diagnosis.response.budget import budget_words
 from en4dvar.diagnosis.response.what_if import Shift
-from en4dvar.model.state import Array, Parameter
+from en4dvar.model.state import Array, Mask, Parameter
 from en4dvar.plumbing.caution import Caution, codes, of_several_modes, untrusted
 from en4dvar.plumbing.tables import table
 from en4dvar.plumbing.units import convert
@@ -93,7 +92,7 @@ def informed_words(name: str, dfs: float, cautions: Sequence[Caution]) -> str:
     return next(words for limit, words in DFS_WORDS if dfs < limit or limit == math.inf)
 
 
-def living(values: Array, alive: npt.NDArray[np.bool_] | bool, p: Parameter) -> Array:
+def living(values: Array, alive: Mask | bool, p: Parameter) -> Array:
     """Finite values (N',) of members alive, in the display unit."""
     return np.asarray(convert(values[np.isfinite(values) & alive], p.unit, p.display_unit))
 

@@ -40,16 +40,12 @@ KILL_TIMEOUT = 0.5  # s for a worker of this machine to end by itself when it is
 class DaskExecutor(FuturesExecutor):
     """Calls as tasks of dask.distributed.
 
-    Parameters
-    ----------
-    workers: processes of the local cluster; with an ``address``, how many calls to keep under way (default: one for
-        each thread of the cluster).
-    address: of a running scheduler, e.g. ``tcp://10.0.0.1:8786``; by default a cluster is started on this machine.
-    limits: of a worker process, which a nanny (dask's default) starts again where they end it.
+    ``workers``: processes of the local cluster; with an ``address``, how many calls to keep under way (default: one for
+    each thread of the cluster). ``address``: of a running scheduler, e.g. ``tcp://10.0.0.1:8786``; by default a cluster
+    is started on this machine. ``limits``: of a worker process, which a nanny (dask's default) starts again where they
+    end it.
 
-    Raises
-    ------
-    ExecutorError: dask is not installed, the scheduler cannot be reached, or it has no worker.
+    Raises ExecutorError: dask is not installed, the scheduler cannot be reached, or it has no worker.
     """
 
     def __init__(self, workers: int | None = None, address: str | None = None, limits: Limits = NO_LIMITS):

@@ -25,7 +25,7 @@ from en4dvar.data.noise import Predicted
 from en4dvar.data.observations import Observations
 from en4dvar.diagnosis.diagnostics import effective_share
 from en4dvar.ensemble.forecast import Forecast
-from en4dvar.model.state import DISCREPANCY, NOISE_SCALE, Array
+from en4dvar.model.state import DISCREPANCY, NOISE_SCALE, Array, Indices
 from en4dvar.priors.prior import Prior
 from en4dvar.sampling.walkers import advance
 
@@ -203,7 +203,7 @@ class ModelRuns:
         alive = outcome.active & np.isfinite(costs)
         return cls(x[alive], outcome.predicted.stacked[alive], costs[alive], outcome.predicted[:0])
 
-    def __getitem__(self, chosen: npt.NDArray[np.intp]) -> "ModelRuns":
+    def __getitem__(self, chosen: Indices) -> "ModelRuns":
         return replace(self, x=self.x[chosen], outputs=self.outputs[chosen], costs=self.costs[chosen])
 
     def joined(self, other: "ModelRuns") -> "ModelRuns":

@@ -113,20 +113,14 @@ def sample(
 ) -> Chain:
     """Sample a density from the neighbourhood of an ensemble.
 
-    Parameters
-    ----------
-    log_density: of positions (B, n) → (B,), −inf where it vanishes; called with half of the walkers at a time.
-    ensemble: (N, n) the Gaussian approximation; walkers start from its members, slightly scattered.
-    seed: of the walkers; the same seed gives the same bits.
-    walkers: at least 2 (n + 1), even. max_steps: at most. target: effective sample size to reach in each direction
-        (default: :data:`ENOUGH`).
-    look: called with what each look at convergence shows.
-    emulated: an approximation at no cost; it guides the walkers, which start from draws of it.
-    proposal: covers all modes; walkers jump to draws of it.
+    ``log_density``: of positions (B, n) → (B,), −inf where it vanishes; called with half of the walkers at a time.
+    ``ensemble``: (N, n) the Gaussian approximation; walkers start from its members, slightly scattered. ``seed``: of
+    the walkers; the same seed gives the same bits. ``walkers``: at least 2 (n + 1), even. ``max_steps``: at most.
+    ``target``: effective sample size to reach in each direction (default: :data:`ENOUGH`). ``look``: called with what
+    each look at convergence shows. ``emulated``: an approximation at no cost; it guides the walkers, which start from
+    draws of it. ``proposal``: covers all modes; walkers jump to draws of it.
 
-    Raises
-    ------
-    En4dvarError: the density vanishes at (nearly) every member.
+    Raises En4dvarError: the density vanishes at (nearly) every member.
     """
     import emcee  # a twentieth of a second that most runs do not need
 

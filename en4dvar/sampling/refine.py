@@ -14,7 +14,6 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from en4dvar.descent.minima import Minimum
 from en4dvar.descent.weight_space import WeightSpace
@@ -22,7 +21,7 @@ from en4dvar.diagnosis import diagnostics as diag
 from en4dvar.diagnosis.analysis import BEYOND_5, ChainRecord, Mode
 from en4dvar.diagnosis.response.ledger import weighted_quantiles
 from en4dvar.ensemble.linalg import resampled, shares_of
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, Indices
 from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.units import convert
 from en4dvar.priors.prior import Prior, member_stream
@@ -333,7 +332,7 @@ def refined(
     )
 
 
-def _own_draws(x: Array, shares: Array, mode: npt.NDArray[np.intp], count: int) -> list[tuple[float, Array]]:
+def _own_draws(x: Array, shares: Array, mode: Indices, count: int) -> list[tuple[float, Array]]:
     """Of each of ``count`` modes its weight, and the quantiles (3, n) of its draws among those (D, n)."""
     own = []
     for number in range(count):

@@ -16,10 +16,9 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from en4dvar.ensemble.linalg import centre
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, Indices
 from en4dvar.priors.prior import whiten_sample
 
 SPANNED = 1e-10  # of the largest singular value: a direction that the ensemble spans
@@ -29,9 +28,7 @@ SPANNED = 1e-10  # of the largest singular value: a direction that the ensemble 
 class ModelError:
     """``rate`` (n,): variance of each variable per unit of time. ``form``: how it enters the ensemble of a filter.
 
-    Raises
-    ------
-    ValueError: a rate that is negative or not finite, or none that is positive.
+    Raises ValueError: a rate that is negative or not finite, or none that is positive.
     """
 
     rate: Array
@@ -42,7 +39,7 @@ class ModelError:
             raise ValueError("a model error needs variances that are not negative, one of them positive")
 
     @cached_property
-    def where(self) -> npt.NDArray[np.intp]:
+    def where(self) -> Indices:
         """(q,) the variables that have one."""
         return np.flatnonzero(self.rate > 0)
 

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, Mask
 from en4dvar.plumbing.errors import DataError
 from en4dvar_movie.drifting import drift_of, shift_at
 from en4dvar_movie.fitting import fit_outline
@@ -104,16 +104,12 @@ class Background:
         return (image - change) / (1 + change if self.relative else np.float32(1))
 
 
-def find_background(
-    movie: Movie, circles: int = 1, watched: npt.NDArray[np.bool_] | None = None
-) -> tuple[Background, Optics]:
+def find_background(movie: Movie, circles: int = 1, watched: Mask | None = None) -> tuple[Background, Optics]:
     """Background and optics of a movie, from its first frames and some along it.
 
     ``watched`` (H, W) is what is looked at.
 
-    Raises
-    ------
-    DataError: no frame can be read or shows a bubble.
+    Raises DataError: no frame can be read or shows a bubble.
     """
     leading, samples, numbers = _look(movie)
     first = leading[0].astype(np.float32)
@@ -169,7 +165,7 @@ def pixel_noise(image: Image, unit: float = 1.0) -> float:
     return max(1.4826 * float(np.median(np.abs(np.diff(image)))) / math.sqrt(2), 0.3 * unit)
 
 
-def _outside(frames: Sequence[Frame]) -> npt.NDArray[np.bool_]:
+def _outside(frames: Sequence[Frame]) -> Mask:
     """The outside of a field of view (H, W), such as a round aperture: dark in two corners of the frames at least, and
     beside it are always light and no wall that moves.
     """
@@ -189,7 +185,7 @@ def _is_white(frame: Frame) -> bool:
     return bool(frame.dtype.kind in "ui" and frame.flat[0] == np.iinfo(frame.dtype).max)
 
 
-def smooth_surface(frames: Sequence[Frame], blind: npt.NDArray[np.bool_], unit: float) -> Array:
+def smooth_surface(frames: Sequence[Frame], blind: Mask, unit: float) -> Array:
     """A quadratic surface (H, W) through the background of frames that all hold a bubble, where it is not ``blind``."""
     typical = np.median(np.array(frames, dtype=np.float32), axis=0)
     y, x = np.mgrid[-1 : 1 : typical.shape[0] * 1j, -1 : 1 : typical.shape[1] * 1j]
@@ -212,13 +208,13 @@ def _lit_as(frame: Image, other: Image) -> Image:
     return frame * (lamp if abs(math.log(lamp)) < LAMP else 1.0)
 
 
-def _changed(frame: Image, other: Image, noise: float, side: int = 5) -> npt.NDArray[np.bool_]:
+def _changed(frame: Image, other: Image, noise: float, side: int = 5) -> Mask:
     """Where two frames differ by more than noise, in means over squares, whatever the lamp does (H, W)."""
     off = ndimage.uniform_filter(frame - _lit_as(other, frame), side)
     return np.asarray(np.abs(off) > max(7 * noise / side, 0.06 * float(np.median(other))))
 
 
-def _writing(leading: Sequence[Frame], noise: float) -> npt.NDArray[np.bool_]:
+def _writing(leading: Sequence[Frame], noise: float) -> Mask:
     """Where something low changes all the time (H, W), brighter here and darker there at once: time stamps."""
     none = np.zeros(leading[0].shape, dtype=bool)
     steps = len(leading) - 1
@@ -250,9 +246,7 @@ def _one_way(frames: Sequence[Image], changes: Sequence[Image], box: tuple[slice
     return float(np.median(mixed or [0.0])) < 0.15
 
 
-def _begins_with_a_bubble(
-    first: Image, samples: Sequence[Frame], noise: float, blind: npt.NDArray[np.bool_], unit: float
-) -> bool:
+def _begins_with_a_bubble(first: Image, samples: Sequence[Frame], noise: float, blind: Mask, unit: float) -> bool:
     """True if the first frame differs from a smooth surface in large patches whose rims other frames show elsewhere."""
     surface = smooth_surface([first], blind, unit)
     usual = float(np.median(np.abs(surface[~blind])))
@@ -270,7 +264,7 @@ def _begins_with_a_bubble(
     return bool(np.mean(moved[edge]) > LIVELY)
 
 
-def _is_round(patch: npt.NDArray[np.bool_]) -> bool:
+def _is_round(patch: Mask) -> bool:
     """True of a disc and what the frame leaves of it, also of one with a bright centre; not of a stripe."""
     circle = circle_through(rim(patch))
     if circle is None:
@@ -280,7 +274,7 @@ def _is_round(patch: npt.NDArray[np.bool_]) -> bool:
     return bool(np.sum(patch & disc) > ROUND * np.sum(patch | disc))
 
 
-def _quiet(leading: Sequence[Frame], first: Image, noise: float, blind: npt.NDArray[np.bool_]) -> int:
+def _quiet(leading: Sequence[Frame], first: Image, noise: float, blind: Mask) -> int:
     """How many leading frames look like the first; most of those after them show the shade in a bubble's middle."""
     for number, frame in enumerate(leading):
         labels, sizes = labelled(_changed(frame.astype(np.float32), first, noise) & ~blind)
@@ -305,7 +299,7 @@ def _without_specks(empty: Sequence[Frame], noise: float) -> Array:
 
 
 def _with_sign(
-    level: Array, samples: Sequence[Frame], noise: float, empty: int, blind: npt.NDArray[np.bool_], unit: float
+    level: Array, samples: Sequence[Frame], noise: float, empty: int, blind: Mask, unit: float
 ) -> Background:
     """Dark on bright, relative to the background; or bright on dark, as it is: by what differs most in most frames."""
     votes = [

@@ -40,14 +40,11 @@ class Camera:
 def film(config: "Config", times: Array | None, out: Path, settings: Mapping[str, str], seed: int) -> str:
     """Also write a movie of the bubble (.tif, .mp4 or .avi) with one frame per instant.
 
-    Parameters
-    ----------
-    times: (K,) instants of the frames, evenly spaced; default those of the configuration.
-    settings: text values of fields of :class:`Camera` and :class:`Scene`.
+    ``times``: (K,) instants of the frames, evenly spaced; default those of the configuration. ``settings``: text values
+    of fields of :class:`Camera` and :class:`Scene`.
 
-    Raises
-    ------
-    ConfigError: a setting is unknown or wrong, or the observable is no length. DataError: the file cannot be written.
+    Raises ConfigError: a setting is unknown or wrong, or the observable is no length. DataError: the file cannot be
+    written.
     """
     from en4dvar.runs.simulation import simulate
 

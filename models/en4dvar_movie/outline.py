@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, Indices
 
 MODES = 6  # of the outline
 TILE = 2  # pixels are averaged over tiles of this side
@@ -119,7 +119,7 @@ def locate(tiles: Array, noise: float) -> list[tuple[Circle, float]]:
     return result
 
 
-def labelled(mask: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], npt.NDArray[np.intp]]:
+def labelled(mask: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], Indices]:
     """The connected patches of a mask, and the size of each by its number; 0 of what belongs to none."""
     labels, _ = ndimage.label(mask)
     sizes = np.bincount(labels.ravel())

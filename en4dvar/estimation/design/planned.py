@@ -15,11 +15,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from en4dvar.data.noise import Linearisation
 from en4dvar.ensemble.forecast import NO_TIMES, Composite, Forecast
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, Indices
 from en4dvar.plumbing.errors import ConfigError, TooFewMembersError
 from en4dvar.priors.prior import standard_normal
 from en4dvar.problem import InverseProblem
@@ -93,7 +92,7 @@ class Planned:
 class Tangents:
     """Linearisations at points ``u`` (R, n); ``alive`` (R,) are their numbers among the points that were asked for."""
 
-    alive: npt.NDArray[np.intp]
+    alive: Indices
     u: Array
     at: tuple[Linearisation, ...]
 

@@ -65,16 +65,12 @@ class Arrow:
     def sample(self, border: Array, own: Callable[[int], Array]) -> tuple[Array, list[Array]]:
         """N draws of the Gaussian of mean zero with this precision: border (N, c), and (N, n_e) of each experiment.
 
-        Parameters
-        ----------
-        border: (N, c) standard normal numbers; own: gives those (N, n_e) of an experiment by its number.
+        ``border``: (N, c) standard normal numbers; own: gives those (N, n_e) of an experiment by its number.
 
         Mean and covariance of the N draws of every pair (border, experiment) are exact. Those of different experiments
         are independent given the border, up to what N draws correlate by chance.
 
-        Raises
-        ------
-        ValueError: N is not larger than c + n_e.
+        Raises ValueError: N is not larger than c + n_e.
         """
         x = whiten_sample(border)
         if x.shape[1]:
