@@ -104,7 +104,6 @@ class Descents:
 
 
 def _members(numbers: Sequence[int]) -> str:
-    """Where descents started."""
     known = [str(i) for i in numbers if i >= 0]
     listed = " and ".join(part for part in (", ".join(known[:-1]), *known[-1:]) if part)
     names = [f"member{'s' * (len(known) > 1)} {listed}"] if known else []

@@ -105,7 +105,6 @@ class LowRank:
     right: Array
 
     def __matmul__(self, columns: Array) -> Array:
-        """Applied to (N, n)."""
         return np.asarray(columns + self.left @ (self.right @ columns))
 
     @property

@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from en4dvar.descent.search import SAME_COST
+from en4dvar.descent.search import SAME_COST, from_draw
 from en4dvar.descent.window import Descent
 from en4dvar.diagnosis import diagnostics as diag
 from en4dvar.diagnosis.analysis import Analysis, Progress
@@ -65,7 +65,6 @@ def assimilate(
 
 
 def _through(stages: Stages) -> Analysis:
-    """All stages, then what is concluded from them."""
     space, prior = stages.space, stages.problem.prior
     prior_run, start = stages.descend()
     outcome, ends = stages.searched(start, prior_run)
@@ -83,7 +82,7 @@ def _through(stages: Stages) -> Analysis:
             lower, excusable = _without_excuse(stages) if excusable else None, False
         if lower is None:
             break
-        after, beside = stages.searched_from(outcome, ends, lower)
+        after, beside = stages.rather(from_draw(space, outcome, lower, stages.tell), outcome, ends)
         if sampled.refined is None and after is outcome:
             break
         looking, outcome, ends = after is not outcome, after, beside
@@ -121,7 +120,6 @@ def _through(stages: Stages) -> Analysis:
 def _concluded(
     stages: Stages, prior_run: Forecast, descent: Descent, sampled: Sampled, control: ControlEnsembles
 ) -> Analysis:
-    """The outcome without its minima and cautions."""
     space, problem, ends = stages.space, stages.problem, sampled.ends
     observations, last = problem.observations, ends.central
     # ln p(y) with constant parameters, NaN where these lose the ensemble; None where nobody asks. It is that of an

@@ -142,7 +142,6 @@ class _Sender:
                 self._timer.start()
 
     def close(self) -> None:
-        """Send what waits."""
         if records := self.rest():
             self._tell(records)
 

@@ -192,7 +192,6 @@ class JointKind(TogetherKind):
 
 
 def _with_carried(estimate: JointEstimate, sets: Sequence[Finished]) -> JointEstimate:
-    """With the warnings of its data sets."""
     without = estimate.without
     if without is not None:
         without = _with_carried(without, [s for s in sets if s.name not in estimate.odd])

@@ -140,7 +140,6 @@ class Bend:
         return cls(np.where(bent, points.mean(axis=0), np.nan))
 
     def __call__(self, x: Array) -> Array:
-        """(B, n) of control vectors (B, n)."""
         bent, of_it = ~np.isnan(self.about), np.array(x)
         of_it[:, bent] = np.logaddexp(0.0, x[:, bent] - self.about[bent])
         return of_it

@@ -79,7 +79,6 @@ class Chain:
         return standing_for(draws, alike, every, self.flat.mean(axis=0), np.cov(self.flat.T))
 
     def warning(self) -> str:
-        """Words for a chain that has not mixed."""
         return (
             f"the Markov chain has not converged after {self.steps} steps (R-hat {np.max(self.r_hat):.3f}, effective "
             f"sample size {np.min(self.effective):.0f}): its ensemble is not yet the posterior"
@@ -140,7 +139,6 @@ def sample(
 
 
 def _moves(emcee: Any, emulated: EmulatedCost | None, proposal: StudentMixture | None) -> list[tuple[Any, float]]:
-    """Moves and their shares."""
     far = []
     if emulated is not None:
         far.append((emcee.moves.MHMove(_guided(emulated)), GUIDED_SHARE))

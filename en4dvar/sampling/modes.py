@@ -61,12 +61,10 @@ class WeightedDraws:
 
     @property
     def mean(self) -> Array:
-        """(n,)"""
         return np.asarray(self.shares @ self.x)
 
     @property
     def covariance(self) -> Array:
-        """(n, n)"""
         apart = self.x - self.mean
         return np.asarray((self.shares[:, None] * apart).T @ apart)
 
@@ -165,7 +163,6 @@ def _guided(
 
 
 def _unsettled(sampler: Importance, enough: float) -> bool:
-    """True if too few draws are effective yet."""
     wanted = enough if len(sampler.z) < MOST_RUNS * enough else min(TOO_FEW, enough)
     return sampler.effective < wanted
 

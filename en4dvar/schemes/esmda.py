@@ -54,12 +54,10 @@ class ESMDA(ETKF):
 
     @property
     def passes(self) -> int:
-        """One an inflation."""
         return len(self.mda_coefficients)
 
     @property
     def inflations(self) -> Array:
-        """α_a, one an assimilation."""
         return mda_inflations(self.mda_coefficients)
 
     def advance(self, weights: Weights, evaluation: Evaluation, iteration: int, draw: Draw) -> Step | GaussNewtonStep:

@@ -114,7 +114,8 @@ def find_background(movie: Movie, circles: int = 1, watched: Mask | None = None)
     leading, samples, numbers = _look(movie)
     first = leading[0].astype(np.float32)
     if not any(float(np.ptp(frame)) > 0 for frame in (*leading, *samples)):
-        words = "black" if not np.any(first) else "white" if _is_white(leading[0]) else "of one brightness"
+        white = leading[0].dtype.kind in "ui" and leading[0].flat[0] == np.iinfo(leading[0].dtype).max
+        words = "black" if not np.any(first) else "white" if white else "of one brightness"
         raise DataError(f"{movie.path}: every frame is {words}; no bubble can be seen")
     drift = drift_of(samples, numbers)
     unseen = np.zeros(first.shape, dtype=bool)  # at the border, of what only some frames show
@@ -179,10 +180,6 @@ def _outside(frames: Sequence[Frame]) -> Mask:
     least = np.min(np.array([ndimage.uniform_filter(f.astype(np.float32), 5) for f in frames]), axis=0)
     steady = np.mean((least > 0.5 * usual)[beside & ~blurred] if (beside & ~blurred).any() else 0)
     return np.asarray(blurred & (steady > 1 - LIVELY))
-
-
-def _is_white(frame: Frame) -> bool:
-    return bool(frame.dtype.kind in "ui" and frame.flat[0] == np.iinfo(frame.dtype).max)
 
 
 def smooth_surface(frames: Sequence[Frame], blind: Mask, unit: float) -> Array:

@@ -365,5 +365,4 @@ def _one_by_one(prior: Prior, members: Array) -> str:
 
 
 def _shown(prior: Prior, j: int, x: float) -> str:
-    """A transformed value as physical, in its display unit."""
     return shown(float(prior.terms[j].to_physical(np.asarray(x))), prior.parameters[j])

@@ -91,7 +91,6 @@ class Arrow:
 
     @cached_property
     def _factors(self) -> list[tuple[Array, bool]]:
-        """Upper Cholesky factors of the blocks."""
         return [cho_factor(block) if len(block) else (block, False) for block in self.blocks]
 
 
@@ -216,11 +215,6 @@ class ArrowSystem:
     forms: tuple[Linearised, ...]
     arrow: Arrow
     slope: tuple[Array, list[Array]]
-
-    @property
-    def own_costs(self) -> Array:
-        """(E,) J_o of each experiment, and J_b of what is its own."""
-        return np.array([form.cost + 0.5 * float(v @ v) for form, v in zip(self.forms, self.place.own, strict=True)])
 
     def chi2(self, joint: JointProblem) -> Array:
         """(E,) misfit per observation of each experiment."""

@@ -149,7 +149,8 @@ class _Estimate:
         without = self._without(lowest.at.cost, singles, said, alone, most) if most else None
         names = without.rest.joint.names if without else joint.names
         kept = [e for e, name in enumerate(joint.names) if name in names]
-        agreed = agreement(joint, said, kept, 2 * np.maximum(lowest.at.own_costs - alone, 0))
+        own = [form.cost + 0.5 * float(v @ v) for form, v in zip(lowest.at.forms, lowest.at.place.own, strict=True)]
+        agreed = agreement(joint, said, kept, 2 * np.maximum(own - alone, 0))
         cautions += doubts(joint, lowest.at.place.border, lowest.at.chi2(joint), agreed, kept, singles)
         normalisation = sum(problem.observations.log_normalisation() for problem in joint.experiments)
         return JointEstimate(
@@ -189,7 +190,6 @@ class _Estimate:
         return rest if is_odd(said, e, 2 * (cost - rest.costs[-1] - alone[e])) else None
 
     def _singles(self) -> list[Single]:
-        """Each experiment by itself."""
         settings = replace(self.settings, refine="none", emulator="off", what_if=False)
         singles = []
         for problem in self.joint.experiments:
@@ -229,7 +229,6 @@ class _Estimate:
         return descents
 
     def _descended(self, start: Place) -> list[JointDescent]:
-        """One descent; none where the start cannot be run."""
         descent = JointDescent(start)
         minimise(self.objective, [descent])
         return [descent] if descent.system else []
@@ -257,7 +256,6 @@ class _Estimate:
 
 
 def _agreeing(descents: Sequence[JointDescent]) -> int:
-    """How many descents ended in the lowest minimum."""
     lowest = min((descent.at.cost for descent in descents), default=np.inf)
     return sum(descent.at.cost - lowest < TOLD for descent in descents)
 
