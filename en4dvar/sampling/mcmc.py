@@ -125,7 +125,7 @@ def sample(
 
     n, target = ensemble.shape[1], ENOUGH if target is None else target
     walkers = max(walkers, 2 * (n + 1)) + max(walkers, 2 * (n + 1)) % 2
-    state = _start(emcee, log_density, ensemble, seed, walkers, emulated)
+    state = _start(log_density, ensemble, seed, walkers, emulated)
     sampler = emcee.EnsembleSampler(walkers, n, log_density, vectorize=True, moves=_moves(emcee, emulated, proposal))
     sampler.log_prob_fn = log_density  # bare: emcee's wrapper prints every position where Ctrl-C comes
     while True:
@@ -169,14 +169,11 @@ def _judged(sampler: Any, target: float, ensemble: Array) -> Chain:
 
 
 def _start(
-    emcee: Any,
-    log_density: Callable[[Array], Array],
-    ensemble: Array,
-    seed: int,
-    walkers: int,
-    emulated: EmulatedCost | None,
+    log_density: Callable[[Array], Array], ensemble: Array, seed: int, walkers: int, emulated: EmulatedCost | None
 ) -> Any:
     """The walkers' first positions and the state of the random numbers. Raises :class:`En4dvarError`."""
+    import emcee
+
     n_members, n = ensemble.shape
     random = np.random.Generator(np.random.Philox(key=seed))
     if emulated is None:

@@ -24,6 +24,7 @@ import numpy as np
 from scipy.special import ndtri, stdtrit
 
 from en4dvar.descent.minima import Minimum
+from en4dvar.diagnosis.response.ledger import weighted_quantiles
 from en4dvar.ensemble.forecast import Composite, costs
 from en4dvar.ensemble.linalg import effective_number, resampled, shares_of
 from en4dvar.ensemble.missing import Beside
@@ -313,14 +314,10 @@ def median_of(middle: Array, std: Array, stream: np.random.Generator) -> tuple[f
     """The weighted median of data sets (S,), and its standard deviation."""
     weights = np.maximum(1 - std**2, SILENT)
     chosen = stream.integers(len(middle), size=(RESAMPLED, len(middle)))
-    medians = _weighted_medians(middle[chosen], weights[chosen])
+    medians = np.array([_weighted_median(middle[rows], weights[rows]) for rows in chosen])
     spread = max(float(medians.std()), float(np.linalg.norm(weights * std) / weights.sum()))
-    return float(_weighted_medians(middle[None], weights[None])[0]), spread
+    return _weighted_median(middle, weights), spread
 
 
-def _weighted_medians(x: Array, weights: Array) -> Array:
-    """(B,) of rows (B, S): half of the weight lies below, interpolated between the middles of steps."""
-    order = np.argsort(x, axis=1, kind="stable")
-    x, weights = np.take_along_axis(x, order, axis=1), np.take_along_axis(weights, order, axis=1)
-    below = (np.cumsum(weights, axis=1) - 0.5 * weights) / weights.sum(axis=1, keepdims=True)
-    return np.array([np.interp(0.5, shares, values) for shares, values in zip(below, x, strict=True)])
+def _weighted_median(x: Array, weights: Array) -> float:
+    return float(weighted_quantiles(x, weights / weights.sum())[1])
