@@ -68,7 +68,10 @@ def examine_shape(
             if settle and doubtful(off):  # by walkers that have not settled, as often as not
                 emulator = emulator.settled(member_stream(seed, "emulator, settled"))
                 off = _off(emulator, ensemble)
-            shape |= {**off, "emulator_fit": emulator.share, **_displayed(space.problem.prior, emulator.draws)}
+            shape |= {**off, "emulator_fit": emulator.share}
+            theta, names = space.problem.prior.to_physical(emulator.draws), space.problem.prior.names
+            for what, values in (("mean", theta.mean(axis=0)), ("std", theta.std(axis=0))):  # of G, not of ln G
+                shape |= {f"emulated_{what}_{name}": float(v) for name, v in zip(names, values, strict=True)}
     return {**shape, "non_gaussian": diag.is_non_gaussian(shape)}
 
 
@@ -155,17 +158,6 @@ def _off(emulator: EmulatedCost, ensemble: Array) -> dict[str, float]:
     return {
         "mean_shift": float(np.max(np.abs(ensemble.mean(axis=0) - draws.mean(axis=0)) / std)),
         "spread_ratio": float(ratio[np.argmax(np.abs(np.log(ratio)))]),
-    }
-
-
-def _displayed(prior: Prior, draws: Array) -> dict[str, float]:
-    """Moments of draws (B, n) as they are printed: of G, not of ln G."""
-    theta = prior.to_physical(draws)
-    moments = {"mean": theta.mean(axis=0), "std": theta.std(axis=0)}
-    return {
-        f"emulated_{what}_{name}": float(v)
-        for what in moments
-        for name, v in zip(prior.names, moments[what], strict=True)
     }
 
 

@@ -125,7 +125,8 @@ def find_background(movie: Movie, circles: int = 1, watched: Mask | None = None)
         height, width = first.shape
         (up, left), (down, right) = drift[:, 1:].min(axis=0).astype(int), drift[:, 1:].max(axis=0).astype(int)
         unseen[max(height - down, 0) :] = unseen[:, max(width - right, 0) :] = unseen[:-up] = unseen[:, :-left] = True
-    unit = _grey_level(samples)
+    of_integers = samples[0].dtype.kind in "ui"  # frames of any floats, such as shares of the light, are as if of 8 bit
+    unit = 1.0 if of_integers else max(float(np.nanmax(np.abs(f))) for f in samples) / 255  # a grey level
     noise = pixel_noise(first, unit)
     blind = _writing(leading, noise) | _outside(samples) | unseen
     if watched is not None:
@@ -154,11 +155,6 @@ def _look(movie: Movie) -> tuple[list[Frame], list[Frame], range]:
             if len(samples) == 2 * SAMPLES:
                 samples, every = samples[::2], 2 * every
     return leading, samples, range(0, every * len(samples), every)
-
-
-def _grey_level(frames: Sequence[Frame]) -> float:
-    """The step between grey levels; of frames of any floats, such as shares of the light, as if they had 8 bit."""
-    return 1.0 if frames[0].dtype.kind in "ui" else max(float(np.nanmax(np.abs(f))) for f in frames) / 255
 
 
 def pixel_noise(image: Image, unit: float = 1.0) -> float:
