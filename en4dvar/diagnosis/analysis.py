@@ -246,8 +246,7 @@ class Analysis:
 
     def pieces(self, walk: RandomWalk, members: Array) -> Array:
         """Values (N, m + 1) over the pieces of a parameter that varies, of ``members`` (N, n)."""
-        names = self.problem.prior.names
-        return walk.pieces({name: members[:, j] for j, name in enumerate(names)})
+        return walk.pieces({name: members[:, j] for j, name in enumerate(self.problem.prior.names)})
 
     @property
     def warnings(self) -> tuple[str, ...]:

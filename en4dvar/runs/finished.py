@@ -31,8 +31,7 @@ class Finished:
     """One data set: its problem, physical members (N, n) of its posterior that are alive, its centre (n,), warnings.
 
     ``white``: the members in white coordinates of the prior; ``groups``: what its configuration shares, and with whom;
-    ``drawn``: draws of its posterior, where it was sampled.
-    Data sets of one name in several runs get a number.
+    ``drawn``: draws of its posterior, where it was sampled. Data sets of one name in several runs get a number.
     """
 
     problem: InverseProblem

@@ -233,8 +233,7 @@ def _apart(prior: Prior, modes: Sequence[Mode]) -> Array:
         prior.from_physical(np.array([getattr(m, key) for m in modes])) for key in ("centre", "q05", "q95")
     )
     std = (high - low) / (2 * BEYOND_5)
-    between = np.abs(at[:, None] - at) / np.maximum(std[:, None], std)
-    return np.asarray(between.max(axis=(0, 1)))
+    return np.asarray((np.abs(at[:, None] - at) / np.maximum(std[:, None], std)).max(axis=(0, 1)))
 
 
 def weighs(space: WeightSpace) -> bool:
@@ -258,8 +257,7 @@ def may_sample(problem: InverseProblem, settings: AssimilationSettings) -> bool:
 def in_doubt(minima: Sequence[Minimum], agree: bool, shape: Mapping[str, float]) -> bool:
     """True if the Gaussian about the lowest of the minima that count may not be the posterior.
 
-    ``agree``: whether descents from different members ended there. ``shape`` is that of
-    :func:`examine_shape`.
+    ``agree``: whether descents from different members ended there. ``shape`` is that of :func:`examine_shape`.
     """
     unclear = shape.get("emulator_fit", 1.0) < diag.EMULATED_ENOUGH
     return not agree or len(minima) > 1 or bool(shape.get("non_gaussian")) or doubtful(shape) or unclear

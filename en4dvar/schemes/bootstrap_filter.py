@@ -77,8 +77,7 @@ class Resampled:
 
 def likelihood_shares(evaluation: Evaluation) -> Array:
     """Likelihoods (N,) of the members, of sum 1, relative to the largest, so that one is left however far all are."""
-    misfit = np.sum((evaluation.d[:, None] - evaluation.S) ** 2, axis=0)
-    return shares_of(-0.5 * misfit)
+    return shares_of(-0.5 * np.sum((evaluation.d[:, None] - evaluation.S) ** 2, axis=0))
 
 
 def systematic(shares: Array, start: float) -> Indices:

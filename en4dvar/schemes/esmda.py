@@ -62,8 +62,7 @@ class ESMDA(ETKF):
 
     def advance(self, weights: Weights, evaluation: Evaluation, iteration: int, draw: Draw) -> Step | GaussNewtonStep:
         """Assimilation number ``iteration``; d is that of the mean prediction, S per unit of the current anomalies."""
-        alpha = float(self.inflations[iteration])
-        root = np.sqrt(alpha)
+        root = np.sqrt(float(self.inflations[iteration]))
         d, S = evaluation.d / root, evaluation.S / root
         hessian = Hessian.of(S)
         shift = hessian.solve(d @ S)

@@ -54,8 +54,7 @@ class ModelError:
 
         With P = V S² Vᵀ of the anomalies U S Vᵀ √(N−1), the anomalies become U (I + S⁻¹VᵀQV S⁻¹)^{1/2} S Vᵀ √(N−1).
         """
-        mean = states.mean(axis=0)
-        anomalies = states - mean
+        anomalies = states - states.mean(axis=0)
         scale = np.sqrt(np.sum(anomalies**2, axis=0) / (len(states) - 1))  # units of the variables do not matter
         scale[scale == 0] = 1.0
         u, s, vt = np.linalg.svd(anomalies / scale, full_matrices=False)

@@ -172,8 +172,7 @@ def explained(
 
 def control_variate(d: Array, rows: Array, u: Array, asked: int) -> Array:
     """c (R,), see above, of innovations d (R, K') and sensitivities (R, K', n) at draws (R, n)."""
-    others = rows[:, :, asked:]
-    return 0.5 * (_centred(d, rows, u) - _centred(d, others, u[:, asked:]))
+    return 0.5 * (_centred(d, rows, u) - _centred(d, rows[:, :, asked:], u[:, asked:]))
 
 
 def _centred(d: Array, rows: Array, u: Array) -> Array:

@@ -121,12 +121,10 @@ class Population:
     def without_hyperprior(self, seed: int) -> tuple[Draws, float]:
         """Draws as they are where ν and τ are equally likely everywhere, and how many of them count.
 
-        From the posterior's draws, weighed; fewer than
-        :data:`FEWEST` say that the hyperprior decides.
+        From the posterior's draws, weighed; fewer than :data:`FEWEST` say that the hyperprior decides.
         """
         d, h = self.posterior, self.hyper
-        logs = 0.5 * np.sum((d.nu / h.mean_std) ** 2 + (d.tau / h.spread) ** 2, axis=1)
-        shares = shares_of(logs)
+        shares = shares_of(0.5 * np.sum((d.nu / h.mean_std) ** 2 + (d.tau / h.spread) ** 2, axis=1))
         taken = resampled(shares, len(shares), member_stream(seed, "without hyperprior"))
         kept = Draws(*(getattr(d, field.name)[taken] for field in fields(Draws)))
         return kept, effective_number(shares) / len(shares) * self.size
