@@ -130,7 +130,7 @@ def resolved(
 ) -> tuple[tuple[Entry, ...], tuple[Dependence, ...]]:
     """The entries with the priors that an ensemble makes, and what the priors have to do with each other.
 
-    ``others``: names that are estimated besides the entries; ``apart``: why a parameter can be correlated with no other.
+    ``others``: names that are estimated besides the entries; ``apart``: why a parameter is correlated with no other.
     Raises :class:`ConfigError`: every fault, located in the file.
     """
     faults: list[Fault] = []

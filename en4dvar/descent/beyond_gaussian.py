@@ -14,18 +14,16 @@ nested Laplace approximations: Rue, Martino & Chopin 2009, J. R. Stat. Soc. B 71
 from collections.abc import Callable
 
 import numpy as np
-import numpy.typing as npt
 
 from en4dvar.data.noise import DiscrepancyNoise, Linearisation, Predicted, sides_of
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.ensemble.forecast import of_framework
 from en4dvar.ensemble.linalg import effective_number, resampled, shares_of, with_moments
-from en4dvar.model.state import NOISE_SCALE, Array
+from en4dvar.model.state import NOISE_SCALE, Array, Mask
 from en4dvar.priors.parameter_map import QUANTILE_MAPS
 from en4dvar.priors.prior import PriorTerm, member_stream
 from en4dvar.problem import InverseProblem
 
-Mask = npt.NDArray[np.bool_]
 DRAWS, FREEDOM = 1500, 5.0  # of Student's t
 WIDER = 1.3  # than the Gaussian at the mode
 AT_ONCE = 50

@@ -18,8 +18,6 @@ Sources: Courtier (1997), Q. J. R. Meteorol. Soc. 123, 2449 (dual form); Emerick
 Geosciences 55, 3 (ES-MDA).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -69,7 +67,7 @@ class Passes(Objective["Passes"], Descends):
         self.alive = np.arange(len(ensemble))
         self.iteration = 0
 
-    def linearise(self, going: Sequence[Passes]) -> list[Update]:
+    def linearise(self, going: "Sequence[Passes]") -> list[Update]:
         a, alpha, first = self.iteration, self.inflations[self.iteration], self.first
         predictions = self._predicted() if a or first is None else first
         finite = np.isfinite(predictions).all(axis=1)
@@ -80,7 +78,7 @@ class Passes(Objective["Passes"], Descends):
         anomalies, innovations = predictions - predictions.mean(axis=0), self.data.values + errors - predictions
         return [self.gain.update(anomalies, alpha * self.data.std**2, innovations)]
 
-    def move(self, going: Sequence[Passes], moves: Sequence[Move | None]) -> None:
+    def move(self, going: "Sequence[Passes]", moves: Sequence[Move | None]) -> None:
         for part in parts(self.ensemble.shape[1], self.data.width(len(self.ensemble))):
             here = self.ensemble[self.alive, part]
             self.ensemble[self.alive, part] = here + self.step(part, here - here.mean(axis=0))

@@ -2,17 +2,14 @@
 localised gain of a problem, by where its readings and unknowns are.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from en4dvar.model.forward import field_of
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, Indices
 from en4dvar.plumbing.errors import ConfigError, En4dvarError
 from en4dvar.priors.field_prior import places_of
 from en4dvar.priors.prior import member_stream
@@ -21,7 +18,7 @@ from en4dvar.schemes import LOCALISED, MINIMISERS
 from en4dvar.schemes.local_gain import ByCorrelation, ByDistance, Gain, parts
 from en4dvar.schemes.settings import AssimilationSettings, Localisation
 
-Members = npt.NDArray[np.intp]
+Members = Indices
 Forward = Callable[[Array], Array]  # members (M, n) → predictions (M, K)
 
 

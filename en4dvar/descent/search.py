@@ -21,7 +21,7 @@ from en4dvar.descent.start import Rounds, choose_start, descent_at, descent_from
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.descent.window import DataWindow, Descent
 from en4dvar.diagnosis.analysis import Record, StartRecord
-from en4dvar.diagnosis.withheld import unforeseen
+from en4dvar.diagnosis.withheld import Withheld, unforeseen
 from en4dvar.ensemble.forecast import Forecast
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import TooFewMembersError
@@ -82,9 +82,10 @@ class Search:
             return outcome
         return self.round(outcome, [n_members + 1 + i for i in range(self.space.side_by_side)])
 
-    def foretold(self, outcome: Outcome, missed: Callable[[], bool]) -> Outcome:
-        """After a descent from :attr:`led`, where readings after the window ``missed`` what is expected of them."""
-        return outcome if self.last in outcome.tried or not missed() else self._from(outcome, self.last)
+    def foretold(self, outcome: Outcome, expected: Callable[[], Withheld | None]) -> Outcome:
+        """After a descent from :attr:`led`, where readings after the window miss what is ``expected`` of them."""
+        doubtful = self.last not in outcome.tried and (withheld := expected()) is not None and withheld.missed
+        return self._from(outcome, self.last) if doubtful else outcome
 
     def unchanging(self, outcome: Outcome) -> Outcome:
         """After a descent from :attr:`steady`, where something changes along the path."""

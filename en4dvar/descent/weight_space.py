@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cached_property
 
 import numpy as np
 
@@ -61,7 +60,7 @@ class WeightSpace:
         n_members = len(self.members)
         if i == n_members:
             return np.zeros(n_members)
-        return np.asarray(self._projection[i] if n_members <= FEW else self.basis @ self.basis[i])
+        return np.asarray(self.basis @ self.basis[i])
 
     def member_costs(self, run: Forecast) -> Array:
         """J (N + 1,) of the members and their mean, whose ``run`` is there."""
@@ -79,11 +78,6 @@ class WeightSpace:
         best = np.argsort(costs, kind="stable").tolist()
         count = self.side_by_side if self.minimiser.economical(self.basis) else 1
         return [i for i in best[:count] if np.isfinite(costs[i])] or best[:1]
-
-    @cached_property
-    def _projection(self) -> Array:
-        """U Uᵀ (N, N)."""
-        return np.asarray(self.basis @ self.basis.T)
 
     def control(self, w: Array) -> Array:
         """Control vectors (…, n) of weights (…, N)."""

@@ -241,7 +241,6 @@ class DataWindow(Objective[Descent]):
         return self.space.minimiser.regresses and near
 
     def _settle(self, descent: Descent) -> None:
-        """A share of the step, whatever J of the central run says."""
         step = descent.newton
         descent.settling = settling = (descent.settling or Settling()).after(step.norm)
         self.record(descent, step.hessian.economical_transform, settling.share)
@@ -339,7 +338,6 @@ class DataWindow(Objective[Descent]):
         return Point(descent.weights.w, at.cost, descent.newton, tangent, self.space.derivatives is not None)
 
     def _require_step(self, descent: Descent) -> None:
-        """Raise where the members lost do not allow a step."""
         at = descent.iterate
         if descent.step is not None or (descent.stop and self._informing(at) >= self.space.needed_members):
             return

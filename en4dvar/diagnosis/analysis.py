@@ -104,7 +104,6 @@ class Descents:
 
 
 def _members(numbers: Sequence[int]) -> str:
-    """Where descents started."""
     known = [str(i) for i in numbers if i >= 0]
     listed = " and ".join(part for part in (", ".join(known[:-1]), *known[-1:]) if part)
     names = [f"member{'s' * (len(known) > 1)} {listed}"] if known else []
@@ -247,8 +246,7 @@ class Analysis:
 
     def pieces(self, walk: RandomWalk, members: Array) -> Array:
         """Values (N, m + 1) over the pieces of a parameter that varies, of ``members`` (N, n)."""
-        names = self.problem.prior.names
-        return walk.pieces({name: members[:, j] for j, name in enumerate(names)})
+        return walk.pieces({name: members[:, j] for j, name in enumerate(self.problem.prior.names)})
 
     @property
     def warnings(self) -> tuple[str, ...]:

@@ -7,10 +7,9 @@ from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from en4dvar.data.observations import Observations
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, Mask
 
 TAIL = 0.0005  # each tail of the central 99.9 % interval
 MEAN_OFF, SPREAD_OFF = 0.5, 0.3  # in posterior standard deviations, as a fraction: beyond, a posterior is non-Gaussian
@@ -128,7 +127,7 @@ def is_non_gaussian(shape: Mapping[str, float]) -> bool:
     return shape.get("gaussian_fit", 1.0) < GAUSSIAN_ENOUGH or any(key.startswith("tail_mean") for key in shape)
 
 
-def active_members(failures: Sequence[str]) -> npt.NDArray[np.bool_]:
+def active_members(failures: Sequence[str]) -> Mask:
     """(N,) True where no reason of failure is given."""
     return np.array([reason == "" for reason in failures], dtype=bool)
 

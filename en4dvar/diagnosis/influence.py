@@ -20,9 +20,8 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-import numpy.typing as npt
 
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, Indices
 from en4dvar.priors.prior import Prior
 
 AT_ONCE = 24_000  # draws times readings
@@ -77,7 +76,7 @@ class Influence:
     change: Array
     in_std: Array
     pareto_shape: Array
-    how: npt.NDArray[np.intp]
+    how: Indices
 
     @classmethod
     def by_weights(cls, theta: Array, log_ratios: Array) -> Self:

@@ -15,9 +15,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, Indices, Mask
 
 FEWEST = 8  # readings below which nothing is said
 MOST = 500  # of them are looked at, evenly chosen blocks would tell no more
@@ -38,8 +37,8 @@ class Residuals:
     white: Array
     absorbed: Array
     speed: Array
-    which: npt.NDArray[np.intp]
-    series: npt.NDArray[np.intp]
+    which: Indices
+    series: Indices
 
     @classmethod
     def of(
@@ -48,8 +47,8 @@ class Residuals:
         sensitivity: Array,
         prior_precision: float,
         speed: Array,
-        which: npt.NDArray[np.intp],
-        series: npt.NDArray[np.intp] | None = None,
+        which: Indices,
+        series: Indices | None = None,
     ) -> "Residuals":
         """From whitened sensitivities S (K, r), all rows of which take part in A, and N − 1.
 
@@ -84,7 +83,7 @@ class Residuals:
         return FEWEST <= len(self.white) <= MOST and ROUNDING < size < math.inf
 
     @cached_property
-    def follows(self) -> npt.NDArray[np.bool_]:
+    def follows(self) -> Mask:
         """(K − 1,) whether a reading follows the one before it in the same series."""
         return np.asarray(self.series[1:] == self.series[:-1])
 

@@ -7,10 +7,9 @@ residuals in the window say of the discrepancy there and of the errors
     F(y) = (1/N) Σ_i Φ((y − m_i − δ_i)/s_i),
 
 whose 5 and 95 % quantiles are a band that a reading lies in with a chance of 90 %, if model, errors and posterior are
-right. Quantities that the model calls :attr:`~en4dvar.model.forward.ForwardModel.unforeseen` change at the last
-maximum of the window, each by normal scores in a fixed order of its own. Nothing was fitted to these readings: how many
-of them lie in their bands is the one test of a real experiment that no choice of priors or errors has passed
-beforehand.
+right. Quantities that the model calls :attr:`~en4dvar.model.forward.ForwardModel.unforeseen` change at the last maximum
+of the window, each by normal scores in a fixed order of its own. Nothing was fitted to these readings: how many of them
+lie in their bands is the one test of a real experiment that no choice of priors or errors has passed beforehand.
 """
 
 from dataclasses import dataclass, replace

@@ -5,12 +5,20 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from en4dvar.data.noise import Predicted, sides_of
-from en4dvar.ensemble.members import NOT_FINITE, Indices, InitialStates, Reading, Readout, batched, operators_of
+from en4dvar.ensemble.members import NOT_FINITE, InitialStates, Reading, Readout, Rows, batched, operators_of
 from en4dvar.executor import Executor, SerialExecutor
-from en4dvar.model.state import NOISE_SCALE, OF_READINGS, READING_OFFSET, READING_SCALE, TIME_SHIFT, Array, Parameter
+from en4dvar.model.state import (
+    NOISE_SCALE,
+    OF_READINGS,
+    READING_OFFSET,
+    READING_SCALE,
+    TIME_SHIFT,
+    Array,
+    Indices,
+    Parameter,
+)
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.problem import InverseProblem
 
@@ -42,8 +50,8 @@ class SpreadRates:
 
     time_std: Array
     instants: Array
-    at: npt.NDArray[np.intp]
-    nodes: npt.NDArray[np.intp]
+    at: Indices
+    nodes: Indices
 
     def rates(self, values: Array, rates: Array) -> Array:
         """(B, K) from ``values`` (5, B, K) of paths at the nodes; those that are given where T is zero."""
@@ -183,11 +191,11 @@ class Composite:
         extremes, beyond = limits[..., 0], limits[..., 1] - shift[:, None]
         return Forecast(predicted, observed[0][:, at_extra], tuple(failures), extremes, beyond)
 
-    def _rates(self, observed: Array, at: Indices, nodes: Indices) -> Array:
+    def _rates(self, observed: Array, at: Rows, nodes: Rows) -> Array:
         rates: Array = observed[1][:, at]
         return rates if self._spread is None else self._spread.rates(np.moveaxis(observed[0][:, nodes], 1, 0), rates)
 
-    def _reading(self, extra_times: Array) -> tuple[Array, Reading, int, Indices, Indices, Indices]:
+    def _reading(self, extra_times: Array) -> tuple[Array, Reading, int, Rows, Rows, Rows]:
         """The instants; what is read there and how many numbers that are; which of them are observations, and curves,
         and the nodes of rates.
 
@@ -197,8 +205,8 @@ class Composite:
         limits = tuple(self.problem.model.validity) if len(extra_times) else ()
         spread = self._spread
         instants, rows = observations.instants if spread is None else (spread.instants, spread.at)
-        nodes: Indices = slice(0, 0) if spread is None else spread.nodes
-        at_extra: Indices = slice(0, 0)
+        nodes: Rows = slice(0, 0) if spread is None else spread.nodes
+        at_extra: Rows = slice(0, 0)
         times = instants
         if len(extra_times):
             times, at_instants, at_extra = _union(instants, extra_times)
@@ -315,7 +323,7 @@ def of_framework(problem: InverseProblem, physical: Array, parameter: Parameter,
     return np.full(len(physical), problem.fixed.get(parameter.name, default))
 
 
-def _union(times: Array, extra: Array) -> tuple[Array, npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+def _union(times: Array, extra: Array) -> tuple[Array, Indices, Indices]:
     """Increasing union of the times and where the observations and the extra times stand in it."""
     nearest = times[np.searchsorted(0.5 * (times[1:] + times[:-1]), extra)]
     extra = np.where(np.abs(extra - nearest) <= SAME_INSTANT * (times[-1] - times[0]), nearest, extra)

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
-import numpy.typing as npt
 from numpy.polynomial import Chebyshev, Polynomial
 
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, Indices
 
 GRAM_LIMIT = 100.0
 LARGEST = 1.0  # bound (Σ λ⁴)^{1/4} of the eigenvalues of a Hessian near its prior, relative to it
@@ -81,7 +80,7 @@ def with_moments(members: Array, mean: Array, covariance: Array) -> Array:
     return np.asarray(mean + np.linalg.solve(own, anomalies.T).T @ target.T)
 
 
-def resampled(shares: Array, count: int, stream: np.random.Generator) -> npt.NDArray[np.intp]:
+def resampled(shares: Array, count: int, stream: np.random.Generator) -> Indices:
     """(count,) indices, each as often as its share says (systematic resampling); shares add up to one."""
     quantiles = (np.arange(count) + stream.uniform()) / count
     return np.searchsorted(np.cumsum(shares), quantiles, side="right").clip(max=len(shares) - 1)
@@ -106,7 +105,6 @@ class LowRank:
     right: Array
 
     def __matmul__(self, columns: Array) -> Array:
-        """Applied to (N, n)."""
         return np.asarray(columns + self.left @ (self.right @ columns))
 
     @property

@@ -10,18 +10,17 @@ from operator import methodcaller
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from en4dvar.data.series import Part
 from en4dvar.executor import Outcome
 from en4dvar.model.forward import Batch, Failure, RateOperator, ValidityLimit, initial_states
-from en4dvar.model.state import Array, Field
+from en4dvar.model.state import Array, Field, Indices
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.user_code import own_fault, reason_of
 from en4dvar.priors.prior import Prior
 from en4dvar.problem import InverseProblem, Tie
 
-Indices = npt.NDArray[np.intp] | slice
+Rows = Indices | slice
 EVERYONE = slice(None)
 
 
@@ -49,7 +48,7 @@ class InitialStates:
         self.fixed = tuple((name, float(problem.fixed[name])) for name in own if name in problem.fixed)
         self.perturbed = tuple((p, columns.get(p.parameter.name)) for p in problem.perturbations)
 
-    def __call__(self, physical: Array, cells: Array | None = None) -> tuple[Indices, Array, list[str]]:
+    def __call__(self, physical: Array, cells: Array | None = None) -> tuple[Rows, Array, list[str]]:
         """Which members (B', of B) have an initial state, the states (B', n_state), and why the others have none (B,).
 
         ``physical`` (B, n) is the control vector, ``cells`` (B, m) what it says of whole fields. Members with a
@@ -128,7 +127,7 @@ class MisshapenError(ValueError):
     """An observation operator gave another number of values than there are instants."""
 
 
-def _without(failures: list[str]) -> Indices:
+def _without(failures: list[str]) -> Rows:
     return np.flatnonzero([not reason for reason in failures]) if any(failures) else EVERYONE
 
 
@@ -200,8 +199,8 @@ class Readout:
     operators: tuple[Callable[[Any], Array], ...]
     parts: tuple[Part, ...]
     n_times: int
-    rows: Indices
-    along: Indices
+    rows: Rows
+    along: Rows
 
     def __call__(self, path: Any) -> Array:
         predictions = []

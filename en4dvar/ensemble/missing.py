@@ -65,7 +65,6 @@ class Beside:
         self.composite, self.prior, self.epsilon, self.forward_runs = composite, prior, epsilon, 0
 
     def __call__(self, x: Array, extra_times: Array = NO_TIMES) -> Forecast:
-        """Of (B, n)."""
         run = self.composite(x, extra_times)
         self.forward_runs += len(x)
         rows, n = np.flatnonzero(run.partial), x.shape[1]

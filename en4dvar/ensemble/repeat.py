@@ -29,15 +29,11 @@ def check_repeats(
 ) -> None:
     """Run the last and the first of the members that are alive again, in this order, and compare.
 
-    Parameters
-    ----------
-    first: (N, ...) what the members gave, ``failures`` (N,) reasons, "" for those alive.
-    run_again: members → the same of these.
+    ``first``: (N, ...) what the members gave, ``failures`` (N,) reasons, "" for those alive. ``run_again``: members →
+    the same of these.
 
-    Raises
-    ------
-    ConfigError: they differ: at all where the model runs members one by one, by more than rounding where it runs
-        batches. Of these it says whether one alone gives the same twice: then the model mixes members.
+    Raises ConfigError: they differ: at all where the model runs members one by one, by more than rounding where it runs
+    batches. Of these it says whether one alone gives the same twice: then the model mixes members.
     """
     alive = [i for i, reason in enumerate(failures) if not reason]
     again = list(dict.fromkeys((alive[-1], alive[0]))) if alive else []

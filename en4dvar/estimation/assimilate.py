@@ -8,13 +8,13 @@ from functools import partial
 
 import numpy as np
 
-from en4dvar.descent.search import SAME_COST
+from en4dvar.descent.search import SAME_COST, from_draw
 from en4dvar.descent.window import Descent
 from en4dvar.diagnosis import diagnostics as diag
-from en4dvar.diagnosis.analysis import Analysis, Progress
+from en4dvar.diagnosis.analysis import Analysis, Discrepancy, Progress
 from en4dvar.diagnosis.honesty import ControlEnsembles, examine
 from en4dvar.diagnosis.response.ledger import ledger
-from en4dvar.diagnosis.response.what_if import Fit, Shift, what_if, with_shifts
+from en4dvar.diagnosis.response.what_if import Fit, LinearResponse, Shift, what_if, with_shifts
 from en4dvar.ensemble.forecast import Forecast, cost, forecast, log_posterior
 from en4dvar.estimation import conclusions
 from en4dvar.estimation.localised import Localised
@@ -65,7 +65,6 @@ def assimilate(
 
 
 def _through(stages: Stages) -> Analysis:
-    """All stages, then what is concluded from them."""
     space, prior = stages.space, stages.problem.prior
     prior_run, start = stages.descend()
     outcome, ends = stages.searched(start, prior_run)
@@ -83,7 +82,7 @@ def _through(stages: Stages) -> Analysis:
             lower, excusable = _without_excuse(stages) if excusable else None, False
         if lower is None:
             break
-        after, beside = stages.searched_from(outcome, ends, lower)
+        after, beside = stages.rather(from_draw(space, outcome, lower, stages.tell), outcome, ends)
         if sampled.refined is None and after is outcome:
             break
         looking, outcome, ends = after is not outcome, after, beside
@@ -121,7 +120,6 @@ def _through(stages: Stages) -> Analysis:
 def _concluded(
     stages: Stages, prior_run: Forecast, descent: Descent, sampled: Sampled, control: ControlEnsembles
 ) -> Analysis:
-    """The outcome without its minima and cautions."""
     space, problem, ends = stages.space, stages.problem, sampled.ends
     observations, last = problem.observations, ends.central
     # ln p(y) with constant parameters, NaN where these lose the ensemble; None where nobody asks. It is that of an
@@ -132,7 +130,15 @@ def _concluded(
     if stages.compares and problem.in_question:
         end = _alone(stages, problem.constant, stages.settings)
         log_evidence_constant = end.log_evidence if end else np.nan
-    response = conclusions.response_of(space, descent, ends.mode, last)
+    linear, central = descent.iterate.linear, last.predicted[0]
+    assert linear is not None
+    along, precision = space.basis.T @ space.anomalies, len(space.members) - 1.0
+    response = LinearResponse(ends.mode, replace(linear, prediction=central), along, precision, observations)
+    explained = observations.noise.explained(observations.values, central)
+    log_evidence = sampled.refined.log_evidence - observations.log_normalisation() if sampled.refined else math.nan
+    if not math.isfinite(log_evidence):  # there are no draws, or too few: by Laplace
+        values = descent.newton.hessian.singular_values
+        log_evidence = diag.log_evidence(descent.iterate.cost, values, len(space.members), observations)
     std = ends.members.std(axis=0, ddof=1)
     shifts: tuple[Shift, ...] = ()
     begun = space.forward_runs  # those of fits are told with the shifts
@@ -150,7 +156,7 @@ def _concluded(
         (space.members, ends.members, ends.mode),
         (prior_run[:-1], ends.run, last),
         fixed_parameters=stages.fixed_parameters,
-        error_std=observations.noise.total_std(last.predicted[0]),
+        error_std=observations.noise.total_std(central),
         trajectory_times=stages.grid,
         iterations=descent.records,
         dfs_per_parameter=diag.dfs_per_parameter(space.prior_variance, ends.members),
@@ -158,12 +164,12 @@ def _concluded(
         stop_reason=descent.stop,
         forward_runs=space.forward_runs,
         shape=sampled.shape,
-        down_weights=observations.noise.down_weights(observations.values, last.predicted[0]),
+        down_weights=observations.noise.down_weights(observations.values, central),
         refinement=sampled.refined.summary if sampled.refined else {},
-        log_evidence=conclusions.log_evidence_of(space, descent, sampled.refined),
+        log_evidence=log_evidence,
         log_evidence_constant=log_evidence_constant,
-        residuals=conclusions.residuals_of(space, descent),
-        discrepancy=conclusions.discrepancy_of(space, descent, last.predicted[0]),
+        residuals=conclusions.residuals_of(space, linear),
+        discrepancy=explained and Discrepancy(*explained, conclusions.shares_of_variance(space, linear)),
         influence=conclusions.influence_of(problem, ends.run, ends.members, response, sampled.refined is None),
         what_if=shifts,
         withheld=withheld,

@@ -1,7 +1,6 @@
 """Conclusions from a descent and the posterior about it: minima, evidence, residuals, influence, discrepancy."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,9 +9,8 @@ from en4dvar.data.noise import DiscrepancyNoise, Linearisation, Predicted
 from en4dvar.descent.minima import Minimum
 from en4dvar.descent.search import Outcome
 from en4dvar.descent.weight_space import WeightSpace
-from en4dvar.descent.window import Descent
 from en4dvar.diagnosis import diagnostics as diag
-from en4dvar.diagnosis.analysis import BEYOND_5, Analysis, Descents, Discrepancy, FieldEstimate, Mode
+from en4dvar.diagnosis.analysis import BEYOND_5, Analysis, Descents, FieldEstimate, Mode
 from en4dvar.diagnosis.influence import Influence
 from en4dvar.diagnosis.residuals import Residuals
 from en4dvar.diagnosis.response.what_if import LinearResponse
@@ -118,28 +116,9 @@ def modes_of(prior: Prior, minima: Sequence[Minimum], sampled: Refined | None) -
     )
 
 
-def log_evidence_of(space: WeightSpace, descent: Descent, sampled: Refined | None) -> float:
-    """ln p(y), by the draws where the posterior was sampled and they are enough, else by Laplace."""
-    values, observations = descent.newton.hessian.singular_values, space.problem.observations
-    if sampled and np.isfinite(sampled.log_evidence):
-        return sampled.log_evidence - observations.log_normalisation()
-    return diag.log_evidence(descent.iterate.cost, values, len(space.members), observations)
-
-
-def response_of(space: WeightSpace, descent: Descent, mode: Array, central: Forecast) -> LinearResponse:
-    """How the mode (n,), whose run is ``central``, follows what it was inferred from."""
-    linear = descent.iterate.linear
-    assert linear is not None
-    linear = replace(linear, prediction=central.predicted[0])
-    directions = space.basis.T @ space.anomalies
-    return LinearResponse(mode, linear, directions, len(space.members) - 1.0, space.problem.observations)
-
-
-def residuals_of(space: WeightSpace, descent: Descent) -> Residuals | None:
-    """Residuals of the linearisation at the end; None where there is none."""
-    observations, linear = space.problem.observations, descent.iterate.linear
-    if linear is None:
-        return None
+def residuals_of(space: WeightSpace, linear: Linearisation) -> Residuals:
+    """Residuals of the linearisation at the end."""
+    observations = space.problem.observations
     speed = np.abs(_rates(space.problem, linear.prediction))
     white, sensitivity = observations.whiten(linear)
     if observations.parts:
@@ -183,13 +162,6 @@ def influence_of(
         return Influence.by_tangent(prior, members[alive], response.tangent(members[alive]))
     ratios = -observations.weights * conditional[alive]
     return Influence.by_weights(prior.to_physical(members[alive]), ratios)
-
-
-def discrepancy_of(space: WeightSpace, descent: Descent, central: Predicted) -> Discrepancy | None:
-    """Discrepancy of the model, where the observations allow for one."""
-    observations, linear = space.problem.observations, descent.iterate.linear
-    explained = observations.noise.explained(observations.values, central)
-    return None if explained is None or linear is None else Discrepancy(*explained, shares_of_variance(space, linear))
 
 
 def future_missed(withheld: Withheld | None) -> tuple[Caution, ...]:

@@ -187,7 +187,6 @@ class Localised:
         self.records[-1] = replace(self.records[-1], spread=spread, active=int(alive.sum()))
 
     def _variance(self, which: Array | slice = slice(None)) -> Array:
-        """(n + m,) of some members."""
         columns = range(self.ensemble.shape[1])
         step = max(1, PATHS // (8 * len(self.ensemble)))
         return np.concatenate([self.ensemble[which, i : i + step].var(axis=0) for i in columns[::step]])

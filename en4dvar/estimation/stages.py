@@ -10,7 +10,7 @@ import numpy as np
 from en4dvar.descent.beyond_gaussian import bounded_members, marginal_members, mean_beyond_mode
 from en4dvar.descent.loop import minimise
 from en4dvar.descent.minima import Minimum, merged
-from en4dvar.descent.search import Outcome, Search, from_draw
+from en4dvar.descent.search import Outcome, Search
 from en4dvar.descent.start import Start, choose_start
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.descent.window import DataWindow, Descent
@@ -132,7 +132,7 @@ class Stages:
             if rest and (len(outcome.minima) > 1 or not fit >= CLEARED):
                 outcome, ends = self.rather(search.round(outcome, rest), outcome, ends)
             outcome, ends = self.rather(search.widened(outcome), outcome, ends)
-        return self.rather(search.foretold(outcome, lambda: self.missed(ends.members)), outcome, ends)
+        return self.rather(search.foretold(outcome, lambda: self.expected(ends.members)), outcome, ends)
 
     def expected(self, members: Array) -> Withheld | None:
         """What members (N, n) expect of the readings after the window, which is run once for each ensemble."""
@@ -142,19 +142,9 @@ class Stages:
             self._foreseen = members, withheld
         return self._foreseen[1]
 
-    def missed(self, members: Array) -> bool:
-        """Whether the readings after the window put the estimate in doubt."""
-        withheld = self.expected(members)
-        return withheld is not None and withheld.missed
-
     def rather(self, after: Outcome, outcome: Outcome, ends: Ends) -> tuple[Outcome, Ends]:
         """What was found ``after`` a round, and the ensemble about it: that of before where it is no lower descent."""
         return after, ends if after.descent is outcome.descent else self.gaussian(after.descent)
-
-    def searched_from(self, outcome: Outcome, ends: Ends, x: Array) -> tuple[Outcome, Ends]:
-        """The same, after a descent from a draw x (n,) of the posterior that lies lower than all minima."""
-        after = from_draw(self.space, outcome, x, self.tell)
-        return self.rather(after, outcome, ends)
 
     def gaussian(self, descent: Descent) -> Ends:
         """The ensemble at the end of a descent, and its forecast."""

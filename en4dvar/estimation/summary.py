@@ -1,7 +1,5 @@
 """A posterior in a few numbers, in display units: for the terminal, ``summary.csv`` and the pages."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -9,7 +7,6 @@ from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -18,7 +15,7 @@ from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.diagnosis.diagnostics import HARDLY_INFORMED, active_members, change_words, member_quantiles
 from en4dvar.diagnosis.response.budget import budget_words
 from en4dvar.diagnosis.response.what_if import Shift
-from en4dvar.model.state import Array, Parameter
+from en4dvar.model.state import Array, Mask, Parameter
 from en4dvar.plumbing.caution import Caution, codes, of_several_modes, untrusted
 from en4dvar.plumbing.tables import table
 from en4dvar.plumbing.units import convert
@@ -70,7 +67,7 @@ class ParameterSummary:
     @classmethod
     def of(
         cls, p: Parameter, prior: Array, posterior: Array, centre: float, dfs: float, cautions: Sequence[Caution]
-    ) -> ParameterSummary:
+    ) -> "ParameterSummary":
         """Of members (N',) alive, in the display unit; the centre is SI, ``cautions`` are those of the run."""
         prior_mean, prior_std = _moments(prior)
         mean, std = _moments(posterior)
@@ -95,7 +92,7 @@ def informed_words(name: str, dfs: float, cautions: Sequence[Caution]) -> str:
     return next(words for limit, words in DFS_WORDS if dfs < limit or limit == math.inf)
 
 
-def living(values: Array, alive: npt.NDArray[np.bool_] | bool, p: Parameter) -> Array:
+def living(values: Array, alive: Mask | bool, p: Parameter) -> Array:
     """Finite values (N',) of members alive, in the display unit."""
     return np.asarray(convert(values[np.isfinite(values) & alive], p.unit, p.display_unit))
 
@@ -248,7 +245,7 @@ def csv_cells(row: ParameterSummary) -> list[object]:
     return list((cells | {"untrusted": " ".join(row.untrusted)}).values())
 
 
-def frame(summaries: Mapping[str, Iterable[ParameterSummary]]) -> pd.DataFrame:
+def frame(summaries: Mapping[str, Iterable[ParameterSummary]]) -> "pd.DataFrame":
     """A row a data set and parameter, in display units; NaN where a number is not to be quoted."""
     import pandas as pd  # takes long to import
 

@@ -8,8 +8,6 @@ Workers need the packages of this machine in the same versions; they need none o
 reads while it runs. Dask repeats the calls of a worker that dies; a worker that joins later takes part.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import itertools
@@ -42,16 +40,12 @@ KILL_TIMEOUT = 0.5  # s for a worker of this machine to end by itself when it is
 class DaskExecutor(FuturesExecutor):
     """Calls as tasks of dask.distributed.
 
-    Parameters
-    ----------
-    workers: processes of the local cluster; with an ``address``, how many calls to keep under way (default: one for
-        each thread of the cluster).
-    address: of a running scheduler, e.g. ``tcp://10.0.0.1:8786``; by default a cluster is started on this machine.
-    limits: of a worker process, which a nanny (dask's default) starts again where they end it.
+    ``workers``: processes of the local cluster; with an ``address``, how many calls to keep under way (default: one for
+    each thread of the cluster). ``address``: of a running scheduler, e.g. ``tcp://10.0.0.1:8786``; by default a cluster
+    is started on this machine. ``limits``: of a worker process, which a nanny (dask's default) starts again where they
+    end it.
 
-    Raises
-    ------
-    ExecutorError: dask is not installed, the scheduler cannot be reached, or it has no worker.
+    Raises ExecutorError: dask is not installed, the scheduler cannot be reached, or it has no worker.
     """
 
     def __init__(self, workers: int | None = None, address: str | None = None, limits: Limits = NO_LIMITS):
@@ -93,7 +87,7 @@ class DaskExecutor(FuturesExecutor):
             message = "has no worker; start some with: dask worker" if connected else "cannot be reached"
             raise ExecutorError(f"dask scheduler {address or ''}: {message} ({error})") from None
 
-    def _submit(self, function: Callable[..., T], call: Call, tell: Tell | None) -> Future[Any]:
+    def _submit(self, function: Callable[..., T], call: Call, tell: Tell | None) -> "Future[Any]":
         if self._client is None or self._client.status != "running":
             raise self._lost()
         key = f"en4dvar-{self._client.id}-{next(self._calls)}"
@@ -117,12 +111,12 @@ class DaskExecutor(FuturesExecutor):
             except queue.Empty:
                 self._require_worker()
 
-    def _give_up(self, futures: Collection[Future[Any]]) -> None:
+    def _give_up(self, futures: "Collection[Future[Any]]") -> None:
         for future in futures:
             self._listening.pop(str(future.key), None)
             future.release()
 
-    def _value(self, future: Future[Any]) -> Any:
+    def _value(self, future: "Future[Any]") -> Any:
         """What the call gave or raised. Waits where the value was lost with its worker and is computed again.
 
         Raises :class:`ExecutorError` where the cluster is gone.

@@ -94,7 +94,6 @@ class FuturesExecutor(Executor):
         """The future of ``function(*call)``, or of ``function(*call, tell)``."""
 
     def _next(self, events: Events) -> Any:
-        """Waits for the next event."""
         return events.get()
 
     @abstractmethod

@@ -12,6 +12,8 @@ from en4dvar.plumbing.errors import retold
 from en4dvar.plumbing.units import UnitError, parse_unit
 
 Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.intp]
+Mask = npt.NDArray[np.bool_]
 TransformName = Literal[
     "normal", "lognormal", "logit", "uniform", "half-normal", "beta", "bounded-normal", "bounded-lognormal"
 ]

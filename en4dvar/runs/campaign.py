@@ -1,7 +1,5 @@
 """What a run leaves behind: for each of up to 10⁵ data sets its file or the reason of its failure, read when asked."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -73,11 +71,11 @@ class Campaign:
         """The table of all data sets."""
         return results_table({o.name: o.summary for o in self.outcomes if not o.failure})
 
-    def summary(self) -> pd.DataFrame:
+    def summary(self) -> "pd.DataFrame":
         """A row a data set and parameter, in display units; NaN where a number is not to be quoted."""
         return frame({o.name: o.summary for o in self.outcomes if not o.failure})
 
-    def plot(self) -> Figure:
+    def plot(self) -> "Figure":
         """The estimates of all data sets side by side."""
         from en4dvar.report.overview import SetSummary, estimates
         from en4dvar.report.paper import on_paper
@@ -87,13 +85,13 @@ class Campaign:
     def __len__(self) -> int:
         return len(self.outcomes) - len(self.failures)
 
-    def __iter__(self) -> Iterator[Result]:
+    def __iter__(self) -> "Iterator[Result]":
         """Posteriors, one after the other; none is kept."""
         from en4dvar.report.result import load_result  # what draws pages is slow to import
 
         return (load_result(o.file) for o in self.outcomes if o.file is not None)
 
-    def __getitem__(self, name: str) -> Result:
+    def __getitem__(self, name: str) -> "Result":
         """The posterior of a data set. Raises :class:`KeyError` where it is unknown or has failed."""
         from en4dvar.report.result import load_result
 

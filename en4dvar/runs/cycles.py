@@ -3,8 +3,6 @@
 Each writes a netCDF file, ``summary.csv`` and a page. After a kill it goes on from the latest checkpoint.
 """
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -79,7 +77,7 @@ class Cycles(RunKind[R]):
 
     units = "cycles up to the last checkpoint"
     pages = (REPORT, *FIGURES)
-    summary: ClassVar[staticmethod[[Any], str]]
+    summary: ClassVar["staticmethod[[Any], str]"]
     config: Any
     on_cycle: Callable[[int], None] | None = None
 

@@ -4,8 +4,6 @@ The engine does the rest, the same for every kind: it claims the directory and l
 answers interrupts, puts the result in place and writes the page. :data:`KINDS` lists the kinds.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -122,12 +120,12 @@ class RunKind(Kind, ABC, Generic[R]):
         """What the user has of a run that is stopped, and where."""
         return f"the {self.units} are kept in {self.directory}"
 
-    def opened(self, run: Session) -> frozenset[str]:
+    def opened(self, run: "Session") -> frozenset[str]:
         """Look at what an earlier run left; returns the data sets that failed in it, whose files may differ now."""
         return frozenset()
 
     @abstractmethod
-    def conduct(self, run: Session, executor: Executor) -> R:
+    def conduct(self, run: "Session", executor: Executor) -> R:
         """Compute every unit of work that is not kept, combine them, and write the result files; the page follows.
 
         Raises :class:`OutputError` and what the computation raises.

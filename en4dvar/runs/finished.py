@@ -14,6 +14,7 @@ from en4dvar.executor import choose_executor, one_blas_thread
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, Severity, caution
 from en4dvar.plumbing.errors import ConfigError, OutputError, retold
+from en4dvar.plumbing.hints import listed
 from en4dvar.plumbing.user_code import RefusedError
 from en4dvar.problem import InverseProblem
 from en4dvar.results.run_results import result_files
@@ -30,8 +31,7 @@ class Finished:
     """One data set: its problem, physical members (N, n) of its posterior that are alive, its centre (n,), warnings.
 
     ``white``: the members in white coordinates of the prior; ``groups``: what its configuration shares, and with whom;
-    ``drawn``: draws of its posterior, where it was sampled.
-    Data sets of one name in several runs get a number.
+    ``drawn``: draws of its posterior, where it was sampled. Data sets of one name in several runs get a number.
     """
 
     problem: InverseProblem
@@ -75,15 +75,12 @@ def carried(sets: Sequence[Finished], spoilt: float = 1.0) -> Iterator[Caution]:
     for code in CARRIED:
         of_it = [(s.name, c) for s in sets for c in s.cautions if c.code == code and c.severity == "serious"]
         if of_it:
-            names = [name for name, _ in of_it]
-            others = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
-            told = f"{', '.join(names[:MOST_NAMES])}{others}: {of_it[0][1].words}"
+            told = f"{listed((name for name, _ in of_it), MOST_NAMES)}: {of_it[0][1].words}"
             severity: Severity = "serious" if len(of_it) > spoilt * len(sets) else "caution"
             yield caution(code, f"of single data sets, {told}", severity)
 
 
 def _recorded(run_dir: Path, result: StoredResult, trust: bool, ask: Ask | None) -> Config:
-    """The configuration of a run."""
     attributes = result.attributes
     if "configuration_resolved" not in attributes:
         raise OutputError(f"{run_dir}: its results do not record a configuration; they were written by a program")

@@ -5,8 +5,6 @@ command line a thread therefore waits for signals as well (:func:`heeded`): what
 so that the process may end wherever it stands.
 """
 
-from __future__ import annotations
-
 import _thread
 import os
 import signal
@@ -84,7 +82,7 @@ def heeded(end: Callable[[str], object]) -> Iterator[None]:
     _answered.clear()
     tell_ignored, tell_error = sys.unraisablehook, sys.excepthook
 
-    def once_more(ignored: sys.UnraisableHookArgs) -> None:
+    def once_more(ignored: "sys.UnraisableHookArgs") -> None:
         if issubclass(ignored.exc_type, KeyboardInterrupt):
             threading.Timer(AGAIN, _thread.interrupt_main).start()
         else:

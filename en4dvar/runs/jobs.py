@@ -77,10 +77,8 @@ class Estimate:
 def estimate(job: Job, executor: Executor | None = None, progress: Progress | None = None) -> Estimate:
     """Assimilate one data set; members run on ``executor``, by default in this process.
 
-    Raises
-    ------
-    ConfigError, DataError: the data file cannot be used. TooFewMembersError: the ensemble is lost. OutputError: a
-        checkpoint cannot be written.
+    Raises ConfigError, DataError: the data file cannot be used. TooFewMembersError: the ensemble is lost. OutputError:
+    a checkpoint cannot be written.
     """
     config, attributes = job.common.value
     seed = own_seed(config.seed, job.name)
@@ -144,7 +142,6 @@ class _Sender:
                 self._timer.start()
 
     def close(self) -> None:
-        """Send what waits."""
         if records := self.rest():
             self._tell(records)
 

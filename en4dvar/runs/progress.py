@@ -124,7 +124,8 @@ class LiveProgress:
     def __call__(self, name: str, record: Record) -> None:
         if isinstance(record, StartRecord | IterationRecord):
             self._open[name] = record.rounds if isinstance(record, StartRecord) else record.iteration
-        self._show(_short(name, record))
+        known = name if len(name) <= LONGEST_NAME else f"{name[: LONGEST_NAME - 1]}…"
+        self._show(f"{known} {_words(record, 1)}")
 
     def compiling(self) -> None:
         """The model is being compiled, which later runs are spared."""
@@ -223,8 +224,3 @@ def counted(what: str) -> Iterator[Callable[[int, int], None] | None]:
     with shown(Bar(console=console, transient=True)) as bar:
         task = bar.add_task(what, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total or None)
-
-
-def _short(name: str, record: Record) -> str:
-    known = name if len(name) <= LONGEST_NAME else f"{name[: LONGEST_NAME - 1]}…"
-    return f"{known} {_words(record, 1)}"

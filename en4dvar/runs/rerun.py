@@ -119,7 +119,6 @@ def _of_cycles(file: Path, workers: int | None, trust: bool, ask: Ask | None) ->
 
 
 def _configuration(file: Path, attributes: Mapping[Any, Any], trust: bool, ask: Ask | None) -> AnyConfig:
-    """What a result file was made of."""
     if "identity" not in attributes:
         raise OutputError(f"{file}: does not record all that a run is made of; it was written by a program")
     document = recorded_configuration(str(attributes["configuration_resolved"]), f"{file}: configuration_resolved")

@@ -1,7 +1,5 @@
 """The kind of run that estimates data sets: configuration → inverse problems → analyses → netCDF → page."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -35,7 +33,7 @@ def run(
     resume: bool = False,
     progress: Progress | None = None,
     command: str = "",
-) -> Result:
+) -> "Result":
     """Estimate the parameters of one data set and write the run directory.
 
     Parameters

@@ -106,7 +106,6 @@ def simulate(config: Config, times: npt.ArrayLike | None = None) -> Simulation:
 
 
 def _series(config: Config) -> tuple[SeriesPlan, ...]:
-    """The series of the data, where there are data."""
     return () if config.data is None else config.data.series
 
 
@@ -141,7 +140,6 @@ def noise_level(text: str, config: Config, simulation: Simulation) -> dict[str, 
 
 
 def _observables(config: Config) -> dict[str, Observable]:
-    """By the name of the series."""
     own = {series.name: series.observable for series in _series(config)}
     return own or {config.observable.name: config.observable}
 

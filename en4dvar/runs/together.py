@@ -83,10 +83,8 @@ class TogetherKind(Kind, ABC):
     ) -> tuple[Path, Path]:  # fmt: skip
         """Of the data sets of finished runs, with the settings of the first; returns the paths of result and page.
 
-        Raises
-        ------
-        RefusedError: code of a stranger, see :func:`~en4dvar.runs.rerun.rerun`. OutputError: there is no result, it is
-            damaged, or a file that no run wrote would be replaced. Others as of :meth:`estimate`.
+        Raises RefusedError: code of a stranger, see :func:`~en4dvar.runs.rerun.rerun`. OutputError: there is no result,
+        it is damaged, or a file that no run wrote would be replaced. Others as of :meth:`estimate`.
         """
         names = (*self.files, *self.pages)
         with RunDirectory.open(out, "beside", names) as directory:
@@ -194,7 +192,6 @@ class JointKind(TogetherKind):
 
 
 def _with_carried(estimate: JointEstimate, sets: Sequence[Finished]) -> JointEstimate:
-    """With the warnings of its data sets."""
     without = estimate.without
     if without is not None:
         without = _with_carried(without, [s for s in sets if s.name not in estimate.odd])

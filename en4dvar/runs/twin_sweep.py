@@ -4,8 +4,6 @@ Settings are compared on the same truths and observations, which depend on the s
 Every run is kept as it ends, under what it depends on: more seeds or values find those that are there.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -65,13 +63,13 @@ class TwinSweep:
     def __repr__(self) -> str:
         return f"<TwinSweep of {len(self.values)} settings, {len(self.seeds)} seeds each, in {self.directory}>"
 
-    def summary(self) -> pd.DataFrame:
+    def summary(self) -> "pd.DataFrame":
         """:attr:`rows` as a table."""
         from en4dvar.plumbing.whole_table import WholeTable
 
         return WholeTable(self.rows)
 
-    def plot(self) -> Figure:
+    def plot(self) -> "Figure":
         """RMSE of each estimate, with its standard error, over the settings."""
         names = [", ".join(map(_text, values)) for values in self.values]
         panel = Panel(", ".join(self.keys), "RMSE", xticks=range(len(names)), names=names, legend=True)

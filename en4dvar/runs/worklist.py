@@ -288,7 +288,6 @@ def _consists_of(path: Path, parts: Iterable[bytes]) -> bool:
 
 
 def _in_one_line(outcome: DatasetOutcome) -> str:
-    """What came of a data set."""
     if outcome.failure:
         return f"failed: {outcome.failure.splitlines()[0]}"
     doubts = [c.code for c in outcome.warnings if c.kind == "warning"]

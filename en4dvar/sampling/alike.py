@@ -6,16 +6,13 @@ than they fit draws. Exchanged draws miss means by a hundredth, standard deviati
 """
 
 import numpy as np
-import numpy.typing as npt
 
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, Indices
 
 LEVELS = (0.05, 0.25, 0.75, 0.95)  # of each parameter, below which members have as large a share as all draws
 SWEEPS = 10  # through the members
 POOL = 5  # times as many draws to choose from, and
 LEAST = 500  # at least so many
-
-Indices = npt.NDArray[np.intp]
 
 
 def standing_for(x: Array, kind: Indices, chosen: Indices, mean: Array, covariance: Array) -> Array:

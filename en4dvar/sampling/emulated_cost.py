@@ -12,8 +12,6 @@ Sources: polynomial surrogates of posteriors, Marzouk & Xiu (2009), Commun. Comp
 surrogate says, Li & Marzouk (2014), SIAM J. Sci. Comput. 36, A1163.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable
@@ -27,7 +25,7 @@ from en4dvar.data.noise import Predicted
 from en4dvar.data.observations import Observations
 from en4dvar.diagnosis.diagnostics import effective_share
 from en4dvar.ensemble.forecast import Forecast
-from en4dvar.model.state import DISCREPANCY, NOISE_SCALE, Array
+from en4dvar.model.state import DISCREPANCY, NOISE_SCALE, Array, Indices
 from en4dvar.priors.prior import Prior
 from en4dvar.sampling.walkers import advance
 
@@ -53,7 +51,7 @@ class Coordinates(NamedTuple):
     whiten: Array
 
     @classmethod
-    def about(cls, points: Array) -> Coordinates:
+    def about(cls, points: Array) -> "Coordinates":
         """Those in which points (N, n) have mean zero and standard deviation 1 in every direction."""
         root = np.linalg.cholesky(np.atleast_2d(np.cov(points, rowvar=False)))
         return cls(points.mean(axis=0), np.asarray(root), np.asarray(np.linalg.inv(root), dtype=float))
@@ -77,7 +75,7 @@ class Emulator(NamedTuple):
     @classmethod
     def fitted(
         cls, coordinates: Coordinates, degree: int, x: Array, outputs: Array, counts: Array, ridge: float
-    ) -> Emulator:
+    ) -> "Emulator":
         """Least squares on runs at ``x`` (B, n) that gave ``outputs`` (B, K) and count so much (B,).
 
         ``ridge`` is relative to the normal equations of scaled columns: it decides where runs leave a coefficient open.
@@ -135,14 +133,13 @@ class Bend:
     about: Array
 
     @classmethod
-    def of(cls, prior: Prior, points: Array) -> Bend:
+    def of(cls, prior: Prior, points: Array) -> "Bend":
         """About the mean of points (B, n). Parameters of errors, whose logarithms are emulated, stay as they are."""
         of_errors = {p.name for p in (NOISE_SCALE, *DISCREPANCY)}
         bent = [t.transform == "lognormal" and t.parameter.name not in of_errors for t in prior.terms]
         return cls(np.where(bent, points.mean(axis=0), np.nan))
 
     def __call__(self, x: Array) -> Array:
-        """(B, n) of control vectors (B, n)."""
         bent, of_it = ~np.isnan(self.about), np.array(x)
         of_it[:, bent] = np.logaddexp(0.0, x[:, bent] - self.about[bent])
         return of_it
@@ -173,7 +170,7 @@ class EmulatedCost:
         observed = self.observations.cost(self.make.unstacked(self.emulator.predictions(self.bend(x))))
         return np.minimum(observed, self.ceiling) + self.prior.cost(x)
 
-    def settled(self, random: np.random.Generator) -> EmulatedCost:
+    def settled(self, random: np.random.Generator) -> "EmulatedCost":
         """With draws of the walkers after :data:`LONGER` more rounds: where the posterior is bent, those of a hundred
         moves from a Gaussian were up to 40 % too narrow.
         """
@@ -200,15 +197,15 @@ class ModelRuns:
     make: Predicted
 
     @classmethod
-    def of(cls, x: Array, outcome: Forecast, costs: Array) -> ModelRuns:
+    def of(cls, x: Array, outcome: Forecast, costs: Array) -> "ModelRuns":
         """Those of control vectors (B, n) and J (B,) that could be run."""
         alive = outcome.active & np.isfinite(costs)
         return cls(x[alive], outcome.predicted.stacked[alive], costs[alive], outcome.predicted[:0])
 
-    def __getitem__(self, chosen: npt.NDArray[np.intp]) -> ModelRuns:
+    def __getitem__(self, chosen: Indices) -> "ModelRuns":
         return replace(self, x=self.x[chosen], outputs=self.outputs[chosen], costs=self.costs[chosen])
 
-    def joined(self, other: ModelRuns) -> ModelRuns:
+    def joined(self, other: "ModelRuns") -> "ModelRuns":
         x, outputs = np.concatenate([self.x, other.x]), np.concatenate([self.outputs, other.outputs])
         return replace(self, x=x, outputs=outputs, costs=np.concatenate([self.costs, other.costs]))
 

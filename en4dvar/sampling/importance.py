@@ -75,8 +75,7 @@ class Importance:
 
     def add(self, z: Array, log_likelihood: Array) -> None:
         """Draws (M, n) and what came of them (M,); weights and evidence of all draws follow."""
-        n = z.shape[1]
-        target = log_likelihood - 0.5 * np.sum(z**2, axis=1) - 0.5 * n * np.log(2 * np.pi)
+        target = log_likelihood - 0.5 * np.sum(z**2, axis=1) - 0.5 * z.shape[1] * np.log(2 * np.pi)
         self.mixture = self._mixed(z)
         self.z = np.concatenate([self.z, z]) if len(self.z) else z
         self.target = np.concatenate([self.target, target])

@@ -79,7 +79,6 @@ class Chain:
         return standing_for(draws, alike, every, self.flat.mean(axis=0), np.cov(self.flat.T))
 
     def warning(self) -> str:
-        """Words for a chain that has not mixed."""
         return (
             f"the Markov chain has not converged after {self.steps} steps (R-hat {np.max(self.r_hat):.3f}, effective "
             f"sample size {np.min(self.effective):.0f}): its ensemble is not yet the posterior"
@@ -113,26 +112,20 @@ def sample(
 ) -> Chain:
     """Sample a density from the neighbourhood of an ensemble.
 
-    Parameters
-    ----------
-    log_density: of positions (B, n) → (B,), −inf where it vanishes; called with half of the walkers at a time.
-    ensemble: (N, n) the Gaussian approximation; walkers start from its members, slightly scattered.
-    seed: of the walkers; the same seed gives the same bits.
-    walkers: at least 2 (n + 1), even. max_steps: at most. target: effective sample size to reach in each direction
-        (default: :data:`ENOUGH`).
-    look: called with what each look at convergence shows.
-    emulated: an approximation at no cost; it guides the walkers, which start from draws of it.
-    proposal: covers all modes; walkers jump to draws of it.
+    ``log_density``: of positions (B, n) → (B,), −inf where it vanishes; called with half of the walkers at a time.
+    ``ensemble``: (N, n) the Gaussian approximation; walkers start from its members, slightly scattered. ``seed``: of
+    the walkers; the same seed gives the same bits. ``walkers``: at least 2 (n + 1), even. ``max_steps``: at most.
+    ``target``: effective sample size to reach in each direction (default: :data:`ENOUGH`). ``look``: called with what
+    each look at convergence shows. ``emulated``: an approximation at no cost; it guides the walkers, which start from
+    draws of it. ``proposal``: covers all modes; walkers jump to draws of it.
 
-    Raises
-    ------
-    En4dvarError: the density vanishes at (nearly) every member.
+    Raises En4dvarError: the density vanishes at (nearly) every member.
     """
     import emcee  # a twentieth of a second that most runs do not need
 
     n, target = ensemble.shape[1], ENOUGH if target is None else target
     walkers = max(walkers, 2 * (n + 1)) + max(walkers, 2 * (n + 1)) % 2
-    state = _start(emcee, log_density, ensemble, seed, walkers, emulated)
+    state = _start(log_density, ensemble, seed, walkers, emulated)
     sampler = emcee.EnsembleSampler(walkers, n, log_density, vectorize=True, moves=_moves(emcee, emulated, proposal))
     sampler.log_prob_fn = log_density  # bare: emcee's wrapper prints every position where Ctrl-C comes
     while True:
@@ -146,7 +139,6 @@ def sample(
 
 
 def _moves(emcee: Any, emulated: EmulatedCost | None, proposal: StudentMixture | None) -> list[tuple[Any, float]]:
-    """Moves and their shares."""
     far = []
     if emulated is not None:
         far.append((emcee.moves.MHMove(_guided(emulated)), GUIDED_SHARE))
@@ -177,14 +169,11 @@ def _judged(sampler: Any, target: float, ensemble: Array) -> Chain:
 
 
 def _start(
-    emcee: Any,
-    log_density: Callable[[Array], Array],
-    ensemble: Array,
-    seed: int,
-    walkers: int,
-    emulated: EmulatedCost | None,
+    log_density: Callable[[Array], Array], ensemble: Array, seed: int, walkers: int, emulated: EmulatedCost | None
 ) -> Any:
     """The walkers' first positions and the state of the random numbers. Raises :class:`En4dvarError`."""
+    import emcee
+
     n_members, n = ensemble.shape
     random = np.random.Generator(np.random.Philox(key=seed))
     if emulated is None:

@@ -9,11 +9,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from en4dvar.descent.minima import Minimum
 from en4dvar.ensemble.linalg import effective_number, resampled
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, Indices, Mask
 from en4dvar.priors.prior import Prior, member_stream
 from en4dvar.sampling.alike import LEAST, POOL, standing_for
 from en4dvar.sampling.emulated_draws import EmulatedProposal, RecordedRuns
@@ -49,7 +48,7 @@ class WeightedDraws:
 
     x: Array
     shares: Array
-    mode: npt.NDArray[np.intp]
+    mode: Indices
     log_evidence: float
     lowest: float
     best: Array
@@ -62,12 +61,10 @@ class WeightedDraws:
 
     @property
     def mean(self) -> Array:
-        """(n,)"""
         return np.asarray(self.shares @ self.x)
 
     @property
     def covariance(self) -> Array:
-        """(n, n)"""
         apart = self.x - self.mean
         return np.asarray((self.shares[:, None] * apart).T @ apart)
 
@@ -166,7 +163,6 @@ def _guided(
 
 
 def _unsettled(sampler: Importance, enough: float) -> bool:
-    """True if too few draws are effective yet."""
     wanted = enough if len(sampler.z) < MOST_RUNS * enough else min(TOO_FEW, enough)
     return sampler.effective < wanted
 
@@ -180,7 +176,7 @@ def _about(prior: Prior, minima: Sequence[Minimum]) -> StudentMixture:
     return StudentMixture(share, centre, root)
 
 
-def nearest(prior: Prior, minima: Sequence[Minimum], x: Array) -> npt.NDArray[np.intp]:
+def nearest(prior: Prior, minima: Sequence[Minimum], x: Array) -> Indices:
     """Numbers (D,) of the minima whose Gaussian, weighted by its evidence, is densest at control vectors (D, n)."""
     logs = []
     for m in minima:
@@ -190,7 +186,7 @@ def nearest(prior: Prior, minima: Sequence[Minimum], x: Array) -> npt.NDArray[np
     return np.asarray(np.argmax(logs, axis=0))
 
 
-def belonging(prior: Prior, minima: Sequence[Minimum], x: Array, shares: Array) -> npt.NDArray[np.intp]:
+def belonging(prior: Prior, minima: Sequence[Minimum], x: Array, shares: Array) -> Indices:
     """Numbers (D,) of the minima that draws (D, n) with ``shares`` (D,) belong to: on whose side of the valley between
     them they lie, and where there is none all to the lower one.
 
@@ -207,7 +203,7 @@ def belonging(prior: Prior, minima: Sequence[Minimum], x: Array, shares: Array) 
     return mode
 
 
-def _beyond_valley(x: Array, first: Array, second: Array) -> npt.NDArray[np.bool_]:
+def _beyond_valley(x: Array, first: Array, second: Array) -> Mask:
     """Which draws (D, n) lie beyond the place that has fewest, on the way from those with shares ``first`` (D,) to
     those with shares ``second`` (D,), along the direction that tells them apart best; none where the way is filled.
     """

@@ -14,7 +14,6 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from en4dvar.descent.minima import Minimum
 from en4dvar.descent.weight_space import WeightSpace
@@ -22,7 +21,7 @@ from en4dvar.diagnosis import diagnostics as diag
 from en4dvar.diagnosis.analysis import BEYOND_5, ChainRecord, Mode
 from en4dvar.diagnosis.response.ledger import weighted_quantiles
 from en4dvar.ensemble.linalg import resampled, shares_of
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, Indices
 from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.units import convert
 from en4dvar.priors.prior import Prior, member_stream
@@ -69,7 +68,10 @@ def examine_shape(
             if settle and doubtful(off):  # by walkers that have not settled, as often as not
                 emulator = emulator.settled(member_stream(seed, "emulator, settled"))
                 off = _off(emulator, ensemble)
-            shape |= {**off, "emulator_fit": emulator.share, **_displayed(space.problem.prior, emulator.draws)}
+            shape |= {**off, "emulator_fit": emulator.share}
+            theta, names = space.problem.prior.to_physical(emulator.draws), space.problem.prior.names
+            for what, values in (("mean", theta.mean(axis=0)), ("std", theta.std(axis=0))):  # of G, not of ln G
+                shape |= {f"emulated_{what}_{name}": float(v) for name, v in zip(names, values, strict=True)}
     return {**shape, "non_gaussian": diag.is_non_gaussian(shape)}
 
 
@@ -159,17 +161,6 @@ def _off(emulator: EmulatedCost, ensemble: Array) -> dict[str, float]:
     }
 
 
-def _displayed(prior: Prior, draws: Array) -> dict[str, float]:
-    """Moments of draws (B, n) as they are printed: of G, not of ln G."""
-    theta = prior.to_physical(draws)
-    moments = {"mean": theta.mean(axis=0), "std": theta.std(axis=0)}
-    return {
-        f"emulated_{what}_{name}": float(v)
-        for what in moments
-        for name, v in zip(prior.names, moments[what], strict=True)
-    }
-
-
 def guide(space: WeightSpace, ensemble: Array, seed: int, fits: int = CHAIN_FITS) -> EmulatedCost | None:
     """An emulator of J about an ensemble (N, n); None where the settings or the model forbid."""
     wanted = space.settings.emulator
@@ -243,8 +234,7 @@ def _apart(prior: Prior, modes: Sequence[Mode]) -> Array:
         prior.from_physical(np.array([getattr(m, key) for m in modes])) for key in ("centre", "q05", "q95")
     )
     std = (high - low) / (2 * BEYOND_5)
-    between = np.abs(at[:, None] - at) / np.maximum(std[:, None], std)
-    return np.asarray(between.max(axis=(0, 1)))
+    return np.asarray((np.abs(at[:, None] - at) / np.maximum(std[:, None], std)).max(axis=(0, 1)))
 
 
 def weighs(space: WeightSpace) -> bool:
@@ -268,8 +258,7 @@ def may_sample(problem: InverseProblem, settings: AssimilationSettings) -> bool:
 def in_doubt(minima: Sequence[Minimum], agree: bool, shape: Mapping[str, float]) -> bool:
     """True if the Gaussian about the lowest of the minima that count may not be the posterior.
 
-    ``agree``: whether descents from different members ended there. ``shape`` is that of
-    :func:`examine_shape`.
+    ``agree``: whether descents from different members ended there. ``shape`` is that of :func:`examine_shape`.
     """
     unclear = shape.get("emulator_fit", 1.0) < diag.EMULATED_ENOUGH
     return not agree or len(minima) > 1 or bool(shape.get("non_gaussian")) or doubtful(shape) or unclear
@@ -334,7 +323,7 @@ def refined(
     )
 
 
-def _own_draws(x: Array, shares: Array, mode: npt.NDArray[np.intp], count: int) -> list[tuple[float, Array]]:
+def _own_draws(x: Array, shares: Array, mode: Indices, count: int) -> list[tuple[float, Array]]:
     """Of each of ``count`` modes its weight, and the quantiles (3, n) of its draws among those (D, n)."""
     own = []
     for number in range(count):

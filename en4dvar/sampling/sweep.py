@@ -188,17 +188,12 @@ def run_sweep(
 ) -> SweepResult:
     """Fit every data set.
 
-    Parameters
-    ----------
-    problems: of one model and the same parameters with the same transforms, whose priors may differ. A prior on
-        ``t_s`` plays no part: the shift is searched within its limits.
-    folder: where finished chunks are kept, and found again by a sweep that continues; the caller clears it.
-    progress: called with the trajectories done and to do.
-    earliest: the instant before which the model has no path; −inf where it has one at any time.
+    ``problems``: of one model and the same parameters with the same transforms, whose priors may differ. A prior on
+    ``t_s`` plays no part: the shift is searched within its limits. ``folder``: where finished chunks are kept, and
+    found again by a sweep that continues; the caller clears it. ``progress``: called with the trajectories done and to
+    do. ``earliest``: the instant before which the model has no path; −inf where it has one at any time.
 
-    Raises
-    ------
-    ConfigError: the data sets do not share a model, fixed values or parameters; nothing but t_s is estimated.
+    Raises ConfigError: the data sets do not share a model, fixed values or parameters; nothing but t_s is estimated.
     DataError: no trajectory fits a set; a reading would be compared before ``earliest``.
     """
     executor = executor or SerialExecutor()

@@ -38,7 +38,6 @@ SCHEMES: dict[str, type[Scheme]] = {
 
 
 def _installed() -> dict[str, type[Scheme]]:
-    """The schemes of other packages."""
     kinds = {}
     for name, entry in installed("en4dvar.schemes").items():
         try:

@@ -63,9 +63,8 @@ class Runs:
     """What the model says of the members of :meth:`Scheme.members`.
 
     ``predictions`` (M, Ky) of the members, ``central`` (Ky,) of the centre, ``active`` (M,) bool; rows of failed
-    members are not read. ``basis`` U (N, r) spans the prior anomalies
-    (:func:`en4dvar.ensemble.linalg.anomaly_basis`). In a series there is neither a centre nor a basis, and no member
-    that failed.
+    members are not read. ``basis`` U (N, r) spans the prior anomalies (:func:`en4dvar.ensemble.linalg.anomaly_basis`).
+    In a series there is neither a centre nor a basis, and no member that failed.
     """
 
     predictions: Array

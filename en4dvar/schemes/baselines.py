@@ -33,5 +33,4 @@ class Climatology(OptimalInterpolation):
     words: ClassVar[str] = "the free members"
 
     def advance(self, weights: Weights, evaluation: Evaluation, iteration: int, draw: Draw) -> Step | GaussNewtonStep:
-        """The weights as they are."""
         return Step(weights, 0.0)

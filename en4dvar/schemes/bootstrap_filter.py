@@ -16,12 +16,11 @@ from dataclasses import dataclass
 from typing import Annotated, ClassVar, cast
 
 import numpy as np
-import numpy.typing as npt
 from annotated_types import Ge
 from scipy.special import ndtr
 
 from en4dvar.ensemble.linalg import centre, shares_of
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, Indices
 from en4dvar.schemes.base import Draw, Evaluation, GaussNewtonStep, Step, Weights
 from en4dvar.schemes.etkf import ETKF
 
@@ -56,7 +55,7 @@ class Resampled:
     them by draws of the covariance that ``shares`` (N,) give, ``jitter`` times its root.
     """
 
-    index: npt.NDArray[np.intp]
+    index: Indices
     w: Array
     shares: Array
     jitter: float
@@ -78,11 +77,10 @@ class Resampled:
 
 def likelihood_shares(evaluation: Evaluation) -> Array:
     """Likelihoods (N,) of the members, of sum 1, relative to the largest, so that one is left however far all are."""
-    misfit = np.sum((evaluation.d[:, None] - evaluation.S) ** 2, axis=0)
-    return shares_of(-0.5 * misfit)
+    return shares_of(-0.5 * np.sum((evaluation.d[:, None] - evaluation.S) ** 2, axis=0))
 
 
-def systematic(shares: Array, start: float) -> npt.NDArray[np.intp]:
+def systematic(shares: Array, start: float) -> Indices:
     """Indices (N,) of the members resampled: the comb (start + j)/N, 0 < start < 1, in the cumulated shares (N,).
 
     >>> systematic(np.array([0.5, 0.0, 0.25, 0.25]), 0.5).tolist()

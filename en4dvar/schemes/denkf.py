@@ -25,7 +25,6 @@ class DEnKF(ETKF):
     approximate: ClassVar[str] = "moves anomalies by half of the gain, which leaves them wider than the posterior"
 
     def advance(self, weights: Weights, evaluation: Evaluation, iteration: int, draw: Draw) -> Step | GaussNewtonStep:
-        """Weights of the analysis."""
         step = gauss_newton(weights.w, evaluation)
         # A⁻¹ SᵀS = I − (N−1) A⁻¹ = I − T²
         transform = 0.5 * (np.eye(len(weights.w)) + step.transform @ step.transform)

@@ -38,7 +38,6 @@ class En4DVar(Minimiser):
     )
 
     def economical(self, basis: Array) -> bool:
-        """Whether a tangent takes fewer runs than members."""
         n_members, rank = basis.shape
         return not self.regresses and 0 < rank < n_members - 1
 

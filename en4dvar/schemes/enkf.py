@@ -36,7 +36,6 @@ class EnKF(ETKF):
     words: ClassVar[str] = "perturbed observations"
 
     def advance(self, weights: Weights, evaluation: Evaluation, iteration: int, draw: Draw) -> Step | GaussNewtonStep:
-        """Weights of the analysis."""
         hessian, n = Hessian.of(evaluation.S), len(weights.w)
         shift = hessian.solve(evaluation.d @ evaluation.S)
         noise = math.sqrt(n / (n - 1)) * draw("perturbed observations")

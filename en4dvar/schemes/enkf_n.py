@@ -34,7 +34,6 @@ class EnKFN(ETKF):
     words: ClassVar[str] = "finite size"
 
     def advance(self, weights: Weights, evaluation: Evaluation, iteration: int, draw: Draw) -> Step | GaussNewtonStep:
-        """Weights of the analysis."""
         n_members = len(weights.w)
         hessian = Hessian.of(evaluation.S)  # its rows are orthogonal, of lengths σ: SᵀS = rowsᵀ rows
         squares = hessian.singular_values**2

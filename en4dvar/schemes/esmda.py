@@ -54,18 +54,15 @@ class ESMDA(ETKF):
 
     @property
     def passes(self) -> int:
-        """One an inflation."""
         return len(self.mda_coefficients)
 
     @property
     def inflations(self) -> Array:
-        """α_a, one an assimilation."""
         return mda_inflations(self.mda_coefficients)
 
     def advance(self, weights: Weights, evaluation: Evaluation, iteration: int, draw: Draw) -> Step | GaussNewtonStep:
         """Assimilation number ``iteration``; d is that of the mean prediction, S per unit of the current anomalies."""
-        alpha = float(self.inflations[iteration])
-        root = np.sqrt(alpha)
+        root = np.sqrt(float(self.inflations[iteration]))
         d, S = evaluation.d / root, evaluation.S / root
         hessian = Hessian.of(S)
         shift = hessian.solve(d @ S)

@@ -28,7 +28,6 @@ class ESRF(ETKF):
     words: ClassVar[str] = "serial square root"
 
     def advance(self, weights: Weights, evaluation: Evaluation, iteration: int, draw: Draw) -> Step | GaussNewtonStep:
-        """Weights of the analysis."""
         w, transform, prior_precision = weights.w.copy(), weights.T.copy(), len(weights.w) - 1.0
         for d, s in zip(evaluation.d, evaluation.S, strict=True):
             v = transform @ s

@@ -74,7 +74,6 @@ class IEnKS(Scheme):
         return np.asarray(weights.w + self.epsilon * np.eye(len(weights.w))) if bundle else weights.rows
 
     def linearise(self, weights: Weights, runs: Runs) -> tuple[Array, Array]:
-        """Mean prediction p̄ (K',) and anomalies per unit weight Y (N, K')."""
         mean, anomalies = centre(runs.predictions)
         if self.linearisation == "bundle":
             return mean, anomalies / self.epsilon
@@ -89,5 +88,4 @@ class IEnKS(Scheme):
         return Step(Weights(step.w + step.direction, step.transform, inverse), step.norm)
 
     def done(self, iteration: int, step: Step | GaussNewtonStep) -> bool:
-        """After the step below the tolerance, or the last one allowed."""
         return step.norm <= self.tolerance or iteration + 1 == self.max_iterations

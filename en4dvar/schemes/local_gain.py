@@ -22,10 +22,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import cho_factor, cho_solve
 
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, Indices
 from en4dvar.schemes.localisation import gaspari_cohn
 
 PART = 1 << 18  # cells times observations that are worked on at once
@@ -82,7 +81,7 @@ class ByDistance:
         return np.nan_to_num(rho, copy=False, nan=1.0)
 
     @property
-    def common(self) -> npt.NDArray[np.intp]:
+    def common(self) -> Indices:
         """Which of the cells have no place."""
         return np.flatnonzero(np.isnan(self.places[:, 0]))
 

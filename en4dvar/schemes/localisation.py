@@ -9,10 +9,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from en4dvar.ensemble.linalg import apply_weights
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, Indices, Mask
 from en4dvar.schemes.base import Draw, Evaluation, Runs, Scheme, Weights
 
 
@@ -42,7 +41,7 @@ class BlockLocalisation:
     State variables in no block keep their forecast.
     """
 
-    blocks: Sequence[npt.NDArray[np.intp]]
+    blocks: Sequence[Indices]
     taper: Array
 
     @classmethod
@@ -59,9 +58,7 @@ class BlockLocalisation:
         return cls(blocks, gaspari_cohn(distances(middles, observed, period), radius))
 
     @classmethod
-    def on_grid(
-        cls, where: npt.NDArray[np.intp], shape: Sequence[int], radius: float, periodic: bool
-    ) -> "BlockLocalisation":
+    def on_grid(cls, where: Indices, shape: Sequence[int], radius: float, periodic: bool) -> "BlockLocalisation":
         """Every cell by itself of a field on a grid of ``shape``, all cells observed, in C order.
 
         ``where`` (n,) are the places of the cells in the state; distances are Euclidean, in cells, and around the ends
@@ -123,6 +120,6 @@ def _tapered(evaluation: Evaluation, taper: Array) -> Evaluation:
     return Evaluation(root * evaluation.d[near], root[:, None] * evaluation.S[near])
 
 
-def _of_some(draw: Draw, near: npt.NDArray[np.bool_]) -> Draw:
+def _of_some(draw: Draw, near: Mask) -> Draw:
     """The numbers of the observations ``near`` (K',): an observation is perturbed in the same way in every block."""
     return lambda purpose, columns=None: draw(purpose, columns) if columns else draw(purpose)[:, near]

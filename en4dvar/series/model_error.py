@@ -16,10 +16,9 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from en4dvar.ensemble.linalg import centre
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, Indices
 from en4dvar.priors.prior import whiten_sample
 
 SPANNED = 1e-10  # of the largest singular value: a direction that the ensemble spans
@@ -29,9 +28,7 @@ SPANNED = 1e-10  # of the largest singular value: a direction that the ensemble 
 class ModelError:
     """``rate`` (n,): variance of each variable per unit of time. ``form``: how it enters the ensemble of a filter.
 
-    Raises
-    ------
-    ValueError: a rate that is negative or not finite, or none that is positive.
+    Raises ValueError: a rate that is negative or not finite, or none that is positive.
     """
 
     rate: Array
@@ -42,7 +39,7 @@ class ModelError:
             raise ValueError("a model error needs variances that are not negative, one of them positive")
 
     @cached_property
-    def where(self) -> npt.NDArray[np.intp]:
+    def where(self) -> Indices:
         """(q,) the variables that have one."""
         return np.flatnonzero(self.rate > 0)
 
@@ -57,8 +54,7 @@ class ModelError:
 
         With P = V S² Vᵀ of the anomalies U S Vᵀ √(N−1), the anomalies become U (I + S⁻¹VᵀQV S⁻¹)^{1/2} S Vᵀ √(N−1).
         """
-        mean = states.mean(axis=0)
-        anomalies = states - mean
+        anomalies = states - states.mean(axis=0)
         scale = np.sqrt(np.sum(anomalies**2, axis=0) / (len(states) - 1))  # units of the variables do not matter
         scale[scale == 0] = 1.0
         u, s, vt = np.linalg.svd(anomalies / scale, full_matrices=False)

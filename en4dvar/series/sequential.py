@@ -18,10 +18,10 @@ from functools import partial
 from typing import TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
 from en4dvar.descent.loop import minimise
 from en4dvar.ensemble.linalg import centre
+from en4dvar.ensemble.members import EVERYONE, Rows
 from en4dvar.ensemble.repeat import check_repeats
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
 from en4dvar.model.forward import ForwardModel, Observable
@@ -36,8 +36,6 @@ from en4dvar.series.series import CycleSeries as CycleSeries
 from en4dvar.series.settings import SequentialSettings as SequentialSettings
 from en4dvar.series.window import Ahead, CycleDescent, CycleWindow, Flow, MembersLost, Share
 
-ALL = slice(None)
-Rows = npt.NDArray[np.intp] | slice  # of an ensemble: those that survive
 R = TypeVar("R")
 
 
@@ -58,18 +56,13 @@ def run_sequential(
 
     The operators of ``observables`` act at each instant by itself; their outputs side by side are the p predictions.
 
-    Parameters
-    ----------
-    members: in ``settings.coordinates``. seed: of the rotations and model errors.
-    on_cycle: called with the index of the last observation time of each cycle, from 0.
-    resume: where an earlier call with the same arguments was interrupted; the result has the same bits as without.
-    keep: called after each cycle with a function that gives the state to resume from.
-    truth: (K, n_state) in a twin experiment, for its rank among the members.
+    ``members``: in ``settings.coordinates``. ``seed``: of the rotations and model errors. ``on_cycle``: called with the
+    index of the last observation time of each cycle, from 0. ``resume``: where an earlier call with the same arguments
+    was interrupted; the result has the same bits as without. ``keep``: called after each cycle with a function that
+    gives the state to resume from. ``truth``: (K, n_state) in a twin experiment, for its rank among the members.
 
-    Raises
-    ------
-    TooFewMembersError: the ensemble is lost. ValueError: localisation with correlated errors. ConfigError: the model
-        gives other numbers when a member is run again.
+    Raises TooFewMembersError: the ensemble is lost. ValueError: localisation with correlated errors. ConfigError: the
+    model gives other numbers when a member is run again.
     """
     if settings.localisation is not None and series.correlation is not None:
         raise ValueError("localisation needs observations with independent errors")
@@ -322,7 +315,7 @@ class _Run:
 
     def surviving(self, attempt: Callable[[Rows], R]) -> tuple[Rows, R]:
         """The rows that none fails of, and what an attempt with them gives."""
-        rows: Rows = ALL
+        rows: Rows = EVERYONE
         while True:
             try:
                 return rows, attempt(rows)

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy.sparse import csr_array
 
 from en4dvar.data.noise import Correlation
@@ -12,7 +11,7 @@ from en4dvar.data.noise.make import correlation_of
 from en4dvar.data.observations import Observations
 from en4dvar.data.series import Part, Places
 from en4dvar.model.forward import Observable, ObservationOperator, Trajectory
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, Indices
 from en4dvar.plumbing.errors import DataError
 
 
@@ -103,7 +102,7 @@ def aligned(observations: Observations, parts: Sequence[Part]) -> tuple[tuple[Ob
     return tuple(observables), CycleSeries(times, values, std, correlation, tuple(names))
 
 
-def _columns(part: Part) -> tuple[npt.NDArray[np.intp], Observable, list[str]]:
+def _columns(part: Part) -> tuple[Indices, Observable, list[str]]:
     """Which column, of those of the part, each reading stands in, what gives the columns, and their names."""
     own = replace(part.observable, name=part.name)
     if part.places is None:
@@ -117,9 +116,7 @@ def _columns(part: Part) -> tuple[npt.NDArray[np.intp], Observable, list[str]]:
     return column.ravel(), replace(own, operator=AtPlaces(part.observable.operator, at)), names
 
 
-def _of_an_instant(
-    whole: csr_array, row: npt.NDArray[np.intp], columns: npt.NDArray[np.intp], size: int, where: str
-) -> Correlation:
+def _of_an_instant(whole: csr_array, row: Indices, columns: Indices, size: int, where: str) -> Correlation:
     """The correlation of the columns, the same at every instant, from that of all readings. Raises DataError."""
     matrix = np.eye(size)
     i, j = whole.nonzero()

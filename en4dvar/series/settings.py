@@ -23,10 +23,8 @@ class SequentialSettings:
     after so many observation times, and the last; 0: the last alone.
     ``smoother``: what goes behind a filter (:mod:`en4dvar.series.smoothers`).
 
-    Raises
-    ------
-    ValueError: a smoother behind what is no cycled filter, localisation of what has no local analysis, a square root
-        of the model error where members must keep their past.
+    Raises ValueError: a smoother behind what is no cycled filter, localisation of what has no local analysis, a square
+    root of the model error where members must keep their past.
     """
 
     scheme: Scheme

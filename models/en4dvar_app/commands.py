@@ -1,7 +1,5 @@
 """``en4dvar app``. Heavy imports stay inside the command."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import click

@@ -6,8 +6,6 @@ lock of ``FOLDER`` while it works, writes ``output`` and at the end ``code``, an
 imported in place of installed ones.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shlex

@@ -1,7 +1,5 @@
 """Frames of a movie as pictures, and tables as numbers, for the page."""
 
-from __future__ import annotations
-
 import csv
 import io
 import re

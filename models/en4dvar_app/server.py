@@ -1,7 +1,5 @@
 """The server of the page: loopback only, a secret in the address, files below one folder."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import secrets

@@ -1,7 +1,5 @@
 """Fields of the page → the words of one command, whose files all lie in the folder."""
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Callable, Mapping
@@ -142,9 +140,7 @@ def text_of(root: Path, fields: Fields) -> str:
 def kept(root: Path, fields: Fields) -> None:
     """Write a text of the page: a configuration that is there, or the corrections of a movie.
 
-    Raises
-    ------
-    FieldError: another window or program has changed the file since the page read it.
+    Raises FieldError: another window or program has changed the file since the page read it.
     """
     path = _text_file(root, fields)
     if text_of(root, fields) not in (fields.get("before", ""), fields.get("text", "")):
@@ -155,9 +151,7 @@ def kept(root: Path, fields: Fields) -> None:
 def masked(root: Path, fields: Fields, shape: tuple[int, ...]) -> None:
     """Blacken or (``uncovers``) whiten the polygon ``outline``, "x,y x,y ...", in the mask of a movie of (H, W) pixels.
 
-    Raises
-    ------
-    FieldError: the outline is none, or the mask is no picture of that size.
+    Raises FieldError: the outline is none, or the mask is no picture of that size.
     """
     path, outline = below(root, beside(existing(root, fields, "movie"), ".mask.png")), fields.get("outline", "")
     if not OUTLINE.fullmatch(f"{outline} "):

@@ -1,7 +1,5 @@
 """What a configuration of somebody else may not do from the page: run code, and read files outside of the folder."""
 
-from __future__ import annotations
-
 import glob
 import os
 from collections.abc import Iterator
@@ -20,9 +18,7 @@ MOST = 100_000  # files that a pattern names
 def below(root: Path, name: str) -> Path:
     """The path of ``name`` in the folder ``root``, which is resolved.
 
-    Raises
-    ------
-    OutputError: it leads out of the folder, through a link too, or a command would take it for an option.
+    Raises OutputError: it leads out of the folder, through a link too, or a command would take it for an option.
     """
     try:
         path = (root / name).resolve()
@@ -39,9 +35,8 @@ def require_harmless(root: Path, config: Path, trust: bool) -> None:
 
     Code is known as the command line knows it in the result files of others (:mod:`en4dvar.runs.trust`).
 
-    Raises
-    ------
-    RefusedError, and :class:`OutputError` for a path. Other faults are left to the command, which says where they are.
+    Raises RefusedError, and :class:`OutputError` for a path. Other faults are left to the command, which says where
+    they are.
     """
     from en4dvar.config import resolve_any
     from en4dvar.config.document import document_from

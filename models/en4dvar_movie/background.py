@@ -1,7 +1,5 @@
 """The background of a movie, and the properties that its frames share: sign, noise, contrast, sharpness."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, Mask
 from en4dvar.plumbing.errors import DataError
 from en4dvar_movie.drifting import drift_of, shift_at
 from en4dvar_movie.fitting import fit_outline
@@ -69,7 +67,7 @@ class Background:
     relative: bool = True
     drift: Array | None = None
 
-    def behind(self, number: int) -> Background:
+    def behind(self, number: int) -> "Background":
         """The background as a frame shows it, where the camera drifts."""
         if self.drift is None:
             return self
@@ -106,21 +104,18 @@ class Background:
         return (image - change) / (1 + change if self.relative else np.float32(1))
 
 
-def find_background(
-    movie: Movie, circles: int = 1, watched: npt.NDArray[np.bool_] | None = None
-) -> tuple[Background, Optics]:
+def find_background(movie: Movie, circles: int = 1, watched: Mask | None = None) -> tuple[Background, Optics]:
     """Background and optics of a movie, from its first frames and some along it.
 
     ``watched`` (H, W) is what is looked at.
 
-    Raises
-    ------
-    DataError: no frame can be read or shows a bubble.
+    Raises DataError: no frame can be read or shows a bubble.
     """
     leading, samples, numbers = _look(movie)
     first = leading[0].astype(np.float32)
     if not any(float(np.ptp(frame)) > 0 for frame in (*leading, *samples)):
-        words = "black" if not np.any(first) else "white" if _is_white(leading[0]) else "of one brightness"
+        white = leading[0].dtype.kind in "ui" and leading[0].flat[0] == np.iinfo(leading[0].dtype).max
+        words = "black" if not np.any(first) else "white" if white else "of one brightness"
         raise DataError(f"{movie.path}: every frame is {words}; no bubble can be seen")
     drift = drift_of(samples, numbers)
     unseen = np.zeros(first.shape, dtype=bool)  # at the border, of what only some frames show
@@ -130,7 +125,8 @@ def find_background(
         height, width = first.shape
         (up, left), (down, right) = drift[:, 1:].min(axis=0).astype(int), drift[:, 1:].max(axis=0).astype(int)
         unseen[max(height - down, 0) :] = unseen[:, max(width - right, 0) :] = unseen[:-up] = unseen[:, :-left] = True
-    unit = _grey_level(samples)
+    of_integers = samples[0].dtype.kind in "ui"  # frames of any floats, such as shares of the light, are as if of 8 bit
+    unit = 1.0 if of_integers else max(float(np.nanmax(np.abs(f))) for f in samples) / 255  # a grey level
     noise = pixel_noise(first, unit)
     blind = _writing(leading, noise) | _outside(samples) | unseen
     if watched is not None:
@@ -161,17 +157,12 @@ def _look(movie: Movie) -> tuple[list[Frame], list[Frame], range]:
     return leading, samples, range(0, every * len(samples), every)
 
 
-def _grey_level(frames: Sequence[Frame]) -> float:
-    """The step between grey levels; of frames of any floats, such as shares of the light, as if they had 8 bit."""
-    return 1.0 if frames[0].dtype.kind in "ui" else max(float(np.nanmax(np.abs(f))) for f in frames) / 255
-
-
 def pixel_noise(image: Image, unit: float = 1.0) -> float:
     """Std of the noise of an image (H, W): robust, of differences between neighbours. ``unit``: a grey level."""
     return max(1.4826 * float(np.median(np.abs(np.diff(image)))) / math.sqrt(2), 0.3 * unit)
 
 
-def _outside(frames: Sequence[Frame]) -> npt.NDArray[np.bool_]:
+def _outside(frames: Sequence[Frame]) -> Mask:
     """The outside of a field of view (H, W), such as a round aperture: dark in two corners of the frames at least, and
     beside it are always light and no wall that moves.
     """
@@ -187,11 +178,7 @@ def _outside(frames: Sequence[Frame]) -> npt.NDArray[np.bool_]:
     return np.asarray(blurred & (steady > 1 - LIVELY))
 
 
-def _is_white(frame: Frame) -> bool:
-    return bool(frame.dtype.kind in "ui" and frame.flat[0] == np.iinfo(frame.dtype).max)
-
-
-def smooth_surface(frames: Sequence[Frame], blind: npt.NDArray[np.bool_], unit: float) -> Array:
+def smooth_surface(frames: Sequence[Frame], blind: Mask, unit: float) -> Array:
     """A quadratic surface (H, W) through the background of frames that all hold a bubble, where it is not ``blind``."""
     typical = np.median(np.array(frames, dtype=np.float32), axis=0)
     y, x = np.mgrid[-1 : 1 : typical.shape[0] * 1j, -1 : 1 : typical.shape[1] * 1j]
@@ -214,13 +201,13 @@ def _lit_as(frame: Image, other: Image) -> Image:
     return frame * (lamp if abs(math.log(lamp)) < LAMP else 1.0)
 
 
-def _changed(frame: Image, other: Image, noise: float, side: int = 5) -> npt.NDArray[np.bool_]:
+def _changed(frame: Image, other: Image, noise: float, side: int = 5) -> Mask:
     """Where two frames differ by more than noise, in means over squares, whatever the lamp does (H, W)."""
     off = ndimage.uniform_filter(frame - _lit_as(other, frame), side)
     return np.asarray(np.abs(off) > max(7 * noise / side, 0.06 * float(np.median(other))))
 
 
-def _writing(leading: Sequence[Frame], noise: float) -> npt.NDArray[np.bool_]:
+def _writing(leading: Sequence[Frame], noise: float) -> Mask:
     """Where something low changes all the time (H, W), brighter here and darker there at once: time stamps."""
     none = np.zeros(leading[0].shape, dtype=bool)
     steps = len(leading) - 1
@@ -252,9 +239,7 @@ def _one_way(frames: Sequence[Image], changes: Sequence[Image], box: tuple[slice
     return float(np.median(mixed or [0.0])) < 0.15
 
 
-def _begins_with_a_bubble(
-    first: Image, samples: Sequence[Frame], noise: float, blind: npt.NDArray[np.bool_], unit: float
-) -> bool:
+def _begins_with_a_bubble(first: Image, samples: Sequence[Frame], noise: float, blind: Mask, unit: float) -> bool:
     """True if the first frame differs from a smooth surface in large patches whose rims other frames show elsewhere."""
     surface = smooth_surface([first], blind, unit)
     usual = float(np.median(np.abs(surface[~blind])))
@@ -272,7 +257,7 @@ def _begins_with_a_bubble(
     return bool(np.mean(moved[edge]) > LIVELY)
 
 
-def _is_round(patch: npt.NDArray[np.bool_]) -> bool:
+def _is_round(patch: Mask) -> bool:
     """True of a disc and what the frame leaves of it, also of one with a bright centre; not of a stripe."""
     circle = circle_through(rim(patch))
     if circle is None:
@@ -282,7 +267,7 @@ def _is_round(patch: npt.NDArray[np.bool_]) -> bool:
     return bool(np.sum(patch & disc) > ROUND * np.sum(patch | disc))
 
 
-def _quiet(leading: Sequence[Frame], first: Image, noise: float, blind: npt.NDArray[np.bool_]) -> int:
+def _quiet(leading: Sequence[Frame], first: Image, noise: float, blind: Mask) -> int:
     """How many leading frames look like the first; most of those after them show the shade in a bubble's middle."""
     for number, frame in enumerate(leading):
         labels, sizes = labelled(_changed(frame.astype(np.float32), first, noise) & ~blind)
@@ -307,7 +292,7 @@ def _without_specks(empty: Sequence[Frame], noise: float) -> Array:
 
 
 def _with_sign(
-    level: Array, samples: Sequence[Frame], noise: float, empty: int, blind: npt.NDArray[np.bool_], unit: float
+    level: Array, samples: Sequence[Frame], noise: float, empty: int, blind: Mask, unit: float
 ) -> Background:
     """Dark on bright, relative to the background; or bright on dark, as it is: by what differs most in most frames."""
     votes = [

@@ -1,7 +1,5 @@
 """What may be the bubble in a frame: patches with the outline of a bubble, and what is doubtful in them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

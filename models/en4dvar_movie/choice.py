@@ -8,16 +8,14 @@ These are a small text file, a line a frame.
 19       270.5 64.0 28.0   start here: x, y and radius in pixels
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from en4dvar.inputs.parts import readable
 from en4dvar.inputs.text_table import numbered_lines
+from en4dvar.model.state import Mask
 from en4dvar.plumbing.decoding import require_plain
 from en4dvar.plumbing.errors import DataError
 from en4dvar_movie.frames import MOVIES, Movie, open_picture
@@ -75,12 +73,10 @@ def numbers(text: str, option: str, names: str) -> tuple[float, ...]:
     return values
 
 
-def watched(movie: Movie, region: str | None, mask: Path | None) -> npt.NDArray[np.bool_] | None:
+def watched(movie: Movie, region: str | None, mask: Path | None) -> Mask | None:
     """The part of a frame (H, W) that is looked at; None: all of it.
 
-    Raises
-    ------
-    DataError: the region lies outside the frame, or the mask is no picture of its size.
+    Raises DataError: the region lies outside the frame, or the mask is no picture of its size.
     """
     if region is None and mask is None:
         return None

@@ -1,7 +1,5 @@
 """``en4dvar track``. Heavy imports stay inside the command."""
 
-from __future__ import annotations
-
 import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -105,8 +103,8 @@ def track(
 
 
 def _scaled(
-    movie: Movie, pixel: str | None, frame_rate: str | None, exposure: str | None, flashes: str | None
-) -> tuple[Movie, Scale]:
+    movie: "Movie", pixel: str | None, frame_rate: str | None, exposure: str | None, flashes: str | None
+) -> "tuple[Movie, Scale]":
     """The movie with its scale. Raises :class:`click.UsageError`, :class:`DataError` where the options cannot be."""
     from en4dvar.plumbing.units import parse_quantity
     from en4dvar_movie.flashes import parse_flashes

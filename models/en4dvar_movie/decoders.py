@@ -3,8 +3,6 @@
 Each function gives values one by one: numbers and words about the file, or frames as the libraries give them.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Iterator

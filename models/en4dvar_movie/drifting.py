@@ -1,7 +1,5 @@
 """A camera that drifts over a background with structure: by how many pixels frames along a movie show it elsewhere."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -28,8 +26,7 @@ def drift_of(frames: Sequence[Frame], numbers: Sequence[int]) -> Array | None:
     every = -(-len(frames) // FEW)
     if every > 1 and drift_of(frames[::every], numbers[::every]) is None:
         return None
-    images = [_structure(frame) for frame in frames]
-    first, *others = images
+    first, *others = [_structure(frame) for frame in frames]
     spectrum = np.conj(fft.rfft2(_clipped(first)))
     shifts, moved = [(numbers[0], 0, 0)], 0
     for number, image in zip(numbers[1:], others, strict=True):

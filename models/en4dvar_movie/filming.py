@@ -3,8 +3,6 @@
 The settings are the fields of :class:`Camera` and of :class:`Scene`, which hold their words and defaults.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -39,17 +37,14 @@ class Camera:
     flashes: Annotated[Instants, "flashes of a frame after its instant, such as 0 us, 2 us"] = (0.0,)
 
 
-def film(config: Config, times: Array | None, out: Path, settings: Mapping[str, str], seed: int) -> str:
+def film(config: "Config", times: Array | None, out: Path, settings: Mapping[str, str], seed: int) -> str:
     """Also write a movie of the bubble (.tif, .mp4 or .avi) with one frame per instant.
 
-    Parameters
-    ----------
-    times: (K,) instants of the frames, evenly spaced; default those of the configuration.
-    settings: text values of fields of :class:`Camera` and :class:`Scene`.
+    ``times``: (K,) instants of the frames, evenly spaced; default those of the configuration. ``settings``: text values
+    of fields of :class:`Camera` and :class:`Scene`.
 
-    Raises
-    ------
-    ConfigError: a setting is unknown or wrong, or the observable is no length. DataError: the file cannot be written.
+    Raises ConfigError: a setting is unknown or wrong, or the observable is no length. DataError: the file cannot be
+    written.
     """
     from en4dvar.runs.simulation import simulate
 

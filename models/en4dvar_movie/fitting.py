@@ -1,7 +1,5 @@
 """Fitting the outline: a blurred edge, or several nested ones, to every pixel near it, robustly."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

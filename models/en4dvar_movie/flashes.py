@@ -1,7 +1,5 @@
 """Several flashes in one exposure: which of the nested circles of a frame belongs to which flash."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise, permutations
 
@@ -30,9 +28,7 @@ def in_time(radii: Sequence[Array], times: Array, flashes: Sequence[float]) -> l
     chosen whose ∫ (d²R/dt²)² dt is least over all frames at once, as of a spline (dynamic programming over the orders
     of two frames that follow each other).
 
-    Parameters
-    ----------
-    radii: of each frame, the circles' radii (S,), the largest first; times: (K,) instants of the frames, s.
+    ``radii``: of each frame, the circles' radii (S,), the largest first; times: (K,) instants of the frames, s.
     """
     orders = list(permutations(range(len(flashes))))
     if len(orders) == 1 or not radii:

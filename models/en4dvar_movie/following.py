@@ -6,8 +6,6 @@ candidates at once). Further bubbles are the next best chains of what is left. T
 it is doubtful: a bubble does not jump.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ Frames are (H, W) arrays of brightness, 8 or 16 bit. Nothing is held: a movie is
 Movies are written frame by frame as well: TIFF with its scale, or a video.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
@@ -84,9 +82,7 @@ class Movie:
 def open_movie(path: str | Path, raw: str | None = None) -> Movie:
     """The movie in a file or folder; ``raw`` is the ``WIDTHxHEIGHTxBITS`` of a file without header.
 
-    Raises
-    ------
-    DataError: there is none, it cannot be read, or a library is missing.
+    Raises DataError: there is none, it cannot be read, or a library is missing.
     """
     path = Path(path).expanduser()
     if not path.exists():
@@ -249,9 +245,7 @@ def write_movie(path: Path, frames: Iterable[Frame], count: int, pixel: float, r
 
     A grey video is without loss; a coloured one is to be looked at.
 
-    Raises
-    ------
-    DataError: the suffix is none of a movie's, a library is missing, or the file cannot be written.
+    Raises DataError: the suffix is none of a movie's, a library is missing, or the file cannot be written.
     """
     require_suffix(path)
     stream = iter(frames)

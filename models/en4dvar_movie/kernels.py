@@ -10,8 +10,6 @@ outermost has the radius R, the others lie d_s inside it. The order of the param
 A_2, B_2, A_3, … and d_2, d_3, … Pixels that are not looked at are NaN.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The order of a folder's frames, and what is missing among them, by the numbers in their names."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -27,9 +25,7 @@ def in_order(path: Path, files: Sequence[Path]) -> tuple[list[Path], list[int], 
     1.9 and 1.10 show that it stands before a count. Of the numbers in a name, that counts which goes up from frame to
     frame, by steps of one size, or whole multiples of it where frames are missing.
 
-    Raises
-    ------
-    DataError: a picture is not named as most are, two have the same numbers, or the numbers go up unevenly.
+    Raises DataError: a picture is not named as most are, two have the same numbers, or the numbers go up unevenly.
     """
     parts = [re.split(BROKEN if _decimal(files) else WHOLE, file.stem) for file in files]
     texts = {(at, text) for name in parts for at, text in enumerate(name) if at % 2 == 0}

@@ -1,7 +1,5 @@
 """Bubbles in one image: where they may be, roughly, and the outline of one, a circle, its modes, what is known."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, Indices
 
 MODES = 6  # of the outline
 TILE = 2  # pixels are averaged over tiles of this side
@@ -121,7 +119,7 @@ def locate(tiles: Array, noise: float) -> list[tuple[Circle, float]]:
     return result
 
 
-def labelled(mask: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], npt.NDArray[np.intp]]:
+def labelled(mask: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], Indices]:
     """The connected patches of a mask, and the size of each by its number; 0 of what belongs to none."""
     labels, _ = ndimage.label(mask)
     sizes = np.bincount(labels.ravel())

@@ -1,7 +1,5 @@
 """What shows the work: the movie with its outlines, and a page with a strip of frames, radius and shape in time."""
 
-from __future__ import annotations
-
 import base64
 import io
 from collections.abc import Iterator, Sequence
@@ -102,7 +100,6 @@ def _picture(number: int, frame: Frame, readings: list[Reading], full: float) ->
 
 
 def png(picture: Frame) -> str:
-    """A picture of 8 bit as base64."""
     from PIL import Image
 
     buffer = io.BytesIO()
@@ -134,12 +131,10 @@ def outlined(movie: Movie, track: Track) -> Iterator[Frame]:
 
 
 def brightest(track: Track) -> float:
-    """The brightness that is shown as white."""
     return max(1.3 * float(np.percentile(track.background.level, 95)), 1.0)
 
 
 def grey(frame: Frame, full: float) -> Frame:
-    """A frame of any depth in 8 bit."""
     return np.clip(255.0 * frame / full, 0, 255).astype(np.uint8)
 
 

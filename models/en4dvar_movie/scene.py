@@ -5,8 +5,6 @@ over the exposure (or over flashes) and over a pixel, blurred by the optics, wit
 whole grey levels.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated

@@ -1,7 +1,5 @@
 """The readings as CSV: one line a frame, lengths in micrometres, times in microseconds."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import version

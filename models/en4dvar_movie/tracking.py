@@ -1,15 +1,13 @@
 """From a movie to readings: candidates of every frame by itself, in any order, then the bubble that continues through
 them, then what neighbouring frames say of the errors."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from en4dvar.executor import SerialExecutor, ThreadsExecutor
+from en4dvar.model.state import Mask
 from en4dvar.plumbing.errors import DataError
 from en4dvar_movie.background import Background, find_background
 from en4dvar_movie.candidates import Look, look_at
@@ -64,21 +62,16 @@ def track(
     progress: Callable[[int], None] = lambda done: None,
     flashes: tuple[float, ...] = (0.0,),
     point: tuple[float, ...] | None = None,
-    watched: npt.NDArray[np.bool_] | None = None,
+    watched: Mask | None = None,
     exposure: float = 0.0,
 ) -> Track:
     """Readings of a bubble in every frame, or at every flash of each; the same numbers for any number of workers.
 
-    Parameters
-    ----------
-    point: x and y within the bubble, in some frame; by default the bubble is that of the laser's spot, or the one whose
-        wall travels furthest.
-    watched: (H, W) the part of the frames that is looked at.
-    exposure: how long light falls on a frame, s; 0 if it is not known.
+    ``point``: x and y within the bubble, in some frame; by default the bubble is that of the laser's spot, or the one
+    whose wall travels furthest. ``watched``: (H, W) the part of the frames that is looked at. ``exposure``: how long
+    light falls on a frame, s; 0 if it is not known.
 
-    Raises
-    ------
-    DataError: the movie cannot be read or shows no bubble, or none near the point.
+    Raises DataError: the movie cannot be read or shows no bubble, or none near the point.
     """
     background, optics = find_background(movie, len(flashes), watched)
     fixed = corrections or {}

@@ -25,8 +25,6 @@ is clearly more than that of the movie's sharpest frames, for theirs: what goes 
 the exposure, which has no such shift.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """The compiled loops over pixels, used on a movie of a few small frames."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path

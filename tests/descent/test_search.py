@@ -12,7 +12,6 @@ from en4dvar.descent.search import Search
 from en4dvar.diagnosis.analysis import Descents, IterationRecord, StartRecord
 from en4dvar.estimation import stages
 from en4dvar.estimation.assimilate import assimilate
-from en4dvar.estimation.stages import Stages
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.priors.varying import RandomWalk
 from en4dvar.problem import InverseProblem
@@ -105,7 +104,7 @@ def test_a_well_without_a_member_is_found_where_noise_and_prior_explain_nothing_
         assert "misfit" not in {c.code for c in analysis.cautions}
     monkeypatch.setattr(Search, "widened", lambda self, found: found)
     # nor is a draw of the sampler followed that happens to fall into the well
-    monkeypatch.setattr(Stages, "searched_from", lambda self, outcome, ends, x: (outcome, ends))
+    monkeypatch.setattr("en4dvar.estimation.assimilate.from_draw", lambda space, found, *_: found)
     lost = assimilate(hidden(15), AssimilationSettings(), 15)
     assert lost.modes[0].cost > 100
     assert "misfit" in {c.code for c in lost.cautions}
@@ -202,7 +201,7 @@ def test_a_draw_that_leads_nowhere_is_told(monkeypatch):
     """Where the descent from it ends no lower, as that of a rough J may, what was found is sampled, once."""
     problem, settings = in_the_wrong_well(monkeypatch)
     tried = []
-    monkeypatch.setattr(stages, "from_draw", lambda space, found, *_: tried.append(found) or found)
+    monkeypatch.setattr("en4dvar.estimation.assimilate.from_draw", lambda _, found, *__: tried.append(found) or found)
     analysis = assimilate(problem, settings, 1)
     assert len(tried) == 1
     assert analysis.descents.members == (-1,)
@@ -271,7 +270,7 @@ def test_readings_after_the_window_lead_to_a_minimum_that_was_missed(kind, monke
         right = sum(mode.weight for mode in analysis.modes if mode.centre[0] > 0)
         assert right == pytest.approx(mass_of_positive(problem), abs=0.06)
         assert "future-missed" not in {c.code for c in analysis.cautions}
-    monkeypatch.setattr(Search, "foretold", lambda self, outcome, missed: outcome)
+    monkeypatch.setattr(Search, "foretold", lambda self, outcome, expected: outcome)
     lost = assimilate(problem, settings, seed)
     assert len(lost.modes) < 2
     assert lost.withheld.inside < 0.1

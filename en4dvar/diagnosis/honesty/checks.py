@@ -7,12 +7,11 @@ from statistics import median
 from types import MappingProxyType
 
 import numpy as np
-import numpy.typing as npt
 
 from en4dvar.diagnosis import diagnostics as diag
 from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.model.forward import ValidityLimit
-from en4dvar.model.state import Array, Parameter
+from en4dvar.model.state import Array, Mask, Parameter
 from en4dvar.plumbing.caution import Caution, Severity, caution
 from en4dvar.plumbing.units import convert
 from en4dvar.priors.prior import Prior
@@ -35,7 +34,6 @@ SEPARATED = 3.0  # standard deviations of the rank sum beyond which a parameter 
 FAR = 1.5  # prior standard deviations from the prior mean that are worth naming for one or two members
 MOST_NAMED, MOST_LISTED = 3, 6
 NONE: Mapping[str, str] = MappingProxyType({})
-Mask = npt.NDArray[np.bool_]
 Findings = Iterator[Caution]
 
 
@@ -367,5 +365,4 @@ def _one_by_one(prior: Prior, members: Array) -> str:
 
 
 def _shown(prior: Prior, j: int, x: float) -> str:
-    """A transformed value as physical, in its display unit."""
     return shown(float(prior.terms[j].to_physical(np.asarray(x))), prior.parameters[j])

@@ -5,13 +5,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.diagnosis.diagnostics import UNSEEN, active_members
 from en4dvar.diagnosis.honesty import checks
 from en4dvar.diagnosis.honesty.advice import advised
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, Mask
 from en4dvar.plumbing.caution import Caution, caution, of_several_modes, untrusted, worst_first
 from en4dvar.priors.prior import Prior
 from en4dvar.problem import InverseProblem
@@ -109,7 +108,7 @@ def _allowed(a: Analysis, findings: checks.Findings) -> checks.Findings:
         yield replace(finding, severity="caution") if vetoes else finding
 
 
-def _validity(a: Analysis, alive: npt.NDArray[np.bool_]) -> checks.Findings:
+def _validity(a: Analysis, alive: Mask) -> checks.Findings:
     """Without a linearisation every reading that counts is taken to inform."""
     limits, observations, residuals = a.problem.model.validity, a.problem.observations, a.residuals
     which, leverage = observations.used, np.ones(len(observations.used))
@@ -141,7 +140,7 @@ def unfinished(analysis: Analysis) -> checks.Findings:
         yield caution("not-converged", words)
 
 
-def collapse(prior: Prior, control: ControlEnsembles, alive: npt.NDArray[np.bool_]) -> checks.Findings:
+def collapse(prior: Prior, control: ControlEnsembles, alive: Mask) -> checks.Findings:
     """A spread far below what J allows: for a Gaussian posterior 2 (J − J_min) of its members is χ²_n, with mean n; of
     draws of another one it may be less.
 

@@ -13,21 +13,18 @@ is submodular (Krause & Guestrin 2005, UAI), as it is of independent readings ab
 choice that no single exchange improves.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Annotated, Literal
 
 import numpy as np
-import numpy.typing as npt
 from annotated_types import Ge
 
 from en4dvar.ensemble.forecast import plotting_times
 from en4dvar.estimation.design.nested import Decision, deciding, nested
 from en4dvar.estimation.design.planned import Planned, Tangents, expected, require_alive, shared_spread
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, Indices, Mask
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.priors.prior import own_seed
 from en4dvar.problem import InverseProblem
@@ -37,7 +34,6 @@ FAN = (0.05, 0.25, 0.5, 0.75, 0.95)
 LEAST, MOST, HALVINGS = 1e-4, 1e3, 20  # factors: below it is exactly known, above it anything; to 2e-5
 SWEEPS = 10  # of exchanges of the readings that are chosen, at most
 WORTH = 1e-9  # nats: an exchange that gains less is none
-Indices = npt.NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -290,7 +286,7 @@ class _Search:
         return _added(self.rows, self.precision) - _added(self.others, self.precision[:, a:, a:])
 
 
-def _room(near: npt.NDArray[np.bool_], chosen: list[int]) -> int:
+def _room(near: Mask, chosen: list[int]) -> int:
     """How many readings can be chosen in all beside these, the earliest that is free each time."""
     blocked, count = np.asarray(near[chosen].any(axis=0)), len(chosen)
     for k in range(len(blocked)):

@@ -26,8 +26,6 @@ too large, by the same amount to second order; I is their mean. E[P(k | y)] of t
 P, is the probability that it will have: 1/L where readings tell nothing, 1 where they decide.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -174,8 +172,7 @@ def explained(
 
 def control_variate(d: Array, rows: Array, u: Array, asked: int) -> Array:
     """c (R,), see above, of innovations d (R, K') and sensitivities (R, K', n) at draws (R, n)."""
-    others = rows[:, :, asked:]
-    return 0.5 * (_centred(d, rows, u) - _centred(d, others, u[:, asked:]))
+    return 0.5 * (_centred(d, rows, u) - _centred(d, rows[:, :, asked:], u[:, asked:]))
 
 
 def _centred(d: Array, rows: Array, u: Array) -> Array:
@@ -205,7 +202,7 @@ class Decision:
     thin: float
 
     @classmethod
-    def of(cls, logs: Sequence[Array], thin: float = 0.0) -> Decision:
+    def of(cls, logs: Sequence[Array], thin: float = 0.0) -> "Decision":
         """From log-evidences (R, L) of readings simulated with each of the L laws, in their order."""
         told, holds = [], []
         for k, log in enumerate(logs):

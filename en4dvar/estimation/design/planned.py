@@ -11,17 +11,14 @@ experiments alike share s, what is asked and what is common to them, such as a s
 common is left out at the end, I ≈ E[½ ln det (I + n (M_s − I))_a].
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from en4dvar.data.noise import Linearisation
 from en4dvar.ensemble.forecast import NO_TIMES, Composite, Forecast
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, Indices
 from en4dvar.plumbing.errors import ConfigError, TooFewMembersError
 from en4dvar.priors.prior import standard_normal
 from en4dvar.problem import InverseProblem
@@ -79,7 +76,7 @@ class Planned:
         """J_o (B,) of readings (K,) for runs; +inf where one has failed."""
         return replace(self.problem.observations, values=values).cost(run.predicted)
 
-    def tangents(self, u: Array, run: Forecast | None = None) -> Tangents:
+    def tangents(self, u: Array, run: Forecast | None = None) -> "Tangents":
         """At points (R, n), by n runs beside each; those where one fails are left out."""
         count, n = u.shape
         run = run or self.run(u)
@@ -95,11 +92,11 @@ class Planned:
 class Tangents:
     """Linearisations at points ``u`` (R, n); ``alive`` (R,) are their numbers among the points that were asked for."""
 
-    alive: npt.NDArray[np.intp]
+    alive: Indices
     u: Array
     at: tuple[Linearisation, ...]
 
-    def some(self, which: Sequence[int]) -> Tangents:
+    def some(self, which: Sequence[int]) -> "Tangents":
         """At some of the points."""
         chosen = list(which)
         return Tangents(self.alive[chosen], self.u[chosen], tuple(self.at[k] for k in chosen))

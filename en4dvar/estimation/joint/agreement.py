@@ -22,12 +22,11 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import chdtrc, fdtrc, gammaincinv
 
 from en4dvar.diagnosis.diagnostics import chi2_interval
 from en4dvar.estimation.joint.problem import JointProblem, Single
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, Indices
 from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.problem import InverseProblem
 
@@ -52,7 +51,7 @@ class Statement:
 
     precision: Array
     pull: Array
-    compared: npt.NDArray[np.intp]
+    compared: Indices
 
     @classmethod
     def of(cls, joint: JointProblem, e: int, single: Single) -> "Statement":

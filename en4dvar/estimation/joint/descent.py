@@ -65,16 +65,12 @@ class Arrow:
     def sample(self, border: Array, own: Callable[[int], Array]) -> tuple[Array, list[Array]]:
         """N draws of the Gaussian of mean zero with this precision: border (N, c), and (N, n_e) of each experiment.
 
-        Parameters
-        ----------
-        border: (N, c) standard normal numbers; own: gives those (N, n_e) of an experiment by its number.
+        ``border``: (N, c) standard normal numbers; own: gives those (N, n_e) of an experiment by its number.
 
         Mean and covariance of the N draws of every pair (border, experiment) are exact. Those of different experiments
         are independent given the border, up to what N draws correlate by chance.
 
-        Raises
-        ------
-        ValueError: N is not larger than c + n_e.
+        Raises ValueError: N is not larger than c + n_e.
         """
         x = whiten_sample(border)
         if x.shape[1]:
@@ -95,7 +91,6 @@ class Arrow:
 
     @cached_property
     def _factors(self) -> list[tuple[Array, bool]]:
-        """Upper Cholesky factors of the blocks."""
         return [cho_factor(block) if len(block) else (block, False) for block in self.blocks]
 
 
@@ -220,11 +215,6 @@ class ArrowSystem:
     forms: tuple[Linearised, ...]
     arrow: Arrow
     slope: tuple[Array, list[Array]]
-
-    @property
-    def own_costs(self) -> Array:
-        """(E,) J_o of each experiment, and J_b of what is its own."""
-        return np.array([form.cost + 0.5 * float(v @ v) for form, v in zip(self.forms, self.place.own, strict=True)])
 
     def chi2(self, joint: JointProblem) -> Array:
         """(E,) misfit per observation of each experiment."""

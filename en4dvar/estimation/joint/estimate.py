@@ -144,12 +144,15 @@ class _Estimate:
             advice = "a lower one may not have been found: make the runs again with narrower priors"
             cautions.append(replace(caution("starts-disagree", words), advice=advice))
         most = int(AT_MOST * len(experiments)) if most is None else most
-        alone = np.array([self._alone(e, single) for e, single in enumerate(singles)])
+        own = [single.mode[joint.columns(e)[1]] for e, single in enumerate(singles)]  # J_o + J_b of these, alone
+        each = zip(experiments, singles, own, strict=True)
+        alone = np.array([float(e.costs(s.mode[None])[0] + 0.5 * v @ v) for e, s, v in each])
         said = [Statement.of(joint, e, single) for e, single in enumerate(singles)]
         without = self._without(lowest.at.cost, singles, said, alone, most) if most else None
         names = without.rest.joint.names if without else joint.names
         kept = [e for e, name in enumerate(joint.names) if name in names]
-        agreed = agreement(joint, said, kept, 2 * np.maximum(lowest.at.own_costs - alone, 0))
+        costs = [form.cost + 0.5 * float(v @ v) for form, v in zip(lowest.at.forms, lowest.at.place.own, strict=True)]
+        agreed = agreement(joint, said, kept, 2 * np.maximum(costs - alone, 0))
         cautions += doubts(joint, lowest.at.place.border, lowest.at.chi2(joint), agreed, kept, singles)
         normalisation = sum(problem.observations.log_normalisation() for problem in joint.experiments)
         return JointEstimate(
@@ -169,11 +172,6 @@ class _Estimate:
             without=without,
         )
 
-    def _alone(self, e: int, single: Single) -> float:
-        """J_o + J_b of its own quantities at an experiment's mode alone."""
-        own = single.mode[self.joint.columns(e)[1]]
-        return float(self.experiments[e].costs(single.mode[None])[0] + 0.5 * own @ own)
-
     def _without(
         self, cost: float, singles: Sequence[Single], said: Sequence[Statement], alone: Array, most: int
     ) -> JointEstimate | None:
@@ -189,7 +187,6 @@ class _Estimate:
         return rest if is_odd(said, e, 2 * (cost - rest.costs[-1] - alone[e])) else None
 
     def _singles(self) -> list[Single]:
-        """Each experiment by itself."""
         settings = replace(self.settings, refine="none", emulator="off", what_if=False)
         singles = []
         for problem in self.joint.experiments:
@@ -229,7 +226,6 @@ class _Estimate:
         return descents
 
     def _descended(self, start: Place) -> list[JointDescent]:
-        """One descent; none where the start cannot be run."""
         descent = JointDescent(start)
         minimise(self.objective, [descent])
         return [descent] if descent.system else []
@@ -257,7 +253,6 @@ class _Estimate:
 
 
 def _agreeing(descents: Sequence[JointDescent]) -> int:
-    """How many descents ended in the lowest minimum."""
     lowest = min((descent.at.cost for descent in descents), default=np.inf)
     return sum(descent.at.cost - lowest < TOLD for descent in descents)
 

@@ -5,9 +5,8 @@ their own, so that
 
     p(s | y) ∝ p(s) Π_e L_e(s),      L_e(s) = ∫ p(y_e | s, v) p(v) dv ≈ mean_k p(y_e | s, v_k) p(v_k) / q(v_k | s)
 
-with v_k from Student's t about where J is lowest given s. The estimate of L_e is unbiased, and with it the
-weights of s and the choice of one v_k for each member are those of the exact posterior (Andrieu & Roberts 2009,
-Ann. Stat. 37, 697).
+with v_k from Student's t about where J is lowest given s. The estimate of L_e is unbiased, and with it the weights of s
+and the choice of one v_k for each member are those of the exact posterior (Andrieu & Roberts 2009, Ann. Stat. 37, 697).
 
 The minimum may hold one experiment in the wrong minimum of its own quantities, as a bubble whose radii explain rebounds
 by their phase and not by their height. The others then keep what is shared about right, so that to look for a lower one

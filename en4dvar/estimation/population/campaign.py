@@ -7,8 +7,6 @@ in each. Each data set is sampled by itself (:mod:`~en4dvar.estimation.populatio
 population enters the hierarchy (:mod:`~en4dvar.estimation.population.hierarchy`) as a likelihood.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -123,17 +121,15 @@ class Population:
     def without_hyperprior(self, seed: int) -> tuple[Draws, float]:
         """Draws as they are where ν and τ are equally likely everywhere, and how many of them count.
 
-        From the posterior's draws, weighed; fewer than
-        :data:`FEWEST` say that the hyperprior decides.
+        From the posterior's draws, weighed; fewer than :data:`FEWEST` say that the hyperprior decides.
         """
         d, h = self.posterior, self.hyper
-        logs = 0.5 * np.sum((d.nu / h.mean_std) ** 2 + (d.tau / h.spread) ** 2, axis=1)
-        shares = shares_of(logs)
+        shares = shares_of(0.5 * np.sum((d.nu / h.mean_std) ** 2 + (d.tau / h.spread) ** 2, axis=1))
         taken = resampled(shares, len(shares), member_stream(seed, "without hyperprior"))
         kept = Draws(*(getattr(d, field.name)[taken] for field in fields(Draws)))
         return kept, effective_number(shares) / len(shares) * self.size
 
-    def combinations(self) -> tuple[Combination, ...]:
+    def combinations(self) -> "tuple[Combination, ...]":
         """Combinations of the means that the data determine where they do not determine each mean by itself."""
         if np.all(self.learned[0] >= DETERMINED):
             return ()

@@ -15,8 +15,6 @@ For a linear Gaussian hierarchy this is exact (product of the posteriors over th
 badly makes r_k anything but Gaussian, which is kept.
 """
 
-from __future__ import annotations
-
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 

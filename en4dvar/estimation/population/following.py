@@ -10,8 +10,6 @@ with s the prior standard deviation of the logarithm: a slope in ln G would be s
 Which of the two holds is told by the draws: the one under which they are denser, with the same slopes in all data sets.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

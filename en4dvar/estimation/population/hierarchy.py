@@ -22,8 +22,6 @@ Stat. Comput. 18, 447). A walker left behind in a secondary mode moves the propo
 is worth.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -14,8 +14,6 @@ its prior, and therefore all data sets of a population have the same slopes. The
 those of ln G are steeper for a soft gel, and a θ that makes all of them stiffer would make them more alike.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,6 +24,7 @@ import numpy as np
 from scipy.special import ndtri, stdtrit
 
 from en4dvar.descent.minima import Minimum
+from en4dvar.diagnosis.response.ledger import weighted_quantiles
 from en4dvar.ensemble.forecast import Composite, costs
 from en4dvar.ensemble.linalg import effective_number, resampled, shares_of
 from en4dvar.ensemble.missing import Beside
@@ -70,7 +69,7 @@ class Mixture(NamedTuple):
     constant: Array
 
     @classmethod
-    def divided(cls, mean: Array, covariance: Array, log_share: Array, prior_std: Array) -> Mixture:
+    def divided(cls, mean: Array, covariance: Array, log_share: Array, prior_std: Array) -> "Mixture":
         """Components of the posterior, means (M, n) and covariances (M, n, n), with the prior N(0, diag prior_std²)
         divided out. ``log_share`` (M,): ln of the components' shares.
         """
@@ -158,7 +157,7 @@ class OwnDraws:
     forward_runs: int
 
     @classmethod
-    def kept(cls, problem: InverseProblem, draws: Array, effective: float, log_evidence: float) -> OwnDraws:
+    def kept(cls, problem: InverseProblem, draws: Array, effective: float, log_evidence: float) -> "OwnDraws":
         """What the estimate of a data set has kept: ``draws`` (D, n), physical, taken from others that are worth
         ``effective`` of them, and ln p(y). Raises :class:`ValueError` for a draw that the prior excludes.
         """
@@ -315,14 +314,10 @@ def median_of(middle: Array, std: Array, stream: np.random.Generator) -> tuple[f
     """The weighted median of data sets (S,), and its standard deviation."""
     weights = np.maximum(1 - std**2, SILENT)
     chosen = stream.integers(len(middle), size=(RESAMPLED, len(middle)))
-    medians = _weighted_medians(middle[chosen], weights[chosen])
+    medians = np.array([_weighted_median(middle[rows], weights[rows]) for rows in chosen])
     spread = max(float(medians.std()), float(np.linalg.norm(weights * std) / weights.sum()))
-    return float(_weighted_medians(middle[None], weights[None])[0]), spread
+    return _weighted_median(middle, weights), spread
 
 
-def _weighted_medians(x: Array, weights: Array) -> Array:
-    """(B,) of rows (B, S): half of the weight lies below, interpolated between the middles of steps."""
-    order = np.argsort(x, axis=1, kind="stable")
-    x, weights = np.take_along_axis(x, order, axis=1), np.take_along_axis(weights, order, axis=1)
-    below = (np.cumsum(weights, axis=1) - 0.5 * weights) / weights.sum(axis=1, keepdims=True)
-    return np.array([np.interp(0.5, shares, values) for shares, values in zip(below, x, strict=True)])
+def _weighted_median(x: Array, weights: Array) -> float:
+    return float(weighted_quantiles(x, weights / weights.sum())[1])

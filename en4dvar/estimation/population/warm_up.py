@@ -1,7 +1,5 @@
 """The compiled loops of this package, each used once."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
@@ -16,7 +14,6 @@ def examples() -> dict[str, Callable[[], object]]:
 
 
 def _hierarchy() -> None:
-    """Two parameters that vary, and one in common."""
     draws = np.random.default_rng(0).standard_normal((4, 200, 3)) * [0.1, 0.2, 1.0]
     drawn = [OwnDraws(z, 0.0, 100.0, 0) for z in draws]
     likelihoods = own_likelihoods(drawn, [0, 1], [2], 0, "abcd", np.zeros(2))

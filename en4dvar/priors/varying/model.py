@@ -26,7 +26,15 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.model.forward import Alternative, Batch, Failure, ForwardModel, Trajectory, ValidityLimit
+from en4dvar.model.forward import (
+    Alternative,
+    Batch,
+    Failure,
+    ForwardModel,
+    Trajectory,
+    ValidityLimit,
+    initial_states,
+)
 from en4dvar.model.state import Array, Field, Parameter, StateLayout
 from en4dvar.plumbing.units import convert
 from en4dvar.priors.prior import PriorTerm
