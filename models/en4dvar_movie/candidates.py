@@ -8,6 +8,7 @@ from en4dvar.model.state import Array
 from en4dvar_movie.background import BRIGHT, CHANGED, Background, share_changed
 from en4dvar_movie.fitting import fit_outline, two_edges
 from en4dvar_movie.frames import Frame
+from en4dvar_movie.merged import two_circles
 from en4dvar_movie.outline import TILE, Circle, Optics, Outline, locate
 
 LEAST_SEEN = 0.12  # share of the outline inside the frame
@@ -15,6 +16,8 @@ LEAST_RADIUS = 2.5  # pixels
 ROUGH = 0.08  # of the contrast: scatter about a real outline, beside the noise of the camera
 MOST_BLUR = 0.12  # of the radius, of an outline that the frame cuts
 ROWS, ROWS_STD = 0.5, 6.0  # pixels and std by which even and odd rows must differ in an interlaced frame
+BLURS = 3.0  # widths of the movie's sharp edges that another bubble's blur reaches
+TOUCHES = "two bubbles: the outline of another, or of something else as dark, touches it"
 WIDER = 1.4  # widths of the movie's sharp edges from which an edge may be two
 
 
@@ -65,13 +68,23 @@ def look_at(
     candidates: list[Candidate] = []
     for place in places:
         steady = background.steadied(image, tiles, place)
-        outlines = fit_outline(steady, place, optics, circles)
-        if outlines is None or any(_same(outlines[0].circle, c.circle) for c in candidates):
-            continue
-        fault = next((words for o in outlines if (words := _fault_of(o, optics, background.noise))), "")
-        doubt = "" if fault else _doubt(steady, outlines[0], optics, circles)
-        candidates.append(Candidate(number, tuple(outlines), fault, doubt))
+        pair = None if start is not None else two_circles(steady, place, optics.contrast, background.noise)
+        for near, other in ((place, None),) if pair is None else (pair, pair[::-1]):
+            seen = steady if other is None else _without(steady, other, optics)
+            outlines = fit_outline(seen, near, optics, circles)
+            if outlines is None or any(_same(outlines[0].circle, c.circle) for c in candidates):
+                continue
+            fault = next((words for o in outlines if (words := _fault_of(o, optics, background.noise))), "")
+            doubt = "" if fault else TOUCHES if pair else _doubt(steady, outlines[0], optics, circles)
+            candidates.append(Candidate(number, tuple(outlines), fault, doubt))
     return Look(number, tuple(candidates), "" if candidates else "no circle fits the outline", spot)
+
+
+def _without(image: Array, other: Circle, optics: Optics) -> Array:
+    """The image without another bubble and its blur."""
+    y, x = np.ogrid[: image.shape[0], : image.shape[1]]
+    near = np.hypot(x - other.x, y - other.y) < other.R + BLURS * optics.width
+    return np.where(near, np.float32(np.nan), image)
 
 
 def _same(a: Circle, b: Circle) -> bool:

@@ -61,7 +61,7 @@ def _fit(image: Array, start: Circle, optics: Optics, circles: int) -> tuple[Arr
         ring = _ring(p, gaps)
         if _glare_is_far(p, gaps, ring):
             p[GLARE], p[RIM] = 0.0, RIM_SHARE * _innermost(p, gaps)
-        modes = modes_for(image.shape, p)
+        modes = modes_for(image, p)
         p = np.concatenate([p[:SHAPE], np.zeros(2 * (modes - 1)), gaps])
         known = replace(optics, spread=max(optics.spread, FIRST_SPREAD[turn]))
         fitted = _descend(image, p, modes, ring, noise, known, CLOSE[turn])
@@ -86,9 +86,9 @@ def nested_radii(image: Array, start: Circle, optics: Optics, circles: int) -> A
     return np.maximum(radii - 1e-3 * np.arange(circles), 1.0)
 
 
-def modes_for(shape: tuple[int, ...], p: Array) -> int:
-    """The highest mode that a circle of this size shows: none where the frame cuts it."""
-    if share_inside(shape, Circle(*p[:3])) < 0.9:
+def modes_for(image: Array, p: Array) -> int:
+    """The highest mode that a circle of this size shows: none where a part of it is not seen."""
+    if share_inside(image, Circle(*p[:3])) < 0.9:
         return 1
     return int(np.clip(p[R] / 4.0, 2, MODES))
 
@@ -233,7 +233,7 @@ def _outlines(image: Array, p: Array, modes: int, noise: float, optics: Optics) 
             ratio=float(np.sum(sums**2) / _left(fitted, weights, A, inverse) / max(spread, 1e-30)),
             common=float(common),
             mode_std=float(np.sqrt(max(mode_variance, 0) * np.sum((left * off) ** 2) / total)),
-            seen=share_inside(image.shape, circle),
+            seen=share_inside(image, circle),
             rows=float(np.subtract(*(product / slopes))),
             rows_std=float(noise * np.sqrt(np.sum(1 / slopes))),
             # as if evenly spread over the distance from which they are told apart

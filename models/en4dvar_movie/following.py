@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from en4dvar.model.state import Array
-from en4dvar_movie.candidates import Candidate, Look
+from en4dvar_movie.candidates import TOUCHES, Candidate, Look
 
 GAP = 12  # frames in which a bubble may be out of sight
 MOST = 8  # bubbles that are followed
@@ -165,9 +165,7 @@ def _touching(bubble: Chain, others: Sequence[Chain]) -> dict[int, str]:
             c = candidate.circle
             apart = np.hypot(circles[near, 0] - c.x, circles[near, 1] - c.y) - circles[near, 2] - c.R
             if np.any(apart < TOUCH):
-                result[candidate.frame] = (
-                    "two bubbles: the outline of another, or of something else as dark, touches it"
-                )
+                result[candidate.frame] = TOUCHES
     return result
 
 

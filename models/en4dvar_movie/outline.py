@@ -45,7 +45,7 @@ class Outline:
     ``width`` is the std of the edge's blur, ``modes`` (2, M−1) are A_n and B_n, ``variance`` that of R if pixels were
     independent and ``ratio`` what sectors of the outline say in units of it, ``common`` the variance that comes from
     the contrast of the movie; ``mode_std`` is the std of a mode's amplitude. ``seen`` is the share of the
-    outline inside the frame. ``rows`` is by how much even rows show a larger bubble than odd ones, ``rows_std`` what
+    outline that can be seen. ``rows`` is by how much even rows show a larger bubble than odd ones, ``rows_std`` what
     noise makes of it. ``joined`` is the std for nested circles that lie too close to be told apart, which all
     have their mean radius.
     """
@@ -88,11 +88,13 @@ class Outline:
         return np.stack([self.circle.x + rho * np.cos(angles), self.circle.y + rho * np.sin(angles)], axis=1)
 
 
-def share_inside(shape: tuple[int, ...], circle: Circle) -> float:
-    """How much of a circle lies inside a frame (H, W)."""
+def share_inside(image: Array, circle: Circle) -> float:
+    """How much of a circle lies inside a frame (H, W), where it is not NaN."""
     angles = np.linspace(0, 2 * np.pi, 180, endpoint=False)
     x, y = circle.x + circle.R * np.cos(angles), circle.y + circle.R * np.sin(angles)
-    return float(np.mean((x >= 0) & (x <= shape[1] - 1) & (y >= 0) & (y <= shape[0] - 1)))
+    inside = (x >= 0) & (x <= image.shape[1] - 1) & (y >= 0) & (y <= image.shape[0] - 1)
+    at = np.rint(y[inside]).astype(int), np.rint(x[inside]).astype(int)
+    return float(np.sum(~np.isnan(image[at]))) / len(angles)
 
 
 def locate(tiles: Array, noise: float) -> list[tuple[Circle, float]]:

@@ -29,7 +29,7 @@ BUBBLE = (
 # and inside the reader of movies
 MOVIE = (
     "decoders", "numbering", "frames", "kernels", "outline", "fitting", "drifting", "background", "uncertainty",
-    "flashes", "candidates", "following", "choice", "tracking", "table", "page", "scene",
+    "merged", "flashes", "candidates", "following", "choice", "tracking", "table", "page", "scene",
     "filming", "commands", "warm_up",
 )  # fmt: skip
 
