@@ -24,7 +24,7 @@ class Wells(Toy):
 
     def trajectories(self, x, times):
         own = np.broadcast_to(times, (len(x), np.shape(times)[-1]))
-        theta = np.broadcast_to(x[:, None, 2:], (*own.shape, 2))
+        theta = np.broadcast_to(x[:, None, 2:], (*own.shape, len(self.parameters)))
         parts = self.curve(theta.transpose(2, 0, 1), own), self.rate(theta.transpose(2, 0, 1), own)
         return [
             Trajectory(t, s, self.layout)
@@ -52,6 +52,30 @@ class Hidden(Wells):
     def curve(self, theta, t):
         a, b = theta
         return np.where(np.abs(a + 1.5) < 0.1, 2 + 30 * (a + 1.6), 2 * np.tanh(a)) + b * t
+
+
+class Chord(Wells):
+    """y = a sin 3 b t and eight slow waves that change it little: J has many minima in b, of which most descents end in
+    one of their own.
+    """
+
+    def __init__(self):
+        super().__init__((*"ab", *(f"c{j}" for j in range(8))), compiled=True)
+
+    def curve(self, theta, t):
+        a, b, *slow = theta
+        return a * np.sin(3 * b * t) + sum(c * np.cos((j + 1) * t / 4) for j, c in enumerate(slow))
+
+    def rate(self, theta, t):
+        return np.zeros(np.broadcast_shapes(np.shape(theta[0]), np.shape(t)))
+
+
+def chord(seed):
+    """Noise as large as the wave: wrong minima are plausible, too. b = 9, known as 3 ± 6."""
+    model = Chord()
+    stds = (0.3, 6.0, *[0.5] * 8)
+    terms = tuple(map(PriorTerm.normal, model.parameters, (1.0, 3.0, *[0.0] * 8), stds))
+    return make_problem(model, [1.0, 9.0, *[0.1] * 8], std=1.2, prior=terms, seed=seed, k=60)
 
 
 def hidden_well(seed):

@@ -2,10 +2,11 @@
 
 Members of low J may all lie in the basin of a wrong minimum. A challenger starts from the member farthest from the
 minimum, chosen by the forecast of the prior ensemble that is there anyway; where it ends elsewhere, others follow.
-Where noise and prior do not explain the lowest J, no member may lie in the right basin: many more draws of the prior
-are run, and the lowest of them start descents. Where something changes along the path, a descent starts where the fit
-without any change ends. Where readings after the window, which nothing was fitted to, come out otherwise than expected,
-a descent starts where all readings together lead.
+Where noise and prior do not explain the lowest J, or too many descents ended each at a place of its own, no member may
+lie in the right basin: many more draws of the prior are run, and the lowest of them start descents, until these settle
+it or there are none left. Where something changes along the path, a descent starts where the fit without any change
+ends. Where readings after the window, which nothing was fitted to, come out otherwise than expected, a descent starts
+where all readings together lead.
 """
 
 from collections.abc import Callable, Sequence
@@ -30,6 +31,9 @@ from en4dvar.schemes.base import GaussNewtonStep
 
 SAME_COST = 0.01  # of J, by which a descent must end lower to be another one
 WIDER = 20  # times the ensemble: draws of the prior beyond it
+TOGETHER = 6  # descents from these in a round, at least: by 9 % they all miss a basin of a third of such draws
+ROUNDS = 3  # of descents from them, at most
+UNSEEN = 0.115  # chance of ending lower that settles a search: two descents that agree and one elsewhere do, 1/9
 
 
 @dataclass(frozen=True)
@@ -47,8 +51,18 @@ class Outcome:
 
     @property
     def agreed(self) -> bool:
-        """Whether descents from different members ended in the lowest minimum."""
-        return self.minima[0].descents >= AGREE
+        """Whether descents from different members ended in the lowest minimum, and another would hardly end lower."""
+        return self.minima[0].descents >= AGREE and self.unseen <= UNSEEN
+
+    @property
+    def unseen(self) -> float:
+        """The chance that one more descent ends lower than the lowest minimum.
+
+        That of a new minimum is the share of descents that ended alone (Good 1953, Biometrika 40, 237), and of all
+        minima with the new one each is as likely the lowest.
+        """
+        ended = [minimum.descents for minimum in self.minima]
+        return ended.count(1) / (sum(ended) * (1 + len(ended)))
 
 
 class Search:
@@ -66,7 +80,7 @@ class Search:
         return self.round(outcome, [challenger(self.space, self.run, outcome)])
 
     def settled(self, outcome: Outcome) -> Outcome:
-        """After ``starts`` members more, and again while one descent alone ended lowest and the budget lasts."""
+        """After ``starts`` members more, and again while descents do not agree and the budget lasts."""
         together = self.space.minimiser.starts
         while not outcome.agreed and (rest := self.rest(outcome)):
             outcome = self.round(outcome, rest[:together])
@@ -74,13 +88,15 @@ class Search:
 
     def widened(self, outcome: Outcome) -> Outcome:
         """After descents from the lowest of many draws beyond the ensemble, where J is higher than noise and prior
-        explain and there were none yet.
+        explain, and round after round while descents do not agree.
         """
-        n_members = len(self.space.members)
-        drawn = any(n_members < i < self.last for i in outcome.tried)
-        if outcome.descent.cost <= highest_plausible(self.space) or drawn:
-            return outcome
-        return self.round(outcome, [n_members + 1 + i for i in range(self.space.side_by_side)])
+        first = len(self.space.members) + 1
+        while rest := [i for i in range(first, self.last) if i not in outcome.tried]:
+            explained = len(rest) < self.last - first or outcome.descent.cost <= highest_plausible(self.space)
+            if explained and outcome.agreed:
+                break
+            outcome = self.round(outcome, rest[: self.together])
+        return outcome
 
     def foretold(self, outcome: Outcome, expected: Callable[[], Withheld | None]) -> Outcome:
         """After a descent from :attr:`led`, where readings after the window miss what is ``expected`` of them."""
@@ -101,7 +117,12 @@ class Search:
     @property
     def last(self) -> int:
         """The number of :attr:`led` in :attr:`Outcome.tried`; where it is there, the search is over."""
-        return len(self.space.members) + 1 + self.space.side_by_side
+        return len(self.space.members) + 1 + ROUNDS * self.together
+
+    @property
+    def together(self) -> int:
+        """Descents in a round of those from draws."""
+        return max(TOGETHER, self.space.side_by_side)
 
     @cached_property
     def led(self) -> Array:
@@ -131,11 +152,11 @@ class Search:
 
     @cached_property
     def lowest_draws(self) -> Array:
-        """(B, n) of the draws that an ensemble :data:`WIDER` times as large would add, as many as go side by side."""
+        """(B, n) of the draws that an ensemble :data:`WIDER` times as large would add, as many as descents may take."""
         space, n_members = self.space, len(self.space.members)
         draws = space.problem.prior.sample((1 + WIDER) * n_members, space.seed, "random")[n_members:]
         costs = np.concatenate([space.costs(x, space.forecast(x)) for x in np.split(draws, WIDER)])
-        return np.asarray(draws[np.argsort(costs, kind="stable")[: space.side_by_side]])
+        return np.asarray(draws[np.argsort(costs, kind="stable")[: self.last - n_members - 1]])
 
     def begin(self, number: int) -> Descent:
         """From a member, the mean, a draw, :attr:`led` or :attr:`steady`; numbers as in :attr:`Outcome.tried`."""

@@ -69,6 +69,8 @@ def _through(stages: Stages) -> Analysis:
     prior_run, start = stages.descend()
     outcome, ends = stages.searched(start, prior_run)
     looking, excusable = True, True
+    searches = stages.minimiser is not None and stages.minimiser.searches
+    scattered = searches and len(outcome.tried) > 1 and not outcome.agreed  # all that the search could do was done
     while True:
         counting = that_count(outcome.minima, prior)
         agree = len(outcome.tried) < 2 or outcome.agreed
@@ -107,7 +109,8 @@ def _through(stages: Stages) -> Analysis:
     cautions += conclusions.future_missed(analysis.withheld)
     cautions += conclusions.missing_readings(ends.run.filled, stages.settings.refine == "mcmc")
     if counting:
-        cautions += mode_cautions(prior, counting, analysis.modes, agree, sampled.refined)
+        settled = agree or (sampled.refined is not None and not scattered)
+        cautions += mode_cautions(prior, counting, analysis.modes, settled, sampled.refined)
     cautions += _missed_knots(stages, analysis)
     analysis = replace(analysis, cautions=examine(analysis, control, outcome.descent.worst_loss, tuple(cautions)))
     analysis = replace(analysis, forward_runs=space.forward_runs)

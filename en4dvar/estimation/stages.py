@@ -110,9 +110,9 @@ class Stages:
 
         After the first descents one from a member far from the minimum looks for another. Of a cheap model, or for a
         chain, many are tried where there is one or where J of the posterior members is not that of a Gaussian, and
-        draws beyond the ensemble where the lowest J is higher than noise and prior explain; of another model some,
-        where the lowest minimum is that of one descent alone. Of any, one from where all readings lead, where those
-        after the window are not what is expected.
+        draws beyond the ensemble where the lowest J is higher than noise and prior explain or descents do not agree; of
+        another model some, where they do not. Of any, one from where all readings lead, where those after the window
+        are not what is expected.
         """
         space, scheme, descent = self.space, self.minimiser, start.descent
         if scheme is None:

@@ -216,5 +216,6 @@ def _beyond_valley(x: Array, first: Array, second: Array) -> Mask:
     t = (x - a) @ way / ((b - a) @ way)
     counts = np.array([both[np.abs(t - at) <= NEAR].sum() for at in ALONG])
     peaks = np.minimum(np.maximum.accumulate(counts), np.maximum.accumulate(counts[::-1])[::-1])
-    lowest = int(np.argmin(counts / peaks))
+    filled = np.divide(counts, peaks, out=np.ones_like(counts), where=peaks > 0)  # no valley is beyond all draws
+    lowest = int(np.argmin(filled))
     return np.asarray((t > ALONG[lowest]) & bool(counts[lowest] < VALLEY * peaks[lowest]))

@@ -197,17 +197,21 @@ def that_count(minima: Sequence[Minimum], prior: Prior, beyond: float = COUNTS) 
 
 
 def mode_cautions(
-    prior: Prior, minima: Sequence[Minimum], modes: Sequence[Mode], agree: bool, result: Refined | None
+    prior: Prior, minima: Sequence[Minimum], modes: Sequence[Mode], settled: bool, result: Refined | None
 ) -> Iterator[Caution]:
-    """Warnings about the minima that count, and the ``modes`` about them; ``result`` is there where sampled."""
+    """Warnings about the minima that count, and the ``modes`` about them; ``result`` is there where sampled.
+
+    ``settled``: whether the search for the lowest of them is.
+    """
     lowest = minima[0].cost
     if result is not None and result.lowest < lowest - MISSED:
         words = f"a draw has J = {result.lowest:.1f}, lower than the lowest minimum that descents found, {lowest:.1f}"
         yield caution("starts-disagree", words)
-    elif result is None and not agree:
+    elif not settled:
         costs = ", ".join(f"{m.cost:.1f}" for m in minima[1:])
         others = f"others ended at {costs}" if costs else "the others came to no minimum"
-        words = f"only one descent ended in the lowest minimum, J = {lowest:.1f}; {others}"
+        number = "one descent" if minima[0].descents < 2 else f"{minima[0].descents} descents"
+        words = f"only {number} ended in the lowest minimum, J = {lowest:.1f}; {others}"
         yield caution("starts-disagree", words)
     seen = [m for m in modes if m.weight >= SEEN]
     if len(seen) < 2:

@@ -5,13 +5,16 @@ import pytest
 from cut_anywhere import assert_cut_anywhere
 from toys import Decay, Wave, make_observations, make_problem, with_discrepancy
 from varying_models import Ramp
-from wells import Parting, UnlikeWells, Wells, hidden_well, mass_of_positive, parted, two_wells
+from wells import Parting, UnlikeWells, Wells, chord, hidden_well, mass_of_positive, parted, two_wells
 
 from en4dvar.descent import search
-from en4dvar.descent.search import Search
+from en4dvar.descent.minima import Minimum
+from en4dvar.descent.search import Outcome, Search
 from en4dvar.diagnosis.analysis import Descents, IterationRecord, StartRecord
 from en4dvar.estimation import stages
 from en4dvar.estimation.assimilate import assimilate
+from en4dvar.estimation.stages import Stages
+from en4dvar.executor import SerialExecutor
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.priors.varying import RandomWalk
 from en4dvar.problem import InverseProblem
@@ -108,6 +111,44 @@ def test_a_well_without_a_member_is_found_where_noise_and_prior_explain_nothing_
     lost = assimilate(hidden(15), AssimilationSettings(), 15)
     assert lost.modes[0].cost > 100
     assert "misfit" in {c.code for c in lost.cautions}
+
+
+def test_where_descents_scatter_draws_beyond_the_ensemble_settle_which_minimum_is_lowest():
+    """Members alone end in a wrong minimum for five of these seeds, at a plausible J, for one of them twice."""
+    for seed in range(8):
+        problem = chord(seed)
+        found = [search_of(problem, members, seed) for members in (48, 200)]
+        assert found[0].minima[0].cost == pytest.approx(found[1].minima[0].cost, abs=0.1)
+        assert found[0].minima[0].x[1] == pytest.approx(9.0, abs=0.2)
+        assert found[0].agreed
+        assert 6 <= sum(i > 48 for i in found[0].tried) <= 18
+
+
+def search_of(problem, members, seed):
+    """The outcome of the search alone."""
+    found = Stages(problem, AssimilationSettings(members=members), seed, SerialExecutor())
+    prior_run, start = found.descend()
+    return found.searched(start, prior_run)[0]
+
+
+def test_a_search_that_does_not_settle_ends_and_is_told(monkeypatch):
+    """Sampled or not; here no share of descents that ended alone is small enough."""
+    monkeypatch.setattr(search, "UNSEEN", -1.0)
+    for how, draws in (("auto", 18), ("none", 0)):
+        settings = AssimilationSettings(refine=how, draws=50, what_if=False)
+        analysis = assimilate(chord(1), settings, 1)
+        assert analysis.descents.members.count(-2) == draws
+        told = {c.code: c for c in analysis.cautions}["starts-disagree"]
+        assert f"only {analysis.descents.agreeing} descents ended in the lowest minimum" in told.words
+        assert "set assimilation.members: 192" in told.advice
+
+
+@pytest.mark.parametrize(("ended", "chance"), [((1,), 1 / 2), ((2, 1), 1 / 9), ((2, 1, 1), 1 / 8), ((9, 1), 1 / 30)])
+def test_the_chance_that_another_descent_ends_lower(ended, chance):
+    minima = tuple(Minimum(np.zeros(1), np.eye(1), 0.0, tuple(range(count))) for count in ended)
+    outcome = Outcome(None, minima, ())
+    assert outcome.unseen == pytest.approx(chance)
+    assert outcome.agreed == (chance < 1 / 8)
 
 
 @pytest.mark.parametrize("settings", [{"refine": "none"}, {"starts": 1}])
@@ -254,6 +295,7 @@ def alone(monkeypatch):
     """Nothing looks for another minimum within the window."""
     monkeypatch.setattr(Search, "challenged", lambda self, outcome: outcome)
     monkeypatch.setattr(Search, "rest", lambda self, outcome: [])
+    monkeypatch.setattr(Search, "widened", lambda self, outcome: outcome)
     monkeypatch.setattr("en4dvar.estimation.stages.weighs", lambda space: False)  # nor do members of the prior tell it
 
 
@@ -296,7 +338,7 @@ def test_a_search_after_the_window_goes_on_to_the_same_bits(settings, off, monke
     if settings:
         alone(monkeypatch)
     problem = parted(UnlikeParting, compiled=settings.get("refine") != "none", off=off)
-    led, told = 48 + 1 + 48 // 3, []
+    led, told = 48 + 1 + search.ROUNDS * (48 // 3), []
     monkeypatch.setattr(Search, "_from", lambda self, outcome, i: told.append(i) or search_from(self, outcome, i))
     assert_cut_anywhere(problem, AssimilationSettings(**settings), 1, cuts=9)
     assert led in told

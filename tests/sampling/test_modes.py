@@ -120,6 +120,14 @@ def test_a_mode_that_the_chain_has_left_has_no_share() -> None:
     np.testing.assert_array_equal(belonging(prior, minima, draws, np.full(4, 0.25)), [0, 0, 1, 0])
 
 
+def test_a_mode_whose_draws_lie_to_both_sides_of_their_mean_keeps_its_valley_to_another() -> None:
+    """None is near the mean of the first; what lies before all draws is no valley."""
+    prior = Prior((PriorTerm.normal(Parameter("a", "m"), 0.0, 1.0),))
+    minima = [Minimum(np.array([x]), np.eye(1) * 0.01, cost, (0,)) for x, cost in ((0.0, 1.0), (1.0, 1.2))]
+    draws = np.array([[-0.2], [0.2], [0.95], [1.05]])
+    np.testing.assert_array_equal(belonging(prior, minima, draws, np.full(4, 0.25)), [0, 0, 1, 1])
+
+
 @pytest.mark.parametrize(("floor", "modes"), [(0.0, 1), (6.0, 2)])
 def test_a_mode_is_where_its_own_draws_are(floor, modes):
     """Flat between a = -4 and 4, or with a ``floor`` of J between two wells; the Gaussian about the second minimum is

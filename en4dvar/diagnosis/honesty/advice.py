@@ -223,13 +223,14 @@ def _modes(case: Case) -> str:
 
 
 def _starts(case: Case) -> str:
-    """More starts than a few a member find nothing new."""
+    """Descents start from no more members than go side by side."""
     starts, members = int(getattr(case.a.settings.own, "starts", 1)), case.a.settings.members
     if members < MANY:
         return f"set assimilation.members: {MANY} and assimilation.starts: {2 * max(starts, 2)}"
-    if starts < MANY // 4:
+    tried = len(case.a.descents.members) if case.a.descents else 0
+    if max(tried, starts) < members // (len(case.a.parameters) + 1):
         return f"set assimilation.starts: {2 * max(starts, 2)} (it is {starts}), or narrow the priors"
-    return "narrow the priors, or set assimilation.refine: mcmc, which does not hang on where descents end"
+    return f"set assimilation.members: {4 * members}, of which more start a descent, or narrow the priors"
 
 
 def _one_descent(case: Case) -> str:
