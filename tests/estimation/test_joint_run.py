@@ -21,7 +21,7 @@ def campaign(tmp_path_factory):
     folder = tmp_path_factory.mktemp("campaign")
     path = make_campaign(folder, n=3)
     for i in range(3):
-        (folder / "data" / f"set{i}.csv").write_text(csv_text(k=2.4))
+        (folder / "data" / f"set{i}.csv").write_text(csv_text(k=2.4, nth=i))
     return run_campaign(path, overrides=_quiet(folder)).directory
 
 
@@ -48,8 +48,12 @@ def test_files_and_table(campaign, tmp_path):
 
 
 def test_two_runs_with_one_name_of_a_data_set(campaign, tmp_path):
-    other = run_campaign(write_toy(tmp_path), overrides=_quiet(tmp_path)).directory
-    found, _ = join([other, other], ["k"], tmp_path / "out")
+    runs = []
+    for i in range(2):
+        folder = tmp_path / f"day{i}"
+        folder.mkdir()
+        runs.append(run_campaign(write_toy(folder, data=csv_text(nth=i)), overrides=_quiet(folder)).directory)
+    found, _ = join(runs, ["k"], tmp_path / "out")
     assert found.datasets == ("toy", "toy_2")
 
 
