@@ -219,10 +219,12 @@ def require_distinct(sets: Sequence[Observations]) -> None:
     for e, own in enumerate(each):
         alike = Counter(i for reading in own.items() for i in holders.get(reading, ()))
         for i, count in alike.items():
-            both, numbers = (sets[i], sets[e]), {own[t] for t in own.keys() & each[i].keys()}
+            if count < len(common := own.keys() & each[i].keys()):
+                continue
+            both, numbers = (sets[i], sets[e]), {own[t] for t in common}
             if both[0].scalars == both[1].scalars:
                 numbers |= {f"{value:.9g}" for value in both[0].scalars.values()}
-            if count == len(own.keys() & each[i].keys()) and len(numbers) >= BY_CHANCE:
+            if len(numbers) >= BY_CHANCE:
                 a, b = (f"{o.name} ({o.source})" if o.source else o.name for o in both)
                 raise ConfigError(
                     f"{a} and {b} hold the same readings, which would count twice: give one of them alone; what two "

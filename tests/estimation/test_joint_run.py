@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -9,10 +12,12 @@ from run_files import make_campaign
 from toy_config import csv_text, write_toy
 
 from en4dvar.cli import main
+from en4dvar.plumbing.caution import caution, untrusted
 from en4dvar.plumbing.errors import ConfigError, OutputError
 from en4dvar.results.joint_file import load_joint
+from en4dvar.runs.finished import carried
 from en4dvar.runs.runner import run_campaign
-from en4dvar.runs.together import join
+from en4dvar.runs.together import SPOILT, join
 
 
 @pytest.fixture(scope="module")
@@ -71,6 +76,18 @@ def test_bad_questions(campaign, tmp_path):
     result = CliRunner().invoke(main, ["joint", str(campaign), "--share", "c"])
     assert result.exit_code == 2
     assert "Traceback" not in result.output
+
+
+def test_what_more_than_a_third_of_the_data_sets_have_spoils_the_joint_intervals():
+    several = [
+        SimpleNamespace(name=f"set{i}", cautions=(caution("misfit", "χ²", "serious"),) * (i < 4)) for i in range(9)
+    ]
+    others = [replace(caution("members-lost", "9 of 9", "serious"), advice=""), caution("misfit", "χ²", "caution")]
+    for count, severity in ((9, "serious"), (12, "caution")):
+        sets = [*several, *[SimpleNamespace(name="more", cautions=others)] * (count - 9)]
+        (told,) = carried(sets, SPOILT)
+        assert (told.code, told.severity) == ("misfit", severity)
+        assert untrusted([told], "k") == (("misfit",) if severity == "serious" else ())
 
 
 def test_a_damaged_file_is_refused(campaign, tmp_path):
