@@ -28,11 +28,11 @@ assimilation:
 """
 
 
-def csv_text(n: int = 31, k: float = 2.0, c: float = 0.02, m: float = 2e-3) -> str:
-    """A damped oscillation of 100 µm every 5 ms, in closed form."""
+def csv_text(n: int = 31, k: float = 2.0, c: float = 0.02, m: float = 2e-3, nth: int = 0) -> str:
+    """A damped oscillation of 100 µm every 5 ms, in closed form; the ``nth`` recording, moved by as many nm."""
     t = np.arange(n) * 5e-3
     a, w = c / (2 * m), np.sqrt(k / m - (c / (2 * m)) ** 2)
-    x = 100 * np.exp(-a * t) * (np.cos(w * t) + a / w * np.sin(w * t))
+    x = 100 * np.exp(-a * t) * (np.cos(w * t) + a / w * np.sin(w * t)) + 1e-3 * nth
     return "# toy\nt_ms,x_um\n" + "".join(f"{1e3 * a:.6g},{b:.6g}\n" for a, b in zip(t, x, strict=True))
 
 

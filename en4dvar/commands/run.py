@@ -130,7 +130,7 @@ class _Warnings:
 
     def __init__(self) -> None:
         self.of: dict[str, list[tuple[float, str, Caution]]] = {}  # code → the worst: place, data set, warning
-        self.counts = Counter[str]()  # of data sets
+        self.counts = Counter[tuple[str, str]]()  # of data sets: of a code, the worst severity it has there
         self.sets = 0
         self.wholes: dict[str, list[str]] = {}  # code → what is estimated of several data sets and has it
         self.joint = False  # single data sets only begin a joint estimate
@@ -144,7 +144,8 @@ class _Warnings:
                 self.wholes.setdefault(code, []).append(name)
         else:
             self.sets += 1
-            self.counts.update(codes(cautions))
+            worst = {c.code: c.severity for c in sorted(cautions, key=lambda c: -c.rank)}
+            self.counts.update(worst.items())  # the milder ones of other data sets are in the report
         for caution in cautions:
             told = [*self.of.get(caution.code, []), (caution.rank - 1e-3 * gravity(cautions), name, caution)]
             self.of[caution.code] = sorted(told, key=lambda entry: entry[0])[:MOST_TOLD]
@@ -157,7 +158,8 @@ class _Warnings:
         begun = []
         for told in sorted(self.of.values(), key=lambda entries: entries[0][2].rank):
             _, name, worst = told[0]
-            count, wholes = self.counts[worst.code], self.wholes.get(worst.code, [])
+            told = [entry for entry in told if self.sets == 1 or entry[2].severity == worst.severity]
+            count, wholes = self.counts[worst.code, worst.severity], self.wholes.get(worst.code, [])
             if self.joint and not wholes and worst.severity != "serious":
                 begun.append(f"{worst.code} in {count}")
                 continue

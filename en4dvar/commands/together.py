@@ -18,7 +18,7 @@ Told = tuple[str, "tuple[Caution, ...]", Path]  # of an estimate: table, warning
 
 
 def several_runs(command: Callable[..., Told]) -> Callable[..., None]:
-    """The arguments RUN_DIR with --out, --workers and --trust of a command that makes one estimate of finished runs.
+    """The arguments RUN_DIR with --out, --force, --workers and --trust of an estimate of finished runs together.
 
     It gets the runs, the folder of its result, and keywords of what computes it. What it returns is printed, warnings
     on standard error.
@@ -30,6 +30,9 @@ def several_runs(command: Callable[..., Told]) -> Callable[..., None]:
     )
     @click.option(
         "--out", type=click.Path(path_type=Path), help=f"Folder of the result; default {kind}_... beside the first."
+    )
+    @click.option(
+        "--force", is_flag=True, expose_value=False, help="As of 'run'; an earlier result is replaced without it too."
     )
     @workers_option
     @trust_option
@@ -62,7 +65,7 @@ def joint(
 ) -> Told:
     """Estimate data sets together that share parameters: samples of one material, records of one instrument.
 
-    Takes finished runs, any of which may be a campaign; their models, windows and errors may differ.
+    Takes finished runs, any of which may be a campaign, of different readings; models, windows and errors may differ.
     Constants of the medium and of the camera that are estimated have one value in all, but for those --apart; each
     data set has its own values of what is not shared. Writes joint.nc, joint.csv and a page.
 

@@ -5,6 +5,7 @@ it was measured at. With ``time_std`` the variance depends on the state through 
 ``ln s_k`` belongs to the cost and the Gauss–Newton step is Fisher scoring (see :mod:`en4dvar.data.noise`).
 """
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -17,10 +18,11 @@ from en4dvar.data.noise import Linearisation, Noise, Predicted, joint_noise, sid
 from en4dvar.data.series import Part, Series
 from en4dvar.model.state import Array, hold_floats
 from en4dvar.plumbing.caution import Caution
-from en4dvar.plumbing.errors import DataError, retold
+from en4dvar.plumbing.errors import ConfigError, DataError, retold
 from en4dvar.priors.prior import LARGEST
 
 SEVERAL = ", "  # between the names of several sources
+BY_CHANCE = 4  # different numbers that two recordings do not share
 SAME_TIME = 1e-9  # of the whole duration: times of different series that are this close are the same instant
 
 
@@ -200,6 +202,40 @@ class Observations:
 
     def __len__(self) -> int:
         return len(self.times)
+
+
+def require_distinct(sets: Sequence[Observations]) -> None:
+    """Refuse data sets that count together and of which two hold one recording, whole or in part, on the same clock:
+    all readings at instants that both have agree to nine digits, but for bounds and those without weight, and they are
+    :data:`BY_CHANCE` different numbers or more, with the scalars where all of these agree as well. Of several series
+    nothing is compared.
+
+    Raises :class:`ConfigError`.
+    """
+    holders: dict[tuple[str, str], list[int]] = {}
+    each = [{} if o.parts else _readings(o) for o in sets]
+    for e, own in enumerate(each):
+        alike = Counter(i for reading in own.items() for i in holders.get(reading, ()))
+        for i, count in alike.items():
+            if count < len(common := own.keys() & each[i].keys()):
+                continue
+            both, numbers = (sets[i], sets[e]), {own[t] for t in common}
+            if both[0].scalars == both[1].scalars:
+                numbers |= {f"{value:.9g}" for value in both[0].scalars.values()}
+            if len(numbers) >= BY_CHANCE:
+                a, b = (f"{o.name} ({o.source})" if o.source else o.name for o in both)
+                raise ConfigError(
+                    f"{a} and {b} hold the same readings, which would count twice: give one of them alone; what two "
+                    "configurations say of one recording is told by 'en4dvar compare'"
+                )
+        for reading in own.items():
+            holders.setdefault(reading, []).append(e)
+
+
+def _readings(observations: Observations) -> dict[str, str]:
+    """Time → value, to nine digits, which a change of units leaves as they are."""
+    used = (of[observations.used].tolist() for of in (observations.times, observations.values))
+    return {f"{time:.9g}": f"{value:.9g}" for time, value in zip(*used, strict=True)}
 
 
 def _same_instants(times: Sequence[Array]) -> list[Array]:

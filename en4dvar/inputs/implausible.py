@@ -32,6 +32,7 @@ WINDOW, DEGREE = 7, 4
 STEEP = 0.5  # of the largest reading of a window: one that holds less, or crosses zero, falls too fast for a polynomial
 MEDIAN_OF_CHI2 = 2 * math.log(2)  # of χ²_2
 OUTLYING = 8.0  # standard deviations from what its neighbours say
+RARE = 0.2  # of all readings: a number that stands for none
 IN_A_ROW = 3  # readings that are judged together
 FALLS = 3.0  # standard deviations by which the nearest neighbours lie below the farthest at the bottom of a collapse
 ASIDE = np.array([0, 1, 2, -3, -2, -1])  # the neighbours, of a window
@@ -65,7 +66,8 @@ def outlying(times: Array, values: Array, scatter: float) -> npt.NDArray[np.bool
     """Which readings (K,) are far from what three neighbours to either side say, with ``scatter`` as errors have.
 
     Up to three in a row are judged together. Readings below neighbours that fall towards them from both sides are the
-    bottom of a collapse; several that move no farther than their neighbours do are an oscillation.
+    bottom of a collapse; several that move no farther than their neighbours do are an oscillation. Of the first three,
+    each is judged by six behind them, and odd if it is above all of these: glare of a laser.
     """
     odd = np.zeros(len(values), dtype=bool)
     for count in range(1, min(IN_A_ROW, len(values) - len(ASIDE)) + 1):
@@ -81,7 +83,21 @@ def outlying(times: Array, values: Array, scatter: float) -> npt.NDArray[np.bool
         falls = near[:, [0, 5]].mean(axis=1) - near[:, [2, 3]].mean(axis=1) > FALLS * scatter
         for first in np.flatnonzero(far.all(axis=1) & ~steep & ~(falls & (off[:, 0] < 0))):
             odd[first + 3 : first + 3 + count] = True
+    ahead, behind = np.arange(IN_A_ROW), np.arange(IN_A_ROW, IN_A_ROW + len(ASIDE))
+    if len(values) > behind[-1] and values[behind].min() > STEEP * values[behind].max():
+        expected, spread = (it[0] for it in _fitted(times[None, : behind[-1] + 1], behind, 2, values[None, behind]))
+        rough = math.sqrt(2 * np.mean((values[behind] - expected[behind]) ** 2))
+        far = values[ahead] - expected[ahead] > OUTLYING * spread[ahead] * max(scatter, rough)
+        odd[ahead] |= far & (values[ahead] > values[behind].max())
     return odd
+
+
+def placeholders(values: Array) -> npt.NDArray[np.bool_]:
+    """Which readings (K,) are one number, met more than once, more than twice as large as every other, and rare."""
+    same = values == values.max(initial=-math.inf)
+    others = values[~same].max(initial=0.0)
+    is_one = bool(1 < same.sum() <= RARE * len(values) and values.max() > 2 * others > 0)
+    return same if is_one else np.zeros_like(same)
 
 
 def _fitted(t: Array, near: npt.NDArray[np.intp], degree: int, values: Array) -> tuple[Array, Array]:

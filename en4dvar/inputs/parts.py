@@ -230,13 +230,14 @@ def _of_mat(variables: Variables, name: str, path: Path) -> Array:
 class Contents:
     """What a data file holds: columns (or vectors) with numbers, as written, and scalars; no units applied.
 
-    ``others``: why what else is in the file cannot be a column, by name. Of the elements of a struct array or a cell
-    array the first stands for all, as ``expts.R`` and ``C``.
+    ``others``: why what else is in the file cannot be a column, by name. ``units``: what a line of a table states. Of
+    the elements of a struct array or a cell array the first stands for all, as ``expts.R`` and ``C``.
     """
 
     columns: Mapping[str, Array]
     scalars: Mapping[str, float] = field(default_factory=dict)
     others: Mapping[str, str] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
 
 
 def read_contents(path: Path, layout: Layout = ANY) -> Contents:
@@ -274,4 +275,4 @@ def _table_contents(table: Table, scalars: Mapping[str, float]) -> Contents:
             columns[name] = table.numbers(i, name)
         except DataError as error:
             others[name] = str(error)
-    return Contents(columns, scalars, others)
+    return Contents(columns, scalars, others, table.units)

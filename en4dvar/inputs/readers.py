@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.inputs.implausible import InFile, outlying, scatter_of
+from en4dvar.inputs.implausible import InFile, outlying, placeholders, scatter_of
 from en4dvar.inputs.parts import ANY, Column, Layout, TimeStep, columns_of
 from en4dvar.inputs.window import index_of
 from en4dvar.model.state import Array
@@ -22,6 +22,7 @@ from en4dvar.plumbing.hints import suggest
 from en4dvar.plumbing.units import convert
 
 Rows = npt.NDArray[np.intp]
+AGAIN = "one number again and again, far above all others, as a missing reading may be written"
 FAR, BELOW = "far from what their neighbours say", "0 or below, as a missing reading may be written"
 
 
@@ -124,9 +125,11 @@ def read_series(
 def _rest(read: Readings, layout: Layout, fewest: int) -> Readings:
     """Without outliers and what is before an instant, where the layout says so. Raises :class:`DataError`."""
     if layout.outliers == "leave out":
-        odd = outlying(read.times, read.values, scatter_of(read.times, read.values))
-        far = {FAR: tuple(read.times[odd])} if odd.any() else {}
-        read = replace(_kept(read, ~odd), left_out={**read.left_out, **far})
+        for reason in (AGAIN, FAR):
+            t, y = read.times, read.values
+            odd = placeholders(y) if reason == AGAIN else outlying(t, y, scatter_of(t, y))
+            told = {reason: tuple(t[odd])} if odd.any() else {}
+            read = replace(_kept(read, ~odd), left_out={**read.left_out, **told})
     if layout.since != ANY.since:
         with retold(DataError, DataError, f"{read.source}: data.since "):
             since = slice(index_of(read.times, read.values, layout.since), None)

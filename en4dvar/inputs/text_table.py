@@ -37,6 +37,9 @@ WIDEST = 10_000  # columns
 BLANK = ("", "nan", "na", "n/a", "-")
 PREAMBLE = 200  # lines among which the names of the columns are looked for
 _SCALAR = re.compile(r"(?:#|%|//)\s*([A-Za-z_]\w*)\s*=\s*([-+.\deE]+)\s*")
+_GROUPED = {
+    ".": re.compile(r"[-+]?[1-9]\d{0,2}(\.\d{3})+(,\d+)?"), ",": re.compile(r"[-+]?[1-9]\d{0,2}(,\d{3})+(\.\d+)?")
+}  # fmt: skip
 _NAMELESS = re.compile(r"c[1-9]\d*")
 
 
@@ -91,12 +94,19 @@ def cells_of(line: Line, delimiter: str) -> list[str]:
     return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))]
 
 
+def _thousands(cell: str) -> str:
+    """What separates the thousands of a number that has both signs, as ``1.600,5`` and ``1,600.5``; "" of others."""
+    both = "." in cell and "," in cell
+    return next((sign for sign, grouped in _GROUPED.items() if grouped.fullmatch(cell)), "") if both else ""
+
+
 class Table:
     """Columns of a text file or a sheet: their ``names``, and ``rows`` of cells with the numbers of their lines.
 
     ``lines`` are numbered lines, of a sheet the cells of each. The names stand in the first line that has all of
     ``wanted`` (names, or patterns with ``*``), else in the one above the numbers; where none does, the columns are
-    ``c1``, ``c2``, …. Lines of words directly below the names, such as units, are no rows.
+    ``c1``, ``c2``, …. Lines of words directly below the names are no rows; ``units``: by name, where one of
+    them states the unit of each. A sign that separates thousands somewhere, before a decimal sign, does so everywhere.
     """
 
     def __init__(self, path: Path, decimal: Decimal, wanted: Sequence[str] = (), lines: Lines | None = None):
@@ -111,10 +121,16 @@ class Table:
         signs = (";", "\t") if self.nameless else ()  # numbers may have decimal commas
         delimiter = next((s for s in signs if s in line), delimiter_of(line, path))
         self.rows = [(n, cells_of(x, delimiter)) for n, x in lines[first:]]
+        if sign := next((sign for _, row in self.rows for cell in row if (sign := _thousands(cell))), ""):
+            plain, grouped = self.rows, _GROUPED[sign]
+            self.rows = [(n, [c.replace(sign, "") if grouped.fullmatch(c) else c for c in row]) for n, row in plain]
+        below: list[list[str]] = []
         if any(_holds_number(cells) for _, cells in self.rows):
             while _words(self.rows[0][1]):
-                del self.rows[0]
+                below.append([cell.strip("[]()") for cell in self.rows.pop(0)[1]])
         self.names = [f"c{i + 1}" for i in range(len(self.rows[0][1]))] if top is None else head[top]
+        alike = (cells for cells in below if len(cells) == len(self.names) and all(map(is_unit, cells)))
+        self.units = dict(zip(self.names, next(alike, ()), strict=False))
 
     def position(self, name: str) -> int:
         """Which column has this name. Raises :class:`DataError`."""
@@ -175,7 +191,7 @@ def _names_and_numbers(head: Sequence[Sequence[str]], wanted: Sequence[str]) -> 
 
 
 def _holds_number(cells: Sequence[str]) -> bool:
-    return any(cell.lower() not in BLANK and is_number(cell.replace(",", ".")) for cell in cells)
+    return any(c.lower() not in BLANK and (is_number(c.replace(",", ".")) or _thousands(c)) for c in cells)
 
 
 def _words(cells: Sequence[str]) -> bool:

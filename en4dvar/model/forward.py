@@ -173,6 +173,7 @@ class Observable(Shown):
 
     ``positive``: it cannot be zero, so that numbers of 0 or below in a file say that there was nothing to read.
     ``fewest`` readings make a data set: 1 of a quantity of the whole path, 3 of one that is followed in time.
+    ``event``: NaN is of a path on which what was read does not happen, so that the reading itself excludes it.
     """
 
     name: str
@@ -183,6 +184,7 @@ class Observable(Shown):
     label: str = ""
     positive: bool = False
     fewest: int = 3
+    event: bool = False
 
 
 @dataclass(frozen=True)

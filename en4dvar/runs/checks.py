@@ -1,7 +1,7 @@
 """What can be told before a run: every fault of configuration and data at once."""
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from en4dvar.config.data import DATA, DataPlan
 from en4dvar.config.document import Document, document_from, override
 from en4dvar.config.load import context_of, in_order
 from en4dvar.config.schema import Section
+from en4dvar.data.observations import Observations, require_distinct
 from en4dvar.inputs.parts import DataFile
 from en4dvar.plumbing.errors import ConfigError, DataError, Fault
 from en4dvar.problem import InverseProblem
@@ -43,6 +44,7 @@ def validate(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any
     with _collecting(faults, document):
         if isinstance(config, Config):
             _read_files(document, inverse_plan(config), partial(checked_problem, config), faults)
+            require_counted_once(config, data_files(inverse_plan(config)))
         if isinstance(config, SequenceConfig):
             build_sequence(config)
     if faults:
@@ -55,6 +57,18 @@ def checked_problem(config: Config, name: str, file: DataFile) -> InverseProblem
     problem = build_one(config, name, file)
     require_free_names(problem)
     return problem
+
+
+def require_counted_once(config: Config, files: Mapping[str, DataFile]) -> None:
+    """Raise :class:`ConfigError` where data sets are estimated together and two hold the same readings."""
+    if not (config.sharing.kinds or config.population):
+        return
+    usable: list[Observations] = []
+    for name, file in files.items():
+        with suppress(DataError):  # told of each in its turn
+            usable.append(read_observations(inverse_plan(config), file, name))
+    with config.document.placing("data", "path"):
+        require_distinct(usable)
 
 
 def _read_data(document: Document, base: Path, faults: list[Fault]) -> None:

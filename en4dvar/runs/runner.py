@@ -16,7 +16,7 @@ from en4dvar.results.campaign_file import DamagedError, save_campaign
 from en4dvar.results.pack import PACK
 from en4dvar.results.together import GROUPS, load_groups_of
 from en4dvar.runs.campaign import Campaign
-from en4dvar.runs.checks import checked_problem
+from en4dvar.runs.checks import checked_problem, require_counted_once
 from en4dvar.runs.engine import FIGURES, REPORT, RunKind, Session, conduct_run
 from en4dvar.runs.together import JointKind, PopulationKind, SetGroup, groups_of, require_population
 from en4dvar.runs.worklist import ENDED, ITERATIONS, SUMMARY, Worklist, datasets
@@ -109,7 +109,7 @@ class EstimateKind(RunKind[Campaign]):
         return data_files(inverse_plan(self.config))
 
     def check(self) -> None:
-        """Raise what is wrong with the data files where none of them can be used, or one is in no group."""
+        """Raise what is wrong with the data files where none can be used, one is in no group, or one counts twice."""
         config, files = self.config, self.data
         for name in files:
             config.sharing.of_dataset(name)
@@ -124,6 +124,7 @@ class EstimateKind(RunKind[Campaign]):
             except DataError as error:
                 unusable.append(error)
             else:
+                require_counted_once(config, files)
                 return
         if faults:
             raise ConfigError(list(dict.fromkeys(faults)))

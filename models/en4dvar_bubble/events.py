@@ -6,7 +6,7 @@ rebounds in turn. The time of an event is counted from the start of the model, w
 time between two does not depend on it. Paths are followed to :data:`HORIZON` times the last reading, on a grid; each
 bracket of Ṙ = 0 is then divided twice by running the members again at instants of their own, and Ṙ is taken for linear
 in the last. A bubble of 300 µs has its collapse to better than 0.1 ns (tests/bubble/test_events.py). A member that has
-no such event fails.
+no such event (NaN) is excluded by the reading of it; one whose run fails (infinity) is lost.
 
 A hydrophone far away. Near the bubble the liquid is incompressible, far from it the wave is φ = −F(t − r/c)/r (Keller &
 Miksis 1980, J. Acoust. Soc. Am. 68, 628). Bernoulli's equation at the wall then gives
@@ -34,8 +34,8 @@ COLLAPSES = 3
 
 
 def events(paths: Paths) -> Mapping[str, Array]:
-    """``time`` (s) and ``radius`` (m) of every member's events, (N, 2·:data:`COLLAPSES`), NaN where there is none; the
-    largest radius comes first, then first collapse, first rebound, ….
+    """``time`` (s) and ``radius`` (m) of every member's events, (N, 2·:data:`COLLAPSES`), NaN where there is none,
+    infinite where the run failed; the largest radius comes first, then first collapse, first rebound, ….
 
     Raises ValueError: the paths do not start where the model does.
     """
@@ -54,11 +54,11 @@ def events(paths: Paths) -> Mapping[str, Array]:
         low, high, V0, V1, R0 = (
             np.take_along_axis(a, at + i, axis=2)[..., 0] for a, i in ((times, 0), (times, 1), (V, 0), (V, 1), (R, 0))
         )
-        lost = ~np.isfinite(low) | (run.solution.status != 0)[:, None]
+        failed, absent = (run.solution.status != 0)[:, None], ~np.isfinite(low)
     share = np.where(V0 == V1, 0.0, V0 / np.where(V0 == V1, 1.0, V0 - V1))
     return {
-        "time": np.where(lost, np.nan, low + share * (high - low)),
-        "radius": np.where(lost, np.nan, R0 + 0.5 * share * V0 * (high - low)),
+        "time": np.where(failed, np.inf, np.where(absent, np.nan, low + share * (high - low))),
+        "radius": np.where(failed, np.inf, np.where(absent, np.nan, R0 + 0.5 * share * V0 * (high - low))),
     }
 
 
@@ -97,7 +97,7 @@ def _observable(name: str, symbol: str, label: str, what: str, event: int, since
 
     OF_WHOLE[label] = read
     unit, shown = ("s", "us") if what == "time" else ("m", "um")
-    return Observable(name, unit, OfPath(label), symbol, shown, label, positive=True, fewest=1)
+    return Observable(name, unit, OfPath(label), symbol, shown, label, positive=True, fewest=1, event=True)
 
 
 def _numbered(name: str, k: int) -> str:

@@ -179,7 +179,10 @@ class OfPath:
     batched: ClassVar[bool] = True
 
     def __call__(self, trajectory: Any) -> Array:
-        return np.asarray(trajectory[self.name])
+        values = np.asarray(trajectory[self.name])
+        if np.isinf(values).any():
+            raise ValueError("the path cannot be followed beyond the readings, to its events")
+        return values
 
 
 class BubbleTrajectory(Trajectory):

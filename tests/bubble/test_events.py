@@ -111,6 +111,25 @@ def test_one_reading_is_a_data_set():
         replace(data, times=one[:0], values=one[:0], weights=one[:0], noise=noise_of(one[:0]))
 
 
+def test_a_bubble_that_creeps_is_excluded_by_its_collapse_and_not_lost():
+    """In a liquid of 2 Pa s none collapses within twice the time that was read."""
+    one = np.ones(1)
+    data = Observations(2e-5 * one, 2e-5 * one, noise_of(1e-7 * one), one, name="one")
+    terms = [PriorTerm.lognormal(p, 0.1, 1.2) for p in MODEL.parameters if p.name == "mu"]
+    fixed = {"G": 5e3, "R_max": 2e-4, "R_eq": 3e-5}
+    problem = InverseProblem(MODEL, OBSERVED["collapse_time"], data, Prior(tuple(terms)), fixed)
+    found = assimilate(problem, AssimilationSettings(members=100, what_if=False, refine="none"), seed=1)
+    lost = [c for c in found.cautions if c.code == "members-lost"]
+    assert lost
+    assert {c.severity for c in lost} == {"note"}
+    assert all("lack the event in the" in c.words and "mu above" in c.words for c in lost)
+
+
+def test_a_path_that_cannot_be_followed_fails():
+    with pytest.raises(ValueError, match="cannot be followed"):
+        OBSERVED["collapse_time"].operator({"time of collapse 1": np.full((2, 1), np.inf)})
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(not POOL.exists(), reason="LHS-simpool-x36_KV.mat is not there (../shared/data)")
 def test_one_gel_from_collapse_times(monkeypatch):

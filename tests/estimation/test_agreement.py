@@ -56,9 +56,11 @@ def variance_of(members):
 
 
 def flat(problem):
-    """The same with readings that say nothing."""
+    """Readings at the same times that say nothing."""
     o = problem.observations
-    return replace(problem, observations=replace(o, noise=replace(o.noise, std=1e7 + o.std), name="flat"))
+    return replace(
+        problem, observations=replace(o, values=o.values + 1, noise=replace(o.noise, std=1e7 + o.std), name="flat")
+    )
 
 
 def test_an_odd_data_set_is_named_and_the_estimate_made_without_it():

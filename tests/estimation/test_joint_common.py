@@ -112,7 +112,7 @@ def oscillators(tmp_path_factory):
     scale = "  reading_scale: {prior: lognormal, median: 1, log_std: 0.05}\n  A: {"
     path.write_text(path.read_text().replace("  A: {", scale))
     for i in range(3):
-        (folder / "data" / f"set{i}.csv").write_text(csv_text(k=2.4))
+        (folder / "data" / f"set{i}.csv").write_text(csv_text(k=2.4, nth=i))
     return path
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -9,10 +12,12 @@ from run_files import make_campaign
 from toy_config import csv_text, write_toy
 
 from en4dvar.cli import main
+from en4dvar.plumbing.caution import caution, untrusted
 from en4dvar.plumbing.errors import ConfigError, OutputError
 from en4dvar.results.together import load_joint
+from en4dvar.runs.finished import carried
 from en4dvar.runs.runner import run_campaign
-from en4dvar.runs.together import join
+from en4dvar.runs.together import SPOILT, join
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +26,7 @@ def campaign(tmp_path_factory):
     folder = tmp_path_factory.mktemp("campaign")
     path = make_campaign(folder, n=3)
     for i in range(3):
-        (folder / "data" / f"set{i}.csv").write_text(csv_text(k=2.4))
+        (folder / "data" / f"set{i}.csv").write_text(csv_text(k=2.4, nth=i))
     return run_campaign(path, overrides=_quiet(folder)).directory
 
 
@@ -48,8 +53,12 @@ def test_files_and_table(campaign, tmp_path):
 
 
 def test_two_runs_with_one_name_of_a_data_set(campaign, tmp_path):
-    other = run_campaign(write_toy(tmp_path), overrides=_quiet(tmp_path)).directory
-    found, _ = join([other, other], ["k"], tmp_path / "out")
+    runs = []
+    for i in range(2):
+        folder = tmp_path / f"day{i}"
+        folder.mkdir()
+        runs.append(run_campaign(write_toy(folder, data=csv_text(nth=i)), overrides=_quiet(folder)).directory)
+    found, _ = join(runs, ["k"], tmp_path / "out")
     assert found.datasets == ("toy", "toy_2")
 
 
@@ -67,6 +76,18 @@ def test_bad_questions(campaign, tmp_path):
     result = CliRunner().invoke(main, ["joint", str(campaign), "--share", "c"])
     assert result.exit_code == 2
     assert "Traceback" not in result.output
+
+
+def test_what_more_than_a_third_of_the_data_sets_have_spoils_the_joint_intervals():
+    several = [
+        SimpleNamespace(name=f"set{i}", cautions=(caution("misfit", "χ²", "serious"),) * (i < 4)) for i in range(9)
+    ]
+    others = [replace(caution("members-lost", "9 of 9", "serious"), advice=""), caution("misfit", "χ²", "caution")]
+    for count, severity in ((9, "serious"), (12, "caution")):
+        sets = [*several, *[SimpleNamespace(name="more", cautions=others)] * (count - 9)]
+        (told,) = carried(sets, SPOILT)
+        assert (told.code, told.severity) == ("misfit", severity)
+        assert untrusted([told], "k") == (("misfit",) if severity == "serious" else ())
 
 
 def test_a_damaged_file_is_refused(campaign, tmp_path):

@@ -32,7 +32,7 @@ def springs(folder, shared=SHARED, groups=GROUPS, model="toy_models:Oscillator")
     path = make_campaign(folder, 4, model)
     path.write_text(path.read_text().replace(K, shared) + groups)
     for i in range(4):
-        (folder / "data" / f"set{i}.csv").write_text(csv_text(k=2.0 if i < 2 else 3.0))
+        (folder / "data" / f"set{i}.csv").write_text(csv_text(k=2.0 if i < 2 else 3.0, nth=i))
     return path
 
 

@@ -127,8 +127,8 @@ def test_decimal_commas_are_read_where_it_is_said(tmp_path: Path, text: str) -> 
     series = read_series(path, TIME, RADIUS, Layout(decimal=","))
     assert series.times.tolist() == [0.0, 0.5e-6, 1e-6]
     assert series.values.tolist() == [1.5e-6, 2.5e-6, 3e-6]
-    path.write_text("t;R\n0;1.000,5\n", encoding="utf-8")
-    with pytest.raises(DataError, match=r"a\.csv:2: '1\.000,5' in column 'R' is not a number$"):
+    path.write_text("t;R\n0;1.00,5\n", encoding="utf-8")
+    with pytest.raises(DataError, match=r"a\.csv:2: '1\.00,5' in column 'R' is not a number$"):
         read_series(path, TIME, RADIUS, Layout(decimal=","))
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from en4dvar.diagnosis import diagnostics as diag
 from en4dvar.diagnosis.analysis import Analysis
+from en4dvar.ensemble.members import NOT_FINITE
 from en4dvar.model.forward import ValidityLimit
 from en4dvar.model.state import Array, Mask, Parameter
 from en4dvar.plumbing.caution import Caution, Severity, caution
@@ -28,6 +29,7 @@ NOTHING = 0.5  # of the readings' own std: a discrepancy beyond it in nearly all
 NINE_OF_TEN = (0.05, 0.95)
 SILENT = 0.1  # DFS of all readings beyond it that count as none
 EXTRAPOLATED = "no action is needed for the parameters; paths beyond the limit are extrapolated"
+EXCLUDED = "no action is needed: it was seen, so that the readings exclude them"
 UNREAD = "no action is needed where the field's own spread says so, cell by cell"
 MANY = 0.1  # share of members whose loss is serious
 SEPARATED = 3.0  # standard deviations of the rank sum beyond which a parameter tells lost members from others
@@ -309,18 +311,27 @@ def weighted(analysis: Analysis) -> Findings:
         yield caution("not-bayesian", f"{words}: the intervals are not those of the Bayesian posterior")
 
 
-def loss(stage: str, failures: Sequence[str], prior: Prior, members: Array | None = None) -> Findings:
+def loss(
+    stage: str, failures: Sequence[str], prior: Prior, members: Array | None = None, events: bool = False
+) -> Findings:
     """The members (N,) that failed in a forecast; ``failures`` are reasons, "" for members alive.
 
-    ``members`` (N, n), transformed, are where they were run, if that tells anything.
+    ``members`` (N, n), transformed, are where they were run, if that tells anything. ``events``: a member that gives no
+    reading lacks what was seen, and is improbable by the data instead of lost.
     """
-    lost = ~diag.active_members(failures)
-    if not lost.any():
-        return
-    words = f"{lost.sum()} of {len(lost)} members failed in the {stage}: {diag.common_reasons(failures)}"
-    if members is not None:
-        words = f"{words}; {where_lost(prior, members, lost)}"
-    yield caution("members-lost", words, "serious" if lost.mean() > MANY else None)
+    absent = np.array([events and reason == NOT_FINITE for reason in failures], dtype=bool)
+    lost = ~diag.active_members(failures) & ~absent
+    reasons = diag.common_reasons([reason for reason, none in zip(failures, absent, strict=True) if not none])
+    for of_it, did in ((lost, f"failed in the {stage}: {reasons}"), (absent, f"lack the event in the {stage}")):
+        if not of_it.any():
+            continue
+        words = f"{of_it.sum()} of {len(of_it)} members {did}"
+        if members is not None:
+            words = f"{words}; {where_lost(prior, members, of_it)}"
+        if of_it is absent:
+            yield replace(caution("members-lost", words, "note"), advice=EXCLUDED)
+        else:
+            yield caution("members-lost", words, SERIOUS if lost.mean() > MANY else None)
 
 
 def where_lost(prior: Prior, members: Array, lost: Mask) -> str:

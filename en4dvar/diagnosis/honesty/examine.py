@@ -47,6 +47,7 @@ def examine(
     alive = active_members(a.posterior_failures)
     members = a.posterior[alive]
     last, n_used = a.iterations[-1], len(a.problem.observations.used)
+    of_events = n_used == len(a.problem.observations) and all(part.observable.event for part in a.problem.parts)
     whole = control.costs is not None  # the ensembles stand for the whole covariance
     warnings = (
         *earlier,
@@ -57,9 +58,9 @@ def examine(
         *unfinished(a),
         *(checks.rank(prior, control.prior, control.posterior[alive]) if whole else ()),
         *(collapse(prior, control, alive) if whole and not a.refinement else ()),
-        *checks.loss("prior forecast", a.prior_failures, prior, control.prior),
-        *checks.loss("iterations", worst_loss, prior),
-        *checks.loss("posterior forecast", a.posterior_failures, prior, control.posterior),
+        *checks.loss("prior forecast", a.prior_failures, prior, control.prior, of_events),
+        *checks.loss("iterations", worst_loss, prior, None, of_events),
+        *checks.loss("posterior forecast", a.posterior_failures, prior, control.posterior, of_events),
         *checks.fit(last.chi2_per_observation * n_used, n_used, last.dfs),
         *_allowed(a, checks.structure(a)),
         *checks.missed(a),

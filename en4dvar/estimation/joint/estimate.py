@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from en4dvar.data.observations import require_distinct
 from en4dvar.descent.loop import minimise
 from en4dvar.descent.weight_space import require_members
 from en4dvar.ensemble.forecast import Forecast, plotting_times
@@ -96,9 +97,10 @@ def estimate_jointly(
 
     Raises
     ------
-    ConfigError: a scheme that does not minimise J.
+    ConfigError: a scheme that does not minimise J; readings that would count twice.
     TooFewMembersError: no start can be run, or fewer members survive than ``min_active_fraction``.
     """
+    require_distinct([problem.observations for problem in joint.experiments])
     with one_blas_thread():
         return _Estimate(joint, settings, seed, executor or SerialExecutor(), tell).result(singles)
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 import scipy  # its trees where they are used: a twentieth of what every command imports
 
+from en4dvar.data.observations import require_distinct
 from en4dvar.ensemble.forecast import check_problem
 from en4dvar.ensemble.linalg import effective_number, resampled, shares_of
 from en4dvar.estimation.population.following import Following
@@ -208,12 +209,14 @@ def population_of(
 
     Raises
     ------
-    ConfigError: fewer than 3 data sets; other parameters in one than in another, or such as vary in time; a prior of
-        ``names`` that is correlated, or not the same in all. ValueError: fewer than 3 data sets have successful runs.
+    ConfigError: fewer than 3 data sets; readings that would count twice; other parameters in one than in another, or
+        such as vary in time; a prior of ``names`` that is correlated, or not the same in all. ValueError: fewer than 3
+        data sets have successful runs.
     """
     if len(problems) < FEWEST_SETS:
         raise ConfigError(f"a population needs at least {FEWEST_SETS} data sets")
     require_population(problems, names)
+    require_distinct([problem.observations for problem in problems])
     hyper, effort = hyper or HyperPrior(), effort or Effort()
     if (factor := math.hypot(hyper.mean_std, hyper.spread)) > REACH:
         tell(f"data sets are sampled with a prior {factor:.2g} times as wide, which is what the hyperprior allows")

@@ -13,7 +13,7 @@ from en4dvar.plumbing.errors import ConfigError, DataError
 from en4dvar.plumbing.units import as_unit, convert
 from en4dvar_bubble.starter.config import FRAMES, PIXELS, TRACKED, quoted, unit_in, without_unit
 
-_TIME = re.compile(r"(?i)t|time|t[ _(\[].*|time[ _(\[].*")
+_TIME = re.compile(r"(?i)(t|time|zeit)([ _(\[].*)?")
 _STEP = re.compile(r"(?i)delta_?t|dt|t_?step|time_?step")
 _SIZE = re.compile(r"(?i)delta_?x|dx|pixel_?size|(um|m)_?per_?(px|pixel)|px_?2_?(um|m)")
 _AS_PIXELS, _AS_FRAMES = ("px", "pixel", "pixels"), ("frame", "frames")
@@ -97,10 +97,14 @@ class Asked:
             if _only(_STEP, self.contents.scalars) is None:
                 time = time or _only(FRAMES, names)
         frames = self.frame_rate is not None and FRAMES.fullmatch(time or "")
-        times = self.time_unit or (None if frames else unit_in(time, "s"))
-        radii = self.radius_unit or (None if self.pixel else unit_in(radius, "m"))
+        times = self.time_unit or (None if frames else self._unit(time, "s"))
+        radii = self.radius_unit or (None if self.pixel else self._unit(radius, "m"))
         named = replace(self, time_column=time, radius_column=radius, time_unit=times, radius_unit=radii)
         return named._of_camera()
+
+    def _unit(self, column: str | None, kind: str) -> str | None:
+        """What the column's name, or a line below the names, says."""
+        return unit_in(column, kind) or unit_in(f"_{self.contents.units.get(column or '', '')}", kind)
 
     def _of_camera(self) -> "Asked":
         asked = self

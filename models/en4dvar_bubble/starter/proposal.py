@@ -179,7 +179,7 @@ def _unmatched(names: Sequence[str], look: Look, model: BubbleModel) -> str:
     }
     questions = [asked[name] for name in names if name in asked]
     if model.start == "acoustic":
-        questions = ["is the driving that of your experiment?"]
+        questions = ["is the driving that of your experiment? If a laser made the bubble, say --start laser"]
     return f"no G and mu of {model.law.name} give this {' and '.join(told[n] for n in names)}: {' '.join(questions)}"
 
 

@@ -1,0 +1,110 @@
+"""Readings count once in what is estimated of several data sets together."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from run_files import configuration, make_campaign
+from toy_config import csv_text
+from toys import make_observations
+
+from en4dvar.cli import main
+from en4dvar.data.noise import noise_of
+from en4dvar.data.observations import require_distinct
+from en4dvar.plumbing.errors import ConfigError
+from en4dvar.runs.runner import run_campaign
+
+TWICE = "hold the same readings, which would count twice: give one of them alone"
+K = "k: {prior: lognormal, median: 3 N/m, log_std: 0.3}"
+
+
+def recording(name="a", part=slice(None), seed=0, digits=4, **more):
+    """Twelve readings of a recording, or a part of them."""
+    values = np.round(np.random.default_rng(seed).uniform(1, 9, 12), digits)
+    data = make_observations(np.arange(12.0)[part], values[part], std=0.1, name=name)
+    return replace(data, source=f"{name}.csv", **more)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        recording("b"),
+        recording("b", weights=2 * np.ones(12)),  # two configurations of one recording
+        recording("b", slice(5, None)),
+        recording("b", slice(None, None, 2)),
+        replace(recording("b"), values=recording().values * (1 + 1e-14)),  # of other units
+        recording("b", scalars={"film": 3.0}),
+    ],
+)
+def test_one_recording_counts_once(other):
+    with pytest.raises(ConfigError, match=rf"^a \(a\.csv\) and b \(b\.csv\) {TWICE}"):
+        require_distinct([recording(), recording("between", seed=1), other])
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        recording("b", seed=1),
+        recording("b", seed=2, digits=0),  # on the same grid, some readings are equal by chance
+        replace(recording("b"), values=recording().values + (np.arange(12) == 7)),
+        recording("b", slice(0, 3)),  # three numbers may be equal by chance
+        replace(recording("b"), noise=noise_of(0.1 * np.ones(12), np.zeros(12), sides=np.ones(12))),  # bounds
+        replace(recording("b"), values=np.zeros(12)),
+    ],
+)
+def test_other_readings_at_the_same_times_are_another_recording(other):
+    require_distinct([recording(digits=0 if "2" in other.name else 4), replace(other, name="b")])
+    require_distinct([replace(recording(), values=np.zeros(12)), replace(recording("b"), values=np.zeros(12))])
+
+
+def test_rows_of_a_table_are_told_apart_by_their_other_columns():
+    """Bubbles of which one time each is read."""
+    row = {"R_max": 0.2, "R_eq": 0.03, "tilt": 7.0}
+    a, b = (recording(name, slice(3, 4), scalars=row) for name in "ab")
+    require_distinct([a, replace(b, scalars={**row, "R_max": 0.21})])
+    with pytest.raises(ConfigError, match=TWICE):
+        require_distinct([a, b])
+
+
+@pytest.fixture
+def run(tmp_path):
+    """Three oscillators of one spring."""
+    path = make_campaign(tmp_path, n=3)
+    run_campaign(configuration(path, tmp_path / "run"))
+    return tmp_path / "run"
+
+
+def test_a_run_given_twice_is_refused(run):
+    for words in (["joint", "--share", "k"], ["population", "--of", "k"]):
+        result = CliRunner().invoke(main, [*words, str(run), str(run)])
+        assert result.exit_code == 2
+        assert TWICE in result.output
+
+
+def test_an_earlier_result_is_replaced_with_force_and_without(run):
+    words = ["joint", "--share", "k", str(run)]
+    for force in ([], [], ["--force"]):
+        result = CliRunner().invoke(main, [*words, *force])
+        assert result.exit_code == 0, result.output
+
+
+@pytest.mark.parametrize("together", ["shared", "population"])
+def test_a_copy_among_the_files_is_refused_before_anything_is_computed(together, tmp_path):
+    path = make_campaign(tmp_path, n=3)
+    text = path.read_text()
+    if together == "shared":
+        text = text.replace(K, K.replace("0.3}", "0.3, shared: all}"))
+    else:
+        text += "population: {of: [k]}\n"
+    path.write_text(text)
+    assert CliRunner().invoke(main, ["validate", str(path)]).exit_code == 0
+    (tmp_path / "data" / "set2.csv").write_text(csv_text(k=1.6))
+    for command in ("validate", "run"):
+        result = CliRunner().invoke(main, [command, str(path)])
+        assert result.exit_code == 2
+        assert "data.path: set0" in result.output
+        assert TWICE in result.output
+    assert not list(tmp_path.glob("**/*.nc"))
