@@ -29,6 +29,7 @@ from en4dvar.plumbing.caution import caution
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
 from en4dvar.report.figures import all_figures
+from en4dvar.schemes import ON_A_SERIES, ON_A_WINDOW
 from en4dvar.schemes.settings import AssimilationSettings
 
 # Of several test processes on the same cores, each with as many threads of BLAS, these wait for each other, spinning:
@@ -184,6 +185,16 @@ def pytest_collection_finish() -> None:
     """What the imported modules consist of is never garbage: to look through it took 6 % of the time."""
     gc.collect()
     gc.freeze()
+
+
+@pytest.fixture
+def schemes_as_before():
+    """Schemes of files that a test names are forgotten behind it, for other tests go through all that there are."""
+    before = [(registry, dict(registry)) for registry in (ON_A_WINDOW, ON_A_SERIES)]
+    yield
+    for registry, known in before:
+        for name in registry.keys() - known.keys():
+            del registry[name]
 
 
 @pytest.fixture(scope="session")

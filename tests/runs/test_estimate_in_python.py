@@ -79,6 +79,7 @@ IN_METRES = {
 }
 
 
+@pytest.mark.usefixtures("schemes_as_before")
 def test_files_are_named_from_the_working_directory(tmp_path, monkeypatch, result):
     monkeypatch.chdir(tmp_path)
     np.savetxt("R.csv", NOISE**2 * np.eye(len(TIMES)), delimiter=",", fmt="%.17g")

@@ -22,6 +22,7 @@ from en4dvar.schemes import ETKF
 class Patient(ETKF):
     {key}: Annotated[int, Ge(0), "How long it waits."] = 3
 """
+pytestmark = pytest.mark.usefixtures("schemes_as_before")
 TAKEN = "part own settings copy json dict schema validate kinds rules unread as_written model_fields members weights _x"
 
 

@@ -104,7 +104,7 @@ class Asked:
 
     def _unit(self, column: str | None, kind: str) -> str | None:
         """What the column's name, or a line below the names, says."""
-        return unit_in(column, kind) or unit_in(f"_{self.contents.units.get(column or '', '')}", kind)
+        return unit_in(column, kind) or unit_in(f"{column}_{self.contents.units.get(column or '', '')}", kind)
 
     def _of_camera(self) -> "Asked":
         asked = self
