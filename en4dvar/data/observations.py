@@ -5,6 +5,7 @@ it was measured at. With ``time_std`` the variance depends on the state through 
 ``ln s_k`` belongs to the cost and the Gauss–Newton step is Fisher scoring (see :mod:`en4dvar.data.noise`).
 """
 
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,6 +14,7 @@ from typing import Self
 
 import numpy as np
 import numpy.typing as npt
+from scipy import special, stats
 
 from en4dvar.data.noise import Linearisation, Noise, Predicted, joint_noise, sides_of
 from en4dvar.data.series import Part, Series
@@ -22,7 +24,10 @@ from en4dvar.plumbing.errors import ConfigError, DataError, retold
 from en4dvar.priors.prior import LARGEST
 
 SEVERAL = ", "  # between the names of several sources
-BY_CHANCE = 4  # different numbers that two recordings do not share
+BY_CHANCE = 1e-6  # chance that two recordings of a campaign agree, below which they are one
+CLOSE = 0.02  # standard deviations: readings that differ by what a shorter way to write them leaves out
+ROUNDING = 1e-8  # of the largest reading
+ALIKE = 1e-3  # chance of another number of a row of a table to agree
 SAME_TIME = 1e-9  # of the whole duration: times of different series that are this close are the same instant
 
 
@@ -205,37 +210,62 @@ class Observations:
 
 
 def require_distinct(sets: Sequence[Observations]) -> None:
-    """Refuse data sets that count together and of which two hold one recording, whole or in part, on the same clock:
-    all readings at instants that both have agree to nine digits, but for bounds and those without weight, and they are
-    :data:`BY_CHANCE` different numbers or more, with the scalars where all of these agree as well. Of several series
-    nothing is compared.
+    """Refuse data sets that count together and of which two hold one recording, whole or in part, on the same clock.
+
+    They do where most readings at instants that both have are closer to each other than independent errors, of the
+    stated size and read on the same scale, bring any two of the sets with a chance of :data:`BY_CHANCE`; scalars help
+    where all of them agree. Bounds, readings without weight and several series are not compared.
 
     Raises :class:`ConfigError`.
     """
-    holders: dict[tuple[str, str], list[int]] = {}
-    each = [{} if o.parts else _readings(o) for o in sets]
+    each, pairs = [{} if o.parts else _readings(o) for o in sets], math.comb(len(sets), 2)
+    width = 2.5 * CLOSE * max((std for own in each for _, std in own.values()), default=1.0)
+    holders: dict[tuple[str, int], list[int]] = {}
     for e, own in enumerate(each):
-        alike = Counter(i for reading in own.items() for i in holders.get(reading, ()))
-        for i, count in alike.items():
-            if count < len(common := own.keys() & each[i].keys()):
-                continue
-            both, numbers = (sets[i], sets[e]), {own[t] for t in common}
-            if both[0].scalars == both[1].scalars:
-                numbers |= {f"{value:.9g}" for value in both[0].scalars.values()}
-            if len(numbers) >= BY_CHANCE:
-                a, b = (f"{o.name} ({o.source})" if o.source else o.name for o in both)
+        cells = [(time, round(value / width)) for time, (value, _) in own.items()]
+        met = Counter(i for time, cell in cells for at in (-1, 0, 1) for i in holders.get((time, cell + at), ()))
+        for i in (i for i, count in sorted(met.items()) if 2 * count > len(own.keys() & each[i].keys())):
+            numbers = {*sets[e].scalars.values()} if sets[i].scalars == sets[e].scalars else set()
+            if pairs * _chance(own, each[i]) * ALIKE ** len(numbers) < BY_CHANCE:
+                a, b = (f"{o.name} ({o.source})" if o.source else o.name for o in (sets[i], sets[e]))
                 raise ConfigError(
                     f"{a} and {b} hold the same readings, which would count twice: give one of them alone; what two "
                     "configurations say of one recording is told by 'en4dvar compare'"
                 )
-        for reading in own.items():
-            holders.setdefault(reading, []).append(e)
+        for held in cells:
+            holders.setdefault(held, []).append(e)
 
 
-def _readings(observations: Observations) -> dict[str, str]:
-    """Time → value, to nine digits, which a change of units leaves as they are."""
-    used = (of[observations.used].tolist() for of in (observations.times, observations.values))
-    return {f"{time:.9g}": f"{value:.9g}" for time, value in zip(*used, strict=True)}
+def _readings(observations: Observations) -> dict[str, tuple[float, float]]:
+    """Time, to nine digits, → value and std."""
+    used = observations.used
+    of = (observations.times, observations.values, observations.noise.std)
+    return {f"{time:.9g}": (value, std) for time, value, std in zip(*(it[used].tolist() for it in of), strict=True)}
+
+
+def _chance(one: Mapping[str, tuple[float, float]], other: Mapping[str, tuple[float, float]]) -> float:
+    """The chance that independent readings of two recordings agree as often as these do."""
+    common = one.keys() & other.keys()
+    values, stds = np.array([[one[t], other[t]] for t in sorted(common)]).transpose(2, 1, 0)
+    apart, std = np.abs(values[0] - values[1]), np.sqrt(np.mean(stds**2, axis=0))
+    scale = _scale(values.ravel())
+    likely = 1.0
+    for near in (np.full(len(common), 0.5 * scale), np.maximum(0.5 * scale, CLOSE * std)):
+        alike = int(np.sum(apart <= near))
+        of_each = float(np.mean(special.erf(np.maximum(scale, near) / (2 * std))))
+        if 2 * alike > len(common):
+            likely = min(likely, float(stats.binom.sf(alike - 1, len(common), of_each)))
+    return likely
+
+
+def _scale(values: Array) -> float:
+    """The step of the scale that all values lie on: their greatest common divisor, as far as rounding tells."""
+    step, least = 0.0, ROUNDING * float(np.max(np.abs(values), initial=0.0))
+    for value in np.abs(values):
+        step, rest = max(step, float(value)), min(step, float(value))
+        while rest > least:
+            step, rest = rest, min(step % rest, rest - step % rest)
+    return step or math.inf
 
 
 def _same_instants(times: Sequence[Array]) -> list[Array]:

@@ -37,6 +37,9 @@ def recording(name="a", part=slice(None), seed=0, digits=4, **more):
         recording("b", slice(None, None, 2)),
         replace(recording("b"), values=recording().values * (1 + 1e-14)),  # of other units
         recording("b", scalars={"film": 3.0}),
+        replace(recording("b"), values=recording().values + (np.arange(12) == 7)),  # one reading was corrected
+        replace(recording("b"), values=np.round(recording().values, 3)),  # an export with fewer digits
+        recording("b", slice(0, 3)),
     ],
 )
 def test_one_recording_counts_once(other):
@@ -49,8 +52,7 @@ def test_one_recording_counts_once(other):
     [
         recording("b", seed=1),
         recording("b", seed=2, digits=0),  # on the same grid, some readings are equal by chance
-        replace(recording("b"), values=recording().values + (np.arange(12) == 7)),
-        recording("b", slice(0, 3)),  # three numbers may be equal by chance
+        recording("b", slice(3, 4)),
         replace(recording("b"), noise=noise_of(0.1 * np.ones(12), np.zeros(12), sides=np.ones(12))),  # bounds
         replace(recording("b"), values=np.zeros(12)),
     ],
@@ -58,6 +60,18 @@ def test_one_recording_counts_once(other):
 def test_other_readings_at_the_same_times_are_another_recording(other):
     require_distinct([recording(digits=0 if "2" in other.name else 4), replace(other, name="b")])
     require_distinct([replace(recording(), values=np.zeros(12)), replace(recording("b"), values=np.zeros(12))])
+
+
+@pytest.mark.parametrize(
+    ("count", "step", "sets"), [(4, 1.0, 50), (5, 0.5, 50), (10, 2.0, 50), (30, 0.5, 12), (6, 0.0, 100)]
+)
+def test_replicates_on_a_coarse_scale_are_recordings_of_their_own(count, step, sets):
+    """Errors of 0.5 about one curve, written down in steps as large: some of them agree by chance."""
+    times = np.arange(float(count))
+    for seed in range(20):
+        read = 20 * np.exp(-0.3 * times) + np.random.default_rng(seed).normal(0, 0.5, (sets, count))
+        read = step * np.round(read / step) if step else read
+        require_distinct([make_observations(times, values, std=0.5, name=f"r{i}") for i, values in enumerate(read)])
 
 
 def test_rows_of_a_table_are_told_apart_by_their_other_columns():
