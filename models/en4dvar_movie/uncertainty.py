@@ -45,6 +45,7 @@ SHARP = 0.15  # of the square of a sharp edge's width, by which it varies
 LIKELY = 2.0  # std of noise beyond which a frame is blurred by motion rather than by chance
 CLEARLY = 3.0  # std of noise by which a frame is blurred more than the sharpest, whose own noise made them so
 BENT = 0.46  # of the exposure in steps: std of the radius in units of the blur that neighbours do not explain
+CUT = 3.0  # amplitudes of mode 2, by the share unseen: circles about cut ellipses are off by 1 to 4
 THRESHOLD = 0.05  # of the contrast: what the level of the edge can be off by in all frames alike
 
 
@@ -69,11 +70,17 @@ def errors_of(outlines: Sequence[Outline | None], optics: Optics, exposure: floa
     """Errors of each frame, of which the exposure takes a share; of those without an outline :data:`NOTHING`."""
     ratios, turns = _smoothed(outlines), _turns(outlines)
     hidden, factor = _hidden(outlines, ratios)
-    beside = hidden + _bent(outlines, ratios, turns, optics, exposure)
+    beside = hidden + _bent(outlines, ratios, turns, optics, exposure) + _unseen(outlines, factor)
     return [
         replace(_errors(o, ratio, variance, turned, optics), factor=factor) if o is not None else NOTHING
         for o, ratio, variance, turned in zip(outlines, ratios, beside, turns, strict=True)
     ]
+
+
+def _unseen(outlines: Sequence[Outline | None], factor: float) -> Array:
+    """Variance of the radius (K,) of what is cut by the frame's edge: a circle's of a part of an elongated outline."""
+    shape = CUT * 6**0.5 / STUDENT * factor
+    return np.array([0.0 if o is None else (shape * o.circle.R * (1 - o.seen)) ** 2 for o in outlines])
 
 
 def _bent(
