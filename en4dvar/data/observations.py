@@ -243,10 +243,10 @@ def _readings(observations: Observations) -> dict[str, tuple[float, float]]:
     return {f"{time:.9g}": (value, std) for time, value, std in zip(*(it[used].tolist() for it in of), strict=True)}
 
 
-def _chance(one: Mapping[str, tuple[float, float]], other: Mapping[str, tuple[float, float]]) -> float:
+def _chance(own: Mapping[str, tuple[float, float]], other: Mapping[str, tuple[float, float]]) -> float:
     """The chance that independent readings of two recordings agree as often as these do."""
-    common = one.keys() & other.keys()
-    values, stds = np.array([[one[t], other[t]] for t in sorted(common)]).transpose(2, 1, 0)
+    common = own.keys() & other.keys()
+    values, stds = np.array([[own[t], other[t]] for t in sorted(common)]).transpose(2, 1, 0)
     apart, std = np.abs(values[0] - values[1]), np.sqrt(np.mean(stds**2, axis=0))
     scale = _scale(values.ravel())
     likely = 1.0
