@@ -67,7 +67,7 @@ def outlying(times: Array, values: Array, scatter: float) -> npt.NDArray[np.bool
 
     Up to three in a row are judged together. Readings below neighbours that fall towards them from both sides are the
     bottom of a collapse; several that move no farther than their neighbours do are an oscillation. Of the first three,
-    each is judged by six behind them, and odd if it is above all of these: glare of a laser.
+    each is judged by six behind it, and odd if it is above all of these: glare of a laser.
     """
     odd = np.zeros(len(values), dtype=bool)
     for count in range(1, min(IN_A_ROW, len(values) - len(ASIDE)) + 1):
@@ -83,12 +83,15 @@ def outlying(times: Array, values: Array, scatter: float) -> npt.NDArray[np.bool
         falls = near[:, [0, 5]].mean(axis=1) - near[:, [2, 3]].mean(axis=1) > FALLS * scatter
         for first in np.flatnonzero(far.all(axis=1) & ~steep & ~(falls & (off[:, 0] < 0))):
             odd[first + 3 : first + 3 + count] = True
-    ahead, behind = np.arange(IN_A_ROW), np.arange(IN_A_ROW, IN_A_ROW + len(ASIDE))
-    if len(values) > behind[-1] and values[behind].min() > STEEP * values[behind].max():
-        expected, spread = (it[0] for it in _fitted(times[None, : behind[-1] + 1], behind, 2, values[None, behind]))
-        rough = math.sqrt(2 * np.mean((values[behind] - expected[behind]) ** 2))
-        far = values[ahead] - expected[ahead] > OUTLYING * spread[ahead] * max(scatter, rough)
-        odd[ahead] |= far & (values[ahead] > values[behind].max())
+    for number in range(IN_A_ROW - 1, -1, -1):  # the last of them first: what is odd judges no other
+        behind = number + 1 + np.flatnonzero(~odd[number + 1 : number + 1 + IN_A_ROW + len(ASIDE)])[: len(ASIDE)]
+        if len(behind) == len(ASIDE) and values[behind].min() > STEEP * values[behind].max():
+            until = behind[-1] + 1
+            fitted = _fitted(times[None, number:until], behind - number, 2, values[None, behind])
+            expected, spread = (np.concatenate([np.zeros(number), it[0]]) for it in fitted)
+            rough = math.sqrt(2 * np.mean((values[behind] - expected[behind]) ** 2))
+            far = values[number] - expected[number] > OUTLYING * spread[number] * max(scatter, rough)
+            odd[number] |= far and values[number] > values[behind].max()
     return odd
 
 
