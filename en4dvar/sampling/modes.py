@@ -192,14 +192,14 @@ def nearest(prior: Prior, minima: Sequence[Minimum], x: Array) -> Indices:
     return np.asarray(np.argmax(logs, axis=0))
 
 
-def belonging(prior: Prior, minima: Sequence[Minimum], x: Array, shares: Array) -> Indices:
+def belonging(prior: Prior, minima: Sequence[Minimum], x: Array, shares: Array, for_one: float = 1.0) -> Indices:
     """Numbers (D,) of the minima that draws (D, n) with ``shares`` (D,) belong to, each of those in its own group; a
-    group in which there is none has a number beyond them.
+    group in which there is none has a number beyond them. ``for_one``: how many of a chain are worth one draw.
     """
     mode, new = np.zeros(len(x), dtype=np.intp), len(minima)
     if not minima:
         return mode
-    groups = separated(np.vstack([x, *(m.x for m in minima)]), np.append(shares, np.zeros(new)))
+    groups = separated(np.vstack([x, *(m.x for m in minima)]), np.append(shares, np.zeros(new)), BESIDE * for_one)
     for group in groups:
         own, inside = group[group < len(x)], group[group >= len(x)] - len(x)
         if len(inside):
@@ -209,10 +209,10 @@ def belonging(prior: Prior, minima: Sequence[Minimum], x: Array, shares: Array) 
     return mode
 
 
-def separated(x: Array, shares: Array) -> list[Indices]:
+def separated(x: Array, shares: Array, beside: float = BESIDE) -> list[Indices]:
     """Numbers of the draws (D, n), with ``shares`` (D,), of each group: empty gaps of one coordinate lie between them.
 
-    A gap is :data:`GAP` times as wide as :data:`BESIDE` effective draws to either side of it. Of draws of any density
+    A gap is :data:`GAP` times as wide as ``beside`` effective draws to either side of it. Of draws of any density
     with one peak that has a chance below 1e-4, and what is curved or bent leaves no gap. Draws that together hold less
     than :data:`NOTHING` leave it empty.
     """
@@ -224,7 +224,7 @@ def separated(x: Array, shares: Array) -> list[Indices]:
         group = waiting.pop()
         there = group[held[group]]
         for values in x.T:
-            at = _gap(values[there], shares[there])
+            at = _gap(values[there], shares[there], beside)
             if at is not None:
                 waiting += [group[values[group] > at], group[values[group] <= at]]
                 break
@@ -233,20 +233,20 @@ def separated(x: Array, shares: Array) -> list[Indices]:
     return groups
 
 
-def _gap(values: Array, shares: Array) -> float | None:
+def _gap(values: Array, shares: Array, beside: float) -> float | None:
     """The middle of a gap among values (D,), of the :data:`LOOKED` widest."""
     at, same = np.unique(values, return_inverse=True)  # a walker may stay where it is
     held, widths = np.asarray(np.bincount(same, shares), dtype=float), np.diff(at)
     for i in np.argsort(-widths, kind="stable")[:LOOKED]:
-        below, above = _span(at[i::-1], held[i::-1]), _span(at[i + 1 :], held[i + 1 :])
+        below, above = (_span(at[j], held[j], beside) for j in (slice(i, None, -1), slice(i + 1, None)))
         if widths[i] > GAP * max(below, above):
             return float(at[i] + 0.5 * widths[i])
     return None
 
 
-def _span(values: Array, shares: Array) -> float:
-    """How far :data:`BESIDE` effective draws reach from the first of values (D,) on; infinite where these are fewer."""
-    enough = np.cumsum(shares) ** 2 >= BESIDE * np.cumsum(shares**2)
+def _span(values: Array, shares: Array, beside: float) -> float:
+    """How far ``beside`` effective draws reach from the first of values (D,) on; infinite where these are fewer."""
+    enough = np.cumsum(shares) ** 2 >= beside * np.cumsum(shares**2)
     return float(abs(values[np.argmax(enough)] - values[0])) if enough.any() else math.inf
 
 

@@ -316,7 +316,8 @@ def refined(
         proposal=draws.proposal if several and draws is not None else None,
     )
     equal = np.full(len(walked.flat), 1 / len(walked.flat))
-    mode = belonging(prior, minima, walked.flat, equal)
+    for_one = max(1.0, len(equal) / float(walked.effective.min()))
+    mode = belonging(prior, minima, walked.flat, equal, for_one)
     known = draws is not None and draws.effective >= TOO_FEW
     return Refined(
         walked.thin(len(posterior), exact),

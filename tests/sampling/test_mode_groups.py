@@ -50,6 +50,16 @@ def test_draws_of_one_mode_are_one_group(shape, count):
         assert len(separated(x, weights / weights.sum())) == 1
 
 
+def test_a_walker_that_creeps_in_a_tail_is_no_mode():
+    """One of four leaves for 50 steps, of a chain of which 100 are worth a draw."""
+    random = np.random.default_rng(2)
+    x = random.standard_normal((4000, 2))
+    x[1000:1050] = np.array([30.0, 0.0]) + 1e-3 * np.cumsum(random.standard_normal((50, 2)), axis=0)
+    minima, equal = [Minimum(np.zeros(2), np.eye(2), 0.0, (0,))], np.full(4000, 1 / 4000)
+    assert belonging(PRIOR, minima, x, equal).any()
+    assert not belonging(PRIOR, minima, x, equal, 100.0).any()
+
+
 def test_modes_that_no_descent_ended_in_are_told(monkeypatch):
     """sin 3x is known to 3 %: needles all over the prior, of which one is known."""
     monkeypatch.setattr("en4dvar.estimation.assimilate.that_count", lambda minima, prior: minima[:1])
