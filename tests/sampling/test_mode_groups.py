@@ -75,3 +75,19 @@ def test_modes_that_no_descent_ended_in_are_told(monkeypatch):
     assert modes["mode_descents"].values[0] > 0
     assert not modes["mode_descents"].values[1:].any()
     assert np.isfinite(modes["mode_cost"].values).all()
+
+
+@pytest.mark.parametrize("seed", [1, 7])
+def test_of_a_cheap_function_an_alias_is_found(seed):
+    """The frequency of a sine read once a second: 30 % of the posterior, by a sum over a grid, is below 3."""
+    random = np.random.default_rng(7)
+    t = np.sort(1 + np.arange(14) + 0.05 * random.standard_normal(14))
+    basis = lambda w, t: np.c_[np.cos(w * t), np.sin(w * t), np.ones(len(t)), (t - 7) / 7]  # noqa: E731
+    stds = np.array([1.0, 1.0, 1.0, 0.5])
+    slopes, w = stds * random.standard_normal(4), 4 + random.standard_normal()
+    y = basis(w, t) @ slopes + 0.25 * random.standard_normal(14)
+    prior = {"w": {"prior": "normal", "mean": 4.0, "std": 1.0}}
+    prior |= {name: {"prior": "normal", "mean": 0.0, "std": float(s)} for name, s in zip("abcd", stds, strict=True)}
+    curve = lambda p, t: basis(p["w"], t) @ np.array([p[name] for name in "abcd"])  # noqa: E731
+    result = estimate(curve, (t, y), prior, error=0.25, cheap=True, seed=seed, progress=False)
+    assert np.mean(result.posterior["w"].values < 3) == pytest.approx(0.30, abs=0.05)
