@@ -97,20 +97,25 @@ def descents_of(outcome: Outcome, n_members: int) -> Descents | None:
 
 
 def modes_of(prior: Prior, minima: Sequence[Minimum], sampled: Refined | None) -> tuple[Mode, ...]:
-    """The minima that count, with weights: by Laplace where the posterior was not sampled, else those of its draws."""
+    """The minima that count, with weights: by Laplace where the posterior was not sampled, else those of its draws,
+    with the modes of these in which no descent ended.
+    """
     if sampled is None:
         logs = np.array([m.log_evidence(prior) - minima[0].log_evidence(prior) for m in minima[1:]])
         relative = np.append(1.0, np.exp(logs))[: len(minima)]
         stds = [BEYOND_5 * np.sqrt(np.diag(m.covariance)) for m in minima]
         own = [
-            (w, m.x + np.outer((-1, 0, 1), s)) for w, m, s in zip(relative / relative.sum(), minima, stds, strict=True)
+            (w, m.x + np.outer((-1, 0, 1), s), m.cost)
+            for w, m, s in zip(relative / relative.sum(), minima, stds, strict=True)
         ]
     else:
         own = list(sampled.modes)
+    ended = [(m.cost, m.descents, m.spread) for m in minima]
+    ended += [(lowest, 0, 0.0) for _, _, lowest in own[len(minima) :]]
     return tuple(
-        Mode(centre, q05, q95, m.cost, m.descents, m.spread, float(weight))
-        for m, weight, (q05, centre, q95) in (
-            (m, w, prior.to_physical(q)) for m, (w, q) in zip(minima, own, strict=True)
+        Mode(centre, q05, q95, *told, float(weight))
+        for told, weight, (q05, centre, q95) in (
+            (told, w, prior.to_physical(q)) for told, (w, q, _) in zip(ended, own, strict=True)
         )
         if weight > 0
     )

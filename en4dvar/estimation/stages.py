@@ -131,6 +131,7 @@ class Stages:
             rest = search.rest(outcome)
             if rest and (len(outcome.minima) > 1 or not fit >= CLEARED):
                 outcome, ends = self.rather(search.round(outcome, rest), outcome, ends)
+            outcome, ends = self.rather(search.surveyed(outcome), outcome, ends)
             outcome, ends = self.rather(search.widened(outcome), outcome, ends)
         return self.rather(search.foretold(outcome, lambda: self.expected(ends.members)), outcome, ends)
 

@@ -58,9 +58,9 @@ class Importance:
         self.log_weights, self.log, self.effective = np.empty(0), -np.inf, 0.0
 
     @property
-    def lowest(self) -> float:
-        """J of the lowest draw."""
-        return float(-self.target.max() - 0.5 * self.z.shape[1] * np.log(2 * np.pi))
+    def costs(self) -> Array:
+        """J (D,) of the draws."""
+        return np.asarray(-self.target - 0.5 * self.z.shape[1] * np.log(2 * np.pi))
 
     @property
     def shares(self) -> Array:

@@ -33,6 +33,7 @@ FEW = 6  # directions up to which that is the factor of each; of more it is smal
 THIN = 0.15  # effective share of draws of a mixture below which the posterior is drawn by an emulator
 TOO_FEW = 60.0  # below so many the draws stand for nothing
 ALONG, NEAR, VALLEY = np.linspace(0, 1, 17), 0.125, 0.5  # windows between modes, and the share of draws of a valley
+BESIDE, GAP, NOTHING, LOOKED = 5, 4.0, 0.005, 20  # draws beside a gap, its width, the share in all gaps, how many
 OF_PRIOR = 0.2  # share of the first draws that come from the prior: what no descent found is not excluded
 
 Cost = Callable[[Array], Array]
@@ -42,17 +43,22 @@ Cost = Callable[[Array], Array]
 class WeightedDraws:
     """Draws (D, n) of a posterior, transformed, with ``shares`` (D,) that sum to one.
 
-    ``mode`` (D,) is the number of the minimum that each draw belongs to, ``log_evidence`` is ln ∫ exp(−J_o) N(x) dx,
-    ``lowest`` J, that of the draw ``best`` (n,), ``proposal`` a mixture that resembles them.
+    ``mode`` (D,) is the number of the minimum that each draw belongs to, see :func:`belonging`, ``costs`` (D,) its J,
+    ``log_evidence`` ln ∫ exp(−J_o) N(x) dx, ``best`` (n,) the lowest draw, ``proposal`` a mixture that resembles them.
     """
 
     x: Array
     shares: Array
     mode: Indices
+    costs: Array
     log_evidence: float
-    lowest: float
     best: Array
     proposal: StudentMixture
+
+    @property
+    def lowest(self) -> float:
+        """J of the lowest draw."""
+        return float(self.costs.min())
 
     @property
     def effective(self) -> float:
@@ -102,7 +108,7 @@ def sample_modes(
         """A round; whether no draw of it is low enough to end them all."""
         z = sampler.draw()
         sampler.add(z, 0.5 * np.sum(z**2, axis=1) - cost(prior.from_white(z)))
-        return sampler.lowest >= below
+        return bool(sampler.costs.min() >= below)
 
     mixture = _about(prior, minima)
     first = ClosingDraws(mixture, member_stream(seed, "modes"), DRAWS, WIDER ** min(1.0, FEW / n))
@@ -128,8 +134,8 @@ def sample_modes(
         x=x,
         shares=sampler.shares,
         mode=belonging(prior, minima, x, sampler.shares),
+        costs=sampler.costs,
         log_evidence=sampler.log,
-        lowest=sampler.lowest,
         best=x[np.argmax(sampler.target)],
         proposal=StudentMixture(
             mixture.share, prior.from_white(mixture.centre), np.ascontiguousarray(columns.transpose(0, 2, 1))
@@ -186,14 +192,72 @@ def nearest(prior: Prior, minima: Sequence[Minimum], x: Array) -> Indices:
     return np.asarray(np.argmax(logs, axis=0))
 
 
-def belonging(prior: Prior, minima: Sequence[Minimum], x: Array, shares: Array) -> Indices:
-    """Numbers (D,) of the minima that draws (D, n) with ``shares`` (D,) belong to: on whose side of the valley between
-    them they lie, and where there is none all to the lower one.
+def belonging(prior: Prior, minima: Sequence[Minimum], x: Array, shares: Array, for_one: float = 1.0) -> Indices:
+    """Numbers (D,) of the minima that draws (D, n) with ``shares`` (D,) belong to, each of those in its own group; a
+    group in which there is none has a number beyond them. ``for_one``: how many of a chain are worth one draw.
+    """
+    mode, new = np.zeros(len(x), dtype=np.intp), len(minima)
+    if not minima:
+        return mode
+    groups = separated(np.vstack([x, *(m.x for m in minima)]), np.append(shares, np.zeros(new)), BESIDE * for_one)
+    for group in groups:
+        own, inside = group[group < len(x)], group[group >= len(x)] - len(x)
+        if len(inside):
+            mode[own] = inside[_by_valleys(prior, [minima[i] for i in inside], x[own], shares[own])]
+        else:
+            mode[own], new = new, new + 1
+    return mode
+
+
+def separated(x: Array, shares: Array, beside: float = BESIDE) -> list[Indices]:
+    """Numbers of the draws (D, n), with ``shares`` (D,), of each group: empty gaps of one coordinate lie between them.
+
+    A gap is :data:`GAP` times as wide as ``beside`` effective draws to either side of it. Of draws of any density
+    with one peak that has a chance below 1e-4, and what is curved or bent leaves no gap. Draws that together hold less
+    than :data:`NOTHING` leave it empty.
+    """
+    order = np.argsort(shares, kind="stable")
+    held = np.zeros(len(x), dtype=bool)
+    held[order[np.cumsum(shares[order]) > NOTHING * shares.sum()]] = True
+    groups, waiting = [], [np.arange(len(x))]
+    while waiting:
+        group = waiting.pop()
+        there = group[held[group]]
+        for values in x.T:
+            at = _gap(values[there], shares[there], beside)
+            if at is not None:
+                waiting += [group[values[group] > at], group[values[group] <= at]]
+                break
+        else:
+            groups.append(group)
+    return groups
+
+
+def _gap(values: Array, shares: Array, beside: float) -> float | None:
+    """The middle of a gap among values (D,), of the :data:`LOOKED` widest."""
+    at, same = np.unique(values, return_inverse=True)  # a walker may stay where it is
+    held, widths = np.asarray(np.bincount(same, shares), dtype=float), np.diff(at)
+    for i in np.argsort(-widths, kind="stable")[:LOOKED]:
+        below, above = (_span(at[j], held[j], beside) for j in (slice(i, None, -1), slice(i + 1, None)))
+        if widths[i] > GAP * max(below, above):
+            return float(at[i] + 0.5 * widths[i])
+    return None
+
+
+def _span(values: Array, shares: Array, beside: float) -> float:
+    """How far ``beside`` effective draws reach from the first of values (D,) on; infinite where these are fewer."""
+    enough = np.cumsum(shares) ** 2 >= beside * np.cumsum(shares**2)
+    return float(abs(values[np.argmax(enough)] - values[0])) if enough.any() else math.inf
+
+
+def _by_valleys(prior: Prior, minima: Sequence[Minimum], x: Array, shares: Array) -> Indices:
+    """Numbers (D,) of the minima on whose side of the valley between them draws (D, n) with ``shares`` (D,) lie, and
+    where there is none all that of the lower one.
 
     Which Gaussian is densest says only where to look: far from all minima, along a bent posterior, it is an accident of
     how wide they are.
     """
-    mode = nearest(prior, minima, x) if len(minima) > 1 else np.zeros(len(x), dtype=np.intp)
+    mode = nearest(prior, minima, x)
     for j in range(1, len(minima)):
         for i in range(j):
             first, second = (shares * (mode == number) for number in (i, j))

@@ -174,7 +174,8 @@ def guide(space: WeightSpace, ensemble: Array, seed: int, fits: int = CHAIN_FITS
 class Refined:
     """Members (N, n), transformed, that take the ensemble's place, and what judges them.
 
-    ``modes``: of each minimum the weight, and the quantiles (3, n) of the draws that belong to it, NaN where none does;
+    ``modes``: of each minimum, and each group of draws without one, the weight, the quantiles (3, n) of the draws that
+    belong to it, NaN where none does, and the lowest J of these;
     ``log_evidence`` ln ∫ exp(−J_o) N(x; prior) dx, NaN where it is not known;
     ``lowest`` J that was met. ``draws`` (:data:`KEPT`, n) are equally likely; there are none of a chain. ``lower`` (n,)
     is a draw that lies lower than all minima; then nothing else was sampled.
@@ -182,7 +183,7 @@ class Refined:
 
     members: Array
     summary: Mapping[str, float]
-    modes: Sequence[tuple[float, Array]] = ()
+    modes: Sequence[tuple[float, Array, float]] = ()
     log_evidence: float = math.nan
     lowest: float = math.inf
     draws: Array = field(default_factory=lambda: np.empty((0, 0)))
@@ -300,7 +301,7 @@ def refined(
         members = draws.members(len(posterior), member_stream(seed, "members of the modes"), exact)
         summary = _summary(draws, posterior)
         kept = draws.x[resampled(draws.shares, KEPT, member_stream(seed, "kept draws"))]
-        own = _own_draws(draws.x, draws.shares, draws.mode, len(minima))
+        own = _own_draws(draws.x, draws.shares, draws.mode, draws.costs, len(minima))
         return Refined(members, summary, own, draws.log_evidence, draws.lowest, kept)
     several = draws is not None and len(minima) > 1
     start = _in_all(minima, len(posterior), seed) if several else posterior
@@ -315,26 +316,31 @@ def refined(
         proposal=draws.proposal if several and draws is not None else None,
     )
     equal = np.full(len(walked.flat), 1 / len(walked.flat))
-    mode = belonging(prior, minima, walked.flat, equal)
+    for_one = max(1.0, len(equal) / float(walked.effective.min()))
+    mode = belonging(prior, minima, walked.flat, equal, for_one)
     known = draws is not None and draws.effective >= TOO_FEW
     return Refined(
         walked.thin(len(posterior), exact),
         walked.summary(),
-        _own_draws(walked.flat, equal, mode, len(minima)),
+        _own_draws(walked.flat, equal, mode, -walked.log_density.ravel(), len(minima)),
         draws.log_evidence if draws is not None and known else math.nan,
         float(-walked.log_density.max()),
         warnings=() if walked.converged else (caution("chain-not-converged", walked.warning()),),
     )
 
 
-def _own_draws(x: Array, shares: Array, mode: Indices, count: int) -> list[tuple[float, Array]]:
-    """Of each of ``count`` modes its weight, and the quantiles (3, n) of its draws among those (D, n)."""
+def _own_draws(x: Array, shares: Array, mode: Indices, costs: Array, count: int) -> list[tuple[float, Array, float]]:
+    """Of each of ``count`` modes, and those beyond them, what :attr:`Refined.modes` says, of draws (D, n) of J
+    ``costs`` (D,).
+    """
     own = []
-    for number in range(count):
-        weight = float(shares[mode == number].sum())
-        of = shares[mode == number] / weight if weight else np.array([np.nan])
-        values = x[mode == number] if weight else np.full((1, x.shape[1]), np.nan)
-        own.append((weight, np.stack([weighted_quantiles(column, of) for column in values.T], axis=1)))
+    for number in range(max(count, int(mode.max()) + 1) if count else 0):
+        there = mode == number
+        weight = float(shares[there].sum())
+        of = shares[there] / weight if weight else np.array([np.nan])
+        values = x[there] if weight else np.full((1, x.shape[1]), np.nan)
+        quantiles = np.stack([weighted_quantiles(column, of) for column in values.T], axis=1)
+        own.append((weight, quantiles, float(costs[there].min(initial=np.inf))))
     return own
 
 
