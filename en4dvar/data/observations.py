@@ -14,7 +14,7 @@ from typing import Self
 
 import numpy as np
 import numpy.typing as npt
-from scipy import special, stats
+from scipy import special
 
 from en4dvar.data.noise import Linearisation, Noise, Predicted, joint_noise, sides_of
 from en4dvar.data.series import Part, Series
@@ -25,7 +25,7 @@ from en4dvar.priors.prior import LARGEST
 
 SEVERAL = ", "  # between the names of several sources
 BY_CHANCE = 1e-6  # chance that two recordings of a campaign agree, below which they are one
-CLOSE = 0.02  # standard deviations: readings that differ by what a shorter way to write them leaves out
+CLOSE = 1e-4  # standard deviations: readings that differ by what a shorter way to write them leaves out
 ROUNDING = 1e-8  # of the largest reading
 ALIKE = 1e-3  # chance of another number of a row of a table to agree
 SAME_TIME = 1e-9  # of the whole duration: times of different series that are this close are the same instant
@@ -254,7 +254,7 @@ def _chance(own: Mapping[str, tuple[float, float]], other: Mapping[str, tuple[fl
         alike = int(np.sum(apart <= near))
         of_each = float(np.mean(special.erf(np.maximum(scale, near) / (2 * std))))
         if 2 * alike > len(common):
-            likely = min(likely, float(stats.binom.sf(alike - 1, len(common), of_each)))
+            likely = min(likely, float(special.bdtrc(alike - 1, len(common), of_each)))
     return likely
 
 

@@ -59,7 +59,7 @@ def flat(problem):
     """Readings at the same times that say nothing."""
     o = problem.observations
     return replace(
-        problem, observations=replace(o, values=o.values + 1, noise=replace(o.noise, std=1e7 + o.std), name="flat")
+        problem, observations=replace(o, values=o.values + 1e5, noise=replace(o.noise, std=1e7 + o.std), name="flat")
     )
 
 

@@ -38,7 +38,9 @@ def recording(name="a", part=slice(None), seed=0, digits=4, **more):
         replace(recording("b"), values=recording().values * (1 + 1e-14)),  # of other units
         recording("b", scalars={"film": 3.0}),
         replace(recording("b"), values=recording().values + (np.arange(12) == 7)),  # one reading was corrected
-        replace(recording("b"), values=np.round(recording().values, 3)),  # an export with fewer digits
+        replace(
+            recording("b"), values=recording().values.astype(np.float32).astype(float)
+        ),  # an export of single precision
         recording("b", slice(0, 3)),
     ],
 )
