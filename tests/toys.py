@@ -6,6 +6,7 @@ import os
 from dataclasses import replace
 
 import numpy as np
+from scipy.linalg import expm
 
 from en4dvar.data.noise import Kernel, noise_of
 from en4dvar.data.observations import Observations
@@ -173,3 +174,20 @@ def visit(space, w):
     window = DataWindow(space)
     (descent.step,) = window.linearise([descent])
     return descent
+
+
+SLOPE = np.array([[0.0, 1.0], [-2.0, -0.15]])  # of the state (x, v) of a swing
+
+
+class Swing(ForwardModel):
+    """ẍ = −2 x − 0.15 ẋ from x = 1 m at rest; no parameters."""
+
+    parameters = ()
+    layout = StateLayout((Field("x", unit="m"), Field("v", unit="m/s")))
+    observables = (Observable("x", "m", StateField("x")),)
+
+    def initial_state(self, theta):
+        return np.array([1.0, 0.0])
+
+    def step(self, x, t0, t1):
+        return expm(SLOPE * (t1 - t0)) @ x

@@ -69,18 +69,20 @@ NOTHING = Errors(float("nan"), float("nan"), float("nan"))
 def errors_of(outlines: Sequence[Outline | None], optics: Optics, exposure: float = 0.0) -> list[Errors]:
     """Errors of each frame, of which the exposure takes a share; of those without an outline :data:`NOTHING`."""
     ratios, turns = _smoothed(outlines), _turns(outlines)
-    hidden, factor = _hidden(outlines, ratios)
-    beside = hidden + _bent(outlines, ratios, turns, optics, exposure) + _unseen(outlines, factor)
+    hidden, lasting = _hidden(outlines, ratios)
+    beside = hidden + _bent(outlines, ratios, turns, optics, exposure) + _unseen(outlines, lasting)
+    factor = STUDENT * lasting / 6**0.5
     return [
         replace(_errors(o, ratio, variance, turned, optics), factor=factor) if o is not None else NOTHING
         for o, ratio, variance, turned in zip(outlines, ratios, beside, turns, strict=True)
     ]
 
 
-def _unseen(outlines: Sequence[Outline | None], factor: float) -> Array:
-    """Variance of the radius (K,) of what is cut by the frame's edge: a circle's of a part of an elongated outline."""
-    shape = CUT * 6**0.5 / STUDENT * factor
-    return np.array([0.0 if o is None else (shape * o.circle.R * (1 - o.seen)) ** 2 for o in outlines])
+def _unseen(outlines: Sequence[Outline | None], lasting: float) -> Array:
+    """Variance of the radius (K,) where the frame's edge cuts an outline of a ``lasting`` mode 2 over R: a circle is
+    fitted to a part of it.
+    """
+    return np.array([0.0 if o is None else (CUT * lasting * o.circle.R * (1 - o.seen)) ** 2 for o in outlines])
 
 
 def _bent(
@@ -161,7 +163,7 @@ def _errors(outline: Outline, ratio: float, hidden: float, turned: bool, optics:
 
 def _hidden(outlines: Sequence[Outline | None], ratios: Array) -> tuple[Array, float]:
     """For the extent along the line of sight: the variance of each radius (K,), by what its own mode 2 or that of its
-    neighbours has beside the one that all frames share, and the std of the factor of all radii, by the latter.
+    neighbours has beside the one that all frames share, and the amplitude over R of the latter.
     """
     where = [k for k, o in enumerate(outlines) if o is not None and o.amplitude(2) >= 0 and o.mode_std > 0]
     known, hidden = [o for k in where if (o := outlines[k]) is not None], np.zeros(len(outlines))
@@ -171,7 +173,7 @@ def _hidden(outlines: Sequence[Outline | None], ratios: Array) -> tuple[Array, f
     noise = 2 * np.array([o.mode_std**2 for o in known]) * ratios[where]  # mean and std of a² where there is no mode 2
     noise /= radii**2
     shape = np.array([o.modes[:, 0] @ (1, 1j) for o in known]) / radii
-    lasting, factor = _lasting(shape, noise)
+    lasting, amplitude = _lasting(shape, noise)
     excess = np.abs(shape - lasting) ** 2 - noise
     bar = (SIGNIFICANT**2 / 2 - 1) * noise
     for n, k in enumerate(where):
@@ -183,7 +185,7 @@ def _hidden(outlines: Sequence[Outline | None], ratios: Array) -> tuple[Array, f
         elif together > SIGNIFICANT / np.sqrt(weights.sum()):
             hidden[k] = together
         hidden[k] *= STUDENT**2 * radii[n] ** 2 / 6
-    return hidden, STUDENT * factor / 6**0.5
+    return hidden, amplitude
 
 
 def _lasting(shape: npt.NDArray[np.complex128], noise: Array) -> tuple[complex, float]:

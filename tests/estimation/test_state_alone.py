@@ -3,27 +3,14 @@
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from toys import SLOPE, Swing
 
 import en4dvar
-from en4dvar import Field, ForwardModel, Observable, StateField, StateLayout
 from en4dvar.assembly.build import build
 from en4dvar.plumbing.errors import ConfigError
 
-SLOPE = np.array([[0.0, 1.0], [-2.0, -0.15]])
 NOISE = 0.1
 TIMES = np.linspace(0.5, 6.0, 12)
-
-
-class Oscillator(ForwardModel):
-    parameters = ()
-    layout = StateLayout((Field("x", unit="m"), Field("v", unit="m/s")))
-    observables = (Observable("x", "m", StateField("x")),)
-
-    def initial_state(self, theta):
-        return np.array([1.0, 0.0])
-
-    def step(self, x, t0, t1):
-        return expm(SLOPE * (t1 - t0)) @ x
 
 
 def position(t, since=0.0, start=(1.0, 0.0)):
@@ -51,7 +38,7 @@ def test_the_initial_state_or_the_model_error_alone_is_something_to_estimate(sec
     covariance = np.diag(np.square(std))
     gain = covariance @ response.T @ np.linalg.inv(response @ covariance @ response.T + NOISE**2 * np.eye(len(y)))
     mean, spread = gain @ (y - BASE), np.sqrt(np.diag(covariance - gain @ response @ covariance))
-    told = en4dvar.estimate(Oscillator, (TIMES, y), {}, error=NOISE, progress=False, **sections).summary()
+    told = en4dvar.estimate(Swing, (TIMES, y), {}, error=NOISE, progress=False, **sections).summary()
     assert list(told.index) == names
     assert told["mean"].to_numpy() == pytest.approx(mean, abs=1e-8)
     assert told["std"].to_numpy() == pytest.approx(spread, rel=1e-8)
@@ -63,17 +50,17 @@ def test_numbers_of_the_readings_alone_are_estimated(name):
     prior = {"prior": "normal", "mean": "0 s", "std": "0.3 s"}
     if name != "t_s":
         prior = {"prior": "lognormal", "median": 1, "log_std": 0.5}
-    told = en4dvar.estimate(Oscillator, (TIMES, y), {name: prior}, error=NOISE, progress=False).summary()
+    told = en4dvar.estimate(Swing, (TIMES, y), {name: prior}, error=NOISE, progress=False).summary()
     true = 0.0 if name == "t_s" else 1.0
     assert abs(told["mean"].iloc[0] - true) < 3 * told["std"].iloc[0]
 
 
 def test_a_file_needs_no_section_of_parameters(tmp_path):
     np.savetxt(tmp_path / "b.csv", np.c_[TIMES, BASE], delimiter=",", header="t,x", comments="")
-    (tmp_path / "oscillator.py").write_text(f"from {__name__} import Oscillator as Oscillator\n", encoding="utf-8")
+    (tmp_path / "oscillator.py").write_text("from toys import Swing as Swing\n", encoding="utf-8")
     text = (
         "name: alone\n"
-        "model: {name: ./oscillator.py:Oscillator}\n"
+        "model: {name: ./oscillator.py:Swing}\n"
         "data: {path: b.csv, columns: {time: {name: t, unit: s}, x: {name: x, unit: m}}, error: {x_std: 0.1 m}}\n"
     )
     file = tmp_path / "alone.yaml"

@@ -4,25 +4,12 @@ import numpy as np
 import pytest
 import xarray as xr
 from scipy.linalg import expm
+from toys import SLOPE, Swing
 
 import en4dvar
-from en4dvar import Field, ForwardModel, Observable, StateField, StateLayout
 
-SLOPE = np.array([[0.0, 1.0], [-2.0, -0.15]])
 TIMES = np.arange(1.0, 9.0) / 2
 READ = np.array([(expm(SLOPE * t) @ [1.1, 0.2])[0] for t in TIMES])
-
-
-class Swing(ForwardModel):
-    parameters = ()
-    layout = StateLayout((Field("x", unit="m"), Field("v", unit="m/s")))
-    observables = (Observable("x", "m", StateField("x")),)
-
-    def initial_state(self, theta):
-        return np.array([1.0, 0.0])
-
-    def step(self, x, t0, t1):
-        return expm(SLOPE * (t1 - t0)) @ x
 
 
 class Breaking(Swing):

@@ -66,7 +66,7 @@ def largest(shares: Mapping[str, float], members: int) -> list[str]:
     """
     spread = {source: 2 * share**0.5 * (1 - share) / members**0.5 for source, share in shares.items()}
     first = next(iter(shares))
-    return [s for s in shares if shares[first] - shares[s] <= 2 * np.hypot(spread[first], spread[s]) or s == first]
+    return [s for s in shares if shares[first] - shares[s] <= 2 * np.hypot(spread[first], spread[s])]
 
 
 def budget_words(a: Analysis, name: str) -> str:
