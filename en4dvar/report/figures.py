@@ -36,7 +36,7 @@ def histograms(result: StoredResult) -> Chart:
         exact, posterior = _prior_density(result, row.name), result.members("posterior", row.name)
         prior = result.members("prior", row.name)
         value = f"{estimate(row, '')}{unit_behind(row.unit)}"
-        doubt = ", not to be trusted" if row.untrusted else ""
+        doubt = "\nnot to be trusted" if row.untrusted else ""
         panel = Panel(
             with_unit(row.symbol, row.unit), title=f"{value}{doubt}", title_colour="posterior", xticks=4, yticks=(),
             left=False, xlim=_reach(prior, posterior), ylim=(-0.14, 1.2),
