@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from en4dvar.descent.field_data import prior_members
+from en4dvar.descent.search import SURVEY
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.ensemble.forecast import Forecast, forecast, plotting_times
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
@@ -96,7 +97,8 @@ def expected_runs(space: WeightSpace) -> int:
 
     A scheme that runs its whole ensemble does so once for each assimilation and once at the end, with the mean. A
     search takes prior and posterior forecast, and for each iteration a tangent (1, n or N runs) and the trials of the
-    step control, ``starts`` descents side by side, one for each shorter window, and a part of one from a far member.
+    step control, ``starts`` descents side by side, one for each shorter window, and a part of one from a far member;
+    of a model that is said to be cheap, those of a survey.
     Where a discrepancy is estimated and nothing is sampled, it takes another search, and one descent from there; where
     something changes along the path, the descents of a constant one, and a part of one from there.
     """
@@ -107,6 +109,8 @@ def expected_runs(space: WeightSpace) -> int:
     tangent = 1 if space.derivatives else 1 + (space.basis.shape[1] if economical else n_members)
     starts = scheme.starts if scheme.start == "best-member" and economical else 1
     challenger = CHALLENGER if scheme.searches and economical else 0.0
+    if challenger and problem.model.cheap and not problem.model.compiled and space.settings.refine != "none":
+        challenger += min(SURVEY, n_members - starts)
     held = 1 + starts + challenger if challenger and problem.estimates_discrepancy and not problem.model.cheap else 0.0
     steady = starts + challenger if challenger and problem.has_constant else 0.0
     iterations = (starts + challenger + held + steady + scheme.lengthen - 1) * min(ITERATIONS, scheme.max_iterations)

@@ -9,6 +9,7 @@ from wells import Parting, UnlikeWells, Wells, chord, hidden_well, mass_of_posit
 
 from en4dvar.descent import search
 from en4dvar.descent.minima import Minimum
+from en4dvar.descent.preview import preview
 from en4dvar.descent.search import Outcome, Search
 from en4dvar.diagnosis.analysis import Descents, IterationRecord, StartRecord
 from en4dvar.estimation import stages
@@ -40,14 +41,24 @@ def test_no_well_is_lost_of_a_model_that_is_not_cheap(kind, settings):
         assert 0 < told.runs < 100
 
 
+class Counting(Decay):
+    runs = 0
+
+    def trajectories(self, x, times):
+        self.runs += len(x)
+        return super().trajectories(x, times)
+
+
+def test_a_survey_of_a_cheap_model_is_foretold():
+    model, settings = Counting(), AssimilationSettings(members=36)
+    model.cheap = True
+    problem = make_problem(model, [1.5, 1.2], std=0.01)
+    told, before = preview(problem, settings, 1).runs, model.runs
+    assimilate(problem, settings, 1)
+    assert 0.5 < told / (model.runs - before) < 2
+
+
 def test_what_the_search_costs_is_what_was_run():
-    class Counting(Decay):
-        runs = 0
-
-        def trajectories(self, x, times):
-            self.runs += len(x)
-            return super().trajectories(x, times)
-
     heard, model = [], Counting()
     problem = make_problem(model, [1.5, 1.2])
     analysis = assimilate(
