@@ -11,11 +11,13 @@ and needs no run of the model. p(h|y) is sampled by importance from Student's t 
 nested Laplace approximations: Rue, Martino & Chopin 2009, J. R. Stat. Soc. B 71, 319).
 """
 
+import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
-from en4dvar.data.noise import DiscrepancyNoise, Linearisation, Predicted, sides_of
+from en4dvar.data.noise import BoundNoise, DiscrepancyNoise, Linearisation, Predicted, sides_of
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.ensemble.forecast import of_framework
 from en4dvar.ensemble.linalg import effective_number, resampled, shares_of, with_moments
@@ -28,7 +30,7 @@ DRAWS, FREEDOM = 1500, 5.0  # of Student's t
 WIDER = 1.3  # than the Gaussian at the mode
 AT_ONCE = 50
 ENOUGH = 60.0  # effective draws below which the ensemble stays as it is
-SWEEPS = 200
+PARTICLES, SWEEPS = 2000, 40  # that bounds are imposed on; moves of each in the end
 STENCIL = 0.02  # width of differences, in prior standard deviations
 
 
@@ -107,48 +109,87 @@ def _given(
     return np.concatenate(log_density) + log_prior, np.concatenate(means), np.concatenate(covariances)
 
 
-def bounded_members(space: WeightSpace, linear: Linearisation, w: Array, posterior: Array) -> Array:
-    """Members (N, n), transformed, in place of ``posterior`` (N, n), the Gaussian about the mode, of weights w (N,),
-    beside readings that are bounds: that of all else, cut off softly.
+@dataclass(frozen=True)
+class Bounded:
+    """``members`` (N, n), transformed, beside readings that are bounds, ``costs`` (N,), J of them as far as predictions
+    are linear about the mode, and ln p(y), ``log_evidence``, so far, but for the errors' normalisation.
+    """
+
+    members: Array
+    costs: Array
+    log_evidence: float
+
+
+def beside_bounds(space: WeightSpace, linear: Linearisation, w: Array, cost: float) -> Bounded | None:
+    """The posterior about its mode, of weights w (N,) and J ``cost``, where readings are bounds: the Gaussian of all
+    else, cut off softly. None where none is.
 
     About a minimum of J the curvature of a bound is that of a Gaussian on one side and zero on the other, so no
-    Gaussian is near. With the predictions linear about it, all but the bounds is a Gaussian in closed form; its draws
-    are moved by elliptical slice sampling (Murray, Adams & MacKay 2010, AISTATS 9, 541), which needs no run of the
+    Gaussian is near. With the predictions linear about it, all but the bounds is a Gaussian in closed form; from its
+    draws the bounds are imposed by degrees (sequential Monte Carlo: Del Moral, Doucet & Jasra 2006, J. R. Stat. Soc. B
+    68, 411), with elliptical slice sampling (Murray, Adams & MacKay 2010, AISTATS 9, 541), which needs no run of the
     model.
     """
     observations, basis = space.problem.observations, space.basis
-    bounds = sides_of(observations.noise) != 0
+    sides = sides_of(observations.noise)
+    bounds = sides != 0
     if not bounds.any():
-        return posterior
+        return None
     d, S = observations.whiten(linear)
     others = np.resize(~bounds, len(d))
     d, S = d[others], S[others]
-    n_members, r = len(posterior), basis.shape[1]
+    n_members, r = basis.shape
     prior = np.sqrt(n_members - 1)
     orthogonal, root = np.linalg.qr(np.vstack([S, prior * np.eye(r)]))
     middle = np.linalg.solve(root, orthogonal.T @ np.concatenate([d, -prior * basis.T @ w]))
-    weights = np.where(bounds, observations.weights, 0.0)
+    noise = BoundNoise(observations.noise.std[bounds], observations.noise.time_std[bounds], sides[bounds])
+    values, weights = observations.values[bounds], observations.weights[bounds]
+    at, slopes = linear.prediction.values[bounds], linear.anomalies[:, : len(bounds)][:, bounds]
 
-    def cost(z: Array) -> Array:
-        """J_o (N,) of the bounds alone, at points z (N, r) that are N(0, I) but for the bounds."""
-        predicted = linear.prediction.values + (middle + np.linalg.solve(root, z.T).T) @ linear.anomalies
-        return observations.noise.cost(observations.values, weights, Predicted(predicted))
+    def moved(z: Array) -> Array:
+        """Coordinates (B, r) about w of points z (B, r) that are N(0, I) but for the bounds."""
+        return np.asarray(middle + np.linalg.solve(root, z.T).T)
 
-    stream = member_stream(space.seed, "bounds")
-    z = np.tile(root @ -middle, (n_members, 1))  # at the mode
-    for _ in range(SWEEPS):
-        z = _moved(z, cost, stream)
-    return space.control(w + (middle + np.linalg.solve(root, z.T).T) @ basis.T)
+    def of_bounds(z: Array) -> Array:
+        """J_o (B,) of the bounds alone."""
+        return noise.cost(values, weights, Predicted(at + moved(z) @ slopes))
+
+    stream, mode = member_stream(space.seed, "bounds"), (root @ -middle)[None]
+    lowest = cost - float(of_bounds(mode)[0]) - 0.5 * float(np.sum(mode**2))  # J of all else at its own minimum
+    z, log_share = _imposed(stream.standard_normal((max(PARTICLES, n_members), r)), of_bounds, stream)
+    z = z[:n_members]
+    log_det = 2 * float(np.log(np.abs(np.diag(root)) / prior).sum())
+    costs = lowest + 0.5 * np.sum(z**2, axis=1) + of_bounds(z)
+    return Bounded(space.control(w + moved(z) @ basis.T), costs, log_share - lowest - 0.5 * log_det)
 
 
-def _moved(z: Array, cost: Callable[[Array], Array], stream: np.random.Generator) -> Array:
-    """A move of each point z (N, r) along an ellipse through it, its arc shrunk until the draw is accepted."""
-    other, level = stream.standard_normal(z.shape), cost(z) - np.log(stream.uniform(size=len(z)))
+def _imposed(z: Array, cost: Callable[[Array], Array], stream: np.random.Generator) -> tuple[Array, float]:
+    """Draws (B, r) of N(0, I) exp(−cost) in place of draws ``z`` of N(0, I), and ln E[exp(−cost)] of these: by powers
+    of exp(−cost), each of which leaves half of the draws effective.
+    """
+    power, log_share = 0.0, 0.0
+    while power < 1:
+        costs, step = cost(z), 1 - power
+        while effective_number(shares_of(-step * costs)) < 0.5 * len(z):
+            step *= 0.7
+        power, logs = (1.0 if step == 1 - power else power + step), -step * costs
+        log_share += float(np.logaddexp.reduce(logs)) - math.log(len(z))
+        z = z[stream.permutation(resampled(shares_of(logs), len(z), stream))]
+        for _ in range(SWEEPS if power == 1 else SWEEPS // 5):
+            z = _moved(z, cost, power, stream)
+    return z, log_share
+
+
+def _moved(z: Array, cost: Callable[[Array], Array], power: float, stream: np.random.Generator) -> Array:
+    """A move of each point z (N, r), drawn from N(0, I) exp(−power · cost), along an ellipse through it, its arc shrunk
+    until the draw is accepted.
+    """
+    other, level = stream.standard_normal(z.shape), power * cost(z) - np.log(stream.uniform(size=len(z)))
     angle = stream.uniform(0, 2 * np.pi, size=len(z))
     low, high = angle - 2 * np.pi, angle.copy()
     while True:
         moved = z * np.cos(angle)[:, None] + other * np.sin(angle)[:, None]
-        refused = cost(moved) > level
+        refused = power * cost(moved) > level
         if not refused.any():
             return moved
         low, high = np.where(refused & (angle < 0), angle, low), np.where(refused & (angle >= 0), angle, high)

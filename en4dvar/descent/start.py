@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from en4dvar.data.noise import noise_of
+from en4dvar.data.noise import noise_of, sides_of
 from en4dvar.descent.loop import minimise
 from en4dvar.descent.minima import AGREE, REACHED, Minimum, merged
 from en4dvar.descent.step_control import Move, Search
@@ -172,6 +172,8 @@ class Rounds(DataWindow):
     ):  # fmt: skip
         super().__init__(space, tell)
         self.known, self.rounds, self.plausible = known, 0, highest_plausible(space)
+        bounded = np.any(sides_of(self.observations.noise))  # of flat J a rough end is anywhere
+        self.rough = space.minimiser.cost_tolerance if bounded else ROUGH
         self.lowest = lowest or Descent(space.start(np.zeros(len(space.members))))
         self.descents, self.minima = list[Descent](), list[Minimum]()
 
@@ -215,7 +217,7 @@ class Rounds(DataWindow):
             if move is not None:
                 self.record(descent, step.hessian.economical_transform, move.step_length)
                 descent.weights, descent.cost = self.space.onwards(move.w, step.hessian), move.cost
-                rough = max(before - move.cost, step.predicted_decrease) <= ROUGH * max(1.0, move.cost)
+                rough = max(before - move.cost, step.predicted_decrease) <= self.rough * max(1.0, move.cost)
                 descent.ended = rough or descent.iteration == self.space.minimiser.max_iterations
             else:
                 descent.ended = True

@@ -139,7 +139,9 @@ def _concluded(
     response = LinearResponse(ends.mode, replace(linear, prediction=central), along, precision, observations)
     explained = observations.noise.explained(observations.values, central)
     log_evidence = sampled.refined.log_evidence - observations.log_normalisation() if sampled.refined else math.nan
-    if not math.isfinite(log_evidence):  # there are no draws, or too few: by Laplace
+    if not math.isfinite(log_evidence) and ends.bounded:  # there are no draws, or too few
+        log_evidence = ends.bounded.log_evidence - observations.log_normalisation()
+    elif not math.isfinite(log_evidence):  # by Laplace
         values = descent.newton.hessian.singular_values
         log_evidence = diag.log_evidence(descent.iterate.cost, values, len(space.members), observations)
     std = ends.members.std(axis=0, ddof=1)

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from en4dvar.descent.beyond_gaussian import bounded_members, marginal_members, mean_beyond_mode
+from en4dvar.descent.beyond_gaussian import Bounded, beside_bounds, marginal_members, mean_beyond_mode
 from en4dvar.descent.loop import minimise
 from en4dvar.descent.minima import Minimum, merged
 from en4dvar.descent.search import Outcome, Search
@@ -42,12 +42,21 @@ from en4dvar.schemes.settings import AssimilationSettings
 
 @dataclass(frozen=True)
 class Ends:
-    """An ensemble (N, n), transformed, about the ``mode`` (n,) of J, and what came of running both."""
+    """An ensemble (N, n), transformed, about the ``mode`` (n,) of J, and what came of running both; how it was drawn
+    beside readings that are bounds, if any are.
+    """
 
     members: Array
     mode: Array
     run: Forecast
     central: Forecast
+    bounded: Bounded | None = None
+
+    def gaussianity(self, costs: Array) -> dict[str, float]:
+        """Of members of J ``costs`` (N,); beside bounds how well J agrees with what they were drawn from."""
+        if self.bounded is None:
+            return diag.gaussianity(self.members, self.mode, costs)
+        return {"gaussian_fit": diag.effective_share(self.bounded.costs - costs)}
 
 
 @dataclass(frozen=True)
@@ -127,7 +136,7 @@ class Stages:
             outcome = search.settled(outcome)
         ends = self.gaussian(outcome.descent)
         if sampling:
-            fit = diag.gaussianity(ends.members, ends.mode, space.costs(ends.members, ends.run))["gaussian_fit"]
+            fit = ends.gaussianity(space.costs(ends.members, ends.run))["gaussian_fit"]
             rest = search.rest(outcome)
             if rest and (len(outcome.minima) > 1 or not fit >= CLEARED):
                 outcome, ends = self.rather(search.round(outcome, rest), outcome, ends)
@@ -158,10 +167,12 @@ class Stages:
             return Ends(members, mode, descent.iterate.members, descent.iterate.central)
         if problem.discrepancy and descent.iterate.linear is not None:
             members = marginal_members(space, descent.iterate.linear, mode, members)
+        bounded = None
         if descent.iterate.linear is not None:
-            members = bounded_members(space, descent.iterate.linear, descent.weights.w, members)
+            bounded = beside_bounds(space, descent.iterate.linear, descent.weights.w, descent.iterate.cost)
+            members = bounded.members if bounded else members
         final = space.whole(np.vstack([members, mode]), self.grid)
-        return Ends(members, mode, final[:-1], final[-1:])
+        return Ends(members, mode, final[:-1], final[-1:], bounded)
 
     def sampled(
         self, ends: Ends, prior_run: Forecast, minima: Sequence[Minimum], agree: bool, looking: bool
@@ -180,7 +191,7 @@ class Stages:
             # with a discrepancy emulated J costs as much as true J: where that may be sampled, it tells
             settle = not (cheap and self.problem.discrepancy)
             costs = space.costs(ends.members, ends.run)
-            shape = examine_shape(space, ends.members, ends.mode, costs, self.seed, settle)
+            shape = examine_shape(space, ends.members, ends.gaussianity(costs), self.seed, settle)
             settles = cheap and bool(minima)
             modes = that_count(minima, self.problem.prior, math.log(SEEN))  # of which a warning is given in any case
             told = in_doubt(minima, agree, shape) if settles else "mean_shift" in shape or len(modes) > 1
@@ -195,7 +206,7 @@ class Stages:
             return Sampled(ends, sampled, {})
         run = space.whole(sampled.members, self.grid)
         central = ends.central if self.minimiser else space.forecast(ends.mode[None], self.grid)
-        return Sampled(Ends(sampled.members, ends.mode, run, central), sampled, {})
+        return Sampled(Ends(sampled.members, ends.mode, run, central, ends.bounded), sampled, {})
 
     def tell(self, record: Record) -> None:
         if self.progress is not None:

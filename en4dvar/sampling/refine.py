@@ -49,18 +49,18 @@ OVERLAP = "no action is needed: mean ± std describe the members"
 
 
 def examine_shape(
-    space: WeightSpace, ensemble: Array, mode: Array, costs: Array, seed: int, settle: bool = True
+    space: WeightSpace, ensemble: Array, shape: Mapping[str, float], seed: int, settle: bool = True
 ) -> dict[str, float]:
     """Numbers for :func:`~en4dvar.diagnosis.diagnostics.is_non_gaussian`, and its answer.
 
-    ``ensemble`` (N, n) and its centre ``mode`` (n,), transformed; ``costs`` J (N,) of its members. Deterministic in
-    ``seed``. ``settle``: a doubt of the emulator's is looked into with more moves of its walkers.
-    ``gaussian_fit``: effective share of the members; where an emulator was needed ``mean_shift``, the largest distance
-    of the ensemble's mean from the posterior's in posterior standard deviations, ``spread_ratio``, the standard
-    deviation of the ensemble over the posterior's where that is farthest from 1, ``emulator_fit``, and
+    Of the ``ensemble`` (N, n), transformed, whose ``shape`` has ``gaussian_fit``, the effective share of the members.
+    Deterministic in ``seed``. ``settle``: a doubt of the emulator's is looked into with more moves of its walkers.
+    Where an emulator was needed there are ``mean_shift``, the largest distance of the ensemble's mean from the
+    posterior's in posterior standard deviations, ``spread_ratio``, the standard deviation of the ensemble over the
+    posterior's where that is farthest from 1, ``emulator_fit``, and
     ``emulated_mean_<name>``, ``emulated_std_<name>`` of each parameter, physical and SI.
     """
-    shape = diag.gaussianity(ensemble, mode, costs)
+    numbers = dict(shape)
     if shape["gaussian_fit"] < CLEARED:
         emulator = guide(space, ensemble, seed, fits=2)
         if emulator is not None:
@@ -68,11 +68,11 @@ def examine_shape(
             if settle and doubtful(off):  # by walkers that have not settled, as often as not
                 emulator = emulator.settled(member_stream(seed, "emulator, settled"))
                 off = _off(emulator, ensemble)
-            shape |= {**off, "emulator_fit": emulator.share}
+            numbers |= {**off, "emulator_fit": emulator.share}
             theta, names = space.problem.prior.to_physical(emulator.draws), space.problem.prior.names
             for what, values in (("mean", theta.mean(axis=0)), ("std", theta.std(axis=0))):  # of G, not of ln G
-                shape |= {f"emulated_{what}_{name}": float(v) for name, v in zip(names, values, strict=True)}
-    return {**shape, "non_gaussian": diag.is_non_gaussian(shape)}
+                numbers |= {f"emulated_{what}_{name}": float(v) for name, v in zip(names, values, strict=True)}
+    return {**numbers, "non_gaussian": diag.is_non_gaussian(numbers)}
 
 
 def examine_tails(space: WeightSpace, ensemble: Array, costs: Array, before: Array, always: bool) -> dict[str, float]:

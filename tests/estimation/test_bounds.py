@@ -23,6 +23,7 @@ from en4dvar.schemes.settings import AssimilationSettings
 
 SIDES = np.array([1.0, 0.0, -1.0, 1.0])
 STD = np.array([0.5, 0.2, 0.3, 0.4])
+STDS = ("a", 2.0), ("b", 1.0)  # of a line's prior
 
 
 def test_the_cost_is_that_of_a_gaussian_beyond_a_bound_and_nothing_elsewhere():
@@ -58,11 +59,16 @@ def _problem(sides, values, std):
 
 def _moments(problem):
     """Mean and std of the posterior, by quadrature."""
-    a = np.linspace(-6, 6, 20001)
-    costs = problem.observations.cost(Predicted(np.tile(a[:, None], len(problem.observations))))
-    density = np.exp(-0.5 * a**2 - costs)
+    a, density = _density(problem)
     mean = float(np.sum(a * density) / np.sum(density))
     return mean, math.sqrt(np.sum((a - mean) ** 2 * density) / np.sum(density))
+
+
+def _density(problem, mean=0.0, std=1.0):
+    """exp(−J_o) times the prior's density, along a grid of a."""
+    a = np.linspace(-6, 6, 20001)
+    costs = problem.observations.cost(Predicted(np.tile(a[:, None], len(problem.observations))))
+    return a, np.exp(-0.5 * ((a - mean) / std) ** 2 - costs) / math.sqrt(2 * math.pi) / std
 
 
 @pytest.mark.parametrize(
@@ -89,6 +95,40 @@ def test_without_sampling_a_linear_model_has_it_too(sides, values):
     analysis = assimilate(problem, AssimilationSettings(members=2000, refine="none"), seed=3)
     assert float(analysis.posterior.mean()) == pytest.approx(mean, abs=0.08 * std)
     assert float(analysis.posterior.std()) == pytest.approx(std, rel=0.06)
+
+
+@pytest.mark.parametrize(
+    ("sides", "values"), [([1.0], [-0.5]), ([-1.0, 0.0], [0.7, 0.4]), ([1.0, -1.0], [0.5, 0.2]), ([1.0], [0.0])]
+)
+def test_the_evidence_of_a_linear_model_is_that_of_quadrature(sides, values):
+    problem = _problem(sides, values, 0.1)
+    analysis = assimilate(problem, AssimilationSettings(members=200, refine="none"), seed=3)
+    a, density = _density(problem, float(analysis.prior.mean()), float(analysis.prior.std(ddof=1)))
+    exact = math.log(np.sum(density) * (a[1] - a[0])) - problem.observations.log_normalisation()
+    assert analysis.log_evidence == pytest.approx(exact, abs=0.1)
+
+
+@pytest.mark.parametrize("seed", [1, 5, 16])
+def test_ranges_about_a_line_leave_one_mode_and_no_doubt(seed):
+    """J of a linear model is convex, but flat within the ranges: a rough end of a descent is anywhere in them."""
+    rng, t = np.random.default_rng(seed), np.linspace(1, 5, 6)
+    low = rng.normal(0, 1) + 0.5 * t - rng.uniform(0.2, 0.8, 6)
+    readings, error = {"lo": (t, low), "hi": (t, low + 1)}, {"lo": {"at_least": True}, "hi": {"at_most": True}}
+    result = en4dvar.estimate(
+        lambda p, t: p["a"] + p["b"] * t, readings, {n: {"prior": "normal", "mean": 0, "std": s} for n, s in STDS},
+        error={name: {"y_std": 0.2, **side} for name, side in error.items()},
+        series={name: {"observable": "y"} for name in readings}, seed=seed, progress=False,
+    )  # fmt: skip
+    assert not result.warnings
+    (a, b), m = np.meshgrid(np.linspace(-6, 6, 601), np.linspace(-3, 3, 601)), 0.0
+    for at, bound in zip(t, low, strict=True):
+        m = m + np.maximum(a + b * at - bound - 1, 0) ** 2 + np.maximum(bound - a - b * at, 0) ** 2
+    density = np.exp(-0.5 * (m / 0.2**2 + (a / 2) ** 2 + b**2)) * 0.02 * 0.01 / (4 * np.pi)
+    assert result.sample_stats.attrs["log_evidence"] == pytest.approx(math.log(density.sum()), abs=0.15)
+    mean = float(np.sum(b * density) / density.sum())
+    std = math.sqrt(np.sum((b - mean) ** 2 * density) / density.sum())
+    assert float(result.posterior["b"].mean()) == pytest.approx(mean, abs=0.5 * std)
+    assert float(result.posterior["b"].std()) == pytest.approx(std, rel=0.4)
 
 
 def test_a_hard_bound_cuts_the_prior_off():
