@@ -50,6 +50,20 @@ def test_a_sign_that_separates_thousands_does_so_in_all_numbers(tmp_path: Path) 
     assert columns["R"].tolist() == [0.5, 112088.9, 0.5, 7.25]
 
 
+def test_thousands_without_decimals_are_told_by_the_others(tmp_path: Path) -> None:
+    text = "".join(f"{t:.1f};{1e3 * R:,.0f}\n" for t, R in zip(TIMES, radii(), strict=True))
+    code, output = told(tmp_path, f"t [us];R [nm]\n{text}")
+    assert code == 0, output
+    assert "R [nm] (83 values, 26695 to 279640)" in output
+    assert "R_max 281 um" in output
+
+
+def test_commas_that_no_number_explains_are_told(tmp_path: Path) -> None:
+    code, output = told(tmp_path, rows("t [us];R [um]\n", radii(), "{:.3f};{:.3f}\n").replace(".", ","))
+    assert code == 0, output
+    assert "no number tells whether 1,600 in column 't [us]' is 1.600, as it is read, or 1600; if commas sep" in output
+
+
 def test_units_below_the_names_in_german(tmp_path: Path) -> None:
     text = rows("Film vom 3.5.\nZeit\tRadius\nµs\tµm\n", radii(), "{:.3f}\t{:.3f}\n").replace(".", ",")
     code, output = told(tmp_path, text)
