@@ -81,7 +81,7 @@ def test_diameters_in_german(tmp_path: Path) -> None:
     assert "'Durchmesser_um' seems to hold diameters" in output
 
 
-@pytest.mark.parametrize(("glare", "when"), [([1], "reading at 3.2 us is"), ([0, 1], "readings at 1.6, 3.2 us are")])
+@pytest.mark.parametrize(("glare", "when"), [([1], "reading at 3.2 us is"), ([0, 1], "2 readings at 1.6, 3.2 us are")])
 def test_glare_in_the_first_readings_is_left_out(tmp_path: Path, glare: list[int], when: str) -> None:
     values = radii()
     values[glare] = 390
@@ -104,7 +104,10 @@ def test_a_placeholder_is_named(tmp_path: Path) -> None:
     values[[16, 30, 31]] = 999
     code, output = told(tmp_path, rows("t_us,R_um\n", values))
     assert code == 0, output
-    assert "readings at 27.2, 49.6, 51.2 us are one number again and again, far above all others" in output
+    assert "3 readings at 27.2, 49.6, 51.2 us are one number again and again, far above all others" in output
+    values[50:54] = 999
+    _, output = told(tmp_path, rows("t_us,R_um\n", values), "--force")
+    assert "the 7 readings at 27.2, 49.6, 51.2, 81.6, 83.2, 84.8 … us are one number again" in output
     assert not placeholders(np.full(9, 5.0)).any()
     assert not placeholders(np.array([1.0, 2, 3, 9] * 3)).any()  # a step
     assert not placeholders(np.array([1.0, 2, 3, 2, 1, 9])).any()  # once
