@@ -1,14 +1,13 @@
 """The decimal sign of a column of text: ``1,201`` is 1201 beside ``998.2``, and 1.201 beside ``0,5``.
 
 Most numbers tell their decimal sign by their form: ``998.2``, ``1,600.5`` and ``1,003,200`` have or allow a point only.
-Those of a column speak for it, else those of the whole table. Where none does, numbers without a sign may: about
-``998``, ``999``, ``1,000`` only commas between thousands let the numbers follow each other evenly.
+Those of a column speak for it, else those of the whole table. Where none of the column does, numbers without a sign
+may: after ``998`` and ``999``, ``1,000`` follows evenly only as 1000.
 """
 
 import math
 import re
 from collections.abc import Sequence
-from itertools import islice
 from typing import Literal
 
 import numpy as np
@@ -22,7 +21,8 @@ _GROUPED: dict[str, re.Pattern[str]] = {
     ".": re.compile(r"[-+]?[1-9]\d{0,2}(\.\d{3})+(,\d+)?"), ",": re.compile(r"[-+]?[1-9]\d{0,2}(,\d{3})+(\.\d+)?")
 }  # fmt: skip
 UNEVEN = math.log(1000) / 2  # of the sum of all steps of ln: one wrong reading among right ones is a step of ln 1000
-SEVERAL = 2  # numbers without a sign: a single one, again and again, may stand for missing readings
+AGAINST_FORM = 4  # as many times as uneven: then numbers contradict the form of others
+SEVERAL = 2  # other numbers that are needed: a single one, again and again, may stand for missing readings
 
 
 def is_open(cell: str) -> bool:
@@ -44,23 +44,33 @@ def decimal_by(cell: str) -> Decimal | None:
 def signs_of(cells: Sequence[str]) -> set[Decimal]:
     """The decimal signs that the numbers of a column tell: none, one, or both where they contradict each other."""
     told = (sign for cell in cells if (sign := decimal_by(cell)))
-    return ({*told} if has_comma(cells) else {*islice(told, 1)}) or _evenly(cells)
+    if (first := next(told, None)) == "." and not has_comma(cells):
+        return {first}
+    by_form = {*told, first} if first else set[Decimal]()
+    return by_form | _evenly(cells, AGAINST_FORM if by_form else 1)
 
 
 def has_comma(cells: Sequence[str]) -> bool:
-    """Whether a number has a comma; where none has, the first that tells the decimal sign tells that of all."""
+    """Whether there is a comma in a column; without one nothing contradicts a decimal point."""
     return any("," in cell for cell in cells)
 
 
-def _evenly(cells: Sequence[str]) -> set[Decimal]:
-    """The decimal sign by which numbers follow each other evenly; none where both do, or neither."""
-    numbers = [cell for cell in cells if is_open(cell) or (cell.isdecimal() and int(cell))]
-    signs = [sign for sign in OTHER.values() if any(sign in cell for cell in numbers)]
-    if len(signs) != 1 or len({cell for cell in numbers if cell.isdecimal()}) < SEVERAL:
+def _evenly(cells: Sequence[str], steps: int) -> set[Decimal]:
+    """The decimal sign by which numbers follow each other evenly, by at least so many ``steps``, if any."""
+    numbers = [cell for cell in cells if is_open(cell) or decimal_by(cell) or cell.isdecimal()]
+    signs = [sign for sign in OTHER.values() if any(sign in cell for cell in numbers if is_open(cell))]
+    if len(signs) != 1 or len({cell for cell in numbers if not is_open(cell) and float(_plain(cell))}) < SEVERAL:
         return set()
-    readings = [[abs(float(cell.replace(signs[0], by))) for cell in numbers] for by in ("", ".")]
-    apart, decimal = (float(np.abs(np.diff(np.log(it))).sum()) for it in readings)
-    return set() if abs(apart - decimal) < UNEVEN else {OTHER[signs[0]] if apart < decimal else signs[0]}
+    own = [abs(float(_plain(cell))) for cell in numbers]
+    thousands = [1000.0 if is_open(cell) else 1.0 for cell in numbers]
+    readings = np.array([np.multiply(own, thousands), own])[:, np.array(own) > 0]
+    apart, decimal = np.abs(np.diff(np.log(readings))).sum(axis=1)
+    return set() if abs(apart - decimal) < steps * UNEVEN else {OTHER[signs[0]] if apart < decimal else signs[0]}
+
+
+def _plain(cell: str) -> str:
+    """A number as Python writes it, the sign of an open one as that of decimals."""
+    return without_thousands(cell, decimal_by(cell)).replace(",", ".")
 
 
 def without_thousands(cell: str, decimal: Decimal | None) -> str:

@@ -67,6 +67,8 @@ def test_numbers_alone_tell_it_only_where_several_have_no_sign(tmp_path):
 def test_both_signs_before_decimals(tmp_path):
     fault = contents(tmp_path, "t;R\n1;1.5\n2;1,5\n3;1,201\n", ",").others["R"]
     assert "a.csv:4: '1,201' in column 'R': decimals or thousands?" in fault
+    mixed = "".join(f"{t};{t + 160}.123\n{t};{t + 160},3\n" for t in range(9))  # thousands would go up and down
+    assert "a.csv:2: '160.123' in column 'R': decimals or thousands?" in contents(tmp_path, f"t;R\n{mixed}").others["R"]
     assert contents(tmp_path, "t;R\n1;1.5\n2;1,5\n3;1201\n", ",").columns["R"].tolist() == [1.5, 1.5, 1201]
 
 
