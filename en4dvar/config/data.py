@@ -11,8 +11,8 @@ from en4dvar.config.context import PLACEHOLDER, Context, Faults, Made, OfObserva
 from en4dvar.config.of_readings import PLACES, WEIGHTS, Error, Placing, Weighing
 from en4dvar.config.quantities import observable_unit, quantity, time_unit, unit_of
 from en4dvar.config.schema import Name, QuantityText, Section
+from en4dvar.inputs.decimal_sign import Decimal
 from en4dvar.inputs.parts import Column, Disorder, Format, Outliers, Repeated, TimeStep
-from en4dvar.inputs.text_table import Decimal
 from en4dvar.inputs.window import Instant, parse_instant
 from en4dvar.model.forward import Observable, field_of
 from en4dvar.plumbing.errors import ConfigError, retold
@@ -175,7 +175,7 @@ class Data(Section):
     format: Format | None = None
     """Format of the files; default: by their suffix."""
     decimal: Decimal = "."
-    """Decimal sign of the numbers in a CSV file."""
+    """Decimal sign of the numbers in a CSV file, where they do not tell it: beside 998.2, 1,201 is 1201."""
     by: Annotated[str | None, Field(min_length=1)] = None
     """Column of a table that says which data set a row belongs to: each is estimated by itself."""
     sheet: str = ""

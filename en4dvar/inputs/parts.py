@@ -15,8 +15,9 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from en4dvar.inputs.decimal_sign import Decimal
 from en4dvar.inputs.matfile import Variables, indexed, mat_variables
-from en4dvar.inputs.text_table import Decimal, Table, matches, scalars_in, sheet_lines
+from en4dvar.inputs.text_table import Table, matches, scalars_in, sheet_lines
 from en4dvar.inputs.window import BY_NAME, Instant
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import DataError, retold
@@ -209,7 +210,10 @@ def _of_table(table: Table, wanted: Sequence[str]) -> dict[str, Array]:
     columns = {name: table.numbers(i, name) for name, i in where.items()}
     for line, cells in table.rows:
         if any(cells[len(table.names) :]):
-            raise DataError(f"{table.path}:{line}: {len(cells)} cells, but the header names {len(table.names)} columns")
+            raise DataError(
+                f"{table.path}:{line}: {len(cells)} cells, but the header names {len(table.names)} columns; a comma "
+                "within a number is to be deleted, or the number quoted"
+            )
     return columns
 
 
@@ -230,14 +234,16 @@ def _of_mat(variables: Variables, name: str, path: Path) -> Array:
 class Contents:
     """What a data file holds: columns (or vectors) with numbers, as written, and scalars; no units applied.
 
-    ``others``: why what else is in the file cannot be a column, by name. ``units``: what a line of a table states. Of
-    the elements of a struct array or a cell array the first stands for all, as ``expts.R`` and ``C``.
+    ``others``: why what else is in the file cannot be a column, by name. ``units``: what a line of a table states.
+    ``unsure``: of columns whose commas may as well separate thousands, such a number. Of the elements of a struct array
+    or a cell array the first stands for all, as ``expts.R`` and ``C``.
     """
 
     columns: Mapping[str, Array]
     scalars: Mapping[str, float] = field(default_factory=dict)
     others: Mapping[str, str] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
+    unsure: Mapping[str, str] = field(default_factory=dict)
 
 
 def read_contents(path: Path, layout: Layout = ANY) -> Contents:
@@ -275,4 +281,5 @@ def _table_contents(table: Table, scalars: Mapping[str, float]) -> Contents:
             columns[name] = table.numbers(i, name)
         except DataError as error:
             others[name] = str(error)
-    return Contents(columns, scalars, others, table.units)
+    unsure = {name: it for i, name in enumerate(table.names) if name in columns and (it := table.unsure(i))}
+    return Contents(columns, scalars, others, table.units, unsure)

@@ -16,10 +16,11 @@ import warnings
 import zipfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from en4dvar.inputs.decimal_sign import Decimal, decimal_by, has_comma, is_open, signs_of, without_thousands
 from en4dvar.model.state import Array
 from en4dvar.plumbing.decoding import Allowed, decoded_whole
 from en4dvar.plumbing.errors import DataError
@@ -30,16 +31,12 @@ from en4dvar.plumbing.units import is_unit
 
 Line = str | Sequence[str]  # of a text, or the cells of a sheet
 Lines = Sequence[tuple[int, Line]]
-Decimal = Literal[".", ","]
 COMMENT = ("#", "%", "//")
 LONGEST = 1_000_000_000  # bytes of a file
 WIDEST = 10_000  # columns
 BLANK = ("", "nan", "na", "n/a", "-")
 PREAMBLE = 200  # lines among which the names of the columns are looked for
 _SCALAR = re.compile(r"(?:#|%|//)\s*([A-Za-z_]\w*)\s*=\s*([-+.\deE]+)\s*")
-_GROUPED = {
-    ".": re.compile(r"[-+]?[1-9]\d{0,2}(\.\d{3})+(,\d+)?"), ",": re.compile(r"[-+]?[1-9]\d{0,2}(,\d{3})+(\.\d+)?")
-}  # fmt: skip
 _NAMELESS = re.compile(r"c[1-9]\d*")
 
 
@@ -94,19 +91,13 @@ def cells_of(line: Line, delimiter: str) -> list[str]:
     return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))]
 
 
-def _thousands(cell: str) -> str:
-    """What separates the thousands of a number that has both signs, as ``1.600,5`` and ``1,600.5``; "" of others."""
-    both = "." in cell and "," in cell
-    return next((sign for sign, grouped in _GROUPED.items() if grouped.fullmatch(cell)), "") if both else ""
-
-
 class Table:
     """Columns of a text file or a sheet: their ``names``, and ``rows`` of cells with the numbers of their lines.
 
     ``lines`` are numbered lines, of a sheet the cells of each. The names stand in the first line that has all of
     ``wanted`` (names, or patterns with ``*``), else in the one above the numbers; where none does, the columns are
     ``c1``, ``c2``, …. Lines of words directly below the names are no rows; ``units``: by name, where one of
-    them states the unit of each. A sign that separates thousands somewhere, before a decimal sign, does so everywhere.
+    them states the unit of each. ``decimal`` holds where the numbers do not tell which sign separates thousands.
     """
 
     def __init__(self, path: Path, decimal: Decimal, wanted: Sequence[str] = (), lines: Lines | None = None):
@@ -121,9 +112,6 @@ class Table:
         signs = (";", "\t") if self.nameless else ()  # numbers may have decimal commas
         delimiter = next((s for s in signs if s in line), delimiter_of(line, path))
         self.rows = [(n, cells_of(x, delimiter)) for n, x in lines[first:]]
-        if sign := next((sign for _, row in self.rows for cell in row if (sign := _thousands(cell))), ""):
-            plain, grouped = self.rows, _GROUPED[sign]
-            self.rows = [(n, [c.replace(sign, "") if grouped.fullmatch(c) else c for c in row]) for n, row in plain]
         below: list[list[str]] = []
         if any(_holds_number(cells) for _, cells in self.rows):
             while _words(self.rows[0][1]):
@@ -146,13 +134,33 @@ class Table:
 
     def numbers(self, i: int, name: str) -> Array:
         """A column as numbers. Raises :class:`DataError`."""
+        cells = self._cells(i)
+        signs = self._decimal_signs(i)
+        if len(signs) > 1 and (unsure := next((k for k, cell in enumerate(cells) if is_open(cell)), None)) is not None:
+            words = "decimals or thousands? other numbers have decimal points, and others commas; write one of the two"
+            raise DataError(f"{self.path}:{self.rows[unsure][0]}: {cells[unsure]!r} in column {short(name)!r}: {words}")
+        if signs != {"."} or has_comma(cells):
+            cells = [without_thousands(cell, decimal_by(cell) or next(iter(signs), None)) for cell in cells]
         numbers = np.empty(len(self.rows))
-        for k, (line, row) in enumerate(self.rows):
+        for k, (line, _) in enumerate(self.rows):
             try:
-                numbers[k] = number_in(row[i] if i < len(row) else "", name, self.path, line, self.decimal)
+                numbers[k] = number_in(cells[k], name, self.path, line, self.decimal)
             except DataError as error:
                 raise DataError(f"{error}{self._below(k, i)}") from None
         return numbers
+
+    def unsure(self, i: int) -> str:
+        """A number of a column whose comma is that of decimals by ``decimal`` alone; "" where there is none."""
+        unsure = next((cell for cell in self._cells(i) if "," in cell and is_open(cell)), "")
+        return "" if self._decimal_signs(i) else unsure
+
+    def _cells(self, i: int) -> list[str]:
+        return [row[i] if i < len(row) else "" for _, row in self.rows]
+
+    def _decimal_signs(self, i: int) -> set[Decimal]:
+        """What the numbers of a column tell, else those of all columns."""
+        every = (signs_of(self._cells(k)) for k in range(len(self.names)))
+        return signs_of(self._cells(i)) or set[Decimal]().union(*every)
 
     def _below(self, k: int, i: int) -> str:
         """What to do where the row ``k`` repeats the names, or ends the numbers of the column ``i``, as a mean does."""
@@ -191,7 +199,7 @@ def _names_and_numbers(head: Sequence[Sequence[str]], wanted: Sequence[str]) -> 
 
 
 def _holds_number(cells: Sequence[str]) -> bool:
-    return any(c.lower() not in BLANK and (is_number(c.replace(",", ".")) or _thousands(c)) for c in cells)
+    return any(c.lower() not in BLANK and (is_number(c.replace(",", ".")) or decimal_by(c)) for c in cells)
 
 
 def _words(cells: Sequence[str]) -> bool:
@@ -211,6 +219,7 @@ def number_in(cell: str, name: str, path: Path, line: int, decimal: Decimal | No
     except ValueError:
         comma = decimal != "," and "," in cell and _holds_number([cell])
     hint = "; write a decimal point" + (", or data.decimal: ','" if decimal else "") if comma else ""
+    hint += "; if the comma separates thousands, delete it" if comma and is_open(cell) else ""
     raise DataError(f"{path}:{line}: {short(cell)!r} in column {short(name)!r} is not a number{hint}")
 
 
@@ -308,10 +317,17 @@ def _sheet(book: Any, name: str, path: Path) -> "ReadOnlyWorksheet":
 
 def _texts(cells: tuple[Any, ...]) -> list[str]:
     """Cells as text, without the blank ones at the end."""
-    texts = ["" if cell is None else repr(cell) if isinstance(cell, float) else str(cell).strip() for cell in cells]
+    texts = ["" if cell is None else _text_of(cell) for cell in cells]
     while texts and not texts[-1]:
         texts.pop()
     return texts
+
+
+def _text_of(cell: Any) -> str:
+    """A cell as text; a number so that its point separates no thousands."""
+    if not isinstance(cell, float):
+        return str(cell).strip()
+    return f"{cell!r}0" if is_open(repr(cell)) else repr(cell)
 
 
 def _refuse_formulas(path: Path, stored: Any, written: Any) -> None:

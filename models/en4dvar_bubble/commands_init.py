@@ -249,6 +249,11 @@ def _columns_of(data: str, options: Mapping[str, str | None], layout: Layout) ->
     if contents.scalars:
         told = ", ".join(f"{name} {value:g}" for name, value in contents.scalars.items())
         echo(f"others in the file: {told}", err=True)
+    if contents.unsure:
+        name, number = next(iter(contents.unsure.items()))
+        words = f"whether {number} in column {name!r} is {number.replace(',', '.')}, as it is read, or "
+        words += f"{number.replace(',', '')}; if commas separate thousands, delete them from the file"
+        echo(f"warning: {first}: no number tells {words}", err=True)
     asked = asked.by_names()
     if not asked.complete_columns and (rows := summaries(contents.columns)) is not None:
         if options["since"] is not None:

@@ -230,6 +230,19 @@ def test_groups_are_a_column_of_a_table(tmp_path: Path, table: str, asked: str, 
     assert groups_in("all.yaml") == expected
 
 
+def test_bubbles_of_groups_are_those_that_are_seen_and_a_column_can_be_typed(tmp_path: Path) -> None:
+    folder = bubbles_of(tmp_path / "all")
+    (folder / "a.csv").write_text("t_us,R_um\n0,\n1,\n")
+    Path("gels.csv").write_text("file,gel [%],day\n" + "".join(f"{x},{i // 2},{i}\n" for i, x in enumerate("abcdef")))
+    said = call("init", "--data", folder, *UNITS, "--groups", "gels.csv").stderr
+    assert "say 'gels.csv:gel [%]' or gels.csv:day" in said
+    done = call("init", "--data", folder, *UNITS, "--groups", "gels.csv:gel [%]")
+    assert "5 bubbles:" not in done.output
+    Path("gels.csv").write_text("file,gel [%],day\n" + "".join(f"{x},{i // 3},{i}\n" for i, x in enumerate("abcdef")))
+    done = call("init", "--data", folder, *UNITS, "--groups", "gels.csv:gel [%]", "--force")
+    assert "5 bubbles: the run ends with the numbers of each gel, and compares them: 0 % (2), 1 % (3)" in done.output
+
+
 def test_groups_are_a_column_of_the_data(tmp_path: Path) -> None:
     """Of one table of many bubbles, and of a file each; the same as of a table of them."""
     lines = write(tmp_path / "one.csv").read_text().splitlines()[1:]

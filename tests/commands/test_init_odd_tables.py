@@ -50,6 +50,20 @@ def test_a_sign_that_separates_thousands_does_so_in_all_numbers(tmp_path: Path) 
     assert columns["R"].tolist() == [0.5, 112088.9, 0.5, 7.25]
 
 
+def test_thousands_without_decimals_are_told_by_the_others(tmp_path: Path) -> None:
+    text = "".join(f"{t:.1f};{1e3 * R:,.0f}\n" for t, R in zip(TIMES, radii(), strict=True))
+    code, output = told(tmp_path, f"t [us];R [nm]\n{text}")
+    assert code == 0, output
+    assert "R [nm] (83 values, 26695 to 279640)" in output
+    assert "R_max 281 um" in output
+
+
+def test_commas_that_no_number_explains_are_told(tmp_path: Path) -> None:
+    code, output = told(tmp_path, rows("t [us];R [um]\n", radii(), "{:.3f};{:.3f}\n").replace(".", ","))
+    assert code == 0, output
+    assert "no number tells whether 1,600 in column 't [us]' is 1.600, as it is read, or 1600; if commas sep" in output
+
+
 def test_units_below_the_names_in_german(tmp_path: Path) -> None:
     text = rows("Film vom 3.5.\nZeit\tRadius\nµs\tµm\n", radii(), "{:.3f}\t{:.3f}\n").replace(".", ",")
     code, output = told(tmp_path, text)
@@ -67,7 +81,7 @@ def test_diameters_in_german(tmp_path: Path) -> None:
     assert "'Durchmesser_um' seems to hold diameters" in output
 
 
-@pytest.mark.parametrize(("glare", "when"), [([1], "reading at 3.2 us is"), ([0, 1], "readings at 1.6, 3.2 us are")])
+@pytest.mark.parametrize(("glare", "when"), [([1], "reading at 3.2 us is"), ([0, 1], "2 readings at 1.6, 3.2 us are")])
 def test_glare_in_the_first_readings_is_left_out(tmp_path: Path, glare: list[int], when: str) -> None:
     values = radii()
     values[glare] = 390
@@ -90,7 +104,10 @@ def test_a_placeholder_is_named(tmp_path: Path) -> None:
     values[[16, 30, 31]] = 999
     code, output = told(tmp_path, rows("t_us,R_um\n", values))
     assert code == 0, output
-    assert "readings at 27.2, 49.6, 51.2 us are one number again and again, far above all others" in output
+    assert "3 readings at 27.2, 49.6, 51.2 us are one number again and again, far above all others" in output
+    values[50:54] = 999
+    _, output = told(tmp_path, rows("t_us,R_um\n", values), "--force")
+    assert "the 7 readings at 27.2, 49.6, 51.2, 81.6, 83.2, 84.8 … us are one number again" in output
     assert not placeholders(np.full(9, 5.0)).any()
     assert not placeholders(np.array([1.0, 2, 3, 9] * 3)).any()  # a step
     assert not placeholders(np.array([1.0, 2, 3, 2, 1, 9])).any()  # once

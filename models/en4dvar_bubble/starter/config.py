@@ -260,8 +260,9 @@ def _left_out(name: str, series: Readings) -> list[str]:
         which = "reading of 0 or below is a frame" if len(none) == 1 else "readings of 0 or below are frames"
         words.append(f"{name}: {len(none)} {which} without a bubble, and left out")
     for reason, why in ((FAR, "none of the bubble by the neighbours"), (AGAIN, AGAIN)):
-        if far := [f"{1e6 * time:.6g}" for time in series.left_out.get(reason, ())[:6]]:
-            which = f"reading at {far[0]} us is" if len(far) == 1 else f"readings at {', '.join(far)} us are"
+        if far := [f"{1e6 * time:.6g}" for time in series.left_out.get(reason, ())]:
+            told = f"{', '.join(far[:6])}{' …' * (len(far) > 6)} us"
+            which = f"reading at {told} is" if len(far) == 1 else f"{len(far)} readings at {told} are"
             words.append(f"{name}: the {which} {why}, and left out (data.outliers)")
     return words
 

@@ -131,10 +131,10 @@ def population(
 ) -> tuple[str, ...]:
     """Lines for the section of the parameters ``names`` of one gel behind ``count`` bubbles; () of too few of them.
 
-    ``groups``: of its bubbles, where there are several, one gel each; () where all have too few.
+    ``groups``: where there are several, one gel each; the largest has ``count`` bubbles.
     How much bubbles of one gel differ is known better than the gel itself; a liquid has one viscosity.
     """
-    if not names or max(map(len, groups.of.values()), default=count) < FEWEST_SETS:
+    if not names or count < FEWEST_SETS:
         return ()
     common = ", ".join(quantity.key for quantity in known(medium))
     kind = groups.kind if groups.kind.isidentifier() else json.dumps(groups.kind, ensure_ascii=False)

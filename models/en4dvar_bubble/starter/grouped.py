@@ -1,6 +1,7 @@
 """Which gel, day or concentration each bubble is of: by its folder, or as a column of a table says."""
 
 import re
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -80,12 +81,13 @@ def _by_table(files: Mapping[str, DataFile], path: Path, column: str) -> tuple[s
     if lacking := [name for name, its in rows_in[of_files].items() if not its]:
         raise DataError(
             f"{path}: no row for {listed(lacking, 5)}; a row needs, in one and the same column, the name of the data "
-            f"file, as {files[lacking[0]].path.name}, and in another its group"
+            f"file, as {files[lacking[0]].path.name}, and in another its group; a file of no bubble is to be moved away"
         )
     others = [name for i, name in enumerate(names) if i != of_files and name]
     if column not in others and (column or len(others) != 1):
         said = f"no column {column!r} of groups" if column else f"{len(others)} columns could be the groups"
-        raise DataError(f"{path}: {said}; say {' or '.join(f'{path}:{name}' for name in others[:5]) or 'one more'}")
+        words = " or ".join(shlex.quote(f"{path}:{name}") for name in others[:5])
+        raise DataError(f"{path}: {said}; say {words or 'one more'}")
     at = names.index(column or others[0])
     each = {name: _only({cell(row, at) for row in its}, f"{path}: {name}") for name, its in rows_in[of_files].items()}
     return names[at], each

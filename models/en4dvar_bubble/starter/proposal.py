@@ -145,15 +145,15 @@ def propose(
     if slow and _in_a_liquid(model):
         distance, prior, source = elsewhere.wall(look.lobe.R_max, ratio)
         wall = (Entry("wall", f"{{distance: {distance}}}", source),), (Entry("wall_distance", prior, "of that plane"),)
-    together = elsewhere.population(
-        [p.name for p in model.law.parameters], len(views), medium, _in_a_liquid(model), groups
-    )
+    sizes = {group: len(looks.keys() & {*names}) for group, names in groups.of.items()}
+    most = max(sizes.values(), default=len(views))
+    together = elsewhere.population([p.name for p in model.law.parameters], most, medium, _in_a_liquid(model), groups)
     return Proposal(
         _data(look, model, {**others, **guess.values}, len(views) == 1),
         (*_model(law_name, model, look), *wall[0]),
         (*_parameters(model, look, believed, tops(looks, histories), medium), *wall[1]),
         SIMPLER[chosen],
-        (*told, *[f"{len(views)} bubbles: {_ends_with(groups)}"] * bool(together)),
+        (*told, *[f"{len(views)} bubbles: {_ends_with(groups.kind, sizes)}"] * bool(together)),
         (*warnings, *unseen),
         together,
         chosen == "laser" and not _in_a_liquid(model) and float(np.median([v.n_minima for v in views])) > 2,
@@ -162,11 +162,11 @@ def propose(
     )
 
 
-def _ends_with(groups: Grouped) -> str:
-    if not groups.of:
+def _ends_with(kind: str, sizes: Mapping[str, int]) -> str:
+    if not sizes:
         return "the run ends with what they say of one gel together"
-    told = ", ".join(f"{name} ({len(names)})" for name, names in groups.of.items())
-    return f"the run ends with the numbers of each {groups.kind}, and compares them: {told}"
+    told = ", ".join(f"{name} ({count})" for name, count in sizes.items())
+    return f"the run ends with the numbers of each {kind}, and compares them: {told}"
 
 
 def _unmatched(names: Sequence[str], look: Look, model: BubbleModel) -> str:
