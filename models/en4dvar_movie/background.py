@@ -39,6 +39,8 @@ SHARPEST = 5  # per cent of the frames: those where the bubble moved least withi
 CLEAR = 4.0  # times the least variance of an edge's width: up to which noise does not make it a sharp one
 BLOB = 120  # pixels: the smallest patch of a first frame that may be a bubble
 ROUND = 0.5  # of a patch and the disc through its rim that both share
+BESIDE, EDGE = 3, 1.5  # pixels about a rim, or along the border, that are compared; std of the blur before that
+FIRST = 0.25  # share of the edges of what changes that tells that the first frame shows a bubble
 DRIFTS = 1.0  # noise of a pixel: means over 3 × 3 pixels that differ by more from frame to frame are dirt that drifts
 SPECK = 100  # pixels: the largest change that is no bubble
 BEGUN, SURE = 0.25, 2.0  # of the shade in a bubble's middle, and of a pixel's noise: what tells that it was there
@@ -240,7 +242,16 @@ def _one_way(frames: Sequence[Image], changes: Sequence[Image], box: tuple[slice
 
 
 def _begins_with_a_bubble(first: Image, samples: Sequence[Frame], noise: float, blind: Mask, unit: float) -> bool:
-    """True if the first frame differs from a smooth surface in large patches whose rims other frames show elsewhere."""
+    """True if the first frame has edges, or a shade over most of its border, that most frames lack; or if it differs
+    from a smooth surface in large patches whose rims other frames show elsewhere.
+    """
+    lit = [_lit_as(frame.astype(np.float32), first) for frame in samples]
+    changed = np.array([_changed(frame, first, noise) & ~blind for frame in lit])
+    border = ~blind & ~ndimage.binary_erosion(np.ones_like(blind), iterations=BESIDE)
+    bared = [np.sum((c & (f > first))[border]) / max(np.sum(border), 1) for f, c in zip(lit, changed, strict=True)]
+    shares = [s for f, c in zip(lit, changed, strict=True) if (s := _edges_of_first(first, f, c, noise)) is not None]
+    if np.median(bared) > 0.5 or np.median(shares or [0.0]) > FIRST:
+        return True
     surface = smooth_surface([first], blind, unit)
     usual = float(np.median(np.abs(surface[~blind])))
     far = np.abs(ndimage.uniform_filter(first - surface, 5)) > max(4 * noise, 0.25 * usual)
@@ -248,13 +259,29 @@ def _begins_with_a_bubble(first: Image, samples: Sequence[Frame], noise: float, 
     large = [n for n in range(1, len(sizes)) if sizes[n] > max(BLOB, 2e-4 * first.size) and _is_round(labels == n)]
     if not large:
         return False
-    changed = np.array([_changed(frame.astype(np.float32), first, noise) for frame in samples])
     if not changed.any():
         return True  # nothing moves in the movie: what is there must be the bubble
     moved = changed.mean(axis=0) > OFTEN
     patches = np.isin(labels, large)
     edge = ndimage.binary_dilation(patches, iterations=2) & ~ndimage.binary_erosion(patches, iterations=2)
     return bool(np.mean(moved[edge]) > LIVELY)
+
+
+def _edges_of_first(first: Image, frame: Image, changed: Mask, noise: float) -> float | None:
+    """The share of the edges about what changed in a frame (H, W) that the first frame shows, 1/2 of a disc that shrank
+    a little; None where nothing large changed. In logarithms: a shade that falls on structure adds none of it.
+    """
+    labels, sizes = labelled(changed)
+    large = np.isin(labels, np.flatnonzero(sizes > max(BLOB, 2e-4 * first.size)))
+    inner = ndimage.binary_erosion(large, iterations=BESIDE, border_value=1)
+    about = ndimage.binary_dilation(large, iterations=BESIDE) & ~inner
+    if not about.any():
+        return None
+    smooth = [np.maximum(ndimage.gaussian_filter(image, EDGE), noise) for image in (first, frame)]
+    before, after = (np.array(np.gradient(np.log(image)))[:, about] for image in smooth)
+    own, other = (np.sum((noise / image[about]) ** 2) / (4 * np.pi * EDGE**4) for image in smooth)  # by noise alone
+    change = after - before
+    return -float(np.sum(change * before) + own) / max(float(np.sum(change**2) - own - other), float(own + other))
 
 
 def _is_round(patch: Mask) -> bool:

@@ -1,0 +1,67 @@
+"""Movies whose first frames show the bubble are read without them as background, whatever shape the frame leaves."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from movies import movie_of
+from scipy.special import expit
+
+from en4dvar_movie.tracking import track
+
+COLLAPSE = [*(62 * (1 - np.linspace(0, 0.97, 14) ** 2) ** 0.5), 24.0, 32, 36, 37, 36, 32, 25, 20, 24, 26, *[22.0] * 26]
+
+
+def filmed(shape, ratio=1.0, upright=False, off=(0.0, 0.0), radii=COLLAPSE, empty=0, seed=1):
+    """Frames of ellipses of these mean radii, whose axes have a ratio and whose centre is ``off`` the frame's middle,
+    along and across the long axis; ``empty`` frames come first."""
+    noise = np.random.default_rng(seed)
+    y, x = (np.arange(side) - (side - 1) / 2 for side in shape)
+    long, short = (y[:, None], x) if upright else (x, y[:, None])
+    long, short = long - off[0], short - off[1]
+    frames = []
+    for R in [0.01] * empty + list(radii):
+        rho = np.hypot(long / ratio**0.5, short * ratio**0.5)
+        shade = expit((R - rho) / 0.7)
+        light = 150 * (1 + 0.0005 * (x + y[:, None])) * (1 - 0.6 * shade)
+        frames.append(np.clip(np.rint(light + noise.normal(0, 3, shape)), 0, 255).astype(np.uint8))
+    return frames
+
+
+def wrong(readings, radii):
+    """Used frames whose radius is not the true one."""
+    return [
+        r.frame
+        for r, R in zip(readings, radii, strict=True)
+        if r.used and abs(r.radius - R) > max(2, 5 * np.hypot(r.errors.std, r.errors.factor * R))
+    ]
+
+
+@pytest.mark.parametrize(
+    ("shape", "ratio", "upright", "off"),
+    [
+        ((96, 128), 1.0, False, (0, 0)),
+        ((96, 128), 1.2, False, (0, 0)),
+        ((96, 128), 1.2, True, (0, 0)),
+        ((128, 128), 1.4, False, (0, 0)),
+        ((128, 96), 1.3, False, (0, 0)),
+        ((64, 192), 1.15, True, (0, 0)),
+        ((112, 160), 1.3, False, (0, 30)),
+        ((112, 160), 1.2, False, (45, 10)),
+        ((84, 92), 1.2, False, (0, 0)),
+    ],
+)
+def test_a_large_bubble_of_the_first_frames_is_no_background(shape, ratio, upright, off):
+    result = track(movie_of(filmed(shape, ratio, upright, off)))
+    assert result.background.frames == 0
+    assert wrong(result.readings, COLLAPSE) == []
+    assert sum(r.used for r in result.readings) > 0.8 * len(COLLAPSE)
+    rest = [r.radius for r in result.readings[-20:]]
+    assert abs(np.mean(rest) / 22 - 1) < 0.03
+
+
+@pytest.mark.parametrize("radii", [COLLAPSE, COLLAPSE[::-1], [95.0] * 2 + [40.0] * 20 + [30.0] * 3])
+def test_empty_frames_before_a_bubble_that_the_frame_cuts_are_the_background(radii):
+    result = track(movie_of(filmed((96, 128), 1.2, radii=radii, empty=4)))
+    assert result.background.frames == 4
+    assert wrong(result.readings, [0.0] * 4 + list(radii)) == []
