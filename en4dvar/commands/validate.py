@@ -18,16 +18,18 @@ if TYPE_CHECKING:
 def validate(source: Source, plot: bool) -> None:
     """Check a configuration and its data; say what would be estimated and what it costs.
 
-    All mistakes are listed at once, with file, line and column. The cost is estimated by running a few prior members.
+    All mistakes are listed at once, with file, line and column. A data file that cannot be used is named, and does not
+    stop the others, as in a run. The cost is estimated by running a few prior members.
 
     \b
     Example:
       en4dvar validate configs/quickstart.yaml --plot
     """
     from en4dvar.config import Config, TwinConfig
-    from en4dvar.runs.checks import validate as check
+    from en4dvar.runs.checks import check_all
 
-    loaded = check(source.path, source.overrides())
+    checked = check_all(source.path, source.overrides())
+    loaded, problems = checked.config, checked.problems
     if not isinstance(loaded, Config):
         from en4dvar.runs.cycles import cycles_of
 
@@ -37,12 +39,10 @@ def validate(source: Source, plot: bool) -> None:
             raise click.UsageError(of_twin if isinstance(loaded, TwinConfig) else of_sequence)
         echo(str(cycles_of(loaded)))
         return
-    from en4dvar.assembly.build import build
     from en4dvar.commands.describe import cost_summary, problem_summary
     from en4dvar.descent.preview import preview
     from en4dvar.priors.prior import own_seed
 
-    problems = build(loaded)
     echo(problem_summary(loaded, problems))
     chosen = problems[:1]
     if plot:
@@ -56,6 +56,10 @@ def validate(source: Source, plot: bool) -> None:
     echo(cost_summary(loaded, previews[0], len(problems)))
     for shown in previews:
         _warn(shown)
+    if checked.unusable:
+        echo(f"warning: a run goes on with {len(problems)} data set(s), without those that cannot be used:", err=True)
+    for fault in checked.unusable:
+        echo(str(fault), err=True)
     if plot:
         folder, name = make_folder(loaded.directory.parent), f"{loaded.directory.name}_prior"
         save_chart(prior_predictive(previews), folder, name)

@@ -2,7 +2,8 @@
 
 Most numbers tell their decimal sign by their form: ``998.2``, ``1,600.5`` and ``1,003,200`` have or allow a point only.
 Those of a column speak for it, else those of the whole table. Where none of the column does, numbers without a sign
-may: after ``998`` and ``999``, ``1,000`` follows evenly only as 1000.
+may: after ``998`` and ``999``, ``1,000`` follows evenly only as 1000. Blanks and apostrophes, as in ``2'000``, can be
+nothing else than signs between thousands.
 """
 
 import math
@@ -20,9 +21,16 @@ _OPEN = re.compile(r"[-+]?[1-9]\d{0,2}[.,]\d{3}")
 _GROUPED: dict[str, re.Pattern[str]] = {
     ".": re.compile(r"[-+]?[1-9]\d{0,2}(\.\d{3})+(,\d+)?"), ",": re.compile(r"[-+]?[1-9]\d{0,2}(,\d{3})+(\.\d+)?")
 }  # fmt: skip
+_SET_APART = re.compile(r"[-+]?[1-9]\d{0,2}(['’´` \u00a0\u2009\u202f])\d{3}(\1\d{3})*([.,]\d+)?")
 UNEVEN = math.log(1000) / 2  # of the sum of all steps of ln: one wrong reading among right ones is a step of ln 1000
 AGAINST_FORM = 4  # as many times as uneven: then numbers contradict the form of others
 SEVERAL = 2  # other numbers that are needed: a single one, again and again, may stand for missing readings
+
+
+def closed_up(cell: str) -> str:
+    """A number without the blanks or apostrophes between its thousands."""
+    match = _SET_APART.fullmatch(cell)
+    return cell.replace(match[1], "") if match else cell
 
 
 def is_open(cell: str) -> bool:

@@ -212,7 +212,7 @@ def _of_table(table: Table, wanted: Sequence[str]) -> dict[str, Array]:
         if any(cells[len(table.names) :]):
             raise DataError(
                 f"{table.path}:{line}: {len(cells)} cells, but the header names {len(table.names)} columns; a comma "
-                "within a number is to be deleted, or the number quoted"
+                "or a blank within a number is to be deleted, or the number quoted"
             )
     return columns
 

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from en4dvar.inputs.decimal_sign import Decimal, decimal_by, has_comma, is_open, signs_of, without_thousands
+from en4dvar.inputs.decimal_sign import Decimal, closed_up, decimal_by, has_comma, is_open, signs_of, without_thousands
 from en4dvar.model.state import Array
 from en4dvar.plumbing.decoding import Allowed, decoded_whole
 from en4dvar.plumbing.errors import DataError
@@ -36,7 +36,10 @@ LONGEST = 1_000_000_000  # bytes of a file
 WIDEST = 10_000  # columns
 BLANK = ("", "nan", "na", "n/a", "-")
 PREAMBLE = 200  # lines among which the names of the columns are looked for
+SEVERAL = 3  # lines of numbers that a table has at least, so that words below them are in its midst
 _SCALAR = re.compile(r"(?:#|%|//)\s*([A-Za-z_]\w*)\s*=\s*([-+.\deE]+)\s*")
+_BETWEEN_BLANKS = re.compile(r"\S+", re.ASCII)  # others stand within a cell, between thousands
+_BRACKETED = re.compile(r"\[.+\]|\(.+\)")
 _NAMELESS = re.compile(r"c[1-9]\d*")
 
 
@@ -87,7 +90,7 @@ def cells_of(line: Line, delimiter: str) -> list[str]:
     if not isinstance(line, str):
         return list(line)
     if not delimiter:
-        return line.split()
+        return _BETWEEN_BLANKS.findall(line.strip())
     return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))]
 
 
@@ -97,7 +100,8 @@ class Table:
     ``lines`` are numbered lines, of a sheet the cells of each. The names stand in the first line that has all of
     ``wanted`` (names, or patterns with ``*``), else in the one above the numbers; where none does, the columns are
     ``c1``, ``c2``, …. Lines of words directly below the names are no rows; ``units``: by name, where one of
-    them states the unit of each. ``decimal`` holds where the numbers do not tell which sign separates thousands.
+    them, or the line above the names, states units. ``decimal`` holds where the numbers do not tell which sign
+    separates thousands.
     """
 
     def __init__(self, path: Path, decimal: Decimal, wanted: Sequence[str] = (), lines: Lines | None = None):
@@ -115,10 +119,11 @@ class Table:
         below: list[list[str]] = []
         if any(_holds_number(cells) for _, cells in self.rows):
             while _words(self.rows[0][1]):
-                below.append([cell.strip("[]()") for cell in self.rows.pop(0)[1]])
+                below.append(self.rows.pop(0)[1])
         self.names = [f"c{i + 1}" for i in range(len(self.rows[0][1]))] if top is None else head[top]
-        alike = (cells for cells in below if len(cells) == len(self.names) and all(map(is_unit, cells)))
-        self.units = dict(zip(self.names, next(alike, ()), strict=False))
+        beside = (*below, *(head[top - 1 : top] if top else ()))
+        units = next((cells for cells in beside if _are_units(cells, self.names)), ())
+        self.units = {name: cell.strip("[]()") for name, cell in zip(self.names, units, strict=False) if _stated(cell)}
 
     def position(self, name: str) -> int:
         """Which column has this name. Raises :class:`DataError`."""
@@ -155,7 +160,7 @@ class Table:
         return "" if self._decimal_signs(i) else unsure
 
     def _cells(self, i: int) -> list[str]:
-        return [row[i] if i < len(row) else "" for _, row in self.rows]
+        return [closed_up(row[i]) if i < len(row) else "" for _, row in self.rows]
 
     def _decimal_signs(self, i: int) -> set[Decimal]:
         """What the numbers of a column tell, else those of all columns."""
@@ -163,13 +168,16 @@ class Table:
         return signs_of(self._cells(i)) or set[Decimal]().union(*every)
 
     def _below(self, k: int, i: int) -> str:
-        """What to do where the row ``k`` repeats the names, or ends the numbers of the column ``i``, as a mean does."""
+        """What to do where row ``k`` repeats the names, ends the numbers of column ``i``, or is words between them."""
         (line, row), (last, _) = self.rows[k], self.rows[-1]
+        another = "if another series begins here, give it a file of its own"
         if row == self.names:
-            return "; the line names the columns again: if another series begins here, give it a file of its own"
-        if k and not any(_holds_number(row[i : i + 1]) for _, row in self.rows[k:]):
+            return f"; the line names the columns again: {another}"
+        numbers = [_holds_number(row[i : i + 1]) for _, row in self.rows]
+        if sum(numbers[:k]) >= len(numbers[k:]) and not any(numbers[k:]):
             return f"; delete {f'line {line}' if line == last else f'lines {line} to {last}'}, below the readings"
-        return ""
+        between = any(numbers[:k]) and any(numbers[k:]) and _words(row)
+        return f"; nothing in the line is a number: delete it, or {another}" if between else ""
 
 
 def matches(name: str, pattern: str) -> bool:
@@ -180,30 +188,62 @@ def matches(name: str, pattern: str) -> bool:
 def _names_and_numbers(head: Sequence[Sequence[str]], wanted: Sequence[str]) -> tuple[int | None, int]:
     """The line that names the columns, None where none does, and the first below it.
 
-    It is the one above the last block of lines with numbers, unless it holds units, which stand below the names.
+    It is the one above the lines with numbers, unless it holds units, which stand below the names.
     """
     for i, cells in enumerate(head if wanted else ()):
         if all(any(_same(cell, name) or matches(cell, name) for cell in cells) for name in wanted):
             return i, i + 1
-    end = next((i for i in reversed(range(len(head))) if _holds_number(head[i])), 0)
-    first = next((i + 1 for i in reversed(range(end)) if _words(head[i])), 0)
+    first = _first_of_numbers(head)
     if _holds_number(head[first]) and (first == 0 or (wanted and all(map(_NAMELESS.fullmatch, wanted)))):
         return None, first
     top = max(first - 1, 0)
-    above = head[top - 1] if top else []
-    if _words(above) and len(above) == len(head[top]) and all(is_unit(cell.strip("[]()")) for cell in head[top]):
+    if top and _words(head[top - 1]) and _are_units(head[top], head[top - 1]):
         top -= 1
     if len(head[top]) == 1 < len(head[first]):
         return None, first
     return top, top + 1
 
 
+def _first_of_numbers(head: Sequence[Sequence[str]]) -> int:
+    """The first of the last lines with numbers between which there are no words but those in the midst of a table.
+
+    Such words stand below several lines that have numbers wherever the line below the words has.
+    """
+    end = next((i for i in reversed(range(len(head))) if _holds_number(head[i])), 0)
+    *begins, first = [0, *(i + 1 for i in range(end) if _words(head[i]))]
+    stop = first - 1
+    for begin in reversed(begins):
+        above = [_number_columns(cells) for cells in head[begin:stop]]
+        stop = begin - 1
+        if above and (len(above) < SEVERAL or not _number_columns(head[first]) <= set[int]().union(*above)):
+            break
+        first = begin if above else first
+    return first
+
+
+def _are_units(cells: Sequence[str], names: Sequence[str]) -> bool:
+    """Whether at least half of what a line of words states of so many columns with names are units."""
+    stated = [i for i, cell in enumerate(cells) if _stated(cell)]
+    units = [i for i in stated if is_unit(cells[i]) or _BRACKETED.fullmatch(cells[i])]
+    named = len(cells) <= len(names) and all(_stated(names[i]) for i in stated)
+    return named and 2 * len(units) >= len(stated) > 0
+
+
+def _stated(cell: str) -> bool:
+    return cell.lower() not in BLANK
+
+
+def _number_columns(cells: Sequence[str]) -> set[int]:
+    return {i for i, cell in enumerate(cells) if _holds_number([cell])}
+
+
 def _holds_number(cells: Sequence[str]) -> bool:
-    return any(c.lower() not in BLANK and (is_number(c.replace(",", ".")) or decimal_by(c)) for c in cells)
+    shut = map(closed_up, filter(_stated, cells))
+    return any(is_number(cell.replace(",", ".")) or decimal_by(cell) for cell in shut)
 
 
 def _words(cells: Sequence[str]) -> bool:
-    return not _holds_number(cells) and any(cell.lower() not in BLANK for cell in cells)
+    return not _holds_number(cells) and any(map(_stated, cells))
 
 
 def _same(a: str, b: str) -> bool:

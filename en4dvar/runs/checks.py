@@ -1,10 +1,11 @@
 """What can be told before a run: every fault of configuration and data at once."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from en4dvar.assembly.build import build_one, build_sequence, data_files, inverse_plan
 from en4dvar.assembly.reading import read_observations
@@ -20,6 +21,17 @@ from en4dvar.plumbing.errors import ConfigError, DataError, Fault
 from en4dvar.problem import InverseProblem
 from en4dvar.results.variables import require_free_names
 
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Checked:
+    """A configuration, the ``problems`` of its data sets, and the faults of those that a campaign goes on without."""
+
+    config: AnyConfig
+    problems: Sequence[InverseProblem]
+    unusable: Sequence[Fault]
+
 
 def validate(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> AnyConfig:
     """Load a configuration and read its data files; nothing is computed or written.
@@ -33,23 +45,30 @@ def validate(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any
     ------
     ConfigError: every fault of the file *and* of the data files it names, each with file, line and column.
     """
+    checked = check_all(source, overrides)
+    if checked.unusable:
+        raise ConfigError(checked.unusable)
+    return checked.config
+
+
+def check_all(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> Checked:
+    """As :func:`validate`; but what is wrong with some data sets only is told beside the others, as a run does."""
     document, base = document_from(source)
     document = override(document, overrides or {})
-    faults: list[Fault] = []
     try:
         config = resolve_any(document, base)
     except ConfigError as error:
-        _read_data(document, base, faults)
-        raise ConfigError(in_order([*error.problems, *faults])) from None
+        raise ConfigError(in_order([*error.problems, *_faults_of_data(document, base)])) from None
+    faults, problems, unusable = list[Fault](), list[InverseProblem](), list[Fault]()
     with _collecting(faults, document):
         if isinstance(config, Config):
-            _read_files(document, inverse_plan(config), partial(checked_problem, config), faults)
+            problems, unusable = _read_files(document, inverse_plan(config), partial(checked_problem, config))
             require_counted_once(config, data_files(inverse_plan(config)))
         if isinstance(config, SequenceConfig):
             build_sequence(config)
-    if faults:
-        raise ConfigError(in_order(faults))
-    return config
+    if faults or (unusable and not problems):
+        raise ConfigError(in_order([*faults, *unusable]))
+    return Checked(config, problems, in_order(unusable))
 
 
 def checked_problem(config: Config, name: str, file: DataFile) -> InverseProblem:
@@ -71,14 +90,14 @@ def require_counted_once(config: Config, files: Mapping[str, DataFile]) -> None:
         require_distinct(usable)
 
 
-def _read_data(document: Document, base: Path, faults: list[Fault]) -> None:
+def _faults_of_data(document: Document, base: Path) -> list[Fault]:
     """Faults of the data files, for a configuration that has faults elsewhere than in its data section."""
     context = context_of(document, base, None)
     section = check(_DataSection, {"data": document.data.get("data")}, (), document, [], context)
     if section is None or context.default is None:
-        return
+        return []
     plan = section.data
-    _read_files(document, plan, lambda name, file: read_observations(plan, file, name), faults)
+    return _read_files(document, plan, lambda name, file: read_observations(plan, file, name))[1]
 
 
 class _DataSection(Section):
@@ -87,14 +106,14 @@ class _DataSection(Section):
     data: DATA
 
 
-def _read_files(
-    document: Document, plan: DataPlan, read: Callable[[str, DataFile], object], faults: list[Fault]
-) -> None:
-    """What keeps the data files from being read, each by itself."""
+def _read_files(document: Document, plan: DataPlan, read: Callable[[str, DataFile], T]) -> tuple[list[T], list[Fault]]:
+    """What is read of each data set, and what keeps others from being read."""
+    results, faults = list[T](), list[Fault]()
     with _collecting(faults, document):
         for name, file in data_files(plan).items():
             with _collecting(faults, document):
-                read(name, file)
+                results.append(read(name, file))
+    return results, faults
 
 
 @contextmanager

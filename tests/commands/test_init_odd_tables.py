@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -72,7 +73,81 @@ def test_units_below_the_names_in_german(tmp_path: Path) -> None:
     assert 'time: {name: Zeit, unit: "µs"}' in config
     assert 'radius: {name: Radius, unit: "µm"}' in config
     (tmp_path / "c.csv").write_text("t,R,note\nus,um,-\n1,2,3\n4,5,6\n")
-    assert read_contents(tmp_path / "c.csv").units == {}
+    assert read_contents(tmp_path / "c.csv").units == {"t": "us", "R": "um"}
+
+
+@pytest.mark.parametrize(
+    ("head", "form"),
+    [
+        ("frame,t_us,R_um\nnr,us,um\n", "0,{:.3f},{:.3f}\n"),
+        ("frame,t_us,R_um\n-,us,um\n", "0,{:.3f},{:.3f}\n"),
+        ("t_us,R_um,note\nus,um,\n", "{:.3f},{:.3f},\n"),
+        ("nr,us,um\nframe,t,R\n", "0,{:.3f},{:.3f}\n"),
+        ("t,R,note\n[us],(um),[-]\n-,-,-\n", "{:.3f},{:.3f},\n"),
+        ("Film 3,,\nt [us],R,V\n-,um,mm^3\n", "{:.3f},{:.3f},1\n"),
+    ],
+)
+def test_units_beside_the_names_with_cells_that_are_none(tmp_path: Path, head: str, form: str) -> None:
+    code, output = told(tmp_path, rows(head, radii(), form))
+    assert code == 0, output
+    config = (tmp_path / "b.yaml").read_text(encoding="utf-8")
+    assert re.search(r"time: \{name: (t|t_us|\"t \[us\]\"), unit: us\}", config)
+    assert re.search("radius: {name: (R|R_um), unit: um}", config)
+
+
+def test_pixels_below_the_names(tmp_path: Path) -> None:
+    code, output = told(tmp_path, rows("Zeit,Radius\n[µs],[px]\n", radii()))
+    assert code == 2
+    assert "columns with numbers: Zeit, Radius; units are never guessed: add --pixel LENGTH (the size of o" in output
+
+
+@pytest.mark.parametrize("words", ["--- second buffer ---", "second buffer", "camera restarted;", "second\nus,um"])
+@pytest.mark.parametrize("head", ["t_us,R_um\n", "t_us;R_um\n", "Camera;X\nrate;2e6\n\nt_us;R_um\nus;um\n"])
+@pytest.mark.parametrize("row", [3, 51])
+def test_words_in_the_midst_of_a_table_do_not_name_columns(tmp_path: Path, head: str, words: str, row: int) -> None:
+    sign = ";" if ";" in head else ","
+    lines = rows(head, radii(), f"{{:.3f}}{sign}{{:.3f}}\n").splitlines()
+    at = row + head.count("\n")
+    code, output = told(tmp_path, "\n".join([*lines[:at], words, *lines[at:]]))
+    assert code == 2
+    first = words.splitlines()[0].strip(sign)
+    assert f"b.csv:{at + 1}: '{first}' in column 't_us' is not a number; nothing in the line is" in output
+    assert "delete it, or if another series begins here, give it a file of its own" in output
+
+
+def test_words_above_several_lines_of_numbers_in_other_columns_name_columns(tmp_path: Path) -> None:
+    for preamble in ("rate,2e6\nwidth,512\nheight,512\n", "width,height\n512,512\n", "1 camera\n2 lenses\n3 lamps\n"):
+        (tmp_path / "a.csv").write_text(f"Camera,X\n{preamble}t,R\n0,1\n1,2\n", encoding="utf-8")
+        assert [*read_contents(tmp_path / "a.csv").columns] == ["t", "R"]
+
+
+def test_columns_without_names_go_on_below_words(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("0,1\n1,2\n2,3\nsecond buffer\n3,4\n4,5\n", encoding="utf-8")
+    fault = read_contents(tmp_path / "a.csv").others["c1"]
+    assert "a.csv:4: 'second buffer' in column 'c1' is not a number; nothing in the line is a number" in fault
+
+
+def test_rows_below_the_readings(tmp_path: Path) -> None:
+    """They are advised to be deleted only where there are more readings."""
+    for readings, below in (("0,1\n1,2\n2,3\n", True), ("0,1\n", False)):
+        (tmp_path / "a.csv").write_text(f"t,R\n{readings}mean,2\nstd,1\n", encoding="utf-8")
+        assert ("below the readings" in read_contents(tmp_path / "a.csv").others["t"]) == below
+
+
+def test_diameters_in_pixels_need_half_the_size_of_a_pixel(tmp_path: Path) -> None:
+    text = rows("t_us,Diameter [px]\n", 2 * radii() / 2.76)
+    code, output = told(tmp_path, text)
+    assert code == 2
+    assert "(half the size of one, since 'Diameter [px]' seems to hold diameters, e.g. '1.38 um'; or" in output
+    code, output = told(tmp_path, text, "--pixel", "2.76 um")
+    assert "'Diameter [px]' seems to hold diameters; then 2.76*um must be half the size of a pixel: is it?" in output
+    _, output = told(tmp_path, text, "--radius-unit", "0.5*um", "--force")
+    assert "seems to hold diameters" not in output
+    _, output = told(tmp_path, text, "--radius-unit", "um", "--force")
+    assert "give, instead of a unit, --pixel with half the size of one" in output
+    assert "--radius-unit" not in output.partition("warning")[2]
+    _, output = told(tmp_path, text.replace(" [px]", ""), "--force")
+    assert "add --radius-unit UNIT (e.g. 0.5*um, since 'Diameter' seems to hold diameters)" in output
 
 
 def test_diameters_in_german(tmp_path: Path) -> None:

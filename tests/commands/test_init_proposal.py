@@ -256,7 +256,7 @@ def test_a_misread_frame_is_no_trough_and_no_top(tmp_path: Path) -> None:
     clean, of_spoilt = (resolve(parse_document(text), tmp_path).document.data for text in texts)
     assert "outliers" not in clean["data"]  # the readings at 44 and 60 µs are collapses, not slips
     assert of_spoilt["data"].pop("outliers") == "leave out"
-    assert "# MIND: b: the readings at 9, 32 us are none of the bubble by the neighbours" in texts[1]
+    assert "# MIND: b: the 2 readings at 9, 32 us are none of the bubble by the neighbours" in texts[1]
     tops = [float(it["parameters"]["R_max"]["mean"].split()[0]) for it in (clean, of_spoilt)]
     assert tops[1] == pytest.approx(tops[0], rel=0.02)
     assert [it["data"]["window"] for it in (clean, of_spoilt)] == [clean["data"]["window"]] * 2

@@ -60,14 +60,23 @@ def test_a_fault_of_the_model_does_not_hide_those_of_the_data(tmp_path: Path) ->
 
 
 def test_faults_of_several_data_files(tmp_path: Path) -> None:
+    """They are told; files that can be used are gone on with, as by a run."""
     path = write_toy(tmp_path, ("toy.csv", "'*.csv'"))
     (tmp_path / "odd.csv").write_text("a,b\n1,2\n")
     (tmp_path / "short.csv").write_text("t_ms,x_um\n0,1\n")
-    done = call("validate", path)
-    assert done.exit_code == 2
-    assert [line.startswith(f"{path}:4:9: data.path: {tmp_path}") for line in done.stderr.splitlines()] == [True, True]
+    done = call("validate", path, "--plot", "--set", f"output.directory={tmp_path}/runs/toy")
+    assert done.exit_code == 0, done.output
+    assert "from 1 data set(s)" in done.stdout
+    assert (tmp_path / "runs" / "toy_prior.png").exists()
+    head, *faults = done.stderr.splitlines()
+    assert head == "warning: a run goes on with 1 data set(s), without those that cannot be used:"
+    assert [line.startswith(f"{path}:4:9: data.path: {tmp_path}") for line in faults] == [True, True]
     assert "odd.csv: no column 'x_um'" in done.stderr
     assert "short.csv: 1 usable observations" in done.stderr
+    alone = call("validate", path, "--set", "data.path=[odd.csv, short.csv]")
+    assert alone.exit_code == 2
+    assert alone.stdout == ""
+    assert len(alone.stderr.splitlines()) == 2
     with pytest.raises(en4dvar.ConfigError) as caught:
         en4dvar.validate(path, {"seed": -1})
     assert len(caught.value.problems) == 3

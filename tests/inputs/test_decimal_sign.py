@@ -45,11 +45,25 @@ def test_the_column_tells_or_else_the_table(tmp_path, R, numbers, german):
         np.testing.assert_array_equal(points[name], commas[name])
 
 
+@pytest.mark.parametrize("sign", ["'", "’", " ", "\u00a0", "\u2009", "\u202f"])
+def test_apostrophes_and_blanks_separate_thousands_only(tmp_path, sign):
+    text = f"t;R\n0;126{sign}000.5\n2{sign}000;1{sign}162{sign}000\n4{sign}000;-1{sign}500.125\n"
+    for written, decimal in ((text, "."), (text.replace(".", ","), ",")):
+        columns = contents(tmp_path, written, decimal).columns
+        assert columns["t"].tolist() == [0, 2000, 4000]
+        assert columns["R"].tolist() == [126000.5, 1162000, -1500.125]
+    for wrong in (f"1{sign}00", f"0{sign}500", f"1{sign}2345", f"1'000{sign * 2}000"):
+        assert "is not a number" in contents(tmp_path, f"t;R\n0;{wrong}\n1;5\n").others["R"]
+    if sign != " ":
+        between_blanks = contents(tmp_path, f"t R\n0 126{sign}000\n2{sign}000 162{sign}000\n")
+        assert between_blanks.columns["R"].tolist() == [126000, 162000]
+
+
 def test_quoted_numbers_between_commas(tmp_path):
     text = 't,R\n1.6,"1,201"\n3.2,"998.4"\n4.8,"1,100"\n'
     assert contents(tmp_path, text).columns["R"].tolist() == [1201, 998.4, 1100]
     (tmp_path / "a.csv").write_text(text.replace('"', ""))
-    with pytest.raises(DataError, match=r"a\.csv:2: 3 cells, but the header names 2 columns; a comma within a number"):
+    with pytest.raises(DataError, match=r"a\.csv:2: 3 cells, but the header names 2 columns; a comma or a blank"):
         read_series(tmp_path / "a.csv", Column("t", "us", "us"), Column("R", "um", "um"))
 
 

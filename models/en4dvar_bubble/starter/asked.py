@@ -11,7 +11,7 @@ import numpy as np
 from en4dvar.inputs.parts import Contents, Layout, read_contents
 from en4dvar.plumbing.errors import ConfigError, DataError
 from en4dvar.plumbing.units import as_unit, convert
-from en4dvar_bubble.starter.config import FRAMES, PIXELS, TRACKED, quoted, unit_in, without_unit
+from en4dvar_bubble.starter.config import DIAMETER, FRAMES, PIXELS, TRACKED, quoted, unit_in, without_unit
 
 _TIME = re.compile(r"(?i)(t|time|zeit)([ _(\[].*)?")
 _STEP = re.compile(r"(?i)delta_?t|dt|t_?step|time_?step")
@@ -153,12 +153,16 @@ class Asked:
             alike = _numbered(others) if len(others) < len(self.contents.columns) else ""
             missing.append(("--radius-column", alike or "NAME", "each of these columns is a bubble" if alike else ""))
         size = _only(_SIZE, self.contents.scalars)
-        named = self.radius_unit is None and (size or PIXELS.search(self.radius_column or ""))
-        if named or self.radius_unit in _AS_PIXELS:
-            example = "'2.76 um'" if size is None else f"'{self.contents.scalars[size]:g} m' if {size} is in m"
-            missing.append(("--pixel", "LENGTH", f"the size of one, e.g. {example}; or --radius-unit UNIT"))
+        radii = self.radius_column or ""
+        halved = bool(DIAMETER.match(radii))
+        since = f", since {radii!r} seems to hold diameters" * halved
+        pixels = PIXELS.search(f"{radii} {self.contents.units.get(radii, '')}")
+        if (self.radius_unit is None and (size or pixels)) or self.radius_unit in _AS_PIXELS:
+            value, unit = (2.76, "um'") if size is None else (self.contents.scalars[size], f"m' if {size} is in m")
+            words = f"{'half ' * halved}the size of one{since}, e.g. '{value / (1 + halved):g} {unit}"
+            missing.append(("--pixel", "LENGTH", f"{words}; or --radius-unit UNIT"))
         elif self.radius_unit is None:
-            missing.append(("--radius-unit", "UNIT", "e.g. um"))
+            missing.append(("--radius-unit", "UNIT", f"e.g. {'0.5*' * halved}um{since}"))
         return missing
 
     def _spoilt(self) -> list[str]:

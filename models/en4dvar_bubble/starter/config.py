@@ -31,7 +31,7 @@ SCHEMA_FILE = "en4dvar.schema.json"
 _PLAIN = re.compile(r"[A-Za-z_./][\w ./*-]*[\w./*]|[A-Za-z_]")
 _WORDS = ("true", "false", "null", "yes", "no", "on", "off")
 FRAMES = re.compile(r"(?i)(frame|bild|image|index|#|n$|nr).*")
-_DIAMETER = re.compile(r"(?i)(d|diam\w*|durchmesser)([ _(\[].*)?$")
+DIAMETER = re.compile(r"(?i)(d|diam\w*|durchmesser)([ _(\[].*)?$")
 _REST = re.compile(r"(?i)(.*\.)?r_?eq")
 LENGTHS, TIMES = ("nm", "um", "mm", "m"), ("ns", "us", "ms", "s")
 ODD_SCALE = 50.0  # of the median of all files: bubbles of one experiment are closer
@@ -323,12 +323,15 @@ def doubts(source: Source) -> list[str]:
         if column is None:
             continue
         name, unit = column
-        diameter, scaled = _DIAMETER.match(name), "*" in unit
-        if PIXELS.search(name) and not scaled:
-            words.append(f"{name!r} seems to hold pixels; then give, instead of a unit, --pixel with the size of one")
+        diameter, pixels, scaled = bool(DIAMETER.match(name)), PIXELS.search(name), "*" in unit
+        if pixels and not scaled:
+            size = f"{'half ' * diameter}the size of one"
+            words.append(f"{name!r} seems to hold pixels; then give, instead of a unit, --pixel with {size}")
         if what == "times" and FRAMES.fullmatch(name) and not scaled:
             words.append(f"{name!r} seems to count frames; then give, instead of a unit, --frame-rate")
-        if what == "radii" and diameter and not scaled:
+        if what == "radii" and diameter and scaled and not unit.startswith("0.5*"):
+            words.append(f"{name!r} seems to hold diameters; then {unit} must be half the size of a pixel: is it?")
+        if what == "radii" and diameter and not scaled and not pixels:
             words.append(f"{name!r} seems to hold diameters; then give half of their unit, --radius-unit '0.5*{unit}'")
         named = None if diameter and scaled else unit_in(name, kind)
         if named and parse_unit(named) != parse_unit(unit):
