@@ -72,7 +72,7 @@ class InitialStates:
 
     def _build(self, physical: Array, cells: Array) -> Array:
         """States (B, n_state); ValueError where one is not a state."""
-        theta = {name: physical[:, j] for name, j in self.estimated}
+        theta = {name: physical[:, j].copy() for name, j in self.estimated}
         theta |= {name: np.full(len(physical), value) for name, value in self.fixed}
         theta |= {tie.parameter.name: _followed(tie, physical[:, j]) for tie, j in self.tied}
         states = np.asarray(initial_states(self.problem.model, theta, len(physical)), dtype=float)

@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from diagnosis.provoked import TWO, bounded, linear, run, waved
-from toys import Fragile, make_problem
+from toys import Fragile, Vectorised, make_problem
 
 from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.diagnosis.honesty import ControlEnsembles, examine
 from en4dvar.diagnosis.honesty.checks import at_bound, loss, rank, validity, where_lost
-from en4dvar.diagnosis.honesty.examine import collapse
+from en4dvar.diagnosis.honesty.examine import collapse, doubts
 from en4dvar.estimation.summary import summarise
 from en4dvar.model.forward import ValidityLimit
 from en4dvar.model.state import Parameter
@@ -45,6 +45,22 @@ def collapsed(shrunk: float = 1.0, alive: int = 48) -> list[Caution]:
 
 def test_a_gaussian_end_is_silent():
     assert examine(*gaussian()) == ()
+
+
+class Writing(Vectorised):
+    """Writes into what it is asked about."""
+
+    def doubts(self, observable, times, values, predicted, members):
+        for handed in (times, values, predicted, *members.values()):
+            handed[:] = 0.0
+        return ()
+
+
+def test_a_model_that_is_asked_for_doubts_changes_no_reading():
+    problem = make_problem(Writing(TWO), (1.0, 0.5))
+    before = problem.observations.values.copy(), problem.observations.times.copy()
+    assert doubts(problem, np.ones((4, 2)), np.ones((4, len(problem.observations)))) == []
+    np.testing.assert_array_equal((problem.observations.values, problem.observations.times), before)
 
 
 def test_what_the_file_makes_doubtful_is_a_warning():
