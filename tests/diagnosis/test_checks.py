@@ -105,6 +105,23 @@ def test_where_lost_is_silent_on_what_does_not_tell():
     assert where_lost(PRIOR, x, some) == "they are spread over the whole ensemble"
 
 
+@pytest.mark.parametrize("count", [2, 3, 4, 9, 44, 46])
+def test_any_number_of_lost_members_is_told_from_the_others(count):
+    """They are those with the largest of one parameter; as many at random are named for one in a hundred cases."""
+    x = PRIOR.sample(48, 5, "random")
+    lost = np.argsort(np.argsort(x[:, 0])) >= 48 - count
+    words = rf"lost members have G above .* \(none of the {48 - count} others\)"
+    assert re.fullmatch(words, where_lost(PRIOR, x, lost))
+    random = np.random.default_rng(count)
+    named = ["lost members have" in where_lost(PRIOR, x, random.permutation(lost)) for _ in range(400)]
+    assert np.mean(named) <= 0.01 + 3 * np.sqrt(0.01 / 400)
+
+
+def test_all_members_lost_are_spread():
+    x = PRIOR.sample(12, 5, "random")
+    assert where_lost(PRIOR, x, np.ones(12, dtype=bool)) == "they are spread over the whole ensemble"
+
+
 def test_one_or_two_lost_members_are_described():
     x = np.array([[np.log(1000.0), 1e-6]] * 6)
     x[2] = [np.log(1000.0) + 1.5, 0.99e-6]
