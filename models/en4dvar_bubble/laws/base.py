@@ -80,7 +80,8 @@ class ConstitutiveLaw:
         super().__init_subclass__(**kwargs)
         for method in _METHODS:
             owner = next(kind for kind in cls.__mro__ if method in vars(kind))
-            if owner is cls or not issubclass(owner, ConstitutiveLaw):  # those of another law do it already
+            written = vars(owner)[method] is not vars(ConstitutiveLaw)[method]
+            if written and (owner is cls or not issubclass(owner, ConstitutiveLaw)):  # another law has done it already
                 setattr(cls, method, _on_copies(vars(owner)[method]))
         own = cls.__dict__.get("name")
         cls.name = own or cls.__name__
