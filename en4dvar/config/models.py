@@ -115,6 +115,10 @@ def build_model(kind: type[ForwardModel], settings: BaseModel) -> ForwardModel:
 def checked(model: ForwardModel) -> ForwardModel:
     """The model itself. Raises :class:`ConfigError` where what it declares does not fit together."""
     observables = model.observables
+    for what, declared in (("parameters", model.parameters), ("observables", observables)):
+        names = [thing.name for thing in declared]
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise ConfigError(f"{type(model).__name__}: two {what} are called {twice[0]!r}; each needs its own name")
     units = [(thing.name, thing.unit, thing.display_unit) for thing in (*model.parameters, *observables)]
     for what, unit, display_unit in (("its times", model.time_unit, model.time_display_unit), *units):
         with retold(UnitError, ConfigError, f"{type(model).__name__}: unit and display unit of {what}: "):

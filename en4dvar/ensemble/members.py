@@ -14,7 +14,7 @@ import numpy as np
 from en4dvar.data.series import Part
 from en4dvar.executor import Outcome
 from en4dvar.model.forward import Batch, Failure, RateOperator, ValidityLimit, initial_states
-from en4dvar.model.state import Array, Field, Indices
+from en4dvar.model.state import Array, Field, Indices, floats
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.user_code import own_fault, reason_of
 from en4dvar.priors.prior import Prior
@@ -72,10 +72,10 @@ class InitialStates:
 
     def _build(self, physical: Array, cells: Array) -> Array:
         """States (B, n_state); ValueError where one is not a state."""
-        theta = {name: physical[:, j] for name, j in self.estimated}
+        theta = {name: physical[:, j].copy() for name, j in self.estimated}
         theta |= {name: np.full(len(physical), value) for name, value in self.fixed}
         theta |= {tie.parameter.name: _followed(tie, physical[:, j]) for tie, j in self.tied}
-        states = np.asarray(initial_states(self.problem.model, theta, len(physical)), dtype=float)
+        states = floats(initial_states(self.problem.model, theta, len(physical)))
         if states.shape != (len(physical), self.size):
             raise ValueError("misshapen initial state")
         if self.perturbed or self.problem.fields:
@@ -206,7 +206,7 @@ class Readout:
         predictions = []
         curves = []
         for operator, part in zip(self.operators, self.parts, strict=True):
-            values, of_field = np.asarray(operator(path)), part.places is not None
+            values, of_field = floats(operator(path)), part.places is not None
             if values.ndim < 1 + of_field or values.shape[-1 - of_field] != self.n_times:
                 raise MisshapenError
             rows = self.rows if isinstance(self.rows, slice) else self.rows[part.where]

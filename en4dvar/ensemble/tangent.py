@@ -13,7 +13,7 @@ import numpy as np
 from en4dvar.ensemble.forecast import Composite, Forecast
 from en4dvar.executor import Outcome, SerialExecutor
 from en4dvar.model.forward import Failure, ForwardModel, Trajectory
-from en4dvar.model.state import TIME_SHIFT, Array
+from en4dvar.model.state import TIME_SHIFT, Array, floats
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.user_code import reason_of
 from en4dvar.problem import InverseProblem
@@ -33,7 +33,7 @@ class _LinearPaths(SerialExecutor):
     def trajectories(self, model: ForwardModel, x: Array, times: Array) -> Sequence[Outcome]:
         try:
             path, changes = model.tangent(x[-1], (x[:-1] - x[-1]) / self.size, np.array(times[-1]))
-            states = path.states + self.size * np.asarray(changes, dtype=float)
+            states = path.states + self.size * floats(changes)
         except BaseException as error:  # a model may fail in any way; the reason is kept
             return [Failure(reason_of(error))] * len(x)
         return [*(Trajectory(path.times, own, path.layout) for own in states), path]

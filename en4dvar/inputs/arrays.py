@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, floats
 from en4dvar.plumbing.errors import DataError
 from en4dvar.plumbing.hints import listed, shown, suggest
 
@@ -20,7 +20,7 @@ FORMS = "(times, values), a dict of columns, a pandas Series or DataFrame, or an
 
 
 def columns_of(data: Any, time: str = TIME, value: str = VALUE) -> dict[str, Array]:
-    """Columns by name, that of the times first and called :data:`TIME`, all of one length; NaN is a missing reading.
+    """Columns by name, that of the times first and called :data:`TIME`, all of one length; NaN is missing, or masked.
 
     ``data``: one of :data:`FORMS`; ``time``: name of the column, coordinate or index of times; ``value``: what a series
     without a name is called.
@@ -32,7 +32,9 @@ def columns_of(data: Any, time: str = TIME, value: str = VALUE) -> dict[str, Arr
         raise DataError(f"no column {time!r} of times{suggest(time, columns)}; say which it is: time='...'")
     numbers = {name: _numbers(name, column) for name, column in {TIME: times, **columns}.items()}
     if missing := np.flatnonzero(np.isnan(numbers[TIME])).tolist():
-        raise DataError(f"the time of reading {missing[0] + 1} is NaN; leave out the reading, or set its value to NaN")
+        raise DataError(
+            f"the time of reading {missing[0] + 1} is NaN or masked; leave out the reading, or set its value to NaN"
+        )
     for name, column in numbers.items():
         if column.shape != numbers[TIME].shape:
             raise DataError(f"{name!r} has shape {column.shape}, but there are {len(numbers[TIME])} times")
@@ -63,12 +65,12 @@ def _coordinate(data: Any, time: str) -> dict[str, Any]:
 
 
 def _numbers(name: str, column: Any) -> Array:
-    values = np.asarray(column)
+    values = np.asanyarray(column)
     if values.dtype.kind in "Mm":
         seconds = "(t - t[0]) / np.timedelta64(1, 's')"
         raise DataError(f"{name!r} holds dates; give elapsed time as numbers, e.g. {seconds} for seconds")
     try:
-        numbers = np.asarray(values, dtype=float)
+        numbers = floats(values)
     except (TypeError, ValueError):
         first = shown(values.ravel().tolist()[0]) if values.size else "nothing"
         raise DataError(f"{name!r} holds no numbers but {first}") from None

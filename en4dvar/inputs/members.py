@@ -12,7 +12,7 @@ import numpy as np
 
 from en4dvar.inputs.parts import Layout, Matrix, opened, read_contents, readable
 from en4dvar.inputs.text_table import cells_of, delimiter_of, number_in, numbered_lines
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, floats
 from en4dvar.plumbing.decoding import Allowed, decoded_whole, require_whole
 from en4dvar.plumbing.errors import DataError, retold
 from en4dvar.plumbing.hints import listed, suggest
@@ -151,4 +151,4 @@ def _numbers(path: Path, variable: Any) -> Array:
         raise DataError(f"{path}: {variable.size} members of {variable.name}; at most {MOST_MEMBERS}")
     if getattr(variable.dtype, "kind", "O") not in "fiub":
         raise DataError(f"{path}: {variable.name} holds no numbers")
-    return np.ma.filled(np.ma.asarray(variable[:]).astype(float), np.nan).ravel()
+    return floats(variable[:]).ravel()

@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Protocol, Self, cast, overload, runtime_checka
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.model.state import Array, Field, Parameter, Shown, StateLayout
+from en4dvar.model.state import Array, Field, Parameter, Shown, StateLayout, floats
 from en4dvar.plumbing.caution import Caution
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.user_code import reason_of
@@ -24,7 +24,7 @@ from en4dvar.plumbing.user_code import reason_of
 def instants_of(times: npt.ArrayLike, unit: str) -> Array:
     """Instants (K,) on a model's clock. Raises :class:`ConfigError` where they do not increase."""
     try:
-        instants = np.asarray(times, dtype=float)
+        instants = floats(times)
     except (TypeError, ValueError):
         instants = np.empty(0)
     if instants.ndim != 1 or not (len(instants) and np.all(np.diff(instants) > 0) and np.all(np.isfinite(instants))):
@@ -291,7 +291,8 @@ class ForwardModel(ABC):
     def initial_states(self, theta: Mapping[str, Array]) -> Array:
         """State vectors (N, n_state) of N members, parameters as name → (N,). This default repeats the above."""
         n_members = len(next(iter(theta.values())))
-        return np.stack([self.initial_state({k: float(v[i]) for k, v in theta.items()}) for i in range(n_members)])
+        each = ({k: float(v[i]) for k, v in theta.items()} for i in range(n_members))
+        return np.stack([floats(self.initial_state(own)) for own in each])
 
     def step(self, x: Array, t0: float, t1: float) -> Array:
         """F_{t1←t0}: advance one state (n_state,). May raise; the caller turns it into a :class:`Failure`.
@@ -360,7 +361,7 @@ class ForwardModel(ABC):
         for k, t_next in enumerate(times):
             if t_next != t:
                 try:
-                    x = np.asarray(self.step(x, t, float(t_next)), dtype=float)
+                    x = floats(self.step(x, t, float(t_next)))
                 except BaseException as error:  # a model may fail in any way; the reason is kept
                     return Failure(reason_of(error), t)
                 t = float(t_next)

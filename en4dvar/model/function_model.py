@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from en4dvar.model.forward import Failure, ForwardModel, Observable, Trajectory
-from en4dvar.model.state import Array, Field, Parameter, StateLayout
+from en4dvar.model.state import Array, Field, Parameter, StateLayout, floats
 from en4dvar.plumbing.user_code import reason_of
 
 Function = Callable[[dict[str, Any], Array], Any]
@@ -36,7 +36,7 @@ class FunctionModel(ForwardModel):
     Parameters
     ----------
     function: gets ``parameters``, a dict of name → float in the parameters' own units, and ``times`` (K,); it may raise
-        or return nothing but NaN, which loses that member; where some are NaN, others tell them.
+        or return nothing but NaN, which loses that member; where some are NaN (or masked), others tell them.
         It is called once a member and keeps nothing between calls.
     parameters: what the function reads.
     observables: name → unit of what it returns; the first is the default.
@@ -137,7 +137,7 @@ def _values(columns: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> Ar
         raise ValueError(f"the function returned {', '.join(map(str, columns)) or 'nothing'}, but no {name!r}")
     if np.iscomplexobj(columns[name]):
         raise ValueError(f"the function returned complex numbers for {name}; return real ones")
-    values = np.asarray(columns[name], dtype=float)
+    values = floats(columns[name])
     if values.shape != shape:
         raise ValueError(f"the function returned shape {values.shape} for {name}, expected {shape}, one per time")
     return values

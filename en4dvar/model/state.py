@@ -19,15 +19,22 @@ TransformName = Literal[
 ]
 
 
+def floats(values: npt.ArrayLike) -> Array:
+    """As an array of float64: NaN where an array of :mod:`numpy.ma` is masked."""
+    if isinstance(values, np.ma.MaskedArray):
+        values = np.ma.filled(values.astype(float), np.nan)
+    return np.asarray(values, dtype=float)
+
+
 def hold_floats(whole: object, *keys: str) -> None:
-    """Make the attributes ``keys`` of ``whole``, even one that is frozen, arrays of float64.
+    """Make the attributes ``keys`` of ``whole``, even one that is frozen, :func:`floats`.
 
     Raises TypeError, ValueError for what is no real numbers.
     """
     for key in keys:
         if np.iscomplexobj(value := getattr(whole, key)):
             raise TypeError(f"{key}: complex numbers")
-        object.__setattr__(whole, key, np.asarray(value, dtype=float))
+        object.__setattr__(whole, key, floats(value))
 
 
 class Shown:

@@ -23,7 +23,7 @@ from en4dvar.diagnosis.analysis import Progress
 from en4dvar.inputs.arrays import TIME, VALUE, columns_of, csv_of, require_columns, stacked, tables_of
 from en4dvar.model.forward import ForwardModel, Observable
 from en4dvar.model.function_model import FunctionModel, digest_of, name_of
-from en4dvar.model.state import OF_READINGS, Array, Parameter
+from en4dvar.model.state import OF_READINGS, Array, Parameter, floats
 from en4dvar.plumbing.errors import ConfigError, DataError, Fault, OutputError, retold
 from en4dvar.plumbing.files import expanded, make_folder, temporary_folder, write_text
 from en4dvar.plumbing.hints import listed, suggest
@@ -79,9 +79,9 @@ def estimate(
     model: a function ``f(parameters, times) -> values`` (see :class:`~en4dvar.model.function_model.FunctionModel`), a
         :class:`~en4dvar.model.forward.ForwardModel`, its class, or what the ``model:`` section of a file says.
     data: (times, values), a dict of columns, a pandas Series or DataFrame, an xarray DataArray or Dataset, in the units
-        of the model. NaN is no reading. Or a dict of several series, name → one of these, each with its own times; its
-        name is that of its observable, and ``error`` is then a dict name → error. A function is asked for all times
-        together, the union of those of the series, and returns a dict of arrays.
+        of the model. NaN, or masked, is no reading. Or a dict of several series, name → one of these, each with its own
+        times; its name is that of its observable, and ``error`` is then a dict name → error. A function is asked for
+        all times together, the union of those of the series, and returns a dict of arrays.
     priors: name → prior, as in a file: ``{"prior": "lognormal", "median": 4, "log_std": 0.5}``; a number fixes a
         parameter. ``t_s`` is a time shift, ``sigma`` the noise scale, ``reading_scale`` that of the predictions.
     error: std of the readings: a number, one a reading, text such as ``"1 % of maximum"``, or a dict as ``data.error``
@@ -293,11 +293,11 @@ class GivenSeries:
         error = dict(self.error) if isinstance(self.error, Mapping) else {std: self.error}
         for key, value in error.items():
             if key == "shared":
-                parts = np.asarray(value).T if hasattr(value, "shape") else value
+                parts = np.asanyarray(value).T if hasattr(value, "shape") else value
                 error[key] = [self._stated(part, f"shared {i}", unit) for i, part in enumerate(parts, 1)]
             elif key == "covariance" and np.ndim(value) == 2:
                 file = f"data.{self.name}.covariance.csv".replace("..", ".")
-                matrix, times = np.asarray(value, dtype=float), self.columns[TIME]
+                matrix, times = floats(value), self.columns[TIME]
                 if matrix.shape != 2 * times.shape:
                     raise DataError(f"error: {self._of()}{key} has shape {matrix.shape} for {len(times)} readings")
                 if self.name:  # in a file with rows of other series
@@ -319,7 +319,7 @@ class GivenSeries:
             counts = f"{len(value)} numbers for {len(self.columns[TIME])} readings"
             raise DataError(f"error: {self._of()}{key} has {counts}")
         column = f"{self.name} error {key}".lstrip()
-        self.used[column] = np.asarray(value, dtype=float)
+        self.used[column] = floats(value)
         return {"column": column}
 
     def _of(self) -> str:
@@ -362,7 +362,7 @@ class Given:
         """The ``prior:`` section, with a file for an ensemble of arrays. Raises :class:`DataError`."""
         if not (isinstance(section, Mapping) and isinstance(members := section.get("ensemble"), Mapping)):
             return section
-        columns = {name: np.asarray(values, dtype=float) for name, values in members.items()}
+        columns = {name: floats(values) for name, values in members.items()}
         if len({values.shape for values in columns.values()}) != 1 or next(iter(columns.values())).ndim != 1:
             raise DataError("prior: give one number a member for each parameter, of all the same number of members")
         self.beside["data.prior.csv"] = csv_of(columns)

@@ -1,12 +1,14 @@
 """Assimilation schemes, one a file: what is computed, and the keys read. A new one is a file and a line below.
 
 Another package brings schemes of its own by entry points of the group ``en4dvar.schemes``: a name for ``scheme:`` and a
-subclass of :class:`Scheme`. One that cannot be loaded is left out with a warning; a name of ours is not replaced.
+subclass of :class:`Scheme`. One that cannot be loaded is left out with a warning; a name of ours is not replaced. They
+are loaded when a registry is first asked for: to write one such a package imports from here.
 """
 
 import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import fields
+from typing import Any
 
 from en4dvar.plumbing.installed import installed
 from en4dvar.schemes.base import Minimiser, Scheme
@@ -21,9 +23,9 @@ from en4dvar.schemes.esrf import ESRF
 from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.ienks import IEnKS
 
-# name in a configuration → class; its fields are keys of the section ``assimilation:``
-SCHEMES: dict[str, type[Scheme]] = {
-    "en4dvar": En4DVar,
+DEFAULT = "en4dvar"
+_OURS: dict[str, type[Scheme]] = {
+    DEFAULT: En4DVar,
     "es-mda": ESMDA,
     "etkf": ETKF,
     "denkf": DEnKF,
@@ -52,11 +54,24 @@ def _installed() -> dict[str, type[Scheme]]:
     return kinds
 
 
-SCHEMES |= {name: kind for name, kind in _installed().items() if name not in SCHEMES}
-ON_A_WINDOW, ON_A_SERIES = ({n: kind for n, kind in SCHEMES.items() if on in kind.on} for on in ("window", "series"))
-DEFAULT = "en4dvar"
-MINIMISERS = tuple(name for name, kind in ON_A_WINDOW.items() if issubclass(kind, Minimiser))
-LOCALISED = tuple(name for name, kind in ON_A_WINDOW.items() if kind.localised_keys is not None)
+# name in a configuration → class; its fields are keys of the section ``assimilation:``
+SCHEMES: dict[str, type[Scheme]]
+ON_A_WINDOW: dict[str, type[Scheme]]
+ON_A_SERIES: dict[str, type[Scheme]]
+MINIMISERS: tuple[str, ...]
+LOCALISED: tuple[str, ...]
+_LATER = "SCHEMES", "ON_A_WINDOW", "ON_A_SERIES", "MINIMISERS", "LOCALISED"
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LATER:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    every = _OURS | _installed() | _OURS  # in this order, and none of ours replaced
+    window, series = ({n: kind for n, kind in every.items() if on in kind.on} for on in ("window", "series"))
+    minimisers = tuple(n for n, kind in window.items() if issubclass(kind, Minimiser))
+    localised = tuple(n for n, kind in window.items() if kind.localised_keys is not None)
+    globals().update(zip(_LATER, (every, window, series, minimisers, localised), strict=True))
+    return globals()[name]
 
 
 def keys_of(kind: type[Scheme], localised: bool = False) -> frozenset[str]:

@@ -6,11 +6,13 @@ from typing import Annotated, Any, Literal
 
 from annotated_types import Ge, Gt, Le
 
+from en4dvar import schemes
 from en4dvar.plumbing.errors import ConfigError, Fault
 from en4dvar.plumbing.hints import suggest
 from en4dvar.plumbing.user_file import is_file_reference
-from en4dvar.schemes import DEFAULT, ON_A_WINDOW, keys_of, unread
+from en4dvar.schemes import DEFAULT, keys_of, unread
 from en4dvar.schemes.base import Scheme
+from en4dvar.schemes.en4dvar import En4DVar
 
 AFTERWARDS = ("refine", "draws", "emulator", "what_if")  # keys of what follows a descent that is not localised
 
@@ -81,18 +83,21 @@ class AssimilationSettings:
     localisation: Annotated[
         Localisation | None, "Which readings act on what: by distance, or by correlation; default: all on everything."
     ] = None
-    own: Scheme = field(default_factory=ON_A_WINDOW[DEFAULT])
+    own: Scheme = field(default_factory=En4DVar)
 
     def __init__(self, scheme: str = DEFAULT, **keys: Any) -> None:
-        before = keys.pop("own", None)  # of settings that are changed by dataclasses.replace
+        kinds, before = (
+            schemes.ON_A_WINDOW,
+            keys.pop("own", None),
+        )  # of settings that are changed by dataclasses.replace
         if before is not None and is_file_reference(scheme):  # which a worker has not read
-            ON_A_WINDOW.setdefault(scheme, type(before))
-        if scheme not in ON_A_WINDOW:
-            raise ConfigError(f"{scheme!r} is not a scheme for the data of one set{suggest(scheme, list(ON_A_WINDOW))}")
-        kind, common = ON_A_WINDOW[scheme], {f.name: f.default for f in fields(self) if f.name not in ("scheme", "own")}
+            kinds.setdefault(scheme, type(before))
+        if scheme not in kinds:
+            raise ConfigError(f"{scheme!r} is not a scheme for the data of one set{suggest(scheme, list(kinds))}")
+        kind, common = kinds[scheme], {f.name: f.default for f in fields(self) if f.name not in ("scheme", "own")}
         changed = {key: keys.pop(key) for key in keys.keys() & keys_of(kind)}
         own = replace(before, **changed) if type(before) is kind else kind(**changed)
-        faults = unread(scheme, ON_A_WINDOW, keys)
+        faults = unread(scheme, kinds, keys)
         for key in keys.keys() - common.keys() - faults.keys():
             faults[key] = f"unknown key{suggest(key, [*common, *keys_of(kind)])}"
         if keys.get("localisation") is not None:
@@ -118,7 +123,7 @@ class AssimilationSettings:
 
 def beside_localisation(scheme: str, keys: Collection[str]) -> dict[str, str]:
     """Those of ``keys`` that a scheme does not read where its gain is localised, each with a message."""
-    if ON_A_WINDOW[scheme].localised_keys is None:
+    if schemes.ON_A_WINDOW[scheme].localised_keys is None:
         return {}  # it cannot be localised at all, which is told by itself
     after = {key: "not read beside a localisation" for key in AFTERWARDS if key in keys}
-    return unread(scheme, ON_A_WINDOW, keys, localised=True) | after
+    return unread(scheme, schemes.ON_A_WINDOW, keys, localised=True) | after

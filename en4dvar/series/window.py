@@ -13,7 +13,7 @@ from en4dvar.ensemble.linalg import centre
 from en4dvar.ensemble.missing import fitted
 from en4dvar.executor import Executor
 from en4dvar.model.forward import Batch, Failure, ForwardModel, Observable, Trajectory
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, floats
 from en4dvar.schemes.base import Evaluation, GaussNewtonStep, Runs, Scheme, Step, Weights
 from en4dvar.schemes.localisation import BlockDescents, BlockLocalisation
 from en4dvar.series.model_error import ModelError
@@ -55,7 +55,7 @@ def propagate(model: ForwardModel, states: Array, start: float, times: Array, ex
     reasons = [outcome.reason if isinstance(outcome, Failure) else "" for outcome in outcomes]
     if any(reasons):
         raise MembersLost(reasons)
-    return require_finite(np.array([outcome.states for outcome in outcomes if isinstance(outcome, Trajectory)]))
+    return require_finite(np.array([floats(outcome.states) for outcome in outcomes if isinstance(outcome, Trajectory)]))
 
 
 def require_finite(paths: Array) -> Array:

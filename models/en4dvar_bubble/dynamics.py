@@ -17,6 +17,7 @@ from en4dvar_bubble.driving import Driving, Reading, histotripsy, silence
 from en4dvar_bubble.gas import CRITICAL_TEMPERATURE, kirchhoff, mass_fraction, saturated_vapour_pressure
 from en4dvar_bubble.laws import ConstitutiveLaw, QuadraticKelvinVoigt
 from en4dvar_bubble.laws.exactness import refuse_unfit
+from en4dvar_bubble.laws.loading import require_names
 from en4dvar_bubble.laws.parameters import MANCIA, positive
 from en4dvar_bubble.medium import WATER_25C, Medium
 from en4dvar_bubble.numbers import ACCOMMODATION, ALL, GAS_CONTENT, OF_MEDIUM, P_A, R_START, RDOT_START, WALL_DISTANCE
@@ -110,8 +111,8 @@ class Dynamics:
 
     Raises
     ------
-    ConfigError: a name that is none of those, or another object. ValueError: options that exclude each other; a law of
-        a user's that the solver's table cannot hold.
+    ConfigError: a name that is none of those, another object, or a parameter of the law that is called like another.
+    ValueError: options that exclude each other; a law of a user's that the solver's table cannot hold.
     """
 
     law: ConstitutiveLaw = field(default_factory=QuadraticKelvinVoigt)
@@ -143,6 +144,7 @@ class Dynamics:
         if is_name:
             object.__setattr__(self, "accuracy", preset(accuracy, self.start))
         require_kinds(self, Dynamics)
+        require_names(type(self.law), self.law.name)
         refuse_unfit(type(self.law))
         if self.law.released and self.start != "laser":
             raise ValueError(f"{self.law.name} needs start: laser: only a released bubble has an R_max at time zero")
@@ -207,7 +209,7 @@ class Dynamics:
 
     @cached_property
     def optional_parameters(self) -> tuple[Parameter, ...]:
-        """The :mod:`numbers` that the equations contain; a law's own parameter of such a name goes before."""
+        """The :mod:`numbers` that the equations contain."""
         heat, transport = self.gas == "heat", self.vapour == "transport"
         pulse = {number.parameter.name: number.parameter for number in self.driving.numbers}
         acts = {p.name: not p.name.startswith("pulse_") for p in ALL} | dict.fromkeys(pulse, True)
@@ -221,8 +223,7 @@ class Dynamics:
         acts |= {WALL_DISTANCE.name: self.wall is not None}
         acts |= {P_A.name: not self.driving.silent, "surface_tension": not self.law.rest_tension}
         acts |= dict.fromkeys((R_START.name, RDOT_START.name), self.start == "acoustic")
-        own = {p.name for p in self.law.parameters}
-        return tuple(pulse.get(p.name, p) for p in ALL if acts[p.name] and p.name not in own)
+        return tuple(pulse.get(p.name, p) for p in ALL if acts[p.name])
 
     def medium_of(self, values: Mapping[str, Array], axes: int = 0) -> Medium:
         """The medium of members with parameters name → (N,): constants that are parameters are (N, 1, …), with as

@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from diagnosis.provoked import TWO, bounded, linear, run, waved
-from toys import Fragile, make_problem
+from toys import Fragile, Vectorised, make_problem
 
 from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.diagnosis.honesty import ControlEnsembles, examine
 from en4dvar.diagnosis.honesty.checks import at_bound, loss, rank, validity, where_lost
-from en4dvar.diagnosis.honesty.examine import collapse
+from en4dvar.diagnosis.honesty.examine import collapse, doubts
 from en4dvar.estimation.summary import summarise
 from en4dvar.model.forward import ValidityLimit
 from en4dvar.model.state import Parameter
@@ -45,6 +45,22 @@ def collapsed(shrunk: float = 1.0, alive: int = 48) -> list[Caution]:
 
 def test_a_gaussian_end_is_silent():
     assert examine(*gaussian()) == ()
+
+
+class Writing(Vectorised):
+    """Writes into what it is asked about."""
+
+    def doubts(self, observable, times, values, predicted, members):
+        for handed in (times, values, predicted, *members.values()):
+            handed[:] = 0.0
+        return ()
+
+
+def test_a_model_that_is_asked_for_doubts_changes_no_reading():
+    problem = make_problem(Writing(TWO), (1.0, 0.5))
+    before = problem.observations.values.copy(), problem.observations.times.copy()
+    assert doubts(problem, np.ones((4, 2)), np.ones((4, len(problem.observations)))) == []
+    np.testing.assert_array_equal((problem.observations.values, problem.observations.times), before)
 
 
 def test_what_the_file_makes_doubtful_is_a_warning():
@@ -87,6 +103,23 @@ def test_where_lost_is_silent_on_what_does_not_tell():
     x = PRIOR.sample(200, 5, "random")
     some = np.random.default_rng(1).random(200) < 0.1
     assert where_lost(PRIOR, x, some) == "they are spread over the whole ensemble"
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 9, 44, 46])
+def test_any_number_of_lost_members_is_told_from_the_others(count):
+    """They are those with the largest of one parameter; as many at random are named for one in a hundred cases."""
+    x = PRIOR.sample(48, 5, "random")
+    lost = np.argsort(np.argsort(x[:, 0])) >= 48 - count
+    words = rf"lost members have G above .* \(none of the {48 - count} others\)"
+    assert re.fullmatch(words, where_lost(PRIOR, x, lost))
+    random = np.random.default_rng(count)
+    named = ["lost members have" in where_lost(PRIOR, x, random.permutation(lost)) for _ in range(400)]
+    assert np.mean(named) <= 0.01 + 3 * np.sqrt(0.01 / 400)
+
+
+def test_all_members_lost_are_spread():
+    x = PRIOR.sample(12, 5, "random")
+    assert where_lost(PRIOR, x, np.ones(12, dtype=bool)) == "they are spread over the whole ensemble"
 
 
 def test_one_or_two_lost_members_are_described():

@@ -185,7 +185,7 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "a null byte": ({"priors": {"a": {"prior": "no\0rmal"}}}, "priors.a.prior: a null byte"),
     "odd section": ({"asimilation": {}}, "asimilation: unknown key 'asimilation'; did you mean 'assimilation'?"),
     "setting": ({"assimilation": {"member": 3}}, "assimilation.member: unknown key 'member'; did you mean 'members'?"),
-    "a time": ({"data": (np.where(TIMES > 2.9, np.nan, TIMES), VALUES)}, "data: the time of reading 12 is NaN; leave"),
+    "a time": ({"data": (np.where(TIMES > 2.9, np.nan, TIMES), VALUES)}, "time of reading 12 is NaN or masked"),
     "order": ({"data": (TIMES[::-1], VALUES)}, "reading 2 of data: times must increase, but 2.72727 1 follows 3 1"),
     "repeated": ({"data": (TIMES.round(), VALUES)}, "follows 0 1; keep one of the two readings, or their mean"),
     "no parameter": ({"priors": {"reading_scale": PRIORS["a"]}}, "priors: none is of a parameter of the function"),

@@ -39,7 +39,7 @@ def package(tmp_path):
     config["output"] = {"report": False}
     config["assimilation"] = {"scheme": "patient", "patience": 4, "members": 16, "what_if": False}
     (tmp_path / "own.yaml").write_text(yaml.safe_dump(config))
-    return {**os.environ, "PYTHONPATH": str(tmp_path)}
+    return {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])}
 
 
 def called(*words, environment, folder):
@@ -65,6 +65,20 @@ def test_it_runs_by_its_name_and_its_keys_are_checked(package, tmp_path):
     (tmp_path / "own.yaml").write_text(text.replace("scheme: patient", "scheme: etkf"))
     refused = called("-m", "en4dvar.cli", "validate", "own.yaml", environment=package, folder=tmp_path)
     assert "scheme etkf does not read it; it is a key of patient" in refused.stderr  # not replaced
+
+
+@pytest.mark.parametrize("first", ["en4dvar.schemes.base", "en4dvar.AssimilationSettings"])
+def test_a_script_may_import_the_package_first(first, package, tmp_path):
+    """Which imports from ours, while it is not yet there itself."""
+    module, _, name = first.rpartition(".")
+    (tmp_path / "patient.py").write_text(f"from {module} import {name}\n{SCHEME}")
+    script = "import patient, en4dvar; print(en4dvar.AssimilationSettings('patient', patience=5).patience)"
+    done = called("-c", script, environment=package, folder=tmp_path)
+    assert done.stdout == "5\n", done.stderr
+    assert "'patient'" not in done.stderr
+    script = "import patient, en4dvar; print(en4dvar.validate('own.yaml'))"
+    done = called("-c", script, environment=package, folder=tmp_path)
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.slow

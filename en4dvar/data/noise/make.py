@@ -21,7 +21,7 @@ from en4dvar.data.noise.correlated import SHARED, CorrelatedNoise, Correlation, 
 from en4dvar.data.noise.discrepancy import DiscrepancyNoise, Kernel, RobustDiscrepancyNoise
 from en4dvar.data.noise.gaussian import Linearisation, Noise, Predicted, ScaleSkewness
 from en4dvar.data.noise.losses import SIDES, BoundNoise, HuberNoise, record_of, sides_of
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, floats
 
 Indices = npt.NDArray[np.intp]
 
@@ -202,8 +202,8 @@ def noise_of(
     Raises ValueError: both a correlation and a robust cost, either or a discrepancy beside bounds, or a matrix that is
     no correlation.
     """
-    std = np.asarray(std, dtype=float)
-    time_std = np.zeros_like(std) if time_std is None else np.asarray(time_std, dtype=float)
+    std = floats(std)
+    time_std = np.zeros_like(std) if time_std is None else floats(time_std)
     if sides is not None and np.any(sides):
         if correlation is not None or huber is not None or discrepancy is not None:
             raise ValueError("bounds (at_most, at_least) stand beside no correlation, robust cost or discrepancy")

@@ -32,7 +32,7 @@ EXTRAPOLATED = "no action is needed for the parameters; paths beyond the limit a
 EXCLUDED = "no action is needed: it was seen, so that the readings exclude them"
 UNREAD = "no action is needed where the field's own spread says so, cell by cell"
 MANY = 0.1  # share of members whose loss is serious
-SEPARATED = 3.0  # standard deviations of the rank sum beyond which a parameter tells lost members from others
+BY_CHANCE = 0.01  # of cases in which a parameter is said to tell lost members from others, and does not
 FAR = 1.5  # prior standard deviations from the prior mean that are worth naming for one or two members
 MOST_NAMED, MOST_LISTED = 3, 6
 NONE: Mapping[str, str] = MappingProxyType({})
@@ -337,31 +337,31 @@ def loss(
 def where_lost(prior: Prior, members: Array, lost: Mask) -> str:
     """Where the lost members lie, in words and display units: the parameters that tell them from the others.
 
-    A parameter is named where the rank sum of the lost members (Mann & Whitney 1947, Ann. Math. Stat. 18, 50) is
-    :data:`SEPARATED` standard deviations from its expectation; one or two members are described one by one.
+    A parameter is named where the rank sum of the lost members (Mann & Whitney 1947, Ann. Math. Stat. 18, 50) would
+    be as far from its expectation by chance in less than :data:`BY_CHANCE` of all cases, in any of the parameters. Of
+    one or two members that no parameter tells from the others each is described.
     """
     n_lost, n_alive = int(lost.sum()), int((~lost).sum())
-    if n_lost < 3 or n_alive < 3:
-        return _one_by_one(prior, members[lost]) if n_lost < 3 else "no parameter tells them from the few others"
-    from scipy.stats import ranksums  # where members are lost: its import takes long
+    from scipy.stats import mannwhitneyu  # where members are lost: its import takes long
 
     sides: list[tuple[float, str]] = []
-    for j in range(members.shape[1]):
+    for j in range(members.shape[1] if min(n_lost, n_alive) > 1 else 0):
         values = members[:, j]
-        score = float(ranksums(values[lost], values[~lost]).statistic)
-        if abs(score) < SEPARATED:
+        rank_sum, chance = mannwhitneyu(values[lost], values[~lost])  # exact where few are on one side
+        if not chance <= BY_CHANCE / members.shape[1]:
             continue
-        mirrored = values if score > 0 else -values
+        higher = rank_sum > n_lost * n_alive / 2
+        mirrored = values if higher else -values
         edge, rest = float(np.min(mirrored[lost])), mirrored[~lost]
         if edge <= float(rest.max()):  # not all on one side: most of the lost lie beyond this quantile
             edge = float(np.quantile(mirrored[lost], 0.1))
         beyond = int(np.sum(rest > edge))
         others = f"as {beyond} of" if beyond else "none of"
-        side, at = ("above", edge) if score > 0 else ("below", -edge)
-        sides.append((abs(score), f"{prior.names[j]} {side} {_shown(prior, j, at)} ({others} the {n_alive} others)"))
+        side, at = ("above", edge) if higher else ("below", -edge)
+        sides.append((chance, f"{prior.names[j]} {side} {_shown(prior, j, at)} ({others} the {n_alive} others)"))
     if not sides:
-        return "they are spread over the whole ensemble"
-    named = [text for _, text in sorted(sides, key=lambda side: -side[0])[:MOST_NAMED]]
+        return _one_by_one(prior, members[lost]) if n_lost < 3 else "they are spread over the whole ensemble"
+    named = [text for _, text in sorted(sides, key=lambda side: side[0])[:MOST_NAMED]]
     return f"lost members have {', '.join(named)}"
 
 

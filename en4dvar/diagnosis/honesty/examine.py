@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -97,7 +98,8 @@ def doubts(problem: InverseProblem, members: Array, predicted: Array) -> Sequenc
         doubt if isinstance(doubt, Caution) else caution("implausible-data", doubt)
         for part in problem.parts
         for doubt in problem.model.doubts(
-            part.observable.name, y.times[part.where], y.values[part.where], predicted[alive, part.where], values
+            part.observable.name,
+            *deepcopy((y.times[part.where], y.values[part.where], predicted[alive, part.where], values)),
         )
     ]
 

@@ -9,7 +9,8 @@ kernel does not change.
 """
 
 from collections.abc import Mapping
-from functools import lru_cache
+from copy import deepcopy
+from functools import lru_cache, wraps
 from typing import Any, ClassVar
 
 import numpy as np
@@ -27,6 +28,17 @@ REGISTRY: "dict[str, type[ConstitutiveLaw]]" = {}
 _TOGETHER = 48  # members sampled at once: their temporary arrays fit in the cache
 _EXAMPLE_BY_NAME = {"G": 5e3, "alpha": 0.03, "mu": 0.1}
 _EXAMPLE_BY_UNIT = {"Pa": 5e3, "Pa s": 0.1, "s": 1e-6, "1": 0.5, "N/m": 0.02}
+_METHODS = ("stress", "strain_energy_rate", "viscosity", "strained_viscosity", "memory")
+
+
+def _on_copies(method: Any) -> Any:
+    """A method of a law that may write into its arguments: it gets copies of them."""
+
+    @wraps(method)
+    def call(law: Any, *arguments: Any, **named: Any) -> Any:
+        return method.__get__(law, type(law))(*deepcopy(arguments), **deepcopy(named))
+
+    return call
 
 
 Limits = tuple[tuple[type["ConstitutiveLaw"], Mapping[str, float]], ...]
@@ -66,6 +78,11 @@ class ConstitutiveLaw:
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
+        for method in _METHODS:
+            owner = next(kind for kind in cls.__mro__ if method in vars(kind))
+            written = vars(owner)[method] is not vars(ConstitutiveLaw)[method]
+            if written and (owner is cls or not issubclass(owner, ConstitutiveLaw)):  # another law has done it already
+                setattr(cls, method, _on_copies(vars(owner)[method]))
         own = cls.__dict__.get("name")
         cls.name = own or cls.__name__
         if own and not is_from_file(cls):  # a law from a file is not registered: two files may name theirs alike

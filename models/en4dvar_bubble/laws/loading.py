@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from en4dvar.model.state import Parameter
+from en4dvar.model.state import DISCREPANCY, OF_READINGS, Parameter
 from en4dvar.plumbing import user_file
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.hints import suggest
@@ -17,9 +17,11 @@ from en4dvar.plumbing.user_code import imported, line_of, loading, reason_of
 from en4dvar_bubble.laws.base import REGISTRY, ConstitutiveLaw
 from en4dvar_bubble.laws.memory import MemoryVariable
 from en4dvar_bubble.laws.parameters import columns
+from en4dvar_bubble.numbers import NAMES
 
-RESERVED = ("R", "Rdot", "p_b", "S", "T", "C", "R0", "R_eq", "R_max", "t_s")
-"""Names of the state vector and of the model's own parameters."""
+RESERVED = {"R", "Rdot", "p_b", "S", "T", "C", "T_m", "Z", "R0", "R_eq", "R_max"}
+RESERVED |= NAMES | {p.name for p in (*OF_READINGS, *DISCREPANCY)}
+"""Names of the state vector, and of parameters of the bubble, its readings and their discrepancy."""
 _MEMBERS = 3
 
 
@@ -54,14 +56,20 @@ def _check_parameters(kind: type[ConstitutiveLaw], name: str) -> None:
         raise ConfigError(
             f"{name}: defines both viscosity and strained_viscosity; no viscosity depends on shear rate and stretch"
         )
-    names = [p.name for p in kind.parameters]
-    if not names:
+    if not kind.parameters:
         raise ConfigError(f"{name}: parameters is empty")
+    require_names(kind, name)
+
+
+def require_names(kind: type[ConstitutiveLaw], name: str) -> None:
+    """Raise :class:`ConfigError` where a parameter of a law is not the only one of its name."""
+    names = [p.name for p in kind.parameters]
     for n in names:
         if names.count(n) > 1:
             raise ConfigError(f"{name}: two parameters are called {n!r}")
         if n in RESERVED:
-            raise ConfigError(f"{name}: the parameter name {n!r} is taken by the bubble model")
+            words = f"the parameter name {n!r} is taken by the bubble model or its readings"
+            raise ConfigError(f"{name}: {words}; choose another, e.g. {n + '_law'!r}")
 
 
 def _probe(law: ConstitutiveLaw, name: str) -> None:

@@ -28,11 +28,11 @@ class MemoryVariable:
 
     def stiffness_at(self, stretch: Array) -> float | Array:
         """a at stretches (K,)."""
-        return self.stiffness(stretch) if callable(self.stiffness) else self.stiffness
+        return self.stiffness(stretch.copy()) if callable(self.stiffness) else self.stiffness
 
     def equilibrium_at(self, stretch: Array) -> float | Array:
         """b at stretches (K,)."""
-        return self.equilibrium(stretch) if callable(self.equilibrium) else self.equilibrium
+        return self.equilibrium(stretch.copy()) if callable(self.equilibrium) else self.equilibrium
 
 
 class MemoryTables(NamedTuple):
