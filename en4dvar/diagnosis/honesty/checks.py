@@ -115,7 +115,7 @@ def missed(analysis: Analysis) -> Findings:
     if amplitude is None or amplitude.name not in names:
         return
     low, high = np.nanquantile(analysis.posterior[:, names.index(amplitude.name)], NINE_OF_TEN)
-    error = float(np.median(analysis.error_std))
+    error = float(np.median(analysis.own_std))
     if low > THERE * error:
         least, most, noise = (shown(size, amplitude) for size in (low, high, error))
         words = (
