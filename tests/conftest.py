@@ -146,6 +146,7 @@ def _analysis(n_members: int = 24, **changes: Any) -> Analysis:
         posterior_predictions=predictions,
         centre_predictions=centre_predictions,
         error_std=std,
+        own_std=std,
         log_likelihood=-0.5 * ((values - predictions) / std) ** 2 - np.log(std * np.sqrt(2 * np.pi)),
         trajectory_times=grid,
         prior_trajectories=_path(prior, grid),

@@ -254,6 +254,6 @@ def errors_of(
         correlation = np.exp(-np.abs(np.subtract.outer(times, times)) / error.correlation_time)
     upper, lower = (np.asarray(stated.get(key, on), dtype=bool) for key, on in error.bounds.items())
     if np.any(upper & lower):
-        raise DataError("a reading is both at_most and at_least; give two readings, one of each")
+        raise DataError("a reading is both at_most and at_least; give two series, one of each")
     sides = np.broadcast_to(upper.astype(float) - lower, times.shape)
     return noise_of(std, time_std, correlation, error.threshold if error.robust else None, kernel, sides)

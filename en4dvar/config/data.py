@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Self, cast
 from pydantic import BeforeValidator, ConfigDict, Discriminator, Field, Tag, WithJsonSchema, model_validator
 
 from en4dvar.config.context import PLACEHOLDER, Context, Faults, Made, OfObservable, Place
-from en4dvar.config.of_readings import PLACES, WEIGHTS, Error, Placing, Weighing
+from en4dvar.config.of_readings import BOUNDS, PLACES, WEIGHTS, Error, Placing, Weighing
 from en4dvar.config.quantities import observable_unit, quantity, time_unit, unit_of
 from en4dvar.config.schema import Name, QuantityText, Section
 from en4dvar.inputs.decimal_sign import Decimal
@@ -207,6 +207,9 @@ class Data(Section):
         for key, word in (("repeated", "average"), ("outliers", "leave out")):
             if keys.get(key) == word and "places" in keys:
                 faults.add((key,), "not together with places, of which each has a reading of its own", at_key=True)
+        error = keys.get("error")
+        if keys.get("repeated") == "average" and isinstance(error, dict) and any(map(error.get, BOUNDS)):
+            faults.add(("repeated",), f"not together with {' or '.join(BOUNDS)}: bounds have no mean", at_key=True)
         block = field_of(context.units, context.observed) if context.observed else None
         if block is not None and block.size > 1 and "places" not in keys:
             faults.add(("places",), f"required: {block.name!r} is a field of {block.size} values; say which were read")

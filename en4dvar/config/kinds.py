@@ -311,7 +311,7 @@ class CampaignSection(Section):
     """Largest number of readings."""
     fewest: Annotated[int, Field(ge=3)] = 5
     """A data set with fewer readings is drawn again."""
-    noise: Annotated[float, quantity(lambda context: context.units.observables[0].unit, "positive")]
+    noise: Annotated[float, quantity(lambda context: context.units.observables[0].unit, "positive", error=True)]
     """Std of the error of a reading, in the observable's unit."""
     time_shift: Interval = (0.0, 0.0)
     """t_s: a reading told at t was taken at t + t_s."""

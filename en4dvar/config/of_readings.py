@@ -53,6 +53,7 @@ def or_column(read: Callable[[Any, Context], Any], unit: Unit) -> Callable[[Any,
 
 
 read_error_std = or_column(read_spread, observable_unit)
+read_time_std = or_column(quantity(time_unit, "not negative", error=True).make, time_unit)
 
 
 def _shared(written: Any, context: Context) -> tuple[Spread | Column, ...]:
@@ -152,9 +153,7 @@ class Error(Section):
         None, alias=f"{PLACEHOLDER}_std"
     )
     """Std of the observation error: a quantity, e.g. '1 % of maximum', or ``{column: NAME}``, one per reading."""
-    time_std: Annotated[
-        float | Column, Made(or_column(quantity(time_unit, "not negative").make, time_unit), json=QUANTITY_OR_COLUMN)
-    ] = 0.0
+    time_std: Annotated[float | Column, Made(read_time_std, json=QUANTITY_OR_COLUMN)] = 0.0
     """Std of the observation times, a quantity or ``{column: NAME}``: adds (rate × time_std)²."""
     model_std: Annotated[Spread | None, Made(read_spread)] = None
     """Std of what the model misses from reading to reading, e.g. '1 % of maximum'; its square is added."""

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from en4dvar.config.context import Context, Made
 from en4dvar.plumbing.described import text_for
 from en4dvar.plumbing.errors import ConfigError
-from en4dvar.plumbing.hints import brief
+from en4dvar.plumbing.hints import brief, shown
 from en4dvar.plumbing.units import UnitError, convert, parse_quantity, parse_unit, split_quantity
 
 Unit = Callable[[Context], str]
@@ -18,10 +18,12 @@ observable_unit: Unit = attrgetter("observable.unit")
 subject_unit: Unit = attrgetter("subject.unit")
 
 
-def quantity(unit: Unit, sign: Literal["positive", "not negative"]) -> Made:
-    """A number in ``unit``, given with a unit of its own."""
+def quantity(unit: Unit, sign: Literal["positive", "not negative"], error: bool = False) -> Made:
+    """A number in ``unit``, given with a unit of its own. Of an ``error`` it is no share, where nobody says of what."""
 
     def read(text: Any, context: Context) -> float:
+        if error:
+            require_no_share(str(text).strip(), unit(context))
         value = parse_quantity(text, unit(context))
         require_sign(value, sign, text)
         return value
@@ -77,11 +79,15 @@ def parse_error_std(text: Any, unit: str, whole: str = "maximum") -> Spread:
     word = str(text).strip()
     if relative := re.fullmatch(rf"(.*%)\s+of\s+(?:the\s+)?{whole}", word):
         return Spread(parse_quantity(relative[1], "1"), relative=True)
-    try:
-        return Spread(parse_quantity(text, unit), unit=split_quantity(word)[1])
-    except UnitError as error:
-        hint = f"; write '{word} of {whole}'" if word.endswith("%") else ""
-        raise UnitError(f"{error}{hint}") from None
+    require_no_share(word, unit, f"'{word} of {whole}' or ")
+    return Spread(parse_quantity(text, unit), unit=split_quantity(word)[1])
+
+
+def require_no_share(text: str, unit: str, rather: str = "") -> None:
+    """Raises :class:`UnitError` for a number in % where ``unit`` is another, 1 as well: nobody says a share of what."""
+    if text.endswith("%") and unit != "%":
+        own = "a plain number" if unit == "1" else f"a quantity in {unit}"
+        raise UnitError(f"{shown(text)} is a share, but does not say of what; write {rather}{own}")
 
 
 def read_spread(text: Any, context: Context, unit: Unit = observable_unit, whole: str = "maximum") -> Spread:

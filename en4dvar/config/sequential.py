@@ -23,10 +23,12 @@ from en4dvar.series.settings import SequentialSettings
 from en4dvar.series.smoothers import EnKS, EnRTS
 from en4dvar.series.start import EnsembleCoordinates
 
+STD = quantity(subject_unit, "positive", error=True)
+
 
 def stds(known: Callable[[ForwardModel], Mapping[str, Any]], relative: bool = False) -> Made:
     """Standard deviations by the names of what is ``known``, at least one; ``relative``: any number, some in %."""
-    read_one: Callable[[Any, Context], Any] = SPREAD.make if relative else quantity(subject_unit, "positive").make
+    read_one: Callable[[Any, Context], Any] = (SPREAD if relative else STD).make
     fewest = 0 if relative else 1
 
     def read(section: Mapping[str, Any], context: Context) -> dict[str, Any]:

@@ -186,6 +186,7 @@ class Analysis:
     posterior_predictions: Array  # (N, K)
     centre_predictions: Array  # (K,)
     error_std: Array  # (K,) total observation-error std at the centre, timing error included
+    own_std: Array  # (K,) the same without what a discrepancy adds
     log_likelihood: Array  # (N, K) of the posterior members
     trajectory_times: Array  # (M,) on the clock of the observations (member i is seen at t + t_s,i)
     prior_trajectories: Array  # (N, M) observable along the path

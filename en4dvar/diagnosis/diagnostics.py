@@ -117,14 +117,18 @@ def gaussianity(members: Array, centre: Array, costs: Array) -> dict[str, float]
     return {"gaussian_fit": effective_share(np.where(alive, 0.5 * squares - costs, -np.inf))}
 
 
-def is_non_gaussian(shape: Mapping[str, float]) -> bool:
+def is_non_gaussian(shape: Mapping[str, float], scaled: bool = False) -> bool:
     """True if mean or spread of the ensemble are not the posterior's, from
     :func:`~en4dvar.sampling.refine.examine_shape` and :func:`~en4dvar.sampling.refine.examine_tails`.
+
+    ``scaled``: a parameter is the scale of others, so that no posterior is Gaussian; an emulator may say that it is.
     """
     if shape.get("emulator_fit", 0.0) >= EMULATED_ENOUGH:
         off = abs(shape["spread_ratio"] - 1)
         return shape["mean_shift"] > MEAN_OFF or off > SPREAD_OFF
-    return shape.get("gaussian_fit", 1.0) < GAUSSIAN_ENOUGH or any(key.startswith("tail_mean") for key in shape)
+    return (
+        scaled or shape.get("gaussian_fit", 1.0) < GAUSSIAN_ENOUGH or any(key.startswith("tail_mean") for key in shape)
+    )
 
 
 def active_members(failures: Sequence[str]) -> Mask:

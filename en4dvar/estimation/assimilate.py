@@ -162,6 +162,7 @@ def _concluded(
         (prior_run[:-1], ends.run, last),
         fixed_parameters=stages.fixed_parameters,
         error_std=observations.noise.total_std(central),
+        own_std=observations.noise.error_std(central),
         trajectory_times=stages.grid,
         iterations=descent.records,
         dfs_per_parameter=diag.dfs_per_parameter(space.prior_variance, ends.members),

@@ -88,6 +88,7 @@ class Localised:
             problem, self.settings, self.seed, (before, after, centre[:n]), (prior_run, run, central),
             fixed_parameters=self.fixed_parameters,
             error_std=problem.observations.std,
+            own_std=problem.observations.std,
             trajectory_times=self.grid,
             iterations=tuple(self.records),
             dfs_per_parameter=diag.dfs_per_parameter(before.var(axis=0), after[diag.active_members(run.failures)]),

@@ -164,8 +164,8 @@ SEVERAL = 4  # readings: a series has as many, and two of them as many each whil
 
 @dataclass(frozen=True)
 class InFile:
-    """The rows ``kept`` (K,) of a file, its ``lines`` if it has them, their times as ``written`` (K,) in ``unit``, and
-    the columns ``wanted``."""
+    """The rows ``kept`` (K,) of a file, its ``lines`` if it has them, their times as ``written`` (K,) in ``unit``, the
+    columns ``wanted``, and whether some of these are marks of ``bounds``."""
 
     path: Path
     layout: Layout
@@ -174,6 +174,7 @@ class InFile:
     written: Array
     unit: str
     wanted: Sequence[str]
+    bounds: bool = False
 
     def require_order(self, times: Array, values: Array) -> None:
         """Raise :class:`DataError` where ``times`` (K,) of ``values`` (K,) are not in order, or one occurs again and
@@ -187,7 +188,9 @@ class InFile:
         apart = "give each a file of its own"
         apart += bool(self.lines) * ", or a column that says whose each row is, and name it by data.by"
         ends = np.flatnonzero(np.diff(times) < 0)
-        if column := self._telling_apart(times):
+        if self.bounds and times[after] == times[before]:
+            hint = "bounds of one time are series of their own: one of those that say at_least, one of at_most"
+        elif column := self._telling_apart(times):
             name = column if column.isidentifier() else repr(column)
             hint = f"column {column!r} says which of several series a row belongs to (data.by: {name})"
         elif _several(times, ends):
@@ -199,13 +202,14 @@ class InFile:
             hint = f"readings of one time differ by far more than they scatter: keep one; of several series, {apart}"
         else:
             hint = "keep one of the two readings, or their mean (data.repeated: average)"
-        unit = "" if "*" in self.unit else f" {self.unit}"
+        unit = "" if "*" in self.unit or self.unit == "1" else f" {self.unit}"
         where = f":{self.lines[self.kept[after]]}" if self.lines else f": sample {self.kept[after] + 1}"
         told = f"times must increase, but {self.written[after]:g}{unit} follows {self.written[before]:g}{unit}"
         raise DataError(f"{self.path}{where}: {told}; {hint}")
 
     def _telling_apart(self, times: Array) -> str | None:
-        """The column of a table that tells several series apart, each with increasing ``times`` (K,)."""
+        """The column of a table that tells several series apart, each with increasing ``times`` (K,), and nothing
+        else."""
         if self.layout.by is not None or not self.lines:
             return None
         with opened(self.path, self.layout) as kind:
@@ -213,7 +217,7 @@ class InFile:
         for i, name in enumerate(table.names):
             cells = np.array([cell(table.rows[k][1], i) for k in self.kept])
             each, which, counts = np.unique(cells, return_inverse=True, return_counts=True)
-            if name and "" not in each and len(each) > 1 and counts.min() >= SEVERAL:
+            if name not in ("", *self.wanted) and "" not in each and len(each) > 1 and counts.min() >= SEVERAL:
                 sort = self.layout.unsorted == "sort"
                 rows = np.lexsort((times, which)) if sort else np.argsort(which, kind="stable")
                 increase = np.all((np.diff(times[rows]) > 0) | (np.diff(which[rows]) > 0))

@@ -105,7 +105,8 @@ def read_series(
     stated = {c.name: _stds(c, converted[c], columns[c.name], kept, len(values), path) for c in errors}
     if isinstance(time, Column) and not repeats:
         written = columns[time.name][kept]
-        InFile(path, layout, kept, lines, written, time.unit, wanted).require_order(times[kept], values[kept])
+        bounds = any(column.kind == "mark" for column in errors)
+        InFile(path, layout, kept, lines, written, time.unit, wanted, bounds).require_order(times[kept], values[kept])
         if layout.unsorted == "sort":
             order = np.argsort(times[kept], kind="stable")
             kept, stated = kept[order], {name: stds[order] for name, stds in stated.items()}

@@ -129,6 +129,8 @@ def judge_chi2(chi2: float, n_observations: int, dfs: float, structured: bool = 
     """What χ² per observation says, whether it needs attention; ``structured``: neighbouring residuals are related."""
     if not math.isfinite(chi2):
         return "cannot be told", True
+    if not n_observations:
+        return "bounds tell no size of errors; this is the sum of their squares where they do not hold", False
     low, high = chi2_interval(max(1.0, n_observations - dfs))
     expected = f"expected are {plain_number(low / n_observations, 2)} to {plain_number(high / n_observations, 2)}"
     if chi2 * n_observations > high:

@@ -153,9 +153,9 @@ SAMPLE_STATS = (
     _withheld("withheld_inside", "share of them in the 90 % bands of what was expected", lambda w: w.inside),
     _withheld("withheld_rms", "root mean square of these readings less the medians, SI", lambda w: w.rms),
     Attribute("discrepancy_share", "share of the squared residuals that the discrepancy takes", _discrepancy_share),
-    Attribute("gaussian_fit, non_gaussian, tail_shift, tail_ratio, tail_excess, tail_mean_G, tail_std_G, mean_shift, "
-              "spread_ratio, emulator_fit, emulated_mean_G, emulated_std_G",
-              "shape of the posterior; tail_mean, tail_std where weights are sure, the latter five of an emulator",
+    Attribute("gaussian_fit, non_gaussian, tail_shift, tail_ratio, tail_excess, tail_members, tail_elsewhere, "
+              "tail_mean_G, tail_std_G, mean_shift, spread_ratio, emulator_fit, emulated_mean_G, emulated_std_G",
+              "shape of the posterior; tail_mean, tail_std where weights are sure, NaN of few; rest of an emulator",
               lambda a: a.shape),
     Attribute("importance_draws, importance_effective_sample_size, importance_largest_shift, "
               "importance_largest_spread_ratio, mcmc_r_hat, mcmc_effective_sample_size, …",

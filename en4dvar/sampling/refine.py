@@ -72,7 +72,8 @@ def examine_shape(
             theta, names = space.problem.prior.to_physical(emulator.draws), space.problem.prior.names
             for what, values in (("mean", theta.mean(axis=0)), ("std", theta.std(axis=0))):  # of G, not of ln G
                 numbers |= {f"emulated_{what}_{name}": float(v) for name, v in zip(names, values, strict=True)}
-    return {**numbers, "non_gaussian": diag.is_non_gaussian(numbers)}
+    scaled = any(walk.spread for walk in space.problem.walks)
+    return {**numbers, "non_gaussian": diag.is_non_gaussian(numbers, scaled)}
 
 
 def examine_tails(space: WeightSpace, ensemble: Array, costs: Array, before: Array, always: bool) -> dict[str, float]:
@@ -85,7 +86,8 @@ def examine_tails(space: WeightSpace, ensemble: Array, costs: Array, before: Arr
     deviations, ``tail_ratio`` the standard deviation of the ensemble over the posterior's where that is farthest from
     1, ``tail_excess`` by how many standard errors of theirs a distance or ratio is beyond :data:`SHIFT` or
     :data:`SPREAD`. ``tail_mean_<name>``, ``tail_std_<name>`` are those of a parameter that is surely off by what is
-    warned of. Nothing of an ensemble without a covariance.
+    warned of, NaN where ``tail_members``, the effective number of the points, is below :data:`TOO_FEW` to say to what.
+    ``tail_elsewhere``: most of the posterior is where the ensemble is not. Nothing of an ensemble without a covariance.
     """
     weighed: dict[str, float] = {}
     with suppress(np.linalg.LinAlgError):
@@ -125,10 +127,15 @@ def _by_weights(prior: Prior, parts: Sequence[tuple[Array, Array]]) -> dict[str,
         "tail_shift": float(np.max(shift)),
         "tail_ratio": float(ratio[np.argmax(np.abs(np.log(ratio)))]),
         "tail_excess": max(0.0, float(np.max(excess))),
+        "tail_members": float(1 / np.sum(shares**2)),
+        "tail_elsewhere": bool(elsewhere),
     }
+    known = np.array([mean, std]) if weighed["tail_members"] >= TOO_FEW else np.full((2, len(mean)), np.nan)
     sure = (excess > diag.SURE) & ((shift > diag.MEAN_OFF) | (np.abs(ratio - 1) > diag.SPREAD_OFF))
     for j in np.flatnonzero(sure):
-        weighed |= {f"tail_mean_{prior.names[j]}": float(mean[j]), f"tail_std_{prior.names[j]}": float(std[j])}
+        weighed |= {
+            f"tail_{what}_{prior.names[j]}": float(v) for what, v in zip(("mean", "std"), known[:, j], strict=True)
+        }
     return weighed
 
 

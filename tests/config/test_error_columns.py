@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import en4dvar
 from en4dvar.assembly.build import build
 from en4dvar.config import load_config
+from en4dvar.config.quantities import Spread, parse_error_std
 from en4dvar.plumbing.errors import ConfigError, DataError
 
 ROWS = [(0, 100, 2, 0.1), (5, 80, 1, 0.2), (10, "", "", ""), (15, 60, 4, 0.3), (20, 50, 3, 0.1)]
@@ -44,6 +46,33 @@ def test_each_reading_has_its_own_error_in_the_unit_of_its_column(tmp_path):
 )
 def test_the_unit_of_the_error_as_it_is_stated_is_that_of_the_advice(tmp_path, error, unit):
     assert problem(tmp_path, f"{{radius_std: {error}}}").observations.error_unit == unit
+
+
+@pytest.mark.parametrize("std", ["5 %", " 5%", "x %"])
+@pytest.mark.parametrize(("unit", "own"), [("1", "a plain number"), ("um", "a quantity in um")])
+def test_a_share_says_of_what(std, unit, own):
+    with pytest.raises(ValueError, match=f"does not say of what; write '{std.strip()} of maximum' or {own}"):
+        parse_error_std(std, unit)
+    assert parse_error_std("5 % of maximum", unit) == Spread(0.05, relative=True)
+    assert parse_error_std("5 %", "%").value == 5  # in the observable's own unit
+
+
+@pytest.mark.parametrize(
+    ("error", "where"),
+    [
+        ("5 %", "error.y_std"),
+        ({"y_std": "5 %"}, "error.y_std"),
+        ({"y_std": 0.1, "model_std": "5 %"}, "error.model_std"),
+        ({"y_std": 0.1, "time_std": "5 %"}, "error.time_std"),
+        ({"y_std": 0.1, "shared": ["5 %"]}, "error.shared"),
+        ({"y_std": 0.1, "discrepancy": {"amplitude": {"median": "5 %"}}}, "error.discrepancy.amplitude.median"),
+    ],
+)
+def test_of_an_observable_without_unit_too(error, where):
+    """``5 %`` is the number 0.05, but as an error it is hardly meant so: beside readings of 50 it is a tenth of a %."""
+    priors = {"k": {"prior": "lognormal", "median": "20 %", "log_std": "50 %"}}
+    with pytest.raises(ConfigError, match=f"{where}: '5 %' is a share, but does not say of what"):
+        en4dvar.estimate(lambda p, t: 50 * np.exp(-p["k"] * t), ([1, 2, 3], [40.0, 32, 26]), priors, error=error)
 
 
 def test_what_the_model_misses_is_added_in_squares(tmp_path):

@@ -65,7 +65,7 @@ def test_defaults_of_the_model_and_the_time_shift(tmp_path: Path) -> None:
         ("    position:", "    radius:", "toy.yaml:7:5: data.columns.radius: unknown column role 'radius'; known: "),
         ("position_std: 2 um", "position_std: 1e-6", "toy.yaml:8:25: data.error.position_std: 1e-06 has no unit"),
         ("position_std: 2 um", "position_std: -2 um", "toy.yaml:8:25: data.error.position_std: must be positive, not"),
-        ("position_std: 2 um", "position_std: 1 %", "toy.yaml:8:25: data.error.position_std: '1 %': unit '%' cannot"),
+        ("position_std: 2 um", "position_std: 1 %", "toy.yaml:8:25: data.error.position_std: '1 %' is a share, but"),
         ("position_std: 2 um", "time_std: 2 us", "toy.yaml:8:3: data.error.position_std: required"),
         ("2 um}", "2 um, time_std: -1 us}", "toy.yaml:8:41: data.error.time_std: must not be negative"),
         ("2 um}", "2 um}\n  window: {to: minimun 2}", "toy.yaml:9:16: data.window.to: 'minimun 2' is not an instant"),

@@ -12,7 +12,7 @@ from toys import Fragile, Vectorised, make_problem
 
 from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.diagnosis.honesty import ControlEnsembles, examine
-from en4dvar.diagnosis.honesty.checks import at_bound, loss, rank, validity, where_lost
+from en4dvar.diagnosis.honesty.checks import at_bound, loss, missed, rank, validity, where_lost
 from en4dvar.diagnosis.honesty.examine import collapse, doubts
 from en4dvar.estimation.summary import summarise
 from en4dvar.model.forward import ValidityLimit
@@ -223,3 +223,14 @@ def test_a_discrepancy_as_large_as_the_signal_leaves_nothing_to_quote(height, se
     assert told.severity == severity
     assert all(("discrepancy-found" in row.untrusted) == (severity == "serious") for row in summarise(analysis))
     assert ("check units" in told.advice) == (severity == "serious")
+
+
+def test_a_discrepancy_is_measured_by_the_errors_of_the_readings_not_by_what_it_makes_of_them():
+    analysis = run(waved(3.0))
+    np.testing.assert_allclose(analysis.own_std, 0.05, rtol=1e-12)
+    assert np.all(analysis.error_std > 0.1)
+    (told,) = missed(analysis)
+    assert "beside errors of 0.05 m: " in told.words
+    low = np.quantile(analysis.posterior[:, 2], 0.05)
+    for times, count in ((3.9, 1), (4.1, 0)):
+        assert len([*missed(replace(analysis, own_std=np.full(40, times * low)))]) == count

@@ -7,12 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from scipy.special import ndtr
 from toy_config import csv_text, write_toy
 from toys import Linear, make_observations
 
 import en4dvar
 from en4dvar.assembly.build import build
+from en4dvar.cli import main
 from en4dvar.data.noise import BoundNoise, Linearisation, Predicted, noise_of, sides_of
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.plumbing.errors import ConfigError, DataError
@@ -213,3 +215,83 @@ def test_yaml_takes_a_column_of_marks(tmp_path):
     path = write_toy(tmp_path, ("position_std: 2 um", "position_std: 2 um, at_least: {column: bound}"), data=wrong)
     with pytest.raises(DataError, match="mark of reading 1 in column 'bound' is 2, neither 0 nor 1"):
         build(en4dvar.load_config(path))
+
+
+LOW, HIGH, AT = np.array([0, 0.5, 1, 1, 1.5, 2]), np.array([1, 1.5, np.nan, 2, 2.5, 3]), np.linspace(1, 5, 6)
+LINE = {"a": {"prior": "normal", "mean": 0, "std": 2}, "b": {"prior": "normal", "mean": 0, "std": 1}}
+RANGES = """
+name: ranges
+seed: 1
+data:
+  path: ranges.csv
+  columns: {time: {name: t, unit: s}}
+  series:
+    lower: {observable: position, columns: {position: {name: low, unit: m}}, error: {position_std: 1 m, at_least: true}}
+    upper: {observable: position, columns: {position: {name: high, unit: m}}, error: {position_std: 1 m, at_most: true}}
+model: {name: "toy_models:Oscillator", mass: 2 g}
+parameters: {k: 5 N/m, c: 0.02 N s/m, A: {prior: normal, mean: 1 m, std: 1 m}}
+"""
+
+
+def line(p, t):
+    return p["a"] + p["b"] * t
+
+
+def test_a_range_is_two_series_of_one_observable(tmp_path):
+    """As docs/several_series.md writes it, against quadrature of a line through six of them, one open above."""
+    a, b = np.meshgrid(np.linspace(-5, 5, 1001), np.linspace(-2, 2, 1001), indexing="ij")
+    paths = a[..., None] + b[..., None] * AT
+    beyond = np.maximum(LOW - paths, 0) ** 2 + np.nan_to_num(np.maximum(paths - HIGH, 0)) ** 2
+    density = np.exp(-0.5 * (beyond.sum(axis=-1) / 0.2**2 + (a / 2) ** 2 + b**2))
+    density /= density.sum()
+    error = {"lower": {"y_std": 0.2, "at_least": True}, "upper": {"y_std": 0.2, "at_most": True}}
+    result = en4dvar.estimate(
+        line, {"lower": (AT, LOW), "upper": (AT, HIGH)}, LINE, error=error, progress=False, cheap=True,
+        series={name: {"observable": "y"} for name in error}, assimilation={"members": 400},
+    )  # fmt: skip
+    for name, value in (("a", a), ("b", b)):
+        mean = np.sum(density * value)
+        std = math.sqrt(np.sum(density * (value - mean) ** 2))
+        drawn = result.posterior[name].values
+        assert drawn.mean() == pytest.approx(mean, abs=0.1 * std)
+        assert drawn.std() == pytest.approx(std, rel=0.1)
+    rows = "\n".join(f"{t},{low},{high if high == high else ''}" for t, low, high in zip(AT, LOW, HIGH, strict=True))
+    (tmp_path / "ranges.csv").write_text(f"t,low,high\n{rows}\n")
+    (tmp_path / "ranges.yaml").write_text(RANGES)
+    (problem,) = build(en4dvar.load_config(tmp_path / "ranges.yaml"))
+    np.testing.assert_array_equal(sides_of(problem.observations.noise), [-1] * 6 + [1] * 5)
+    done = CliRunner().invoke(main, ["run", str(tmp_path / "ranges.yaml"), "--out", str(tmp_path / "run")])
+    assert done.exit_code == 0, done.output
+    assert "bounds tell no size of errors" in (tmp_path / "run" / "report.html").read_text()
+
+
+def test_bounds_of_one_time_in_one_series_are_told_to_be_two(tmp_path):
+    """And never to be told apart by a column that says something else."""
+    words = "bounds of one time are series of their own: one of those that say at_least, one of at_most$"
+    times, values, up = np.repeat(AT, 2), np.ravel([LOW, LOW + 1], order="F"), np.tile([0, 1], 6)
+    error = {"y_std": 0.2, "at_most": up, "at_least": 1 - up}
+    with pytest.raises(DataError, match=f"reading 2 of data: times must increase, but 1 follows 1; {words}"):
+        en4dvar.estimate(line, (times, values), LINE, error=error)
+    rows = "".join(f"{t},{y},{mark},{1 - mark}\n" for t, y, mark in zip(times, values, up, strict=True))
+    (tmp_path / "long.csv").write_text(f"time,y,up,low\n{rows}")
+    path, error = tmp_path / "long.yaml", "error: {position_std: 1 m, at_most: {column: up}, at_least: {column: low}}"
+    columns = "columns: {time: {name: time, unit: s}, position: {name: y, unit: m}}"
+    data = f"name: long\ndata:\n  path: long.csv\n  {columns}\n  {error}\n"
+    path.write_text(f"{data}model: {RANGES.partition('model: ')[2]}")
+    with pytest.raises(DataError, match=words):
+        build(en4dvar.load_config(path))
+    rows = rows.replace(",0,1", ",0.1,one").replace(",1,0", ",0.2,two")  # where a column does say it
+    (tmp_path / "long.csv").write_text(f"time,y,s,film\n{rows}")
+    path.write_text(path.read_text().replace(error, "error: {position_std: {column: s}}"))
+    with pytest.raises(DataError, match=r"column 'film' says which of several series a row belongs to"):
+        build(en4dvar.load_config(path))
+
+
+def test_bounds_have_no_mean(tmp_path):
+    path = write_toy(
+        tmp_path,
+        ("position_std: 2 um", "position_std: 2 um, at_most: true"),
+        ("  error:", "  repeated: average\n  error:"),
+    )
+    with pytest.raises(ConfigError, match=r"data.repeated: not together with at_most or at_least: bounds have no mean"):
+        en4dvar.load_config(path)

@@ -129,7 +129,7 @@ model: {name: trend}
 data:
   path: data.csv
   columns: {time: {name: t, unit: "1"}, x: {name: x, unit: "1"}}
-  error: {x_std: 10 %, shared: [{column: drift, unit: "%"}, 0.2]}
+  error: {x_std: 0.1, shared: [{column: drift, unit: "%"}, 0.2]}
 parameters: {level: 0, slope: {prior: normal, mean: 1, std: 1}}
 """
 
@@ -161,12 +161,12 @@ def test_from_yaml_and_from_python(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("x_std: 10 %", "x_std: 10 %, robust: huber", "robust: not together with shared"),
-        ("x_std: 10 %", "x_std: 10 %, correlation_time: 1 s", "shared: not together with correlation_time"),
-        ("x_std: 10 %", "x_std: 10 %, at_most: true", "at_most: not together with shared"),
+        ("x_std: 0.1", "x_std: 0.1, robust: huber", "robust: not together with shared"),
+        ("x_std: 0.1", "x_std: 0.1, correlation_time: 1 s", "shared: not together with correlation_time"),
+        ("x_std: 0.1", "x_std: 0.1, at_most: true", "at_most: not together with shared"),
         ("0.2]", "0.2 kg]", "data.error.shared"),
         ("0.2]", "{column: level}]", "level"),
-        ("x_std: 10 %", "x_std: 1e-6", "10⁴ times"),
+        ("x_std: 0.1", "x_std: 1e-6", "10⁴ times"),
     ],
 )
 def test_what_cannot_be_used_is_refused(tmp_path: Path, old: str, new: str, message: str) -> None:

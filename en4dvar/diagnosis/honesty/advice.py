@@ -46,7 +46,7 @@ class Case:
     @property
     def stated(self) -> float:
         """The error of a reading, the median of all, SI."""
-        return float(np.median(self.a.error_std))
+        return float(np.median(self.a.own_std))
 
     @property
     def absurd(self) -> bool:

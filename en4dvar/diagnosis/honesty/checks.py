@@ -115,7 +115,7 @@ def missed(analysis: Analysis) -> Findings:
     if amplitude is None or amplitude.name not in names:
         return
     low, high = np.nanquantile(analysis.posterior[:, names.index(amplitude.name)], NINE_OF_TEN)
-    error = float(np.median(analysis.error_std))
+    error = float(np.median(analysis.own_std))
     if low > THERE * error:
         least, most, noise = (shown(size, amplitude) for size in (low, high, error))
         words = (
@@ -251,9 +251,9 @@ def gaussian(prior: Prior, members: Array, shape: Mapping[str, float], approxima
     posterior by an emulator or by weights. The finding is about the parameters that are off, and serious where one is
     off by much. ``approximate``: what a scheme does that is no posterior even where this is Gaussian.
     """
-    if not diag.is_non_gaussian(shape):
+    if not shape.get("non_gaussian", diag.is_non_gaussian(shape)):
         return
-    sizes, off, severity = [], [], None
+    sizes, off, severity = [], [], SERIOUS if shape.get("tail_elsewhere") else None
     why = f"the scheme {approximate}" if approximate else "the posterior is far from Gaussian"
     words = f"{why}: mean and spread of the ensemble are not the posterior's"
     by = "emulated" if shape.get("emulator_fit", 0.0) >= diag.EMULATED_ENOUGH else "tail"
@@ -270,18 +270,21 @@ def gaussian(prior: Prior, members: Array, shape: Mapping[str, float], approxima
         if by == "tail" or abs(shift) > diag.MEAN_OFF or abs(ratio - 1) > diag.SPREAD_OFF:
             off.append(p.name)
             sizes.append(_both(p, members[:, j], shape, by))
-            if abs(shift) > 1 or not 0.5 < ratio < 2:
+            if abs(shift) > 1 or ratio <= 0.5 or ratio >= 2:  # where they are known
                 severity = SERIOUS
     more = f": {'; '.join(sizes)}" if sizes else ""
+    if by == "tail" and told and math.isnan(shape[f"tail_mean_{off[0]}"]):
+        more += f"; weighted, only {shape['tail_members']:.2g} members count: too few to say what these should be"
     yield caution("non-gaussian", f"{words}{more}", severity, tuple(off))
 
 
 def _both(p: Parameter, members: Array, shape: Mapping[str, float], by: str) -> str:
-    """Mean ± std of the members and of the posterior, ``by`` an emulator or weights, in the display unit."""
+    """Mean ± std of the members and of the posterior, ``by`` an emulator or weights (NaN: not known), as displayed."""
     si = (members.mean(), members.std(ddof=1), shape[f"{by}_mean_{p.name}"], shape[f"{by}_std_{p.name}"])
     mean, std, estimate, spread = (convert(float(v), p.unit, p.display_unit) for v in si)
     unit = "" if p.display_unit == "1" else f" {p.display_unit}"
-    return f"{p.name} = {mean:.2g} ± {std:.2g}{unit} where it should be about {estimate:.2g} ± {spread:.2g}{unit}"
+    rather = "" if math.isnan(estimate) else f" where it should be about {estimate:.2g} ± {spread:.2g}{unit}"
+    return f"{p.name} = {mean:.2g} ± {std:.2g}{unit}{rather}"
 
 
 def down_weighted(analysis: Analysis) -> Findings:
