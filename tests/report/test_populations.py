@@ -16,7 +16,7 @@ import en4dvar
 from en4dvar.cli import main
 from en4dvar.estimation.population import Effort
 from en4dvar.plumbing.errors import OutputError
-from en4dvar.report.populations import Difference, _sentence
+from en4dvar.report.populations import Difference, _sentence, medians_table
 from en4dvar.results.together import load_population
 from en4dvar.runs.runner import run_campaign
 from en4dvar.runs.together import population
@@ -76,6 +76,23 @@ def test_the_command_its_page_and_tables(gels, tmp_path):
     assert float(row["ratio_q05"]) < float(row["ratio_q50"]) < float(row["ratio_q95"]) < 1
     (of_line,) = csv.DictReader((out / "lines.csv").read_text().splitlines())
     assert float(of_line["slope_q50"]) == pytest.approx(-np.log(float(row["ratio_q50"])) / 5, rel=0.02)
+
+
+def test_the_numbers_to_quote_are_those_of_each_population_by_itself_unless_known_ones_calibrate_them(gels, tmp_path):
+    """The median that the population's own page gives, not the one that its neighbours move."""
+    own = {f.name: load_population(f / "population.nc").group("posterior")["k_median"].values for f in only(gels)}
+    expected = np.stack([np.quantile(x, (0.05, 0.5, 0.95)) for x in own.values()], axis=1)
+    found = en4dvar.compare_populations(only(gels))
+    np.testing.assert_allclose(found.quoted["k"], expected, rtol=0.01)
+    assert "each population's own median: the numbers to quote" in found.caption
+    assert "Of one by itself quote its own median" in str(found)
+    told = dict(line.split("  k ") for line in medians_table(found).splitlines()[1:])
+    for name, middle in zip(own, expected[1], strict=True):
+        assert float(told[f"{name:10}"].split()[-2]) == pytest.approx(middle, abs=0.02)
+    known = en4dvar.compare_populations(only(gels), known={"stiff_only": {"k": "2 ± 0.001 N/m"}})
+    np.testing.assert_allclose(known.quoted["k"][:, 1], np.quantile(known.medians["k"][:, 1], (0.05, 0.5, 0.95)), 0.01)
+    assert "calibrated by what is known" in known.caption
+    assert "quote its own median" not in str(known)
 
 
 def test_a_known_median_is_taken_as_it_is_and_compared_with_the_data(gels):
