@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.diagnosis.diagnostics import HARDLY_INFORMED, active_members, change_words, member_quantiles
 from en4dvar.diagnosis.response.budget import budget_words
-from en4dvar.diagnosis.response.what_if import Shift
+from en4dvar.diagnosis.response.what_if import Shift, is_manifold
 from en4dvar.model.state import Array, Mask, Parameter
 from en4dvar.plumbing.caution import Caution, codes, of_several_modes, untrusted
 from en4dvar.plumbing.tables import table
@@ -145,6 +145,7 @@ def _moved(parameters: Iterable[Parameter], shift: Shift) -> str:
             value = f"{convert(float(change), p.unit, p.display_unit):+.2g} {p.display_unit}"
             value = value.removesuffix(" 1")
             shown = value if np.isnan(relative) else f"{100 * relative:+.2g} %"
+            shown = f"{1 + relative:.2g} times as large" if is_manifold(relative) else shown
             words.append(f"{p.name} {shown} ({abs(in_std):.1f} std)")
     return ", ".join(words)
 

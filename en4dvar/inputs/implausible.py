@@ -35,6 +35,8 @@ OUTLYING = 8.0  # standard deviations from what its neighbours say
 RARE = 0.2  # of all readings: a number that stands for none
 IN_A_ROW = 3  # readings that are judged together
 FALLS = 3.0  # standard deviations by which the nearest neighbours lie below the farthest at the bottom of a collapse
+BESIDE = 4  # readings to either side of a plateau, or half as many as it has
+CUT = 5.0  # standard deviations by which they lead higher: of 5500 tops that are rounded none comes above 3.5
 ASIDE = np.array([0, 1, 2, -3, -2, -1])  # the neighbours, of a window
 
 
@@ -101,6 +103,28 @@ def placeholders(values: Array) -> npt.NDArray[np.bool_]:
     others = values[~same].max(initial=0.0)
     is_one = bool(1 < same.sum() <= RARE * len(values) and values.max() > 2 * others > 0)
     return same if is_one else np.zeros_like(same)
+
+
+def cut_off(times: Array, values: Array, scatter: float) -> npt.NDArray[np.bool_]:
+    """Which readings (K,) are a plateau at the largest number above which nothing could be read, as of a bubble that
+    leaves the picture: the parabola through those beside it lies higher than ``scatter``, and rounding in it, explain.
+    """
+    same, odd = values == values.max(), np.zeros(len(values), dtype=bool)
+    first, last = np.flatnonzero(same)[[0, -1]]
+    count = last + 1 - first
+    beside = max(BESIDE, count // 2)
+    near = np.r_[max(first - beside, 0) : first, last + 1 : min(last + 1 + beside, len(values))]
+    near = near[values[near] > STEEP * values[first]]
+    before = int(np.sum(near < first))
+    if same.sum() < max(IN_A_ROW, 0.75 * count) or min(before, len(near) - before) < 2 or len(near) <= BESIDE:
+        return odd
+    powers = ((times - times[first]) / (times[last] - times[first]))[:, None] ** np.arange(3)
+    inverse = np.linalg.pinv(powers[near])
+    weights = powers[first : last + 1].mean(axis=0) @ inverse
+    rough = math.sqrt(np.sum((values[near] - powers[near] @ inverse @ values[near]) ** 2) / (len(near) - 3))
+    higher = weights @ values[near] - values[first]
+    odd[first : last + 1] = higher > CUT * np.linalg.norm(weights) * max(scatter, rough)
+    return odd
 
 
 def _fitted(t: Array, near: npt.NDArray[np.intp], degree: int, values: Array) -> tuple[Array, Array]:

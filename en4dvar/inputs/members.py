@@ -120,7 +120,10 @@ def _of_table(path: Path, names: Mapping[str, Any]) -> dict[str, tuple[Array, st
 
 
 def netcdf_members(path: Path, names: Sequence[str]) -> Iterator[dict[str, tuple[Array, str]]]:
-    """The numbers of each name, with their unit. Raises :class:`DataError`."""
+    """The numbers of each name, with their unit; of a population those of its next data set, ``G_next``.
+
+    Raises :class:`DataError`.
+    """
     import netCDF4  # a tenth of a second that other files do not need
 
     require_whole(path)
@@ -134,7 +137,7 @@ def netcdf_members(path: Path, names: Sequence[str]) -> Iterator[dict[str, tuple
         for name in names:
             if name not in group.variables:
                 raise DataError(f"{path}: no variable {name!r}{suggest(name, group.variables)}")
-            variable = group.variables[name]
+            variable = group.variables.get(f"{name}_next", group.variables[name])
             values = _numbers(path, variable)
             values = values[alive] if alive is not None and len(alive) == len(values) else values
             members[name] = values, str(getattr(variable, "units", ""))
@@ -142,8 +145,13 @@ def netcdf_members(path: Path, names: Sequence[str]) -> Iterator[dict[str, tuple
 
 
 def _numbers(path: Path, variable: Any) -> Array:
-    """All numbers of a variable along its members, NaN where they are missing."""
+    """All numbers of a variable along its members, NaN where they are missing; those that data sets share once."""
     others = [d for d, size in zip(variable.dimensions, variable.shape, strict=True) if d not in DRAWS and size != 1]
+    if others == ["dataset"] and variable.size <= MOST_MEMBERS:
+        each = np.ma.filled(np.ma.asarray(variable[:]).astype(float), np.nan)
+        each = np.moveaxis(each, variable.dimensions.index("dataset"), 0)
+        if np.array_equal(each, np.broadcast_to(each[0], each.shape)):
+            return np.asarray(each[0].ravel())
     if others or not variable.ndim:
         where = f"lies along {', '.join(variable.dimensions) or 'nothing'}"
         raise DataError(f"{path}: {variable.name} {where}; members must lie along one of {', '.join(DRAWS)}")

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.inputs.implausible import InFile, outlying, placeholders, scatter_of
+from en4dvar.inputs.implausible import InFile, cut_off, outlying, placeholders, scatter_of
 from en4dvar.inputs.parts import ANY, Column, Layout, TimeStep, columns_of
 from en4dvar.inputs.window import index_of
 from en4dvar.model.state import Array
@@ -23,6 +23,7 @@ from en4dvar.plumbing.units import convert
 
 Rows = npt.NDArray[np.intp]
 AGAIN = "one number again and again, far above all others, as a missing reading may be written"
+CLIPPED = "one largest number though those beside them lead higher, as where a bubble leaves the picture"
 FAR, BELOW = "far from what their neighbours say", "0 or below, as a missing reading may be written"
 
 
@@ -123,12 +124,16 @@ def read_series(
     return _rest(Readings(times, values, str(path), scalars, stated, left_out, rows, count, usable), layout, fewest)
 
 
+ODD = {AGAIN: lambda _, values, __: placeholders(values), CLIPPED: cut_off, FAR: outlying}
+"""Why readings are left out, in this order, and what tells which of times, values and the std of errors."""
+
+
 def _rest(read: Readings, layout: Layout, fewest: int) -> Readings:
     """Without outliers and what is before an instant, where the layout says so. Raises :class:`DataError`."""
     if layout.outliers == "leave out":
-        for reason in (AGAIN, FAR):
+        for reason, which in ODD.items():
             t, y = read.times, read.values
-            odd = placeholders(y) if reason == AGAIN else outlying(t, y, scatter_of(t, y))
+            odd = which(t, y, scatter_of(t, y))
             told = {reason: tuple(t[odd])} if odd.any() else {}
             read = replace(_kept(read, ~odd), left_out={**read.left_out, **told})
     if layout.since != ANY.since:

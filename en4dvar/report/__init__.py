@@ -131,9 +131,9 @@ def _headlines(run_dir: Path) -> list[Headline]:
         headlines.append(("summary.csv", "All data sets", [groups], "", ""))
     elif groups is not None:
         populations.write_tables(groups, run_dir)
-        drawn, caption = svg(populations.figure(groups), "populations", populations.CAPTION), populations.CAPTION
+        drawn = svg(populations.figure(groups), "populations", groups.caption)
         told = [*populations.group_sentences(groups)]
-        headlines.append(("differences.csv", "The differences", told, drawn, caption))
+        headlines.append(("differences.csv", "The differences", told, drawn, groups.caption))
     for name, (folder, of) in populations_of(run_dir).items():
         words = f"The population of {name}" if name else "The population behind them"
         told = [f"{name}: {line}" if name else upper_first(line) for line in together.sentences(of)]

@@ -10,6 +10,7 @@ do not compare: there the posteriors are shown, and no probabilities.
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -35,6 +36,7 @@ from en4dvar.report.svg import draw
 from en4dvar.report.text import figure_text, fixed, with_unit
 from en4dvar.results.run_results import result_files
 from en4dvar.results.store import StoredResult, load_stored
+from en4dvar.results.together import load_groups_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -299,7 +301,7 @@ def _panel(estimates: Sequence[ComparedEstimate], runs: Sequence[str]) -> Panel:
 def named(runs: Sequence[str | Path] | Mapping[str, T]) -> Mapping[str, T | Path]:
     """Name → run: names of the folders, or their paths where names repeat; at least two runs."""
     if isinstance(runs, str | Path | StoredResult) or len(runs) < 2:
-        raise OutputError("compare needs at least two run directories")
+        raise OutputError(f"compare needs at least two run directories{_its_groups(runs)}")
     if isinstance(runs, Mapping):
         return runs
     if any(isinstance(run, StoredResult) for run in runs):
@@ -310,6 +312,19 @@ def named(runs: Sequence[str | Path] | Mapping[str, T]) -> Mapping[str, T | Path
     if len(set(labels)) < len(labels):
         raise OutputError("compare: a run directory is given twice")
     return dict(zip(labels, paths, strict=True))
+
+
+def _its_groups(runs: Any) -> str:
+    """Where the comparison of the groups of one run is, and what it may be told; "" where it has none."""
+    paths = [it for it in (runs if isinstance(runs, list | tuple) else [runs]) if isinstance(it, str | Path)]
+    groups = [str(folder) for path in paths for folder, _ in load_groups_of(Path(path)).values()]
+    if len(groups) < 2:
+        return ""
+    return (
+        f"; {paths[0]} compares its {len(groups)} groups itself, on its page: a median that is known stands in its "
+        "configuration (population.known), a line needs numbers with a unit in the names of the groups, or compare "
+        f"the folders {' '.join(shlex.quote(folder) for folder in groups)}"
+    )
 
 
 def _results(run: str | Path | StoredResult) -> dict[str, StoredResult]:

@@ -41,7 +41,7 @@ SURE = 0.999  # no number of draws says more
 FAR = 2.5  # standard deviations between what is known and what the data say
 _NUMBER = re.compile(r"(?<![^\W_])(?<!\.)(\d+(?:\.\d+)?)[ _]?(%|[^\W\d_]+)(?![^\W_])")  # with a unit, in a name
 OFF_THE_LINE = 0.05  # probability below which populations differ by more than a line says
-CAPTION = "Median and 5–95 % of each population's median, given the data of all; what is common moves them together."
+CAPTION = "Median and 5–95 % of each population's {}: the numbers to quote. Their ratios are those in words."
 
 
 @dataclass(frozen=True)
@@ -72,17 +72,27 @@ class PopulationsCompared:
     """``medians``: parameter → draws (M, K) in its display unit, of all populations together; ``lines``: the
     straight line of them, of their logarithm where it is in ``logarithmic``, against a number of each population.
 
+    ``quoted``: parameter → 5, 50 and 95 % (3, K) of the median of each population by itself, or, where ``calibrated``
+    by what is known of some of them, of ``medians``.
+
     ``common``: quantities with one value in several populations; ``notes``: what else has to be known.
     """
 
     populations: tuple[str, ...]
     parameters: Mapping[str, Parameter]
     medians: Mapping[str, Array]
+    quoted: Mapping[str, Array]
     differences: tuple[Difference, ...]
     common: tuple[str, ...]
     notes: tuple[str, ...] = ()
     lines: Mapping[str, StraightLine] = field(default_factory=dict)
     logarithmic: frozenset[str] = frozenset()
+    calibrated: bool = False
+
+    @property
+    def caption(self) -> str:
+        """Of the figure."""
+        return CAPTION.format("median, calibrated by what is known of some" if self.calibrated else "own median")
 
     def plot(self) -> Figure:
         """The median of each population with its interval, a panel a parameter."""
@@ -131,7 +141,7 @@ def compare_populations(
             raise OutputError(f"compare: {name}: not common to the data sets of any population{hint}")
     terms = {name: [s.prior_of(name) for s in stored.values()] for name in names}
     logarithmic = frozenset(name for name in names if all(t.transform == "lognormal" for t in terms[name]))
-    medians: dict[str, Array] = {}
+    medians, quoted, calibrated = dict[str, Array](), dict[str, Array](), any(values.values())
     lines: dict[str, StraightLine] = {}
     differences, notes = [], []
     if own := [name for name in every_common if name not in (*common, *apart)]:
@@ -140,6 +150,8 @@ def compare_populations(
         centres = {label: _centre(name, s, keys[label], seed, values[label]) for label, s in stored.items()}
         alone = [replace(c, common=tuple((label, key) for key in c.common)) for label, c in centres.items()]
         medians[name] = _physical(drawn_together([*centres.values()], seed), terms[name])
+        each = medians[name].T if calibrated else [_own(s, name) for s in stored.values()]
+        quoted[name] = np.transpose([_three(draws) for draws in each])
         independent = _physical(drawn_together(alone, seed), terms[name])
         for (i, a), (j, b) in combinations(enumerate(stored), 2):
             doubts = dict.fromkeys((*untrusted(stored[a].cautions, name), *untrusted(stored[b].cautions, name)))
@@ -158,8 +170,16 @@ def compare_populations(
             lines[name] = line(of_it, np.asarray(numbers, dtype=float))
     parameters = {name: terms[name][0].parameter for name in names}
     return PopulationsCompared(
-        tuple(stored), parameters, medians, tuple(differences), common, tuple(notes), lines, logarithmic
-    )
+        tuple(stored), parameters, medians, quoted, tuple(differences), common, tuple(notes), lines, logarithmic,
+        calibrated,
+    )  # fmt: skip
+
+
+def _own(s: StoredPopulation, name: str) -> Array:
+    """Draws (M,) of the median of a population by itself, in the display unit."""
+    parameter = s.prior_of(name).parameter
+    draws = s.group("posterior")[f"{name}_{s.headline}"].values.ravel()
+    return convert(draws, parameter.unit, parameter.display_unit)
 
 
 def _physical(white: Array, terms: Sequence[PriorTerm]) -> Array:
@@ -231,8 +251,7 @@ def _calibrated(
         unit = unit_behind(parameter.display_unit)
         if name in values[label]:
             value, std = (convert(number, parameter.unit, parameter.display_unit) for number in values[label][name])
-            draws = s.group("posterior")[f"{name}_{s.headline}"].values
-            x = convert(draws.ravel(), parameter.unit, parameter.display_unit)
+            x = _own(s, name)
             off = (value - float(np.median(x))) / float(np.hypot(x.std(), std))
             words = f"{name} of {label} is known, {number_like(value, std)} ± {number_like(std, std)}{unit}"
             yield words + (f"; its own data say otherwise, {abs(off):.1f} std away" if abs(off) > FAR else "")
@@ -278,6 +297,11 @@ def sentences(c: PopulationsCompared) -> Iterator[str]:
         yield _line_sentence(c, name, of_it)
     if c.common:
         yield f"Of one value in all of them, so that it cancels as far as it moves them alike: {', '.join(c.common)}."
+    if not c.calibrated:
+        yield (
+            "Of one by itself quote its own median; ratios and differences are of all data together, without the pull "
+            "of the hyperpriors on the medians unless it is said, and need not be those of the own medians."
+        )
     yield from (f"{note}." for note in c.notes)
 
 
@@ -322,11 +346,10 @@ def _range(three: tuple[float, float, float], plain: bool = False) -> str:
 
 
 def medians_table(c: PopulationsCompared) -> str:
-    """What the terminal shows: the median of each parameter in each population."""
+    """What the terminal shows: the median to quote of each parameter in each population."""
     rows: list[tuple[str, ...]] = [("population", "parameter", "unit", "5 %", "50 %", "95 %")]
-    for name, draws in c.medians.items():
-        for label, column in zip(c.populations, draws.T, strict=True):
-            three = _three(column)
+    for name, quantiles in c.quoted.items():
+        for label, three in zip(c.populations, quantiles.T, strict=True):
             cells = (number_like(value, _std(three)).replace("−", "-") for value in three)
             rows.append((label, name, c.parameters[name].display_unit, *cells))
     return table(rows)
@@ -335,9 +358,8 @@ def medians_table(c: PopulationsCompared) -> str:
 def figure(c: PopulationsCompared) -> Chart:
     """The median of each population, one panel a parameter."""
     panels = []
-    for name, draws in c.medians.items():
+    for name, (low, middle, high) in c.quoted.items():
         p, places = c.parameters[name], -np.arange(float(len(c.populations)))
-        low, middle, high = member_quantiles(draws, QUANTILES, axis=0)
         panel = Panel(with_unit(p.symbol, p.display_unit), ylim=(-float(len(places)), 1.0))
         panel.yticks, panel.y_names = [*places], [figure_text(label) for label in c.populations]
         panel.intervals(low, high, places, "posterior")
@@ -350,10 +372,10 @@ def figure(c: PopulationsCompared) -> Chart:
 def write_populations(c: PopulationsCompared, out: str | Path) -> Path:
     """Write ``compare.html``, ``populations.png``, ``.pdf``, tables; returns the page. Raises :class:`OutputError`."""
     out = make_folder(out)
-    ((_, _, drawn),) = draw([("populations", CAPTION, figure(c))], folder=out)
+    ((_, _, drawn),) = draw([("populations", c.caption, figure(c))], folder=out)
     write_tables(c, out)
     about = {"title": " – ".join(c.populations), "populations": tuple(sentences(c))}
-    return write_page(out / "compare.html", "compare.html.j2", figure=drawn, caption=CAPTION, **about)
+    return write_page(out / "compare.html", "compare.html.j2", figure=drawn, caption=c.caption, **about)
 
 
 def write_tables(c: PopulationsCompared, folder: Path) -> None:

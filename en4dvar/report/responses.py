@@ -11,6 +11,7 @@ import numpy.typing as npt
 from markupsafe import Markup
 
 from en4dvar.diagnosis.influence import UNKNOWN
+from en4dvar.diagnosis.response.what_if import is_manifold
 from en4dvar.model.state import Array
 from en4dvar.report.chart import POINTS, Chart, Panel, Row
 from en4dvar.report.text import axis_label, fixed, number_like, plain_number, pretty_unit, shown, signed, symbol_html
@@ -100,7 +101,11 @@ def stored_shifts(result: StoredResult) -> tuple[tuple[StoredShift, ...], ...]:
 
 
 def shift_text(shift: StoredShift) -> str:
-    """``"+15 %"``, or in the parameter's unit where its value may be negative; an en dash where it is not known."""
+    """``"+15 %"``, ``"× 3.8"`` from a factor of two on, or in the parameter's unit where its value may be negative; an
+    en dash where it is not known.
+    """
+    if is_manifold(shift.relative):
+        return f"× {plain_number(1 + shift.relative, 2)}"
     value, unit = shift.change, pretty_unit(shift.unit)
     if math.isfinite(shift.relative):
         value, unit = 100 * shift.relative, "%"
@@ -117,15 +122,18 @@ def sentence(shifts: Sequence[StoredShift]) -> str:
         return f"if {first.words}, {words} ({first.reason})"
     moved = sorted((s for s in shifts if s.exceeds), key=lambda s: -abs(s.in_std))
     parts = [
-        Markup("{} would be {} {} ({} times its error bar)").format(
-            symbol_html(s.symbol),
-            shift_text(s).lstrip("+−"),
-            "higher" if s.change > 0 else "lower",
-            fixed(abs(s.in_std), 1),
+        Markup("{} would be {} ({} times its error bar)").format(
+            symbol_html(s.symbol), _amount(s), fixed(abs(s.in_std), 1)
         )
         for s in moved
     ]
     return Markup("if {}, {}").format(first.words, Markup(", ").join(parts))
+
+
+def _amount(shift: StoredShift) -> str:
+    if is_manifold(shift.relative):
+        return f"{shift_text(shift).removeprefix('× ')} times as large"
+    return f"{shift_text(shift).lstrip('+−')} {'higher' if shift.change > 0 else 'lower'}"
 
 
 def exceeding(rows: Iterable[Sequence[StoredShift]]) -> list[Sequence[StoredShift]]:

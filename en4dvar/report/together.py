@@ -234,7 +234,10 @@ def sentences(stored: StoredPopulation) -> tuple[str, ...]:
     effective = float(stored.tree.attrs["effective_draws_without_hyperprior"])
     if effective < FEWEST:
         words = f"the data leave {stored.headline} or spread open, or lie in its tail"
-        return (*lines, f"What would hold without the hyperprior cannot be told from it: {words}.")
+        return (
+            *lines,
+            f"What would hold without the hyperprior of {stored.headline} and spread cannot be told: {words}.",
+        )
     free = (f"{m.name} {_range(m)}, spread {_range(s)}" for m, s in zip(free_centres, free_spreads, strict=True))
     words = f"{stored.headline} and spread equally likely everywhere"
     return (*lines, f"Without the hyperprior ({words}): {'; '.join(free)}.")

@@ -1,5 +1,6 @@
 """The kind of run that plans experiments: every design of a file evaluated, kept as it ends, and reported."""
 
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -29,6 +30,8 @@ from en4dvar.plumbing.units import UnitError
 from en4dvar.problem import InverseProblem
 from en4dvar.results.checkpoint import FOLDER, digest
 from en4dvar.results.design_file import FILE, Asked, DesignRow, Designs, load_designs, save_designs
+from en4dvar.results.run_results import has_results, result_files
+from en4dvar.results.together import POPULATION, load_groups_of
 from en4dvar.runs.engine import KeptUnits, RunKind, Session, Tell, conduct_run
 
 STATE = f"{FOLDER}/designs"
@@ -78,7 +81,8 @@ def run_design(
 ) -> tuple[Designs, Path]:
     """Evaluate the designs of a configuration. Returns what was found and the directory it lies in.
 
-    ``after``: a finished run (or a file of members), whose posterior is the prior of what is asked: what is next?
+    ``after``: a finished run (or a file of members), whose posterior is the prior of what is asked: what is next? Of a
+    population what it says of its next data set.
     ``on_design`` is called with how many designs are done, and of how many.
 
     Raises :class:`ConfigError`, :class:`DataError`: the file cannot be used, or none of its designs.
@@ -194,8 +198,26 @@ def _known(document: Document, base: Path, after: Path) -> dict[str, Any]:
     config = resolve(document, base)
     estimated = [entry.parameter.name for entry in config.parameters if isinstance(entry, Uncertain)]
     names = (*(config.design.about or estimated), *config.design.common)
-    file = after / "posterior.nc" if after.is_dir() else after
-    return {"prior.ensemble": str(file.absolute()), **{f"parameters.{name}": {"prior": "ensemble"} for name in names}}
+    return {
+        "prior.ensemble": str(_members_of(after).absolute()),
+        **{f"parameters.{name}": {"prior": "ensemble"} for name in names},
+    }
+
+
+def _members_of(after: Path) -> Path:
+    """The file of a finished run or population that tells of the next experiment. Raises :class:`ConfigError`."""
+    if not after.is_dir():
+        return after
+    if (after / POPULATION).exists():
+        return after / POPULATION
+    if groups := [shlex.quote(str(folder)) for folder, _ in load_groups_of(after).values()]:
+        raise ConfigError(f"--after {after}: several populations; give the folder of one of them: {' '.join(groups)}")
+    if has_results(after) and (count := len(result_files(after))) > 1:
+        raise ConfigError(
+            f"--after {after}: a campaign of {count} data sets without a population; give the run of one data set, or "
+            "the folder that 'en4dvar population' makes of this one"
+        )
+    return after / "posterior.nc"
 
 
 def _wanted(config: Config, problem: InverseProblem) -> dict[str, tuple[float, bool]]:

@@ -242,7 +242,7 @@ def _alternatives(model: Dynamics) -> Iterator[Alternative]:
             yield changed(key, words, medium=replace(medium, **{of: factor * getattr(medium, of)}))
     if model.wall is None:
         wall, far = NEARBY if model.start == "laser" else NEARBY_DRIVEN
-        yield changed("wall", f"a rigid wall were {far} away", wall=wall)
+        yield changed("wall", f"a rigid wall were {far} away (model.wall.distance)", wall=wall)
     if model.gas != "heat":
         yield changed("gas_model", "the gas conducted heat to the wall (gas: heat)", gas="heat")
     else:

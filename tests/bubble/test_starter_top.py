@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from en4dvar.inputs.implausible import outlying, scatter_of
+from en4dvar.inputs.implausible import cut_off, outlying, scatter_of
 from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.settings import BubbleSettings
 from en4dvar_bubble.starter.look import Top, look, top
+from en4dvar_bubble.starter.proposal import TOP_WIDTH
 
 _PATH = solve_ivp(
     lambda _, y: [y[1], (-1 - 1.5 * y[1] ** 2) / y[0]], (0, 0.9), [1.0, 0.0], dense_output=True, rtol=1e-10
@@ -70,6 +71,35 @@ def test_readings_that_are_none_are_told_and_not_taken_for_the_top(count: int) -
     odd = outlying(t, r, scatter_of(t, r))
     assert np.flatnonzero(odd).tolist() == list(range(where, where + count))
     assert look(t[~odd], 1e-4 * r[~odd]).top.height == pytest.approx(1e-4, rel=0.02)
+
+
+@pytest.mark.parametrize("per_collapse", [15, 30])
+@pytest.mark.parametrize("ceiling", [0.9, 0.94])
+def test_a_top_that_is_cut_off_is_told_and_its_height_is_that_of_the_sides(per_collapse: float, ceiling: float) -> None:
+    stream = np.random.default_rng(10)
+    for _ in range(10):
+        t, r = history(stream, per_collapse, 0.005, 0.8)
+        clipped = np.minimum(np.round(r / 0.006) * 0.006, ceiling)
+        odd = cut_off(t, clipped, scatter_of(t, clipped))
+        assert set(np.flatnonzero(clipped == ceiling)) <= set(np.flatnonzero(odd))
+        assert np.all(r[odd] > ceiling - 0.03)
+        seen = look(t[~odd], 1e-4 * clipped[~odd]).top
+        assert abs(seen.height - 1e-4) < 1.645 * TOP_WIDTH * seen.height_std  # 5 to 95 % of the prior
+        assert seen.height > 1.02e-4 * ceiling
+
+
+def test_a_top_that_is_rounded_is_not_cut_off() -> None:
+    """Several equal largest readings are what pixels make of a top."""
+    stream, plateaus = np.random.default_rng(11), 0
+    for per_collapse in (8, 20, 80):
+        for noise_std in (0.0, 0.002, 0.01):
+            for pixel in (0.005, 0.02, 0.05):
+                for _ in range(10):
+                    t, r = history(stream, per_collapse, noise_std, 0.8)
+                    rounded = np.round(r / pixel) * pixel
+                    plateaus += np.sum(rounded == rounded.max()) > 3
+                    assert not cut_off(t, rounded, scatter_of(t, rounded)).any()
+    assert plateaus > 100
 
 
 def test_a_bubble_that_is_large_when_first_seen_is_no_nucleus() -> None:

@@ -12,9 +12,12 @@ from scipy.integrate import solve_ivp
 from scipy.special import logit
 
 from en4dvar_bubble import WATER_25C, Accuracy, BubbleModel, get_law, simulate
-from en4dvar_bubble.collapse import RAYLEIGH
+from en4dvar_bubble.collapse import RAYLEIGH, lobe
 from en4dvar_bubble.driving import tabulated
 from en4dvar_bubble.dynamics import Wall
+from en4dvar_bubble.medium import Medium
+from en4dvar_bubble.starter.elsewhere import BY_VISCOSITY
+from en4dvar_bubble.starter.guess import OF_GELS
 from en4dvar_bubble.starter.proposal import propose
 
 APECSS = Path(__file__).resolve().parents[3] / "shared" / "reference" / "apecss"
@@ -190,3 +193,47 @@ def test_a_slow_collapse_in_a_liquid_proposes_a_wall_that_may_be_near_or_far(wal
     assert "wall" not in {entry.key for entry in propose({"bubble": (3 * times, viscous)}, "laser", "newtonian").model}
     in_gel = propose({"bubble": (times, R)}, "laser", "neo-hookean-kelvin-voigt")
     assert "wall" not in {entry.key for entry in in_gel.model}
+
+
+GEL = {"G": 8e3, "mu": 0.1, "R_eq": 40e-6, "R_max": 250e-6}
+
+
+def history_in_gel(wall=None, **values):
+    """Times (K,) and radius (K,) of a bubble in a gel, whose gas and vapour are those that ``init`` proposes."""
+    times, options = np.arange(0, 60e-6, 0.25e-6), {"gas": "heat", "vapour": "transport", "medium_heat": "conducting"}
+    data = simulate("neo-hookean-kelvin-voigt", GEL | values, times, start="laser", wall=wall, **options)
+    return times, data.R[0].values
+
+
+@pytest.mark.parametrize(
+    ("wall", "values", "told"),
+    [
+        (Wall(750e-6), {}, True),  # whose G comes out as 2 kPa
+        (None, {}, False),
+        (None, {"G": 1e3, "mu": 0.2}, True),  # which nobody can tell from a plane
+        (None, {"mu": 0.08, "R_max": 120e-6, "R_eq": 18e-6}, False),  # viscosity makes small ones slow
+    ],
+)
+def test_a_slow_collapse_in_a_gel_tells_what_a_plane_would_do_to_its_modulus(wall, values, told):
+    bubble = history_in_gel(wall, **values)
+    warnings = [w for w in propose({"bubble": bubble}, "laser").warnings if "rigid plane nearby" in w]
+    assert len(warnings) == told
+    if wall is not None:
+        assert "makes G too small by about 7 kPa at 3 R_max and 2 kPa at 10 R_max" in warnings[0]
+        assert warnings[0].endswith("--set model.wall.distance='750 um'")
+        of_several = propose({"a": history_in_gel(), "b": bubble, "c": history_in_gel()}, "laser").warnings
+        assert [w for w in of_several if w.startswith("b: the collapse takes 1.0")]
+
+
+@pytest.mark.parametrize("radius", [150e-6, 250e-6, 400e-6])
+@pytest.mark.parametrize("rest", [0.1, 0.2])
+def test_what_a_usual_gel_takes_is_what_forward_runs_say(radius, rest):
+    """A hundredth is worth a kPa, and the amount of gas is known to no better."""
+    medium, (G, mu) = Medium(), (OF_GELS[name][0] for name in ("G", "mu"))
+    usual = 1 + BY_VISCOSITY * mu / (radius * np.sqrt(medium.rho * medium.p_inf))
+    slowness = {
+        modulus: lobe(*history_in_gel(G=modulus, mu=mu, R_eq=rest * radius, R_max=radius)).rayleigh_ratio(medium)
+        for modulus in (G, 2 * G)
+    }
+    assert slowness[G] == pytest.approx(usual, abs=0.02)
+    assert slowness[G] - slowness[2 * G] == pytest.approx(G / 1e5, rel=0.25)

@@ -337,3 +337,20 @@ def test_a_pixel_that_the_file_holds_is_told(tmp_path: Path) -> None:
     savemat("b.mat", {"R": np.arange(9.0), "deltat": 3.7e-6, "deltax": 2.76e-6})
     done = call("init", "--data", "b.mat", "--time-unit", "s")
     assert "add --pixel LENGTH (the size of one, e.g. '2.76e-06 m' if deltax is in m; or" in done.stderr
+
+
+def test_a_top_that_leaves_the_picture_is_left_out_by_init_and_doubted_without(tmp_path: Path) -> None:
+    t, r = rebounding(0.04)
+    r = np.minimum(np.round(r + 0.004 * np.random.default_rng(3).standard_normal(len(t)), 2), 0.935)
+    rows = [f"{24 * time:.4g},{250 * radius:.5g}" for time, radius in zip(t, r, strict=True)]
+    (tmp_path / "b.csv").write_text("\n".join(["t_us,R_um", *rows, ""]))
+    done = call("init", "--data", "b.csv", *UNITS)
+    assert "us are one largest number though those beside them lead higher" in done.stderr, done.output
+    text = Path("b.yaml").read_text()
+    assert text.count("  outliers: leave out\n") == 1
+    top = re.search(r"R_max: {prior: normal, mean: ([\d.]+) um, std: ([\d.]+) %", text)
+    assert top
+    assert float(top[1]) == pytest.approx(250, rel=1.645 * float(top[2]) / 100)
+    assert "data.outliers: leave out" not in call("validate", "b.yaml").stderr
+    Path("b.yaml").write_text(text.replace("  outliers: leave out\n", ""))
+    assert "lead higher, as where a bubble leaves the picture: leave them out" in call("validate", "b.yaml").stderr

@@ -16,7 +16,7 @@ from run_files import add_to_pack
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.model.forward import Alternative
 from en4dvar.report import write_pages
-from en4dvar.report.responses import StoredShift, shift_text, stored_ledger, stored_shifts
+from en4dvar.report.responses import StoredShift, sentence, shift_text, stored_ledger, stored_shifts
 from en4dvar.report.result import Result, load_result
 from en4dvar.results.campaign_file import save_campaign
 from en4dvar.results.pack import PACK, Pack
@@ -132,6 +132,8 @@ def test_every_variable_is_documented(run_dir):
     [
         (0.012, 0.1269, 2.41, "+12.7 %"),
         (-0.055, np.nan, -1.37, "−0.055 µs"),
+        (5.9, 2.8, 1.3, "× 3.8"),  # however wide its interval
+        (-0.8, -0.62, -0.9, "× 0.38"),
         (0.0, 0.0, 0.0, "0.000 %"),
         (np.nan, np.nan, np.nan, "–"),
     ],
@@ -139,3 +141,9 @@ def test_every_variable_is_documented(run_dir):
 def test_a_shift_is_as_fine_as_its_error_bar(change, relative, in_std, words):
     shift = StoredShift("a", "…", "t", "us", change, relative, in_std, 0.0, "", "$t$")
     assert shift_text(shift) == words
+
+
+def test_a_value_that_doubles_at_least_is_told_as_a_factor():
+    shift = StoredShift("wall", "a wall were near", "G", "kPa", 5.9, 2.8, 1.34, 0.0, "", "$G$")
+    assert "would be 3.8 times as large (1.3 times its error bar)" in sentence([shift])
+    assert "would be 42 % higher" in sentence([shift._replace(relative=0.42, change=0.9)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import shlex
 import shutil
 from dataclasses import replace
 
@@ -15,9 +16,11 @@ from toy_config import csv_text
 import en4dvar
 from en4dvar.cli import main
 from en4dvar.estimation.population import Effort
-from en4dvar.plumbing.errors import OutputError
-from en4dvar.report.populations import Difference, _sentence
+from en4dvar.inputs.members import read_members
+from en4dvar.plumbing.errors import ConfigError, OutputError
+from en4dvar.report.populations import Difference, _sentence, medians_table
 from en4dvar.results.together import load_population
+from en4dvar.runs.design_run import run_design
 from en4dvar.runs.runner import run_campaign
 from en4dvar.runs.together import population
 
@@ -76,6 +79,23 @@ def test_the_command_its_page_and_tables(gels, tmp_path):
     assert float(row["ratio_q05"]) < float(row["ratio_q50"]) < float(row["ratio_q95"]) < 1
     (of_line,) = csv.DictReader((out / "lines.csv").read_text().splitlines())
     assert float(of_line["slope_q50"]) == pytest.approx(-np.log(float(row["ratio_q50"])) / 5, rel=0.02)
+
+
+def test_the_numbers_to_quote_are_those_of_each_population_by_itself_unless_known_ones_calibrate_them(gels, tmp_path):
+    """The median that the population's own page gives, not the one that its neighbours move."""
+    own = {f.name: load_population(f / "population.nc").group("posterior")["k_median"].values for f in only(gels)}
+    expected = np.stack([np.quantile(x, (0.05, 0.5, 0.95)) for x in own.values()], axis=1)
+    found = en4dvar.compare_populations(only(gels))
+    np.testing.assert_allclose(found.quoted["k"], expected, rtol=0.01)
+    assert "each population's own median: the numbers to quote" in found.caption
+    assert "Of one by itself quote its own median" in str(found)
+    told = dict(line.split("  k ") for line in medians_table(found).splitlines()[1:])
+    for name, middle in zip(own, expected[1], strict=True):
+        assert float(told[f"{name:10}"].split()[-2]) == pytest.approx(middle, abs=0.02)
+    known = en4dvar.compare_populations(only(gels), known={"stiff_only": {"k": "2 ± 0.001 N/m"}})
+    np.testing.assert_allclose(known.quoted["k"][:, 1], np.quantile(known.medians["k"][:, 1], (0.05, 0.5, 0.95)), 0.01)
+    assert "calibrated by what is known" in known.caption
+    assert "quote its own median" not in str(known)
 
 
 def test_a_known_median_is_taken_as_it_is_and_compared_with_the_data(gels):
@@ -143,6 +163,43 @@ def test_folders_that_cannot_be_compared(gels, tmp_path):
         en4dvar.compare_populations([only(gels)[0], tmp_path])
     with pytest.raises(OutputError, match="the same readings"):
         en4dvar.compare_populations({"one": only(gels)[0], "law": only(gels)[0]})
+
+
+def grouped(gels, folder):
+    """What a run with two groups leaves: a population of each in a folder of its own."""
+    for number, (gel, of) in enumerate(zip(only(gels), ("soft gel", "stiff"), strict=True), 1):
+        shutil.copytree(gel, folder / "groups" / f"{number}_{of}")
+    return folder
+
+
+@pytest.mark.parametrize("more", [[], ["--against", "3,8"], ["--known", "soft:k=3 ± 0.1"]])
+def test_one_run_with_groups_is_told_where_these_are_compared(gels, tmp_path, more):
+    run = grouped(gels, tmp_path / "run")
+    result = CliRunner().invoke(main, ["compare", str(run), *more])
+    assert result.exit_code == 2
+    assert "compares its 2 groups itself" in result.output
+    assert "population.known" in result.output
+    folders = shlex.split(result.output.partition("compare the folders ")[2])
+    again = CliRunner().invoke(main, ["compare", *folders, "--against", "3,8", "--out", str(tmp_path / "compared")])
+    assert again.exit_code == 0, again.output
+
+
+def test_what_to_measure_next_follows_from_a_population_and_not_from_a_campaign(gels, tmp_path):
+    """The prior of the next data set's spring is what the population says of one; damping belongs to each."""
+    plan = tmp_path / "plan.yaml"
+    plan.write_text((gels[0] / "toy.yaml").read_text())
+    options = {"design.about": ["k"], "design.times": {"from": "0.1 s", "to": "2 s", "step": "0.2 s"}}
+    options |= {"design.method": "linear", "output.report": False, "parameters.A": "100 um"}
+    before, _ = run_design(plan, overrides=options, out=tmp_path / "before")
+    after, _ = run_design(plan, overrides=options, out=tmp_path / "after", after=only(gels)[0])
+    assert after.rows[0].result.gain < before.rows[0].result.gain - 0.5
+    members = read_members(only(gels)[0] / "population.nc", {"k": ("N/m", "")})["k"]
+    stored = load_population(only(gels)[0] / "population.nc")
+    np.testing.assert_array_equal(members, stored.group("posterior")["k_next"].values.ravel())
+    with pytest.raises(ConfigError, match="a campaign of 4 data sets without a population; give the run of one data"):
+        run_design(plan, overrides=options, out=tmp_path / "no", after=gels[0] / "soft")
+    with pytest.raises(ConfigError, match=r"several populations; give the folder of one of them: .*1_soft gel"):
+        run_design(plan, overrides=options, out=tmp_path / "no", after=grouped(gels, tmp_path / "run"))
 
 
 def test_words_of_a_difference():

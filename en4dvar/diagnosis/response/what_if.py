@@ -14,6 +14,7 @@ until what it changes is small in every parameter. An alternative that does not 
 beyond linear response and is fitted again.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -34,6 +35,7 @@ MOST_RUNS = 6  # of one alternative
 SETTLED = 0.1  # of each parameter's shift, and of its std: a correction below one of them counts as small
 FAR = 3.0  # posterior standard deviations that a parameter of R may move: further away a chord seems to settle anywhere
 NOWHERE = "too few members survive"
+TWOFOLD = math.log(2)  # of a value that doubles or halves a factor tells more than per cent
 SMALL = 0.3  # posterior standard deviations of a first step that is believed without a second
 
 
@@ -143,6 +145,11 @@ class Shift:
     def exceeds(self) -> bool:
         """True if a parameter goes, or may go, beyond its error bar."""
         return self.largest > 1 or not self.settled
+
+
+def is_manifold(relative: float) -> bool:
+    """True of a relative change by which a value doubles or halves at least; NaN is none."""
+    return relative <= -1 or abs(math.log1p(relative)) >= TWOFOLD
 
 
 def what_if(

@@ -12,14 +12,18 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from en4dvar.estimation.population.campaign import FEWEST_SETS
 from en4dvar.model.state import READING_SCALE
 from en4dvar.plumbing.errors import ConfigError, retold
 from en4dvar.plumbing.hints import shown, suggest
 from en4dvar.plumbing.units import UnitError, parse_quantity
-from en4dvar_bubble.medium import MEDIA, known_medium
+from en4dvar_bubble.collapse import Lobe, doubt
+from en4dvar_bubble.medium import MEDIA, Medium, known_medium
 from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.starter.grouped import NO_GROUPS, Grouped
+from en4dvar_bubble.starter.guess import OF_GELS
 
 ANY = "gel"
 CHOICES = (ANY, *MEDIA)
@@ -31,6 +35,10 @@ the second, the liquid is viscous: a wall at 1.1 R_max makes it 1.19."""
 
 WALLS = 8.0, 200.0
 """Median of a wall's distance, in R_max, and the largest, where a collapse takes 0.1 % longer."""
+
+BY_VISCOSITY = 1.6
+"""Over Re = R_max √(ρ p_∞)/μ: by what part of the Rayleigh time a collapse in a gel of 5 kPa takes longer, for gas and
+elasticity cancel there (R_eq of 0.1 to 0.2 R_max; tests/bubble/test_wall.py holds it to forward runs)."""
 
 
 LIKE_A_GEL = (
@@ -124,6 +132,30 @@ def wall(radius: float, slowness: float) -> tuple[str, str, str]:
     prior = f"{{prior: logit, lower: {nearest:.4g} um, upper: {farthest:.4g} um, median: {distance}, logit_std: 2}}"
     source = f"the collapse takes {slowness:.2f} of the Rayleigh time, as beside a plane or in a viscous liquid"
     return distance, prior, source
+
+
+def plane_in_a_gel(lobes: Mapping[str, Lobe], medium: Medium) -> list[str]:
+    """What a plane would do to G of the ``lobes`` that take longer than in a gel as :data:`OF_GELS` are; one line or
+    none. A softer or thicker gel does so, too; 1 % of the collapse time is worth 1 kPa.
+    """
+    G, mu = (OF_GELS[name][0] for name in ("G", "mu"))
+    slow = {}
+    for name, lobe in lobes.items():
+        usual = 1 + BY_VISCOSITY * mu / (lobe.R_max * math.sqrt(medium.rho * medium.p_inf))
+        if (ratio := lobe.rayleigh_ratio(medium)) > usual and not doubt(lobe, medium):
+            slow[name] = ratio, usual, 1e6 * lobe.R_max
+    if not slow:
+        return []
+    ratio, usual, radius = np.median([*slow.values()], axis=0)
+    names = f"{', '.join([*slow][:3])}{f' and {len(slow) - 3} more' if len(slow) > 3 else ''}: " * (len(lobes) > 1)
+    near = " and ".join(f"{20.5 / h:.0f} kPa at {h} R_max" for h in (3, 10))
+    return [
+        f"{names}the collapse takes {ratio:.2f} of the Rayleigh time, in a gel of {G / 1e3:g} kPa and {mu:g} Pa s it "
+        f"takes {usual:.2f}: a softer or thicker gel does that, and so does a rigid plane nearby (wall of the vessel, "
+        f"cover glass), which makes G too small by about {near} and leaves no other trace (the free surface of the gel "
+        f"makes it too large); if one is within 10 R_max, state its distance from the bubble's centre: "
+        f"--set model.wall.distance='{float(f'{3 * radius:.2g}'):g} um'"
+    ]
 
 
 def population(

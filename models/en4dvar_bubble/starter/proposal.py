@@ -140,6 +140,8 @@ def propose(
         warnings.append(words)
     elif guess.misfit > FAR:  # no node comes close to what was observed
         warnings.append(_unmatched(guess.unmatched, look, model))
+    if chosen == "laser" and "G" in guess.values:
+        warnings += elsewhere.plane_in_a_gel({name: view.lobe for name, view in looks.items()}, model.medium)
     wall: tuple[tuple[Entry, ...], tuple[Entry, ...]] = (), ()
     slow = elsewhere.SLOW[0] < ratio < elsewhere.SLOW[1]
     if slow and _in_a_liquid(model):
