@@ -168,6 +168,8 @@ def test_every_prior_has_its_fields_or_is_told_to_be_in_the_text(visit, serve, t
         own = yaml.safe_load(page.input_value("#text"))["parameters"]
         heads = page.eval_on_selector_all("#priors th[scope=row]", "cells => cells.map((c) => c.innerText)")
         assert heads == [key for key, term in own.items() if "prior" in term], name
+        text, priors = (page.locator(part).bounding_box() for part in ("#text", "#priors"))
+        assert text["x"] + text["width"] < priors["x"]
         assert page.is_visible("#others") is (name == "acoustic_design")
     opened(page, "shell.yaml")
     page.get_by_label("sigma_0: width", exact=True).fill("2")
