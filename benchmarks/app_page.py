@@ -82,9 +82,8 @@ def walk(page: Any, address: str, pictures: Path) -> None:
     page.wait_for_timeout(1000)
     picture(page, "#model", pictures / "app_model.png")
     page.click("button[data-step=run]")
-    page.wait_for_selector("#job-run.done", timeout=300_000)
-    page.wait_for_function("document.getElementById('log').hidden")
-    picture(page, "#live", pictures / "app_live.png")
+    page.wait_for_function("document.getElementById('log').innerText.includes('iteration 20')", timeout=300_000)
+    picture(page, "#bands", pictures / "app_live.png")
 
 
 def clicks_counted(page: Any) -> None:

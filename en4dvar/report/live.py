@@ -48,8 +48,8 @@ def standings(log: str) -> dict[str, Standing]:
     return sets
 
 
-def bands(standing: Standing) -> Chart | None:
-    """Median and middle 90 % of each parameter over the iterations; None before the first."""
+def bands(standing: Standing, columns: int = 4) -> Chart | None:
+    """Median and middle 90 % of each parameter over the iterations, up to four side by side; None before the first."""
     panels = []
     for (parameter, unit), band in standing.bands.items():
         steps = sorted(band)
@@ -60,4 +60,4 @@ def bands(standing: Standing) -> Chart | None:
         panel.line(steps, middle, "posterior")
         panel.dots(steps, middle, "posterior")
         panels.append(panel)
-    return in_columns(panels, 3.2 * POINTS, 4, PAGE) if panels else None
+    return in_columns(panels, 3.2 * POINTS, columns, columns / 4 * PAGE) if panels else None

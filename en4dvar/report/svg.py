@@ -64,9 +64,11 @@ def svg(chart: Chart, name: str, description: str) -> Markup:
         for j, panel in enumerate(row.panels):
             key = (len(row.panels) if j else 0, j)
             margins[key] = max(margins.get(key, 0.0), _left(panel))
-    for i, row in enumerate(chart.rows):
-        lefts = [margins[len(row.panels) if j else 0, j] for j in range(len(row.panels))]
-        x, width = 0.0, (chart.width - sum(lefts) - len(lefts) * GAP) / len(lefts)
+    of_rows = [[margins[len(row.panels) if j else 0, j] for j in range(len(row.panels))] for row in chart.rows]
+    rooms = [(chart.width - sum(lefts) - len(lefts) * GAP) / len(lefts) for lefts in of_rows]
+    right = max((_right(row.panels[-1], room) for row, room in zip(chart.rows, rooms, strict=True)), default=0.0)
+    for i, (row, lefts) in enumerate(zip(chart.rows, of_rows, strict=True)):
+        x, width = 0.0, rooms[i] - max(0.0, right - GAP) / len(lefts)
         for j, (panel, left) in enumerate(zip(row.panels, lefts, strict=True)):
             parts += _panel(panel, row, top, x + left, width, f"{name}-{i}-{j}")
             x += left + width + GAP
@@ -80,6 +82,20 @@ def svg(chart: Chart, name: str, description: str) -> Markup:
 
 def _y_ticks(panel: Panel) -> list[tuple[float, str]]:
     return labelled(panel.limits()[1], panel.yticks, panel.y_names, logarithmic=panel.logarithmic)
+
+
+def _x_ticks(panel: Panel) -> list[tuple[float, str]]:
+    return labelled(panel.limits()[0], panel.xticks, panel.names, logarithmic=panel.x_logarithmic, whole=panel.whole)
+
+
+def _right(panel: Panel, width: float) -> float:
+    """Points that the numbers below reach beyond an axis of ``width``."""
+    if panel.bare or panel.names or not panel.x_numbers:
+        return 0.0
+    axis = Frame(0, 0, width, 0, *panel.limits(), panel.logarithmic, panel.x_logarithmic)
+    return max(
+        (x + len(text) * WIDEST * SMALL / 2 - width for x, text in _placed(_x_ticks(panel), axis.across)), default=0
+    )
 
 
 def _left(panel: Panel) -> float:
@@ -129,9 +145,8 @@ def _below(panel: Panel) -> float:
 
 def _axes(panel: Panel, place: Frame, below: float) -> Iterator[str]:
     base, left, far = place.y + place.height, place.x, place.x + place.width
-    along = labelled(place.xlim, panel.xticks, panel.names, logarithmic=panel.x_logarithmic, whole=panel.whole)
     lines, words = [f"M{left:.1f} {base:.1f}H{far:.1f}"], []
-    for x, text in _placed(along, place.across):
+    for x, text in _placed(_x_ticks(panel), place.across):
         lines.append(f"M{x:.1f} {base:.1f}v2.5")
         if panel.names:
             words.append(written(text, 0, 0, "end", turned=(x + 2.3, base + 4)))

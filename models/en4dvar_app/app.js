@@ -7,11 +7,20 @@ const MINE = {
 };
 const BOX = { prior: "validate", resume: "run", export: "compare" };
 // A prior of the text: '  G: {prior: lognormal, median: 3.6 kPa, log_std: 1.6} # why'.
-const PRIOR = /^(\s+)(\w+)(: \{prior: \w+, (?:median|mean): )([^\s,}]+)( ?)([^,}]*)(, (?:log_std|std): )([^,}]+)(\}.*)$/;
+const PRIOR = /^(\s+)(\w+)(: \{prior: \w+, (?:[^{}]*, )?(?:median|mean): )([^\s,}]+)( ?)([^,}]*)(, (?:log_std|logit_std|std): )([^,}]+)([,}].*)$/;
+const ANY_PRIOR = /^[^#\n]*\bprior:/gm;
 const PARTS = { 4: "median or mean", 6: "unit", 8: "width" };
-let state = null, before = "", lastJobs = null, table = null, checks = false, queue = Promise.resolve();
+const turns = {}, drafts = {}; // of a configuration that was left with changes: what was read, and what was typed
+let state = null, before = "", edited = "", lastJobs = null, table = null, checks = false, queue = Promise.resolve(), over = null;
 
-function say(words) { $("message").textContent = words; if (words) $("message").scrollIntoView({ block: "nearest" }); }
+// A message; it goes by itself once 'ends' is true.
+function say(words, ends = null) { over = ends; $("message").textContent = words; if (words) $("message").scrollIntoView({ block: "nearest" }); }
+
+// Of questions of one kind the last counts: the answer to an earlier one never comes, so that nothing follows from it.
+function latest(kind, answer) {
+  const turn = turns[kind] = (turns[kind] || 0) + 1;
+  return answer.finally(() => turn === turns[kind] || new Promise(() => {}));
+}
 
 async function fetched(what, fields) {
   const answer = await fetch(`look/${what}?` + new URLSearchParams(fields));
@@ -21,7 +30,7 @@ async function fetched(what, fields) {
 
 async function post(step, fields) {
   const answer = await fetch(step, { method: "POST", body: JSON.stringify(fields) });
-  say(answer.ok ? "" : await answer.text());
+  say(answer.ok ? "" : await answer.text(), answer.status === 409 ? () => !busy() : null);
   return answer.ok;
 }
 
@@ -33,11 +42,13 @@ function options(select, names, empty) {
   return select.value !== now || !now;
 }
 
-// What was typed about a movie or a table: in this window, or else for the last command about it.
+// The fields of a movie or a table: what was typed about it in this window, or else given to the last command about it.
+// Of the one that was chosen before, nothing stays.
 function recall(step) {
   const [of, ...ids] = MINE[step], name = $(of).value, last = state.jobs.findLast((job) => job.step === step && job.subject === name);
   const known = { ...last?.options, ...JSON.parse(sessionStorage.getItem(`${step} ${name}`)) };
-  for (const id of ids) if (id in known) $(id).value = known[id];
+  for (const id of ids) $(id).value = known[id] ?? "";
+  return known;
 }
 
 function remember(step) {
@@ -63,7 +74,7 @@ function show(now) {
     if (options($(id), names, empty)) changed(id);
   if (first) resumeLast().catch((error) => say(error.message));
   for (const button of document.querySelectorAll("button[data-step]")) button.disabled = !!runs(...Object.keys(MINE).filter((s) => s !== "validate"));
-  $("cancel").disabled = !runs(...Object.keys(MINE));
+  $("cancel").disabled = !busy();
   const last = {};
   for (const job of now.jobs) last[BOX[job.step] || job.step] = job;
   for (const [step, job] of Object.entries(last)) showJob(step, job);
@@ -85,6 +96,7 @@ async function resumeLast() {
 }
 
 const runs = (...steps) => state?.jobs.find((job) => job.state === "running" && steps.includes(job.step));
+const busy = () => runs(...Object.keys(MINE));
 
 function item(...parts) { const li = document.createElement("li"); li.append(...parts); return li; }
 
@@ -96,6 +108,7 @@ function showJob(step, job) {
   const words = document.createElement("pre");
   words.textContent = `$ ${job.line}\n${job.output}`; words.tabIndex = 0;
   box.replaceChildren(`${job.state}; the command that repeats this step, in this folder:`, words);
+  words.scrollTop = words.scrollHeight; // warnings come last
   const prior = job.output.match(/^prior predictive: (.*\.png) and/m);
   if (job.state === "done" && step === "track") box.append(link(job.out.replace(/csv$/, "html"), "Open the page of all outlines"));
   if (job.state === "done" && step === "run") box.append(link(`${job.out}/report.html`, "Open the result"));
@@ -132,7 +145,9 @@ function showFaults(job) {
 // The text is the truth: its priors as fields, which change one line of it.
 function showPriors() {
   const found = $("text").value.split("\n").map((line, i) => [line.match(PRIOR), i + 1]).filter(([m]) => m), names = found.map(([m]) => m[2]).join();
-  $("priors").hidden = !names;
+  const all = $("text").value.match(ANY_PRIOR)?.length || 0;
+  $("priors").hidden = !all;
+  $("others").hidden = all <= found.length;
   if ($("priors").dataset.names !== names) $("priors").tBodies[0].replaceChildren(...found.map(([m]) => {
     const row = document.createElement("tr"), head = document.createElement("th");
     head.scope = "row"; head.textContent = m[2]; row.append(head);
@@ -168,8 +183,8 @@ function showRuns(runs) {
   const chosen = new Set([...list.querySelectorAll("input:checked")].map((box) => box.value));
   list.replaceChildren(...runs.map(({ name, done }) => {
     const box = document.createElement("input"), label = document.createElement("label");
-    box.type = "checkbox"; box.value = name; box.checked = chosen.has(name); label.append(box, ` ${name} `);
-    return item(label, done ? link(`runs/${name}/report.html`, "open the result") : "not finished");
+    box.type = "checkbox"; box.value = name; box.checked = chosen.has(name); label.append(box, ` ${name}`);
+    return item(label, " ", done ? link(`runs/${name}/report.html`, "open the result") : "not finished");
   }));
 }
 
@@ -178,24 +193,21 @@ async function refresh() {
     const answer = await fetch("state");
     if (!answer.ok) throw new Error();
     show(await answer.json());
-    if ($("message").dataset.lost) { delete $("message").dataset.lost; say(""); }
+    if (over?.()) say("");
   } catch (error) {
-    if (error instanceof TypeError || !error.message) {
-      $("message").dataset.lost = "1";
-      say("The server does not answer. Nothing is lost: start 'en4dvar app' again and open the address that it prints.");
-    } else throw error;
+    if (!(error instanceof TypeError) && error.message) throw error;
+    say("The server does not answer. Nothing is lost: start 'en4dvar app' again and open the address that it prints.", () => true);
   }
-  await showLive(state?.jobs.findLast((job) => ["run", "resume"].includes(job.step)));
+  await showLive(runs("run", "resume"));
 }
 
-// Of the last run, while it works and as it ended: parameters over the iterations, or where the data sets stand.
+// Of a run at work: parameters over the iterations, or where the data sets stand. Of one that has ended the result counts.
 async function showLive(job) {
-  const whole = job && `${job.number} ${job.state}`, running = job?.state === "running";
-  if (!job || (!running && $("live").dataset.whole === whole)) return;
-  const told = await fetched("live", { run: job.out.replace("runs/", "") }).catch(() => null);
+  const columns = Math.max(1, Math.min(4, Math.floor(document.body.clientWidth / 200)));
+  const told = job && (await fetched("live", { run: job.out.replace("runs/", ""), columns }).catch(() => null));
+  $("live").hidden = !told || !runs("run", "resume");
   if (!told) return;
-  $("live").dataset.whole = whole;
-  $("log").hidden = !running; $("log").textContent = told.text;
+  $("log").textContent = told.text;
   $("bands").innerHTML = told.bands;
   $("sets").hidden = !told.sets.length;
   $("sets").tBodies[0].replaceChildren();
@@ -209,17 +221,16 @@ const freeName = (stem, names, end = "") => {
 async function readTable() {
   const name = $("table").value;
   table = null;
-  $("sheet").value = "";
-  recall("init");
+  const known = recall("init");
   if (name) $("proposal").value = freeName(name.replace(/\.[^.]*$/, ""), state.configs, ".yaml");
-  if (name) try { table = await fetched("table", { table: name, sheet: $("sheet").value }); say(""); } catch (error) { say(error.message); }
-  const names = table ? Object.keys(table.columns) : [];
-  options($("by"), [...(table?.words || []), ...names], "the file");
-  for (const [id, own] of [["time-column", table?.time], ["radius-column", table?.radius]]) {
-    options($(id), names, table?.tracked ? "as the table says" : "choose");
-    $(id).value = (!table?.tracked && own) || "";
+  const read = name ? fetched("table", { table: name, sheet: $("sheet").value }) : Promise.resolve(null);
+  try { table = await latest("table", read); if (name) say(""); } catch (error) { say(error.message); }
+  const names = table ? Object.keys(table.columns) : [], empty = table?.tracked ? "as the table says" : "choose";
+  for (const [id, all, none, own] of [["by", [...(table?.words || []), ...names], "the file"],
+    ["time-column", names, empty, table?.time], ["radius-column", names, empty, table?.radius]]) {
+    options($(id), all, none);
+    $(id).value = known[id] || (!table?.tracked && own) || "";
   }
-  recall("init");
   $("about-table").textContent = !table ? "" : table.tracked ? "A table of 'en4dvar track': it says its columns and units itself."
     : `${table.files} file(s); of ${table.file}${table.decimal === "," ? ", with decimal commas" : ""}. Units are never guessed: give them.`;
   plotTable();
@@ -233,17 +244,35 @@ function plotTable() {
 
 async function readConfig() {
   const config = $("config").value;
-  $("text").value = before = config ? (await fetched("text", { config })).text : "";
+  if (edited && $("text").value !== before) drafts[edited] = [before, $("text").value];
+  $("text").value = before = edited = "";
+  const { text } = await latest("config", config ? fetched("text", { config }) : Promise.resolve({ text: "" }));
+  edited = config;
+  [before, $("text").value] = drafts[config] || [text, text];
+  if (drafts[config]) say(`${config}: the changes that you typed are not kept yet.`);
+  delete drafts[config];
   showPriors();
   if (config) $("run").value = freeName(config.replace(/\.[^.]*$/, ""), (state?.runs || []).map((run) => run.name));
   $("faults").replaceChildren();
 }
 
+// Keep a text. If nothing was typed and the file is no longer what the page 'shows', that is mended and said.
+async function keepText(of, read, text, shows) {
+  if (await post("keep", { ...of, before: read, text })) return true;
+  const now = text === read ? await fetched("text", of).catch(() => null) : null;
+  if (now && now.text !== read) {
+    shows(now.text);
+    say(`${Object.values(of)[0]}: another window or program has changed the text; this is what it now is.`);
+  }
+  return false;
+}
+
 async function keep() {
-  const fields = { config: $("config").value, before, text: $("text").value };
-  if (!(await post("keep", fields))) return false;
-  before = fields.text;
-  return true;
+  const text = $("text").value, config = $("config").value;
+  const shows = (now) => { if (edited === config) { $("text").value = before = now; showPriors(); } };
+  const done = await keepText({ config }, before, text, shows);
+  if (done && edited === config) before = text;
+  return done;
 }
 
 // One after the other: what is clicked while a text is checked begins after that.
@@ -252,7 +281,8 @@ function begin(step) { queue = queue.then(() => begun(step)).catch((error) => sa
 async function begun(step) {
   while (runs("validate")) { await new Promise((wait) => setTimeout(wait, 200)); await refresh(); }
   if (step === "validate") checks = false;
-  if (["validate", "prior", "run", "resume"].includes(step) && $("text").value !== before && !(await keep())) return;
+  if (["validate", "prior", "run", "resume"].includes(step) && !(await keep())) return;
+  if (step === "track" && movie && !(await keepCorrections())) return;
   const fields = Object.fromEntries([...MINE[step], "proposal"].map((id) => [id, $(id).value]));
   if (step === "compare") fields.runs = [...document.querySelectorAll("#runs input:checked")].map((box) => box.value).join("\n");
   await post(step, fields);
@@ -268,5 +298,5 @@ for (const id of ["table", "sheet"]) $(id).addEventListener("change", readTable)
 $("config").addEventListener("change", readConfig);
 for (const id of ["time-column", "radius-column", "time-unit", "radius-unit"]) $(id).addEventListener("change", plotTable);
 fetched("laws", {}).then(({ laws }) => $("laws").replaceChildren(...laws.map((law) => new Option(law, law)))).catch(() => {});
-window.addEventListener("beforeunload", (event) => { if ($("text").value !== before) event.preventDefault(); });
+window.addEventListener("beforeunload", (event) => { if ($("text").value !== before || Object.keys(drafts).length) event.preventDefault(); });
 window.addEventListener("load", () => { refresh(); setInterval(refresh, 1000); });

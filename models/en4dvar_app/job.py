@@ -30,13 +30,16 @@ _begun: dict[Path, subprocess.Popen[bytes]] = {}  # by this process
 def start(root: Path, step: str, subject: str, words: list[str], trust: bool) -> int:
     """Begin ``en4dvar WORDS`` in the folder ``root``; the number of the job. Raises :class:`OutputError`."""
     jobs = inside(root, JOBS)
-    jobs.mkdir(exist_ok=True)
-    number = 1 + max(map(int, _names(jobs)), default=0)
-    job = jobs / str(number)
     try:
+        jobs.mkdir(exist_ok=True)
+        number = 1 + max(map(int, _names(jobs)), default=0)
+        job = jobs / str(number)
         job.mkdir()
     except FileExistsError:
         raise OutputError("another window begins a command: look at the page again") from None
+    except OSError as error:
+        why = f"no command can write into {root} ({error.strerror})"
+        raise OutputError(f"{why}; copy what is in it to a folder of yours, and open that one") from None
     about = {"step": step, "subject": subject, "words": words, "trust": trust}
     write_text(job / "command.json", json.dumps(about))
     _begun[job] = subprocess.Popen(

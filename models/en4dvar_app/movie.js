@@ -1,24 +1,26 @@
 "use strict";
 // The inspector: frames with outlines beside R(t). Corrections are lines of the text file that `track` reads.
-let movie = null, at = 0, kept = "", drag = null, bar = null, waiting = 0, covered = null;
+let movie = null, at = 0, kept = "", drag = null, bar = null, covered = null;
 const bitmaps = new Map();
 const LINE = /^\s*(\d+)\s+(\S.*)$/;
+
+// Until the next movie is there none is shown, and no frame of the last one comes any more.
+function noMovie() { movie = null; $("inspector").hidden = true; latest("frame", Promise.resolve()); }
 
 async function readMovie(afresh = true) {
   const name = $("movie").value;
   if (!name) return;
-  if (afresh) for (const id of ["bubble", "region", "mask", "raw"]) $(id).value = "";
-  if (afresh) recall("track");
+  if (afresh) { noMovie(); $("length").value = ""; recall("track"); }
+  const raw = $("raw").value;
   try {
-    const seen = await fetched("movie", { movie: name, raw: $("raw").value });
-    movie = { name, raw: $("raw").value, picture: afresh ? null : movie?.picture, ...seen };
-  } catch (error) { movie = null; $("inspector").hidden = true; return say(error.message); }
+    const [seen, { text }] = await latest("movie", Promise.all([fetched("movie", { movie: name, raw }), fetched("text", { movie: name })]));
+    movie = Object.assign(movie || { name, raw, picture: null }, seen);
+    if (afresh) $("corrections").value = kept = text;
+  } catch (error) { noMovie(); return say(error.message); }
   if (afresh) {
     bitmaps.clear(); at = 0; bar = null;
-    if (movie.pixel) $("pixel").value = `${+(movie.pixel * 1e6).toPrecision(9)} um`;
-    if (movie.rate) $("frame-rate").value = `${+movie.rate.toPrecision(9)} Hz`;
-    recall("track");
-    $("corrections").value = kept = (await fetched("text", { movie: name })).text;
+    if (movie.pixel) $("pixel").value ||= `${+(movie.pixel * 1e6).toPrecision(9)} um`;
+    if (movie.rate) $("frame-rate").value ||= `${+movie.rate.toPrecision(9)} Hz`;
   }
   movie.rows = new Map((movie.readings?.rows || []).map((row) => [row.frame, row]));
   $("corrections-name").textContent = `${stem()}.corrections.txt`;
@@ -31,8 +33,8 @@ async function readMovie(afresh = true) {
 const stem = () => movie.name.replace(/\.[^.]*$/, "");
 
 async function showMask() {
-  const name = $("mask").value, answer = name.endsWith(".png") ? await fetch(link(name, "").href) : {};
-  covered = answer.ok ? await createImageBitmap(await answer.blob()) : null;
+  const name = $("mask").value, answer = name.endsWith(".png") ? fetch(link(name, "").href) : Promise.resolve({});
+  covered = await latest("mask", answer.then(async (seen) => (seen.ok ? createImageBitmap(await seen.blob()) : null)));
   draw();
 }
 
@@ -48,11 +50,7 @@ async function go(n) {
   at = Math.max(0, Math.min(movie.count - 1, n));
   $("number").value = at;
   tell();
-  const asked = ++waiting;
-  try {
-    const picture = await bitmap(at);
-    if (asked === waiting) { draw(picture); history(); }
-  } catch (error) { say(error.message); }
+  try { draw(await latest("frame", bitmap(at))); history(); } catch (error) { say(error.message); }
   for (let k = 1; k < 6 && at + k < movie.count; k++) bitmap(at + k).catch(() => {});
 }
 
@@ -79,7 +77,7 @@ function tell() {
 
 function draw(picture) {
   if (picture) movie.picture = picture;
-  if (!movie.picture) return; // it is on its way
+  if (!movie?.picture) return; // it is on its way
   const canvas = $("frame"), scale = canvas.clientWidth / movie.width, ratio = window.devicePixelRatio || 1;
   canvas.width = canvas.clientWidth * ratio; canvas.height = scale * movie.height * ratio;
   const pen = canvas.getContext("2d");
@@ -115,16 +113,22 @@ function history() {
 }
 
 async function correct(n, words) {
+  const was = $("corrections").value;
   const others = $("corrections").value.split("\n").filter((text) => text.trim() && (text.match(LINE) || [])[1] !== String(n));
   if (words) others.push(`${n} ${words}`);
   $("corrections").value = others.length ? `${others.join("\n")}\n` : "";
-  await keepCorrections();
+  await keepCorrections(was);
 }
 
-async function keepCorrections() {
-  const text = $("corrections").value;
-  if (text !== kept && (await post("keep", { movie: movie.name, before: kept, text }))) kept = text;
+// If that fails, a mark is taken back to what 'was' there; what was typed stays.
+async function keepCorrections(was) {
+  const text = $("corrections").value, own = movie, shows = (now) => { if (own === movie) $("corrections").value = kept = now; };
+  const done = await keepText({ movie: own.name }, kept, text, shows);
+  if (own !== movie) return false;
+  if (done) kept = text;
+  else if (was !== undefined) $("corrections").value = was;
   tell(); draw(); history();
+  return done;
 }
 
 function where(event) {
@@ -173,8 +177,10 @@ $("frame").addEventListener("pointerup", async (event) => {
   if (tool() === "scale") scaled();
   if (outline) {
     const text = outline.map(({ x, y }) => rounded(x, y).join(",")).join(" "), own = { movie: movie.name, raw: movie.raw, outline: text };
-    $("mask").value = moved && (await post("mask", { ...own, uncovers: event.shiftKey ? "1" : "" })) ? `${stem()}.mask.png` : "";
-    await showMask();
+    const covers = moved && (await post("mask", { ...own, uncovers: event.shiftKey ? "1" : "" }));
+    if (movie?.name !== own.movie) return;
+    $("mask").value = covers ? `${stem()}.mask.png` : "";
+    showMask();
   }
   remember("track");
   draw();
@@ -196,10 +202,10 @@ $("circle").addEventListener("click", () => {
   if (numbers.every(Number.isFinite) && numbers[2] > 0) correct(at, numbers.join(" "));
   else say("Give x, y and a positive radius in pixels.");
 });
-$("corrections").addEventListener("change", keepCorrections);
+$("corrections").addEventListener("change", () => keepCorrections());
 $("length").addEventListener("change", scaled);
-$("mask").addEventListener("change", () => movie && showMask());
-for (const id of ["region", "bubble"]) $(id).addEventListener("change", () => movie && draw());
+$("mask").addEventListener("change", showMask);
+for (const id of ["region", "bubble"]) $(id).addEventListener("change", () => draw());
 for (const id of ["movie", "raw"]) $(id).addEventListener("change", () => readMovie());
 $("inspector").addEventListener("keydown", (event) => {
   if (!movie || event.ctrlKey || event.altKey || event.metaKey || ["TEXTAREA", "SELECT"].includes(event.target.tagName)) return;

@@ -206,8 +206,9 @@ class Look(Guarded):
         from en4dvar.report.svg import svg
 
         told = job.end_of(below(self.root, f"runs/{arguments.get('run', '')}/run.log"), 20 * job.LONGEST)
-        sets = standings(told)
-        chart = bands(*sets.values()) if len(sets) == 1 else None
+        sets, columns = standings(told), arguments.get("columns", "")
+        side_by_side = int(columns) if columns in ("1", "2", "3") else 4
+        chart = bands(next(iter(sets.values())), side_by_side) if len(sets) == 1 else None
         drawn = svg(chart, "live", "Median and middle 90 % of each parameter over the iterations") if chart else ""
         rows = sorted((name, each.at, each.estimate) for name, each in sets.items())
         return {"text": told[-job.LONGEST :], "bands": drawn, "sets": rows if len(rows) > 1 else []}
@@ -239,7 +240,7 @@ class Step(Guarded):
             elif step == "mask":
                 steps.masked(self.root, fields, _opened(self.root, fields).shape)
             elif running:
-                raise steps.FieldError("another command is running: wait for it, or cancel it")
+                raise tornado.web.HTTPError(409, "another command is running: wait for it, or cancel it")
             else:
                 words = steps.STEPS[step](self.root, fields)
                 job.start(self.root, step, words[1], words, self.trust)

@@ -13,6 +13,7 @@ from en4dvar.plumbing.errors import En4dvarError, OutputError
 from en4dvar.plumbing.files import read_plain, write_bytes, write_text
 from en4dvar_app.trusted import below
 from en4dvar_movie.frames import open_picture
+from en4dvar_movie.table import movie_of, other_movie
 
 OF_TRACK = ("pixel", "frame-rate", "exposure", "flashes", "raw", "bubble", "region")
 OF_INIT = (
@@ -21,7 +22,7 @@ OF_INIT = (
 )  # fmt: skip
 TABLE, CORRECTIONS = ".csv", ".corrections.txt"
 LONGEST = 1_000_000  # bytes of a text
-TRACKED = b"# en4dvar track, "  # begins a table that may be read anew
+_LINE_END = re.compile("\r\n?")  # a page knows only one
 OUTLINE = re.compile(r"(?:-?\d{1,5}(?:\.\d{1,9})?,-?\d{1,5}(?:\.\d{1,9})? ){3,}")  # of three corners at least
 Fields = Mapping[str, str]
 
@@ -36,7 +37,10 @@ def beside(movie: str, suffix: str) -> str:
 
 
 def existing(root: Path, fields: Fields, key: str) -> str:
-    """The name of a file or folder of ``root``, which holds no link that leads out of it."""
+    """The name of a file or folder of ``root``, which holds no link that leads out of it.
+
+    Raises FieldError: it is not there, or it is a movie for which the table of another one is in the way.
+    """
     name = fields.get(key, "")
     if not name:
         raise FieldError(f"choose a {'configuration' if key == 'config' else key} first")
@@ -45,6 +49,8 @@ def existing(root: Path, fields: Fields, key: str) -> str:
         raise FieldError(f"{name}: is not in the folder any more")
     for part in path.iterdir() if path.is_dir() else ():
         below(root, part.relative_to(root).as_posix())
+    if key == "movie" and (other := other_movie(below(root, table := beside(name, TABLE)), name)):
+        raise FieldError(f"{table}: was read from {other}, to which its corrections belong; give {name} another name")
     return name
 
 
@@ -62,9 +68,8 @@ def _track(root: Path, fields: Fields) -> list[str]:
         words.append(f"--corrections={corrections}")
     below(root, f"{Path(table).stem}.html")
     if below(root, table).exists():
-        with (root / table).open("rb") as file:
-            if not file.read(len(TRACKED)) == TRACKED:
-                raise FieldError(f"{table}: is there and was not read from a movie; rename it first")
+        if not movie_of(root / table):
+            raise FieldError(f"{table}: is there and was not read from a movie; rename it first")
         words.append("--force")  # the same table, read anew
     return [*words, f"--out={table}"]
 
@@ -94,7 +99,7 @@ def _config(root: Path, fields: Fields) -> str:
 def _run_dir(root: Path, fields: Fields) -> str:
     name = fields.get("run", "").strip()
     if not name or name in (".", "..") or "/" in name or "\\" in name or name.startswith("-"):
-        raise FieldError("give the run a name without '/'")
+        raise FieldError("give the run a name without '/'" if name else "give the run a name")
     below(root, f"runs/{name}")
     return f"runs/{name}"
 
@@ -134,7 +139,7 @@ STEPS: dict[str, Callable[[Path, Fields], list[str]]] = {
 def text_of(root: Path, fields: Fields) -> str:
     """The text of a configuration, or of the corrections of a movie ("" where there are none yet)."""
     path = _text_file(root, fields)
-    return read_plain(path, LONGEST).decode("utf-8", "replace") if path.exists() else ""
+    return _LINE_END.sub("\n", read_plain(path, LONGEST).decode("utf-8", "replace")) if path.exists() else ""
 
 
 def kept(root: Path, fields: Fields) -> None:
@@ -143,9 +148,11 @@ def kept(root: Path, fields: Fields) -> None:
     Raises FieldError: another window or program has changed the file since the page read it.
     """
     path = _text_file(root, fields)
-    if text_of(root, fields) not in (fields.get("before", ""), fields.get("text", "")):
+    held, text = text_of(root, fields), fields.get("text", "")
+    if held not in (fields.get("before", ""), text):
         raise FieldError(f"{path.name}: another window or program has changed it; load the page again to see it")
-    write_text(path, fields.get("text", ""))
+    if held != text:
+        write_text(path, text)
 
 
 def masked(root: Path, fields: Fields, shape: tuple[int, ...]) -> None:

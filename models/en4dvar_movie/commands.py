@@ -53,6 +53,7 @@ def track(
     """
     from en4dvar.commands.common import command_line, refuse_to_replace
     from en4dvar.executor import available_cores
+    from en4dvar.plumbing.errors import OutputError
     from en4dvar.plumbing.files import write_text
     from en4dvar.runs.progress import counted
     from en4dvar_movie.choice import numbers, read_corrections, watched
@@ -60,7 +61,7 @@ def track(
     from en4dvar_movie.frames import open_movie, require_suffix, write_movie
     from en4dvar_movie.page import outlined as outlined_frames
     from en4dvar_movie.page import page_text
-    from en4dvar_movie.table import to_csv
+    from en4dvar_movie.table import other_movie, to_csv
     from en4dvar_movie.tracking import doubted
     from en4dvar_movie.tracking import track as track_movie
 
@@ -72,6 +73,8 @@ def track(
     more = [table.with_name(f"{table.stem}_{n}{table.suffix}") for n in range(2, MOST + 1)] if choice["every"] else []
     for target in (table, shown, outlined, *more):
         refuse_to_replace(target, force)
+    if out is None and (another := other_movie(table, movie.name)):
+        raise OutputError(f"{table}: was read from {another} and is not replaced; give --out another name")
     fixed = read_corrections(corrections) if corrections else {}
     point = None if choice["bubble"] is None else numbers(choice["bubble"], "--bubble", "X,Y")
     part = watched(opened, choice["region"], choice["mask"])

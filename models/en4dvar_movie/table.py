@@ -1,8 +1,10 @@
 """The readings as CSV: one line a frame, lengths in micrometres, times in microseconds."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
+from pathlib import Path
 
 import numpy as np
 
@@ -12,6 +14,8 @@ from en4dvar_movie.tracking import Reading
 MODES = (2, 3, 4)  # whose amplitudes are columns
 SHAPE = ("eccentricity", "angle_deg", *(f"mode_{n}_um" for n in MODES), "mode_std_um")
 COLUMNS = ("frame", "t_us", "R_um", "R_std_um", "t_std_us", "x_um", "y_um", *SHAPE, "used", "reason")
+LONGEST_HEAD = 100_000  # bytes, of which most is the command line
+_HEAD = re.compile(rb"# en4dvar track, .*\n# movie: (.*); pixel: ")
 COMMON, SHAPED = "R_common_um", "R_shape_common"
 STEADY = 0.1  # of the exposure: where its light may be centred
 UNKNOWN = 0.01  # of the step between frames, where no exposure is given
@@ -34,6 +38,19 @@ class Scale:
     def time_std(self) -> float:
         """Std of a frame's instant, s."""
         return STEADY * self.exposure if self.exposure > 0 else UNKNOWN / self.rate
+
+
+def movie_of(table: Path) -> str:
+    """The name of the movie that a table was read from; "" where it is none of ``en4dvar track``."""
+    with table.open("rb") as file:
+        head = _HEAD.match(file.read(LONGEST_HEAD))
+    return Path(head[1].decode("utf-8", "replace")).name if head else ""
+
+
+def other_movie(table: Path, movie: str) -> str:
+    """The name of another movie than ``movie`` that a table, if there is one, was read from; else ""."""
+    named = movie_of(table) if table.is_file() else ""
+    return named if named != " ".join(movie.split()) else ""
 
 
 def to_csv(readings: Sequence[Reading], scale: Scale, movie: str, command: str) -> str:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import shutil
 import socket
 from pathlib import Path
 
 import pytest
+
+from en4dvar.plumbing.errors import OutputError
+from en4dvar_app import job
 
 CONFIG = "name: a\nmodel: {name: bubble, law: neo-hookean-kelvin-voigt}\ndata: {path: a.csv}\n"
 
@@ -135,9 +139,9 @@ def test_a_configuration_reads_nothing_outside_of_the_folder(server, path):
     (server.folder / "sub" / "way.csv").symlink_to(outside)
     (server.folder / "a.yaml").write_text(CONFIG.replace("a.csv", f"'{path.format(outside=outside)}'"))
     assert server.post("validate", config="a.yaml")[0] == 200
-    job = server.last()
-    assert job["state"] == "failed"
-    assert "outside of the folder" in job["output"]
+    ended = server.last()
+    assert ended["state"] == "failed"
+    assert "outside of the folder" in ended["output"]
 
 
 LAW = (
@@ -160,9 +164,9 @@ def test_a_configuration_that_names_code_is_not_run(server, kind):
     (server.folder / "a.yaml").write_text(f"name: a\n{NAMED[kind]}\ndata: {{path: a.csv}}\n")
     for step in ("validate", "run"):
         assert server.post(step, config="a.yaml", run="b")[0] == 200
-        job = server.last()
-        assert job["state"] == "failed"
-        assert "--trust" in job["output"] or kind == "module", job["output"]
+        ended = server.last()
+        assert ended["state"] == "failed"
+        assert "--trust" in ended["output"] or kind == "module", ended["output"]
         assert not (server.folder / "ran").exists()
 
 
@@ -189,5 +193,51 @@ def test_jobs_that_somebody_else_prepared_are_not_run(server):
     for name, text in (("1", '{"step": "run", "subject": "", "words": ["--version"]}'), ("2", "[]"), ("x", "{}")):
         (jobs / name).mkdir(parents=True)
         (jobs / name / "command.json").write_text(text)
-    assert [job["state"] for job in server.state()["jobs"]] == ["stopped"]
+    assert [each["state"] for each in server.state()["jobs"]] == ["stopped"]
     assert not (jobs / "1" / "output").exists()
+
+
+TRACKED = (
+    "# en4dvar track, version 1: en4dvar track a.tif\n# movie: {}; pixel: 1 um; frame rate: 1 Hz\nframe,t_us,R_um\n"
+)
+
+
+@pytest.mark.parametrize("name", ["b.tif", "elsewhere/b.tif"])
+def test_the_table_of_another_movie_of_that_name_is_not_taken_for_its_own(server, name):
+    (server.folder / "b.mp4").write_bytes(b"")
+    (server.folder / "b.csv").write_text(TRACKED.format(name))
+    (server.folder / "b.corrections.txt").write_text("3 out\n")
+    before = {path.name: path.read_bytes() for path in server.folder.glob("b.*")}
+    told = b"b.csv: was read from b.tif, to which its corrections belong; give b.mp4 another name"
+    assert server.ask("/look/movie?movie=b.mp4") == (400, told)
+    assert server.ask("/look/text?movie=b.mp4") == (400, told)
+    for step in ("track", "keep", "mask"):
+        assert server.post(step, movie="b.mp4", before="3 out\n", text="4 out\n") == (400, told.decode())
+    assert {path.name: path.read_bytes() for path in server.folder.glob("b.*")} == before
+    (server.folder / "b.csv").write_text(TRACKED.format("films/b.mp4"))
+    assert json.loads(server.ask("/look/text?movie=b.mp4")[1]) == {"text": "3 out\n"}
+
+
+def test_a_text_that_is_not_changed_is_not_written(server):
+    (server.folder / "a.yaml").write_bytes(CONFIG.replace("\n", "\r\n").encode())
+    assert json.loads(server.ask("/look/text?config=a.yaml")[1]) == {"text": CONFIG}
+    assert server.post("keep", config="a.yaml", before=CONFIG, text=CONFIG)[0] == 200
+    assert (server.folder / "a.yaml").read_bytes().count(b"\r\n") == 3
+    (server.folder / "a.yaml").write_text(CONFIG + "# of another program\n")
+    status, words = server.post("keep", config="a.yaml", before=CONFIG, text=CONFIG)
+    assert status == 400
+    assert "another window or program has changed it" in words
+
+
+def test_a_run_without_a_name_is_asked_for_one(server):
+    assert server.post("run", config="a.yaml", run=" ") == (400, "give the run a name")
+    assert server.post("run", config="a.yaml", run="a/b") == (400, "give the run a name without '/'")
+
+
+def test_a_folder_in_which_nothing_can_be_written_is_told_with_what_to_do(tmp_path, monkeypatch):
+    def refused(*_, **__):
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(Path, "mkdir", refused)
+    with pytest.raises(OutputError, match=r"no command can write into .*\(Read-only file system\); copy what is in it"):
+        job.start(tmp_path, "validate", "a.yaml", ["validate", "a.yaml"], trust=False)

@@ -112,6 +112,18 @@ def test_the_table_of_parameters_fits_a_screen_with_long_values(opened, pages):
     assert needed <= there
 
 
+def test_a_comparison_fits_a_screen_with_what_is_not_to_be_trusted(opened, pages):
+    script = """() => {
+      for (const row of document.querySelector("table.sets").tBodies[0].rows) {
+        row.cells[0].textContent = "R_max maximum radius, where the bubble is released";
+        row.cells[3].innerHTML = "<b>0.0419, not to be trusted</b>";
+        row.cells[row.cells.length - 1].textContent = "not to be trusted: model-validity, gas-content";
+      }
+      return [...document.querySelectorAll(".scroll")].map((e) => e.scrollWidth - e.clientWidth);
+    }"""
+    assert max(opened(pages["compare"], width=1200).page.evaluate(script)) <= 0
+
+
 def test_table_sorts_by_click_and_by_key(opened, pages):
     page = opened(pages["campaign"]).page
     names = column(page, 0)

@@ -13,6 +13,7 @@ from en4dvar.config import load_config
 from en4dvar_movie.scene import Scene, render
 
 PIXEL, RATE = 2.5, 4e5  # µm, 1/s
+SCALE = ["--pixel", f"{PIXEL} um", "--frame-rate", "400 kHz"]
 
 
 def history():
@@ -25,7 +26,7 @@ def tracked(folder, monkeypatch):
     monkeypatch.chdir(folder)
     frames = list(render(np.maximum(history(), 5)[:, None], Scene(), np.random.default_rng(3)))
     tifffile.imwrite(folder / "gel.tif", np.array(frames), photometric="minisblack")
-    words = ["track", "gel.tif", "--pixel", f"{PIXEL} um", "--frame-rate", "400 kHz", "--out", "gel.csv"]
+    words = ["track", "gel.tif", *SCALE, "--out", "gel.csv"]
     return CliRunner().invoke(main, words)
 
 
@@ -97,6 +98,20 @@ def test_flashes_raw_frames_and_corrections_go_through_that_step_too(tmp_path, m
     refused = CliRunner().invoke(main, ["init", "--flashes", "0 us, 1 us"])
     assert refused.exit_code == 2
     assert "--flashes needs a --movie" in refused.output
+
+
+def test_the_table_of_another_movie_of_that_name_is_replaced_only_by_its_name(tmp_path, monkeypatch):
+    assert tracked(tmp_path, monkeypatch).exit_code == 0
+    own = CliRunner().invoke(main, ["track", "gel.tif", *SCALE, "--out", "gel.csv", "--force"])
+    assert own.exit_code == 0, own.output
+    (tmp_path / "gel.tif").rename(tmp_path / "gel.tiff")
+    before = (tmp_path / "gel.csv").read_bytes()
+    other = CliRunner().invoke(main, ["track", "gel.tiff", *SCALE, "--force"])
+    assert other.exit_code != 0
+    assert "gel.csv: was read from gel.tif and is not replaced; give --out another name" in other.output
+    assert (tmp_path / "gel.csv").read_bytes() == before
+    named = CliRunner().invoke(main, ["track", "gel.tiff", *SCALE, "--force", "--out", "gel.csv"])
+    assert named.exit_code == 0, named.output
 
 
 def test_nothing_is_replaced_and_the_scale_is_asked_for(tmp_path, monkeypatch):

@@ -84,6 +84,14 @@ def test_numbers_stand_at_their_ticks():
     assert found["4"][0] == pytest.approx(x + 0.4 * width, abs=0.2)
 
 
+@pytest.mark.parametrize("names", [1, 2])
+def test_a_number_at_the_end_of_an_axis_stays_within_the_drawing(names):
+    panels = [Panel(xlim=(0.0, 0.15), xticks=(0.0, 0.05, 0.10, 0.15)) for _ in range(names)]
+    text = str(svg(Chart([Row(100.0, panels)], 200.0), "a", "about"))
+    end = max(float(x) for x in re.findall(r'x="([\d.]+)"[^>]*>0\.15<', text))
+    assert end + 4 * 0.64 * 7 / 2 <= 200.1  # half of its four characters
+
+
 def test_gaps_stay_gaps_and_what_is_not_finite_is_not_drawn():
     panel = Panel(xlim=(0.0, 4.0), ylim=(0.0, 4.0))
     panel.line([0, 1, 2, 3], [0, 1, np.nan, 3], "ink")
