@@ -121,9 +121,9 @@ def cut_off(times: Array, values: Array, scatter: float) -> npt.NDArray[np.bool_
     powers = ((times - times[first]) / (times[last] - times[first]))[:, None] ** np.arange(3)
     inverse = np.linalg.pinv(powers[near])
     weights = powers[first : last + 1].mean(axis=0) @ inverse
-    rough = math.sqrt(np.sum((values[near] - powers[near] @ inverse @ values[near]) ** 2) / (len(near) - 3))
-    higher = weights @ values[near] - values[first]
-    odd[first : last + 1] = higher > CUT * np.linalg.norm(weights) * max(scatter, rough)
+    share = values[near] / values[first]
+    rough = math.sqrt(np.sum((share - powers[near] @ inverse @ share) ** 2) / (len(near) - 3))
+    odd[first : last + 1] = weights @ share - 1 > CUT * np.linalg.norm(weights) * max(scatter / values[first], rough)
     return odd
 
 

@@ -20,7 +20,7 @@ FAILURES = [NOT_FINITE] * 8 + [""] * 30 + ["step size too small"] * 2
 def test_what_lacks_the_event_is_a_note_and_the_rest_is_lost():
     lost, absent = loss("prior forecast", FAILURES, PRIOR, MEMBERS, events=True)
     assert (lost.severity, absent.severity) == ("caution", "note")
-    assert lost.words.startswith("2 of 40 members failed in the prior forecast: step size too small (2×); lost at r =")
+    assert lost.words.startswith("2 of 40 members failed in the prior forecast: step size too small (2×); lost members")
     assert absent.words.startswith("8 of 40 members lack the event in the prior forecast; lost members have r below")
     assert absent.advice.startswith("no action is needed")
 

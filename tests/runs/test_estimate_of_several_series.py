@@ -34,7 +34,7 @@ def fit(model: Any = two, data: Any = None, **more: Any) -> en4dvar.Result:
 
 
 def test_a_reading_is_counted_in_its_series():
-    with pytest.raises(en4dvar.DataError, match=r"reading 3 of q: times must increase, but 0\.3 1 follows 0\.45 1"):
+    with pytest.raises(en4dvar.DataError, match=r"reading 3 of q: times must increase, but 0\.3 follows 0\.45;"):
         fit(data={**DATA, "q": (np.where(T2[2] == T2, T2[0], T2), V2)})
 
 
