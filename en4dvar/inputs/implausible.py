@@ -53,7 +53,8 @@ def scatter_of(times: Array, values: Array) -> float:
     if not smooth.any():
         return math.nan
     t, r = t[smooth], r[smooth]
-    squares = np.sum((r - _fitted(t, np.arange(WINDOW), DEGREE, r)[0]) ** 2, axis=1)
+    with np.errstate(over="ignore"):  # of readings of 1e300, which are refused later
+        squares = np.sum((r - _fitted(t, np.arange(WINDOW), DEGREE, r)[0]) ** 2, axis=1)
     return max(math.sqrt(float(np.median(squares)) / MEDIAN_OF_CHI2), _rounding(values))
 
 
