@@ -17,6 +17,8 @@ from en4dvar.data.noise import noise_of
 from en4dvar.data.noise.correlated import SharedErrors
 from en4dvar.estimation.population import Effort, HyperPrior
 from en4dvar.estimation.population.campaign import Draws, Population, population_of
+from en4dvar.estimation.population.own import OwnDraws
+from en4dvar.model.state import READING_OFFSET
 from en4dvar.plumbing.caution import caution
 from en4dvar.plumbing.errors import ConfigError, OutputError
 from en4dvar.priors.prior import Prior, PriorTerm
@@ -176,6 +178,25 @@ def test_what_is_determined_together_only():
     kept, effective = found.without_hyperprior(1)
     assert kept.nu[:, 0].std() > 0.9 * nu[:, 0].std()
     assert effective < 200
+
+
+def test_what_is_a_data_sets_own_follows_what_all_have_in_common():
+    """b + offset is what each data set reads: where the offset is less certain in all than in one, b moves with it."""
+    rng, model = np.random.default_rng(1), Vectorised()
+    terms = [PriorTerm.normal(p, 0.0, 1.0) for p in (*model.parameters, READING_OFFSET)]
+    problems, kept = [], []
+    for s in range(SETS):
+        problem = make_problem(model, [1.0, 0.4], seed=s)
+        observed = replace(problem.observations, name=f"set{s}")
+        problems.append(replace(problem, observations=observed, prior=Prior(tuple(terms))))
+        a, b, offset = rng.standard_normal((3, 1000)) * [[0.2], [0.01], [0.3]]
+        kept.append(OwnDraws(np.stack([a, 0.1 * s - offset + b, offset], axis=1), 0.0, 500.0, 0))
+    found = population_of(problems, [k.z[:20] for k in kept], ["a"], 2, kept=kept, effort=SMALL)
+    assert found.common == ("reading_offset",)
+    assert found.theta.std() > 0.8
+    read = found.sets[:, :, 1] + found.theta
+    np.testing.assert_allclose(read.mean(axis=0), 0.1 * np.arange(SETS), atol=0.01)
+    assert np.all(read.std(axis=0) < 0.02)
 
 
 @pytest.mark.slow

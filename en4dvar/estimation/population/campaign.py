@@ -315,14 +315,18 @@ def _sets(
     shared: Sequence[int], stream: np.random.Generator,
 ) -> list[Array]:  # fmt: skip
     """Control vectors (M, n) of each data set given all, white: what is neither of the population nor common is as
-    in one of the data set's own draws whose y is nearest.
+    in one of the data set's own draws whose y is nearest, moved with what is common as its draws have it.
     """
     z = []
     for s, (draws, likelihood) in enumerate(zip(drawn, likelihoods, strict=True)):
         scale = likelihood.adjusted.std(axis=0)
         _, near = scipy.spatial.cKDTree(likelihood.adjusted / scale).query(estimated.x[:, s] / scale, k=NEAR)
         chosen = near[np.arange(len(near)), stream.integers(NEAR, size=len(near))]
-        own = draws.z[chosen]
+        own, theta = draws.z[chosen], draws.z[:, list(shared)]
+        rest = np.setdiff1d(np.arange(own.shape[1]), [*varying, *shared])
+        apart = draws.z[:, rest] - draws.z[:, rest].mean(axis=0)
+        slopes = np.linalg.lstsq(theta - theta.mean(axis=0), apart, rcond=None)[0]
+        own[:, rest] += (estimated.theta - theta[chosen]) @ slopes
         own[:, list(varying)] = likelihood.following.together(estimated.x[:, s], estimated.theta)
         own[:, list(shared)] = estimated.theta
         z.append(own)
