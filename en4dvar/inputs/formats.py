@@ -1,4 +1,4 @@
-"""The formats of data files and what may be done with their rows, for whoever only lists them: it imports nothing."""
+"""The formats of data files and what may be done with their rows, in a module that is imported in no time."""
 
 from collections.abc import Mapping
 from typing import Literal
