@@ -19,9 +19,10 @@ from en4dvar.config.quantities import Spread
 from en4dvar.data.noise import Noise, SharedErrors, noise_of
 from en4dvar.data.observations import Observations
 from en4dvar.data.series import Series, balanced
+from en4dvar.inputs.formats import SUFFIXES
 from en4dvar.inputs.implausible import cut_off, scatter_of, step_doubts
 from en4dvar.inputs.members import read_covariance
-from en4dvar.inputs.parts import ANY, SUFFIXES, Column, DataFile, Layout, parts_of
+from en4dvar.inputs.parts import ANY, Column, DataFile, Layout, parts_of
 from en4dvar.inputs.readers import CLIPPED, Readings, Rows, read_series
 from en4dvar.inputs.window import select
 from en4dvar.model.state import Array

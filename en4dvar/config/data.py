@@ -12,7 +12,8 @@ from en4dvar.config.of_readings import BOUNDS, PLACES, WEIGHTS, Error, Placing, 
 from en4dvar.config.quantities import observable_unit, quantity, time_unit, unit_of
 from en4dvar.config.schema import Name, QuantityText, Section
 from en4dvar.inputs.decimal_sign import Decimal
-from en4dvar.inputs.parts import Column, Disorder, Format, Outliers, Repeated, TimeStep
+from en4dvar.inputs.formats import Disorder, Format, Outliers, Repeated
+from en4dvar.inputs.parts import Column, TimeStep
 from en4dvar.inputs.window import Instant, parse_instant
 from en4dvar.model.forward import Observable, field_of
 from en4dvar.plumbing.errors import ConfigError, retold

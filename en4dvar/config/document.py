@@ -17,7 +17,7 @@ from typing import Any, cast
 
 import yaml
 
-from en4dvar.inputs.parts import SUFFIXES
+from en4dvar.inputs.formats import SUFFIXES
 from en4dvar.plumbing.errors import ConfigError, DataError, Fault, retold
 from en4dvar.plumbing.files import open_plain
 from en4dvar.plumbing.hints import brief, shown

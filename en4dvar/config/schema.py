@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, TypeVar, cast, get_type_hints
 
 from pydantic import ConfigDict, Discriminator, Field, Tag, WithJsonSchema, create_model, model_validator
+from pydantic.fields import FieldInfo
 from pydantic.functional_validators import ModelWrapValidatorHandler
 from pydantic_core import from_json, to_json
 
@@ -58,7 +59,7 @@ class Section(Described):
         return kind(**{field.name: getattr(self, field.name) for field in fields(cast(Any, kind))})
 
     def as_written(self, section: Mapping[str, Any]) -> dict[str, Any]:
-        """The section as it was given, paths absolute, what was left out filled in with defaults; plain data."""
+        """The section as it was given, paths absolute, defaults that a file can say filled in; plain data."""
         keys = {field.alias or name: (name, field) for name, field in type(self).model_fields.items()}
         if not keys.keys() >= section.keys():  # keys named after something of the model
             plain: dict[str, Any] = _plain(section)
@@ -66,7 +67,7 @@ class Section(Described):
         written: dict[str, Any] = {}
         for key, (name, field) in keys.items():
             value = getattr(self, name)
-            text = section[key] if key in section else field.get_default(call_default_factory=True)
+            text = section.get(key, _as_a_file_says(field))
             if hasattr(value, "as_written"):
                 written[key] = value.as_written(text if isinstance(text, dict) else {})
             elif isinstance(value, tuple) and isinstance(text, list) and all(isinstance(v, Section) for v in value):
@@ -76,6 +77,12 @@ class Section(Described):
             elif text is not None:
                 written[key] = _plain(text)
         return written
+
+
+def _as_a_file_says(field: FieldInfo) -> Any:
+    """The default of a key; None where a file says it otherwise, as a number in the units of the model."""
+    converted = not field.validate_default and any(isinstance(it, Made | Quantity) for it in field.metadata)
+    return None if converted else field.get_default(call_default_factory=True)
 
 
 def _plain(value: Any) -> Any:

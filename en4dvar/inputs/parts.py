@@ -7,7 +7,7 @@ A file must be there and of a known format; whatever goes wrong in reading it is
 import csv
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +16,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from en4dvar.inputs.decimal_sign import Decimal
+from en4dvar.inputs.formats import SUFFIXES, Disorder, Format, Outliers, Repeated
 from en4dvar.inputs.matfile import Variables, indexed, mat_variables
 from en4dvar.inputs.text_table import Table, matches, scalars_in, sheet_lines
 from en4dvar.inputs.window import BY_NAME, Instant
@@ -23,12 +24,7 @@ from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import DataError, retold
 from en4dvar.plumbing.hints import listed
 
-Format = Literal["csv", "mat", "xlsx"]
-Disorder = Literal["refuse", "sort"]
-Repeated = Literal["refuse", "average"]
-Outliers = Literal["keep", "leave out"]
-_TEXT: Mapping[str, Format] = {".csv": "csv", ".txt": "csv", ".dat": "csv", ".tsv": "csv"}
-SUFFIXES: Mapping[str, Format] = {**_TEXT, ".mat": "mat", ".xlsx": "xlsx", ".xlsm": "xlsx"}
+VARIABLES: dict[str, Callable[[Path], Variables]] = {"mat": mat_variables}  # format → reader; the others are tables
 SHEETS = (".xls", ".xlsb", ".ods")
 
 
@@ -129,7 +125,7 @@ def columns_of(
 ) -> tuple[dict[str, Array], Mapping[str, float], list[int]]:
     """The columns wanted of a part, the file's scalars, and the numbers of the lines, none where it has no lines."""
     with opened(path, layout) as kind:
-        if kind != "mat":
+        if kind not in VARIABLES:
             table = table_of(path, kind, layout, [*wanted, *([layout.by] if layout.by is not None else [])])
             if layout.by is not None:
                 if part not in _groups(table, layout.by):
@@ -139,8 +135,8 @@ def columns_of(
             scalars = scalars_in(path) if kind == "csv" else {}
             scalars |= _constant(table) if layout.by is not None else {}
             return _of_table(table, wanted), scalars, [line for line, _ in table.rows]
-        variables = _variables(path, layout).of(part)
-        return {name: _of_mat(variables, name, path) for name in wanted}, variables.scalars, []
+        variables = _variables(path, kind, layout).of(part)
+        return {name: _column(variables, name, path) for name in wanted}, variables.scalars, []
 
 
 def parts_of(path: Path, value: Column, layout: Layout = ANY, time: str | None = None) -> tuple[str, ...]:
@@ -151,17 +147,17 @@ def parts_of(path: Path, value: Column, layout: Layout = ANY, time: str | None =
     ``expts(2).R``, …; or what the column ``by`` of a table says. Raises :class:`DataError`.
     """
     several = "*" in value.name
-    if layout.by is None and not several and format_of(path, layout) in ("csv", "xlsx"):
+    if layout.by is None and not several and format_of(path, layout) not in (None, *VARIABLES):
         return ()  # whatever is in the file: of 10⁵ files each is opened where it is estimated
     with opened(path, layout) as kind:
-        if kind != "mat":
+        if kind not in VARIABLES:
             table = table_of(path, kind, layout, [value.name, *(c for c in (time, layout.by) if c is not None)])
             if layout.by is not None:
                 return _groups(table, layout.by)
             if value.name in table.names:
                 return ()
             return tuple(name for name in table.names if matches(name, value.name) and name != time)
-        variables = _variables(path, layout)
+        variables = _variables(path, kind, layout)
     if several:
         return tuple(name for name in variables.matching(value.name) if name != time)
     if variables.vector(value.name) is not None:
@@ -173,10 +169,10 @@ def table_of(path: Path, kind: Format, layout: Layout, wanted: Sequence[str] = (
     return Table(path, layout.decimal, wanted, None if kind == "csv" else sheet_lines(path, layout.sheet))
 
 
-def _variables(path: Path, layout: Layout) -> Variables:
+def _variables(path: Path, kind: Format, layout: Layout) -> Variables:
     if layout.by is not None:
         raise DataError(f"{path}: data.by is for tables; elements of a struct array are data sets without it")
-    return mat_variables(path)
+    return VARIABLES[kind](path)
 
 
 def _groups(table: Table, by: str) -> tuple[str, ...]:
@@ -217,7 +213,7 @@ def _of_table(table: Table, wanted: Sequence[str]) -> dict[str, Array]:
     return columns
 
 
-def _of_mat(variables: Variables, name: str, path: Path) -> Array:
+def _column(variables: Variables, name: str, path: Path) -> Array:
     vector = variables.vector(name)
     if vector is not None:
         return np.asarray(vector, dtype=float)
@@ -249,13 +245,12 @@ class Contents:
 def read_contents(path: Path, layout: Layout = ANY) -> Contents:
     """Every column that holds numbers. Raises :class:`DataError`."""
     with opened(path, layout) as kind:
-        if kind == "mat":
-            return _mat_contents(path)
+        if kind in VARIABLES:
+            return _variable_contents(path, VARIABLES[kind](path).of_first())
         return _table_contents(table_of(path, kind, layout), scalars_in(path) if kind == "csv" else {})
 
 
-def _mat_contents(path: Path) -> Contents:
-    held = mat_variables(path).of_first()
+def _variable_contents(path: Path, held: Variables) -> Contents:
     columns = held.columns()
     words = {name: f"{path}: {name} is {kind}; save what is in it as vectors" for name, kind in held.others.items()}
     words |= {

@@ -128,22 +128,22 @@ def _headlines(run_dir: Path) -> list[Headline]:
     headlines: list[Headline] = []
     groups = populations.groups_compared(run_dir)
     if isinstance(groups, str):
-        headlines.append(("summary.csv", "All data sets", [groups], "", ""))
+        headlines.append(("summary.csv", "All data sets", [groups], "", "", ()))
     elif groups is not None:
         populations.write_tables(groups, run_dir)
         drawn = svg(populations.figure(groups), "populations", groups.caption)
         told = [*populations.group_sentences(groups)]
-        headlines.append(("differences.csv", "The differences", told, drawn, groups.caption))
+        headlines.append(("differences.csv", "The differences", told, drawn, groups.caption, ()))
     for name, (folder, of) in populations_of(run_dir).items():
         words = f"The population of {name}" if name else "The population behind them"
         told = [f"{name}: {line}" if name else upper_first(line) for line in together.sentences(of)]
         address = quote((folder / "population.html").relative_to(run_dir).as_posix())
-        headlines.append((address, words, told, together.population_figure(of), together.caption(of)))
+        headlines.append((address, words, told, together.population_figure(of), together.caption(of), of.cautions))
     if (run_dir / JOINT).exists():
         shared = load_joint(run_dir / JOINT)
         lines = [upper_first(line) for line in together.joint_lines(shared)]
         figure = together.joint_figure(shared)
-        headlines.append(("joint.html", "All of them together", lines, figure, together.SHARED))
+        headlines.append(("joint.html", "All of them together", lines, figure, together.SHARED, shared.cautions))
     return headlines
 
 

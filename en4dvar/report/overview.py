@@ -19,8 +19,9 @@ from en4dvar.results.store import StoredResult
 
 NAMED = 40  # data sets whose names fit below a figure
 LISTED = 2000  # data sets in the table: a browser shows as many at once
-Headline = tuple[str, str, Sequence[str], str, str]
-"""What data sets say together: the address of a page and words for it, lines of the answer, a figure (SVG), caption."""
+Headline = tuple[str, str, Sequence[str], str, str, Sequence[Caution]]
+"""What data sets say together: the address of a page and words for it, lines of the answer, a figure (SVG), caption,
+warnings."""
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ larger than another, by how much, how surely, and its trend.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
@@ -41,7 +41,10 @@ SURE = 0.999  # no number of draws says more
 FAR = 2.5  # standard deviations between what is known and what the data say
 _NUMBER = re.compile(r"(?<![^\W_])(?<!\.)(\d+(?:\.\d+)?)[ _]?(%|[^\W\d_]+)(?![^\W_])")  # with a unit, in a name
 OFF_THE_LINE = 0.05  # probability below which populations differ by more than a line says
-CAPTION = "Median and 5–95 % of each population's {}: the numbers to quote. Their ratios are those in words."
+CAPTION = (
+    "Median and 5–95 % of each population's {}: the numbers to quote. Their ratios are those in words. Orange ring "
+    "without a bar: not to be trusted, for the warnings of the population."
+)
 
 
 @dataclass(frozen=True)
@@ -75,6 +78,8 @@ class PopulationsCompared:
     ``quoted``: parameter → 5, 50 and 95 % (3, K) of the median of each population by itself, or, where ``calibrated``
     by what is known of some of them, of ``medians``.
 
+    ``doubted``: parameter → the populations in which it is not to be trusted.
+
     ``common``: quantities with one value in several populations; ``notes``: what else has to be known.
     """
 
@@ -88,6 +93,7 @@ class PopulationsCompared:
     lines: Mapping[str, StraightLine] = field(default_factory=dict)
     logarithmic: frozenset[str] = frozenset()
     calibrated: bool = False
+    doubted: Mapping[str, Collection[str]] = field(default_factory=dict)
 
     @property
     def caption(self) -> str:
@@ -169,9 +175,10 @@ def compare_populations(
             of_it = np.log(medians[name]) if name in logarithmic else medians[name]
             lines[name] = line(of_it, np.asarray(numbers, dtype=float))
     parameters = {name: terms[name][0].parameter for name in names}
+    doubted = {name: [label for label, s in stored.items() if untrusted(s.cautions, name)] for name in names}
     return PopulationsCompared(
         tuple(stored), parameters, medians, quoted, tuple(differences), common, tuple(notes), lines, logarithmic,
-        calibrated,
+        calibrated, doubted,
     )  # fmt: skip
 
 
@@ -362,8 +369,10 @@ def figure(c: PopulationsCompared) -> Chart:
         p, places = c.parameters[name], -np.arange(float(len(c.populations)))
         panel = Panel(with_unit(p.symbol, p.display_unit), ylim=(-float(len(places)), 1.0))
         panel.yticks, panel.y_names = [*places], [figure_text(label) for label in c.populations]
-        panel.intervals(low, high, places, "posterior")
-        panel.dots(middle, places, "posterior", 3.0)
+        doubted = np.isin(c.populations, [*c.doubted.get(name, ())])
+        panel.intervals(low[~doubted], high[~doubted], places[~doubted], "posterior")
+        panel.dots(middle[~doubted], places[~doubted], "posterior", 3.0)
+        panel.dots(middle[doubted], places[doubted], "centre", 5.5, kind="rings")
         panels.append(panel)
     height = (2.0 + 0.6 * len(c.populations)) * POINTS
     return in_columns(panels, height, width=COLUMN * (2 if len(panels) > 1 else 1))

@@ -39,7 +39,10 @@ from en4dvar.results.together import JOINT, POPULATION, QUANTILES, StoredGroups,
 MOST_FITS = 12  # panels of the figure
 NOTHING = np.full(1, np.nan)
 NINETY = 3.2897073  # std of a normal distribution between its 5 and 95 %
-SHARED = "Median and 5–95 % of what is shared, as each data set has it alone (grey) and as all have it together."
+DOUBTED = "Orange, without an interval: not to be trusted, for its warnings."
+SHARED = (
+    f"Median and 5–95 % of what is shared, as each data set has it alone (grey) and as all have it together. {DOUBTED}"
+)
 FITS = "Observations and 5–95 % of the joint posterior's predictions."
 
 
@@ -133,9 +136,10 @@ def forest(
         low, middle, high = shown(draws, member_quantiles(draws.values, QUANTILES))
         panel = Panel(axis_label(draws), ylim=(-float(count), 1.0))
         panel.yticks, panel.y_names = (range(0, -count, -1), [figure_text(d) for d in datasets]) if named else ((), ())
-        if not untrusted(groups.cautions, name):
+        doubted = bool(untrusted(groups.cautions, name))
+        if not doubted:
             panel.band([low, high], np.full(2, -count), np.ones(2), "posterior", 0.2)
-        panel.line([middle, middle], [-count, 1], "posterior")
+        panel.line([middle, middle], [-count, 1], *(("centre", 0.9, "--") if doubted else ("posterior",)))
         if reference and name in reference:
             value = float(shown(draws, reference[name][0]))
             panel.line([value, value], [-count, 1], "ink", dash=":")
@@ -145,8 +149,11 @@ def forest(
         panel.dots(rows[has, 1], -has, "prior", 3.0)
         if "dataset" in posterior.get(name, draws).dims:
             low, middle, high = shown(draws, member_quantiles(posterior[name].values[0], QUANTILES, axis=0))
-            panel.intervals(low[has], high[has], -has - 0.3, "posterior")
-            panel.dots(middle[has], -has - 0.3, "posterior", 2.0)
+            if not doubted:
+                panel.intervals(low[has], high[has], -has - 0.3, "posterior")
+                panel.dots(middle[has], -has - 0.3, "posterior", 2.0)
+            else:
+                panel.dots(middle[has], -has - 0.3, "centre", 3.0, kind="rings")
         panel.x_logarithmic = bool(np.all(rows[has] > 0) and rows[has].max() > 20 * rows[has].min())
         panels.append(panel)
     height = (2.0 + 0.36 * min(count, 60)) * POINTS
@@ -192,7 +199,10 @@ def write_joint(folder: Path) -> Path:
     )
 
 
-CAPTION = "Median and 5–95 % of each data set alone (grey) and given all (below it); band: the {} of the population{}."
+CAPTION = (
+    "Median and 5–95 % of each data set alone (grey) and given all (below it); band: the {} of the population{}. "
+    + DOUBTED
+)
 
 
 def summaries(stored: StoredPopulation, group: str = "posterior") -> list[Found]:

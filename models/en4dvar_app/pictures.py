@@ -99,7 +99,8 @@ def _number(text: str | None) -> float | str | None:
 def columns(path: Path, sheet: str = "") -> dict[str, Any]:
     """Columns of a table with their numbers (thinned out if many), which would be taken for times and radii, and the
     names of those of words. Raises :class:`DataError`."""
-    from en4dvar.inputs.parts import SUFFIXES, Layout
+    from en4dvar.inputs.formats import SUFFIXES
+    from en4dvar.inputs.parts import Layout
     from en4dvar_bubble.starter.asked import Asked, first_with_columns
 
     files = sorted(p for p in path.iterdir() if p.suffix.lower() in SUFFIXES) if path.is_dir() else [path]

@@ -9,11 +9,12 @@ from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import click
 
 from en4dvar.commands.common import Failed, command_line, echo
+from en4dvar.inputs.formats import Disorder, Format, Repeated
 from en4dvar.plumbing.errors import En4dvarError, OutputError, retold
 from en4dvar_bubble.commands import completed_law
 
@@ -63,12 +64,10 @@ _MOVIES = (".tif", ".tiff", ".png", ".bmp", ".jpg", ".jpeg", ".gif", ".mp4", ".a
     help="Which gel, day or concentration each bubble is of: a column of the data, or a table of files (gels.csv, or "
     "gels.csv:COLUMN).",
 )
-@click.option("--format", type=click.Choice(["csv", "mat", "xlsx"]), help="Of the data, if their name does not tell.")
+@click.option("--format", type=click.Choice(get_args(Format)), help="Of the data, if their name does not tell.")
 @click.option("--sheet", metavar="SHEET", help="Sheet of a workbook or a range of it, e.g. 'Film 3!A3:D40'.")
-@click.option("--unsorted", type=click.Choice(["refuse", "sort"]), help="What to do if times do not increase.")
-@click.option(
-    "--repeated", type=click.Choice(["refuse", "average"]), help="What to do with several readings of a time."
-)
+@click.option("--unsorted", type=click.Choice(get_args(Disorder)), help="What to do if times do not increase.")
+@click.option("--repeated", type=click.Choice(get_args(Repeated)), help="What to do with several readings of a time.")
 @click.option(
     "--since", metavar="INSTANT", help="Leave out what is before, e.g. 'trough 1': the first collapse, or '60 us'."
 )

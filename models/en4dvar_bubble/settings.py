@@ -19,7 +19,7 @@ from pydantic import (
     model_validator,
 )
 
-from en4dvar.inputs.parts import Format
+from en4dvar.inputs.formats import Format
 from en4dvar.model.state import Parameter
 from en4dvar.plumbing.described import Described, text_for
 from en4dvar.plumbing.errors import ConfigError, En4dvarError, retold

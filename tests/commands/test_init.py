@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import get_args
 
+import click
 import numpy as np
 import pytest
 from init_files import UNITS, call, proposed, simulate, write
@@ -12,6 +14,7 @@ from init_files import UNITS, call, proposed, simulate, write
 from en4dvar.assembly.build import build, data_files, inverse_plan
 from en4dvar.config import load_config
 from en4dvar.config.document import parse_document
+from en4dvar.inputs.formats import Format
 from en4dvar.runs.together import groups_of
 from en4dvar_bubble import commands_init
 from en4dvar_bubble.starter.config import quoted
@@ -436,6 +439,12 @@ def test_disorder_is_answered_with_options_of_init(tmp_path: Path, rows: str, wo
     assert words in done.stderr
     assert "data." not in done.stderr
     assert done.stderr.splitlines()[-1].endswith(following)
+
+
+def test_init_knows_every_format_of_data() -> None:
+    option = next(it for it in commands_init.init.params if it.name == "format")
+    assert isinstance(option.type, click.Choice)
+    assert tuple(option.type.choices) == get_args(Format)
 
 
 def test_sheets_movies_and_unknown_files_are_answered_with_options(tmp_path: Path) -> None:

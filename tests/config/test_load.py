@@ -2,14 +2,19 @@
 
 from dataclasses import FrozenInstanceError
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import pytest
 from toy_config import YAML, write_toy
 
 from en4dvar.config import load_config
+from en4dvar.config.context import Context
 from en4dvar.config.parameters import Fixed, Uncertain
+from en4dvar.config.quantities import quantity, time_unit
+from en4dvar.config.schema import Section
 from en4dvar.plumbing.errors import ConfigError
+from en4dvar.plumbing.units import Quantity
 from en4dvar.schemes.settings import AssimilationSettings
 
 
@@ -136,6 +141,28 @@ def test_resolved_file_loads_again(tmp_path: Path) -> None:
     assert [p.value for p in again.parameters if isinstance(p, Fixed)] == [0.0]
     assert again.model.mass == 2e-3  # type: ignore[attr-defined]
     assert "epsilon: 0.001" in config.resolved
+
+
+class Timed(Section):
+    lag: Annotated[float, quantity(time_unit, "not negative")] = 0.0
+    limit: Annotated[float, Quantity("s")] = 60.0
+    count: int = 3
+
+
+@pytest.mark.parametrize("section", [{}, {"lag": "2 us"}, {"limit": "1 min"}])
+def test_a_default_in_the_units_of_the_model_is_not_written(tmp_path: Path, section) -> None:
+    """A file would have to say it with a unit."""
+    context = Context(Path(), built=load_config(write_toy(tmp_path)).model)
+    written = Timed.model_validate(section, context=context).as_written(section)
+    assert written == {**section, "count": 3}
+    assert Timed.model_validate(written, context=context) == Timed.model_validate(section, context=context)
+
+
+def test_a_resolved_choice_of_readings_loads_again(tmp_path: Path) -> None:
+    design = "seed: 3\ndesign: {about: [k], times: {from: 0 ms, to: 2 ms, step: 1 ms}, choose: {readings: 2}}\n"
+    resolved = load_config(write_toy(tmp_path, ("seed: 3\n", design))).resolved
+    (tmp_path / "again.yaml").write_text(resolved, encoding="utf-8")
+    assert load_config(tmp_path / "again.yaml").resolved == resolved
 
 
 def test_a_resolved_file_has_the_folder_that_a_tilde_stands_for(tmp_path: Path, monkeypatch) -> None:

@@ -24,7 +24,7 @@ from en4dvar.plumbing.errors import ConfigError, OutputError
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.priors.varying import RandomWalk, StateChanges
 from en4dvar.problem import InverseProblem
-from en4dvar.report.together import sentences
+from en4dvar.report.together import forest, sentences
 from en4dvar.results.together import load_population
 from en4dvar.runs.runner import run_campaign
 from en4dvar.runs.together import population
@@ -39,6 +39,9 @@ def campaign(tmp_path_factory):
     folder = tmp_path_factory.mktemp("population")
     overrides = {"output.report": False, "output.directory": str(folder / "run")}
     return run_campaign(make_campaign(folder, n=4), overrides=overrides).directory
+
+
+DOUBT = caution("chain-not-converged", "only 8 effective draws stand behind the population")
 
 
 @pytest.fixture(scope="module")
@@ -76,15 +79,25 @@ def test_the_median_of_a_lognormal_population_lies_below_its_mean(found):
 def test_where_draws_are_few_the_median_one_by_one_stands_with_its_interval(found):
     """Warned draws give no number away, and withhold none."""
     stored = found[0]
-    line = caution("chain-not-converged", "only 8 effective draws stand behind the population").line
     tree = stored.tree.copy()
-    tree.attrs["warnings"] = line
+    tree.attrs["warnings"] = DOUBT.line
     (first, *_) = sentences(replace(stored, tree=tree))
     low, _, high = stored.group("empirical")["k"].values
     assert "the median of 4 data sets one by one is k =" in first
     assert "chain-not-converged" in first
     low_text, high_text = first.split("5–95 %: ")[1].split(")")[0].split(" … ")
     assert (float(low_text), float(high_text)) == pytest.approx((low, high), abs=0.02)
+
+
+def test_what_is_not_to_be_trusted_is_drawn_in_orange_without_an_interval(found):
+    stored = found[0]
+    tree = stored.tree.copy()
+    common = {"k": stored.group("posterior")["k_median"]}
+    for warnings, colours in (("", {"prior", "posterior"}), (DOUBT.line, {"prior", "centre"})):
+        tree.attrs["warnings"] = warnings
+        ((panel,),) = (row.panels for row in forest(replace(stored, tree=tree), stored.datasets, common).rows)
+        assert {mark.colour for mark in panel.marks} == colours
+        assert sum(mark.kind == "band" for mark in panel.marks) == (not warnings)
 
 
 def test_who_is_odd_is_said_beside_the_number(found):

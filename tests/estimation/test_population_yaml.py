@@ -13,8 +13,9 @@ from run_files import assert_same_results, configuration, interrupt, make_campai
 
 from en4dvar.cli import main
 from en4dvar.estimation.population import Effort
+from en4dvar.plumbing.caution import caution
 from en4dvar.plumbing.errors import ConfigError
-from en4dvar.results.together import load_population
+from en4dvar.results.together import StoredGroups, load_population
 from en4dvar.runs.engine import write_report
 from en4dvar.runs.runner import run_campaign
 from en4dvar.runs.together import population
@@ -85,6 +86,18 @@ def test_it_is_what_the_command_says_and_has_a_page(finished, tmp_path):
     assert within.reference == {"k": (1.9, 0.1)}
     listed = (run / ".en4dvar-files").read_text()
     assert all(name in listed for name in ("population.nc", "population.html", "population.csv", "population.tex"))
+
+
+@pytest.mark.slow
+def test_warnings_of_the_population_are_on_the_page_of_the_run(finished, tmp_path, monkeypatch):
+    run = tmp_path / "run"
+    shutil.copytree(finished[0], run)
+    few = caution("chain-not-converged", "only 8 effective draws stand behind the population")
+    monkeypatch.setattr(StoredGroups, "cautions", (few,))
+    write_report(run)
+    page = (run / "report.html").read_text()
+    assert page.index("The population behind them: warnings") < page.index(few.words) < page.index("<svg")
+    assert "<code>chain-not-converged</code>" in page
 
 
 @pytest.mark.slow

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from en4dvar.inputs.parts import Column, Disorder, Layout
+from en4dvar.inputs.formats import Disorder
+from en4dvar.inputs.parts import Column, Layout
 from en4dvar.inputs.readers import read_series
 from en4dvar.plumbing.errors import DataError
 

@@ -14,8 +14,9 @@ import pytest
 from openpyxl import Workbook
 from scipy.io import savemat
 
+from en4dvar.inputs import parts
 from en4dvar.inputs.implausible import step_doubts
-from en4dvar.inputs.matfile import mat_variables
+from en4dvar.inputs.matfile import Variables, mat_variables
 from en4dvar.inputs.parts import Column, Layout, parts_of, read_contents
 from en4dvar.inputs.readers import Readings, read_series
 from en4dvar.inputs.text_table import lines_of_workbook
@@ -142,6 +143,21 @@ def test_bubbles_of_a_sheet(tmp_path):
     several = Column("R_*", "um", "um")
     assert parts_of(path, several) == ("R_1", "R_2")
     assert read_series(path, TIME, several, part="R_2").values.tolist() == [2, 3, 4]
+
+
+def test_a_further_format_of_variables_is_read_in_every_way(tmp_path, monkeypatch):
+    def archive(path):
+        with np.load(path) as held:
+            return Variables({name: np.atleast_1d(held[name]) for name in held.files})
+
+    monkeypatch.setitem(parts.VARIABLES, "npz", archive)
+    path, layout, several = tmp_path / "a.npz", Layout(format="npz"), Column("R_*", "um", "um")
+    np.savez(path, t=np.arange(3.0), R_1=np.arange(1.0, 4), R_2=np.arange(2.0, 5), gel=7.0)
+    contents = read_contents(path, layout)
+    assert (list(contents.columns), contents.scalars) == (["t", "R_1", "R_2"], {"gel": 7.0})
+    assert parts_of(path, several, layout) == ("R_1", "R_2")
+    assert read_series(path, TIME, several, layout, part="R_2").values.tolist() == [2, 3, 4]
+    assert parts_of(path, Column("R_1", "um", "um"), layout) == ()
 
 
 def test_bad_cells_and_formulas_are_told_with_their_place(tmp_path):

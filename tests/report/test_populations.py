@@ -18,7 +18,7 @@ from en4dvar.cli import main
 from en4dvar.estimation.population import Effort
 from en4dvar.inputs.members import read_members
 from en4dvar.plumbing.errors import ConfigError, OutputError
-from en4dvar.report.populations import Difference, _sentence, medians_table
+from en4dvar.report.populations import Difference, PopulationsCompared, _sentence, figure, medians_table
 from en4dvar.results.together import load_population
 from en4dvar.runs.design_run import run_design
 from en4dvar.runs.runner import run_campaign
@@ -45,6 +45,17 @@ def gels(tmp_path_factory):
 
 def only(gels):
     return [gels[0] / "soft_only", gels[1] / "stiff_only"]
+
+
+def test_a_population_that_is_not_to_be_trusted_is_a_ring_without_a_bar():
+    quoted = {"k": np.array([[1.0, 3.0], [2.0, 4.0], [3.0, 5.0]])}
+    parameters = {"k": en4dvar.Parameter("k", "N/m")}
+    compared = PopulationsCompared(("soft", "stiff"), parameters, {}, quoted, (), (), doubted={"k": ["stiff"]})
+    ((panel,),) = (row.panels for row in figure(compared).rows)
+    drawn = {(mark.colour, mark.kind): mark.x[np.isfinite(mark.x)].tolist() for mark in panel.marks}
+    assert drawn == {
+        ("posterior", "line"): [1.0, 3.0], ("posterior", "dots"): [2.0], ("centre", "rings"): [4.0],
+    }  # fmt: skip
 
 
 @pytest.mark.slow

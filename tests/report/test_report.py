@@ -25,7 +25,7 @@ from en4dvar.plumbing.caution import Caution
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.priors.prior import Prior
 from en4dvar.report import write_pages
-from en4dvar.report.figures import all_figures, traces
+from en4dvar.report.figures import FIGURES, all_figures, traces
 from en4dvar.report.history import history
 from en4dvar.report.html import render
 from en4dvar.report.overview import LISTED, SetSummary, overview_figures, render_overview
@@ -35,7 +35,6 @@ from en4dvar.report.svg import draw
 from en4dvar.results.pack import PACK
 from en4dvar.results.provenance import provenance
 
-FIGURES = ("posterior", "history", "influence", "cost", "iterations", "pairs")
 VOID = {"meta", "link", "br", "img", "path", "use"}
 
 
@@ -52,6 +51,13 @@ def write_run(tmp_path):
 @pytest.fixture
 def run_dir(write_run, analysis):
     return write_run(analysis)
+
+
+@pytest.fixture(scope="module")
+def names(analysis):
+    """Of the figures of its page."""
+    result = Result.from_analysis(analysis, provenance("name: test\n"))
+    return [name for name, _, there, _ in FIGURES if there(result)]
 
 
 @pytest.fixture(scope="module")
@@ -103,17 +109,26 @@ class Page(HTMLParser):
         self.text.append(data)
 
 
-def test_page_is_well_formed_and_self_contained(html):
+def test_page_is_well_formed_and_self_contained(html, names):
     page = Page(html)
     assert page.faults == []
     assert page.links == []
     assert page.open == []
     assert len(page.ids) == len(set(page.ids))
     assert set(page.targets) <= set(page.ids)
-    assert page.tags.count("svg") == len(FIGURES)
+    assert page.tags.count("svg") == len(names)
     assert page.tags.count("script") == 1  # that of charts and tables
     assert not re.search(r"(?:https?:)?//[\w.-]+\.\w", html)
     assert "prefers-color-scheme: dark" in html
+
+
+def test_a_further_figure_is_on_the_page(write_run, analysis, names, monkeypatch):
+    further = ("further", "Traces once more.", lambda result: True, traces)
+    monkeypatch.setattr("en4dvar.report.figures.FIGURES", (further, *FIGURES))
+    page = Page(write_pages(write_run(analysis)).read_text(encoding="utf-8"))
+    assert page.faults == []
+    assert page.tags.count("svg") == len(names) + 1
+    assert "Traces once more." in "".join(page.text)
 
 
 def test_page_says_what_was_estimated_and_how_well(html):
@@ -151,15 +166,15 @@ def test_strings_of_data_and_configuration_are_escaped(write_run, analysis, rena
 
 
 @pytest.mark.slow
-def test_figures_are_drawn_as_pdf_and_png(reported):
-    for name in FIGURES:
+def test_figures_are_drawn_as_pdf_and_png(reported, names):
+    for name in names:
         assert (reported / "figures" / f"{name}.pdf").read_bytes().startswith(b"%PDF")
         with Image.open(reported / "figures" / f"{name}.png") as image:
             assert image.info["dpi"] == pytest.approx((200, 200), abs=0.01)
             pixels = np.asarray(image.convert("RGB"), dtype=float)
         assert pixels.std() > 10, name
         assert np.unique(pixels.reshape(-1, 3), axis=0).shape[0] > 20, name
-    assert len(list((reported / "figures").iterdir())) == 2 * len(FIGURES)
+    assert len(list((reported / "figures").iterdir())) == 2 * len(names)
 
 
 @pytest.mark.slow

@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 import numpy as np
 from annotated_types import Ge, Gt, Le
 
-from en4dvar.inputs.parts import Column, Format, Layout
+from en4dvar.inputs.formats import Format
+from en4dvar.inputs.parts import Column, Layout
 from en4dvar.inputs.readers import read_series
 from en4dvar.model.state import Array, Parameter, TransformName
 from en4dvar.plumbing.errors import ConfigError, retold

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from en4dvar.inputs.parts import ANY, DataFile, Layout, cell, opened, table_of
+from en4dvar.inputs.parts import ANY, VARIABLES, DataFile, Layout, cell, opened, table_of
 from en4dvar.inputs.text_table import cells_of, delimiter_of, numbered_lines, sheet_lines
 from en4dvar.plumbing.errors import DataError
 from en4dvar.plumbing.files import expanded, readable
@@ -96,7 +96,7 @@ def _by_table(files: Mapping[str, DataFile], path: Path, column: str) -> tuple[s
 def _lines(path: Path) -> list[list[str]]:
     """Cells of a table whose first line names the columns. Raises :class:`DataError`."""
     with opened(path, ANY) as kind:
-        if kind == "mat":
+        if kind in VARIABLES:
             raise DataError(f"{path}: groups are read from a table (CSV, Excel)")
         lines = sheet_lines(path, "") if kind == "xlsx" else numbered_lines(path)
     if not lines:
@@ -116,7 +116,7 @@ def _in_data(file: DataFile, column: str, layout: Layout) -> str:
     """What the column of its own table says of a data set."""
     wanted = [column] if layout.by is None else [column, layout.by]
     with opened(file.path, layout) as kind:
-        if kind == "mat":
+        if kind in VARIABLES:
             raise DataError(f"{file.path}: the groups of elements of a .mat file are given in a table, as gels.csv")
         table = table_of(file.path, kind, layout, wanted)
     at, by = table.position(column), table.position(wanted[-1])
