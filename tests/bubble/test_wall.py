@@ -21,6 +21,7 @@ from en4dvar_bubble.starter.guess import OF_GELS
 from en4dvar_bubble.starter.proposal import propose
 
 APECSS = Path(__file__).resolve().parents[3] / "shared" / "reference" / "apecss"
+MEASURED = APECSS.parents[1] / "data" / "bubbles" / "stiff_polyacrylamide"
 TIGHT = Accuracy(nodes=12, rtol=1e-9)
 WATER = {"mu": 1e-3, "R_max": 200e-6, "R_eq": 40e-6}
 TIMES = np.linspace(0, 60e-6, 241)
@@ -223,6 +224,15 @@ def test_a_slow_collapse_in_a_gel_tells_what_a_plane_would_do_to_its_modulus(wal
         assert warnings[0].endswith("--set model.wall.distance='750 um'")
         of_several = propose({"a": history_in_gel(), "b": bubble, "c": history_in_gel()}, "laser").warnings
         assert [w for w in of_several if w.startswith("b: the collapse takes 1.0")]
+
+
+@pytest.mark.parametrize("name", ["pa_01", "pa_05", "pa_13", "pa_15"])
+def test_a_history_that_begins_behind_its_top_tells_no_plane(name):
+    """Its collapse begins at an instant that nobody has seen; with the growth before, it is quicker than usual."""
+    table = np.genfromtxt(MEASURED / f"{name}.csv", delimiter=",", skip_header=2) * 1e-6
+    behind = table[int(np.argmax(table[:, 1])) + 1 :]
+    for times, radius in (table.T, behind.T):
+        assert not [w for w in propose({"bubble": (times, radius)}, "laser").warnings if "rigid plane nearby" in w]
 
 
 @pytest.mark.parametrize("radius", [150e-6, 250e-6, 400e-6])

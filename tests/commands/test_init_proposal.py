@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from init_files import TRUTH, UNITS, call, proposed, simulate
+from init_files import TRUTH, UNITS, call, proposed, simulate, write
 from jsonschema import Draft202012Validator
 from scipy.integrate import solve_ivp
 from scipy.io import loadmat, savemat
@@ -21,11 +21,13 @@ from en4dvar.inputs.parts import Column
 from en4dvar.inputs.readers import read_series
 from en4dvar.plumbing.errors import ConfigError, DataError
 from en4dvar.report.result import load_result
+from en4dvar_bubble import simulate as bubble_path
 from en4dvar_bubble.collapse import RAYLEIGH, lobe
+from en4dvar_bubble.driving import sine_burst
 from en4dvar_bubble.laws import REGISTRY
 from en4dvar_bubble.medium import known_medium
 from en4dvar_bubble.starter.config import Source, yaml_text
-from en4dvar_bubble.starter.look import look
+from en4dvar_bubble.starter.look import before, look
 from en4dvar_bubble.starter.proposal import starter
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -169,6 +171,67 @@ def test_an_acoustic_bubble_gets_no_comparison() -> None:
     assert "gas: heat" in text
     assert "polytropic" not in text
     assert "vapour" not in text
+
+
+def driven(path: Path, rest: int, std: float = 0.1) -> None:
+    """A gas bubble of 8 um that ultrasound drives to 16 um, and ``rest`` readings before the sound."""
+    sound = sine_burst(-0.3e6, 0.3e6, 3, delay=rest * 0.2e-6, envelope="hann")
+    gel, times = {"G": 20e3, "mu": 0.03, "R0": 8e-6}, 0.2e-6 * np.arange(rest + 100)
+    path_of_wall = bubble_path("neo-hookean-kelvin-voigt", gel, times, driving=sound, gas="polytropic").R[0].values
+    radius = 1e6 * path_of_wall + np.random.default_rng(3).normal(0, std, len(times))
+    rows = [f"{1e6 * t:.1f},{r:.4f}" for t, r in zip(times, radius, strict=True)]
+    path.write_text("\n".join(["t_us,R_um", *rows, ""]))
+
+
+@pytest.mark.parametrize(("rest", "std"), [(0, 0.1), (12, 0.1), (12, 0.3), (60, 0.2)])
+def test_the_gas_of_a_driven_bubble_is_what_is_seen_before_it_grows(tmp_path: Path, rest: int, std: float) -> None:
+    driven(tmp_path / "burst.csv", rest, std)
+    done = call("init", "--data", "burst.csv", "--start", "acoustic")
+    assert done.exit_code == 0, done.output
+    assert "of the Rayleigh time 0.915" not in done.stderr  # which is that of an empty bubble
+    (problem,) = build(proposed(Path("burst.yaml")))
+    gas, G = (next(term for term in problem.prior.terms if term.parameter.name == name) for name in ("R0", "G"))
+    assert abs(G.mean - np.log(20e3)) < 1.645 * G.std  # the pulse that the guess was made with is not theirs
+    assert gas.std == pytest.approx(np.hypot(std / 8, 0.005), rel=0.5)  # of the logarithm
+    assert abs(gas.mean - np.log(8e-6)) < 2 * gas.std
+
+
+@pytest.mark.parametrize("begun", [3e-6, 60e-6, 120e-6])
+def test_a_history_that_begins_in_growth_shows_no_bubble_at_rest(begun: float) -> None:
+    times = np.arange(0, 1, 0.005)
+    growth = 250e-6 * np.clip(1 - (1 - times) ** 2, 0, 1) ** 0.4
+    radius = np.concatenate([growth, growth[::-1][1:]])[int(np.searchsorted(growth, begun)) :]
+    radius = radius + np.random.default_rng(1).normal(0, 1e-6, len(radius))
+    assert not np.isfinite(before(1e-7 * np.arange(len(radius)), radius, 1e-6)[0])
+
+
+def test_a_pulse_that_is_not_known_exactly_gets_its_line(tmp_path: Path) -> None:
+    driven(tmp_path / "burst.csv", 12)
+    done = call("init", "--data", "burst.csv", "--start", "acoustic")
+    assert "the amplitude of the pulse is taken as exact" in done.stderr
+    text = Path("burst.yaml").read_text()
+    Path("burst.yaml").write_text(text.replace("# p_A:", "p_A:"))
+    (problem,) = build(proposed(Path("burst.yaml")))
+    (term,) = (term for term in problem.prior.terms if term.parameter.name == "p_A")
+    assert (term.mean, term.std) == pytest.approx((-24e6, 1.2e6))
+    assert "# p_A:" in yaml_text(
+        "a", Source("b.csv", ("t", "us"), None, ("R", "um")), starter("acoustic", None), "test"
+    )
+
+
+def test_what_a_lasting_shape_hides_is_in_the_height_of_the_top_as_in_the_scale(tmp_path: Path) -> None:
+    head, *rows = write(tmp_path / "plain.csv").read_text().splitlines()
+    errors = [f"{head},R_std_um,t_std_us", *(f"{row},0.1,0.02" for row in rows), ""]
+    variance = {"R_max": [], "reading_scale": []}
+    for name, comment in (("plain", []), ("shaped", ["# R_shape_common = 0.05"])):
+        (tmp_path / f"{name}.csv").write_text("\n".join(comment + errors))
+        assert call("init", "--data", f"{name}.csv", "--start", "laser").exit_code == 0
+        (problem,) = build(proposed(Path(f"{name}.yaml")))
+        terms = {term.parameter.name: term for term in problem.prior.terms}
+        variance["reading_scale"].append(terms["reading_scale"].std ** 2)
+        variance["R_max"].append((terms["R_max"].std / terms["R_max"].mean) ** 2)
+    for plain, shaped in variance.values():
+        assert shaped - plain == pytest.approx(0.05**2, rel=0.1)
 
 
 def test_the_collapse_time_is_rayleigh_s() -> None:

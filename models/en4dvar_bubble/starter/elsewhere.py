@@ -19,11 +19,13 @@ from en4dvar.model.state import READING_SCALE
 from en4dvar.plumbing.errors import ConfigError, retold
 from en4dvar.plumbing.hints import shown, suggest
 from en4dvar.plumbing.units import UnitError, parse_quantity
-from en4dvar_bubble.collapse import Lobe, doubt
+from en4dvar_bubble.collapse import doubt
 from en4dvar_bubble.medium import MEDIA, Medium, known_medium
 from en4dvar_bubble.model import BubbleModel
+from en4dvar_bubble.numbers import P_A
 from en4dvar_bubble.starter.grouped import NO_GROUPS, Grouped
 from en4dvar_bubble.starter.guess import OF_GELS
+from en4dvar_bubble.starter.look import Look
 
 ANY = "gel"
 CHOICES = (ANY, *MEDIA)
@@ -64,6 +66,16 @@ class Known:
 
 SCALE = Known(READING_SCALE.name, "1", 0.005, "size of a pixel: a calibration target tells it to about 0.5 %")
 PRESSURE = Known("p_inf", "101.3 kPa", 0.01, "weather moves it by 1 %, 100 m of height take 1.2 %: give yours")
+AMPLITUDE = (
+    f"# {P_A.name}",
+    "{prior: normal, mean: -24 MPa, std: 5 %}",
+    "amplitude of the driving: that of your pulse, with what your hydrophone errs by, often 5 or 10 %",
+)
+"""A line of the parameters, which is a comment until it holds the amplitude of the pulse that the model states."""
+PULSE = (
+    "the amplitude of the pulse is taken as exact: one that is 10 % off can make G wrong by half; put what your "
+    f"hydrophone errs by into the line '# {P_A.name}' of the parameters, and take the '# ' from it"
+)
 _OF_ANY = (
     Known("rho", "1030 kg/m^3", 0.02, "density: of 90 % from water, 997, to what rheometry codes take for gels, 1064"),
     Known("c", "1510 m/s", 0.015, "speed of sound: from water, 1497 m/s, to gels of 15 % of polymer, 1540 m/s"),
@@ -134,20 +146,22 @@ def wall(radius: float, slowness: float) -> tuple[str, str, str]:
     return distance, prior, source
 
 
-def plane_in_a_gel(lobes: Mapping[str, Lobe], medium: Medium) -> list[str]:
-    """What a plane would do to G of the ``lobes`` that take longer than in a gel as :data:`OF_GELS` are; one line or
-    none. A softer or thicker gel does so, too; 1 % of the collapse time is worth 1 kPa.
+def plane_in_a_gel(views: Mapping[str, Look], medium: Medium) -> list[str]:
+    """What a plane would do to G of the bubbles whose collapse takes longer than in a gel as :data:`OF_GELS` are, by
+    more than the instant of the top, where it begins, is uncertain; one line or none. A softer or thicker gel does so,
+    too; 1 % of the collapse time is worth 1 kPa.
     """
     G, mu = (OF_GELS[name][0] for name in ("G", "mu"))
     slow = {}
-    for name, lobe in lobes.items():
+    for name, view in views.items():
+        lobe, unsure = view.lobe, view.top.time_std / view.lobe.t_c
         usual = 1 + BY_VISCOSITY * mu / (lobe.R_max * math.sqrt(medium.rho * medium.p_inf))
-        if (ratio := lobe.rayleigh_ratio(medium)) > usual and not doubt(lobe, medium):
+        if (ratio := lobe.rayleigh_ratio(medium)) > usual + unsure and not doubt(lobe, medium):
             slow[name] = ratio, usual, 1e6 * lobe.R_max
     if not slow:
         return []
     ratio, usual, radius = np.median([*slow.values()], axis=0)
-    names = f"{', '.join([*slow][:3])}{f' and {len(slow) - 3} more' if len(slow) > 3 else ''}: " * (len(lobes) > 1)
+    names = f"{', '.join([*slow][:3])}{f' and {len(slow) - 3} more' if len(slow) > 3 else ''}: " * (len(views) > 1)
     near = " and ".join(f"{20.5 / h:.0f} kPa at {h} R_max" for h in (3, 10))
     return [
         f"{names}the collapse takes {ratio:.2f} of the Rayleigh time, in a gel of {G / 1e3:g} kPa and {mu:g} Pa s it "

@@ -13,6 +13,7 @@ of the estimates contradicts those before it. The largest reading itself, which 
 off and is too high by about ε √(2 ln n).
 """
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeVar
@@ -141,6 +142,8 @@ GAS = 0.6  # of R_max: a bubble at rest is smaller
 ACOUSTIC_BEGINS = 0.1  # of R_max: one that begins below has grown from a nucleus
 EMERGES = 0.5  # of R_max: a nucleus that grows is seen before it is as large
 SEVERAL = 4  # readings before a bubble, or at least of one
+AWAY = 3.0  # standard deviations: farther from the first readings a bubble has left its rest
+RESOLVED = 5.0  # standard deviations: of a level that is read, and is not what a camera shows of next to nothing
 CREEPS = 1.5  # collapse times after the maximum: a history that goes on for longer without a rebound is damped
 
 
@@ -152,6 +155,7 @@ class Look:
     ``top`` is where and how high the maximum was.
     ``rebound`` is the second maximum over the first, NaN where none is seen; ``rest`` the median of the last quarter
     of a history that rebounds and comes to rest, NaN else; ``drift`` says in words what it does instead of resting, "".
+    ``before`` is the radius at rest before an acoustic bubble grows, and the std of a reading of it, NaN without one.
     ``begin`` is the first instant, ``step`` the median time between samples; ``descent`` the last instant of the first
     descent, NaN where the history ends with it. ``n_minima`` follow the maximum with a ``prominence`` relative to the
     range. ``reason`` says in words why ``start`` is proposed, ``clear`` whether the data leave no doubt.
@@ -165,6 +169,7 @@ class Look:
     rebound: float
     rest: float
     drift: str
+    before: tuple[float, float]
     n_minima: int
     prominence: float
     descent: float
@@ -201,9 +206,37 @@ def look(times: Array, radius: Array, start: Start | None = None) -> Look:
         )
     step, descent = float(np.median(np.diff(times))), _end_of_descent(times, radius)
     return Look(
-        float(times[0]), peak, highest, step, scatter, rebound, rest, drift, n_minima, prominence, descent, chosen,
-        reason, clear,
+        float(times[0]), peak, highest, step, scatter, rebound, rest, drift, before(times, radius, scatter),
+        n_minima, prominence, descent, chosen, reason, clear,
     )  # fmt: skip
+
+
+def before(times: Array, radius: Array, scatter: float) -> tuple[float, float]:
+    """The level (m) of several readings before the bubble grows, and their std; NaN where there is no such plateau.
+
+    It is resolved, and rises less than half as fast as the bubble does from there to its maximum: a history that
+    begins in the midst of growth rises fastest at first.
+    """
+    largest = int(np.argmax(radius))
+    std = scatter if np.isfinite(scatter) else UNKNOWN * float(radius[largest])
+    away = np.abs(radius[:largest] - np.median(radius[:SEVERAL])) > AWAY * std
+    left = np.flatnonzero(away[1:] & away[:-1])  # one reading alone may be odd
+    count = int(left[0]) if len(left) else 0
+    if count >= SEVERAL:
+        t, level = times[:count], float(np.median(radius[: max(SEVERAL, count // 2)]))  # before growth begins
+        slope = np.polyfit(t, radius[:count], 1)[0] + AGREE * std / (np.std(t) * np.sqrt(count))
+        slow = slope < 0.5 * (radius[largest] - level) / (times[largest] - t[-1])
+        if slow and level > max(RESOLVED * std, ACOUSTIC_BEGINS * radius[largest]):
+            return level, std
+    return float("nan"), float("nan")
+
+
+def common_rest(levels: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    """One radius at rest of several bubbles, each with its std, and a std that covers theirs; NaN of none."""
+    if not levels:
+        return float("nan"), float("nan")
+    level, std = np.median(levels, axis=0)
+    return float(level), math.hypot(std, float(np.std([each for each, _ in levels])))
 
 
 def _begins(radius: Array, largest: int) -> int:

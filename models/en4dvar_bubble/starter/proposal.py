@@ -21,7 +21,7 @@ from en4dvar_bubble.settings import BubbleSettings
 from en4dvar_bubble.starter import elsewhere
 from en4dvar_bubble.starter.grouped import NO_GROUPS, Grouped
 from en4dvar_bubble.starter.guess import FAR, OF_GELS, Guess, first_guess
-from en4dvar_bubble.starter.look import Look, Start, look, typical, usable
+from en4dvar_bubble.starter.look import Look, Start, common_rest, look, typical, usable
 
 LAWS: Mapping[Start, str] = {"acoustic": "quadratic-kelvin-voigt", "laser": "neo-hookean-kelvin-voigt"}
 MODEL: Mapping[Start, Mapping[str, str]] = {
@@ -131,6 +131,7 @@ def propose(
     warnings += [
         f"{name}: {view.drift}; no radius at rest is taken from it" for name, view in looks.items() if view.drift
     ]
+    warnings += [elsewhere.PULSE] * (chosen == "acoustic")
     doubted, believed = _doubted(looks, model), guess
     if doubted:
         warnings += doubted
@@ -140,8 +141,9 @@ def propose(
         warnings.append(words)
     elif guess.misfit > FAR:  # no node comes close to what was observed
         warnings.append(_unmatched(guess.unmatched, look, model))
+        believed = Guess({}, {}, 0.0) if chosen == "acoustic" else guess  # made with a pulse that is not theirs
     if chosen == "laser" and "G" in guess.values:
-        warnings += elsewhere.plane_in_a_gel({name: view.lobe for name, view in looks.items()}, model.medium)
+        warnings += elsewhere.plane_in_a_gel(looks, model.medium)
     wall: tuple[tuple[Entry, ...], tuple[Entry, ...]] = (), ()
     slow = elsewhere.SLOW[0] < ratio < elsewhere.SLOW[1]
     if slow and _in_a_liquid(model):
@@ -201,7 +203,8 @@ def _doubted(looks: Mapping[str, Look], model: BubbleModel) -> list[str]:
     """Data sets whose scales cannot be right, one line for those with the same words."""
     doubts: dict[str, list[str]] = {}
     for name, view in looks.items():
-        if words := doubt(view.lobe, model.medium):
+        holds_gas = model.start == "acoustic" and np.isfinite(view.before[0])  # and is no Rayleigh's empty bubble
+        if not holds_gas and (words := doubt(view.lobe, model.medium)):
             doubts.setdefault(words, []).append(name)
     return [words if len(looks) == 1 else f"{', '.join(names)}: {words}" for words, names in doubts.items()]
 
@@ -215,6 +218,7 @@ def starter(start: Start, law: str | None) -> Proposal:
         data[:0] = [Entry("window", "{from: top, to: end}", words), Entry("time_zero", "window")]
     lines = [example(p, model) for p in model.law.parameters]
     lines += _radii(start, None)
+    lines += [Entry(*elsewhere.AMPLITUDE)] * (start == "acoustic")
     lines += [Entry("t_s", "{prior: normal, mean: 0 us, std: 0.5 us}", "the clock of the data against the model's")]
     return Proposal(tuple(data), _model(law_name, model, None), tuple(lines), SIMPLER[start])
 
@@ -231,11 +235,20 @@ def with_columns(proposal: Proposal, errors: Sequence[str], common: str, factor:
         "reading_offset", f"{{prior: normal, mean: 0 um, std: {common}}}", "the level of the edge, of all alike"
     )
     parameters = [entry for entry in proposal.parameters if not factor or entry.key != elsewhere.SCALE.key]
+    of_readings = (R0.name, R_MAX.name)
+    parameters = [_wider(entry, factor) if entry.key in of_readings else entry for entry in parameters]
     if factor:
         std = float(f"{math.hypot(elsewhere.SCALE.log_std, factor):.2g}")
         of_shape = f"{elsewhere.SCALE.source}; a shape that lasts hides {100 * factor:.2g} % along the line of sight"
         parameters.append(_of_known(replace(elsewhere.SCALE, log_std=std, source=of_shape)))
     return replace(proposal, data=data, parameters=(*parameters, *[alike] * bool(common)))
+
+
+def _wider(entry: Entry, factor: float) -> Entry:
+    """A prior whose relative std or log_std, the last number, has the std of a ``factor`` beside it."""
+    before, _, std = entry.value.removesuffix("}").removesuffix(" %").rpartition(" ")
+    unit, percent = (100, " %") if entry.value.endswith(" %}") else (1, "")
+    return replace(entry, value=f"{before} {math.hypot(float(std), unit * factor):.2g}{percent}}}")
 
 
 def built(start: Start, law: str | None) -> tuple[BubbleModel, str]:
@@ -265,6 +278,7 @@ def _typical(views: Sequence[Look]) -> Look:
         **medians | least,
         lobe=Lobe(*(typical([getattr(v.lobe, k) for v in views]) for k in ("R_max", "t_max", "t_c"))),
         drift=next((v.drift for v in views if v.drift), ""),
+        before=common_rest([v.before for v in views if np.isfinite(v.before[0])]),
         descent=max((v.descent for v in views if np.isfinite(v.descent)), default=float("nan")),
     )
 
@@ -274,7 +288,7 @@ def _others(model: BubbleModel, look: Look) -> dict[str, float]:
     example = {name: float(v[0]) for name, v in model.law.example_values().items() if name not in WIDTHS[model.start]}
     example |= {name: STIFFENING[0] for name in example if name == "alpha"}
     if model.start == "acoustic":
-        return {**example, "R0": NUCLEUS}
+        return {**example, "R0": look.before[0] if np.isfinite(look.before[0]) else NUCLEUS}
     return {**example, "R_eq": _rest(look), "R_max": look.lobe.R_max}
 
 
@@ -401,6 +415,7 @@ def _parameters(model: BubbleModel, look: Look, guess: Guess, top: Tops, medium:
     if R_EQ.name in water and not np.isfinite(look.rest):
         radii[R_EQ.name] = Entry(R_EQ.name, *water[R_EQ.name])
     lines += radii.values()
+    lines += [Entry(*elsewhere.AMPLITUDE)] * (start == "acoustic")
     mean, std = (0.0, 0.5e-6) if start == "acoustic" else top.t_s
     prior = f"{{prior: normal, mean: {_text(mean, 's', 'us', 4)}, std: {_text(std, 's', 'us')}}}"
     words = "the clock of the data against that of the pulse"
@@ -455,7 +470,12 @@ def _lognormal(p: Parameter, median: str, log_std: str, words: str) -> Entry:
 
 def _radii(start: Start, look: Look | None, top: Tops | None = None) -> list[Entry]:
     if start == "acoustic":
-        return [_lognormal(R0, _text(NUCLEUS, "m", "um"), "0.5", "readings say little about it")]
+        value, log_std, words = _text(NUCLEUS, "m", "um"), "0.5", "readings say little about it"
+        if look is not None and np.isfinite(look.before[0]):
+            level, std = look.before
+            value, log_std = _text(level, "m", "um", 4), f"{math.hypot(std / level, elsewhere.SCALE.log_std):.2g}"
+            words = "the readings before it grows, with the errors of one and of the scale"
+        return [_lognormal(R0, value, log_std, words)]
     value, width, words = "20 um", 0.4, R_EQ.label
     if look is not None:
         value, words = _text(_rest(look), "m", "um"), f"{GAS_FRACTION:g} R_max: no radius at rest is seen"
