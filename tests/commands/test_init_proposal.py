@@ -228,6 +228,7 @@ def test_what_a_lasting_shape_hides_is_in_the_height_of_the_top_as_in_the_scale(
         assert call("init", "--data", f"{name}.csv", "--start", "laser").exit_code == 0
         (problem,) = build(proposed(Path(f"{name}.yaml")))
         terms = {term.parameter.name: term for term in problem.prior.terms}
+        assert terms["reading_scale"].parameter.common == (name == "plain")  # a shape is each bubble's own
         variance["reading_scale"].append(terms["reading_scale"].std ** 2)
         variance["R_max"].append((terms["R_max"].std / terms["R_max"].mean) ** 2)
     for plain, shaped in variance.values():

@@ -240,7 +240,8 @@ def with_columns(proposal: Proposal, errors: Sequence[str], common: str, factor:
     if factor:
         std = float(f"{math.hypot(elsewhere.SCALE.log_std, factor):.2g}")
         of_shape = f"{elsewhere.SCALE.source}; a shape that lasts hides {100 * factor:.2g} % along the line of sight"
-        parameters.append(_of_known(replace(elsewhere.SCALE, log_std=std, source=of_shape)))
+        apart = ", shared: none" * (factor > elsewhere.SCALE.log_std)  # the larger part is each bubble's own
+        parameters.append(_of_known(replace(elsewhere.SCALE, log_std=std, source=of_shape), apart))
     return replace(proposal, data=data, parameters=(*parameters, *[alike] * bool(common)))
 
 
