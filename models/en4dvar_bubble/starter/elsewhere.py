@@ -188,7 +188,7 @@ def population(
         "population: # of the gel behind its bubbles, at the end of the run",
         f"  of: [{', '.join(names)}] # these vary from bubble to bubble about one median",
         LIKE_A_LIQUID if liquid else LIKE_A_GEL,
-        f"  # {common} have one value in all bubbles; the others are each bubble's own",
+        f"  # {common} have one value in all bubbles, unless 'shared: none' is said; the others are each bubble's own",
         *[f"  by: {kind} # each {groups.kind} has its own median and spread; they are compared"] * bool(groups.of),
         f"  # reference: {{{names[0]}: VALUE ± STD UNIT, source: NAME}} # a value to compare with, on the page",
         *(["groups:", f"  {kind}:"] if groups.of else []),
