@@ -159,6 +159,16 @@ def with_discrepancy(
     return replace(problem, observations=replace(o, noise=noise), prior=Prior(tuple(terms)))
 
 
+class Counted:
+    """Of a model that this is mixed into, how many members have been run."""
+
+    runs = 0
+
+    def trajectories(self, x, times):
+        self.runs += len(x)
+        return super().trajectories(x, times)
+
+
 class Dying(Linear):
     """Kills its process where the first parameter is negative."""
 

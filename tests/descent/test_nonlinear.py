@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 from scipy.optimize import minimize
-from toys import Decay, Vectorised, Wave, make_problem
+from toys import Counted, Decay, Vectorised, Wave, make_problem
 
 from en4dvar.descent.step_control import NEAR
 from en4dvar.diagnosis.analysis import StartRecord
@@ -108,12 +108,8 @@ def test_stop_on_the_cost_and_on_the_step():
 
 
 def test_progress_and_forward_runs_are_reported():
-    class Counting(Decay):
-        runs = 0
-
-        def trajectories(self, x, times):
-            self.runs += len(x)
-            return super().trajectories(x, times)
+    class Counting(Counted, Decay):
+        pass
 
     problem = make_problem(Counting(), [1.5, 1.2])
     seen = []

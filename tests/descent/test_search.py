@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from cut_anywhere import assert_cut_anywhere
-from toys import Decay, Wave, make_observations, make_problem, with_discrepancy
+from toys import Counted, Decay, Wave, make_observations, make_problem, with_discrepancy
 from varying_models import Ramp
 from wells import Parting, UnlikeWells, Wells, chord, hidden_well, mass_of_positive, parted, two_wells
 
@@ -41,12 +41,8 @@ def test_no_well_is_lost_of_a_model_that_is_not_cheap(kind, settings):
         assert 0 < told.runs < 100
 
 
-class Counting(Decay):
-    runs = 0
-
-    def trajectories(self, x, times):
-        self.runs += len(x)
-        return super().trajectories(x, times)
+class Counting(Counted, Decay):
+    pass
 
 
 def test_a_survey_of_a_cheap_model_is_foretold():

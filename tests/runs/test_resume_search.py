@@ -6,6 +6,7 @@ import signal
 import pytest
 from cut_anywhere import kept_runs
 from same_bits import assert_same_bits
+from toys import Counted
 from wells import UnlikeWells, two_wells
 
 from en4dvar.diagnosis.analysis import StartRecord
@@ -18,12 +19,8 @@ from en4dvar.schemes.settings import AssimilationSettings
 SETTINGS, SEED = AssimilationSettings(start="prior-mean"), 3
 
 
-class Counting(UnlikeWells):
-    runs = 0
-
-    def trajectories(self, x, times):
-        self.runs += len(x)
-        return super().trajectories(x, times)
+class Counting(Counted, UnlikeWells):
+    pass
 
 
 def problem():

@@ -234,10 +234,13 @@ def with_columns(proposal: Proposal, errors: Sequence[str], common: str, factor:
     alike = Entry(
         "reading_offset", f"{{prior: normal, mean: 0 um, std: {common}}}", "the level of the edge, of all alike"
     )
-    parameters = [entry for entry in proposal.parameters if not factor or entry.key != elsewhere.SCALE.key]
-    of_readings = (R0.name, R_MAX.name)
-    parameters = [_wider(entry, factor) if entry.key in of_readings else entry for entry in parameters]
+    parameters = list(proposal.parameters)
     if factor:
+        parameters = [
+            _wider(entry, factor) if entry.key in (R0.name, R_MAX.name) else entry
+            for entry in parameters
+            if entry.key != elsewhere.SCALE.key
+        ]
         std = float(f"{math.hypot(elsewhere.SCALE.log_std, factor):.2g}")
         of_shape = f"{elsewhere.SCALE.source}; a shape that lasts hides {100 * factor:.2g} % along the line of sight"
         apart = ", shared: none" * (factor > elsewhere.SCALE.log_std)  # the larger part is each bubble's own
