@@ -3,7 +3,7 @@
 Rows that hold NaN or a blank are dropped; every remaining number must be finite and the times must increase. Fields of
 ``.mat`` files may be rows or columns; their leading zeros and NaN (frames before nucleation) are dropped and their
 scalars collected. Of a column that cannot be zero all numbers of 0 or below are dropped, from CSV files too, and those
-after its first reading are told: they are codes of missing readings.
+below 0, or after its first reading, are told: they are codes of missing readings.
 """
 
 from collections.abc import Mapping, Sequence
@@ -98,9 +98,11 @@ def read_series(
     zero = bool(lines) and not value.positive
     first = 0 if zero else int(np.argmax(values > 0 if value.positive else np.nan_to_num(values) != 0))
     kept = np.arange(first, len(values))[~(np.isnan(times) | np.isnan(values))[first:]]
-    below = values[kept] <= 0 if value.positive else np.zeros(len(kept), dtype=bool)
-    left_out = {BELOW: tuple(np.sort(times[kept[below]]))} if below.any() else {}
-    kept = kept[~below]
+    left_out = dict[str, tuple[float, ...]]()
+    if value.positive:
+        kept = kept[values[kept] > 0]
+        codes = (values <= 0) & ((values < 0) | (np.arange(len(values)) >= first)) & ~np.isnan(times)
+        left_out |= {BELOW: tuple(np.sort(times[codes]))} if codes.any() else {}
     _check(times[kept], values[kept], value.name, path, fewest, zero)
     if repeats:
         kept = kept[np.argsort(times[kept], kind="stable")]
