@@ -37,6 +37,9 @@ IN_A_ROW = 3  # readings that are judged together
 FALLS = 3.0  # standard deviations by which the nearest neighbours lie below the farthest at the bottom of a collapse
 BESIDE = 4  # readings to either side of a plateau, or half as many as it has
 CUT = 5.0  # standard deviations by which they lead higher: of 5500 tops that are rounded none comes above 3.5
+LEVELS = np.linspace(0.99, 0.7, 15)  # of the largest reading: where the search for a level top begins
+ROUNDS = 6  # of the search from there
+POWER = 2.5  # of a radius, which is a parabola in time about its maximum
 ASIDE = np.array([0, 1, 2, -3, -2, -1])  # the neighbours, of a window
 
 
@@ -125,6 +128,55 @@ def cut_off(times: Array, values: Array, scatter: float) -> npt.NDArray[np.bool_
     share = values[near] / values[first]
     rough = math.sqrt(np.sum((share - powers[near] @ inverse @ share) ** 2) / (len(near) - 3))
     odd[first : last + 1] = weights @ share - 1 > CUT * np.linalg.norm(weights) * max(scatter / values[first], rough)
+    return odd
+
+
+def level_top(times: Array, radius: Array, scatter: float) -> npt.NDArray[np.bool_]:
+    """Which readings (K,) of a radius are a plateau at a level about which they scatter, as where a bubble leaves the
+    picture and a tracker reads what is left of it.
+
+    About a maximum R^{5/2} is nearly a parabola. Its cubic through the readings beside a plateau, cut off at a level,
+    has as many numbers as a polynomial of degree four through all of them, which any rounded top follows better. It is
+    cut off where the sum of squares about the latter is larger by CUT² variances, and the cubic leads higher than one
+    reading scatters: this met none of 4000 random tops whose errors are 0.2 to 3 %.
+    """
+    odd, largest = np.zeros(len(radius), dtype=bool), int(np.argmax(radius))
+    low = np.flatnonzero(radius <= STEEP * radius[largest])
+    first, stop = max(low[low < largest], default=-1) + 1, min(low[low > largest], default=len(radius))
+    count = stop - first
+    if count < IN_A_ROW + DEGREE + 1:
+        return odd
+    t, share = times[first:stop], radius[first:stop] / radius[largest]
+    y, powers = share**POWER, np.vander(2 * (t - t[0]) / (t[-1] - t[0]) - 1, DEGREE + 1, increasing=True)
+    smooth = np.clip(powers[:, :3] @ np.linalg.lstsq(powers[:, :3], y)[0], 0.05, None) ** (1 / POWER)
+    weights = smooth ** (1 - POWER) / POWER  # an error of R is one of 5/2 R^{3/2} in R^{5/2}
+
+    def cut(inside: npt.NDArray[np.bool_]) -> tuple[float, float, Array]:
+        beside = weights * ~inside
+        cubic = powers[:, :DEGREE] @ np.linalg.lstsq(beside[:, None] * powers[:, :DEGREE], beside * y)[0]
+        level = float(np.average(y[inside], weights=weights[inside] ** 2))
+        return float(np.sum((weights * (y - np.where(inside, level, cubic))) ** 2)), level, cubic
+
+    best = (math.inf, 0.0, y, odd)
+    for start in LEVELS:
+        inside = share > start
+        for _ in range(ROUNDS):
+            within = np.flatnonzero(inside)
+            if len(within) < IN_A_ROW or min(within[0], count - 1 - within[-1]) < 2:
+                break
+            inside[within[0] : within[-1]] = True
+            if count - inside.sum() < DEGREE:
+                break
+            squares, level, cubic = cut(inside)
+            best = min(best, (squares, level, cubic, inside), key=lambda fit: fit[0])
+            inside = cubic > level
+    squares, level, cubic, inside = best
+    if squares < math.inf:
+        variance = max(squares / (count - DEGREE - 1), np.nan_to_num(scatter / radius[largest]) ** 2)
+        quartic = powers @ np.linalg.lstsq(weights[:, None] * powers, weights * y)[0]
+        lead = float(np.mean(np.clip(cubic[inside], 0, None) ** (1 / POWER))) / level ** (1 / POWER) - 1
+        better = float(np.sum((weights * (y - quartic)) ** 2)) - squares
+        odd[first:stop] = inside & (better > CUT**2 * variance) & (lead > math.sqrt(variance))
     return odd
 
 

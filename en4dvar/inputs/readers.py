@@ -3,7 +3,7 @@
 Rows that hold NaN or a blank are dropped; every remaining number must be finite and the times must increase. Fields of
 ``.mat`` files may be rows or columns; their leading zeros and NaN (frames before nucleation) are dropped and their
 scalars collected. Of a column that cannot be zero all numbers of 0 or below are dropped, from CSV files too, and those
-after its first reading are told: they are codes of missing readings.
+below 0, or after its first reading, are told: they are codes of missing readings.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.inputs.implausible import InFile, cut_off, outlying, placeholders, scatter_of
+from en4dvar.inputs.implausible import InFile, cut_off, level_top, outlying, placeholders, scatter_of
 from en4dvar.inputs.parts import ANY, Column, Layout, TimeStep, columns_of
 from en4dvar.inputs.window import index_of
 from en4dvar.model.state import Array
@@ -24,6 +24,7 @@ from en4dvar.plumbing.units import convert
 Rows = npt.NDArray[np.intp]
 AGAIN = "one number again and again, far above all others, as a missing reading may be written"
 CLIPPED = "one largest number though those beside them lead higher, as where a bubble leaves the picture"
+LEVEL = "level but for scatter though those beside them lead higher, as where a bubble leaves the picture"
 FAR, BELOW = "far from what their neighbours say", "0 or below, as a missing reading may be written"
 
 
@@ -97,9 +98,11 @@ def read_series(
     zero = bool(lines) and not value.positive
     first = 0 if zero else int(np.argmax(values > 0 if value.positive else np.nan_to_num(values) != 0))
     kept = np.arange(first, len(values))[~(np.isnan(times) | np.isnan(values))[first:]]
-    below = values[kept] <= 0 if value.positive else np.zeros(len(kept), dtype=bool)
-    left_out = {BELOW: tuple(np.sort(times[kept[below]]))} if below.any() else {}
-    kept = kept[~below]
+    left_out = dict[str, tuple[float, ...]]()
+    if value.positive:
+        kept = kept[values[kept] > 0]
+        codes = (values <= 0) & ((values < 0) | (np.arange(len(values)) >= first)) & ~np.isnan(times)
+        left_out |= {BELOW: tuple(np.sort(times[codes]))} if codes.any() else {}
     _check(times[kept], values[kept], value.name, path, fewest, zero)
     if repeats:
         kept = kept[np.argsort(times[kept], kind="stable")]
@@ -121,17 +124,21 @@ def read_series(
             sums = np.sqrt(np.bincount(which, own**2)) if c.kind == "std" else np.bincount(which, own)
             stated[c.name] = np.asarray(sums / counts)
         times, values, rows = each, np.bincount(which, values) / counts, None
-    return _rest(Readings(times, values, str(path), scalars, stated, left_out, rows, count, usable), layout, fewest)
+    read = Readings(times, values, str(path), scalars, stated, left_out, rows, count, usable)
+    return _rest(read, layout, fewest, value.positive)
 
 
-ODD = {AGAIN: lambda _, values, __: placeholders(values), CLIPPED: cut_off, FAR: outlying}
-"""Why readings are left out, in this order, and what tells which of times, values and the std of errors."""
+ODD = {AGAIN: lambda _, values, __: placeholders(values), CLIPPED: cut_off, LEVEL: level_top, FAR: outlying}
+"""Why readings are left out, in this order, and what tells which of times, values and the std of errors. LEVEL is asked
+of what is positive, as a radius is: a voltage or a temperature may be held."""
 
 
-def _rest(read: Readings, layout: Layout, fewest: int) -> Readings:
+def _rest(read: Readings, layout: Layout, fewest: int, positive: bool) -> Readings:
     """Without outliers and what is before an instant, where the layout says so. Raises :class:`DataError`."""
     if layout.outliers == "leave out":
         for reason, which in ODD.items():
+            if reason == LEVEL and not positive:
+                continue
             t, y = read.times, read.values
             odd = which(t, y, scatter_of(t, y))
             told = {reason: tuple(t[odd])} if odd.any() else {}

@@ -10,6 +10,7 @@ before openpyxl sees it.
 
 import csv
 import fnmatch
+import itertools
 import re
 import unicodedata
 import warnings
@@ -188,7 +189,8 @@ def matches(name: str, pattern: str) -> bool:
 def _names_and_numbers(head: Sequence[Sequence[str]], wanted: Sequence[str]) -> tuple[int | None, int]:
     """The line that names the columns, None where none does, and the first below it.
 
-    It is the one above the lines with numbers, unless it holds units, which stand below the names.
+    It is the one above the lines with numbers, unless it or one of words above it holds units, which stand below the
+    names, as comments stand below units.
     """
     for i, cells in enumerate(head if wanted else ()):
         if all(any(_same(cell, name) or matches(cell, name) for cell in cells) for name in wanted):
@@ -197,8 +199,8 @@ def _names_and_numbers(head: Sequence[Sequence[str]], wanted: Sequence[str]) -> 
     if _holds_number(head[first]) and (first == 0 or (wanted and all(map(_NAMELESS.fullmatch, wanted)))):
         return None, first
     top = max(first - 1, 0)
-    if top and _words(head[top - 1]) and _are_units(head[top], head[top - 1]):
-        top -= 1
+    words = itertools.takewhile(lambda k: k and _words(head[k]) and _words(head[k - 1]), range(top, -1, -1))
+    top = next((k - 1 for k in words if _are_units(head[k], head[k - 1])), top)
     if len(head[top]) == 1 < len(head[first]):
         return None, first
     return top, top + 1

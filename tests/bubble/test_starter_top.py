@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from en4dvar.inputs.implausible import cut_off, outlying, scatter_of
+from en4dvar.inputs.implausible import cut_off, level_top, outlying, scatter_of
 from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.settings import BubbleSettings
 from en4dvar_bubble.starter.look import Top, look, top
@@ -100,6 +100,35 @@ def test_a_top_that_is_rounded_is_not_cut_off() -> None:
                     plateaus += np.sum(rounded == rounded.max()) > 3
                     assert not cut_off(t, rounded, scatter_of(t, rounded)).any()
     assert plateaus > 100
+
+
+@pytest.mark.parametrize("per_collapse", [12, 20, 40])
+@pytest.mark.parametrize(("ceiling", "noise_std"), [(0.96, 0.003), (0.92, 0.003), (0.92, 0.006)])
+def test_a_top_that_is_cut_off_and_scatters_is_told(per_collapse: float, ceiling: float, noise_std: float) -> None:
+    stream, told = np.random.default_rng(12), 0
+    for _ in range(20):
+        t, r = history(stream, per_collapse, 0.0, 0.8)
+        read = np.minimum(r, ceiling) + noise_std * stream.standard_normal(len(t))
+        odd = level_top(t, read, scatter_of(t, read))
+        if not odd.any():
+            continue
+        told += 1
+        assert read[odd].min() > ceiling - 4 * noise_std
+        assert np.sum(odd & (r > ceiling)) > 0.8 * np.sum(r > ceiling)
+        assert not level_top(t[~odd], read[~odd], scatter_of(t[~odd], read[~odd])).any()
+        seen = look(t[~odd], 1e-4 * read[~odd]).top
+        assert abs(seen.height - 1e-4) < 1.645 * TOP_WIDTH * seen.height_std
+    assert told > 15
+
+
+def test_a_top_that_scatters_is_not_level() -> None:
+    stream = np.random.default_rng(13)
+    for _ in range(400):
+        per_collapse, noise_std = np.exp(stream.uniform(np.log([5, 0.002]), np.log([60, 0.03])))
+        t, r = history(stream, per_collapse, noise_std, stream.choice([0.5, 0.8]))
+        pixel = stream.choice([1e-9, 0.005, 0.02, 0.05])
+        rounded = np.round(r / pixel) * pixel
+        assert not level_top(t, rounded, scatter_of(t, rounded)).any()
 
 
 def test_a_bubble_that_is_large_when_first_seen_is_no_nucleus() -> None:

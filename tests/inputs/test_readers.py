@@ -45,14 +45,14 @@ def test_csv_dialects(tmp_path: Path, text: str) -> None:
 
 
 def test_no_number_of_0_or_below_is_a_reading_of_what_is_positive(tmp_path: Path) -> None:
-    """Wherever it stands, with its error, which may be blank; those before the first reading are not told."""
+    """Wherever it stands, with its error, which may be blank; zeros before the first reading are not told."""
     rows = "0,-1,\n1,0,\n2,5,1\n3,0,\n4,4,2\n5,-1,\n6,3,3\n7,2,4\n8,0,\n9,nan,\n"
     (tmp_path / "a.csv").write_text(f"t,R,s\n{rows}")
     radius = Column("R", "um", "m", positive=True)
     read = read_series(tmp_path / "a.csv", TIME, radius, errors=[Column("s", "um", "m")])
     np.testing.assert_allclose(read.times, [2e-6, 4e-6, 6e-6, 7e-6])
     np.testing.assert_allclose(read.errors["s"], [1e-6, 2e-6, 3e-6, 4e-6])
-    assert read.left_out[BELOW] == pytest.approx([3e-6, 5e-6, 8e-6])
+    assert read.left_out[BELOW] == pytest.approx([0, 3e-6, 5e-6, 8e-6])
     savemat(tmp_path / "a.mat", {"t": np.arange(6.0), "R": [0.0, 3, -1, 2, 1, 0]})
     read = read_series(tmp_path / "a.mat", TIME, radius)
     assert (read.times.size, len(read.left_out[BELOW])) == (3, 2)

@@ -55,6 +55,9 @@ def test_columns_without_names_are_counted(tmp_path, text, decimal):
         ("Camera,X\nrate,2e6\n\nt,R\nus,um\n0,1\n1,2\n", ["t", "R"]),
         ("t,R\n0,1\n1,2\nend of film\n", ["t", "R"]),
         ("a b c\nt;R;note\n0;1;\n1;2;blurred\n", ["t", "R"]),
+        ("t\tR\nus\tum\n\tbubble 3\n0\t1\n1\t2\n", ["t", "R"]),
+        ("t\tR\nus\tum\nrun 2\t2 MPa, slow\n0\t1\n1\t2\n", ["t", "R"]),
+        ("X,2026\nus,um\nt,R\n0,1\n1,2\n", ["t", "R"]),
     ],
 )
 def test_the_names_are_found_above_the_numbers(tmp_path, text, names):

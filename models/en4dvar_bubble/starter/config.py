@@ -18,7 +18,7 @@ from en4dvar.config.document import parse_document
 from en4dvar.inputs.implausible import step_doubts
 from en4dvar.inputs.matfile import indexed
 from en4dvar.inputs.parts import ANY, Column, DataFile, Layout, TimeStep
-from en4dvar.inputs.readers import AGAIN, BELOW, CLIPPED, FAR, ODD, Readings, read_series
+from en4dvar.inputs.readers import AGAIN, BELOW, CLIPPED, FAR, LEVEL, ODD, Readings, read_series
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.files import expanded
 from en4dvar.plumbing.units import UnitError, convert, parse_quantity, parse_unit
@@ -259,7 +259,7 @@ def _left_out(name: str, series: Readings) -> list[str]:
     if none := series.left_out.get(BELOW):
         which = "reading of 0 or below is a frame" if len(none) == 1 else "readings of 0 or below are frames"
         words.append(f"{name}: {len(none)} {which} without a bubble, and left out")
-    for reason, why in ((FAR, "none of the bubble by the neighbours"), *((it, it) for it in (AGAIN, CLIPPED))):
+    for reason, why in ((FAR, "none of the bubble by the neighbours"), *((it, it) for it in (AGAIN, CLIPPED, LEVEL))):
         if far := [f"{1e6 * time:.6g}" for time in series.left_out.get(reason, ())]:
             told = f"{', '.join(far[:6])}{' …' * (len(far) > 6)} us"
             which = f"reading at {told} is" if len(far) == 1 else f"{len(far)} readings at {told} are"
