@@ -20,10 +20,10 @@ from en4dvar.data.noise import Noise, SharedErrors, noise_of
 from en4dvar.data.observations import Observations
 from en4dvar.data.series import Series, balanced
 from en4dvar.inputs.formats import SUFFIXES
-from en4dvar.inputs.implausible import scatter_of, step_doubts
+from en4dvar.inputs.implausible import cut_off, scatter_of, step_doubts
 from en4dvar.inputs.members import read_covariance
 from en4dvar.inputs.parts import ANY, Column, DataFile, Layout, parts_of
-from en4dvar.inputs.readers import CLIPPED, LEVEL, ODD, Readings, Rows, read_series
+from en4dvar.inputs.readers import CLIPPED, Readings, Rows, read_series
 from en4dvar.inputs.window import select
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, caution
@@ -184,11 +184,10 @@ def _doubts(data: Data, read: Readings) -> tuple[Caution, ...]:
             words += f", at {', '.join(f'{time:.6g}' for time in listed)}{more} {column.unit}"
         left_out += (caution("down-weighted", words),)
     if len(times) == len(read.times) > 0:
-        for reason in (CLIPPED, LEVEL) if data.columns.observable.positive else (CLIPPED,):
-            cut = ODD[reason](times, read.values, scatter_of(times, read.values))
-            if cut.any():
-                words = f"{cut.sum()} readings at the top are {reason}: leave them out (data.outliers: leave out)"
-                left_out += (caution("implausible-data", words),)
+        cut = cut_off(times, read.values, scatter_of(times, read.values))
+        if cut.any():
+            words = f"{cut.sum()} readings at the top are {CLIPPED}: leave them out (data.outliers: leave out)"
+            left_out += (caution("implausible-data", words),)
     if not isinstance(column, Column) or len(times) < 3:
         return left_out
     return left_out + step_doubts(times, column.target, column.unit, read.scalars, column.rate)

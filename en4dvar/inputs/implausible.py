@@ -172,11 +172,15 @@ def level_top(times: Array, radius: Array, scatter: float) -> npt.NDArray[np.boo
             inside = cubic > level
     squares, level, cubic, inside = best
     if squares < math.inf:
-        variance = max(squares / (count - DEGREE - 1), np.nan_to_num(scatter / radius[largest]) ** 2)
+        own = float(np.nan_to_num(scatter / radius[largest]))
+        variance = max(squares / (count - DEGREE - 1), own**2)
         quartic = powers @ np.linalg.lstsq(weights[:, None] * powers, weights * y)[0]
         lead = float(np.mean(np.clip(cubic[inside], 0, None) ** (1 / POWER))) / level ** (1 / POWER) - 1
         better = float(np.sum((weights * (y - quartic)) ** 2)) - squares
-        odd[first:stop] = inside & (better > CUT**2 * variance) & (lead > math.sqrt(variance))
+        sides = np.split(share, np.flatnonzero(inside)[[0, -1]])  # they rise and fall, where a bubble has no other tops
+        dips = [np.max(np.maximum.accumulate(side) - side) for side in (sides[0], sides[-1][::-1])]
+        clipped = better > CUT**2 * variance and lead > math.sqrt(variance) and max(dips) <= CUT * own
+        odd[first:stop] = inside & clipped
     return odd
 
 

@@ -131,6 +131,15 @@ def test_a_top_that_scatters_is_not_level() -> None:
         assert not level_top(t, rounded, scatter_of(t, rounded)).any()
 
 
+def test_a_bubble_that_oscillates_has_no_level_top() -> None:
+    stream = np.random.default_rng(14)
+    for _ in range(400):
+        t = np.linspace(0, 1, stream.integers(8, 200))
+        cycles, amplitude, phase = stream.uniform((0.2, 0.05, 0), (8, 0.45, 2 * np.pi))
+        r = 1 + amplitude * np.sin(2 * np.pi * cycles * t + phase) + 0.005 * stream.standard_normal(len(t))
+        assert not level_top(t, r, scatter_of(t, r)).any()
+
+
 def test_a_bubble_that_is_large_when_first_seen_is_no_nucleus() -> None:
     """Seen from 72 % of R_max to 36 %, growth from small would have been seen before."""
     t, r = history(np.random.default_rng(8), 24, 0.003, 0.65)
