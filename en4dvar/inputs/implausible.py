@@ -179,6 +179,7 @@ def level_top(times: Array, radius: Array, scatter: float) -> npt.NDArray[np.boo
         better = float(np.sum((weights * (y - quartic)) ** 2)) - squares
         sides = np.split(share, np.flatnonzero(inside)[[0, -1]])  # they rise and fall, where a bubble has no other tops
         dips = [np.max(np.maximum.accumulate(side) - side) for side in (sides[0], sides[-1][::-1])]
+        dips.append(2 * float(np.std(share[inside])))
         clipped = better > CUT**2 * variance and lead > math.sqrt(variance) and max(dips) <= CUT * own
         odd[first:stop] = inside & clipped
     return odd
