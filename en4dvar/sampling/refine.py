@@ -4,8 +4,8 @@ The members' own J, known from the posterior forecast, clear most runs. Where th
 emulator of J is fitted about the ensemble and sampled: its mean and standard deviations are those of the posterior
 within about a tenth, and what they differ from the ensemble's is what a Markov chain would find
 (benchmarks/gaussianity.py). A Gaussian that is too narrow draws no member where the tails of the posterior are, and a
-tangent does not see what is elsewhere: members of the prior may, and as many runs twice as far out as members.
-Weighted, they tell mean and spread of any model.
+tangent does not see what is elsewhere: members of the prior may, and as many runs twice as far out as members, or
+along a way on which J hardly rises. Weighted, they tell mean and spread of any model.
 """
 
 import math
@@ -41,6 +41,8 @@ KEPT = 500  # draws of the posterior beside the members
 CHAIN_FITS = 4  # of an emulator that has to guide a chain into the tails; two tell mean and spread
 SHIFT, SPREAD = 0.25, 0.15  # of the ensemble, by the emulator, that leave a doubt: half of what is warned of
 FAR = 2.0  # times as far out as the members
+END = 3.0  # standard deviations to either side of the mean, where J of the Gaussian has risen by 4.5
+SHORT = 1.5  # less than that by which J rises to an end from which tails are looked into
 TINY = 1e-3  # standard error, or share that is left, below which none matters
 ROUNDING = 1e-9  # of the standard deviation of all points: where one has all of the weight
 ELSEWHERE = 0.5  # share of the posterior at members of the prior beyond the ensemble's own share there
@@ -80,24 +82,46 @@ def examine_tails(space: WeightSpace, ensemble: Array, costs: Array, before: Arr
     """How far mean and standard deviation of the ensemble (N, n) are from the posterior's in what is printed.
 
     By members of J ``costs`` (N,), those of the prior of J ``before`` (N,) and, ``always`` or where these leave a
-    doubt, as many runs :data:`FAR` times as far out as the members. All are weighted with the density that they are
-    drawn from, for the posterior and for the Gaussian of the ensemble: of a Gaussian posterior both weights are the
-    same, whatever the points are. ``tail_shift`` is the largest distance of both means in posterior standard
-    deviations, ``tail_ratio`` the standard deviation of the ensemble over the posterior's where that is farthest from
-    1, ``tail_excess`` by how many standard errors of theirs a distance or ratio is beyond :data:`SHIFT` or
-    :data:`SPREAD`. ``tail_mean_<name>``, ``tail_std_<name>`` are those of a parameter that is surely off by what is
-    warned of, NaN where ``tail_members``, the effective number of the points, is below :data:`TOO_FEW` to say to what.
+    doubt or J rises too little along a parameter, as many runs :data:`FAR` times as far out as the members; where a
+    doubt remains that is not sure, and not ``always``, by as many again about the end of the way along which J rises
+    least. All are weighted with the density that they are drawn from, for the posterior and for the Gaussian of the
+    ensemble: of a Gaussian posterior both weights are the same, whatever the points are. ``tail_shift`` is the largest
+    distance of both means in posterior standard deviations, ``tail_ratio`` the standard deviation of the ensemble over
+    the posterior's where that is farthest from 1, ``tail_excess`` by how many standard errors of theirs a distance or
+    ratio is beyond :data:`SHIFT` or :data:`SPREAD`. ``tail_mean_<name>``, ``tail_std_<name>`` are those of a parameter
+    that is surely off by what is warned of, NaN where ``tail_members``, the effective number of the points, is below
+    :data:`TOO_FEW` to say to what.
     ``tail_elsewhere``: most of the posterior is where the ensemble is not. Nothing of an ensemble without a covariance.
     """
     weighed: dict[str, float] = {}
     with suppress(np.linalg.LinAlgError):
-        parts = [(ensemble, costs), (space.members, before)]
-        weighed = _by_weights(space.problem.prior, parts)
-        if always or weighed["tail_excess"] > 0:
+        prior, parts = space.problem.prior, [(ensemble, costs), (space.members, before)]
+
+        def with_runs(points: Array) -> dict[str, float]:
+            parts.append((points, space.costs(points, space.forecast(points))))
+            return _by_weights(prior, parts)
+
+        weighed = _by_weights(prior, parts)
+        way, rise = (np.zeros(len(prior.names)), 0.0) if always else _flattest(space, ensemble)
+        if weighed["tail_excess"] > 0 or rise < 0.5 * END**2 - SHORT:
             mean = ensemble.mean(axis=0)
-            far = mean + FAR * (ensemble - mean)
-            weighed = _by_weights(space.problem.prior, [*parts, (far, space.costs(far, space.forecast(far)))])
+            weighed = with_runs(mean + FAR * (ensemble - mean))
+            if not always and doubtful(weighed) and not diag.is_non_gaussian(weighed):
+                weighed = with_runs(ensemble + way)
     return weighed
+
+
+def _flattest(space: WeightSpace, ensemble: Array) -> tuple[Array, float]:
+    """The way (n,) from the mean of an ensemble (N, n) along which J rises least, and by how much.
+
+    On each way one parameter goes :data:`END` standard deviations, and the others where the Gaussian then expects them.
+    """
+    mean, covariance = ensemble.mean(axis=0), np.atleast_2d(np.cov(ensemble.T))
+    ways = END * covariance / np.sqrt(np.diag(covariance))[:, None]
+    ways = np.concatenate([np.zeros((1, len(mean))), ways, -ways])
+    costs = space.costs(mean + ways, space.forecast(mean + ways))
+    least = 1 + int(np.argmin(costs[1:]))
+    return ways[least], float(costs[least]) - float(costs[0])
 
 
 def _by_weights(prior: Prior, parts: Sequence[tuple[Array, Array]]) -> dict[str, float]:

@@ -104,6 +104,30 @@ def test_of_another_function_it_is_told(name, seed):
     assert "non-gaussian" in codes or "several-modes" in codes
 
 
+@pytest.mark.parametrize("seed", [105, 135, 140, 148, 149])
+def test_a_tail_along_which_the_cost_hardly_rises_is_told(seed):
+    """Of a decay that was over before the second reading, against quadrature: no member is where k is large."""
+    rng, t = np.random.default_rng(seed), np.arange(4.0)
+    while True:
+        a, k = np.exp(rng.standard_normal(2))
+        if 1 < a < 4 and 0.5 < k < 3:
+            break
+    y = a * np.exp(-k * t) + 0.3 * rng.standard_normal(4)
+    ln_a, ln_k = np.linspace(-2, 3, 251)[:, None], np.linspace(-5, 5, 501)
+    logs = -0.5 * (ln_a**2 + ln_k**2)
+    for at, value in zip(t, y, strict=True):
+        logs = logs - 0.5 * ((value - np.exp(ln_a - np.exp(ln_k) * at)) / 0.3) ** 2
+    shares = np.exp(logs - logs.max()).sum(axis=0)
+    found = en4dvar.estimate(
+        lambda p, t: p["a"] * np.exp(-p["k"] * t), (t, y), {name: lognormal(1, 1)[0] for name in "ak"},
+        error=0.3, seed=seed, progress=False,
+    )  # fmt: skip
+    beyond = np.exp(ln_k) > np.quantile(found.posterior["k"].values, 0.95)
+    assert shares[beyond].sum() > 0.15 * shares.sum()
+    (told,) = (c for c in found.cautions if c.code == "non-gaussian")
+    assert "k" in told.parameters
+
+
 def test_what_is_told_is_what_the_posterior_is():
     """Weights of many members, against quadrature."""
     case = CASES["wider than its prior says in ln k"]
