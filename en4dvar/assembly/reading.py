@@ -134,7 +134,7 @@ def read_one(plan: SeriesPlan, file: DataFile, fewest: int) -> Series:
         clock = data.columns.time
         early, unit = -times[0], ""
         if isinstance(clock, Column):
-            early, unit = convert(early, clock.target, clock.unit), f" {clock.unit}"
+            early, unit = convert(early, clock.target, clock.unit), "" if clock.unit == "1" else f" {clock.unit}"
         words = f"the first observation used lies {early:g}{unit} before time zero, where the model's clock starts"
         raise DataError(f"{path}: {words}; put it earlier (data.time_zero), or begin later (data.window.from)")
 

@@ -84,9 +84,9 @@ class WeightSpace:
         return np.asarray(self.mean + w @ self.anomalies)
 
     def weights_of(self, x: Array) -> Array:
-        """The shortest weights (N,) of a control vector (n,) that the anomalies reach."""
+        """The shortest weights (…, N) of control vectors (…, n) that the anomalies reach."""
         scale = np.sqrt(self.prior_variance)
-        return np.asarray(np.linalg.lstsq((self.anomalies / scale).T, (x - self.mean) / scale, rcond=None)[0])
+        return np.asarray(np.linalg.lstsq((self.anomalies / scale).T, ((x - self.mean) / scale).T, rcond=None)[0].T)
 
     def ensemble(self, w: Array, transform: Array | LowRank) -> Array:
         """Control vectors (N + 1, n) of the members w + T_i of a transform T and, last, of w (N,)."""

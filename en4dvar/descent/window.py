@@ -18,7 +18,7 @@ from en4dvar.descent.step_control import NEAR, STEP_CONTROLS, Move, Point, Searc
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.diagnosis import diagnostics as diag
 from en4dvar.diagnosis.analysis import IterationRecord, Record
-from en4dvar.diagnosis.diagnostics import UNSEEN
+from en4dvar.diagnosis.diagnostics import SHORT_STEP, UNSEEN
 from en4dvar.ensemble.forecast import NO_TIMES, Forecast
 from en4dvar.ensemble.linalg import LowRank
 from en4dvar.ensemble.missing import filled
@@ -83,6 +83,11 @@ class Descent(Descends):
         return self.step
 
     @property
+    def at_minimum(self) -> bool:
+        """Whether J may be expanded about where it ended."""
+        return self.converged or self.newton.norm <= SHORT_STEP
+
+    @property
     def iterate(self) -> Iterate:
         """Where it stands, once the runs are there."""
         assert self.at is not None
@@ -92,8 +97,8 @@ class Descent(Descends):
 class DataWindow(Objective[Descent]):
     """The window of an estimate: one descent, to the minimum of J or through the passes of a scheme.
 
-    ``first`` is the forecast of the prior members and their mean, which a scheme that runs its whole ensemble does not
-    repeat; with ``grid`` (M,) its last forecast is read along these times as well, so that it is the posterior's.
+    ``first`` is the forecast of the members and the centre where it starts, which a scheme that runs its whole ensemble
+    does not repeat; with ``grid`` (M,) its last forecast is read along these times as well, as that of the posterior.
     """
 
     def __init__(
@@ -276,18 +281,19 @@ class DataWindow(Objective[Descent]):
         self.record(descent, descent.weights.T, 0.0 if descent.stop else 1.0)
         descent.ended = bool(descent.stop)
         if descent.ended:
+            descent.converged = descent.newton.norm <= SHORT_STEP
             return
         assert taken is not None
         count = descent.iteration
         if self.scheme.done(count - 1, taken):
-            descent.stop, descent.converged = f"{count} assimilations", True
+            descent.stop = f"{count} assimilation{'s' * (count > 1)}"
         basis = self.space.basis  # of the weights of the mean, those that move no parameter are no part of J_b
         descent.weights = Weights(basis @ (basis.T @ taken.weights.w), taken.weights.dense)
 
     def _run_ensemble(self, descent: Descent) -> Runs | None:
         space = self.space
-        if descent.iteration == 0 and self.first is not None:
-            run = self.first
+        if self.first is not None:
+            run, self.first = self.first, None
         else:
             rows = np.array([*self.scheme.members(descent.weights), descent.weights.w])
             run = space.forecast(space.control(rows), self.grid if descent.stop else NO_TIMES)

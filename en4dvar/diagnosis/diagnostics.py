@@ -18,6 +18,7 @@ EMULATED_ENOUGH = 0.2  # effective share of its runs below which an emulator is 
 GAUSSIAN_ENOUGH = 0.35  # the same of the members: the criterion where there is no emulator to believe
 DECISIVE = 20.0  # ratio of two evidences from which on the data are said to speak for one of the models
 UNSEEN = 0.1  # posterior standard deviations: a step that is within what so few members tell of the posterior
+SHORT_STEP = 0.5  # the same: the end of a step that is longer is no minimum
 HARDLY_INFORMED = 0.1  # DFS of a parameter below which its posterior is said to be its prior
 METHOD: Literal["normal_unbiased"] = "normal_unbiased"
 

@@ -77,7 +77,7 @@ def _through(stages: Stages) -> Analysis:
         descents = conclusions.descents_of(outcome, len(space.members))
         if descents and looking:  # else they are those that were told
             stages.tell(descents)
-        sampled = stages.sampled(ends, prior_run, counting, agree, looking)
+        sampled = stages.sampled(outcome.descent, ends, prior_run, counting, agree, looking)
         if sampled.refined:
             lower = sampled.refined.lower
         else:  # a chain would have found what lies lower
@@ -141,9 +141,9 @@ def _concluded(
     log_evidence = sampled.refined.log_evidence - observations.log_normalisation() if sampled.refined else math.nan
     if not math.isfinite(log_evidence) and ends.bounded:  # there are no draws, or too few
         log_evidence = ends.bounded.log_evidence - observations.log_normalisation()
-    elif not math.isfinite(log_evidence):  # by Laplace
-        values = descent.newton.hessian.singular_values
-        log_evidence = diag.log_evidence(descent.iterate.cost, values, len(space.members), observations)
+    elif not math.isfinite(log_evidence) and descent.at_minimum:  # by Laplace
+        newton, lowest = descent.newton, descent.iterate.cost - descent.newton.predicted_decrease
+        log_evidence = diag.log_evidence(lowest, newton.hessian.singular_values, len(space.members), observations)
     std = ends.members.std(axis=0, ddof=1)
     shifts: tuple[Shift, ...] = ()
     begun = space.forward_runs  # those of fits are told with the shifts

@@ -175,13 +175,14 @@ class Stages:
         return Ends(members, mode, final[:-1], final[-1:], bounded)
 
     def sampled(
-        self, ends: Ends, prior_run: Forecast, minima: Sequence[Minimum], agree: bool, looking: bool
+        self, descent: Descent, ends: Ends, prior_run: Forecast, minima: Sequence[Minimum], agree: bool, looking: bool
     ) -> Sampled:
         """The ensemble, sampled where that is asked for or there is a doubt.
 
         ``agree``: descents from different members ended in the lowest of the ``minima`` that count. ``looking``: end at
-        a draw that lies lower than all minima. Where members lack readings nothing is sampled: draws without one would
-        count as impossible.
+        a draw that lies lower than all minima. The ``descent`` of a scheme that minimises nothing moves to the draw of
+        lowest J and the linearisation that the draws give, so that what is told is told of them. Where members lack
+        readings nothing is sampled: draws without one would count as impossible.
         """
         space = self.space
         if ends.run.filled:
@@ -204,9 +205,20 @@ class Stages:
         sampled = refined(space, ends.members, minima, self.seed, looking=looking, look=self.tell)
         if sampled.lower is not None:
             return Sampled(ends, sampled, {})
-        run = space.whole(sampled.members, self.grid)
-        central = ends.central if self.minimiser else space.forecast(ends.mode[None], self.grid)
-        return Sampled(Ends(sampled.members, ends.mode, run, central, ends.bounded), sampled, {})
+        if self.minimiser:
+            run, mode, central = space.whole(sampled.members, self.grid), ends.mode, ends.central
+        else:
+            mode = sampled.best
+            whole = space.whole(np.vstack([sampled.members, mode]), self.grid)
+            run, central = whole[:-1], whole[-1:]
+            self._moved(descent, sampled.members, mode, whole)
+        return Sampled(Ends(sampled.members, mode, run, central, ends.bounded), sampled, {})
+
+    def _moved(self, descent: Descent, members: Array, mode: Array, run: Forecast) -> None:
+        """Set a descent that minimised nothing to draws (N, n) about the ``mode`` (n,), whose ``run`` is there."""
+        rows = self.space.weights_of(np.vstack([members, mode]))
+        descent.weights, descent.ended = Weights(rows[-1], rows[:-1] - rows[-1]), False
+        minimise(DataWindow(self.space, self.tell, run, self.grid), [descent])
 
     def tell(self, record: Record) -> None:
         if self.progress is not None:

@@ -74,6 +74,9 @@ UNPREFIXED = {
     "rad": ONE,
     "min": _unit("60", s=1),
     "h": _unit("3600", s=1),
+    **dict.fromkeys(("d", "day"), _unit("86400", s=1)),
+    "week": _unit("604800", s=1),
+    **dict.fromkeys(("yr", "year"), _unit("31557600", s=1)),  # Julian, 365.25 d
     "atm": _unit("101325", m=-1, kg=1, s=-2),
 }
 PREFIXES = {"T": 12, "G": 9, "M": 6, "k": 3, "h": 2, "d": -1, "c": -2, "m": -3, "u": -6, "n": -9, "p": -12, "f": -15}
@@ -99,10 +102,12 @@ def _symbol(name: str) -> Unit:
 
 
 def _did_you_mean(name: str) -> str:
-    words = {"micron": "um", "sec": "s", "usec": "us", "msec": "ms", "hz": "Hz", "degC": "K", "C": "K", "percent": "%"}
+    words = {"micron": "um", "sec": "s", "usec": "us", "msec": "ms", "hz": "Hz", "degC": "K", "C": "K", "percent": "%",
+             "hour": "h", "hr": "h", "minute": "min", "second": "s", "a": "yr", "month": "d"}  # fmt: skip
+    single = name.removesuffix("s")
     known = [*UNPREFIXED, *PREFIXED, *(p + u for p in PREFIXES for u in PREFIXED)]
     same_letters = [k for k in known if k.lower() == name.lower()]
-    close = [words[name]] if name in words else same_letters[:1] or get_close_matches(name, known, 1, 0.6)
+    close = [words[single]] if single in words else same_letters[:1] or get_close_matches(name, known, 1, 0.6)
     return f"; did you mean {close[0]!r}?" if close else ""
 
 

@@ -27,9 +27,10 @@ _permitted: dict[tuple[Path, str], bytes] = {}  # file and digest → its source
 
 
 def is_file_reference(name: str) -> bool:
-    """True if ``name`` is ``file.py:Class`` rather than ``package:Class`` or a single word."""
-    where, colon, _ = name.rpartition(":")
-    return bool(colon) and (where.endswith(".py") or "/" in where or "\\" in where)
+    """True if ``name`` is ``file.py:Class`` rather than ``package:Class``, ``tcp://host:8786`` or a single word."""
+    where, colon, attribute = name.rpartition(":")
+    in_folder = attribute.isidentifier() and ("/" in where or "\\" in where)
+    return bool(colon) and (where.endswith(".py") or in_folder)
 
 
 def is_from_file(kind: type) -> bool:

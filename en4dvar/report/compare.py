@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-from scipy.special import softmax
 
 from en4dvar.data.observations import Observations
 from en4dvar.diagnosis.diagnostics import member_quantiles
@@ -26,7 +25,7 @@ from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, codes
 from en4dvar.plumbing.errors import ConfigError, OutputError, retold
 from en4dvar.plumbing.files import make_folder
-from en4dvar.plumbing.hints import shown, suggest
+from en4dvar.plumbing.hints import listed, shown, suggest
 from en4dvar.plumbing.tables import table, write_csv
 from en4dvar.plumbing.units import UnitError, convert
 from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, in_columns
@@ -148,8 +147,13 @@ class Comparison:
             return f"not compared: {self.incomparable}"
         if dataset not in self.datasets:
             raise ConfigError(f"verdict: no data set {shown(dataset)}{suggest(dataset, self.datasets)}")
-        best, second = sorted(self.of(dataset), key=lambda score: -score.log_evidence)[:2]
-        words = preferred(best.run, second.run, -second.difference)
+        known = [score for score in self.of(dataset) if np.isfinite(score.log_evidence)]
+        lacking = listed(score.run for score in self.of(dataset) if score not in known)
+        without = f"the evidence of {lacking} is not known before its warnings are settled" if lacking else ""
+        if len(known) < 2:
+            return f"not compared: {without}"
+        best, second = sorted(known, key=lambda score: -score.log_evidence)[:2]
+        words = preferred(best.run, second.run, -second.difference) + f"; {without}" * bool(without)
         if doubts := [f"{score.run} ({score.doubted})" for score in (best, second) if score.doubted]:
             words += f"; not to be trusted before the warnings of {' and '.join(doubts)} are settled"
         return words
@@ -376,7 +380,9 @@ def _total(scores: Sequence[ModelScore]) -> ModelScore:
 def ranked(scores: Sequence[S]) -> list[S]:
     """The scores with the difference of their log-evidence from the best one, and their probabilities."""
     evidence = np.array([s.log_evidence for s in scores])
+    difference = evidence - evidence[np.isfinite(evidence)].max(initial=-np.inf)
+    odds = np.exp(difference)  # the models are equally probable before the data
     return [
-        replace(s, difference=float(s.log_evidence - evidence.max()), probability=float(p))
-        for s, p in zip(scores, softmax(evidence), strict=True)  # the models are equally probable before the data
+        replace(s, difference=float(d), probability=float(p))
+        for s, d, p in zip(scores, difference, odds / np.nansum(odds), strict=True)
     ]

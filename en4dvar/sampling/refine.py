@@ -208,8 +208,8 @@ class Refined:
     ``modes``: of each minimum, and each group of draws without one, the weight, the quantiles (3, n) of the draws that
     belong to it, NaN where none does, and the lowest J of these;
     ``log_evidence`` ln ∫ exp(−J_o) N(x; prior) dx, NaN where it is not known;
-    ``lowest`` J that was met. ``draws`` (:data:`KEPT`, n) are equally likely; there are none of a chain. ``lower`` (n,)
-    is a draw that lies lower than all minima; then nothing else was sampled.
+    ``lowest`` J that was met, at ``best`` (n,) where a chain met it. ``draws`` (:data:`KEPT`, n) are equally likely;
+    there are none of a chain. ``lower`` (n,) is a draw that lies lower than all minima; then nothing else was sampled.
     """
 
     members: Array
@@ -217,6 +217,7 @@ class Refined:
     modes: Sequence[tuple[float, Array, float]] = ()
     log_evidence: float = math.nan
     lowest: float = math.inf
+    best: Array = field(default_factory=lambda: np.empty(0))
     draws: Array = field(default_factory=lambda: np.empty((0, 0)))
     lower: Array | None = None
     warnings: tuple[Caution, ...] = ()
@@ -333,7 +334,7 @@ def refined(
         summary = _summary(draws, posterior)
         kept = draws.x[resampled(draws.shares, KEPT, member_stream(seed, "kept draws"))]
         own = _own_draws(draws.x, draws.shares, draws.mode, draws.costs, len(minima))
-        return Refined(members, summary, own, draws.log_evidence, draws.lowest, kept)
+        return Refined(members, summary, own, draws.log_evidence, draws.lowest, draws=kept)
     several = draws is not None and len(minima) > 1
     start = _in_all(minima, len(posterior), seed) if several else posterior
     emulated = None if several else guide(space, posterior, seed)
@@ -356,6 +357,7 @@ def refined(
         _own_draws(walked.flat, equal, mode, -walked.log_density.ravel(), len(minima)),
         draws.log_evidence if draws is not None and known else math.nan,
         float(-walked.log_density.max()),
+        walked.flat[np.argmax(walked.log_density)],
         warnings=() if walked.converged else (caution("chain-not-converged", walked.warning()),),
     )
 

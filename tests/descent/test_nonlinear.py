@@ -92,7 +92,8 @@ def test_iteration_limit_is_not_convergence():
     analysis = assimilate(problem, AssimilationSettings(members=16, max_iterations=1, start="prior-mean"), 1)
     assert not analysis.converged
     assert analysis.stop_reason == "iteration limit (1) reached"
-    assert analysis.warnings[0] == "not converged: iteration limit (1) reached"
+    assert analysis.warnings[0].startswith("not converged: iteration limit (1) reached; the next step would be 0.")
+    assert np.isnan(analysis.log_evidence)  # which is that of a minimum
     assert len(analysis.iterations) == 2
 
 

@@ -4,6 +4,7 @@ import pytest
 from distributed import LocalCluster
 from run_files import assert_same_results, configuration, make_campaign
 
+import en4dvar
 from en4dvar.executor import ExecutorError
 from en4dvar.executor import dask as dask_executor
 from en4dvar.plumbing.errors import ConfigError
@@ -34,6 +35,16 @@ def test_no_scheduler(tmp_path, monkeypatch):
     with pytest.raises(ExecutorError, match=r"dask scheduler tcp://127\.0\.0\.1:9: cannot be reached"):
         run_campaign(configuration(path, tmp_path / "run", address="tcp://127.0.0.1:9"))
     assert not (tmp_path / "run").exists()
+
+
+def test_the_address_in_a_script_is_no_file(monkeypatch):
+    monkeypatch.setattr(dask_executor, "CONNECT_TIMEOUT", 1.0)
+    address = "tcp://127.0.0.1:9"
+    with pytest.raises(ExecutorError, match=f"dask scheduler {address}: cannot be reached"):
+        en4dvar.estimate(
+            lambda p, t: p["a"] + 0 * t, ([1, 2], [1, 2]), {"a": {"prior": "normal", "mean": 0, "std": 2}}, error=1,
+            execution={"executor": "dask", "address": address},
+        )  # fmt: skip
 
 
 def test_an_address_is_of_dask_only(tmp_path):

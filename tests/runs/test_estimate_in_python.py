@@ -190,6 +190,7 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "repeated": ({"data": (TIMES.round(), VALUES)}, "follows 0; keep one of the two readings, or their mean"),
     "no parameter": ({"priors": {"reading_scale": PRIORS["a"]}}, "priors: none is of a parameter of the function"),
     "members": ({"assimilation": {"members": 10**9}}, "assimilation.members: should be less than or equal to 100000"),
+    "early": ({"data": (TIMES - 2, VALUES)}, "the first observation used lies 2 before time zero, where the model's"),
     "window": ({"window": {"form": 1}}, "window.form: unknown key 'form'; did you mean 'from'?"),
 }  # fmt: skip
 

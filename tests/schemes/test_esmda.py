@@ -49,7 +49,7 @@ def test_square_root_form_is_one_update_of_a_linear_model(coefficients, sampling
     assert gap(analysis.centre, mean) < 1e-12
     assert gap(np.cov(analysis.posterior.T), cov) < 1e-12
     assert len(analysis.iterations) == len(coefficients) + 1
-    assert analysis.stop_reason == f"{len(coefficients)} assimilations"
+    assert analysis.stop_reason == f"{len(coefficients)} assimilation{'s' * (len(coefficients) > 1)}"
 
 
 def test_perturbed_form_once_has_the_mean_of_the_kalman_update():

@@ -60,6 +60,17 @@ class Case:
         first = next((code for code in CAUSES if code in self.codes), "")
         return f"settle the warning {first} first, which may be the reason" if first else ""
 
+    def with_scheme(self, option: str) -> str:
+        """What only a scheme that minimises J takes, with such a scheme where there is another."""
+        own = self.a.settings.own.minimiser
+        return option if own else f"{option}, with assimilation.scheme: {MINIMISERS[0]}"
+
+    @property
+    def structure(self) -> str:
+        """The catalogue's advice about residuals with structure."""
+        option = "data.error.discrepancy: estimated"
+        return CATALOGUE["residual-structure"][1].replace(option, self.with_scheme(option))
+
     def reading(self, value: float) -> str:
         """A size of readings in the unit in which their errors are stated."""
         observable = self.a.problem.observable
@@ -84,6 +95,8 @@ def advised(a: Analysis, cautions: Sequence[Caution]) -> tuple[Caution, ...]:
 
 
 def _not_converged(case: Case) -> str:
+    if case.a.settings.own.minimiser is None:
+        return f"set assimilation.scheme: {MINIMISERS[0]}, which minimises J, or assimilation.refine: mcmc"
     now = getattr(case.a.settings.own, "max_iterations", ENOUGH)
     if now < ENOUGH:
         return f"set assimilation.max_iterations: {max(20, 2 * now)} (it is {now})"
@@ -112,8 +125,8 @@ def _misfit(case: Case) -> str:
         f"state an error of about {case.reading(case.scatter * case.stated)} ({case.reading(case.stated)} is stated)"
     )
     return (
-        f"look at the residuals; if the readings scatter as much as they do, {larger}, or {SIGMA}; if not, the model "
-        "or the window must change"
+        f"look at the residuals; if the readings scatter as much as they do, {larger}, or {case.with_scheme(SIGMA)}; "
+        "if not, the model or the window must change"
     )
 
 
@@ -124,8 +137,8 @@ def _overstated(case: Case) -> str:
             f"check the unit of data.error: {case.reading(case.stated)} is stated, the residuals scatter by {scatter}"
         )
     if "residual-structure" in case.codes and not case.a.problem.discrepancy:
-        return CATALOGUE["residual-structure"][1]
-    also = "" if NOISE_SCALE.name in case.a.problem.prior.names else f", or {SIGMA}"
+        return case.structure
+    also = "" if NOISE_SCALE.name in case.a.problem.prior.names else f", or {case.with_scheme(SIGMA)}"
     return f"state an error of about {scatter} ({case.reading(case.stated)} is stated){also}; intervals are too wide"
 
 
@@ -136,7 +149,7 @@ def _structure(case: Case) -> str:
         return cause
     kernel = getattr(case.a.observations.noise, "kernel", None)
     if kernel is None:
-        return CATALOGUE["residual-structure"][1]
+        return case.structure
     smoother = sorted((nu, name) for name, nu in SMOOTHNESS.items() if nu > kernel.smoothness)
     other = f"kernel: {smoother[0][1]}" if smoother else "grows_beyond" if not kernel.grows else ""
     if other:
@@ -171,7 +184,7 @@ def _odd(case: Case) -> str:
         first = "state how uncertain the times are (data.error.time_std)" if sure else "a larger data.error.time_std"
         return f"{first}; if the times are right, the model errs where the observable changes fast"
     if _may_be_robust(case):
-        return "look at this reading; set data.error.robust: huber, with which such readings count less"
+        return f"look at this reading; with {case.with_scheme('data.error.robust: huber')} such readings count less"
     return "look at this reading; if it is wrong, delete its line from the data file and say so"
 
 
@@ -245,7 +258,8 @@ def _one_descent(case: Case) -> str:
 def _gaussian(case: Case) -> str:
     if case.a.settings.own.approximate:
         return f"set assimilation.scheme: {MINIMISERS[0]}, whose ensemble is the posterior"
-    said = "" if case.a.problem.model.cheap else ", or say that the model is cheap, if ten thousand runs take seconds"
+    settled = case.a.problem.model.cheap or case.a.settings.own.minimiser is None
+    said = "" if settled else ", or say that the model is cheap, if ten thousand runs take seconds"
     return f"{CATALOGUE['non-gaussian'][1]}{said}"
 
 

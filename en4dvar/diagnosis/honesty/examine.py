@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from en4dvar.diagnosis.analysis import Analysis
-from en4dvar.diagnosis.diagnostics import UNSEEN, active_members
+from en4dvar.diagnosis.diagnostics import SHORT_STEP, UNSEEN, active_members
 from en4dvar.diagnosis.honesty import checks
 from en4dvar.diagnosis.honesty.advice import advised
 from en4dvar.model.state import Array, Mask
@@ -17,7 +17,6 @@ from en4dvar.priors.prior import Prior
 from en4dvar.problem import InverseProblem
 
 COLLAPSED = 1 / 9  # of the mean of 2 (J − J_min) per parameter: a spread below a third of what J allows
-SHORT_STEP = 0.5  # posterior standard deviations
 NO_SPREAD = 1e-14  # of the size of values: members that agree to rounding
 
 
@@ -132,15 +131,18 @@ def unfinished(analysis: Analysis) -> checks.Findings:
     if analysis.converged or step_norm <= UNSEEN:
         return
     words = f"not converged: {analysis.stop_reason}"
+    following = f"the next step would be {step_norm:.2g} posterior standard deviations"
     if analysis.refinement:
         words = f"the search for the minimum has {words}; members are drawn from the posterior itself, wherever that is"
         yield replace(caution("not-converged", words, "note"), advice="no action is needed")
     elif step_norm <= SHORT_STEP:
-        words = f"{words}; the next step would be {step_norm:.2g} posterior standard deviations"
+        words = f"{words}; {following}"
         advice = "no action is needed where this is little to you; else start again from another seed"
         yield replace(caution("not-converged", words, "note"), advice=advice)
     else:
-        yield caution("not-converged", words)
+        settings = analysis.settings
+        by = "" if settings.own.minimiser else f" of {settings.scheme}, which does not seek the minimum of J"
+        yield caution("not-converged", f"{words}{by}; {following}")
 
 
 def collapse(prior: Prior, control: ControlEnsembles, alive: Mask) -> checks.Findings:
