@@ -28,7 +28,8 @@ from pathlib import Path
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
-ATTACKED = [str(ROOT / "tests" / name) for name in ("faults", "", "fuzz", "model")]  # where the commands find modules
+FOLDERS = ("tests/faults", "tests", "tests/fuzz", "tests/model", "", "models")
+ATTACKED = [str(ROOT / name) for name in FOLDERS]  # where commands find modules: in this tree, before what is installed
 sys.path[:0] = ATTACKED
 
 import damage  # noqa: E402

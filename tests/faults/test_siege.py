@@ -1,6 +1,9 @@
 """The attacks of benchmarks/siege.py and the kills of benchmarks/kills.py, a few of each."""
 
 import os
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 from kills import survive
@@ -22,6 +25,15 @@ def siege(tmp_path_factory):
         made.prepare()
         yield made
         made.children.close()
+
+
+def test_the_code_of_this_tree_is_attacked(tmp_path):
+    """Of a second working tree too, where another one is installed."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(ATTACKED)}
+    for package in ("en4dvar", "en4dvar_bubble"):
+        words = [sys.executable, "-c", f"import {package}; print({package}.__file__)"]
+        told = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True).stdout
+        assert Path(told.strip()).is_relative_to(Path(__file__).parents[2])
 
 
 @pytest.mark.parametrize("kind", KINDS)
