@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.diagnosis.diagnostics import HARDLY_INFORMED, active_members, change_words, member_quantiles
 from en4dvar.diagnosis.response.budget import budget_words
-from en4dvar.diagnosis.response.what_if import Shift, is_manifold
+from en4dvar.diagnosis.response.what_if import Shift, exclusion, is_manifold
 from en4dvar.model.state import Array, Mask, Parameter
 from en4dvar.plumbing.caution import Caution, codes, of_several_modes, untrusted
 from en4dvar.plumbing.tables import table
@@ -118,9 +118,12 @@ def remarks(a: Analysis) -> tuple[str, ...]:
     path's parameters are made of, how the readings after the window came out, and the alternatives that move a
     parameter beyond its error bar.
     """
-    large = [shift for shift in a.what_if if shift.exceeds]
+    last, used = a.iterations[-1], len(a.problem.observations.used)
+    excluded = {s.name: exclusion(last.chi2_per_observation, used, s.cost_change) for s in a.what_if}
+    large = [shift for shift in a.what_if if shift.exceeds and not excluded[shift.name]]
     lines = [f"what if {shift.words}: {_moved(a.parameters, shift)}" for shift in large[:MOST_REMARKS]]
     more = len(large) - len(lines)
+    lines += [f"what if {s.words}: {excluded[s.name]}" for s in a.what_if if excluded[s.name]][:MOST_REMARKS]
     if a.log_evidence_change is not None:
         names = " and ".join(change.name for change in a.problem.varying)
         lines.insert(0, change_words(names, a.log_evidence_change))

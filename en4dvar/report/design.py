@@ -3,6 +3,7 @@
 import math
 import re
 from collections.abc import Sequence
+from itertools import permutations
 from pathlib import Path
 from textwrap import fill
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from en4dvar.estimation.design.evaluate import Evaluated
-from en4dvar.estimation.design.nested import Decision
+from en4dvar.estimation.design.nested import THIN, Decision
 from en4dvar.model.state import Array
 from en4dvar.plumbing.tables import table, write_csv
 from en4dvar.plumbing.units import convert
@@ -26,7 +27,6 @@ NAMED = 4  # of the designs that cannot be had for the same reason
 NOTHING = 0.9  # of the prior's std: a posterior that is wider has learned nothing to speak of
 RARELY = 0.1  # share of experiments that decide which law holds, below which none is promised
 COARSE = 1.0  # relative std beyond which a percentage says nothing
-THIN = 0.1  # share of evidences with few effective draws that is told
 NUMBER = re.compile(r"\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*")  # begins the value of a knob; its unit follows
 GAINS = "Expected information against what can be turned, each mark a design; bars: Monte Carlo standard errors."
 FRONT = "Expected information against price; joined: the designs that no other beats in both."
@@ -145,8 +145,23 @@ def remarks(designs: Designs) -> list[str]:
         names = [settings_text(row) for row in failed if row.failure == reason]
         more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
         told.append(f"{'; '.join(names[:NAMED])}{more}: {reason}")
-    thin = sum(decision is not None and decision.thin > THIN for decision in (row.evaluated.decision for row in rows))
+    worth = [row.evaluated for row in rows]
+    stands = sum(it.thin > THIN and it.method != "nested" for it in worth)
+    thin = sum(max(it.thin, it.decision.thin if it.decision else 0.0) > THIN for it in worth) - stands
     told += [f"of {thin} designs the evidences of many readings are rough; raise design.inner"] if thin else []
+    told += (
+        [f"of {stands} designs too few draws check the linearised information, which stands; raise design.inner"]
+        if stands
+        else []
+    )
+    told += [
+        f"{settings_text(row)}: {row.evaluated.alike} of these experiments (by {by(row.evaluated)}) cannot tell more "
+        f"than {more.evaluated.alike} (by {by(more.evaluated)}): the two are not comparable; set design.method: laplace"
+        for row, more in permutations(rows, 2)
+        if row.number == more.number
+        and row.evaluated.alike < more.evaluated.alike
+        and row.evaluated.worth > more.evaluated.worth
+    ]
     told += [
         f"{settings_text(row)}: {100 * row.evaluated.beyond:.0f} % of the prior leaves what the model is valid for"
         for row in rows[:TOLD]

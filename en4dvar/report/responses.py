@@ -11,7 +11,7 @@ import numpy.typing as npt
 from markupsafe import Markup
 
 from en4dvar.diagnosis.influence import UNKNOWN
-from en4dvar.diagnosis.response.what_if import is_manifold
+from en4dvar.diagnosis.response.what_if import exclusion, is_manifold
 from en4dvar.model.state import Array
 from en4dvar.report.chart import POINTS, Chart, Panel, Row
 from en4dvar.report.text import axis_label, fixed, number_like, plain_number, pretty_unit, shown, signed, symbol_html
@@ -26,7 +26,8 @@ ENTRY_COLUMNS = ("parameter", "quantity", "unit", "q05", "q50", "q95")
 
 class StoredShift(NamedTuple):
     """What one parameter would do under an alternative, in its display unit; ``relative``: of the value, NaN where that
-    may be negative; ``reason``: why linear response does not tell, or "". Cells of :data:`SHIFT_COLUMNS`, and a symbol.
+    may be negative; ``reason``: why linear response does not tell, or "". Cells of :data:`SHIFT_COLUMNS`, a symbol, and
+    ``excluded``: words where the readings exclude the alternative, or "".
     """
 
     alternative: str
@@ -39,6 +40,7 @@ class StoredShift(NamedTuple):
     cost_change: float
     reason: str
     symbol: str
+    excluded: str = ""
 
     @property
     def exceeds(self) -> bool:
@@ -93,7 +95,8 @@ def stored_shifts(result: StoredResult) -> tuple[tuple[StoredShift, ...], ...]:
         about, value = parameters[name].attrs, float(shown(parameters[name], change[i, j]))
         numbers = value, float(relative[i, j]), float(in_std[i, j]), float(of["cost_change"][i])
         known = str(alternatives[i]), str(of["words"][i]), name, about["display_units"]
-        return StoredShift(*known, *numbers, str(of["reason"][i]), about["symbol"])
+        excluded = exclusion(float(stats.attrs["chi2_per_observation"]), int(stats.attrs["n_weighted"]), numbers[-1])
+        return StoredShift(*known, *numbers, str(of["reason"][i]), about["symbol"], excluded)
 
     largest = np.where(of["reason"] == "", np.abs(in_std).max(axis=1), 1.0)
     order = np.argsort(-largest, kind="stable").tolist()
@@ -137,8 +140,8 @@ def _amount(shift: StoredShift) -> str:
 
 
 def exceeding(rows: Iterable[Sequence[StoredShift]]) -> list[Sequence[StoredShift]]:
-    """The alternatives that move a parameter beyond its error bar, or may."""
-    return [row for row in rows if row[0].reason or any(shift.exceeds for shift in row)]
+    """The alternatives that move a parameter beyond its error bar, or may, and that the readings do not exclude."""
+    return [row for row in rows if row[0].reason or (not row[0].excluded and any(shift.exceeds for shift in row))]
 
 
 CAPTION = (

@@ -24,6 +24,7 @@ COLUMNS = {  # field of an evaluation → variable, its dimensions beside that o
     "lost": ("lost", "", "share of the prior where the model fails"),
     "beyond": ("beyond", "", "share of the prior that leaves the model's validity"),
     "forward_runs": ("forward_runs", "", "forward runs"),
+    "thin": ("thin", "", "share of simulated readings explained by few effective draws"),
     "std": ("std", "parameter", "expected posterior std, units of parameters"),
     "relative": ("relative_std", "parameter", "the same relative to the value"),
     "ratio": ("std_ratio", "parameter", "posterior over prior std"),
@@ -159,7 +160,8 @@ def _row(root: Group, i: int) -> DesignRow:
     number, settings, price, failure = int(of("number")), json.loads(of("settings")), of("price"), of("failure")
     if failure:
         return DesignRow(number, settings, None, price, failure)
-    columns = COLUMNS | (NEEDED if "needed_factor" in root else {})
+    optional = {key for key, (name, *_) in (NEEDED | {"thin": COLUMNS["thin"]}).items() if name not in root}
+    columns = {key: about for key, about in (COLUMNS | NEEDED).items() if key not in optional}
     held = {key: of(name, along) for key, (name, along, _) in columns.items()}
     counts = {key: int(held[key]) for key in ("alike", "forward_runs")}
     fan = held["fan"][:, : len(held["grid"])]

@@ -202,6 +202,12 @@ def load_stored(path: str | Path) -> StoredResult:
             group.check()
             joined(groups, path_in_file).check()
     with understood(path):
+        if "/posterior" in groups and "dataset" in groups["/posterior"]:
+            names = list(map(str, groups["/posterior"]["dataset"].values))
+            raise OutputError(
+                f"{path}: a campaign of {len(names)} data sets; give the address of one of them, such as "
+                f"{path.parent / PACK / names[0]}, or open all of them with xarray.open_datatree"
+            )
         for fault in _faults({path_in_file: joined(groups, path_in_file) for path_in_file in groups}):
             raise OutputError(f"{path}: not a result of en4dvar: {fault}")
     return StoredResult(groups)

@@ -21,6 +21,7 @@ from en4dvar.data.observations import Observations
 from en4dvar.data.series import Series
 from en4dvar.ensemble.forecast import forecast
 from en4dvar.estimation.design.evaluate import Evaluated, Method, SampleSizes, evaluate
+from en4dvar.estimation.design.nested import THIN
 from en4dvar.estimation.design.planned import Planned
 from en4dvar.executor import Executor
 from en4dvar.inputs.parts import DataFile
@@ -154,19 +155,23 @@ class DesignKind(RunKind[Designs]):
         return load_designs(file)
 
     def _evaluate_all(self, kept: KeptUnits[Done], executor: Executor) -> None:
-        """By the method asked for; ``auto`` checks the linearised information and replaces it if it is off."""
+        """By the method asked for; ``auto`` checks the linearised information and replaces it if it is off.
+
+        A nested estimate of few effective draws is no check: the linearised one stands and says so.
+        """
         every, method = range(len(self.every)), self.config.design.method
         if method != "auto" or self.config.design.laws:  # what designs tell of the law, by which they rank, is exact
             self._evaluate(kept, executor, every, "laplace" if method == "auto" else method)
             return
         self._evaluate(kept, executor, every, "laplace")
-        gains = {d.number: d.results[0].gain for d in _latest(kept.done) if d.results}
-        best = sorted(gains, key=lambda number: -gains[number])[:CHECKED]
-        checked = [number for number in dict.fromkeys([0, *best]) if number in gains]
-        self._evaluate(kept, executor, checked, "nested")
-        exact = {d.number: d.results[0] for d in _latest(kept.done) if d.method == "nested" and d.results}
-        if any(abs(exact[n].gain - gains[n]) > AGREE + 2 * exact[n].error for n in checked if n in exact):
-            self._evaluate(kept, executor, list(gains), "nested")
+        told = {d.number: d.results for d in kept.done if d.method == "laplace" and d.results}
+        best = sorted(told, key=lambda number: -told[number][0].gain)[:CHECKED]
+        self._evaluate(kept, executor, [n for n in dict.fromkeys([0, *best]) if n in told], "nested")
+        both = (
+            pair for d in kept.done if d.method == "nested" for pair in zip(d.results, told[d.number], strict=False)
+        )
+        if any(abs(n.gain - o.gain) > AGREE + 2 * n.error for n, o in both if n.thin <= THIN):
+            self._evaluate(kept, executor, list(told), "nested")
 
     def _evaluate(self, kept: KeptUnits[Done], executor: Executor, numbers: Sequence[int], method: Method) -> None:
         done = {d.number for d in kept.done if d.method == method}
@@ -189,8 +194,15 @@ class DesignKind(RunKind[Designs]):
 
 
 def _latest(done: Sequence[Done]) -> list[Done]:
-    """Of each candidate what came last: nested after laplace."""
-    return list({d.number: d for d in done}.values())
+    """Of each candidate what came last: nested after laplace, which stays where the nested one rests on few draws."""
+    latest: dict[int, Done] = {}
+    for d in done:
+        before = latest.get(d.number)
+        if before and any(result.thin > THIN for result in d.results):
+            pairs = zip(before.results, d.results, strict=True)
+            d = replace(before, results=tuple(replace(old, thin=new.thin) for old, new in pairs))
+        latest[d.number] = d
+    return list(latest.values())
 
 
 def _known(document: Document, base: Path, after: Path) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from en4dvar_bubble.driving import Driving, Reading, histotripsy, silence
 from en4dvar_bubble.gas import CRITICAL_TEMPERATURE, kirchhoff, mass_fraction, saturated_vapour_pressure
 from en4dvar_bubble.laws import ConstitutiveLaw, QuadraticKelvinVoigt
 from en4dvar_bubble.laws.exactness import refuse_unfit
-from en4dvar_bubble.laws.loading import require_names
+from en4dvar_bubble.laws.loading import require_parameters
 from en4dvar_bubble.laws.parameters import MANCIA, positive
 from en4dvar_bubble.medium import WATER_25C, Medium
 from en4dvar_bubble.numbers import ACCOMMODATION, ALL, GAS_CONTENT, OF_MEDIUM, P_A, R_START, RDOT_START, WALL_DISTANCE
@@ -144,7 +144,7 @@ class Dynamics:
         if is_name:
             object.__setattr__(self, "accuracy", preset(accuracy, self.start))
         require_kinds(self, Dynamics)
-        require_names(type(self.law), self.law.name)
+        require_parameters(type(self.law), self.law.name)
         refuse_unfit(type(self.law))
         if self.law.released and self.start != "laser":
             raise ValueError(f"{self.law.name} needs start: laser: only a released bubble has an R_max at time zero")

@@ -167,6 +167,7 @@ class TestRefusing:
             ("    def memory(self, p):\n        return (MemoryVariable(1.0, stiffness=p.mu[:, 0]),)\n", "stiffness"),
             ("    parameters = (MU, MU)\n", "two parameters are called 'mu'"),
             ("    parameters = ()\n", "parameters is empty"),
+            ("    parameters = (Parameter('E', 'kPa'), MU)\n", "parameter E is declared in kPa"),
             ("    parameters = [MU]\n", "must be a tuple"),
             ("    parameters = (Parameter('R0', 'm'),)\n", "'R0' is taken"),
             ("    def __init__(self, grade):\n        pass\n", "without arguments"),

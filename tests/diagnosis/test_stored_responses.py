@@ -13,10 +13,12 @@ from acting import Acting, acting_problem
 from doc_pages import hook
 from run_files import add_to_pack
 
+from en4dvar.diagnosis.response.what_if import exclusion
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.model.forward import Alternative
+from en4dvar.plumbing.errors import OutputError
 from en4dvar.report import write_pages
-from en4dvar.report.responses import StoredShift, sentence, shift_text, stored_ledger, stored_shifts
+from en4dvar.report.responses import StoredShift, exceeding, sentence, shift_text, stored_ledger, stored_shifts
 from en4dvar.report.result import Result, load_result
 from en4dvar.results.campaign_file import save_campaign
 from en4dvar.results.pack import PACK, Pack
@@ -114,6 +116,10 @@ def test_a_campaign_keeps_them(run_dir, tmp_path):
         assert stats["what_if_change"].dimensions == ("dataset", "alternative", "parameter")
         assert list(stats["alternative"][:]) == ["clock", "scale", "other"]
         np.testing.assert_allclose(np.sum(stats["ledger_weight"][:], axis=-1), 1.0)
+    for place in (tmp_path, path):
+        with pytest.raises(OutputError, match=r"a campaign of 2 data sets; give the address .*datasets\.pack/a, or"):
+            load_result(place)
+    assert load_result(tmp_path / PACK / "a").parameters
 
 
 def test_every_variable_is_documented(run_dir):
@@ -147,3 +153,12 @@ def test_a_value_that_doubles_at_least_is_told_as_a_factor():
     shift = StoredShift("wall", "a wall were near", "G", "kPa", 5.9, 2.8, 1.34, 0.0, "", "$G$")
     assert "would be 3.8 times as large (1.3 times its error bar)" in sentence([shift])
     assert "would be 42 % higher" in sentence([shift._replace(relative=0.42, change=0.9)])
+
+
+def test_an_alternative_that_the_readings_exclude_has_its_misfit_instead_of_shifts():
+    """45 readings fitted to χ² of 36, or of 180 where their errors are stated too small."""
+    assert exclusion(0.8, 45, 3438.7) == "the readings exclude it: χ² is 6913 for 45 readings"
+    assert exclusion(0.8, 45, 20.0) == exclusion(4.0, 45, 40.0) == exclusion(np.nan, 0, np.nan) == ""
+    shift = StoredShift("gas", "heat flowed", "G", "kPa", 5.9, 2.8, 26.0, 3438.7, "", "$G$", exclusion(0.8, 45, 3438.7))
+    assert exceeding([[shift]]) == []
+    assert exceeding([[shift._replace(excluded="")]])

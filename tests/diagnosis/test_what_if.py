@@ -238,7 +238,7 @@ def test_what_cannot_be_run_or_told_has_a_reason_and_stands_before_what_is_small
 def test_the_posterior_is_the_same_and_its_runs_are_counted():
     plain = make_problem(Linear(("a", "b")), [1.0, 0.5])
     first = assimilate(plain, SETTINGS, 3)
-    other = offering(make_problem(Linear(("a", "b")), [1.0, 0.5]), Alternative("offset", "…", Offset(5.0)))
+    other = offering(make_problem(Linear(("a", "b")), [1.0, 0.5]), Alternative("offset", "…", Offset(0.5)))
     second = assimilate(other, SETTINGS, 3)
     assert np.array_equal(first.posterior, second.posterior)
     assert second.forward_runs == first.forward_runs + second.what_if[0].runs
@@ -247,6 +247,8 @@ def test_the_posterior_is_the_same_and_its_runs_are_counted():
     (line,) = remarks(second)
     assert line.startswith("what if …: ")
     assert "std)" in line
+    far = offering(plain, Alternative("offset", "…", Offset(5.0)))
+    assert "the readings exclude it: χ² is 1670 for 9 readings" in remarks(assimilate(far, SETTINGS, 3))[0]
 
 
 def test_the_shifts_are_added_to_the_covariance_and_the_mean_stays():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -142,6 +143,26 @@ def test_experiments_alike(tmp_path):
     assert (one.alike, four.alike) == (1, 4)
     assert four.gain > one.gain
     assert [row.price for row in found.rows] == [7, 28]
+
+
+@pytest.mark.parametrize("thin", [0.0, 0.9])
+def test_a_nested_estimate_of_few_effective_draws_is_no_check(tmp_path, monkeypatch, thin):
+    """Five nats more than the linearised estimate, which it replaces only where enough draws are behind it."""
+
+    def rough(problem, about, sizes, method, *args):
+        return [
+            replace(it, method=method, gain=it.gain + 5, thin=thin) if method == "nested" and it.alike == 1 else it
+            for it in evaluate(problem, about, sizes, "laplace", *args)
+        ]
+
+    evaluate = design_run.evaluate
+    monkeypatch.setattr(design_run, "evaluate", rough)
+    plan = _plan(knobs={}, about=["a"], experiments=[1, 4])
+    found, _ = run_design(plan, out=tmp_path / "out", overrides={"execution.executor": "serial"})
+    told, one = "\n".join(remarks(found)), found.rows[0].result
+    assert (one.method, one.thin) == ("laplace" if thin else "nested", thin)
+    assert ("the linearised information, which stands" in told) == bool(thin)
+    assert ("1 of these experiments (by nested) cannot tell more than 4 (by laplace)" in told) == (not thin)
 
 
 def test_a_design_that_cannot_be_made(tmp_path):

@@ -72,6 +72,30 @@ def test_nested_sampling_of_the_closed_form(std, about, correlated):
     assert abs(found.gain - _exact(problem, about)[0]) < 4 * found.error
 
 
+def twisted(p, t):
+    """Linear in (a, x), where x is b, …, g with two pairs rotated by angles that a third coordinate sets."""
+    x = [p["a"], p["b"], p["c"], p["d"], p["e"], p["f"], p["g"]]
+    for i, j, k in ((1, 2, 3), (4, 5, 6)):
+        cos, sin = np.cos(0.3 * x[k]), np.sin(0.3 * x[k])
+        x[i], x[j] = cos * x[i] - sin * x[j], sin * x[i] + cos * x[j]
+    return sum(x[j] * np.cos(j * t + j**2 / 3) for j in range(7))
+
+
+def test_one_of_seven_parameters_of_a_bent_posterior():
+    """A rotation by an angle of its own keeps N(0, I): the information about a is that of the linear problem."""
+    t, std = np.linspace(0.1, 2.5, 6), 0.3
+    model = FunctionModel(twisted, [Parameter(name, "1") for name in "abcdefg"], {"y": "1"})
+    prior = Prior(tuple(PriorTerm.normal(p, 0.0, 1.0) for p in model.parameters))
+    problem = InverseProblem(model, model.observables[0], make_observations(t, np.zeros(6), std=std), prior)
+    planned, j = Planned(problem, ("a",)), np.arange(7)
+    H = np.cos(t[:, None] * j + j**2 / 3)
+    exact = -0.5 * np.log(np.linalg.inv(np.eye(7) + H.T @ H / std**2)[0, 0])
+    found = nested(planned, planned.draws(60, 1), 200, 1)
+    assert found.gain == pytest.approx(exact, abs=3 * found.error)
+    assert found.error < 0.06
+    assert found.thin == 0
+
+
 @pytest.mark.slow
 def test_the_stated_error_is_that_of_many_seeds():
     """Over 200 seeds the mean has no bias and deviations of the stated size."""

@@ -36,6 +36,7 @@ SETTLED = 0.1  # of each parameter's shift, and of its std: a correction below o
 FAR = 3.0  # posterior standard deviations that a parameter of R may move: further away a chord seems to settle anywhere
 NOWHERE = "too few members survive"
 TWOFOLD = math.log(2)  # of a value that doubles or halves a factor tells more than per cent
+EXCLUDED = 5.0  # standard deviations of χ² above what it is expected to be
 SMALL = 0.3  # posterior standard deviations of a first step that is believed without a second
 
 
@@ -150,6 +151,16 @@ class Shift:
 def is_manifold(relative: float) -> bool:
     """True of a relative change by which a value doubles or halves at least; NaN is none."""
     return relative <= -1 or abs(math.log1p(relative)) >= TWOFOLD
+
+
+def exclusion(chi2_per_reading: float, readings: int, cost_change: float) -> str:
+    """Words for an alternative with which the readings cannot be fitted, whose shifts mean nothing; "" for others.
+
+    χ² with it is that of the fit and twice the change of J. Errors count as large as the fit itself finds them.
+    """
+    chi2 = chi2_per_reading * readings + 2 * cost_change
+    limit = max(1.0, chi2_per_reading) * (readings + EXCLUDED * math.sqrt(2 * readings))
+    return f"the readings exclude it: χ² is {chi2:.0f} for {readings} readings" if readings and chi2 > limit else ""
 
 
 def what_if(

@@ -53,7 +53,8 @@ class Evaluated:
     that is asked for in its unit, ``relative`` (a,) to the value, ``ratio`` (a,) of posterior to prior std in
     transformed space. ``lost``: share of the draws at which the model fails; ``beyond``: share that leaves what the
     model is valid for. ``readings`` (k,) are taken, at ``times`` (k,). ``fan`` (5, M) are quantiles of what will be
-    seen at ``grid`` (M,). ``forward_runs`` it took. ``decision``: what it tells of which of several laws holds.
+    seen at ``grid`` (M,). ``forward_runs`` it took. ``thin``: share of the simulated readings that nested sampling
+    explains by few effective draws. ``decision``: what it tells of which of several laws holds.
     ``needed`` (W, B + 1): how much larger the prior std of each of the B others, or of all, may be for what is wanted;
     ``others`` (2, B): those stds, in units and relative to the values.
     """
@@ -72,6 +73,7 @@ class Evaluated:
     fan: Array
     alike: int = 1
     forward_runs: int = 0
+    thin: float = 0.0
     decision: Decision | None = None
     needed: Array | None = None
     others: Array | None = None
@@ -133,6 +135,7 @@ def evaluate(
     for n in alike:
         values = expected(planned, tangents, tried, n)
         gain, error, by = values.gain, values.error, str("laplace" if method == "nested" else method)
+        thin = 0.0
         std, relative = in_units(planned, planned.about, values.std, tangents.u)
         linearised = np.stack([std, relative])
         ratio = values.std.mean(axis=0)
@@ -140,6 +143,7 @@ def evaluate(
             simulated = nested(planned, u[: sizes.simulated], sizes.inner, seed)
             more, its_error = simulated.correction
             gain, error, by = gain + more, float(np.hypot(error, its_error)), method
+            thin = simulated.thin
             std, ratio = simulated.std.mean(axis=0), simulated.ratio.mean(axis=0)
             relative = np.median(simulated.relative, axis=0)
         more_than_linear = np.ones_like(linearised)
@@ -161,6 +165,7 @@ def evaluate(
                 fan=np.quantile(run.path[run.active][:, : len(grid)], FAN, axis=0),
                 alike=n,
                 forward_runs=before + planned.forward_runs,
+                thin=thin,
                 decision=decision,
                 needed=needs[0],
                 others=needs[1],

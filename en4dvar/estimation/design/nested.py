@@ -5,7 +5,8 @@ Draw i of the prior predicts m_i and is read as y_i. With z = (a, b), a what is 
     g_i = ln p(y_i | a_i) − ln p(y_i),     p(y) = ∫ e^{−J_o} N(u; 0, I) du,     p(y | a) = ∫ e^{−J_o} N(b; 0, I) db,
 
 both by importance sampling with runs of their own about the posterior of y_i (never with those of other draws, whose
-number N would bound the result by ln N). Of M draws of weight w the logarithm of their mean is too small by
+number N would bound the result by ln N), and never with those that the proposal was fitted to, which make p(y) of a
+bent posterior of six parameters a third too small. Of M draws of weight w the logarithm of their mean is too small by
 var(w)/(2 M w̄²), which is added; what remains is O(M⁻²) (Rainforth et al. 2018, ICML, on nested estimates).
 
 Were the prediction linear with the sensitivities S of draw i, g_i would be a constant and, with the whitened errors e,
@@ -31,31 +32,35 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from en4dvar.ensemble.linalg import effective_number, shares_of
 from en4dvar.estimation.design.planned import Gains, Planned, Tangents, about, precision, require_alive, standard_error
 from en4dvar.model.state import Array
 from en4dvar.priors.prior import member_stream, own_seed
-from en4dvar.sampling.importance import Importance
+from en4dvar.sampling.importance import ClosingDraws, FixedDraws, Importance
 from en4dvar.sampling.mixture import StudentMixture
 
-ROUNDS = 4  # of proposals, while few draws have a weight
-ENOUGH = 25.0  # effective draws; proposals fitted to draws that they are weighed with make the integral too small
+CLOSING, GOOD = (
+    3,
+    0.4,
+)  # rounds, at most, in which proposals close in on a posterior, and the effective share of a good one
+ENOUGH, ROUNDS = 150.0, 15  # effective draws behind an integral, and rounds until then
+THIN = 0.1  # share of integrals with fewer above which an estimate is rough
 OTHERS, PLAUSIBLE = 6, 8.0  # draws that explain the readings best, and the J above the lowest that they may promise
 FROM_PRIOR = 0.1  # share of a proposal that is the prior's: a second minimum is found, no weight is without bound
-WIDER = 1.2  # than the Gaussian that it is made of
-OF_LAW, ROUNDS_OF_LAW = 100.0, 10  # effective draws behind the evidence of a law, and rounds until then
+WIDER = 1.4  # than the Gaussian that it is made of, and than the posterior
 DECIDED = 0.95  # probability of the law that holds: odds of 19, or a difference of 3 between two log-evidences
 
 
 @dataclass(frozen=True)
 class Nested(Gains):
     """Gains of simulated readings, less their control variate; ``linearised`` (R,) gains at the same draws,
-    ``effective`` (R,) importance draws behind each. ``std`` (R, a) of what is asked in the posterior of each set of
-    readings, in its units, ``relative`` (R, a) to the value that they are of, and ``ratio`` (R, a) to the prior's in
-    transformed space.
+    ``thin`` share of those with fewer effective draws than wanted. ``std`` (R, a) of what is asked in the posterior of
+    each set of readings, in its units, ``relative`` (R, a) to the value that they are of, and ``ratio`` (R, a) to the
+    prior's in transformed space.
     """
 
     linearised: Array
-    effective: Array
+    thin: float
     std: Array
     relative: Array
     ratio: Array
@@ -97,7 +102,14 @@ def nested(planned: Planned, u: Array, inner: int, seed: int) -> Nested:
     true = planned.problem.prior.to_physical(planned.control(truths.u[alive]))[:, order]
     of_prior = np.linalg.norm(planned.root[order], axis=1)
     std, transformed = np.moveaxis(spread[alive], 1, 0)
-    return Nested(gains[alive], linearised[alive], effective[alive], std, std / np.abs(true), transformed / of_prior)
+    return Nested(
+        gains[alive],
+        linearised[alive],
+        float(np.mean(effective[alive] < ENOUGH)),
+        std,
+        std / np.abs(true),
+        transformed / of_prior,
+    )
 
 
 def _spread(planned: Planned, draws: Importance) -> Array:
@@ -139,35 +151,44 @@ def log_integral(draws: Importance) -> tuple[float, float]:
 
 
 def explained(
-    planned: Planned,
-    values: Array,
-    known: Array,
-    near: tuple[Array, Array],
-    inner: int,
-    stream: np.random.Generator,
-    enough: float = ENOUGH,
-    rounds: int = ROUNDS,
+    planned: Planned, values: Array, known: Array, near: tuple[Array, Array], inner: int, stream: np.random.Generator
 ) -> Importance:
     """Draws of the coordinates behind the ``known`` ones, weighted by how they explain the readings.
 
-    In at most so many ``rounds`` of ``inner`` runs, until there are ``enough`` effective draws.
+    Proposals close in on the posterior in rounds of ``inner`` runs; draws of the last one are weighted, until enough
+    of them are effective.
     """
     (centres, matrices), k = near, len(known)
     own = matrices[:, k:, k:]
     shift = np.linalg.solve(own, (matrices[:, k:, :k] @ (known - centres[:, :k])[..., None]))[..., 0]
     roots = WIDER * np.linalg.inv(np.linalg.cholesky(own)).transpose(0, 2, 1)
-    shares = np.append(np.full(len(own), (1 - FROM_PRIOR) / len(own)), FROM_PRIOR)
-    n = own.shape[1]
-    first = StudentMixture(
-        shares, np.vstack([centres[:, k:] - shift, np.zeros(n)]), np.vstack([roots, np.eye(n)[None]])
-    )
-    draws = Importance(first, stream, inner, WIDER)
-    for _ in range(rounds):
+
+    def more(draws: Importance) -> None:
         z = draws.draw()
         draws.add(z, -planned.cost(values, planned.run(np.hstack([np.tile(known, (inner, 1)), z]))))
-        if draws.effective >= enough:
+
+    alike = StudentMixture(np.full(len(own), 1 / len(own)), centres[:, k:] - shift, roots)
+    closing = ClosingDraws(_beside_prior(alike), stream, inner, WIDER)
+    for _ in range(CLOSING):
+        more(closing)
+        if closing.near or effective_number(shares_of(closing.tempered)) > GOOD * len(closing.z):
             break
-    return draws
+    final = FixedDraws(_beside_prior(closing.next_proposal()), stream, inner)
+    for _ in range(ROUNDS):
+        more(final)
+        if final.effective >= ENOUGH:
+            break
+    return final
+
+
+def _beside_prior(mixture: StudentMixture) -> StudentMixture:
+    """With a share of draws from the prior's place and size."""
+    n = mixture.centre.shape[1]
+    return StudentMixture(
+        np.append((1 - FROM_PRIOR) * mixture.share, FROM_PRIOR),
+        np.vstack([mixture.centre, np.zeros(n)]),
+        np.vstack([mixture.root, np.eye(n)[None]]),
+    )
 
 
 def control_variate(d: Array, rows: Array, u: Array, asked: int) -> Array:
@@ -243,10 +264,10 @@ def deciding(laws: Sequence[Planned], count: int, inner: int, seed: int) -> Deci
             for j, law in enumerate(laws):
                 near = explaining(law, tangents[j], values, i if j == k else None)
                 stream = member_stream(seed, f"design evidence {k}", int(number))
-                draws = explained(law, values, np.empty(0), near, inner, stream, OF_LAW, ROUNDS_OF_LAW)
+                draws = explained(law, values, np.empty(0), near, inner, stream)
                 evidences[i, j], effective = log_integral(draws)
                 behind.append(effective)
         alive = np.isfinite(evidences[:, k])
         require_alive(int(alive.sum()), count)
         logs.append(evidences[alive])
-    return Decision.of(logs, float(np.mean(np.array(behind) < OF_LAW)))
+    return Decision.of(logs, float(np.mean(np.array(behind) < ENOUGH)))

@@ -13,6 +13,7 @@ from en4dvar.plumbing import user_file
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.hints import suggest
 from en4dvar.plumbing.installed import installed
+from en4dvar.plumbing.units import parse_unit
 from en4dvar.plumbing.user_code import imported, line_of, loading, reason_of
 from en4dvar_bubble.laws.base import REGISTRY, ConstitutiveLaw
 from en4dvar_bubble.laws.memory import MemoryVariable
@@ -58,11 +59,17 @@ def _check_parameters(kind: type[ConstitutiveLaw], name: str) -> None:
         )
     if not kind.parameters:
         raise ConfigError(f"{name}: parameters is empty")
-    require_names(kind, name)
+    require_parameters(kind, name)
 
 
-def require_names(kind: type[ConstitutiveLaw], name: str) -> None:
-    """Raise :class:`ConfigError` where a parameter of a law is not the only one of its name."""
+def require_parameters(kind: type[ConstitutiveLaw], name: str) -> None:
+    """Raise :class:`ConfigError` where a parameter of a law is not the only one of its name, or not in SI."""
+    for p in kind.parameters:
+        if parse_unit(p.unit).factor != 1:
+            raise ConfigError(
+                f"{name}: the parameter {p.name} is declared in {p.unit}, but laws compute in SI units; declare the SI "
+                f"unit, such as 'Pa' or 'Pa s', and display_unit={p.unit!r} to see {p.unit} in tables and figures"
+            )
     names = [p.name for p in kind.parameters]
     for n in names:
         if names.count(n) > 1:
