@@ -20,7 +20,10 @@ from en4dvar_movie.outline import TILE, Circle, Optics, circle_through, labelled
 Image = npt.NDArray[Any]  # brightness (H, W), of any precision
 DEAD = 0.25  # of the brightness about it: where a background shows nothing of a bubble, as writing does
 STRUCTURE = 0.1  # of that brightness: structure that a bubble darkens as it does the rest
-FLICKER = 0.2  # of the brightness: what a lamp may change from frame to frame
+FLICKER = 0.2  # of the brightness: what a lamp may change, whatever else the frame shows
+CORNERS = (
+    0.01  # share of the tiles: what is brighter yet, where the light of a larger change is a bubble's or a flash's
+)
 TOP, MANY = 90, 0.4  # per cent of the tiles that are not the brightest; the share of tiles that tells the light
 ALIKE, CLOSE = 4.0, 0.05  # std of noise, or of the brightness, by which tiles in one light may differ
 LAMP = 0.25  # logarithm of the ratio of brightness of two frames that differ by their lamp
@@ -85,16 +88,22 @@ class Background:
         rows, columns = (TILE * (side // TILE) for side in image.shape)
         whole = np.where(np.isnan(image), np.float32(0), image)[:rows, :columns]
         tiles = np.mean([whole[j::TILE, i::TILE] for j in range(TILE) for i in range(TILE)], axis=0)
-        change = self._light(tiles[:: -(-tiles.size // STEADY)]) if self.relative else 0.0
-        if abs(change) > FLICKER:  # a bubble that fills the frame, or a flash
-            return image, tiles
+        white = frame.dtype.kind in "ui" and np.median(frame) == np.iinfo(frame.dtype).max
+        change = self._light(tiles[:: -(-tiles.size // STEADY)], bool(white)) if self.relative else 0.0
         scale = np.float32(1 / (1 + change))
         return (image - np.float32(change)) * scale, np.where(tiles == 0, 0, (tiles - np.float32(change)) * scale)
 
-    def _light(self, tiles: Array) -> float:
-        """How much brighter than the level the background is, by its brightest tiles: the others may be the bubble."""
-        alike = tiles > np.percentile(tiles, TOP) - max(ALIKE * self.noise / TILE, CLOSE)
-        return float(np.median(tiles[alike])) if np.mean(alike) > MANY else 0.0
+    def _light(self, tiles: Array, white: bool) -> float:
+        """How much brighter than the level the background is, by its brightest tiles: the others may be the bubble.
+
+        A bubble that nearly fills the frame leaves corners that are brighter yet; a flash is brightest in its middle, or
+        makes the frame ``white``.
+        """
+        apart = max(ALIKE * self.noise / TILE, CLOSE)
+        alike = tiles > np.percentile(tiles, TOP) - apart
+        change = float(np.median(tiles[alike])) if np.mean(alike) > MANY else 0.0
+        brighter = np.mean((tiles > change + apart) & (tiles != 0))
+        return change if abs(change) <= FLICKER or (brighter < CORNERS and not white) else 0.0
 
     def steadied(self, image: Array, tiles: Array, bubble: Circle) -> Array:
         """The image at the background's own brightness: what the light does far from the bubble is taken out."""

@@ -241,3 +241,22 @@ def test_a_bubble_that_covers_half_of_the_frame_is_no_change_of_light(noise):
     off = np.array([r.radius for r in found.readings[3:]]) - radii
     assert np.abs(off).max() < 0.15
     assert np.abs(off / [r.errors.std for r in found.readings[3:]]).max() < 5
+
+
+@pytest.mark.parametrize("lamp", ["fades", "flickers"])
+def test_a_lamp_that_changes_much_leaves_the_radii(lamp):
+    radii = np.linspace(31.0, 8.0, 24)
+    shown = frames(radii=radii)
+    light = np.linspace(1, 0.6, 27) if lamp == "fades" else 1 + 0.2 * np.random.default_rng(5).standard_normal(27)
+    read = track(
+        movie_of([np.rint(np.minimum(f * part, 255)).astype(np.uint8) for f, part in zip(shown, light, strict=True)])
+    )
+    assert [r.frame for r in read.readings if not r.used] == [0, 1, 2]
+    np.testing.assert_allclose([r.radius for r in read.readings[3:]], radii, atol=0.2)
+
+
+def test_a_bubble_that_leaves_only_corners_is_no_change_of_light():
+    radii = np.array([*np.linspace(30.0, 60.0, 12), *np.linspace(60.0, 30.0, 12)])
+    read = track(movie_of(frames(Scene(shape=(96, 96)), radii)))
+    assert [r.frame for r in read.readings if not r.used] == [0, 1, 2]
+    np.testing.assert_allclose([r.radius for r in read.readings[3:]], radii, atol=0.5)
