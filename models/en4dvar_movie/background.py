@@ -21,9 +21,7 @@ Image = npt.NDArray[Any]  # brightness (H, W), of any precision
 DEAD = 0.25  # of the brightness about it: where a background shows nothing of a bubble, as writing does
 STRUCTURE = 0.1  # of that brightness: structure that a bubble darkens as it does the rest
 FLICKER = 0.2  # of the brightness: what a lamp may change, whatever else the frame shows
-CORNERS = (
-    0.01  # share of the tiles: what is brighter yet, where the light of a larger change is a bubble's or a flash's
-)
+CORNERS = 0.01  # share of the tiles that are brighter yet, where a larger change is a bubble's or a flash's
 TOP, MANY = 90, 0.4  # per cent of the tiles that are not the brightest; the share of tiles that tells the light
 ALIKE, CLOSE = 4.0, 0.05  # std of noise, or of the brightness, by which tiles in one light may differ
 LAMP = 0.25  # logarithm of the ratio of brightness of two frames that differ by their lamp
@@ -96,8 +94,8 @@ class Background:
     def _light(self, tiles: Array, white: bool) -> float:
         """How much brighter than the level the background is, by its brightest tiles: the others may be the bubble.
 
-        A bubble that nearly fills the frame leaves corners that are brighter yet; a flash is brightest in its middle, or
-        makes the frame ``white``.
+        A bubble that nearly fills the frame leaves corners that are brighter yet; a flash is brightest in its middle,
+        or makes the frame ``white``.
         """
         apart = max(ALIKE * self.noise / TILE, CLOSE)
         alike = tiles > np.percentile(tiles, TOP) - apart
