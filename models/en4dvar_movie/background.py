@@ -96,8 +96,8 @@ class Background:
     def _light(self, tiles: Array, white: bool) -> float:
         """How much brighter than the level the background is, by its brightest tiles: the others may be the bubble.
 
-        A bubble that nearly fills the frame leaves corners that are brighter yet; a flash is brightest in its middle, or
-        makes the frame ``white``.
+        A bubble that nearly fills the frame leaves corners that are brighter yet; a flash is brightest in its middle,
+        or makes the frame ``white``.
         """
         apart = max(ALIKE * self.noise / TILE, CLOSE)
         alike = tiles > np.percentile(tiles, TOP) - apart
