@@ -203,8 +203,11 @@ def _tracked(movie: Path, target: Path, options: Mapping[str, str], force: bool)
     table = target.with_suffix(".csv")
     scales = [word for name, text in options.items() for word in (f"--{name.replace('_', '-')}", text)]
     words = ["--out", str(table), *scales, *["--force"] * force, "--", str(movie)]
-    with command.make_context("track", words, parent=context) as inner:
-        inner.command.invoke(inner)
+    try:
+        with command.make_context("track", words, parent=context) as inner:
+            inner.command.invoke(inner)
+    except click.UsageError as error:
+        raise click.UsageError(error.format_message(), context) from None
     return table
 
 

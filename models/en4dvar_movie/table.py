@@ -1,5 +1,6 @@
 """The readings as CSV: one line a frame, lengths in micrometres, times in microseconds."""
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -81,10 +82,11 @@ def _row(reading: Reading, scale: Scale) -> Sequence[str]:
     last = [str(int(reading.used)), reading.reason]
     if not reading.used or outline is None:
         return [*first, *[""] * (len(COLUMNS) - 4), *last]
+    digits = 4 - math.floor(math.log10(um))  # of lengths: to a 10,000th of a pixel or better
     numbers = [
-        f"{um * reading.radius:.4f}", f"{um * reading.errors.std:.4f}", f"{1e6 * scale.time_std:.4g}",
-        f"{um * outline.circle.x:.3f}", f"{um * outline.circle.y:.3f}",
+        f"{um * reading.radius:.{digits}f}", f"{um * reading.errors.std:.4g}", f"{1e6 * scale.time_std:.4g}",
+        *(f"{um * at:.{digits - 1}f}" for at in (outline.circle.x, outline.circle.y)),
     ]  # fmt: skip
     modes = [*(um * outline.amplitude(n) for n in MODES), um * reading.errors.mode_std]
-    shape = [f"{outline.eccentricity:.4f}", f"{outline.angle:.1f}", *(f"{value:.4f}" for value in modes)]
+    shape = [f"{outline.eccentricity:.4f}", f"{outline.angle:.1f}", *(f"{value:.{digits}f}" for value in modes)]
     return [*first, *numbers, *("" if text == "nan" or not outline.modes.size else text for text in shape), *last]

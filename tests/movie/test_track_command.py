@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 import tifffile
 from click.testing import CliRunner
+from movies import movie_of
 
 from en4dvar.assembly.build import build
 from en4dvar.cli import main
 from en4dvar.config import load_config
 from en4dvar_movie.scene import Scene, render
+from en4dvar_movie.table import Scale, to_csv
+from en4dvar_movie.tracking import track
 
 PIXEL, RATE = 2.5, 4e5  # µm, 1/s
 SCALE = ["--pixel", f"{PIXEL} um", "--frame-rate", "400 kHz"]
@@ -145,3 +148,24 @@ def test_options_that_cannot_be(tmp_path, monkeypatch, words, message):
     outcome = CliRunner().invoke(main, ["track", "m.tif", *scale, *words])
     assert outcome.exit_code == 2
     assert message in outcome.output
+
+
+@pytest.mark.parametrize("pixel", [0.005, 20.0])
+def test_lengths_have_digits_for_pixels_of_any_size(pixel):
+    shown = Scale(1e-6 * pixel, RATE, float("nan"))
+    readings = track(movie_of(list(render(history()[:4, None], Scene(), np.random.default_rng(3))))).readings
+    rows = to_csv(readings, shown, "gel.tif", "").split("used,reason\n")[1].splitlines()[3:]
+    written = np.array([[float(text) for text in row.split(",")[2:4]] for row in rows]) / pixel
+    np.testing.assert_allclose(written[:, 0], [r.radius for r in readings[3:]], atol=1e-4)
+    np.testing.assert_allclose(written[:, 1], [r.errors.std for r in readings[3:]], rtol=1e-3)
+
+
+def test_what_is_wrong_of_a_movie_is_said_of_the_command_that_was_typed(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    tifffile.imwrite("gel.tif", np.zeros((2, 64, 64), np.uint8), photometric="minisblack")
+    words = ["init", "--movie", "gel.tif", "--pixel", "3 mm", "--frame-rate", "400 kHz"]
+    refused = CliRunner().invoke(main, words)
+    assert refused.exit_code == 2
+    assert "is the unit right?" in refused.output
+    assert "init [OPTIONS]" in refused.output
+    assert "track" not in refused.output
