@@ -24,11 +24,11 @@ from en4dvar.estimation.joint.descent import ArrowSystem, Experiment, Place
 from en4dvar.model.state import Array
 from en4dvar.priors.prior import member_stream
 
-DRAWS, INNER = 192, 36  # of what is shared, and of the own quantities for each of them
+DRAWS, INNER = 96, 36  # of what is shared, and of the own quantities for each of them
 STAGES, STEPS = 4, 8  # on the way to what is shared; linearisations at each that own quantities given it are sought by
 FREEDOM = 7.0  # degrees of freedom of Student's t
 WIDER = 1.2  # the proposals than the Gaussian
-ROUNDS = 6  # of such draws at most
+LEAST, ROUNDS = 2, 12  # rounds of such draws, at least and at most
 ENOUGH, FEWEST = 96.0, 24.0  # effective draws that end the rounds; below which the weights say nothing
 OF_PRIOR, DEEPEST, DESCENTS = 48, 4, 8  # of the prior; of which are descended from; and with so many linearisations
 LOWER = 0.5  # of J
@@ -68,7 +68,8 @@ def sampled(
     """By importance, in rounds until enough are effective; None where the proposals do not reach the posterior.
 
     Each further round draws about where the rounds before it have found the posterior, which may be bent, √2 times as
-    wide, and all draws are weighed by the mixture of the proposals (Cornuet et al. 2012, Scand. J. Stat. 39, 798).
+    wide, and all draws are weighed by the mixture of the proposals (Cornuet et al. 2012, Scand. J. Stat. 39, 798). The
+    weights of a first round that has not reached a tail do not tell that it is missing: one round is never enough.
     """
     stream, rounds, proposals = member_stream(seed, "joint importance"), list[list[Array]](), list[Proposal]()
     proposal = Proposal(at.place.border, at.arrow.schur)
@@ -89,7 +90,7 @@ def sampled(
         weights = shares_of(log_weights)
         effective = effective_number(weights)
         tell(f"{effective:.0f} effective draws after {number + 1} of at most {ROUNDS} rounds, {ENOUGH:.0f} are wanted")
-        if effective >= ENOUGH or not border.shape[1]:
+        if (number + 1 >= LEAST and effective >= ENOUGH) or not border.shape[1]:
             break
         capped = np.minimum(weights, len(weights) ** -0.5)  # Ionides 2008, J. Comput. Graph. Stat. 17, 295
         covariance = np.atleast_2d(np.cov(border.T, aweights=capped))
