@@ -233,7 +233,7 @@ def comparison_table(comparison: Comparison) -> str:
     header = ("data set", "run", "log-evidence", "difference", "probability", "chi2/K", "DFS", "NRMSE")
     rows = [
         (
-            s.dataset, s.run, f"{s.log_evidence:.2f}{' *' * s.stored}", fixed(s.difference, 2),
+            s.dataset, s.run, f"{fixed(s.log_evidence, 2)}{' *' * s.stored}", fixed(s.difference, 2),
             fixed(s.probability, 3), f"{s.chi2_per_observation:.3g}", f"{s.dfs:.2f}", f"{s.nrmse:.4f}",
         )
         for s in comparison.scores

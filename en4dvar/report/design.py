@@ -149,11 +149,8 @@ def remarks(designs: Designs) -> list[str]:
     stands = sum(it.thin > THIN and it.method != "nested" for it in worth)
     thin = sum(max(it.thin, it.decision.thin if it.decision else 0.0) > THIN for it in worth) - stands
     told += [f"of {thin} designs the evidences of many readings are rough; raise design.inner"] if thin else []
-    told += (
-        [f"of {stands} designs too few draws check the linearised information, which stands; raise design.inner"]
-        if stands
-        else []
-    )
+    few = f"of {stands} designs too few draws check the linearised information, which stands; raise design.inner"
+    told += [few] if stands else []
     told += [
         f"{settings_text(row)}: {row.evaluated.alike} of these experiments (by {by(row.evaluated)}) cannot tell more "
         f"than {more.evaluated.alike} (by {by(more.evaluated)}): the two are not comparable; set design.method: laplace"

@@ -39,10 +39,8 @@ from en4dvar.priors.prior import member_stream, own_seed
 from en4dvar.sampling.importance import ClosingDraws, FixedDraws, Importance
 from en4dvar.sampling.mixture import StudentMixture
 
-CLOSING, GOOD = (
-    3,
-    0.4,
-)  # rounds, at most, in which proposals close in on a posterior, and the effective share of a good one
+CLOSING = 3  # rounds at most in which proposals close in on a posterior
+GOOD = 0.4  # effective share of the draws of a proposal that is close enough
 ENOUGH, ROUNDS = 150.0, 15  # effective draws behind an integral, and rounds until then
 THIN = 0.1  # share of integrals with fewer above which an estimate is rough
 OTHERS, PLAUSIBLE = 6, 8.0  # draws that explain the readings best, and the J above the lowest that they may promise
@@ -102,14 +100,8 @@ def nested(planned: Planned, u: Array, inner: int, seed: int) -> Nested:
     true = planned.problem.prior.to_physical(planned.control(truths.u[alive]))[:, order]
     of_prior = np.linalg.norm(planned.root[order], axis=1)
     std, transformed = np.moveaxis(spread[alive], 1, 0)
-    return Nested(
-        gains[alive],
-        linearised[alive],
-        float(np.mean(effective[alive] < ENOUGH)),
-        std,
-        std / np.abs(true),
-        transformed / of_prior,
-    )
+    thin = float(np.mean(effective[alive] < ENOUGH))
+    return Nested(gains[alive], linearised[alive], thin, std, std / np.abs(true), transformed / of_prior)
 
 
 def _spread(planned: Planned, draws: Importance) -> Array:
