@@ -182,4 +182,6 @@ def sweep_twin(source: Source, varied: tuple[str, ...], seeds: int, **how: Any) 
     echo(str(result))
     for reason in dict.fromkeys(run.failure for runs in result.runs for run in runs if run.failure):
         tell(f"failed: {reason}")
+    for words in result.doubts:
+        tell(f"warning: {words}")
     echo(f"averages: {result.directory / 'sweep.csv'}")

@@ -34,10 +34,11 @@ COLOURS = ("prior", "posterior", "background")  # of the estimates
 
 @dataclass(frozen=True)
 class TwinRun:
-    """What came of one run: (estimate, RMSE, spread) after the burn-in, or why it failed."""
+    """What came of one run: (estimate, RMSE, spread) after the burn-in and its warnings, or why it failed."""
 
     scores: tuple[tuple[str, float, float], ...] = ()
     failure: str = ""
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -55,10 +56,22 @@ class TwinSweep:
         """A row a setting and estimate, as for ``pandas.DataFrame``."""
         return [
             dict(zip(self.keys, values, strict=True)) | {"estimate": name} | average
-            | {"failed": sum(bool(run.failure) for run in runs)}
+            | {"failed": sum(bool(run.failure) for run in runs), "doubted": sum(bool(run.warnings) for run in runs)}
             for values, runs in zip(self.values, self.runs, strict=True)
             for name, average in averages(runs).items()
         ]  # fmt: skip
+
+    @property
+    def doubts(self) -> Iterator[str]:
+        """Warnings of the runs, one line for each advice: of how many runs, and of which first."""
+        told: dict[str, list[str]] = {}
+        for values, runs in zip(self.values, self.runs, strict=True):
+            for seed, run in zip(self.seeds, runs, strict=True):
+                for words in run.warnings:
+                    line = f"{', '.join(map(_text, values))}, seed {seed}: {words}"
+                    told.setdefault(words.rpartition("; ")[2], []).append(line)
+        total = len(self.values) * len(self.seeds)
+        return (f"{len(lines)} of {total} runs, the first is {lines[0]}" for lines in told.values())
 
     def __repr__(self) -> str:
         return f"<TwinSweep of {len(self.values)} settings, {len(self.seeds)} seeds each, in {self.directory}>"
@@ -85,7 +98,7 @@ class TwinSweep:
         head = [*(key.rpartition(".")[2] for key in self.keys), "estimate", "runs", "RMSE", "spread"]
         lines = [
             [*(_text(row[key]) for key in self.keys), row["estimate"],
-             f"{row['runs']}" + (f" ({row['failed']} failed)" if row["failed"] else ""),
+             f"{row['runs']}" + "".join(f" ({row[key]} {key})" for key in ("failed", "doubted") if row[key]),
              _with_error(row["rmse"], row["rmse_error"]), _with_error(row["spread"], row["spread_error"])]
             for row in self.rows
         ]  # fmt: skip
@@ -200,10 +213,11 @@ class SweepKind(RunKind[TwinSweep]):
 
 def _one(experiment: TwinExperiment, seed: int) -> TwinRun:
     try:
-        scores = conduct(experiment, seed).scores
+        result = conduct(experiment, seed)
     except En4dvarError as error:
         return TwinRun(failure=readable(error))
-    return TwinRun(tuple((name, score.mean_rmse, score.mean_spread) for name, score in scores.items()))
+    scores = tuple((name, score.mean_rmse, score.mean_spread) for name, score in result.scores.items())
+    return TwinRun(scores, warnings=result.warnings)
 
 
 def _values(key: str, choices: Sequence[Any] | str) -> tuple[Any, ...]:
@@ -217,13 +231,15 @@ def _values(key: str, choices: Sequence[Any] | str) -> tuple[Any, ...]:
 
 def runs_table(sweep: TwinSweep) -> Iterator[list[str]]:
     """A line a run and estimate, below their heads."""
-    yield [*sweep.keys, "seed", "estimate", "rmse", "spread", "failure"]
+    yield [*sweep.keys, "seed", "estimate", "rmse", "spread", "failure", "warnings"]
     for values, runs in zip(sweep.values, sweep.runs, strict=True):
         own = [_text(value) for value in values]
         for seed, run in zip(sweep.seeds, runs, strict=True):
-            yield from ([*own, str(seed), name, repr(rmse), repr(spread), ""] for name, rmse, spread in run.scores)
+            doubts = "; ".join(run.warnings)
+            for name, rmse, spread in run.scores:
+                yield [*own, str(seed), name, repr(rmse), repr(spread), "", doubts]
             if run.failure:
-                yield [*own, str(seed), "", "", "", run.failure]
+                yield [*own, str(seed), "", "", "", run.failure, ""]
 
 
 def _text(value: Any) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 
 import numpy as np
 import pytest
@@ -92,6 +93,19 @@ def test_a_run_that_fails_ends_no_sweep(tmp_path, monkeypatch):
     ]  # fmt: skip
     assert "all are lost" in (tmp_path / "a" / "runs.csv").read_text()
     assert "2 (1 failed)" in str(found)
+
+
+def test_warnings_of_single_runs_are_told(tmp_path):
+    path = tmp_path / "ring.yaml"
+    path.write_text(str(CONFIG))
+    vary = ["--vary", "assimilation.inflation=[0.5, 1.0]", "--seeds", "2", "--workers", "1"]
+    told = CliRunner().invoke(main, ["sweep-twin", str(path), *vary, "--out", str(tmp_path / "a")])
+    assert told.exit_code == 0, told.output
+    assert re.search(r"^0\.5 +analysis +2 \(2 doubted\)", told.stdout, re.MULTILINE)
+    assert "warning: 2 of 4 runs, the first is 0.5, seed 4: the spread of the analysis is" in told.stderr
+    with open(tmp_path / "a" / "runs.csv", newline="") as file:
+        doubts = {(line["assimilation.inflation"], line["warnings"][:27]) for line in csv.DictReader(file)}
+    assert doubts == {("0.5", "the spread of the analysis "), ("1.0", "")}
 
 
 @pytest.mark.parametrize(
