@@ -34,7 +34,7 @@ from en4dvar.priors.prior import member_stream, own_seed
 from en4dvar.problem import InverseProblem
 from en4dvar.report.calibration import ERRORS, FIT, LEVELS, Calibration, Judged, load_calibration, write_sets
 from en4dvar.results.checkpoint import FOLDER, digest
-from en4dvar.runs.engine import KeptUnits, RunKind, Session, Tell, conduct_run
+from en4dvar.runs.engine import KeptUnits, RunKind, Session, Tell, conduct_run, require_some
 
 STATE = f"{FOLDER}/calibration"
 ATTEMPTS = 100  # truths that the model cannot run are drawn again so often
@@ -131,6 +131,7 @@ class CalibrationKind(RunKind[Calibration]):
             line=lambda judged: f"set {judged.number}: {judged.failure or 'estimated'}",
         )  # fmt: skip
         told = sorted((judged for judged in kept.done if judged.number <= self.sets), key=lambda judged: judged.number)
+        require_some("sets", [judged.failure for judged in told])
         name, file = next(iter(self.data.items()))
         estimated = build_one(self.config, name, file).prior.parameters
         quantities = [*((p.name, p.display_unit or p.unit) for p in estimated), (FIT, "1"), (ERRORS, "1")]

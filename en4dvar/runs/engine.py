@@ -17,7 +17,7 @@ from en4dvar.executor import Executor, ExecutorError, choose_executor, one_blas_
 from en4dvar.executor.processes import UnguardedError
 from en4dvar.inputs.parts import DataFile
 from en4dvar.model.forward import ForwardModel
-from en4dvar.plumbing.errors import ConfigError, OutputError
+from en4dvar.plumbing.errors import ConfigError, En4dvarError, OutputError
 from en4dvar.plumbing.files import write_text
 from en4dvar.plumbing.user_code import reason_of
 from en4dvar.results.checkpoint import FOLDER, CheckpointError, Keeper, read_checkpoint, write_checkpoint
@@ -235,6 +235,12 @@ class KeptUnits(Generic[S]):
             if tell:
                 tell(total - len(calls) + count, total)
         self.keeper.write(tuple(self.done))
+
+
+def require_some(units: str, failures: Sequence[str]) -> None:
+    """Raise :class:`En4dvarError` where all units of work failed; ``failures``: why each did, "" where it did not."""
+    if all(failures):
+        raise En4dvarError(f"all {len(failures)} {units} failed, the first: {failures[0]}")
 
 
 def directory_mode(force: bool, resume: bool) -> Mode:

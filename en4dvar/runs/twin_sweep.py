@@ -22,7 +22,7 @@ from en4dvar.report.chart import POINTS, Chart, Panel, Row
 from en4dvar.report.paper import on_paper
 from en4dvar.results.checkpoint import FOLDER, digest, write_checkpoint
 from en4dvar.results.provenance import identity
-from en4dvar.runs.engine import RunKind, Session, conduct_run
+from en4dvar.runs.engine import RunKind, Session, conduct_run, require_some
 from en4dvar.series.twin import TwinExperiment, conduct
 
 if TYPE_CHECKING:
@@ -186,6 +186,7 @@ class SweepKind(RunKind[TwinSweep]):
 
     def conduct(self, run: Session, executor: Executor) -> TwinSweep:
         runs, n = self._runs(run, executor), len(self.seeds)
+        require_some("runs", [twin.failure for twin in runs])
         of_settings = tuple(tuple(runs[i : i + n]) for i in range(0, len(runs), n))
         sweep = TwinSweep(self.keys, self.values, self.seeds, of_settings, self.directory)
         rows = sweep.rows

@@ -13,7 +13,7 @@ from toy_config import write_toy
 import en4dvar
 from en4dvar.cli import main
 from en4dvar.config import load_config
-from en4dvar.plumbing.errors import ConfigError, DataError, OutputError
+from en4dvar.plumbing.errors import ConfigError, DataError, En4dvarError, OutputError
 from en4dvar.report.calibration import ERRORS, FIT, Judged, load_calibration
 
 QUIET = {"output.report": False, "assimilation.members": 24}
@@ -85,6 +85,12 @@ def test_sets_without_a_posterior_are_told(toy, tmp_path):
     failed = replace(result, sets=(*result.sets, Judged(4, "toy", failure="lost")))
     assert "1 of 4 sets have no posterior: lost" in failed.remarks
     assert len(failed.good) == 3
+
+
+def test_sets_that_all_fail_end_with_the_first_reason(toy, tmp_path):
+    fragile = {**QUIET, "model.name": "toy_models:Fragile"}
+    with pytest.raises(En4dvarError, match="all 2 sets failed, the first: no truth drawn from the prior can be run"):
+        en4dvar.calibrate(toy, 2, overrides=fragile, out=tmp_path / "out")
 
 
 def test_what_cannot_be_done_is_told(toy, tmp_path):

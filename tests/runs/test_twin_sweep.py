@@ -13,7 +13,7 @@ from twin_models import Ring
 import en4dvar
 from en4dvar.cli import main
 from en4dvar.config import load_twin
-from en4dvar.plumbing.errors import ConfigError, OutputError, TooFewMembersError
+from en4dvar.plumbing.errors import ConfigError, En4dvarError, OutputError, TooFewMembersError
 from en4dvar.runs.interrupt import Interrupted
 from en4dvar.series.twin import conduct
 
@@ -93,6 +93,15 @@ def test_a_run_that_fails_ends_no_sweep(tmp_path, monkeypatch):
     ]  # fmt: skip
     assert "all are lost" in (tmp_path / "a" / "runs.csv").read_text()
     assert "2 (1 failed)" in str(found)
+
+
+def test_a_sweep_whose_runs_all_fail_ends_with_the_first_reason(tmp_path, monkeypatch):
+    def fail(experiment, seed):
+        raise TooFewMembersError(f"all are lost with seed {seed}")
+
+    monkeypatch.setattr("en4dvar.runs.twin_sweep.conduct", fail)
+    with pytest.raises(En4dvarError, match="all 12 runs failed, the first: all are lost with seed 4"):
+        sweep(tmp_path / "a")
 
 
 def test_warnings_of_single_runs_are_told(tmp_path):
