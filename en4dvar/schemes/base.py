@@ -163,9 +163,10 @@ class Scheme:
     parameters), ``series``, or both. ``filters``: it analyses its members once, where they stand. ``resamples``:
     members survive as a whole, so that no part of the state can be analysed by itself, and its forecast is not
     Gaussian. ``cycled``: the next forecast of a series starts from the analysis; a baseline's from the forecast, as if
-    nothing was observed. ``approximate``: what it does, in words, that makes its ensemble another than the posterior
-    even where model and errors are linear and Gaussian. ``localised_keys``: the fields that it reads where its gain is
-    localised; None: it cannot be.
+    nothing was observed. ``climatological``: the covariances of its analysis, where that is not localised, are averages
+    over the forecasts of a series so far. ``approximate``: what it does, in words, that makes its ensemble another than
+    the posterior even where model and errors are linear and Gaussian. ``localised_keys``: the fields that it reads
+    where its gain is localised; None: it cannot be.
     """
 
     words: ClassVar[str] = ""
@@ -173,6 +174,7 @@ class Scheme:
     filters: ClassVar[bool] = False
     resamples: ClassVar[bool] = False
     cycled: ClassVar[bool] = True
+    climatological: ClassVar[bool] = False
     approximate: ClassVar[str] = ""
     localised_keys: ClassVar[frozenset[str] | None] = None
 

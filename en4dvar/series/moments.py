@@ -171,12 +171,14 @@ class SequentialState(SequentialResult):
     """What a run has found so far, with all that the rest of it depends on, besides its arguments.
 
     ``cycle`` observation times are done; ``ensemble`` (N', n_state + changes) stand at ``start`` (0: time zero, k:
-    observation time k). Random numbers are drawn by cycle, so that no generator has a state.
+    observation time k). ``covariances``: averages, (n, p) and (p, p). Random numbers are drawn by cycle, so that no
+    generator has a state.
     """
 
     cycle: int = 0
     start: int = 0
     trail: tuple[Array, ...] = ()
+    covariances: tuple[Array, ...] = ()
 
     @property
     def ensemble(self) -> Array:

@@ -102,6 +102,7 @@ class _Run:
         cycles = len(series.times)
         self.iterations, self.effective = np.zeros(cycles), np.full(cycles, np.nan)
         self.trail: list[Array] = []
+        self.covariances: tuple[Array, ...] = ()  # (n, p) and (p, p), averages over the forecasts so far
         self.ensemble, self.start = members, 0  # start: k is the k-th observation time
         self.failures: list[str] = []
         self.kept: list[tuple[int, Array]] = []
@@ -111,7 +112,7 @@ class _Run:
             self.ensemble, self.start, self.flow.runs = resume.ensemble, resume.start, resume.forward_runs
             self.failures, self.kept, self.done = list(resume.failures), list(resume.kept), resume.cycle
             self.iterations[: resume.cycle], self.effective[: resume.cycle] = resume.iterations, resume.effective
-            self.trail = list(resume.trail)
+            self.trail, self.covariances = list(resume.trail), resume.covariances
             earlier = resume.forecast, resume.analysis, resume.smoothed
         self.before, self.after, self.smooth = (MomentsRecorder(cycles, size, moments, truth) for moments in earlier)
         self.predicted = InnovationRecorder(series, truth is None, resume)
@@ -124,7 +125,7 @@ class _Run:
         return SequentialState(
             before, after, smooth, predicted, ranks, evidence, self.iterations[:done].copy(),
             self.effective[:done].copy(), self.ensemble, tuple(self.kept), tuple(self.failures), self.flow.runs, done,
-            self.start, tuple(self.trail),
+            self.start, tuple(self.trail), self.covariances,
         )  # fmt: skip
 
     def result(self) -> SequentialResult:
@@ -145,6 +146,8 @@ class _Run:
         self.iterations[newest - 1] = descent.iteration
         self.effective[newest - 1] = getattr(descent.step, "effective", np.nan)
         mean, anomalies = window.posterior(descent)
+        if self.scheme.climatological and window.localised is None:
+            mean, anomalies = self.interpolated(window, newest)
         posterior = mean + anomalies if repeated else self.ensemble
         if self.rotations is not None:
             turned = self.rotations.of_cycle(newest - 1, len(anomalies))
@@ -242,6 +245,22 @@ class _Run:
         rest = self.ensemble[:, self.flow.size + changes :]
         self.ensemble = np.hstack([moved, rest]) if rest.size else moved
         self.start = next_start
+
+    def interpolated(self, window: CycleWindow, newest: int) -> tuple[Array, Array]:
+        """Mean and anomalies (N, n) after an analysis with averaged covariances, in which a time weighs by its number:
+        what the members were before they had forgotten their start fades.
+        """
+        (ahead,) = window.ahead
+        reference, predicted = centre(ahead.predicted)
+        now = (each.T @ predicted / (len(predicted) - 1) for each in (window.anomalies, predicted))
+        before: Sequence[Array | float] = self.covariances or (0.0, 0.0)
+        self.covariances = tuple(c + 2 / (newest + 1) * (n - c) for c, n in zip(before, now, strict=True))
+        d, S = self.series.whiten(newest - 1, reference, predicted)
+        (_, cross), (_, half) = (self.series.whiten(newest - 1, reference, c) for c in self.covariances)
+        values, vectors = np.linalg.eigh(self.series.whiten(newest - 1, reference, half)[1] + np.eye(len(d)))
+        cross = vectors.T @ cross
+        increment = (vectors.T @ d / values) @ cross
+        return window.mean + increment, window.anomalies - (S.T @ vectors / (values + np.sqrt(values))) @ cross
 
     def keep_members(self, first: int, newest: int, states: Array) -> None:
         every, last = self.settings.members_every, len(self.series.times)
