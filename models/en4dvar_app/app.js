@@ -35,11 +35,11 @@ async function post(step, fields) {
 }
 
 function options(select, names, empty) {
-  const now = select.value, wanted = empty === undefined ? names : ["", ...names];
+  const shown = select.value, now = shown || sessionStorage.getItem(select.id), wanted = empty === undefined ? names : ["", ...names];
   if ([...select.options].map((o) => o.value).join("\n") === wanted.join("\n") && select.options.length) return false;
   select.replaceChildren(...wanted.map((name) => new Option(name || empty, name)));
   select.value = wanted.includes(now) ? now : wanted[0] ?? "";
-  return select.value !== now || !now;
+  return select.value !== shown || !shown;
 }
 
 // The fields of a movie or a table: what was typed about it in this window, or else given to the last command about it.
@@ -294,6 +294,7 @@ $("text").addEventListener("input", showPriors);
 $("keep").addEventListener("click", keep);
 $("cancel").addEventListener("click", async () => { await post("cancel", {}); await refresh(); });
 for (const step of ["track", "init"]) for (const id of MINE[step].slice(1)) $(id).addEventListener("change", () => remember(step));
+for (const id of ["movie", "table"]) $(id).addEventListener("change", () => sessionStorage.setItem(id, $(id).value));
 for (const id of ["table", "sheet"]) $(id).addEventListener("change", readTable);
 $("config").addEventListener("change", readConfig);
 for (const id of ["time-column", "radius-column", "time-unit", "radius-unit"]) $(id).addEventListener("change", plotTable);

@@ -57,6 +57,18 @@ def test_of_another_movie_nothing_stays(visit, serve, two_movies):
     assert values(page, *fields) == ["2.5 um", *[""] * (len(fields) - 1)]
 
 
+def test_a_page_that_is_loaded_again_shows_the_movie_and_the_table_of_before(visit, serve, two_movies):
+    for name in ("a", "b"):
+        (two_movies / f"{name}.csv").write_text("t,R\n1,1\n2,2\n3,3\n")
+    page = visit(serve(two_movies))
+    until(page, "movie?.name === 'a.tif'")
+    page.select_option("#movie", "b.tif")
+    page.select_option("#table", "b.csv")
+    until(page, "movie?.name === 'b.tif' && table?.file === 'b.csv'")
+    page.reload()
+    until(page, "movie?.name === 'b.tif' && table?.file === 'b.csv'")
+
+
 def test_of_another_table_nothing_stays(visit, serve, german):
     shutil.copy(german / "messung.csv", german / "zwei.csv")
     page, fields = visit(serve(german)), ("time-unit", "radius-unit", "law", "medium", "start", "time-column")
