@@ -11,7 +11,18 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
-from en4dvar.executor.base import Call, Executor, Hear, Outcome, T, Tell, WorkerLostError, kept, run_chunk
+from en4dvar.executor.base import (
+    Call,
+    Executor,
+    Hear,
+    Outcome,
+    T,
+    Tell,
+    WorkerLostError,
+    kept,
+    run_chunk,
+    without_warnings,
+)
 from en4dvar.model.forward import ForwardModel
 from en4dvar.model.state import Array
 from en4dvar.plumbing.children import HaltedError, end_those_of, raise_in, starts_again
@@ -162,15 +173,15 @@ class ThreadsExecutor(PoolExecutor):
         A forecast takes 1 ms: threads that contend for the interpreter, and one more to wake, would be a third of it.
         """
         try:
-            shared = model.share(x, times)
-            if shared is not None:
-                helpers = min(self.workers, -(-len(x) // model.batch)) - 1
-                futures = [self._submit(shared.work, (), None) for _ in range(helpers)]
-                shared.work()
-                for future in futures:
-                    future.result()
-                if len(results := kept(shared.results())) == len(x):
-                    return results
+            with without_warnings():
+                if (shared := model.share(x, times)) is not None:
+                    helpers = min(self.workers, -(-len(x) // model.batch)) - 1
+                    futures = [self._submit(shared.work, (), None) for _ in range(helpers)]
+                    shared.work()
+                    for future in futures:
+                        future.result()
+                    if len(results := kept(shared.results())) == len(x):
+                        return results
         except BaseException as error:  # told member by member
             own_fault(error)
         return super().trajectories(model, x, times)

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,9 @@ from en4dvar.estimation.assimilate import assimilate
 from en4dvar.executor import ProcessesExecutor, SerialExecutor, ThreadsExecutor, choose_executor, cut
 from en4dvar.model.forward import Failure
 from en4dvar.schemes.settings import AssimilationSettings
+from en4dvar_bubble import BubbleModel
+from en4dvar_bubble.laws import get_law
+from en4dvar_bubble.medium import WATER_25C
 
 SETTINGS = AssimilationSettings(members=13)
 
@@ -51,6 +55,20 @@ def test_exception_fails_only_the_batch_that_raised(kind):
         assert [isinstance(r, Failure) for r in results] == expected
         assert results[2].reason == "FloatingPointError: overflow"
         assert np.array_equal(results[4].states[0], model.step(x[4], 0.0, 0.1))
+
+
+@pytest.mark.filterwarnings("always")
+@pytest.mark.parametrize("kind", [SerialExecutor, lambda: ThreadsExecutor(2)])
+def test_a_member_that_numpy_would_warn_of_fails_in_silence(kind, recwarn):
+    """With so little gas its pressure is lost beside that of the vapour."""
+    medium = replace(WATER_25C, p_v=3169.0)
+    model = BubbleModel(get_law("neo-hookean-kelvin-voigt"), start="laser", medium=medium)
+    values = {"G": 4e3, "mu": 0.1, "R_max": 3e-4}
+    theta = {"R_eq": np.array([3e-12, 5e-5]), **{name: np.full(2, value) for name, value in values.items()}}
+    with kind() as executor:
+        results = executor.trajectories(model, model.initial_states(theta), np.array([1e-6]))
+    assert [isinstance(r, Failure) for r in results] == [True, False]
+    assert not recwarn.list
 
 
 @pytest.mark.slow
