@@ -110,12 +110,13 @@ class Table:
         lines = numbered_lines(path) if lines is None else lines
         if not lines:
             raise DataError(f"{path}: the file holds no data")
-        head = [cells_of(line, delimiter_of(line, path)) for _, line in lines[:PREAMBLE]]
-        top, first = _names_and_numbers(head, wanted)
+        signs = [delimiter_of(line, path) for _, line in lines[:PREAMBLE]]
+        head = [cells_of(line, sign) for (_, line), sign in zip(lines, signs, strict=False)]
+        top, first = _names_and_numbers(head, signs, wanted)
         self.nameless = top is None
         line = lines[first if top is None else top][1]
-        signs = (";", "\t") if self.nameless else ()  # numbers may have decimal commas
-        delimiter = next((s for s in signs if s in line), delimiter_of(line, path))
+        others = (";", "\t") if self.nameless else ()  # numbers may have decimal commas
+        delimiter = next((s for s in others if s in line), delimiter_of(line, path))
         self.rows = [(n, cells_of(x, delimiter)) for n, x in lines[first:]]
         below: list[list[str]] = []
         if any(_holds_number(cells) for _, cells in self.rows):
@@ -186,8 +187,10 @@ def matches(name: str, pattern: str) -> bool:
     return "*" in pattern and fnmatch.fnmatchcase(name, pattern)
 
 
-def _names_and_numbers(head: Sequence[Sequence[str]], wanted: Sequence[str]) -> tuple[int | None, int]:
-    """The line that names the columns, None where none does, and the first below it.
+def _names_and_numbers(
+    head: Sequence[Sequence[str]], signs: Sequence[str], wanted: Sequence[str]
+) -> tuple[int | None, int]:
+    """The line that names the columns, None where none does, and the first below it; ``signs`` separate the cells.
 
     It is the one above the lines with numbers, unless it or one of words above it holds units, which stand below the
     names, as comments stand below units.
@@ -195,7 +198,7 @@ def _names_and_numbers(head: Sequence[Sequence[str]], wanted: Sequence[str]) -> 
     for i, cells in enumerate(head if wanted else ()):
         if all(any(_same(cell, name) or matches(cell, name) for cell in cells) for name in wanted):
             return i, i + 1
-    first = _first_of_numbers(head)
+    first = _first_of_numbers(head, signs)
     if _holds_number(head[first]) and (first == 0 or (wanted and all(map(_NAMELESS.fullmatch, wanted)))):
         return None, first
     top = max(first - 1, 0)
@@ -206,18 +209,21 @@ def _names_and_numbers(head: Sequence[Sequence[str]], wanted: Sequence[str]) -> 
     return top, top + 1
 
 
-def _first_of_numbers(head: Sequence[Sequence[str]]) -> int:
+def _first_of_numbers(head: Sequence[Sequence[str]], signs: Sequence[str]) -> int:
     """The first of the last lines with numbers between which there are no words but those in the midst of a table.
 
-    Such words stand below several lines that have numbers wherever the line below the words has.
+    Such words stand below lines that have numbers wherever the line below the words has: several, or any where the
+    words name no columns, for they are too few or parted by other ``signs``.
     """
     end = next((i for i in reversed(range(len(head))) if _holds_number(head[i])), 0)
     *begins, first = [0, *(i + 1 for i in range(end) if _words(head[i]))]
     stop = first - 1
     for begin in reversed(begins):
-        above = [_number_columns(cells) for cells in head[begin:stop]]
+        above, own = [_number_columns(cells) for cells in head[begin:stop]], _number_columns(head[first])
+        between = [[*filter(_stated, head[k])] for k in range(stop, first) if signs[k] == signs[first]]
+        needed = SEVERAL if any(len(cells) >= len(own) for cells in between) else 1
         stop = begin - 1
-        if above and (len(above) < SEVERAL or not _number_columns(head[first]) <= set[int]().union(*above)):
+        if above and (len(above) < needed or not own <= set[int]().union(*above)):
             break
         first = begin if above else first
     return first

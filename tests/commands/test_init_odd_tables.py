@@ -115,6 +115,23 @@ def test_words_in_the_midst_of_a_table_do_not_name_columns(tmp_path: Path, head:
     assert "delete it, or if another series begins here, give it a file of its own" in output
 
 
+@pytest.mark.parametrize("words", ["laser", "laser fired", "laser fired now,"])
+@pytest.mark.parametrize("head", ["t,R\n", ""])
+@pytest.mark.parametrize("row", [1, 2])
+def test_words_that_name_no_columns_stand_in_the_midst_below_any_reading(
+    tmp_path: Path, head: str, words: str, row: int
+) -> None:
+    """The readings above them were left out without a word."""
+    lines = [*head.splitlines(), "0,9", "1,8", "2,7", "3,6", "4,5"]
+    at = row + bool(head)
+    (tmp_path / "a.csv").write_text("\n".join([*lines[:at], words, *lines[at:]]), encoding="utf-8")
+    contents = read_contents(tmp_path / "a.csv")
+    assert contents.columns["R" if head else "c2"][0] == 9
+    fault = contents.others["t" if head else "c1"]
+    assert f"a.csv:{at + 1}: {words.strip(',')!r} in column" in fault
+    assert "nothing in the line is a number: delete it" in fault
+
+
 def test_words_above_several_lines_of_numbers_in_other_columns_name_columns(tmp_path: Path) -> None:
     for preamble in ("rate,2e6\nwidth,512\nheight,512\n", "width,height\n512,512\n", "1 camera\n2 lenses\n3 lamps\n"):
         (tmp_path / "a.csv").write_text(f"Camera,X\n{preamble}t,R\n0,1\n1,2\n", encoding="utf-8")
