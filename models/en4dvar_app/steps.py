@@ -49,7 +49,7 @@ def existing(root: Path, fields: Fields, key: str) -> str:
         raise FieldError(f"{name}: is not in the folder any more")
     for part in path.iterdir() if path.is_dir() else ():
         below(root, part.relative_to(root).as_posix())
-    if key == "movie" and (other := other_movie(below(root, table := beside(name, TABLE)), name)):
+    if key == "movie" and (other := other_movie(below(root, table := beside(name, TABLE)), path)):
         raise FieldError(f"{table}: was read from {other}, to which its corrections belong; give {name} another name")
     return name
 

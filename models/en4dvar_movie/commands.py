@@ -73,7 +73,7 @@ def track(
     more = [table.with_name(f"{table.stem}_{n}{table.suffix}") for n in range(2, MOST + 1)] if choice["every"] else []
     for target in (table, shown, outlined, *more):
         refuse_to_replace(target, force)
-    if out is None and (another := other_movie(table, movie.name)):
+    if out is None and (another := other_movie(table, movie)):
         raise OutputError(f"{table}: was read from {another} and is not replaced; give --out another name")
     fixed = read_corrections(corrections) if corrections else {}
     point = None if choice["bubble"] is None else numbers(choice["bubble"], "--bubble", "X,Y")

@@ -1,6 +1,7 @@
 """The readings as CSV: one line a frame, lengths in micrometres, times in microseconds."""
 
 import math
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -42,16 +43,18 @@ class Scale:
 
 
 def movie_of(table: Path) -> str:
-    """The name of the movie that a table was read from; "" where it is none of ``en4dvar track``."""
+    """The movie that a table was read from, as it was named; "" where it is none of ``en4dvar track``."""
     with table.open("rb") as file:
         head = _HEAD.match(file.read(LONGEST_HEAD))
-    return Path(head[1].decode("utf-8", "replace")).name if head else ""
+    return head[1].decode("utf-8", "replace") if head else ""
 
 
-def other_movie(table: Path, movie: str) -> str:
-    """The name of another movie than ``movie`` that a table, if there is one, was read from; else ""."""
+def other_movie(table: Path, movie: Path) -> str:
+    """Another movie than ``movie``, by name or place, that a table, if there is one, was read from; else ""."""
     named = movie_of(table) if table.is_file() else ""
-    return named if named != " ".join(movie.split()) else ""
+    if (name := Path(named).name) != " ".join(movie.name.split()):
+        return name
+    return named if os.path.exists(at := table.parent / named) and not at.samefile(movie) else ""
 
 
 def to_csv(readings: Sequence[Reading], scale: Scale, movie: str, command: str) -> str:

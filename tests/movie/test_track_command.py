@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+
 import numpy as np
 import pytest
 import tifffile
@@ -115,6 +117,19 @@ def test_the_table_of_another_movie_of_that_name_is_replaced_only_by_its_name(tm
     assert (tmp_path / "gel.csv").read_bytes() == before
     named = CliRunner().invoke(main, ["track", "gel.tiff", *SCALE, "--force", "--out", "gel.csv"])
     assert named.exit_code == 0, named.output
+
+
+def test_the_table_of_a_movie_of_that_name_in_another_folder_is_replaced_only_by_its_name(tmp_path, monkeypatch):
+    assert tracked(tmp_path, monkeypatch).exit_code == 0
+    before = (tmp_path / "gel.csv").read_bytes()
+    (tmp_path / "second").mkdir()
+    shutil.copy(tmp_path / "gel.tif", tmp_path / "second")
+    other = CliRunner().invoke(main, ["track", "second/gel.tif", *SCALE, "--force"])
+    assert other.exit_code != 0
+    assert "gel.csv: was read from gel.tif and is not replaced; give --out another name" in other.output
+    assert (tmp_path / "gel.csv").read_bytes() == before
+    own = CliRunner().invoke(main, ["track", str(tmp_path / "gel.tif"), *SCALE, "--force"])
+    assert own.exit_code == 0, own.output
 
 
 def test_nothing_is_replaced_and_the_scale_is_asked_for(tmp_path, monkeypatch):
