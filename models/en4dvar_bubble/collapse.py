@@ -35,6 +35,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import stdtrit
 
+from en4dvar.inputs.window import maxima
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.errors import DataError
@@ -49,6 +50,7 @@ SOFT = 1.02  # r of a large bubble in a soft gel, whose gas and viscosity prolon
 APART = 1.05  # noise and physics that the model lacks move r by less than this
 TAILS = 0.5  # of the range of the members' ln r: 48 of a Gaussian reach 2.2 standard deviations, with tails twice that
 SURE = 0.99  # one-sided probability, by the scatter of the samples
+REBOUND = 0.5  # of the collapse time: a rebound that has no top by then is not seen, or there is none
 SAME_FACTOR = 1.12  # a factor that is this close to that of a known mistake may be it
 
 
@@ -61,6 +63,12 @@ class Gel(NamedTuple):
 
 COMMON = Gel(20e3, 0.3)  # published: 7.7 kPa (Estrada et al. 2018), stiff polyacrylamide; 0.19 Pa s (Yang et al. 2020)
 EXTREME = Gel(100e3, 1.0)  # no bubble was used on more
+SINGLE = (
+    "the readings end before the first rebound has a top, so that whatever else takes the energy of that collapse "
+    "(sound, fragments, jets, a shape that is no sphere) is told as viscosity and stiffness: measured bubbles told 2 "
+    "to 28 times the viscosity, and up to 4 times the modulus, of a window that holds the rebound",
+    "film the rebound until its top is past, and let the window (data.window) hold it; else quote upper limits",
+)  # words and advice of a warning
 
 
 @dataclass(frozen=True)
@@ -225,6 +233,20 @@ def _explained(factor: float) -> str:
     size, step = ("large", "short") if factor > 1 else ("small", "long")
     words = f"radii {by:.3g} times too {size}, or the time step {by:.3g} times too {step}"
     return f"{words}; are the units of both columns right?" if by > 30 else f"{words} (pixel size, frame rate, units)"
+
+
+def single(times: Array, radius: Array) -> bool:
+    """True if the readings end with their first collapse or before its rebound has a top: what took the energy of that
+    collapse, viscosity or sound, fragments, jets and a shape that is no sphere, is then told by nothing.
+    """
+    falling = slice(int(np.argmax(radius)), None)
+    if radius[falling].min() > TOLD * radius.max() or len(maxima(radius[falling])):
+        return False
+    try:
+        view = lobe(times, radius, with_margin=False)
+    except DataError:
+        return False
+    return bool(times[-1] < view.t_max + (1 + REBOUND) * view.t_c)
 
 
 def doubts(

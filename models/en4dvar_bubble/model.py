@@ -30,7 +30,7 @@ from en4dvar.model.forward import (
 )
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution
-from en4dvar_bubble.collapse import doubts
+from en4dvar_bubble.collapse import SINGLE, doubts, single
 from en4dvar_bubble.dynamics import MACH_LIMITS, Dynamics, Wall
 from en4dvar_bubble.events import OBSERVABLES
 from en4dvar_bubble.gas import saturated_vapour_pressure
@@ -123,8 +123,16 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
     def doubts(
         self, observable: str, times: Array, values: Array, predicted: Array, members: Mapping[str, Array]
     ) -> Sequence[Caution]:
-        """Whether the collapse time can be right, see :mod:`en4dvar_bubble.collapse`."""
-        return doubts(times, values, predicted, members, self.medium) if observable == "radius" else ()
+        """Whether the collapse time can be right, and what one collapse tells of the law, see
+        :mod:`en4dvar_bubble.collapse`.
+        """
+        if observable != "radius":
+            return ()
+        told = doubts(times, values, predicted, members, self.medium)
+        asked = tuple(p.name for p in self.law.parameters if np.ptp(members.get(p.name, 0.0)))
+        if self.start == "laser" and asked and single(times, values):
+            told = (*told, Caution("model-validity", "caution", *SINGLE, asked))
+        return told
 
     def initial_state(self, theta: Mapping[str, float]) -> Array:
         return np.asarray(self.initial_states({p.name: np.array([theta[p.name]]) for p in self.parameters})[0])

@@ -191,3 +191,21 @@ def test_a_collapse_that_no_frame_shows_has_its_time(step: float, lost: tuple[in
         assert lobe(*with_gap).t_c == pytest.approx(RAYLEIGH, rel=0.06)
         behind = int(np.searchsorted(with_gap[0], t[least])) + 1
         assert lobe(*(it[:behind] for it in with_gap)).t_c == pytest.approx(RAYLEIGH, rel=0.06)  # it ends there
+
+
+def test_what_one_collapse_alone_tells_of_a_law_is_an_upper_limit() -> None:
+    """Said of a laser's bubble until the top of the rebound is read, or none comes; not where the law is known."""
+    t = np.arange(0, 120e-6, 1e-6)
+    model = BubbleModel.from_settings(
+        BubbleSettings.model_validate({"law": "neo-hookean-kelvin-voigt", "start": "laser"})
+    )
+
+    def told(mu: float, end: int, members: tuple[float, float] = (0.01, 0.1)) -> list[str]:
+        known = {"G": 2e3, "mu": mu, "R_max": 200e-6, "R_eq": 30e-6}
+        (path,) = model.trajectories(model.initial_state(known)[None], t)
+        R = path.states[:end, 0]
+        cautions = model.doubts("radius", t[:end], R, np.stack([R, R]), {"mu": np.array(members)})
+        return [c.code for c in cautions if c.parameters == ("mu",)]
+
+    assert told(0.01, 21) == told(0.01, 24) == ["model-validity"]
+    assert told(0.01, 80) == told(0.5, 119) == told(0.01, 21, (0.01, 0.01)) == []
