@@ -39,7 +39,7 @@ def all_figures(study: Study) -> Iterator[Captioned]:
         members = len(fit.members("mu"))
         caption = f"Combined final ensembles of all sets, {members} members; {fit.gel} gel, general QLKV."
         yield f"members_{named(fit.gel)}", caption, combined(study, fit)
-        caption = f"Iterative estimates, one line a data set; {fit.gel} gel, general QLKV."
+        caption = f"Iterative estimates from the initial guess (0) on, one line a data set; {fit.gel} gel, general QLKV."
         yield f"iterations_{named(fit.gel)}", caption, iterations(fit)
     if study.populations:
         caption = "Population mean (95 % interval) by the hierarchical step and mean of the stacked ensembles"
@@ -83,7 +83,7 @@ def dimensional(fit: Fit) -> Chart:
     values = {p.name: fit.sweep.theta[chosen, j] for j, p in enumerate(fit.sweep.parameters)}
     units = {q.name: "× 10⁻²" if q.unit == "10⁻²" else q.unit for q in QUANTITIES if q.name in values}
     numbers = [f"{q.latex} = {values[q.name] * q.factor:.3g} {units[q.name]}" for q in QUANTITIES if q.name in units]
-    title = ", ".join([*numbers, f"NRMSE = {fit.sweep.nrmse[chosen]:.3f}"])
+    title = ",\n".join(map(", ".join, (numbers[:2], [*numbers[2:], f"NRMSE = {fit.sweep.nrmse[chosen]:.3f}"])))
     panel = Panel("time (µs)", "radius (µm)", title=title)
     for i, problem in enumerate(fit.problems):
         o = problem.observations
@@ -191,7 +191,7 @@ def iterations(fit: Fit) -> Chart:
     for q in R0_FIRST:
         j = fit.prior.names.index(q.name)
         guess = float(np.exp(fit.prior.mean[j])) * q.factor
-        panel = Panel("iteration (0: initial guess)", _label(q), whole=True)
+        panel = Panel("iteration", _label(q), whole=True)
         for analysis in fit.analyses:
             path = [guess, *(record.centre[j] * q.factor for record in analysis.iterations)]
             panel.line(np.arange(len(path)), path, "posterior", 0.6, alpha=0.7)

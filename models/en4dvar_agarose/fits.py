@@ -107,8 +107,9 @@ class Fit:
         return np.asarray(stacked[np.isfinite(stacked)])
 
     def prior_members(self, name: str) -> Array:
-        """(N,) members of the prior, SI."""
-        return np.asarray(self.analyses[0].prior[:, self.prior.names.index(name)])
+        """(S·N,) members of the priors of all sets, SI."""
+        j = self.prior.names.index(name)
+        return np.concatenate([a.prior[:, j] for a in self.analyses])
 
 
 @dataclass(frozen=True)
