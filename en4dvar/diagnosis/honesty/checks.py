@@ -181,7 +181,7 @@ def at_bound(prior: Prior, members: Array, posterior: Array, failures: Sequence[
     """
     for j, (term, parameter) in enumerate(zip(prior.terms, prior.parameters, strict=True)):
         low, high = term.bounds if term.has_bound else parameter.bounds
-        if term.transform == "lognormal":
+        if term.open_below:
             low = -math.inf
         if math.isinf(low) and math.isinf(high):
             continue
