@@ -16,7 +16,7 @@ import numpy as np
 
 from en4dvar.config.data import Data, DataPlan, SeriesPlan
 from en4dvar.config.quantities import Spread
-from en4dvar.data.noise import Noise, SharedErrors, noise_of
+from en4dvar.data.noise import DecayingErrors, Noise, SharedErrors, noise_of
 from en4dvar.data.observations import Observations
 from en4dvar.data.series import Series, balanced
 from en4dvar.inputs.formats import SUFFIXES
@@ -231,7 +231,7 @@ def errors_of(
     ``at_least`` (K,) where columns of the file hold them. ``rows``: where the observations stand in a covariance file
     of so many rows, see :meth:`~en4dvar.inputs.readers.Readings.rows_among`.
     """
-    error, correlation = data.error, cast(Array | SharedErrors | None, None)
+    error, correlation = data.error, cast(Array | SharedErrors | DecayingErrors | None, None)
     largest = float(values.max())
     kernel = error.discrepancy.kernel_at(times) if error.discrepancy else None
     timing = stated.get("time_std")
@@ -257,7 +257,7 @@ def errors_of(
         columns = [of(part, f"shared {i}") for i, part in enumerate(error.shared)]
         std, correlation = SharedErrors.beside(std, np.stack(columns, axis=1))
     if error.correlation_time is not None:
-        correlation = np.exp(-np.abs(np.subtract.outer(times, times)) / error.correlation_time)
+        correlation = DecayingErrors(times / error.correlation_time)
     upper, lower = (np.asarray(stated.get(key, on), dtype=bool) for key, on in error.bounds.items())
     if np.any(upper & lower):
         raise DataError("a reading is both at_most and at_least; give two series, one of each")

@@ -22,7 +22,7 @@ from en4dvar.priors.varying.model import can_vary
 
 _RECIPES = {
     "normal": "mean and std, and may have lower and upper",
-    "lognormal": "median and log_std, which may have lower and upper, or mean and std",
+    "lognormal": "median and log_std, which may have upper, or lower and upper, or mean and std",
     "logit": "lower, upper, median and logit_std",
     "uniform": "lower and upper",
     "half-normal": "std, and lower where it does not start at zero",
@@ -93,8 +93,8 @@ class PriorSection(Section):
     """A prior by name; locations and spreads carry the parameter's unit, a ``%`` spread is relative to the location."""
 
     prior: Literal["normal", "lognormal", "logit", "uniform", "half-normal", "beta", "ensemble"]
-    """Shape: normal (mean, std), lognormal (median and log_std, or mean and std), each also cut off at lower and upper,
-    logit (lower, upper, median, …),
+    """Shape: normal (mean, std), lognormal (median and log_std, or mean and std), each also cut off at lower and upper
+    (a lognormal: or at upper alone), logit (lower, upper, median, …),
     uniform (lower, upper), half-normal (std, and lower, by default 0), beta (lower, upper, alpha, beta), or ensemble:
     mean, spread and correlations are those of the members in the file of ``prior: {ensemble: FILE}``."""
     mean: Location = None
@@ -207,6 +207,7 @@ class Uncertain:
             "normal lower mean std upper": lambda: PriorTerm.bounded(p, "normal", mean, self._std(mean), bounds),
             "lognormal mean std": lambda: PriorTerm.lognormal_moments(p, mean, self._std(mean)),
             "lognormal log_std median": lambda: PriorTerm.lognormal(p, median, log_std),
+            "lognormal log_std median upper": lambda: PriorTerm.bounded(p, "lognormal", median, log_std, bounds),
             "lognormal log_std lower median upper": lambda: PriorTerm.bounded(p, "lognormal", median, log_std, bounds),
             "logit logit_std lower median upper": lambda: PriorTerm.logit(p, bounds, median, logit_std),
             "uniform lower upper": lambda: PriorTerm.uniform(p, bounds),

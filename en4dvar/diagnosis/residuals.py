@@ -159,10 +159,10 @@ def positive_chance(weights: Array) -> float:
     >>> round(positive_chance(np.array([1.0, -1.0])), 6), round(positive_chance(np.array([1.0, 1.0, -1.0])), 4)
     (0.5, 0.7071)
     """
-    scaled = weights / np.max(np.abs(weights))
+    scaled = weights / np.linalg.norm(weights)  # the integrand falls within a few units of u
     u = FREQUENCIES
     angle = 0.5 * np.arctan(np.outer(u, scaled)).sum(axis=1)
-    size = np.exp(0.25 * np.log1p(np.outer(u, scaled) ** 2).sum(axis=1))
-    integrand = np.sin(angle) / (u * size)
+    fall = np.exp(-0.25 * np.log1p(np.outer(u, scaled) ** 2).sum(axis=1))
+    integrand = np.sin(angle) * fall / u
     area = float(np.trapezoid(integrand, u)) + float(u[0]) * 0.5 * float(scaled.sum())
     return min(1.0, max(0.0, 0.5 + area / math.pi))

@@ -34,6 +34,7 @@ Sampling = Literal["exact", "random"]
 LARGEST = 1e150  # its square is a number still
 LARGEST_LOG = 300.0  # std of a logarithm or logit: one std is 130 powers of ten
 SHAPES = 0.1, 1e6  # smallest and largest α, β of a beta
+UNREACHED = 8.0  # standard deviations below the mean, where a Gaussian has no probability to rounding
 RESOLVED = 1e-12  # of the mean: an ensemble that spreads by less has four digits at most
 
 
@@ -136,9 +137,12 @@ class PriorTerm:
     def bounded(
         cls, parameter: Parameter, kind: Literal["normal", "lognormal"], mean: float, std: float, bounds: Bounds
     ) -> Self:
-        """:meth:`normal` of ``mean`` and ``std``, or :meth:`lognormal` of median and log_std, between ``bounds``."""
+        """:meth:`normal` of ``mean`` and ``std``, or :meth:`lognormal` of median and log_std, between ``bounds``; the
+        lower one of a lognormal may be 0, which it does not reach anyway."""
         whole = cls.normal(parameter, mean, std) if kind == "normal" else cls.lognormal(parameter, mean, std)
         low, high = bounds
+        if kind == "lognormal" and low == 0:
+            low = math.exp(whole.mean - (UNREACHED + 1) * std)
         whole._require(low <= mean <= high and low < high, f"{mean:g} does not lie between the bounds {bounds}")
         whole._require(kind == "normal" or low > 0, f"the bounds of a logarithm must be positive, not {bounds}")
         a, b = (low, high) if kind == "normal" else (math.log(low), math.log(high))
@@ -146,7 +150,7 @@ class PriorTerm:
         wide = shape[1] - shape[0] > 1e-6 and shape[-1] < LARGEST_LOG
         whole._require(wide, f"the bounds {bounds} do not suit the standard deviation {std:g}; use a uniform prior")
         name: TransformName = "bounded-normal" if kind == "normal" else "bounded-lognormal"
-        return cls._by_quantiles(parameter, name, bounds, shape)
+        return cls._by_quantiles(parameter, name, (low, high), shape)
 
     @classmethod
     def _by_quantiles(cls, parameter: Parameter, kind: TransformName, bounds: Bounds, shape: Numbers) -> Self:
@@ -164,6 +168,12 @@ class PriorTerm:
     def has_bound(self) -> bool:
         """True if the map, rather than the parameter, sets a limit at which the prior has probability."""
         return self.transform == "logit" or self.transform in QUANTILE_MAPS
+
+    @property
+    def open_below(self) -> bool:
+        """True of a logarithm that is not cut off below: zero is infinitely far."""
+        cut = self.transform == "bounded-lognormal"
+        return self.transform == "lognormal" or (cut and self.shape[0] < -UNREACHED)
 
     def slope(self, x: float) -> float:
         """dθ/dx of the parameter map at a transformed value."""

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from scipy.sparse import csr_array
 
 from en4dvar.config.models import symbol_fault
-from en4dvar.data.noise import SIDES, noise_of_readings, noise_of_record
+from en4dvar.data.noise import SIDES, noise_of_readings, noise_of_record, recorded
 from en4dvar.data.observations import Observations
 from en4dvar.data.series import Part, Places
 from en4dvar.diagnosis.analysis import Analysis
@@ -143,7 +143,7 @@ class StoredResult:
         times, time_std = (self.of_readings(held, key, shared=True) for key in ("time", "time_std"))
         parts = _parts(data, axes, observables or {})
         if parts:
-            matrix = _correlation(data, len(times)) if "correlation" in data else None
+            matrix = _correlation(data, len(times))
             within = [float(data.attrs.get(f"{p.name}_huber_threshold", math.inf)) for p in parts]
             thresholds = np.repeat(within, [p.end - p.begin for p in parts])
             sides = data[SIDES].values if SIDES in data else None
@@ -326,13 +326,13 @@ def _continued(data: Group, later: Group, series: str, name: str) -> Observation
     return Observations(times, both(series), noise, np.ones(len(times)), name)
 
 
-def _correlation(data: Group, count: int) -> csr_array:
-    """Of all readings, from the matrix or from its entries that are not zero."""
-    values = data["correlation"].values
-    if values.ndim == 2:
-        return csr_array(values)
-    rows, columns = (data[f"correlation_{side}"].values for side in ("row", "column"))
-    return csr_array((values, (rows, columns)), shape=(count, count))
+def _correlation(data: Group, count: int) -> csr_array | None:
+    """Of all readings, from its entries that are not zero or whatever else is recorded; None where there is none."""
+    if "correlation_row" in data:
+        rows, columns = (data[f"correlation_{side}"].values for side in ("row", "column"))
+        return csr_array((data["correlation"].values, (rows, columns)), shape=(count, count))
+    held = recorded({key: variable.values for key, variable in data.variables.items()})
+    return None if held is None else csr_array(held if isinstance(held, np.ndarray) else held.matrix)
 
 
 def _parts(data: Group, axes: Sequence[Axis], observables: Mapping[str, Observable]) -> tuple[Part, ...]:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.data.noise import SHARED, SIDES
+from en4dvar.data.noise import DECAY, SHARED, SIDES
 from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.diagnosis.diagnostics import active_members
 from en4dvar.diagnosis.influence import prior_distance
@@ -49,7 +49,7 @@ def _matrices(a: Analysis) -> Iterator[Item]:
     own = "reading" if several else "time"
     for key, (matrix, words) in a.observations.noise.matrices().items():
         name = key if several else f"{a.problem.observable.name}_{key}"
-        dims = {SHARED: f"{own} shared_error", SIDES: own}.get(key, "correlated_pair")
+        dims = {SHARED: f"{own} shared_error", SIDES: own, DECAY: own}.get(key, "correlated_pair")
         dims = f"{own} {own}_column" if matrix.ndim == 2 and key != SHARED else dims
         yield Item(matrix, {"matrix": name, "pairs": dims}, words)
 

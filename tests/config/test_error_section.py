@@ -253,9 +253,11 @@ def test_a_result_keeps_the_correlation(tmp_path: Path) -> None:
     config = write_toy(tmp_path, CORRELATED)
     outcome = CliRunner().invoke(main, ["run", str(config), "--out", str(tmp_path / "run"), "--no-report"])
     assert outcome.exit_code == 0, outcome.output
-    correlation = load_result(tmp_path / "run" / "posterior.nc").observed_data["position_correlation"]
-    assert correlation.dims == ("time", "time_column")
-    assert correlation.values[0, 4] == pytest.approx(np.exp(-1))
+    result = load_result(tmp_path / "run" / "posterior.nc")
+    decay = result.observed_data["position_decay_time"]
+    assert decay.dims == ("time",)
+    assert decay.values[4] - decay.values[0] == pytest.approx(1)
+    assert result.observations().noise.correlation.matrix[0, 4] == pytest.approx(np.exp(-1))
 
 
 def test_only_the_initial_state_may_be_estimated(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import pytest
 from diagnosis.provoked import TWO, bounded, linear, run, waved
 from toys import Fragile, Vectorised, make_problem
 
+import en4dvar
 from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.diagnosis.honesty import ControlEnsembles, examine
 from en4dvar.diagnosis.honesty.checks import at_bound, loss, missed, rank, validity, where_lost
@@ -135,6 +136,64 @@ def test_a_tenth_of_the_members_lost_is_serious(lost, severity):
     (found,) = loss("prior forecast", ["gone"] * lost + [""] * (40 - lost), PRIOR)
     assert found.severity == severity
     assert found.words.startswith(f"{lost} of 40 members failed in the prior forecast: gone ({lost}×)")
+
+
+@pytest.mark.parametrize("stage", ["prior forecast", "iterations"])
+def test_members_lost_before_the_posterior_was_sampled_are_a_note(stage):
+    (told,) = loss(stage, ["gone"] * 12 + [""] * 28, PRIOR, sampled=True)
+    assert (told.severity, told.kind) == ("note", "note")
+    assert "no action is needed where these values are impossible" in told.advice
+
+
+def along_a_curve(p, t):
+    y = p["a"] * np.exp(-p["k"] * t)
+    return np.where(p["k"] * p["a"] > 1.0, np.nan, y)
+
+
+def up_to_an_edge(p, t):
+    y = p["a"] * np.exp(-p["k"] * t)
+    return np.where(p["k"] > 0.8, np.nan, y)
+
+
+def of_a_decay(function, cheap=False):
+    t = np.linspace(0.5, 10, 12)
+    y = np.exp(-0.6 * t) + 0.3 * np.random.default_rng(7).standard_normal(12)
+    prior = {name: {"prior": "lognormal", "median": m, "log_std": 0.7} for name, m in (("a", 1), ("k", 0.5))}
+    return en4dvar.estimate(function, (t, y), prior, error=0.3, cheap=cheap)
+
+
+@pytest.mark.parametrize("function", [along_a_curve, up_to_an_edge])
+def test_a_cut_of_the_prior_is_advised_only_where_it_takes_no_values_that_the_model_allows(function):
+    (told,) = [c for c in of_a_decay(function).cautions if c.code == "members-lost" and "prior" in c.words]
+    assert told.severity == "serious"
+    assert "lost members have k above" in told.words
+    cut = re.search(
+        r"cut the prior at k = ([\d.]+), beyond which hardly any member runs \(parameters.k.upper\)", told.advice
+    )
+    if function is along_a_curve:
+        assert "cut" not in told.advice
+        assert "narrow" not in told.advice
+    else:
+        assert 0.75 < float(cut[1]) < 0.9
+    assert "assimilation.refine: mcmc" in told.advice
+
+
+def test_a_posterior_that_was_sampled_is_told_where_the_model_fails_for_a_part_of_the_prior():
+    """Against 400 000 draws of the prior, weighted."""
+    result = of_a_decay(along_a_curve, cheap=True)
+    rng = np.random.default_rng(0)
+    a, k = np.exp(0.7 * rng.standard_normal((2, 400_000, 1))) * np.array([1.0, 0.5])[:, None, None]
+    t = np.linspace(0.5, 10, 12)
+    y = np.exp(-0.6 * t) + 0.3 * np.random.default_rng(7).standard_normal(12)
+    predicted = along_a_curve({"a": a, "k": k}, t)
+    likelihood = np.nan_to_num(np.exp(-0.5 * np.sum(((y - predicted) / 0.3) ** 2, axis=1)))
+    for row, values in zip(result.rows, (a[:, 0], k[:, 0]), strict=True):
+        mean = np.average(values, weights=likelihood)
+        std = np.sqrt(np.average((values - mean) ** 2, weights=likelihood))
+        assert row.untrusted == ()
+        assert row.mean == pytest.approx(mean, abs=0.15 * std)
+        assert row.std == pytest.approx(std, rel=0.15)
+    assert [c.severity for c in result.cautions if c.code == "members-lost"] == ["note"]
 
 
 def test_lost_members_of_a_run_are_placed_in_prior_space():

@@ -90,11 +90,35 @@ def test_a_bounded_lognormal_is_the_exponential_of_a_bounded_normal():
         assert term.slope(at) == pytest.approx(float(term.to_physical(np.array(at))) * of_log.slope(at), rel=1e-9)
 
 
+@pytest.mark.parametrize("log_std", [0.1, 0.7, 4.0])
+def test_a_lognormal_that_is_cut_above_alone(log_std):
+    """Of its logarithm; and small values do not pile up at a bound that nobody has set."""
+    term = PriorTerm.bounded(A, "lognormal", 2.0, log_std, (0.0, 2.5))
+    named = stats.truncnorm(-np.inf, math.log(2.5 / 2.0) / log_std, math.log(2.0), log_std)
+    x = np.linspace(-6, 6, 25)
+    theta = term.to_physical(x)
+    assert named.cdf(np.log(theta[x < 0])) == pytest.approx(stats.norm.cdf(x[x < 0]), rel=1e-7)
+    assert named.sf(np.log(theta[x >= 0])) == pytest.approx(stats.norm.sf(x[x >= 0]), rel=1e-7)
+    assert term.from_physical(theta) == pytest.approx(x, abs=1e-6)
+    prior = Prior((term,))
+    members = prior.sample(200, 1)
+    assert not list(at_bound(prior, members, 0.1 * members - 4, [""] * 200))
+    (found,) = at_bound(prior, members, 0.1 * members + 5, [""] * 200)
+    assert "pile up at its upper bound (2.5 m)" in found.words
+
+
+@pytest.mark.parametrize("cut", ["upper: 4 N/m", "lower: 0 N/m, upper: 4 N/m"])
+def test_a_cut_above_alone_from_yaml(tmp_path: Path, cut: str):
+    (problem,) = build(load_config(write_toy(tmp_path, ("log_std: 0.3", f"log_std: 0.3, {cut}"))))
+    (term,) = [term for term in problem.prior.terms if term.transform == "bounded-lognormal"]
+    assert term.bounds == (pytest.approx(3 * math.exp(-2.7)), 4.0)
+
+
 @pytest.mark.parametrize(
     ("kind", "mean", "std", "bounds", "words"),
     [
         ("normal", 5.0, 1.0, (0.0, 4.0), "5 does not lie between the bounds"),
-        ("lognormal", 1.0, 1.0, (0.0, 4.0), "the bounds of a logarithm must be positive"),
+        ("lognormal", 1.0, 1.0, (-1.0, 4.0), "the bounds of a logarithm must be positive"),
         ("normal", 0.0, 1e9, (-1.0, 1.0), "use a uniform prior"),
     ],
 )

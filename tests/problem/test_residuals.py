@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from diagnosis.provoked import bent, run, spiked
+from scipy.special import fdtrc
 from toys import with_discrepancy
 
 from en4dvar.diagnosis.residuals import Residuals, positive_chance
@@ -38,6 +39,13 @@ def test_imhof_against_draws():
     weights = np.random.default_rng(1).standard_normal(12)
     z = np.random.default_rng(2).standard_normal((200_000, 12))
     assert positive_chance(weights) == pytest.approx(np.mean(z**2 @ weights > 0), abs=0.004)
+
+
+@pytest.mark.parametrize("count", [6, 300, 500])
+@pytest.mark.parametrize("ratio", [0.9, 1.0, 1.3])
+def test_imhof_against_the_distribution_of_a_ratio_of_squares(count, ratio):
+    weights = np.repeat([1.0, -ratio], [count // 2, count - count // 2])
+    assert positive_chance(weights) == pytest.approx(fdtrc(count / 2, count / 2, ratio), abs=1e-4)
 
 
 def test_leverages_add_up_to_the_degrees_of_freedom():

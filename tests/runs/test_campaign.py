@@ -119,15 +119,14 @@ def test_correlated_errors_are_kept_beside_one_another(tmp_path):
     path.write_text(path.read_text().replace("position_std: 2 um", "position_std: 2 um, correlation_time: 20 ms"))
     done = run_campaign(configuration(path, tmp_path / "run"))
     with xr.open_datatree(done.directory / "posterior.nc") as tree:
-        together = tree["observation_errors"]["position_correlation"]
-        assert together.dims == ("dataset", "observation", "observation_column")
-        assert together.shape == (2, 31, 31)
+        together = tree["observation_errors"]["position_decay_time"]
+        assert together.dims == ("dataset", "observation")
+        assert together.shape == (2, 31)
         for result in done:
             n = len(result.observed_data["time"])
             ours = together.sel(dataset=result.name).values
-            np.testing.assert_array_equal(ours[:n, :n], result.observed_data["position_correlation"])
+            np.testing.assert_array_equal(ours[:n], result.observed_data["position_decay_time"])
             assert np.isnan(ours[n:]).all()
-            assert np.isnan(ours[:, n:]).all()
     assert {len(result.observed_data["time"]) for result in done} == {25, 31}
 
 

@@ -22,18 +22,28 @@ the gradient is exact, SᵀS bounds the Hessian of the part of m from above.
 
 A kind of errors is one class of this folder: :class:`Noise` is Gaussian and independent, the others say what differs.
 Several series are blocks, joined where they are correlated (:mod:`en4dvar.data.noise.make`). What readings share makes
-C a diagonal plus low rank, whitened without any matrix (:class:`SharedErrors`).
+C a diagonal plus low rank, and errors that decay exponentially are a Markov process: both are whitened without any
+matrix (:class:`SharedErrors`, :class:`DecayingErrors`).
 A discrepancy of the model (:mod:`en4dvar.data.noise.discrepancy`) adds a Gaussian process to any of them.
 """
 
-from en4dvar.data.noise.correlated import SHARED, CorrelatedNoise, Correlation, SharedErrors
+from en4dvar.data.noise.correlated import (
+    DECAY,
+    SHARED,
+    CorrelatedNoise,
+    Correlation,
+    DecayingErrors,
+    SharedErrors,
+    recorded,
+)  # fmt: skip
 from en4dvar.data.noise.discrepancy import SMOOTHNESS, DiscrepancyNoise, Kernel, RobustDiscrepancyNoise
 from en4dvar.data.noise.gaussian import Linearisation, Noise, Predicted, ScaleSkewness
 from en4dvar.data.noise.losses import SIDES, BoundNoise, HuberNoise, sides_of
 from en4dvar.data.noise.make import BlockNoise, joint_noise, noise_of, noise_of_readings, noise_of_record
 
 __all__ = [
-    "SHARED", "SIDES", "SMOOTHNESS", "BlockNoise", "BoundNoise", "CorrelatedNoise", "Correlation", "DiscrepancyNoise",
-    "HuberNoise", "Kernel", "Linearisation", "Noise", "Predicted", "RobustDiscrepancyNoise", "ScaleSkewness",
-    "SharedErrors", "joint_noise", "noise_of", "noise_of_readings", "noise_of_record", "sides_of",
+    "DECAY", "SHARED", "SIDES", "SMOOTHNESS", "BlockNoise", "BoundNoise", "CorrelatedNoise", "Correlation",
+    "DecayingErrors", "DiscrepancyNoise", "HuberNoise", "Kernel", "Linearisation", "Noise", "Predicted",
+    "RobustDiscrepancyNoise", "ScaleSkewness", "SharedErrors", "joint_noise", "noise_of", "noise_of_readings",
+    "noise_of_record", "recorded", "sides_of",
 ]  # fmt: skip

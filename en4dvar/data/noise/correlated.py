@@ -1,10 +1,12 @@
 """Gaussian errors that are correlated: by a given matrix, or because they have parts in common."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
 
 import numpy as np
+from scipy.linalg import cholesky_banded, solve_banded
 
 from en4dvar.data.noise.gaussian import Noise, Predicted
 from en4dvar.model.state import Array
@@ -70,9 +72,12 @@ class Correlation:
         return np.asarray(rows @ self.precision)
 
     @cached_property
-    def scale_root(self) -> Array:
-        """B (K, K), lower triangular, with B Bᵀ = I + C∘C⁻¹, the Fisher information of ln s."""
+    def _scale_root(self) -> Array:
         return np.asarray(np.linalg.cholesky(np.eye(len(self.root)) + self.matrix * self.precision))
+
+    def of_scale(self, score: Array, slopes: Array) -> tuple[Array, Array]:
+        """B⁻¹ applied to (K,) and Bᵀ to (K, N), with B Bᵀ = I + C∘C⁻¹, the Fisher information of ln s."""
+        return np.asarray(np.linalg.solve(self._scale_root, score)), self._scale_root.T @ slopes
 
     def record(self) -> dict[str, tuple[Array, str]]:
         """What a file holds of it: name → values and what they are."""
@@ -162,17 +167,110 @@ class SharedErrors:
         z = rows / np.sqrt(self._own)
         return np.asarray((z - z @ self._a @ self._filter[2] @ self._a.T) / np.sqrt(self._own))
 
-    @property
-    def scale_root(self) -> Array:
+    def of_scale(self, score: Array, slopes: Array) -> tuple[Array, Array]:
         """As of :class:`Correlation`."""
-        return Correlation(self.matrix).scale_root
+        return Correlation(self.matrix).of_scale(score, slopes)
 
     def record(self) -> dict[str, tuple[Array, str]]:
         """What a file holds of it: name → values and what they are."""
         return {SHARED: (self.columns, "what observation errors share, each column in total standard deviations")}
 
 
-SHARED = "shared_errors"  # in the record
+@dataclass(frozen=True)
+class DecayingErrors:
+    """C = exp(−|Δt|) at ``times`` (K,) in correlation times, increasing: an error, given those before it, depends on
+    the last of them alone. So L⁻¹ has two diagonals, C⁻¹ three, and time and memory are those of K numbers.
+
+    Raises :class:`ValueError` for times that do not increase, to rounding.
+    """
+
+    times: Array
+
+    def __post_init__(self) -> None:
+        if self.times.ndim != 1 or not np.all(self._kept < 1):  # also of NaN
+            words = "the covariance of the observation errors is not positive definite"
+            raise ValueError(f"{words}: readings are too close in time for their correlation time")
+
+    def check_size(self, size: int) -> None:
+        """Raise :class:`ValueError` unless it is that of so many errors."""
+        if len(self.times) != size:
+            raise ValueError(f"correlation of {len(self.times)} errors does not match {size} observations")
+
+    @cached_property
+    def matrix(self) -> Array:
+        """C (K, K)."""
+        return np.asarray(np.exp(-np.abs(np.subtract.outer(self.times, self.times))))
+
+    @cached_property
+    def _kept(self) -> Array:
+        """φ (K,), the correlation with the error before, 0 of the first."""
+        return np.exp(-np.diff(self.times, prepend=-np.inf))
+
+    @cached_property
+    def _new(self) -> Array:
+        """L_kk (K,), the std of what is new in an error."""
+        return np.sqrt(-np.expm1(-2 * np.diff(self.times, prepend=-np.inf)))
+
+    @cached_property
+    def _pull(self) -> Array:
+        """φ/L_kk (K,)."""
+        return np.asarray(self._kept / self._new)
+
+    @cached_property
+    def precision_diagonal(self) -> Array:
+        """The diagonal of C⁻¹ (K,)."""
+        return np.asarray(self._new**-2 + np.append(self._pull[1:] ** 2, 0.0))
+
+    @property
+    def log_root(self) -> Array:
+        """ln L_kk (K,)."""
+        return np.asarray(np.log(self._new))
+
+    def decorrelated(self, rows: Array) -> Array:
+        """L⁻¹ applied to rows (…, K)."""
+        v = rows / self._new
+        v[..., 1:] -= self._pull[1:] * rows[..., :-1]
+        return np.asarray(v)
+
+    def correlated(self, rows: Array) -> Array:
+        """Independent numbers (…, K) made to have this correlation."""
+        diagonals = np.stack([1 / self._new, -np.append(self._pull[1:], 0.0)])
+        columns = solve_banded((1, 0), diagonals, rows.reshape(-1, rows.shape[-1]).T)
+        return np.asarray(columns.T.reshape(rows.shape))
+
+    def solved(self, rows: Array) -> Array:
+        """C⁻¹ applied to rows (…, K)."""
+        v = self.decorrelated(rows)
+        u = v / self._new
+        u[..., :-1] -= self._pull[1:] * v[..., 1:]
+        return np.asarray(u)
+
+    @cached_property
+    def _scale_root(self) -> Array:
+        """The two diagonals (2, K) of B."""
+        information = np.stack([1 + self.precision_diagonal, -np.append(self._pull[1:] ** 2, 0.0)])
+        return np.asarray(cholesky_banded(information, lower=True))
+
+    def of_scale(self, score: Array, slopes: Array) -> tuple[Array, Array]:
+        """As of :class:`Correlation`."""
+        transposed = self._scale_root[0, :, None] * slopes
+        transposed[:-1] += self._scale_root[1, :-1, None] * slopes[1:]
+        return np.asarray(solve_banded((1, 0), self._scale_root, score)), transposed
+
+    def record(self) -> dict[str, tuple[Array, str]]:
+        """What a file holds of it: name → values and what they are."""
+        return {DECAY: (self.times, "time in correlation times: errors are correlated by exp(−|Δ|)")}
+
+
+SHARED, DECAY = "shared_errors", "decay_time"  # in the record
+AnyCorrelation = Correlation | SharedErrors | DecayingErrors
+
+
+def recorded(record: Mapping[str, Array]) -> Array | AnyCorrelation | None:
+    """The inverse of ``record``: what errors share, their decay, or their matrix; None where they have none."""
+    if SHARED in record:
+        return SharedErrors(record[SHARED])
+    return DecayingErrors(record[DECAY]) if DECAY in record else record.get("correlation")
 
 
 def _from_before(to: Array, of: Array, rows: Array) -> Array:
@@ -188,7 +286,7 @@ def _from_before(to: Array, of: Array, rows: Array) -> Array:
 class CorrelatedNoise(Noise):
     """Gaussian errors R = D C D."""
 
-    correlation: Correlation | SharedErrors
+    correlation: AnyCorrelation
 
     words = ", correlated"
     independent = False
@@ -224,9 +322,8 @@ class CorrelatedNoise(Noise):
     def _scale_rows(self, root_weight: Array, z: Array, v: Array, log_s: Array) -> tuple[Array, Array]:
         if not self.timed:  # all stds grow alike: the score is vᵀv − K, the information 2K
             return super()._scale_rows(root_weight, v, v, log_s)
-        root = self.correlation.scale_root
-        of_scale = root_weight * np.linalg.solve(root, z * self.correlation.solved(z) - 1)
-        return of_scale, root_weight[:, None] * (root.T @ log_s.T)
+        of_scale, slopes = self.correlation.of_scale(z * self.correlation.solved(z) - 1, log_s.T)
+        return root_weight * of_scale, root_weight[:, None] * slopes
 
     def _log_root(self) -> Array:
         return self.correlation.log_root

@@ -21,7 +21,7 @@ from typing import ClassVar
 import numpy as np
 from scipy.linalg import cho_solve, solve_triangular
 
-from en4dvar.data.noise.correlated import CorrelatedNoise, Correlation, SharedErrors
+from en4dvar.data.noise.correlated import AnyCorrelation, CorrelatedNoise, Correlation
 from en4dvar.data.noise.gaussian import Linearisation, Noise, Predicted
 from en4dvar.data.noise.losses import HuberNoise
 from en4dvar.data.noise.state_space import boxed, innovations
@@ -121,7 +121,7 @@ class DiscrepancyNoise(Noise):
     """Gaussian errors, correlated where there is a ``correlation``, beside a discrepancy with a ``kernel``."""
 
     kernel: Kernel
-    correlation: Correlation | SharedErrors | None = None
+    correlation: AnyCorrelation | None = None
 
     discrepant: ClassVar[bool] = True
     independent = False

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import block_array, csr_array, eye_array
 
-from en4dvar.data.noise.correlated import SHARED, CorrelatedNoise, Correlation, SharedErrors
+from en4dvar.data.noise.correlated import AnyCorrelation, CorrelatedNoise, Correlation, recorded
 from en4dvar.data.noise.discrepancy import DiscrepancyNoise, Kernel, RobustDiscrepancyNoise
 from en4dvar.data.noise.gaussian import Linearisation, Noise, Predicted, ScaleSkewness
 from en4dvar.data.noise.losses import SIDES, BoundNoise, HuberNoise, record_of, sides_of
@@ -181,20 +181,19 @@ def noise_of_record(
     kernel = None
     if "discrepancy_smoothness" in held:
         kernel = Kernel(times, held["discrepancy_smoothness"], held["discrepancy_grows_beyond"])
-    correlation = SharedErrors(matrices[SHARED]) if SHARED in matrices else matrices.get("correlation")
-    return noise_of(std, time_std, correlation, held.get("huber_threshold"), kernel, matrices.get(SIDES))
+    return noise_of(std, time_std, recorded(matrices), held.get("huber_threshold"), kernel, matrices.get(SIDES))
 
 
 def noise_of(
     std: Array,
     time_std: Array | None = None,
-    correlation: Array | SharedErrors | None = None,
+    correlation: Array | AnyCorrelation | None = None,
     huber: float | None = None,
     discrepancy: Kernel | None = None,
     sides: Array | None = None,
 ) -> Noise:
-    """Errors of the kind that is given: independent, correlated by a matrix (K, K) or by what they share, or robust
-    beyond ``huber`` std.
+    """Errors of the kind that is given: independent, correlated by a matrix (K, K), by what they share or as they
+    decay, or robust beyond ``huber`` std.
 
     Any of them may stand beside a ``discrepancy`` of the model; its amplitude and length are then parameters
     (:data:`~en4dvar.model.state.DISCREPANCY`). ``sides`` (K,): readings that are upper (1) or lower (−1) bounds.

@@ -12,6 +12,8 @@ import numpy as np
 
 from en4dvar.data.noise import SMOOTHNESS
 from en4dvar.diagnosis.analysis import Analysis
+from en4dvar.diagnosis.diagnostics import active_members
+from en4dvar.diagnosis.honesty.checks import shown, sides_of_lost
 from en4dvar.model.state import NOISE_SCALE, Parameter
 from en4dvar.plumbing.caution import CATALOGUE, Caution
 from en4dvar.plumbing.units import convert
@@ -21,6 +23,7 @@ MANY = 48  # members that start far enough apart
 ENOUGH = 30  # iterations beyond which more of them seldom help
 SHARE = 0.1  # of the members beyond a limit of the model, from when on the window is too long
 CAUSES = ("rank-deficient", "ensemble-collapse", "not-converged", "at-bound")  # of residuals that are odd
+FEW = 0.1  # of the members lost: so many others may lie where a cut of the prior is advised
 SIGMA = "estimate their size (parameters.sigma: {prior: lognormal, median: 1, log_std: 0.5})"
 
 
@@ -64,6 +67,12 @@ class Case:
         """What only a scheme that minimises J takes, with such a scheme where there is another."""
         own = self.a.settings.own.minimiser
         return option if own else f"{option}, with assimilation.scheme: {MINIMISERS[0]}"
+
+    @property
+    def or_cheap(self) -> str:
+        """What else lets a posterior be sampled, behind ``refine: mcmc``; "" where nothing does."""
+        settled = self.a.problem.model.cheap or self.a.settings.own.minimiser is None
+        return "" if settled else ", or say that the model is cheap, if ten thousand runs take seconds"
 
     @property
     def structure(self) -> str:
@@ -258,9 +267,23 @@ def _one_descent(case: Case) -> str:
 def _gaussian(case: Case) -> str:
     if case.a.settings.own.approximate:
         return f"set assimilation.scheme: {MINIMISERS[0]}, whose ensemble is the posterior"
-    settled = case.a.problem.model.cheap or case.a.settings.own.minimiser is None
-    said = "" if settled else ", or say that the model is cheap, if ten thousand runs take seconds"
-    return f"{CATALOGUE['non-gaussian'][1]}{said}"
+    return f"{CATALOGUE['non-gaussian'][1]}{case.or_cheap}"
+
+
+def _lost(case: Case) -> str:
+    """A cut of the prior is advised where it takes no values that the model allows: where the model fails along a
+    curve, no parameter alone has such an edge.
+    """
+    a, lost = case.a, ~active_members(case.a.prior_failures)
+    edges = [(a.parameters[s.j], s) for s in sides_of_lost(a.prior, lost) if s.others <= FEW * lost.sum()]
+    ways = ["find out why it fails"]
+    for p, side in edges[:1]:
+        key = f"parameters.{p.name}.{'upper' if side.higher else 'lower'}"
+        ways.append(f"cut the prior at {p.name} = {shown(side.edge, p)}, beyond which hardly any member runs ({key})")
+    if a.settings.localisation is None and a.settings.refine != "mcmc" and "readings-missing" not in case.codes:
+        cheap = case.or_cheap if "non-gaussian" in case.codes else ""
+        ways.append(f"set assimilation.refine: mcmc{cheap}: that posterior is the one given that the model runs")
+    return f"the posterior holds only where the model runs: {', or '.join(ways)}"
 
 
 def _chain(case: Case) -> str:
@@ -290,6 +313,7 @@ ADVICE: dict[str, Callable[[Case], str]] = {
     "prior-conflict": _conflict,
     "several-modes": _modes,
     "starts-disagree": _starts,
+    "members-lost": _lost,
     "one-descent": _one_descent,
     "not-informed": _silent,
 }

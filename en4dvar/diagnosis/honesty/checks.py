@@ -5,6 +5,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from statistics import median
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,6 +31,10 @@ NINE_OF_TEN = (0.05, 0.95)
 SILENT = 0.1  # DFS of all readings beyond it that count as none
 EXTRAPOLATED = "no action is needed for the parameters; paths beyond the limit are extrapolated"
 EXCLUDED = "no action is needed: it was seen, so that the readings exclude them"
+IMPOSSIBLE = (
+    "no action is needed where these values are impossible: the posterior was sampled, and is the one given that the "
+    "model runs; else find out why it fails"
+)
 UNREAD = "no action is needed where the field's own spread says so, cell by cell"
 MANY = 0.1  # share of members whose loss is serious
 BY_CHANCE = 0.01  # of cases in which a parameter is said to tell lost members from others, and does not
@@ -176,7 +181,7 @@ def at_bound(prior: Prior, members: Array, posterior: Array, failures: Sequence[
     """
     for j, (term, parameter) in enumerate(zip(prior.terms, prior.parameters, strict=True)):
         low, high = term.bounds if term.has_bound else parameter.bounds
-        if term.transform == "lognormal":
+        if term.open_below:
             low = -math.inf
         if math.isinf(low) and math.isinf(high):
             continue
@@ -315,12 +320,14 @@ def weighted(analysis: Analysis) -> Findings:
 
 
 def loss(
-    stage: str, failures: Sequence[str], prior: Prior, members: Array | None = None, events: bool = False
-) -> Findings:
+    stage: str, failures: Sequence[str], prior: Prior, members: Array | None = None, events: bool = False,
+    sampled: bool = False,
+) -> Findings:  # fmt: skip
     """The members (N,) that failed in a forecast; ``failures`` are reasons, "" for members alive.
 
     ``members`` (N, n), transformed, are where they were run, if that tells anything. ``events``: a member that gives no
-    reading lacks what was seen, and is improbable by the data instead of lost.
+    reading lacks what was seen, and is improbable by the data instead of lost. ``sampled``: the posterior was sampled
+    after this forecast, by a likelihood that is zero where the model fails.
     """
     absent = np.array([events and reason == NOT_FINITE for reason in failures], dtype=bool)
     lost = ~diag.active_members(failures) & ~absent
@@ -331,23 +338,35 @@ def loss(
         words = f"{of_it.sum()} of {len(of_it)} members {did}"
         if members is not None:
             words = f"{words}; {where_lost(prior, members, of_it)}"
-        if of_it is absent:
-            yield replace(caution("members-lost", words, "note"), advice=EXCLUDED)
+        if of_it is absent or sampled:
+            advice = EXCLUDED if of_it is absent else IMPOSSIBLE
+            yield replace(caution("members-lost", words, "note"), advice=advice)
         else:
             yield caution("members-lost", words, SERIOUS if lost.mean() > MANY else None)
 
 
-def where_lost(prior: Prior, members: Array, lost: Mask) -> str:
-    """Where the lost members lie, in words and display units: the parameters that tell them from the others.
+class Side(NamedTuple):
+    """Nine of ten lost members, or more, have parameter ``j`` above ``edge`` (below, where not ``higher``), as so many
+    ``others`` have that are alive. The ``chance`` is that of so clear a side where the parameter does not matter.
+    """
 
-    A parameter is named where the rank sum of the lost members (Mann & Whitney 1947, Ann. Math. Stat. 18, 50) would
-    be as far from its expectation by chance in less than :data:`BY_CHANCE` of all cases, in any of the parameters. Of
-    one or two members that no parameter tells from the others each is described.
+    chance: float
+    j: int
+    higher: bool
+    edge: float
+    others: int
+
+
+def sides_of_lost(members: Array, lost: Mask) -> list[Side]:
+    """The parameters that tell lost ``members`` (N, n), physical or transformed, from the others, the clearest first.
+
+    These are those of which the rank sum of the lost members (Mann & Whitney 1947, Ann. Math. Stat. 18, 50) would be as
+    far from its expectation by chance in less than :data:`BY_CHANCE` of all cases, in any of the parameters.
     """
     n_lost, n_alive = int(lost.sum()), int((~lost).sum())
     from scipy.stats import mannwhitneyu  # where members are lost: its import takes long
 
-    sides: list[tuple[float, str]] = []
+    sides = []
     for j in range(members.shape[1] if min(n_lost, n_alive) > 1 else 0):
         values = members[:, j]
         rank_sum, chance = mannwhitneyu(values[lost], values[~lost])  # exact where few are on one side
@@ -358,13 +377,23 @@ def where_lost(prior: Prior, members: Array, lost: Mask) -> str:
         edge, rest = float(np.min(mirrored[lost])), mirrored[~lost]
         if edge <= float(rest.max()):  # not all on one side: most of the lost lie beyond this quantile
             edge = float(np.quantile(mirrored[lost], 0.1))
-        beyond = int(np.sum(rest > edge))
-        others = f"as {beyond} of" if beyond else "none of"
-        side, at = ("above", edge) if higher else ("below", -edge)
-        sides.append((chance, f"{prior.names[j]} {side} {_shown(prior, j, at)} ({others} the {n_alive} others)"))
+        sides.append(Side(chance, j, bool(higher), edge if higher else -edge, int(np.sum(rest > edge))))
+    return sorted(sides, key=lambda side: side.chance)
+
+
+def where_lost(prior: Prior, members: Array, lost: Mask) -> str:
+    """Where the lost members lie, in words and display units: the parameters that tell them from the others.
+
+    Of one or two members that no parameter tells from the others each is described.
+    """
+    sides = sides_of_lost(members, lost)
     if not sides:
-        return _one_by_one(prior, members[lost]) if n_lost < 3 else "they are spread over the whole ensemble"
-    named = [text for _, text in sorted(sides, key=lambda side: side[0])[:MOST_NAMED]]
+        return _one_by_one(prior, members[lost]) if lost.sum() < 3 else "they are spread over the whole ensemble"
+    named = [
+        f"{prior.names[s.j]} {'above' if s.higher else 'below'} {_shown(prior, s.j, s.edge)} "
+        f"({f'as {s.others}' if s.others else 'none'} of the {(~lost).sum()} others)"
+        for s in sides[:MOST_NAMED]
+    ]
     return f"lost members have {', '.join(named)}"
 
 
