@@ -128,8 +128,8 @@ def read_one(plan: SeriesPlan, file: DataFile, fewest: int) -> Series:
     )  # fmt: skip
     window = _window(data, read, path)
     times, values = read.times[window], read.values[window]
-    zero = {"file": 0.0, "window": times[0]}.get(str(data.time_zero), data.time_zero)
-    times = times - float(zero)
+    zero = float({"file": 0.0, "window": times[0]}.get(str(data.time_zero), data.time_zero))
+    times = times - zero
     if times[0] < 0:
         clock = data.columns.time
         early, unit = -times[0], ""
@@ -143,7 +143,7 @@ def read_one(plan: SeriesPlan, file: DataFile, fewest: int) -> Series:
 
     def errors(part: slice) -> Noise:
         of_columns = {key: read.errors[column.name][part] for key, column in _errors(data).items()}
-        return errors_of(data, read.times[part] - float(zero), values, of_columns, partial(read.rows_among, used=part))
+        return errors_of(data, read.times[part] - zero, values, of_columns, partial(read.rows_among, used=part))
 
     try:
         noise, whole = errors(window), slice(window.start, max(window.stop, _window(data, read, path, until=True).stop))
@@ -162,10 +162,11 @@ def read_one(plan: SeriesPlan, file: DataFile, fewest: int) -> Series:
             source=readable(path),
             scalars=read.scalars,
             doubts=_doubts(data, read),
-            continued=(read.times[whole] - float(zero), read.values[whole], errors(whole))
+            continued=(read.times[whole] - zero, read.values[whole], errors(whole))
             if window.stop < whole.stop and data.error.separate and not places
             else None,
             error_unit=data.error.std.unit if data.error.std else "",
+            zero=zero,
         )
     except (ValueError, DataError) as error:
         words = str(error)

@@ -37,6 +37,8 @@ def test_window_zero_weights_and_relative_error(tmp_path: Path) -> None:
     (problem,) = build(load_config(path, {"assimilation.weights": "mean"}))
     y = problem.observations
     assert y.times[0] == 0.0
+    assert y.file_times == pytest.approx(build(load_config(path, {"data.time_zero": "file"}))[0].observations.times)
+    assert y.zero == y.file_times[0] > 0
     assert y.values[0] < y.values[1] < y.values[-1]
     assert y.std == pytest.approx(np.full(len(y), 0.01 * y.values.max()))
     assert y.weights.sum() == pytest.approx(1.0)

@@ -233,6 +233,15 @@ def test_a_window_that_ends_before_the_model_leaves_its_validity_is_named():
     assert told(follow(a, c, None), "model-validity") is None
 
 
+def test_a_window_is_ended_on_the_clock_of_the_data():
+    problem = make_problem(Late(TWO), (1.0, -0.6), std=0.01, k=18)
+    ends = [
+        float(re.search(r"to: ([\d.]+) s\}", told(run(read(problem, zero=zero)), "model-validity").advice)[1])
+        for zero in (0.0, 100.0)
+    ]
+    assert ends[1] == pytest.approx(ends[0] + 100.0, abs=1e-3)
+
+
 def test_what_is_set_already_is_not_advised():
     """The size of errors that is estimated beside a discrepancy."""
     scaled = run(with_discrepancy(bent(), sigma=0.5, amplitude=(0.05, 1.0), length=(0.3, 0.7)))

@@ -12,6 +12,7 @@ import numpy as np
 
 from en4dvar.data.noise import SMOOTHNESS
 from en4dvar.diagnosis.analysis import Analysis
+from en4dvar.diagnosis.honesty.checks import moments
 from en4dvar.model.state import NOISE_SCALE, Parameter
 from en4dvar.plumbing.caution import CATALOGUE, Caution
 from en4dvar.plumbing.units import convert
@@ -76,11 +77,6 @@ class Case:
         observable = self.a.problem.observable
         unit = self.a.observations.error_unit or observable.display_unit
         return f"{convert(value, observable.unit, unit):.2g} {unit}"
-
-    def moment(self, value: float) -> str:
-        """A time in the display unit."""
-        model = self.a.problem.model
-        return f"{convert(value, model.time_unit, model.time_display_unit):.4g} {model.time_display_unit}"
 
 
 def advised(a: Analysis, cautions: Sequence[Caution]) -> tuple[Caution, ...]:
@@ -189,14 +185,13 @@ def _odd(case: Case) -> str:
 
 
 def _validity(case: Case) -> str:
-    a, times = case.a, np.sort(case.a.observations.times[case.a.observations.used])
+    a, used = case.a, case.a.observations.used
     left = np.quantile(a.beyond.min(axis=1), SHARE, method="lower")
-    kept = times[times < left]
+    kept = used[a.observations.times[used] < left]
     if len(kept) <= len(a.parameters):
         return f"choose a model that is valid there: too few readings ({len(kept)}) come before for a shorter window"
-    return (
-        f"end the window before (data.window: {{to: {case.moment(kept[-1])}}}), or choose a model that is valid there"
-    )
+    end = moments(a)[max(kept, key=a.observations.times.__getitem__)]
+    return f"end the window before (data.window: {{to: {end}}}), or choose a model that is valid there"
 
 
 def _bound(case: Case) -> str:
