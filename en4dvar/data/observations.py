@@ -49,6 +49,7 @@ class Observations:
         one value at a time.
     continued: these readings and those after the window, which are predicted; None where there are none.
     error_unit: in which the user states the errors of one series; "": the display unit of the observable.
+    next_end: the trough after the window, as ``data.window.to`` names it; "" where there is none, or none is known.
     zero: what the clock of the data shows at the model's time zero; (K,) of several series, which may differ.
 
     Raises
@@ -67,6 +68,7 @@ class Observations:
     parts: tuple[Part, ...] = ()
     continued: "Observations | None" = None
     error_unit: str = ""
+    next_end: str = ""
     zero: Array | float = 0.0
 
     @classmethod
@@ -117,6 +119,7 @@ class Observations:
             parts=() if len(series) == 1 and series[0].places is None else parts,
             continued=None if more is None else cls(*more, np.ones(len(more[0])), name, zero=series[0].zero),
             error_unit=series[0].error_unit if len(series) == 1 else "",
+            next_end=series[0].next_end if len(series) == 1 else "",
             zero=np.concatenate([np.full(len(s.times), s.zero) for s in series]) if len(series) > 1 else series[0].zero,
         )
 

@@ -265,5 +265,17 @@ def test_a_table_that_is_not_there_is_asked_for_and_one_that_cannot_be_is_not_na
     assert "look at the what-if table and compare other models" in told(there, "discrepancy-found").advice
 
 
+def test_a_future_that_is_missed_is_taken_in_up_to_the_next_trough():
+    problem = turned(10)
+    assert "data.window.to:" not in told(run(problem), "future-missed").advice
+    problem = read(problem, next_end="trough 3")
+    assert "(data.window.to: trough 3); not more" in told(run(problem), "future-missed").advice
+    problem.model.unforeseen = {"y": 0.01}
+    asked = (
+        "(data.window.to: trough 3), with what may change on the way (model_error: {y: {at: maxima, std: 1 %}}); not"
+    )
+    assert asked in told(run(problem), "future-missed").advice
+
+
 def test_every_code_of_the_catalogue_is_followed_somewhere():
     assert set(CATALOGUE) == {*PROVOKED, *OF_SEVERAL, "chain-not-converged"}

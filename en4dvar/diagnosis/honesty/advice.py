@@ -264,6 +264,21 @@ def _chain(case: Case) -> str:
     return f"do not quote these intervals; {first}run again with more data or narrower priors"
 
 
+def _future(case: Case) -> str:
+    problem = case.a.problem
+    if not (end := problem.observations.next_end):
+        return CATALOGUE["future-missed"][1]
+    constant = {
+        name: std for name, std in problem.model.unforeseen.items() if name not in {v.name for v in problem.varying}
+    }
+    changes = ", ".join(f"{name}: {{at: maxima, std: {100 * std:.3g} %}}" for name, std in constant.items())
+    also = f", with what may change on the way (model_error: {{{changes}}})" if changes else ""
+    return (
+        "look at the figure of the readings after the window: as far as they are of the same system, let the model "
+        f"explain them, too, up to the next minimum (data.window.to: {end}){also}; not more at a time"
+    )
+
+
 def _silent(case: Case) -> str:
     p = case.parameters[0]
     return f"do not quote {p.name} as measured: fix it (parameters.{p.name}: a value), or add data that depend on it"
@@ -273,6 +288,7 @@ ADVICE: dict[str, Callable[[Case], str]] = {
     "not-converged": _not_converged,
     "ensemble-collapse": _members,
     "rank-deficient": _members,
+    "future-missed": _future,
     "misfit": _misfit,
     "discrepancy-found": _missed,
     "overstated-error": _overstated,
