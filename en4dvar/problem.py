@@ -14,6 +14,8 @@ from en4dvar.priors.field_prior import FieldPrior
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.priors.varying import PiecewiseModel, RandomWalk, Varying
 
+AT_ONCE = "estimate all data sets with one configuration (en4dvar run FILE.yaml --data FOLDER)"  # where theirs differ
+
 
 def __getattr__(name: str) -> Any:
     return former_name(__name__, name)

@@ -24,7 +24,7 @@ from en4dvar.inputs.implausible import cut_off, scatter_of, step_doubts
 from en4dvar.inputs.members import read_covariance
 from en4dvar.inputs.parts import ANY, Column, DataFile, Layout, parts_of
 from en4dvar.inputs.readers import CLIPPED, Readings, Rows, read_series
-from en4dvar.inputs.window import select
+from en4dvar.inputs.window import Instant, index_of, select
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.errors import DataError, retold
@@ -128,8 +128,8 @@ def read_one(plan: SeriesPlan, file: DataFile, fewest: int) -> Series:
     )  # fmt: skip
     window = _window(data, read, path)
     times, values = read.times[window], read.values[window]
-    zero = {"file": 0.0, "window": times[0]}.get(str(data.time_zero), data.time_zero)
-    times = times - float(zero)
+    zero = float({"file": 0.0, "window": times[0]}.get(str(data.time_zero), data.time_zero))
+    times = times - zero
     if times[0] < 0:
         clock = data.columns.time
         early, unit = -times[0], ""
@@ -143,7 +143,7 @@ def read_one(plan: SeriesPlan, file: DataFile, fewest: int) -> Series:
 
     def errors(part: slice) -> Noise:
         of_columns = {key: read.errors[column.name][part] for key, column in _errors(data).items()}
-        return errors_of(data, read.times[part] - float(zero), values, of_columns, partial(read.rows_among, used=part))
+        return errors_of(data, read.times[part] - zero, values, of_columns, partial(read.rows_among, used=part))
 
     try:
         noise, whole = errors(window), slice(window.start, max(window.stop, _window(data, read, path, until=True).stop))
@@ -162,10 +162,12 @@ def read_one(plan: SeriesPlan, file: DataFile, fewest: int) -> Series:
             source=readable(path),
             scalars=read.scalars,
             doubts=_doubts(data, read),
-            continued=(read.times[whole] - float(zero), read.values[whole], errors(whole))
+            continued=(read.times[whole] - zero, read.values[whole], errors(whole))
             if window.stop < whole.stop and data.error.separate and not places
             else None,
             error_unit=data.error.std.unit if data.error.std else "",
+            next_end=_next_end(data, read, window.start, range(window.stop, whole.stop)),
+            zero=zero,
         )
     except (ValueError, DataError) as error:
         words = str(error)
@@ -211,6 +213,19 @@ def _window(data: Data, read: Readings, path: Path, until: bool = False) -> slic
     if not len(read.times[window]):
         raise DataError(f"{path}: no observation lies in the window{_span(read.times, data)}")
     return window
+
+
+def _next_end(data: Data, read: Readings, begin: int, after: range) -> str:
+    """The first trough among the readings ``after`` a window that begins with the reading ``begin``; "" for none."""
+    number = 0
+    while True:
+        trough = Instant("trough", number := number + 1)
+        try:
+            at = index_of(read.times, read.values, trough, begin, data.window.prominence, last=True)
+        except DataError:
+            return ""
+        if at >= after.start:
+            return f"trough {number}" if at in after else ""
 
 
 def _span(times: Array, data: Data) -> str:

@@ -101,14 +101,14 @@ def _seconds(value: float) -> str:
 def _series_row(problem: InverseProblem, part: Part) -> tuple[str, ...]:
     y, own, model, observable = problem.observations, part.where, problem.model, part.observable
     name = y.name if len(problem.parts) == 1 else f"{y.name}: {part.name}"
-    start, end = (convert(float(t), model.time_unit, model.time_display_unit) for t in y.times[own][[0, -1]])
+    start, end = (convert(float(t), model.time_unit, model.time_display_unit) for t in y.file_times[own][[0, -1]])
     stated = y.values[own].max(), np.median(y.std[own])
     top, std = (convert(float(v), observable.unit, observable.display_unit) for v in stated)
     timing = convert(float(np.median(y.noise.time_std[own])), model.time_unit, model.time_display_unit)
     also = f", {timing:.3g} {model.time_display_unit} in time" if timing else ""
     also += y.noise.words
     unit = observable.display_unit
-    window = f"{start:.4g} to {end:.4g} {model.time_display_unit}"
+    window = f"{start:.6g} to {end:.6g} {model.time_display_unit}"
     count = str(part.end - part.begin)
     if y.continued is not None:
         count += f", then {len(y.continued) - len(y)} to predict"

@@ -49,6 +49,8 @@ class Observations:
         one value at a time.
     continued: these readings and those after the window, which are predicted; None where there are none.
     error_unit: in which the user states the errors of one series; "": the display unit of the observable.
+    next_end: the trough after the window, as ``data.window.to`` names it; "" where there is none, or none is known.
+    zero: what the clock of the data shows at the model's time zero; (K,) of several series, which may differ.
 
     Raises
     ------
@@ -66,6 +68,8 @@ class Observations:
     parts: tuple[Part, ...] = ()
     continued: "Observations | None" = None
     error_unit: str = ""
+    next_end: str = ""
+    zero: Array | float = 0.0
 
     @classmethod
     def of_series(
@@ -113,8 +117,10 @@ class Observations:
             scalars={key: value for readings in series for key, value in readings.scalars.items()},
             doubts=tuple(doubt for readings in series for doubt in readings.doubts),
             parts=() if len(series) == 1 and series[0].places is None else parts,
-            continued=None if more is None else cls(*more, np.ones(len(more[0])), name),
+            continued=None if more is None else cls(*more, np.ones(len(more[0])), name, zero=series[0].zero),
             error_unit=series[0].error_unit if len(series) == 1 else "",
+            next_end=series[0].next_end if len(series) == 1 else "",
+            zero=np.concatenate([np.full(len(s.times), s.zero) for s in series]) if len(series) > 1 else series[0].zero,
         )
 
     def __post_init__(self) -> None:
@@ -160,6 +166,11 @@ class Observations:
         """First and last time."""
         times, _ = self.instants
         return float(times[0]), float(times[-1])
+
+    @property
+    def file_times(self) -> Array:
+        """(K,) on the clock of the data."""
+        return self.times + self.zero
 
     @property
     def std(self) -> Array:

@@ -76,7 +76,7 @@ class Series:
     weights: (K,) β ≥ 0; None: 1.
     name: of the series; default: the observable's. group: what it is balanced as (:func:`balanced`); default: its name.
     places: where on a field the readings were taken; None of an observable with one value at a time.
-    source, scalars, doubts, error_unit: as of :class:`~en4dvar.data.observations.Observations`.
+    source, scalars, doubts, error_unit, next_end, zero: as of :class:`~en4dvar.data.observations.Observations`.
     continued: times, values and errors of these readings and those after the window; None where there are none.
     """
 
@@ -93,6 +93,8 @@ class Series:
     doubts: tuple[Caution, ...] = ()
     continued: tuple[Array, Array, Noise] | None = None
     error_unit: str = ""
+    next_end: str = ""
+    zero: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "name", self.name or self.observable.name)

@@ -115,9 +115,8 @@ def modes_of(prior: Prior, minima: Sequence[Minimum], sampled: Refined | None) -
     return tuple(
         Mode(centre, q05, q95, *told, float(weight))
         for told, weight, (q05, centre, q95) in (
-            (told, w, prior.to_physical(q)) for told, (w, q, _) in zip(ended, own, strict=True)
+            (told, w, prior.to_physical(q)) for told, (w, q, _) in zip(ended, own, strict=True) if w > 0
         )
-        if weight > 0
     )
 
 

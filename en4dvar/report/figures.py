@@ -340,7 +340,7 @@ def bands(result: StoredResult) -> Chart:
     for walk in stored_walks(result):
         least, most = float(np.nanmin(walk.posterior)), float(np.nanmax(walk.prior))
         steep = least > 0 and math.isfinite(most) and most > 5 * least
-        labels = with_unit("time", walk.time_unit), with_unit(walk.symbol, walk.unit)
+        labels = responses.time_label(result), with_unit(walk.symbol, walk.unit)
         panel = Panel(*labels, logarithmic=steep, legend=True)
         for quantiles, colour, alpha in ((walk.prior, "prior", 0.3), (walk.posterior, "posterior", 0.35)):
             (x, low), (_, high) = (steps(walk.edges, quantiles[i]) for i in (0, 2))

@@ -13,8 +13,18 @@ from en4dvar.diagnosis.diagnostics import member_quantiles
 from en4dvar.model.state import Array
 from en4dvar.plumbing.units import convert
 from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, Row, in_columns
-from en4dvar.report.text import axis_label, figure_text, number_like, percent, shown, unit_behind, with_unit
-from en4dvar.results.declared import Axis
+from en4dvar.report.text import (
+    axis_label,
+    figure_text,
+    number_like,
+    percent,
+    shown,
+    since,
+    time_axis,
+    unit_behind,
+    with_unit,
+)
+from en4dvar.results.declared import Axis, zero_of
 from en4dvar.results.netcdf import Group, Variable
 from en4dvar.results.store import StoredResult
 
@@ -66,7 +76,7 @@ def _along(observed: Group, axis: Axis) -> tuple[Array, str]:
     times, places = shown(observed[axis.time]), observed[place].values if place in observed else ()
     if len(np.unique(places)) > len(np.unique(times)):
         return np.asarray(places), with_unit("place", str(observed[place].attrs["units"]))
-    return times, axis_label(observed[axis.time], "time")
+    return times, time_axis(observed[axis.time])
 
 
 def _quantity(observed: Variable) -> str:
@@ -159,7 +169,8 @@ def _prior(preview: Preview, part: Part, path: Array | None) -> Panel:
     label, symbol = observable.label, observable.symbol
     if label != symbol:
         label = f"{label} {symbol}" if "$" in symbol or len(symbol) > 1 else f"{label} ${symbol}$"
-    panel = Panel(with_unit("time", model.time_display_unit), with_unit(label, shown_unit))
+    zero = convert(float(np.broadcast_to(y.zero, len(y))[part.begin]), model.time_unit, model.time_display_unit)
+    panel = Panel(since(zero, model.time_display_unit), with_unit(label, shown_unit))
     if len(paths) > 1:
         for levels, alpha, words in (((0.05, 0.95), 0.3, "prior 90 %"), ((0.25, 0.75), 0.45, "50 %")):
             low, high = member_quantiles(paths, levels, axis=0)
@@ -176,12 +187,14 @@ def _prior(preview: Preview, part: Part, path: Array | None) -> Panel:
 
 
 def withheld_lines(result: StoredResult) -> list[tuple[object, ...]]:
-    """A line a reading after the window, in display units; none where none follows."""
+    """A line a reading after the window, on the clock of the data, in display units; none where none follows."""
     if "/withheld" not in result.groups:
         return []
     held = result.groups["/withheld"]
     units = [held[key].attrs["display_units"] for key in ("withheld_time", result.observable)]
-    columns = (values.tolist() for values in _withheld(result))
+    times, *more = _withheld(result)
+    file_times = times + shown(held["withheld_time"], zero_of(held["withheld_time"]))
+    columns = (values.tolist() for values in (file_times, *more))
     return [
         (units[0], time, units[1], value, low, median, high, int(low <= value <= high))
         for time, value, low, median, high in zip(*columns, strict=True)
@@ -214,7 +227,7 @@ def expected(result: StoredResult) -> Chart:
     """Readings after the window over bands of what was expected."""
     held = result.groups["/withheld"]
     times, readings, low, median, high = _withheld(result)
-    panel = Panel(axis_label(held["withheld_time"], "time"), axis_label(held[result.observable]), legend=True)
+    panel = Panel(time_axis(held["withheld_time"]), axis_label(held[result.observable]), legend=True)
     panel.band(times, low, high, "posterior", 0.3, "expected 90 %")
     panel.line(times, median, "posterior", 0.9, label="median")
     panel.dots(times, readings, "ink", 2.2, label="reading")

@@ -10,11 +10,23 @@ import numpy as np
 import numpy.typing as npt
 from markupsafe import Markup
 
+from en4dvar.diagnosis.honesty.checks import CLOCK
 from en4dvar.diagnosis.influence import UNKNOWN
 from en4dvar.diagnosis.response.what_if import exclusion, is_manifold
 from en4dvar.model.state import Array
 from en4dvar.report.chart import POINTS, Chart, Panel, Row
-from en4dvar.report.text import axis_label, fixed, number_like, plain_number, pretty_unit, shown, signed, symbol_html
+from en4dvar.report.text import (
+    fixed,
+    number_like,
+    plain_number,
+    pretty_unit,
+    shown,
+    signed,
+    symbol_html,
+    time_axis,
+    unit_behind,
+)
+from en4dvar.results.declared import zero_of
 from en4dvar.results.store import StoredResult
 
 SHIFT_COLUMNS = (
@@ -169,7 +181,7 @@ def times(result: StoredResult) -> Array:
 
 def time_label(result: StoredResult) -> str:
     """Of an axis of :func:`times`."""
-    return axis_label(result.group("observed_data")[result.axes[0].time], "time")
+    return time_axis(result.group("observed_data")[result.axes[0].time])
 
 
 def whitened(result: StoredResult) -> Array:
@@ -256,14 +268,15 @@ def _farthest(result: StoredResult) -> Markup:
 
 
 def _time(result: StoredResult, k: int) -> str:
-    """When a reading was taken, of several series of which, of a field where."""
+    """When a reading was taken on the clock of the data, of several series of which, of a field where."""
     observed = result.group("observed_data")
     for axis in result.axes:
         time = observed[axis.time]
         if k < len(time.values):
             break
         k -= len(time.values)
-    words = f"{plain_number(float(shown(time)[k]))} {pretty_unit(time.attrs['display_units'])}".strip()
+    when = float(shown(time, time.values[k] + zero_of(time)))
+    words = f"{plain_number(when, 6)}{unit_behind(time.attrs['display_units'])} {CLOCK}"
     if f"{axis.name}_place" in observed:
         place = observed[f"{axis.name}_place"]
         words += f", place {plain_number(float(place.values[k]))} {pretty_unit(str(place.attrs['units']))}".rstrip()

@@ -13,6 +13,7 @@ from markupsafe import Markup, escape
 from en4dvar.estimation.summary import ParameterSummary
 from en4dvar.model.state import Array
 from en4dvar.plumbing.units import convert
+from en4dvar.results.declared import zero_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -147,6 +148,16 @@ def shown(variable: Variable | xr.DataArray, values: npt.ArrayLike | None = None
 def axis_label(variable: Variable | xr.DataArray, words: str = "") -> str:
     """Words, or the symbol of a variable of a result file, and its display unit."""
     return with_unit(words or str(variable.attrs["symbol"]), str(variable.attrs["display_units"]))
+
+
+def since(zero: float, unit: str) -> str:
+    """Of an axis of the model's times, at whose zero the clock of the data shows ``zero``, both in a display unit."""
+    return with_unit(f"time since {zero:.6g}{unit_behind(unit)} of the data" if zero else "time", unit)
+
+
+def time_axis(time: Variable) -> str:
+    """Of an axis of times of readings of a result file."""
+    return since(float(shown(time, zero_of(time))), str(time.attrs["display_units"]))
 
 
 def figure_text(name: str) -> str:

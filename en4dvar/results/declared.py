@@ -157,6 +157,11 @@ def parameter_of(name: str, about: Mapping[str, Any]) -> Parameter:
     return Parameter(name, str(about["units"]), label=label, symbol=symbol, display_unit=str(about["display_units"]))
 
 
+def zero_of(time: Variable) -> float:
+    """What the clock of the data shows at the model's time zero, in the unit of the times of readings."""
+    return float(time.attrs.get("time_zero", 0.0))
+
+
 @dataclass(frozen=True)
 class Axis:
     """Of the series ``name``; ``alone``: it is the only one."""

@@ -28,7 +28,17 @@ from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.caution import Caution, parsed
 from en4dvar.plumbing.errors import OutputError, retold
 from en4dvar.plumbing.units import UnitError, convert
-from en4dvar.results.declared import MEMBER, Axis, Declared, attributes_of, axes_of, group_of, lay_out, parameter_of
+from en4dvar.results.declared import (
+    MEMBER,
+    Axis,
+    Declared,
+    attributes_of,
+    axes_of,
+    group_of,
+    lay_out,
+    parameter_of,
+    zero_of,
+)
 from en4dvar.results.netcdf import Group, Groups, Variable, read_groups, understood
 from en4dvar.results.pack import PACK, read_result, unpacked
 from en4dvar.results.scalars import ATTRIBUTES, SCALAR
@@ -141,7 +151,7 @@ class StoredResult:
         held, axes, later = "observed_data", self.axes, self.groups.get("/withheld")
         data, std = self.group(held), self.of_readings(held, "reading_std")
         times, time_std = (self.of_readings(held, key, shared=True) for key in ("time", "time_std"))
-        parts = _parts(data, axes, observables or {})
+        parts, zeros = _parts(data, axes, observables or {}), [zero_of(data[axis.time]) for axis in axes]
         if parts:
             matrix = _correlation(data, len(times))
             within = [float(data.attrs.get(f"{p.name}_huber_threshold", math.inf)) for p in parts]
@@ -161,6 +171,7 @@ class StoredResult:
             scalars={k.removeprefix(SCALAR): float(v) for k, v in data.attrs.items() if k.startswith(SCALAR)},
             parts=parts,
             continued=None if later is None else _continued(data, later, axes[0].name, self.name),
+            zero=np.repeat(zeros, [len(data[axis.time].values) for axis in axes]) if len(axes) > 1 else zeros[0],
         )
 
     @property
@@ -323,7 +334,7 @@ def _continued(data: Group, later: Group, series: str, name: str) -> Observation
 
     times, std = both("time", "withheld_time"), both(f"{series}_reading_std")
     noise = noise_of_record(times, std, both("time_std"), {}, data.attrs)
-    return Observations(times, both(series), noise, np.ones(len(times)), name)
+    return Observations(times, both(series), noise, np.ones(len(times)), name, zero=zero_of(data["time"]))
 
 
 def _correlation(data: Group, count: int) -> csr_array | None:

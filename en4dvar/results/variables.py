@@ -88,6 +88,16 @@ def _clock(**more: str) -> UnitRule:
 
 
 TIME, CELL_TIME, PIECE_TIME = _clock(axis="T"), _clock(), _clock(axis="T", symbol="t")
+
+
+def _of_data(a: Analysis, item: Item) -> dict[str, Any]:
+    """Times of readings, with what the clock of the data shows at the model's time zero where that is not zero."""
+    y = a.observations
+    zero = float(np.broadcast_to(y.zero, len(y))[item.held.begin if item.held else 0])
+    return {**TIME.attributes(a, item), **({"time_zero": zero} if zero else {})}
+
+
+READ_TIME = UnitRule(TIME.words, _of_data, TIME.keys)
 FIXED = UnitRule("its own", lambda _, item: item.about, ("units", "symbol"))
 LIMIT = UnitRule("its own", lambda _, item: item.about)
 PLACE = UnitRule("of the field's coordinates", lambda _, item: {"units": item.held.places.unit})
@@ -401,12 +411,12 @@ def _coordinate(name: str, meaning: str, values: Callable[..., Any], **how: Any)
 COORDINATES = (
     _coordinate("chain", "chain", lambda a: np.zeros(1, dtype=np.int64)),
     _coordinate("draw", "ensemble member", lambda a: np.arange(len(a.prior))),
-    _coordinate("{time}", "observation time", of_series(lambda a: a.observations.times), unit=TIME),
+    _coordinate("{time}", "observation time", of_series(lambda a: a.observations.times), unit=READ_TIME),
     _coordinate(
         "withheld_time",
         "time of readings after the window",
         lambda a: a.withheld.times if a.withheld else np.empty(0),
-        unit=TIME,
+        unit=READ_TIME,
     ),
     _coordinate("path_time", "time on the clock of the observations", lambda a: a.trajectory_times, unit=TIME),
     _coordinate("parameter", "estimated parameter", lambda a: text(p.name for p in a.parameters), needed=True),

@@ -18,6 +18,14 @@ from en4dvar.schemes.settings import AssimilationSettings
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 
 
+def test_sets_that_lose_a_reading_of_no_bubble_are_as_many_as_the_page_says():
+    sets = [p.observations for gel in ("03", "10") for p in build(load_config(CONFIGS / f"agarose_{gel}_qlkv.yaml"))]
+    lost = [y for y in sets if any("left out, for they are 0 or below" in doubt.words for doubt in y.doubts)]
+    assert all(y.values.min() > 0 for y in sets)
+    page = (CONFIGS.parent / "docs" / "agarose_study.md").read_text(encoding="utf-8")
+    assert f"{len(lost)} of the {len(sets)} sets lose their last reading" in page
+
+
 @pytest.mark.slow
 def test_bubbles_of_one_gel_are_recognised_and_those_of_several_are_not():
     base = build(load_config(CONFIGS / "agarose_10_qlkv.yaml"))[:4]

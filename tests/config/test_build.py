@@ -37,9 +37,25 @@ def test_window_zero_weights_and_relative_error(tmp_path: Path) -> None:
     (problem,) = build(load_config(path, {"assimilation.weights": "mean"}))
     y = problem.observations
     assert y.times[0] == 0.0
+    assert y.file_times == pytest.approx(build(load_config(path, {"data.time_zero": "file"}))[0].observations.times)
+    assert y.zero == y.file_times[0] > 0
     assert y.values[0] < y.values[1] < y.values[-1]
     assert y.std == pytest.approx(np.full(len(y), 0.01 * y.values.max()))
     assert y.weights.sum() == pytest.approx(1.0)
+
+
+def test_the_trough_after_the_window_is_named(tmp_path: Path) -> None:
+    """Counted as ``data.window.to`` counts it, from the window's start, as far as readings are predicted."""
+    path = write_toy(tmp_path, data=csv_text(121))
+    for window, name in (
+        ({"from": "start", "to": "trough 1"}, "trough 2"),
+        ({"from": "start", "to": "20 ms"}, "trough 1"),
+        ({"from": "minimum 1", "to": "250 ms"}, "trough 1"),
+        ({"from": "start", "to": "trough 1", "until": "250 ms"}, ""),
+        ({"from": "start", "to": "end"}, ""),
+    ):
+        (problem,) = build(load_config(path, {"data.window": window}))
+        assert problem.observations.next_end == name
 
 
 def test_value_from_a_mat_file(tmp_path: Path) -> None:

@@ -233,6 +233,15 @@ def test_a_window_that_ends_before_the_model_leaves_its_validity_is_named():
     assert told(follow(a, c, None), "model-validity") is None
 
 
+def test_a_window_is_ended_on_the_clock_of_the_data():
+    problem = make_problem(Late(TWO), (1.0, -0.6), std=0.01, k=18)
+    ends = [
+        float(re.search(r"to: ([\d.]+) s\}", told(run(read(problem, zero=zero)), "model-validity").advice)[1])
+        for zero in (0.0, 100.0)
+    ]
+    assert ends[1] == pytest.approx(ends[0] + 100.0, abs=1e-3)
+
+
 def test_what_is_set_already_is_not_advised():
     """The size of errors that is estimated beside a discrepancy."""
     scaled = run(with_discrepancy(bent(), sigma=0.5, amplitude=(0.05, 1.0), length=(0.3, 0.7)))
@@ -254,6 +263,18 @@ def test_a_table_that_is_not_there_is_asked_for_and_one_that_cannot_be_is_not_na
     there = run(assuming, what_if=True)
     assert there.what_if
     assert "look at the what-if table and compare other models" in told(there, "discrepancy-found").advice
+
+
+def test_a_future_that_is_missed_is_taken_in_up_to_the_next_trough():
+    problem = turned(10)
+    assert "data.window.to:" not in told(run(problem), "future-missed").advice
+    problem = read(problem, next_end="trough 3")
+    assert "(data.window.to: trough 3); not more" in told(run(problem), "future-missed").advice
+    problem.model.unforeseen = {"y": 0.01}
+    asked = (
+        "(data.window.to: trough 3), with what may change on the way (model_error: {y: {at: maxima, std: 1 %}}); not"
+    )
+    assert asked in told(run(problem), "future-missed").advice
 
 
 def test_every_code_of_the_catalogue_is_followed_somewhere():

@@ -19,6 +19,7 @@ from en4dvar.executor import SerialExecutor
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
 from en4dvar.report import write_pages
+from en4dvar.report.responses import reading_words, time_label
 from en4dvar.report.result import Result
 from en4dvar.results.store import load_stored
 from en4dvar.runs.rerun import rerun
@@ -134,20 +135,22 @@ def test_written_read_back_and_shown(tmp_path):
     times, std = np.append(y.times, LATER), np.full(len(y) + 7, 0.1)
     noise = noise_of(std, np.zeros(len(times)), discrepancy=Kernel(times))
     whole = replace(continued(plain, (1.0, 0.5), 2).observations.continued, noise=noise)
-    problem = replace(problem, observations=replace(y, continued=whole))
+    problem = replace(problem, observations=replace(y, continued=replace(whole, zero=30.0), zero=30.0))
     a = assimilate(problem, SETTINGS, 1)
     Result.from_analysis(a, {}).save(tmp_path / "posterior.nc")
     stored = load_stored(tmp_path / "posterior.nc")
     held, again = stored.groups["/withheld"], stored.observations({"y": OBSERVABLE}).continued
     np.testing.assert_array_equal(held["y_median"].values, a.withheld.median)
-    for key in ("times", "values"):
-        np.testing.assert_array_equal(getattr(again, key), getattr(whole, key))
+    for key in ("times", "values", "zero"):
+        np.testing.assert_array_equal(getattr(again, key), getattr(problem.observations.continued, key))
     np.testing.assert_array_equal(again.noise.std, whole.noise.std)
     assert again.noise.kernel.smoothness == whole.noise.kernel.smoothness
     write_pages(tmp_path)
     with (tmp_path / "withheld.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert [float(row["time"]) for row in rows] == LATER.tolist()
+    assert [float(row["time"]) for row in rows] == pytest.approx(LATER + 30.0)
+    assert "the farthest, at 31.1 s on the clock of the data" in reading_words(stored)[-1]
+    assert time_label(stored) == "time since 30 s of the data (s)"
     assert np.mean([int(row["inside"]) for row in rows]) == a.withheld.inside
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert f"{a.withheld.inside * 7:.0f} of 7 readings after the window" in page

@@ -272,7 +272,7 @@ def _numbered(changes):
         yield replace(term, parameter=replace(term.parameter, name=f"y_change_{k}"))
 
 
-def test_parameters_that_walk_have_no_population():
+def test_parameters_that_walk_or_have_several_priors_have_no_population():
     model = Batched()
     first = PriorTerm.normal(model.parameters[0], 0.0, 1.0)
     observed = make_observations(np.arange(1.0, 5.0), np.ones(4), 0.1)
@@ -280,3 +280,6 @@ def test_parameters_that_walk_have_no_population():
     walking = problem.varied([RandomWalk.of(model, first, (2.0,), 0.3)])
     with pytest.raises(ConfigError, match="do not vary in time"):
         population_of([walking] * 3, [np.zeros((20, 2))] * 3, ["r"], 2)
+    other = replace(problem, prior=Prior((replace(first, std=2.0),)))
+    with pytest.raises(ConfigError, match=r"r: its prior must be the same .* with one configuration"):
+        population_of([problem, other, problem], [np.zeros((20, 1))] * 3, ["r"], 2)

@@ -229,7 +229,7 @@ def test_page_names_the_reading_that_decides(tmp_path, analysis):
     marked = influenced(analysis)
     result = Result.from_analysis(marked, provenance("name: test\n"))
     moving, far = map(str, reading_words(result))
-    assert "Without the reading at 16 µs <i>μ</i> would change most" in moving
+    assert "Without the reading at 16 µs on the clock of the data <i>μ</i> would change most" in moving
     assert "0.8 posterior standard deviations" in moving
     size = marked.influence.change[1, 7]
     assert f"by {size:.2g} Pa·s".replace("-", "−") in moving

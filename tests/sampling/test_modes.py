@@ -11,6 +11,7 @@ from en4dvar import estimate
 from en4dvar.descent.minima import Minimum
 from en4dvar.diagnosis.analysis import Mode
 from en4dvar.estimation.assimilate import assimilate, log_posterior
+from en4dvar.estimation.conclusions import modes_of
 from en4dvar.estimation.summary import summarise
 from en4dvar.executor import ThreadsExecutor
 from en4dvar.model.state import Parameter
@@ -164,6 +165,15 @@ def test_modes_that_overlap_are_only_worth_knowing(apart: float, severity: str) 
     assert (told.code, told.severity) == ("several-modes", severity)
     (told,) = mode_cautions(prior, minima, modes, True, None)  # members describe one of them alone
     assert told.severity == "serious"
+
+
+def test_a_minimum_that_no_draw_belongs_to_is_no_mode():
+    """Its quantiles are not known, and nothing is computed of them."""
+    prior = Prior((PriorTerm.logit(Parameter("a", "1"), (0.0, 1.0), 0.5, 1.0),))
+    minima = [Minimum(np.array([x]), np.eye(1), 3.0, (1,)) for x in (0.0, 1.0)]
+    own = [(1.0, np.array([[-1.0], [0.0], [1.0]]), 3.0), (0.0, np.full((3, 1), np.nan), np.inf)]
+    (mode,) = modes_of(prior, minima, Refined(np.zeros((8, 1)), {}, own))
+    assert mode.centre == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize(("others", "words"), [(1, "others ended at 9.0"), (0, "the others came to no minimum")])

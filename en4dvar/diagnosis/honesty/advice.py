@@ -13,7 +13,7 @@ import numpy as np
 from en4dvar.data.noise import SMOOTHNESS
 from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.diagnosis.diagnostics import active_members
-from en4dvar.diagnosis.honesty.checks import shown, sides_of_lost
+from en4dvar.diagnosis.honesty.checks import moments, shown, sides_of_lost
 from en4dvar.model.state import NOISE_SCALE, Parameter
 from en4dvar.plumbing.caution import CATALOGUE, Caution
 from en4dvar.plumbing.units import convert
@@ -85,11 +85,6 @@ class Case:
         observable = self.a.problem.observable
         unit = self.a.observations.error_unit or observable.display_unit
         return f"{convert(value, observable.unit, unit):.2g} {unit}"
-
-    def moment(self, value: float) -> str:
-        """A time in the display unit."""
-        model = self.a.problem.model
-        return f"{convert(value, model.time_unit, model.time_display_unit):.4g} {model.time_display_unit}"
 
 
 def advised(a: Analysis, cautions: Sequence[Caution]) -> tuple[Caution, ...]:
@@ -198,14 +193,13 @@ def _odd(case: Case) -> str:
 
 
 def _validity(case: Case) -> str:
-    a, times = case.a, np.sort(case.a.observations.times[case.a.observations.used])
+    a, used = case.a, case.a.observations.used
     left = np.quantile(a.beyond.min(axis=1), SHARE, method="lower")
-    kept = times[times < left]
+    kept = used[a.observations.times[used] < left]
     if len(kept) <= len(a.parameters):
         return f"choose a model that is valid there: too few readings ({len(kept)}) come before for a shorter window"
-    return (
-        f"end the window before (data.window: {{to: {case.moment(kept[-1])}}}), or choose a model that is valid there"
-    )
+    end = moments(a)[max(kept, key=a.observations.times.__getitem__)]
+    return f"end the window before (data.window: {{to: {end}}}), or choose a model that is valid there"
 
 
 def _bound(case: Case) -> str:
@@ -292,6 +286,21 @@ def _chain(case: Case) -> str:
     return f"do not quote these intervals; {first}run again with more data or narrower priors"
 
 
+def _future(case: Case) -> str:
+    problem = case.a.problem
+    if not (end := problem.observations.next_end):
+        return CATALOGUE["future-missed"][1]
+    constant = {
+        name: std for name, std in problem.model.unforeseen.items() if name not in {v.name for v in problem.varying}
+    }
+    changes = ", ".join(f"{name}: {{at: maxima, std: {100 * std:.3g} %}}" for name, std in constant.items())
+    also = f", with what may change on the way (model_error: {{{changes}}})" if changes else ""
+    return (
+        "look at the figure of the readings after the window: as far as they are of the same system, let the model "
+        f"explain them, too, up to the next minimum (data.window.to: {end}){also}; not more at a time"
+    )
+
+
 def _silent(case: Case) -> str:
     p = case.parameters[0]
     return f"do not quote {p.name} as measured: fix it (parameters.{p.name}: a value), or add data that depend on it"
@@ -301,6 +310,7 @@ ADVICE: dict[str, Callable[[Case], str]] = {
     "not-converged": _not_converged,
     "ensemble-collapse": _members,
     "rank-deficient": _members,
+    "future-missed": _future,
     "misfit": _misfit,
     "discrepancy-found": _missed,
     "overstated-error": _overstated,

@@ -40,6 +40,7 @@ MANY = 0.1  # share of members whose loss is serious
 BY_CHANCE = 0.01  # of cases in which a parameter is said to tell lost members from others, and does not
 FAR = 1.5  # prior standard deviations from the prior mean that are worth naming for one or two members
 MOST_NAMED, MOST_LISTED = 3, 6
+CLOCK = "on the clock of the data"  # which shows another time than the model's, if data.time_zero says so
 NONE: Mapping[str, str] = MappingProxyType({})
 Findings = Iterator[Caution]
 
@@ -106,8 +107,8 @@ def structure(analysis: Analysis) -> Findings:
         which, probability = residuals.outlier
         place = int(np.flatnonzero(residuals.which == which)[0])
         words = (
-            f"the reading at {moments(analysis)[which]} is {abs(residuals.studentised[place]):.1f} standard deviations "
-            f"off (probability {_chance(probability)}); its leverage is {residuals.leverage[place]:.0%}"
+            f"the reading at {moments(analysis)[which]} {CLOCK} is {abs(residuals.studentised[place]):.1f} standard "
+            f"deviations off (probability {_chance(probability)}); its leverage is {residuals.leverage[place]:.0%}"
         )
         yield caution("odd-residuals", words)
 
@@ -139,10 +140,10 @@ def missed(analysis: Analysis) -> Findings:
 
 
 def moments(analysis: Analysis) -> list[str]:
-    """The times (K,) of all observations in the display unit."""
+    """The times (K,) of all observations on the clock of the data, in the display unit."""
     model = analysis.problem.model
-    times = convert(analysis.observations.times, model.time_unit, model.time_display_unit)
-    return [f"{time:.4g} {model.time_display_unit}" for time in times]
+    times = convert(analysis.observations.file_times, model.time_unit, model.time_display_unit)
+    return [f"{time:.6g} {model.time_display_unit}" for time in times]
 
 
 def _chance(probability: float) -> str:
@@ -303,7 +304,7 @@ def down_weighted(analysis: Analysis) -> Findings:
     more = f" and {len(worst) - MOST_LISTED} more" if len(worst) > MOST_LISTED else ""
     words = (
         f"{len(worst)} of {len(weights)} observations lie beyond {within:g} standard deviations and "
-        f"were down-weighted (Huber): {listed}{more}"
+        f"were down-weighted (Huber): at {listed}{more} {CLOCK}"
     )
     yield caution("down-weighted", words)
 

@@ -11,7 +11,7 @@ from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.hints import suggest
 from en4dvar.priors.prior import Prior, PriorTerm
-from en4dvar.problem import InverseProblem, common_to
+from en4dvar.problem import AT_ONCE, InverseProblem, common_to
 
 EVERYONE = ""  # the group of a quantity that all experiments share
 
@@ -60,7 +60,9 @@ class JointProblem:
             raise ConfigError("a joint estimate shares at least one parameter")
         for key, terms in self._terms.items():
             if any(term != terms[0] for term in terms):
-                raise ConfigError(f"{self.words(key)}: its prior must be the same in all experiments that share it")
+                raise ConfigError(
+                    f"{self.words(key)}: its prior must be the same in all experiments that share it: {AT_ONCE}"
+                )
 
     @property
     def shared(self) -> tuple[tuple[str, str], ...]:

@@ -25,7 +25,7 @@ from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.hints import suggest
 from en4dvar.priors.prior import PriorTerm, member_stream
-from en4dvar.problem import InverseProblem, common_to
+from en4dvar.problem import AT_ONCE, InverseProblem, common_to
 
 DETERMINED = 0.9  # of the hyperprior's variance, taken away by the data
 IN_IT = 0.2  # of the largest exponent: a parameter that is part of a combination
@@ -166,7 +166,7 @@ def terms_of(problems: Sequence[InverseProblem], names: Sequence[str]) -> tuple[
                 raise ConfigError(words)
         terms = [p.prior.terms[p.prior.names.index(name)] for p in problems]
         if any(term != terms[0] for term in terms):
-            raise ConfigError(f"{name}: its prior must be the same in all data sets of a population")
+            raise ConfigError(f"{name}: its prior must be the same in all data sets of a population: {AT_ONCE}")
         shared_terms.append(terms[0])
     return tuple(shared_terms)
 
@@ -178,7 +178,7 @@ def require_population(problems: Sequence[InverseProblem], names: Sequence[str])
         name = problem.observations.name
         check_problem(problem)
         if problem.constant.prior.names != problems[0].constant.prior.names:
-            raise ConfigError(f"{name}: a population needs the same parameters in all data sets")
+            raise ConfigError(f"{name}: a population needs the same parameters in all data sets: {AT_ONCE}")
         if problem.walks or problem.fields:
             raise ConfigError(f"{name}: a population needs parameters that do not vary in time or space")
         if correlated := [n for block in problem.prior.blocks for n in block.names if n in names]:
