@@ -335,6 +335,18 @@ def test_an_experiment_in_the_wrong_minimum_of_its_own_is_found():
     assert found.chi2.max() < 1
 
 
+def test_descents_that_end_in_different_minima_are_told():
+    """All share c, of both signs; one single estimate says +1, where J is lower, and all others −1."""
+    model, t = Folded(names=("a", "c"), compiled=True), np.array([1.0, 2.0, 3.0])
+    prior = Prior(tuple(PriorTerm.normal(p, 0.0, 1.0) for p in model.parameters))
+    data = [make_observations(t, 0.5 * t + 1 + 0.1 * t, std=0.02, name=f"{e}") for e in range(8)]
+    singles = [Single(np.array([0.6 - 0.1 * c, c]), np.diag([100.0, 100.0])) for c in (1.0, *[-1.0] * 7)]
+    joint = sharing([InverseProblem(model, model.observables[0], each, prior) for each in data], ("c",))
+    found = estimate.estimate_jointly(joint, SETTINGS, seed=3, singles=singles)
+    np.testing.assert_allclose(found.shared_mode, 1.0, atol=0.1)
+    assert "starts-disagree" in {c.code for c in found.cautions}
+
+
 def test_advice_names_nothing_that_a_joint_estimate_does_not_read(monkeypatch):
     """It has no chain, and chooses its starts itself."""
     monkeypatch.setattr(members, "FEWEST", np.inf)
