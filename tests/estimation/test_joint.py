@@ -211,6 +211,59 @@ def test_what_is_shared_on_a_bent_line_by_experiments_without_own_quantities():
     assert 0.8 < np.mean(found) / exact < 1.1
 
 
+class Phase(Bent):
+    """y = sin(t + 6 (c + 0.8 (exp(a) − 1))): a period of c off, the readings are as well explained."""
+
+    def trajectories(self, x, times):
+        return [replace(t, states=np.sin(t.times[:, None] + 6 * t.states)) for t in super().trajectories(x, times)]
+
+
+def test_descents_that_start_where_single_estimates_disagree_end_in_one_minimum():
+    """Each single estimate has its own a, and the c that explains its readings with it, beside the minimum over a."""
+    model, y, std = Phase(names=("a", "c"), compiled=True), np.array([0.3, -0.4, 0.1, -0.2]), 0.01
+    prior, t = Prior(tuple(PriorTerm.normal(p, 0.0, 1.0) for p in model.parameters)), np.array([1.0, 2.0, 3.0])
+    problems, singles = [], []
+    for value, a in zip(y, (-1.5, 0.5, 1.0, -0.7), strict=True):
+        data = make_observations(t, np.sin(t + 6 * value), std=std, name=f"{value}")
+        problems.append(InverseProblem(model, model.observables[0], data, prior))
+        slope = 6 * np.cos(t + 6 * value)[:, None] * [0.8 * np.exp(a), 1.0] / std
+        singles.append(Single(np.array([a, value - 0.8 * np.expm1(a)]), np.eye(2) + slope.T @ slope))
+    found = estimate.estimate_jointly(sharing(problems, ("a",)), SETTINGS, seed=3, singles=singles)
+    a = np.linspace(-2, 2, 4001)
+    lowest = (0.5 * (a**2 + np.sum((y[:, None] - 0.8 * np.expm1(a)) ** 2, axis=0))).min()
+    assert found.costs[-1] == pytest.approx(lowest, abs=1e-3)
+    assert "starts-disagree" not in {c.code for c in found.cautions}
+
+
+class Rounded(Vectorised):
+    """y = a t + c²."""
+
+    def trajectories(self, x, times):
+        own = np.broadcast_to(times, (len(x), np.shape(times)[-1]))
+        y = x[:, 2, None] * own + x[:, 3, None] ** 2
+        theta = np.broadcast_to(x[:, None, 2:], (*own.shape, 2))
+        states = np.concatenate([y[..., None], np.zeros((*own.shape, 1)), theta], axis=-1)
+        return [Trajectory(t, s, self.layout) for t, s in zip(own, states, strict=True)]
+
+
+def test_own_quantities_of_two_minima_that_both_count():
+    """Against the integral: the curvature where J is lowest tells of one of ±c, and the draws find the other."""
+    model, t, std = Rounded(names=("a", "c"), compiled=True), np.array([1.0, 2.0, 3.0]), 0.3
+    prior, y = Prior(tuple(PriorTerm.normal(p, 0.0, 1.0) for p in model.parameters)), 0.5 * t + 0.7
+    data = [make_observations(t, y, std=std, name=f"{e}") for e in range(8)]
+    joint = sharing([InverseProblem(model, model.observables[0], each, prior) for each in data], ("a",))
+    a, c = np.linspace(-2, 2, 801)[:, None], np.linspace(-4, 4, 2001)
+    misfit = sum((value - a * at - c**2) ** 2 for at, value in zip(t, y, strict=True)) / std**2
+    own = np.exp(-0.5 * (c**2 + misfit)).sum(axis=1) * (c[1] - c[0]) / np.sqrt(2 * np.pi)
+    density = np.exp(-0.5 * a[:, 0] ** 2 + 8 * np.log(own)) * 0.005 / np.sqrt(2 * np.pi)
+    exact = np.log(density.sum()) - 8 * 3 * np.log(std * np.sqrt(2 * np.pi))
+    settings = replace(SETTINGS, refine="auto", members=96)
+    found = estimate.estimate_jointly(joint, settings, seed=2)
+    assert found.members.effective >= members.ENOUGH
+    assert found.log_evidence == pytest.approx(exact, abs=0.7)
+    np.testing.assert_allclose([np.mean(found.control(e)[:-1, 1] < 0) for e in range(8)], 0.5, atol=0.25)
+
+
 class Decaying(Vectorised):
     """y = a exp(−G c t) of the logarithms of G, a and c in units of 1.5, 0.3 and 0.25."""
 
@@ -280,6 +333,18 @@ def test_an_experiment_in_the_wrong_minimum_of_its_own_is_found():
     found = estimate.estimate_jointly(sharing(problems, ("a",)), SETTINGS, seed=3, singles=singles)
     np.testing.assert_allclose([found.control(e)[-1, 1] for e in range(8)], truths, atol=0.1)
     assert found.chi2.max() < 1
+
+
+def test_descents_that_end_in_different_minima_are_told():
+    """All share c, of both signs; one single estimate says +1, where J is lower, and all others −1."""
+    model, t = Folded(names=("a", "c"), compiled=True), np.array([1.0, 2.0, 3.0])
+    prior = Prior(tuple(PriorTerm.normal(p, 0.0, 1.0) for p in model.parameters))
+    data = [make_observations(t, 0.5 * t + 1 + 0.1 * t, std=0.02, name=f"{e}") for e in range(8)]
+    singles = [Single(np.array([0.6 - 0.1 * c, c]), np.diag([100.0, 100.0])) for c in (1.0, *[-1.0] * 7)]
+    joint = sharing([InverseProblem(model, model.observables[0], each, prior) for each in data], ("c",))
+    found = estimate.estimate_jointly(joint, SETTINGS, seed=3, singles=singles)
+    np.testing.assert_allclose(found.shared_mode, 1.0, atol=0.1)
+    assert "starts-disagree" in {c.code for c in found.cautions}
 
 
 def test_advice_names_nothing_that_a_joint_estimate_does_not_read(monkeypatch):

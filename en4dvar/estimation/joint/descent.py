@@ -24,6 +24,7 @@ from en4dvar.schemes.base import Minimiser
 
 LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.03, 0.01)  # of a step, tried in turn until J falls
 CLOSE = 0.3  # posterior standard deviations: own quantities that a step moves no further have settled
+STAGES, STEPS = 4, 8  # on the way to what is shared; linearisations at each that own quantities given it are sought by
 LONGEST = 40.0  # step in prior standard deviations of one experiment, as of a data set alone (step_control.py)
 
 
@@ -187,6 +188,25 @@ class Experiment:
             going = going[np.einsum("mi,mij,mj->m", step, precision, step)[going] > CLOSE**2]
         return mean, precision, lowest
 
+    def followed(self, border: Array, origin: Array, own: Array, block: Array, edge: Array) -> tuple[Array, Array]:
+        """The own quantities that J is low at, given what is shared (M, c), and their precision (M, n_e, n_e), from
+        those (n_e,) that J is low at where what is shared is at its ``origin`` (c,), with ``block`` (n_e, n_e) and
+        ``edge`` (c, n_e) of J's Hessian there.
+
+        In stages, each from where the line through the last two leads: what one experiment knows much better alone than
+        what is shared, as a time shift, is off the straight line of the Hessian by many of its standard deviations, and
+        from there a descent may end in another minimum.
+        """
+        precision, step = np.broadcast_to(block, (len(border), *block.shape)), (border - origin) / STAGES
+        if not len(own):
+            return np.zeros((len(border), 0)), precision
+        mean, ahead = own, -np.linalg.solve(block, edge.T @ step.T).T
+        for stage in range(1, STAGES + 1):
+            before = mean
+            mean, precision, _ = self.settled(origin + stage * step, mean + ahead, precision, STEPS)
+            ahead = mean - before
+        return mean, precision
+
 
 @dataclass(frozen=True)
 class Place:
@@ -325,11 +345,20 @@ class JointObjective(Objective[JointDescent]):
         standard = self.joint.standard
         far = max(float(np.linalg.norm(standard(e, border, step))) for e, step in enumerate(own))
         for length in np.array(LENGTHS) * (LONGEST / max(far, LONGEST)):
-            there = at.place.moved(at.direction, length)
+            there, enough = at.place.moved(at.direction, length), at.cost - SUFFICIENT * length * at.norm**2
             cost = yield [there]
-            if cost <= at.cost - SUFFICIENT * length * at.norm**2:
+            if cost > enough:  # a straight step leaves a bent valley that own quantities follow what is shared in
+                there = self._settled(there, at.arrow)
+                cost = yield [there]
+            if cost <= enough:
                 return Move(there, cost, length)
         return None
+
+    def _settled(self, place: Place, arrow: Arrow) -> Place:
+        """With the own quantities that J is low at, given what is shared."""
+        each = zip(self.experiments, place.own, arrow.blocks, strict=True)
+        own = [e.settled(place.border[None], v[None], block[None], STEPS)[0][0] for e, v, block in each]
+        return Place(place.border, tuple(own))
 
     def try_out(self, candidates: Sequence[Place]) -> float:
         """J at the one candidate there is."""

@@ -200,19 +200,24 @@ class _Estimate:
         return singles
 
     def _starts(self, singles: Sequence[Single]) -> list[Place]:
-        """Where the quadratic forms of the single estimates meet, and where what is shared is as in one of them."""
+        """Where the quadratic forms of the single estimates meet, and where what is shared is as in one of them, with
+        what is each experiment's own followed there from its single estimate.
+        """
         joint = self.joint
         likelihoods = [single.precision - np.eye(len(single.mode)) for single in singles]
         arrow, a, b = assembled(joint, likelihoods, [single.precision @ single.mode for single in singles])
-        x, y = arrow.solve(a, b)
-        starts = [Place(x, tuple(y))]
-        for e in np.linspace(0, len(singles) - 1, min(TRIED, len(singles))).astype(int).tolist():
-            shared, _ = joint.columns(e)
-            own_value = x.copy()
-            own_value[joint.of_border(e)] = singles[e].mode[shared]
-            rest_modes = tuple(single.mode[joint.columns(i)[1]] for i, single in enumerate(singles))
-            starts.append(Place(own_value, rest_modes))
-        return starts
+        meeting, _ = arrow.solve(a, b)
+        tried = np.linspace(0, len(singles) - 1, min(TRIED, len(singles))).astype(int).tolist()
+        border = np.tile(meeting, (1 + len(tried), 1))
+        for row, e in zip(border[1:], tried, strict=True):
+            row[joint.of_border(e)] = singles[e].mode[joint.columns(e)[0]]
+        own = []
+        for e, (experiment, single) in enumerate(zip(self.experiments, singles, strict=True)):
+            (shared, rest), origin = joint.columns(e), np.zeros(len(meeting))
+            origin[joint.of_border(e)] = single.mode[shared]
+            edge = arrow.edges[e]
+            own.append(experiment.followed(border, origin, single.mode[rest], arrow.blocks[e], edge)[0])
+        return [Place(row, tuple(v[i] for v in own)) for i, row in enumerate(border)]
 
     def _descents(self, starts: Sequence[Place]) -> list[JointDescent]:
         """From one start after the other, that of lowest J first, until two have ended in the lowest minimum."""

@@ -5,8 +5,10 @@ their own, so that
 
     p(s | y) ∝ p(s) Π_e L_e(s),      L_e(s) = ∫ p(y_e | s, v) p(v) dv ≈ mean_k p(y_e | s, v_k) p(v_k) / q(v_k | s)
 
-with v_k from Student's t about where J is lowest given s. The estimate of L_e is unbiased, and with it the weights of s
-and the choice of one v_k for each member are those of the exact posterior (Andrieu & Roberts 2009, Ann. Stat. 37, 697).
+with v_k from Student's t about where J is lowest given s and, once there are draws, half of them from one with the mean
+and covariance of these: a curvature does not tell of a second minimum. The estimate of L_e is unbiased, and with it the
+weights of s and the choice of one v_k for each member are those of the exact posterior (Andrieu & Roberts 2009, Ann.
+Stat. 37, 697).
 
 The minimum may hold one experiment in the wrong minimum of its own quantities, as a bubble whose radii explain rebounds
 by their phase and not by their height. The others then keep what is shared about right, so that to look for a lower one
@@ -25,13 +27,15 @@ from en4dvar.model.state import Array
 from en4dvar.priors.prior import member_stream
 
 DRAWS, INNER = 96, 36  # of what is shared, and of the own quantities for each of them
-STAGES, STEPS = 4, 8  # on the way to what is shared; linearisations at each that own quantities given it are sought by
 FREEDOM = 7.0  # degrees of freedom of Student's t
 WIDER = 1.2  # the proposals than the Gaussian
 LEAST, ROUNDS = 2, 12  # rounds of such draws, at least and at most
 ENOUGH, FEWEST = 96.0, 24.0  # effective draws that end the rounds; below which the weights say nothing
+TEMPERING, POWERS = 0.9, 60  # uneven weights are raised to a power of this base, of so many that are tried
 OF_PRIOR, DEEPEST, DESCENTS = 48, 4, 8  # of the prior; of which are descended from; and with so many linearisations
 LOWER = 0.5  # of J
+
+Moments = tuple[Array, Array]  # mean (n,) and covariance (n, n)
 
 
 @dataclass(frozen=True)
@@ -72,36 +76,40 @@ def sampled(
     weights of a first round that has not reached a tail do not tell that it is missing: one round is never enough.
     """
     stream, rounds, proposals = member_stream(seed, "joint importance"), list[list[Array]](), list[Proposal]()
-    proposal = Proposal(at.place.border, at.arrow.schur)
+    proposal, of_own = Proposal(at.place.border, at.arrow.schur), list[Moments | None]([None] * len(experiments))
     for number in range(ROUNDS):
         proposals.append(proposal)
         border = proposal.drawn((DRAWS,), stream)
         log_target = -0.5 * np.sum(border**2, axis=1) - 0.5 * border.shape[1] * np.log(2 * np.pi)
-        drawn = [_own(experiment, at, border, stream) for experiment in experiments]
-        for _, log_ratio in drawn:
+        drawn = [_own(e, at, border, moments, stream) for e, moments in zip(experiments, of_own, strict=True)]
+        for _, log_ratio, _ in drawn:
             log_target = log_target + logsumexp(log_ratio, axis=1) - np.log(INNER)
-        rounds.append([border, log_target, *(part for pair in drawn for part in pair)])
-        border, log_target, *pairs = (np.concatenate(parts) for parts in zip(*rounds, strict=True))
+        rounds.append([border, log_target, *(part for of_it in drawn for part in of_it)])
+        border, log_target, *parts = (np.concatenate(of_all) for of_all in zip(*rounds, strict=True))
+        each = [parts[3 * i : 3 * i + 3] for i in range(len(experiments))]
         log_weights = (
             log_target - logsumexp([p.log_density(border) for p in proposals], axis=0) + np.log(len(proposals))
         )
-        if not np.isfinite(log_weights).any():
+        alive = np.isfinite(log_weights)
+        if alive.sum() < FEWEST:
             return None
         weights = shares_of(log_weights)
         effective = effective_number(weights)
         tell(f"{effective:.0f} effective draws after {number + 1} of at most {ROUNDS} rounds, {ENOUGH:.0f} are wanted")
         if (number + 1 >= LEAST and effective >= ENOUGH) or not border.shape[1]:
             break
-        capped = np.minimum(weights, len(weights) ** -0.5)  # Ionides 2008, J. Comput. Graph. Stat. 17, 295
-        covariance = np.atleast_2d(np.cov(border.T, aweights=capped))
-        proposal = Proposal(np.average(border, axis=0, weights=capped), np.asarray(np.linalg.inv(2 * covariance)))
+        centre, covariance = _moments(border[alive], log_weights[alive])
+        proposal = Proposal(centre, np.asarray(np.linalg.inv(2 * covariance)))
+        for e, (_, log, off) in enumerate(each):
+            log_own = log[alive] + (log_weights - logsumexp(log, axis=1))[alive, None]
+            of_own[e] = _moments(off[alive].reshape(log_own.size, off.shape[2]), log_own.ravel())
     if effective < FEWEST:
         return None
     order = np.argsort(border[:, 0], kind="stable") if border.shape[1] else np.arange(len(border))
     taken = order[resampled(weights[order], count, stream)]
     own_members = tuple(
         np.concatenate([own[i, resampled(shares_of(log[i]), 1, stream)] for i in taken])  # one each, by their weights
-        for own, log in zip(pairs[::2], pairs[1::2], strict=True)
+        for own, log, _ in each
     )
     evidence = float(logsumexp(log_weights)) - float(np.log(len(border)))
     return JointMembers(border[taken], own_members, effective, evidence)
@@ -132,37 +140,35 @@ class Proposal:
         )  # fmt: skip
 
 
-def _own(experiment: Experiment, at: ArrowSystem, border: Array, stream: np.random.Generator) -> tuple[Array, Array]:
-    """Own quantities (M, INNER, n_e) of an experiment given border (M, c), and ln p(y, v)/q(v) (M, INNER)."""
-    e, n = experiment.e, len(at.place.own[experiment.e])
-    means, precisions = _given(experiment, at, border)
-    proposal = Proposal(means[:, None], precisions[:, None])
-    own = proposal.drawn((len(border), INNER), stream)
+def _moments(points: Array, log_weights: Array) -> Moments:
+    """Mean (n,) and covariance (n, n) of points (D, n), with the largest power of the weights that leaves 2 √D of them
+    effective: of the few that weights as uneven as those of a first round leave, both are too narrow.
+    """
+    powers = (shares_of(power * log_weights) for power in TEMPERING ** np.arange(POWERS))
+    weights = next((w for w in powers if effective_number(w) >= 2 * len(w) ** 0.5), None)
+    return np.average(points, axis=0, weights=weights), np.atleast_2d(np.cov(points.T, aweights=weights))
+
+
+def _own(
+    experiment: Experiment, at: ArrowSystem, border: Array, moments: Moments | None, stream: np.random.Generator
+) -> tuple[Array, Array, Array]:
+    """Own quantities v (M, INNER, n_e) of an experiment given border (M, c), ln p(y, v)/q(v) (M, INNER), and how far
+    they are from where J is lowest, in units of its curvature there, of which ``moments`` are known from earlier draws.
+    """
+    e, n, arrow = experiment.e, len(at.place.own[experiment.e]), at.arrow
+    means, precisions = experiment.followed(border, at.place.border, at.place.own[e], arrow.blocks[e], arrow.edges[e])
+    units = np.swapaxes(np.linalg.inv(np.linalg.cholesky(precisions)), 1, 2)  # of the curvature: v = means + units u
+    proposals = [Proposal(means[:, None], precisions[:, None])]
+    if moments is not None:
+        spread = units @ moments[1] @ np.swapaxes(units, 1, 2)
+        proposals.append(Proposal((means + units @ moments[0])[:, None], np.asarray(np.linalg.inv(spread))[:, None]))
+    own = np.concatenate([p.drawn((len(border), INNER // len(proposals)), stream) for p in proposals], axis=1)
     points = experiment.joint.standard(e, np.repeat(border, INNER, axis=0), own.reshape(len(border) * INNER, n))
     costs = experiment.costs(points).reshape(len(border), INNER)
     log_p = -0.5 * np.sum(own**2, axis=2) - 0.5 * n * np.log(2 * np.pi)
-    return own, log_p - costs - proposal.log_density(own)
-
-
-def _given(experiment: Experiment, at: ArrowSystem, border: Array) -> tuple[Array, Array]:
-    """The Gaussian of an experiment's own quantities given border (M, c): mean (M, n_e), precision (M, n_e, n_e).
-
-    Followed from the mode in stages, each by Gauss–Newton from where the line through the last two leads: what one
-    experiment knows much better alone than what is shared, as a time shift, is off the arrow's straight line by many of
-    its standard deviations, and from there a descent may end in another minimum.
-    """
-    e, arrow = experiment.e, at.arrow
-    block = arrow.blocks[e]
-    precision = np.broadcast_to(block, (len(border), *block.shape))
-    if not experiment.joint.columns(e)[1]:
-        return np.zeros((len(border), 0)), precision
-    step = (border - at.place.border) / STAGES
-    mean, ahead = at.place.own[e], -np.linalg.solve(block, arrow.edges[e].T @ step.T).T
-    for stage in range(1, STAGES + 1):
-        before, there = mean, at.place.border + stage * step
-        mean, precision, _ = experiment.settled(there, mean + ahead, precision, STEPS)
-        ahead = mean - before
-    return mean, precision
+    log_q = logsumexp([p.log_density(own) for p in proposals], axis=0) - np.log(len(proposals))
+    off = np.linalg.solve(units, np.swapaxes(own - means[:, None], 1, 2))
+    return own, log_p - costs - log_q, np.swapaxes(off, 1, 2)
 
 
 def challenger(experiments: Sequence[Experiment], at: ArrowSystem, seed: int) -> Place | None:
