@@ -30,12 +30,18 @@ class Optics:
     """Optical properties that the frames of a movie share: contrast of a bubble against its background, width of a
     sharp edge (pixels).
 
-    ``spread`` is how well the contrast is known, as a share of it: 1 where it is not.
+    ``spread`` is how well the contrast is known, as a share of it: 1 where it is not; ``differs`` the share by which
+    that of a frame differs from it, ``noise`` the std of a pixel. ``rim`` is that of :mod:`en4dvar_movie.kernels`:
+    light, distance and width in pixels, without a rim 0, and ``rim_std`` how well a frame's are known.
     """
 
     contrast: float
     width: float = 2.0
     spread: float = 1.0
+    differs: float = 0.0
+    noise: float = 0.0
+    rim: tuple[float, ...] = (0.0, 0.0, 0.0)
+    rim_std: tuple[float, ...] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -63,6 +69,7 @@ class Outline:
     rows: float = 0.0
     rows_std: float = 1.0
     joined: float = 0.0
+    rim: tuple[float, ...] = (0.0, 0.0, 0.0)
 
     def amplitude(self, n: int) -> float:
         """Amplitude of mode n, in pixels; NaN where it was not fitted."""
