@@ -15,8 +15,7 @@ from en4dvar.plumbing.errors import DataError
 from en4dvar_movie.drifting import drift_of, shift_at
 from en4dvar_movie.fitting import FREE, fit_outline, tells_contrast
 from en4dvar_movie.frames import Frame, Movie
-from en4dvar_movie.outline import TILE, Circle, Optics, Outline, circle_through, labelled, locate, rim
-from en4dvar_movie.uncertainty import THRESHOLD
+from en4dvar_movie.outline import THRESHOLD, TILE, Circle, Optics, Outline, circle_through, labelled, locate, rim
 
 Image = npt.NDArray[Any]  # brightness (H, W), of any precision
 DEAD = 0.25  # of the brightness about it: where a background shows nothing of a bubble, as writing does
@@ -393,18 +392,18 @@ def share_changed(tiles: Array, noise: float) -> float:
 
 def _optics(background: Background, samples: Sequence[Frame], movie: Movie, circles: int) -> Optics:
     """What the sampled frames say of contrast, sharpness and rim. Raises :class:`DataError` where none has a bubble."""
-    seen: list[tuple[Image, Outline]] = []
+    shown: list[tuple[Image, Outline]] = []
     for image, ((place, contrast), *_) in _steadied(background, samples):
         outlines = fit_outline(image, place, Optics(-contrast), circles)
         if outlines is not None and outlines[0].seen > 0.15 and outlines[0].contrast < 0:
-            seen.append((image, outlines[0]))
-    if not seen:
+            shown.append((image, outlines[0]))
+    if not shown:
         raise DataError(
             f"{movie.path}: no frame shows a bubble that differs from the background; where the frames show more than "
             "the field about it, such as a holder or a screen, leave that out with --region or --mask"
         )
-    optics = _shared([o for _, o in seen], background.noise)
-    clearest = sorted(seen, key=lambda of: -of[1].seen * of[1].circle.R / of[1].width)[:TELLING]
+    optics = _shared([o for _, o in shown], background.noise)
+    clearest = sorted(shown, key=lambda of: -of[1].seen * of[1].circle.R / of[1].width)[:TELLING]
     rim, rim_std = (tuple(float(optics.width * n) for n in of) for of in (ANY_RIM, ANY_RIM_STD))
     rims = _again(clearest, replace(optics, differs=FREE, rim=rim, rim_std=rim_std), circles)
     values = np.array([o.rim for o in rims]).reshape(-1, 3)
@@ -413,11 +412,11 @@ def _optics(background: Background, samples: Sequence[Frame], movie: Movie, circ
         return optics
     rim, rim_std = tuple(np.median(values, axis=0)), tuple(_scatter(values))
     known = replace(optics, differs=FREE, rim=rim, rim_std=rim_std)
-    return replace(_shared(_again(seen, known, circles), background.noise), rim=rim, rim_std=rim_std)
+    return replace(_shared(_again(shown, known, circles), background.noise), rim=rim, rim_std=rim_std)
 
 
-def _again(seen: Sequence[tuple[Image, Outline]], optics: Optics, circles: int) -> list[Outline]:
-    fitted = [fit_outline(image, outline.circle, optics, circles) for image, outline in seen]
+def _again(shown: Sequence[tuple[Image, Outline]], optics: Optics, circles: int) -> list[Outline]:
+    fitted = [fit_outline(image, outline.circle, optics, circles) for image, outline in shown]
     return [outlines[0] for outlines in fitted if outlines is not None]
 
 

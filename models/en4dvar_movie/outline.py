@@ -13,6 +13,7 @@ MODES = 6  # of the outline
 TILE = 2  # pixels are averaged over tiles of this side
 LEAST_TILES = 6  # tiles of a patch
 MOST_PATCHES = 4  # patches of a frame
+THRESHOLD = 0.05  # of the contrast: what the level of the edge can be off by in all frames alike
 LEAST_CONTRAST = 0.08  # of the background's brightness
 
 

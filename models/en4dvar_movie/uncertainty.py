@@ -32,7 +32,7 @@ import numpy as np
 import numpy.typing as npt
 
 from en4dvar.model.state import Array
-from en4dvar_movie.outline import Optics, Outline
+from en4dvar_movie.outline import THRESHOLD, Optics, Outline
 
 NEIGHBOURS = 10  # frames to each side
 STUDENT = 2.92 / 1.645  # 95 % quantiles of t with 2 degrees of freedom and of the normal distribution
@@ -47,7 +47,6 @@ CLEARLY = 3.0  # std of noise by which a frame is blurred more than the sharpest
 BENT = 0.46  # of the exposure in steps: std of the radius in units of the blur that neighbours do not explain
 CUT = 3.0  # amplitudes of mode 2, by the share unseen: circles about cut ellipses are off by 1 to 4
 RIM = 0.5  # of its level at the edge: what is not known of a rim's shape
-THRESHOLD = 0.05  # of the contrast: what the level of the edge can be off by in all frames alike
 
 
 @dataclass(frozen=True)
