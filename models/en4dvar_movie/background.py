@@ -13,9 +13,9 @@ from scipy import ndimage
 from en4dvar.model.state import Array, Mask
 from en4dvar.plumbing.errors import DataError
 from en4dvar_movie.drifting import drift_of, shift_at
-from en4dvar_movie.fitting import fit_outline
+from en4dvar_movie.fitting import FREE, fit_outline, tells_contrast
 from en4dvar_movie.frames import Frame, Movie
-from en4dvar_movie.outline import TILE, Circle, Optics, circle_through, labelled, locate, rim
+from en4dvar_movie.outline import THRESHOLD, TILE, Circle, Optics, Outline, circle_through, labelled, locate, rim
 
 Image = npt.NDArray[Any]  # brightness (H, W), of any precision
 DEAD = 0.25  # of the brightness about it: where a background shows nothing of a bubble, as writing does
@@ -34,6 +34,9 @@ SAMPLES = 24  # frames looked at for what they share
 SMOOTH = 12.0  # pixels: the brightness that contrasts are relative to varies slowly
 LEAST_SPREAD = 0.002  # of the contrast
 FULL = 2  # power of its radius over its edge's width with which a bubble tells the contrast: small ones show less of it
+TELLING, LEAST_TELLING = 8, 4  # frames that are asked for a rim; and those that tell how much contrasts differ
+ANY_RIM, ANY_RIM_STD = (0.1, 2.5, 1.0), (3.0, 2.5, 2.0)  # a rim before it is fitted, in widths of the edge
+DENSITY = 1 / math.sqrt(2 * math.pi)  # of the normal distribution in its middle
 LARGE = 95  # per cent of the frames: from which on bubbles count alike
 NOISY = 0.1  # of a pixel's noise: what a contrast can be uncertain by for the noise
 SHARPEST = 5  # per cent of the frames: those where the bubble moved least within the exposure
@@ -388,26 +391,56 @@ def share_changed(tiles: Array, noise: float) -> float:
 
 
 def _optics(background: Background, samples: Sequence[Frame], movie: Movie, circles: int) -> Optics:
-    """Contrast and sharpness that the sampled frames share. Raises :class:`DataError` where none shows a bubble."""
-    optics = []
+    """What the sampled frames say of contrast, sharpness and rim. Raises :class:`DataError` where none has a bubble."""
+    shown: list[tuple[Image, Outline]] = []
     for image, ((place, contrast), *_) in _steadied(background, samples):
         outlines = fit_outline(image, place, Optics(-contrast), circles)
         if outlines is not None and outlines[0].seen > 0.15 and outlines[0].contrast < 0:
-            optics.append(outlines[0])
-    if not optics:
+            shown.append((image, outlines[0]))
+    if not shown:
         raise DataError(
             f"{movie.path}: no frame shows a bubble that differs from the background; where the frames show more than "
             "the field about it, such as a holder or a screen, leave that out with --region or --mask"
         )
-    contrasts = np.array([o.contrast for o in optics])
-    clear = np.array([o.circle.R / o.width for o in optics])
+    optics = _shared([o for _, o in shown], background.noise)
+    clearest = sorted(shown, key=lambda of: -of[1].seen * of[1].circle.R / of[1].width)[:TELLING]
+    rim, rim_std = (tuple(float(optics.width * n) for n in of) for of in (ANY_RIM, ANY_RIM_STD))
+    rims = _again(clearest, replace(optics, differs=FREE, rim=rim, rim_std=rim_std), circles)
+    values = np.array([o.rim for o in rims]).reshape(-1, 3)
+    heights = values[:, 0] * DENSITY / np.hypot([o.width for o in rims], values[:, 2])
+    if not rims or np.median(heights) - _scatter(heights) < THRESHOLD:
+        return optics
+    rim, rim_std = tuple(np.median(values, axis=0)), tuple(_scatter(values))
+    known = replace(optics, differs=FREE, rim=rim, rim_std=rim_std)
+    return replace(_shared(_again(shown, known, circles), background.noise), rim=rim, rim_std=rim_std)
+
+
+def _again(shown: Sequence[tuple[Image, Outline]], optics: Optics, circles: int) -> list[Outline]:
+    fitted = [fit_outline(image, outline.circle, optics, circles) for image, outline in shown]
+    return [outlines[0] for outlines in fitted if outlines is not None]
+
+
+def _scatter(values: Array) -> Array:
+    """Robust std of values (K, …) over K."""
+    return np.asarray(1.4826 * np.median(np.abs(values - np.median(values, axis=0)), axis=0))
+
+
+def _shared(outlines: Sequence[Outline], noise: float) -> Optics:
+    """Contrast and sharpness that outlines share."""
+    contrasts = np.array([o.contrast for o in outlines])
+    clear = np.array([o.circle.R / o.width for o in outlines])
     weights = np.minimum(clear, np.percentile(clear, LARGE)) ** FULL
     weights /= weights.sum()
     order = np.argsort(contrasts)
     contrast = float(contrasts[order][np.searchsorted(np.cumsum(weights[order]), 0.5)])
     spread = float(np.sqrt(weights @ (contrasts - contrast) ** 2))
     scatter = 1.2533 * spread / max(1 / float(weights @ weights) - 1, 1) ** 0.5  # of a median
-    clearest = CLEAR * min(o.variance * o.ratio for o in optics)
-    width = float(np.percentile([o.width for o in optics if o.variance * o.ratio <= clearest], SHARPEST))
-    scatter = min(scatter, NOISY * background.noise)  # more is not noise: bubbles differ in how bright their centre is
-    return Optics(contrast, width, max(scatter / -contrast, LEAST_SPREAD))
+    scatter = min(scatter, NOISY * noise)  # more is not noise: bubbles differ in how bright their centre is
+    clearest = CLEAR * min(o.variance * o.ratio for o in outlines)
+    width = float(np.percentile([o.width for o in outlines if o.variance * o.ratio <= clearest], SHARPEST))
+    optics = Optics(contrast, width, max(scatter / -contrast, LEAST_SPREAD), noise=noise)
+    telling = np.array([tells_contrast(o.circle.R, o.width, o.noise, optics) for o in outlines])
+    if telling.sum() >= LEAST_TELLING:  # what those differ by beside noise, bubbles do
+        differ = 1.4826 * float(np.median(np.abs(contrasts[telling] - contrast)))
+        optics = replace(optics, differs=max(differ**2 - (2 * NOISY * noise) ** 2, 0.0) ** 0.5 / -contrast)
+    return optics

@@ -17,12 +17,17 @@ FIRST_SPREAD = (0.03, 0.0, 0.0)  # of the contrast in the first turns
 LOOSE = 0.1  # how much less is known of the level next to an edge that is blurred
 CUTOFF = 5.0  # of Tukey's weights, in robust std
 DARKER = 3.0  # std of the contrast: no bubble is darker than the movie's clearest by more
+OWN = 6.0  # widths of the edge: a bubble with a larger radius may tell its contrast itself
+EVEN = 0.03  # of the contrast: what the brightness near the outline may scatter by beside noise if it does
+AGAINST = 2.5  # std of the contrast from which it then does
+FREE = 0.3  # of the contrast: what it may then differ by
+MOST_RIM = 20.0  # pixels: what the light of a rim, its distance and its width may be
 REACH = 4.0  # how far from the outline pixels are used, in widths of the edge
 APART = 1.5  # widths of the edge: nested circles that are closer are not told apart
 SHARP = 1.35  # widths of the movie's sharp edges: what is no wider is blurred by nothing else
 TWO = 2.6  # their own widths by which two edges lie apart that are no blurred one
 SURE = 0.03  # share of the squares that two edges must explain and a blurred one does not
-X, Y, R, W, LEVEL, CONTRAST, GLARE, RIM = range(SHAPE)
+X, Y, R, W, LEVEL, CONTRAST, GLARE, RIM, LIGHT, BESIDE, WIDE = range(SHAPE)
 
 
 def fit_outline(image: Array, start: Circle, optics: Optics, circles: int = 1) -> list[Outline] | None:
@@ -31,7 +36,7 @@ def fit_outline(image: Array, start: Circle, optics: Optics, circles: int = 1) -
     With several ``circles``, nested about one centre, one of each, the largest first.
     """
     fitted = _fit(image, start, optics, circles)
-    return None if fitted is None else _outlines(image, *fitted, optics)
+    return None if fitted is None else _outlines(image, *fitted)
 
 
 def two_edges(image: Array, start: Circle, optics: Optics) -> float:
@@ -39,7 +44,7 @@ def two_edges(image: Array, start: Circle, optics: Optics) -> float:
     single, double = (_fit(image, start, optics, circles) for circles in (1, 2))
     if single is None or double is None:
         return 0.0
-    (p, modes, _), (q, q_modes, noise) = single, double
+    (p, modes, *_), (q, q_modes, noise, _) = single, double
     ring = _ring(p, q[-1:])
     fits = (p, modes), (q, q_modes)
     wrong, less = (float(np.sum(np.minimum(residuals(image, *of, ring)[0] / noise, 5.0) ** 2)) for of in fits)
@@ -47,13 +52,14 @@ def two_edges(image: Array, start: Circle, optics: Optics) -> float:
     return float(q[-1]) if sharp and wrong - less > SURE * wrong else 0.0
 
 
-def _fit(image: Array, start: Circle, optics: Optics, circles: int) -> tuple[Array, int, float] | None:
-    """Parameters (P,), the highest mode and the noise."""
+def _fit(image: Array, start: Circle, optics: Optics, circles: int) -> tuple[Array, int, float, Optics] | None:
+    """Parameters (P,), the highest mode, the noise, and the optics as they are known for this frame."""
     radii = nested_radii(image, start, optics, circles)
     p = np.zeros(SHAPE + circles - 1)
     p[[X, Y, R, W, CONTRAST]] = start.x, start.y, radii[0], optics.width, optics.contrast
     p[SHAPE:] = radii[0] - radii[1:]
     p[RIM] = RIM_SHARE * radii[-1]
+    p[LIGHT : WIDE + 1] = optics.rim
     noise = abs(optics.contrast)
     modes = 1
     for turn in range(3):  # the ring of pixels follows the circle; the cutoff follows the noise
@@ -69,7 +75,17 @@ def _fit(image: Array, start: Circle, optics: Optics, circles: int) -> tuple[Arr
             return None
         p = _sorted(fitted, circles)
         noise = max(1.4826 * float(np.median(np.abs(residuals(image, p, modes, ring)[0]))), 1e-6)
-    return p, modes, noise
+    against = abs(p[CONTRAST] / optics.contrast - 1) > AGAINST * (optics.spread + optics.differs)
+    if against and optics.differs < FREE and p[R] > OWN * p[W]:
+        own = _fit(image, Circle(*p[:W]), replace(optics, differs=FREE), circles)
+        if own is not None and tells_contrast(own[0][R], own[0][W], own[2], optics):
+            return own
+    return p, modes, noise, optics
+
+
+def tells_contrast(radius: float, width: float, noise: float, optics: Optics) -> bool:
+    """True of a bubble that is much larger than its edge's width and evenly dark, but for the noise of a pixel."""
+    return radius > OWN * width and noise**2 < optics.noise**2 + (EVEN * optics.contrast) ** 2
 
 
 def nested_radii(image: Array, start: Circle, optics: Optics, circles: int) -> Array:
@@ -107,7 +123,8 @@ def _sorted(p: Array, circles: int) -> Array:
 
 def _ring(p: Array, gaps: Array) -> Array:
     reach = max(REACH * p[W], 6.0)
-    return np.array([p[X], p[Y], max(0.0, _innermost(p, gaps) - reach), p[R] + reach])
+    rim = p[BESIDE] + 2 * np.hypot(p[W], p[WIDE]) if p[LIGHT] else 0.0
+    return np.array([p[X], p[Y], max(0.0, _innermost(p, gaps) - reach), p[R] + max(reach, rim)])
 
 
 def _glare_is_far(p: Array, gaps: Array, ring: Array) -> bool:
@@ -126,7 +143,9 @@ def _known(p: Array, gaps: Array, ring: Array, noise: float, optics: Optics) -> 
     moved = max(p[W] ** 2 - optics.width**2 - chance, 0.0) ** 0.5
     loose = max(0.0, moved / p[R] - 0.1)  # a bubble that collapses within the exposure is fainter, its halo blurred
     precision[LEVEL] = noise**2 / (max(LEVEL_SPREAD, optics.spread / 3, LOOSE * loose) * optics.contrast) ** 2
-    precision[CONTRAST] = noise**2 / ((optics.spread + loose) * optics.contrast) ** 2
+    precision[CONTRAST] = noise**2 / ((optics.spread + optics.differs + loose) * optics.contrast) ** 2
+    centre[LIGHT : WIDE + 1] = optics.rim
+    precision[LIGHT : WIDE + 1] = noise**2 / np.maximum(optics.rim_std, 1e-6) ** 2
     precision[len(p) - len(gaps) :] = noise**2 / p[R] ** 2  # of circles that cannot be told apart
     return centre, precision
 
@@ -139,7 +158,7 @@ def _descend(
     centre, precision = _known(p, p[SHAPE + 2 * (modes - 1) :], ring, noise, optics)
     nested = len(p) > SHAPE + 2 * (modes - 1)
     bright = 0.0, -optics.contrast  # what the centre can be between
-    darkest = (1 + DARKER * optics.spread) * optics.contrast
+    darkest = (1 + DARKER * (optics.spread + optics.differs)) * optics.contrast
     A, g, total, cost = normal_equations(image, p, modes, ring, cutoff)
     if total < 3 * len(p):
         return None
@@ -153,6 +172,7 @@ def _descend(
         trial = p + step
         trial[W] = np.clip(trial[W], 0.3, max(2 * p[W], 1.0))
         trial[GLARE] = np.clip(trial[GLARE], min(bright), max(bright))
+        trial[LIGHT : WIDE + 1] = np.clip(trial[LIGHT : WIDE + 1], 0.0, MOST_RIM)
         trial[CONTRAST] = max(trial[CONTRAST], darkest)
         inner = _innermost(trial, trial[SHAPE + 2 * (modes - 1) :])
         trial[RIM] = np.clip(trial[RIM], 0.1 * inner, 0.75 * inner)
@@ -236,6 +256,7 @@ def _outlines(image: Array, p: Array, modes: int, noise: float, optics: Optics) 
             seen=share_inside(image, circle),
             rows=float(np.subtract(*(product / slopes))),
             rows_std=float(noise * np.sqrt(np.sum(1 / slopes))),
+            rim=tuple(p[LIGHT : WIDE + 1]),
             # as if evenly spread over the distance from which they are told apart
             joined=float(np.hypot(APART * p[W] / 12**0.5, np.std(inside))) if len(group) > 1 else 0.0,
         )

@@ -13,6 +13,7 @@ MODES = 6  # of the outline
 TILE = 2  # pixels are averaged over tiles of this side
 LEAST_TILES = 6  # tiles of a patch
 MOST_PATCHES = 4  # patches of a frame
+THRESHOLD = 0.05  # of the contrast: what the level of the edge can be off by in all frames alike
 LEAST_CONTRAST = 0.08  # of the background's brightness
 
 
@@ -30,12 +31,18 @@ class Optics:
     """Optical properties that the frames of a movie share: contrast of a bubble against its background, width of a
     sharp edge (pixels).
 
-    ``spread`` is how well the contrast is known, as a share of it: 1 where it is not.
+    ``spread`` is how well the contrast is known, as a share of it: 1 where it is not; ``differs`` the share by which
+    that of a frame differs from it, ``noise`` the std of a pixel. ``rim`` is that of :mod:`en4dvar_movie.kernels`:
+    light, distance and width in pixels, without a rim 0, and ``rim_std`` how well a frame's are known.
     """
 
     contrast: float
     width: float = 2.0
     spread: float = 1.0
+    differs: float = 0.0
+    noise: float = 0.0
+    rim: tuple[float, ...] = (0.0, 0.0, 0.0)
+    rim_std: tuple[float, ...] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -63,6 +70,7 @@ class Outline:
     rows: float = 0.0
     rows_std: float = 1.0
     joined: float = 0.0
+    rim: tuple[float, ...] = (0.0, 0.0, 0.0)
 
     def amplitude(self, n: int) -> float:
         """Amplitude of mode n, in pixels; NaN where it was not fitted."""

@@ -32,7 +32,7 @@ import numpy as np
 import numpy.typing as npt
 
 from en4dvar.model.state import Array
-from en4dvar_movie.outline import Optics, Outline
+from en4dvar_movie.outline import THRESHOLD, Optics, Outline
 
 NEIGHBOURS = 10  # frames to each side
 STUDENT = 2.92 / 1.645  # 95 % quantiles of t with 2 degrees of freedom and of the normal distribution
@@ -46,7 +46,7 @@ LIKELY = 2.0  # std of noise beyond which a frame is blurred by motion rather th
 CLEARLY = 3.0  # std of noise by which a frame is blurred more than the sharpest, whose own noise made them so
 BENT = 0.46  # of the exposure in steps: std of the radius in units of the blur that neighbours do not explain
 CUT = 3.0  # amplitudes of mode 2, by the share unseen: circles about cut ellipses are off by 1 to 4
-THRESHOLD = 0.05  # of the contrast: what the level of the edge can be off by in all frames alike
+RIM = 0.5  # of its level at the edge: what is not known of a rim's shape
 
 
 @dataclass(frozen=True)
@@ -157,7 +157,10 @@ def _errors(outline: Outline, ratio: float, hidden: float, turned: bool, optics:
     elif outline.seen < 0.9:
         words = f"{outline.seen:.0%} of the outline lies in the frame"
     # the edge's profile has the slope 1/(√(2π) w) at its half level
-    common = float(THRESHOLD * np.sqrt(2 * np.pi) * outline.width)
+    light, beside, wide = outline.rim
+    blurred = np.hypot(outline.width, wide)
+    there = light * np.exp(-0.5 * (beside / blurred) ** 2) / blurred / np.sqrt(2 * np.pi)  # the rim's level at the edge
+    common = float(np.hypot(THRESHOLD, RIM * there) * np.sqrt(2 * np.pi) * outline.width)
     return Errors(radius, float(np.sqrt(variance)), common, words, outline.mode_std * float(np.sqrt(ratio)))
 
 
