@@ -39,7 +39,9 @@ def all_figures(study: Study) -> Iterator[Captioned]:
         members = len(fit.members("mu"))
         caption = f"Combined final ensembles of all sets, {members} members; {fit.gel} gel, general QLKV."
         yield f"members_{named(fit.gel)}", caption, combined(study, fit)
-        caption = f"Iterative estimates from the initial guess (0) on, one line a data set; {fit.gel} gel, general QLKV."
+        caption = (
+            f"Iterative estimates from the initial guess (0) on, one line a data set; {fit.gel} gel, general QLKV."
+        )
         yield f"iterations_{named(fit.gel)}", caption, iterations(fit)
     if study.populations:
         caption = "Population mean (95 % interval) by the hierarchical step and mean of the stacked ensembles"

@@ -16,6 +16,7 @@ from en4dvar_movie.drifting import drift_of, shift_at
 from en4dvar_movie.fitting import FREE, fit_outline, tells_contrast
 from en4dvar_movie.frames import Frame, Movie
 from en4dvar_movie.outline import THRESHOLD, TILE, Circle, Optics, Outline, circle_through, labelled, locate, rim
+from en4dvar_movie.surfaces import smooth_surface, surface_beside_discs
 
 Image = npt.NDArray[Any]  # brightness (H, W), of any precision
 DEAD = 0.25  # of the brightness about it: where a background shows nothing of a bubble, as writing does
@@ -144,7 +145,13 @@ def find_background(movie: Movie, circles: int = 1, watched: Mask | None = None)
     if watched is not None:
         blind |= ~watched
     empty = 0 if _begins_with_a_bubble(first, samples, noise, blind, unit) else _quiet(leading, first, noise, blind)
-    level = _without_specks(leading[:empty], noise) if empty else smooth_surface(samples, blind, unit)
+    level = _without_specks(leading[:empty], noise) if empty else surface_beside_discs(samples, blind, unit)
+    if level is None:
+        raise DataError(
+            f"{movie.path}: no frame is empty, and beside any smooth background hardly anything has a round outline, "
+            "as where the bubble covers nearly all of most frames; let the movie begin with an empty frame, or leave "
+            "out with --region or --mask what is neither bubble nor background"
+        )
     if empty > 2:
         steady = pixel_noise(np.array([f - level for f in leading[:empty]]), unit)
         noise = steady * float(np.sqrt(empty / (empty - 1)))
@@ -188,23 +195,6 @@ def _outside(frames: Sequence[Frame]) -> Mask:
     least = np.min(np.array([ndimage.uniform_filter(f.astype(np.float32), 5) for f in frames]), axis=0)
     steady = np.mean((least > 0.5 * usual)[beside & ~blurred] if (beside & ~blurred).any() else 0)
     return np.asarray(blurred & (steady > 1 - LIVELY))
-
-
-def smooth_surface(frames: Sequence[Frame], blind: Mask, unit: float) -> Array:
-    """A quadratic surface (H, W) through the background of frames that all hold a bubble, where it is not ``blind``."""
-    typical = np.median(np.array(frames, dtype=np.float32), axis=0)
-    y, x = np.mgrid[-1 : 1 : typical.shape[0] * 1j, -1 : 1 : typical.shape[1] * 1j]
-    terms = np.stack([np.ones_like(x), x, y, x * y, x * x, y * y]).reshape(6, -1)
-    values = typical.ravel().astype(float)
-    field, rim = ~blind, max(2, min(typical.shape) // 10)
-    kept = (field & ~ndimage.minimum_filter(field, 2 * rim + 1, mode="constant")).ravel()
-    for _ in range(8):
-        chosen = terms * kept
-        fitted = np.linalg.solve(chosen @ terms.T, chosen @ values)  # of terms within ±1, so that squares lose little
-        off = values - fitted @ terms
-        near = np.abs(off) <= 3 * max(1.4826 * float(np.median(np.abs(off[kept]))), 0.5 * unit)
-        kept = near & field.ravel()
-    return np.asarray((fitted @ terms).reshape(typical.shape).astype(np.float32))
 
 
 def _lit_as(frame: Image, other: Image) -> Image:

@@ -28,7 +28,8 @@ BUBBLE = (
 
 # and inside the reader of movies
 MOVIE = (
-    "decoders", "numbering", "frames", "kernels", "outline", "fitting", "drifting", "background", "uncertainty",
+    "decoders", "numbering", "frames", "kernels", "outline", "fitting", "drifting", "surfaces", "background",
+    "uncertainty",
     "merged", "flashes", "candidates", "following", "choice", "tracking", "table", "page", "scene",
     "filming", "commands", "warm_up",
 )  # fmt: skip

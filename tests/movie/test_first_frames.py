@@ -7,6 +7,7 @@ import pytest
 from movies import movie_of
 from scipy.special import expit
 
+from en4dvar.plumbing.errors import DataError
 from en4dvar_movie.tracking import track
 
 COLLAPSE = [*(62 * (1 - np.linspace(0, 0.97, 14) ** 2) ** 0.5), 24.0, 32, 36, 37, 36, 32, 25, 20, 24, 26, *[22.0] * 26]
@@ -65,3 +66,24 @@ def test_empty_frames_before_a_bubble_that_the_frame_cuts_are_the_background(rad
     result = track(movie_of(filmed((96, 128), 1.2, radii=radii, empty=4)))
     assert result.background.frames == 4
     assert wrong(result.readings, [0.0] * 4 + list(radii)) == []
+
+
+MOSTLY_COVERED = [*(90 * (1 - np.linspace(0, 0.97, 20) ** 2) ** 0.5), 30.0, 50, 64, 70, 71, 70, 64, 52, *[60.0] * 32]
+
+
+@pytest.mark.parametrize(("shape", "off"), [((96, 144), (0, 0)), ((112, 160), (10, 6)), ((64, 192), (-9, 2))])
+def test_a_bubble_that_covers_most_of_most_frames_is_read_by_its_arcs(shape, off):
+    result = track(movie_of(filmed(shape, off=off, radii=MOSTLY_COVERED)))
+    assert result.background.frames == 0
+    assert wrong(result.readings, MOSTLY_COVERED) == []
+    rest = [r.radius for r in result.readings[-30:] if r.used]
+    assert len(rest) > 25
+    assert abs(np.mean(rest) / 60 - 1) < 0.01
+
+
+def test_a_bubble_that_leaves_hardly_any_background_to_be_seen_is_refused():
+    radii = 1.2 * np.array(MOSTLY_COVERED)
+    with pytest.raises(
+        DataError, match="no frame is empty, and beside any smooth background hardly anything has a round"
+    ):
+        track(movie_of(filmed((96, 144), radii=radii)))

@@ -1,0 +1,103 @@
+"""The background of a movie without an empty frame: the smooth surface beside which what differs is a disc."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
+
+from en4dvar.model.state import Array, Mask
+from en4dvar_movie.frames import Frame
+from en4dvar_movie.outline import MOST_PATCHES, circle_through, labelled, rim
+
+Image = npt.NDArray[Any]  # brightness (H, W), of any precision
+ROUNDS, LEANINGS = 8, 30  # of a fit that leaves out what is far off, and of one that lies above most
+OFTEN = 90  # per cent of the frames that are darker than what begins an envelope
+WITHIN = 0.01  # weight of what lies within an envelope, as a share of that of what lies beyond it
+TOPS = 98  # per cent of the pixels that lie lower over an envelope than those that tell its scatter
+MEAN, DIFFERS = 3, 0.3  # pixels: side of squares that differ from a level; by which share of what differs most
+LEAST = 24  # pixels of a patch
+BETTER = 1 / 3  # of what no disc explains beside the usual surface: what may be left beside another that replaces it
+MOST = 2  # times what no disc explains: what discs must
+DISCS = 0.5  # of what discs explain beside the usual surface: what they must beside another
+UNTOLD = 0.1  # of the frames: what structure that no disc explains may take
+
+
+def surface_beside_discs(frames: Sequence[Frame], blind: Mask, unit: float) -> Array | None:
+    """A quadratic surface (H, W) through the background of frames that all hold a bubble, where it is not ``blind``.
+    None where beside each of them most of what differs is no disc.
+
+    Of three, that beside which discs explain best what differs: the one through what the border usually shows, which a
+    bubble may cover, and those that begin as a plane over the brightest and under the darkest that pixels often show.
+    """
+    films = np.array(frames, dtype=np.float32)
+    surfaces = [smooth_surface(frames, blind, unit)]
+    smooth = ndimage.uniform_filter(films, (0, MEAN, MEAN))
+    terms = _terms(blind.shape)
+    for side, extreme in zip((-1, 1), np.percentile(smooth, (100 - OFTEN, OFTEN), axis=0), strict=True):
+        over = np.zeros_like(extreme)
+        for _ in range(LEANINGS):  # asymmetric least squares
+            over = side * (extreme - _fitted(terms[:3], extreme, ~blind * np.where(over >= 0, 1.0, WITHIN)))
+        tops = over[~blind & (over >= np.percentile(over[~blind], TOPS))]
+        surfaces.append(_trimmed(terms, extreme, np.abs(over) <= _far(tops, unit), ~blind, unit))
+    discs, rest = np.array([_discs_and_rest(films - surface, ~blind) for surface in surfaces]).T
+    told = discs > np.maximum(MOST * rest, DISCS * discs[0])
+    left = np.where(told | (rest < [UNTOLD, 0, 0]), rest, np.inf)
+    best = int(np.argmin(left * (BETTER, 1, 1)))
+    return surfaces[best] if left[best] < np.inf else None
+
+
+def smooth_surface(frames: Sequence[Frame], blind: Mask, unit: float) -> Array:
+    """A quadratic surface (H, W) through what frames usually show and most of their border does."""
+    field, border = ~blind, max(2, min(blind.shape) // 10)
+    kept = field & ~ndimage.minimum_filter(field, 2 * border + 1, mode="constant")
+    typical = np.median(np.array(frames, dtype=np.float32), axis=0)
+    return _trimmed(_terms(blind.shape), typical, kept, field, unit)
+
+
+def _terms(shape: tuple[int, ...]) -> Array:
+    y, x = np.mgrid[-1 : 1 : shape[0] * 1j, -1 : 1 : shape[1] * 1j]  # within ±1, so that squares lose little
+    return np.stack([np.ones_like(x), x, y, x * y, x * x, y * y]).reshape(6, -1)
+
+
+def _fitted(terms: Array, values: Image, weights: Array | Mask) -> Array:
+    chosen = terms * weights.ravel()
+    fitted = np.linalg.solve(chosen @ terms.T, chosen @ values.ravel().astype(float))
+    return np.asarray((fitted @ terms).reshape(values.shape))
+
+
+def _trimmed(terms: Array, values: Image, kept: Mask, field: Mask, unit: float) -> Array:
+    """The surface through the pixels that are ``kept`` at first, then through all of the field that lie near it."""
+    for _ in range(ROUNDS):
+        surface = _fitted(terms, values, kept & field)
+        off = np.abs(values - surface)
+        kept = field & (off <= _far(off[kept & field], unit))
+    return np.asarray(surface, dtype=np.float32)
+
+
+def _far(off: Array, unit: float) -> float:
+    return 3 * max(1.4826 * float(np.median(np.abs(off))), 0.5 * unit)
+
+
+def _discs_and_rest(differences: Array, field: Mask) -> tuple[float, float]:
+    """Of images (K, H, W): the share that differs and lies in discs through the rims of what differs, and the share
+    that is in either but not in both. What has no rim, as a bubble that fills the field, tells nothing.
+    """
+    smooth = np.abs(ndimage.uniform_filter(differences, (0, MEAN, MEAN)))
+    most = float(np.max(np.percentile(smooth[:, field], 99, axis=1)))
+    y, x = np.ogrid[: field.shape[0], : field.shape[1]]
+    both = either = 0
+    for differs in (smooth > DIFFERS * most) & field:
+        labels, sizes = labelled(ndimage.binary_fill_holes(differs))  # bright centres are holes
+        for number in np.argsort(-sizes)[: min(MOST_PATCHES, np.sum(sizes >= LEAST))]:
+            patch = labels == number
+            points = rim(patch)
+            sides = [np.array(half(points), dtype=int).T for half in (np.floor, np.ceil)]
+            circle = circle_through(points[np.all([field[v, u] for u, v in sides], axis=0)])
+            if circle is None:
+                continue
+            disc = field & ((x - circle.x) ** 2 + (y - circle.y) ** 2 < circle.R**2)
+            both, either = both + np.sum(patch & disc), either + np.sum(patch | disc)
+    of_all = len(differences) * np.sum(field)
+    return both / of_all, (either - both) / of_all
