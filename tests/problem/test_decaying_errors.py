@@ -5,12 +5,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from estimation.test_field_modes import READ, TIMES, VALUES, line
 from toys import Linear, make_problem
 
 import en4dvar
-from en4dvar.data.noise import CorrelatedNoise, Correlation, DecayingErrors, Linearisation, Predicted
+from en4dvar.data.noise import CorrelatedNoise, Correlation, DecayingErrors, Linearisation, Predicted, SharedErrors
+from en4dvar.data.observations import Observations
+from en4dvar.data.series import Places, Series
 from en4dvar.estimation.assimilate import assimilate
-from en4dvar.report.result import load_result
+from en4dvar.report.result import Result, load_result
 from en4dvar.schemes.settings import AssimilationSettings
 
 K = 40
@@ -89,3 +92,15 @@ def test_a_file_holds_what_a_rerun_needs(tmp_path):
     precision = t @ np.linalg.solve(R, t) + 1
     assert result.rows[0].mean == pytest.approx((t @ np.linalg.solve(R, y) + 1) / precision, abs=0.02 * precision**-0.5)
     assert result.rows[0].std == pytest.approx(precision**-0.5, rel=0.03)
+
+
+@pytest.mark.parametrize("correlation", [DecayingErrors(np.arange(6) / 3), SharedErrors(np.full((6, 1), 0.5))])
+def test_a_file_of_readings_at_places_holds_the_correlation_too(tmp_path, correlation):
+    noise = CorrelatedNoise(np.full(6, 0.3), np.zeros(6), correlation)
+    problem = line()
+    u = Series(problem.observable, TIMES, VALUES, noise, places=Places.at_indices(READ))
+    problem = replace(problem, observations=Observations.of_series([u]))
+    analysis = assimilate(problem, AssimilationSettings(members=40), 1)
+    stored = load_result(Result.from_analysis(analysis, {}).save(tmp_path / "posterior.nc"))
+    again = stored.observations().noise
+    np.testing.assert_allclose(again.correlation.matrix, correlation.matrix, atol=1e-15)
