@@ -16,6 +16,7 @@ from en4dvar.diagnosis.response.what_if import exclusion, is_manifold
 from en4dvar.model.state import Array
 from en4dvar.report.chart import POINTS, Chart, Panel, Row
 from en4dvar.report.text import (
+    axis_label,
     fixed,
     number_like,
     plain_number,
@@ -180,8 +181,10 @@ def times(result: StoredResult) -> Array:
 
 
 def time_label(result: StoredResult) -> str:
-    """Of an axis of :func:`times`."""
-    return time_axis(result.group("observed_data")[result.axes[0].time])
+    """Of an axis of :func:`times`; of series whose clocks begin at other times it is the model's alone."""
+    observed = [result.group("observed_data")[axis.time] for axis in result.axes]
+    labels = {time_axis(time) for time in observed}
+    return labels.pop() if len(labels) == 1 else axis_label(observed[0], "time")
 
 
 def whitened(result: StoredResult) -> Array:

@@ -97,7 +97,7 @@ def _of_data(a: Analysis, item: Item) -> dict[str, Any]:
     return {**TIME.attributes(a, item), **({"time_zero": zero} if zero else {})}
 
 
-READ_TIME = UnitRule(TIME.words, _of_data, TIME.keys)
+READ_TIME = UnitRule(f"{TIME.words}, at whose zero the clock of the data shows `time_zero`", _of_data, TIME.keys)
 FIXED = UnitRule("its own", lambda _, item: item.about, ("units", "symbol"))
 LIMIT = UnitRule("its own", lambda _, item: item.about)
 PLACE = UnitRule("of the field's coordinates", lambda _, item: {"units": item.held.places.unit})

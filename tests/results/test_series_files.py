@@ -14,8 +14,11 @@ import en4dvar
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.report.figures import all_figures
+from en4dvar.report.history import history
 from en4dvar.report.page import render_set
+from en4dvar.report.responses import time_label
 from en4dvar.report.result import Result, load_result
+from en4dvar.results.store import load_stored
 from en4dvar.runs.rerun import rerun
 from en4dvar.runs.together import join
 from en4dvar.schemes.settings import AssimilationSettings
@@ -50,6 +53,19 @@ def test_each_series_has_its_dimension(analysis, result):
     paths = np.hstack([curves["p_path"][0], curves["q_path"][0]])
     assert paths.dtype == np.float32
     np.testing.assert_allclose(paths, analysis.posterior_trajectories, rtol=2.0**-24)
+
+
+def test_the_clock_of_each_series_is_kept(analysis, tmp_path):
+    y, parts = analysis.observations, analysis.problem.parts
+    zero = np.repeat([0.0, 3.0, 5.0], [part.end - part.begin for part in parts])
+    late = replace(analysis, problem=replace(analysis.problem, observations=replace(y, zero=zero)))
+    Result.from_analysis(late, {}).save(tmp_path / "posterior.nc")
+    stored = load_stored(tmp_path / "posterior.nc")
+    again = stored.observations({part.name: part.observable for part in parts})
+    assert np.array_equal(again.file_times, y.times + zero)
+    rows = history(stored).rows
+    assert [row.panels[0].xlabel for row in rows[1::2]] == ["time (s)", "time since 3 s of the data (s)", "place (m)"]
+    assert time_label(stored) == "time (s)"
 
 
 @pytest.mark.parametrize("scale", [1e50, 1e-50])
