@@ -251,7 +251,8 @@ def _one_descent(case: Case) -> str:
     own, n = case.a.settings.own, len(case.a.parameters)
     wanted = ["assimilation.starts: 2"] * (getattr(own, "starts", 2) < 2)
     wanted += ["assimilation.start: best-member"] * (not isinstance(getattr(own, "start", ""), str))
-    wanted += ["assimilation.linearisation: bundle"] * (getattr(own, "linearisation", "") == "transform")
+    noisy = case.a.settings.stochastic_model  # which takes no bundle
+    wanted += ["assimilation.linearisation: bundle"] * (getattr(own, "linearisation", "") == "transform" and not noisy)
     wanted += [f"assimilation.members: {2 * n + 2}"] * (case.a.settings.members <= n + 1)
     return f"set {' and '.join(wanted)}" if wanted else "compare with another seed"
 
