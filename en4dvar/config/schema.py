@@ -25,7 +25,7 @@ from en4dvar.plumbing.hints import shown
 from en4dvar.plumbing.units import Quantity, parse_quantity
 from en4dvar.schemes import DEFAULT, ON_A_WINDOW, keys_of, unread
 from en4dvar.schemes.base import Scheme
-from en4dvar.schemes.settings import AssimilationSettings, Localisation, beside_localisation
+from en4dvar.schemes.settings import AssimilationSettings, Localisation, beside_localisation, beside_noise
 
 QuantityText = str | int | float
 T = TypeVar("T")
@@ -329,7 +329,7 @@ class Assimilation(_Settings):
 
     @classmethod
     def unread(cls, section: Mapping[str, Any]) -> dict[str, str]:
-        faults: dict[str, str] = super().unread(section)
+        faults: dict[str, str] = beside_noise(section) | super().unread(section)
         name = section.get("scheme", DEFAULT)
         if section.get("localisation") is not None and isinstance(name, str) and name in ON_A_WINDOW:
             faults |= beside_localisation(name, section)

@@ -234,7 +234,8 @@ def mode_cautions(
 ) -> Iterator[Caution]:
     """Warnings about the minima that count, and the ``modes`` about them; ``result`` is there where sampled.
 
-    ``settled``: whether the search for the lowest of them is.
+    ``settled``: whether the search for the lowest of them is. Where not sampled, the first is the one that members
+    describe, which counts however little of the probability it holds: the lowest may be the narrowest.
     """
     lowest = minima[0].cost
     if result is not None and result.lowest < lowest - MISSED:
@@ -246,7 +247,7 @@ def mode_cautions(
         number = "one descent" if minima[0].descents < 2 else f"{minima[0].descents} descents"
         words = f"only {number} ended in the lowest minimum, J = {lowest:.1f}; {others}"
         yield caution("starts-disagree", words)
-    seen = [m for m in modes if m.weight >= SEEN]
+    seen = [m for i, m in enumerate(modes) if m.weight >= SEEN or (i == 0 and result is None)]
     if len(seen) < 2:
         return
     distances = _apart(prior, seen)

@@ -235,7 +235,8 @@ class Minimiser(Scheme):
     linearisation: Annotated[
         Literal["auto", "tangent", "bundle", "transform"],
         "By the derivatives that a model gives (tangent), by runs close to the iterate (bundle), or by regression over "
-        "the ensemble (transform); auto: tangent where the model gives derivatives, else bundle.",
+        "the ensemble (transform); auto: transform of a stochastic_model, else tangent where the model gives "
+        "derivatives, else bundle.",
     ] = "auto"
     epsilon: Annotated[float, Gt(0), Le(1), "Largest size of the bundle, in prior standard deviations."] = 1e-3
     step_control: Annotated[

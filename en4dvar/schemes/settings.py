@@ -104,6 +104,9 @@ class AssimilationSettings:
             values = {f.name: (getattr(own, f.name), f.default) for f in fields(own)}
             values |= {key: (keys.get(key, common[key]), common[key]) for key in AFTERWARDS}
             faults |= beside_localisation(scheme, [key for key, (value, default) in values.items() if value != default])
+        elif keys.get("stochastic_model") and own.minimiser:
+            faults |= beside_noise({**keys, "linearisation": own.minimiser.linearisation})
+            own = replace(own.minimiser, linearisation="transform")
         if faults:
             raise ConfigError([Fault(words, key) for key, words in faults.items()])
         for name, value in {"scheme": scheme, **common, **keys, "own": own}.items():
@@ -119,6 +122,14 @@ class AssimilationSettings:
         """Every key with its value, the scheme's own included."""
         every = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "own"}
         return every | {f.name: getattr(self.own, f.name) for f in fields(self.own)}
+
+
+def beside_noise(section: Mapping[str, Any]) -> dict[str, str]:
+    """A linearisation by runs that are close together, of a stochastic model, with a message."""
+    if section.get("stochastic_model") is not True or section.get("linearisation") not in ("bundle", "tangent"):
+        return {}
+    why = "close to each other, runs of a stochastic_model tell its noise instead of its slope"
+    return {"linearisation": f"{why}; leave it out, or set linearisation: transform"}
 
 
 def beside_localisation(scheme: str, keys: Collection[str]) -> dict[str, str]:

@@ -11,6 +11,7 @@ from rows import row
 from run_files import configuration, run_cli
 from toy_config import write_toy
 
+from en4dvar import estimate
 from en4dvar.assembly.build import build
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.model.forward import ForwardModel
@@ -19,6 +20,7 @@ from en4dvar.runs.cycles import run_twin
 from en4dvar.runs.rerun import rerun
 from en4dvar.runs.runner import run
 from en4dvar.schemes.etkf import ETKF
+from en4dvar.schemes.settings import AssimilationSettings
 from en4dvar.series.sequential import SequentialSettings
 from en4dvar.series.twin import TwinExperiment, conduct
 
@@ -87,6 +89,36 @@ def test_it_can_be_accepted(tmp_path):
 
 
 @pytest.mark.fault("model-varies")
+@pytest.mark.parametrize("noise", [0.002, 0.007, 0.02])
+def test_one_with_noise_of_its_own_is_estimated(noise):
+    """A straight line read to 0.1, against the closed form: differences of runs that are close are all noise."""
+    rng, t, prior = np.random.default_rng(0), np.linspace(0, 5, 9), {"prior": "normal", "mean": 1, "std": 1}
+    y, slopes = 2 - 0.3 * t + 0.1 * rng.standard_normal(9), np.stack([np.ones(9), t], axis=1)
+    covariance = np.linalg.inv(np.eye(2) + slopes.T @ slopes / 0.01)
+    mean, std = covariance @ (1 + slopes.T @ y / 0.01), np.sqrt(np.diag(covariance))
+    line = estimate(
+        lambda p, t: p["a"] + p["b"] * t + noise * rng.standard_normal(9), (t, y), {"a": prior, "b": prior},
+        error=0.1, seed=0, progress=False, assimilation={"stochastic_model": True},
+    )  # fmt: skip
+    assert [row.mean for row in line.rows] == pytest.approx(mean, abs=0.1 * std.min())
+    assert [row.std for row in line.rows] == pytest.approx(std, rel=0.1)
+    assert not any(row.untrusted for row in line.rows)
+    assert not any("bundle" in c.advice for c in line.cautions)
+
+
+@pytest.mark.fault("model-varies")
+@pytest.mark.parametrize("linearisation", ["bundle", "tangent"])
+def test_runs_that_are_close_are_refused_beside_it(tmp_path, linearisation):
+    settings = AssimilationSettings(stochastic_model=True)
+    assert settings.linearisation == "transform"
+    with pytest.raises(ConfigError, match=r"linearisation: .* its noise instead of its slope; leave"):
+        replace(settings, linearisation=linearisation)
+    path = varying(tmp_path, "Noisy", stochastic_model="true", linearisation=linearisation)
+    with pytest.raises(ConfigError, match=r"assimilation\.linearisation: .* its noise instead of its slope; leave"):
+        run(configuration(path, tmp_path / "run", executor="serial"))
+
+
+@pytest.mark.fault("model-varies")
 @pytest.mark.slow
 def test_the_command_line_ends_with_one_line(tmp_path):
     path = write_toy(tmp_path, ("toy_models:Oscillator", "execution_models:Noisy"))
@@ -113,7 +145,7 @@ def test_two_runs_more_and_the_same_numbers(tmp_path):
     runs = []
     for accepted in (False, True):
         Counted.runs = 0
-        settings = replace(config.assimilation, stochastic_model=accepted)
+        settings = replace(config.assimilation, linearisation="transform", stochastic_model=accepted)
         runs.append((assimilate(problem, settings, 3), Counted.runs))
     (checked, n_checked), (accepted, n_accepted) = runs
     assert n_checked == n_accepted + 2 + 5

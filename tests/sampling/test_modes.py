@@ -18,7 +18,7 @@ from en4dvar.model.state import Parameter
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.sampling import mcmc
 from en4dvar.sampling.modes import belonging, sample_modes
-from en4dvar.sampling.refine import Refined, mode_cautions
+from en4dvar.sampling.refine import SEEN, Refined, mode_cautions
 from en4dvar.schemes.settings import AssimilationSettings
 
 KEYWORDS = mcmc.sample.__kwdefaults__
@@ -174,6 +174,18 @@ def test_a_minimum_that_no_draw_belongs_to_is_no_mode():
     own = [(1.0, np.array([[-1.0], [0.0], [1.0]]), 3.0), (0.0, np.full((3, 1), np.nan), np.inf)]
     (mode,) = modes_of(prior, minima, Refined(np.zeros((8, 1)), {}, own))
     assert mode.centre == pytest.approx(0.5)
+
+
+def test_a_mode_that_members_describe_counts_however_small_it_is() -> None:
+    """The lowest minimum is the narrowest: of weight 0.002, and another one holds the posterior."""
+    prior = Prior((PriorTerm.normal(Parameter("a", "1"), 0.0, 1.0),))
+    minima = [Minimum(np.array([x]), np.array([[std**2]]), x, (1, 2)) for x, std in ((0.0, 1e-4), (0.5, 0.1))]
+    modes = modes_of(prior, minima, None)
+    assert modes[0].weight < SEEN
+    (told,) = mode_cautions(prior, minima, modes, True, None)
+    assert (told.code, told.severity) == ("several-modes", "serious")
+    draws = Refined(np.zeros((8, 1)), {})  # they are of the other one
+    assert list(mode_cautions(prior, minima, modes, True, draws)) == []
 
 
 @pytest.mark.parametrize(("others", "words"), [(1, "others ended at 9.0"), (0, "the others came to no minimum")])

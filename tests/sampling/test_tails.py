@@ -149,6 +149,35 @@ def test_few_members_do_not_tell_what_it_should_be(name):
     assert told.severity == "serious"  # most of the posterior is where the ensemble is not
 
 
+@pytest.mark.parametrize("seed", [0, 17, 102, 147])
+def test_the_edge_of_a_step_is_never_quoted_for_its_plateau(seed):
+    """Of a whole number n, against the closed form: the lowest minimum is the narrow edge of a step, and another
+    descent ends on a plateau, which holds almost all of the posterior.
+    """
+    rng, t, n = np.random.default_rng(7 * seed + 5), np.linspace(0.5, 10, 12), np.arange(1, 7)
+    truth = rng.uniform(0.5, 6.5), rng.standard_normal()
+    y = np.round(truth[0]) * t / 10 + truth[1] + 0.5 * rng.standard_normal(12)
+    logs = stats.multivariate_normal(np.zeros(12), 0.25 * np.eye(12) + 1).logpdf(y - n[:, None] * t / 10)
+    shares = np.exp(logs - logs.max()) / np.exp(logs - logs.max()).sum()
+    mean, std = shares @ n, np.sqrt(shares @ (n - shares @ n) ** 2 + 1 / 12)
+
+    def whole(**more):
+        return en4dvar.estimate(
+            lambda p, t: np.round(p["n"]) * t / 10 + p["b"], (t, y),
+            {"n": uniform(0.5, 6.5)[0], "b": normal(0, 1)[0]}, error=0.5, seed=seed, progress=False, **more,
+        )  # fmt: skip
+
+    edge = whole()
+    assert edge.posterior["n"].values.std() < 0.2 * std
+    assert all(row.untrusted for row in edge.rows)
+    assert all("seed" not in c.advice for c in edge.cautions)
+    assert any(c.severity == "serious" and "set assimilation.refine: mcmc" in c.advice for c in edge.cautions)
+    for sampled in (whole(assimilation={"refine": "mcmc"}), whole(cheap=True)):
+        values = sampled.posterior["n"].values.ravel()
+        assert values.mean() == pytest.approx(mean, abs=0.2 * std)
+        assert values.std(ddof=1) == pytest.approx(std, rel=0.2)
+
+
 class Driven(ForwardModel):
     """x' = −0.3 x + u, whose u may vary."""
 

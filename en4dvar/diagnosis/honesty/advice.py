@@ -101,11 +101,12 @@ def advised(a: Analysis, cautions: Sequence[Caution]) -> tuple[Caution, ...]:
 def _not_converged(case: Case) -> str:
     if case.a.settings.own.minimiser is None:
         return f"set assimilation.scheme: {MINIMISERS[0]}, which minimises J, or assimilation.refine: mcmc"
+    little = "no action is needed where this is little to you; else " * (case.caution.severity == "note")
     now = getattr(case.a.settings.own, "max_iterations", ENOUGH)
     if now < ENOUGH:
-        return f"set assimilation.max_iterations: {max(20, 2 * now)} (it is {now})"
+        return f"{little}set assimilation.max_iterations: {max(20, 2 * now)} (it is {now})"
     unsure = "narrow the priors of the parameters that the data hardly constrain"
-    return f"{unsure}, or set assimilation.refine: mcmc, which needs no minimum"
+    return f"{little}set assimilation.refine: mcmc, which needs no minimum, or {unsure}"
 
 
 def _members(case: Case) -> str:
@@ -253,7 +254,8 @@ def _one_descent(case: Case) -> str:
     own, n = case.a.settings.own, len(case.a.parameters)
     wanted = ["assimilation.starts: 2"] * (getattr(own, "starts", 2) < 2)
     wanted += ["assimilation.start: best-member"] * (not isinstance(getattr(own, "start", ""), str))
-    wanted += ["assimilation.linearisation: bundle"] * (getattr(own, "linearisation", "") == "transform")
+    noisy = case.a.settings.stochastic_model  # which takes no bundle
+    wanted += ["assimilation.linearisation: bundle"] * (getattr(own, "linearisation", "") == "transform" and not noisy)
     wanted += [f"assimilation.members: {2 * n + 2}"] * (case.a.settings.members <= n + 1)
     return f"set {' and '.join(wanted)}" if wanted else "compare with another seed"
 

@@ -136,9 +136,7 @@ def unfinished(analysis: Analysis) -> checks.Findings:
         words = f"the search for the minimum has {words}; members are drawn from the posterior itself, wherever that is"
         yield replace(caution("not-converged", words, "note"), advice="no action is needed")
     elif step_norm <= SHORT_STEP:
-        words = f"{words}; {following}"
-        advice = "no action is needed where this is little to you; else start again from another seed"
-        yield replace(caution("not-converged", words, "note"), advice=advice)
+        yield caution("not-converged", f"{words}; {following}", "note")
     else:
         settings = analysis.settings
         by = "" if settings.own.minimiser else f" of {settings.scheme}, which does not seek the minimum of J"
