@@ -13,10 +13,8 @@ from en4dvar.plumbing.tables import table
 from en4dvar.plumbing.units import convert
 from en4dvar.priors.field_prior import FieldPrior
 from en4dvar.problem import InverseProblem
-from en4dvar.sampling.modes import ENOUGH
-from en4dvar.sampling.refine import may_sample
+from en4dvar.sampling.refine import may_sample, runs_of_doubt
 
-RUNS_A_DRAW = 10 / 3  # that counts, of a posterior that is sampled, typically
 MOST_PAIRS, MOST_NAMED, LEAST_SHOWN = 15, 100, 0.005  # of correlations: rows, parameters of a block, size
 
 
@@ -77,17 +75,24 @@ def _field_row(prior: FieldPrior) -> tuple[str, ...]:
 
 def cost_summary(config: Config, preview: Preview, count: int) -> str:
     """The cost of an estimate: forward runs of a data set and of all ``count``, and the time on one thread."""
-    total = preview.runs * count
-    runs = f"about {preview.runs} forward runs" + (f" a data set, {total} in all" if count > 1 else "")
-    more = "; the Markov chain comes on top" if config.assimilation.refine == "mcmc" else ""
-    if may_sample(preview.problem, config.assimilation):
-        sampled = round(RUNS_A_DRAW * (config.assimilation.draws or ENOUGH))
-        took = _seconds(sampled * preview.seconds)
-        more = f"; a posterior that leaves a doubt is sampled by some {sampled} more, {took}"
-        if config.assimilation.what_if:
-            more += ", and minima that are hard to find, with what if, can take ten times all this"
-    took = f"{_seconds(preview.seconds)} each: {_seconds(total * preview.seconds)} on one thread"
-    return f"cost: {runs}, {took}, plus some seconds for files and report{more}"
+    settings, least = config.assimilation, preview.runs
+    most, more = least, "; the Markov chain comes on top" if settings.refine == "mcmc" else ""
+    if may_sample(preview.problem, settings):
+        most += runs_of_doubt(preview.problem, settings)
+        most += least * len(preview.problem.alternatives) if settings.what_if else 0
+        more = "; the most where a doubt is sampled, and minima that are hard to find can take twice as many"
+
+    def span(words: Callable[[float], str], times: float) -> str:
+        return " to ".join(dict.fromkeys(words(runs * times) for runs in (least, most)))
+
+    a_set, in_all = (" a data set", f"; in all {span(_digits, count)},") if count > 1 else ("", ":")
+    runs = f"about {span(_digits, 1)} forward runs{a_set}, {_seconds(preview.seconds)} each{in_all}"
+    took = f"{span(_seconds, count * preview.seconds)} on one thread"
+    return f"cost: {runs} {took}, plus up to some seconds a data set for all else{more}"
+
+
+def _digits(count: float) -> str:
+    return f"{float(f'{count:.2g}'):.0f}"
 
 
 def _seconds(value: float) -> str:

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 Values = Mapping[str, tuple[float, float]]  # parameter → value and std
 SURE = 0.999  # no number of draws says more
-FAR = 2.5  # standard deviations between what is known and what the data say
+FAR, TOO_FAR = 2.5, 4.0  # standard deviations between what is known and what the data say: told, and not believed
 _NUMBER = re.compile(r"(?<![^\W_])(?<!\.)(\d+(?:\.\d+)?)[ _]?(%|[^\W\d_]+)(?![^\W_])")  # with a unit, in a name
 OFF_THE_LINE = 0.05  # probability below which populations differ by more than a line says
 CAPTION = (
@@ -120,7 +120,8 @@ def compare_populations(
     Quantities that are common to the data sets of each population, of the same name and prior, have one value in all
     populations, but for those named ``apart``. ``numbers``: of each run one, e.g. a concentration, that the medians are
     seen as a straight line of. ``known``: of a run medians that are known from elsewhere, {"G": "9.8 ± 0.3 kPa"},
-    which calibrate what is common; they go before those of its configuration.
+    which calibrate what is common; they go before those of its configuration. One that is :data:`TOO_FAR` from what
+    its own data say calibrates nothing.
 
     Raises
     ------
@@ -137,6 +138,8 @@ def compare_populations(
     if numbers and (len(numbers) != len(stored) or np.ptp(numbers) == 0 or not np.isfinite(numbers).all()):
         raise OutputError(f"compare: {len(stored)} numbers are needed, one for each run and not all the same")
     values = _known_medians(stored, known or {})
+    off = {label: {name: _off(name, s, values[label][name]) for name in values[label]} for label, s in stored.items()}
+    used = {label: {n: v for n, v in of_it.items() if off[label][n] <= TOO_FAR} for label, of_it in values.items()}
     keys = {name: _common(s, apart, name) for name, s in stored.items()}
     every = [key for of_one in keys.values() for key in of_one]
     common = tuple(dict.fromkeys(key[0] for key in every if every.count(key) > 1))
@@ -147,13 +150,13 @@ def compare_populations(
             raise OutputError(f"compare: {name}: not common to the data sets of any population{hint}")
     terms = {name: [s.prior_of(name) for s in stored.values()] for name in names}
     logarithmic = frozenset(name for name in names if all(t.transform == "lognormal" for t in terms[name]))
-    medians, quoted, calibrated = dict[str, Array](), dict[str, Array](), any(values.values())
+    medians, quoted, calibrated = dict[str, Array](), dict[str, Array](), any(used.values())
     lines: dict[str, StraightLine] = {}
     differences, notes = [], []
     if own := [name for name in every_common if name not in (*common, *apart)]:
         notes.append(f"{', '.join(own)}: of one population alone, or with other priors: taken as each population's own")
     for name in names:
-        centres = {label: _centre(name, s, keys[label], seed, values[label]) for label, s in stored.items()}
+        centres = {label: _centre(name, s, keys[label], seed, used[label]) for label, s in stored.items()}
         alone = [replace(c, common=tuple((label, key) for key in c.common)) for label, c in centres.items()]
         medians[name] = _physical(drawn_together([*centres.values()], seed), terms[name])
         each = medians[name].T if calibrated else [_own(s, name) for s in stored.values()]
@@ -168,7 +171,7 @@ def compare_populations(
             unit, more = terms[name][0].parameter.display_unit, _three(x - y)
             greater = float(np.mean(x > y))
             differences.append(Difference(name, a, b, unit, ratio, more, greater, by_itself, " ".join(doubts)))
-        notes += _calibrated(name, stored, values, medians[name], independent if common else None)
+        notes += _calibrated(name, stored, values, off, medians[name], independent if common else None)
         if held := [label for label, c in centres.items() if c.pulled]:
             notes.append(f"{name}: the data of {', '.join(held)} leave its median open: the hyperprior holds it")
         if numbers:
@@ -246,23 +249,31 @@ def _known(s: StoredPopulation, values: Values) -> Iterator[tuple[int, float, fl
         yield s.names.index(name), (x - term.mean) / term.std, std / abs(term.slope(x)) / term.std
 
 
+def _off(name: str, s: StoredPopulation, value: tuple[float, float]) -> float:
+    """How far a ``value`` with its std is from what the data say, in standard deviations of both, transformed."""
+    ((_, known, std),) = _known(s, {name: value})
+    own = s.white(name)
+    return float(abs(known - np.median(own)) / np.hypot(own.std(), std))
+
+
 def _calibrated(
-    name: str, stored: Mapping[str, StoredPopulation], values: Mapping[str, Values], median: Array, alone: Array | None
-) -> Iterator[str]:
-    """What groups that are known from elsewhere do to the median (M, K) of a parameter in the others; ``alone``: the
-    same were nothing common, None where nothing is.
+    name: str, stored: Mapping[str, StoredPopulation], values: Mapping[str, Values],
+    off: Mapping[str, Mapping[str, float]], median: Array, alone: Array | None,
+) -> Iterator[str]:  # fmt: skip
+    """What groups that are known from elsewhere, ``off`` from their own data, do to the median (M, K) of a parameter in
+    the others; ``alone``: the same were nothing common, None where nothing is.
     """
-    known = [label for label, of_it in values.items() if of_it]
+    known = [label for label, of_it in off.items() if any(by <= TOO_FAR for by in of_it.values())]
     for k, (label, s) in enumerate(stored.items()):
         parameter = s.prior_of(name).parameter
         unit = unit_behind(parameter.display_unit)
         if name in values[label]:
             value, std = (convert(number, parameter.unit, parameter.display_unit) for number in values[label][name])
-            x = _own(s, name)
-            off = (value - float(np.median(x))) / float(np.hypot(x.std(), std))
+            by = off[label][name]
             words = f"{name} of {label} is known, {number_like(value, std)} ± {number_like(std, std)}{unit}"
-            yield words + (f"; its own data say otherwise, {abs(off):.1f} std away" if abs(off) > FAR else "")
-            if alone is None:
+            words += f"; its own data say otherwise, {by:.1f} std away" if by > FAR else ""
+            yield words + (": it calibrates nothing (is its unit right?)" if by > TOO_FAR else "")
+            if alone is None and by <= TOO_FAR:
                 yield "Nothing is common to the groups that this could calibrate"
         elif known and alone is not None and label not in known:
             now, before = (_range(_three(draws[:, k]), plain=True) for draws in (median, alone))

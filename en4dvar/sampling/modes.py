@@ -100,8 +100,7 @@ def sample_modes(
     Deterministic in ``seed``.
     """
     enough, n = ENOUGH if enough is None else enough, len(prior.names)
-    most = math.ceil(LAST_RUNS * enough / DRAWS)
-    closing = min(CLOSING[0] + n // CLOSING[1], CLOSING[2])
+    most, closing = math.ceil(LAST_RUNS * enough / DRAWS), _closing(n)
     runs = cost if isinstance(cost, RecordedRuns) else None
 
     def more(sampler: Importance) -> bool:
@@ -141,6 +140,17 @@ def sample_modes(
             mixture.share, prior.from_white(mixture.centre), np.ascontiguousarray(columns.transpose(0, 2, 1))
         ),
     )
+
+
+def _closing(n: int) -> int:
+    """Rounds in which proposals of n directions close in, at least."""
+    return min(CLOSING[0] + n // CLOSING[1], CLOSING[2])
+
+
+def typical_runs(n: int, enough: float | None) -> int:
+    """Forward runs of :func:`sample_modes` for n parameters where an emulator has to be trained and is just good."""
+    last = math.ceil((ENOUGH if enough is None else enough) / (GOOD * DRAWS))
+    return DRAWS * (_closing(n) + len(HEATS) + TRIED + last)
 
 
 def _guided(

@@ -16,6 +16,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from en4dvar.descent.minima import Minimum
+from en4dvar.descent.preview import ITERATIONS, SEARCH
+from en4dvar.descent.search import TOGETHER, WIDER
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.diagnosis import diagnostics as diag
 from en4dvar.diagnosis.analysis import BEYOND_5, ChainRecord, Mode
@@ -29,7 +31,7 @@ from en4dvar.problem import InverseProblem
 from en4dvar.sampling import mcmc
 from en4dvar.sampling.emulated_cost import Coordinates, EmulatedCost, emulate, needed_runs
 from en4dvar.sampling.emulated_draws import RecordedRuns
-from en4dvar.sampling.modes import TOO_FEW, WeightedDraws, belonging, sample_modes
+from en4dvar.sampling.modes import TOO_FEW, WeightedDraws, belonging, sample_modes, typical_runs
 from en4dvar.schemes.settings import AssimilationSettings
 
 COUNTS = math.log(1e-3)  # evidence of a minimum relative to that of the lowest, by Laplace, from which it may matter
@@ -194,11 +196,14 @@ def _off(emulator: EmulatedCost, ensemble: Array) -> dict[str, float]:
 
 def guide(space: WeightSpace, ensemble: Array, seed: int, fits: int = CHAIN_FITS) -> EmulatedCost | None:
     """An emulator of J about an ensemble (N, n); None where the settings or the model forbid."""
-    wanted = space.settings.emulator
-    if wanted == "off" or (wanted == "auto" and not space.problem.model.compiled):
+    if not _emulates(space.problem, space.settings):
         return None
     random = member_stream(seed, "emulator")
     return emulate(space.forecast, space.problem.prior, space.problem.observations, ensemble, random, fits)
+
+
+def _emulates(problem: InverseProblem, settings: AssimilationSettings) -> bool:
+    return settings.emulator != "off" and (settings.emulator != "auto" or problem.model.compiled)
 
 
 @dataclass(frozen=True)
@@ -291,6 +296,17 @@ def may_sample(problem: InverseProblem, settings: AssimilationSettings) -> bool:
     gaussian = problem.walks and not any(walk.spread for walk in problem.walks)
     few = needed_runs(len(problem.prior.names)) is not None and not gaussian
     return settings.refine == "auto" and problem.model.cheap and few and not settings.stochastic_model
+
+
+def runs_of_doubt(problem: InverseProblem, settings: AssimilationSettings) -> int:
+    """Forward runs that a doubt takes, typically, where it may be settled by sampling: draws of the prior and a round
+    of descents from them, an emulator of J, and all rounds of sampling.
+    """
+    n = len(problem.prior.names)
+    wanted = needed_runs(n) if _emulates(problem, settings) else None
+    emulator = 2 * wanted[1] if wanted else 0
+    descents = TOGETHER * ITERATIONS * (1 + n + SEARCH)
+    return WIDER * settings.members + descents + emulator + typical_runs(n, settings.draws)
 
 
 def in_doubt(minima: Sequence[Minimum], agree: bool, shape: Mapping[str, float]) -> bool:

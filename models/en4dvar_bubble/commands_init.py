@@ -52,7 +52,7 @@ _MOVIES = (".tif", ".tiff", ".png", ".bmp", ".jpg", ".jpeg", ".gif", ".mp4", ".a
     "--mask", metavar="FILE", type=click.Path(), help="Picture: where it is black the movie is not looked at."
 )
 @click.option("--example", type=click.Choice(["quickstart"]), help="An example and its synthetic data instead.")
-@click.option("--time-unit", metavar="UNIT", help="Unit of the times in the file, e.g. us.")
+@click.option("--time-unit", metavar="UNIT", help="Unit of the times in the file, e.g. us, or frame.")
 @click.option("--radius-unit", metavar="UNIT", help="Unit of the radii in the file, e.g. um.")
 @click.option("--time-column", metavar="NAME", help="Column of times, if its name does not tell.")
 @click.option("--radius-column", metavar="NAME", help="Column of radii, if its name does not tell.")
@@ -291,6 +291,7 @@ def _answered(asked: Asked) -> Asked:
     if asked.time_step is None:
         if asked.time_column is None and asked.step is None:
             asked = replace(asked, time_column=click.prompt("Column of times", type=click.Choice(columns), err=True))
+            asked = asked.of_camera()
         if asked.time_unit is None:
             unit = _ask_unit(asked.shown(str(asked.time_column or asked.step)), "s", "us, ms, s or 1/(270*kHz)")
             asked = replace(asked, time_unit=unit)

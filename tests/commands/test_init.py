@@ -337,61 +337,6 @@ def test_a_file_that_no_option_names_is_answered_with_the_option(words: list[str
     assert wanted in done.stderr
 
 
-def test_pixels_and_frame_numbers(tmp_path: Path) -> None:
-    """The configuration reads the same histories as one with the sizes multiplied in."""
-    t, R = np.loadtxt(write(tmp_path / "b.csv"), delimiter=",", skiprows=1).T
-    rows = zip(np.rint(t / 0.7), R / 2.5, strict=True)
-    Path("px.csv").write_text("\n".join(["frame,R_px", *(f"{n:g},{r:.17g}" for n, r in rows), ""]))
-    scales = ("--pixel", "2.5 um", "--frame-rate", "1.4285714285714286 MHz")
-    for more in ((), ("--time-unit", "frame", "--radius-unit", "px")):
-        done = call("init", "--data", "px.csv", *scales, *more, "--force")
-        assert done.exit_code == 0, done.output
-        assert "seems to" not in done.stderr
-        (read,) = build(proposed(Path("px.yaml")))
-        assert call("init", "--data", "b.csv", *UNITS, "--force").exit_code == 0
-        (known,) = build(proposed(Path("b.yaml")))
-        assert read.observations.values == pytest.approx(known.observations.values, rel=1e-12)
-        assert read.observations.times == pytest.approx(known.observations.times, rel=1e-12)
-
-
-@pytest.mark.parametrize("header", ["R_um", "R_um,quality"])
-def test_a_table_without_times_needs_the_frame_rate_alone(tmp_path: Path, header: str) -> None:
-    R = np.loadtxt(write(tmp_path / "b.csv"), delimiter=",", skiprows=1)[:, 1]
-    Path("rows.csv").write_text("\n".join([header, *(f"{r:g}{',1' * header.count(',')}" for r in R), ""]))
-    done = call("init", "--data", "rows.csv", "--frame-rate", f"{1 / 0.7:.17g} MHz")
-    assert done.exit_code == 0, done.output
-    (read,) = build(proposed(Path("rows.yaml")))
-    assert call("init", "--data", "b.csv", *UNITS).exit_code == 0
-    (known,) = build(proposed(Path("b.yaml")))
-    assert read.observations.times == pytest.approx(known.observations.times, rel=1e-9)
-    assert read.observations.values == pytest.approx(known.observations.values, rel=1e-12)
-
-
-def test_a_column_that_may_be_times_is_not_passed_over_for_the_frame_rate(tmp_path: Path) -> None:
-    done = call("init", "--data", write(tmp_path / "b.csv", "clock,R_um"), "--frame-rate", "270 kHz")
-    assert done.exit_code == 2
-    assert "add --time-unit UNIT" in done.stderr
-
-
-@pytest.mark.parametrize(
-    ("options", "needed", "following"),
-    [
-        ((), "--frame-rate RATE (e.g. '270 kHz', where frame", "--frame-rate RATE --pixel LENGTH"),
-        (("--time-unit", "frame", "--pixel", "2 um"), "add --frame-rate RATE", "--frame-rate RATE"),
-        (("--frame-rate", "270 kfps", "--radius-unit", "px"), "add --pixel LENGTH", "--pixel LENGTH"),
-    ],
-)
-def test_pixels_and_frames_without_their_size_end_with_the_next_command(
-    tmp_path: Path, options: tuple[str, ...], needed: str, following: str
-) -> None:
-    done = call("init", "--data", write(tmp_path / "b.csv", "frame,R_px"), *options)
-    assert done.exit_code == 2
-    assert needed in done.stderr
-    last = done.stderr.splitlines()[-1]
-    assert last.startswith("next: en4dvar ")
-    assert last.endswith(following)
-
-
 @pytest.mark.parametrize("option", ["--since", "--groups", "--time-unit"])
 def test_an_option_of_data_needs_data(option: str) -> None:
     for example in ((), ("--example", "quickstart")):

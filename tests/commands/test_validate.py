@@ -12,9 +12,11 @@ from toy_config import csv_text, write_toy
 import en4dvar
 from en4dvar.assembly.build import build
 from en4dvar.cli import main
+from en4dvar.commands.describe import cost_summary
 from en4dvar.config import load_config
 from en4dvar.descent.preview import preview
 from en4dvar.diagnosis.diagnostics import member_quantiles
+from en4dvar.estimation.assimilate import assimilate
 from en4dvar.report.history import prior_predictive
 from en4dvar.runs.checks import validate
 
@@ -92,24 +94,39 @@ def test_a_prior_that_does_not_suit_the_data(tmp_path: Path) -> None:
 
 
 def test_the_cost_is_that_of_a_run(tmp_path: Path) -> None:
-    """Typical numbers of runs: within a factor of two of what these runs took."""
+    """Typical numbers of runs, where nothing is left in doubt: within a factor of two of what these runs took."""
     for path in (write_toy(tmp_path), ROOT / "configs" / "quickstart.yaml"):
         done = call("validate", path)
         assert done.exit_code == 0, done.output
-        told = re.search(r"^cost: about (\d+) forward runs, ([\d.]+) (us|ms) each: ", done.stdout, re.MULTILINE)
+        pattern = r"^cost: about (\d+)(?: to \d+)? forward runs, ([\d.]+) (us|ms) each: "
+        told = re.search(pattern, done.stdout, re.MULTILINE)
         assert told
         options = {"output.directory": str(tmp_path / "run"), "output.report": False}
         took = en4dvar.run(path, overrides=options, force=True).sample_stats.attrs["forward_runs"]
         assert 0.5 < int(told[1]) / took < 2
         assert float(told[2]) > 0
-        sampled = "a posterior that leaves a doubt is sampled by some 5000 more" in done.stdout
+        sampled = "the most where a doubt is sampled" in done.stdout
         assert sampled == (path.name == "quickstart.yaml")  # the toy is not cheap
-    more = call("validate", path, "--set", "assimilation.draws=6000").stdout
-    assert "a posterior that leaves a doubt is sampled by some 20000 more" in more
     two = tmp_path / "two.csv"
     two.write_text(csv_text(k=1.9))
     done = call("validate", write_toy(tmp_path), "--data", tmp_path / "t*.csv")
-    assert re.search(r"cost: about (\d+) forward runs a data set, (\d+) in all", done.stdout)
+    told = re.search(r"cost: about (\d+) forward runs a data set, [\d.]+ .s each; in all (\d+), ", done.stdout)
+    assert told
+    assert int(told[2]) == pytest.approx(2 * int(told[1]), rel=0.05)
+
+
+def test_the_cost_of_a_doubt_is_told() -> None:
+    """The larger number is, for a data set, within a factor of two of the runs of one that is sampled in doubt."""
+    config = load_config(ROOT / "configs" / "combined_laser.yaml")
+    problem = build(config)[0]
+    words = cost_summary(config, preview(problem, config.assimilation, config.seed), 10)
+    pattern = r"cost: about \d+ to (\d+) forward runs a data set, [\d.]+ .s each; in all \d+ to (\d+), .+"
+    told = re.fullmatch(pattern, words)
+    assert told
+    analysis = assimilate(problem, config.assimilation, config.seed)
+    assert "importance_draws" in analysis.refinement
+    assert 0.5 < int(told[1]) / analysis.forward_runs < 2
+    assert int(told[2]) == pytest.approx(10 * int(told[1]), rel=0.1)
 
 
 def test_the_plot_is_written_where_the_run_will_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

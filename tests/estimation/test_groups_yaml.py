@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import re
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import xarray as xr
 from click.testing import CliRunner
 from execution_models import Stops
 from run_files import assert_same_results, configuration, interrupt
@@ -111,17 +109,18 @@ def test_a_line_needs_three_groups(tmp_path, monkeypatch, names, numbers):
 
 def test_what_a_known_group_does_to_the_others_is_told():
     """What is known and far from the group's own data is told as such; both groups' medians without and with it."""
-    draws = xr.DataArray(np.linspace(7.9, 8.1, 101))
-    stored = {"a": SimpleNamespace(), "ref": SimpleNamespace(headline="median")}
-    stored["ref"].group = lambda of: {"k_median": draws}
+    draws = np.linspace(7.9, 8.1, 101)
+    stored = {"a": SimpleNamespace(), "ref": SimpleNamespace()}
     together, alone = (np.column_stack([5 + s * np.linspace(-1, 1, 101), draws]) for s in (0.1, 0.5))
     for of_it in stored.values():
         of_it.prior_of = lambda name: SimpleNamespace(parameter=Parameter(name, "N/m"))
-    values = {"a": {}, "ref": {"k": (9.0, 0.1)}}
-    told = [*populations._calibrated("k", stored, values, together, alone)]
+    values, off = {"a": {}, "ref": {"k": (9.0, 0.1)}}, {"a": {}, "ref": {"k": 3.9}}
+    told = [*populations._calibrated("k", stored, values, off, together, alone)]
     assert told[0] == "k of a is 5.000 (4.909 … 5.091) N/m, calibrated by ref; without, 5.00 (4.54 … 5.46) N/m"
-    assert re.fullmatch(r"k of ref is known, 9.00 ± 0.10 N/m; its own data say otherwise, 8.\d std away", told[1])
+    assert told[1] == "k of ref is known, 9.00 ± 0.10 N/m; its own data say otherwise, 3.9 std away"
     assert len(told) == 2
+    (told_of_unit,) = populations._calibrated("k", stored, values, {"a": {}, "ref": {"k": 4.1}}, together, alone)
+    assert told_of_unit.endswith("otherwise, 4.1 std away: it calibrates nothing (is its unit right?)")
 
 
 @pytest.mark.slow

@@ -119,8 +119,17 @@ def test_a_known_median_is_taken_as_it_is_and_compared_with_the_data(gels):
     np.testing.assert_array_equal(found.medians["k"][:, 0], before[:, 0])
     assert any("k of stiff_only is known" in note for note in found.notes)
     assert "Nothing is common" in str(found)
-    far = en4dvar.compare_populations(only(gels), known={"stiff_only": {"k": f"{4 * value} ± 0.001 N/m"}})
-    assert "its own data say otherwise" in str(far)
+
+
+@pytest.mark.parametrize("slip", [1000, 0.001])
+def test_a_known_median_far_from_its_own_data_calibrates_nothing(gels, slip):
+    """A slip of unit, however wide what is known is said to be: all numbers are those without it."""
+    without = en4dvar.compare_populations(only(gels))
+    far = en4dvar.compare_populations(only(gels), known={"stiff_only": {"k": f"{2.4 * slip} ± {0.8 * slip} N/m"}})
+    np.testing.assert_array_equal(far.medians["k"], without.medians["k"])
+    np.testing.assert_array_equal(far.quoted["k"], without.quoted["k"])
+    assert not far.calibrated
+    assert "std away: it calibrates nothing (is its unit right?)" in str(far)
 
 
 def test_runs_of_two_gels_are_compared_by_their_populations_and_by_nothing_else(gels, tmp_path):

@@ -1,5 +1,6 @@
 """What ``en4dvar init`` is told about the columns of a file, what their names tell, and which options are missing."""
 
+import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -23,6 +24,7 @@ _RADIUS = re.compile(r"(?i)r|radius|radii|rnew|roft|r[ _(\[].*|radius[ _(\[].*")
 
 
 LOOKED_AT = 20  # files of a folder
+SAME_CLOCK = 1e-3  # relative difference of a unit of time and a frame that is rounding
 
 
 @dataclass(frozen=True)
@@ -96,26 +98,33 @@ class Asked:
                     time = other[radius]
             if _only(_STEP, self.contents.scalars) is None:
                 time = time or _only(FRAMES, names)
-        frames = self.frame_rate is not None and FRAMES.fullmatch(time or "")
+        named = replace(self, time_column=time, radius_column=radius)
+        frames = self.frame_rate is not None and named._counts_frames
         times = self.time_unit or (None if frames else self._unit(time, "s"))
         radii = self.radius_unit or (None if self.pixel else self._unit(radius, "m"))
-        named = replace(self, time_column=time, radius_column=radius, time_unit=times, radius_unit=radii)
-        return named._of_camera()
+        return replace(named, time_unit=times, radius_unit=radii).of_camera()
 
     def _unit(self, column: str | None, kind: str) -> str | None:
         """What the column's name, or a line below the names, says."""
         return unit_in(column, kind) or unit_in(f"{column}_{self.contents.units.get(column or '', '')}", kind)
 
-    def _of_camera(self) -> "Asked":
+    def of_camera(self) -> "Asked":
+        """With what pixel and frame rate make of units. Raises as :meth:`by_names` does."""
         asked = self
         if asked.pixel is not None:
             if asked.radius_unit not in (None, *_AS_PIXELS):
                 raise ConfigError("--pixel makes pixels the unit of radii: give it, or --radius-unit, not both")
-            asked = replace(asked, radius_unit=as_unit(asked.pixel, "um"))
+            asked = replace(asked, radius_unit=as_unit(asked.pixel, "um"), pixel=None)
         if asked.frame_rate is not None and (asked._in_frames or asked._frame_each_row):
             between = f"1/({as_unit(asked.frame_rate, 'kHz')})"
-            step = f"{convert(1.0, between, 'us'):.12g} us" if asked._frame_each_row else asked.time_step
-            asked = replace(asked, time_unit=between, time_step=step, frame_rate=None)
+            step, unit = convert(1.0, between, "us"), between if asked.time_unit in _AS_FRAMES else asked.time_unit
+            if unit and not math.isclose(convert(1.0, unit, "us"), step, rel_tol=SAME_CLOCK):
+                raise ConfigError(
+                    f"--frame-rate makes {asked.time_column} numbers of frames of {step:.4g} us, --time-unit times in "
+                    f"{unit}: give the one that is right, not both"
+                )
+            each = f"{step:.12g} us" if asked._frame_each_row else asked.time_step
+            asked = replace(asked, time_unit=between, time_step=each, frame_rate=None)
         return asked
 
     @property
@@ -126,9 +135,18 @@ class Asked:
         return not named and not any(np.all(np.diff(values) > 0) for values in others)
 
     @property
+    def _counts_frames(self) -> bool:
+        """Whether the column of times is called as frames are, or rises by one and its name tells no unit."""
+        name = self.time_column or ""
+        steps = np.diff(self.contents.columns.get(name, np.empty(0)))
+        by_one = len(steps) > 0 and np.median(steps) == 1 and np.all(steps == np.rint(steps))
+        return bool(FRAMES.fullmatch(name) or (by_one and not self._unit(name, "s")))
+
+    @property
     def _in_frames(self) -> bool:
-        named = FRAMES.fullmatch(self.time_column or "")
-        return self.time_unit in _AS_FRAMES or bool(self.time_unit is None and named)
+        """Whether times are numbers of frames: by their unit, by a rate beside such numbers, or by their name alone."""
+        named = self.time_unit is None and FRAMES.fullmatch(self.time_column or "")
+        return self.time_unit in _AS_FRAMES or (self._counts_frames if self.frame_rate is not None else bool(named))
 
     @property
     def complete_columns(self) -> bool:
@@ -146,8 +164,10 @@ class Asked:
                 missing.append(("--time-column", "NAME", ""))
             if self._in_frames:
                 missing.append(("--frame-rate", "RATE", f"e.g. '270 kHz', where {time} counts frames"))
-            elif self.time_unit is None:
-                missing.append(("--time-unit", "UNIT", "e.g. us"))
+            elif self.time_unit is None and (time or self.frame_rate is None):
+                may_count = time and (self.frame_rate is not None or self._counts_frames)
+                frames = f", or 'frame' beside --frame-rate where {time} counts frames" if may_count else ""
+                missing.append(("--time-unit", "UNIT", f"e.g. us{frames}"))
         if self.radius_column is None:
             others = [name for name in self.contents.columns if name != self.time_column]
             alike = _numbered(others) if len(others) < len(self.contents.columns) else ""
