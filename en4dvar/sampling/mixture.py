@@ -43,12 +43,13 @@ class StudentMixture:
 
 
 def fit_gaussians(
-    x: Array, rng: np.random.Generator, components: int, rounds: int, alike: float = 0.0
+    x: Array, rng: np.random.Generator, components: int, rounds: int, alike: float = 0.0, widest: Array | None = None
 ) -> tuple[Array, Array, Array]:
     """Shares (M,), means (M, n) and covariances (M, n, n) of a mixture for points (D, n); expectation maximisation.
 
     Covariances are drawn towards that of all points, of a size that M parts of it have, as if ``alike`` more points of
     each component said so: its mode under the inverse Wishart prior (Fraley & Raftery 2007, J. Classif. 24, 155).
+    ``widest`` (n,): standard deviations of independent coordinates; no component exceeds these in any direction.
     """
     count, n = x.shape
     middle, root = x.mean(axis=0), np.linalg.cholesky(np.atleast_2d(np.cov(x, rowvar=False)))
@@ -69,6 +70,11 @@ def fit_gaussians(
         apart = z - centre[:, None]
         scatter = (of_part[..., None] * apart).swapaxes(1, 2) @ apart + common
         covariance = scatter / (size + alike)[:, None, None] + SMALLEST * np.eye(n)
+        if widest is not None:  # the most likely such covariance has the same axes
+            unit = root / widest[:, None]
+            values, vectors = np.linalg.eigh(unit @ covariance @ unit.T)
+            axes = np.linalg.inv(unit) @ vectors
+            covariance = axes * np.minimum(values, 1.0)[:, None] @ axes.swapaxes(1, 2)
     return share, middle + centre @ root.T, root @ covariance @ root.T
 
 

@@ -9,9 +9,12 @@ Of the coordinates x that vary and the quantities θ that all data sets have in 
 tell how x follows θ (:mod:`~en4dvar.estimation.population.following`): the likelihood is one of y, such as x − Bθ,
 which gives the regression of x on θ in the posterior the slopes (I − C) B, where C is the covariance of x given θ and
 the prior of x is N(0, I). A Gaussian mixture describes y; dividing by its prior leaves the likelihood of the data set,
-with which :mod:`~en4dvar.estimation.population.hierarchy` works. What the data tell of θ itself is left aside: it keeps
-its prior, and therefore all data sets of a population have the same slopes. Their own would tell of θ, and falsely:
-those of ln G are steeper for a soft gel, and a θ that makes all of them stiffer would make them more alike.
+with which :mod:`~en4dvar.estimation.population.hierarchy` works. No component is wider than the prior, so that each is
+one of the likelihood. There are always four: what too few get wrong is alike in all data sets and adds up, what scarce
+draws get wrong averages out, and a criterion for fewer took upper limits for measurements. What the data tell of θ
+itself is left aside: it keeps its prior, and therefore all data sets of a population have the same slopes. Their own
+would tell of θ, and falsely: those of ln G are steeper for a soft gel, and a θ that makes all of them stiffer would
+make them more alike.
 """
 
 import math
@@ -35,13 +38,13 @@ from en4dvar.plumbing.compiled import kernel
 from en4dvar.priors.prior import PriorTerm, member_stream, own_seed
 from en4dvar.problem import InverseProblem
 from en4dvar.sampling.emulated_draws import RecordedRuns
-from en4dvar.sampling.mixture import fit_gaussians, log_gaussians
+from en4dvar.sampling.mixture import fit_gaussians
 from en4dvar.sampling.modes import sample_modes
 
 ENOUGH = 500.0  # effective draws that are asked for: they know a mean to 4 % of its std
 NARROWEST = 0.03  # standard deviation of the first draws about members, in units of the prior's
 KEPT = 2000  # equally likely draws of each data set
-MOST_PARTS, ROUNDS = 4, 60  # components of a mixture; rounds of expectation maximisation
+PARTS, ROUNDS = 4, 200  # components of each mixture; rounds of expectation maximisation, of which four need more
 BESIDE = 1e-3  # prior standard deviations that runs for readings that one lacks are apart
 SMALLEST = 1e-12  # variance that every slope is taken to have
 INFORMED = 0.1  # least share of the prior's variance that the data take away, for a slope to be read from draws
@@ -224,7 +227,8 @@ def own_likelihoods(
             shares = shares_of(beyond)
             as_drawn = adjusted[resampled(shares, len(shares), stream)]
             effective *= effective_number(shares) / len(shares)
-        share, centre, covariance = _fitted(as_drawn, effective, stream)
+        alike = (len(varying) + 2) * len(z) / effective
+        share, centre, covariance = fit_gaussians(as_drawn, stream, PARTS, ROUNDS, alike, std)
         mixture = Mixture.divided(centre, covariance, np.log(share) + constant, std)
         likelihoods.append(OwnLikelihood(mixture, following, adjusted))
     return likelihoods
@@ -258,22 +262,6 @@ def pooled_slopes(slopes: Sequence[Array], variances: Sequence[Array]) -> Array:
     beyond = np.sum(weights * apart**2, axis=0) - (len(each) - 1)
     scatter = np.maximum(beyond, 0.0) / (weights.sum(axis=0) - np.sum(weights**2, axis=0) / weights.sum(axis=0))
     return np.asarray(np.average(each, axis=0, weights=1 / (scatter + errors)))
-
-
-def _fitted(x: Array, effective: float, stream: np.random.Generator) -> tuple[Array, Array, Array]:
-    """Shares, means and covariances of the mixture of as many Gaussians as Schwarz' criterion grants draws (D, p)."""
-    p, best, lowest = x.shape[1], None, np.inf
-    for parts in range(1, MOST_PARTS + 1):
-        share, centre, covariance = fit_gaussians(x, stream, parts, ROUNDS)
-        kept = share > 1e-6
-        share, centre, covariance = share[kept] / share[kept].sum(), centre[kept], covariance[kept]
-        numbers = parts * (1 + p + p * (p + 1) / 2) - 1
-        logs = np.logaddexp.reduce(log_gaussians(x, share, centre, covariance), axis=0)
-        criterion = -effective * (logs.mean() - 0.5 * p * math.log(2 * math.pi)) + 0.5 * numbers * math.log(effective)
-        if criterion < lowest:
-            best, lowest = (share, centre, covariance), criterion
-    assert best is not None
-    return best
 
 
 @dataclass(frozen=True)
