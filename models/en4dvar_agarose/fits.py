@@ -26,6 +26,7 @@ DECISIVE = 3.0  # |Δ log-evidence|: odds of 20 to 1
 HYPER = HyperPrior(spread=1.0)  # R0 of the softer gel varies by more than what is known of it beforehand
 LEVELS = (0.025, 0.5, 0.975)  # of the interval of a population, and its middle
 MISFIT = 2.0  # χ² per reading above which a model is not one of those to choose from
+UNSURE = ("not-converged", "non-gaussian", "starts-disagree")  # cautions by which an evidence may be off
 
 
 @dataclass(frozen=True)
@@ -171,12 +172,14 @@ class Comparison:
     ``single`` (S,) of each data set by itself. ``population``: parameters of all bubbles about a common mean with a
     common spread. ``shared``: of all of them in one gel, material parameters common and R0, t_s of each bubble's own.
     ``chi2`` of one gel per reading, (neo-Hookean, quadratic): far from one where no single gel explains the readings.
+    ``doubts``: codes of cautions for which ``shared`` may be off.
     """
 
     single: Array
     population: float
     shared: float
     chi2: tuple[float, float]
+    doubts: tuple[str, ...]
 
     @property
     def independent(self) -> float:
@@ -198,10 +201,11 @@ class OneByOne:
 
 @dataclass(frozen=True)
 class OneGel:
-    """One law with one value of its parameters in all data sets of a gel."""
+    """One law with one value of its parameters in all data sets of a gel, and codes of doubts about its evidence."""
 
     log_evidence: float
     chi2_per_observation: float
+    doubts: tuple[str, ...] = ()
 
 
 def probability(difference: Array) -> Array:

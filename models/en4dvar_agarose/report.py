@@ -165,9 +165,12 @@ def _comparison(study: Study) -> list[list[str]]:
         compared += [("all sets, one population", comparison.population), ("all sets, one gel", comparison.shared)]
         for words, value in compared:
             rows.append([gel, words, f"{value:+.1f}", f"{float(probability(np.array(value))):.2f}", verdict(value)])
-        if min(comparison.chi2) > MISFIT:
-            nh, quadratic = comparison.chi2
-            rows[-1][-1] = f"no verdict: no single gel fits (χ² per reading {nh:.1f} and {quadratic:.1f})"
+        nh, quadratic = comparison.chi2
+        reasons = [f"its evidence is in doubt ({', '.join(comparison.doubts)})"] if comparison.doubts else []
+        if min(nh, quadratic) > MISFIT:
+            reasons.append(f"no single gel fits (χ² per reading {nh:.1f} and {quadratic:.1f})")
+        if reasons:
+            rows[-1][-1] = f"no verdict: {'; '.join(reasons)}"
     return rows
 
 

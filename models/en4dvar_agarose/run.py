@@ -37,7 +37,7 @@ from en4dvar.runs.engine import directory_mode
 from en4dvar.runs.interrupt import tell_interrupt, terminate_as_interrupt
 from en4dvar.runs.rundir import RunDirectory
 from en4dvar.sampling.sweep import SweepResult, SweepSettings, run_sweep
-from en4dvar_agarose.fits import HYPER, Comparison, Fit, OneByOne, OneGel, Study, read_truth
+from en4dvar_agarose.fits import HYPER, UNSURE, Comparison, Fit, OneByOne, OneGel, Study, read_truth
 from en4dvar_agarose.paper import TABLE_2, Model
 from en4dvar_agarose.settings import StudyPlan
 from en4dvar_bubble.model import BubbleModel
@@ -263,6 +263,7 @@ class _Parts:
             population=pooled["qlkv"] - pooled["nh"],
             shared=one_general.log_evidence - one_nh.log_evidence,
             chi2=(one_nh.chi2_per_observation, one_general.chi2_per_observation),
+            doubts=tuple(code for code in UNSURE if code in one_nh.doubts + one_general.doubts),
         )
 
     def _one_gel(self, fit: Fit) -> OneGel:
@@ -275,7 +276,8 @@ class _Parts:
         settings = self.plan.configs[fit.gel][fit.model].assimilation
         joint = estimate_jointly(sharing(fit.problems, names), settings, self.plan.seed, self.executor, singles)
         readings = np.array([len(p.observations) for p in fit.problems])
-        return OneGel(joint.log_evidence, float(joint.chi2 @ readings / readings.sum()))
+        doubts = tuple(c.code for c in joint.cautions if c.code in UNSURE)
+        return OneGel(joint.log_evidence, float(joint.chi2 @ readings / readings.sum()), doubts)
 
 
 def one_model(problems: Sequence[InverseProblem]) -> list[InverseProblem]:

@@ -98,8 +98,8 @@ def sampled(
         tell(f"{effective:.0f} effective draws after {number + 1} of at most {ROUNDS} rounds, {ENOUGH:.0f} are wanted")
         if (number + 1 >= LEAST and effective >= ENOUGH) or not border.shape[1]:
             break
-        centre, covariance = _moments(border[alive], log_weights[alive])
-        proposal = Proposal(centre, np.asarray(np.linalg.inv(2 * covariance)))
+        if of_shared := _moments(border[alive], log_weights[alive]):
+            proposal = Proposal(of_shared[0], np.asarray(np.linalg.inv(2 * of_shared[1])))
         for e, (_, log, off) in enumerate(each):
             log_own = log[alive] + (log_weights - logsumexp(log, axis=1))[alive, None]
             of_own[e] = _moments(off[alive].reshape(log_own.size, off.shape[2]), log_own.ravel())
@@ -140,12 +140,16 @@ class Proposal:
         )  # fmt: skip
 
 
-def _moments(points: Array, log_weights: Array) -> Moments:
-    """Mean (n,) and covariance (n, n) of points (D, n), with the largest power of the weights that leaves 2 √D of them
-    effective: of the few that weights as uneven as those of a first round leave, both are too narrow.
+def _moments(points: Array, log_weights: Array) -> Moments | None:
+    """Mean (n,) and covariance (n, n) of points (D, n), with the largest power of the weights that leaves 2 √D and 2 n
+    of them effective: of the few that weights as uneven as those of a first round leave, both are too narrow. None of
+    fewer points.
     """
+    least = 2 * max(len(points) ** 0.5, points.shape[1])
+    if len(points) < least:
+        return None
     powers = (shares_of(power * log_weights) for power in TEMPERING ** np.arange(POWERS))
-    weights = next((w for w in powers if effective_number(w) >= 2 * len(w) ** 0.5), None)
+    weights = next((w for w in powers if effective_number(w) >= least), None)
     return np.average(points, axis=0, weights=weights), np.atleast_2d(np.cov(points.T, aweights=weights))
 
 
