@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from movies import movie_of
+from scipy import ndimage
 from scipy.special import expit
 
 from en4dvar.plumbing.errors import DataError
@@ -87,3 +88,36 @@ def test_a_bubble_that_leaves_hardly_any_background_to_be_seen_is_refused():
         DataError, match="no frame is empty, and beside any smooth background hardly anything has a round"
     ):
         track(movie_of(filmed((96, 144), radii=radii)))
+
+
+def glaring(shape, off, radii, glare, depth, dirt, seed, bright=False):
+    """Frames of discs that are dark, or ``bright`` in a dark field, whose middle shows the lamp within a share of their
+    radius; ``dirt`` is the relative std of a lasting texture of the light."""
+    noise = np.random.default_rng(seed)
+    y, x = (np.arange(side) - (side - 1) / 2 for side in shape)
+    rho = np.hypot(x - off[0], y[:, None] - off[1])
+    texture = ndimage.gaussian_filter(noise.normal(size=shape), 2)
+    light = 150 * (1 + 0.0004 * (x + y[:, None])) * (1 + dirt * texture / texture.std())
+    frames = []
+    for R in radii:
+        shade = depth * (expit((R - rho) / 0.7) - 0.7 * expit((glare * R - rho) / 0.7))
+        image = 15 + 0.15 * light + 150 * shade if bright else light * (1 - shade)
+        frames.append(np.clip(np.rint(image + noise.normal(0, 2.5, shape)), 0, 255).astype(np.uint8))
+    return frames
+
+
+SLOW_COLLAPSE = [*(54.4 * (1 - np.linspace(0, 0.88, 14) ** 2) ** 0.5), *(30 + 15.5 * np.linspace(0, 1, 8) ** 0.5)]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_dark_bubble_with_a_bright_middle_is_not_taken_for_a_bright_one(seed):
+    result = track(movie_of(glaring((128, 128), (-9.5, 6.4), SLOW_COLLAPSE, 0.36, 0.39, 0.02, seed)))
+    assert wrong(result.readings, SLOW_COLLAPSE) == []
+    assert sum(r.used for r in result.readings) > 0.8 * len(SLOW_COLLAPSE)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_dark_middle_of_a_bubble_that_fills_a_dark_field_is_not_taken_for_the_bubble(seed):
+    radii = 52.2 + 1.5 * np.sin(np.arange(12) / 2)
+    with pytest.raises(DataError, match="no frame is empty"):
+        track(movie_of(glaring((127, 112), (0, 0), radii, 0.37, 0.68, 0.08, seed, bright=True)))
