@@ -218,7 +218,7 @@ def _window(data: Data, read: Readings, path: Path, until: bool = False) -> slic
 def _next_end(data: Data, read: Readings, begin: int, after: range) -> str:
     """The first trough among the readings ``after`` a window that begins with the reading ``begin``; "" for none."""
     number = 0
-    while True:
+    while after:
         trough = Instant("trough", number := number + 1)
         try:
             at = index_of(read.times, read.values, trough, begin, data.window.prominence, last=True)
@@ -226,6 +226,7 @@ def _next_end(data: Data, read: Readings, begin: int, after: range) -> str:
             return ""
         if at >= after.start:
             return f"trough {number}" if at in after else ""
+    return ""
 
 
 def _span(times: Array, data: Data) -> str:
