@@ -7,8 +7,11 @@ import pytest
 from toys import Vectorised, make_observations
 
 from en4dvar.estimation.joint import estimate_jointly, members, sharing
+from en4dvar.estimation.joint.descent import Experiment, JointDescent, JointObjective, Place
 from en4dvar.estimation.joint.members import Proposal, _moments
 from en4dvar.estimation.joint.problem import Single
+from en4dvar.executor import SerialExecutor
+from en4dvar.model.forward import Trajectory
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
 from en4dvar.schemes.settings import AssimilationSettings
@@ -38,3 +41,28 @@ def test_more_shared_quantities_than_draws_are_drawn_about_the_minimum(monkeypat
     settings = AssimilationSettings(what_if=False, emulator="off", members=110)
     shared = estimate_jointly(joint, settings, 3, singles=singles).shared
     assert shared.std(axis=0).mean() == pytest.approx(1.0, abs=0.15)  # 12 readings leave most of 100 to the prior
+
+
+class Flat(Vectorised):
+    """Readings a, (u + 2)² − 9 and 10^5 w⁵ of four w: Gauss–Newton shortens each w by a fifth a step."""
+
+    def trajectories(self, x, times):
+        own = np.broadcast_to(times, (len(x), np.shape(times)[-1])).astype(int)
+        values = np.hstack([x[:, 2:3], (x[:, 3:4] + 2) ** 2 - 9, 1e5 * x[:, 4:] ** 5])
+        states = np.zeros((*own.shape, x.shape[1]))
+        states[..., 0], states[..., 2:] = np.take_along_axis(values, own, axis=1), x[:, None, 2:]
+        return [Trajectory(t, s, self.layout) for t, s in zip(own, states, strict=True)]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_lower_minimum_of_an_experiment_that_is_slow_to_reach_is_met(seed):
+    """u = −5 explains the readings as u = 1 does, which the prior prefers by 12 in J."""
+    model = Flat(names=("a", "u", "w1", "w2", "w3", "w4"), compiled=True)
+    prior = Prior(tuple(PriorTerm.normal(p, 0.0, 1.0) for p in model.parameters))
+    data = [make_observations(np.arange(6), np.zeros(6), std=0.02, name=f"{e}") for e in range(2)]
+    joint = sharing([InverseProblem(model, model.observables[0], each, prior) for each in data], ("a",))
+    experiments = [Experiment(joint, e, 1e-3, SerialExecutor()) for e in range(2)]
+    descent = JointDescent(Place(np.zeros(1), (np.array([-5.0, 0, 0, 0, 0]),) * 2))
+    JointObjective(joint, experiments, AssimilationSettings().own.minimiser).linearise([descent])
+    lower = members.challenger(experiments, descent.at, seed)
+    np.testing.assert_allclose([own[0] for own in lower.own], 1.0, atol=0.05)

@@ -32,7 +32,7 @@ WIDER = 1.2  # the proposals than the Gaussian
 LEAST, ROUNDS = 2, 12  # rounds of such draws, at least and at most
 ENOUGH, FEWEST = 96.0, 24.0  # effective draws that end the rounds; below which the weights say nothing
 TEMPERING, POWERS = 0.9, 60  # uneven weights are raised to a power of this base, of so many that are tried
-OF_PRIOR, DEEPEST, DESCENTS = 48, 4, 8  # of the prior; of which are descended from; and with so many linearisations
+OF_PRIOR, DEEPEST, DESCENTS = 48, 4, 8  # of the prior; of which are descended from; by so many linearisations each
 LOWER = 0.5  # of J
 
 Moments = tuple[Array, Array]  # mean (n,) and covariance (n, n)
@@ -188,7 +188,9 @@ def challenger(experiments: Sequence[Experiment], at: ArrowSystem, seed: int) ->
         costs = experiment.costs(experiment.joint.standard(e, border, draws)) + 0.5 * np.sum(draws**2, axis=1)
         starts = draws[np.argsort(costs, kind="stable")[:DEEPEST]]
         precision = np.broadcast_to(at.arrow.blocks[e], (DEEPEST, n, n))
-        places, _, ends = experiment.settled(border[:DEEPEST], starts, precision, DESCENTS)
-        if ends.min() < at.forms[e].cost + 0.5 * float(own[e] @ own[e]) - LOWER:
-            own[e], lower = places[np.argmin(ends)], True
+        places, precision, ends = experiment.settled(border[:DEEPEST], starts, precision, DESCENTS)
+        lowest = [np.argmin(ends)]  # goes on by as many
+        places, _, ends = experiment.settled(border[:1], places[lowest], precision[lowest], DESCENTS)
+        if ends[0] < at.forms[e].cost + 0.5 * float(own[e] @ own[e]) - LOWER:
+            own[e], lower = places[0], True
     return Place(place.border, tuple(own)) if lower else None
