@@ -401,8 +401,8 @@ def _optics(background: Background, samples: Sequence[Frame], movie: Movie, circ
     if not rims or np.median(heights) - _scatter(heights) < THRESHOLD:
         return optics
     rim, rim_std = tuple(np.median(values, axis=0)), tuple(_scatter(values))
-    known = replace(optics, differs=FREE, rim=rim, rim_std=rim_std)
-    return replace(_shared(_again(shown, known, circles), background.noise), rim=rim, rim_std=rim_std)
+    rimmed = _again(shown, replace(optics, differs=FREE, rim=rim, rim_std=rim_std), circles)
+    return replace(_shared(rimmed, background.noise), rim=rim, rim_std=rim_std) if rimmed else optics
 
 
 def _again(shown: Sequence[tuple[Image, Outline]], optics: Optics, circles: int) -> list[Outline]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+
 import numpy as np
 import pytest
 from movies import movie_of
@@ -121,3 +123,9 @@ def test_the_dark_middle_of_a_bubble_that_fills_a_dark_field_is_not_taken_for_th
     radii = 52.2 + 1.5 * np.sin(np.arange(12) / 2)
     with pytest.raises(DataError, match="no frame is empty"):
         track(movie_of(glaring((127, 112), (0, 0), radii, 0.37, 0.68, 0.08, seed, bright=True)))
+
+
+def test_a_movie_of_which_no_outline_can_be_fitted_with_its_rim_is_read_or_refused_and_does_not_end_in_a_traceback():
+    radii = 47.04 * (1 + 0.05 * (np.sin(np.arange(12) / 2) - 1))
+    with contextlib.suppress(DataError):
+        track(movie_of(glaring((127, 112), (0, 0), radii, 0.0, 0.68, 0.05, 2, bright=True)), 1)
