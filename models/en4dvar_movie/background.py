@@ -55,6 +55,7 @@ BRIGHT = 0.25  # of the contrast: how much brighter a flash is
 STEADY = 10_000  # tiles that say how bright a frame is
 CHANGED = 0.3  # share of tiles that a flash changes
 DIM, FIELD = 0.3, 95  # of the light that most pixels (per cent) have at most: what the field of view's outside has
+SWINGS = 0.05  # of the light: std of the edge of a bright bubble that moves by a pixel, which no aperture does
 APERTURE = (2, 6)  # pixels beside such an outside: where the light is blurred, and where it tells that it ends there
 
 
@@ -182,8 +183,8 @@ def pixel_noise(image: Image, unit: float = 1.0) -> float:
 
 
 def _outside(frames: Sequence[Frame]) -> Mask:
-    """The outside of a field of view (H, W), such as a round aperture: dark in two corners of the frames at least, and
-    beside it are always light and no wall that moves.
+    """The outside of a field of view (H, W), such as a round aperture: dark in two corners of the frames at least, with
+    an edge that stands still, beside which are always light and no wall that moves.
     """
     usual = ndimage.uniform_filter(np.median(np.array(frames, dtype=np.float32), axis=0), 5)
     labels, _ = ndimage.label(usual < DIM * np.percentile(usual, FIELD))
@@ -192,9 +193,11 @@ def _outside(frames: Sequence[Frame]) -> Mask:
     if np.sum(corners > 0) < 2:
         return np.zeros_like(dark)
     blurred, beside = (ndimage.binary_dilation(dark, iterations=n) for n in APERTURE)
-    least = np.min(np.array([ndimage.uniform_filter(f.astype(np.float32), 5) for f in frames]), axis=0)
-    steady = np.mean((least > 0.5 * usual)[beside & ~blurred] if (beside & ~blurred).any() else 0)
-    return np.asarray(blurred & (steady > 1 - LIVELY))
+    each = np.array([ndimage.uniform_filter(f.astype(np.float32), 5) for f in frames])
+    steady = np.mean((each.min(axis=0) > 0.5 * usual)[beside & ~blurred] if (beside & ~blurred).any() else 0)
+    lamp = np.percentile(each, FIELD, axis=(1, 2), keepdims=True)
+    swing = np.median((each / np.maximum(lamp, 1e-6)).std(axis=0)[blurred & ~dark] if (blurred & ~dark).any() else 0)
+    return np.asarray(blurred & (steady > 1 - LIVELY) & (swing < SWINGS))
 
 
 def _lit_as(frame: Image, other: Image) -> Image:
