@@ -435,5 +435,6 @@ def _shared(outlines: Sequence[Outline], noise: float) -> Optics:
     telling = np.array([tells_contrast(o.circle.R, o.width, o.noise, optics) for o in outlines])
     if telling.sum() >= LEAST_TELLING:  # what those differ by beside noise, bubbles do
         differ = 1.4826 * float(np.median(np.abs(contrasts[telling] - contrast)))
-        optics = replace(optics, differs=max(differ**2 - (2 * NOISY * noise) ** 2, 0.0) ** 0.5 / -contrast)
+        differs = max(differ**2 - (2 * NOISY * noise) ** 2, 0.0) ** 0.5 / -contrast
+        optics = replace(optics, differs=differs, even=True)
     return optics

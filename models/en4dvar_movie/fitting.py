@@ -76,7 +76,7 @@ def _fit(image: Array, start: Circle, optics: Optics, circles: int) -> tuple[Arr
         p = _sorted(fitted, circles)
         noise = max(1.4826 * float(np.median(np.abs(residuals(image, p, modes, ring)[0]))), 1e-6)
     against = abs(p[CONTRAST] / optics.contrast - 1) > AGAINST * (optics.spread + optics.differs)
-    if against and optics.differs < FREE and p[R] > OWN * p[W]:
+    if against and optics.even and optics.differs < FREE and p[R] > OWN * p[W]:
         own = _fit(image, Circle(*p[:W]), replace(optics, differs=FREE), circles)
         if own is not None and tells_contrast(own[0][R], own[0][W], own[2], optics):
             return own

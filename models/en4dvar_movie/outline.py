@@ -32,8 +32,9 @@ class Optics:
     sharp edge (pixels).
 
     ``spread`` is how well the contrast is known, as a share of it: 1 where it is not; ``differs`` the share by which
-    that of a frame differs from it, ``noise`` the std of a pixel. ``rim`` is that of :mod:`en4dvar_movie.kernels`:
-    light, distance and width in pixels, without a rim 0, and ``rim_std`` how well a frame's are known.
+    that of a frame differs from it, ``noise`` the std of a pixel, and ``even`` that bubbles are evenly dark, so that a
+    frame may tell a contrast of its own. ``rim`` is that of :mod:`en4dvar_movie.kernels`: light, distance and width in
+    pixels, without a rim 0, and ``rim_std`` how well a frame's are known.
     """
 
     contrast: float
@@ -41,6 +42,7 @@ class Optics:
     spread: float = 1.0
     differs: float = 0.0
     noise: float = 0.0
+    even: bool = False
     rim: tuple[float, ...] = (0.0, 0.0, 0.0)
     rim_std: tuple[float, ...] = (0.0, 0.0, 0.0)
 
