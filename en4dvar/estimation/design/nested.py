@@ -148,7 +148,7 @@ def explained(
     """Draws of the coordinates behind the ``known`` ones, weighted by how they explain the readings.
 
     Proposals close in on the posterior in rounds of ``inner`` runs; draws of the last one are weighted, until enough
-    of them are effective.
+    of them are effective. One that would not come to that, as it was fitted to few, is closed in on again.
     """
     (centres, matrices), k = near, len(known)
     own = matrices[:, k:, k:]
@@ -170,6 +170,10 @@ def explained(
         more(final)
         if final.effective >= ENOUGH:
             break
+        if final.effective * ROUNDS < ENOUGH * len(final.z) / inner:
+            more(closing)
+            final = FixedDraws(_beside_prior(closing.next_proposal()), stream, inner)
+            more(final)
     return final
 
 
