@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-
 import numpy as np
 import pytest
 from movies import movie_of
@@ -124,12 +122,6 @@ def test_the_dark_middle_of_a_bubble_that_fills_a_dark_field_is_not_taken_for_th
     result = track(movie_of(glaring((127, 112), (0, 0), radii, 0.37, 0.68, 0.08, seed, bright=True)))
     assert wrong(result.readings, radii) == []
     assert sum(r.used for r in result.readings) > 8
-
-
-def test_a_movie_of_which_no_outline_can_be_fitted_with_its_rim_is_read_or_refused_and_does_not_end_in_a_traceback():
-    radii = 47.04 * (1 + 0.05 * (np.sin(np.arange(12) / 2) - 1))
-    with contextlib.suppress(DataError):
-        track(movie_of(glaring((127, 112), (0, 0), radii, 0.0, 0.68, 0.05, 2, bright=True)), 1)
 
 
 @pytest.mark.parametrize("glare", [0.0, 0.37])

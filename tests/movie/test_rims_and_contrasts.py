@@ -12,6 +12,7 @@ from movies import film as film_plain
 from movies import movie_of
 from scipy.ndimage import gaussian_filter
 
+from en4dvar_movie import background
 from en4dvar_movie.background import find_background
 from en4dvar_movie.kernels import residuals
 from en4dvar_movie.tracking import track
@@ -67,6 +68,18 @@ def test_a_bright_rim_moves_no_radius(rim, blur):
     assert abs(np.median(off)) < 0.06
     assert np.std((off - np.median(off)) / std) < 1.5
     assert abs(np.median(off)) < np.median(common)
+
+
+def test_a_rim_with_which_no_outline_can_be_fitted_again_is_left_out(monkeypatch):
+    again, calls = background._again, []
+
+    def seldom(*asked):
+        calls.append(asked)
+        return again(*asked) if len(calls) == 1 else []
+
+    monkeypatch.setattr(background, "_again", seldom)
+    assert track(movie_of(filmed(gaussian(0.25, 2.0, 0.8))), 1).optics.rim == (0.0, 0.0, 0.0)
+    assert len(calls) == 2
 
 
 @pytest.mark.parametrize("ratio", [8.0, 15.0])
