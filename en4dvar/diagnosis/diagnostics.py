@@ -13,6 +13,7 @@ from en4dvar.model.state import Array, Mask
 
 TAIL = 0.0005  # each tail of the central 99.9 % interval
 MEAN_OFF, SPREAD_OFF = 0.5, 0.3  # in posterior standard deviations, as a fraction: beyond, a posterior is non-Gaussian
+ENDS_OFF = 0.5  # the same of 5 and 95 % points, in posterior standard deviations
 SURE = 2.0  # standard errors of weighted moments beyond what leaves a doubt, from which it is warned of
 EMULATED_ENOUGH = 0.2  # effective share of its runs below which an emulator is not believed
 GAUSSIAN_ENOUGH = 0.35  # the same of the members: the criterion where there is no emulator to believe
@@ -127,9 +128,8 @@ def is_non_gaussian(shape: Mapping[str, float], scaled: bool = False) -> bool:
     if shape.get("emulator_fit", 0.0) >= EMULATED_ENOUGH:
         off = abs(shape["spread_ratio"] - 1)
         return shape["mean_shift"] > MEAN_OFF or off > SPREAD_OFF
-    return (
-        scaled or shape.get("gaussian_fit", 1.0) < GAUSSIAN_ENOUGH or any(key.startswith("tail_mean") for key in shape)
-    )
+    tails = any(key.startswith(("tail_mean", "tail_q")) for key in shape)
+    return scaled or shape.get("gaussian_fit", 1.0) < GAUSSIAN_ENOUGH or tails
 
 
 def active_members(failures: Sequence[str]) -> Mask:

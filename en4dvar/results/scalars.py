@@ -154,8 +154,10 @@ SAMPLE_STATS = (
     _withheld("withheld_rms", "root mean square of these readings less the medians, SI", lambda w: w.rms),
     Attribute("discrepancy_share", "share of the squared residuals that the discrepancy takes", _discrepancy_share),
     Attribute("gaussian_fit, non_gaussian, tail_shift, tail_ratio, tail_excess, tail_members, tail_elsewhere, "
-              "tail_mean_G, tail_std_G, mean_shift, spread_ratio, emulator_fit, emulated_mean_G, emulated_std_G",
-              "shape of the posterior; tail_mean, tail_std where weights are sure, NaN of few; rest of an emulator",
+              "tail_mean_G, tail_std_G, tail_end, tail_q05_G, tail_q95_G, mean_shift, spread_ratio, emulator_fit, "
+              "emulated_mean_G, emulated_std_G",
+              "shape of the posterior; tail_mean, tail_std where weights are sure, NaN of few; tail_q05, tail_q95 of "
+              "an interval whose end is off; rest of an emulator",
               lambda a: a.shape),
     Attribute("importance_draws, importance_effective_sample_size, importance_largest_shift, "
               "importance_largest_spread_ratio, mcmc_r_hat, mcmc_effective_sample_size, …",

@@ -22,6 +22,7 @@ from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.diagnosis import diagnostics as diag
 from en4dvar.diagnosis.analysis import BEYOND_5, ChainRecord, Mode
 from en4dvar.diagnosis.response.ledger import weighted_quantiles
+from en4dvar.ensemble.forecast import Forecast
 from en4dvar.ensemble.linalg import resampled, shares_of
 from en4dvar.model.state import Array, Indices
 from en4dvar.plumbing.caution import Caution, caution
@@ -29,8 +30,9 @@ from en4dvar.plumbing.units import convert
 from en4dvar.priors.prior import Prior, member_stream
 from en4dvar.problem import InverseProblem
 from en4dvar.sampling import mcmc
-from en4dvar.sampling.emulated_cost import Coordinates, EmulatedCost, emulate, needed_runs
+from en4dvar.sampling.emulated_cost import Coordinates, EmulatedCost, ModelRuns, emulate, needed_runs
 from en4dvar.sampling.emulated_draws import RecordedRuns
+from en4dvar.sampling.ends import examine_ends
 from en4dvar.sampling.modes import TOO_FEW, WeightedDraws, belonging, sample_modes, typical_runs
 from en4dvar.schemes.settings import AssimilationSettings
 
@@ -43,8 +45,6 @@ KEPT = 500  # draws of the posterior beside the members
 CHAIN_FITS = 4  # of an emulator that has to guide a chain into the tails; two tell mean and spread
 SHIFT, SPREAD = 0.25, 0.15  # of the ensemble, by the emulator, that leave a doubt: half of what is warned of
 FAR = 2.0  # times as far out as the members
-END = 3.0  # standard deviations to either side of the mean, where J of the Gaussian has risen by 4.5
-SHORT = 1.5  # less than that by which J rises to an end from which tails are looked into
 TINY = 1e-3  # standard error, or share that is left, below which none matters
 ROUNDING = 1e-9  # of the standard deviation of all points: where one has all of the weight
 ELSEWHERE = 0.5  # share of the posterior at members of the prior beyond the ensemble's own share there
@@ -80,50 +80,40 @@ def examine_shape(
     return {**numbers, "non_gaussian": diag.is_non_gaussian(numbers, scaled)}
 
 
-def examine_tails(space: WeightSpace, ensemble: Array, costs: Array, before: Array, always: bool) -> dict[str, float]:
-    """How far mean and standard deviation of the ensemble (N, n) are from the posterior's in what is printed.
+def examine_tails(
+    space: WeightSpace, ensemble: Array, before: Forecast, after: Forecast, always: bool
+) -> dict[str, float]:
+    """How far mean, standard deviation and ends of the ensemble (N, n) are from the posterior's in what is printed.
 
-    By members of J ``costs`` (N,), those of the prior of J ``before`` (N,) and, ``always`` or where these leave a
-    doubt or J rises too little along a parameter, as many runs :data:`FAR` times as far out as the members; where a
-    doubt remains that is not sure, and not ``always``, by as many again about the end of the way along which J rises
-    least. All are weighted with the density that they are drawn from, for the posterior and for the Gaussian of the
-    ensemble: of a Gaussian posterior both weights are the same, whatever the points are. ``tail_shift`` is the largest
-    distance of both means in posterior standard deviations, ``tail_ratio`` the standard deviation of the ensemble over
-    the posterior's where that is farthest from 1, ``tail_excess`` by how many standard errors of theirs a distance or
-    ratio is beyond :data:`SHIFT` or :data:`SPREAD`. ``tail_mean_<name>``, ``tail_std_<name>`` are those of a parameter
-    that is surely off by what is warned of, NaN where ``tail_members``, the effective number of the points, is below
-    :data:`TOO_FEW` to say to what.
-    ``tail_elsewhere``: most of the posterior is where the ensemble is not. Nothing of an ensemble without a covariance.
+    By members of J known by their forecast ``after``, those of the prior by that ``before``, runs along each parameter
+    and, ``always`` or where members leave a doubt or J rises too little along a parameter, as many runs :data:`FAR`
+    times as far out as the members. Points are weighted with the density that they are drawn from, for the posterior
+    and for the Gaussian of the ensemble: of a Gaussian posterior both weights are the same, whatever the points are.
+    ``tail_shift`` is the largest distance of both means in posterior standard deviations, ``tail_ratio`` the standard
+    deviation of the ensemble over the posterior's where that is farthest from 1, ``tail_excess`` by how many standard
+    errors of theirs a distance or ratio is beyond :data:`SHIFT` or :data:`SPREAD`. ``tail_mean_<name>``,
+    ``tail_std_<name>`` are those of a parameter that is surely off by what is warned of, NaN where ``tail_members``,
+    the effective number of the points, is below :data:`TOO_FEW` to say to what.
+    ``tail_elsewhere``: most of the posterior is where the ensemble is not. ``tail_end`` is the largest distance of a 5
+    or 95 % point of the Gaussian from :func:`~en4dvar.sampling.ends.examine_ends`'s, in posterior standard deviations,
+    and ``tail_q05_<name>``, ``tail_q95_<name>`` are the points of a parameter where that is what is warned of. Nothing
+    of an ensemble without a covariance.
     """
     weighed: dict[str, float] = {}
     with suppress(np.linalg.LinAlgError):
-        prior, parts = space.problem.prior, [(ensemble, costs), (space.members, before)]
-
-        def with_runs(points: Array) -> dict[str, float]:
-            parts.append((points, space.costs(points, space.forecast(points))))
-            return _by_weights(prior, parts)
-
+        prior = space.problem.prior
+        members = [(x, run, space.costs(x, run)) for x, run in ((ensemble, after), (space.members, before))]
+        parts = [(x, costs) for x, _, costs in members]
         weighed = _by_weights(prior, parts)
-        way, rise = (np.zeros(len(prior.names)), 0.0) if always else _flattest(space, ensemble)
-        if weighed["tail_excess"] > 0 or rise < 0.5 * END**2 - SHORT:
+        ends = examine_ends(space, ensemble, ModelRuns.of(*members[0]).joined(ModelRuns.of(*members[1])))
+        if always or weighed["tail_excess"] > 0 or not ends.rises:
             mean = ensemble.mean(axis=0)
-            weighed = with_runs(mean + FAR * (ensemble - mean))
-            if not always and doubtful(weighed) and not diag.is_non_gaussian(weighed):
-                weighed = with_runs(ensemble + way)
+            points = mean + FAR * (ensemble - mean)
+            weighed = _by_weights(prior, [*parts, (points, space.costs(points, space.forecast(points)))])
+        weighed["tail_end"] = float(ends.off.max())
+        for j in np.flatnonzero(ends.off > diag.ENDS_OFF):
+            weighed |= {f"tail_{q}_{prior.names[j]}": float(ends.quantiles[i, j]) for q, i in (("q05", 0), ("q95", 2))}
     return weighed
-
-
-def _flattest(space: WeightSpace, ensemble: Array) -> tuple[Array, float]:
-    """The way (n,) from the mean of an ensemble (N, n) along which J rises least, and by how much.
-
-    On each way one parameter goes :data:`END` standard deviations, and the others where the Gaussian then expects them.
-    """
-    mean, covariance = ensemble.mean(axis=0), np.atleast_2d(np.cov(ensemble.T))
-    ways = END * covariance / np.sqrt(np.diag(covariance))[:, None]
-    ways = np.concatenate([np.zeros((1, len(mean))), ways, -ways])
-    costs = space.costs(mean + ways, space.forecast(mean + ways))
-    least = 1 + int(np.argmin(costs[1:]))
-    return ways[least], float(costs[least]) - float(costs[0])
 
 
 def _by_weights(prior: Prior, parts: Sequence[tuple[Array, Array]]) -> dict[str, float]:
@@ -177,10 +167,10 @@ def _moments(theta: Array, shares: Array) -> tuple[Array, Array, Array, Array]:
 
 def doubtful(shape: Mapping[str, float]) -> bool:
     """True if mean or spread of the ensemble are off by half of what is warned of, by the emulator or, by more than
-    their standard error, by weights.
+    their standard error, by weights, or an end of its Gaussian by what is warned of.
     """
     off = shape.get("mean_shift", 0.0) > SHIFT or abs(shape.get("spread_ratio", 1.0) - 1) > SPREAD
-    return off or shape.get("tail_excess", 0.0) > 1
+    return off or shape.get("tail_excess", 0.0) > 1 or shape.get("tail_end", 0.0) > diag.ENDS_OFF
 
 
 def _off(emulator: EmulatedCost, ensemble: Array) -> dict[str, float]:

@@ -39,7 +39,10 @@ def test_linear_experiments_raise_no_false_alarm(settings):
 
 
 def test_a_discrepancy_that_is_not_there_is_not_found():
-    assert false_alarms([waved(0.0)]) == []
+    """Its amplitude has an upper limit, which is no Gaussian: by importance sampling its 95 % point is 0.032 where the
+    ensemble's Gaussian has 0.042, which may be told, and nothing else.
+    """
+    assert all("[non-gaussian]" in words for alarms in false_alarms([waved(0.0)]) for words in alarms)
 
 
 def off_by_little(analysis):

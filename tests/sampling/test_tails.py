@@ -128,6 +128,41 @@ def test_a_tail_along_which_the_cost_hardly_rises_is_told(seed):
     assert "k" in told.parameters
 
 
+@pytest.mark.parametrize("seed", [78, 99, 120])
+def test_the_upper_end_of_a_growth_that_is_seen_to_its_bend_is_told_or_sampled(seed):
+    """Of a logistic growth, against draws of the prior: how far it goes has a long tail, along a bent way."""
+    rng, t = np.random.default_rng(seed), np.linspace(0.5, 10, 12)
+
+    def grown(p, t):
+        return p["M"] / (1 + np.exp(-p["r"] * (t - p["m"])))
+
+    def drawn(rng, count):
+        m, r, middle = rng.standard_normal((3, count))
+        return {"M": 3 * np.exp(0.5 * m), "r": np.exp(0.7 * r), "m": 8 + 3 * middle}
+
+    y = grown(drawn(rng, 1), t) + 0.25 * rng.standard_normal(12)
+    many = drawn(np.random.default_rng(1), 400_000)
+    logs = -0.5 * sum((value - grown(many, at)) ** 2 for at, value in zip(t, y, strict=True)) / 0.25**2
+    shares, m = np.exp(logs - logs.max()) / np.exp(logs - logs.max()).sum(), many["M"]
+    order, std = np.argsort(m), np.sqrt(shares @ (m - shares @ m) ** 2)
+    end = np.interp(0.95, np.cumsum(shares[order]), m[order])
+    priors = {"M": lognormal(3, 0.5)[0], "r": lognormal(1, 0.7)[0], "m": normal(8, 3)[0]}
+
+    def estimated(**more):
+        return en4dvar.estimate(grown, (t, y), priors, error=0.25, seed=seed, progress=False, **more)
+
+    of_members = estimated()
+    assert end - np.quantile(of_members.posterior["M"].values, 0.95) > 0.7 * std
+    (told,) = (c for c in of_members.cautions if c.code == "non-gaussian")
+    assert "M" in told.parameters
+    if "tail_q95_M" in of_members.sample_stats.attrs:
+        assert of_members.sample_stats.attrs["tail_q95_M"] == pytest.approx(end, abs=0.5 * std)
+    sampled = estimated(cheap=True)
+    assert sampled.sample_stats.attrs["importance_draws"] > 0
+    row = next(row for row in sampled.rows if row.name == "M")
+    assert row.q95 == pytest.approx(end, abs=0.5 * std)
+
+
 def test_what_is_told_is_what_the_posterior_is():
     """Weights of many members, against quadrature."""
     case = CASES["wider than its prior says in ln k"]
@@ -243,6 +278,7 @@ def test_a_linear_function_is_neither_sampled_nor_doubted(n, members):
         assert "importance_draws" not in found
         assert (found["tail_shift"], found["tail_ratio"]) == pytest.approx((0, 1), abs=1e-6)
         assert found["tail_excess"] == 0
+        assert found["tail_end"] == pytest.approx(0, abs=1e-6)
 
 
 @pytest.mark.slow

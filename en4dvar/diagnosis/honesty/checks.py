@@ -251,11 +251,12 @@ def information(
 
 
 def gaussian(prior: Prior, members: Array, shape: Mapping[str, float], approximate: str = "") -> Findings:
-    """Members (N, n), physical and alive, whose mean or spread are not the posterior's.
+    """Members (N, n), physical and alive, whose mean, spread or ends are not the posterior's.
 
     Sizes are those of the numbers that are printed, for G of G and not of ln G: ``shape`` holds mean and std of the
-    posterior by an emulator or by weights. The finding is about the parameters that are off, and serious where one is
-    off by much. ``approximate``: what a scheme does that is no posterior even where this is Gaussian.
+    posterior by an emulator or by weights, and 5 and 95 % points. The finding is about the parameters that are off, and
+    serious where one is off by much. ``approximate``: what a scheme does that is no posterior even where this is
+    Gaussian.
     """
     if not shape.get("non_gaussian", diag.is_non_gaussian(shape)):
         return
@@ -264,7 +265,10 @@ def gaussian(prior: Prior, members: Array, shape: Mapping[str, float], approxima
     words = f"{why}: mean and spread of the ensemble are not the posterior's"
     by = "emulated" if shape.get("emulator_fit", 0.0) >= diag.EMULATED_ENOUGH else "tail"
     told = [(j, p) for j, p in enumerate(prior.parameters) if f"{by}_mean_{p.name}" in shape]
-    if not told:
+    ends = [(j, p) for j, p in enumerate(prior.parameters) if f"tail_q95_{p.name}" in shape and (j, p) not in told]
+    if ends and not told:
+        words = f"{why}: the ends of the intervals of the ensemble are not the posterior's"
+    elif not told:
         words = (
             f"{why} (effective share of members {shape['gaussian_fit']:.2f}): mean and spread of the ensemble may be "
             "off by more than they say"
@@ -278,6 +282,9 @@ def gaussian(prior: Prior, members: Array, shape: Mapping[str, float], approxima
             sizes.append(_both(p, members[:, j], shape, by))
             if abs(shift) > 1 or ratio <= 0.5 or ratio >= 2:  # where they are known
                 severity = SERIOUS
+    for j, p in ends:
+        off.append(p.name)
+        sizes.append(_ends(p, members[:, j], shape))
     more = f": {'; '.join(sizes)}" if sizes else ""
     if by == "tail" and told and math.isnan(shape[f"tail_mean_{off[0]}"]):
         more += f"; weighted, only {shape['tail_members']:.2g} members count: too few to say what these should be"
@@ -291,6 +298,16 @@ def _both(p: Parameter, members: Array, shape: Mapping[str, float], by: str) -> 
     unit = "" if p.display_unit == "1" else f" {p.display_unit}"
     rather = "" if math.isnan(estimate) else f" where it should be about {estimate:.2g} ± {spread:.2g}{unit}"
     return f"{p.name} = {mean:.2g} ± {std:.2g}{unit}{rather}"
+
+
+def _ends(p: Parameter, members: Array, shape: Mapping[str, float]) -> str:
+    """The 5 and 95 % points of the members and of the posterior, as displayed."""
+    si = (*diag.member_quantiles(members, (0.05, 0.95)), shape[f"tail_q05_{p.name}"], shape[f"tail_q95_{p.name}"])
+    low, high, begin, end = (convert(float(v), p.unit, p.display_unit) for v in si)
+    unit = "" if p.display_unit == "1" else f" {p.display_unit}"
+    return (
+        f"5–95 % of {p.name} is {low:.2g} to {high:.2g}{unit} where it should be about {begin:.2g} to {end:.2g}{unit}"
+    )
 
 
 def down_weighted(analysis: Analysis) -> Findings:

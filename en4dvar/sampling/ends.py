@@ -1,0 +1,160 @@
+r"""The ends of the interval of each parameter, of a posterior that its ensemble as a Gaussian may not be.
+
+    p(x_j) ∝ exp(−J(x*)) V(x*),   x* = argmin J at x_j
+
+Points at multiples of the spread of a Gaussian that is too narrow do not reach a long tail. So each parameter is moved
+outwards, the others to where J is lowest, until J has risen by what leaves no tail. Where J is lowest, and the volume V
+of the others there, is what an emulator says that is fitted to the runs there are, which costs none; J is the model's.
+Of a linear model the ends are the Gaussian's, whatever the points are.
+
+Source: marginals by Laplace's approximation at each value, Tierney & Kadane (1986), J. Am. Stat. Assoc. 81, 82.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from en4dvar.descent.weight_space import WeightSpace
+from en4dvar.diagnosis.response.ledger import weighted_quantiles
+from en4dvar.ensemble.linalg import shares_of
+from en4dvar.model.state import Array
+from en4dvar.priors.prior import member_stream
+from en4dvar.sampling.emulated_cost import DEGREES, RUNS_PER_TERM, ModelRuns, fitted_cost
+from en4dvar.sampling.emulated_draws import LARGEST
+
+END = 3.0  # standard deviations to either side of the mean, where J of the Gaussian has risen by 4.5
+SHORT = 1.5  # less than that by which J rises to a point beyond which there may be a tail: it is followed
+FURTHER = 1.5  # times as far
+TRIED, WIDTHS = 128, (2.0, 1.0, 0.5, 0.25)  # points about x*, so wide, among which emulated J is lowest
+PLACES = 2001  # of a parameter, at which its density is known
+
+
+class Intervals(NamedTuple):
+    """The 5, 50 and 95 % points (3, n) of the posterior in what is printed, and by how much the 5 or 95 % point of the
+    Gaussian is off (n,), in posterior standard deviations; whether J ``rises`` to all points at :data:`END`.
+    """
+
+    quantiles: Array
+    off: Array
+    rises: bool
+
+
+class _Walk:
+    """Along each parameter j, to both sides, from the mean of an ensemble (N, n); ``runs`` are there.
+
+    ``costs`` of each side are J − ln V (relative to that at the mean) by the distance in standard deviations.
+    """
+
+    def __init__(self, space: WeightSpace, ensemble: Array, runs: ModelRuns):
+        self.space, self.runs, n = space, runs, ensemble.shape[1]
+        self.mean, self.std = ensemble.mean(axis=0), ensemble.std(axis=0, ddof=1)
+        correlation = np.atleast_2d(np.corrcoef(ensemble.T))
+        self.ways = np.array([side * self.std * correlation[j] for j in range(n) for side in (-1, 1)])
+        half = member_stream(space.seed, "ends").standard_normal((TRIED // 2, n - 1))
+        self.normal = np.concatenate([half, -half])
+        roots = [self.std[:, None] * _conditional(correlation, j) for j in range(n) for _ in range(2)]
+        self.about = np.array([self.normal @ root.T for root in roots])  # (2n, T, n) of the others, about each point
+        self.bends = np.zeros_like(self.ways)  # of the last x* from the way, relative to the distance
+        at_mean = float(space.costs(self.mean[None], space.forecast(self.mean[None]))[0])
+        self.costs = [{0.0: at_mean} for _ in self.ways]
+
+    @property
+    def lowest(self) -> float:
+        return min(min(costs.values()) for costs in self.costs)
+
+    def go(self, sides: list[int], far: float) -> None:
+        """So ``far`` on ``sides``."""
+        x, log_volume = self.mean + far * (self.ways + self.bends)[sides], np.zeros(len(sides))
+        if self.runs.outputs.shape[1] <= LARGEST and self.space.settings.emulator != "off":
+            x, log_volume = self._emulated(x, self.about[sides])
+        outcome = self.space.forecast(x)
+        costs = self.space.costs(x, outcome)
+        self.runs = self.runs.joined(ModelRuns.of(x, outcome, costs))
+        self.bends[sides] = (x - self.mean) / far - self.ways[sides]
+        for side, cost in zip(sides, costs - log_volume, strict=True):
+            self.costs[side][far] = float(cost)
+
+    def _emulated(self, x: Array, about: Array) -> tuple[Array, Array]:
+        """The points x* (S, n) among those ``about`` (S, T, n) the points ``x`` (S, n), and ln V (S,)."""
+        problem, n = self.space.problem, len(self.mean)
+        degree = next((d for d in DEGREES if RUNS_PER_TERM * math.comb(n + d, d) <= len(self.runs.x)), 1)
+        emulated = fitted_cost(problem.prior, problem.observations, degree, self.runs, 2 * n)
+
+        def costs(tried: Array) -> Array:
+            return emulated.cost(tried.reshape(-1, n)).reshape(tried.shape[:2])
+
+        def log_volume(at: Array) -> Array:
+            falls = emulated.cost(at)[:, None] - costs(at[:, None] + about)
+            return np.asarray(np.logaddexp.reduce(falls + 0.5 * np.sum(self.normal**2, axis=1), axis=1))
+
+        for width in WIDTHS:
+            tried = np.concatenate([x[:, None], x[:, None] + width * about], axis=1)
+            x = tried[np.arange(len(x)), np.argmin(costs(tried), axis=1)]
+        return x, log_volume(x) - log_volume(np.broadcast_to(self.mean, x.shape))
+
+    def rise(self, side: int, far: float) -> float:
+        """Of J on a side, to where it was so far."""
+        return self.costs[side][far] - self.lowest
+
+    def short(self, far: float, sides: list[int]) -> list[int]:
+        """Those of the ``sides`` beyond whose distance ``far`` there may be a tail."""
+        return [side for side in sides if self.rise(side, far) < 0.5 * END**2 - SHORT]
+
+    def density(self, j: int) -> tuple[Array, Array]:
+        """Distances (P,) along parameter j and its density there, up to a constant.
+
+        Between the points √(2 (J − min J)) is interpolated, which is the distance itself where J is quadratic; beyond
+        the last, as far again, it goes on as before.
+        """
+        from scipy.interpolate import PchipInterpolator  # not needed to import the package
+
+        distances, roots = [0.0], [0.0]
+        for sign, costs in zip((-1, 1), self.costs[2 * j : 2 * j + 2], strict=True):
+            far = sorted(costs)
+            root = [min(2 * END, math.sqrt(2 * max(0.0, costs[d] - self.lowest))) if d else 0.0 for d in far]
+            slope = max(0.0, root[-1] - root[-2]) / (far[-1] - far[-2])
+            root.append(root[-1] + slope * far[-1])
+            far.append(2 * far[-1])
+            distances += [sign * d for d in far[1:]]
+            roots += [sign * r for r in root[1:]]
+        order = np.argsort(distances)
+        z = np.linspace(min(distances), max(distances), PLACES)
+        return z, np.exp(-0.5 * PchipInterpolator(np.array(distances)[order], np.array(roots)[order])(z) ** 2)
+
+
+def _conditional(correlation: Array, j: int) -> Array:
+    """Root (n, n − 1) of the covariance of the others where parameter j stands still, in their standard deviations."""
+    others = np.delete(np.arange(len(correlation)), j)
+    root = np.zeros((len(correlation), len(others)))
+    left = correlation - np.outer(correlation[j], correlation[j])
+    root[others] = np.linalg.cholesky(left[np.ix_(others, others)])
+    return root
+
+
+def examine_ends(space: WeightSpace, ensemble: Array, runs: ModelRuns) -> Intervals:
+    """Of an ensemble (N, n), by 2n + 1 runs beside the ``runs`` there are, and more where J rises too little."""
+    walk, prior, far = _Walk(space, ensemble, runs), space.problem.prior, END
+    sides = list(range(len(walk.ways)))
+    walk.go(sides, END)
+    left = walk.short(END, sides)
+    bent = [side for side in sides if side in left or walk.rise(side, END) > 0.5 * END**2 + SHORT]
+    rises = not left
+    while left:
+        far *= FURTHER
+        walk.go(left, far)
+        left = walk.short(far, left)
+    if bent:  # how it rises there
+        walk.go(bent, END / 2)
+    quantiles, off = np.empty((3, len(walk.mean))), np.empty(len(walk.mean))
+    for j in range(len(off)):
+        z, density = walk.density(j)
+        x = np.tile(walk.mean, (len(z), 1))
+        x[:, j] += walk.std[j] * z
+        theta = prior.to_physical(x)[:, j]
+        shares = density / density.sum()
+        quantiles[:, j] = weighted_quantiles(theta, shares)
+        gaussian = weighted_quantiles(theta, shares_of(-0.5 * z**2))
+        std = math.sqrt(shares @ (theta - shares @ theta) ** 2)
+        off[j] = np.max(np.abs(gaussian - quantiles[:, j])[[0, 2]]) / std
+    return Intervals(quantiles, off, rises)
