@@ -56,10 +56,10 @@ import en4dvar
 from en4dvar.assembly.build import build
 from en4dvar.cli import main as command_line
 from en4dvar.config import load_config
+from en4dvar.data.extrema import minima
 from en4dvar.diagnosis.diagnostics import member_quantiles
 from en4dvar.diagnosis.withheld import BAND, expectations, quantile
 from en4dvar.executor import SerialExecutor
-from en4dvar.inputs.window import minima
 from en4dvar.model.state import Array
 from en4dvar.problem import InverseProblem
 from en4dvar.report.history import withheld_lines

@@ -146,4 +146,4 @@ for command in (
     main.add_command(command)
 
 if __name__ == "__main__":
-    main()
+    main(prog_name="en4dvar")

@@ -24,7 +24,7 @@ from en4dvar.inputs.implausible import cut_off, scatter_of, step_doubts
 from en4dvar.inputs.members import read_covariance
 from en4dvar.inputs.parts import ANY, Column, DataFile, Layout, parts_of
 from en4dvar.inputs.readers import CLIPPED, Readings, Rows, read_series
-from en4dvar.inputs.window import Instant, index_of, select
+from en4dvar.inputs.window import Instant, index_of, select, vertex
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.errors import DataError, retold
@@ -128,7 +128,8 @@ def read_one(plan: SeriesPlan, file: DataFile, fewest: int) -> Series:
     )  # fmt: skip
     window = _window(data, read, path)
     times, values = read.times[window], read.values[window]
-    zero = float({"file": 0.0, "window": times[0]}.get(str(data.time_zero), data.time_zero))
+    top = vertex(read.times, read.values) if data.time_zero == "top" else 0.0
+    zero = float({"file": 0.0, "window": times[0], "top": top}.get(str(data.time_zero), data.time_zero))
     times = times - zero
     if times[0] < 0:
         clock = data.columns.time

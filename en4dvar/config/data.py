@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, cast
+from typing import Annotated, Any, Literal, Self, cast, get_args
 
 from pydantic import BeforeValidator, ConfigDict, Discriminator, Field, Tag, WithJsonSchema, model_validator
 
@@ -143,10 +143,13 @@ class WindowSection(Section):
     """How deep a minimum must be to count, relative to the range of the series."""
 
 
-def read_time_zero(text: Any, context: Context) -> Literal["file", "window"] | float:
-    if text in ("file", "window"):
-        return "file" if text == "file" else "window"
-    with retold(UnitError, UnitError, "write file, window or a time: "):
+TimeZero = Literal["file", "window", "top"]
+
+
+def read_time_zero(text: Any, context: Context) -> TimeZero | float:
+    if text in get_args(TimeZero):
+        return cast(TimeZero, text)
+    with retold(UnitError, UnitError, "write file, window, top or a time: "):
         return parse_quantity(text, time_unit(context))
 
 
@@ -193,8 +196,9 @@ class Data(Section):
     seen in the whole file."""
     columns: Annotated[Columns, OfObservable("column role")]
     window: WindowSection = Field({}, validate_default=True)
-    time_zero: Annotated[Literal["file", "window"] | float, Made(read_time_zero)] = Field("file", validate_default=True)
-    """Where the model's clock starts: file (the file's own zero), window (the first observation used), or a time."""
+    time_zero: Annotated[TimeZero | float, Made(read_time_zero)] = Field("file", validate_default=True)
+    """Where the model's clock starts: file (the file's own zero), window (the first observation used), top (the vertex
+    of a parabola through the readings about the largest), or a time."""
     weights: Annotated[Weighing | None, WEIGHTS] = None
     """How often each observation counts, beside ``assimilation.weights``: a list, ``{column: NAME}``,
     ``{zero_near_minima: 2 us}``, or ``{function: ./weights.py:name}``. Other than 0 and 1 they are not Bayesian."""

@@ -15,10 +15,10 @@ from pydantic import BeforeValidator, ConfigDict, Field, TypeAdapter
 from en4dvar.config.context import PLACEHOLDER, TEXT, Context, Faults, Made
 from en4dvar.config.quantities import Spread, Unit, observable_unit, quantity, read_spread, time_unit, unit_of
 from en4dvar.config.schema import OfReadings, Section
+from en4dvar.data.extrema import minima
 from en4dvar.data.noise import SMOOTHNESS, Kernel
 from en4dvar.data.series import Places
 from en4dvar.inputs.parts import Column, Matrix
-from en4dvar.inputs.window import minima
 from en4dvar.model.forward import field_of
 from en4dvar.model.state import Array, Parameter
 from en4dvar.model.state import Field as StateBlock

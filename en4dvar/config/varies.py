@@ -15,8 +15,8 @@ from pydantic import model_validator
 from en4dvar.config.context import Context, Faults, Made, read_each
 from en4dvar.config.quantities import SPREAD, Spread, parse_spread, quantity, subject_unit, time_unit
 from en4dvar.config.schema import Section
+from en4dvar.data.extrema import maxima
 from en4dvar.data.observations import Observations
-from en4dvar.inputs.window import maxima
 from en4dvar.model.forward import ForwardModel
 from en4dvar.model.state import Field, Parameter
 from en4dvar.plumbing.errors import ConfigError

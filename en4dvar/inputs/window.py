@@ -16,6 +16,7 @@ from typing import Literal
 
 import numpy as np
 
+from en4dvar.data.extrema import minima
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import DataError, retold
 from en4dvar.plumbing.hints import shown
@@ -92,7 +93,7 @@ def index_of(
     if instant.kind == "maximum":
         return first + int(np.argmax(values[first:]))
     if instant.kind == "top":
-        return int(np.searchsorted(times, _top(times[first:], values[first:])))
+        return int(np.searchsorted(times, vertex(times[first:], values[first:])))
     indices = minima(values[first:], prominence)
     if instant.number > len(indices):
         few = f"only {len(indices)} minima with a prominence of {prominence:.0%} of the range follow its start"
@@ -107,8 +108,8 @@ def index_of(
     return first + index
 
 
-def _top(times: Array, values: Array) -> float:
-    """Where a parabola through the samples about the largest has its vertex; the largest where they make none."""
+def vertex(times: Array, values: Array) -> float:
+    """When a parabola through the samples about the largest has its vertex; the largest where they make none."""
     largest = int(np.argmax(values))
     low = np.flatnonzero(values < ABOUT * values[largest])
     near = slice(int(max(low[low < largest], default=-1)) + 1, int(min(low[low > largest], default=len(values))))
@@ -116,8 +117,8 @@ def _top(times: Array, values: Array) -> float:
     if len(t) < 5:
         return float(times[largest])
     curvature, slope, _ = np.polyfit(t, y, 2)
-    vertex = -slope / (2 * curvature) if curvature < 0 else 0.0
-    return float(times[largest] + np.clip(vertex, t[0], t[-1]))
+    top = -slope / (2 * curvature) if curvature < 0 else 0.0
+    return float(times[largest] + np.clip(top, t[0], t[-1]))
 
 
 def _middle(times: Array, values: Array, index: int) -> float:
@@ -126,19 +127,3 @@ def _middle(times: Array, values: Array, index: int) -> float:
 
     _, _, left, right = peak_widths(-values, [index], rel_height=0.5)
     return float(np.mean(np.interp([left[0], right[0]], np.arange(len(times)), times)))
-
-
-def maxima(values: Array) -> Array:
-    """Indices of the local maxima of ``values`` (K,) behind their first minimum, of 10 % prominence."""
-    first, tops = minima(values)[:1], minima(-values)
-    return tops[tops > first] if len(first) else first
-
-
-def minima(values: Array, prominence: float = 0.1) -> Array:
-    """Indices of the local minima of ``values`` (K,) with at least ``prominence`` times its range."""
-    from scipy.signal import find_peaks
-
-    if len(values) < 3:
-        return np.empty(0, dtype=int)
-    indices, _ = find_peaks(-values, prominence=prominence * np.ptp(values))
-    return np.asarray(indices)

@@ -127,7 +127,9 @@ def parse_unit(text: str) -> Unit:
         tokens.append(match)
         end = match.end()
     if end < len(clean):
-        raise UnitError(f"cannot read unit {text!r} at {clean[end:]!r}")
+        multiple = re.fullmatch(r"\s*([\d.]+(?:[eE][+-]?\d+)?)\s*([A-Za-z%(].*)", clean)
+        hint = f"; a multiple of a unit has a star: '{multiple[1]}*{multiple[2]}'" if multiple else ""
+        raise UnitError(f"cannot read unit {text!r} at {clean[end:]!r}{hint}")
     unit = _product(iter(tokens), text)
     if not 1e-90 < unit.factor < 1e90:
         raise UnitError(f"cannot read unit {text!r}: a unit is a positive multiple of another")

@@ -228,7 +228,7 @@ def write_design(folder: Path) -> Path:
     designs = load_designs(folder / FILE)
     write_csv(folder / "designs.csv", _cells(designs))
     rows, best = ranked(designs), {id(row) for row in front(designs)}
-    figures = [("fans", FANS, fans(designs))]
+    figures = [("fans", FANS, fans(designs))] if all(len(row.evaluated.grid) for row in rows) else []
     if len({row.price for row in rows}) > 1:
         figures.insert(0, ("prices", FRONT, prices(designs)))
     if designs.asked.knobs or len({row.evaluated.alike for row in rows}) > 1:
@@ -249,11 +249,12 @@ def write_design(folder: Path) -> Path:
 def readings_text(designs: Designs, row: DesignRow) -> str:
     """When readings are taken: "43 from 0.7 to 59.5 µs, every 1.4 µs", or each where they are not evenly spaced."""
     stored, shown = designs.asked.axes[0]
-    t, unit = convert(row.evaluated.times, stored, shown), "" if shown == "1" else f" {shown}"
+    count, unit = len(row.evaluated.times), "" if shown == "1" else f" {shown}"
+    t = np.unique(convert(row.evaluated.times, stored, shown))
     gaps = np.diff(t)
     if len(t) > 2 and np.ptp(gaps) < 1e-6 * gaps.mean():
-        return f"{len(t)} from {t[0]:.4g} to {t[-1]:.4g}{unit}, every {gaps.mean():.4g}{unit}"
-    return f"{len(t)}, at {', '.join(f'{instant:.4g}' for instant in t)}{unit}"
+        return f"{count} from {t[0]:.4g} to {t[-1]:.4g}{unit}, every {gaps.mean():.4g}{unit}"
+    return f"{count}, at {', '.join(f'{instant:.4g}' for instant in t)}{unit}"
 
 
 def _cells(designs: Designs) -> list[list[Any]]:

@@ -250,7 +250,9 @@ class _Parts:
         if len(fit.problems) < FEWEST_SETS:
             return None
         names = [name for name in POPULATION if fit.estimated(name)]
-        return population_of(fit.problems, list(fit.starts), names, self.plan.seed, kept=fit.sampled, hyper=HYPER)
+        return population_of(
+            fit.problems, list(fit.starts), names, self.plan.seed, kept=fit.sampled, executor=self.executor, hyper=HYPER
+        )
 
     def _comparison(self, models: Mapping[Model, Fit], populations: Mapping[Model, Population | None]) -> Comparison:
         nh, general = (models[m] for m in COMPARED)

@@ -232,7 +232,7 @@ async function readTable() {
     $(id).value = known[id] || (!table?.tracked && own) || "";
   }
   $("about-table").textContent = !table ? "" : table.tracked ? "A table of 'en4dvar track': it says its columns and units itself."
-    : `${table.files} file(s); of ${table.file}${table.decimal === "," ? ", with decimal commas" : ""}. Units are never guessed: give them.`;
+    : `${table.files} file(s); of ${table.file}${table.decimal === "," ? ", with decimal commas" : ""}. ${table.words.length ? `Words stand in ${table.words.join(", ")}: no times or radii. ` : ""}Units are never guessed: give them.`;
   plotTable();
 }
 

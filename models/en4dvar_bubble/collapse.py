@@ -35,7 +35,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import stdtrit
 
-from en4dvar.inputs.window import maxima
+from en4dvar.data.extrema import maxima
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.errors import DataError

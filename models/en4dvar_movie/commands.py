@@ -94,7 +94,8 @@ def track(
         write_movie(outlined, pictures, len({r.frame for r in track.readings}), scale.pixel, scale.rate)
     used = [r for r in track.readings if r.used]
     what = "frames" if len(scale.flashes) == 1 else "circles"
-    echo(f"{len(used)} of {len(track.readings)} {what} read; the others and why: see the page")
+    others = "; the others and why: see the page" if len(used) < len(track.readings) else ""
+    echo(f"{len(used)} of {len(track.readings)} {what} read{others}")
     if doubtful := doubted(track.readings):
         echo(f"doubtful, and not used until a line of --corrections confirms them: {doubtful}")
     for other, readings in zip(more, track.others, strict=False):

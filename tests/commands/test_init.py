@@ -9,7 +9,7 @@ from typing import get_args
 import click
 import numpy as np
 import pytest
-from init_files import UNITS, call, proposed, simulate, write
+from init_files import UNITS, call, proposed, rebounding, simulate, write
 
 from en4dvar.assembly.build import build, data_files, inverse_plan
 from en4dvar.config import load_config
@@ -17,6 +17,7 @@ from en4dvar.config.document import parse_document
 from en4dvar.inputs.formats import Format
 from en4dvar.runs.together import groups_of
 from en4dvar_bubble import commands_init
+from en4dvar_bubble.collapse import single
 from en4dvar_bubble.starter.config import quoted
 
 pytestmark = pytest.mark.usefixtures("own_folder")
@@ -138,6 +139,53 @@ def test_a_folder_is_a_campaign_and_its_odd_file_is_named(tmp_path: Path) -> Non
     done = call("init", "--data", folder, *UNITS, "--force")
     assert done.exit_code == 2
     assert done.stderr.count("other.csv: ") == 2
+
+
+def test_the_clock_of_a_bubble_is_as_certain_in_a_folder_as_alone(tmp_path: Path) -> None:
+    """Films of the same bubble whose frames lie otherwise about its top, at t = 0 after any time of the camera's."""
+    (tmp_path / "gel").mkdir()
+    stream, clocks = np.random.default_rng(5), {}
+    for n in range(4):
+        t, R = rebounding(0.1, 0.025 * n)
+        readings = zip(20 * (t + 3.3 * n), 200 * R + 0.4 * stream.standard_normal(len(R)), strict=True)
+        (tmp_path / "gel" / f"b{n}.csv").write_text("t_us,R_um\n" + "".join(f"{a:.4f},{b:.4f}\n" for a, b in readings))
+    for data in ("gel", *(f"gel/b{n}.csv" for n in range(4))):
+        assert call("init", "--data", data, "--start", "laser", "--out", "b.yaml", "--force").exit_code == 0
+        for problem in build(proposed(Path("b.yaml"))):
+            (clock,) = (term for term in problem.prior.terms if term.parameter.name == "t_s")
+            clocks[data, problem.observations.name] = clock.std
+            late = clock.mean - problem.observations.zero + 20e-6 * 3.3 * int(problem.observations.name[1:])
+            assert abs(late) < 2 * clock.std  # of what the frames' clock shows at the top
+    for n in range(4):
+        assert clocks["gel", f"b{n}"] == pytest.approx(clocks[f"gel/b{n}.csv", f"b{n}"], rel=0.3)
+
+
+@pytest.mark.parametrize(
+    ("ends", "words"),
+    [
+        ((1.1,), "warning: the readings end before the first rebound has a top, .* upper limits .*: record longer, "),
+        ((1.5,), ""),
+        ((1.5, 1.6), ""),
+        ((3.0,), ""),
+        ((1.1, 3.0), "warning: b0: the readings end .*; the window of the others can .* if those files are moved away"),
+        ((1.5, 3.0), "warning: b0: without a second minimum the window ends before .*; the window of the others can "),
+    ],
+)
+def test_a_recording_that_ends_with_the_first_collapse_is_told_at_once(
+    tmp_path: Path, ends: tuple[float, ...], words: str
+) -> None:
+    """Where a run of the same files tells upper limits only; a rebound whose top is past is in the window."""
+    (tmp_path / "gel").mkdir()
+    t, R = rebounding(0.05)
+    for n, end in enumerate(ends):
+        rows = zip(20 * t[t < end], 200 * R[t < end], strict=True)
+        (tmp_path / "gel" / f"b{n}.csv").write_text("t_us,R_um\n" + "".join(f"{a:.4f},{b:.4f}\n" for a, b in rows))
+    done = call("init", "--data", "gel", "--start", "laser", "--out", "b.yaml")
+    assert done.exit_code == 0, done.output
+    assert re.search(words, done.stderr)
+    assert ("upper limits" in done.stderr) == bool(words)
+    for problem in build(load_config("b.yaml")):
+        assert single(problem.observations.times, problem.observations.values) == bool(words)
 
 
 def test_without_data_a_starter_is_written() -> None:

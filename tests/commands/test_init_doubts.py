@@ -66,7 +66,7 @@ def test_frames_without_a_bubble_change_nothing_but_a_note(tmp_path: Path) -> No
         text = Path(f"{name}.yaml").read_text().replace(name, "blank")
         written[name] = [line for line in text.splitlines() if "frames without" not in line]
         (problem,) = build(load_config(f"{name}.yaml"))
-        written[name] += [problem.observations.continued.times.tolist()]
+        written[name] += [problem.observations.times.tolist()]
     assert written["blank"] == written["coded"] == written["coded_too"]
     said = call("validate", "coded.yaml").stderr
     assert "note: coded: readings left out, for they are 0 or below, as a missing reading may be written: 3 of" in said
@@ -203,7 +203,7 @@ def test_rows_of_a_matrix_are_columns_where_it_is_flat(tmp_path: Path) -> None:
     done = call("init", "--data", "b.mat", *UNITS, "--time-column", "data(1,:)", "--radius-column", "data(2,:)")
     assert done.exit_code == 0, done.output
     (problem,) = build(proposed(Path("b.yaml")))
-    assert problem.observations.continued.values.min() == pytest.approx(1e-6 * rows[1].min())
+    assert problem.observations.values.min() == pytest.approx(1e-6 * rows[1].min())
 
 
 @pytest.mark.parametrize("name", ["dR_um", "R_err_um", "sigma_um", "radius_std", "R std [nm]"])

@@ -44,6 +44,20 @@ def test_window_zero_weights_and_relative_error(tmp_path: Path) -> None:
     assert y.weights.sum() == pytest.approx(1.0)
 
 
+def test_the_clock_can_start_at_the_top_that_each_data_set_shows(tmp_path: Path) -> None:
+    """A parabola read every 5 ms, whose top lies at 52 ms in one file and at 54 ms in the other."""
+    path = write_toy(tmp_path, ("  path: toy.csv\n", "  path: [toy.csv, late.csv]\n  window: {from: top, to: end}\n"))
+    for name, top in (("toy", 52), ("late", 54)):
+        rows = "".join(f"{t},{100 - 0.01 * (t - top) ** 2}\n" for t in range(0, 150, 5))
+        (tmp_path / f"{name}.csv").write_text("t_ms,x_um\n" + rows)
+    problems = build(load_config(path, {"data.time_zero": "top"}))
+    assert [problem.observations.zero for problem in problems] == pytest.approx([52e-3, 54e-3])
+    assert [problem.observations.times[0] for problem in problems] == pytest.approx([3e-3, 1e-3])
+    assert [problem.observations.file_times[0] for problem in problems] == pytest.approx([55e-3, 55e-3])
+    with pytest.raises(DataError, match=r"lies 52 ms before time zero.*begin later"):
+        build(load_config(path, {"data.time_zero": "top", "data.window": {"from": "start"}}))
+
+
 def test_the_trough_after_the_window_is_named(tmp_path: Path) -> None:
     """Counted as ``data.window.to`` counts it, from the window's start, as far as readings are predicted."""
     path = write_toy(tmp_path, data=csv_text(121))

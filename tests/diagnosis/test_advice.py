@@ -26,12 +26,14 @@ from diagnosis.provoked_by_several import OF_SEVERAL
 from estimation.test_agreement import joint
 from toys import Vectorised, make_observations, make_problem, with_discrepancy, with_noise
 
+from en4dvar.data.extrema import maxima
 from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.model.forward import Alternative, ValidityLimit
-from en4dvar.model.state import Parameter
+from en4dvar.model.state import Field, Parameter
 from en4dvar.plumbing.caution import CATALOGUE, Caution
 from en4dvar.priors.prior import Prior, PriorTerm
+from en4dvar.priors.varying import StateChanges
 from en4dvar.problem import InverseProblem
 from en4dvar.sampling import mcmc
 from en4dvar.schemes.settings import AssimilationSettings
@@ -263,6 +265,20 @@ def test_a_table_that_is_not_there_is_asked_for_and_one_that_cannot_be_is_not_na
     there = run(assuming, what_if=True)
     assert there.what_if
     assert "look at the what-if table and compare other models" in told(there, "discrepancy-found").advice
+
+
+def test_what_the_model_says_may_change_is_let_change_where_a_long_window_shows_a_discrepancy():
+    """A window with one maximum behind the first minimum, or several; or in which it changes already."""
+    problem = waved(3.0)
+    problem.model.unforeseen = {"y": 0.01}
+    asked = "let y change on the way (--set model_error.y='{at: maxima, std: 1 %}') and compare other models"
+    y, t = problem.observations.values, problem.observations.times
+    for frequency, count in ((6, 1), (12, 4)):
+        bouncing = read(problem, values=y + 0.15 * (np.sin(frequency * t) - np.sin(5 * t)))
+        assert len(maxima(bouncing.observations.values)) == count
+        assert (asked in told(run(bouncing), "discrepancy-found").advice) == (count > 1)
+    changes = StateChanges.of(problem.model, Field("y"), [float(t[20])], 0.01, relative=True)
+    assert "model_error" not in told(run(bouncing.varied([changes])), "discrepancy-found").advice
 
 
 def test_a_future_that_is_missed_is_taken_in_up_to_the_next_trough():

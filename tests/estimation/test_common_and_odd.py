@@ -147,14 +147,9 @@ def test_one_that_is_odd_in_one_parameter_alone_is_named():
     y = np.array([0.3, -0.2]) + np.hypot(0.1, error) * rng.standard_normal((12, 2))
     y[0] = 1.0, -0.2
     left = 1 / (1 + error**-2)
-    likelihoods = [
-        OwnLikelihood(
-            Mixture.divided(left / error**2 * row[None], left * np.eye(2)[None], np.zeros(1), np.ones(2)),
-            Following(np.zeros((2, 0)), np.zeros(2)),
-            row + error * rng.standard_normal((400, 2)),
-        )
-        for row in y
-    ]
+    each = ((r, Mixture.divided(left / error**2 * r[None], left * np.eye(2)[None], np.zeros(1), np.ones(2))) for r in y)
+    following = Following(np.zeros((2, 0)), np.zeros(2))
+    likelihoods = [OwnLikelihood(m, m, following, r + error * rng.standard_normal((400, 2))) for r, m in each]
     hierarchy, h = Hierarchy(likelihoods, hyper), np.array([[0.3, -0.2, *np.log([0.1, 0.2])]])
     variances = np.array([[0.01, 0.04], [0.01 + 1, 0.04], [0.01, 0.04 + 1]]) + error**2
     under_prior = norm(0, np.hypot(1, error)).pdf(y).prod(axis=1)
@@ -253,7 +248,7 @@ def test_the_median_one_by_one_of_sets_that_only_what_is_common_makes_uncertain(
     """Their members scatter by chance less than the common quantity alone would say; what is their own is 0.01."""
     rng, count = np.random.default_rng(1), 12
     theta, own = rng.standard_normal((400, 1)), 0.01 * rng.standard_normal((count, 400, 1))
-    likelihoods = [OwnLikelihood(None, Following(np.array([[0.5]]), np.zeros(1)), z) for z in own]
+    likelihoods = [OwnLikelihood(None, None, Following(np.array([[0.5]]), np.zeros(1)), z) for z in own]
     sets = [0.9 * (0.5 * theta + z) for z in own]
     (median,) = _empirical([PriorTerm.normal(A, 0.0, 1.0)], sets, likelihoods, 1)
     assert median.common == pytest.approx(0.5, rel=1e-6)

@@ -321,3 +321,26 @@ def test_what_is_wanted_where_nothing_else_is_asked_for(tmp_path):
     for row in designs.rows:
         assert row.evaluated.others.shape == (2, 0)
         assert needs(designs, row) == ["a to ± 50 %", "b to ± 0.001 m: not with these readings"]
+
+
+def test_whole_fields_are_refused_with_what_to_do(tmp_path):
+    plan = _plan(knobs={}, method="laplace", about=["recharge"])
+    plan["model"] = {"name": "aquifer", "shape": [5, 5], "step": 2}
+    del plan["design"]["times"]
+    (tmp_path / "wells.csv").write_text("t,cell,head\n4,3,0.1\n4,20,0.1\n8,12,0.1\n")
+    plan["data"] = {
+        "path": str(tmp_path / "wells.csv"),
+        "columns": {"time": {"name": "t", "unit": "1"}, "head": {"name": "head", "unit": "1"}},
+        "places": {"column": "cell"},
+        "error": {"head_std": "0.1"},
+    }
+    plan["parameters"] = {"recharge": {"prior": "lognormal", "median": 0.01, "log_std": 0.3}, "storage": 0.1}
+    plan["initial_state"] = {"ln_T": {"std": 1, "kernel": "gaussian", "length": 2, "modes": 3}}
+    localised = {"assimilation.localisation": {"radius": 3}}
+    with pytest.raises(ConfigError, match=r"whole fields .* without assimilation\.localisation .* by its modes"):
+        run_design(plan, out=tmp_path / "whole", overrides=localised)
+    by_modes, _ = run_design(plan, out=tmp_path / "modes", overrides=PAGE)
+    assert by_modes.rows[0].result.gain > 0
+    page = (tmp_path / "modes" / "design.html").read_text()
+    assert "3, at 4, 8" in page
+    assert "<svg" not in page

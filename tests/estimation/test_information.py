@@ -81,6 +81,7 @@ def twisted(p, t):
     return sum(x[j] * np.cos(j * t + j**2 / 3) for j in range(7))
 
 
+@pytest.mark.slow
 def test_one_of_seven_parameters_of_a_bent_posterior():
     """A rotation by an angle of its own keeps N(0, I): the information about a is that of the linear problem."""
     t, std = np.linspace(0.1, 2.5, 6), 0.3

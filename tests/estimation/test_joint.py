@@ -246,6 +246,7 @@ class Rounded(Vectorised):
         return [Trajectory(t, s, self.layout) for t, s in zip(own, states, strict=True)]
 
 
+@pytest.mark.slow
 def test_own_quantities_of_two_minima_that_both_count():
     """Against the integral: the curvature where J is lowest tells of one of ±c, and the draws find the other."""
     model, t, std = Rounded(names=("a", "c"), compiled=True), np.array([1.0, 2.0, 3.0]), 0.3
@@ -279,6 +280,7 @@ class Decaying(Vectorised):
         return [Trajectory(t, s, self.layout) for t, s in zip(own, states, strict=True)]
 
 
+@pytest.mark.slow
 def test_a_tail_that_the_first_draws_do_not_reach():
     """Quantiles of a shared G of 24 seeds against the integral over a grid; the curvature of J tells too narrow a G."""
     model, rng = Decaying(names=("G", "a", "c"), compiled=True), np.random.default_rng(14)

@@ -11,16 +11,17 @@ from en4dvar.estimation.population.own import Mixture, log_marginal
 STD = 0.3
 RNG = np.random.default_rng(0)
 H, Y, PRIOR_STD = RNG.standard_normal((4, 3)), RNG.standard_normal(4), np.array([0.5, 1.5, 0.7])
+PRIOR_MEAN = np.array([0.4, -1.0, 0.2])
 
 
 @pytest.fixture(scope="module")
 def mixture():
-    """Of the posterior of y = Hx + noise under N(0, diag PRIOR_STD²), in units that make it the likelihood."""
+    """Of the posterior of y = Hx + noise under N(PRIOR_MEAN, diag PRIOR_STD²), in units that make it the likelihood."""
     covariance = np.linalg.inv(np.diag(PRIOR_STD**-2.0) + H.T @ H / STD**2)
-    mean = covariance @ H.T @ Y / STD**2
-    evidence = multivariate_normal(np.zeros(4), H @ np.diag(PRIOR_STD**2) @ H.T + STD**2 * np.eye(4)).logpdf(Y)
+    mean = covariance @ (H.T @ Y / STD**2 + PRIOR_MEAN / PRIOR_STD**2)
+    evidence = multivariate_normal(H @ PRIOR_MEAN, H @ np.diag(PRIOR_STD**2) @ H.T + STD**2 * np.eye(4)).logpdf(Y)
     shares = np.log([0.3, 0.7]) + evidence  # two components that are alike are one
-    return Mixture.divided(np.tile(mean, (2, 1)), np.tile(covariance, (2, 1, 1)), shares, PRIOR_STD)
+    return Mixture.divided(np.tile(mean, (2, 1)), np.tile(covariance, (2, 1, 1)), shares, PRIOR_STD, PRIOR_MEAN)
 
 
 def test_prior_divided_out_is_the_likelihood(mixture):

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from en4dvar.inputs.window import Instant, maxima, minima, parse_instant, select
+from en4dvar.data.extrema import maxima, minima
+from en4dvar.inputs.window import Instant, parse_instant, select
 from en4dvar.plumbing.errors import DataError
 from en4dvar.plumbing.units import UnitError
 

@@ -113,6 +113,8 @@ def test_a_multiple_is_a_unit() -> None:
     assert convert(2.0, "1e-6 * m", "um") == 2.0
     assert convert(3.0, "1/(270*kHz)", "s") == pytest.approx(3 / 270e3, rel=1e-15)
     assert as_unit("+500 kfps", "Hz") == "500*kfps"
+    with pytest.raises(UnitError, match=r"a multiple of a unit has a star: '250\*um'"):
+        parse_unit("250 um")
     assert convert(1.0, f"1/({as_unit('5e5 1/s', 'Hz')})", "us") == 2.0
     huge = "9e29*(" * 9 + "m" + ")" * 9
     for wrong in ("0*um", "2.76um", "2.76 um", "-1*um", "1e99*um", "2*3*um*", "m 2*s", "m/2*s", huge):

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from en4dvar.data.extrema import maxima
 from en4dvar.data.noise import SMOOTHNESS
 from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.diagnosis.diagnostics import active_members
@@ -79,6 +80,21 @@ class Case:
         """The catalogue's advice about residuals with structure."""
         option = "data.error.discrepancy: estimated"
         return CATALOGUE["residual-structure"][1].replace(option, self.with_scheme(option))
+
+    @property
+    def changes(self) -> dict[str, str]:
+        """What the model says may change unforeseen and is constant here, as ``model_error`` is told it."""
+        varying, stds = {v.name for v in self.a.problem.varying}, self.a.problem.model.unforeseen
+        return {name: f"{{at: maxima, std: {100 * std:.3g} %}}" for name, std in stds.items() if name not in varying}
+
+    @property
+    def changing(self) -> str:
+        """How to let that change in a window with several maxima behind its first minimum; "" for another."""
+        y = self.a.observations
+        if not self.changes or y.parts or len(maxima(y.values)) < 2:
+            return ""
+        options = " ".join(f"--set model_error.{name}='{text}'" for name, text in self.changes.items())
+        return f"let {' and '.join(self.changes)} change on the way ({options})"
 
     def reading(self, value: float) -> str:
         """A size of readings in the unit in which their errors are stated."""
@@ -152,6 +168,8 @@ def _structure(case: Case) -> str:
         return _overstated(case)
     if cause := case.cause:
         return cause
+    if "discrepancy-found" in case.codes and case.changing:
+        return "follow the advice of the warning discrepancy-found first"
     kernel = getattr(case.a.observations.noise, "kernel", None)
     if kernel is None:
         return case.structure
@@ -164,12 +182,13 @@ def _structure(case: Case) -> str:
 
 def _missed(case: Case) -> str:
     if case.caution.severity != "serious":
-        advice, table = CATALOGUE["discrepancy-found"][1], ""
+        steps = [case.changing]
         if case.a.what_if:
-            table = "look at the what-if table and "
+            steps += ["look at the what-if table"]
         elif case.a.problem.alternatives and not case.a.settings.what_if:
-            table = "ask for the what-if table (--set assimilation.what_if=true) and "
-        return advice.replace("compare", f"{table}compare", 1)
+            steps += ["ask for the what-if table (--set assimilation.what_if=true)"]
+        first = "".join(f"{step} and " for step in steps if step)
+        return CATALOGUE["discrepancy-found"][1].replace("compare", f"{first}compare", 1)
     return (
         "quote nothing of this fit: look at the prior over the readings (en4dvar validate --plot); check units and "
         "columns (data), how the history starts, the law and the medium (model), and values that are fixed (parameters)"
@@ -292,10 +311,7 @@ def _future(case: Case) -> str:
     problem = case.a.problem
     if not (end := problem.observations.next_end):
         return CATALOGUE["future-missed"][1]
-    constant = {
-        name: std for name, std in problem.model.unforeseen.items() if name not in {v.name for v in problem.varying}
-    }
-    changes = ", ".join(f"{name}: {{at: maxima, std: {100 * std:.3g} %}}" for name, std in constant.items())
+    changes = ", ".join(f"{name}: {text}" for name, text in case.changes.items())
     also = f", with what may change on the way (model_error: {{{changes}}})" if changes else ""
     return (
         "look at the figure of the readings after the window: as far as they are of the same system, let the model "

@@ -161,7 +161,7 @@ def evaluate(
                 beyond=float(exceeds.mean()) if len(exceeds) else 0.0,
                 readings=used.astype(float),
                 times=problem.observations.times[used],
-                grid=grid,
+                grid=grid[: run.path.shape[1]],  # of a field there is no path
                 fan=np.quantile(run.path[run.active][:, : len(grid)], FAN, axis=0),
                 alike=n,
                 forward_runs=before + planned.forward_runs,

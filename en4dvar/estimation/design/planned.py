@@ -35,10 +35,16 @@ class Planned:
     order (asked, common, others), so that the first ``asked`` of them are those of what is asked for, whatever the
     others are, and the first ``shared`` those of what experiments share.
 
-    Raises ConfigError: a name that is not estimated, or twice; weights other than 0 and 1, which are not Bayesian.
+    Raises ConfigError: a name that is not estimated, or twice; weights other than 0 and 1, which are not Bayesian;
+    whole fields.
     """
 
     def __init__(self, problem: InverseProblem, about: Sequence[str] = (), common: Sequence[str] = ()):
+        if problem.fields:
+            raise ConfigError(
+                "whole fields cannot be planned for; without assimilation.localisation a field of at most 2000 cells "
+                "is planned by its modes"
+            )
         names = problem.prior.names
         about, common = tuple(about) or names, tuple(common)
         if unknown := [name for name in (*about, *common) if name not in names]:

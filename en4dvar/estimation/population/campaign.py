@@ -19,12 +19,20 @@ from en4dvar.ensemble.forecast import check_problem
 from en4dvar.ensemble.linalg import effective_number, resampled, shares_of
 from en4dvar.estimation.population.following import Following
 from en4dvar.estimation.population.hierarchy import Effort, Hierarchy, HierarchyDraws, HyperPrior, named
-from en4dvar.estimation.population.own import Empirical, OwnDraws, OwnLikelihood, empirical, own_draws, own_likelihoods
+from en4dvar.estimation.population.own import (
+    ENOUGH,
+    Empirical,
+    OwnDraws,
+    OwnLikelihood,
+    empirical,
+    own_draws,
+    own_likelihoods,
+)
 from en4dvar.executor import Executor, one_blas_thread
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.hints import suggest
-from en4dvar.priors.prior import PriorTerm, member_stream
+from en4dvar.priors.prior import PriorTerm, member_stream, own_seed
 from en4dvar.problem import AT_ONCE, InverseProblem, common_to
 
 DETERMINED = 0.9  # of the hyperprior's variance, taken away by the data
@@ -35,6 +43,8 @@ FEWEST = 100.0  # effective draws of a result that can be trusted
 REACH = 1.5  # prior standard deviations: a hyperprior of mean and spread that reaches further needs draws that do
 NODES = 24  # of the quadrature
 NEAR = 5  # draws of a data set among which one is chosen for what is its own
+SCARCE = 0.25  # variance of ln p(all data | mean and spread) by the draws of the data sets, from which more are taken
+ANEW, BEYOND, BELONGS = 3, 1.5, 0.5  # times, twice as many each; how much more widely than it lies; of such sets
 
 
 @dataclass(frozen=True)
@@ -61,6 +71,7 @@ class Population:
     ``common``: names of the quantities with one value in all data sets, ``theta`` (M, c) their draws in units of the
     prior. ``belongs`` (S,): probability that each data set is of the population. ``empirical``: for each of ``names``
     the median of the data sets one by one. ``left_out``: data sets that could not be sampled, and why.
+    ``uncertain``: variance that the scarcity of the data sets' draws leaves of ln p(all data | mean and spread).
     """
 
     names: tuple[str, ...]
@@ -77,6 +88,7 @@ class Population:
     belongs: Array = field(default_factory=lambda: np.empty(0))
     empirical: tuple[Empirical, ...] = ()
     left_out: Mapping[str, str] = field(default_factory=dict)
+    uncertain: float = 0.0
 
     @property
     def size(self) -> float:
@@ -220,7 +232,8 @@ def population_of(
     hyper, effort = hyper or HyperPrior(), effort or Effort()
     if (factor := math.hypot(hyper.mean_std, hyper.spread)) > REACH:
         tell(f"data sets are sampled with a prior {factor:.2g} times as wide, which is what the hyperprior allows")
-        wide = [_wider(problem, names, factor) for problem in problems]
+        around = np.zeros(len(names)), np.full(len(names), factor)
+        wide = [_about(problem, names, *around) for problem in problems]
         at = [w.prior.white(p.prior.from_white(z)) for w, p, z in zip(wide, problems, start, strict=True)]
         scaled = replace(hyper, mean_std=hyper.mean_std / factor, spread=hyper.spread / factor)
         result = population_of(wide, at, names, seed, executor=executor, hyper=scaled, effort=effort, tell=tell)
@@ -231,12 +244,47 @@ def population_of(
         return replace(result, problems=sampled, hyper=hyper, posterior=posterior, prior=prior)
     with one_blas_thread():
         drawn, left_out = sampled_sets(problems, start, seed, executor, tell, kept)
-        return population_from(drawn, left_out, start, problems, names, seed, hyper, effort)
+        result = population_from(drawn, left_out, start, problems, names, seed, hyper, effort)
+        for number in range(ANEW):
+            if result.uncertain < SCARCE:
+                break
+            tell("data sets have too few draws where their population is: more are taken there")
+            near = _distribution(result)
+            for s, belongs in zip(drawn, result.belongs.tolist(), strict=True):
+                if belongs > BELONGS:
+                    again, enough = own_seed(seed, f"sampled anew, {number}"), ENOUGH * 2**number
+                    drawn[s] = _drawn_about(problems[s], names, near, start[s], drawn[s], again, executor, enough)
+            anew = population_from(drawn, left_out, start, problems, names, seed, hyper, effort)
+            result = replace(anew, empirical=result.empirical)  # of the data sets' own posteriors
+        return result
 
 
-def _wider(problem: InverseProblem, names: Sequence[str], factor: float) -> InverseProblem:
-    """With so many times the standard deviation of the transformed parameters ``names``."""
-    terms = (replace(t, std=factor * t.std) if t.parameter.name in names else t for t in problem.prior.terms)
+def _distribution(population: Population) -> tuple[Array, Array]:
+    """Mean and standard deviation (p,) of the next data set, in units of the prior, the latter widened."""
+    nu, tau = population.posterior.nu, population.posterior.tau
+    return nu.mean(axis=0), BEYOND * np.sqrt(nu.var(axis=0) + np.mean(tau**2, axis=0))
+
+
+def _drawn_about(
+    problem: InverseProblem, names: Sequence[str], about: tuple[Array, Array], start: Array, before: OwnDraws,
+    seed: int, executor: Executor | None, enough: float,
+) -> OwnDraws:  # fmt: skip
+    """Draws with a prior of ``names`` that is ``about`` their population; those ``before`` where no run succeeds."""
+    near, own = _about(problem, names, *about), problem.prior
+    try:
+        draws = own_draws(near, near.prior.white(own.from_white(start)), seed, executor, enough)
+    except ValueError:
+        return before
+    z, runs = own.white(near.prior.from_white(draws.z)), before.forward_runs + draws.forward_runs
+    gain = draws.log_evidence - before.log_evidence
+    return OwnDraws(z, before.log_evidence, draws.effective, runs, about, gain)
+
+
+def _about(problem: InverseProblem, names: Sequence[str], mean: Array, std: Array) -> InverseProblem:
+    """With a prior of ``names`` about ``mean`` (p,), ``std`` (p,) times as wide, in units of its own."""
+    moves = dict(zip(names, zip(mean.tolist(), std.tolist(), strict=True), strict=True))
+    each = ((term, *moves.get(term.parameter.name, (0.0, 1.0))) for term in problem.prior.terms)
+    terms = (replace(term, mean=term.mean + m * term.std, std=s * term.std) for term, m, s in each)
     return replace(problem, prior=problem.prior.of(tuple(terms)))
 
 
@@ -294,6 +342,7 @@ def population_from(
         theta=estimated.theta,
         belongs=estimated.belongs,
         empirical=_empirical(terms, [start[s][:, varying] for s in drawn], likelihoods, seed),
+        uncertain=float(estimated.uncertain.sum()),
         left_out=left_out,
     )
 

@@ -64,9 +64,9 @@ class Following:
         moved = whole[1] + sides * np.hypot(whole - whole[1], size)
         return np.asarray(np.log(np.maximum(moved, LEAST * whole)) / s)
 
-    def prior(self, y: Array) -> tuple[Array, Array]:
-        """Standard deviations (p,) of a normal density about zero, and ln (D,) of how many times it is the prior's of
-        y (D, p): of x ~ N(0, I), θ ~ N(0, I).
+    def prior(self, y: Array, mean: Array, std: Array) -> tuple[Array, Array]:
+        """Standard deviations (p,) of a normal density about ``mean`` (p,), and ln (D,) of how many times it is the
+        prior's of y (D, p): of x ~ N(mean, diag std²), θ ~ N(0, I).
         """
         size = np.sqrt(np.sum(self.slopes**2, axis=1))
         logs = np.zeros(len(y))
@@ -77,9 +77,9 @@ class Following:
             possible = before > 0
             x = np.log(np.where(possible, before, 1.0)) / s
             slope = np.where(least, 1.0, whole / np.where(possible, before, 1.0))
-            density = np.where(possible, np.exp(-0.5 * x**2) * slope, 0.0).mean(axis=1)
-            logs += -0.5 * y[:, j] ** 2 - np.log(density + TINY)
-        return np.where(self.logs > 0, 1.0, np.sqrt(1 + size**2)), logs
+            density = np.where(possible, np.exp(-0.5 * ((x - mean[j]) / std[j]) ** 2) * slope, 0.0).mean(axis=1)
+            logs += -0.5 * ((y[:, j] - mean[j]) / std[j]) ** 2 - np.log(density + TINY)
+        return np.where(self.logs > 0, std, np.sqrt(std**2 + size**2)), logs
 
 
 def following_of(

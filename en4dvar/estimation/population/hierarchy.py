@@ -24,7 +24,7 @@ is worth.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -108,6 +108,7 @@ def named(belongs: Array, odd: float) -> tuple[int, ...]:
 class HierarchyDraws:
     """Draws of ν and τ (M, p), θ (M, c), and of y_i (M, S, p) given them; ``belongs`` (S,) the probabilities
     that the data sets are of the population; ``effective`` draws and ``log_evidence`` in units of the sets' own.
+    ``uncertain`` (S,): variance over these draws of the error that the ln of each likelihood has by its own draws.
     """
 
     nu: Array
@@ -117,6 +118,7 @@ class HierarchyDraws:
     belongs: Array
     effective: float
     log_evidence: float
+    uncertain: Array
 
 
 class Hierarchy:
@@ -173,7 +175,19 @@ class Hierarchy:
         evidence = float(np.logaddexp.reduce(logs)) - math.log(len(logs))
         nu, tau, theta = taken[:, :p], np.exp(taken[:, p : 2 * p]), taken[:, 2 * p :]
         x = self._given(taken, belongs, stream)
-        return HierarchyDraws(nu, tau, theta, x, belongs[..., 0].mean(axis=0), effective_number(shares), evidence)
+        belonging = belongs[..., 0].mean(axis=0)
+        uncertain = self._uncertain(taken)
+        return HierarchyDraws(nu, tau, theta, x, belonging, effective_number(shares), evidence, uncertain)
+
+    def _uncertain(self, h: Array) -> Array:
+        """(S,) variances over populations h (B, 2p + c) of the error that the ln of each likelihood has by its draws.
+
+        What half of the draws says differs from what all say by an error like that of all (half-sample replication:
+        McCarthy 1969, Rev. Int. Stat. Inst. 37, 239).
+        """
+        halves = Hierarchy([replace(own, mixture=own.half) for own in self.likelihoods], self.hyper)
+        half, whole = (np.logaddexp.reduce(of.log_parts(h), axis=2) for of in (halves, self))
+        return np.asarray((half - whole).var(axis=0))
 
     def _walked(self, stream: np.random.Generator, effort: Effort) -> Array:
         """(D, 2p + c) positions of walkers, the first third left out."""

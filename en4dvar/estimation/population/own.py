@@ -11,7 +11,9 @@ which gives the regression of x on θ in the posterior the slopes (I − C) B, w
 the prior of x is N(0, I). A Gaussian mixture describes y; dividing by its prior leaves the likelihood of the data set,
 with which :mod:`~en4dvar.estimation.population.hierarchy` works. No component is wider than the prior, so that each is
 one of the likelihood. There are always four: what too few get wrong is alike in all data sets and adds up, what scarce
-draws get wrong averages out, and a criterion for fewer took upper limits for measurements. What the data tell of θ
+draws get wrong averages out, and a criterion for fewer took upper limits for measurements. Where the population lies in
+the tails of its data sets, where hardly a draw is, neither holds: then they are drawn with another prior, about the
+population, which is divided out instead of their own. What the data tell of θ
 itself is left aside: it keeps its prior, and therefore all data sets of a population have the same slopes. Their own
 would tell of θ, and falsely: those of ln G are steeper for a soft gel, and a θ that makes all of them stiffer would
 make them more alike.
@@ -57,10 +59,10 @@ class Mixture(NamedTuple):
     r"""L of one set as a mixture of Gaussians, and what it says about a population: ``precision`` Λ (M, n, n),
     ``linear`` η (M, n), ``constant`` k (M,). Kernels can read it.
 
-    The draws of a posterior L_i(x) N(x; 0, C_0) are described by a mixture Σ_m a_m N(c_m, Σ_m); the prior is divided
+    The draws of a posterior L_i(x) N(x; c_0, C_0) are described by a mixture Σ_m a_m N(c_m, Σ_m); the prior is divided
     out of every component, so that
 
-        L_i(x) ∝ Σ_m exp(k_m + η_mᵀx − ½ xᵀΛ_m x),     Λ_m = Σ_m⁻¹ − C_0⁻¹,   η_m = Σ_m⁻¹ c_m,
+        L_i(x) ∝ Σ_m exp(k_m + η_mᵀx − ½ xᵀΛ_m x),     Λ_m = Σ_m⁻¹ − C_0⁻¹,   η_m = Σ_m⁻¹ c_m − C_0⁻¹ c_0,
         ∫ L_i(x) N(x; ν, D) dx = Σ_m exp(k_m + ½ bᵀA⁻¹b − ½ νᵀD⁻¹ν) |I + DΛ_m|^{-1/2},  A = Λ_m + D⁻¹, b = η_m + D⁻¹ν,
 
     and x given ν, D is drawn exactly: a component, then N(A⁻¹b, A⁻¹). A direction the data say nothing about has Λ = 0;
@@ -72,20 +74,22 @@ class Mixture(NamedTuple):
     constant: Array
 
     @classmethod
-    def divided(cls, mean: Array, covariance: Array, log_share: Array, prior_std: Array) -> "Mixture":
-        """Components of the posterior, means (M, n) and covariances (M, n, n), with the prior N(0, diag prior_std²)
-        divided out. ``log_share`` (M,): ln of the components' shares.
+    def divided(
+        cls, mean: Array, covariance: Array, log_share: Array, prior_std: Array, prior_mean: Array | float = 0.0
+    ) -> "Mixture":
+        """Components of the posterior, means (M, n) and covariances (M, n, n), with the prior N(prior_mean, diag
+        prior_std²) divided out. ``log_share`` (M,): ln of the components' shares.
         """
         # in units of the prior's standard deviation, so that cutting off means the same in every direction
-        z = mean / prior_std
+        z, centre = mean / prior_std, prior_mean / prior_std
         values, vectors = np.linalg.eigh(covariance / np.outer(prior_std, prior_std))
         gain = np.maximum(1 / values - 1, 0.0)
         precision = np.einsum("sij,sj,skj->sik", vectors, gain, vectors)
         inverse = precision + np.eye(len(prior_std))
-        linear = np.einsum("sij,sj->si", inverse, z)  # η = C⁻¹ z, with the same directions cut off
+        linear = np.einsum("sij,sj->si", inverse, z)  # C⁻¹ z, with the same directions cut off
         log_det = -np.linalg.slogdet(inverse)[1]
-        constant = log_share - 0.5 * log_det - 0.5 * np.einsum("si,si->s", linear, z)
-        return cls(precision / np.outer(prior_std, prior_std), linear / prior_std, constant)
+        constant = log_share - 0.5 * (log_det + np.einsum("si,si->s", linear, z) - np.sum(centre**2))
+        return cls(precision / np.outer(prior_std, prior_std), (linear - centre) / prior_std, constant)
 
 
 @kernel
@@ -152,12 +156,16 @@ class OwnDraws:
     """Equally likely draws ``z`` (D, n) of one posterior, in white coordinates of its prior.
 
     ``log_evidence``: ln ∫ exp(−J_o) π dz; ``effective``: the number of independent draws that they are worth at least.
+    ``about``: of the coordinates of a population, means and standard deviations (p,) under the prior that they were
+    drawn with, 0 and 1 of π; ``gain``: ln of how many times its evidence is that of π.
     """
 
     z: Array
     log_evidence: float
     effective: float
     forward_runs: int
+    about: tuple[Array | float, Array | float] = (0.0, 1.0)
+    gain: float = 0.0
 
     @classmethod
     def kept(cls, problem: InverseProblem, draws: Array, effective: float, log_evidence: float) -> "OwnDraws":
@@ -172,16 +180,20 @@ class OwnDraws:
 class OwnLikelihood:
     """The likelihood of one data set in p coordinates x given c common quantities θ, in units of its evidence.
 
-    ``mixture``: of y, as ``following`` has it, the same in all; ``adjusted`` (D, p): the draws of y.
+    ``mixture``: of y, as ``following`` has it, the same in all; ``adjusted`` (D, p): the draws of y; ``half``: what
+    the first half of them says alone.
     """
 
     mixture: Mixture
+    half: Mixture
     following: Following
     adjusted: Array
 
 
-def own_draws(problem: InverseProblem, start: Array, seed: int, executor: Executor | None = None) -> OwnDraws:
-    """Draws of one posterior, from members (N, n) near it in white coordinates.
+def own_draws(
+    problem: InverseProblem, start: Array, seed: int, executor: Executor | None = None, enough: float = ENOUGH
+) -> OwnDraws:
+    """Draws of one posterior until ``enough`` are effective, from members (N, n) near it in white coordinates.
 
     The same for a data set whatever others there are. Raises :class:`ValueError` where no run succeeds.
     """
@@ -192,7 +204,7 @@ def own_draws(problem: InverseProblem, start: Array, seed: int, executor: Execut
     covariance = np.atleast_2d(np.cov(x, rowvar=False)) + np.diag((NARROWEST * prior.std) ** 2)
     about = Minimum(x.mean(axis=0), covariance, 0.0)  # of one alone, J does not matter
     runs = RecordedRuns(composite, partial(costs, problem), prior, observations)
-    draws = sample_modes(runs, prior, [about], seed, ENOUGH)
+    draws = sample_modes(runs, prior, [about], seed, enough)
     taken = resampled(draws.shares, KEPT, member_stream(seed, "population: kept draws"))
     effective = _worth(KEPT, draws.effective)
     return OwnDraws(prior.white(draws.x[taken]), draws.log_evidence, effective, composite.forward_runs)
@@ -214,29 +226,36 @@ def own_likelihoods(
 
     def slopes(coordinates: Sequence[Array]) -> Array:
         each = zip(x, coordinates, theta, drawn, strict=True)
-        return pooled_slopes(*zip(*(_slopes(z, u, t, draws.effective) for z, u, t, draws in each), strict=True))
+        of_sets = (_slopes(z, u, t, draws.effective, draws.about[1] * np.ones(len(varying))) for z, u, t, draws in each)
+        return pooled_slopes(*zip(*of_sets, strict=True))
 
     following = following_of(x, theta, logs, slopes)
     streams = (member_stream(own_seed(seed, name), "population: mixture") for name in names)
     likelihoods = []
     for z, t, draws, stream in zip(x, theta, drawn, streams, strict=True):
-        adjusted, effective = following.own(z, t), draws.effective
-        std, beyond = following.prior(adjusted)
-        constant, as_drawn = float(np.logaddexp.reduce(beyond)) - math.log(len(beyond)), adjusted
-        if following.logs.any():
-            shares = shares_of(beyond)
-            as_drawn = adjusted[resampled(shares, len(shares), stream)]
-            effective *= effective_number(shares) / len(shares)
-        alike = (len(varying) + 2) * len(z) / effective
-        share, centre, covariance = fit_gaussians(as_drawn, stream, PARTS, ROUNDS, alike, std)
-        mixture = Mixture.divided(centre, covariance, np.log(share) + constant, std)
-        likelihoods.append(OwnLikelihood(mixture, following, adjusted))
+        y = following.own(z, t)
+        whole, half = (_mixture(part, following, draws, stream) for part in (y, y[: len(y) // 2]))
+        likelihoods.append(OwnLikelihood(whole, half, following, y))
     return likelihoods
 
 
-def _slopes(x: Array, u: Array, theta: Array, effective: float) -> tuple[Array, Array]:
+def _mixture(y: Array, following: Following, draws: OwnDraws, stream: np.random.Generator) -> Mixture:
+    """Of y (D, p), some of the draws."""
+    mean, std = (np.broadcast_to(part, y.shape[1]) for part in draws.about)
+    std, beyond = following.prior(y, mean, std)
+    constant = float(np.logaddexp.reduce(beyond)) - math.log(len(beyond)) + draws.gain
+    alike = (y.shape[1] + 2) * len(draws.z) / draws.effective
+    if following.logs.any():
+        shares = shares_of(beyond)
+        y = y[resampled(shares, len(shares), stream)]
+        alike *= len(shares) / effective_number(shares)
+    share, centre, covariance = fit_gaussians(y, stream, PARTS, ROUNDS, alike, std)
+    return Mixture.divided(centre, covariance, np.log(share) + constant, std, mean)
+
+
+def _slopes(x: Array, u: Array, theta: Array, effective: float, std: Array) -> tuple[Array, Array]:
     """Slopes (p, c) with θ of the likelihood's coordinates ``u``, functions of x, from posterior draws x and u (D, p)
-    and θ (D, c), and the variances (p, c) of these slopes.
+    and θ (D, c), and the variances (p, c) of these slopes. ``std`` (p,): of the prior of x.
     """
     if not theta.shape[1]:
         return np.zeros((x.shape[1], 0)), np.zeros((x.shape[1], 0))
@@ -245,8 +264,8 @@ def _slopes(x: Array, u: Array, theta: Array, effective: float) -> tuple[Array, 
     apart = (u - u.mean(axis=0)) / along
     of_posterior = np.linalg.lstsq(centred, apart, rcond=None)[0].T
     left = np.atleast_2d(np.cov((apart - centred @ of_posterior.T).T))
-    values, vectors = np.linalg.eigh(np.eye(len(left)) - left)
-    undone = vectors @ (vectors.T / np.maximum(values, INFORMED)[:, None])
+    values, vectors = np.linalg.eigh(np.eye(len(left)) - left / np.outer(std, std))
+    undone = std[:, None] * (vectors @ (vectors.T / np.maximum(values, INFORMED)[:, None])) / std
     variance = np.outer(np.diag(undone @ left @ undone.T), 1 / centred.var(axis=0)) / effective
     return np.asarray(along[:, None] * (undone @ of_posterior)), np.asarray(along[:, None] ** 2 * variance)
 

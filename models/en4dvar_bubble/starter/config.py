@@ -22,7 +22,7 @@ from en4dvar.inputs.readers import AGAIN, BELOW, CLIPPED, FAR, LEVEL, ODD, Readi
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.files import expanded
 from en4dvar.plumbing.units import UnitError, convert, parse_quantity, parse_unit
-from en4dvar_bubble.starter.elsewhere import known
+from en4dvar_bubble.starter.elsewhere import known, scale_of
 from en4dvar_bubble.starter.grouped import grouped, parted
 from en4dvar_bubble.starter.look import Start, usable
 from en4dvar_bubble.starter.proposal import Entry, Proposal, propose, with_columns
@@ -210,16 +210,15 @@ def propose_config(
         law,
         medium,
         grouped(files, data, groups, layout),
+        scale_of(_largest(readings, TRACKED_SHAPE)),
     )
     odd = [words for name, series in readings.items() for words in _left_out(name, series)]
     if any(ODD.keys() & series.left_out.keys() for series in readings.values()):
         source = replace(source, layout=replace(layout, outliers="leave out"))
     proposal = _with_rest(proposal, readings, source.radius[1])
     if errors:
-        common, factor = (
-            max(series.scalars.get(key, 0.0) for series in readings.values()) for key in (TRACKED_COMMON, TRACKED_SHAPE)
-        )
-        proposal = with_columns(proposal, errors, f"{common:g} {source.radius[1]}" if common > 0 else "", factor)
+        common = _largest(readings, TRACKED_COMMON)
+        proposal = with_columns(proposal, errors, f"{common:g} {source.radius[1]}" if common > 0 else "")
     told = (*proposal.warnings, *odd, *doubts(source), *scales(readings, source), *_steps(readings, source), *unusable)
     proposal = replace(proposal, warnings=told)
     name = name or run_name(str(data))
@@ -227,6 +226,10 @@ def propose_config(
     _, unbuilt = usable(proposal.datasets, lambda dataset: build_one(config, dataset, files[dataset]))
     proposal = replace(proposal, warnings=(*proposal.warnings, *unbuilt))
     return Proposed(yaml_text(name, source, proposal, command), proposal)
+
+
+def _largest(readings: Mapping[str, Readings], name: str) -> float:
+    return max(series.scalars.get(name, 0.0) for series in readings.values())
 
 
 def histories(files: Mapping[str, DataFile], source: Source) -> tuple[dict[str, Readings], list[str]]:

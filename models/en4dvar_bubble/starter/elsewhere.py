@@ -56,12 +56,14 @@ LIKE_A_LIQUID = (
 
 @dataclass(frozen=True)
 class Known:
-    """A quantity as it stands in a configuration: its key, median with unit, std of its logarithm, and the source."""
+    """A quantity as it stands in a configuration: its key, median with unit, std of its logarithm, the source, and what
+    says that data sets do not have one value of it, "" where they do."""
 
     key: str
     median: str
     log_std: float
     source: str
+    shared: str = ""
 
 
 SCALE = Known(READING_SCALE.name, "1", 0.005, "size of a pixel: a calibration target tells it to about 0.5 %")
@@ -82,7 +84,7 @@ _OF_ANY = (
 )
 
 
-def known(medium: str) -> Sequence[Known]:
+def known(medium: str, scale: Known = SCALE) -> Sequence[Known]:
     """What is known of an experiment in one of the :data:`CHOICES`, which a concentration may follow: ``agarose 1 %``.
 
     Raises
@@ -106,7 +108,15 @@ def known(medium: str) -> Sequence[Known]:
             Known("rho", f"{it.rho:.4g} kg/m^3", float(f"{it.rho_log_std:.2g}"), f"density of {it.source}"),
             Known("c", f"{it.c:.4g} m/s", float(f"{it.c_log_std:.2g}"), f"speed of sound in {name}"),
         )
-    return (*of_medium, PRESSURE, SCALE)
+    return (*of_medium, PRESSURE, scale)
+
+
+def scale_of(factor: float) -> Known:
+    """That of a camera, and of a shape that lasts, which gives all radii of a bubble a factor of this std."""
+    source = f"{SCALE.source}; a shape that lasts hides {100 * factor:.2g} % along the line of sight"
+    wide = float(f"{math.hypot(SCALE.log_std, factor):.2g}")
+    own = ", shared: none" * (factor > SCALE.log_std)  # the larger part is each bubble's own
+    return replace(SCALE, log_std=wide, source=source, shared=own) if factor else SCALE
 
 
 def centred(model: BubbleModel, medium: str) -> BubbleModel:

@@ -14,17 +14,18 @@ off and is too high by about ε √(2 ln n).
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeVar
 
 import numpy as np
 
+from en4dvar.data.extrema import minima
 from en4dvar.inputs.implausible import scatter_of
-from en4dvar.inputs.window import minima
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import DataError
-from en4dvar_bubble.collapse import Lobe, lobe
+from en4dvar.plumbing.hints import listed
+from en4dvar_bubble.collapse import Lobe, lobe, single
 
 WINDOWS = (0.15, 0.2, 0.27, 0.35, 0.45, 0.55, 0.65, 0.75, 0.85)  # half widths in collapse times
 LOWEST = 0.45  # of R_max: what lies lower belongs to the end of the collapse, or to the beginning of the growth
@@ -158,7 +159,8 @@ class Look:
     ``before`` is the radius at rest before an acoustic bubble grows, and the std of a reading of it, NaN without one.
     ``begin`` is the first instant, ``step`` the median time between samples; ``descent`` the last instant of the first
     descent, NaN where the history ends with it. ``n_minima`` follow the maximum with a ``prominence`` relative to the
-    range. ``reason`` says in words why ``start`` is proposed, ``clear`` whether the data leave no doubt.
+    range; a ``short`` laser bubble ends before the first rebound has a top. ``reason`` says in words why ``start`` is
+    proposed, ``clear`` whether the data leave no doubt.
     """
 
     begin: float
@@ -173,9 +175,15 @@ class Look:
     n_minima: int
     prominence: float
     descent: float
+    short: bool
     start: Start
     reason: str
     clear: bool
+
+    @property
+    def whole(self) -> bool:
+        """Whether all of it belongs into the window: a rebound has a top, and no second minimum follows."""
+        return self.n_minima < 2 and not (self.short or self.drift)
 
 
 def look(times: Array, radius: Array, start: Start | None = None) -> Look:
@@ -207,8 +215,23 @@ def look(times: Array, radius: Array, start: Start | None = None) -> Look:
     step, descent = float(np.median(np.diff(times))), _end_of_descent(times, radius)
     return Look(
         float(times[0]), peak, highest, step, scatter, rebound, rest, drift, before(times, radius, scatter),
-        n_minima, prominence, descent, chosen, reason, clear,
+        n_minima, prominence, descent, chosen == "laser" and single(times, radius), chosen, reason, clear,
     )  # fmt: skip
+
+
+def without_rebound(looks: Mapping[str, Look]) -> list[str]:
+    """Which data sets let the window of all end before the first rebound has a top, and what to do."""
+    short = [name for name, view in looks.items() if view.short]
+    names = short or [name for name, view in looks.items() if view.n_minima == 1 and view.start == "laser"]
+    if not names or all(view.whole for view in looks.values()):
+        return []
+    who = f"{listed(names, 5)}: " * (len(looks) > 1)
+    ends, past = ("the readings end", "that top") if short else ("without a second minimum the window ends", "it")
+    others = "; the window of the others can hold theirs if those files are moved away" * (len(names) < len(looks))
+    return [
+        f"{who}{ends} before the first rebound has a top, so that a run tells upper limits of stiffness and viscosity: "
+        f"record longer, until {past} is past{others}"
+    ]
 
 
 def before(times: Array, radius: Array, scatter: float) -> tuple[float, float]:

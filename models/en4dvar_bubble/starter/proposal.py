@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from en4dvar.inputs.window import Instant, select
+from en4dvar.inputs.window import vertex
 from en4dvar.model.forward import Trajectory
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.errors import ConfigError, DataError, retold
@@ -21,7 +21,7 @@ from en4dvar_bubble.settings import BubbleSettings
 from en4dvar_bubble.starter import elsewhere
 from en4dvar_bubble.starter.grouped import NO_GROUPS, Grouped
 from en4dvar_bubble.starter.guess import FAR, OF_GELS, Guess, first_guess
-from en4dvar_bubble.starter.look import Look, Start, common_rest, look, typical, usable
+from en4dvar_bubble.starter.look import Look, Start, common_rest, look, typical, usable, without_rebound
 
 LAWS: Mapping[Start, str] = {"acoustic": "quadratic-kelvin-voigt", "laser": "neo-hookean-kelvin-voigt"}
 MODEL: Mapping[Start, Mapping[str, str]] = {
@@ -102,10 +102,12 @@ def propose(
     law: str | None = None,
     medium: str = "gel",
     groups: Grouped = NO_GROUPS,
+    scale: elsewhere.Known = elsewhere.SCALE,
 ) -> Proposal:
     """A proposal for one or several data sets: name → times (K,) s, radius (K,) m.
 
-    ``medium``: one of those of :mod:`en4dvar_bubble.starter.elsewhere`. ``groups``: of its data sets.
+    ``medium``: one of those of :mod:`en4dvar_bubble.starter.elsewhere`. ``groups``: of its data sets. ``scale``: what
+    is known of what multiplies all radii.
 
     Raises
     ------
@@ -142,6 +144,7 @@ def propose(
     elif guess.misfit > FAR:  # no node comes close to what was observed
         warnings.append(_unmatched(guess.unmatched, look, model))
         believed = Guess({}, {}, 0.0) if chosen == "acoustic" else guess  # made with a pulse that is not theirs
+    warnings += without_rebound(looks)
     if chosen == "laser" and "G" in guess.values:
         warnings += elsewhere.plane_in_a_gel(looks, model.medium)
     wall: tuple[tuple[Entry, ...], tuple[Entry, ...]] = (), ()
@@ -153,9 +156,9 @@ def propose(
     most = max(sizes.values(), default=len(views))
     together = elsewhere.population([p.name for p in model.law.parameters], most, medium, _in_a_liquid(model), groups)
     return Proposal(
-        _data(look, model, {**others, **guess.values}, len(views) == 1),
+        _data(look, model, {**others, **guess.values}, views),
         (*_model(law_name, model, look), *wall[0]),
-        (*_parameters(model, look, believed, tops(looks, histories), medium), *wall[1]),
+        (*_parameters(model, look, believed, tops(looks, histories, scale), medium, scale), *wall[1]),
         SIMPLER[chosen],
         (*told, *[f"{len(views)} bubbles: {_ends_with(groups.kind, sizes)}"] * bool(together)),
         (*warnings, *unseen),
@@ -215,7 +218,7 @@ def starter(start: Start, law: str | None) -> Proposal:
     data = [Entry("error", "{radius_std: 1 % of maximum}", "how well a radius is known: put yours")]
     if start == "laser":
         words = "where readings show two collapses, 'to: trough 2' ends it at the second"
-        data[:0] = [Entry("window", "{from: top, to: end}", words), Entry("time_zero", "window")]
+        data[:0] = [Entry("window", "{from: top, to: end}", words), Entry("time_zero", "top")]
     lines = [example(p, model) for p in model.law.parameters]
     lines += _radii(start, None)
     lines += [Entry(*elsewhere.AMPLITUDE)] * (start == "acoustic")
@@ -223,9 +226,9 @@ def starter(start: Start, law: str | None) -> Proposal:
     return Proposal(tuple(data), _model(law_name, model, None), tuple(lines), SIMPLER[start])
 
 
-def with_columns(proposal: Proposal, errors: Sequence[str], common: str, factor: float) -> Proposal:
+def with_columns(proposal: Proposal, errors: Sequence[str], common: str) -> Proposal:
     """The proposal with the errors that the data file states: columns of the std of radii and of times, and the
-    ``common`` std of what moves all radii alike, "" where the file states none; and that of a ``factor`` which does."""
+    ``common`` std of what moves all radii alike, "" where the file states none."""
     own = {
         "radius_std": Entry("  radius_std", f"{{column: {errors[0]}}}", "each reading's own"),
         "time_std": Entry("  time_std", f"{{column: {errors[1]}}}", "of the exposure"),
@@ -234,25 +237,7 @@ def with_columns(proposal: Proposal, errors: Sequence[str], common: str, factor:
     alike = Entry(
         "reading_offset", f"{{prior: normal, mean: 0 um, std: {common}}}", "the level of the edge, of all alike"
     )
-    parameters = list(proposal.parameters)
-    if factor:
-        parameters = [
-            _wider(entry, factor) if entry.key in (R0.name, R_MAX.name) else entry
-            for entry in parameters
-            if entry.key != elsewhere.SCALE.key
-        ]
-        std = float(f"{math.hypot(elsewhere.SCALE.log_std, factor):.2g}")
-        of_shape = f"{elsewhere.SCALE.source}; a shape that lasts hides {100 * factor:.2g} % along the line of sight"
-        apart = ", shared: none" * (factor > elsewhere.SCALE.log_std)  # the larger part is each bubble's own
-        parameters.append(_of_known(replace(elsewhere.SCALE, log_std=std, source=of_shape), apart))
-    return replace(proposal, data=data, parameters=(*parameters, *[alike] * bool(common)))
-
-
-def _wider(entry: Entry, factor: float) -> Entry:
-    """A prior whose relative std or log_std, the last number, has the std of a ``factor`` beside it."""
-    before, _, std = entry.value.removesuffix("}").removesuffix(" %").rpartition(" ")
-    unit, percent = (100, " %") if entry.value.endswith(" %}") else (1, "")
-    return replace(entry, value=f"{before} {math.hypot(float(std), unit * factor):.2g}{percent}}}")
+    return replace(proposal, data=data, parameters=(*proposal.parameters, *[alike] * bool(common)))
 
 
 def built(start: Start, law: str | None) -> tuple[BubbleModel, str]:
@@ -300,12 +285,12 @@ def _rest(look: Look) -> float:
     return look.rest if np.isfinite(look.rest) else GAS_FRACTION * look.lobe.R_max
 
 
-def _data(look: Look, model: BubbleModel, theta: Mapping[str, float], single: bool) -> tuple[Entry, ...]:
+def _data(look: Look, model: BubbleModel, theta: Mapping[str, float], views: Sequence[Look]) -> tuple[Entry, ...]:
     """Window, clock and errors."""
     if model.start == "laser":
         lines = [
-            _window(look, single),
-            Entry("time_zero", "window", "the model's clock starts at the top, t_s later or earlier"),
+            _window(look, views),
+            Entry("time_zero", "top", "the model's clock starts at the top, t_s later or earlier"),
         ]
     else:
         end = _text(look.descent, "s", "us", 4) if np.isfinite(look.descent) else "end"
@@ -326,12 +311,13 @@ def _data(look: Look, model: BubbleModel, theta: Mapping[str, float], single: bo
     )
 
 
-def _window(look: Look, single: bool) -> Entry:
-    """From the top to the second minimum."""
-    end = f"trough {min(look.n_minima, 2)}" if look.n_minima else "end"
+def _window(look: Look, views: Sequence[Look]) -> Entry:
+    """From the top to the second minimum; to the end of histories that are whole windows."""
+    whole = all(view.whole for view in views)
+    end = f"trough {min(look.n_minima, 2)}" if look.n_minima and not whole else "end"
     low = f", prominence: {100 * look.prominence:g} %" if look.prominence < 0.1 else ""
     words = "what happens before the top is not modelled"
-    ends = bool(look.drift and look.n_minima and single)  # with its last minimum
+    ends = bool(look.drift and look.n_minima and len(views) == 1)  # with its last minimum
     if ends or (look.drift and not look.n_minima):
         words += f"; {look.drift}: " + ("no bubble after its last minimum" if ends else "end it before that")
     until = f", until: trough {look.n_minima}" if ends else ""
@@ -339,31 +325,30 @@ def _window(look: Look, single: bool) -> Entry:
 
 
 class Tops(NamedTuple):
-    """Priors of where and how high the tops of histories are, against the first reading of the window: mean and std (s)
-    of the clock, mean (as text) and relative std of the height.
+    """Priors of where and how high the tops of histories are: mean and std (s) of the clock that starts where each
+    history's own readings put its top (``time_zero: top``), mean (as text) and relative std of the height.
     """
 
     t_s: tuple[float, float]
     R_max: tuple[str, float]
 
 
-def tops(looks: Mapping[str, Look], histories: Mapping[str, tuple[Array, Array]]) -> Tops:
-    """Of one history those of its top; of several, what covers the tops of all, beside the largest readings."""
-    shifts, heights = [], []
+def tops(looks: Mapping[str, Look], histories: Mapping[str, tuple[Array, Array]], scale: elsewhere.Known) -> Tops:
+    """Of the clock, beside each history's own top; of the heights of several, what covers all largest readings."""
+    rows = []
     for name, view in looks.items():
         times, radius = histories[name]
-        first = select(times, radius, Instant("top"), Instant("end")).start
-        shifts.append((times[first] - view.top.time, TOP_WIDTH * view.top.time_std))
-        largest = float(radius[first:].max())
-        heights.append((view.top.height / largest - 1, TOP_WIDTH * view.top.height_std / largest))
-    if len(looks) == 1:
-        shift, height = shifts[0][0], _text(view.top.height, "m", "um", 5)
-        wide = [shifts[0][1], heights[0][1]]
-    else:
-        shift, height = 0.0, "maximum"
-        wide = [float(np.sqrt(np.mean(np.sum(np.square(values), axis=1)))) for values in (shifts, heights)]
-    least = LEAST_SHIFT * float(np.mean([view.step for view in looks.values()]))
-    return Tops((shift, math.hypot(wide[0], least)), (height, math.hypot(wide[1], elsewhere.SCALE.log_std)))
+        zero = vertex(times, radius)
+        largest = float(radius[times >= zero].max())
+        of_time = zero - view.top.time, TOP_WIDTH * view.top.time_std, LEAST_SHIFT * view.step
+        rows.append((*of_time, view.top.height / largest - 1, TOP_WIDTH * view.top.height_std / largest))
+    several, (shift, *_) = len(looks) > 1, np.mean(rows, axis=0)
+    _, late, least, high, size = np.sqrt(np.mean(np.square(rows), axis=0))
+    height = "maximum" if several else _text(view.top.height, "m", "um", 5)
+    return Tops(
+        (float(shift), math.hypot(np.std(rows, axis=0)[0], late, least)),
+        (height, math.hypot(high * several, size, scale.log_std)),
+    )
 
 
 def _clock(look: Look, model: BubbleModel, theta: Mapping[str, float]) -> Entry:
@@ -404,7 +389,9 @@ def _model(law: str, model: BubbleModel, look: Look | None) -> tuple[Entry, ...]
     return tuple(lines)
 
 
-def _parameters(model: BubbleModel, look: Look, guess: Guess, top: Tops, medium: str) -> tuple[Entry, ...]:
+def _parameters(
+    model: BubbleModel, look: Look, guess: Guess, top: Tops, medium: str, scale: elsewhere.Known
+) -> tuple[Entry, ...]:
     start, lines = model.start, []
     water = elsewhere.of_water(look.lobe.R_max) if medium == "water" and _in_a_liquid(model) else {}
     for p in model.law.parameters:
@@ -415,7 +402,7 @@ def _parameters(model: BubbleModel, look: Look, guess: Guess, top: Tops, medium:
             lines.append(_spread(p, guess.values[p.name], width, f"{guess.source},", "knew before"))
         else:
             lines.append(example(p, model))
-    radii = {line.key: line for line in _radii(start, look, top)}
+    radii = {line.key: line for line in _radii(start, look, top, scale)}
     if R_EQ.name in water and not np.isfinite(look.rest):
         radii[R_EQ.name] = Entry(R_EQ.name, *water[R_EQ.name])
     lines += radii.values()
@@ -424,23 +411,22 @@ def _parameters(model: BubbleModel, look: Look, guess: Guess, top: Tops, medium:
     prior = f"{{prior: normal, mean: {_text(mean, 's', 'us', 4)}, std: {_text(std, 's', 'us')}}}"
     words = "the clock of the data against that of the pulse"
     if start == "laser":
-        words = "the first reading of the window against the top, by a parabola through the readings about it"
+        words = "the vertex of a parabola through the readings about the top against the top itself"
     sigma = f"{{prior: lognormal, median: 1, log_std: {NOISE_LOG_STD:g}}}"
     return (
         *lines,
         Entry("t_s", prior, words),
         Entry("sigma", sigma, "scale of the stated errors"),
-        *known_elsewhere(medium),
+        *known_elsewhere(medium, scale=scale),
     )
 
 
-def known_elsewhere(medium: str, more: str = "") -> tuple[Entry, ...]:
+def known_elsewhere(medium: str, more: str = "", scale: elsewhere.Known = elsewhere.SCALE) -> tuple[Entry, ...]:
     """Priors of what is known from elsewhere than from the data; ``more`` is what else stands in each."""
-    return tuple(_of_known(k, more) for k in elsewhere.known(medium))
-
-
-def _of_known(k: elsewhere.Known, more: str = "") -> Entry:
-    return Entry(k.key, f"{{prior: lognormal, median: {k.median}, log_std: {k.log_std:g}{more}}}", k.source)
+    return tuple(
+        Entry(k.key, f"{{prior: lognormal, median: {k.median}, log_std: {k.log_std:g}{k.shared or more}}}", k.source)
+        for k in elsewhere.known(medium, scale)
+    )
 
 
 def example(p: Parameter, model: BubbleModel) -> Entry:
@@ -472,12 +458,14 @@ def _lognormal(p: Parameter, median: str, log_std: str, words: str) -> Entry:
     return Entry(p.name, f"{{prior: lognormal, median: {median}, log_std: {log_std}}}", f"{p.label}: {words}")
 
 
-def _radii(start: Start, look: Look | None, top: Tops | None = None) -> list[Entry]:
+def _radii(
+    start: Start, look: Look | None, top: Tops | None = None, scale: elsewhere.Known = elsewhere.SCALE
+) -> list[Entry]:
     if start == "acoustic":
         value, log_std, words = _text(NUCLEUS, "m", "um"), "0.5", "readings say little about it"
         if look is not None and np.isfinite(look.before[0]):
             level, std = look.before
-            value, log_std = _text(level, "m", "um", 4), f"{math.hypot(std / level, elsewhere.SCALE.log_std):.2g}"
+            value, log_std = _text(level, "m", "um", 4), f"{math.hypot(std / level, scale.log_std):.2g}"
             words = "the readings before it grows, with the errors of one and of the scale"
         return [_lognormal(R0, value, log_std, words)]
     value, width, words = "20 um", 0.4, R_EQ.label
