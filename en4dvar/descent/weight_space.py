@@ -139,6 +139,10 @@ class WeightSpace:
         """J (B,) of control vectors (B, n), from their forecast and the prior's own mean and covariance."""
         return costs(self.problem, x, run)
 
+    def with_sampled_prior(self, x: Array, costs: Array) -> Array:
+        """J (B,) of control vectors (B, n) with the prior's mean and covariance of the members, from ``costs``."""
+        return costs - self.problem.prior.cost(x) + diag.background_cost(self.weights_of(x))
+
     def try_out(self, w: Array, expected: Callable[[Array], Array] | None = None) -> Trials:
         """J and predictions of central trajectories at weights (B, N).
 

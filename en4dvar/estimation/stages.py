@@ -197,7 +197,7 @@ class Stages:
             modes = that_count(minima, self.problem.prior, math.log(SEEN))  # of which a warning is given in any case
             told = in_doubt(minima, agree, shape) if settles else "mean_shift" in shape or len(modes) > 1
             if minima and weighs(space) and not told and not shape["non_gaussian"] and not prior_run.filled:
-                shape |= examine_tails(space, ends.members, prior_run[:-1], ends.run, settles)
+                shape |= examine_tails(space, minima[0], ends.members, prior_run[:-1], ends.run, settles)
                 shape["non_gaussian"] = diag.is_non_gaussian(shape)
             if not (settles and in_doubt(minima, agree, shape)):
                 return Sampled(ends, None, shape)

@@ -4,8 +4,8 @@ r"""The ends of the interval of each parameter, of a posterior that its ensemble
 
 Points at multiples of the spread of a Gaussian that is too narrow do not reach a long tail. So each parameter is moved
 outwards, the others to where J is lowest, until J has risen by what leaves no tail. Where J is lowest, and the volume V
-of the others there, is what an emulator says that is fitted to the runs there are, which costs none; J is the model's.
-Of a linear model the ends are the Gaussian's, whatever the points are.
+of the others there, is what an emulator says that is fitted to the runs there are, which costs none; J is the model's,
+with the prior that the prior's members have. Of a linear model the ends are the Gaussian's, whatever the points are.
 
 Source: marginals by Laplace's approximation at each value, Tierney & Kadane (1986), J. Am. Stat. Assoc. 81, 82.
 """
@@ -15,15 +15,18 @@ from typing import NamedTuple
 
 import numpy as np
 
+from en4dvar.descent.minima import Minimum
 from en4dvar.descent.weight_space import WeightSpace
-from en4dvar.diagnosis.response.ledger import weighted_quantiles
+from en4dvar.diagnosis import diagnostics as diag
+from en4dvar.diagnosis.response.ledger import QUANTILES, weighted_quantiles
 from en4dvar.ensemble.linalg import shares_of
 from en4dvar.model.state import Array
 from en4dvar.priors.prior import member_stream
 from en4dvar.sampling.emulated_cost import DEGREES, RUNS_PER_TERM, ModelRuns, fitted_cost
 from en4dvar.sampling.emulated_draws import LARGEST
 
-END = 3.0  # standard deviations to either side of the mean, where J of the Gaussian has risen by 4.5
+NEARLY = 0.01  # of the Gaussian's rise, and beside it, by which J may differ from it at all members
+END = 3.0  # standard deviations to either side of the minimum, where J of the Gaussian has risen by 4.5
 SHORT = 1.5  # less than that by which J rises to a point beyond which there may be a tail: it is followed
 FURTHER = 1.5  # times as far
 TRIED, WIDTHS = 128, (2.0, 1.0, 0.5, 0.25)  # points about x*, so wide, among which emulated J is lowest
@@ -31,8 +34,9 @@ PLACES = 2001  # of a parameter, at which its density is known
 
 
 class Intervals(NamedTuple):
-    """The 5, 50 and 95 % points (3, n) of the posterior in what is printed, and by how much the 5 or 95 % point of the
-    Gaussian is off (n,), in posterior standard deviations; whether J ``rises`` to all points at :data:`END`.
+    """The 5, 50 and 95 % points (3, n) of the posterior in what is printed, and by how much the 5 or 95 % point both of
+    the Gaussian and of the members is off (n,), in posterior standard deviations: members alone may be by chance, and
+    are what is printed. Whether J ``rises`` to all points at :data:`END`.
     """
 
     quantiles: Array
@@ -41,23 +45,22 @@ class Intervals(NamedTuple):
 
 
 class _Walk:
-    """Along each parameter j, to both sides, from the mean of an ensemble (N, n); ``runs`` are there.
+    """Along each parameter j, to both sides, from a minimum; ``runs`` are there.
 
-    ``costs`` of each side are J − ln V (relative to that at the mean) by the distance in standard deviations.
+    ``costs`` of each side are J − ln V (relative to that at the minimum) by the distance in standard deviations.
     """
 
-    def __init__(self, space: WeightSpace, ensemble: Array, runs: ModelRuns):
-        self.space, self.runs, n = space, runs, ensemble.shape[1]
-        self.mean, self.std = ensemble.mean(axis=0), ensemble.std(axis=0, ddof=1)
-        correlation = np.atleast_2d(np.corrcoef(ensemble.T))
+    def __init__(self, space: WeightSpace, minimum: Minimum, runs: ModelRuns):
+        self.space, self.runs, self.start, n = space, runs, minimum.x, len(minimum.x)
+        self.std = np.sqrt(np.diag(minimum.covariance))
+        correlation = minimum.covariance / np.outer(self.std, self.std)
         self.ways = np.array([side * self.std * correlation[j] for j in range(n) for side in (-1, 1)])
         half = member_stream(space.seed, "ends").standard_normal((TRIED // 2, n - 1))
         self.normal = np.concatenate([half, -half])
         roots = [self.std[:, None] * _conditional(correlation, j) for j in range(n) for _ in range(2)]
         self.about = np.array([self.normal @ root.T for root in roots])  # (2n, T, n) of the others, about each point
         self.bends = np.zeros_like(self.ways)  # of the last x* from the way, relative to the distance
-        at_mean = float(space.costs(self.mean[None], space.forecast(self.mean[None]))[0])
-        self.costs = [{0.0: at_mean} for _ in self.ways]
+        self.costs = [{0.0: minimum.cost} for _ in self.ways]
 
     @property
     def lowest(self) -> float:
@@ -65,33 +68,34 @@ class _Walk:
 
     def go(self, sides: list[int], far: float) -> None:
         """So ``far`` on ``sides``."""
-        x, log_volume = self.mean + far * (self.ways + self.bends)[sides], np.zeros(len(sides))
+        x, log_volume = self.start + far * (self.ways + self.bends)[sides], np.zeros(len(sides))
         if self.runs.outputs.shape[1] <= LARGEST and self.space.settings.emulator != "off":
             x, log_volume = self._emulated(x, self.about[sides])
         outcome = self.space.forecast(x)
         costs = self.space.costs(x, outcome)
         self.runs = self.runs.joined(ModelRuns.of(x, outcome, costs))
-        self.bends[sides] = (x - self.mean) / far - self.ways[sides]
-        for side, cost in zip(sides, costs - log_volume, strict=True):
+        self.bends[sides] = (x - self.start) / far - self.ways[sides]
+        for side, cost in zip(sides, self.space.with_sampled_prior(x, costs) - log_volume, strict=True):
             self.costs[side][far] = float(cost)
 
     def _emulated(self, x: Array, about: Array) -> tuple[Array, Array]:
         """The points x* (S, n) among those ``about`` (S, T, n) the points ``x`` (S, n), and ln V (S,)."""
-        problem, n = self.space.problem, len(self.mean)
+        problem, n = self.space.problem, len(self.start)
         degree = next((d for d in DEGREES if RUNS_PER_TERM * math.comb(n + d, d) <= len(self.runs.x)), 1)
         emulated = fitted_cost(problem.prior, problem.observations, degree, self.runs, 2 * n)
 
         def costs(tried: Array) -> Array:
-            return emulated.cost(tried.reshape(-1, n)).reshape(tried.shape[:2])
+            x = tried.reshape(-1, n)
+            return self.space.with_sampled_prior(x, emulated.cost(x)).reshape(tried.shape[:-1])
 
         def log_volume(at: Array) -> Array:
-            falls = emulated.cost(at)[:, None] - costs(at[:, None] + about)
+            falls = costs(at)[:, None] - costs(at[:, None] + about)
             return np.asarray(np.logaddexp.reduce(falls + 0.5 * np.sum(self.normal**2, axis=1), axis=1))
 
         for width in WIDTHS:
             tried = np.concatenate([x[:, None], x[:, None] + width * about], axis=1)
             x = tried[np.arange(len(x)), np.argmin(costs(tried), axis=1)]
-        return x, log_volume(x) - log_volume(np.broadcast_to(self.mean, x.shape))
+        return x, log_volume(x) - log_volume(np.broadcast_to(self.start, x.shape))
 
     def rise(self, side: int, far: float) -> float:
         """Of J on a side, to where it was so far."""
@@ -132,9 +136,14 @@ def _conditional(correlation: Array, j: int) -> Array:
     return root
 
 
-def examine_ends(space: WeightSpace, ensemble: Array, runs: ModelRuns) -> Intervals:
-    """Of an ensemble (N, n), by 2n + 1 runs beside the ``runs`` there are, and more where J rises too little."""
-    walk, prior, far = _Walk(space, ensemble, runs), space.problem.prior, END
+def examine_ends(space: WeightSpace, minimum: Minimum, ensemble: Array, runs: ModelRuns) -> Intervals | None:
+    """Of an ensemble (N, n) about a minimum, by 2n runs beside the ``runs`` there are, and more where J rises too
+    little; none, and None, where J of all runs there are is the Gaussian's.
+    """
+    walk, prior, far = _Walk(space, minimum, runs), space.problem.prior, END
+    rise = space.with_sampled_prior(runs.x, runs.costs) - minimum.cost
+    if np.allclose(rise, [0.5 * minimum.distance(x) ** 2 for x in runs.x], rtol=NEARLY, atol=NEARLY):
+        return None
     sides = list(range(len(walk.ways)))
     walk.go(sides, END)
     left = walk.short(END, sides)
@@ -146,15 +155,14 @@ def examine_ends(space: WeightSpace, ensemble: Array, runs: ModelRuns) -> Interv
         left = walk.short(far, left)
     if bent:  # how it rises there
         walk.go(bent, END / 2)
-    quantiles, off = np.empty((3, len(walk.mean))), np.empty(len(walk.mean))
+    quantiles, off = np.empty((len(QUANTILES), len(walk.start))), np.empty(len(walk.start))
+    printed = diag.member_quantiles(prior.to_physical(ensemble), QUANTILES, axis=0)
     for j in range(len(off)):
         z, density = walk.density(j)
-        x = np.tile(walk.mean, (len(z), 1))
+        x = np.tile(walk.start, (len(z), 1))
         x[:, j] += walk.std[j] * z
-        theta = prior.to_physical(x)[:, j]
-        shares = density / density.sum()
+        theta, shares = prior.to_physical(x)[:, j], density / density.sum()
         quantiles[:, j] = weighted_quantiles(theta, shares)
-        gaussian = weighted_quantiles(theta, shares_of(-0.5 * z**2))
-        std = math.sqrt(shares @ (theta - shares @ theta) ** 2)
-        off[j] = np.max(np.abs(gaussian - quantiles[:, j])[[0, 2]]) / std
+        of_both = np.array([weighted_quantiles(theta, shares_of(-0.5 * z**2)), printed[:, j]]) - quantiles[:, j]
+        off[j] = np.abs(of_both).min(axis=0)[[0, 2]].max() / math.sqrt(shares @ (theta - shares @ theta) ** 2)
     return Intervals(quantiles, off, rises)

@@ -81,9 +81,10 @@ def examine_shape(
 
 
 def examine_tails(
-    space: WeightSpace, ensemble: Array, before: Forecast, after: Forecast, always: bool
+    space: WeightSpace, minimum: Minimum, ensemble: Array, before: Forecast, after: Forecast, always: bool
 ) -> dict[str, float]:
-    """How far mean, standard deviation and ends of the ensemble (N, n) are from the posterior's in what is printed.
+    """How far mean, standard deviation and ends of the ensemble (N, n) about a minimum are from the posterior's in what
+    is printed.
 
     By members of J known by their forecast ``after``, those of the prior by that ``before``, runs along each parameter
     and, ``always`` or where members leave a doubt or J rises too little along a parameter, as many runs :data:`FAR`
@@ -95,9 +96,9 @@ def examine_tails(
     ``tail_std_<name>`` are those of a parameter that is surely off by what is warned of, NaN where ``tail_members``,
     the effective number of the points, is below :data:`TOO_FEW` to say to what.
     ``tail_elsewhere``: most of the posterior is where the ensemble is not. ``tail_end`` is the largest distance of a 5
-    or 95 % point of the Gaussian from :func:`~en4dvar.sampling.ends.examine_ends`'s, in posterior standard deviations,
-    and ``tail_q05_<name>``, ``tail_q95_<name>`` are the points of a parameter where that is what is warned of. Nothing
-    of an ensemble without a covariance.
+    or 95 % point of Gaussian and members from :func:`~en4dvar.sampling.ends.examine_ends`'s, in posterior standard
+    deviations, and ``tail_q05_<name>``, ``tail_q95_<name>`` are the points of a parameter where that is what is warned
+    of; there are none where J of all members is the Gaussian's. Nothing of an ensemble without a covariance.
     """
     weighed: dict[str, float] = {}
     with suppress(np.linalg.LinAlgError):
@@ -105,14 +106,16 @@ def examine_tails(
         members = [(x, run, space.costs(x, run)) for x, run in ((ensemble, after), (space.members, before))]
         parts = [(x, costs) for x, _, costs in members]
         weighed = _by_weights(prior, parts)
-        ends = examine_ends(space, ensemble, ModelRuns.of(*members[0]).joined(ModelRuns.of(*members[1])))
-        if always or weighed["tail_excess"] > 0 or not ends.rises:
+        ends = examine_ends(space, minimum, ensemble, ModelRuns.of(*members[0]).joined(ModelRuns.of(*members[1])))
+        if always or weighed["tail_excess"] > 0 or (ends and not ends.rises):
             mean = ensemble.mean(axis=0)
             points = mean + FAR * (ensemble - mean)
             weighed = _by_weights(prior, [*parts, (points, space.costs(points, space.forecast(points)))])
-        weighed["tail_end"] = float(ends.off.max())
-        for j in np.flatnonzero(ends.off > diag.ENDS_OFF):
-            weighed |= {f"tail_{q}_{prior.names[j]}": float(ends.quantiles[i, j]) for q, i in (("q05", 0), ("q95", 2))}
+        if ends:
+            weighed["tail_end"] = float(ends.off.max())
+            for j in np.flatnonzero(ends.off > diag.ENDS_OFF):
+                of_it = {"q05": ends.quantiles[0, j], "q95": ends.quantiles[-1, j]}
+                weighed |= {f"tail_{q}_{prior.names[j]}": float(value) for q, value in of_it.items()}
     return weighed
 
 
