@@ -34,7 +34,7 @@ class Optics:
     ``spread`` is how well the contrast is known, as a share of it: 1 where it is not; ``differs`` the share by which
     that of a frame differs from it, ``noise`` the std of a pixel, and ``even`` that bubbles are evenly dark, so that a
     frame may tell a contrast of its own. ``rim`` is that of :mod:`en4dvar_movie.kernels`: light, distance and width in
-    pixels, without a rim 0, and ``rim_std`` how well a frame's are known.
+    pixels, () without a rim, and ``rim_std`` how well a frame's are known.
     """
 
     contrast: float
@@ -43,8 +43,8 @@ class Optics:
     differs: float = 0.0
     noise: float = 0.0
     even: bool = False
-    rim: tuple[float, ...] = (0.0, 0.0, 0.0)
-    rim_std: tuple[float, ...] = (0.0, 0.0, 0.0)
+    rim: tuple[float, ...] = ()
+    rim_std: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class Outline:
     rows: float = 0.0
     rows_std: float = 1.0
     joined: float = 0.0
-    rim: tuple[float, ...] = (0.0, 0.0, 0.0)
+    rim: tuple[float, ...] = ()
 
     def amplitude(self, n: int) -> float:
         """Amplitude of mode n, in pixels; NaN where it was not fitted."""

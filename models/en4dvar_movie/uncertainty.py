@@ -157,7 +157,7 @@ def _errors(outline: Outline, ratio: float, hidden: float, turned: bool, optics:
     elif outline.seen < 0.9:
         words = f"{outline.seen:.0%} of the outline lies in the frame"
     # the edge's profile has the slope 1/(√(2π) w) at its half level
-    light, beside, wide = outline.rim
+    light, beside, wide = outline.rim or (0.0, 0.0, 0.0)
     blurred = np.hypot(outline.width, wide)
     there = light * np.exp(-0.5 * (beside / blurred) ** 2) / blurred / np.sqrt(2 * np.pi)  # the rim's level at the edge
     common = float(np.hypot(THRESHOLD, RIM * there) * np.sqrt(2 * np.pi) * outline.width)
