@@ -22,6 +22,8 @@ EVEN = 0.03  # of the contrast: what the brightness near the outline may scatter
 AGAINST = 2.5  # std of the contrast from which it then does
 FREE = 0.3  # of the contrast: what it may then differ by
 MOST_RIM = 20.0  # pixels: what the light of a rim, its distance and its width may be
+WHOLE = 0.9  # of the outline: how much is seen of one that the frame does not cut
+LONG = 1.0  # of the radius: what amplitudes of modes may be
 REACH = 4.0  # how far from the outline pixels are used, in widths of the edge
 APART = 1.5  # widths of the edge: nested circles that are closer are not told apart
 SHARP = 1.35  # widths of the movie's sharp edges: what is no wider is blurred by nothing else
@@ -29,15 +31,27 @@ TWO = 2.6  # their own widths by which two edges lie apart that are no blurred o
 SURE = 0.03  # share of the squares that two edges must explain and a blurred one does not
 X, Y, R, W, LEVEL, CONTRAST, GLARE, RIM = range(SHAPE)
 Parts = tuple[int, int]  # where the distances of nested circles begin, and the rim
+Fit = tuple[Array, Parts, float, Optics]  # parameters (P,), the noise, and the optics as they are known for this frame
 
 
-def fit_outline(image: Array, start: Circle, optics: Optics, circles: int = 1) -> list[Outline] | None:
+def fit_outline(
+    image: Array, start: Circle, optics: Optics, circles: int = 1, ovals: bool = False
+) -> list[Outline] | None:
     """The outline near ``start`` in an image (H, W) whose background is zero; None where nothing fits.
 
-    With several ``circles``, nested about one centre, one of each, the largest first.
+    With several ``circles``, nested about one centre, one of each, the largest first. With ``ovals``, where the frame
+    cuts them, they tell what mode 2 changes.
     """
     fitted = _fit(image, start, optics, circles)
-    return None if fitted is None else _outlines(image, *fitted)
+    outlines = None if fitted is None else _outlines(image, *fitted)
+    if not ovals or fitted is None or not outlines or outlines[0].seen >= WHOLE:
+        return outlines
+    oval = _fit(image, outlines[0].circle, optics, circles, 2)
+    others = None if oval is None else _outlines(image, *oval)
+    if oval is None or others is None:
+        return outlines
+    wrong, less = _misfits(image, fitted, oval)
+    return [replace(o, oval=other, better=(wrong - less) / 2) for o, other in zip(outlines, others, strict=True)]
 
 
 def two_edges(image: Array, start: Circle, optics: Optics) -> float:
@@ -45,17 +59,22 @@ def two_edges(image: Array, start: Circle, optics: Optics) -> float:
     single, double = (_fit(image, start, optics, circles) for circles in (1, 2))
     if single is None or double is None:
         return 0.0
-    (p, parts, *_), (q, q_parts, noise, _) = single, double
-    apart = q[q_parts[0]]
-    ring = _ring(p, q[slice(*q_parts)], p[parts[1] :])
-    fits = (p, parts), (q, q_parts)
-    wrong, less = (float(np.sum(np.minimum(residuals(image, *of, ring)[0] / noise, 5.0) ** 2)) for of in fits)
-    sharp = q[W] < SHARP * optics.width and apart > TWO * q[W]
-    return float(apart) if sharp and wrong - less > SURE * wrong else 0.0
+    wrong, less = _misfits(image, single, double)
+    q, (apart, _), *_ = double
+    sharp = q[W] < SHARP * optics.width and q[apart] > TWO * q[W]
+    return float(q[apart]) if sharp and wrong - less > SURE * wrong else 0.0
 
 
-def _fit(image: Array, start: Circle, optics: Optics, circles: int) -> tuple[Array, Parts, float, Optics] | None:
-    """Parameters (P,) and their parts, the noise, and the optics as they are known for this frame."""
+def _misfits(image: Array, first: Fit, second: Fit) -> tuple[float, float]:
+    """Sums of squares of what two fits leave about the first, in units of the noise beside the second."""
+    (p, parts, *_), (q, second_parts, noise, _) = first, second
+    ring = _ring(p, q[slice(*second_parts)], p[parts[1] :])
+    of_first, of_second = (residuals(image, *fit[:2], ring)[0] / noise for fit in (first, second))
+    return float(np.sum(np.minimum(of_first, 5) ** 2)), float(np.sum(np.minimum(of_second, 5) ** 2))
+
+
+def _fit(image: Array, start: Circle, optics: Optics, circles: int, least: int = 1) -> Fit | None:
+    """A fit with modes up to ``least`` at least."""
     radii = nested_radii(image, start, optics, circles)
     p = np.concatenate([np.zeros(SHAPE), radii[0] - radii[1:], optics.rim])
     p[[X, Y, R, W, CONTRAST]] = start.x, start.y, radii[0], optics.width, optics.contrast
@@ -67,7 +86,7 @@ def _fit(image: Array, start: Circle, optics: Optics, circles: int) -> tuple[Arr
         ring = _ring(p, gaps, rim)
         if _glare_is_far(p, gaps, ring):
             p[GLARE], p[RIM] = 0.0, RIM_SHARE * _innermost(p, gaps)
-        first = SHAPE + 2 * (modes_for(image, p) - 1)
+        first = SHAPE + 2 * (max(modes_for(image, p), least) - 1)
         parts = first, first + circles - 1
         p = np.concatenate([p[:SHAPE], np.zeros(first - SHAPE), gaps, rim])
         known = replace(optics, spread=max(optics.spread, FIRST_SPREAD[turn]))
@@ -78,7 +97,7 @@ def _fit(image: Array, start: Circle, optics: Optics, circles: int) -> tuple[Arr
         noise = max(1.4826 * float(np.median(np.abs(residuals(image, p, parts, ring)[0]))), 1e-6)
     against = abs(p[CONTRAST] / optics.contrast - 1) > AGAINST * (optics.spread + optics.differs)
     if against and optics.even and optics.differs < FREE and p[R] > OWN * p[W]:
-        own = _fit(image, Circle(*p[:W]), replace(optics, differs=FREE), circles)
+        own = _fit(image, Circle(*p[:W]), replace(optics, differs=FREE), circles, least)
         if own is not None and tells_contrast(own[0][R], own[0][W], own[2], optics):
             return own
     return p, parts, noise, optics
@@ -105,7 +124,7 @@ def nested_radii(image: Array, start: Circle, optics: Optics, circles: int) -> A
 
 def modes_for(image: Array, p: Array) -> int:
     """The highest mode that a circle of this size shows: none where a part of it is not seen."""
-    if share_inside(image, Circle(*p[:3])) < 0.9:
+    if share_inside(image, Circle(*p[:3])) < WHOLE:
         return 1
     return int(np.clip(p[R] / 4.0, 2, MODES))
 
@@ -138,6 +157,7 @@ def _known(p: Array, parts: Parts, ring: Array, noise: float, optics: Optics) ->
     centre[RIM], centre[CONTRAST] = RIM_SHARE * inner, optics.contrast
     tight = 1e12 if _glare_is_far(p, gaps, ring) else 1.0
     precision[RIM] = noise**2 * tight / (0.1 * inner) ** 2
+    precision[SHAPE : parts[0]] = noise**2 / (LONG * p[R]) ** 2
     precision[GLARE] = noise**2 * tight / optics.contrast**2
     chance = 2 * (8 / np.pi**0.5 * p[W] / p[R]) ** 0.5 * p[W] * noise / abs(p[CONTRAST])  # 2 std of the width's square
     moved = max(p[W] ** 2 - optics.width**2 - chance, 0.0) ** 0.5

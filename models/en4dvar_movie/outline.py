@@ -56,7 +56,8 @@ class Outline:
     the contrast of the movie; ``mode_std`` is the std of a mode's amplitude. ``seen`` is the share of the
     outline that can be seen. ``rows`` is by how much even rows show a larger bubble than odd ones, ``rows_std`` what
     noise makes of it. ``joined`` is the std for nested circles that lie too close to be told apart, which all
-    have their mean radius.
+    have their mean radius. ``oval`` is the outline of which mode 2 is fitted too, where the frame
+    cuts it, and ``better`` by how much its −log likelihood is less.
     """
 
     circle: Circle
@@ -73,6 +74,8 @@ class Outline:
     rows_std: float = 1.0
     joined: float = 0.0
     rim: tuple[float, ...] = ()
+    oval: "Outline | None" = None
+    better: float = 0.0
 
     def amplitude(self, n: int) -> float:
         """Amplitude of mode n, in pixels; NaN where it was not fitted."""
