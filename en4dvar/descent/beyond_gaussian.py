@@ -63,8 +63,8 @@ def over_errors(space: WeightSpace, linear: Linearisation, mode: Array, posterio
     squares = np.sum(np.linalg.solve(root, (draws - about).T) ** 2, axis=0)
     norm = math.lgamma(0.5 * (FREEDOM + count)) - math.lgamma(0.5 * FREEDOM) - 0.5 * count * math.log(FREEDOM * math.pi)
     log_t = norm - np.log(np.diag(root)).sum() - 0.5 * (FREEDOM + count) * np.log1p(squares / FREEDOM)
-    given = _Given.of(space, linear, mode, of_errors)
-    log_marginal, means, roots = given.moments(draws)
+    linearised = _Linear.of(space, linear, mode, of_errors)
+    log_marginal, means, roots = linearised.moments(draws)
     logs = log_marginal + log_prior - np.logaddexp(log_t, log_prior) + math.log(2)
     weights = shares_of(logs)
     if effective_number(weights) < ENOUGH:
@@ -74,22 +74,22 @@ def over_errors(space: WeightSpace, linear: Linearisation, mode: Array, posterio
     normal = stream.standard_normal((len(posterior), means.shape[1]))
     members = np.empty(posterior.shape)
     members[:, of_errors] = draws[chosen]
-    members[:, ~of_errors] = means[chosen] + np.einsum("dji,dj->di", roots[chosen], normal)
+    members[:, ~of_errors] = means[chosen] + np.einsum("dij,dj->di", roots[chosen], normal)
     if space.settings.sampling == "exact":
         # The members mapped linearly so that mean and covariance are those of the whole mixture
         centres = np.empty((len(draws), len(mode)))
         centres[:, of_errors], centres[:, ~of_errors] = draws, means
-        mean = weights @ centres
-        target = (weights[:, None] * (centres - mean)).T @ (centres - mean)
-        weighted = (np.sqrt(weights)[:, None, None] * roots).reshape(-1, means.shape[1])
-        target[np.ix_(~of_errors, ~of_errors)] += weighted.T @ weighted
-        members = with_moments(members, mean, target)
+        mean, share = weights @ centres, np.sqrt(weights)
+        apart = np.zeros((roots.shape[2], *centres.shape))
+        apart[..., ~of_errors] = np.moveaxis(share[:, None, None] * roots, 2, 0)
+        rows = np.vstack([share[:, None] * (centres - mean), apart.reshape(-1, len(mode))])
+        members = with_moments(members, mean, np.linalg.qr(rows, mode="r"))
     evidence = float(np.logaddexp.reduce(logs)) - math.log(len(logs))
-    return Drawn(prior.from_white(members), given.cost, evidence)
+    return Drawn(prior.from_white(members), linearised.cost, evidence)
 
 
 @dataclass(frozen=True)
-class _Given:
+class _Linear:
     """J with predictions linear about a mode: ``slopes`` (n', K) of u, which lies at ``rest`` (n',) there; white
     coordinates.
     """
@@ -101,7 +101,7 @@ class _Given:
     rest: Array
 
     @classmethod
-    def of(cls, space: WeightSpace, linear: Linearisation, mode: Array, of_errors: Mask) -> "_Given":
+    def of(cls, space: WeightSpace, linear: Linearisation, mode: Array, of_errors: Mask) -> "_Linear":
         prior = space.problem.prior
         to_control = np.ascontiguousarray(prior.white_change((space.anomalies.T @ space.basis).T).T)
         slopes = (np.linalg.pinv(to_control).T @ linear.anomalies)[~of_errors]
@@ -116,7 +116,7 @@ class _Given:
 
     def moments(self, draws: Array) -> tuple[Array, Array, Array]:
         """ln p(y|h) (D,) but for the errors' normalisation, −inf where it is not known, and of u the mean (D, n') and
-        B (D, n', n') with the covariance BᵀB, for draws of h (D, n'').
+        B (D, n', n') with the covariance BBᵀ, for draws of h (D, n'').
         """
         each = [self._moments(draws[first : first + AT_ONCE]) for first in range(0, len(draws), AT_ONCE)]
         log, mean, root = (np.concatenate(parts) for parts in zip(*each, strict=True))
@@ -126,15 +126,16 @@ class _Given:
         observations, rest = self.space.problem.observations, self.rest
         predicted = self._predicted(draws, np.tile(self.at.values, (len(draws), 1)))
         log = -observations.cost(predicted) - 0.5 * rest @ rest
-        products = np.zeros((len(draws), len(rest) + 1, len(rest) + 1))
         possible = np.isfinite(log)
-        rows = np.vstack([observations.values - self.at.values, self.slopes])
-        white = observations.whitened_rows(rows, predicted[possible])
-        products[possible] = white @ white.swapaxes(1, 2)
-        root = np.linalg.inv(np.linalg.cholesky(np.eye(len(rest)) + products[:, 1:, 1:]))
-        moved = np.einsum("dij,dj->di", root, products[:, 1:, 0] - rest)
-        log += 0.5 * np.sum(moved**2, axis=1) + np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
-        return log, rest + np.einsum("dji,dj->di", root, moved), root
+        rows = np.vstack([self.slopes, observations.values - self.at.values])
+        # Least squares in u − rest: readings, then the prior, the right-hand side last
+        readings = np.zeros((len(draws), len(self.at.values), len(rows)))
+        readings[possible] = observations.whitened_rows(rows, predicted[possible]).swapaxes(1, 2)
+        prior = np.tile(np.column_stack([np.eye(len(rest)), -rest]), (len(draws), 1, 1))
+        triangle = np.linalg.qr(np.concatenate([readings, prior], axis=1), mode="r")
+        root, side = np.linalg.inv(triangle[:, :-1, :-1]), triangle[:, :-1, -1]
+        log += 0.5 * np.sum(side**2, axis=1) + np.log(np.abs(np.diagonal(root, axis1=1, axis2=2))).sum(axis=1)
+        return log, rest + np.einsum("dij,dj->di", root, side), root
 
     def _predicted(self, draws: Array, values: Array) -> Predicted:
         """Predictions ``values`` (D, K) beside draws of h (D, n'')."""

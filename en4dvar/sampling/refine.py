@@ -103,14 +103,14 @@ def examine_tails(
     weighed: dict[str, float] = {}
     with suppress(np.linalg.LinAlgError):
         prior, own = space.problem.prior, _of_drawn(drawn, space.problem.prior) if drawn else _gaussian(ensemble)
-        parts = [Part(ensemble, costs, own), Part(space.members, before, _gaussian(space.members))]
+        parts = [Points(ensemble, costs, own), Points(space.members, before, _gaussian(space.members))]
 
         def with_runs(points: Array, log_density: LogDensity) -> dict[str, float]:
-            parts.append(Part(points, space.costs(points, space.forecast(points)), log_density))
+            parts.append(Points(points, space.costs(points, space.forecast(points)), log_density))
             return _by_weights(prior, parts)
 
         weighed = _by_weights(prior, parts)
-        way, more = (np.zeros(len(prior.names)), 0.0) if always else _flattest(space, ensemble, own)
+        way, more = (np.zeros(len(prior.names)), -math.inf) if always else _flattest(space, ensemble, own)
         if weighed["tail_excess"] > 0 or more < -SHORT:
             mean, wider = ensemble.mean(axis=0), len(prior.names) * math.log(FAR)
             weighed = with_runs(mean + FAR * (ensemble - mean), lambda x: own(mean + (x - mean) / FAR) - wider)
@@ -120,7 +120,7 @@ def examine_tails(
 
 
 @dataclass(frozen=True)
-class Part:
+class Points:
     """Points (B, n), J (B,) of them and the logarithm of the density that they are drawn from, but for (2π)^(−n/2)."""
 
     points: Array
@@ -152,7 +152,7 @@ def _flattest(space: WeightSpace, ensemble: Array, own: LogDensity) -> tuple[Arr
     return ways[least], float(beyond[least]) - float(beyond[0])
 
 
-def _by_weights(prior: Prior, parts: Sequence[Part]) -> dict[str, float]:
+def _by_weights(prior: Prior, parts: Sequence[Points]) -> dict[str, float]:
     """The numbers of :func:`examine_tails`, of the ensemble, the prior's members and others.
 
     The posterior is that of the prior's members, which the ensemble stands for where they are drawn at random, too.

@@ -46,11 +46,7 @@ class HuberNoise(Noise):
 
     @cached_property
     def scale_information(self) -> float:  # type: ignore[override]
-        """E[v²ψ²] − 1 = 1 + E[v²ψ'], ψ = ρ': for large thresholds the same as for Gaussian errors.
-
-        >>> round(HuberNoise(np.ones(1), np.zeros(1), 6.0).scale_information, 4)
-        2.0
-        """
+        """E[v²ψ²] − 1 = 1 + E[v²ψ'], ψ = ρ': for large thresholds the same as for Gaussian errors."""
         return 1 + (self._inside - 2 * self.threshold * self._edge) / math.exp(self._log_norm())
 
     def _white(self, stream: np.random.Generator, shape: tuple[int, ...]) -> Array:
