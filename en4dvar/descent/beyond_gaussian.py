@@ -67,7 +67,7 @@ def over_errors(space: WeightSpace, linear: Linearisation, mode: Array, posterio
     log_marginal, means, roots = linearised.moments(draws)
     logs = log_marginal + log_prior - np.logaddexp(log_t, log_prior) + math.log(2)
     weights = shares_of(logs)
-    if effective_number(weights) < ENOUGH:
+    if not effective_number(weights) >= ENOUGH:  # also of NaN
         return None
     # members (N, n) of the mixture, in units of the prior: systematic in h, random in u
     chosen = resampled(weights, len(posterior), stream)
@@ -83,7 +83,7 @@ def over_errors(space: WeightSpace, linear: Linearisation, mode: Array, posterio
         apart = np.zeros((roots.shape[2], *centres.shape))
         apart[..., ~of_errors] = np.moveaxis(share[:, None, None] * roots, 2, 0)
         rows = np.vstack([share[:, None] * (centres - mean), apart.reshape(-1, len(mode))])
-        members = with_moments(members, mean, np.linalg.qr(rows, mode="r"))
+        members = with_moments(members, mean, np.asarray(np.linalg.qr(rows, mode="r")))
     evidence = float(np.logaddexp.reduce(logs)) - math.log(len(logs))
     return Drawn(prior.from_white(members), linearised.cost, evidence)
 
@@ -132,7 +132,7 @@ class _Linear:
         readings = np.zeros((len(draws), len(self.at.values), len(rows)))
         readings[possible] = observations.whitened_rows(rows, predicted[possible]).swapaxes(1, 2)
         prior = np.tile(np.column_stack([np.eye(len(rest)), -rest]), (len(draws), 1, 1))
-        triangle = np.linalg.qr(np.concatenate([readings, prior], axis=1), mode="r")
+        triangle = np.asarray(np.linalg.qr(np.concatenate([readings, prior], axis=1), mode="r"))
         root, side = np.linalg.inv(triangle[:, :-1, :-1]), triangle[:, :-1, -1]
         log += 0.5 * np.sum(side**2, axis=1) + np.log(np.abs(np.diagonal(root, axis1=1, axis2=2))).sum(axis=1)
         return log, rest + np.einsum("dij,dj->di", root, side), root
