@@ -202,6 +202,10 @@ class Observations:
         """Whitened innovation d (K',) and whitened anomalies S (K', N); see :meth:`en4dvar.data.noise.Noise.whiten`."""
         return self.noise.whiten(self.values, self.weights, at)
 
+    def whitened_rows(self, rows: Array, predicted: Predicted) -> Array:
+        """√β times :meth:`en4dvar.data.noise.Noise.whitened_rows`."""
+        return self.noise.whitened_rows(self.values, rows, predicted) * np.sqrt(self.weights)
+
     def precision_times(self, at: Predicted, vectors: Array) -> Array:
         """β R⁻¹ applied to vectors (…, K), R at a prediction."""
         return self.noise.precision_times(self.values, self.weights, at, vectors)

@@ -1,14 +1,16 @@
-r"""What the Gaussian about a mode of J lacks: a mixture, bounds, and a mean beyond the mode.
+r"""What the Gaussian about a mode of J lacks: a mixture over the parameters of the errors, and bounds.
 
-Beside an estimated discrepancy the posterior is a mixture over amplitude, length and noise scale. At the mode
-of J these are too small, for a fit uses up degrees of freedom, and a posterior at one value of them is too narrow. With
-the predictions linear about the mode, m(u) = m(0) + M u in the other coordinates u ~ N(0, I), all that depends on the
-parameters h of the covariance K(h) is known in closed form,
+Where parameters h of the covariance K(h) of the errors are estimated (the noise scale, amplitude and length of a
+discrepancy), the posterior is a mixture over them. At the mode of J these are too small, for a fit uses up degrees of
+freedom, and a posterior at one value of them is too narrow. With the predictions linear about the mode,
+m(u) = m(0) + M u in the other coordinates u ~ N(0, I), all that depends on h is known in closed form,
 
     p(h|y) ∝ N(y − m(0); 0, K + M Mᵀ) p(h),   u | h ~ N(P MᵀK⁻¹(y − m(0)), P),   P = (I + MᵀK⁻¹M)⁻¹,
 
-and needs no run of the model. p(h|y) is sampled by importance from Student's t about the mode (Kennedy & O'Hagan 2001;
-nested Laplace approximations: Rue, Martino & Chopin 2009, J. R. Stat. Soc. B 71, 319).
+and needs no run of the model; of a robust cost each h has Laplace's approximation in u, by one step from the mode.
+Rates, where K has any, are those of the mode. p(h|y) is sampled by importance, half of the draws from Student's t about
+the mode and half from the prior, as far as which a posterior of few readings may reach (Kennedy & O'Hagan 2001; nested
+Laplace approximations: Rue, Martino & Chopin 2009, J. R. Stat. Soc. B 71, 319; Hesterberg 1995, Technometrics 37, 185).
 """
 
 import math
@@ -17,110 +19,141 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from en4dvar.data.noise import BoundNoise, DiscrepancyNoise, Linearisation, Predicted, sides_of
+from en4dvar.data.noise import BoundNoise, Linearisation, Predicted, sides_of
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.ensemble.forecast import of_framework
 from en4dvar.ensemble.linalg import effective_number, resampled, shares_of, with_moments
 from en4dvar.model.state import NOISE_SCALE, Array, Mask
-from en4dvar.priors.parameter_map import QUANTILE_MAPS
-from en4dvar.priors.prior import PriorTerm, member_stream
-from en4dvar.problem import InverseProblem
+from en4dvar.priors.prior import member_stream
 
-DRAWS, FREEDOM = 1500, 5.0  # of Student's t
+DRAWS, FREEDOM = 250, 5.0  # of Student's t, and as many of the prior, for each parameter of the errors
 WIDER = 1.3  # than the Gaussian at the mode
 AT_ONCE = 50
 ENOUGH = 60.0  # effective draws below which the ensemble stays as it is
 PARTICLES, SWEEPS = 2000, 40  # that bounds are imposed on; moves of each in the end
-STENCIL = 0.02  # width of differences, in prior standard deviations
-
-
-def marginal_members(space: WeightSpace, linear: Linearisation, mode: Array, posterior: Array) -> Array:
-    """Members (N, n), transformed, in place of ``posterior`` (N, n), the Gaussian about the ``mode`` (n,)."""
-    problem, prior = space.problem, space.problem.prior
-    of_errors = np.array([name in problem.of_errors for name in prior.names])
-    if not np.any([p.name in prior.names for p in problem.discrepancy]):
-        return posterior
-    z_mode = prior.white(mode)
-    stream = member_stream(space.seed, "discrepancy")
-    covariance = prior.white_covariance(np.atleast_2d(np.cov(posterior.T)))
-    root = WIDER * np.linalg.cholesky(covariance[np.ix_(of_errors, of_errors)])
-    normal = stream.standard_normal((DRAWS, len(root))) / np.sqrt(stream.chisquare(FREEDOM, (DRAWS, 1)) / FREEDOM)
-    draws = z_mode[of_errors] + normal @ root.T
-    log_proposal = -0.5 * (FREEDOM + len(root)) * np.log1p(np.sum(normal**2, axis=1) / FREEDOM)
-    log_marginal, means, covariances = _given(space, linear, mode, of_errors, draws)
-    logs = log_marginal - log_proposal
-    weights = shares_of(np.where(np.isnan(logs), -np.inf, logs))
-    if effective_number(weights) < ENOUGH:
-        return posterior
-    # members (N, n) of the mixture, in units of the prior: systematic in h, random in u
-    chosen = resampled(weights, len(posterior), stream)
-    normal = stream.standard_normal((len(posterior), means.shape[1]))
-    members = np.empty((len(posterior), len(of_errors)))
-    members[:, of_errors] = draws[chosen]
-    members[:, ~of_errors] = means[chosen] + np.einsum("dij,dj->di", np.linalg.cholesky(covariances[chosen]), normal)
-    if space.settings.sampling == "exact":
-        # The members mapped linearly so that mean and covariance are those of the whole mixture
-        centres = np.empty((len(draws), len(of_errors)))
-        centres[:, of_errors], centres[:, ~of_errors] = draws, means
-        mean = weights @ centres
-        target = (weights[:, None] * (centres - mean)).T @ (centres - mean)
-        target[np.ix_(~of_errors, ~of_errors)] += np.einsum("d,dij->ij", weights, covariances)
-        members = with_moments(members, mean, target)
-    return prior.from_white(members)
-
-
-def _given(
-    space: WeightSpace, linear: Linearisation, mode: Array, of_errors: Mask, draws: Array
-) -> tuple[Array, Array, Array]:
-    """ln p(h|y) (D,) up to a constant, and mean (D, n') and covariance (D, n', n') of u, for draws of h (D, n'')."""
-    prior, observations = space.problem.prior, space.problem.observations
-    noise = observations.noise
-    assert isinstance(noise, DiscrepancyNoise)
-    at, beta = linear.prediction, float(observations.weights[0])
-    noise = noise.gaussian_at(observations.values, at)
-    to_control = np.ascontiguousarray(prior.white_change((space.anomalies.T @ space.basis).T).T)
-    slopes = (linear.anomalies.T @ np.linalg.pinv(to_control))[:, ~of_errors]
-    rest = prior.white(mode)[~of_errors]
-    columns = np.column_stack([observations.values - at.values + slopes @ rest, slopes])
-    x = np.tile(mode, (len(draws), 1))
-    x[:, of_errors] = prior.mean[of_errors] + prior.std[of_errors] * draws
-    problem, physical, count = space.problem, prior.to_physical(x), len(draws)
-    predicted = Predicted(
-        np.tile(at.values, (count, 1)),
-        None if at.rates is None else np.tile(at.rates, (count, 1)),
-        of_framework(problem, physical, NOISE_SCALE, 1.0) if problem.has_noise_scale else None,
-        np.stack([of_framework(problem, physical, p, 1.0) for p in problem.discrepancy], axis=1),
-    )
-    log_density, means, covariances = [], [], []
-    for first in range(0, len(draws), AT_ONCE):
-        white, roots = noise.whitened_columns(columns, predicted[first : first + AT_ONCE])
-        products = beta * np.einsum("dki,dkj->dij", white, white, optimize=True)
-        impossible = ~np.isfinite(products).all(axis=(1, 2))
-        products[impossible] = 0.0
-        information = np.eye(slopes.shape[1]) + products[:, 1:, 1:]
-        inverse = np.linalg.inv(information)
-        mean = np.einsum("dij,dj->di", inverse, products[:, 1:, 0])
-        squares = products[:, 0, 0] - np.einsum("di,di->d", products[:, 0, 1:], mean)
-        dets = 2 * np.log(roots).sum(axis=1) + np.linalg.slogdet(information)[1]
-        log_density.append(np.where(impossible, -np.inf, -0.5 * (squares + dets)))
-        means.append(mean)
-        covariances.append(inverse)
-    log_prior = -0.5 * np.sum(draws**2, axis=1)
-    return np.concatenate(log_density) + log_prior, np.concatenate(means), np.concatenate(covariances)
 
 
 @dataclass(frozen=True)
-class Bounded:
-    """``members`` (N, n), transformed, beside readings that are bounds, ``costs`` (N,), J of them as far as predictions
-    are linear about the mode, and ln p(y), ``log_evidence``, so far, but for the errors' normalisation.
+class Drawn:
+    """``members`` (N, n), transformed, of a posterior that is no Gaussian; ``cost``, J (B,) of control vectors (B, n)
+    as far as predictions are linear about the mode, and ln p(y), ``log_evidence``, so far, but for the errors'
+    normalisation.
     """
 
     members: Array
-    costs: Array
+    cost: Callable[[Array], Array]
     log_evidence: float
 
 
-def beside_bounds(space: WeightSpace, linear: Linearisation, w: Array, cost: float) -> Bounded | None:
+def over_errors(space: WeightSpace, linear: Linearisation, mode: Array, posterior: Array) -> Drawn | None:
+    """The mixture over the parameters of the errors in place of ``posterior`` (N, n), the Gaussian about the ``mode``
+    (n,), all transformed. None where no such parameter is estimated, or members are too few for all coordinates.
+    """
+    problem, prior = space.problem, space.problem.prior
+    of_errors = np.array([name in problem.of_errors for name in prior.names])
+    if not of_errors.any() or space.basis.shape[1] < len(mode):
+        return None
+    stream, count = member_stream(space.seed, "parameters of the errors"), int(of_errors.sum())
+    covariance = prior.white_covariance(np.atleast_2d(np.cov(posterior.T)))
+    root = WIDER * np.linalg.cholesky(covariance[np.ix_(of_errors, of_errors)])
+    about, half = prior.white(mode)[of_errors], DRAWS * count
+    heavy = stream.standard_normal((half, count)) / np.sqrt(stream.chisquare(FREEDOM, (half, 1)) / FREEDOM)
+    draws = np.concatenate([about + heavy @ root.T, stream.standard_normal((half, count))])
+    log_prior = -0.5 * np.sum(draws**2, axis=1) - 0.5 * count * math.log(2 * math.pi)
+    squares = np.sum(np.linalg.solve(root, (draws - about).T) ** 2, axis=0)
+    norm = math.lgamma(0.5 * (FREEDOM + count)) - math.lgamma(0.5 * FREEDOM) - 0.5 * count * math.log(FREEDOM * math.pi)
+    log_t = norm - np.log(np.diag(root)).sum() - 0.5 * (FREEDOM + count) * np.log1p(squares / FREEDOM)
+    linearised = _Linear.of(space, linear, mode, of_errors)
+    log_marginal, means, roots = linearised.moments(draws)
+    logs = log_marginal + log_prior - np.logaddexp(log_t, log_prior) + math.log(2)
+    weights = shares_of(logs)
+    if not effective_number(weights) >= ENOUGH:  # also of NaN
+        return None
+    # members (N, n) of the mixture, in units of the prior: systematic in h, random in u
+    chosen = resampled(weights, len(posterior), stream)
+    normal = stream.standard_normal((len(posterior), means.shape[1]))
+    members = np.empty(posterior.shape)
+    members[:, of_errors] = draws[chosen]
+    members[:, ~of_errors] = means[chosen] + np.einsum("dij,dj->di", roots[chosen], normal)
+    if space.settings.sampling == "exact":
+        # The members mapped linearly so that mean and covariance are those of the whole mixture
+        centres = np.empty((len(draws), len(mode)))
+        centres[:, of_errors], centres[:, ~of_errors] = draws, means
+        mean, share = weights @ centres, np.sqrt(weights)
+        apart = np.zeros((roots.shape[2], *centres.shape))
+        apart[..., ~of_errors] = np.moveaxis(share[:, None, None] * roots, 2, 0)
+        rows = np.vstack([share[:, None] * (centres - mean), apart.reshape(-1, len(mode))])
+        members = with_moments(members, mean, np.asarray(np.linalg.qr(rows, mode="r")))
+    evidence = float(np.logaddexp.reduce(logs)) - math.log(len(logs))
+    return Drawn(prior.from_white(members), linearised.cost, evidence)
+
+
+@dataclass(frozen=True)
+class _Linear:
+    """J with predictions linear about a mode: ``slopes`` (n', K) of u, which lies at ``rest`` (n',) there; white
+    coordinates.
+    """
+
+    space: WeightSpace
+    at: Predicted
+    of_errors: Mask
+    slopes: Array
+    rest: Array
+
+    @classmethod
+    def of(cls, space: WeightSpace, linear: Linearisation, mode: Array, of_errors: Mask) -> "_Linear":
+        prior = space.problem.prior
+        to_control = np.ascontiguousarray(prior.white_change((space.anomalies.T @ space.basis).T).T)
+        slopes = (np.linalg.pinv(to_control).T @ linear.anomalies)[~of_errors]
+        return cls(space, linear.prediction, of_errors, slopes, prior.white(mode)[~of_errors])
+
+    def cost(self, x: Array) -> Array:
+        """J (B,) of control vectors (B, n)."""
+        z = self.space.problem.prior.white(x)
+        values = self.at.values + (z[:, ~self.of_errors] - self.rest) @ self.slopes
+        predicted = self._predicted(z[:, self.of_errors], values)
+        return np.asarray(0.5 * np.sum(z**2, axis=1) + self.space.problem.observations.cost(predicted))
+
+    def moments(self, draws: Array) -> tuple[Array, Array, Array]:
+        """ln p(y|h) (D,) but for the errors' normalisation, −inf where it is not known, and of u the mean (D, n') and
+        B (D, n', n') with the covariance BBᵀ, for draws of h (D, n'').
+        """
+        each = [self._moments(draws[first : first + AT_ONCE]) for first in range(0, len(draws), AT_ONCE)]
+        log, mean, root = (np.concatenate(parts) for parts in zip(*each, strict=True))
+        return log, mean, root
+
+    def _moments(self, draws: Array) -> tuple[Array, Array, Array]:
+        observations, rest = self.space.problem.observations, self.rest
+        predicted = self._predicted(draws, np.tile(self.at.values, (len(draws), 1)))
+        log = -observations.cost(predicted) - 0.5 * rest @ rest
+        possible = np.isfinite(log)
+        rows = np.vstack([self.slopes, observations.values - self.at.values])
+        # Least squares in u − rest: readings, then the prior, the right-hand side last
+        readings = np.zeros((len(draws), len(self.at.values), len(rows)))
+        readings[possible] = observations.whitened_rows(rows, predicted[possible]).swapaxes(1, 2)
+        prior = np.tile(np.column_stack([np.eye(len(rest)), -rest]), (len(draws), 1, 1))
+        triangle = np.asarray(np.linalg.qr(np.concatenate([readings, prior], axis=1), mode="r"))
+        root, side = np.linalg.inv(triangle[:, :-1, :-1]), triangle[:, :-1, -1]
+        log += 0.5 * np.sum(side**2, axis=1) + np.log(np.abs(np.diagonal(root, axis1=1, axis2=2))).sum(axis=1)
+        return log, rest + np.einsum("dij,dj->di", root, side), root
+
+    def _predicted(self, draws: Array, values: Array) -> Predicted:
+        """Predictions ``values`` (D, K) beside draws of h (D, n'')."""
+        problem, prior, count = self.space.problem, self.space.problem.prior, len(draws)
+        z = np.zeros((count, len(prior.names)))
+        z[:, self.of_errors] = draws
+        physical = prior.to_physical(prior.from_white(z))
+        return Predicted(
+            values,
+            None if self.at.rates is None else np.tile(self.at.rates, (count, 1)),
+            of_framework(problem, physical, NOISE_SCALE, 1.0) if problem.has_noise_scale else None,
+            np.stack([of_framework(problem, physical, p, 1.0) for p in problem.discrepancy], axis=1)
+            if problem.discrepancy
+            else None,
+        )
+
+
+def beside_bounds(space: WeightSpace, linear: Linearisation, w: Array, cost: float) -> Drawn | None:
     """The posterior about its mode, of weights w (N,) and J ``cost``, where readings are bounds: the Gaussian of all
     else, cut off softly. None where none is.
 
@@ -159,8 +192,12 @@ def beside_bounds(space: WeightSpace, linear: Linearisation, w: Array, cost: flo
     z, log_share = _imposed(stream.standard_normal((max(PARTICLES, n_members), r)), of_bounds, stream)
     z = z[:n_members]
     log_det = 2 * float(np.log(np.abs(np.diag(root)) / prior).sum())
-    costs = lowest + 0.5 * np.sum(z**2, axis=1) + of_bounds(z)
-    return Bounded(space.control(w + moved(z) @ basis.T), costs, log_share - lowest - 0.5 * log_det)
+
+    def cost_of(x: Array) -> Array:
+        z = ((space.weights_of(x) - w) @ basis - middle) @ root.T
+        return np.asarray(lowest + 0.5 * np.sum(z**2, axis=1) + of_bounds(z))
+
+    return Drawn(space.control(w + moved(z) @ basis.T), cost_of, log_share - lowest - 0.5 * log_det)
 
 
 def _imposed(z: Array, cost: Callable[[Array], Array], stream: np.random.Generator) -> tuple[Array, float]:
@@ -194,62 +231,3 @@ def _moved(z: Array, cost: Callable[[Array], Array], power: float, stream: np.ra
             return moved
         low, high = np.where(refused & (angle < 0), angle, low), np.where(refused & (angle >= 0), angle, high)
         angle = np.where(refused, stream.uniform(low, high), angle)
-
-
-def mean_beyond_mode(problem: InverseProblem, mode: Array, posterior: Array, dfs: float) -> Array:
-    r"""What to add to the ``mode`` (n,) for the mean (n,); zero without a noise scale, or beside a discrepancy,
-    where all parameters of the errors are marginalised (:func:`marginal_members`).
-
-    ``posterior`` (N, n) are members whose covariance is C, ``dfs`` = tr (M + U) C; all in transformed space.
-
-    With u = ln σ, v = (y − m)/s and ψ = ρ' the third derivatives of J_o with respect to u and any two directions do not
-    vanish on average: a fit uses up degrees of freedom, so that J prefers too small a σ. In the notation of
-    :mod:`en4dvar.data.noise`, with the information M = SᵀS of the predictions and U of ln σ, their expectations under
-    exp(−ρ) are
-
-        ∂²_m ∂_u J = −r_m M,   r_m = E[2ψ' + vψ''] / E[ψ/v],
-        ∂³_u J = −r_u U,       r_u = E[vψ + 3v²ψ' + v³ψ''] / E[vψ + v²ψ'],
-
-    both 2 where errors are Gaussian. For u = g(x), x the coordinate that is estimated, C = A⁻¹, the mean of any
-    coordinate lies −½ C tr(C ∇³J) beyond the mode (Tierney & Kadane 1986, J. Am. Stat. Assoc. 81, 82):
-
-        ½ C e_x [ g' (r_m tr MC + r_u tr UC) − 3 (g''/g') tr UC − g''' ∂_u J C_xx ].
-    """
-    prior, name = problem.prior, NOISE_SCALE.name
-    if name not in prior.names or not problem.has_noise_scale or problem.discrepancy:
-        return np.zeros(len(mode))
-    column = prior.names.index(name)
-    anomalies = posterior - posterior.mean(axis=0)
-    covariance = anomalies.T @ anomalies[:, column] / (len(posterior) - 1)
-    term, x, variance = prior.terms[column], float(mode[column]), float(covariance[column])
-    first, second, third = log_derivatives(term, x)
-    ratio = problem.observations.noise.scale_skewness()
-    of_scale = float(problem.observations.weights.sum()) * ratio.information * first**2 * variance
-    slope = -(x - term.mean) / term.std**2 / first  # of J_o in u: the mode balances it against the prior
-    skewness = (
-        first * (ratio.of_predictions * (dfs - of_scale) + ratio.of_scale * of_scale)
-        - 3 * second / first * of_scale
-        - third * slope * variance
-    )
-    return np.asarray(0.5 * covariance * skewness)
-
-
-def log_derivatives(term: PriorTerm, x: float) -> tuple[float, float, float]:
-    """Derivatives g', g'', g''' of u = ln σ in the transformed coordinate at ``x``."""
-    if term.transform == "lognormal":
-        return 1.0, 0.0, 0.0
-    if term.transform in QUANTILE_MAPS:
-        # The same by central differences over seven points
-        h, u = STENCIL, np.log(term.to_physical(x + STENCIL * np.arange(-3.0, 4.0)))
-        first = np.dot([-1, 9, -45, 0, 45, -9, 1], u) / (60 * h)
-        second = np.dot([2, -27, 270, -490, 270, -27, 2], u) / (180 * h**2)
-        return float(first), float(second), float(np.dot([1, -8, 13, 0, -13, 8, -1], u) / (8 * h**3))
-    sigma = float(term.to_physical(np.array(x)))
-    slopes = 1.0, 0.0, 0.0
-    if term.transform == "logit":
-        low, high = term.bounds
-        share = (sigma - low) / (high - low)
-        slope = (high - low) * share * (1 - share)
-        slopes = slope, slope * (1 - 2 * share), slope * (1 - 6 * share + 6 * share**2)
-    a, b, c = (slope / sigma for slope in slopes)
-    return a, b - a**2, c - 3 * a * b + 2 * a**3

@@ -72,12 +72,13 @@ def bundle_steps(spread: Array, axes: Array, epsilon: float) -> Array:
     return np.eye(len(axes)) if np.all(shares >= 1) else np.clip(shares, LEAST, 1)[:, None] * axes.T
 
 
-def with_moments(members: Array, mean: Array, covariance: Array) -> Array:
-    """Members (N, n), N > n, mapped linearly so that these (n,), (n, n) are their mean and covariance."""
-    anomalies = members - members.mean(axis=0)
-    target = np.linalg.cholesky(np.atleast_2d(covariance))
-    own = np.linalg.cholesky(np.atleast_2d(np.cov(members.T)))
-    return np.asarray(mean + np.linalg.solve(own, anomalies.T).T @ target.T)
+def with_moments(members: Array, mean: Array, root: Array) -> Array:
+    """Members (N, n), N > n, mapped linearly so that ``mean`` (n,) is theirs, and their covariance RᵀR of a ``root`` R
+    (n, n). No covariance is formed, of which rounding would lose more.
+    """
+    orthogonal, own = np.linalg.qr(members - members.mean(axis=0))
+    signs = np.copysign(math.sqrt(len(members) - 1), np.diag(own) * np.diag(root))  # both roots as Cholesky's
+    return np.asarray(mean + (orthogonal * signs) @ root)
 
 
 def resampled(shares: Array, count: int, stream: np.random.Generator) -> Indices:

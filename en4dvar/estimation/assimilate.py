@@ -139,11 +139,12 @@ def _concluded(
     response = LinearResponse(ends.mode, replace(linear, prediction=central), along, precision, observations)
     explained = observations.noise.explained(observations.values, central)
     log_evidence = sampled.refined.log_evidence - observations.log_normalisation() if sampled.refined else math.nan
-    if not math.isfinite(log_evidence) and ends.bounded:  # there are no draws, or too few
-        log_evidence = ends.bounded.log_evidence - observations.log_normalisation()
-    elif not math.isfinite(log_evidence) and descent.at_minimum:  # by Laplace
+    if not math.isfinite(log_evidence) and descent.at_minimum:  # there are no draws, or too few
         newton, lowest = descent.newton, descent.iterate.cost - descent.newton.predicted_decrease
-        log_evidence = diag.log_evidence(lowest, newton.hessian.singular_values, len(space.members), observations)
+        if ends.drawn:
+            log_evidence = ends.drawn.log_evidence - observations.log_normalisation()
+        else:  # by Laplace
+            log_evidence = diag.log_evidence(lowest, newton.hessian.singular_values, len(space.members), observations)
     std = ends.members.std(axis=0, ddof=1)
     shifts: tuple[Shift, ...] = ()
     begun = space.forward_runs  # those of fits are told with the shifts

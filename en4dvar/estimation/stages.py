@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from en4dvar.descent.beyond_gaussian import Bounded, beside_bounds, marginal_members, mean_beyond_mode
+from en4dvar.descent.beyond_gaussian import Drawn, beside_bounds, over_errors
 from en4dvar.descent.loop import minimise
 from en4dvar.descent.minima import Minimum, merged
 from en4dvar.descent.search import Outcome, Search
@@ -43,20 +43,20 @@ from en4dvar.schemes.settings import AssimilationSettings
 @dataclass(frozen=True)
 class Ends:
     """An ensemble (N, n), transformed, about the ``mode`` (n,) of J, and what came of running both; how it was drawn
-    beside readings that are bounds, if any are.
+    where that is no Gaussian: beside bounds, or parameters of the errors.
     """
 
     members: Array
     mode: Array
     run: Forecast
     central: Forecast
-    bounded: Bounded | None = None
+    drawn: Drawn | None = None
 
     def gaussianity(self, costs: Array) -> dict[str, float]:
-        """Of members of J ``costs`` (N,); beside bounds how well J agrees with what they were drawn from."""
-        if self.bounded is None:
+        """Of members of J ``costs`` (N,); of others how well J agrees with what they were drawn from."""
+        if self.drawn is None:
             return diag.gaussianity(self.members, self.mode, costs)
-        return {"gaussian_fit": diag.effective_share(self.bounded.costs - costs)}
+        return {"gaussian_fit": diag.effective_share(self.drawn.cost(self.members) - costs)}
 
 
 @dataclass(frozen=True)
@@ -158,21 +158,19 @@ class Stages:
 
     def gaussian(self, descent: Descent) -> Ends:
         """The ensemble at the end of a descent, and its forecast."""
-        space, problem = self.space, self.problem
+        space = self.space
         transform = descent.newton.hessian.economical_transform if self.minimiser else descent.weights.T
         ends = space.ensemble(descent.weights.w, transform)
         members, mode = ends[:-1], ends[-1]
-        members = members + mean_beyond_mode(problem, mode, members, descent.records[-1].dfs)
         if self.minimiser is None:  # the last ensemble that was run is the posterior
             return Ends(members, mode, descent.iterate.members, descent.iterate.central)
-        if problem.discrepancy and descent.iterate.linear is not None:
-            members = marginal_members(space, descent.iterate.linear, mode, members)
-        bounded = None
-        if descent.iterate.linear is not None:
-            bounded = beside_bounds(space, descent.iterate.linear, descent.weights.w, descent.iterate.cost)
-            members = bounded.members if bounded else members
+        drawn, linear = None, descent.iterate.linear
+        if linear is not None:
+            drawn = beside_bounds(space, linear, descent.weights.w, descent.iterate.cost)
+            drawn = drawn or over_errors(space, linear, mode, members)
+            members = drawn.members if drawn else members
         final = space.whole(np.vstack([members, mode]), self.grid)
-        return Ends(members, mode, final[:-1], final[-1:], bounded)
+        return Ends(members, mode, final[:-1], final[-1:], drawn)
 
     def sampled(
         self, descent: Descent, ends: Ends, prior_run: Forecast, minima: Sequence[Minimum], agree: bool, looking: bool
@@ -197,7 +195,7 @@ class Stages:
             modes = that_count(minima, self.problem.prior, math.log(SEEN))  # of which a warning is given in any case
             told = in_doubt(minima, agree, shape) if settles else "mean_shift" in shape or len(modes) > 1
             if minima and weighs(space) and not told and not shape["non_gaussian"] and not prior_run.filled:
-                shape |= examine_tails(space, minima[0], ends.members, prior_run[:-1], ends.run, settles)
+                shape |= examine_tails(space, minima[0], ends.members, prior_run[:-1], ends.run, settles, ends.drawn)
                 shape["non_gaussian"] = diag.is_non_gaussian(shape)
             if not (settles and in_doubt(minima, agree, shape)):
                 return Sampled(ends, None, shape)
@@ -211,7 +209,7 @@ class Stages:
             whole = space.whole(np.vstack([sampled.members, mode]), self.grid)
             run, central = whole[:-1], whole[-1:]
             self._moved(descent, sampled.members, mode, whole)
-        return Sampled(Ends(sampled.members, mode, run, central, ends.bounded), sampled, {})
+        return Sampled(Ends(sampled.members, mode, run, central, ends.drawn), sampled, {})
 
     def _moved(self, descent: Descent, members: Array, mode: Array, run: Forecast) -> None:
         """Set a descent that minimised nothing to draws (N, n) about the ``mode`` (n,), whose ``run`` is there."""

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from en4dvar.descent.beyond_gaussian import Drawn
 from en4dvar.descent.minima import Minimum
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.diagnosis import diagnostics as diag
@@ -31,12 +32,13 @@ SHORT = 1.5  # less than that by which J rises to a point beyond which there may
 FURTHER = 1.5  # times as far
 TRIED, WIDTHS = 128, (2.0, 1.0, 0.5, 0.25)  # points about x*, so wide, among which emulated J is lowest
 PLACES = 2001  # of a parameter, at which its density is known
+Costs = list[dict[float, float]]
 
 
 class Intervals(NamedTuple):
     """The 5, 50 and 95 % points (3, n) of the posterior in what is printed, and by how much the 5 or 95 % point both of
-    the Gaussian and of the members is off (n,), in posterior standard deviations: members alone may be by chance, and
-    are what is printed. Whether J ``rises`` to all points at :data:`END`.
+    what members are drawn from and of them is off (n,), in posterior standard deviations: members alone may be by
+    chance, and are what is printed. Whether J ``rises`` to all points at :data:`END`.
     """
 
     quantiles: Array
@@ -47,11 +49,12 @@ class Intervals(NamedTuple):
 class _Walk:
     """Along each parameter j, to both sides, from a minimum; ``runs`` are there.
 
-    ``costs`` of each side are J − ln V (relative to that at the minimum) by the distance in standard deviations.
+    ``costs`` of each side are J − ln V (relative to that at the minimum) by the distance in standard deviations, and
+    those of what members are ``drawn`` from likewise, if that is no Gaussian.
     """
 
-    def __init__(self, space: WeightSpace, minimum: Minimum, runs: ModelRuns):
-        self.space, self.runs, self.start, n = space, runs, minimum.x, len(minimum.x)
+    def __init__(self, space: WeightSpace, minimum: Minimum, runs: ModelRuns, drawn: Drawn | None):
+        self.space, self.runs, self.start, self.drawn, n = space, runs, minimum.x, drawn, len(minimum.x)
         self.std = np.sqrt(np.diag(minimum.covariance))
         correlation = minimum.covariance / np.outer(self.std, self.std)
         self.ways = np.array([side * self.std * correlation[j] for j in range(n) for side in (-1, 1)])
@@ -60,11 +63,11 @@ class _Walk:
         roots = [self.std[:, None] * _conditional(correlation, j) for j in range(n) for _ in range(2)]
         self.about = np.array([self.normal @ root.T for root in roots])  # (2n, T, n) of the others, about each point
         self.bends = np.zeros_like(self.ways)  # of the last x* from the way, relative to the distance
-        self.costs = [{0.0: minimum.cost} for _ in self.ways]
-
-    @property
-    def lowest(self) -> float:
-        return min(min(costs.values()) for costs in self.costs)
+        self.costs: Costs = [{0.0: minimum.cost} for _ in self.ways]
+        self.of_drawn: Costs = []
+        if drawn:
+            at_start = float(drawn.cost(self.start[None])[0])
+            self.of_drawn = [{0.0: at_start} for _ in self.ways]
 
     def go(self, sides: list[int], far: float) -> None:
         """So ``far`` on ``sides``."""
@@ -75,8 +78,10 @@ class _Walk:
         costs = self.space.costs(x, outcome)
         self.runs = self.runs.joined(ModelRuns.of(x, outcome, costs))
         self.bends[sides] = (x - self.start) / far - self.ways[sides]
-        for side, cost in zip(sides, self.space.with_sampled_prior(x, costs) - log_volume, strict=True):
-            self.costs[side][far] = float(cost)
+        for i, side in enumerate(sides):
+            self.costs[side][far] = float(self.space.with_sampled_prior(x, costs)[i] - log_volume[i])
+            if self.drawn:
+                self.of_drawn[side][far] = float(self.drawn.cost(x)[i] - log_volume[i])
 
     def _emulated(self, x: Array, about: Array) -> tuple[Array, Array]:
         """The points x* (S, n) among those ``about`` (S, T, n) the points ``x`` (S, n), and ln V (S,)."""
@@ -99,14 +104,14 @@ class _Walk:
 
     def rise(self, side: int, far: float) -> float:
         """Of J on a side, to where it was so far."""
-        return self.costs[side][far] - self.lowest
+        return self.costs[side][far] - _lowest(self.costs)
 
     def short(self, far: float, sides: list[int]) -> list[int]:
         """Those of the ``sides`` beyond whose distance ``far`` there may be a tail."""
         return [side for side in sides if self.rise(side, far) < 0.5 * END**2 - SHORT]
 
-    def density(self, j: int) -> tuple[Array, Array]:
-        """Distances (P,) along parameter j and its density there, up to a constant.
+    def density(self, j: int, sides: Costs) -> tuple[Array, Array]:
+        """Distances (P,) along parameter j and shares (P,) of its density there, from costs of all ``sides``.
 
         Between the points √(2 (J − min J)) is interpolated, which is the distance itself where J is quadratic; beyond
         the last, as far again, it goes on as before.
@@ -114,9 +119,9 @@ class _Walk:
         from scipy.interpolate import PchipInterpolator  # not needed to import the package
 
         distances, roots = [0.0], [0.0]
-        for sign, costs in zip((-1, 1), self.costs[2 * j : 2 * j + 2], strict=True):
+        for sign, costs in zip((-1, 1), sides[2 * j : 2 * j + 2], strict=True):
             far = sorted(costs)
-            root = [min(2 * END, math.sqrt(2 * max(0.0, costs[d] - self.lowest))) if d else 0.0 for d in far]
+            root = [min(2 * END, math.sqrt(2 * max(0.0, costs[d] - _lowest(sides)))) if d else 0.0 for d in far]
             slope = max(0.0, root[-1] - root[-2]) / (far[-1] - far[-2])
             root.append(root[-1] + slope * far[-1])
             far.append(2 * far[-1])
@@ -124,7 +129,11 @@ class _Walk:
             roots += [sign * r for r in root[1:]]
         order = np.argsort(distances)
         z = np.linspace(min(distances), max(distances), PLACES)
-        return z, np.exp(-0.5 * PchipInterpolator(np.array(distances)[order], np.array(roots)[order])(z) ** 2)
+        return z, shares_of(-0.5 * PchipInterpolator(np.array(distances)[order], np.array(roots)[order])(z) ** 2)
+
+
+def _lowest(sides: Costs) -> float:
+    return min(min(costs.values()) for costs in sides)
 
 
 def _conditional(correlation: Array, j: int) -> Array:
@@ -136,14 +145,16 @@ def _conditional(correlation: Array, j: int) -> Array:
     return root
 
 
-def examine_ends(space: WeightSpace, minimum: Minimum, ensemble: Array, runs: ModelRuns) -> Intervals | None:
-    """Of an ensemble (N, n) about a minimum, by 2n runs beside the ``runs`` there are, and more where J rises too
-    little; none, and None, where J of all runs there are is the Gaussian's.
+def examine_ends(
+    space: WeightSpace, minimum: Minimum, ensemble: Array, runs: ModelRuns, drawn: Drawn | None = None
+) -> Intervals | None:
+    """Of an ensemble (N, n) about a minimum, Gaussian or ``drawn`` otherwise, by 2n runs beside the ``runs`` there are,
+    and more where J rises too little; none, and None, where J of all runs there are is what the ensemble was drawn by.
     """
-    walk, prior, far = _Walk(space, minimum, runs), space.problem.prior, END
-    rise = space.with_sampled_prior(runs.x, runs.costs) - minimum.cost
-    if np.allclose(rise, [0.5 * minimum.distance(x) ** 2 for x in runs.x], rtol=NEARLY, atol=NEARLY):
+    own = drawn.cost(runs.x) - minimum.cost if drawn else [0.5 * minimum.distance(x) ** 2 for x in runs.x]
+    if np.allclose(space.with_sampled_prior(runs.x, runs.costs) - minimum.cost, own, rtol=NEARLY, atol=NEARLY):
         return None
+    walk, prior, far = _Walk(space, minimum, runs, drawn), space.problem.prior, END
     sides = list(range(len(walk.ways)))
     walk.go(sides, END)
     left = walk.short(END, sides)
@@ -158,11 +169,12 @@ def examine_ends(space: WeightSpace, minimum: Minimum, ensemble: Array, runs: Mo
     quantiles, off = np.empty((len(QUANTILES), len(walk.start))), np.empty(len(walk.start))
     printed = diag.member_quantiles(prior.to_physical(ensemble), QUANTILES, axis=0)
     for j in range(len(off)):
-        z, density = walk.density(j)
+        z, shares = walk.density(j, walk.costs)
         x = np.tile(walk.start, (len(z), 1))
         x[:, j] += walk.std[j] * z
-        theta, shares = prior.to_physical(x)[:, j], density / density.sum()
+        theta = prior.to_physical(x)[:, j]
         quantiles[:, j] = weighted_quantiles(theta, shares)
-        of_both = np.array([weighted_quantiles(theta, shares_of(-0.5 * z**2)), printed[:, j]]) - quantiles[:, j]
+        of_drawn = walk.density(j, walk.of_drawn)[1] if drawn else shares_of(-0.5 * z**2)
+        of_both = np.array([weighted_quantiles(theta, of_drawn), printed[:, j]]) - quantiles[:, j]
         off[j] = np.abs(of_both).min(axis=0)[[0, 2]].max() / math.sqrt(shares @ (theta - shares @ theta) ** 2)
     return Intervals(quantiles, off, rises)

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from en4dvar.descent.beyond_gaussian import Drawn
 from en4dvar.descent.minima import Minimum
 from en4dvar.descent.preview import ITERATIONS, SEARCH
 from en4dvar.descent.search import TOGETHER, WIDER
@@ -49,6 +50,7 @@ TINY = 1e-3  # standard error, or share that is left, below which none matters
 ROUNDING = 1e-9  # of the standard deviation of all points: where one has all of the weight
 ELSEWHERE = 0.5  # share of the posterior at members of the prior beyond the ensemble's own share there
 CLEARED = 0.85  # effective share of the members above which no run was found that was off (docs: calibration)
+LogDensity = Callable[[Array], Array]
 OVERLAP = "no action is needed: mean ± std describe the members"
 
 
@@ -81,7 +83,13 @@ def examine_shape(
 
 
 def examine_tails(
-    space: WeightSpace, minimum: Minimum, ensemble: Array, before: Forecast, after: Forecast, always: bool
+    space: WeightSpace,
+    minimum: Minimum,
+    ensemble: Array,
+    before: Forecast,
+    after: Forecast,
+    always: bool,
+    drawn: Drawn | None = None,
 ) -> dict[str, float]:
     """How far mean, standard deviation and ends of the ensemble (N, n) about a minimum are from the posterior's in what
     is printed.
@@ -89,28 +97,34 @@ def examine_tails(
     By members of J known by their forecast ``after``, those of the prior by that ``before``, runs along each parameter
     and, ``always`` or where members leave a doubt or J rises too little along a parameter, as many runs :data:`FAR`
     times as far out as the members. Points are weighted with the density that they are drawn from, for the posterior
-    and for the Gaussian of the ensemble: of a Gaussian posterior both weights are the same, whatever the points are.
+    and for that of the ensemble, which is Gaussian unless it was ``drawn`` otherwise: where it is the posterior both
+    weights are the same, whatever the points are.
     ``tail_shift`` is the largest distance of both means in posterior standard deviations, ``tail_ratio`` the standard
     deviation of the ensemble over the posterior's where that is farthest from 1, ``tail_excess`` by how many standard
     errors of theirs a distance or ratio is beyond :data:`SHIFT` or :data:`SPREAD`. ``tail_mean_<name>``,
     ``tail_std_<name>`` are those of a parameter that is surely off by what is warned of, NaN where ``tail_members``,
     the effective number of the points, is below :data:`TOO_FEW` to say to what.
     ``tail_elsewhere``: most of the posterior is where the ensemble is not. ``tail_end`` is the largest distance of a 5
-    or 95 % point of Gaussian and members from :func:`~en4dvar.sampling.ends.examine_ends`'s, in posterior standard
-    deviations, and ``tail_q05_<name>``, ``tail_q95_<name>`` are the points of a parameter where that is what is warned
-    of; there are none where J of all members is the Gaussian's. Nothing of an ensemble without a covariance.
+    or 95 % point of that density and of members from those of :func:`~en4dvar.sampling.ends.examine_ends`, in posterior
+    standard deviations, and ``tail_q05_<name>``, ``tail_q95_<name>`` are the points of a parameter where that is what
+    is warned of; there are none where J of all members is what that density says. Nothing of an ensemble without a
+    covariance.
     """
     weighed: dict[str, float] = {}
     with suppress(np.linalg.LinAlgError):
-        prior = space.problem.prior
+        prior, own = space.problem.prior, _of_drawn(drawn, space.problem.prior) if drawn else _gaussian(ensemble)
         members = [(x, run, space.costs(x, run)) for x, run in ((ensemble, after), (space.members, before))]
-        parts = [(x, costs) for x, _, costs in members]
+        parts = [
+            Points(x, costs, log) for (x, _, costs), log in zip(members, (own, _gaussian(space.members)), strict=True)
+        ]
         weighed = _by_weights(prior, parts)
-        ends = examine_ends(space, minimum, ensemble, ModelRuns.of(*members[0]).joined(ModelRuns.of(*members[1])))
+        runs = ModelRuns.of(*members[0]).joined(ModelRuns.of(*members[1]))
+        ends = examine_ends(space, minimum, ensemble, runs, drawn)
         if always or weighed["tail_excess"] > 0 or (ends and not ends.rises):
-            mean = ensemble.mean(axis=0)
-            points = mean + FAR * (ensemble - mean)
-            weighed = _by_weights(prior, [*parts, (points, space.costs(points, space.forecast(points)))])
+            mean, wider = ensemble.mean(axis=0), len(prior.names) * math.log(FAR)
+            x = mean + FAR * (ensemble - mean)
+            farther = Points(x, space.costs(x, space.forecast(x)), lambda x: own(mean + (x - mean) / FAR) - wider)
+            weighed = _by_weights(prior, [*parts, farther])
         if ends:
             weighed["tail_end"] = float(ends.off.max())
             for j in np.flatnonzero(ends.off > diag.ENDS_OFF):
@@ -119,24 +133,40 @@ def examine_tails(
     return weighed
 
 
-def _by_weights(prior: Prior, parts: Sequence[tuple[Array, Array]]) -> dict[str, float]:
-    """The numbers of :func:`examine_tails`, of points (B, n) and their J (B,): the ensemble's, the prior's and others.
+@dataclass(frozen=True)
+class Points:
+    """Points (B, n), J (B,) of them and the logarithm of the density that they are drawn from, but for (2π)^(−n/2)."""
+
+    points: Array
+    costs: Array
+    log_density: LogDensity
+
+
+def _gaussian(points: Array) -> LogDensity:
+    coordinates = Coordinates.about(points)
+    log_root = float(np.sum(np.log(np.diag(coordinates.root))))
+    return lambda x: np.asarray(-0.5 * np.sum(coordinates.of(x) ** 2, axis=1) - log_root)
+
+
+def _of_drawn(drawn: Drawn, prior: Prior) -> LogDensity:
+    return lambda x: -drawn.cost(x) - drawn.log_evidence - prior.log_det_root
+
+
+def _by_weights(prior: Prior, parts: Sequence[Points]) -> dict[str, float]:
+    """The numbers of :func:`examine_tails`, of the ensemble, the prior's members and others.
 
     The posterior is that of the prior's members, which the ensemble stands for where they are drawn at random, too.
     Few weights may be most of the posterior, which their errors say. Where that is at members of the prior which the
     ensemble does not reach, it is elsewhere, however few these are: a model with steps, of which a bundle sees one.
     """
-    x, costs = (np.concatenate(every) for every in zip(*parts, strict=True))
-    logs = []
-    for points, _ in parts:
-        coordinates = Coordinates.about(points)
-        logs.append(-0.5 * np.sum(coordinates.of(x) ** 2, axis=1) - np.sum(np.log(np.diag(coordinates.root))))
+    x, costs = (np.concatenate([getattr(part, of) for part in parts]) for of in ("points", "costs"))
+    logs = [part.log_density(x) for part in parts]
     drawn, theta = np.logaddexp.reduce(logs), prior.to_physical(x)
     likelihood = prior.cost(x) - costs
     shares, its_shares = shares_of(likelihood + logs[1] - drawn), shares_of(logs[0] - drawn)
     mean, std, at, wide = _moments(theta, shares)
     its_mean, its_std, its_at, its_wide = _moments(theta, its_shares)
-    begin, end = len(parts[0][0]), len(parts[0][0]) + len(parts[1][0])
+    begin, end = np.cumsum([len(part.points) for part in parts[:2]])
     elsewhere = np.sum((shares - its_shares)[begin:end]) > ELSEWHERE
     shift, ratio = np.abs(its_mean - mean) / std, its_std / std
     off = np.array([shift - SHIFT, np.abs(np.log(ratio)) - math.log1p(SPREAD)])

@@ -55,7 +55,7 @@ BRIGHT = 0.25  # of the contrast: how much brighter a flash is
 STEADY = 10_000  # tiles that say how bright a frame is
 CHANGED = 0.3  # share of tiles that a flash changes
 DIM, FIELD = 0.3, 95  # of the light that most pixels (per cent) have at most: what the field of view's outside has
-SWINGS = 0.05  # of the light: std of the edge of a bright bubble that moves by a pixel, which no aperture does
+SWINGS = 0.015  # of the light: std beside the edge of a bright bubble that moves by half a pixel, as no aperture does
 APERTURE = (2, 6)  # pixels beside such an outside: where the light is blurred, and where it tells that it ends there
 
 
@@ -186,18 +186,21 @@ def _outside(frames: Sequence[Frame]) -> Mask:
     """The outside of a field of view (H, W), such as a round aperture: dark in two corners of the frames at least, with
     an edge that stands still, beside which are always light and no wall that moves.
     """
-    usual = ndimage.uniform_filter(np.median(np.array(frames, dtype=np.float32), axis=0), 5)
+    films = np.array(frames, dtype=np.float32)
+    usual = ndimage.uniform_filter(np.median(films, axis=0), 5)
     labels, _ = ndimage.label(usual < DIM * np.percentile(usual, FIELD))
     corners = labels[[0, 0, -1, -1], [0, -1, 0, -1]]
     dark = np.isin(labels, corners[corners > 0])
-    if np.sum(corners > 0) < 2:
-        return np.zeros_like(dark)
     blurred, beside = (ndimage.binary_dilation(dark, iterations=n) for n in APERTURE)
-    each = np.array([ndimage.uniform_filter(f.astype(np.float32), 5) for f in frames])
-    steady = np.mean((each.min(axis=0) > 0.5 * usual)[beside & ~blurred] if (beside & ~blurred).any() else 0)
-    lamp = np.percentile(each, FIELD, axis=(1, 2), keepdims=True)
-    swing = np.median((each / np.maximum(lamp, 1e-6)).std(axis=0)[blurred & ~dark] if (blurred & ~dark).any() else 0)
-    return np.asarray(blurred & (steady > 1 - LIVELY) & (swing < SWINGS))
+    about = beside & ~blurred
+    if np.sum(corners > 0) < 2 or not about.any():
+        return np.zeros_like(dark)
+    each = ndimage.uniform_filter(films, (0, 5, 5))
+    steady = np.mean((each.min(axis=0) > 0.5 * usual)[about])
+    lamp = np.maximum(np.percentile(each, FIELD, axis=(1, 2), keepdims=True), 1e-6)
+    of_pixel, swing = (np.median((f[:, about] / lamp[:, :, 0]).var(axis=0)) for f in (films, each))
+    noise = max(of_pixel - swing, 0.0) / 24  # in a mean of 25 pixels
+    return np.asarray(blurred & (steady > 1 - LIVELY) & (swing - noise < SWINGS**2))
 
 
 def _lit_as(frame: Image, other: Image) -> Image:

@@ -71,7 +71,7 @@ def look_at(
         pair = None if start is not None else two_circles(steady, place, optics.contrast, background.noise)
         for near, other in ((place, None),) if pair is None else (pair, pair[::-1]):
             seen = steady if other is None else _without(steady, other, optics)
-            outlines = fit_outline(seen, near, optics, circles)
+            outlines = fit_outline(seen, near, optics, circles, ovals=True)
             if outlines is None or any(_same(outlines[0].circle, c.circle) for c in candidates):
                 continue
             fault = next((words for o in outlines if (words := _fault_of(o, optics, background.noise))), "")

@@ -22,21 +22,36 @@ EVEN = 0.03  # of the contrast: what the brightness near the outline may scatter
 AGAINST = 2.5  # std of the contrast from which it then does
 FREE = 0.3  # of the contrast: what it may then differ by
 MOST_RIM = 20.0  # pixels: what the light of a rim, its distance and its width may be
+WHOLE = 0.9  # of the outline: how much is seen of one that the frame does not cut
+LONG = 1.0  # of the radius: what amplitudes of modes may be
 REACH = 4.0  # how far from the outline pixels are used, in widths of the edge
 APART = 1.5  # widths of the edge: nested circles that are closer are not told apart
 SHARP = 1.35  # widths of the movie's sharp edges: what is no wider is blurred by nothing else
 TWO = 2.6  # their own widths by which two edges lie apart that are no blurred one
 SURE = 0.03  # share of the squares that two edges must explain and a blurred one does not
-X, Y, R, W, LEVEL, CONTRAST, GLARE, RIM, LIGHT, BESIDE, WIDE = range(SHAPE)
+X, Y, R, W, LEVEL, CONTRAST, GLARE, RIM = range(SHAPE)
+Parts = tuple[int, int]  # where the distances of nested circles begin, and the rim
+Fit = tuple[Array, Parts, float, Optics]  # parameters (P,), the noise, and the optics as they are known for this frame
 
 
-def fit_outline(image: Array, start: Circle, optics: Optics, circles: int = 1) -> list[Outline] | None:
+def fit_outline(
+    image: Array, start: Circle, optics: Optics, circles: int = 1, ovals: bool = False
+) -> list[Outline] | None:
     """The outline near ``start`` in an image (H, W) whose background is zero; None where nothing fits.
 
-    With several ``circles``, nested about one centre, one of each, the largest first.
+    With several ``circles``, nested about one centre, one of each, the largest first. With ``ovals``, where the frame
+    cuts them, they tell what mode 2 changes.
     """
     fitted = _fit(image, start, optics, circles)
-    return None if fitted is None else _outlines(image, *fitted)
+    outlines = None if fitted is None else _outlines(image, *fitted)
+    if not ovals or fitted is None or not outlines or outlines[0].seen >= WHOLE:
+        return outlines
+    oval = _fit(image, outlines[0].circle, optics, circles, 2)
+    others = None if oval is None else _outlines(image, *oval)
+    if oval is None or others is None:
+        return outlines
+    wrong, less = _misfits(image, fitted, oval)
+    return [replace(o, oval=other, better=(wrong - less) / 2) for o, other in zip(outlines, others, strict=True)]
 
 
 def two_edges(image: Array, start: Circle, optics: Optics) -> float:
@@ -44,43 +59,48 @@ def two_edges(image: Array, start: Circle, optics: Optics) -> float:
     single, double = (_fit(image, start, optics, circles) for circles in (1, 2))
     if single is None or double is None:
         return 0.0
-    (p, modes, *_), (q, q_modes, noise, _) = single, double
-    ring = _ring(p, q[-1:])
-    fits = (p, modes), (q, q_modes)
-    wrong, less = (float(np.sum(np.minimum(residuals(image, *of, ring)[0] / noise, 5.0) ** 2)) for of in fits)
-    sharp = q[W] < SHARP * optics.width and q[-1] > TWO * q[W]
-    return float(q[-1]) if sharp and wrong - less > SURE * wrong else 0.0
+    wrong, less = _misfits(image, single, double)
+    q, (apart, _), *_ = double
+    sharp = q[W] < SHARP * optics.width and q[apart] > TWO * q[W]
+    return float(q[apart]) if sharp and wrong - less > SURE * wrong else 0.0
 
 
-def _fit(image: Array, start: Circle, optics: Optics, circles: int) -> tuple[Array, int, float, Optics] | None:
-    """Parameters (P,), the highest mode, the noise, and the optics as they are known for this frame."""
+def _misfits(image: Array, first: Fit, second: Fit) -> tuple[float, float]:
+    """Sums of squares of what two fits leave about the first, in units of the noise beside the second."""
+    (p, parts, *_), (q, second_parts, noise, _) = first, second
+    ring = _ring(p, q[slice(*second_parts)], p[parts[1] :])
+    of_first, of_second = (residuals(image, *fit[:2], ring)[0] / noise for fit in (first, second))
+    return float(np.sum(np.minimum(of_first, 5) ** 2)), float(np.sum(np.minimum(of_second, 5) ** 2))
+
+
+def _fit(image: Array, start: Circle, optics: Optics, circles: int, least: int = 1) -> Fit | None:
+    """A fit with modes up to ``least`` at least."""
     radii = nested_radii(image, start, optics, circles)
-    p = np.zeros(SHAPE + circles - 1)
+    p = np.concatenate([np.zeros(SHAPE), radii[0] - radii[1:], optics.rim])
     p[[X, Y, R, W, CONTRAST]] = start.x, start.y, radii[0], optics.width, optics.contrast
-    p[SHAPE:] = radii[0] - radii[1:]
     p[RIM] = RIM_SHARE * radii[-1]
-    p[LIGHT : WIDE + 1] = optics.rim
     noise = abs(optics.contrast)
-    modes = 1
+    parts = SHAPE, SHAPE + circles - 1
     for turn in range(3):  # the ring of pixels follows the circle; the cutoff follows the noise
-        gaps = p[len(p) - circles + 1 :]
-        ring = _ring(p, gaps)
+        gaps, rim = p[slice(*parts)], p[parts[1] :]
+        ring = _ring(p, gaps, rim)
         if _glare_is_far(p, gaps, ring):
             p[GLARE], p[RIM] = 0.0, RIM_SHARE * _innermost(p, gaps)
-        modes = modes_for(image, p)
-        p = np.concatenate([p[:SHAPE], np.zeros(2 * (modes - 1)), gaps])
+        first = SHAPE + 2 * (max(modes_for(image, p), least) - 1)
+        parts = first, first + circles - 1
+        p = np.concatenate([p[:SHAPE], np.zeros(first - SHAPE), gaps, rim])
         known = replace(optics, spread=max(optics.spread, FIRST_SPREAD[turn]))
-        fitted = _descend(image, p, modes, ring, noise, known, CLOSE[turn])
+        fitted = _descend(image, p, parts, ring, noise, known, CLOSE[turn])
         if fitted is None:
             return None
-        p = _sorted(fitted, circles)
-        noise = max(1.4826 * float(np.median(np.abs(residuals(image, p, modes, ring)[0]))), 1e-6)
+        p = _sorted(fitted, parts)
+        noise = max(1.4826 * float(np.median(np.abs(residuals(image, p, parts, ring)[0]))), 1e-6)
     against = abs(p[CONTRAST] / optics.contrast - 1) > AGAINST * (optics.spread + optics.differs)
     if against and optics.even and optics.differs < FREE and p[R] > OWN * p[W]:
-        own = _fit(image, Circle(*p[:W]), replace(optics, differs=FREE), circles)
+        own = _fit(image, Circle(*p[:W]), replace(optics, differs=FREE), circles, least)
         if own is not None and tells_contrast(own[0][R], own[0][W], own[2], optics):
             return own
-    return p, modes, noise, optics
+    return p, parts, noise, optics
 
 
 def tells_contrast(radius: float, width: float, noise: float, optics: Optics) -> bool:
@@ -104,7 +124,7 @@ def nested_radii(image: Array, start: Circle, optics: Optics, circles: int) -> A
 
 def modes_for(image: Array, p: Array) -> int:
     """The highest mode that a circle of this size shows: none where a part of it is not seen."""
-    if share_inside(image, Circle(*p[:3])) < 0.9:
+    if share_inside(image, Circle(*p[:3])) < WHOLE:
         return 1
     return int(np.clip(p[R] / 4.0, 2, MODES))
 
@@ -113,53 +133,53 @@ def _innermost(p: Array, gaps: Array) -> float:
     return float(p[R] - max(gaps, default=0.0))
 
 
-def _sorted(p: Array, circles: int) -> Array:
+def _sorted(p: Array, parts: Parts) -> Array:
     """The largest radius as R, the others inside it by growing distances."""
-    if circles == 1:
-        return p
-    radii = np.sort(p[R] - np.append(0.0, p[1 - circles :]))[::-1]
-    return np.concatenate([p[:R], radii[:1], p[W : 1 - circles], radii[0] - radii[1:]])
+    radii = np.sort(p[R] - np.append(0.0, p[slice(*parts)]))[::-1]
+    return np.concatenate([p[:R], radii[:1], p[W : parts[0]], radii[0] - radii[1:], p[parts[1] :]])
 
 
-def _ring(p: Array, gaps: Array) -> Array:
+def _ring(p: Array, gaps: Array, rim: Array) -> Array:
     reach = max(REACH * p[W], 6.0)
-    rim = p[BESIDE] + 2 * np.hypot(p[W], p[WIDE]) if p[LIGHT] else 0.0
-    return np.array([p[X], p[Y], max(0.0, _innermost(p, gaps) - reach), p[R] + max(reach, rim)])
+    beside = rim[1] + 2 * np.hypot(p[W], rim[2]) if rim.any() else 0.0
+    return np.array([p[X], p[Y], max(0.0, _innermost(p, gaps) - reach), p[R] + max(reach, beside)])
 
 
 def _glare_is_far(p: Array, gaps: Array, ring: Array) -> bool:
     return bool(ring[2] > 0.75 * _innermost(p, gaps))
 
 
-def _known(p: Array, gaps: Array, ring: Array, noise: float, optics: Optics) -> tuple[Array, Array]:
+def _known(p: Array, parts: Parts, ring: Array, noise: float, optics: Optics) -> tuple[Array, Array]:
     """The prior knowledge: contrast; the bright centre, which may be missing. Centre (P,) and precision (P,)."""
     centre, precision = np.zeros(len(p)), np.zeros(len(p))
+    gaps = p[slice(*parts)]
     inner = _innermost(p, gaps)
     centre[RIM], centre[CONTRAST] = RIM_SHARE * inner, optics.contrast
     tight = 1e12 if _glare_is_far(p, gaps, ring) else 1.0
     precision[RIM] = noise**2 * tight / (0.1 * inner) ** 2
+    precision[SHAPE : parts[0]] = noise**2 / (LONG * p[R]) ** 2
     precision[GLARE] = noise**2 * tight / optics.contrast**2
     chance = 2 * (8 / np.pi**0.5 * p[W] / p[R]) ** 0.5 * p[W] * noise / abs(p[CONTRAST])  # 2 std of the width's square
     moved = max(p[W] ** 2 - optics.width**2 - chance, 0.0) ** 0.5
     loose = max(0.0, moved / p[R] - 0.1)  # a bubble that collapses within the exposure is fainter, its halo blurred
     precision[LEVEL] = noise**2 / (max(LEVEL_SPREAD, optics.spread / 3, LOOSE * loose) * optics.contrast) ** 2
     precision[CONTRAST] = noise**2 / ((optics.spread + optics.differs + loose) * optics.contrast) ** 2
-    centre[LIGHT : WIDE + 1] = optics.rim
-    precision[LIGHT : WIDE + 1] = noise**2 / np.maximum(optics.rim_std, 1e-6) ** 2
-    precision[len(p) - len(gaps) :] = noise**2 / p[R] ** 2  # of circles that cannot be told apart
+    centre[parts[1] :] = optics.rim
+    precision[parts[1] :] = noise**2 / np.maximum(optics.rim_std, 1e-6) ** 2
+    precision[slice(*parts)] = noise**2 / p[R] ** 2  # of circles that cannot be told apart
     return centre, precision
 
 
 def _descend(
-    image: Array, p: Array, modes: int, ring: Array, noise: float, optics: Optics, close: float
+    image: Array, p: Array, parts: Parts, ring: Array, noise: float, optics: Optics, close: float
 ) -> Array | None:
     """Levenberg–Marquardt; None where it leaves what an outline can be."""
     damping, cutoff = 1e-3, CUTOFF * noise
-    centre, precision = _known(p, p[SHAPE + 2 * (modes - 1) :], ring, noise, optics)
-    nested = len(p) > SHAPE + 2 * (modes - 1)
+    centre, precision = _known(p, parts, ring, noise, optics)
+    nested = parts[1] > parts[0]
     bright = 0.0, -optics.contrast  # what the centre can be between
     darkest = (1 + DARKER * (optics.spread + optics.differs)) * optics.contrast
-    A, g, total, cost = normal_equations(image, p, modes, ring, cutoff)
+    A, g, total, cost = normal_equations(image, p, parts, ring, cutoff)
     if total < 3 * len(p):
         return None
     cost += 0.5 * float(precision @ (p - centre) ** 2)
@@ -172,9 +192,9 @@ def _descend(
         trial = p + step
         trial[W] = np.clip(trial[W], 0.3, max(2 * p[W], 1.0))
         trial[GLARE] = np.clip(trial[GLARE], min(bright), max(bright))
-        trial[LIGHT : WIDE + 1] = np.clip(trial[LIGHT : WIDE + 1], 0.0, MOST_RIM)
+        trial[parts[1] :] = np.clip(trial[parts[1] :], 0.0, MOST_RIM)
         trial[CONTRAST] = max(trial[CONTRAST], darkest)
-        inner = _innermost(trial, trial[SHAPE + 2 * (modes - 1) :])
+        inner = _innermost(trial, trial[slice(*parts)])
         trial[RIM] = np.clip(trial[RIM], 0.1 * inner, 0.75 * inner)
         gone = not np.all(np.isfinite(trial)) or inner < 1 or trial[R] > 3 * max(image.shape)
         if gone and (not nested or damping > 1e6):  # a single circle that shrinks to nothing is a speck of dirt
@@ -182,7 +202,7 @@ def _descend(
         if gone:
             damping *= 10
             continue
-        equations = normal_equations(image, trial, modes, ring, cutoff)
+        equations = normal_equations(image, trial, parts, ring, cutoff)
         better = equations[3] + 0.5 * float(precision @ (trial - centre) ** 2)
         if better <= cost and equations[2] > 0:
             done = np.max(np.abs(step[:W])) < close and cost - better <= max(close**2, 1e-7) * cost
@@ -197,29 +217,29 @@ def _descend(
 
 
 def normal_equations(
-    image: Array, p: Array, modes: int, ring: Array, cutoff: float
+    image: Array, p: Array, parts: Parts, ring: Array, cutoff: float
 ) -> tuple[Array, Array, float, float]:
     """JᵀWJ (P, P), JᵀWr (P,), Σ w and the robust cost, W of Tukey's bisquare with ``cutoff``."""
-    off, rows, _ = residuals(image, p, modes, ring)
+    off, rows, _ = residuals(image, p, parts, ring)
     left = np.maximum(1 - (off / cutoff) ** 2, 0.0)  # of Tukey's weights the roots
     rows *= left[:, None]
     return rows.T @ rows, (left * off) @ rows, float(left @ left), float(np.sum(1 - left**3)) * cutoff**2 / 6
 
 
-def _outlines(image: Array, p: Array, modes: int, noise: float, optics: Optics) -> list[Outline] | None:
-    gaps = p[SHAPE + 2 * (modes - 1) :]
-    ring = _ring(p, gaps)
-    off, rows, places = residuals(image, p, modes, ring)
+def _outlines(image: Array, p: Array, parts: Parts, noise: float, optics: Optics) -> list[Outline] | None:
+    gaps, rim = p[slice(*parts)], p[parts[1] :]
+    ring = _ring(p, gaps, rim)
+    off, rows, places = residuals(image, p, parts, ring)
     left = np.maximum(1 - (off / (CUTOFF * noise)) ** 2, 0.0)  # of Tukey's weights the roots
     total = np.sum(left**2)
     A = rows.T @ (left[:, None] ** 2 * rows)
-    _, precision = _known(p, gaps, ring, noise, optics)
+    _, precision = _known(p, parts, ring, noise, optics)
     try:
         inverse = np.linalg.inv(A + np.diag(precision))
     except np.linalg.LinAlgError:
         return None
-    shape = p[SHAPE : SHAPE + 2 * (modes - 1)].reshape(-1, 2).T if modes > 1 else np.zeros((2, 0))
-    mode_variance = float(np.diag(inverse)[SHAPE : SHAPE + shape.size].mean()) if modes > 1 else 0.0
+    shape = p[SHAPE : parts[0]].reshape(-1, 2).T
+    mode_variance = float(np.diag(inverse)[SHAPE : parts[0]].mean()) if shape.size else 0.0
     free = len(p) - 2 * _glare_is_far(p, gaps, ring)
     # how much larger even and odd rows show the radius: Σ r dm/dR / Σ (dm/dR)²
     slopes, product = (np.bincount(places[:, 0] % 2, rows[:, R] * part, 2) for part in (rows[:, R], off))
@@ -231,7 +251,7 @@ def _outlines(image: Array, p: Array, modes: int, noise: float, optics: Optics) 
     # nested circles by their places, the largest first; those that are closer to the next are together
     for group in np.split(np.arange(len(every)), 1 + np.flatnonzero(np.diff(every) >= APART * p[W])):
         # of the radius, or of the mean of radii that cannot be told apart
-        weights = inverse[R] - np.mean([inverse[SHAPE + shape.size + s - 1] if s else 0 * p for s in group], axis=0)
+        weights = inverse[R] - np.mean([inverse[parts[0] + s - 1] if s else 0 * p for s in group], axis=0)
         inside = every[group]
         circle = Circle(float(p[X]), float(p[Y]), float(p[R] - inside.mean()))
         sectors = int(np.clip(2 * np.pi * circle.R / max(4.0, 2 * p[W]), 8, 256))
@@ -256,7 +276,7 @@ def _outlines(image: Array, p: Array, modes: int, noise: float, optics: Optics) 
             seen=share_inside(image, circle),
             rows=float(np.subtract(*(product / slopes))),
             rows_std=float(noise * np.sqrt(np.sum(1 / slopes))),
-            rim=tuple(p[LIGHT : WIDE + 1]),
+            rim=tuple(rim),
             # as if evenly spread over the distance from which they are told apart
             joined=float(np.hypot(APART * p[W] / 12**0.5, np.std(inside))) if len(group) > 1 else 0.0,
         )

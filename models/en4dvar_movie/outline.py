@@ -34,7 +34,7 @@ class Optics:
     ``spread`` is how well the contrast is known, as a share of it: 1 where it is not; ``differs`` the share by which
     that of a frame differs from it, ``noise`` the std of a pixel, and ``even`` that bubbles are evenly dark, so that a
     frame may tell a contrast of its own. ``rim`` is that of :mod:`en4dvar_movie.kernels`: light, distance and width in
-    pixels, without a rim 0, and ``rim_std`` how well a frame's are known.
+    pixels, () without a rim, and ``rim_std`` how well a frame's are known.
     """
 
     contrast: float
@@ -43,8 +43,8 @@ class Optics:
     differs: float = 0.0
     noise: float = 0.0
     even: bool = False
-    rim: tuple[float, ...] = (0.0, 0.0, 0.0)
-    rim_std: tuple[float, ...] = (0.0, 0.0, 0.0)
+    rim: tuple[float, ...] = ()
+    rim_std: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,8 @@ class Outline:
     the contrast of the movie; ``mode_std`` is the std of a mode's amplitude. ``seen`` is the share of the
     outline that can be seen. ``rows`` is by how much even rows show a larger bubble than odd ones, ``rows_std`` what
     noise makes of it. ``joined`` is the std for nested circles that lie too close to be told apart, which all
-    have their mean radius.
+    have their mean radius. ``oval`` is the outline of which mode 2 is fitted too, where the frame
+    cuts it, and ``better`` by how much its −log likelihood is less.
     """
 
     circle: Circle
@@ -72,7 +73,9 @@ class Outline:
     rows: float = 0.0
     rows_std: float = 1.0
     joined: float = 0.0
-    rim: tuple[float, ...] = (0.0, 0.0, 0.0)
+    rim: tuple[float, ...] = ()
+    oval: "Outline | None" = None
+    better: float = 0.0
 
     def amplitude(self, n: int) -> float:
         """Amplitude of mode n, in pixels; NaN where it was not fitted."""

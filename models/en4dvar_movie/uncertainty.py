@@ -11,6 +11,9 @@ own a does not stand out of its noise, that of neighbouring frames together may,
 dirt at its edge, say) counts no more than the least that would. What mode 2 has in common in all frames, as a share of
 the radius and with its direction, moves all radii alike by one factor; a is what is left of it.
 
+Cut: where the frame's edge cuts an outline, a circle is fitted, which is off where the bubble is elongated; an outline
+with mode 2, fitted to the same pixels, tells by how much.
+
 Exposure: over an exposure of length T the mean radius lies T² R̈/24 from that in its middle, R̈ as three frames show it;
 or, where the edge is blurred more than the steps to its neighbours explain, as its speed differs from theirs over half
 a step.
@@ -69,7 +72,7 @@ NOTHING = Errors(float("nan"), float("nan"), float("nan"))
 def errors_of(outlines: Sequence[Outline | None], optics: Optics, exposure: float = 0.0) -> list[Errors]:
     """Errors of each frame, of which the exposure takes a share; of those without an outline :data:`NOTHING`."""
     ratios, turns = _smoothed(outlines), _turns(outlines)
-    hidden, lasting = _hidden(outlines, ratios)
+    hidden, lasting = _hidden([o and (o.oval or o) for o in outlines], ratios)
     beside = hidden + _bent(outlines, ratios, turns, optics, exposure) + _unseen(outlines, lasting)
     factor = STUDENT * lasting / 6**0.5
     return [
@@ -79,10 +82,34 @@ def errors_of(outlines: Sequence[Outline | None], optics: Optics, exposure: floa
 
 
 def _unseen(outlines: Sequence[Outline | None], lasting: float) -> Array:
-    """Variance of the radius (K,) where the frame's edge cuts an outline of a ``lasting`` mode 2 over R: a circle is
-    fitted to a part of it.
+    """Variance of the radius (K,) where the frame's edge cuts an outline, and a circle is fitted to a part of it.
+
+    It is how far the radius of a circle is from that of an oval where that fits better by more than noise does; and
+    what a ``lasting`` mode 2 over R makes of it, as far as noise may hide that.
     """
-    return np.array([0.0 if o is None else (CUT * lasting * o.circle.R * (1 - o.seen)) ** 2 for o in outlines])
+    where = [k for k, o in enumerate(outlines) if o is not None and o.seen < 1]
+    cut, variance = [o for k in where if (o := outlines[k]) is not None], np.zeros(len(outlines))
+    ovals = [o.oval for o in cut]
+    off = np.array([(v.circle.R if v else o.circle.R) - o.circle.R for o, v in zip(cut, ovals, strict=True)])
+    noise = np.array([v.variance * v.ratio if v else o.circle.R**2 for o, v in zip(cut, ovals, strict=True)])
+    better = np.array([o.better / v.ratio if v else 0.0 for o, v in zip(cut, ovals, strict=True)])
+    elongated = np.array([(CUT * lasting * o.circle.R * (1 - o.seen)) ** 2 for o in cut])
+    told = _beyond(better, np.ones(len(cut))) > 0
+    variance[where] = np.where(told, off**2 + noise, np.minimum(elongated, noise))
+    return variance
+
+
+def _beyond(squares: Array, noise: Array) -> Array:
+    """What squares (K,) hold beside their noise, of this mean and std: of neighbours together where it is not seen in
+    their own."""
+    excess, bar, weights = squares - noise, (SIGNIFICANT**2 / 2 - 1) * noise, 1 / noise**2
+    beyond = np.where(excess > bar, excess, 0.0)
+    for n in np.flatnonzero(excess <= bar):
+        near = slice(max(0, n - NEIGHBOURS), n + NEIGHBOURS + 1)
+        together = float(np.minimum(excess, bar)[near] @ weights[near])
+        if together > SIGNIFICANT * weights[near].sum() ** 0.5:
+            beyond[n] = together / weights[near].sum()
+    return beyond
 
 
 def _bent(
@@ -157,7 +184,7 @@ def _errors(outline: Outline, ratio: float, hidden: float, turned: bool, optics:
     elif outline.seen < 0.9:
         words = f"{outline.seen:.0%} of the outline lies in the frame"
     # the edge's profile has the slope 1/(√(2π) w) at its half level
-    light, beside, wide = outline.rim
+    light, beside, wide = outline.rim or (0.0, 0.0, 0.0)
     blurred = np.hypot(outline.width, wide)
     there = light * np.exp(-0.5 * (beside / blurred) ** 2) / blurred / np.sqrt(2 * np.pi)  # the rim's level at the edge
     common = float(np.hypot(THRESHOLD, RIM * there) * np.sqrt(2 * np.pi) * outline.width)
@@ -177,17 +204,7 @@ def _hidden(outlines: Sequence[Outline | None], ratios: Array) -> tuple[Array, f
     noise /= radii**2
     shape = np.array([o.modes[:, 0] @ (1, 1j) for o in known]) / radii
     lasting, amplitude = _lasting(shape, noise)
-    excess = np.abs(shape - lasting) ** 2 - noise
-    bar = (SIGNIFICANT**2 / 2 - 1) * noise
-    for n, k in enumerate(where):
-        near = slice(max(0, n - NEIGHBOURS), n + NEIGHBOURS + 1)
-        weights = 1 / noise[near] ** 2
-        together = float(np.average(np.minimum(excess, bar)[near], weights=weights))
-        if excess[n] > bar[n]:
-            hidden[k] = excess[n]
-        elif together > SIGNIFICANT / np.sqrt(weights.sum()):
-            hidden[k] = together
-        hidden[k] *= STUDENT**2 * radii[n] ** 2 / 6
+    hidden[where] = STUDENT**2 * radii**2 / 6 * _beyond(np.abs(shape - lasting) ** 2, noise)
     return hidden, amplitude
 
 

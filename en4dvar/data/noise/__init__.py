@@ -37,13 +37,13 @@ from en4dvar.data.noise.correlated import (
     recorded,
 )  # fmt: skip
 from en4dvar.data.noise.discrepancy import SMOOTHNESS, DiscrepancyNoise, Kernel, RobustDiscrepancyNoise
-from en4dvar.data.noise.gaussian import Linearisation, Noise, Predicted, ScaleSkewness
+from en4dvar.data.noise.gaussian import Linearisation, Noise, Predicted
 from en4dvar.data.noise.losses import SIDES, BoundNoise, HuberNoise, sides_of
 from en4dvar.data.noise.make import BlockNoise, joint_noise, noise_of, noise_of_readings, noise_of_record
 
 __all__ = [
     "DECAY", "SHARED", "SIDES", "SMOOTHNESS", "BlockNoise", "BoundNoise", "CorrelatedNoise", "Correlation",
     "DecayingErrors", "DiscrepancyNoise", "HuberNoise", "Kernel", "Linearisation", "Noise", "Predicted",
-    "RobustDiscrepancyNoise", "ScaleSkewness", "SharedErrors", "joint_noise", "noise_of", "noise_of_readings",
+    "RobustDiscrepancyNoise", "SharedErrors", "joint_noise", "noise_of", "noise_of_readings",
     "noise_of_record", "recorded", "sides_of",
 ]  # fmt: skip

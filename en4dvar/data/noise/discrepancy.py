@@ -179,10 +179,6 @@ class DiscrepancyNoise(Noise):
         np.fill_diagonal(correlation, 1.0)
         return CorrelatedNoise(std, np.zeros_like(std), Correlation(0.5 * (correlation + correlation.T)))
 
-    def gaussian_at(self, values: Array, predicted: Predicted) -> "DiscrepancyNoise":
-        """Gaussian errors that count each reading as these do at a prediction."""
-        return self
-
     def drawn(self, predicted: Predicted, stream: np.random.Generator) -> Array:
         root = np.linalg.cholesky(self.covariance_of_discrepancy(predicted))
         missed = np.einsum("...ij,...j->...i", root, stream.standard_normal(predicted.values.shape))
@@ -252,17 +248,15 @@ class DiscrepancyNoise(Noise):
         root = np.linalg.cholesky(self.covariance(at, self._light(values, at)))
         return np.asarray(weights[0] * cho_solve((root, True), vectors.T).T)
 
-    def whitened_columns(self, columns: Array, predicted: Predicted) -> tuple[Array, Array]:
-        """L⁻¹c (B, K, M) of columns c (K, M), and the diagonal of L (B, K), for R + A = LLᵀ of runs (B,)."""
+    def whitened_rows(self, values: Array, rows: Array, predicted: Predicted) -> Array:
+        """L⁻¹c (B, M, K) of rows c (M, K), for R/w + A = LLᵀ of runs (B,)."""
+        light = self._light(values, predicted)
         if self.correlation is not None:
-            root = np.linalg.cholesky(self.covariance(predicted))
-            white = np.linalg.solve(root, np.broadcast_to(columns, (len(root), *columns.shape)))
-            return np.asarray(white), np.asarray(root.diagonal(0, 1, 2))
-        count, parts = columns.shape[1], self._in_time(predicted.values, predicted)[1:]
-        s, a, length = (np.repeat(part, count, axis=0) for part in parts)
-        white, roots = self._filtered(np.tile(columns.T, (len(parts[0]), 1)), s**2, a, length)
-        shape = len(parts[0]), count, len(columns)
-        return white.reshape(shape).swapaxes(1, 2), roots.reshape(shape)[:, 0]
+            root = np.linalg.cholesky(self.covariance(predicted, light))
+            return np.linalg.solve(root, np.broadcast_to(rows.T, (len(root), *rows.T.shape))).swapaxes(1, 2)
+        _, s, a, length = self._in_time(values, predicted)
+        each = (np.repeat(part, len(rows), axis=0) for part in (s**2 / light, a, length))
+        return np.asarray(self._filtered(np.tile(rows, (len(s), 1)), *each)[0].reshape(len(s), *rows.shape))
 
     def _correlated(self, v: Array) -> Array:
         return v if self.correlation is None else self.correlation.correlated(v)
@@ -373,10 +367,6 @@ class RobustDiscrepancyNoise(DiscrepancyNoise):
 
     def attributes(self) -> dict[str, float]:
         return {**self.huber.attributes(), **super().attributes()}
-
-    def gaussian_at(self, values: Array, predicted: Predicted) -> DiscrepancyNoise:
-        root = np.sqrt(self._light(values, predicted))
-        return DiscrepancyNoise(self.std / root, self.time_std / root, self.kernel)
 
     def _light(self, values: Array, predicted: Predicted) -> Array:
         _, errors, s, *_ = self._at_mode(values, predicted)

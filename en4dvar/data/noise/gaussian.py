@@ -12,7 +12,7 @@ from typing import ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, Mask
 
 Where = slice | npt.NDArray[np.intp]  # which readings
 
@@ -31,7 +31,7 @@ class Predicted:
     noise_scale: Array | None = None
     discrepancy: Array | None = None
 
-    def __getitem__(self, runs: int | slice) -> "Predicted":
+    def __getitem__(self, runs: int | slice | Mask) -> "Predicted":
         return self.each(lambda part: part[runs])
 
     def among(self, where: Where) -> "Predicted":
@@ -100,18 +100,6 @@ class Linearisation:
 
 
 @dataclass(frozen=True)
-class ScaleSkewness:
-    """Expected third derivatives of J_o along ln σ relative to informations (:mod:`en4dvar.descent.beyond_gaussian`).
-
-    ``of_predictions`` r_m and ``of_scale`` r_u; ``information`` of ln σ in one observation.
-    """
-
-    of_predictions: float = 2.0
-    of_scale: float = 2.0
-    information: float = 2.0
-
-
-@dataclass(frozen=True)
 class Noise:
     """Gaussian errors, independent of each other: C = 1, ρ(v) = ½ v².
 
@@ -122,6 +110,7 @@ class Noise:
     std: Array
     time_std: Array
 
+    scale_information = 2.0  # of ln σ in one observation
     discrepant: ClassVar[bool] = False  # whether amplitude and length of a discrepancy belong to the parameters
 
     def check(self, weights: Array) -> None:
@@ -266,9 +255,10 @@ class Noise:
         s = self.error_std(at)
         return np.asarray(vectors * (weights * self.influence((values - at.values) / s) / s**2))
 
-    def scale_skewness(self) -> ScaleSkewness:
-        """Expected third derivatives of J_o along ln σ, on which the mean of ln σ depends."""
-        return ScaleSkewness()
+    def whitened_rows(self, values: Array, rows: Array, predicted: Predicted) -> Array:
+        """√w L⁻¹ D⁻¹ c (B, M, K) of rows c (M, K), with R and how much readings count, w, of runs (B,)."""
+        s, light = self.error_std(predicted), self._light(values, predicted)
+        return np.asarray(self._decorrelated(rows / s[..., None, :]) * np.sqrt(light)[:, None])
 
     def attributes(self) -> dict[str, float]:
         """Numbers that say of which kind the errors are, for the record."""
@@ -295,7 +285,7 @@ class Noise:
 
     def _scale_rows(self, root_weight: Array, z: Array, v: Array, log_s: Array) -> tuple[Array, Array]:
         """The rows of d and S that belong to ln s, from anomalies ∂ln s (N, K): its score is v ρ'(v) − 1."""
-        root = math.sqrt(self.scale_skewness().information)
+        root = math.sqrt(self.scale_information)
         of_scale = root_weight * (self.influence(z) * z * z - 1) / root
         return of_scale, root * root_weight[:, None] * log_s.T
 

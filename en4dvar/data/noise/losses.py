@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from en4dvar.data.noise.gaussian import Noise, Predicted, ScaleSkewness
+from en4dvar.data.noise.gaussian import Noise, Predicted
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError
 
@@ -44,25 +44,10 @@ class HuberNoise(Noise):
         """E[ρ''] under the density of ρ: the share within the threshold."""
         return self._inside / (self._inside + 2 / self.threshold * self._edge)
 
-    def scale_skewness(self) -> ScaleSkewness:
-        """For large thresholds the same as for Gaussian errors.
-
-        >>> round(HuberNoise(np.ones(1), np.zeros(1), 6.0).scale_skewness().of_scale, 4)
-        2.0
-        """
-        c, edge = self.threshold, self._edge
-        if c > 8:  # e^{−c²/2} is rounding there
-            return ScaleSkewness()
-        from scipy.special import exp1
-
-        norm = self._inside + 2 / c * edge
-        slope = self._inside / norm  # E[ψ']
-        square = (self._inside - 2 * c * edge) / norm  # E[v²ψ']
-        at_edge = 2 * edge / norm  # E[vψ''] = −c · at_edge, E[v³ψ''] = −c³ · at_edge: ψ' drops to 0 at ±c
-        weight = slope + 2 * c * edge * float(exp1(c * c)) * math.exp(c * c) / norm  # E[ψ/v]
-        information = 1 + square  # E[v²ψ²] − 1 = E[vψ + v²ψ'], for E[vψ] = 1
-        of_scale = (1 + 3 * square - c**3 * at_edge) / information
-        return ScaleSkewness((2 * slope - c * at_edge) / weight, of_scale, information)
+    @cached_property
+    def scale_information(self) -> float:  # type: ignore[override]
+        """E[v²ψ²] − 1 = 1 + E[v²ψ'], ψ = ρ': for large thresholds the same as for Gaussian errors."""
+        return 1 + (self._inside - 2 * self.threshold * self._edge) / math.exp(self._log_norm())
 
     def _white(self, stream: np.random.Generator, shape: tuple[int, ...]) -> Array:
         """Within the threshold of a Gaussian cut there, beyond it exponential."""

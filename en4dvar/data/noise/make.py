@@ -9,7 +9,7 @@ are sums over blocks, and what each reading contributes stands at its place.
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from typing import cast
 
@@ -19,7 +19,7 @@ from scipy.sparse import block_array, csr_array, eye_array
 
 from en4dvar.data.noise.correlated import AnyCorrelation, CorrelatedNoise, Correlation, recorded
 from en4dvar.data.noise.discrepancy import DiscrepancyNoise, Kernel, RobustDiscrepancyNoise
-from en4dvar.data.noise.gaussian import Linearisation, Noise, Predicted, ScaleSkewness
+from en4dvar.data.noise.gaussian import Linearisation, Noise, Predicted
 from en4dvar.data.noise.losses import SIDES, BoundNoise, HuberNoise, record_of, sides_of
 from en4dvar.model.state import Array, floats
 
@@ -146,11 +146,12 @@ class BlockNoise(Noise):
             )
         return product
 
-    def scale_skewness(self) -> ScaleSkewness:
-        """The mean over the readings: they inform the one scale together."""
-        share = [len(block.where) / len(self.std) for block in self.blocks]
-        each = zip(*(astuple(block.noise.scale_skewness()) for block in self.blocks), strict=True)
-        return ScaleSkewness(*(sum(w * of_block for w, of_block in zip(share, of, strict=True)) for of in each))
+    def whitened_rows(self, values: Array, rows: Array, predicted: Predicted) -> Array:
+        white = np.empty((len(predicted.values), *rows.shape))
+        for b in self.blocks:
+            own = b.noise.whitened_rows(values[b.where], rows[:, b.where], predicted.among(b.where))
+            white[..., b.where] = own
+        return white
 
     def matrices(self) -> dict[str, tuple[Array, str]]:
         bounds = {} if self.sides is None else record_of(self.sides)
