@@ -110,17 +110,18 @@ def _given(
 
 
 @dataclass(frozen=True)
-class Bounded:
-    """``members`` (N, n), transformed, beside readings that are bounds, ``costs`` (N,), J of them as far as predictions
-    are linear about the mode, and ln p(y), ``log_evidence``, so far, but for the errors' normalisation.
+class Drawn:
+    """``members`` (N, n), transformed, of a posterior that is no Gaussian; ``cost``, J (B,) of control vectors (B, n)
+    as far as predictions are linear about the mode, and ln p(y), ``log_evidence``, so far, but for the errors'
+    normalisation.
     """
 
     members: Array
-    costs: Array
+    cost: Callable[[Array], Array]
     log_evidence: float
 
 
-def beside_bounds(space: WeightSpace, linear: Linearisation, w: Array, cost: float) -> Bounded | None:
+def beside_bounds(space: WeightSpace, linear: Linearisation, w: Array, cost: float) -> Drawn | None:
     """The posterior about its mode, of weights w (N,) and J ``cost``, where readings are bounds: the Gaussian of all
     else, cut off softly. None where none is.
 
@@ -159,8 +160,12 @@ def beside_bounds(space: WeightSpace, linear: Linearisation, w: Array, cost: flo
     z, log_share = _imposed(stream.standard_normal((max(PARTICLES, n_members), r)), of_bounds, stream)
     z = z[:n_members]
     log_det = 2 * float(np.log(np.abs(np.diag(root)) / prior).sum())
-    costs = lowest + 0.5 * np.sum(z**2, axis=1) + of_bounds(z)
-    return Bounded(space.control(w + moved(z) @ basis.T), costs, log_share - lowest - 0.5 * log_det)
+
+    def cost_of(x: Array) -> Array:
+        z = ((space.weights_of(x) - w) @ basis - middle) @ root.T
+        return np.asarray(lowest + 0.5 * np.sum(z**2, axis=1) + of_bounds(z))
+
+    return Drawn(space.control(w + moved(z) @ basis.T), cost_of, log_share - lowest - 0.5 * log_det)
 
 
 def _imposed(z: Array, cost: Callable[[Array], Array], stream: np.random.Generator) -> tuple[Array, float]:

@@ -139,8 +139,8 @@ def _concluded(
     response = LinearResponse(ends.mode, replace(linear, prediction=central), along, precision, observations)
     explained = observations.noise.explained(observations.values, central)
     log_evidence = sampled.refined.log_evidence - observations.log_normalisation() if sampled.refined else math.nan
-    if not math.isfinite(log_evidence) and ends.bounded:  # there are no draws, or too few
-        log_evidence = ends.bounded.log_evidence - observations.log_normalisation()
+    if not math.isfinite(log_evidence) and ends.drawn:  # there are no draws, or too few
+        log_evidence = ends.drawn.log_evidence - observations.log_normalisation()
     elif not math.isfinite(log_evidence) and descent.at_minimum:  # by Laplace
         newton, lowest = descent.newton, descent.iterate.cost - descent.newton.predicted_decrease
         log_evidence = diag.log_evidence(lowest, newton.hessian.singular_values, len(space.members), observations)

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from en4dvar.descent.beyond_gaussian import Bounded, beside_bounds, marginal_members, mean_beyond_mode
+from en4dvar.descent.beyond_gaussian import Drawn, beside_bounds, marginal_members, mean_beyond_mode
 from en4dvar.descent.loop import minimise
 from en4dvar.descent.minima import Minimum, merged
 from en4dvar.descent.search import Outcome, Search
@@ -23,6 +23,7 @@ from en4dvar.executor import Executor
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.problem import InverseProblem
+from en4dvar.sampling.near_bounds import near_bounds
 from en4dvar.sampling.refine import (
     CLEARED,
     SEEN,
@@ -43,20 +44,20 @@ from en4dvar.schemes.settings import AssimilationSettings
 @dataclass(frozen=True)
 class Ends:
     """An ensemble (N, n), transformed, about the ``mode`` (n,) of J, and what came of running both; how it was drawn
-    beside readings that are bounds, if any are.
+    where that is no Gaussian: beside bounds.
     """
 
     members: Array
     mode: Array
     run: Forecast
     central: Forecast
-    bounded: Bounded | None = None
+    drawn: Drawn | None = None
 
     def gaussianity(self, costs: Array) -> dict[str, float]:
-        """Of members of J ``costs`` (N,); beside bounds how well J agrees with what they were drawn from."""
-        if self.bounded is None:
+        """Of members of J ``costs`` (N,); of others how well J agrees with what they were drawn from."""
+        if self.drawn is None:
             return diag.gaussianity(self.members, self.mode, costs)
-        return {"gaussian_fit": diag.effective_share(self.bounded.costs - costs)}
+        return {"gaussian_fit": diag.effective_share(self.drawn.cost(self.members) - costs)}
 
 
 @dataclass(frozen=True)
@@ -136,9 +137,8 @@ class Stages:
             outcome = search.settled(outcome)
         ends = self.gaussian(outcome.descent)
         if sampling:
-            fit = ends.gaussianity(space.costs(ends.members, ends.run))["gaussian_fit"]
             rest = search.rest(outcome)
-            if rest and (len(outcome.minima) > 1 or not fit >= CLEARED):
+            if rest and (len(outcome.minima) > 1 or not self.fit(ends) >= CLEARED):
                 outcome, ends = self.rather(search.round(outcome, rest), outcome, ends)
             outcome, ends = self.rather(search.surveyed(outcome), outcome, ends)
             outcome, ends = self.rather(search.widened(outcome), outcome, ends)
@@ -167,12 +167,25 @@ class Stages:
             return Ends(members, mode, descent.iterate.members, descent.iterate.central)
         if problem.discrepancy and descent.iterate.linear is not None:
             members = marginal_members(space, descent.iterate.linear, mode, members)
-        bounded = None
-        if descent.iterate.linear is not None:
-            bounded = beside_bounds(space, descent.iterate.linear, descent.weights.w, descent.iterate.cost)
-            members = bounded.members if bounded else members
-        final = space.whole(np.vstack([members, mode]), self.grid)
-        return Ends(members, mode, final[:-1], final[-1:], bounded)
+        near, drawn, linear = None, None, descent.iterate.linear
+        if linear is not None:
+            if leaning := near_bounds(space, linear, mode, members):
+                near = self.about(mode, leaning.members, leaning)
+                if self.fit(near) >= CLEARED:
+                    return near
+            drawn = beside_bounds(space, linear, descent.weights.w, descent.iterate.cost)
+            members = drawn.members if drawn else members
+        other = self.about(mode, members, drawn)
+        return near if near and self.fit(near) > self.fit(other) else other
+
+    def about(self, mode: Array, members: Array, drawn: Drawn | None = None) -> Ends:
+        """Members (N, n) about a mode (n,), run."""
+        final = self.space.whole(np.vstack([members, mode]), self.grid)
+        return Ends(members, mode, final[:-1], final[-1:], drawn)
+
+    def fit(self, ends: Ends) -> float:
+        """The effective share of members that stand for the posterior."""
+        return ends.gaussianity(self.space.costs(ends.members, ends.run))["gaussian_fit"]
 
     def sampled(
         self, descent: Descent, ends: Ends, prior_run: Forecast, minima: Sequence[Minimum], agree: bool, looking: bool
@@ -198,7 +211,7 @@ class Stages:
             told = in_doubt(minima, agree, shape) if settles else "mean_shift" in shape or len(modes) > 1
             if minima and weighs(space) and not told and not shape["non_gaussian"] and not prior_run.filled:
                 before = space.costs(space.members, prior_run[:-1])
-                shape |= examine_tails(space, ends.members, costs, before, settles)
+                shape |= examine_tails(space, ends.members, costs, before, settles, ends.drawn)
                 shape["non_gaussian"] = diag.is_non_gaussian(shape)
             if not (settles and in_doubt(minima, agree, shape)):
                 return Sampled(ends, None, shape)
@@ -212,7 +225,7 @@ class Stages:
             whole = space.whole(np.vstack([sampled.members, mode]), self.grid)
             run, central = whole[:-1], whole[-1:]
             self._moved(descent, sampled.members, mode, whole)
-        return Sampled(Ends(sampled.members, mode, run, central, ends.bounded), sampled, {})
+        return Sampled(Ends(sampled.members, mode, run, central, ends.drawn), sampled, {})
 
     def _moved(self, descent: Descent, members: Array, mode: Array, run: Forecast) -> None:
         """Set a descent that minimised nothing to draws (N, n) about the ``mode`` (n,), whose ``run`` is there."""

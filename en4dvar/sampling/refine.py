@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from en4dvar.descent.beyond_gaussian import Drawn
 from en4dvar.descent.minima import Minimum
 from en4dvar.descent.preview import ITERATIONS, SEARCH
 from en4dvar.descent.search import TOGETHER, WIDER
@@ -43,12 +44,13 @@ KEPT = 500  # draws of the posterior beside the members
 CHAIN_FITS = 4  # of an emulator that has to guide a chain into the tails; two tell mean and spread
 SHIFT, SPREAD = 0.25, 0.15  # of the ensemble, by the emulator, that leave a doubt: half of what is warned of
 FAR = 2.0  # times as far out as the members
-END = 3.0  # standard deviations to either side of the mean, where J of the Gaussian has risen by 4.5
-SHORT = 1.5  # less than that by which J rises to an end from which tails are looked into
+END = 3.0  # standard deviations to either side of the mean, where J of a Gaussian has risen by 4.5
+SHORT = 1.5  # less than J of what members are drawn from, by which J rises to an end from which tails are looked into
 TINY = 1e-3  # standard error, or share that is left, below which none matters
 ROUNDING = 1e-9  # of the standard deviation of all points: where one has all of the weight
 ELSEWHERE = 0.5  # share of the posterior at members of the prior beyond the ensemble's own share there
 CLEARED = 0.85  # effective share of the members above which no run was found that was off (docs: calibration)
+LogDensity = Callable[[Array], Array]
 OVERLAP = "no action is needed: mean ± std describe the members"
 
 
@@ -80,14 +82,17 @@ def examine_shape(
     return {**numbers, "non_gaussian": diag.is_non_gaussian(numbers, scaled)}
 
 
-def examine_tails(space: WeightSpace, ensemble: Array, costs: Array, before: Array, always: bool) -> dict[str, float]:
+def examine_tails(
+    space: WeightSpace, ensemble: Array, costs: Array, before: Array, always: bool, drawn: Drawn | None = None
+) -> dict[str, float]:
     """How far mean and standard deviation of the ensemble (N, n) are from the posterior's in what is printed.
 
     By members of J ``costs`` (N,), those of the prior of J ``before`` (N,) and, ``always`` or where these leave a
     doubt or J rises too little along a parameter, as many runs :data:`FAR` times as far out as the members; where a
     doubt remains that is not sure, and not ``always``, by as many again about the end of the way along which J rises
-    least. All are weighted with the density that they are drawn from, for the posterior and for the Gaussian of the
-    ensemble: of a Gaussian posterior both weights are the same, whatever the points are. ``tail_shift`` is the largest
+    least. All are weighted with the density that they are drawn from, for the posterior and for that of the ensemble,
+    which is Gaussian unless it was ``drawn`` otherwise: where it is the posterior both weights are the same, whatever
+    the points are. ``tail_shift`` is the largest
     distance of both means in posterior standard deviations, ``tail_ratio`` the standard deviation of the ensemble over
     the posterior's where that is farthest from 1, ``tail_excess`` by how many standard errors of theirs a distance or
     ratio is beyond :data:`SHIFT` or :data:`SPREAD`. ``tail_mean_<name>``, ``tail_std_<name>`` are those of a parameter
@@ -97,53 +102,71 @@ def examine_tails(space: WeightSpace, ensemble: Array, costs: Array, before: Arr
     """
     weighed: dict[str, float] = {}
     with suppress(np.linalg.LinAlgError):
-        prior, parts = space.problem.prior, [(ensemble, costs), (space.members, before)]
+        prior, own = space.problem.prior, _of_drawn(drawn, space.problem.prior) if drawn else _gaussian(ensemble)
+        parts = [Points(ensemble, costs, own), Points(space.members, before, _gaussian(space.members))]
 
-        def with_runs(points: Array) -> dict[str, float]:
-            parts.append((points, space.costs(points, space.forecast(points))))
+        def with_runs(points: Array, log_density: LogDensity) -> dict[str, float]:
+            parts.append(Points(points, space.costs(points, space.forecast(points)), log_density))
             return _by_weights(prior, parts)
 
         weighed = _by_weights(prior, parts)
-        way, rise = (np.zeros(len(prior.names)), 0.0) if always else _flattest(space, ensemble)
-        if weighed["tail_excess"] > 0 or rise < 0.5 * END**2 - SHORT:
-            mean = ensemble.mean(axis=0)
-            weighed = with_runs(mean + FAR * (ensemble - mean))
+        way, more = (np.zeros(len(prior.names)), -math.inf) if always else _flattest(space, ensemble, own)
+        if weighed["tail_excess"] > 0 or more < -SHORT:
+            mean, wider = ensemble.mean(axis=0), len(prior.names) * math.log(FAR)
+            weighed = with_runs(mean + FAR * (ensemble - mean), lambda x: own(mean + (x - mean) / FAR) - wider)
             if not always and doubtful(weighed) and not diag.is_non_gaussian(weighed):
-                weighed = with_runs(ensemble + way)
+                weighed = with_runs(ensemble + way, lambda x: own(x - way))
     return weighed
 
 
-def _flattest(space: WeightSpace, ensemble: Array) -> tuple[Array, float]:
-    """The way (n,) from the mean of an ensemble (N, n) along which J rises least, and by how much.
+@dataclass(frozen=True)
+class Points:
+    """Points (B, n), J (B,) of them and the logarithm of the density that they are drawn from, but for (2π)^(−n/2)."""
+
+    points: Array
+    costs: Array
+    log_density: LogDensity
+
+
+def _gaussian(points: Array) -> LogDensity:
+    coordinates = Coordinates.about(points)
+    log_root = float(np.sum(np.log(np.diag(coordinates.root))))
+    return lambda x: np.asarray(-0.5 * np.sum(coordinates.of(x) ** 2, axis=1) - log_root)
+
+
+def _of_drawn(drawn: Drawn, prior: Prior) -> LogDensity:
+    return lambda x: -drawn.cost(x) - drawn.log_evidence - prior.log_det_root
+
+
+def _flattest(space: WeightSpace, ensemble: Array, own: LogDensity) -> tuple[Array, float]:
+    """The way (n,) from the mean of an ensemble (N, n) of the density ``own`` along which J rises least beyond what
+    that falls, and by how much.
 
     On each way one parameter goes :data:`END` standard deviations, and the others where the Gaussian then expects them.
     """
     mean, covariance = ensemble.mean(axis=0), np.atleast_2d(np.cov(ensemble.T))
     ways = END * covariance / np.sqrt(np.diag(covariance))[:, None]
     ways = np.concatenate([np.zeros((1, len(mean))), ways, -ways])
-    costs = space.costs(mean + ways, space.forecast(mean + ways))
-    least = 1 + int(np.argmin(costs[1:]))
-    return ways[least], float(costs[least]) - float(costs[0])
+    beyond = space.costs(mean + ways, space.forecast(mean + ways)) + own(mean + ways)
+    least = 1 + int(np.argmin(beyond[1:]))
+    return ways[least], float(beyond[least]) - float(beyond[0])
 
 
-def _by_weights(prior: Prior, parts: Sequence[tuple[Array, Array]]) -> dict[str, float]:
-    """The numbers of :func:`examine_tails`, of points (B, n) and their J (B,): the ensemble's, the prior's and others.
+def _by_weights(prior: Prior, parts: Sequence[Points]) -> dict[str, float]:
+    """The numbers of :func:`examine_tails`, of the ensemble, the prior's members and others.
 
     The posterior is that of the prior's members, which the ensemble stands for where they are drawn at random, too.
     Few weights may be most of the posterior, which their errors say. Where that is at members of the prior which the
     ensemble does not reach, it is elsewhere, however few these are: a model with steps, of which a bundle sees one.
     """
-    x, costs = (np.concatenate(every) for every in zip(*parts, strict=True))
-    logs = []
-    for points, _ in parts:
-        coordinates = Coordinates.about(points)
-        logs.append(-0.5 * np.sum(coordinates.of(x) ** 2, axis=1) - np.sum(np.log(np.diag(coordinates.root))))
+    x, costs = (np.concatenate([getattr(part, of) for part in parts]) for of in ("points", "costs"))
+    logs = [part.log_density(x) for part in parts]
     drawn, theta = np.logaddexp.reduce(logs), prior.to_physical(x)
     likelihood = prior.cost(x) - costs
     shares, its_shares = shares_of(likelihood + logs[1] - drawn), shares_of(logs[0] - drawn)
     mean, std, at, wide = _moments(theta, shares)
     its_mean, its_std, its_at, its_wide = _moments(theta, its_shares)
-    begin, end = len(parts[0][0]), len(parts[0][0]) + len(parts[1][0])
+    begin, end = np.cumsum([len(part.points) for part in parts[:2]])
     elsewhere = np.sum((shares - its_shares)[begin:end]) > ELSEWHERE
     shift, ratio = np.abs(its_mean - mean) / std, its_std / std
     off = np.array([shift - SHIFT, np.abs(np.log(ratio)) - math.log1p(SPREAD)])
