@@ -113,12 +113,10 @@ def examine_tails(
     weighed: dict[str, float] = {}
     with suppress(np.linalg.LinAlgError):
         prior, own = space.problem.prior, _of_drawn(drawn, space.problem.prior) if drawn else _gaussian(ensemble)
-        members = [(x, run, space.costs(x, run)) for x, run in ((ensemble, after), (space.members, before))]
-        parts = [
-            Points(x, costs, log) for (x, _, costs), log in zip(members, (own, _gaussian(space.members)), strict=True)
-        ]
+        costs, before_costs = space.costs(ensemble, after), space.costs(space.members, before)
+        parts = [Points(ensemble, costs, own), Points(space.members, before_costs, _gaussian(space.members))]
         weighed = _by_weights(prior, parts)
-        runs = ModelRuns.of(*members[0]).joined(ModelRuns.of(*members[1]))
+        runs = ModelRuns.of(ensemble, after, costs).joined(ModelRuns.of(space.members, before, before_costs))
         ends = examine_ends(space, minimum, ensemble, runs, drawn)
         if always or weighed["tail_excess"] > 0 or (ends and not ends.rises):
             mean, wider = ensemble.mean(axis=0), len(prior.names) * math.log(FAR)
