@@ -30,6 +30,7 @@ NEARLY = 0.01  # of the Gaussian's rise, and beside it, by which J may differ fr
 END = 3.0  # standard deviations to either side of the minimum, where J of the Gaussian has risen by 4.5
 SHORT = 1.5  # less than that by which J rises to a point beyond which there may be a tail: it is followed
 FURTHER = 1.5  # times as far
+NEAR = 100.0  # above the lowest J: runs up to there are fitted, of which those much farther out would set the scale
 TRIED, WIDTHS = 128, (2.0, 1.0, 0.5, 0.25)  # points about x*, so wide, among which emulated J is lowest
 PLACES = 2001  # of a parameter, at which its density is known
 Costs = list[dict[float, float]]
@@ -86,8 +87,10 @@ class _Walk:
     def _emulated(self, x: Array, about: Array) -> tuple[Array, Array]:
         """The points x* (S, n) among those ``about`` (S, T, n) the points ``x`` (S, n), and ln V (S,)."""
         problem, n = self.space.problem, len(self.start)
-        degree = next((d for d in DEGREES if RUNS_PER_TERM * math.comb(n + d, d) <= len(self.runs.x)), 1)
-        emulated = fitted_cost(problem.prior, problem.observations, degree, self.runs, 2 * n)
+        near = int(np.sum(self.runs.costs - self.runs.costs.min() < NEAR))
+        runs = self.runs[np.argsort(self.runs.costs, kind="stable")[: max(near, RUNS_PER_TERM * (n + 1))]]
+        degree = next((d for d in DEGREES if RUNS_PER_TERM * math.comb(n + d, d) <= len(runs.x)), 1)
+        emulated = fitted_cost(problem.prior, problem.observations, degree, runs, 2 * n)
 
         def costs(tried: Array) -> Array:
             x = tried.reshape(-1, n)

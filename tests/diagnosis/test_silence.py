@@ -45,7 +45,7 @@ def test_a_discrepancy_that_is_not_there_is_not_found():
 
 
 def off_by_little(analysis):
-    """Whether mean and std are those of the posterior on a grid, by half of what is warned of, and ends by 0.9 of it."""
+    """Whether mean and std are those of the posterior on a grid, by half of what is warned of, ends by 0.9 of it."""
     problem, x = analysis.problem, analysis.problem.prior.from_physical(analysis.posterior)
     axes = [m + s * np.linspace(-7, 7, 121) for m, s in zip(x.mean(axis=0), x.std(axis=0), strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, x.shape[1])
