@@ -5,7 +5,8 @@ r"""The ends of the interval of each parameter, of a posterior that its ensemble
 Points at multiples of the spread of a Gaussian that is too narrow do not reach a long tail. So each parameter is moved
 outwards, the others to where J is lowest, until J has risen by what leaves no tail. Where J is lowest, and the volume V
 of the others there, is what an emulator says that is fitted to the runs there are, which costs none; J is the model's,
-with the prior that the prior's members have. Of a linear model the ends are the Gaussian's, whatever the points are.
+with the prior that the prior's members have. Where no emulator says it, J on the straight way is no less than at x*,
+and only a lower one counts. Of a linear model the ends are the Gaussian's, whatever the points are.
 
 Source: marginals by Laplace's approximation at each value, Tierney & Kadane (1986), J. Am. Stat. Assoc. 81, 82.
 """
@@ -23,14 +24,15 @@ from en4dvar.diagnosis.response.ledger import QUANTILES, weighted_quantiles
 from en4dvar.ensemble.linalg import shares_of
 from en4dvar.model.state import Array
 from en4dvar.priors.prior import member_stream
-from en4dvar.sampling.emulated_cost import DEGREES, RUNS_PER_TERM, ModelRuns, fitted_cost
+from en4dvar.sampling.emulated_cost import DEGREES, RUNS_PER_TERM, EmulatedCost, ModelRuns, fitted_cost
 from en4dvar.sampling.emulated_draws import LARGEST
 
 NEARLY = 0.01  # of the Gaussian's rise, and beside it, by which J may differ from it at all members
 END = 3.0  # standard deviations to either side of the minimum, where J of the Gaussian has risen by 4.5
 SHORT = 1.5  # less than that by which J rises to a point beyond which there may be a tail: it is followed
 FURTHER = 1.5  # times as far
-NEAR = 100.0  # above the lowest J: runs up to there are fitted, of which those much farther out would set the scale
+NEAR = 100.0  # above the lowest J: runs up to there are fitted, where they suffice for more than the Gaussian has
+MISLED = 0.5  # of J, by which it may exceed emulated J: beyond, the point on the way is tried too
 TRIED, WIDTHS = 128, (2.0, 1.0, 0.5, 0.25)  # points about x*, so wide, among which emulated J is lowest
 PLACES = 2001  # of a parameter, at which its density is known
 Costs = list[dict[float, float]]
@@ -72,28 +74,44 @@ class _Walk:
 
     def go(self, sides: list[int], far: float) -> None:
         """So ``far`` on ``sides``."""
-        x, log_volume = self.start + far * (self.ways + self.bends)[sides], np.zeros(len(sides))
-        if self.runs.outputs.shape[1] <= LARGEST and self.space.settings.emulator != "off":
-            x, log_volume = self._emulated(x, self.about[sides])
+        straight, n = self.start + far * (self.ways + self.bends)[sides], len(self.start)
+        x, log_volume, expected = straight.copy(), np.zeros(len(sides)), np.full(len(sides), np.inf)
+        lowest = np.zeros(len(sides), dtype=bool)  # whether x is x*
+        near = self.runs[np.flatnonzero(self.runs.costs - self.runs.costs.min() < NEAR)]
+        degree = next((d for d in DEGREES if RUNS_PER_TERM * math.comb(n + d, d) <= len(near.x)), None)
+        if degree and near.outputs.shape[1] <= LARGEST and self.space.settings.emulator != "off":
+            prior, observations = self.space.problem.prior, self.space.problem.observations
+            emulated = fitted_cost(prior, observations, degree, near, 2 * n)
+            x, log_volume = self._lowest(emulated, x, self.about[sides])
+            expected, lowest[:] = emulated.cost(x), True
+        costs = self._run(x)
+        misled = np.flatnonzero(costs > expected + MISLED)
+        if len(misled):
+            instead = self._run(straight[misled])
+            misled, instead = misled[instead < costs[misled]], instead[instead < costs[misled]]
+            x[misled], costs[misled], log_volume[misled], lowest[misled] = straight[misled], instead, 0.0, False
+        self.bends[sides] = (x - self.start) / far - self.ways[sides]
+        of_drawn = self.drawn.cost(x) if self.drawn else np.full(len(sides), self.costs[0][0.0] + 0.5 * far**2)
+        as_drawn = of_drawn - self.of_drawn[0][0.0] + self.costs[0][0.0] if self.drawn else of_drawn
+        costs = self.space.with_sampled_prior(x, costs)
+        costs = np.where(lowest, costs, np.minimum(costs, as_drawn))  # a higher J on the way is not that of x*
+        for i, side in enumerate(sides):
+            self.costs[side][far] = float(costs[i] - log_volume[i])
+            if self.drawn:
+                self.of_drawn[side][far] = float(of_drawn[i] - log_volume[i])
+
+    def _run(self, x: Array) -> Array:
+        """J (S,) of points (S, n), by which an emulator learns."""
         outcome = self.space.forecast(x)
         costs = self.space.costs(x, outcome)
         self.runs = self.runs.joined(ModelRuns.of(x, outcome, costs))
-        self.bends[sides] = (x - self.start) / far - self.ways[sides]
-        for i, side in enumerate(sides):
-            self.costs[side][far] = float(self.space.with_sampled_prior(x, costs)[i] - log_volume[i])
-            if self.drawn:
-                self.of_drawn[side][far] = float(self.drawn.cost(x)[i] - log_volume[i])
+        return costs
 
-    def _emulated(self, x: Array, about: Array) -> tuple[Array, Array]:
+    def _lowest(self, emulated: EmulatedCost, x: Array, about: Array) -> tuple[Array, Array]:
         """The points x* (S, n) among those ``about`` (S, T, n) the points ``x`` (S, n), and ln V (S,)."""
-        problem, n = self.space.problem, len(self.start)
-        near = int(np.sum(self.runs.costs - self.runs.costs.min() < NEAR))
-        runs = self.runs[np.argsort(self.runs.costs, kind="stable")[: max(near, RUNS_PER_TERM * (n + 1))]]
-        degree = next((d for d in DEGREES if RUNS_PER_TERM * math.comb(n + d, d) <= len(runs.x)), 1)
-        emulated = fitted_cost(problem.prior, problem.observations, degree, runs, 2 * n)
 
         def costs(tried: Array) -> Array:
-            x = tried.reshape(-1, n)
+            x = tried.reshape(-1, tried.shape[-1])
             return self.space.with_sampled_prior(x, emulated.cost(x)).reshape(tried.shape[:-1])
 
         def log_volume(at: Array) -> Array:
