@@ -31,7 +31,7 @@ NEARLY = 0.01  # of the Gaussian's rise, and beside it, by which J may differ fr
 END = 3.0  # standard deviations to either side of the minimum, where J of the Gaussian has risen by 4.5
 SHORT = 1.5  # less than that by which J rises to a point beyond which there may be a tail: it is followed
 FURTHER = 1.5  # times as far
-NEAR = 100.0  # above the lowest J: runs up to there are fitted, where they suffice for more than the Gaussian has
+NEAR = 1000.0  # above the lowest J: runs up to there are fitted, where they suffice for more than the Gaussian has
 MISLED = 0.5  # of J, by which it may exceed emulated J: beyond, the point on the way is tried too
 TRIED, WIDTHS = 128, (2.0, 1.0, 0.5, 0.25)  # points about x*, so wide, among which emulated J is lowest
 PLACES = 2001  # of a parameter, at which its density is known
@@ -137,8 +137,6 @@ class _Walk:
         Between the points √(2 (J − min J)) is interpolated, which is the distance itself where J is quadratic; beyond
         the last, as far again, it goes on as before.
         """
-        from scipy.interpolate import PchipInterpolator  # not needed to import the package
-
         distances, roots = [0.0], [0.0]
         for sign, costs in zip((-1, 1), sides[2 * j : 2 * j + 2], strict=True):
             far = sorted(costs)
@@ -150,7 +148,7 @@ class _Walk:
             roots += [sign * r for r in root[1:]]
         order = np.argsort(distances)
         z = np.linspace(min(distances), max(distances), PLACES)
-        return z, shares_of(-0.5 * PchipInterpolator(np.array(distances)[order], np.array(roots)[order])(z) ** 2)
+        return z, shares_of(-0.5 * np.interp(z, np.array(distances)[order], np.array(roots)[order]) ** 2)
 
 
 def _lowest(sides: Costs) -> float:
