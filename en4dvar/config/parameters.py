@@ -1,5 +1,6 @@
 """The ``parameters:`` section: what is estimated, what is fixed, and what waits for a number from the data file."""
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal
@@ -21,7 +22,7 @@ from en4dvar.priors.varying import RandomWalk
 from en4dvar.priors.varying.model import can_vary
 
 _RECIPES = {
-    "normal": "mean and std, and may have lower and upper",
+    "normal": "mean and std, and may have lower, upper or both",
     "lognormal": "median and log_std, which may have upper, or lower and upper, or mean and std",
     "logit": "lower, upper, median and logit_std",
     "uniform": "lower and upper",
@@ -94,7 +95,7 @@ class PriorSection(Section):
 
     prior: Literal["normal", "lognormal", "logit", "uniform", "half-normal", "beta", "ensemble"]
     """Shape: normal (mean, std), lognormal (median and log_std, or mean and std), each also cut off at lower and upper
-    (a lognormal: or at upper alone), logit (lower, upper, median, …),
+    (a normal: or at one of them alone; a lognormal: or at upper alone), logit (lower, upper, median, …),
     uniform (lower, upper), half-normal (std, and lower, by default 0), beta (lower, upper, alpha, beta), or ensemble:
     mean, spread and correlations are those of the members in the file of ``prior: {ensemble: FILE}``."""
     mean: Location = None
@@ -198,13 +199,17 @@ class Uncertain:
             raise ConfigError([replace(f, message=f.message.removeprefix(own)) for f in error.problems]) from None
 
     def _term(self, mean: float, median: float) -> PriorTerm:
-        spec, p, bounds = self.spec, self.parameter, (self.spec.lower or 0.0, self.spec.upper or 0.0)
+        spec, p, missing = self.spec, self.parameter, math.inf if self.spec.prior == "normal" else 0.0
+        bounds = -missing if spec.lower is None else spec.lower, missing if spec.upper is None else spec.upper
         if self.of_members is not None:
             return self.of_members
         log_std, logit_std = spec.log_std or 0.0, spec.logit_std or 0.0  # each is there where it is read
         makers: dict[str, Callable[[], PriorTerm]] = {
             "normal mean std": lambda: PriorTerm.normal(p, mean, self._std(mean)),
-            "normal lower mean std upper": lambda: PriorTerm.bounded(p, "normal", mean, self._std(mean), bounds),
+            **dict.fromkeys(
+                ("normal lower mean std", "normal mean std upper", "normal lower mean std upper"),
+                lambda: PriorTerm.bounded(p, "normal", mean, self._std(mean), bounds),
+            ),
             "lognormal mean std": lambda: PriorTerm.lognormal_moments(p, mean, self._std(mean)),
             "lognormal log_std median": lambda: PriorTerm.lognormal(p, median, log_std),
             "lognormal log_std median upper": lambda: PriorTerm.bounded(p, "lognormal", median, log_std, bounds),

@@ -23,6 +23,7 @@ from en4dvar.executor import Executor
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.problem import InverseProblem
+from en4dvar.sampling.near_bounds import near_bounds
 from en4dvar.sampling.refine import (
     CLEARED,
     SEEN,
@@ -136,9 +137,8 @@ class Stages:
             outcome = search.settled(outcome)
         ends = self.gaussian(outcome.descent)
         if sampling:
-            fit = ends.gaussianity(space.costs(ends.members, ends.run))["gaussian_fit"]
             rest = search.rest(outcome)
-            if rest and (len(outcome.minima) > 1 or not fit >= CLEARED):
+            if rest and (len(outcome.minima) > 1 or not self.fit(ends) >= CLEARED):
                 outcome, ends = self.rather(search.round(outcome, rest), outcome, ends)
             outcome, ends = self.rather(search.surveyed(outcome), outcome, ends)
             outcome, ends = self.rather(search.widened(outcome), outcome, ends)
@@ -164,13 +164,26 @@ class Stages:
         members, mode = ends[:-1], ends[-1]
         if self.minimiser is None:  # the last ensemble that was run is the posterior
             return Ends(members, mode, descent.iterate.members, descent.iterate.central)
-        drawn, linear = None, descent.iterate.linear
+        near, drawn, linear = None, None, descent.iterate.linear
         if linear is not None:
+            if leaning := near_bounds(space, linear, mode, members):
+                near = self.about(mode, leaning.members, leaning)
+                if self.fit(near) >= CLEARED:
+                    return near
             drawn = beside_bounds(space, linear, descent.weights.w, descent.iterate.cost)
             drawn = drawn or over_errors(space, linear, mode, members)
             members = drawn.members if drawn else members
-        final = space.whole(np.vstack([members, mode]), self.grid)
+        other = self.about(mode, members, drawn)
+        return near if near and self.fit(near) > self.fit(other) else other
+
+    def about(self, mode: Array, members: Array, drawn: Drawn | None = None) -> Ends:
+        """Members (N, n) about a mode (n,), run."""
+        final = self.space.whole(np.vstack([members, mode]), self.grid)
         return Ends(members, mode, final[:-1], final[-1:], drawn)
+
+    def fit(self, ends: Ends) -> float:
+        """The effective share of members that stand for the posterior."""
+        return ends.gaussianity(self.space.costs(ends.members, ends.run))["gaussian_fit"]
 
     def sampled(
         self, descent: Descent, ends: Ends, prior_run: Forecast, minima: Sequence[Minimum], agree: bool, looking: bool

@@ -34,7 +34,8 @@ Sampling = Literal["exact", "random"]
 LARGEST = 1e150  # its square is a number still
 LARGEST_LOG = 300.0  # std of a logarithm or logit: one std is 130 powers of ten
 SHAPES = 0.1, 1e6  # smallest and largest α, β of a beta
-UNREACHED = 8.0  # standard deviations below the mean, where a Gaussian has no probability to rounding
+UNREACHED = 8.0  # standard deviations from the mean, where a Gaussian has no probability to rounding
+UNBOUNDED = 30.0  # the same, where a normal is cut on a side without a bound: scores are numbers up to there
 RESOLVED = 1e-12  # of the mean: an ensemble that spreads by less has four digits at most
 
 
@@ -137,12 +138,15 @@ class PriorTerm:
     def bounded(
         cls, parameter: Parameter, kind: Literal["normal", "lognormal"], mean: float, std: float, bounds: Bounds
     ) -> Self:
-        """:meth:`normal` of ``mean`` and ``std``, or :meth:`lognormal` of median and log_std, between ``bounds``; the
-        lower one of a lognormal may be 0, which it does not reach anyway."""
+        """:meth:`normal` of ``mean`` and ``std``, or :meth:`lognormal` of median and log_std, between ``bounds``; of a
+        normal either may be infinite, and the lower one of a lognormal 0, which it does not reach anyway."""
         whole = cls.normal(parameter, mean, std) if kind == "normal" else cls.lognormal(parameter, mean, std)
         low, high = bounds
         if kind == "lognormal" and low == 0:
             low = math.exp(whole.mean - (UNREACHED + 1) * std)
+        if kind == "normal":
+            low = mean - UNBOUNDED * std if low == -math.inf else low
+            high = mean + UNBOUNDED * std if high == math.inf else high
         whole._require(low <= mean <= high and low < high, f"{mean:g} does not lie between the bounds {bounds}")
         whole._require(kind == "normal" or low > 0, f"the bounds of a logarithm must be positive, not {bounds}")
         a, b = (low, high) if kind == "normal" else (math.log(low), math.log(high))
@@ -170,10 +174,11 @@ class PriorTerm:
         return self.transform == "logit" or self.transform in QUANTILE_MAPS
 
     @property
-    def open_below(self) -> bool:
-        """True of a logarithm that is not cut off below: zero is infinitely far."""
-        cut = self.transform == "bounded-lognormal"
-        return self.transform == "lognormal" or (cut and self.shape[0] < -UNREACHED)
+    def unreached(self) -> tuple[bool, bool]:
+        """True of the lower, the upper bound that has no prior probability beside it: zero is infinitely far from a
+        logarithm that is not cut off below."""
+        low, high = self.shape[:2] if self.transform in ("bounded-normal", "bounded-lognormal") else (0.0, 0.0)
+        return self.transform == "lognormal" or low < -UNREACHED, high > UNREACHED
 
     def slope(self, x: float) -> float:
         """dθ/dx of the parameter map at a transformed value."""

@@ -97,13 +97,20 @@ class EmulatedProposal:
             return emulated.cost(runs.prior.from_white(z)) / heat
 
         if isinstance(start, StudentMixture):
-            made = cls(lambda z: -start.log_density(z), start, start.draw(WALKERS, stream), 0.0)
-            made, turns = made.bridged(cost, stream), FIRST_TURNS
+            made, turns = cls.bridged_from(start, cost, stream), FIRST_TURNS
         else:
             made, turns = start.bridged(cost, stream), TURNS
         for _ in range(turns):
             made = made.settled(stream)
         return made
+
+    @classmethod
+    def bridged_from(
+        cls, start: StudentMixture, cost: Callable[[Array], Array], stream: np.random.Generator
+    ) -> "EmulatedProposal":
+        """The proposal exp(−``cost``), from a mixture."""
+        first = cls(lambda z: -start.log_density(z), start, start.draw(WALKERS, stream), 0.0)
+        return first.bridged(cost, stream)
 
     def bridged(self, cost: Callable[[Array], Array], stream: np.random.Generator) -> "EmulatedProposal":
         """The proposal exp(−``cost``), from this one."""

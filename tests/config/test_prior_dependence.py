@@ -176,7 +176,7 @@ def test_a_bad_correlation_is_told_in_place(tmp_path, text, line, words):
         ((A_MEMBERS,), 13, "no ensemble is given; write 'prior: {ensemble: FILE}'"),
         ((add("prior: {ensemble: prior.nc}"),), 16, "no parameter takes its prior from it"),
         (((A_MEMBERS[0], "A: {prior: ensemble, mean: 1 um}"),), 13, "an ensemble prior takes map and unit"),
-        (((A_MEMBERS[0], "A: {prior: normal, map: logit}"),), 13, "may have lower and upper; given: map"),
+        (((A_MEMBERS[0], "A: {prior: normal, map: logit}"),), 13, "may have lower, upper or both; given: map"),
         (
             ((FREE_C[0], "  sigma: {prior: lognormal, median: 1, log_std: 0.5}\n"),
              add("prior_correlation:\n  - {between: [sigma, A], correlation: 0.5}")),

@@ -29,6 +29,11 @@ NAMED = {
     "beta": (PriorTerm.beta(A, (-1.0, 3.0), 2.0, 5.0), stats.beta(2, 5, -1, 4)),
     "bounded normal": (PriorTerm.bounded(A, "normal", 0.5, 1.0, (-1.5, 2.0)), stats.truncnorm(-2, 1.5, 0.5, 1.0)),
     "bounded at its mean": (PriorTerm.bounded(A, "normal", 1.0, 2.0, (1.0, 9.0)), stats.truncnorm(0, 4, 1.0, 2.0)),
+    "normal cut below": (PriorTerm.bounded(A, "normal", 1.0, 1.0, (0.0, math.inf)), stats.truncnorm(-1, np.inf, 1.0)),
+    "normal cut above": (
+        PriorTerm.bounded(A, "normal", 1.0, 2.0, (-math.inf, 1.5)),
+        stats.truncnorm(-np.inf, 0.25, 1, 2),
+    ),
     "beta with peaks at its bounds": (PriorTerm.beta(A, (0.0, 1.0), 0.5, 0.5), stats.beta(0.5, 0.5)),
 }
 
@@ -112,6 +117,28 @@ def test_a_cut_above_alone_from_yaml(tmp_path: Path, cut: str):
     (problem,) = build(load_config(write_toy(tmp_path, ("log_std: 0.3", f"log_std: 0.3, {cut}"))))
     (term,) = [term for term in problem.prior.terms if term.transform == "bounded-lognormal"]
     assert term.bounds == (pytest.approx(3 * math.exp(-2.7)), 4.0)
+
+
+@pytest.mark.parametrize(
+    ("cut", "bounds", "side"),
+    [("lower: 2.5 N/m", (2.5, 12.0), "lower"), ("upper: 3.2 N/m", (-6.0, 3.2), "upper")],
+)
+def test_a_normal_that_is_cut_at_one_side_from_yaml(tmp_path: Path, cut: str, bounds: tuple[float, float], side: str):
+    """The other bound is so far away that nothing piles up there."""
+    (problem,) = build(
+        load_config(
+            write_toy(
+                tmp_path,
+                ("prior: lognormal, median: 3 N/m, log_std: 0.3", f"prior: normal, mean: 3 N/m, std: 0.3 N/m, {cut}"),
+            )
+        )
+    )
+    (term,) = [term for term in problem.prior.terms if term.transform == "bounded-normal"]
+    assert term.bounds == pytest.approx(bounds)
+    prior = Prior((term,))
+    x = prior.sample(200, 1)
+    (told,) = [*at_bound(prior, x, 0.1 * x - 5, [""] * 200), *at_bound(prior, x, 0.1 * x + 5, [""] * 200)]
+    assert f"pile up at its {side} bound" in told.words
 
 
 @pytest.mark.parametrize(

@@ -49,8 +49,6 @@ BETA = {"prior": "beta", "lower": 0, "upper": 2, "alpha": 0.5, "beta": 0.5}
 CASES = {
     "wider than its prior says in ln k": Bent(decay, ONE, [0.02], 0.1, *lognormal(1, 1)),
     "a prior with two horns": Bent(decay, EIGHT, DECAYED, 0.3, BETA, stats.beta(0.5, 0.5, 0, 2), (1e-9, 2 - 1e-9)),
-    "at a bound of a uniform prior": Bent(decay, EIGHT, DECAYED, 0.1, *uniform(0.9, 3)),
-    "a reading beyond a bound": Bent(lambda k, t: k + 0 * t, ONE, [-0.1], 0.1, *uniform(0, 1)),
     "saturated": Bent(lambda k, t: np.tanh(k) + 0 * t, ONE, [1.0], 0.05, *normal(0, 2)),
     "flat": Bent(lambda k, t: k**3 + 0 * t, ONE, [0.0], 0.2, *normal(0.5, 1)),
     "flat on one side": Bent(lambda k, t: np.maximum(k - 0.5, 0) + 0 * t, ONE, [0.0], 0.1, *normal(0, 1)),

@@ -182,8 +182,7 @@ def at_bound(prior: Prior, members: Array, posterior: Array, failures: Sequence[
     """
     for j, (term, parameter) in enumerate(zip(prior.terms, prior.parameters, strict=True)):
         low, high = term.bounds if term.has_bound else parameter.bounds
-        if term.open_below:
-            low = -math.inf
+        low, high = np.where(term.unreached, (-math.inf, math.inf), (low, high)).tolist()
         if math.isinf(low) and math.isinf(high):
             continue
         before, after = term.to_physical(members[:, j]), term.to_physical(posterior[:, j])

@@ -1,0 +1,96 @@
+r"""The posterior where priors end at bounds, by predictions that are linear in what is bounded.
+
+    m(x) ≈ m(x̂) + G (s(x) − s(x̂)),   s = θ where a prior ends at a bound (ln θ of a lognormal), else x
+
+Such a prior is Gaussian in its score x = Φ⁻¹(F(θ)), which is bent at the bound, and a posterior within few standard
+deviations of it is no Gaussian about its mode x̂, however linear the model: the Gaussian lies off the bound, for θ
+hardly changes with x there. With these predictions J costs no run, and its posterior is drawn as an emulated one is.
+The members' own runs then say how good it is.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from en4dvar.data.noise import Linearisation
+from en4dvar.descent.beyond_gaussian import Drawn
+from en4dvar.descent.weight_space import WeightSpace
+from en4dvar.diagnosis.diagnostics import effective_share
+from en4dvar.ensemble.forecast import of_framework
+from en4dvar.ensemble.linalg import with_moments
+from en4dvar.model.state import NOISE_SCALE, Array
+from en4dvar.priors.parameter_map import QUANTILE_MAPS
+from en4dvar.priors.prior import Prior, member_stream
+from en4dvar.sampling.emulated_draws import LARGEST, EmulatedProposal
+from en4dvar.sampling.mixture import StudentMixture
+
+STRAIGHT = 0.995  # effective share of the members for which predictions may as well be linear in x
+LEFT_OUT, KEPT = 3, 6  # turns of the walkers
+
+
+def near_bounds(space: WeightSpace, linear: Linearisation, mode: Array, posterior: Array) -> Drawn | None:
+    """Members (N, n) in place of ``posterior`` (N, n), the Gaussian about the ``mode`` (n,), all transformed.
+
+    None where predictions that are linear in x say the same, where these are too many or not known in all directions,
+    and where the posterior is a mixture of its own: beside an estimated discrepancy or scale of what varies.
+    """
+    problem, prior = space.problem, space.problem.prior
+    mixed = problem.discrepancy or any(walk.spread for walk in problem.walks)
+    ending = [t.transform in QUANTILE_MAPS and t.parameter.name != NOISE_SCALE.name for t in prior.terms]
+    bent = np.flatnonzero(ending).tolist()
+    if mixed or not bent or space.basis.shape[1] < len(mode) or linear.anomalies.shape[1] > LARGEST:
+        return None
+    scale, like = linear.log_scale_anomalies, linear.prediction.each(lambda part: np.asarray(part)[None])
+    parts = linear.anomalies, linear.rate_anomalies, None if scale is None else scale[:, None]
+    slopes = np.linalg.solve(space.basis.T @ space.anomalies, np.hstack([part for part in parts if part is not None]))
+    bend = _bend(prior, bent, mode)
+
+    def cost(x: Array, change: Array) -> Array:
+        """J (B,) at control vectors (B, n), of predictions that change by ``change`` (B, n) from those at the mode."""
+        predicted = like.unstacked(like.stacked + change @ slopes)
+        if problem.has_noise_scale:
+            exact = of_framework(problem, prior.to_physical(x), NOISE_SCALE, 1.0)
+            predicted = replace(predicted, noise_scale=exact)
+        return np.asarray(prior.cost(x) + problem.observations.cost(predicted))
+
+    def bent_cost(x: Array) -> Array:
+        return cost(x, bend(x))
+
+    if effective_share(cost(posterior, posterior - mode) - bent_cost(posterior)) > STRAIGHT:
+        return None
+    stream = member_stream(space.seed, "near bounds")
+    start = StudentMixture.fitted(prior.white(posterior), stream, 1)
+    turns = [EmulatedProposal.bridged_from(start, lambda z: bent_cost(prior.from_white(z)), stream)]
+    for _ in range(LEFT_OUT + KEPT):
+        turns.append(turns[-1].settled(stream))
+    draws = prior.from_white(np.concatenate([turn.walkers for turn in turns[-KEPT:]]))
+    # evenly along what is bent most, so that few members have its quantiles
+    bends = np.std(bend(posterior) - posterior, axis=0) / np.std(posterior, axis=0)
+    most = bent[int(np.argmax(bends[bent]))]
+    even = ((np.arange(len(posterior)) + 0.5) * len(draws) / len(posterior)).astype(int)
+    members = draws[np.argsort(draws[:, most])[stream.permutation(even)]]
+    if space.settings.sampling == "exact":
+        members = with_moments(members, draws.mean(axis=0), np.cov(draws.T))
+    log = float(np.mean([turn.log for turn in turns[-KEPT:]])) - 0.5 * len(mode) * math.log(2 * math.pi)
+    return Drawn(members, bent_cost, log)
+
+
+def _bend(prior: Prior, bent: list[int], mode: Array) -> Callable[[Array], Array]:
+    """(s(x) − s(x̂))/s'(x̂) (B, n) of control vectors (B, n); in the other coordinates x − x̂."""
+
+    def straight(x: Array, j: int) -> Array:
+        theta = prior.terms[j].to_physical(x)
+        return np.log(theta) if prior.terms[j].transform == "bounded-lognormal" else theta
+
+    def bend(x: Array) -> Array:
+        change = x - mode
+        for j in bent:
+            slope = prior.terms[j].slope(float(mode[j]))
+            if prior.terms[j].transform == "bounded-lognormal":
+                slope /= float(prior.terms[j].to_physical(mode[j]))
+            change[:, j] = (straight(x[:, j], j) - straight(mode[j], j)) / slope
+        return change
+
+    return bend
