@@ -8,9 +8,9 @@ geometric mean. Collapse times of model and data are taken in the same way
 (:func:`~en4dvar_bubble.collapse.lobe`).
 
 A guess has seen the data that a prior is then confronted with. A wide one is centred on it where these determine G and
-μ by themselves, as of laser-induced bubbles (what gels are known to be instead moves ln G of four measured ones by less
-than 0.05 of its std); a pulse that stretches a gel hundreds of times tells G α/R0 alone, and a G that fits with α and
-R0 at their medians would count what is known of these twice.
+μ by themselves, as of laser-induced bubbles: centred on what gels are known to be, it moves ln G of measured ones by a
+twentieth of its std, of soft synthetic ones by a fifth. A pulse that stretches a gel hundreds of times tells G α/R0
+alone, and a G that fits with α and R0 at their medians would count what is known of these twice.
 """
 
 import itertools
