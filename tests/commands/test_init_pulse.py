@@ -58,3 +58,19 @@ def test_a_window_to_the_end_says_why_it_does_not_end_before() -> None:
     (line,) = (line for line in Path("pulse.yaml").read_text().splitlines() if line.startswith("  window:"))
     assert "to: end}" in line
     assert line.endswith("# all readings: none after the maximum is below 20 % of it")
+
+
+def test_bubbles_of_one_gel_grow_from_alike_nuclei() -> None:
+    """Six bubbles do not tell the nuclei of a gel six times as well as what is known: R0 varies, unless it is seen."""
+    Path("gel").mkdir()
+    for k in range(3):
+        of_file(STIFF, 0.01 * k)
+        Path("pulse.csv").rename(f"gel/b{k}.csv")
+    assert call("init", "--data", "gel", "--start", "acoustic").exit_code == 0
+    assert proposed(Path("gel.yaml")).document.data["population"]["of"] == ["G", "alpha", "mu", "R0"]
+    for k in range(3):  # gas at rest before the pulse
+        head, *rows = Path(f"gel/b{k}.csv").read_text().splitlines()
+        rest = [f"{t:.2f},{20 + 0.1 * (-1) ** t:.2f}" for t in range(-12, 5)]
+        Path(f"gel/b{k}.csv").write_text("\n".join([head, *rest, *rows, ""]))
+    assert call("init", "--data", "gel", "--start", "acoustic", "--force").exit_code == 0
+    assert proposed(Path("gel.yaml")).document.data["population"]["of"] == ["G", "alpha", "mu"]

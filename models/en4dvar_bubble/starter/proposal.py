@@ -149,8 +149,8 @@ def propose(
         distance, prior, source = elsewhere.wall(look.lobe.R_max, ratio)
         wall = (Entry("wall", f"{{distance: {distance}}}", source),), (Entry("wall_distance", prior, "of that plane"),)
     sizes = {group: len(looks.keys() & {*names}) for group, names in groups.of.items()}
-    most = max(sizes.values(), default=len(views))
-    together = elsewhere.population([p.name for p in model.law.parameters], most, medium, _in_a_liquid(model), groups)
+    vary = [p.name for p in model.law.parameters] + [R0.name] * (R0 in model.parameters and math.isnan(look.before[0]))
+    together = elsewhere.population(vary, max(sizes.values(), default=len(views)), medium, _in_a_liquid(model), groups)
     return Proposal(
         _data(look, model, {**others, **guess.values}, len(views) == 1),
         (*_model(law_name, model, look), *wall[0]),
