@@ -72,7 +72,7 @@ def near_bounds(space: WeightSpace, linear: Linearisation, mode: Array, posterio
     even = ((np.arange(len(posterior)) + 0.5) * len(draws) / len(posterior)).astype(int)
     members = draws[np.argsort(draws[:, most])[stream.permutation(even)]]
     if space.settings.sampling == "exact":
-        members = with_moments(members, draws.mean(axis=0), np.cov(draws.T))
+        members = with_moments(members, draws.mean(axis=0), np.linalg.cholesky(np.atleast_2d(np.cov(draws.T))).T)
     log = float(np.mean([turn.log for turn in turns[-KEPT:]])) - 0.5 * len(mode) * math.log(2 * math.pi)
     return Drawn(members, bent_cost, log)
 
