@@ -82,11 +82,11 @@ def change_words(names: str, log_factor: float) -> str:
 
 
 @lru_cache(maxsize=256)  # every start and every examination asks for the same few
-def chi2_interval(degrees: float) -> tuple[float, float]:
-    """Central 99.9 % interval of χ² with ``degrees`` degrees of freedom (need not be whole)."""
+def chi2_interval(degrees: float, tail: float = TAIL) -> tuple[float, float]:
+    """Interval of χ² with ``degrees`` degrees of freedom (need not be whole), the probability ``tail`` to each side."""
     from scipy.special import gammaincinv  # scipy is not needed to import the package
 
-    return float(2 * gammaincinv(degrees / 2, TAIL)), float(2 * gammaincinv(degrees / 2, 1 - TAIL))
+    return float(2 * gammaincinv(degrees / 2, tail)), float(2 * gammaincinv(degrees / 2, 1 - tail))
 
 
 def effective_share(log_weights: Array) -> float:

@@ -44,7 +44,7 @@ from en4dvar.schemes.settings import AssimilationSettings
 @dataclass(frozen=True)
 class Ends:
     """An ensemble (N, n), transformed, about the ``mode`` (n,) of J, and what came of running both; how it was drawn
-    where that is no Gaussian: beside bounds, at those of priors, or beside parameters of the errors.
+    where that is no Gaussian: beside bounds, or parameters of the errors.
     """
 
     members: Array

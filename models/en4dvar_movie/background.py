@@ -15,8 +15,8 @@ from en4dvar.plumbing.errors import DataError
 from en4dvar_movie.drifting import drift_of, shift_at
 from en4dvar_movie.fitting import FREE, fit_outline, tells_contrast
 from en4dvar_movie.frames import Frame, Movie
-from en4dvar_movie.outline import THRESHOLD, TILE, Circle, Optics, Outline, circle_through, labelled, locate, rim
-from en4dvar_movie.surfaces import smooth_surface, surface_beside_discs
+from en4dvar_movie.outline import THRESHOLD, TILE, Circle, Optics, Outline, labelled, locate
+from en4dvar_movie.surfaces import is_round, smooth_surface, surface_beside_discs
 
 Image = npt.NDArray[Any]  # brightness (H, W), of any precision
 DEAD = 0.25  # of the brightness about it: where a background shows nothing of a bubble, as writing does
@@ -43,7 +43,6 @@ NOISY = 0.1  # of a pixel's noise: what a contrast can be uncertain by for the n
 SHARPEST = 5  # per cent of the frames: those where the bubble moved least within the exposure
 CLEAR = 4.0  # times the least variance of an edge's width: up to which noise does not make it a sharp one
 BLOB = 120  # pixels: the smallest patch of a first frame that may be a bubble
-ROUND = 0.5  # of a patch and the disc through its rim that both share
 BESIDE, EDGE = 3, 1.5  # pixels about a rim, or along the border, that are compared; std of the blur before that
 FIRST = 0.25  # share of the edges of what changes that tells that the first frame shows a bubble
 DRIFTS = 1.0  # noise of a pixel: means over 3 × 3 pixels that differ by more from frame to frame are dirt that drifts
@@ -146,13 +145,22 @@ def find_background(movie: Movie, circles: int = 1, watched: Mask | None = None)
     if watched is not None:
         blind |= ~watched
     empty = 0 if _begins_with_a_bubble(first, samples, noise, blind, unit) else _quiet(leading, first, noise, blind)
-    level = _without_specks(leading[:empty], noise) if empty else surface_beside_discs(samples, blind, unit)
-    if level is None:
+    of_empty = (_without_specks(leading[:empty], noise), np.zeros_like(blind)) if empty else None
+    beside = of_empty or surface_beside_discs(samples, blind, unit)
+    if beside is None:
         raise DataError(
             f"{movie.path}: no frame is empty, and beside any smooth background hardly anything has a round outline, "
             "as where the bubble covers nearly all of most frames; let the movie begin with an empty frame, or leave "
             "out with --region or --mask what is neither bubble nor background"
         )
+    level, stands = beside
+    if stands.any():
+        blind |= stands
+        patches, sizes = labelled(stands)
+        middles = ndimage.center_of_mass(stands, patches, range(1, len(sizes)))
+        at = " and ".join(f"{x:.0f},{y:.0f}" for y, x in middles)
+        words = f"{movie.path}: what stands still about {at} (x,y) in all frames is no bubble and is not looked at"
+        movie.notes.extend([words] * (words not in movie.notes))
     if empty > 2:
         steady = pixel_noise(np.array([f - level for f in leading[:empty]]), unit)
         noise = steady * float(np.sqrt(empty / (empty - 1)))
@@ -262,7 +270,7 @@ def _begins_with_a_bubble(first: Image, samples: Sequence[Frame], noise: float, 
     usual = float(np.median(np.abs(surface[~blind])))
     far = np.abs(ndimage.uniform_filter(first - surface, 5)) > max(4 * noise, 0.25 * usual)
     labels, sizes = labelled(far & ~blind)
-    large = [n for n in range(1, len(sizes)) if sizes[n] > max(BLOB, 2e-4 * first.size) and _is_round(labels == n)]
+    large = [n for n in range(1, len(sizes)) if sizes[n] > max(BLOB, 2e-4 * first.size) and is_round(labels == n)]
     if not large:
         return False
     if not changed.any():
@@ -288,16 +296,6 @@ def _edges_of_first(first: Image, frame: Image, changed: Mask, noise: float) -> 
     own, other = (np.sum((noise / image[about]) ** 2) / (4 * np.pi * EDGE**4) for image in smooth)  # by noise alone
     change = after - before
     return -float(np.sum(change * before) + own) / max(float(np.sum(change**2) - own - other), float(own + other))
-
-
-def _is_round(patch: Mask) -> bool:
-    """True of a disc and what the frame leaves of it, also of one with a bright centre; not of a stripe."""
-    circle = circle_through(rim(patch))
-    if circle is None:
-        return False
-    j, i = np.indices(patch.shape)
-    disc = (i - circle.x) ** 2 + (j - circle.y) ** 2 < circle.R**2
-    return bool(np.sum(patch & disc) > ROUND * np.sum(patch | disc))
 
 
 def _quiet(leading: Sequence[Frame], first: Image, noise: float, blind: Mask) -> int:

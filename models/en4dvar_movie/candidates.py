@@ -6,7 +6,7 @@ import numpy as np
 
 from en4dvar.model.state import Array
 from en4dvar_movie.background import BRIGHT, CHANGED, Background, share_changed
-from en4dvar_movie.fitting import fit_outline, two_edges
+from en4dvar_movie.fitting import SHARP, fit_outline, two_edges
 from en4dvar_movie.frames import Frame
 from en4dvar_movie.merged import two_circles
 from en4dvar_movie.outline import TILE, Circle, Optics, Outline, locate
@@ -14,10 +14,11 @@ from en4dvar_movie.outline import TILE, Circle, Optics, Outline, locate
 LEAST_SEEN = 0.12  # share of the outline inside the frame
 LEAST_RADIUS = 2.5  # pixels
 ROUGH = 0.08  # of the contrast: scatter about a real outline, beside the noise of the camera
-MOST_BLUR = 0.12  # of the radius, of an outline that the frame cuts
+MOST_BLUR = 0.12  # of the radius, of an outline that the frame cuts, where it is no sharp edge of the movie's
 ROWS, ROWS_STD = 0.5, 6.0  # pixels and std by which even and odd rows must differ in an interlaced frame
 BLURS = 3.0  # widths of the movie's sharp edges that another bubble's blur reaches
 TOUCHES = "two bubbles: the outline of another, or of something else as dark, touches it"
+NO_CIRCLE = "no circle fits the outline"
 WIDER = 1.4  # widths of the movie's sharp edges from which an edge may be two
 
 
@@ -77,7 +78,7 @@ def look_at(
             fault = next((words for o in outlines if (words := _fault_of(o, optics, background.noise))), "")
             doubt = "" if fault else TOUCHES if pair else _doubt(steady, outlines[0], optics, circles)
             candidates.append(Candidate(number, tuple(outlines), fault, doubt))
-    return Look(number, tuple(candidates), "" if candidates else "no circle fits the outline", spot)
+    return Look(number, tuple(candidates), "" if candidates else NO_CIRCLE, spot)
 
 
 def _without(image: Array, other: Circle, optics: Optics) -> Array:
@@ -105,7 +106,7 @@ def _fault_of(outline: Outline, optics: Optics, noise: float) -> str:
         return f"too small: the radius is below {LEAST_RADIUS:g} pixels"
     if outline.seen < LEAST_SEEN:
         return f"cut: {outline.seen:.0%} of the outline lies in the frame"
-    if outline.seen < 0.9 and outline.width > MOST_BLUR * outline.circle.R:
+    if outline.seen < 0.9 and outline.width > max(MOST_BLUR * outline.circle.R, SHARP * optics.width):
         return f"cut and blurred: {outline.seen:.0%} of the outline lies in the frame, and it is no edge"
     if outline.noise > 2.5 * noise + ROUGH * abs(optics.contrast):
         return "the brightness next to the outline is not that of a bubble"

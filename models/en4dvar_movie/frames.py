@@ -37,7 +37,8 @@ class Movie:
 
     ``pixel`` (m) and ``rate`` (1/s) are what the file itself says, NaN where it says nothing. ``notes`` are what
     reading showed that a user should know, ``damaged`` the frames of which it showed that they are not whole, or not
-    there; ``within`` is the name of the file that is being read of a folder.
+    there, ``copies`` those that are the frame before bit for bit, as no camera's noise repeats itself; ``within`` is
+    the name of the file that is being read of a folder.
     """
 
     path: Path
@@ -47,12 +48,14 @@ class Movie:
     rate: float = float("nan")
     notes: list[str] = field(default_factory=list)
     damaged: set[int] = field(default_factory=set)
+    copies: set[int] = field(default_factory=set)
     within: list[str] = field(default_factory=list)
 
     def frames(self) -> Iterator[Frame]:
         """Frames (H, W), all of one shape. Raises :class:`DataError`, which names the frame."""
         shape: tuple[int, ...] = ()
         number, channel = -1, 0
+        before: Frame | None = None
         try:
             for number, read in enumerate(self.open()):
                 if number == 0:
@@ -66,6 +69,10 @@ class Movie:
                 shape = shape or frame.shape
                 if frame.shape != shape:
                     raise DataError(f"{where} is {_size(frame.shape)}, the first {_size(shape)}")
+                same = before is not None and np.array_equal(frame, before) and number not in self.damaged
+                if same and np.median(np.diff(frame) != 0):  # noise, that of a camera
+                    self.copies.add(number)
+                before = frame
                 yield frame
         except En4dvarError:
             raise

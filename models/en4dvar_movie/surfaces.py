@@ -9,7 +9,7 @@ from scipy import ndimage
 
 from en4dvar.model.state import Array, Mask
 from en4dvar_movie.frames import Frame
-from en4dvar_movie.outline import MOST_PATCHES, circle_through, labelled, rim
+from en4dvar_movie.outline import LEAST_CONTRAST, MOST_PATCHES, circle_through, labelled, rim
 
 Image = npt.NDArray[Any]  # brightness (H, W), of any precision
 ROUNDS, LEANINGS = 8, 30  # of a fit that leaves out what is far off, and of one that lies above most
@@ -22,11 +22,18 @@ BETTER = 1 / 3  # of what no disc explains beside the usual surface: what may be
 MOST = 2  # times what no disc explains: what discs must
 DISCS = 0.5  # of what discs explain beside the usual surface: what they must beside another
 UNTOLD = 0.1  # of the frames: what structure that no disc explains may take
+FEW = 5  # per cent of the frames: in which something may be seen, or not seen, that never, or always, is
+BESIDE = 3  # pixels about what never differs: where a rim stands still
+STILL = 0.1  # of a patch: how much of it lies next to such a rim where it stands still
+BLURRED, SHADE = 12, 0.03  # pixels that its blur reaches at most; the share of what differs most that is no blur
+SLENDER = 0.25  # of the field: what stands still before the background takes less
+COVERED, BARE = 0.6, 0.1  # of a ring about its middle: what a bubble always covers of it at least; and of one beyond
+ROUND, DISC = 0.5, 0.8  # of a patch and the disc through its rim that both share, if it is all that tells a bubble
 
 
-def surface_beside_discs(frames: Sequence[Frame], blind: Mask, unit: float) -> Array | None:
-    """A quadratic surface (H, W) through the background of frames that all hold a bubble, where it is not ``blind``.
-    None where beside each of them most of what differs is no disc.
+def surface_beside_discs(frames: Sequence[Frame], blind: Mask, unit: float) -> tuple[Array, Mask] | None:
+    """A quadratic surface (H, W) through the background of frames that all hold a bubble, where it is not ``blind``,
+    and what stands still before it, as a needle. None where beside each of them most of what differs is no disc.
 
     Of three, that beside which discs explain best what differs: the one through what the border usually shows, which a
     bubble may cover, and those that begin as a plane over the brightest and under the darkest that pixels often show.
@@ -41,11 +48,67 @@ def surface_beside_discs(frames: Sequence[Frame], blind: Mask, unit: float) -> A
             over = side * (extreme - _fitted(terms[:3], extreme, ~blind * np.where(over >= 0, 1.0, WITHIN)))
         tops = over[~blind & (over >= np.percentile(over[~blind], TOPS))]
         surfaces.append(_trimmed(terms, extreme, np.abs(over) <= _far(tops, unit), ~blind, unit))
-    discs, rest = np.array([_discs_and_rest(films - surface, ~blind) for surface in surfaces]).T
-    told = discs > np.maximum(MOST * rest, DISCS * discs[0])
-    left = np.where(told | (rest < [UNTOLD, 0, 0]), rest, np.inf)
-    best = int(np.argmin(left * (BETTER, 1, 1)))
-    return surfaces[best] if left[best] < np.inf else None
+    extremes = np.percentile(smooth, (FEW, 50, 100 - FEW), axis=0)
+    still = [_standing(extremes - surface, ~blind, surface) for surface in surfaces]
+    for fields in ([~blind] * len(surfaces), [~blind & ~stands for stands in still]):
+        of_each = zip(surfaces, fields, strict=True)
+        discs, rest = np.array([_discs_and_rest(films - surface, field) for surface, field in of_each]).T
+        told = discs > np.maximum(MOST * rest, DISCS * discs[0])
+        left = np.where(told | (rest < [UNTOLD, 0, 0]), rest, np.inf)
+        best = int(np.argmin(left * (BETTER, 1, 1)))
+        if left[best] < np.inf:
+            return surfaces[best], still[best]
+    return None
+
+
+def _standing(extremes: Array, field: Mask, surface: Array) -> Mask:
+    """What stands still (H, W) and comes from the border: patches that differ in nearly every frame, beside a rim of
+    which nothing differs in more than a few, and which are no disc. Where they are wider than there, a bubble is.
+
+    ``extremes`` (3, H, W): what differs usually, and most in a few frames to both sides.
+    """
+    low, usual, high = extremes
+    most = float(np.max(np.percentile(np.abs(extremes[:, field]), 99, axis=1)))
+    limit = max(DIFFERS * most, LEAST_CONTRAST * float(np.median(np.abs(surface[field]))))
+    border = field & ~ndimage.binary_erosion(field, np.ones((3, 3)))
+    result = np.zeros_like(field)
+    for always, ever, shade in ((-high, -low, -usual), (low, high, usual)):
+        never = field & (ever < limit)
+        beside = ndimage.binary_dilation(never, iterations=BESIDE)
+        labels, sizes = labelled(field & (always > limit))
+        for number in {*labels[border]} & {*np.flatnonzero(sizes >= LEAST)}:
+            patch = labels == number
+            depth, nearest = ndimage.distance_transform_edt(patch, return_indices=True)
+            by_still = patch & beside[tuple(nearest)]
+            if by_still.sum() < STILL * patch.sum() or is_round(patch, DISC):
+                continue
+            core = _core(patch, by_still, field & (ever > limit), float(depth[patch & border].max()))
+            stands = ndimage.binary_opening(patch & ~core, np.ones((3, 3)))
+            off = ndimage.distance_transform_edt(~stands)
+            rings = ((off > n) & (off <= n + 1) & never for n in range(BLURRED))
+            blurred = [float(np.median(shade[ring])) > SHADE * most for ring in rings if ring.any()]
+            result |= off <= [*blurred, False].index(False)
+    return result & (np.mean(result[field]) < SLENDER)  # or the surface is that of the bubble
+
+
+def _core(patch: Mask, by_still: Mask, ever: Mask, width: float) -> Mask:
+    """What a bubble always covers (H, W) of a patch that stands still and reaches into it: a disc about the middle of
+    what it ``ever`` does, if that is wider than half the ``width`` of what stands still. Its rim is seen on the side
+    away from where the patch is ``by_still``."""
+    labels, _ = labelled(ever)
+    room = ndimage.distance_transform_edt(labels == np.max(labels[patch]))
+    y, x = np.unravel_index(np.argmax(room), room.shape)
+    if room[y, x] < width + BESIDE:
+        return np.zeros_like(patch)
+    down, across = np.ogrid[-y : len(patch) - y, -x : patch.shape[1] - x]
+    r = np.hypot(down, across)
+    v, u = np.mean(np.nonzero(by_still), axis=1) - (y, x)
+    away = down * v + across * u <= 0
+    rings = r.astype(int)
+    of_patch, of_all = (np.bincount(rings[part], minlength=rings.max() + 3) for part in (away & patch, away))
+    covered = of_patch / np.maximum(of_all, 1)
+    end = 2 + np.max(np.flatnonzero(covered[: int(room[y, x])] > COVERED), initial=-2)
+    return np.asarray((r < end) & (covered[end] < BARE))
 
 
 def smooth_surface(frames: Sequence[Frame], blind: Mask, unit: float) -> Array:
@@ -101,3 +164,13 @@ def _discs_and_rest(differences: Array, field: Mask) -> tuple[float, float]:
             both, either = both + np.sum(patch & disc), either + np.sum(patch | disc)
     of_all = len(differences) * np.sum(field)
     return both / of_all, (either - both) / of_all
+
+
+def is_round(patch: Mask, share: float = ROUND) -> bool:
+    """True of a disc and what the frame leaves of it, also of one with a bright centre; not of a stripe."""
+    circle = circle_through(rim(patch))
+    if circle is None:
+        return False
+    j, i = np.indices(patch.shape)
+    disc = (i - circle.x) ** 2 + (j - circle.y) ** 2 < circle.R**2
+    return bool(np.sum(patch & disc) > share * np.sum(patch | disc))

@@ -10,7 +10,7 @@ from en4dvar.executor import SerialExecutor, ThreadsExecutor
 from en4dvar.model.state import Mask
 from en4dvar.plumbing.errors import DataError
 from en4dvar_movie.background import Background, find_background
-from en4dvar_movie.candidates import Look, look_at
+from en4dvar_movie.candidates import NO_CIRCLE, TOUCHES, Look, look_at
 from en4dvar_movie.choice import Correction
 from en4dvar_movie.drifting import shift_at
 from en4dvar_movie.flashes import in_time
@@ -80,6 +80,8 @@ def track(
         if number in movie.damaged:
             words = "the frame is missing in the folder" if movie.path.is_dir() else "the file is damaged here"
             return Look(number, (), words)
+        if number in movie.copies:
+            return Look(number, (), "copy: the frame is the one before it, bit for bit")
         start = fixed[number].start if number in fixed else None
         return look_at(number, frame, background, optics, start, len(flashes))
 
@@ -102,6 +104,12 @@ def track(
             f"the camera drifts: the last frame shows the background {across} pixels to the right and {down} down of "
             "where the first does; a region or mask is that of the first frame and moves with it, x and y do not"
         )
+    if movie.copies:
+        notes.append(
+            f"the same, bit for bit, as the frame before, and so not used: {_ranges(sorted(movie.copies))}; if a "
+            "conversion put them in, all later times are late by a frame each: take the movie as the camera saved it, "
+            "or take them out; if they stand for frames that were lost, the times are right"
+        )
     if point is not None and (not bubbles or bubbles[0].distance(*point)[0] > AWAY):
         raise DataError(f"{movie.path}: no bubble is seen near {point[0]:g},{point[1]:g} in any frame")
     share = exposure * movie.rate if len(flashes) == 1 else 0.0
@@ -109,6 +117,11 @@ def track(
         tuple(_readings(looks, bubble, bubbles, fixed if n == 0 else {}, optics, movie.rate, flashes, share))
         for n, bubble in enumerate(bubbles or [Chain(())])
     ]
+    if not background.frames and any(r.reason in (TOUCHES, NO_CIRCLE) for r in read[0]):
+        notes.append(
+            "no frame is empty, and what stands still beside the bubble may have been taken for a part of it: an empty "
+            "frame in front shows what that is, and a tight --mask leaves it out"
+        )
     return Track(read[0], background, optics, flashes, tuple(read[1:]), tuple(notes))
 
 

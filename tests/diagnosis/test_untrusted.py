@@ -152,6 +152,18 @@ def test_a_conflict_tells_both_values_as_they_are_printed():
     assert "mu at" not in found.words
 
 
+def test_a_conflict_of_one_parameter_among_many_is_told():
+    prior = Prior(tuple(PriorTerm.normal(Parameter(f"k_{j}", "1"), 0.0, 1.0) for j in range(12)))
+    centre = np.zeros(12)
+    centre[7] = 4.5
+    (found,) = conflict(prior, centre)
+    assert "(k_7 at 4.5 where the prior says -1 to 1: +4.5 prior standard deviations)" in found.words
+    centre[7] = 3.8
+    assert not list(conflict(prior, centre))
+    draws = np.random.default_rng(1).standard_normal((20000, 12))
+    assert sum(bool(list(conflict(prior, draw))) for draw in draws) < 20  # 10 are expected
+
+
 def test_a_bound_is_told_as_it_is_printed():
     p = Parameter("y0", "m", bounds=(0.0, 1.0), display_unit="mm")
     model = PROVOKED["at-bound"]().problem.model

@@ -151,9 +151,12 @@ def _chance(probability: float) -> str:
 
 
 def conflict(prior: Prior, centre: Array) -> Findings:
-    """A posterior centre (n,) far from the prior: 2 J_b beyond the 99.95 % point of χ²_n."""
-    z, white = (centre - prior.mean) / prior.std, prior.white(centre)
-    if float(white @ white) <= diag.chi2_interval(len(z))[1]:
+    """A posterior centre (n,) far from the prior: 2 J_b beyond what χ²_n exceeds once in 4000, or one of the z² beyond
+    what the largest of n does.
+    """
+    z, white, each = (centre - prior.mean) / prior.std, prior.white(centre), diag.TAIL / 2
+    together, alone = diag.chi2_interval(len(z), each)[1], diag.chi2_interval(1, each / len(z))[1]
+    if float(white @ white) <= together and np.max(z**2) <= alone:
         return
     worst = np.argsort(-np.abs(z))
     far = [j for j in worst if abs(z[j]) > 2] or worst[:1]

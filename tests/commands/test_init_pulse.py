@@ -1,0 +1,76 @@
+"""``en4dvar init`` of bubbles that a pulse made: what is known before the readings, and where the clock lies."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from init_files import call, proposed
+
+from en4dvar.assembly.build import build
+from en4dvar.priors.prior import PriorTerm
+from en4dvar_bubble import simulate as bubble_path
+
+SOFT = {"G": 420.0, "alpha": 0.025, "mu": 0.086, "R0": 0.43e-6}  # agarose of 0.3 and of 1 %: Mancia et al. (2021)
+STIFF = {"G": 6900.0, "alpha": 0.025, "mu": 0.15, "R0": 1.3e-6}
+
+pytestmark = pytest.mark.usefixtures("own_folder")
+
+
+def of_file(gel: dict[str, float], zero: float) -> tuple[float, dict[str, PriorTerm]]:
+    """The proposed ``time_zero`` (s) and priors of a bubble read every µs on a clock that is ``zero`` (µs) late."""
+    times = np.arange(5.6, 34.0, 1.0)
+    radius = 1e6 * bubble_path("quadratic-kelvin-voigt", gel, 1e-6 * times).R[0].values
+    top = int(np.argmax(radius))
+    kept = (np.arange(len(times)) <= top) | (radius > 0.25 * radius[top])
+    readings = radius + np.random.default_rng(2).standard_normal(len(times))
+    rows = [f"{t + zero:.2f},{r:.3f}" for t, r in zip(times[kept], readings[kept], strict=True)]
+    Path("pulse.csv").write_text("\n".join(["t_us,R_um", *rows, ""]))
+    done = call("init", "--data", "pulse.csv", "--start", "acoustic", "--force")
+    assert done.exit_code == 0, done.output
+    config = proposed(Path("pulse.yaml"))
+    (problem,) = build(config)
+    said = config.document.data["data"]["time_zero"]
+    terms = {term.parameter.name: term for term in problem.prior.terms}
+    return (0.0 if said == "file" else 1e-6 * float(said.removesuffix(" us"))), terms
+
+
+def test_of_a_gel_that_a_pulse_stretches_no_prior_is_what_the_readings_say() -> None:
+    """They tell G α/R0: a G that fits with α and R0 at their medians counts what is known of these twice."""
+    soft, stiff = (of_file(gel, 0.0)[1] for gel in (SOFT, STIFF))
+    for name in ("G", "alpha", "mu", "R0"):
+        assert (soft[name].mean, soft[name].std) == (stiff[name].mean, stiff[name].std)
+        for gel in (SOFT, STIFF):
+            assert abs(np.log(gel[name]) - soft[name].mean) < 2 * soft[name].std, name
+
+
+@pytest.mark.parametrize("gel", [SOFT, STIFF], ids=["soft", "stiff"])
+def test_a_guessed_clock_is_as_exact_late_as_early(gel: dict[str, float]) -> None:
+    early, late = (of_file(gel, zero) for zero in (134.26, 12345.26))
+    assert late[0] - early[0] == pytest.approx(12211e-6, abs=0.11e-6)
+    for (proposed_zero, terms), zero in ((early, 134.26e-6), (late, 12345.26e-6)):
+        assert abs(proposed_zero - zero) < 2 * terms["t_s"].std
+
+
+def test_a_window_to_the_end_says_why_it_does_not_end_before() -> None:
+    of_file(STIFF, 0.0)
+    (line,) = (line for line in Path("pulse.yaml").read_text().splitlines() if line.startswith("  window:"))
+    assert "to: end}" in line
+    assert line.endswith("# all readings: none after the maximum is below 20 % of it")
+
+
+def test_bubbles_of_one_gel_grow_from_alike_nuclei() -> None:
+    """Six bubbles do not tell the nuclei of a gel six times as well as what is known: R0 varies, unless it is seen."""
+    Path("gel").mkdir()
+    for k in range(3):
+        of_file(STIFF, 0.01 * k)
+        Path("pulse.csv").rename(f"gel/b{k}.csv")
+    assert call("init", "--data", "gel", "--start", "acoustic").exit_code == 0
+    assert proposed(Path("gel.yaml")).document.data["population"]["of"] == ["G", "alpha", "mu", "R0"]
+    for k in range(3):  # gas at rest before the pulse
+        head, *rows = Path(f"gel/b{k}.csv").read_text().splitlines()
+        rest = [f"{t:.2f},{20 + 0.1 * (-1) ** t:.2f}" for t in range(-12, 5)]
+        Path(f"gel/b{k}.csv").write_text("\n".join([head, *rest, *rows, ""]))
+    assert call("init", "--data", "gel", "--start", "acoustic", "--force").exit_code == 0
+    assert proposed(Path("gel.yaml")).document.data["population"]["of"] == ["G", "alpha", "mu"]
