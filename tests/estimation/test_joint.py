@@ -188,8 +188,7 @@ def test_own_quantities_that_follow_what_is_shared_on_a_bent_line(kind):
     found = estimate.estimate_jointly(sharing(problems, ("a",)), settings, seed=3)
     a = np.linspace(-6, 4, 4001)
     density = np.exp(-0.5 * (a**2 + np.sum((y[:, None] - 0.8 * np.expm1(a)) ** 2, axis=0)))
-    weights = density / density.sum()
-    mean = weights @ a
+    mean = (weights := density / density.sum()) @ a
     std = np.sqrt(weights @ (a - mean) ** 2)
     assert found.members.effective > 50
     assert abs(found.shared.mean() - mean) < 0.2 * std
