@@ -23,11 +23,12 @@ from en4dvar.ensemble.linalg import with_moments
 from en4dvar.model.state import NOISE_SCALE, Array
 from en4dvar.priors.parameter_map import QUANTILE_MAPS
 from en4dvar.priors.prior import Prior, member_stream
-from en4dvar.sampling.emulated_draws import LARGEST, EmulatedProposal
+from en4dvar.sampling.emulated_draws import EmulatedProposal
 from en4dvar.sampling.mixture import StudentMixture
 
 STRAIGHT = 0.995  # effective share of the members for which predictions may as well be linear in x
 LEFT_OUT, KEPT = 3, 6  # turns of the walkers
+MANY = 500  # readings, of which J of all walkers takes seconds, and of correlated ones of four times as many a minute
 
 
 def near_bounds(space: WeightSpace, linear: Linearisation, mode: Array, posterior: Array) -> Drawn | None:
@@ -40,7 +41,7 @@ def near_bounds(space: WeightSpace, linear: Linearisation, mode: Array, posterio
     mixed = problem.discrepancy or any(walk.spread for walk in problem.walks)
     ending = [t.transform in QUANTILE_MAPS and t.parameter.name != NOISE_SCALE.name for t in prior.terms]
     bent = np.flatnonzero(ending).tolist()
-    if mixed or not bent or space.basis.shape[1] < len(mode) or linear.anomalies.shape[1] > LARGEST:
+    if mixed or not bent or space.basis.shape[1] < len(mode) or linear.anomalies.shape[1] > MANY:
         return None
     scale, like = linear.log_scale_anomalies, linear.prediction.each(lambda part: np.asarray(part)[None])
     parts = linear.anomalies, linear.rate_anomalies, None if scale is None else scale[:, None]

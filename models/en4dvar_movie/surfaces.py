@@ -27,7 +27,7 @@ BESIDE = 3  # pixels about what never differs: where a rim stands still
 STILL = 0.1  # of a patch: how much of it lies next to such a rim where it stands still
 BLURRED, SHADE = 12, 0.03  # pixels that its blur reaches at most; the share of what differs most that is no blur
 SLENDER = 0.25  # of the field: what stands still before the background takes less
-COVERED, BARE = 0.6, 0.1  # of a ring about its middle: what a bubble always covers of it at least; and of one beyond
+COVERED, BARE = 0.6, 0.5  # of a ring about its middle: what a bubble always covers of it at least; and of one beyond
 ROUND, DISC = 0.5, 0.8  # of a patch and the disc through its rim that both share, if it is all that tells a bubble
 
 

@@ -14,14 +14,16 @@ SHAPE, CENTRE = (120, 144), (71.4, 60.3)
 RADII = [*(36 * (1 - np.linspace(0, 0.98, 12) ** 2) ** 0.5), 9.0, 11, 10, 7, 5.5, 6.3, 6.8, *[6.5] * 12]
 
 
-def filmed(shade, radii=RADII, centre=CENTRE, seed=1, bright=False):
-    """Frames of discs behind what stands still and lets through all but a ``shade`` (H, W) of the light."""
+def filmed(shade, radii=RADII, centre=CENTRE, seed=1, bright=False, scatter=2.5, stretch=1.0):
+    """Frames of discs, or ellipses ``stretch`` times as wide as high, behind what stands still and lets through all but
+    a ``shade`` (H, W) of the light.
+    """
     noise = np.random.default_rng(seed)
     y, x = np.indices(SHAPE)
     frames = []
     for R in radii:
-        light = 150 - 120 * expit((R - np.hypot(x - centre[0], y - centre[1])) / 0.6)
-        frame = light * (1 - 0.85 * shade) + noise.normal(0, 2.5, SHAPE)
+        light = 150 - 120 * expit((R - np.hypot((x - centre[0]) / stretch**0.5, (y - centre[1]) * stretch**0.5)) / 0.6)
+        frame = light * (1 - 0.85 * shade) + noise.normal(0, scatter, SHAPE)
         frames.append(np.clip(np.rint(255 - frame if bright else frame), 0, 255).astype(np.uint8))
     return frames
 
@@ -98,3 +100,19 @@ def test_a_frame_that_is_there_twice_is_no_second_reading_and_is_told():
     wrong = off(result.readings, np.array(RADII)[twice])
     assert np.sum(np.isfinite(wrong)) >= len(RADII) - 1
     assert np.nanmax(np.abs(wrong)) < 0.15
+
+
+def test_frames_of_a_movie_without_noise_may_be_the_same():
+    texture = np.random.default_rng(3).uniform(0, 0.1, SHAPE)
+    movie = movie_of(filmed(texture, scatter=0.0))
+    result = track(movie)
+    assert not movie.copies
+    assert np.sum(np.isfinite(off(result.readings, RADII))) >= len(RADII) - 1
+
+
+def test_an_ellipse_at_rest_at_a_needle_is_told_from_it():
+    radii = np.array([*np.linspace(34, 15, 6), *(11 + 0.5 * np.sin(np.arange(22)))])
+    result = track(movie_of(filmed(needle(-90, 10, 6), radii, stretch=1.27)))
+    wrong = off(result.readings, radii)
+    assert np.sum(np.isfinite(wrong)) >= len(radii) - 2
+    assert np.nanmax(np.abs(wrong) / [max(r.errors.std, 0.1) if r.used else 1 for r in result.readings]) < 4
