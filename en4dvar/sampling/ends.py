@@ -125,7 +125,7 @@ class _Walk:
 
     def rise(self, side: int, far: float) -> float:
         """Of J on a side, to where it was so far."""
-        return self.costs[side][far] - _lowest(self.costs)
+        return self.costs[side][far] - _least(self.costs)
 
     def short(self, far: float, sides: list[int]) -> list[int]:
         """Those of the ``sides`` beyond whose distance ``far`` there may be a tail."""
@@ -140,7 +140,7 @@ class _Walk:
         distances, roots = [0.0], [0.0]
         for sign, costs in zip((-1, 1), sides[2 * j : 2 * j + 2], strict=True):
             far = sorted(costs)
-            root = [min(2 * END, math.sqrt(2 * max(0.0, costs[d] - _lowest(sides)))) if d else 0.0 for d in far]
+            root = [min(2 * END, math.sqrt(2 * max(0.0, costs[d] - _least(sides)))) if d else 0.0 for d in far]
             slope = max(0.0, root[-1] - root[-2]) / (far[-1] - far[-2])
             root.append(root[-1] + slope * far[-1])
             far.append(2 * far[-1])
@@ -151,7 +151,7 @@ class _Walk:
         return z, shares_of(-0.5 * np.interp(z, np.array(distances)[order], np.array(roots)[order]) ** 2)
 
 
-def _lowest(sides: Costs) -> float:
+def _least(sides: Costs) -> float:
     return min(min(costs.values()) for costs in sides)
 
 

@@ -57,3 +57,4 @@ def test_a_circle_that_the_frame_cuts_is_as_exact_as_before(centre):
 def test_of_an_ellipse_that_the_frame_always_cuts_the_error_holds_the_radius(ratio, angle, centre, noise):
     off, std = readings(ratio, angle, centre, noise)
     assert np.abs(off / std).max() < 2.5
+    assert std.max() < 3 * np.abs(off).max()  # no wider than needed
