@@ -117,6 +117,7 @@ def rms(values):
     return float(np.sqrt(np.mean(np.square(values))))
 
 
+@pytest.mark.slow
 def test_a_known_gel_tells_the_pulse(tmp_path):
     """A twin: p_f is told far better than it was known, and is as far off as its bands say."""
     t, true, found = twin(tmp_path, 5)

@@ -68,6 +68,7 @@ def population(problems, kept, seed=0, **how):
     return population_of(problems, [own.z[:40] for own in kept], ["a"], seed, kept=kept, **{"hyper": HYPER, **how})
 
 
+@pytest.mark.slow
 def test_a_mean_in_the_tails_of_all_is_where_quadrature_has_it():
     """Each reading tells a limit, and few of its draws lie near the mean that all together tell."""
     apart, evidence = [], []
