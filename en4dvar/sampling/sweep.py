@@ -188,12 +188,13 @@ def run_sweep(
 ) -> SweepResult:
     """Fit every data set.
 
-    ``problems``: of one model and the same parameters with the same transforms, whose priors may differ. A prior on
-    ``t_s`` plays no part: the shift is searched within its limits. ``folder``: where finished chunks are kept, and
-    found again by a sweep that continues; the caller clears it. ``progress``: called with the trajectories done and to
-    do. ``earliest``: the instant before which the model has no path; −inf where it has one at any time.
+    ``problems``: of one model and the same parameters with the same transforms, whose priors may differ. Priors on
+    ``t_s`` and on parameters of the errors play no part: the shift is searched within its limits. ``folder``: where
+    finished chunks are kept, and found again by a sweep that continues; the caller clears it. ``progress``: called
+    with the trajectories done and to do. ``earliest``: the instant before which the model has no path; −inf where
+    it has one at any time.
 
-    Raises ConfigError: the data sets do not share a model, fixed values or parameters; nothing but t_s is estimated.
+    Raises ConfigError: the data sets do not share a model, fixed values or parameters; none of these is the model's.
     DataError: no trajectory fits a set; a reading would be compared before ``earliest``.
     """
     executor = executor or SerialExecutor()
@@ -202,7 +203,7 @@ def run_sweep(
         aims = targets([p.observations for p in problems], settings.shift, settings.step, earliest)
     ones = np.ones(len(aims.grid))
     traced = Observations(aims.grid, ones, noise_of(ones, 0 * ones), ones)
-    score = _Score(replace(_without_shift(problems[0]), observations=traced), ranges, aims)
+    score = _Score(replace(_searched(problems[0]), observations=traced), ranges, aims)
     low, high = ranges.low.min(axis=0), ranges.high.max(axis=0)
     design = sobol_box((low + high) / 2, (high - low) / 2, settings.trajectories, seed)
     parts = [design[i : i + settings.chunk] for i in range(0, len(design), settings.chunk)]
@@ -237,18 +238,23 @@ def sobol_box(centre: Array, half: Array, count: int, seed: int) -> Array:
     return np.asarray(centre + (2 * unit - 1) * half)
 
 
-def _searched(problem: InverseProblem) -> tuple[object, ...]:
+def _in_common(problem: InverseProblem) -> tuple[object, ...]:
     """The settings that data sets of one design have in common besides the model."""
     terms = [(t.parameter.name, t.transform, t.bounds, t.shape) for t in problem.prior.terms]
     return terms, problem.fixed, problem.perturbations, problem.tied, problem.observable.name
 
 
-def _without_shift(problem: InverseProblem) -> InverseProblem:
-    """The problem whose control vector is what a sweep searches. Raises :class:`ConfigError` where that is nothing."""
-    terms = tuple(t for t in problem.prior.terms if t.parameter.name != TIME_SHIFT.name)
+def _searched(problem: InverseProblem) -> InverseProblem:
+    """The problem whose control vector is what a sweep searches: neither the time shift nor parameters of the errors.
+
+    Raises :class:`ConfigError` where that is nothing.
+    """
+    apart = {TIME_SHIFT.name, *problem.of_errors}
+    terms = tuple(t for t in problem.prior.terms if t.parameter.name not in apart)
     if not terms:
-        raise ConfigError("only the time shift is estimated; a sweep needs a prior on another parameter")
-    fixed = {name: value for name, value in problem.fixed.items() if name != TIME_SHIFT.name}
+        words = "nothing but a time shift and errors is estimated; a sweep needs a prior on a parameter of the model"
+        raise ConfigError(words)
+    fixed = {name: value for name, value in problem.fixed.items() if name not in apart}
     return replace(problem, prior=problem.prior.of(terms), fixed=fixed)
 
 
@@ -265,12 +271,12 @@ class _Ranges:
         """Raises :class:`ConfigError` where the data sets cannot share a design."""
         first = problems[0]
         for other in problems[1:]:
-            if other.model is not first.model or _searched(other) != _searched(first):
+            if other.model is not first.model or _in_common(other) != _in_common(first):
                 raise ConfigError(
                     "the design is shared: all data sets need one model, the same parameters and the same fixed "
                     f"values, unlike {other.observations.name}"
                 )
-        priors = [_without_shift(p).prior for p in problems]
+        priors = [_searched(p).prior for p in problems]
         mean, std = np.stack([p.mean for p in priors]), np.stack([p.std for p in priors])
         return cls(mean - width * std, mean + width * std, std)
 

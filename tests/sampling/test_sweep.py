@@ -18,7 +18,9 @@ from en4dvar.config import load_config
 from en4dvar.data.noise import noise_of
 from en4dvar.data.observations import Observations
 from en4dvar.executor import ThreadsExecutor
+from en4dvar.model.state import NOISE_SCALE
 from en4dvar.plumbing.errors import ConfigError, DataError
+from en4dvar.priors.prior import PriorTerm
 from en4dvar.sampling.sweep import SweepSettings, best_over_shifts, run_sweep, sobol_box, targets
 from en4dvar_agarose.run import one_model
 
@@ -120,6 +122,19 @@ def test_refinement_never_worsens_and_finds_better(problems, whole):
     assert np.all(refined.nrmse >= whole.nrmse)
     assert np.any(refined.nrmse > whole.nrmse)
     assert refined.trajectories == 192 + 3 * 32 * 3
+
+
+def test_parameters_of_the_errors_are_not_searched(problems, whole):
+    """NRMSE knows no errors: a scale of theirs would be told as if the readings said something of it."""
+    scaled = [
+        replace(problem, prior=problem.prior.of((*problem.prior.terms, PriorTerm.lognormal(NOISE_SCALE, 1.0, 0.4))))
+        for problem in problems
+    ]
+    again = run_sweep(scaled, SMALL, seed=1)
+    assert again.parameters == whole.parameters
+    np.testing.assert_array_equal(again.theta, whole.theta)
+    with pytest.raises(ConfigError, match="nothing but a time shift and errors"):
+        run_sweep([replace(p, prior=p.prior.of(p.prior.terms[-1:])) for p in scaled], SMALL, seed=1)
 
 
 def test_weighted_moments(whole):
