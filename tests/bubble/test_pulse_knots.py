@@ -74,6 +74,7 @@ def test_the_pulse_goes_through_the_knots_and_through_a_trigonometric_polynomial
     np.testing.assert_allclose(more, expected, atol=1e-8 * abs(base.amplitude))
 
 
+@pytest.mark.slow
 def test_paths_are_those_of_a_record_of_the_pulse():
     """Each member's own pulse against the same pressures as a table from a hydrophone."""
     base = histotripsy(**PULSE)

@@ -138,6 +138,7 @@ def search_of(problem, members, seed):
     return found.searched(start, prior_run)[0]
 
 
+@pytest.mark.slow
 def test_a_search_that_does_not_settle_ends_and_is_told(monkeypatch):
     """Sampled or not; here no share of descents that ended alone is small enough."""
     monkeypatch.setattr(search, "UNSEEN", -1.0)

@@ -116,7 +116,7 @@ def by_quadrature(case):
 
 
 CASES = [
-    pytest.param(Case(curved), id="curved"),
+    pytest.param(Case(curved), id="curved", marks=pytest.mark.slow),
     pytest.param(Case(curved, outlier=2.0), id="outlier", marks=pytest.mark.slow),
     pytest.param(Case(cusped), id="cusped", marks=pytest.mark.slow),
     pytest.param(Case(twofold, middle=1.2), id="twofold", marks=[pytest.mark.slow, pytest.mark.long]),

@@ -102,7 +102,7 @@ def test_an_odd_data_set_is_named_where_the_others_are_drawn_anew():
 
 
 def test_draws_taken_anew_are_the_same_on_any_workers():
-    problems, _, kept = campaign(2.0, 1.4, 3)
+    problems, _, kept = campaign(2.0, 1.4, 3, 12)
     apart = []
     for workers in (1, 3):
         with ThreadsExecutor(workers) as executor:

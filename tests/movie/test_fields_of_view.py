@@ -45,7 +45,7 @@ def test_a_bright_bubble_in_the_middle_is_no_field_of_view():
         assert np.abs(off).max() < 0.2
 
 
-@pytest.mark.parametrize("light", [1.0, 1e-6, 1e4])
+@pytest.mark.parametrize("light", [pytest.param(1.0, marks=pytest.mark.slow), 1e-6, 1e4])
 @pytest.mark.parametrize("before", [0, 3])
 @pytest.mark.parametrize("bright", [False, True])
 def test_frames_of_floats_are_read_as_those_of_grey_levels(light, before, bright):

@@ -14,6 +14,7 @@ from en4dvar.plumbing.errors import DataError
 from en4dvar_movie.tracking import track
 
 COLLAPSE = [*(62 * (1 - np.linspace(0, 0.97, 14) ** 2) ** 0.5), 24.0, 32, 36, 37, 36, 32, 25, 20, 24, 26, *[22.0] * 26]
+SEEDS = [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))]
 
 
 def filmed(shape, ratio=1.0, upright=False, off=(0.0, 0.0), radii=COLLAPSE, empty=0, seed=1):
@@ -47,10 +48,10 @@ def wrong(readings, radii):
         pytest.param((96, 128), 1.0, False, (0, 0), marks=pytest.mark.slow),
         pytest.param((96, 128), 1.2, False, (0, 0), marks=pytest.mark.slow),
         ((96, 128), 1.2, True, (0, 0)),
-        ((128, 128), 1.4, False, (0, 0)),
+        pytest.param((128, 128), 1.4, False, (0, 0), marks=pytest.mark.slow),
         pytest.param((128, 96), 1.3, False, (0, 0), marks=pytest.mark.slow),
         pytest.param((64, 192), 1.15, True, (0, 0), marks=pytest.mark.slow),
-        ((112, 160), 1.3, False, (0, 30)),
+        pytest.param((112, 160), 1.3, False, (0, 30), marks=pytest.mark.slow),
         ((112, 160), 1.2, False, (45, 10)),
         pytest.param((84, 92), 1.2, False, (0, 0), marks=pytest.mark.slow),
     ],
@@ -64,7 +65,14 @@ def test_a_large_bubble_of_the_first_frames_is_no_background(shape, ratio, uprig
     assert abs(np.mean(rest) / 22 - 1) < 0.03
 
 
-@pytest.mark.parametrize("radii", [COLLAPSE, COLLAPSE[::-1], [95.0] * 2 + [40.0] * 20 + [30.0] * 3])
+@pytest.mark.parametrize(
+    "radii",
+    [
+        pytest.param(COLLAPSE, marks=pytest.mark.slow),
+        pytest.param(COLLAPSE[::-1], marks=pytest.mark.slow),
+        [95.0] * 2 + [40.0] * 20 + [30.0] * 3,
+    ],
+)
 def test_empty_frames_before_a_bubble_that_the_frame_cuts_are_the_background(radii):
     result = track(movie_of(filmed((96, 128), 1.2, radii=radii, empty=4)))
     assert result.background.frames == 4
@@ -74,7 +82,14 @@ def test_empty_frames_before_a_bubble_that_the_frame_cuts_are_the_background(rad
 MOSTLY_COVERED = [*(90 * (1 - np.linspace(0, 0.97, 20) ** 2) ** 0.5), 30.0, 50, 64, 70, 71, 70, 64, 52, *[60.0] * 32]
 
 
-@pytest.mark.parametrize(("shape", "off"), [((96, 144), (0, 0)), ((112, 160), (10, 6)), ((64, 192), (-9, 2))])
+@pytest.mark.parametrize(
+    ("shape", "off"),
+    [
+        pytest.param((96, 144), (0, 0), marks=pytest.mark.slow),
+        pytest.param((112, 160), (10, 6), marks=pytest.mark.slow),
+        ((64, 192), (-9, 2)),
+    ],
+)
 def test_a_bubble_that_covers_most_of_most_frames_is_read_by_its_arcs(shape, off):
     result = track(movie_of(filmed(shape, off=off, radii=MOSTLY_COVERED)))
     assert result.background.frames == 0
@@ -111,14 +126,14 @@ def glaring(shape, off, radii, glare, depth, dirt, seed, bright=False):
 SLOW_COLLAPSE = [*(54.4 * (1 - np.linspace(0, 0.88, 14) ** 2) ** 0.5), *(30 + 15.5 * np.linspace(0, 1, 8) ** 0.5)]
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", SEEDS)
 def test_a_dark_bubble_with_a_bright_middle_is_not_taken_for_a_bright_one(seed):
     result = track(movie_of(glaring((128, 128), (-9.5, 6.4), SLOW_COLLAPSE, 0.36, 0.39, 0.02, seed)))
     assert wrong(result.readings, SLOW_COLLAPSE) == []
     assert sum(r.used for r in result.readings) > 0.8 * len(SLOW_COLLAPSE)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", SEEDS)
 def test_the_dark_middle_of_a_bubble_that_fills_a_dark_field_is_not_taken_for_the_bubble(seed):
     radii = 52.2 + 1.5 * np.sin(np.arange(12) / 2)
     result = track(movie_of(glaring((127, 112), (0, 0), radii, 0.37, 0.68, 0.08, seed, bright=True)))
@@ -128,7 +143,10 @@ def test_the_dark_middle_of_a_bubble_that_fills_a_dark_field_is_not_taken_for_th
 
 @pytest.mark.parametrize("swing", [0.25, 0.5, 1.28])  # to each side
 @pytest.mark.parametrize(("glare", "dirt"), [(0.0, 0.02), (0.37, 0.02), (0.37, 0.08)])
-@pytest.mark.parametrize(("radius", "shape", "off"), [(42.6, (127, 112), (0, 0)), (25.0, (128, 160), (5, -4))])
+@pytest.mark.parametrize(
+    ("radius", "shape", "off"),
+    [(42.6, (127, 112), (0, 0)), pytest.param(25.0, (128, 160), (5, -4), marks=pytest.mark.slow)],
+)
 def test_a_bright_bubble_whose_edge_moves_by_half_a_pixel_is_no_aperture(radius, shape, off, glare, dirt, swing):
     radii = radius + swing * np.sin(np.arange(12) / 2)
     movie = movie_of(glaring(shape, off, radii, glare, 0.68, dirt, 2, bright=True))

@@ -112,6 +112,7 @@ def test_a_bubble_that_touches_is_told():
     assert all("two bubbles" in words for words in doubtful.values())
 
 
+@pytest.mark.slow
 def test_a_correction_confirms_a_doubtful_frame():
     filmed = film("interlaced", 2)
     _, result = read(filmed)
@@ -121,6 +122,7 @@ def test_a_correction_confirms_a_doubtful_frame():
     assert confirmed.reason == "by hand: looked at"
 
 
+@pytest.mark.slow
 def test_all_bubbles_by_the_command(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     filmed = film("side by side, pointed at", 0)

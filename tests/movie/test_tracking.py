@@ -136,6 +136,7 @@ def test_stated_errors_of_a_small_bubble_are_at_most_twice_the_real_ones():
     assert 0.5 < np.median(np.abs(scores)) / 0.674 < 1.3
 
 
+@pytest.mark.slow
 def test_what_a_lasting_shape_hides_is_one_factor_of_all_radii():
     """Ellipsoids that keep their shape: what is not seen of them is no scatter, and their readings do not scatter."""
     off, scatter = [], []
