@@ -43,7 +43,7 @@ class Preview:
         observations = self.problem.observations
         alive = self.run.predictions[self.run.active]
         if not len(alive):
-            return 1.0
+            return 0.0  # nothing is expected
         low, high = alive.min(axis=0) - 2 * observations.std, alive.max(axis=0) + 2 * observations.std
         return float(np.mean((observations.values < low) | (observations.values > high)))
 

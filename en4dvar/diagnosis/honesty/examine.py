@@ -88,9 +88,11 @@ def _beside(a: Analysis) -> set[str]:
 def doubts(problem: InverseProblem, members: Array, predicted: Array) -> Sequence[Caution]:
     """The model's doubts about the observations, serious ones where it does not say.
 
-    Beside prior ``members`` (N, n), physical, and their predictions (N, K), NaN where one failed.
+    Beside prior ``members`` (N, n), physical, and their predictions (N, K), NaN where one failed; none where all did.
     """
     y, alive = problem.observations, np.all(np.isfinite(predicted), axis=1)
+    if not alive.any():
+        return ()
     values = {name: np.full(alive.sum(), value) for name, value in problem.fixed.items()}
     values |= dict(zip(problem.prior.names, members[alive].T, strict=True))
     return [
