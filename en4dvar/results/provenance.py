@@ -1,9 +1,7 @@
 """Where a result comes from: versions, platform, commit, configuration, as attributes of the file that holds it; and
-what decides the numbers of a run, as text that can be compared: a run is continued only where it agrees.
-
-The latter: configuration (without ``execution`` and ``output``, which never change the numbers), versions of the
-numerical packages, sources of the framework and of the model, files that the model's settings name, content of the data
-files.
+what decides the numbers of a run, as text that must agree where a run is continued: configuration (without
+``execution`` and ``output``, which never change the numbers), versions of the numerical packages, sources of the
+framework and of the model, files that the model's settings name, content of the data files.
 """
 
 import difflib
@@ -32,11 +30,10 @@ PACKAGES = ("en4dvar", "numpy", "scipy", "numba", "xarray", "netCDF4", "pydantic
 
 
 def provenance(config_text: str, config_path: str | Path | None = None, command: str = "") -> dict[str, str]:
-    """ACDD and provenance attributes of a result. ``config_text``: the configuration, verbatim; ``config_path``: its
-    file, of which the commit is recorded; ``command``: what the user typed, for ``history``.
+    """ACDD and provenance attributes of a result; what cannot be found out (no git, an installed package) is "".
 
-    Nothing here fails: what cannot be found out (no git, an installed package) is left as an empty string.
-    """
+    ``config_text``: the configuration, verbatim; ``config_path``: its file, of which the commit is recorded;
+    ``command``: what the user typed, for ``history``."""
     now = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
     versions = package_versions(PACKAGES)
     return {
