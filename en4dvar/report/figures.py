@@ -311,7 +311,7 @@ def _stored_walk(result: StoredResult, name: str) -> StoredWalk:
         values = values[result.alive] if group == "posterior" else values
         values = values[np.isfinite(values).all(axis=1)]
         there = values if len(values) else np.full((1, len(begins)), np.nan)
-        return shown(pieces, member_quantiles(there, (0.05, 0.5, 0.95), axis=0))
+        return shown(pieces, member_quantiles(there, BAND, axis=0))
 
     after = quantiles("posterior")
     if untrusted(result.cautions, name):

@@ -17,7 +17,7 @@ from en4dvar.report.history import withheld_words
 from en4dvar.report.html import render
 from en4dvar.report.responses import exceeding, stored_ledger, stored_shifts
 from en4dvar.report.svg import draw
-from en4dvar.report.text import number_like, plain_number, shown
+from en4dvar.report.text import number_like, plain_number, range_words, shown
 from en4dvar.results.store import StoredResult
 from en4dvar.results.variables import ITERATIONS, SHARES
 
@@ -164,11 +164,9 @@ def _modes(result: StoredResult) -> list[tuple[str, ...]]:
         of = {key: float(stats[f"mode_{key}"].values[k]) for key in ("weight", "cost", "cost_spread", "descents")}
         centre = []
         for j, (row, v) in enumerate(zip(result.rows, result.parameters.values(), strict=True)):
-            at, low, high = (
-                number_like(float(shown(v, stats[f"mode_{key}"].values[k, j])), row.std)
-                for key in ("centre", "q05", "q95")
-            )
-            centre.append(f"{at} ({low} … {high})")
+            keys = ("mode_centre", "mode_q05", "mode_q95")
+            at, low, high = (float(shown(v, stats[key].values[k, j])) for key in keys)
+            centre.append(f"{number_like(at, row.std)} ({range_words(low, high, row.std)})")
         spread = f" (they were ended within {of['cost_spread']:.2g} of its J)" if of["cost_spread"] else ""
         rows.append((f"{of['weight']:.2f}", f"{of['cost']:.2f}", f"{of['descents']:.0f}{spread}", *centre))
     return rows

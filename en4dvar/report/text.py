@@ -94,9 +94,14 @@ def number_like(value: float, std: float) -> str:
     return text.lstrip("-") if float(text) == 0 else text.replace("-", "−")
 
 
+def quantity(value: float, std: float, unit: str = "1") -> str:
+    """``"2.80 kPa"``, with the decimals that the std calls for."""
+    return f"{number_like(value, std)}{unit_behind(unit)}"
+
+
 def range_words(low: float, high: float, std: float, unit: str = "1") -> str:
     """``"2.6 … 3.0 kPa"``, with the decimals that the std calls for."""
-    return f"{number_like(low, std)} … {number_like(high, std)}{unit_behind(unit)}"
+    return f"{number_like(low, std)} … {quantity(high, std, unit)}"
 
 
 def plus_minus(mean: float, std: float) -> str:
@@ -155,9 +160,10 @@ def since(zero: float, unit: str) -> str:
     return with_unit(f"time since {zero:.6g}{unit_behind(unit)} of the data" if zero else "time", unit)
 
 
-def time_axis(time: Variable) -> str:
-    """Of an axis of times of readings of a result file."""
-    return since(float(shown(time, zero_of(time))), str(time.attrs["display_units"]))
+def time_axis(*times: Variable) -> str:
+    """Of an axis of times of readings of a result file; of clocks that begin at other times it is the model's alone."""
+    zeros = {float(shown(time, zero_of(time))) for time in times}
+    return since(zeros.pop() if len(zeros) == 1 else 0.0, str(times[0].attrs["display_units"]))
 
 
 def figure_text(name: str) -> str:
