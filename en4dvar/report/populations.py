@@ -315,17 +315,15 @@ def sentences(c: PopulationsCompared) -> Iterator[str]:
 
 
 def _sentence(d: Difference) -> str:
-    unit = unit_behind(d.unit)
-    by = f"{_range(d.difference, plain=True)}{unit} more"
-    if d.difference[1] < 0:
-        low, middle, high = (-value for value in d.difference)
-        by = f"{_range((high, middle, low), plain=True)}{unit} less"
+    low, middle, high = d.difference
+    by, more = (d.difference, "more") if middle >= 0 else ((-high, -middle, -low), "less")
+    difference = f"{_range(by, plain=True)}{unit_behind(d.unit)} {more}"
     sure, side = (d.greater, "larger") if d.greater >= 0.5 else (1 - d.greater, "smaller")
     chance = f"over {SURE}" if sure > SURE else f"{sure:.3f}" if sure > 0.99 else f"{sure:.2f}"
     if d.is_ratio:
-        words = f"{d.parameter} of {d.first} is {_range(d.ratio)} times that of {d.second}, and {by}"
+        words = f"{d.parameter} of {d.first} is {_range(d.ratio)} times that of {d.second}, and {difference}"
     else:
-        words = f"{d.parameter} of {d.first} is {by} than that of {d.second}"
+        words = f"{d.parameter} of {d.first} is {difference} than that of {d.second}"
     words += f"; it is {side} with probability {chance}"
     alone = range_words(d.apart[0], d.apart[2], _std(d.apart), "1" if d.is_ratio else d.unit)
     words += f" (were nothing common: {alone}{' times' * d.is_ratio})"

@@ -105,8 +105,8 @@ def last_analysis(data: Group) -> Iterator[tuple[str, float, float, str]]:
 def cycles_table(file: Path, kind: Kind) -> str:
     """A table of the result file of a sequence or a twin experiment as text, in display units. ``csv``: a line for each
     time and variable of the state, mean and std of each estimate, and the truth; ``members``: for each member and time
-    that is kept; ``latex``: for each variable of the last analysis. Raises :class:`OutputError`: it is damaged, or of a
-    twin experiment, which holds no members."""
+    that is kept (a twin experiment has none: :class:`OutputError`); ``latex``: for each variable of the last analysis.
+    """
     data = read_groups(file)["/"]
     if kind == "members" and "members" not in data:
         raise OutputError(f"{file}: a twin experiment keeps no members; --csv has each variable's mean and std in time")

@@ -17,22 +17,11 @@ from en4dvar.estimation.summary import ParameterSummary, estimate_cells, results
 from en4dvar.plumbing.caution import Caution, parsed, untrusted
 from en4dvar.plumbing.files import write_text
 from en4dvar.plumbing.tables import table, write_csv
+from en4dvar.report import text
 from en4dvar.report.chart import COLUMN, PAGE, POINTS, Chart, Panel, in_columns
 from en4dvar.report.export import Found, latex_table
 from en4dvar.report.html import write_page
 from en4dvar.report.svg import svg
-from en4dvar.report.text import (
-    axis_label,
-    figure_text,
-    percent,
-    plain_number,
-    plus_minus,
-    quantity,
-    range_words,
-    shown,
-    unit_behind,
-    with_unit,
-)
 from en4dvar.results.declared import parameter_of
 from en4dvar.results.together import JOINT, POPULATION, QUANTILES, StoredGroups, StoredJoint, StoredPopulation
 
@@ -87,9 +76,9 @@ def _as_stated(joint: StoredJoint, name: str) -> bool:
 def _row(
     cautions: Sequence[Caution], name: str, draws: xr.DataArray, prior: xr.DataArray | None = None
 ) -> ParameterSummary:
-    before = NOTHING if prior is None else shown(prior).ravel()
+    before, after = (NOTHING if draw is None else text.shown(draw).ravel() for draw in (prior, draws))
     centre, learned = float(np.median(draws.values)), float(draws.attrs.get("learned", np.nan))
-    return ParameterSummary.of(parameter_of(name, draws.attrs), before, shown(draws).ravel(), centre, learned, cautions)
+    return ParameterSummary.of(parameter_of(name, draws.attrs), before, after, centre, learned, cautions)
 
 
 def joint_lines(joint: StoredJoint) -> list[str]:
@@ -129,25 +118,24 @@ def forest(
     Where the posterior has the parameter for each data set too, that is drawn below.
     """
     alone, posterior, count = groups.group("alone"), groups.group("posterior"), len(datasets)
-    named = count <= 60
+    ticks, labels = (range(0, -count, -1), [text.figure_text(d) for d in datasets]) if count <= 60 else ((), ())
     panels = []
     for name, draws in common.items():
-        low, middle, high = shown(draws, member_quantiles(draws.values, QUANTILES))
-        panel = Panel(axis_label(draws), ylim=(-float(count), 1.0))
-        panel.yticks, panel.y_names = (range(0, -count, -1), [figure_text(d) for d in datasets]) if named else ((), ())
+        low, middle, high = text.shown(draws, member_quantiles(draws.values, QUANTILES))
+        panel = Panel(text.axis_label(draws), ylim=(-float(count), 1.0), yticks=ticks, y_names=labels)
         doubted = bool(untrusted(groups.cautions, name))
         if not doubted:
             panel.band([low, high], np.full(2, -count), np.ones(2), "posterior", 0.2)
         panel.line([middle, middle], [-count, 1], *(("centre", 0.9, "--") if doubted else ("posterior",)))
         if reference and name in reference:
-            value = float(shown(draws, reference[name][0]))
+            value = float(text.shown(draws, reference[name][0]))
             panel.line([value, value], [-count, 1], "ink", dash=":")
-        rows = shown(draws, alone[name].values)
+        rows = text.shown(draws, alone[name].values)
         has = np.flatnonzero(np.isfinite(rows[:, 1]))
         panel.intervals(rows[has, 0], rows[has, 2], -has, "prior")
         panel.dots(rows[has, 1], -has, "prior", 3.0)
         if "dataset" in posterior.get(name, draws).dims:
-            low, middle, high = shown(draws, member_quantiles(posterior[name].values[0], QUANTILES, axis=0))
+            low, middle, high = text.shown(draws, member_quantiles(posterior[name].values[0], QUANTILES, axis=0))
             if not doubted:
                 panel.intervals(low[has], high[has], -has - 0.3, "posterior")
                 panel.dots(middle[has], -has - 0.3, "posterior", 2.0)
@@ -166,8 +154,8 @@ def fits(joint: StoredJoint) -> Chart | None:
     for name in followed[:MOST_FITS]:
         curve = fit.sel(dataset=name)
         times, low, middle, high = curve["band"].values.T
-        label = with_unit(str(curve["observable"].item()), str(curve["unit"].item()))
-        panel = Panel(with_unit("time", str(curve["time_unit"].item())), label, title=figure_text(name))
+        label = text.with_unit(str(curve["observable"].item()), str(curve["unit"].item()))
+        panel = Panel(text.with_unit("time", str(curve["time_unit"].item())), label, title=text.figure_text(name))
         panel.band(times, low, high, "posterior", 0.25)
         panel.line(times, middle, "posterior")
         panel.dots(curve["time"].values, curve["value"].values, "ink", 1.8)
@@ -251,11 +239,11 @@ def sentences(stored: StoredPopulation) -> tuple[str, ...]:
 
 
 def _range(row: ParameterSummary) -> str:
-    return range_words(row.q05, row.q95, row.std, row.unit)
+    return text.range_words(row.q05, row.q95, row.std, row.unit)
 
 
 def _median(row: ParameterSummary) -> str:
-    return quantity(row.q50, row.std, row.unit)
+    return text.quantity(row.q50, row.std, row.unit)
 
 
 def _sentence(
@@ -269,7 +257,7 @@ def _sentence(
     draws = [stored.group("posterior")[f"{centre.name}_{what}"] for what in ("mean", "between")]
     logarithmic = _logarithmic(draws[0])
     if logarithmic:
-        low, middle, high = map(percent, np.quantile(draws[1].values / draws[0].values, (0.05, 0.5, 0.95)))
+        low, middle, high = map(text.percent, np.quantile(draws[1].values / draws[0].values, (0.05, 0.5, 0.95)))
         spread = f"{middle} ({low} … {high})"
     what = "median (geometric mean)" if logarithmic and stored.headline == "median" else stored.headline
     words = f"{centre.label} {centre.name} = {_median(centre)} (5–95 %: {_range(centre)}), "
@@ -285,19 +273,19 @@ def _compared(stored: StoredPopulation, centre: ParameterSummary) -> Iterator[st
     if centre.name not in stored.reference:
         return
     posterior = stored.group("posterior")[f"{centre.name}_{stored.headline}"]
-    value, std = map(float, shown(posterior, stored.reference[centre.name]))
+    value, std = map(float, text.shown(posterior, stored.reference[centre.name]))
     source = str(stored.tree.attrs.get("reference_source", ""))
-    stated = plus_minus(value, std) if std == std else plain_number(value, 4)
-    below = float(np.mean(shown(posterior) < value))
-    words = f"reference: {centre.name} = {stated}{unit_behind(centre.unit)}{f', {source}' if source else ''}"
+    stated = text.plus_minus(value, std) if std == std else text.plain_number(value, 4)
+    below = float(np.mean(text.shown(posterior) < value))
+    words = f"reference: {centre.name} = {stated}{text.unit_behind(centre.unit)}{f', {source}' if source else ''}"
     side, chance = ("below", below) if below > 0.5 else ("above", 1 - below)
     yield f"{words}; the estimate lies {side} it with probability {chance:.2f}."
 
 
 def _in_parts(stored: StoredPopulation, mean: ParameterSummary, of: xr.DataArray, std: float) -> str:
     """What the interval is made of, where data sets have anything in common."""
-    stds = map(float, shown(of, [of.attrs["std_between"], of.attrs["std_common"]]))
-    between, common = (quantity(part, std, mean.unit) for part in stds)
+    stds = map(float, text.shown(of, [of.attrs["std_between"], of.attrs["std_common"]]))
+    between, common = (text.quantity(part, std, mean.unit) for part in stds)
     return (
         f"Of it ± {between} is from the data sets and how they differ, and ± {common} from what they have in common "
         f"({', '.join(stored.common)}), which more of them do not reduce."
@@ -307,12 +295,12 @@ def _in_parts(stored: StoredPopulation, mean: ParameterSummary, of: xr.DataArray
 def _of_sets(stored: StoredPopulation, centre: ParameterSummary) -> str:
     """The median over the data sets one by one, which needs no model of how they vary."""
     of = stored.group("empirical")[centre.name]
-    low, middle, high = shown(of)
+    low, middle, high = text.shown(of)
     std = (high - low) / 3.29
     words = (
         f"the median of {len(stored.datasets)} data sets one by one is {centre.name} = "
-        f"{quantity(middle, std, centre.unit)} (5–95 %: {range_words(low, high, std)}), where each counts by the share "
-        "of its prior's variance that its data took away"
+        f"{text.quantity(middle, std, centre.unit)} (5–95 %: {text.range_words(low, high, std)}), where each counts by "
+        "the share of its prior's variance that its data took away"
     )
     parts = _in_parts(stored, centre, of, std).removesuffix(".") if centre.untrusted and stored.common else ""
     return f"{words}. {parts}" if parts else words
@@ -323,9 +311,9 @@ def _together(stored: StoredPopulation, combination: Combination) -> str:
     names = " and ".join(name for name, _ in combination.parts)
     if not all(_logarithmic(stored.group("posterior")[f"{name}_mean"]) for name, _ in combination.parts):
         return f"{names}: the data determine a combination of them, and less of each."
-    powers = ((name, quantity(exponent, 0.1)) for name, exponent in combination.parts)
+    powers = ((name, text.quantity(exponent, 0.1)) for name, exponent in combination.parts)
     product = " · ".join(name if power == "1.00" else f"{name}^{power}" for name, power in powers)
-    return f"{names}: the data determine {product}, to {percent(combination.std)}, and less of each."
+    return f"{names}: the data determine {product}, to {text.percent(combination.std)}, and less of each."
 
 
 def _logarithmic(draws: xr.DataArray) -> bool:

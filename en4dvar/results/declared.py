@@ -24,7 +24,8 @@ _PLACEHOLDER = re.compile(r"\{(\w+)\}")
 @dataclass(frozen=True)
 class Item:
     """A parameter, a series or the like that has variables: ``held``, the object that their values are taken from;
-    ``names`` in place of placeholders; ``label``, in prose; ``about``: ``units``, ``symbol`` and so on."""
+    ``names`` in place of placeholders; ``label``, in prose; ``about``: ``units``, ``symbol`` and so on.
+    """
 
     held: Any
     names: Mapping[str, str]
@@ -40,7 +41,8 @@ Scopes = Mapping[str, Callable[[Any], Iterable[Item]]]
 @dataclass(frozen=True)
 class UnitRule:
     """The unit of a variable and how it is shown: ``words`` for the reference page, ``attributes`` of a subject and an
-    item, and ``keys`` of them that are in every file."""
+    item, and ``keys`` of them that are in every file.
+    """
 
     words: str
     attributes: Callable[[Any, Item], Mapping[str, Any]]
@@ -64,7 +66,8 @@ ALWAYS = When("", lambda _, item: True)
 class Declared:
     """A variable. ``meaning``: its ``long_name``, with ``{label}`` for that of the item. ``values``: of a subject and,
     where the name has a placeholder, of an item. ``needed``: no result is without it. ``fill`` and ``single`` as of
-    :class:`~en4dvar.results.netcdf.Variable`."""
+    :class:`~en4dvar.results.netcdf.Variable`.
+    """
 
     name: str
     dims: str
@@ -114,12 +117,13 @@ def lay_out(table: Table, subject: Any, scopes: Scopes) -> dict[str, Variable]:
 
 
 def group_of(
-    variables: Mapping[str, Variable], coordinates: Mapping[str, Variable], attributes: Mapping[str, Any] | None = None
-) -> Group:
-    """A group of variables with those of the coordinates that belong to their dimensions."""
+    variables: Mapping[str, Variable], coordinates: Mapping[str, Variable], about: Iterable[Attribute], subject: Any, /,
+    **more: Any,
+) -> Group:  # fmt: skip
+    """A group of variables with the coordinates that belong to their dimensions, and attributes of the subject."""
     dims = dict.fromkeys(dim for variable in variables.values() for dim in variable.dims)
     own = {dim: coordinates[dim] for dim in dims if dim in coordinates}
-    return Group(variables, own, netcdf_attributes(attributes or {}))
+    return Group(variables, own, netcdf_attributes(attributes_of(about, subject) | more))
 
 
 def attributes_of(table: Iterable[Attribute], subject: Any) -> dict[str, Any]:

@@ -33,7 +33,8 @@ class StoppedError(Exception):
 class Journal(Executor):
     """An ``executor`` of forward runs that are not made where they are known from ``before``. ``keeper`` writes them to
     a file, unless this worker does not see its folder. ``stop`` gives the data set up at its next forecast (within one
-    process only)."""
+    process only).
+    """
 
     def __init__(
         self, executor: Executor, before: KnownRuns = KnownRuns(), keeper: Keeper | None = None,

@@ -33,7 +33,8 @@ def provenance(config_text: str, config_path: str | Path | None = None, command:
     """ACDD and provenance attributes of a result; what cannot be found out (no git, an installed package) is "".
 
     ``config_text``: the configuration, verbatim; ``config_path``: its file, of which the commit is recorded;
-    ``command``: what the user typed, for ``history``."""
+    ``command``: what the user typed, for ``history``.
+    """
     now = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
     versions = package_versions(PACKAGES)
     return {

@@ -28,17 +28,7 @@ from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.caution import Caution, parsed
 from en4dvar.plumbing.errors import OutputError, retold
 from en4dvar.plumbing.units import UnitError, convert
-from en4dvar.results.declared import (
-    MEMBER,
-    Axis,
-    Declared,
-    attributes_of,
-    axes_of,
-    group_of,
-    lay_out,
-    parameter_of,
-    zero_of,
-)
+from en4dvar.results.declared import MEMBER, Axis, Declared, axes_of, group_of, lay_out, parameter_of, zero_of
 from en4dvar.results.netcdf import Group, Groups, Variable, read_groups, understood
 from en4dvar.results.pack import PACK, read_result, unpacked
 from en4dvar.results.scalars import ATTRIBUTES, SCALAR
@@ -223,11 +213,11 @@ def load_stored(path: str | Path) -> StoredResult:
 def build_groups(a: Analysis, attributes: Mapping[str, Any]) -> dict[str, Group]:
     """All groups of an analysis by path; ``attributes`` are added to the root's and win over the defaults."""
     coordinates = lay_out(COORDINATES, a, SCOPES)
-    groups = {"/": group_of({}, {}, {**attributes_of(ATTRIBUTES["/"], a), **attributes})}
+    groups = {"/": group_of({}, {}, ATTRIBUTES["/"], a, **attributes)}
     for path, table in GROUPS.items():
         variables = lay_out(table, a, SCOPES)
         if variables or path not in OPTIONAL:
-            groups[path] = group_of(variables, coordinates, attributes_of(ATTRIBUTES.get(path, ()), a))
+            groups[path] = group_of(variables, coordinates, ATTRIBUTES.get(path, ()), a)
     return groups
 
 
