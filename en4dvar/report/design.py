@@ -177,7 +177,8 @@ def gains(designs: Designs) -> Chart:
         rows = [row for row in ranked(designs) if name in row.settings or name == "experiments"]
         values = [row.settings.get(name, row.evaluated.alike) for row in rows]
         x, labels, unit = _positions(values)
-        worth, errors = np.array([(row.evaluated.worth, row.evaluated.worth_error) for row in rows]).T
+        worth = np.array([row.evaluated.worth for row in rows])
+        errors = np.array([row.evaluated.worth_error for row in rows])
         panel = Panel(figure_text(name) + unit, "information [nats]", names=labels)
         if labels:
             panel.xticks = range(len(labels))

@@ -42,14 +42,18 @@ _ESCAPES |= {"–": "--", "—": "---", "…": r"\dots{}"}
 def export_table(run_dir: str | Path, kind: Kind = "csv") -> str:
     """A table of a run directory as text, in display units.
 
-    ``csv``: a line for each data set and parameter (prior, mean, std, 5/50/95 %, centre, DFS), every digit kept;
-    ``members``: a line for each data set and living posterior member, a column a parameter; ``latex``: for a paper
-    (package booktabs) mean ± std, or of a skewed posterior the median with its 5 and 95 %, a row a parameter, or of
-    several data sets a row each. Warnings come along: in a column of the CSV, as footnotes in LaTeX, where notes are
-    comments. A number that is not to be trusted stands without an interval.
+    Parameters
+    ----------
+    kind: ``csv``: a line for each data set and parameter (prior, mean, std, 5/50/95 %, centre, DFS), every digit kept;
+        ``members``: a line for each data set and living posterior member, a column a parameter; ``latex``: for a paper
+        (package booktabs) mean ± std, or of a skewed posterior the median with its 5 and 95 %, a row a parameter, or
+        of several data sets a row each. Warnings come along: in a column of the CSV, as footnotes in LaTeX, where notes
+        are comments. A number that is not to be trusted stands without an interval.
 
-    Raises :class:`ConfigError`: an unknown kind. :class:`OutputError`: the directory holds no results.
-    :class:`LackingError`: it lacks some, which are named; ``rest`` is the table of the others.
+    Raises
+    ------
+    ConfigError: an unknown kind. OutputError: the directory holds no results. LackingError: it lacks some, which are
+        named; ``rest`` is the table of the others.
     """
     if kind not in get_args(Kind):
         raise ConfigError(f"no kind of table is called {shown(kind)}{suggest(kind, get_args(Kind))}")

@@ -51,10 +51,9 @@ class Frame:
 
 def _share(values: Array, limits: tuple[float, float], logarithmic: bool) -> Array:
     low, high = limits
-    if not logarithmic:
-        return (values - low) / (high - low)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(np.log(values / low) / math.log(high / low))
+        share = np.log(values / low) / math.log(high / low) if logarithmic else (values - low) / (high - low)
+    return np.asarray(share)
 
 
 def svg(chart: Chart, name: str, description: str) -> Markup:

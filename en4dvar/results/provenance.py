@@ -44,7 +44,7 @@ def provenance(config_text: str, config_path: str | Path | None = None, command:
         "configuration": config_text,
         "configuration_file": Path(config_path).name if config_path else "",
         "configuration_git_commit": git_commit(Path(config_path)) if config_path else "",
-        "git_commit": _own_commit(),
+        "git_commit": _kept_commit(Path(__file__)),
         "package_versions": ", ".join(f"{name} {v}" for name, v in versions.items()),
         "python_version": platform.python_version(),
         "platform": f"{platform.system()} {platform.release()} {platform.machine()}",
@@ -64,11 +64,6 @@ def package_versions(names: Iterable[str]) -> dict[str, str]:
 _version = cache(metadata.version)  # modules stay what they were when they were imported
 
 
-@cache
-def _own_commit() -> str:
-    return git_commit(Path(__file__))
-
-
 def git_commit(path: Path) -> str:
     """Commit of the repository that tracks ``path``, with ``+changes`` where the work tree differs; "" if none."""
     folder = path.resolve().parent
@@ -77,6 +72,9 @@ def git_commit(path: Path) -> str:
     commit = _git(folder, "rev-parse", "HEAD")
     changed = commit and _git(folder, "status", "--porcelain", "--untracked-files=no")
     return f"{commit}+changes" if changed else commit
+
+
+_kept_commit = cache(git_commit)  # of this package, as it was imported
 
 
 def _git(folder: Path, *arguments: str) -> str:

@@ -118,11 +118,7 @@ LEDGER = When("a model with quantities of its path", lambda a, _: a.ledger is no
 
 def of_series(values: Callable[[Any], Any]) -> Callable[[Analysis, Item], Array]:
     """The part of a series of numbers (…, K) of all readings."""
-
-    def part(a: Analysis, item: Item) -> Array:
-        return np.asarray(values(a))[..., item.held.where]
-
-    return part
+    return lambda a, item: np.asarray(values(a))[..., item.held.where]
 
 
 # Members, predictions, readings, iterations
@@ -272,16 +268,12 @@ MEMBERS = (
 )  # fmt: skip
 
 
-def _whitened(key: str) -> Callable[[Analysis, Item], Array]:
-    """A property of the residuals; NaN where a reading does not count."""
-
-    def of_all(a: Analysis) -> Array:
-        row = np.full(len(a.observations), np.nan)
-        if a.residuals is not None:
-            row[a.residuals.which] = getattr(a.residuals, key)
-        return row
-
-    return of_series(of_all)
+def _of_residuals(a: Analysis, key: str) -> Array:
+    """A property of theirs; NaN where a reading does not count."""
+    row = np.full(len(a.observations), np.nan)
+    if a.residuals is not None:
+        row[a.residuals.which] = getattr(a.residuals, key)
+    return row
 
 
 def _prior_distance(a: Analysis) -> Array:
@@ -290,12 +282,12 @@ def _prior_distance(a: Analysis) -> Array:
 
 
 READINGS = (
-    Declared("{series}_whitened_residual", "{time}", "whitened residual at the minimum of J", _whitened("white"),
-             when=WHITENED),
+    Declared("{series}_whitened_residual", "{time}", "whitened residual at the minimum of J",
+             of_series(lambda a: _of_residuals(a, "white")), when=WHITENED),
     Declared("{series}_studentised", "{time}", "whitened residual over its own expected std",
-             _whitened("studentised"), when=WHITENED),
-    Declared("{series}_leverage", "{time}", "share of the reading in its own prediction", _whitened("leverage"),
-             when=WHITENED),
+             of_series(lambda a: _of_residuals(a, "studentised")), when=WHITENED),
+    Declared("{series}_leverage", "{time}", "share of the reading in its own prediction",
+             of_series(lambda a: _of_residuals(a, "leverage")), when=WHITENED),
     Declared("{series}_discrepancy", "{time}", "{label}, what the model misses, at the minimum of J",
              of_series(lambda a: a.discrepancy.mean), OWN, DISCREPANT_FIRST),
     Declared("{series}_discrepancy_std", "{time}", "{label}, std of what the model misses",
@@ -349,11 +341,7 @@ def shifts(a: Analysis) -> list[Shift]:
 
 
 def _what_if(name: str, dims: str, key: str, meaning: str) -> Declared:
-    def values(a: Analysis) -> Any:
-        held = [getattr(shift, key) for shift in shifts(a)]
-        return text(held) if isinstance(held[0], str) else np.array(held)
-
-    return Declared(name, dims, meaning, values, when=RESPONSE)
+    return Declared(name, dims, meaning, lambda a: [getattr(shift, key) for shift in shifts(a)], when=RESPONSE)
 
 
 WHAT_IF = (
