@@ -22,7 +22,6 @@ from en4dvar.results.store import StoredResult
 SHIFT_COLUMNS = (
     "alternative", "if", "parameter", "unit", "change", "relative_change", "change_in_std", "cost_change", "reason",
 )  # fmt: skip
-
 ENTRY_COLUMNS = ("parameter", "quantity", "unit", "q05", "q50", "q95")
 
 
@@ -148,8 +147,6 @@ CAPTION = (
     "conflict."
 )
 FAR = 3.0  # std between a reading and the prior that are told
-
-
 COLOURS = ("ink", "posterior", "centre", "background", "muted")  # of several series, in their order
 
 
