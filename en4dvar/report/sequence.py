@@ -30,7 +30,7 @@ from en4dvar.report.html import render
 from en4dvar.report.page import provenance_rows
 from en4dvar.report.paper import on_paper
 from en4dvar.report.svg import Captioned, draw
-from en4dvar.report.text import percent, plain_number, pretty_unit, shown, with_unit
+from en4dvar.report.text import axis_label, percent, plain_number, pretty_unit, shown, with_unit
 from en4dvar.results.netcdf import Group, read_groups, understood
 from en4dvar.results.series_file import estimates, series_file, series_group
 from en4dvar.series.problem import SeriesResult
@@ -64,12 +64,6 @@ def write_cycles_page(run_dir: Path, data: Group, figures: Iterable[Captioned], 
 def span_of(time: Array) -> tuple[float, float] | None:
     """Limits of an axis of time without margins."""
     return (float(time[0]), float(time[-1])) if time[-1] > time[0] else None
-
-
-def time_label(data: Group) -> str:
-    """Of an axis of time."""
-    about = data["time"].attrs
-    return with_unit("time", str(about.get("display_units", about["units"])))
 
 
 def ranks(ranked: Array, members: int) -> Chart:
@@ -254,7 +248,7 @@ def in_time(data: Group, kind: str, chosen: npt.NDArray[np.intp]) -> Chart:
             readings = convert(data["observations"].values[:, read_as.index(name)], unit, display)
             panel.dots(time, readings, "ink", 1.6, label="readings")
         panels.append(panel)
-    return stacked(panels, 2.8 * POINTS, time_label(data), PAGE)
+    return stacked(panels, 2.8 * POINTS, axis_label(data["time"], "time"), PAGE)
 
 
 def innovations(data: Group) -> Chart:
@@ -272,7 +266,7 @@ def innovations(data: Group) -> Chart:
         panel.rule(0, size=0.5)
         panel.dots(at, convert(innovation[there, i], unit, display), "ink", 1.6, label="innovation")
         panels.append(panel)
-    return stacked(panels, 2.6 * POINTS, time_label(data), PAGE)
+    return stacked(panels, 2.6 * POINTS, axis_label(data["time"], "time"), PAGE)
 
 
 def _some(places: npt.NDArray[np.intp], most: int) -> npt.NDArray[np.intp]:
