@@ -44,10 +44,9 @@ TABLES: dict[str, tuple[Sequence[str], Callable[[StoredResult], Iterable[Line]]]
 def write_pages(run_dir: str | Path, datasets: Sequence[str] = (), workers: int = 1, files: bool = False) -> Path:
     """Write the report of a run and return the path of ``report.html``.
 
-    Reads ``datasets.pack`` where the run has several data sets, else ``posterior.nc``. ``datasets`` are names of data
-    sets of a campaign: their pages are written and the overview links to them. ``files``: figures are also kept as PDF
-    and PNG, in a campaign of ``datasets`` or, where none is named, of all that have a page. Pages of a campaign are
-    drawn by up to ``workers`` processes, each with its share of :data:`SHARE` or more.
+    ``datasets`` are names of data sets of a campaign: their pages are written and the overview links to them.
+    ``files``: figures are also kept as PDF and PNG, in a campaign of ``datasets`` or, where none is named, of all that
+    have a page. Pages of a campaign are drawn by up to ``workers`` processes, with :data:`SHARE` or more for each.
 
     Raises :class:`OutputError`: there is nothing to read, a name is unknown, or the directory cannot be written.
     :class:`LackingError`: results of data sets cannot be read; the page of the others, ``rest``, names them.
@@ -56,9 +55,8 @@ def write_pages(run_dir: str | Path, datasets: Sequence[str] = (), workers: int 
     if not run_dir.is_dir():
         raise OutputError(f"{run_dir}: no such run directory")
     stored = RunResults(run_dir)
-    whole = stored.whole
-    if stored.files == [whole]:
-        result = load_stored(whole)
+    if stored.files == [stored.whole]:
+        result = load_stored(stored.whole)
         write_csv(run_dir / "summary.csv", summary_rows([(result.name, result.rows, result.cautions)], {}))
         _write_tables(run_dir, [_lines(result)])
         folder = inside(run_dir, "figures") if files else None
@@ -74,7 +72,7 @@ def write_pages(run_dir: str | Path, datasets: Sequence[str] = (), workers: int 
     for name in datasets:
         if name not in stems:
             raise OutputError(f"{run_dir}: no data set {name!r}{suggest(name, stems)}")
-    failures = failed_datasets(whole) | stored.lacking
+    failures = failed_datasets(stored.whole) | stored.lacking
     write_csv(run_dir / "summary.csv", summary_rows(((s.name, s.rows.values(), s.cautions) for s in sets), failures))
     page = _write_campaign(run_dir, sets, failures, {stems[name] for name in datasets}, workers, files)
     stored.require(page)

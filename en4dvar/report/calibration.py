@@ -223,8 +223,7 @@ def curves(calibration: Calibration) -> Chart:
     """The distribution of the ranks of each quantity, less that of uniform ones, and the band of these."""
     panels, names = [], [name for name, _ in calibration.quantities]
     for verdict in calibration.verdicts:
-        j = names.index(verdict.quantity)
-        uniform = calibration.uniform
+        j, uniform = names.index(verdict.quantity), calibration.uniform
         x, (low, high) = uniform.shares, uniform.band
         title = f"{figure_text(verdict.quantity)}: p = {verdict.p:.2g}"
         panel = Panel("rank of the truth, 0 to 1", "difference of shares", title=title, xlim=(0.0, 1.0))
@@ -239,15 +238,8 @@ def write_calibration(folder: Path) -> Path:
     """Write ``calibration.html`` from ``calibration.csv``. Raises :class:`OutputError`."""
     calibration = load_calibration(folder)
     figures: Sequence[tuple[str, str, Chart]] = [("ranks", CURVES, curves(calibration))] if calibration.verdicts else []
-    return write_page(
-        folder / "calibration.html",
-        "calibration.html.j2",
-        calibration=calibration,
-        head=HEAD,
-        level=LEVEL,
-        figures=draw(figures),
-        configuration=_configuration(folder),
-    )
+    about = {"calibration": calibration, "head": HEAD, "level": LEVEL, "configuration": _configuration(folder)}
+    return write_page(folder, "calibration", figures=draw(figures), **about)
 
 
 def load_calibration(folder: Path) -> Calibration:

@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -87,32 +87,32 @@ class Panel:
     def line(
         self, x: Values, y: Values, colour: str, size: float = 1.1, dash: str = "", label: str = "", alpha: float = 1.0
     ) -> None:
-        self._add("line", x, y, (), colour, size, alpha, dash, label)
+        self._add("line", x, y, (), colour, size, alpha=alpha, dash=dash, label=label)
 
     def dots(
         self, x: Values, y: Values, colour: str, size: float = 2.2, alpha: float = 1.0, label: str = "",
         kind: Kind = "dots",
     ) -> None:  # fmt: skip
         """Also ``rings``, ``ticks`` (upright) and ``dashes`` (level)."""
-        self._add(kind, x, y, (), colour, size, alpha, "", label)
+        self._add(kind, x, y, (), colour, size, alpha=alpha, label=label)
 
     def band(self, x: Values, low: Values, high: Values, colour: str, alpha: float, label: str = "") -> None:
-        self._add("band", x, low, high, colour, 0.0, alpha, "", label)
+        self._add("band", x, low, high, colour, 0.0, alpha=alpha, label=label)
 
     def bars(
         self, x: Values, low: Values, high: Values, colour: str, size: float = 0.8, alpha: float = 1.0, label: str = ""
     ) -> None:
         low, high = (np.broadcast_to(np.asarray(v, dtype=float), np.shape(x)) for v in (low, high))
-        self._add("bars", x, low, high, colour, size, alpha, "", label)
+        self._add("bars", x, low, high, colour, size, alpha=alpha, label=label)
 
     def rule(self, y: float, colour: str = "muted", size: float = 0.6) -> None:
-        self._add("rule", (), (y,), (), colour, size, 1.0, "", "")
+        self._add("rule", (), (y,), (), colour, size)
 
     def upright(self, x: float, colour: str, size: float = 0.9, dash: str = "", alpha: float = 1.0) -> None:
-        self._add("upright", (x,), (), (), colour, size, alpha, dash, "")
+        self._add("upright", (x,), (), (), colour, size, alpha=alpha, dash=dash)
 
     def span(self, low: float, high: float, colour: str, alpha: float) -> None:
-        self._add("span", (), (low,), (high,), colour, 0.0, alpha, "", "")
+        self._add("span", (), (low,), (high,), colour, 0.0, alpha=alpha)
 
     def histogram(self, values: Array, colour: str, alpha: float) -> None:
         """Scaled to its peak; values that do not differ are a line."""
@@ -141,7 +141,7 @@ class Panel:
 
     def tiles(self, x: Values, y: Values, size: tuple[float, float], colour: str) -> None:
         """Rectangles about ``x`` and ``y`` (n,), ``size`` wide and high."""
-        self._add("tiles", x, y, size, colour, 0.0, 1.0, "", "")
+        self._add("tiles", x, y, size, colour, 0.0)
 
     def limits(self) -> tuple[tuple[float, float], tuple[float, float]]:
         """Of both axes; where they are not given, those of the marks and 5 % around."""
@@ -153,12 +153,17 @@ class Panel:
         """Labels of the legend, each once."""
         return list(dict.fromkeys(m.label for m in self.marks if m.label)) if self.legend else []
 
-    def _add(
-        self, kind: Kind, x: Values, y: Values, top: Values, colour: str, size: float, alpha: float, dash: str,
-        label: str,
-    ) -> None:  # fmt: skip
+    def x_ticks(self) -> list[tuple[float, str]]:
+        """Along x, each with its number or its name."""
+        return labelled(self.limits()[0], self.xticks, self.names, self.x_logarithmic, self.whole)
+
+    def y_ticks(self) -> list[tuple[float, str]]:
+        """The same along y."""
+        return labelled(self.limits()[1], self.yticks, self.y_names, self.logarithmic, False)
+
+    def _add(self, kind: Kind, x: Values, y: Values, top: Values, colour: str, size: float, **how: Any) -> None:
         x, y, top = (np.asarray(v, dtype=float).ravel() for v in (x, y, top))
-        self.marks.append(Mark(kind, x, y, top, colour, size, alpha, dash, label))
+        self.marks.append(Mark(kind, x, y, top, colour, size, **how))
 
 
 @dataclass(frozen=True)
@@ -241,9 +246,8 @@ def ticks(low: float, high: float, wanted: int | Sequence[float], whole: bool = 
 
 
 def labelled(
-    limits: tuple[float, float], wanted: int | Sequence[float], names: Sequence[str] = (), *, logarithmic: bool = False,
-    whole: bool = False,
-) -> list[tuple[float, str]]:  # fmt: skip
+    limits: tuple[float, float], wanted: int | Sequence[float], names: Sequence[str], logarithmic: bool, whole: bool
+) -> list[tuple[float, str]]:
     """The ticks of an axis within its limits, each with its number or its name."""
     low, high = sorted(limits)
     powers_of_ten = logarithmic and isinstance(wanted, int)

@@ -1,11 +1,9 @@
 """Runs side by side: posteriors of any, and for models of the same data evidence and posterior model probabilities.
 
-Probabilities start from equal ones and follow the evidence of each run, p(M|y) ∝ p(y|M): sampled for the comparison
-where the model is cheap, else that of the result, which is Laplace's approximation unless its posterior was sampled.
-That can be far off: of 1000 bubbles it stated 0.998 where 0.982 were right. Over several data sets, each with its own
-parameters, log-evidences add. A difference below one is called undecidable: "not worth
-more than a bare mention" (Kass & Raftery 1995, J. Am. Stat. Assoc. 90, 773). Evidences of different data (two gels)
-do not compare: there the posteriors are shown, and no probabilities.
+Probabilities start from equal ones, p(M|y) ∝ p(y|M), with the evidence that was sampled for the comparison, else that
+of the result: Laplace's approximation unless its posterior was sampled, which can be far off (of 1000 bubbles it stated
+0.998 where 0.982 were right). Over several data sets log-evidences add. A difference below one is undecidable, "not
+worth more than a bare mention" (Kass & Raftery 1995, J. Am. Stat. Assoc. 90, 773).
 """
 
 from __future__ import annotations
@@ -13,6 +11,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -48,8 +47,7 @@ ALL = "all data sets"
 COLOURS = ("posterior", "centre", "background", "#cc79a7", "#b58900", "muted")
 CAPTION = (
     "Posterior of each run, scaled to its peak; bars hold 5–95 % of the members, where these are to be trusted. "
-    "Where a run has several data sets, "
-    "the members of all of them are taken together."
+    "Where a run has several data sets, the members of all of them are taken together."
 )
 STORED = "* as the result has it: Laplace's approximation, unless its posterior was sampled"
 
@@ -120,7 +118,7 @@ class Comparison:
     @property
     def by_parameter(self) -> tuple[ComparedEstimate, ...]:
         """The estimates, those of one parameter below each other."""
-        return tuple(e for name in self.parameters for e in self.estimates if e.summary.name == name)
+        return tuple(sorted(self.estimates, key=lambda e: self.parameters.index(e.summary.name)))
 
     def of(self, dataset: str) -> tuple[ModelScore, ...]:
         """The scores of one data set, or of :data:`ALL` together, runs in the order given."""
@@ -181,7 +179,7 @@ def compare_runs(runs: Sequence[str | Path] | Mapping[str, str | Path | StoredRe
     if reason := _difference(results):
         scores = [_score(name, dataset, result) for name, held in results.items() for dataset, result in held.items()]
         return Comparison(tuple(scores), estimates, reason, cautions)
-    return Comparison(_judged([_score(*pair) for pair in pairs], datasets), estimates, "", cautions)
+    return Comparison(_judged([_score(*pair) for pair in pairs]), estimates, "", cautions)
 
 
 def with_evidences(comparison: Comparison, sampled: Sequence[Mapping[str, float]]) -> Comparison:
@@ -191,16 +189,13 @@ def with_evidences(comparison: Comparison, sampled: Sequence[Mapping[str, float]
     for i, score in enumerate(scores):
         if score.dataset in better[score.run]:
             scores[i] = replace(score, log_evidence=better[score.run][score.dataset], stored=False)
-    return replace(comparison, scores=_judged(scores, [name for name in comparison.datasets if name != ALL]))
+    return replace(comparison, scores=_judged(scores))
 
 
-def _judged(scores: Sequence[ModelScore], datasets: Sequence[str]) -> tuple[ModelScore, ...]:
+def _judged(scores: Sequence[ModelScore]) -> tuple[ModelScore, ...]:
     """The scores of each data set ranked, and behind those of several the sums."""
-    of_each: dict[str, list[ModelScore]] = {name: [] for name in datasets}
-    for score in scores:
-        of_each[score.dataset].append(score)
-    every = list(map(ranked, of_each.values()))
-    if len(datasets) > 1:
+    every = [ranked(list(of_dataset)) for _, of_dataset in groupby(scores, key=lambda score: score.dataset)]
+    if len(every) > 1:
         every.append(ranked([_total(run) for run in zip(*every, strict=True)]))
     return tuple(score for of_dataset in every for score in of_dataset)
 
@@ -210,14 +205,11 @@ def _difference(results: Mapping[str, Mapping[str, StoredResult]]) -> str:
     first, *others = results
     for name in others:
         if odd := sorted(set(results[name]) ^ set(results[first])):
-            more = f" and {len(odd) - 3} more" if len(odd) > 3 else ""
-            return f"{name} and {first} hold different data sets: {', '.join(odd[:3])}{more}"
+            return f"{name} and {first} hold different data sets: {listed(odd, 3)}"
         for dataset, result in results[name].items():
             if not _same_data(result, results[first][dataset]):
-                return (
-                    f"{name} and {first} used different observations of {dataset}; evidences of different data, errors "
-                    "or weights do not compare"
-                )
+                why = "evidences of different data, errors or weights do not compare"
+                return f"{name} and {first} used different observations of {dataset}; {why}"
     return ""
 
 
@@ -238,9 +230,8 @@ def comparison_table(comparison: Comparison) -> str:
         )
         for s in comparison.scores
     ]  # fmt: skip
-    verdicts = [f"{name}: {comparison.verdict(name)}" for name in comparison.datasets]
-    if comparison.incomparable:
-        verdicts = [comparison.verdict("")]
+    told = [f"{name}: {comparison.verdict(name)}" for name in comparison.datasets]
+    verdicts = [comparison.verdict("")] if comparison.incomparable else told
     notes = [STORED] if any(s.stored for s in comparison.scores) and not comparison.incomparable else []
     warned = [f"{c.caution.kind}: {c.run}: {c.dataset}: {c.caution}" for c in comparison.cautions]
     if (more := len(warned) - MOST_WARNINGS) > 0:
@@ -271,7 +262,7 @@ def write_comparison(comparison: Comparison, out: str | Path) -> Path:
     columns = [f.name for f in fields(ModelScore)]
     write_csv(out / "evidence.csv", [columns, *([getattr(s, c) for c in columns] for s in comparison.scores)])
     about = {"title": " – ".join(comparison.runs), "figure": figure, "caption": CAPTION, "comparison": comparison}
-    return write_page(out / "compare.html", "compare.html.j2", **about)
+    return write_page(out, "compare", **about)
 
 
 def overlay(comparison: Comparison) -> Chart:
@@ -321,13 +312,13 @@ def named(runs: Sequence[str | Path] | Mapping[str, T]) -> Mapping[str, T | Path
 def _its_groups(runs: Any) -> str:
     """Where the comparison of the groups of one run is, and what it may be told; "" where it has none."""
     paths = [it for it in (runs if isinstance(runs, list | tuple) else [runs]) if isinstance(it, str | Path)]
-    groups = [str(folder) for path in paths for folder, _ in load_groups_of(Path(path)).values()]
+    groups = [shlex.quote(str(folder)) for path in paths for folder, _ in load_groups_of(Path(path)).values()]
     if len(groups) < 2:
         return ""
     return (
         f"; {paths[0]} compares its {len(groups)} groups itself, on its page: a median that is known stands in its "
         "configuration (population.known), a line needs numbers with a unit in the names of the groups, or compare "
-        f"the folders {' '.join(shlex.quote(folder) for folder in groups)}"
+        f"the folders {' '.join(groups)}"
     )
 
 
@@ -347,15 +338,9 @@ def _same_data(a: StoredResult, b: StoredResult) -> bool:
 
 def _stated(o: Observations) -> dict[str, Array]:
     """The observations and everything that is stated about their errors."""
-    return {
-        "times": o.times,
-        "values": o.values,
-        "weights": o.weights,
-        "std": o.noise.std,
-        "time_std": o.noise.time_std,
-        **{name: matrix for name, (matrix, _) in o.noise.matrices().items()},
-        **{name: np.asarray(number) for name, number in o.noise.attributes().items()},
-    }
+    stated = {"times": o.times, "values": o.values, "weights": o.weights, "std": o.noise.std}
+    stated |= {"time_std": o.noise.time_std, **{name: matrix for name, (matrix, _) in o.noise.matrices().items()}}
+    return stated | {name: np.asarray(number) for name, number in o.noise.attributes().items()}
 
 
 def _score(run: str, dataset: str, result: StoredResult) -> ModelScore:
@@ -382,7 +367,5 @@ def ranked(scores: Sequence[S]) -> list[S]:
     evidence = np.array([s.log_evidence for s in scores])
     difference = evidence - evidence[np.isfinite(evidence)].max(initial=-np.inf)
     odds = np.exp(difference)  # the models are equally probable before the data
-    return [
-        replace(s, difference=float(d), probability=float(p))
-        for s, d, p in zip(scores, difference, odds / np.nansum(odds), strict=True)
-    ]
+    judged = zip(scores, difference.tolist(), (odds / np.nansum(odds)).tolist(), strict=True)
+    return [replace(s, difference=d, probability=p) for s, d, p in judged]

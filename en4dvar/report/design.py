@@ -75,7 +75,7 @@ def _spread(std: float, relative: float, unit: str, shown: str) -> str:
     """In % of the value where that says something, else in the unit shown."""
     if relative < COARSE:
         return f"{rough_number(100 * relative)} %"
-    return f"{rough_number(float(convert(np.array(std), unit, shown)))}{'' if shown == '1' else f' {shown}'}"
+    return f"{rough_number(convert(std, unit, shown))} {shown}".removesuffix(" 1")
 
 
 def needs(designs: Designs, row: DesignRow) -> list[str]:
@@ -115,7 +115,6 @@ def by(result: Evaluated) -> str:
 def design_table(designs: Designs) -> str:
     """The best designs and the file's own, for the terminal."""
     rows, own = ranked(designs), [row for row in designs.rows if not row.settings and row.result]
-    told = list({id(row): row for row in (*rows[:TOLD], *own)}.values())
     several = any(row.evaluated.alike > 1 for row in rows)
     gain = "law [nats]" if designs.asked.laws else "gain [nats]"
     head = ("design", *["experiments"] * several, "readings", "price", gain, "by", "what is known")
@@ -124,11 +123,12 @@ def design_table(designs: Designs) -> str:
             settings_text(row), *[str(it.alike)] * several, str(len(it.readings)), f"{row.price:g}",
             f"{it.worth:.2f} ± {it.worth_error:.2f}", by(it), words(designs, row),
         )
-        for row, it in ((row, row.evaluated) for row in told)
+        for row, it in ((row, row.evaluated) for row in dict.fromkeys([*rows[:TOLD], *own]))
     ]  # fmt: skip
-    ends = list({id(row): row for row in (*rows[:1], *own)}.values())
-    alike = {id(row): f"; {row.evaluated.alike} experiments" if several else "" for row in ends}
-    wanted = [f"{settings_text(row)}{alike[id(row)]}: {text}" for row in ends for text in needs(designs, row)]
+    wanted = []
+    for row in dict.fromkeys([*rows[:1], *own]):
+        alike = f"; {row.evaluated.alike} experiments" if several else ""
+        wanted += [f"{settings_text(row)}{alike}: {text}" for text in needs(designs, row)]
     return "\n".join([table([head, *cells]), *wanted])
 
 
@@ -148,9 +148,11 @@ def remarks(designs: Designs) -> list[str]:
     worth = [row.evaluated for row in rows]
     stands = sum(it.thin > THIN and it.method != "nested" for it in worth)
     thin = sum(max(it.thin, it.decision.thin if it.decision else 0.0) > THIN for it in worth) - stands
-    told += [f"of {thin} designs the evidences of many readings are rough; raise design.inner"] if thin else []
-    few = f"of {stands} designs too few draws check the linearised information, which stands; raise design.inner"
-    told += [few] if stands else []
+    if thin:
+        told.append(f"of {thin} designs the evidences of many readings are rough; raise design.inner")
+    if stands:
+        few = "too few draws check the linearised information, which stands; raise design.inner"
+        told.append(f"of {stands} designs {few}")
     told += [
         f"{settings_text(row)}: {row.evaluated.alike} of these experiments (by {by(row.evaluated)}) cannot tell more "
         f"than {more.evaluated.alike} (by {by(more.evaluated)}): the two are not comparable; set design.method: laplace"
@@ -190,10 +192,7 @@ def gains(designs: Designs) -> Chart:
 def prices(designs: Designs) -> Chart:
     """Information against price, with the front."""
     panel = Panel("price", "information [nats]")
-    (x, y), (u, v) = (
-        ([row.price for row in rows], [row.evaluated.worth for row in rows])
-        for rows in (ranked(designs), front(designs))
-    )
+    (x, y), (u, v) = (np.array([(row.price, row.evaluated.worth) for row in of(designs)]).T for of in (ranked, front))
     panel.dots(x, y, "prior", 3.0)
     panel.line(u, v, "posterior")
     panel.dots(u, v, "posterior", 4.0)
@@ -227,20 +226,21 @@ def write_design(folder: Path) -> Path:
     """Write ``design.html`` and ``designs.csv`` from ``design.nc``; returns the page. Raises :class:`OutputError`."""
     designs = load_designs(folder / FILE)
     write_csv(folder / "designs.csv", _cells(designs))
-    rows, best = ranked(designs), {id(row) for row in front(designs)}
-    figures = [("fans", FANS, fans(designs))] if all(len(row.evaluated.grid) for row in rows) else []
-    if len({row.price for row in rows}) > 1:
-        figures.insert(0, ("prices", FRONT, prices(designs)))
+    rows, best, figures = ranked(designs), front(designs), []
     if designs.asked.knobs or len({row.evaluated.alike for row in rows}) > 1:
-        figures.insert(0, ("gains", GAINS, gains(designs)))
-    told = {id(row): "; ".join([words(designs, row), *needs(designs, row)]) for row in front(designs)}
+        figures.append(("gains", GAINS, gains(designs)))
+    if len({row.price for row in rows}) > 1:
+        figures.append(("prices", FRONT, prices(designs)))
+    if all(len(row.evaluated.grid) for row in rows):
+        figures.append(("fans", FANS, fans(designs)))
+    told = ["; ".join([words(designs, row), *needs(designs, row)]) for row in best]
     return write_page(
-        folder / "design.html",
-        "design.html.j2",
+        folder,
+        "design",
         designs=designs,
         by=by,
-        rows=[(settings_text(row), row, words(designs, row), id(row) in best) for row in rows],
-        lab=[(settings_text(row), readings_text(designs, row), row, told[id(row)]) for row in front(designs)],
+        rows=[(settings_text(row), row, words(designs, row), row in best) for row in rows],
+        lab=[(settings_text(row), readings_text(designs, row), row, of) for row, of in zip(best, told, strict=True)],
         remarks=remarks(designs),
         drawings=draw(figures),
     )
@@ -249,7 +249,7 @@ def write_design(folder: Path) -> Path:
 def readings_text(designs: Designs, row: DesignRow) -> str:
     """When readings are taken: "43 from 0.7 to 59.5 µs, every 1.4 µs", or each where they are not evenly spaced."""
     stored, shown = designs.asked.axes[0]
-    count, unit = len(row.evaluated.times), "" if shown == "1" else f" {shown}"
+    count, unit = len(row.evaluated.times), f" {shown}".removesuffix(" 1")
     t = np.unique(convert(row.evaluated.times, stored, shown))
     gaps = np.diff(t)
     if len(t) > 2 and np.ptp(gaps) < 1e-6 * gaps.mean():
@@ -269,7 +269,7 @@ def _cells(designs: Designs) -> list[list[Any]]:
         cells |= {"gain_nats": result.gain, "gain_error": result.error, "method": result.method}
         cells |= {name: getattr(result.decision, field) for field, (name, _) in DECISION.items() if result.decision}
         for name, (unit, shown), std in zip(asked.parameters, asked.units, result.std.tolist(), strict=True):
-            cells[f"{name}_std" + ("" if shown == "1" else f" [{shown}]")] = float(convert(std, unit, shown))
+            cells[f"{name}_std [{shown}]".removesuffix(" [1]")] = convert(std, unit, shown)
         cells |= {f"{name}_std_ratio": float(x) for name, x in zip(asked.parameters, result.ratio, strict=True)}
         cells |= {"lost": result.lost, "beyond_validity": result.beyond}
         cells |= zip(needed, [] if result.needed is None else result.needed.ravel().tolist(), strict=True)

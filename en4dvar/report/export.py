@@ -28,6 +28,7 @@ _COMMANDS = (
     "nabla|ell|cdot|times|pm|prime|dagger|ast|star|perp|parallel|circ|left|right|langle|rangle|quad|"
     "max|min"
 )
+_FORMULA = re.compile(rf"\$(?:[A-Za-z0-9_^{{}}()\[\],.+\-*/=' <>|]|\\(?:{_COMMANDS})(?![A-Za-z])|\\[,;:! ])+\$")
 Kind = Literal["csv", "latex", "members"]
 _ESCAPES = {c: f"\\{c}" for c in "#$%&_{}"} | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\^{}"}
 _SIGNS = {
@@ -46,9 +47,8 @@ def export_table(run_dir: str | Path, kind: Kind = "csv") -> str:
     kind: ``csv``: a line for each data set and parameter (prior, mean, std, 5/50/95 %, centre, DFS), every digit kept;
         ``members``: a line for each data set and living posterior member, a column a parameter; ``latex``: for a paper
         (package booktabs) mean ± std, or of a skewed posterior the median with its 5 and 95 %, a row a parameter, or
-        with several data sets a row a data set. Warnings come along: in a column of the CSV, as footnotes in LaTeX,
-        where notes are comments. A number that is not to be
-        trusted stands without an interval.
+        of several data sets a row each. Warnings come along: in a column of the CSV, as footnotes in LaTeX, where notes
+        are comments. A number that is not to be trusted stands without an interval.
 
     Raises
     ------
@@ -230,12 +230,8 @@ def is_math(text: str) -> bool:
     >>> is_math(r"$\mu_{max}$"), is_math(r"$\frac{1}{2}R^2$"), is_math(r"$\input{x}$"), is_math("$a}b{c$")
     (True, True, False, False)
     """
-    if not re.fullmatch(
-        rf"\$(?:[A-Za-z0-9_^{{}}()\[\],.+\-*/=' <>|]|\\(?:{_COMMANDS})(?![A-Za-z])|\\[,;:! ])+\$", text
-    ):
-        return False
     depths = list(itertools.accumulate((c == "{") - (c == "}") for c in text))
-    return min(depths) == 0 == depths[-1]
+    return bool(_FORMULA.fullmatch(text)) and min(depths) == 0 == depths[-1]
 
 
 def latex_unit(unit: str) -> str:

@@ -113,9 +113,8 @@ def cost(result: StoredResult) -> Chart:
 
 def traces(result: StoredResult) -> Chart:
     """Each parameter over the iterations: mean and middle 68 % of the ensemble of the iterate, and its centre."""
-    held = result.group("iterations")
+    held, panels = result.group("iterations"), []
     steps = held["iteration"].values
-    panels = []
     for row in result.rows:
         panel = Panel("iteration", with_unit(row.symbol, row.unit), whole=True, yticks=4)
         members, centre = (shown(held[key]) for key in (row.name, f"{row.name}_centre"))
@@ -292,11 +291,8 @@ class StoredWalk:
 
 def stored_walks(result: StoredResult) -> tuple[StoredWalk, ...]:
     """The parameters that vary."""
-    return tuple(
-        _stored_walk(result, name.removesuffix(PIECES))
-        for name, variable in result.groups["/posterior"].variables.items()
-        if variable.dims[2:] == (f"{name.removesuffix(PIECES)}{PIECE}",)
-    )
+    of_pieces = [v.dims[2] for v in result.groups["/posterior"].variables.values() if len(v.dims) == 3]
+    return tuple(_stored_walk(result, dim.removesuffix(PIECE)) for dim in of_pieces)
 
 
 def _stored_walk(result: StoredResult, name: str) -> StoredWalk:
@@ -311,7 +307,7 @@ def _stored_walk(result: StoredResult, name: str) -> StoredWalk:
         values = values[result.alive] if group == "posterior" else values
         values = values[np.isfinite(values).all(axis=1)]
         there = values if len(values) else np.full((1, len(begins)), np.nan)
-        return shown(pieces, member_quantiles(there, (0.05, 0.5, 0.95), axis=0))
+        return shown(pieces, member_quantiles(there, BAND, axis=0))
 
     after = quantiles("posterior")
     if untrusted(result.cautions, name):

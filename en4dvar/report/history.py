@@ -13,17 +13,7 @@ from en4dvar.diagnosis.diagnostics import member_quantiles
 from en4dvar.model.state import Array
 from en4dvar.plumbing.units import convert
 from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, Row, in_columns
-from en4dvar.report.text import (
-    axis_label,
-    figure_text,
-    number_like,
-    percent,
-    shown,
-    since,
-    time_axis,
-    unit_behind,
-    with_unit,
-)
+from en4dvar.report.text import axis_label, figure_text, percent, quantity, shown, since, time_axis, with_unit
 from en4dvar.results.declared import Axis, zero_of
 from en4dvar.results.netcdf import Group, Variable
 from en4dvar.results.store import StoredResult
@@ -213,13 +203,13 @@ def withheld_words(result: StoredResult) -> str:
     stats = result.group("sample_stats").attrs
     if "withheld_readings" not in stats:
         return ""
-    count, inside, rms = (float(stats[f"withheld_{key}"]) for key in ("readings", "inside", "rms"))
+    count, inside, stored = (float(stats[f"withheld_{key}"]) for key in ("readings", "inside", "rms"))
     observed = result.group("observed_data")[result.observable]
-    rms = float(shown(observed, rms))
-    off = f"{number_like(rms, rms)}{unit_behind(observed.attrs['display_units'])}"
+    rms = float(shown(observed, stored))
     return (
         f"{inside * count:.0f} of {count:.0f} readings after the window ({percent(inside)}) lie in the 90 % bands of "
-        f"what was expected; they are off the medians by {off} (root mean square)."
+        "what was expected; they are off the medians by "
+        f"{quantity(rms, rms, observed.attrs['display_units'])} (root mean square)."
     )
 
 

@@ -21,17 +21,17 @@ WRITERS = (  # what templates call
 )  # fmt: skip
 
 
-def write_page(path: Path, template: str, **content: Any) -> Path:
-    """Write the page of a template of ours. Raises :class:`OutputError`."""
-    return write_text(path, render(template, **content))
+def write_page(folder: Path, name: str, **content: Any) -> Path:
+    """Write ``name.html`` from our template of that name. Raises :class:`OutputError`."""
+    return write_text(folder / f"{name}.html", render(f"{name}.html.j2", **content))
 
 
 def render(template: str, package: str = "en4dvar.report", /, **content: Any) -> str:
-    """The page of a template of a package as text; of ours with the scripts of charts and of tables that are sorted.
+    """The page of a template of a package as text; of ours with the scripts of charts and of tables that are sorted. A
+    content security policy forbids it every address and every script but these: what escaping might miss would not run.
 
-    A content security policy forbids the page every address and every script but these: what escaping might miss
-    would still not run. A template of an application gets the colours on ``light`` and on ``dark`` ground. Raises
-    :class:`LookupError`: the content lacks what the page shows.
+    A template of an application gets the colours on ``light`` and on ``dark`` ground. Raises :class:`LookupError`: the
+    content lacks what the page shows.
     """
     try:
         return _environment(package).get_template(template).render(**content)

@@ -10,14 +10,13 @@ from en4dvar.diagnosis.diagnostics import chi2_interval
 from en4dvar.diagnosis.honesty.checks import MOVED
 from en4dvar.estimation.summary import AS_WIDE, ParameterSummary
 from en4dvar.plumbing.caution import worst_first
-from en4dvar.plumbing.units import convert
 from en4dvar.report import responses
 from en4dvar.report.figures import all_figures, neighbours, stored_walks, verdict
 from en4dvar.report.history import withheld_words
 from en4dvar.report.html import render
 from en4dvar.report.responses import exceeding, stored_ledger, stored_shifts
 from en4dvar.report.svg import draw
-from en4dvar.report.text import number_like, plain_number, shown
+from en4dvar.report.text import display_unit, number_like, plain_number, range_words, shown
 from en4dvar.results.store import StoredResult
 from en4dvar.results.variables import ITERATIONS, SHARES
 
@@ -164,11 +163,9 @@ def _modes(result: StoredResult) -> list[tuple[str, ...]]:
         of = {key: float(stats[f"mode_{key}"].values[k]) for key in ("weight", "cost", "cost_spread", "descents")}
         centre = []
         for j, (row, v) in enumerate(zip(result.rows, result.parameters.values(), strict=True)):
-            at, low, high = (
-                number_like(float(shown(v, stats[f"mode_{key}"].values[k, j])), row.std)
-                for key in ("centre", "q05", "q95")
-            )
-            centre.append(f"{at} ({low} … {high})")
+            keys = ("mode_centre", "mode_q05", "mode_q95")
+            at, low, high = (float(shown(v, stats[key].values[k, j])) for key in keys)
+            centre.append(f"{number_like(at, row.std)} ({range_words(low, high, row.std)})")
         spread = f" (they were ended within {of['cost_spread']:.2g} of its J)" if of["cost_spread"] else ""
         rows.append((f"{of['weight']:.2f}", f"{of['cost']:.2f}", f"{of['descents']:.0f}{spread}", *centre))
     return rows
@@ -178,9 +175,8 @@ def _fixed(result: StoredResult) -> list[tuple[str, str, float, str]]:
     """(symbol, label, value, unit) of the values held fixed."""
     rows = []
     for variable in result.group("constant_data").variables.values():
-        a = variable.attrs
-        unit = a.get("display_units", a["units"])
-        rows.append((a["symbol"], a["long_name"], convert(float(variable.values), a["units"], unit), unit))
+        about, value = variable.attrs, float(shown(variable))
+        rows.append((about["symbol"], about["long_name"], value, display_unit(variable)))
     return rows
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from en4dvar.plumbing.files import write_bytes
-from en4dvar.report.chart import LIGHT, Chart, Mark, Panel, labelled
+from en4dvar.report.chart import LIGHT, Chart, Mark, Panel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -94,9 +94,8 @@ def _panel(ax: Axes, panel: Panel) -> None:
     ax.set(xlabel=panel.xlabel, ylabel=panel.ylabel, xlim=xlim, ylim=ylim)
     if panel.title:
         ax.set_title(panel.title, color=LIGHT.get(panel.title_colour))
-    along = labelled(xlim, panel.xticks, panel.names, logarithmic=panel.x_logarithmic, whole=panel.whole)
-    _ticks(ax.xaxis, along, rotation=90 if panel.names else 0)
-    _ticks(ax.yaxis, labelled(ylim, panel.yticks, panel.y_names, logarithmic=panel.logarithmic))
+    _ticks(ax.xaxis, panel.x_ticks(), rotation=90 if panel.names else 0)
+    _ticks(ax.yaxis, panel.y_ticks())
     ax.tick_params(labelbottom=panel.x_numbers, labelleft=panel.y_numbers and panel.left, left=panel.left)
     ax.spines["left"].set_visible(panel.left)
     if panel.grid:

@@ -29,7 +29,7 @@ from en4dvar.report.compare import named
 from en4dvar.report.html import write_page
 from en4dvar.report.paper import on_paper
 from en4dvar.report.svg import draw
-from en4dvar.report.text import figure_text, number_like, plain_number, range_words, unit_behind, with_unit
+from en4dvar.report.text import figure_text, number_like, plain_number, plus_minus, range_words, unit_behind, with_unit
 from en4dvar.results.netcdf import understood
 from en4dvar.results.together import POPULATION, QUANTILES, StoredPopulation, load_groups_of, load_population
 
@@ -72,15 +72,11 @@ class Difference:
 
 @dataclass(frozen=True)
 class PopulationsCompared:
-    """``medians``: parameter → draws (M, K) in its display unit, of all populations together; ``lines``: the
-    straight line of them, of their logarithm where it is in ``logarithmic``, against a number of each population.
-
-    ``quoted``: parameter → 5, 50 and 95 % (3, K) of the median of each population by itself, or, where ``calibrated``
-    by what is known of some of them, of ``medians``.
-
-    ``doubted``: parameter → the populations in which it is not to be trusted.
-
-    ``common``: quantities with one value in several populations; ``notes``: what else has to be known.
+    """By parameter, ``medians``: draws (M, K) in its display unit, of all populations together; ``lines``: the straight
+    line of them, of their logarithm where it is in ``logarithmic``, against a number of each population; ``quoted``:
+    5, 50 and 95 % (3, K) of the median of each population by itself, or, where ``calibrated`` by what is known of some
+    of them, of ``medians``; ``doubted``: the populations in which it is not to be trusted. ``common``: quantities with
+    one value in several populations; ``notes``: what else has to be known.
     """
 
     populations: tuple[str, ...]
@@ -144,10 +140,9 @@ def compare_populations(
     every = [key for of_one in keys.values() for key in of_one]
     common = tuple(dict.fromkeys(key[0] for key in every if every.count(key) > 1))
     every_common = tuple(dict.fromkeys(n for s in stored.values() for n in s.common))
-    for name in apart:
-        if name not in every_common:
-            hint = suggest(name, every_common)
-            raise OutputError(f"compare: {name}: not common to the data sets of any population{hint}")
+    if unknown := [name for name in apart if name not in every_common]:
+        hint = suggest(unknown[0], every_common)
+        raise OutputError(f"compare: {unknown[0]}: not common to the data sets of any population{hint}")
     terms = {name: [s.prior_of(name) for s in stored.values()] for name in names}
     logarithmic = frozenset(name for name in names if all(t.transform == "lognormal" for t in terms[name]))
     medians, quoted, calibrated = dict[str, Array](), dict[str, Array](), any(used.values())
@@ -202,11 +197,9 @@ def _physical(white: Array, terms: Sequence[PriorTerm]) -> Array:
 def same_readings(stored: Mapping[str, StoredPopulation]) -> str:
     """Why populations are not independent; "" where they are."""
     for (a, first), (b, second) in combinations(stored.items(), 2):
-        if both := [first.readings[key] for key in first.readings.keys() & second.readings.keys()]:
-            return (
-                f"{a} and {b} hold the same readings ({', '.join(sorted(both)[:3])}): what differs between them is the "
-                "model and not what was measured"
-            )
+        if both := sorted(first.readings[key] for key in first.readings.keys() & second.readings.keys()):
+            which = f"{a} and {b} hold the same readings ({', '.join(both[:3])})"
+            return f"{which}: what differs between them is the model and not what was measured"
     return ""
 
 
@@ -270,7 +263,7 @@ def _calibrated(
         if name in values[label]:
             value, std = (convert(number, parameter.unit, parameter.display_unit) for number in values[label][name])
             by = off[label][name]
-            words = f"{name} of {label} is known, {number_like(value, std)} ± {number_like(std, std)}{unit}"
+            words = f"{name} of {label} is known, {plus_minus(value, std)}{unit}"
             words += f"; its own data say otherwise, {by:.1f} std away" if by > FAR else ""
             yield words + (": it calibrates nothing (is its unit right?)" if by > TOO_FAR else "")
             if alone is None and by <= TOO_FAR:
@@ -324,17 +317,15 @@ def sentences(c: PopulationsCompared) -> Iterator[str]:
 
 
 def _sentence(d: Difference) -> str:
-    unit = unit_behind(d.unit)
-    by = f"{_range(d.difference, plain=True)}{unit} more"
-    if d.difference[1] < 0:
-        low, middle, high = (-value for value in d.difference)
-        by = f"{_range((high, middle, low), plain=True)}{unit} less"
+    low, middle, high = d.difference
+    by, more = (d.difference, "more") if middle >= 0 else ((-high, -middle, -low), "less")
+    difference = f"{_range(by, plain=True)}{unit_behind(d.unit)} {more}"
     sure, side = (d.greater, "larger") if d.greater >= 0.5 else (1 - d.greater, "smaller")
     chance = f"over {SURE}" if sure > SURE else f"{sure:.3f}" if sure > 0.99 else f"{sure:.2f}"
     if d.is_ratio:
-        words = f"{d.parameter} of {d.first} is {_range(d.ratio)} times that of {d.second}, and {by}"
+        words = f"{d.parameter} of {d.first} is {_range(d.ratio)} times that of {d.second}, and {difference}"
     else:
-        words = f"{d.parameter} of {d.first} is {by} than that of {d.second}"
+        words = f"{d.parameter} of {d.first} is {difference} than that of {d.second}"
     words += f"; it is {side} with probability {chance}"
     alone = range_words(d.apart[0], d.apart[2], _std(d.apart), "1" if d.is_ratio else d.unit)
     words += f" (were nothing common: {alone}{' times' * d.is_ratio})"
@@ -394,16 +385,18 @@ def write_populations(c: PopulationsCompared, out: str | Path) -> Path:
     out = make_folder(out)
     ((_, _, drawn),) = draw([("populations", c.caption, figure(c))], folder=out)
     write_tables(c, out)
-    about = {"title": " – ".join(c.populations), "populations": tuple(sentences(c))}
-    return write_page(out / "compare.html", "compare.html.j2", figure=drawn, caption=c.caption, **about)
+    title, told = " – ".join(c.populations), tuple(sentences(c))
+    return write_page(out, "compare", title=title, populations=told, figure=drawn, caption=c.caption)
 
 
 def write_tables(c: PopulationsCompared, folder: Path) -> None:
     """``differences.csv`` and, with numbers, ``lines.csv``. Raises :class:`OutputError`."""
     three = [f"{what}_{q}" for what in ("ratio", "difference", "apart") for q in ("q05", "q50", "q95")]
     head = ["parameter", "first", "second", "unit", *three, "greater", "untrusted"]
-    of_each = ((d, (*d.ratio, *d.difference, *d.apart)) for d in c.differences)
-    rows = ([d.parameter, d.first, d.second, d.unit, *numbers, d.greater, d.untrusted] for d, numbers in of_each)
+    rows = (
+        [d.parameter, d.first, d.second, d.unit, *d.ratio, *d.difference, *d.apart, d.greater, d.untrusted]
+        for d in c.differences
+    )
     write_csv(folder / "differences.csv", [head, *rows])
     if c.lines:
         three = [f"{what}_{q}" for what in ("slope", "level") for q in ("q05", "q50", "q95")]

@@ -15,25 +15,13 @@ from en4dvar.diagnosis.influence import UNKNOWN
 from en4dvar.diagnosis.response.what_if import exclusion, is_manifold
 from en4dvar.model.state import Array
 from en4dvar.report.chart import POINTS, Chart, Panel, Row
-from en4dvar.report.text import (
-    axis_label,
-    fixed,
-    number_like,
-    plain_number,
-    pretty_unit,
-    shown,
-    signed,
-    symbol_html,
-    time_axis,
-    unit_behind,
-)
+from en4dvar.report.text import fixed, plain_number, quantity, shown, signed, symbol_html, time_axis, unit_behind
 from en4dvar.results.declared import zero_of
 from en4dvar.results.store import StoredResult
 
 SHIFT_COLUMNS = (
     "alternative", "if", "parameter", "unit", "change", "relative_change", "change_in_std", "cost_change", "reason",
 )  # fmt: skip
-
 ENTRY_COLUMNS = ("parameter", "quantity", "unit", "q05", "q50", "q95")
 
 
@@ -122,12 +110,11 @@ def shift_text(shift: StoredShift) -> str:
     """
     if is_manifold(shift.relative):
         return f"× {plain_number(1 + shift.relative, 2)}"
-    value, unit = shift.change, pretty_unit(shift.unit)
-    if math.isfinite(shift.relative):
-        value, unit = 100 * shift.relative, "%"
+    value, unit = (100 * shift.relative, "%") if math.isfinite(shift.relative) else (shift.change, shift.unit)
+    if not math.isfinite(value):
+        return "–"
     bar = abs(value / shift.in_std) if shift.in_std else math.nan
-    text = f"{number_like(value, bar)} {unit}".strip() if math.isfinite(value) else "–"
-    return text if value <= 0 or not math.isfinite(value) else f"+{text}"
+    return f"{'+' * (value > 0)}{quantity(value, bar, unit)}"
 
 
 def sentence(shifts: Sequence[StoredShift]) -> str:
@@ -137,12 +124,8 @@ def sentence(shifts: Sequence[StoredShift]) -> str:
         words = "the numbers may change by more than their error bars; a fit with it tells"
         return f"if {first.words}, {words} ({first.reason})"
     moved = sorted((s for s in shifts if s.exceeds), key=lambda s: -abs(s.in_std))
-    parts = [
-        Markup("{} would be {} ({} times its error bar)").format(
-            symbol_html(s.symbol), _amount(s), fixed(abs(s.in_std), 1)
-        )
-        for s in moved
-    ]
+    told = Markup("{} would be {} ({} times its error bar)")
+    parts = [told.format(symbol_html(s.symbol), _amount(s), fixed(abs(s.in_std), 1)) for s in moved]
     return Markup("if {}, {}").format(first.words, Markup(", ").join(parts))
 
 
@@ -164,8 +147,6 @@ CAPTION = (
     "conflict."
 )
 FAR = 3.0  # std between a reading and the prior that are told
-
-
 COLOURS = ("ink", "posterior", "centre", "background", "muted")  # of several series, in their order
 
 
@@ -181,10 +162,9 @@ def times(result: StoredResult) -> Array:
 
 
 def time_label(result: StoredResult) -> str:
-    """Of an axis of :func:`times`; of series whose clocks begin at other times it is the model's alone."""
-    observed = [result.group("observed_data")[axis.time] for axis in result.axes]
-    labels = {time_axis(time) for time in observed}
-    return labels.pop() if len(labels) == 1 else axis_label(observed[0], "time")
+    """Of an axis of :func:`times`."""
+    observed = result.group("observed_data")
+    return time_axis(*(observed[axis.time] for axis in result.axes))
 
 
 def whitened(result: StoredResult) -> Array:
@@ -250,10 +230,9 @@ def _most_moving(result: StoredResult) -> Markup:
     j, k = np.unravel_index(int(np.nanargmax(np.abs(in_std))), in_std.shape)
     row = result.rows[int(j)]
     size = float(shown(result.parameters[row.name], change[j, k]))
-    words = Markup(
-        "Without the reading at {} {} would change most: by {} {}, {} posterior standard deviations."
-    ).format(
-        _time(result, int(k)), symbol_html(row.symbol), signed(size), pretty_unit(row.unit), fixed(abs(in_std[j, k]), 1)
+    by, stds = f"{signed(size)}{unit_behind(row.unit)}", fixed(abs(in_std[j, k]), 1)
+    words = Markup("Without the reading at {} {} would change most: by {}, {} posterior standard deviations.").format(
+        _time(result, int(k)), symbol_html(row.symbol), by, stds
     )
     blank = int(np.sum(how == UNKNOWN))
     return words + (f" For {blank} of {in_std.shape[1]} readings it takes a fit without them to tell." if blank else "")
@@ -282,5 +261,5 @@ def _time(result: StoredResult, k: int) -> str:
     words = f"{plain_number(when, 6)}{unit_behind(time.attrs['display_units'])} {CLOCK}"
     if f"{axis.name}_place" in observed:
         place = observed[f"{axis.name}_place"]
-        words += f", place {plain_number(float(place.values[k]))} {pretty_unit(str(place.attrs['units']))}".rstrip()
+        words += f", place {plain_number(float(place.values[k]))}{unit_behind(str(place.attrs['units']))}"
     return words if axis.alone else f"{words} ({axis.name})"

@@ -169,8 +169,7 @@ def _in_display_units(group: xr.Dataset) -> xr.Dataset:
     for name, variable in group.data_vars.items():
         unit, display = variable.attrs.get("units"), variable.attrs.get("display_units")
         if unit and display and unit != display:
-            shown[name] = variable.copy(data=convert(variable.values, unit, display))
-            shown[name].attrs["units"] = display
+            shown[name] = variable.copy(data=convert(variable.values, unit, display)).assign_attrs(units=display)
     return group.assign(shown)
 
 

@@ -1,6 +1,5 @@
-"""Page and figures of a sequence, from ``sequence.nc`` alone: state, parameters, innovations in time, and ranks; what a
-session gets of it; sequences of the same readings side by side, by the forecasts of their observations. First, what it
-has in common with a twin experiment: the page, the rank histogram, and tables for other programs.
+"""Page and figures of a sequence, from ``sequence.nc`` alone; what a session gets of it; sequences of the same readings
+side by side. First, what it has in common with a twin experiment: the page, the rank histogram, and tables.
 
 ln p(y) = Σ_k ln p(y_k | y_1 … y_{k−1}), each the density of N(H x̄, P + R) of the forecast: exact for a linear model and
 an ensemble of enough members, as in a Kalman filter. Source: Schweppe (1965), IEEE Trans. Inf. Theory 11, 61; for
@@ -21,17 +20,17 @@ from scipy.stats import binom
 
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import OutputError
-from en4dvar.plumbing.files import inside
+from en4dvar.plumbing.files import inside, write_text
 from en4dvar.plumbing.tables import csv_text, table
 from en4dvar.plumbing.units import convert
 from en4dvar.report.chart import PAGE, POINTS, Chart, Panel, Row, interval, stacked
 from en4dvar.report.compare import named, preferred, ranked
 from en4dvar.report.export import Kind, Notes, column_name, escaped, latex_unit, plus_minus, tabular
-from en4dvar.report.html import write_page
+from en4dvar.report.html import render
 from en4dvar.report.page import provenance_rows
 from en4dvar.report.paper import on_paper
 from en4dvar.report.svg import Captioned, draw
-from en4dvar.report.text import plain_number, pretty_unit, shown, with_unit
+from en4dvar.report.text import axis_label, percent, plain_number, pretty_unit, shown, with_unit
 from en4dvar.results.netcdf import Group, read_groups, understood
 from en4dvar.results.series_file import estimates, series_file, series_group
 from en4dvar.series.problem import SeriesResult
@@ -59,18 +58,12 @@ def write_cycles_page(run_dir: Path, data: Group, figures: Iterable[Captioned], 
     """
     drawn = draw(figures, folder=inside(run_dir, "figures") if files else None)
     about |= {"attributes": data.attrs, "provenance": provenance_rows(data.attrs), "figures": drawn, "copies": files}
-    return write_page(run_dir / "report.html", "cycles.html.j2", **about)
+    return write_text(run_dir / "report.html", render("cycles.html.j2", **about))
 
 
 def span_of(time: Array) -> tuple[float, float] | None:
     """Limits of an axis of time without margins."""
     return (float(time[0]), float(time[-1])) if time[-1] > time[0] else None
-
-
-def time_label(data: Group) -> str:
-    """Of an axis of time."""
-    about = data["time"].attrs
-    return with_unit("time", str(about.get("display_units", about["units"])))
 
 
 def ranks(ranked: Array, members: int) -> Chart:
@@ -106,8 +99,7 @@ def last_analysis(data: Group) -> Iterator[tuple[str, float, float, str]]:
 def cycles_table(file: Path, kind: Kind) -> str:
     """A table of the result file of a sequence or a twin experiment as text, in display units. ``csv``: a line for each
     time and variable of the state, mean and std of each estimate, and the truth; ``members``: for each member and time
-    that is kept; ``latex``: for each variable of the last analysis. Raises :class:`OutputError`: it is damaged, or
-    holds no members (a twin experiment).
+    that is kept (a twin experiment has none: :class:`OutputError`); ``latex``: for each variable of the last analysis.
     """
     data = read_groups(file)["/"]
     if kind == "members" and "members" not in data:
@@ -198,12 +190,10 @@ def write_sequence_report(run_dir: Path, files: bool = False) -> Path:
         for name, mean, std, unit in islice(last_analysis(data), LISTED)
     ]
     rows = []
-    for i, name in enumerate(data["observation"].values[:LISTED]):
-        innovations = data["normalised_innovation"].values[:, i]
-        innovations = innovations[np.isfinite(innovations)]
-        size = plain_number(float(np.sqrt(np.mean(innovations**2))), 3) if len(innovations) else "–"
-        share = f"{100 * np.mean(np.abs(innovations) <= 2):.0f} %" if len(innovations) else "–"
-        rows.append((str(name), str(len(innovations)), size, share))
+    for name, column in zip(data["observation"].values[:LISTED], data["normalised_innovation"].values.T, strict=False):
+        there = column[np.isfinite(column)]
+        size, share = (np.sqrt(np.mean(there**2)), np.mean(np.abs(there) <= 2)) if len(there) else (np.nan, np.nan)
+        rows.append((str(name), str(len(there)), plain_number(float(size), 3), percent(float(share))))
     return write_cycles_page(
         run_dir,
         data,
@@ -231,7 +221,7 @@ def sequence_figures(data: Group) -> Iterator[Captioned]:
     held = np.array([state.index(name) for name in parameters if name in state], dtype=np.intp)
     spread = data[f"{best}_std"].values.max(axis=0)
     uncertain = np.flatnonzero(spread > CERTAIN * np.abs(data[f"{best}_mean"].values).max(axis=0))
-    dynamic = np.array([i for i in uncertain if i not in held], dtype=np.intp)
+    dynamic = np.setdiff1d(uncertain, held)
     if len(dynamic):
         words = "" if len(dynamic) <= SHOWN else f" {SHOWN} of {len(dynamic)} variables."
         caption = f"The state in time: mean of the {best} ensemble within two standard deviations, and readings of it."
@@ -258,7 +248,7 @@ def in_time(data: Group, kind: str, chosen: npt.NDArray[np.intp]) -> Chart:
             readings = convert(data["observations"].values[:, read_as.index(name)], unit, display)
             panel.dots(time, readings, "ink", 1.6, label="readings")
         panels.append(panel)
-    return stacked(panels, 2.8 * POINTS, time_label(data), PAGE)
+    return stacked(panels, 2.8 * POINTS, axis_label(data["time"], "time"), PAGE)
 
 
 def innovations(data: Group) -> Chart:
@@ -276,7 +266,7 @@ def innovations(data: Group) -> Chart:
         panel.rule(0, size=0.5)
         panel.dots(at, convert(innovation[there, i], unit, display), "ink", 1.6, label="innovation")
         panels.append(panel)
-    return stacked(panels, 2.6 * POINTS, time_label(data), PAGE)
+    return stacked(panels, 2.6 * POINTS, axis_label(data["time"], "time"), PAGE)
 
 
 def _some(places: npt.NDArray[np.intp], most: int) -> npt.NDArray[np.intp]:
@@ -303,11 +293,11 @@ def compare_sequences(run_dirs: Sequence[Path]) -> tuple[SequenceScore, ...]:
     for name, other in others:
         if not all(_same(reference, other, key) for key in READINGS):
             raise OutputError(f"{name} and {first} hold other readings or errors: their evidences cannot be compared")
-    sizes = [float(np.sqrt(np.nanmean(data["normalised_innovation"].values ** 2))) for data in runs.values()]
-    scores = [
-        SequenceScore(run, str(data.attrs["scheme"]), float(data.attrs["log_evidence"]), np.nan, np.nan, size)
-        for (run, data), size in zip(runs.items(), sizes, strict=True)
-    ]
+    scores = []
+    for run, data in runs.items():
+        size = float(np.sqrt(np.nanmean(data["normalised_innovation"].values ** 2)))
+        scheme, evidence = str(data.attrs["scheme"]), float(data.attrs["log_evidence"])
+        scores.append(SequenceScore(run, scheme, evidence, np.nan, np.nan, size))
     return tuple(ranked(scores))
 
 
@@ -329,8 +319,6 @@ def _sequence(run_dir: Path) -> Group:
     if file.stem == "twin":
         raise OutputError(f"{run_dir}: a twin experiment has no evidence; RMSE and spread are in its summary.csv")
     data = read_groups(file)["/"]
-    if "log_evidence" not in data.attrs:
-        raise OutputError(f"{run_dir}: written by an earlier version, without an evidence; run it again")
     if why := str(data.attrs["without_evidence"]):
         raise OutputError(f"{run_dir}: has no evidence to compare: {why}")
     if not np.isfinite(data.attrs["log_evidence"]):

@@ -16,7 +16,7 @@ from markupsafe import Markup, escape
 
 from en4dvar.model.state import Array
 from en4dvar.plumbing.files import make_folder
-from en4dvar.report.chart import Chart, Mark, Panel, Row, labelled
+from en4dvar.report.chart import Chart, Mark, Panel, Row
 from en4dvar.report.paper import save_chart
 from en4dvar.report.text import math_pieces
 
@@ -43,10 +43,10 @@ class Frame:
     x_logarithmic: bool = False
 
     def across(self, values: Array) -> Array:
-        return np.asarray(self.x + self.width * _share(np.asarray(values, dtype=float), self.xlim, self.x_logarithmic))
+        return self.x + self.width * _share(values, self.xlim, self.x_logarithmic)
 
     def up(self, values: Array) -> Array:
-        return np.asarray(self.y + self.height * (1 - _share(values, self.ylim, self.logarithmic)))
+        return self.y + self.height * (1 - _share(values, self.ylim, self.logarithmic))
 
 
 def _share(values: Array, limits: tuple[float, float], logarithmic: bool) -> Array:
@@ -80,29 +80,20 @@ def svg(chart: Chart, name: str, description: str) -> Markup:
     return Markup(f"{head}{''.join(parts)}</svg>")
 
 
-def _y_ticks(panel: Panel) -> list[tuple[float, str]]:
-    return labelled(panel.limits()[1], panel.yticks, panel.y_names, logarithmic=panel.logarithmic)
-
-
-def _x_ticks(panel: Panel) -> list[tuple[float, str]]:
-    return labelled(panel.limits()[0], panel.xticks, panel.names, logarithmic=panel.x_logarithmic, whole=panel.whole)
-
-
 def _right(panel: Panel, width: float) -> float:
     """Points that the numbers below reach beyond an axis of ``width``."""
     if panel.bare or panel.names or not panel.x_numbers:
         return 0.0
     axis = Frame(0, 0, width, 0, *panel.limits(), panel.logarithmic, panel.x_logarithmic)
-    return max(
-        (x + len(text) * WIDEST * SMALL / 2 - width for x, text in _placed(_x_ticks(panel), axis.across)), default=0
-    )
+    placed = _placed(panel.x_ticks(), axis.across)
+    return max((x + len(text) * WIDEST * SMALL / 2 - width for x, text in placed), default=0)
 
 
 def _left(panel: Panel) -> float:
     """Points that the labels on the left need."""
     if panel.bare or not panel.left:
         return 8.0 if panel.x_numbers and not panel.bare else 2.0  # half a number below the corner
-    labels = [text for _, text in _y_ticks(panel)] if panel.y_numbers else []
+    labels = [text for _, text in panel.y_ticks()] if panel.y_numbers else []
     widest = max(map(len, labels), default=0) * WIDEST * SMALL
     return widest + 4.5 + (FONT + 5 if panel.ylabel else 0)
 
@@ -115,7 +106,7 @@ def _panel(panel: Panel, row: Row, top: float, x: float, width: float, name: str
     place = Frame(x, top + above, width, height, *panel.limits(), panel.logarithmic, panel.x_logarithmic)
     if panel.bare:
         return [written(panel.words, x + width / 2, place.y + place.height / 2 + 3, size=FONT)] if panel.words else []
-    lines = "".join(f"M{place.x:.1f} {y:.1f}h{place.width:.1f}" for y, _ in _placed(_y_ticks(panel), place.up))
+    lines = "".join(f"M{place.x:.1f} {y:.1f}h{place.width:.1f}" for y, _ in _placed(panel.y_ticks(), place.up))
     box = f'x="{place.x:.1f}" y="{place.y:.1f}" width="{place.width:.1f}" height="{place.height:.1f}"'
     drawn = "".join(path_of(mark, place) for mark in panel.marks)
     (x0, x1), (y0, y1) = place.xlim, place.ylim
@@ -146,7 +137,7 @@ def _below(panel: Panel) -> float:
 def _axes(panel: Panel, place: Frame, below: float) -> Iterator[str]:
     base, left, far = place.y + place.height, place.x, place.x + place.width
     lines, words = [f"M{left:.1f} {base:.1f}H{far:.1f}"], []
-    for x, text in _placed(_x_ticks(panel), place.across):
+    for x, text in _placed(panel.x_ticks(), place.across):
         lines.append(f"M{x:.1f} {base:.1f}v2.5")
         if panel.names:
             words.append(written(text, 0, 0, "end", turned=(x + 2.3, base + 4)))
@@ -154,7 +145,7 @@ def _axes(panel: Panel, place: Frame, below: float) -> Iterator[str]:
             words.append(written(text, x, base + SMALL + 3))
     if panel.left:
         lines.append(f"M{left:.1f} {place.y:.1f}V{base:.1f}")
-        for y, text in _placed(_y_ticks(panel), place.up):
+        for y, text in _placed(panel.y_ticks(), place.up):
             lines.append(f"M{left:.1f} {y:.1f}h-2.5")
             words.append(written(text, left - 4, y + 2.5, "end") if panel.y_numbers else "")
     yield f'<path d="{"".join(lines)}" stroke="var(--muted)" stroke-width="0.6" fill="none"/>'
@@ -247,7 +238,7 @@ def draw(
 
 
 def path_of(mark: Mark, place: Frame) -> str:
-    colour, edges = mark.colour if mark.colour.startswith("#") else f"var(--{mark.colour})", ""
+    colour = mark.colour if mark.colour.startswith("#") else f"var(--{mark.colour})"
     alpha = f' opacity="{mark.alpha:g}"' if mark.alpha < 1 else ""
     x, y, top = place.across(mark.x), place.up(mark.y), place.up(mark.top)
     far, base = place.x + place.width, place.y + place.height
@@ -289,11 +280,9 @@ def _spots(x: Array, y: Array, mark: Mark) -> tuple[Array, Array, list[str]]:
     """Where dots are drawn, each spot once, and what is drawn there."""
     seen = np.isfinite(x) & np.isfinite(y)
     spots: Array = np.unique(np.round(np.column_stack([x[seen], y[seen]]), 1), axis=0)
-    r = mark.size / 2
-    arc = f"a{r:g} {r:g} 0 1 0"
-    stroke = {"dots": "h0", "ticks": f"m0 {r:g}v-{mark.size:g}", "dashes": f"m-{r:g} 0h{mark.size:g}"}.get(
-        mark.kind, f"m-{r:g} 0{arc} {mark.size:g} 0{arc}-{mark.size:g} 0"
-    )
+    r, size = f"{mark.size / 2:g}", f"{mark.size:g}"
+    ring = f"m-{r} 0a{r} {r} 0 1 0 {size} 0a{r} {r} 0 1 0-{size} 0"
+    stroke = {"dots": "h0", "ticks": f"m0 {r}v-{size}", "dashes": f"m-{r} 0h{size}", "rings": ring}[mark.kind]
     return spots[:, 0], spots[:, 1], [stroke] * len(spots)
 
 
@@ -303,13 +292,12 @@ def _each(x: Array, y: Array, strokes: Sequence[str]) -> str:
 
 def _line(x: Array, y: Array) -> str:
     """A path through what is finite, anew behind each gap."""
-    parts, pen = [], False
+    parts, letter = [], "M"
     for u, v in zip(x.tolist(), y.tolist(), strict=True):
-        if math.isfinite(u) and math.isfinite(v):
-            parts.append(f"{'L' if pen else 'M'}{u:.1f} {v:.1f}")
-            pen = True
-        else:
-            pen = False
+        there = math.isfinite(u) and math.isfinite(v)
+        if there:
+            parts.append(f"{letter}{u:.1f} {v:.1f}")
+        letter = "L" if there else "M"
     return "".join(parts)
 
 

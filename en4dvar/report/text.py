@@ -94,9 +94,14 @@ def number_like(value: float, std: float) -> str:
     return text.lstrip("-") if float(text) == 0 else text.replace("-", "−")
 
 
+def quantity(value: float, std: float, unit: str = "1") -> str:
+    """``"2.80 kPa"``, with the decimals that the std calls for."""
+    return f"{number_like(value, std)}{unit_behind(unit)}"
+
+
 def range_words(low: float, high: float, std: float, unit: str = "1") -> str:
     """``"2.6 … 3.0 kPa"``, with the decimals that the std calls for."""
-    return f"{number_like(low, std)} … {number_like(high, std)}{unit_behind(unit)}"
+    return f"{number_like(low, std)} … {quantity(high, std, unit)}"
 
 
 def plus_minus(mean: float, std: float) -> str:
@@ -142,12 +147,17 @@ def fixed(value: float, places: int) -> str:
 def shown(variable: Variable | xr.DataArray, values: npt.ArrayLike | None = None) -> Array:
     """The values of a variable of a result file in its display unit, or others that have its unit."""
     held = np.asarray(variable.values if values is None else values, dtype=float)
-    return convert(held, str(variable.attrs["units"]), str(variable.attrs["display_units"]))
+    return convert(held, str(variable.attrs["units"]), display_unit(variable))
+
+
+def display_unit(variable: Variable | xr.DataArray) -> str:
+    """The unit in which a variable of a result file is shown."""
+    return str(variable.attrs.get("display_units", variable.attrs["units"]))
 
 
 def axis_label(variable: Variable | xr.DataArray, words: str = "") -> str:
     """Words, or the symbol of a variable of a result file, and its display unit."""
-    return with_unit(words or str(variable.attrs["symbol"]), str(variable.attrs["display_units"]))
+    return with_unit(words or str(variable.attrs["symbol"]), display_unit(variable))
 
 
 def since(zero: float, unit: str) -> str:
@@ -155,9 +165,10 @@ def since(zero: float, unit: str) -> str:
     return with_unit(f"time since {zero:.6g}{unit_behind(unit)} of the data" if zero else "time", unit)
 
 
-def time_axis(time: Variable) -> str:
-    """Of an axis of times of readings of a result file."""
-    return since(float(shown(time, zero_of(time))), str(time.attrs["display_units"]))
+def time_axis(*times: Variable) -> str:
+    """Of an axis of times of readings of a result file; of clocks that begin at other times it is the model's alone."""
+    zeros = {float(shown(time, zero_of(time))) for time in times}
+    return since(zeros.pop() if len(zeros) == 1 else 0.0, display_unit(times[0]))
 
 
 def figure_text(name: str) -> str:

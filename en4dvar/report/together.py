@@ -17,22 +17,11 @@ from en4dvar.estimation.summary import ParameterSummary, estimate_cells, results
 from en4dvar.plumbing.caution import Caution, parsed, untrusted
 from en4dvar.plumbing.files import write_text
 from en4dvar.plumbing.tables import table, write_csv
+from en4dvar.report import text
 from en4dvar.report.chart import COLUMN, PAGE, POINTS, Chart, Panel, in_columns
 from en4dvar.report.export import Found, latex_table
 from en4dvar.report.html import write_page
 from en4dvar.report.svg import svg
-from en4dvar.report.text import (
-    axis_label,
-    figure_text,
-    number_like,
-    percent,
-    plain_number,
-    plus_minus,
-    range_words,
-    shown,
-    unit_behind,
-    with_unit,
-)
 from en4dvar.results.declared import parameter_of
 from en4dvar.results.together import JOINT, POPULATION, QUANTILES, StoredGroups, StoredJoint, StoredPopulation
 
@@ -87,9 +76,9 @@ def _as_stated(joint: StoredJoint, name: str) -> bool:
 def _row(
     cautions: Sequence[Caution], name: str, draws: xr.DataArray, prior: xr.DataArray | None = None
 ) -> ParameterSummary:
-    before = NOTHING if prior is None else shown(prior).ravel()
+    before, after = (NOTHING if draw is None else text.shown(draw).ravel() for draw in (prior, draws))
     centre, learned = float(np.median(draws.values)), float(draws.attrs.get("learned", np.nan))
-    return ParameterSummary.of(parameter_of(name, draws.attrs), before, shown(draws).ravel(), centre, learned, cautions)
+    return ParameterSummary.of(parameter_of(name, draws.attrs), before, after, centre, learned, cautions)
 
 
 def joint_lines(joint: StoredJoint) -> list[str]:
@@ -97,9 +86,8 @@ def joint_lines(joint: StoredJoint) -> list[str]:
     lines, shared = [], [e for e in estimates(joint) if not e.dataset]
     for e in (e for e in shared if not e.stated):
         without = f" without {e.without}" if e.without else f", one value in {len(joint.datasets)} data sets"
-        interval = f"5–95 %: {range_words(e.q05, e.q95, e.std, e.unit)}"
-        doubt = f"not to be trusted: {', '.join(e.untrusted)}" if e.untrusted else interval
-        lines.append(f"{e.label} {e.name} = {number_like(e.q50, e.std)}{unit_behind(e.unit)} ({doubt}){without}")
+        doubt = f"not to be trusted: {', '.join(e.untrusted)}" if e.untrusted else f"5–95 %: {_range(e)}"
+        lines.append(f"{e.label} {e.name} = {_median(e)} ({doubt}){without}")
     if stated := [e.label for e in shared if e.stated]:
         lines.append(f"left as stated beforehand, for the data say nothing new of them: {', '.join(stated)}")
     return lines
@@ -130,25 +118,24 @@ def forest(
     Where the posterior has the parameter for each data set too, that is drawn below.
     """
     alone, posterior, count = groups.group("alone"), groups.group("posterior"), len(datasets)
-    named = count <= 60
+    ticks, labels = (range(0, -count, -1), [text.figure_text(d) for d in datasets]) if count <= 60 else ((), ())
     panels = []
     for name, draws in common.items():
-        low, middle, high = shown(draws, member_quantiles(draws.values, QUANTILES))
-        panel = Panel(axis_label(draws), ylim=(-float(count), 1.0))
-        panel.yticks, panel.y_names = (range(0, -count, -1), [figure_text(d) for d in datasets]) if named else ((), ())
+        low, middle, high = text.shown(draws, member_quantiles(draws.values, QUANTILES))
+        panel = Panel(text.axis_label(draws), ylim=(-float(count), 1.0), yticks=ticks, y_names=labels)
         doubted = bool(untrusted(groups.cautions, name))
         if not doubted:
             panel.band([low, high], np.full(2, -count), np.ones(2), "posterior", 0.2)
         panel.line([middle, middle], [-count, 1], *(("centre", 0.9, "--") if doubted else ("posterior",)))
         if reference and name in reference:
-            value = float(shown(draws, reference[name][0]))
+            value = float(text.shown(draws, reference[name][0]))
             panel.line([value, value], [-count, 1], "ink", dash=":")
-        rows = shown(draws, alone[name].values)
+        rows = text.shown(draws, alone[name].values)
         has = np.flatnonzero(np.isfinite(rows[:, 1]))
         panel.intervals(rows[has, 0], rows[has, 2], -has, "prior")
         panel.dots(rows[has, 1], -has, "prior", 3.0)
         if "dataset" in posterior.get(name, draws).dims:
-            low, middle, high = shown(draws, member_quantiles(posterior[name].values[0], QUANTILES, axis=0))
+            low, middle, high = text.shown(draws, member_quantiles(posterior[name].values[0], QUANTILES, axis=0))
             if not doubted:
                 panel.intervals(low[has], high[has], -has - 0.3, "posterior")
                 panel.dots(middle[has], -has - 0.3, "posterior", 2.0)
@@ -167,8 +154,8 @@ def fits(joint: StoredJoint) -> Chart | None:
     for name in followed[:MOST_FITS]:
         curve = fit.sel(dataset=name)
         times, low, middle, high = curve["band"].values.T
-        label = with_unit(str(curve["observable"].item()), str(curve["unit"].item()))
-        panel = Panel(with_unit("time", str(curve["time_unit"].item())), label, title=figure_text(name))
+        label = text.with_unit(str(curve["observable"].item()), str(curve["unit"].item()))
+        panel = Panel(text.with_unit("time", str(curve["time_unit"].item())), label, title=text.figure_text(name))
         panel.band(times, low, high, "posterior", 0.25)
         panel.line(times, middle, "posterior")
         panel.dots(curve["time"].values, curve["value"].values, "ink", 1.8)
@@ -186,8 +173,8 @@ def write_joint(folder: Path) -> Path:
     cells = [[getattr(e, c) for c in columns] + [" ".join(e.untrusted)] for e in rows]
     write_csv(folder / "joint.csv", [[*columns, "warnings"], *cells])
     return write_page(
-        folder / "joint.html",
-        "joint.html.j2",
+        folder,
+        "joint",
         joint=joint,
         shared=[e for e in rows if not e.dataset],
         own=[e for e in rows if e.dataset],
@@ -225,7 +212,7 @@ def sentences(stored: StoredPopulation) -> tuple[str, ...]:
     """The answer: one sentence a parameter, and what the data determine together only."""
     of = dict(zip(stored.words, (rows for _, rows, _ in summaries(stored)), strict=False))
     free_of = dict(zip(stored.words, (rows for _, rows, _ in summaries(stored, "without_hyperprior")), strict=True))
-    centres, free_centres, free_spreads = of[stored.headline], free_of[stored.headline], free_of["between"]
+    centres = of[stored.headline]
     lines = []
     for centre, mean, spread in zip(centres, of["mean"], of["between"], strict=True):
         lines.append(_sentence(stored, centre, mean, spread))
@@ -241,20 +228,22 @@ def sentences(stored: StoredPopulation) -> tuple[str, ...]:
         checked = [_of_sets(stored, centre) for centre in centres if not centre.untrusted]
         lines += [f"Check without a model of the population: {words}." for words in checked]
     lines += [_together(stored, combination) for combination in stored.combinations]
-    effective = float(stored.tree.attrs["effective_draws_without_hyperprior"])
-    if effective < FEWEST:
+    if float(stored.tree.attrs["effective_draws_without_hyperprior"]) < FEWEST:
         words = f"the data leave {stored.headline} or spread open, or lie in its tail"
-        return (
-            *lines,
-            f"What would hold without the hyperprior of {stored.headline} and spread cannot be told: {words}.",
-        )
-    free = (f"{m.name} {_range(m)}, spread {_range(s)}" for m, s in zip(free_centres, free_spreads, strict=True))
-    words = f"{stored.headline} and spread equally likely everywhere"
-    return (*lines, f"Without the hyperprior ({words}): {'; '.join(free)}.")
+        free = f"What would hold without the hyperprior of {stored.headline} and spread cannot be told: {words}."
+    else:
+        each = zip(free_of[stored.headline], free_of["between"], strict=True)
+        ranges = "; ".join(f"{centre.name} {_range(centre)}, spread {_range(spread)}" for centre, spread in each)
+        free = f"Without the hyperprior ({stored.headline} and spread equally likely everywhere): {ranges}."
+    return (*lines, free)
 
 
 def _range(row: ParameterSummary) -> str:
-    return range_words(row.q05, row.q95, row.std, row.unit)
+    return text.range_words(row.q05, row.q95, row.std, row.unit)
+
+
+def _median(row: ParameterSummary) -> str:
+    return text.quantity(row.q50, row.std, row.unit)
 
 
 def _sentence(
@@ -264,18 +253,17 @@ def _sentence(
     if centre.untrusted and "empirical" in stored.tree.children:
         words = f"the draws of the population are not to be trusted ({', '.join(centre.untrusted)}): see the warnings"
         return f"{centre.label}: {_of_sets(stored, centre)}; {words}."
-    unit = unit_behind(centre.unit)
-    spread = f"{number_like(between.q50, between.std)}{unit} ({_range(between)})"
+    spread = f"{_median(between)} ({_range(between)})"
     draws = [stored.group("posterior")[f"{centre.name}_{what}"] for what in ("mean", "between")]
     logarithmic = _logarithmic(draws[0])
     if logarithmic:
-        low, middle, high = map(percent, np.quantile(draws[1].values / draws[0].values, (0.05, 0.5, 0.95)))
+        low, middle, high = map(text.percent, np.quantile(draws[1].values / draws[0].values, (0.05, 0.5, 0.95)))
         spread = f"{middle} ({low} … {high})"
     what = "median (geometric mean)" if logarithmic and stored.headline == "median" else stored.headline
-    words = f"{centre.label} {centre.name} = {number_like(centre.q50, centre.std)}{unit} (5–95 %: {_range(centre)}), "
+    words = f"{centre.label} {centre.name} = {_median(centre)} (5–95 %: {_range(centre)}), "
     words += f"the {what} of the population; from data set to data set it varies by {spread}"
     if logarithmic and stored.headline == "median":
-        words += f"; its arithmetic mean is {number_like(mean.q50, mean.std)}{unit} ({_range(mean)})"
+        words += f"; its arithmetic mean is {_median(mean)} ({_range(mean)})"
     if centre.untrusted:
         return f"{words}; not to be trusted: see the warnings."
     return words + (f"; the median is {centre.informed}." if centre.dfs < DETERMINED and centre.informed else ".")
@@ -285,34 +273,34 @@ def _compared(stored: StoredPopulation, centre: ParameterSummary) -> Iterator[st
     if centre.name not in stored.reference:
         return
     posterior = stored.group("posterior")[f"{centre.name}_{stored.headline}"]
-    value, std = map(float, shown(posterior, stored.reference[centre.name]))
+    value, std = map(float, text.shown(posterior, stored.reference[centre.name]))
     source = str(stored.tree.attrs.get("reference_source", ""))
-    stated = plus_minus(value, std) if std == std else plain_number(value, 4)
-    below = float(np.mean(shown(posterior) < value))
-    words = f"reference: {centre.name} = {stated}{unit_behind(centre.unit)}{f', {source}' if source else ''}"
+    stated = text.plus_minus(value, std) if std == std else text.plain_number(value, 4)
+    below = float(np.mean(text.shown(posterior) < value))
+    words = f"reference: {centre.name} = {stated}{text.unit_behind(centre.unit)}{f', {source}' if source else ''}"
     side, chance = ("below", below) if below > 0.5 else ("above", 1 - below)
     yield f"{words}; the estimate lies {side} it with probability {chance:.2f}."
 
 
 def _in_parts(stored: StoredPopulation, mean: ParameterSummary, of: xr.DataArray, std: float) -> str:
     """What the interval is made of, where data sets have anything in common."""
-    between, common = map(float, shown(of, [of.attrs["std_between"], of.attrs["std_common"]]))
-    unit, shared = unit_behind(mean.unit), ", ".join(stored.common)
+    stds = map(float, text.shown(of, [of.attrs["std_between"], of.attrs["std_common"]]))
+    between, common = (text.quantity(part, std, mean.unit) for part in stds)
     return (
-        f"Of it ± {number_like(between, std)}{unit} is from the data sets and how they differ, and ± "
-        f"{number_like(common, std)}{unit} from what they have in common ({shared}), which more of them do not reduce."
+        f"Of it ± {between} is from the data sets and how they differ, and ± {common} from what they have in common "
+        f"({', '.join(stored.common)}), which more of them do not reduce."
     )
 
 
 def _of_sets(stored: StoredPopulation, centre: ParameterSummary) -> str:
     """The median over the data sets one by one, which needs no model of how they vary."""
     of = stored.group("empirical")[centre.name]
-    low, middle, high = shown(of)
+    low, middle, high = text.shown(of)
     std = (high - low) / 3.29
     words = (
         f"the median of {len(stored.datasets)} data sets one by one is {centre.name} = "
-        f"{number_like(middle, std)}{unit_behind(centre.unit)} (5–95 %: {range_words(low, high, std)}), where each "
-        "counts by the share of its prior's variance that its data took away"
+        f"{text.quantity(middle, std, centre.unit)} (5–95 %: {text.range_words(low, high, std)}), where each counts by "
+        "the share of its prior's variance that its data took away"
     )
     parts = _in_parts(stored, centre, of, std).removesuffix(".") if centre.untrusted and stored.common else ""
     return f"{words}. {parts}" if parts else words
@@ -323,9 +311,9 @@ def _together(stored: StoredPopulation, combination: Combination) -> str:
     names = " and ".join(name for name, _ in combination.parts)
     if not all(_logarithmic(stored.group("posterior")[f"{name}_mean"]) for name, _ in combination.parts):
         return f"{names}: the data determine a combination of them, and less of each."
-    powers = ((name, number_like(exponent, 0.1)) for name, exponent in combination.parts)
+    powers = ((name, text.quantity(exponent, 0.1)) for name, exponent in combination.parts)
     product = " · ".join(name if power == "1.00" else f"{name}^{power}" for name, power in powers)
-    return f"{names}: the data determine {product}, to {percent(combination.std)}, and less of each."
+    return f"{names}: the data determine {product}, to {text.percent(combination.std)}, and less of each."
 
 
 def _logarithmic(draws: xr.DataArray) -> bool:
@@ -358,8 +346,8 @@ def write_population(folder: Path) -> Path:
     write_csv(folder / "population.csv", summary_rows(rows, {}))
     write_text(folder / "population.tex", latex_table(rows))
     return write_page(
-        folder / "population.html",
-        "population.html.j2",
+        folder,
+        "population",
         stored=stored,
         sentences=sentences(stored),
         population=rows[: len(stored.words)],

@@ -15,7 +15,7 @@ from en4dvar.report import sequence
 from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, Row, stacked
 from en4dvar.report.paper import on_paper
 from en4dvar.report.svg import Captioned
-from en4dvar.report.text import plain_number, pretty_unit, with_unit
+from en4dvar.report.text import axis_label, plain_number, pretty_unit, with_unit
 from en4dvar.results.netcdf import Group, read_groups
 from en4dvar.results.series_file import MEAN, series_group
 from en4dvar.series.twin import TwinResult
@@ -116,7 +116,7 @@ def scores(data: Group) -> Chart:
         panel.line(time, spread.values, "centre", 0.7, "--", label="spread")
         panel.rule(average, colour)
         panels.append(panel)
-    return stacked(panels, 3.0 * POINTS, sequence.time_label(data))
+    return stacked(panels, 3.0 * POINTS, axis_label(data["time"], "time"))
 
 
 def errors(data: Group) -> Chart:
@@ -135,7 +135,7 @@ def errors(data: Group) -> Chart:
         panel.rule(0, size=0.5)
         panel.line(time, error[-LAST:, i], "ink", 0.8, label="analysis − truth")
         panels.append(panel)
-    return stacked(panels, 2.8 * POINTS, sequence.time_label(data))
+    return stacked(panels, 2.8 * POINTS, axis_label(data["time"], "time"))
 
 
 def truth_ranks(data: Group) -> Chart:

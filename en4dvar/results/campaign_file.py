@@ -75,8 +75,7 @@ def save_campaign(
     path: Path, pack: Pack, sources: Mapping[str, str], attributes: Mapping[str, Any], failures: Mapping[str, str]
 ) -> Path:
     """Write the campaign's file; one that is there already, of the same results, is left as it is. ``sources``: name of
-    the data set → its name in the ``pack``, in order, not empty; ``failures``: name of one without a posterior →
-    reason.
+    the data set → its name in the ``pack``, in order, not empty; ``failures``: name of one without a posterior → why.
 
     Raises :class:`DamagedError`: results cannot be read. :class:`OutputError`: the file cannot be written.
     """
@@ -97,15 +96,14 @@ def save_campaign(
 
 
 def _layout(pack: Pack, sources: Mapping[str, str]) -> _Layout:
-    layout, damaged, reasons = _Layout(), [], []
+    layout, damaged = _Layout(), dict[str, str]()
     for name, stem in sources.items():
         try:
             layout.add(pack.content(stem))
         except (OutputError, KeyError, ValueError) as error:  # the last two: written by somebody else
-            damaged.append(name)
-            reasons.append(str(error))
+            damaged[name] = str(error)
     if damaged:
-        raise DamagedError(damaged, "\n".join(reasons))
+        raise DamagedError([*damaged], "\n".join(damaged.values()))
     return layout
 
 
@@ -202,10 +200,8 @@ def _place(rows: np.ndarray[Any, Any], which: list[int], variable: netcdf.Variab
     if rows.shape[1:] == variable.values.shape[1:] and (places is None or PARAMETER not in variable.dims):
         rows[which] = variable.values
     elif variable.values.size:  # no parameter, no value
-        where = (
-            places if places and dim == PARAMETER else slice(n)
-            for dim, n in zip(variable.dims, variable.values.shape[1:], strict=True)
-        )  # fmt: skip
+        sizes = zip(variable.dims, variable.values.shape[1:], strict=True)
+        where = (places if places and dim == PARAMETER else slice(n) for dim, n in sizes)
         own = rows[which]
         own[(slice(None), *where)] = variable.values
         rows[which] = own

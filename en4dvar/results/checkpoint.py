@@ -1,16 +1,12 @@
 """Checkpoints: what an interrupted run needs to continue to the same bits.
 
-``checkpoints/run.yaml`` says what was computed (resolved configuration, sources, data); ``<data set>.iteration`` holds
-the forward runs of a data set under way (:mod:`~en4dvar.results.journal`), ``ended`` how a single one ended.
-``twin.cycle`` holds the state of a twin experiment. Prior ensembles, perturbations and rotations are drawn again from
-the seed: their streams are counter-based and have no state.
+Prior ensembles, perturbations and rotations are not among it: they are drawn again from the seed.
 
 Every file starts with one line: format, version, kind, fingerprint of the run and the data set, and the SHA-256 of the
-rest. A file that was cut short, altered, or written by another run is named and not used.
-
-What it holds are frozen dataclasses of numbers, text and arrays: one JSON text, which says of each array its kind, its
-shape, its order and where it begins, and after it the numbers of all arrays. What is read back is checked against the
-annotations of the dataclass. Nothing that is read is executed (no pickle).
+rest. A file that was cut short, altered, or written by another run is named and not used. It holds frozen dataclasses
+of numbers, text and arrays: one JSON text, which says of each array its kind, its shape, its order and where it begins,
+and after it the numbers of all arrays. What is read back is checked against the annotations of the dataclass. Nothing
+that is read is executed (no pickle).
 """
 
 import functools
@@ -38,7 +34,7 @@ FORMAT = "en4dvar-checkpoint"
 VERSION = "4"
 LONGEST = 64_000_000_000  # bytes of a checkpoint
 FOLDER = "checkpoints"
-_HEAD = struct.Struct("<cQ")  # before what holds arrays: a letter and the size of the text
+_HEAD = struct.Struct("<cQ")  # before what holds numbers of arrays: a letter and the size of the text
 
 
 class CheckpointError(OutputError):
@@ -127,16 +123,11 @@ def encode(value: Any) -> bytes:
     """Bytes of a dataclass whose fields are float, int, bool, str, None, float arrays, tuples and dataclasses."""
     numbers = bytearray()
     text = json.dumps(_plain(value, numbers)).encode("ascii")  # repr of a float is exact; NaN and Infinity are kept
-    return b"".join((_HEAD.pack(b"A", len(text)), text, numbers))
-
-
-def encode_text(value: Any) -> bytes:
-    """As :func:`encode`, of a dataclass without arrays: its JSON text alone."""
-    return json.dumps(_plain(value, bytearray())).encode("ascii")
+    return b"".join((_HEAD.pack(b"A", len(text)), text, numbers)) if numbers else text
 
 
 def decode(content: bytes, kind: type[D]) -> D:
-    """The dataclass of :func:`encode` or :func:`encode_text`. Raises :class:`ValueError`: it is not of ``kind``."""
+    """The dataclass of :func:`encode`. Raises :class:`ValueError`: it is not of ``kind``."""
     with retold((KeyError, TypeError, ValueError, struct.error), ValueError, f"not a {kind.__name__}: "):
         text, numbers = content, bytearray()
         if not content.startswith(b"{"):

@@ -1,7 +1,5 @@
-"""Variables and attributes of a result file, each declared once: name, dimensions, unit, meaning, and its values.
-
-Writing follows the declarations (:func:`lay_out`), and so do the check of a file that is read
-(:mod:`en4dvar.results.store`) and the reference page of the documentation.
+"""Variables and attributes of a result file, each declared once: name, dimensions, unit, meaning, and its values. The
+declarations say what is written, what is asked of a file that is read, and the reference page of the documentation.
 
 A name may hold a placeholder, as in ``{parameter}_centre``. Such a variable exists once for each item of a scope (each
 parameter, each series), whose names take the places of all placeholders in its name and its dimensions.
@@ -26,8 +24,7 @@ _PLACEHOLDER = re.compile(r"\{(\w+)\}")
 @dataclass(frozen=True)
 class Item:
     """A parameter, a series or the like that has variables: ``held``, the object that their values are taken from;
-    ``names`` in place of placeholders; ``label``, in prose; ``about``: ``units``, ``display_units``, ``symbol`` and so
-    on.
+    ``names`` in place of placeholders; ``label``, in prose; ``about``: ``units``, ``symbol`` and so on.
     """
 
     held: Any
@@ -43,8 +40,8 @@ Scopes = Mapping[str, Callable[[Any], Iterable[Item]]]
 
 @dataclass(frozen=True)
 class UnitRule:
-    """A rule for the unit of a variable and how it is shown: ``words`` for the reference page, the ``attributes`` of a
-    subject and an item, and ``keys`` of them that are in every file.
+    """The unit of a variable and how it is shown: ``words`` for the reference page, ``attributes`` of a subject and an
+    item, and ``keys`` of them that are in every file.
     """
 
     words: str
@@ -67,10 +64,9 @@ ALWAYS = When("", lambda _, item: True)
 
 @dataclass(frozen=True)
 class Declared:
-    """A variable. ``meaning``: its ``long_name``, with ``{label}`` for that of the item.
-
-    ``values``: of the subject, and of the item where the name has a placeholder. ``needed``: a file without it is no
-    result. ``fill`` and ``single`` as of :class:`~en4dvar.results.netcdf.Variable`.
+    """A variable. ``meaning``: its ``long_name``, with ``{label}`` for that of the item. ``values``: of a subject and,
+    where the name has a placeholder, of an item. ``needed``: no result is without it. ``fill`` and ``single`` as of
+    :class:`~en4dvar.results.netcdf.Variable`.
     """
 
     name: str
@@ -121,12 +117,13 @@ def lay_out(table: Table, subject: Any, scopes: Scopes) -> dict[str, Variable]:
 
 
 def group_of(
-    variables: Mapping[str, Variable], coordinates: Mapping[str, Variable], attributes: Mapping[str, Any] | None = None
-) -> Group:
-    """A group of variables with those of the coordinates that belong to their dimensions."""
+    variables: Mapping[str, Variable], coordinates: Mapping[str, Variable], about: Iterable[Attribute], subject: Any, /,
+    **more: Any,
+) -> Group:  # fmt: skip
+    """A group of variables with the coordinates that belong to their dimensions, and attributes of the subject."""
     dims = dict.fromkeys(dim for variable in variables.values() for dim in variable.dims)
     own = {dim: coordinates[dim] for dim in dims if dim in coordinates}
-    return Group(variables, own, netcdf_attributes(attributes or {}))
+    return Group(variables, own, netcdf_attributes(attributes_of(about, subject) | more))
 
 
 def attributes_of(table: Iterable[Attribute], subject: Any) -> dict[str, Any]:

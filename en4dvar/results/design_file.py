@@ -34,11 +34,7 @@ COLUMNS = {  # field of an evaluation → variable, its dimensions beside that o
     "fan": ("fan", "level point", "{seen}"),
 }
 NEEDED = {  # the same, where something is wanted; of the last condition all others at once
-    "needed": (
-        "needed_factor",
-        "wanted condition",
-        "largest factor of the prior std of others that allows what is wanted",
-    ),
+    "needed": ("needed_factor", "wanted condition", "largest factor of others' prior std that allows what is wanted"),
     "others": ("other_std", "measure other", "prior std of others, in their units and relative to the value"),
 }
 PADDED = ("taken", "point")  # of which one design has more than another
@@ -53,7 +49,7 @@ DECISION = {  # field → variable, description
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # of arrays, which do not compare
 class DesignRow:
     """A design: its ``number`` in the file, what its knobs are set to (nothing: as in the file), what it is worth, or
     the reason why that is not known; ``price`` in the unit of the file.
@@ -160,11 +156,9 @@ def _row(root: Group, i: int) -> DesignRow:
     number, settings, price, failure = int(of("number")), json.loads(of("settings")), of("price"), of("failure")
     if failure:
         return DesignRow(number, settings, None, price, failure)
-    optional = {key for key, (name, *_) in (NEEDED | {"thin": COLUMNS["thin"]}).items() if name not in root}
-    columns = {key: about for key, about in (COLUMNS | NEEDED).items() if key not in optional}
-    held = {key: of(name, along) for key, (name, along, _) in columns.items()}
-    counts = {key: int(held[key]) for key in ("alike", "forward_runs")}
-    fan = held["fan"][:, : len(held["grid"])]
+    held = {key: of(name, along) for key, (name, along, _) in (COLUMNS | NEEDED).items() if name in root}
+    held |= {key: int(held[key]) for key in ("alike", "forward_runs")}
+    held["fan"] = held["fan"][:, : len(held["grid"])]
     decision = {key: of(name) for key, (name, _) in DECISION.items() if name in root}
     told = Decision(**decision) if decision else None
-    return DesignRow(number, settings, Evaluated(**{**held, **counts, "fan": fan, "decision": told}), price)
+    return DesignRow(number, settings, Evaluated(**held, decision=told), price)

@@ -1,8 +1,7 @@
 """The forward runs of a data set under way, in the order in which they were asked for.
 
 Between them nothing is random and nothing is read, so that an interrupted estimate that begins again asks for the same
-ones: it is given those that were kept, makes the others, and comes to the same bits. This holds of everything that runs
-the model: prior forecast, start, iterations, searches, chains, importance draws and what-if fits.
+ones: it is given those that were kept, makes the others, and comes to the same bits.
 """
 
 import threading
@@ -32,10 +31,9 @@ class StoppedError(Exception):
 
 
 class Journal(Executor):
-    """An ``executor`` of forward runs that are kept, and that are not made where they are known from ``before``.
-
-    ``keeper`` writes them to a file; a worker that does not see its folder keeps none. ``stop`` gives the data set up
-    at its next forecast (within one process only).
+    """An ``executor`` of forward runs that are not made where they are known from ``before``. ``keeper`` writes them to
+    a file, unless this worker does not see its folder. ``stop`` gives the data set up at its next forecast (within one
+    process only).
     """
 
     def __init__(
@@ -60,12 +58,11 @@ class Journal(Executor):
             return self.forecasts[at]
         del self.keys[at:], self.forecasts[at:]
         forecast = run(*asked)
-        keeper = self.keeper
-        if keeper is not None and keeper.path.parent.is_dir() and at == len(self.keys) and self.room > 0:
+        if self.keeper and self.keeper.path.parent.is_dir() and at == len(self.keys) and self.room > 0:
             self.keys.append(key)
             self.forecasts.append(forecast)
             self.room -= forecast.nbytes
-            keeper.keep(lambda: KnownRuns(tuple(self.keys), tuple(self.forecasts)))
+            self.keeper.keep(lambda: KnownRuns(tuple(self.keys), tuple(self.forecasts)))
         return forecast
 
     def map(self, *arguments: Any, **named: Any) -> Any:

@@ -1,11 +1,9 @@
-"""Groups of variables ⇄ NETCDF4 files, several times faster than through xarray's file backend.
+"""Groups of variables ⇄ NETCDF4 files, several times faster than through xarray, whose import takes as long as an
+estimate; :func:`tree_of` and :func:`dataset_of` show them through it.
 
 All definitions come before all data: HDF5 then lays out its metadata once. The encoding is xarray's own (NaN as fill
-value of floats, truth values as bytes with ``dtype: bool``, text as variable-length strings), so that every reader
-sees the same. A file is made in memory: a worker far away can do it, and a file system is touched once.
-
-:class:`Group` and :class:`Variable` are what the program works with: the import of xarray takes as long as an estimate.
-:func:`tree_of` and :func:`dataset_of` show them through it.
+value of floats, truth values as bytes with ``dtype: bool``, text as variable-length strings). A file is made in memory:
+a worker far away can do it, and a file system is touched once.
 
 The last line of a file is its seal: format, version and SHA-256 of everything before it. HDF5 has no checksum of its
 own: of files with one flipped bit most are read without a word, and some send its library into an endless loop. So the
@@ -135,9 +133,8 @@ def netcdf_attributes(attributes: Mapping[Any, Any]) -> dict[str, Any]:
 
 def variable(dims: str | tuple[str, ...], values: Any, units: str, long_name: str, **attrs: Any) -> Variable:
     """A variable with what CF asks of it."""
-    dims = (dims,) if isinstance(dims, str) else dims
     attributes = netcdf_attributes({"units": units, "long_name": long_name, **attrs})
-    return Variable(dims, np.asarray(values), attributes)
+    return Variable((dims,) if isinstance(dims, str) else dims, np.asarray(values), attributes)
 
 
 Groups = Mapping[str, Group]
@@ -154,10 +151,8 @@ def to_bytes(groups: Groups) -> SealedBytes:
             data = [item for path, group in groups.items() for item in _define(file, path, group)]
             for variable, values in data:
                 _write(variable, values)
-        except BaseException:
-            file.close()
-            raise
-        content = file.close()
+        finally:
+            content = file.close()
     return SealedBytes.of(content)
 
 
@@ -228,8 +223,7 @@ def _read(group: Any) -> Iterator[tuple[str, Group]]:
 def _read_variable(variable: Any) -> tuple[Variable, str]:
     """With the names of coordinates that xarray lists beside it."""
     about = Said(variable.__dict__)
-    fill, listed = "_FillValue" in about, str(about.pop("coordinates", ""))
-    about.pop("_FillValue", None)
+    fill, listed = about.pop("_FillValue", None) is not None, str(about.pop("coordinates", ""))
     values = np.asarray(variable[...], dtype=object if variable.dtype is str else None)
     if about.get("dtype") == "bool":
         del about["dtype"]

@@ -5,10 +5,9 @@ then how the data set ended, then its groups. What is there is known from the li
 by a kill or a full disk is the last one and is overwritten, and damage ends at the next line that can be read. Of
 several records of a name the last one counts. The result of a data set has an address: ``datasets.pack/<name>``.
 
-Groups are two JSON texts, then the numbers: ten times faster to write and to read than a netCDF file of them, of which
-the definitions are most of the work. The first text says which variables there are, and is the same for most data sets
-of a campaign, so that it is understood once; the second holds what is said of the groups, and variables of text.
-Nothing that is read is executed.
+Groups are two JSON texts, then the numbers: ten times faster than a netCDF file of them. The first text says which
+variables there are, and is the same for most data sets of a campaign, so that it is understood once; the second holds
+what is said of the groups, and variables of text. Nothing that is read is executed.
 """
 
 import functools
@@ -106,10 +105,8 @@ def read_outcome(path: Path, name: str, entry: Entry) -> bytes:
 
 
 def file_names(names: Iterable[str]) -> dict[str, str]:
-    """Name of the data set → name of a file, without suffix, that every file system takes and that is unique there.
-
-    Letters of any script stay; blanks and signs become ``_``; names that differ only in case or accents' encoding get
-    a number.
+    """Name of the data set → name of a file, without suffix, that every file system takes and that is unique there:
+    blanks and signs become ``_``; names that differ only in case or accents' encoding get a number.
 
     >>> file_names(["gel 1", "gel/1", "Gel_1", "ゲル"])
     {'gel 1': 'gel_1', 'gel/1': 'gel_1_2', 'Gel_1': 'Gel_1_3', 'ゲル': 'ゲル'}

@@ -1,9 +1,7 @@
 """Where a result comes from: versions, platform, commit, configuration, as attributes of the file that holds it; and
-what decides the numbers of a run, as text that can be compared: a run is continued only where it agrees.
-
-The latter: configuration (without ``execution`` and ``output``, which never change the numbers), versions of the
-numerical packages, sources of the framework and of the model, files that the model's settings name, content of the data
-files.
+what decides the numbers of a run, as text that must agree where a run is continued: configuration (without
+``execution`` and ``output``, which never change the numbers), versions of the numerical packages, sources of the
+framework and of the model, files that the model's settings name, content of the data files.
 """
 
 import difflib
@@ -32,10 +30,10 @@ PACKAGES = ("en4dvar", "numpy", "scipy", "numba", "xarray", "netCDF4", "pydantic
 
 
 def provenance(config_text: str, config_path: str | Path | None = None, command: str = "") -> dict[str, str]:
-    """ACDD and provenance attributes of a result. ``config_text``: the configuration, verbatim; ``config_path``: its
-    file, of which the commit is recorded; ``command``: what the user typed, for ``history``.
+    """ACDD and provenance attributes of a result; what cannot be found out (no git, an installed package) is "".
 
-    Nothing here fails: what cannot be found out (no git, an installed package) is left as an empty string.
+    ``config_text``: the configuration, verbatim; ``config_path``: its file, of which the commit is recorded;
+    ``command``: what the user typed, for ``history``.
     """
     now = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
     versions = package_versions(PACKAGES)
@@ -46,7 +44,7 @@ def provenance(config_text: str, config_path: str | Path | None = None, command:
         "configuration": config_text,
         "configuration_file": Path(config_path).name if config_path else "",
         "configuration_git_commit": git_commit(Path(config_path)) if config_path else "",
-        "git_commit": _own_commit(),
+        "git_commit": _kept_commit(Path(__file__)),
         "package_versions": ", ".join(f"{name} {v}" for name, v in versions.items()),
         "python_version": platform.python_version(),
         "platform": f"{platform.system()} {platform.release()} {platform.machine()}",
@@ -66,11 +64,6 @@ def package_versions(names: Iterable[str]) -> dict[str, str]:
 _version = cache(metadata.version)  # modules stay what they were when they were imported
 
 
-@cache
-def _own_commit() -> str:
-    return git_commit(Path(__file__))
-
-
 def git_commit(path: Path) -> str:
     """Commit of the repository that tracks ``path``, with ``+changes`` where the work tree differs; "" if none."""
     folder = path.resolve().parent
@@ -79,6 +72,9 @@ def git_commit(path: Path) -> str:
     commit = _git(folder, "rev-parse", "HEAD")
     changed = commit and _git(folder, "status", "--porcelain", "--untracked-files=no")
     return f"{commit}+changes" if changed else commit
+
+
+_kept_commit = cache(git_commit)  # of this package, as it was imported
 
 
 def _git(folder: Path, *arguments: str) -> str:

@@ -1,7 +1,6 @@
-"""The results of a run directory: those that are there, and by name those that ought to be.
-
-What a campaign ought to hold is known from three places: the lines of its pack, the names of its data sets in
-``checkpoints/run``, and those in ``posterior.nc``. Whichever is damaged, no data set vanishes without a word.
+"""The results of a run directory: those that are there, and by name those that ought to be, which is known from three
+places: the lines of its pack, ``checkpoints/run`` and ``posterior.nc``. Whichever is damaged, no data set vanishes
+without a word.
 """
 
 from collections.abc import Callable, Iterator
@@ -22,9 +21,7 @@ NAMELESS = "some data set"
 
 
 class LackingError(OutputError):
-    """Data sets of a run cannot be read, which the message names; ``rest`` is what was made of the others (a text, the
-    path of a page), None where nothing was.
-    """
+    """Data sets of a run, which the message names, cannot be read; ``rest``: what was made of others, if anything."""
 
     def __init__(self, message: str, rest: str | Path | None = None):
         super().__init__(message)
@@ -95,11 +92,9 @@ class RunResults:
         told = [f"{name} ({reason})" for name, reason in list(self.lacking.items())[:MOST_NAMES]]
         if len(self.lacking) > MOST_NAMES:
             told.append(f"and {len(self.lacking) - MOST_NAMES} more")
-        raise LackingError(
-            f"{self.run_dir}: no result that can be read of {', '.join(told)}; "
-            "'en4dvar run' with --resume estimates what is missing",
-            rest if self._read else None,
-        )
+        words = f"{self.run_dir}: no result that can be read of {', '.join(told)}"
+        hint = "'en4dvar run' with --resume estimates what is missing"
+        raise LackingError(f"{words}; {hint}", rest if self._read else None)
 
 
 def result_files(run_dir: Path) -> list[Path]:

@@ -4,7 +4,8 @@ import json
 import math
 from collections.abc import Callable
 from dataclasses import asdict
-from typing import Any, TypeVar
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,6 @@ from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import codes
 from en4dvar.results.declared import Attribute
 
-P = TypeVar("P")
 CONVENTIONS = "CF-1.11 ACDD-1.3"
 REFERENCES = (
     "Bocquet & Sakov (2014), doi:10.1002/qj.2236; Sakov, Oliver & Bertino (2012), doi:10.1175/MWR-D-11-00176.1; "
@@ -79,19 +79,15 @@ def _discrepancy_share(a: Analysis) -> float | None:
     return 1 - float(left @ left) / (float(residual @ residual) or np.nan)
 
 
-def _of(part: Callable[[Analysis], P | None]) -> Callable[[str, str, Callable[[P], Any]], Attribute]:
-    """Attributes of a part of an analysis, which are written where there is one."""
-
-    def attribute(name: str, meaning: str, value: Callable[[P], Any]) -> Attribute:
-        return Attribute(name, meaning, lambda a: None if (held := part(a)) is None else value(held))
-
-    return attribute
+def _of(part: Callable[[Analysis], Any], name: str, meaning: str, value: Callable[[Any], Any]) -> Attribute:
+    """An attribute of a part of an analysis, which is written where there is one."""
+    return Attribute(name, meaning, lambda a: None if (held := part(a)) is None else value(held))
 
 
-_withheld = _of(lambda a: a.withheld)
-_residual = _of(lambda a: a.residuals if a.residuals and a.residuals.enough else None)
-_change = _of(lambda a: None if a.log_evidence_change is None else a)  # of parameters that may vary in time
-_search = _of(lambda a: a.descents)  # of a scheme that searches for several minima
+_withheld = partial(_of, lambda a: a.withheld)
+_residual = partial(_of, lambda a: a.residuals if a.residuals and a.residuals.enough else None)
+_change = partial(_of, lambda a: None if a.log_evidence_change is None else a)  # of parameters that may vary in time
+_search = partial(_of, lambda a: a.descents)  # of a scheme that searches for several minima
 
 
 ROOT = (

@@ -35,9 +35,8 @@ def series_group(result: SeriesResult | TwinResult, attributes: Mapping[str, Any
 # What is common to both
 
 
-def _model(r: Any) -> ForwardModel:
-    model: ForwardModel = r.experiment.model if isinstance(r, TwinResult) else r.problem.start.model
-    return model
+def _model(r: SeriesResult | TwinResult) -> ForwardModel:
+    return r.experiment.model if isinstance(r, TwinResult) else r.problem.start.model
 
 
 def _series(r: Any) -> Any:

@@ -1,7 +1,7 @@
 """A stored result: what a run hands back, as its groups, without xarray; an analysis laid out in the ArviZ schema.
 
-Some groups stand beside those of ArviZ: tools take every variable of the observed data for one that is predicted, and
-every dimension of the predictions for one of the readings. So errors of readings and paths have groups of their own.
+Errors of readings and paths have groups of their own beside those of ArviZ: tools take every variable of the observed
+data for one that is predicted, and every dimension of the predictions for one of the readings.
 
 A file that is read is checked for what a result consists of, also behind a good seal, for anybody can seal a file.
 """
@@ -28,17 +28,7 @@ from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.caution import Caution, parsed
 from en4dvar.plumbing.errors import OutputError, retold
 from en4dvar.plumbing.units import UnitError, convert
-from en4dvar.results.declared import (
-    MEMBER,
-    Axis,
-    Declared,
-    attributes_of,
-    axes_of,
-    group_of,
-    lay_out,
-    parameter_of,
-    zero_of,
-)
+from en4dvar.results.declared import MEMBER, Axis, Declared, axes_of, group_of, lay_out, parameter_of, zero_of
 from en4dvar.results.netcdf import Group, Groups, Variable, read_groups, understood
 from en4dvar.results.pack import PACK, read_result, unpacked
 from en4dvar.results.scalars import ATTRIBUTES, SCALAR
@@ -198,10 +188,8 @@ class StoredResult:
 def require_settled(run_dir: Path) -> None:
     """Raise :class:`OutputError` where files of two runs may lie side by side."""
     if (run_dir / NEXT / COMPLETE).exists():
-        raise OutputError(
-            f"{run_dir}: a run was killed while its files took the place of an earlier run's; 'en4dvar run' with "
-            "--resume finishes that"
-        )
+        words = "a run was killed while its files took the place of an earlier run's"
+        raise OutputError(f"{run_dir}: {words}; 'en4dvar run' with --resume finishes that")
 
 
 def load_stored(path: str | Path) -> StoredResult:
@@ -215,10 +203,8 @@ def load_stored(path: str | Path) -> StoredResult:
     with understood(path):
         if "/posterior" in groups and "dataset" in groups["/posterior"]:
             names = list(map(str, groups["/posterior"]["dataset"].values))
-            raise OutputError(
-                f"{path}: a campaign of {len(names)} data sets; give the address of one of them, such as "
-                f"{path.parent / PACK / names[0]}, or open all of them with xarray.open_datatree"
-            )
+            hint = f"such as {path.parent / PACK / names[0]}, or open all of them with xarray.open_datatree"
+            raise OutputError(f"{path}: a campaign of {len(names)} data sets; give the address of one of them, {hint}")
         for fault in _faults({path_in_file: joined(groups, path_in_file) for path_in_file in groups}):
             raise OutputError(f"{path}: not a result of en4dvar: {fault}")
     return StoredResult(groups)
@@ -227,11 +213,11 @@ def load_stored(path: str | Path) -> StoredResult:
 def build_groups(a: Analysis, attributes: Mapping[str, Any]) -> dict[str, Group]:
     """All groups of an analysis by path; ``attributes`` are added to the root's and win over the defaults."""
     coordinates = lay_out(COORDINATES, a, SCOPES)
-    groups = {"/": group_of({}, {}, {**attributes_of(ATTRIBUTES["/"], a), **attributes})}
+    groups = {"/": group_of({}, {}, ATTRIBUTES["/"], a, **attributes)}
     for path, table in GROUPS.items():
         variables = lay_out(table, a, SCOPES)
         if variables or path not in OPTIONAL:
-            groups[path] = group_of(variables, coordinates, attributes_of(ATTRIBUTES.get(path, ()), a))
+            groups[path] = group_of(variables, coordinates, ATTRIBUTES.get(path, ()), a)
     return groups
 
 

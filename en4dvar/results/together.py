@@ -134,16 +134,14 @@ def _fit(estimate: JointEstimate, names: Sequence[str]) -> dict[str, Variable]:
         alive = run.path[:-1][run.active[:-1]]
         bands[e, : len(grid), 1:] = convert(member_quantiles(alive, QUANTILES, axis=0).T, *to_value)
     observables = [experiment.observable for experiment in experiments]
-    time_units = text(experiment.model.time_display_unit for experiment in experiments)
     apart = "from the value of all others, in standard deviations"
-    odd = np.array([int(name in estimate.odd) for name in names])
-    alive_counts = np.array([int(run.active[:-1].sum()) for run in estimate.forecasts])
+    odd = [int(name in estimate.odd) for name in names]
     return {
         "chi2_per_observation": variable("dataset", estimate.chi2, "1", "misfit per observation at the mode"),
-        "alive": variable("dataset", alive_counts, "1", "members that ran"),
+        "alive": variable("dataset", [run.active[:-1].sum() for run in estimate.forecasts], "1", "members that ran"),
         "observable": variable("dataset", text(o.label for o in observables), "", "what was observed"),
         "unit": variable("dataset", text(o.display_unit for o in observables), "", "unit of values and bands"),
-        "time_unit": variable("dataset", time_units, "", "unit of times"),
+        "time_unit": variable("dataset", text(e.model.time_display_unit for e in experiments), "", "unit of times"),
         "time": variable(("dataset", "observation"), times, "1", "times of the observations"),
         "value": variable(("dataset", "observation"), values, "1", "observations"),
         "band": variable(("dataset", "point", "what"), bands, "1", "time; 5, 50 and 95 % of the members there"),

@@ -81,8 +81,7 @@ def _clock(**more: str) -> UnitRule:
     """Times of the model; ``more`` attributes."""
 
     def attributes(a: Analysis, _: Item) -> dict[str, str]:
-        model = a.problem.model
-        return {"units": model.time_unit, "display_units": model.time_display_unit, **more}
+        return {"units": a.problem.model.time_unit, "display_units": a.problem.model.time_display_unit, **more}
 
     return UnitRule("time of the model", attributes, ("units", "display_units"))
 
@@ -119,11 +118,7 @@ LEDGER = When("a model with quantities of its path", lambda a, _: a.ledger is no
 
 def of_series(values: Callable[[Any], Any]) -> Callable[[Analysis, Item], Array]:
     """The part of a series of numbers (…, K) of all readings."""
-
-    def part(a: Analysis, item: Item) -> Array:
-        return np.asarray(values(a))[..., item.held.where]
-
-    return part
+    return lambda a, item: np.asarray(values(a))[..., item.held.where]
 
 
 # Members, predictions, readings, iterations
@@ -209,20 +204,16 @@ ITERATIONS = (
 )  # fmt: skip
 
 
-def _cells(name: str, key: str, meaning: str) -> Declared:
-    return Declared(name, "{field}_cell", f"{{label}}, {meaning}", lambda _, i: getattr(i.held, key), OWN)
-
-
+CELL = "{field}_cell"
 FIELDS = (
-    Declared("{field}", "draw {field}_cell", "{label}, posterior members", lambda _, i: i.held.members, OWN,
-             single=True),
-    _cells("{field}_mean", "mean", "posterior mean"),
-    _cells("{field}_std", "std", "posterior standard deviation"),
-    _cells("{field}_centre", "centre", "value at the minimum of J"),
-    _cells("{field}_prior_mean", "prior_mean", "prior mean"),
-    _cells("{field}_prior_std", "prior_std", "prior standard deviation"),
-    Declared("{field}_at", "{field}_cell {field}_axis", "where the cells are", lambda _, i: i.held.prior.places, AT),
-)  # fmt: skip
+    Declared("{field}", f"draw {CELL}", "{label}, posterior members", lambda _, i: i.held.members, OWN, single=True),
+    Declared("{field}_mean", CELL, "{label}, posterior mean", lambda _, i: i.held.mean, OWN),
+    Declared("{field}_std", CELL, "{label}, posterior standard deviation", lambda _, i: i.held.std, OWN),
+    Declared("{field}_centre", CELL, "{label}, value at the minimum of J", lambda _, i: i.held.centre, OWN),
+    Declared("{field}_prior_mean", CELL, "{label}, prior mean", lambda _, i: i.held.prior_mean, OWN),
+    Declared("{field}_prior_std", CELL, "{label}, prior standard deviation", lambda _, i: i.held.prior_std, OWN),
+    Declared("{field}_at", f"{CELL} {{field}}_axis", "where the cells are", lambda _, i: i.held.prior.places, AT),
+)
 
 
 DRAWS = (
@@ -231,24 +222,21 @@ DRAWS = (
 )  # fmt: skip
 
 
-def _expected(name: str, meaning: str, key: str) -> Declared:
-    return Declared(name, "withheld_time", meaning, lambda a, _: getattr(a.withheld, key), OWN, WITHHELD)
-
-
 def _of_later(key: str) -> Callable[..., Array]:
     """Of the errors of the readings after the window."""
     return lambda a, *_: getattr(a.observations.continued.noise, key)[len(a.observations) :]
 
 
+LATER = "withheld_time"
 WITHHELD_READINGS = (
-    _expected("{series}", "{label}, read after the window", "values"),
-    _expected("{series}_low", "{label}, 5 % of what was expected", "low"),
-    _expected("{series}_median", "{label}, median of what was expected", "median"),
-    _expected("{series}_high", "{label}, 95 % of what was expected", "high"),
-    Declared("{series}_reading_std", "withheld_time", "{label}, observation-error std of the reading alone",
+    Declared("{series}", LATER, "{label}, read after the window", lambda a, _: a.withheld.values, OWN, WITHHELD),
+    Declared("{series}_low", LATER, "{label}, 5 % of what was expected", lambda a, _: a.withheld.low, OWN, WITHHELD),
+    Declared("{series}_median", LATER, "{label}, median of what was expected",
+             lambda a, _: a.withheld.median, OWN, WITHHELD),
+    Declared("{series}_high", LATER, "{label}, 95 % of what was expected", lambda a, _: a.withheld.high, OWN, WITHHELD),
+    Declared("{series}_reading_std", LATER, "{label}, observation-error std of the reading alone",
              _of_later("std"), OWN, WITHHELD),
-    Declared("time_std", "withheld_time", "std of the observation times", _of_later("time_std"), TIME, WITHHELD,
-             fill=False),
+    Declared("time_std", LATER, "std of the observation times", _of_later("time_std"), TIME, WITHHELD, fill=False),
 )  # fmt: skip
 
 
@@ -280,16 +268,12 @@ MEMBERS = (
 )  # fmt: skip
 
 
-def _whitened(key: str) -> Callable[[Analysis, Item], Array]:
-    """A property of the residuals; NaN where a reading does not count."""
-
-    def of_all(a: Analysis) -> Array:
-        row = np.full(len(a.observations), np.nan)
-        if a.residuals is not None:
-            row[a.residuals.which] = getattr(a.residuals, key)
-        return row
-
-    return of_series(of_all)
+def _of_residuals(a: Analysis, key: str) -> Array:
+    """A property of theirs; NaN where a reading does not count."""
+    row = np.full(len(a.observations), np.nan)
+    if a.residuals is not None:
+        row[a.residuals.which] = getattr(a.residuals, key)
+    return row
 
 
 def _prior_distance(a: Analysis) -> Array:
@@ -297,17 +281,13 @@ def _prior_distance(a: Analysis) -> Array:
     return prior_distance(a.observations.values, living, a.error_std)
 
 
-def _influence(key: str) -> Callable[[Analysis, Item], Array]:
-    return of_series(lambda a: getattr(a.influence, key))
-
-
 READINGS = (
-    Declared("{series}_whitened_residual", "{time}", "whitened residual at the minimum of J", _whitened("white"),
-             when=WHITENED),
+    Declared("{series}_whitened_residual", "{time}", "whitened residual at the minimum of J",
+             of_series(lambda a: _of_residuals(a, "white")), when=WHITENED),
     Declared("{series}_studentised", "{time}", "whitened residual over its own expected std",
-             _whitened("studentised"), when=WHITENED),
-    Declared("{series}_leverage", "{time}", "share of the reading in its own prediction", _whitened("leverage"),
-             when=WHITENED),
+             of_series(lambda a: _of_residuals(a, "studentised")), when=WHITENED),
+    Declared("{series}_leverage", "{time}", "share of the reading in its own prediction",
+             of_series(lambda a: _of_residuals(a, "leverage")), when=WHITENED),
     Declared("{series}_discrepancy", "{time}", "{label}, what the model misses, at the minimum of J",
              of_series(lambda a: a.discrepancy.mean), OWN, DISCREPANT_FIRST),
     Declared("{series}_discrepancy_std", "{time}", "{label}, std of what the model misses",
@@ -320,12 +300,12 @@ READINGS = (
     ),
     Declared("{series}_prior_distance", "{time}",
              "distance of the reading from the prior's prediction, in the std of both", of_series(_prior_distance)),
-    Declared("{shared}influence_change", "parameter {time}", f"{WITHOUT}, {EACH_UNIT}", _influence("change"),
-             when=TOLD),
+    Declared("{shared}influence_change", "parameter {time}", f"{WITHOUT}, {EACH_UNIT}",
+             of_series(lambda a: a.influence.change), when=TOLD),
     Declared("{shared}influence_in_std", "parameter {time}", f"{WITHOUT}, in posterior standard deviations",
-             _influence("in_std"), when=TOLD),
-    Declared("{shared}influence_pareto_shape", "{time}", "Pareto shape of the weights", _influence("pareto_shape"),
-             when=TOLD),
+             of_series(lambda a: a.influence.in_std), when=TOLD),
+    Declared("{shared}influence_pareto_shape", "{time}", "Pareto shape of the weights",
+             of_series(lambda a: a.influence.pareto_shape), when=TOLD),
     Declared("{shared}influence_how", "{time}",
              "0: found by weighting the members, 1: by linear response, 2: needs a fit without the reading",
              of_series(lambda a: a.influence.how.astype(float)), when=TOLD),
@@ -361,11 +341,7 @@ def shifts(a: Analysis) -> list[Shift]:
 
 
 def _what_if(name: str, dims: str, key: str, meaning: str) -> Declared:
-    def values(a: Analysis) -> Any:
-        held = [getattr(shift, key) for shift in shifts(a)]
-        return text(held) if isinstance(held[0], str) else np.array(held)
-
-    return Declared(name, dims, meaning, values, when=RESPONSE)
+    return Declared(name, dims, meaning, lambda a: [getattr(shift, key) for shift in shifts(a)], when=RESPONSE)
 
 
 WHAT_IF = (
@@ -380,21 +356,17 @@ WHAT_IF = (
 )  # fmt: skip
 
 
-def _ledger(name: str, dims: str, meaning: str, values: Callable[..., Any], **how: Any) -> Declared:
-    return Declared(name, dims, meaning, values, when=LEDGER, **how)
-
-
 LEDGERS = (
-    _ledger("ledger_time", "path_cell path_edge", "begin and end of the cell",
-            lambda a: np.column_stack([a.ledger.edges[:-1], a.ledger.edges[1:]]), unit=CELL_TIME),
-    _ledger("ledger_weight", "path_parameter path_cell", "share of the cell in what informed the parameter",
-            lambda a: a.ledger.weights),
-    _ledger("ledger_kernel", "path_parameter path_cell", "averaging kernel of the estimate over the cell",
-            lambda a: a.ledger.kernel),
-    _ledger("ledger_{quantity}", "path_cell", "{label}, mean size in the cell", lambda a, i: a.ledger.values[i.held],
-            unit=OWN),
-    _ledger("ledger_{quantity}_quantiles", "path_parameter quantile", "{label}",
-            lambda a, i: a.ledger.quantiles[:, i.held], unit=OWN),
+    Declared("ledger_time", "path_cell path_edge", "begin and end of the cell",
+             lambda a: np.column_stack([a.ledger.edges[:-1], a.ledger.edges[1:]]), CELL_TIME, LEDGER),
+    Declared("ledger_weight", "path_parameter path_cell", "share of the cell in what informed the parameter",
+             lambda a: a.ledger.weights, when=LEDGER),
+    Declared("ledger_kernel", "path_parameter path_cell", "averaging kernel of the estimate over the cell",
+             lambda a: a.ledger.kernel, when=LEDGER),
+    Declared("ledger_{quantity}", "path_cell", "{label}, mean size in the cell",
+             lambda a, i: a.ledger.values[i.held], OWN, LEDGER),
+    Declared("ledger_{quantity}_quantiles", "path_parameter quantile", "{label}",
+             lambda a, i: a.ledger.quantiles[:, i.held], OWN, LEDGER),
 )  # fmt: skip
 
 SAMPLE_STATS = (*MEMBERS, *READINGS, *MODES, *WHAT_IF, *LEDGERS)
@@ -412,12 +384,8 @@ COORDINATES = (
     _coordinate("chain", "chain", lambda a: np.zeros(1, dtype=np.int64)),
     _coordinate("draw", "ensemble member", lambda a: np.arange(len(a.prior))),
     _coordinate("{time}", "observation time", of_series(lambda a: a.observations.times), unit=READ_TIME),
-    _coordinate(
-        "withheld_time",
-        "time of readings after the window",
-        lambda a: a.withheld.times if a.withheld else np.empty(0),
-        unit=READ_TIME,
-    ),
+    _coordinate("withheld_time", "time of readings after the window",
+                lambda a: a.withheld.times if a.withheld else np.empty(0), unit=READ_TIME),
     _coordinate("path_time", "time on the clock of the observations", lambda a: a.trajectory_times, unit=TIME),
     _coordinate("parameter", "estimated parameter", lambda a: text(p.name for p in a.parameters), needed=True),
     _coordinate("iteration", "iteration", lambda a: [r.iteration for r in a.iterations]),
@@ -426,7 +394,7 @@ COORDINATES = (
     _coordinate("prior_score", "standard score under the prior", lambda a: SCORES),
     _coordinate("quantile", "quantile under the weights", lambda a: QUANTILES),
     _coordinate("{walk}_piece", "begin of the piece", lambda _, i: (0.0, *i.held.knots), unit=PIECE_TIME),
-)
+)  # fmt: skip
 
 GROUPS: dict[str, Table] = {
     "/prior": _parameters(lambda a: a.prior),

@@ -20,7 +20,7 @@ from en4dvar.inputs.parts import DataFile
 from en4dvar.plumbing.tables import csv_text
 from en4dvar.priors.prior import own_seed
 from en4dvar.problem import InverseProblem
-from en4dvar.results.checkpoint import Keeper, digest, encode_text
+from en4dvar.results.checkpoint import Keeper, digest, encode
 from en4dvar.results.journal import Journal, KnownRuns
 from en4dvar.results.netcdf import SealedBytes, to_bytes
 from en4dvar.results.pack import packed
@@ -101,7 +101,7 @@ def estimate(job: Job, executor: Executor | None = None, progress: Progress | No
     ending = f"{converged}: {analysis.stop_reason}; {analysis.forward_runs} forward runs"
     warnings = (f"{warning.severity}: {warning}" for warning in analysis.cautions)
     told = (f"estimate: {brief(summary)}", ending, *warnings)
-    return Estimate(content, sha256, encode_text(outcome), told)
+    return Estimate(content, sha256, encode(outcome), told)
 
 
 def estimate_and_tell(job: Job, tell: Callable[[tuple[Told, ...]], None]) -> Estimate:

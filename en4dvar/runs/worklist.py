@@ -17,7 +17,7 @@ from en4dvar.plumbing.errors import En4dvarError, OutputError
 from en4dvar.plumbing.files import atomic_path, open_plain, readable, remove_file
 from en4dvar.plumbing.tables import csv_text
 from en4dvar.problem import InverseProblem
-from en4dvar.results.checkpoint import FOLDER, Keeper, decode, encode_text, file_digest
+from en4dvar.results.checkpoint import FOLDER, Keeper, decode, encode, file_digest
 from en4dvar.results.journal import KnownRuns
 from en4dvar.results.netcdf import SealedBytes
 from en4dvar.results.pack import PACK, Entry, Pack, file_names, read_outcome
@@ -265,7 +265,7 @@ class Worklist:
             raise error
         exit_code = error.exit_code if isinstance(error, En4dvarError) else 1
         failed = DatasetOutcome(d.name, failure=reason, exit_code=exit_code)
-        self._end(d, failed, encode_text(failed))
+        self._end(d, failed, encode(failed))
 
     def _end(
         self, d: Dataset, failed: DatasetOutcome | None, outcome: bytes, content: bytes = b"", content_digest: str = ""
