@@ -3,7 +3,6 @@ synthetic campaign), ``calibrate``, ``design`` and ``sweep-twin``.
 """
 
 import os
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -59,12 +58,11 @@ def simulate(
             raise click.UsageError(f"{words} and --noise do not apply to a configuration with a 'campaign:'")
         base = source.path.resolve().parent
         plan = resolve_campaign(override(document, source.overrides(seed=seed)), base)
-        if out:
-            plan = replace(plan, directory=out)
-        else:  # a folder that came with the configuration may be a link
-            inside(base, os.path.relpath(plan.directory, base))
+        folder = out or plan.file.campaign.directory
+        if not out:  # a folder that came with the configuration may be a link
+            inside(base, os.path.relpath(folder, base))
         sets = draw_campaign(plan)
-        truth = write_campaign(plan, sets, command_line(), force)
+        truth = write_campaign(plan, sets, folder, command_line(), force)
         fits = [s.nrmse for s in sets]
         echo(f"{len(sets)} synthetic data sets, NRMSE of the truth {min(fits):.3f} to {max(fits):.3f}; truth: {truth}")
         return

@@ -4,7 +4,6 @@ import math
 import threading
 import time
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, ClassVar
@@ -112,54 +111,30 @@ def estimate_and_tell(job: Job, tell: Callable[[tuple[Told, ...]], None]) -> Est
     try:
         outcome = estimate(job, None, sender)
     except BaseException:
-        sender.close()
+        sender.send()
         raise
-    return replace(outcome, records=sender.rest())
+    return replace(outcome, records=tuple(sender.waiting))
 
 
 class _Sender:
-    """Sends records at once, or, where the last message is too young, as soon as it is old enough."""
+    """Sends records at once, or, where the last message is too young, with the next one that comes late enough."""
 
     _sent: ClassVar[float] = -math.inf  # when this process sent the last message, of any data set
 
     def __init__(self, tell: Callable[[tuple[Told, ...]], None]):
-        self._tell, self._lock = tell, threading.RLock()
-        self._waiting: list[Told] = []
-        self._timer: threading.Timer | None = None
+        self._tell = tell
+        self.waiting: list[Told] = []
 
     def __call__(self, name: str, record: Record) -> None:
         line = describe(name, record)  # here, for the process that hears it serves all workers
         if isinstance(record, IterationRecord):
             record = replace(record, members=record.members[:0])
-        with self._lock:
-            self._waiting.append((name, record, line))
-            rest = self._sent + SEND_EVERY - time.monotonic()
-            if rest <= 0:
-                self._send()
-            elif self._timer is None:
-                self._timer = threading.Timer(rest, self._later)
-                self._timer.daemon = True
-                self._timer.start()
+        self.waiting.append((name, record, line))
+        if time.monotonic() >= self._sent + SEND_EVERY:
+            self.send()
 
-    def close(self) -> None:
-        if records := self.rest():
-            self._tell(records)
-
-    def rest(self) -> tuple[Told, ...]:
-        """What waits and is not sent any more."""
-        with self._lock:
-            if self._timer is not None:
-                self._timer.cancel()
-                self._timer = None
-            records = tuple(self._waiting)
-            self._waiting.clear()
-            return records
-
-    def _later(self) -> None:
-        with self._lock, suppress(OSError):  # nobody is there to hear it: the call's own thread will notice
-            self._send()
-
-    def _send(self) -> None:
-        if records := self.rest():
-            self._tell(records)
+    def send(self) -> None:
+        if self.waiting:
+            self._tell(tuple(self.waiting))
+            self.waiting.clear()
             _Sender._sent = time.monotonic()
