@@ -32,8 +32,8 @@ def time_grid(start: str | float, end: str | float, step: str | float, unit: str
     return np.asarray(first + width * np.arange(int(np.floor(steps)) + 1), dtype=float)
 
 
-class Rate(Section):
-    """Instants at one rate."""
+class Later(Section):
+    """Instants at another rate."""
 
     end: Annotated[QuantityText, Field(alias="to")]
     """Last instant with its unit."""
@@ -41,12 +41,16 @@ class Rate(Section):
     """Time step with its unit."""
 
 
-class Times(Rate):
+class Times(Section):
     """Instants at one rate or at two, one after the other; both ends are included."""
 
     start: Annotated[QuantityText, Field(alias="from")] = "start"
     """First instant with its unit; start is time zero."""
-    then: Rate | None = None
+    end: Annotated[QuantityText, Field(alias="to")]
+    """Last instant with its unit."""
+    step: QuantityText
+    """Time step with its unit."""
+    then: Later | None = None
     """Another rate, of a camera that changes it: after ``to``."""
 
 
