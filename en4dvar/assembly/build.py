@@ -64,7 +64,6 @@ def inverse_plan(config: Config) -> DataPlan:
 
 def build_one(config: Config, name: str, file: DataFile) -> InverseProblem:
     """The inverse problem of one of :func:`data_files`. Raises :class:`ConfigError`, :class:`DataError`."""
-    config.sharing.of_dataset(name)
     return problem_of(config, read_observations(inverse_plan(config), file, name, config.weights))
 
 

@@ -73,6 +73,7 @@ def check_all(source: str | Path | Mapping[str, Any], overrides: Mapping[str, An
 
 def checked_problem(config: Config, name: str, file: DataFile) -> InverseProblem:
     """The inverse problem of one data set, whose result can be written. Raises :class:`ConfigError`, `DataError`."""
+    config.sharing.of_dataset(name)
     problem = build_one(config, name, file)
     require_free_names(problem)
     return problem
