@@ -213,8 +213,7 @@ def validate(source: Source, plot: bool) -> None:
     from en4dvar.config import Config, TwinConfig
     from en4dvar.runs.checks import check_all
 
-    checked = check_all(source.path, source.overrides())
-    loaded, problems = checked.config, checked.problems
+    loaded, problems, unusable = check_all(source.path, source.overrides())
     if not isinstance(loaded, Config):
         from en4dvar.runs.cycles import cycles_of
 
@@ -241,9 +240,9 @@ def validate(source: Source, plot: bool) -> None:
     echo(cost_summary(loaded, previews[0], len(problems)))
     for shown in previews:
         _warn(shown)
-    if checked.unusable:
+    if unusable:
         echo(f"warning: a run goes on with {len(problems)} data set(s), without those that cannot be used:", err=True)
-    for fault in checked.unusable:
+    for fault in unusable:
         echo(str(fault), err=True)
     if plot:
         folder, name = make_folder(loaded.directory.parent), f"{loaded.directory.name}_prior"

@@ -31,11 +31,12 @@ from en4dvar.plumbing.user_code import loading, reason_of
 from en4dvar.priors.prior import PriorTerm
 
 
-class ErrorColumn(OfReadings):
-    """A column of standard deviations, one per reading."""
+class InUnit(OfReadings):
+    """A column of standard deviations or of places, one per reading."""
 
     unit: str | None = None
-    """Unit of the numbers in it; default: that of the readings' own column."""
+    """Unit of the numbers in it; default: that of the readings' own column, and of places none: these are indices,
+    counted from 0."""
 
 
 def or_column(read: Callable[[Any, Context], Any], unit: Unit) -> Callable[[Any, Context], Any]:
@@ -44,7 +45,7 @@ def or_column(read: Callable[[Any, Context], Any], unit: Unit) -> Callable[[Any,
     def read_either(written: Any, context: Context) -> Any:
         if not isinstance(written, Mapping):
             return read(written, context)
-        chosen = ErrorColumn.model_validate(written, context=context)
+        chosen = InUnit.model_validate(written, context=context)
         if chosen.unit is not None:
             convert(1.0, chosen.unit, unit(context))
         return Column(chosen.column, chosen.unit or "", unit(context))
@@ -65,7 +66,7 @@ MARKS = Made(
     lambda mark, context: mark if isinstance(mark, bool) else Column(mark.column, "1", "1", kind="mark"),
     bool | OfReadings,
 )
-QUANTITY_OR_COLUMN = {"anyOf": [TEXT, ErrorColumn.model_json_schema()]}
+QUANTITY_OR_COLUMN = {"anyOf": [TEXT, InUnit.model_json_schema()]}
 
 LogStd = Annotated[float, Field(gt=0)]
 
@@ -318,13 +319,6 @@ SECTIONS = OfReadings, AwayFromMinima, WeightFunction
 WEIGHTS = Made(weighing, json={"oneOf": [NUMBERS.json_schema(), *(kind.model_json_schema() for kind in SECTIONS)]})
 
 
-class PlaceColumn(OfReadings):
-    """A column of places, one per reading."""
-
-    unit: str | None = None
-    """Unit of the coordinates in it; without a unit they are indices, counted from 0."""
-
-
 @dataclass(frozen=True)
 class Placing:
     """Places as they are stated: a ``column``, or ``positions`` (one for all readings, or one each).
@@ -357,7 +351,7 @@ def placing(written: Any, context: Context) -> Placing:
     """Raises :class:`ConfigError`, its path the faulty key, ValueError."""
     section, entries = None, written if isinstance(written, list) else [written]
     if isinstance(written, Mapping) and "column" in written:
-        section = PlaceColumn.model_validate(written, context=context)
+        section = InUnit.model_validate(written, context=context)
     elif not all(isinstance(entry, int | str) and not isinstance(entry, bool) for entry in entries):
         raise ValueError("write an index, a coordinate such as '3 m', a list of either, or {column: NAME}")
     block = field_of(context.units, context.observable)
@@ -386,4 +380,4 @@ def _coordinates(block: StateBlock | None, key: str) -> StateBlock:
 
 
 STATED = TypeAdapter[Any](int | str | list[int | str])
-PLACES = Made(placing, json={"oneOf": [STATED.json_schema(), PlaceColumn.model_json_schema()]})
+PLACES = Made(placing, json={"oneOf": [STATED.json_schema(), InUnit.model_json_schema()]})

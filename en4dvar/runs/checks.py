@@ -1,8 +1,7 @@
 """What can be told before a run: every fault of configuration and data at once."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -24,15 +23,6 @@ from en4dvar.results.variables import require_free_names
 T = TypeVar("T")
 
 
-@dataclass(frozen=True)
-class Checked:
-    """A configuration, the ``problems`` of its data sets, and the faults of those that a campaign goes on without."""
-
-    config: AnyConfig
-    problems: Sequence[InverseProblem]
-    unusable: Sequence[Fault]
-
-
 def validate(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> AnyConfig:
     """Load a configuration and read its data files; nothing is computed or written.
 
@@ -45,14 +35,16 @@ def validate(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any
     ------
     ConfigError: every fault of the file *and* of the data files it names, each with file, line and column.
     """
-    checked = check_all(source, overrides)
-    if checked.unusable:
-        raise ConfigError(checked.unusable)
-    return checked.config
+    config, _, unusable = check_all(source, overrides)
+    if unusable:
+        raise ConfigError(unusable)
+    return config
 
 
-def check_all(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> Checked:
-    """As :func:`validate`; but what is wrong with some data sets only is told beside the others, as a run does."""
+def check_all(
+    source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None
+) -> tuple[AnyConfig, list[InverseProblem], list[Fault]]:
+    """As :func:`validate`; the problems of the data sets, and the faults of those that a campaign goes on without."""
     document, base = document_from(source)
     document = override(document, overrides or {})
     try:
@@ -68,7 +60,7 @@ def check_all(source: str | Path | Mapping[str, Any], overrides: Mapping[str, An
             build_sequence(config)
     if faults or (unusable and not problems):
         raise ConfigError(in_order([*faults, *unusable]))
-    return Checked(config, problems, in_order(unusable))
+    return config, problems, in_order(unusable)
 
 
 def checked_problem(config: Config, name: str, file: DataFile) -> InverseProblem:

@@ -417,13 +417,8 @@ class Given:
             return checked(model), {"name": HANDED, "object": name_of(type(model)), "digest": _digest_of_model(model)}
         if not callable(model):
             raise ConfigError(f"model: {type(model).__name__} is neither a function nor a model; {MODELS}")
-        section = {
-            "name": HANDED,
-            "object": name_of(model),
-            "digest": digest_of(model),
-            **({"cheap": True} if cheap else {}),
-        }
-        return self._function(model, cheap), section
+        section = {"name": HANDED, "object": name_of(model), "digest": digest_of(model)}
+        return self._function(model, cheap), section | ({"cheap": True} if cheap else {})
 
     def _function(self, function: Any, cheap: bool) -> FunctionModel:
         names = [name for name in self.priors if name not in {p.name for p in OF_READINGS}]
