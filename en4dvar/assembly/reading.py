@@ -119,9 +119,9 @@ def read_observations(plan: DataPlan, file: DataFile, name: str, weights: str = 
 def read_one(plan: SeriesPlan, file: DataFile, fewest: int) -> Series:
     """One series inside its window. Raises :class:`DataError`."""
     data, path, weights, places = plan.data, file.path, plan.data.weights, plan.data.places
-    stated = (*_errors(data).values(), weights and weights.column, places and places.column)
+    stated = (*data.error_columns.values(), weights and weights.column, places and places.column)
     read = read_series(
-        path, data.columns.time, data.columns.observable, data.part(Layout), [column for column in stated if column],
+        path, data.columns.time, data.columns.observable, data.part(Layout), [*filter(None, stated)],
         file.part, repeats=places is not None, fewest=fewest,
     )  # fmt: skip
     asked = data.window
@@ -142,7 +142,7 @@ def read_one(plan: SeriesPlan, file: DataFile, fewest: int) -> Series:
         return read.errors[column.name][window] if column else None
 
     def errors(part: slice) -> Noise:
-        of_columns = {key: read.errors[column.name][part] for key, column in _errors(data).items()}
+        of_columns = {key: read.errors[column.name][part] for key, column in data.error_columns.items()}
         return errors_of(data, read.times[part] - zero, values, of_columns, partial(read.rows_among, used=part))
 
     try:
@@ -173,14 +173,6 @@ def read_one(plan: SeriesPlan, file: DataFile, fewest: int) -> Series:
     except (ValueError, DataError) as error:
         words = str(error)
         raise DataError(words if words.startswith(str(path)) else f"{readable(path)}: {words}") from None
-
-
-def _errors(data: Data) -> dict[str, Column]:
-    """The columns that hold errors of readings or times, or say which readings are bounds."""
-    time = data.columns.time
-    clock = time if isinstance(time, Column) else time.column
-    columns = data.error.columns(data.columns.observable.unit, clock.unit if clock else "")
-    return columns | {key: marked for key, marked in data.error.bounds.items() if isinstance(marked, Column)}
 
 
 def errors_of(

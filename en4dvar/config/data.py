@@ -225,6 +225,13 @@ class Data(Section):
         if columns.keys() <= set(roles):
             faults.add(("columns",), f"name the column of one observable of: {', '.join(roles[1:])}")
 
+    @property
+    def error_columns(self) -> dict[str, Column]:
+        """The columns that hold errors of readings or times, or say which readings are bounds."""
+        time = self.columns.time
+        clock = time if isinstance(time, Column) else time.column
+        return self.error.columns(self.columns.observable.unit, clock.unit if clock else "")
+
     def as_written(self, source: Mapping[str, Any]) -> dict[str, Any]:
         """The section as it was written, with absolute paths."""
         written = super().as_written(source)

@@ -202,9 +202,11 @@ class Error(Section):
             faults.add((std,), "required: the standard deviation of the observation error")
 
     def columns(self, readings: str, times: str) -> dict[str, Column]:
-        """The columns of errors, in the units of ``readings`` and ``times`` where they have none of their own."""
+        """The columns of errors, in the units of ``readings`` and ``times`` where they have none of their own, and those
+        that say which readings are bounds."""
         shared = {f"shared {i}": (part, readings) for i, part in enumerate(self.shared)}
-        every = {"std": (self.std, readings), "time_std": (self.time_std, times), **shared}
+        marks = {key: (marked, "1") for key, marked in self.bounds.items()}
+        every = {"std": (self.std, readings), "time_std": (self.time_std, times), **shared, **marks}
         return {key: replace(c, unit=c.unit or unit) for key, (c, unit) in every.items() if isinstance(c, Column)}
 
     @property
