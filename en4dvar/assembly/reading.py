@@ -119,7 +119,8 @@ def read_observations(plan: DataPlan, file: DataFile, name: str, weights: str = 
 def read_one(plan: SeriesPlan, file: DataFile, fewest: int) -> Series:
     """One series inside its window. Raises :class:`DataError`."""
     data, path, weights, places = plan.data, file.path, plan.data.weights, plan.data.places
-    stated = (*data.error_columns.values(), weights and weights.column, places and places.column)
+    beside_them = weights.column if weights else None, places.column if places else None
+    stated: tuple[Column | None, ...] = (*data.error_columns.values(), *beside_them)
     read = read_series(
         path, data.columns.time, data.columns.observable, data.part(Layout), [*filter(None, stated)],
         file.part, repeats=places is not None, fewest=fewest,
