@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.inputs.implausible import InFile, cut_off, level_top, outlying, placeholders, scatter_of, step_doubts
+from en4dvar.inputs.implausible import check_order, cut_off, level_top, outlying, placeholders, scatter_of, step_doubts
 from en4dvar.inputs.parts import ANY, Column, Layout, TimeStep, columns_of
 from en4dvar.inputs.window import Instant, index_of, select
 from en4dvar.model.state import Array
@@ -161,7 +161,7 @@ def read_series(
     if isinstance(time, Column) and not repeats:
         written = columns[time.name][kept]
         bounds = any(column.kind == "mark" for column in errors)
-        InFile(path, layout, kept, lines, written, time.unit, wanted, bounds).require_order(times[kept], values[kept])
+        check_order(path, layout, kept, lines, written, time.unit, wanted, bounds, times[kept], values[kept])
         if layout.unsorted == "sort":
             order = np.argsort(times[kept], kind="stable")
             kept, stated = kept[order], {name: stds[order] for name, stds in stated.items()}

@@ -123,6 +123,4 @@ def _collecting(faults: list[Fault], document: Document) -> Iterator[None]:
 def _place_of(error: DataError, document: Document) -> tuple[str, ...]:
     """Where the file is named, of one series or of all."""
     own = ("data", "series", error.series)
-    if not document.has(own):
-        return ("data", "path") if document.has(("data", "path")) else ("data",)
-    return next((path for path in ((*own, "path"), ("data", "path")) if document.has(path)), own)
+    return next((place for place in ((*own, "path"), ("data", "path"), own) if document.has(place)), ("data",))
