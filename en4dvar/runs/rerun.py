@@ -109,7 +109,7 @@ def _of_cycles(file: Path, workers: int | None, trust: bool, ask: Ask | None) ->
     kind = cycles_of(config)
     with of_strangers(file.parent, ask, trust):  # data may have weights by a function
         kind.check()
-    with choose_executor(kind.model, workers=workers or 1) as executor:
+    with choose_executor(config.model, workers=workers or 1) as executor:
         again = kind.again(executor)
     was, now = ({f"/{name}": v.values for name, v in result.every.items()} for result in (recorded, again))
     repeated = Repeated(config.name, len(was), differences(was, now), "")

@@ -130,8 +130,8 @@ class EstimateKind(RunKind[Campaign]):
     def kept(self) -> str:
         ended = self.work.ended if self.work else {}
         if self.resume and not ended:  # stopped, perhaps, before it was read what had been done
-            return f"what {self.directory} holds is kept"
-        return f"{len(ended)} of {len(self.data)} data sets are done and kept in {self.directory}"
+            return f"what {self.config.directory} holds is kept"
+        return f"{len(ended)} of {len(self.data)} data sets are done and kept in {self.config.directory}"
 
     def opened(self, run: Session) -> frozenset[str]:
         self.work = Worklist(self.config, run, datasets(self.data), self.progress)
