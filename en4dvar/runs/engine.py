@@ -240,18 +240,17 @@ def directory_mode(force: bool, resume: bool) -> Mode:
 
 def conduct_run(kind: RunKind[R], force: bool = False, resume: bool = False, command: str = "") -> R:
     """Conduct a run in its directory; arguments and errors as of :func:`en4dvar.run`."""
+    names = (*kind.files, *kind.pages)
     with (
         one_blas_thread(),
         terminate_as_interrupt(),
         # first: what follows may compile the model
-        RunDirectory.open(
-            kind.config.directory, directory_mode(force, resume), (*kind.files, *kind.pages)
-        ) as directory,
+        RunDirectory.open(kind.config.directory, directory_mode(force, resume), names) as directory,
     ):
         kind.check()
         with kind.executor() as executor, _session(kind, directory, command) as run:
             try:
-                run.begin(*kind.files, *kind.pages, retried=kind.opened(run))
+                run.begin(*names, retried=kind.opened(run))
                 result = kind.conduct(run, executor)
                 if kind.writer and kind.config.report:
                     kind.page(directory.work, figures=kind.config.figures)
