@@ -8,18 +8,7 @@ from typing import Any
 
 import click
 
-from en4dvar.commands.common import (
-    Source,
-    command_line,
-    config_options,
-    continuable,
-    deliver,
-    echo,
-    parted,
-    refuse_to_replace,
-    tell,
-    workers_option,
-)
+from en4dvar.commands.common import Source, config_options, continuable, deliver, echo, parted, tell, workers_option
 from en4dvar.commands.plugins import WithForms, asked, loaded
 
 
@@ -43,6 +32,7 @@ def simulate(
       en4dvar simulate configs/quickstart.yaml --set parameters.G='0.5 kPa' \\
           --times '0 us:60 us:1 us' --noise '1.4 um' --out synthetic.csv
     """
+    from en4dvar.commands.common import command_line, refuse_to_replace
     from en4dvar.config.document import override, read_document
     from en4dvar.config.kinds import resolve_campaign
     from en4dvar.plumbing.files import inside
