@@ -24,16 +24,9 @@ T = TypeVar("T")
 
 
 def validate(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> AnyConfig:
-    """Load a configuration and read its data files; nothing is computed or written.
+    """Load a configuration, as :func:`load_config` does, and read its data files; nothing is computed or written.
 
-    Parameters
-    ----------
-    source: the YAML file, paths inside it relative to its folder; or a dict of the same, relative to this folder.
-    overrides: values for dotted keys such as ``"assimilation.members"``; text is read as YAML.
-
-    Raises
-    ------
-    ConfigError: every fault of the file *and* of the data files it names, each with file, line and column.
+    Raises :class:`ConfigError`: every fault of the file *and* of the data files it names, with file, line and column.
     """
     config, _, unusable = check_all(source, overrides)
     if unusable:

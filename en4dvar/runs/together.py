@@ -133,8 +133,7 @@ def join(
 
     Settings of the ensemble and the seed are those of the first run; ``how`` as of :meth:`TogetherKind.of_runs`.
 
-    Raises :class:`RefusedError`, :class:`OutputError`: as of :meth:`TogetherKind.of_runs`. :class:`ConfigError`: the
-    data sets cannot share these parameters. :class:`TooFewMembersError`: the ensemble is lost.
+    Raises what :meth:`TogetherKind.of_runs` does; :class:`ConfigError`: the data sets cannot share these parameters.
     """
     file, page = JointKind(tuple(names), tuple(apart)).of_runs(run_dirs, out, **how)
     return stored.load_joint(file), page
@@ -206,9 +205,8 @@ def population(
     ``population:`` in the configuration of the first run, whose seed is taken as well; ``how`` as of
     :meth:`TogetherKind.of_runs`.
 
-    Raises :class:`RefusedError`, :class:`OutputError`: as of :meth:`TogetherKind.of_runs`. :class:`ConfigError`: there
-    is no population of these data sets, as :func:`~en4dvar.estimation.population.campaign.population_of` says.
-    :class:`TooFewMembersError`: too many forward runs failed.
+    Raises what :meth:`TogetherKind.of_runs` does, and :class:`ConfigError` where there is no population of these data
+    sets, as :func:`~en4dvar.estimation.population.campaign.population_of` says.
     """
     file, page = PopulationKind(tuple(names), hyper, effort).of_runs(run_dirs, out, **how)
     return stored.load_population(file), page
