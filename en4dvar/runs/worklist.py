@@ -7,6 +7,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -123,31 +124,47 @@ def estimate_and_tell(job: Job, tell: Callable[[tuple[Told, ...]], None]) -> Est
     except BaseException:
         sender.send()
         raise
-    return replace(outcome, records=tuple(sender.waiting))
+    return replace(outcome, records=sender.rest())
 
 
 class _Sender:
-    """Sends records at once, or, where the last message is too young, with the next one that comes late enough."""
+    """Sends records at once, or, where the last message is too young, as soon as it is old enough."""
 
     _sent: ClassVar[float] = -math.inf  # when this process sent the last message, of any data set
 
     def __init__(self, tell: Callable[[tuple[Told, ...]], None]):
-        self._tell = tell
-        self.waiting: list[Told] = []
+        self._tell, self._lock = tell, threading.RLock()
+        self._waiting: list[Told] = []
 
     def __call__(self, name: str, record: Record) -> None:
         line = describe(name, record)  # here, for the process that hears it serves all workers
         if isinstance(record, IterationRecord):
             record = replace(record, members=record.members[:0])
-        self.waiting.append((name, record, line))
-        if time.monotonic() >= self._sent + SEND_EVERY:
-            self.send()
+        with self._lock:
+            self._waiting.append((name, record, line))
+            rest = self._sent + SEND_EVERY - time.monotonic()
+            if rest <= 0:
+                self.send()
+            elif len(self._waiting) == 1:  # others go with it
+                timer = threading.Timer(rest, self._later)
+                timer.daemon = True
+                timer.start()
+
+    def rest(self) -> tuple[Told, ...]:
+        """What waits and is not sent any more."""
+        with self._lock:
+            records, self._waiting = tuple(self._waiting), []
+            return records
 
     def send(self) -> None:
-        if self.waiting:
-            self._tell(tuple(self.waiting))
-            self.waiting.clear()
-            _Sender._sent = time.monotonic()
+        with self._lock:
+            if records := self.rest():
+                self._tell(records)
+                _Sender._sent = time.monotonic()
+
+    def _later(self) -> None:
+        with suppress(OSError):  # nobody is there to hear it: the call's own thread will notice
+            self.send()
 
 
 @dataclass(frozen=True, slots=True)
