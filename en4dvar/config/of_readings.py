@@ -71,10 +71,6 @@ QUANTITY_OR_COLUMN = {"anyOf": [TEXT, InUnit.model_json_schema()]}
 LogStd = Annotated[float, Field(gt=0)]
 
 
-def rate_unit(context: Context) -> str:
-    return f"({observable_unit(context)})/({time_unit(context)})"
-
-
 class AmplitudeSection(Section):
     """Lognormal prior of ``discrepancy_amplitude``, the discrepancy's standard deviation."""
 
@@ -102,7 +98,9 @@ class DiscrepancySection(Section):
     length: LengthSection = Field({}, validate_default=True)
     kernel: Literal["exponential", "matern-3/2", "matern-5/2"] = "exponential"
     """Correlation in time: exponential (rough paths), or Matérn's with one or two derivatives."""
-    grows_beyond: Annotated[float | None, quantity(rate_unit, "positive")] = None
+    grows_beyond: Annotated[
+        float | None, quantity(lambda c: f"({observable_unit(c)})/({time_unit(c)})", "positive")
+    ] = None
     """Rate of the observable beyond which the amplitude grows in proportion to it, e.g. 20 m/s; default: constant."""
 
     def kernel_at(self, times: Array) -> Kernel:

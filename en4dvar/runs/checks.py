@@ -104,16 +104,12 @@ def _read_files(document: Document, plan: DataPlan, read: Callable[[str, DataFil
 
 @contextmanager
 def _collecting(faults: list[Fault], document: Document) -> Iterator[None]:
-    """Within, errors of settings and data are told as ``faults``; a file's at the place that names the file."""
+    """Within, errors of settings and data are told as ``faults``; a file's where it is named, by one series or all."""
     try:
         yield
     except ConfigError as error:
         faults += error.problems
     except DataError as error:
-        faults.append(document.fault(_place_of(error, document), str(error)))
-
-
-def _place_of(error: DataError, document: Document) -> tuple[str, ...]:
-    """Where the file is named, of one series or of all."""
-    own = ("data", "series", error.series)
-    return next((place for place in ((*own, "path"), ("data", "path"), own) if document.has(place)), ("data",))
+        own = ("data", "series", error.series)
+        places = (place for place in ((*own, "path"), ("data", "path"), own) if document.has(place))
+        faults.append(document.fault(next(places, ("data",)), str(error)))
