@@ -113,8 +113,8 @@ def _varying(config: Config, observations: Observations, terms: Sequence[PriorTe
     varying: list[Varying] = []
     for name, said in _said_to_vary(config):
         with config.document.placing("parameters", name, "varies"):
-            std, estimated = said.std_of(by_name[name]), isinstance(said.std, Estimated)
-            varying.append(RandomWalk.of(model, by_name[name], said.knots(observations), std, estimated))
+            knots, estimated = said.knots(observations), isinstance(said.std, Estimated)
+            varying.append(RandomWalk.of(model, by_name[name], knots, said.std_of(by_name[name]), estimated))
     for error in config.model_error:
         with config.document.placing("model_error", error.field.name):
             varying.append(error.changes(model, observations))
