@@ -42,7 +42,7 @@ CHECKS = (
     "en4dvar.results.run_results._planned",
     "en4dvar.results.pack.open_plain",
     "en4dvar.results.pack.digest",
-    "en4dvar.runs.jobs.digest",
+    "en4dvar.runs.worklist.digest",
     "en4dvar.results.checkpoint.open_plain",
     "en4dvar.plumbing.files.open_plain",
     "en4dvar.plumbing.decoding.require_plain",

@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 from cheap_model import write_campaign
 
-import en4dvar.runs.jobs
+import en4dvar.runs.worklist
 import en4dvar_bubble
 from en4dvar.assembly.build import data_files, inverse_plan
 from en4dvar.config import Config, load_config
@@ -38,8 +38,8 @@ from en4dvar.ensemble.members import Reading
 from en4dvar.executor import Executor, ProcessesExecutor, SerialExecutor, ThreadsExecutor, one_blas_thread
 from en4dvar.executor.base import CommonValue
 from en4dvar.results.pack import PACK, Pack
-from en4dvar.runs.jobs import Job, estimate
 from en4dvar.runs.runner import run_campaign
+from en4dvar.runs.worklist import Job, estimate
 from en4dvar_bubble.model import BubbleModel
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -146,7 +146,11 @@ def spent(config: Config) -> list[float]:
     contents = [estimate(job).content for job in work]
     clock, rows = time.thread_time, []
     forward = (BubbleModel, "initial_states"), (SerialExecutor, "trajectories"), (Reading, "observe")
-    making = (en4dvar.runs.jobs, "build_groups"), (en4dvar.runs.jobs, "packed"), (en4dvar.runs.jobs, "summarise")
+    making = (
+        (en4dvar.runs.worklist, "build_groups"),
+        (en4dvar.runs.worklist, "packed"),
+        (en4dvar.runs.worklist, "summarise"),
+    )
     with tempfile.TemporaryDirectory() as folder:
         pack = Pack(Path(folder, PACK))
         for _ in range(REPEATS):

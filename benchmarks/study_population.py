@@ -90,11 +90,11 @@ def table() -> list[str]:
 def campaign(key: str, seed: int) -> list[list[object]]:
     """Rows of the file for one campaign; ``true`` is the mean of the lognormal that the truths were drawn from."""
     plan = resolve_campaign(read_document(CONFIGS / "agarose_twin.yaml"), CONFIGS)
-    group = plan.settings.groups[f"agarose_{key}"]
-    only = plan.settings.model_copy(update={"groups": {f"agarose_{key}": group}})
+    group = plan.file.campaign.groups[f"agarose_{key}"]
+    only = plan.file.campaign.model_copy(update={"groups": {f"agarose_{key}": group}})
     config = load_config(CONFIGS / f"agarose_{key}_qlkv.yaml")
     base = build(config)[0]
-    sets = draw_campaign(replace(plan, seed=seed, settings=only))
+    sets = draw_campaign(replace(plan, file=plan.file.model_copy(update={"seed": seed, "campaign": only})))
     problems = []
     for s in sets:
         ones = np.ones(len(s.times))

@@ -15,13 +15,10 @@ from typing import Any
 import click
 
 from en4dvar.commands.common import Failed, give_up_output, printable, to_continue
-from en4dvar.commands.installation import models, schema, warm_up
-from en4dvar.commands.plugins import COMMANDS, PluginCommand
-from en4dvar.commands.results import compare, export, report, rerun
-from en4dvar.commands.run import run
+from en4dvar.commands.plugins import COMMANDS, PluginCommand, models, schema, warm_up
+from en4dvar.commands.results import compare, export, joint, population, report, rerun
+from en4dvar.commands.run import run, validate
 from en4dvar.commands.synthetic import calibrate, design, simulate, sweep_twin
-from en4dvar.commands.together import joint, population
-from en4dvar.commands.validate import validate
 from en4dvar.plumbing.errors import En4dvarError
 from en4dvar.plumbing.installed import installed
 from en4dvar.runs.interrupt import heeded

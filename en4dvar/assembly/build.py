@@ -1,7 +1,8 @@
 """Settings → problems and series: reads the data files, cuts the windows, evaluates what refers to the data."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from en4dvar.config.data import DataPlan, SeriesPlan
 from en4dvar.config.kinds import SequenceConfig
 from en4dvar.config.parameters import Fixed, Scalar, Tied, Uncertain, inside_bounds
 from en4dvar.config.sequential import SeriesLocalisation, error_rates, localisation_of, per_time
-from en4dvar.config.varies import Perturbed, modes_of
+from en4dvar.config.varies import Estimated, Perturbed, VariesSection, modes_of
 from en4dvar.data.observations import Observations
 from en4dvar.descent.field_data import gain_of
 from en4dvar.descent.start import given
@@ -23,7 +24,7 @@ from en4dvar.plumbing.errors import ConfigError, DataError, Fault, retold
 from en4dvar.plumbing.units import convert
 from en4dvar.priors.field_prior import FieldPrior
 from en4dvar.priors.prior import Prior, PriorTerm
-from en4dvar.priors.varying import Varying
+from en4dvar.priors.varying import RandomWalk, Varying
 from en4dvar.problem import InverseProblem, Tie, discrepancy_parameters
 from en4dvar.schemes.localisation import BlockLocalisation
 from en4dvar.series.problem import SeriesProblem
@@ -63,7 +64,6 @@ def inverse_plan(config: Config) -> DataPlan:
 
 def build_one(config: Config, name: str, file: DataFile) -> InverseProblem:
     """The inverse problem of one of :func:`data_files`. Raises :class:`ConfigError`, :class:`DataError`."""
-    config.sharing.of_dataset(name)
     return problem_of(config, read_observations(inverse_plan(config), file, name, config.weights))
 
 
@@ -110,14 +110,22 @@ def problem_of(config: Config, observations: Observations) -> InverseProblem:
 def _varying(config: Config, observations: Observations, terms: Sequence[PriorTerm]) -> list[Varying]:
     """Parameters and model errors that vary in time; knots that do not suit the observations raise ConfigError."""
     model, by_name = config.model, {term.parameter.name: term for term in terms}
-    varying: list[Varying | None] = []
-    for name, entry in ((e.parameter.name, e) for e in config.parameters if isinstance(e, Uncertain)):
+    varying: list[Varying] = []
+    for name, said in _said_to_vary(config):
         with config.document.placing("parameters", name, "varies"):
-            varying.append(entry.walk(model, by_name[name], observations))
+            knots, estimated = said.knots(observations), isinstance(said.std, Estimated)
+            varying.append(RandomWalk.of(model, by_name[name], knots, said.std_of(by_name[name]), estimated))
     for error in config.model_error:
         with config.document.placing("model_error", error.field.name):
             varying.append(error.changes(model, observations))
-    return [process for process in varying if process is not None]
+    return varying
+
+
+def _said_to_vary(config: Config | SequenceConfig) -> Iterator[tuple[str, VariesSection]]:
+    """Names of the parameters that vary in time, and how."""
+    for entry in config.parameters:
+        if isinstance(entry, Uncertain) and entry.spec.varies is not None:
+            yield entry.parameter.name, entry.spec.varies
 
 
 def discrepancy_terms(config: Config, observations: Observations) -> tuple[PriorTerm, ...]:
@@ -160,7 +168,7 @@ def data_files(plan: DataPlan) -> dict[str, DataFile]:
 def _files_of(series: SeriesPlan) -> dict[str, DataFile]:
     data = series.data
     with retold(DataError, DataError, "", series.name):
-        files = find_files(data.path.base, data.path.texts)
+        files = find_files(Path(), data.path)
     time = data.columns.time.name if isinstance(data.columns.time, Column) else None
     return with_parts(files, data.columns.observable, data.part(Layout), time)
 
@@ -257,11 +265,8 @@ def _localisation(config: SequenceConfig, asked: SeriesLocalisation, problem: Se
 def _walks(config: SequenceConfig, terms: Sequence[PriorTerm]) -> Array:
     """Variance (n_state,) per unit of time of parameters that vary, in the coordinates of their priors."""
     rate, by_name = np.zeros(config.model.layout.size), {term.parameter.name: term for term in terms}
-    for entry in config.parameters:
-        if not isinstance(entry, Uncertain) or entry.spec.varies is None:
-            continue
-        name = entry.parameter.name
+    for name, said in _said_to_vary(config):
         with config.document.placing("parameters", name, "varies"):
-            std = entry.spec.varies.std_of(by_name[name])
-        rate[config.model.layout[name]] = per_time(entry.spec.varies, std, f"parameters.{name}.varies")
+            std = said.std_of(by_name[name])
+        rate[config.model.layout[name]] = per_time(said, std, f"parameters.{name}.varies")
     return rate

@@ -20,13 +20,11 @@ from en4dvar.data.noise import DecayingErrors, Noise, SharedErrors, noise_of
 from en4dvar.data.observations import Observations
 from en4dvar.data.series import Series, balanced
 from en4dvar.inputs.formats import SUFFIXES
-from en4dvar.inputs.implausible import cut_off, scatter_of, step_doubts
 from en4dvar.inputs.members import read_covariance
 from en4dvar.inputs.parts import ANY, Column, DataFile, Layout, parts_of
-from en4dvar.inputs.readers import CLIPPED, Readings, Rows, read_series
-from en4dvar.inputs.window import Instant, index_of, select, vertex
+from en4dvar.inputs.readers import Rows, read_series
+from en4dvar.inputs.window import vertex
 from en4dvar.model.state import Array
-from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.errors import DataError, retold
 from en4dvar.plumbing.files import PathError, expanded, readable
 from en4dvar.plumbing.hints import natural
@@ -121,12 +119,14 @@ def read_observations(plan: DataPlan, file: DataFile, name: str, weights: str = 
 def read_one(plan: SeriesPlan, file: DataFile, fewest: int) -> Series:
     """One series inside its window. Raises :class:`DataError`."""
     data, path, weights, places = plan.data, file.path, plan.data.weights, plan.data.places
-    stated = (*_errors(data).values(), weights and weights.column, places and places.column)
+    beside_them = weights.column if weights else None, places.column if places else None
+    stated: tuple[Column | None, ...] = (*data.error_columns.values(), *beside_them)
     read = read_series(
-        path, data.columns.time, data.columns.observable, data.part(Layout), [column for column in stated if column],
+        path, data.columns.time, data.columns.observable, data.part(Layout), [*filter(None, stated)],
         file.part, repeats=places is not None, fewest=fewest,
     )  # fmt: skip
-    window = _window(data, read, path)
+    asked = data.window
+    window = read.window(asked.start, asked.end, asked.prominence)
     times, values = read.times[window], read.values[window]
     top = vertex(read.times, read.values) if data.time_zero == "top" else 0.0
     zero = float({"file": 0.0, "window": times[0], "top": top}.get(str(data.time_zero), data.time_zero))
@@ -143,11 +143,12 @@ def read_one(plan: SeriesPlan, file: DataFile, fewest: int) -> Series:
         return read.errors[column.name][window] if column else None
 
     def errors(part: slice) -> Noise:
-        of_columns = {key: read.errors[column.name][part] for key, column in _errors(data).items()}
+        of_columns = {key: read.errors[column.name][part] for key, column in data.error_columns.items()}
         return errors_of(data, read.times[part] - zero, values, of_columns, partial(read.rows_among, used=part))
 
     try:
-        noise, whole = errors(window), slice(window.start, max(window.stop, _window(data, read, path, until=True).stop))
+        until = read.window(asked.start, asked.until, asked.prominence).stop
+        noise, whole = errors(window), slice(window.start, max(window.stop, until))
         if len(times) < fewest:
             held = f"{len(times)} of {len(read.times)} usable observations"
             raise DataError(f"the window data.window holds {held}; at least {fewest} are needed")
@@ -156,87 +157,23 @@ def read_one(plan: SeriesPlan, file: DataFile, fewest: int) -> Series:
             times=times,
             values=values,
             noise=noise,
-            weights=weights.weights(times, values, data.window.prominence, beside(weights.column)) if weights else None,
+            weights=weights.weights(times, values, asked.prominence, beside(weights.column)) if weights else None,
             name=plan.name,
             group=plan.group,
             places=places.places(len(times), beside(places.column)) if places else None,
             source=readable(path),
             scalars=read.scalars,
-            doubts=_doubts(data, read),
+            doubts=read.doubts,
             continued=(read.times[whole] - zero, read.values[whole], errors(whole))
             if window.stop < whole.stop and data.error.separate and not places
             else None,
             error_unit=data.error.std.unit if data.error.std else "",
-            next_end=_next_end(data, read, window.start, range(window.stop, whole.stop)),
+            next_end=read.next_end(window.start, range(window.stop, whole.stop), asked.prominence),
             zero=zero,
         )
     except (ValueError, DataError) as error:
         words = str(error)
         raise DataError(words if words.startswith(str(path)) else f"{readable(path)}: {words}") from None
-
-
-def _doubts(data: Data, read: Readings) -> tuple[Caution, ...]:
-    """Readings that were left out, and warnings about implausible times of a series, where the file states them."""
-    column, times, left_out = data.columns.time, np.unique(read.times), tuple[Caution, ...]()
-    every = len(read.times) + sum(map(len, read.left_out.values()))
-    for reason, when in read.left_out.items():
-        words = f"readings left out, for they are {reason}: {len(when)} of {every}"
-        if isinstance(column, Column):
-            listed = convert(np.array(when[:6]), column.target, column.unit)
-            more = " …" if len(when) > 6 else ""
-            words += f", at {', '.join(f'{time:.6g}' for time in listed)}{more} {column.unit}"
-        left_out += (caution("down-weighted", words),)
-    if len(times) == len(read.times) > 0:
-        cut = cut_off(times, read.values, scatter_of(times, read.values))
-        if cut.any():
-            words = f"{cut.sum()} readings at the top are {CLIPPED}: leave them out (data.outliers: leave out)"
-            left_out += (caution("implausible-data", words),)
-    if not isinstance(column, Column) or len(times) < 3:
-        return left_out
-    return left_out + step_doubts(times, column.target, column.unit, read.scalars, column.rate)
-
-
-def _errors(data: Data) -> dict[str, Column]:
-    """The columns that hold errors of readings or times, or say which readings are bounds."""
-    time = data.columns.time
-    clock = time if isinstance(time, Column) else time.column
-    columns = data.error.columns(data.columns.observable.unit, clock.unit if clock else "")
-    return columns | {key: marked for key, marked in data.error.bounds.items() if isinstance(marked, Column)}
-
-
-def _window(data: Data, read: Readings, path: Path, until: bool = False) -> slice:
-    """Which of the readings are used, or these and those predicted. Raises :class:`DataError` where none is."""
-    asked = data.window
-    try:
-        window = select(read.times, read.values, asked.start, asked.until if until else asked.end, asked.prominence)
-    except DataError as error:
-        raise DataError(f"{path}: {error}{_span(read.times, data)}") from None
-    if not len(read.times[window]):
-        raise DataError(f"{path}: no observation lies in the window{_span(read.times, data)}")
-    return window
-
-
-def _next_end(data: Data, read: Readings, begin: int, after: range) -> str:
-    """The first trough among the readings ``after`` a window that begins with the reading ``begin``; "" for none."""
-    number = 0
-    while after:
-        trough = Instant("trough", number := number + 1)
-        try:
-            at = index_of(read.times, read.values, trough, begin, data.window.prominence, last=True)
-        except DataError:
-            return ""
-        if at >= after.start:
-            return f"trough {number}" if at in after else ""
-    return ""
-
-
-def _span(times: Array, data: Data) -> str:
-    """Where the readings are, on the file's clock."""
-    column = data.columns.time
-    if not isinstance(column, Column):
-        return ""
-    first, last = convert(times[[0, -1]], column.target, column.unit)
-    return f"; the readings go from {first:g} to {last:g} {column.unit}"
 
 
 def errors_of(

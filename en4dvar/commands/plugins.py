@@ -1,4 +1,5 @@
-"""What application packages add to the command line by entry points: subcommands, and forms of a simulation.
+"""Commands about what is installed: ``en4dvar models``, ``schema`` and ``warm-up``; and what application packages add
+to the command line by entry points: subcommands, and forms of a simulation.
 
 Group ``en4dvar.commands``, name → click command. ``en4dvar --help`` must stay quick and must not fail because of a
 package, so help reads the command's docstring from its source; only invoking a command imports it.
@@ -9,7 +10,9 @@ before such an option is used.
 """
 
 import ast
-from collections.abc import Mapping
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping
 from importlib.metadata import EntryPoint
 from importlib.util import find_spec
 from pathlib import Path
@@ -17,12 +20,14 @@ from typing import Any
 
 import click
 
-from en4dvar.commands.common import parted
+from en4dvar.commands.common import deliver, echo, parted
 from en4dvar.plumbing.errors import En4dvarError, retold
 from en4dvar.plumbing.installed import installed
 
 COMMANDS = "en4dvar.commands"
 FORMS = "en4dvar.simulate"
+WARM_UP = "en4dvar.warm_up"
+"""Entry points whose value is a function without arguments: what is compiled, in words → a small call that does."""
 
 
 class PluginCommand(click.Command):
@@ -97,3 +102,58 @@ def asked(options: Mapping[str, Any]) -> dict[str, tuple[EntryPoint, Path, dict[
         if out is not None:
             answers[name] = entry, out, {key: value.strip() for key, value in parted(texts, f"--{name}-set").items()}
     return answers
+
+
+@click.command()
+def models() -> None:
+    """List the models with their observables, parameters, units and settings.
+
+    \b
+    Example:
+      en4dvar models | less
+    """
+    from en4dvar.config.models import model_listing
+
+    echo(model_listing())
+
+
+@click.command()
+@click.option("--out", type=click.Path(path_type=Path), help="JSON file to write; default standard output.")
+def schema(out: Path | None) -> None:
+    """Print the JSON schema of configuration files: completion and checks in an editor.
+
+    Name it in the first line of a configuration:  # yaml-language-server: $schema=en4dvar.schema.json
+
+    \b
+    Example:
+      en4dvar schema --out en4dvar.schema.json
+    """
+    from en4dvar.config.json_schema import schema_text
+
+    deliver(schema_text(), out, "schema")
+
+
+@click.command("warm-up")
+def warm_up() -> None:
+    """Compile now what is otherwise compiled at first use: for images, clusters and first runs.
+
+    Each kind of equations, and each method with compiled loops, is used once on a tiny problem.
+
+    \b
+    Example:
+      en4dvar warm-up  # in an image, or before a batch of jobs
+    """
+    from en4dvar.plumbing.compiled import KERNELS, compilations
+
+    for what, call in examples():
+        before, start = compilations(), time.perf_counter()
+        call()
+        took = f"compiled in {time.perf_counter() - start:.1f} s" if compilations() > before else "there already"
+        echo(f"{what}: {took}")
+    echo(f"compiled code is kept below {os.path.commonpath([kernel.stats.cache_path for kernel in KERNELS])}")
+
+
+def examples() -> Iterator[tuple[str, Callable[[], object]]]:
+    """Names of kernels, each with a call that compiles it. Raises :class:`En4dvarError`: a package is at fault."""
+    for name, entry in installed(WARM_UP).items():
+        yield from loaded(entry, f"warm-up of {name!r}")().items()

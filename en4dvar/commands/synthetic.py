@@ -3,24 +3,12 @@ synthetic campaign), ``calibrate``, ``design`` and ``sweep-twin``.
 """
 
 import os
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import click
 
-from en4dvar.commands.common import (
-    Source,
-    command_line,
-    config_options,
-    continuable,
-    deliver,
-    echo,
-    parted,
-    refuse_to_replace,
-    tell,
-    workers_option,
-)
+from en4dvar.commands.common import Source, config_options, continuable, deliver, echo, parted, tell, workers_option
 from en4dvar.commands.plugins import WithForms, asked, loaded
 
 
@@ -44,6 +32,7 @@ def simulate(
       en4dvar simulate configs/quickstart.yaml --set parameters.G='0.5 kPa' \\
           --times '0 us:60 us:1 us' --noise '1.4 um' --out synthetic.csv
     """
+    from en4dvar.commands.common import command_line, refuse_to_replace
     from en4dvar.config.document import override, read_document
     from en4dvar.config.kinds import resolve_campaign
     from en4dvar.plumbing.files import inside
@@ -59,12 +48,11 @@ def simulate(
             raise click.UsageError(f"{words} and --noise do not apply to a configuration with a 'campaign:'")
         base = source.path.resolve().parent
         plan = resolve_campaign(override(document, source.overrides(seed=seed)), base)
-        if out:
-            plan = replace(plan, directory=out)
-        else:  # a folder that came with the configuration may be a link
-            inside(base, os.path.relpath(plan.directory, base))
+        folder = out or plan.file.campaign.directory
+        if not out:  # a folder that came with the configuration may be a link
+            inside(base, os.path.relpath(folder, base))
         sets = draw_campaign(plan)
-        truth = write_campaign(plan, sets, command_line(), force)
+        truth = write_campaign(plan, sets, folder, command_line(), force)
         fits = [s.nrmse for s in sets]
         echo(f"{len(sets)} synthetic data sets, NRMSE of the truth {min(fits):.3f} to {max(fits):.3f}; truth: {truth}")
         return

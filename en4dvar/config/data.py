@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any, Literal, Self, cast, get_args
 
 from pydantic import BeforeValidator, ConfigDict, Discriminator, Field, Tag, WithJsonSchema, model_validator
@@ -153,25 +152,18 @@ def read_time_zero(text: Any, context: Context) -> TimeZero | float:
         return parse_quantity(text, time_unit(context))
 
 
-@dataclass(frozen=True)
-class Files:
-    """Files, folders and patterns, relative to ``base``."""
-
-    base: Path
-    texts: tuple[str, ...]
-
-
-def _files(written: str | tuple[str, ...], context: Context) -> Files:
+def _files(written: str | tuple[str, ...], context: Context) -> tuple[str, ...]:
+    """Paths and patterns from the root on."""
     if not written or not all(written):
         raise ValueError("no file is named")
     texts = (written,) if isinstance(written, str) else written
-    return Files(context.base, tuple(str(expanded(text)) for text in texts))
+    return tuple(str(context.base / expanded(text)) for text in texts)
 
 
 class Data(Section):
     """Where the observations are, what they mean and how well they are known; in the model's units."""
 
-    path: Annotated[Files, Made(_files, str | tuple[str, ...])]
+    path: Annotated[tuple[str, ...], Made(_files, str | tuple[str, ...])]
     """A data file, a folder (one without data files: its subfolders), a pattern such as data/*.csv, or a list of them;
     relative to this file's folder."""
     name: Name | None = None
@@ -233,11 +225,17 @@ class Data(Section):
         if columns.keys() <= set(roles):
             faults.add(("columns",), f"name the column of one observable of: {', '.join(roles[1:])}")
 
+    @property
+    def error_columns(self) -> dict[str, Column]:
+        """The columns that hold errors of readings or times, or say which readings are bounds."""
+        time = self.columns.time
+        clock = time if isinstance(time, Column) else time.column
+        return self.error.columns(self.columns.observable.unit, clock.unit if clock else "")
+
     def as_written(self, source: Mapping[str, Any]) -> dict[str, Any]:
         """The section as it was written, with absolute paths."""
         written = super().as_written(source)
-        paths = [str(self.path.base / text) for text in self.path.texts]
-        written["path"] = paths[0] if len(paths) == 1 else paths
+        written["path"] = self.path[0] if len(self.path) == 1 else list(self.path)
         if self.error.covariance is not None:
             written["error"]["covariance"]["path"] = str(self.error.covariance.path)
         if self.weights is not None and self.weights.stated is not None:

@@ -32,8 +32,17 @@ def time_grid(start: str | float, end: str | float, step: str | float, unit: str
     return np.asarray(first + width * np.arange(int(np.floor(steps)) + 1), dtype=float)
 
 
+class Later(Section):
+    """Instants at another rate."""
+
+    end: Annotated[QuantityText, Field(alias="to")]
+    """Last instant with its unit."""
+    step: QuantityText
+    """Time step with its unit."""
+
+
 class Times(Section):
-    """A uniform grid of instants, both ends included."""
+    """Instants at one rate or at two, one after the other; both ends are included."""
 
     start: Annotated[QuantityText, Field(alias="from")] = "start"
     """First instant with its unit; start is time zero."""
@@ -41,11 +50,17 @@ class Times(Section):
     """Last instant with its unit."""
     step: QuantityText
     """Time step with its unit."""
+    then: Later | None = None
+    """Another rate, of a camera that changes it: after ``to``."""
 
 
 def read_times(times: Times, context: Context) -> Array:
-    """The instants (K,) of a grid."""
-    return time_grid(times.start, times.end, times.step, time_unit(context))
+    """The instants (K,)."""
+    first = time_grid(times.start, times.end, times.step, time_unit(context))
+    if times.then is None:
+        return first
+    later = time_grid(times.end, times.then.end, times.then.step, time_unit(context))
+    return np.concatenate([first, later[later > first[-1] + 0.5 * (later[1] - later[0])]])
 
 
 class Knob(Section):
@@ -55,29 +70,6 @@ class Knob(Section):
     """The key, its sections before it: ``model.pulse.amplitude``, ``design.times.step``, ``data.error.radius_std``."""
     values: Annotated[tuple[Value, ...], Field(min_length=1)]
     """The values, as they would stand in the file."""
-
-
-class Later(Section):
-    """Another rate, of a camera that changes it: after ``to``."""
-
-    end: Annotated[QuantityText, Field(alias="to")]
-    """Last instant with its unit."""
-    step: QuantityText
-    """Time step with its unit."""
-
-
-class Rates(Times):
-    """Instants at one rate or at two, one after the other."""
-
-    then: Later | None = None
-
-
-def _read_rates(times: Rates, context: Context) -> Array:
-    first = read_times(times, context)
-    if times.then is None:
-        return first
-    later = time_grid(times.end, times.then.end, times.then.step, time_unit(context))
-    return np.concatenate([first, later[later > first[-1] + 0.5 * (later[1] - later[0])]])
 
 
 class Choice(Section):
@@ -134,7 +126,7 @@ class Design(Section, SampleSizes):
     wanted: dict[str, QuantityText] = Field({})
     """Parameter asked for → what it is to be known to, one standard deviation (5 %, or in its unit): what each other
     parameter must be known to for it is told."""
-    times: Annotated[Array | None, Made(_read_rates, Rates)] = None
+    times: Annotated[Array | None, Made(read_times, Times)] = None
     """When readings are taken, on the model's clock; default: ``simulate.times``, else those of the data file."""
     knobs: dict[str, Knob] = Field({})
     """Name → a key of this file and the values that are tried; every combination is a design."""

@@ -33,16 +33,9 @@ NULL = "a null byte, which no name, word or number holds"
 _INT = re.compile(r"[-+]?\d{1,40}")
 _FLOAT = re.compile(r"[-+]?(\.\d+|\d+(\.\d*)?)([eE][-+]?\d{1,3})?")
 _WORDS = {
-    ".inf": math.inf,
-    "-.inf": -math.inf,
-    "true": True,
-    "True": True,
-    "false": False,
-    "False": False,
-    "null": None,
-    "~": None,
-    "": None,
-}
+    ".inf": math.inf, "-.inf": -math.inf, "true": True, "True": True, "false": False, "False": False,
+    "null": None, "~": None, "": None,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)

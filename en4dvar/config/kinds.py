@@ -335,19 +335,6 @@ class CampaignFile(File):
     campaign: CampaignSection
 
 
-@dataclass(frozen=True)
-class CampaignPlan:
-    """A validated campaign; ``directory`` is where its files go."""
-
-    name: str
-    seed: int
-    model: ForwardModel
-    directory: Path
-    settings: CampaignSection
-
-
-def resolve_campaign(document: Document, base: Path) -> CampaignPlan:
+def resolve_campaign(document: Document, base: Path) -> Read[CampaignFile]:
     """Validate a document with a ``campaign:`` section. Raises :class:`ConfigError`, every fault at once."""
-    read = read_file(CampaignFile, document, base)
-    file = read.file
-    return CampaignPlan(file.name, file.seed, read.model, file.campaign.directory, file.campaign)
+    return read_file(CampaignFile, document, base)

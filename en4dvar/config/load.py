@@ -178,7 +178,6 @@ class Read(Generic[S]):
     file: S
     model: ForwardModel
     document: Document
-    context: Context
     model_section: dict[str, Any]
 
     def common(self, parameters: Iterable[Entry]) -> dict[str, Any]:
@@ -214,11 +213,10 @@ def read_file(kind: type[S], document: Document, base: Path, model: ForwardModel
         if document.data["model"].get(key) is not None and parameters and all(name in parameters for name in names):
             words = f"not read, for it says {' and '.join(names)}, which are parameters; leave it out, or change these"
             faults.append(document.fault(("model", key), words, at_key=True))
-    context = context_of(document, base, model)
-    file = check(kind, document.data, (), document, faults, context)
+    file = check(kind, document.data, (), document, faults, context_of(document, base, model))
     if file is None or built is None or model is None or faults:
         raise ConfigError(in_order(faults))
-    return Read(file, model, document, context, built[1])
+    return Read(file, model, document, built[1])
 
 
 def context_of(document: Document, base: Path, model: ForwardModel | None) -> Context:

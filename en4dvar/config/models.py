@@ -119,14 +119,15 @@ def checked(model: ForwardModel) -> ForwardModel:
         names = [thing.name for thing in declared]
         if twice := [name for name in names if names.count(name) > 1]:
             raise ConfigError(f"{type(model).__name__}: two {what} are called {twice[0]!r}; each needs its own name")
-    units = [(thing.name, thing.unit, thing.display_unit) for thing in (*model.parameters, *observables)]
-    for what, unit, display_unit in (("its times", model.time_unit, model.time_display_unit), *units):
-        with retold(UnitError, ConfigError, f"{type(model).__name__}: unit and display unit of {what}: "):
-            convert(1.0, unit, display_unit)
-    for thing in (*model.parameters, *observables):
+    things = (*model.parameters, *observables)
+    for thing in things:
         for what, text in (("symbol", thing.symbol), ("label", thing.label)):
             if reason := symbol_fault(text):
                 raise ConfigError(f"the {what} {shown(text)} of {thing.name} cannot be written in a figure: {reason}")
+    units = [(thing.name, thing.unit, thing.display_unit) for thing in things]
+    for what, unit, display_unit in (("its times", model.time_unit, model.time_display_unit), *units):
+        with retold(UnitError, ConfigError, f"{type(model).__name__}: unit and display unit of {what}: "):
+            convert(1.0, unit, display_unit)
     for observable in observables:
         if isinstance(observable.operator, StateField):
             for field in (observable.operator.name, observable.operator.rate_of):

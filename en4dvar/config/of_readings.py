@@ -31,11 +31,12 @@ from en4dvar.plumbing.user_code import loading, reason_of
 from en4dvar.priors.prior import PriorTerm
 
 
-class ErrorColumn(OfReadings):
-    """A column of standard deviations, one per reading."""
+class InUnit(OfReadings):
+    """A column of standard deviations or of places, one per reading."""
 
     unit: str | None = None
-    """Unit of the numbers in it; default: that of the readings' own column."""
+    """Unit of the numbers in it; default: that of the readings' own column, and of places none: these are indices,
+    counted from 0."""
 
 
 def or_column(read: Callable[[Any, Context], Any], unit: Unit) -> Callable[[Any, Context], Any]:
@@ -44,7 +45,7 @@ def or_column(read: Callable[[Any, Context], Any], unit: Unit) -> Callable[[Any,
     def read_either(written: Any, context: Context) -> Any:
         if not isinstance(written, Mapping):
             return read(written, context)
-        chosen = ErrorColumn.model_validate(written, context=context)
+        chosen = InUnit.model_validate(written, context=context)
         if chosen.unit is not None:
             convert(1.0, chosen.unit, unit(context))
         return Column(chosen.column, chosen.unit or "", unit(context))
@@ -65,13 +66,9 @@ MARKS = Made(
     lambda mark, context: mark if isinstance(mark, bool) else Column(mark.column, "1", "1", kind="mark"),
     bool | OfReadings,
 )
-QUANTITY_OR_COLUMN = {"anyOf": [TEXT, ErrorColumn.model_json_schema()]}
+QUANTITY_OR_COLUMN = {"anyOf": [TEXT, InUnit.model_json_schema()]}
 
 LogStd = Annotated[float, Field(gt=0)]
-
-
-def rate_unit(context: Context) -> str:
-    return f"({observable_unit(context)})/({time_unit(context)})"
 
 
 class AmplitudeSection(Section):
@@ -101,7 +98,9 @@ class DiscrepancySection(Section):
     length: LengthSection = Field({}, validate_default=True)
     kernel: Literal["exponential", "matern-3/2", "matern-5/2"] = "exponential"
     """Correlation in time: exponential (rough paths), or Matérn's with one or two derivatives."""
-    grows_beyond: Annotated[float | None, quantity(rate_unit, "positive")] = None
+    grows_beyond: Annotated[
+        float | None, quantity(lambda c: f"({observable_unit(c)})/({time_unit(c)})", "positive")
+    ] = None
     """Rate of the observable beyond which the amplitude grows in proportion to it, e.g. 20 m/s; default: constant."""
 
     def kernel_at(self, times: Array) -> Kernel:
@@ -201,9 +200,12 @@ class Error(Section):
             faults.add((std,), "required: the standard deviation of the observation error")
 
     def columns(self, readings: str, times: str) -> dict[str, Column]:
-        """The columns of errors, in the units of ``readings`` and ``times`` where they have none of their own."""
+        """The columns of errors, in the units of ``readings`` and ``times`` where they have none of their own, and of
+        what says which readings are bounds.
+        """
         shared = {f"shared {i}": (part, readings) for i, part in enumerate(self.shared)}
-        every = {"std": (self.std, readings), "time_std": (self.time_std, times), **shared}
+        marks = {key: (marked, "1") for key, marked in self.bounds.items()}
+        every = {"std": (self.std, readings), "time_std": (self.time_std, times), **shared, **marks}
         return {key: replace(c, unit=c.unit or unit) for key, (c, unit) in every.items() if isinstance(c, Column)}
 
     @property
@@ -318,13 +320,6 @@ SECTIONS = OfReadings, AwayFromMinima, WeightFunction
 WEIGHTS = Made(weighing, json={"oneOf": [NUMBERS.json_schema(), *(kind.model_json_schema() for kind in SECTIONS)]})
 
 
-class PlaceColumn(OfReadings):
-    """A column of places, one per reading."""
-
-    unit: str | None = None
-    """Unit of the coordinates in it; without a unit they are indices, counted from 0."""
-
-
 @dataclass(frozen=True)
 class Placing:
     """Places as they are stated: a ``column``, or ``positions`` (one for all readings, or one each).
@@ -357,7 +352,7 @@ def placing(written: Any, context: Context) -> Placing:
     """Raises :class:`ConfigError`, its path the faulty key, ValueError."""
     section, entries = None, written if isinstance(written, list) else [written]
     if isinstance(written, Mapping) and "column" in written:
-        section = PlaceColumn.model_validate(written, context=context)
+        section = InUnit.model_validate(written, context=context)
     elif not all(isinstance(entry, int | str) and not isinstance(entry, bool) for entry in entries):
         raise ValueError("write an index, a coordinate such as '3 m', a list of either, or {column: NAME}")
     block = field_of(context.units, context.observable)
@@ -386,4 +381,4 @@ def _coordinates(block: StateBlock | None, key: str) -> StateBlock:
 
 
 STATED = TypeAdapter[Any](int | str | list[int | str])
-PLACES = Made(placing, json={"oneOf": [STATED.json_schema(), PlaceColumn.model_json_schema()]})
+PLACES = Made(placing, json={"oneOf": [STATED.json_schema(), InUnit.model_json_schema()]})

@@ -10,15 +10,13 @@ from pydantic import Field
 from en4dvar.config.context import Context, Faults, Made, read_each
 from en4dvar.config.quantities import SPREAD, Spread, subject_unit, unit_of
 from en4dvar.config.schema import Section
-from en4dvar.config.varies import Estimated, VariesSection
-from en4dvar.data.observations import Observations
+from en4dvar.config.varies import VariesSection
 from en4dvar.model.forward import ForwardModel
 from en4dvar.model.state import OF_READINGS, READING_OFFSET, TIME_SHIFT, Parameter
 from en4dvar.plumbing.errors import ConfigError, retold
 from en4dvar.plumbing.hints import brief, shown, suggest
 from en4dvar.plumbing.units import parse_quantity
 from en4dvar.priors.prior import PriorTerm
-from en4dvar.priors.varying import RandomWalk
 from en4dvar.priors.varying.model import can_vary
 
 _RECIPES = {
@@ -34,14 +32,14 @@ _RECIPES = {
 
 def _bounded(text: Any, parameter: Parameter) -> float:
     """A value in the parameter's unit. Raises :class:`ConfigError`, :class:`UnitError`."""
-    return inside_bounds(parse_quantity(text, parameter.unit, parameter.display_unit), parameter, brief(str(text), 80))
+    return inside_bounds(parse_quantity(text, parameter.unit, parameter.display_unit), parameter, text)
 
 
-def inside_bounds(value: float, parameter: Parameter, shown: str = "") -> float:
-    """The value, in the parameter's unit. Raises :class:`ConfigError` with it as ``shown``."""
+def inside_bounds(value: float, parameter: Parameter, written: Any = "") -> float:
+    """The value, in the parameter's unit. Raises :class:`ConfigError` with it as it is ``written``."""
     low, high = parameter.bounds
     if not low <= value <= high:
-        words = shown or f"{value:g} {parameter.unit}"
+        words = brief(str(written), 80) or f"{value:g} {parameter.unit}"
         raise ConfigError(f"{words} is outside the bounds [{low:g}, {high:g}] {parameter.unit}")
     return value
 
@@ -242,16 +240,6 @@ class Uncertain:
             self.term()
         elif self.spec.prior != "logit":
             self.term(lambda where: 1.0)  # the other values do not wait for the data
-
-    def walk(self, model: ForwardModel, term: PriorTerm, observations: Observations) -> RandomWalk | None:
-        """How it varies over a window of observations; None where it does not.
-
-        Raises :class:`ConfigError`, its path the faulty key of ``varies``.
-        """
-        if (varies := self.spec.varies) is None:
-            return None
-        estimated = isinstance(varies.std, Estimated)
-        return RandomWalk.of(model, term, varies.knots(observations), varies.std_of(term), estimated)
 
     def _location(self, key: Literal["mean", "median"], of_data: Callable[[str | Scalar], float] | None) -> float:
         value: float | str | Scalar | None = getattr(self.spec, key)

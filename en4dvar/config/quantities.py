@@ -4,10 +4,9 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from operator import attrgetter
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 from en4dvar.config.context import Context, Made
-from en4dvar.plumbing.described import text_for
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.hints import brief, shown
 from en4dvar.plumbing.units import UnitError, convert, parse_quantity, parse_unit, split_quantity
@@ -68,10 +67,11 @@ def unit_of(target: Unit) -> Made:
     """The text of a unit that can be converted to ``target``."""
 
     def fits(unit: str, context: Context) -> str:
+        parse_unit(unit)  # also where what it is converted to is not known
         convert(1.0, unit, target(context))
         return unit
 
-    return Made(fits, Annotated[str, text_for(parse_unit)])
+    return Made(fits, str)
 
 
 def parse_error_std(text: Any, unit: str, whole: str = "maximum") -> Spread:

@@ -329,7 +329,8 @@ class Assimilation(_Settings):
 
     @classmethod
     def unread(cls, section: Mapping[str, Any]) -> dict[str, str]:
-        faults: dict[str, str] = beside_noise(section) | super().unread(section)
+        faults: dict[str, str] = super().unread(section)
+        faults = beside_noise(section) | faults
         name = section.get("scheme", DEFAULT)
         if section.get("localisation") is not None and isinstance(name, str) and name in ON_A_WINDOW:
             faults |= beside_localisation(name, section)

@@ -3,8 +3,16 @@
 import os
 from typing import Literal
 
-from en4dvar.executor.base import Executor, ExecutorError, Outcome, WorkerLostError, cut, run_chunk
-from en4dvar.executor.futures import SerialExecutor, ThreadsExecutor
+from en4dvar.executor.base import (
+    Executor,
+    ExecutorError,
+    Outcome,
+    SerialExecutor,
+    ThreadsExecutor,
+    WorkerLostError,
+    cut,
+    run_chunk,
+)
 from en4dvar.executor.limits import NO_LIMITS, Limits, TimeLimitError, one_blas_thread
 from en4dvar.executor.processes import ProcessesExecutor
 from en4dvar.model.forward import ForwardModel

@@ -19,8 +19,7 @@ import time
 from collections.abc import Callable, Collection, Mapping
 from typing import TYPE_CHECKING, Any
 
-from en4dvar.executor.base import Call, ExecutorError, T, Tell, WorkerLostError
-from en4dvar.executor.futures import Events, FuturesExecutor
+from en4dvar.executor.base import Call, Events, ExecutorError, FuturesExecutor, T, Tell, WorkerLostError
 from en4dvar.executor.limits import NO_LIMITS, Limits, apply_limits
 from en4dvar.plumbing.user_code import in_worker, own_fault
 

@@ -19,8 +19,7 @@ from multiprocessing.connection import Connection
 from multiprocessing.reduction import ForkingPickler
 from typing import Any
 
-from en4dvar.executor.base import Call, ExecutorError, T, Tell, WorkerLostError
-from en4dvar.executor.futures import PoolExecutor
+from en4dvar.executor.base import Call, ExecutorError, PoolExecutor, T, Tell, WorkerLostError
 from en4dvar.executor.limits import NO_LIMITS, Limits, apply_limits
 from en4dvar.plumbing.files import here
 from en4dvar.plumbing.user_code import describe, in_worker, own_fault

@@ -15,7 +15,6 @@ import itertools
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +22,7 @@ import numpy.typing as npt
 from numpy.lib.stride_tricks import sliding_window_view
 
 from en4dvar.inputs.parts import Layout, cell, opened, table_of
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, Indices
 from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.errors import DataError
 from en4dvar.plumbing.units import convert
@@ -245,70 +244,65 @@ def _off(frames: Array) -> Array:
 SEVERAL = 4  # readings: a series has as many, and two of them as many each while both go on
 
 
-@dataclass(frozen=True)
-class InFile:
-    """The rows ``kept`` (K,) of a file, its ``lines`` if it has them, their times as ``written`` (K,) in ``unit``, the
-    columns ``wanted``, and whether some of these are marks of ``bounds``."""
+def check_order(
+    path: Path, layout: Layout, kept: Indices, lines: Sequence[int], written: Array, unit: str, wanted: Sequence[str],
+    bounds: bool, times: Array, values: Array,
+) -> None:  # fmt: skip
+    """Raise :class:`DataError` where ``times`` (K,) of ``values`` (K,) are not in order, or one occurs again and may
+    not. They are those of the rows ``kept`` (K,) of a file, ``written`` (K,) there in ``unit``.
 
-    path: Path
-    layout: Layout
-    kept: npt.NDArray[np.intp]
-    lines: Sequence[int]
-    written: Array
-    unit: str
-    wanted: Sequence[str]
-    bounds: bool = False
+    ``lines``: the numbers of its lines, if it has any; ``wanted``: the columns that are read; ``bounds``: some of these
+    are marks of bounds.
+    """
+    order = np.argsort(times, kind="stable") if layout.unsorted == "sort" else np.arange(len(times))
+    steps = np.diff(times[order])
+    wrong = np.flatnonzero(steps < 0 if layout.repeated == "average" else steps <= 0)
+    if not len(wrong):
+        return
+    before, after = order[wrong[0] : wrong[0] + 2]
+    apart = "give each a file of its own"
+    apart += bool(lines) * ", or a column that says whose each row is, and name it by data.by"
+    ends = np.flatnonzero(np.diff(times) < 0)
+    if bounds and times[after] == times[before]:
+        hint = "bounds of one time are series of their own: one of those that say at_least, one of at_most"
+    elif column := _telling_apart(path, layout, kept, lines, wanted, times):
+        name = column if column.isidentifier() else repr(column)
+        hint = f"column {column!r} says which of several series a row belongs to (data.by: {name})"
+    elif _several(times, ends):
+        before, after = ends[0], ends[0] + 1
+        hint = f"these look like {len(ends) + 1} series one after another: {apart}"
+    elif times[after] != times[before]:
+        hint = "correct it, or sort the rows (data.unsorted: sort)"
+    elif _differ(times, values):
+        hint = f"readings of one time differ by far more than they scatter: keep one; of several series, {apart}"
+    else:
+        hint = "keep one of the two readings, or their mean (data.repeated: average)"
+    unit = "" if "*" in unit or unit == "1" else f" {unit}"
+    where = f":{lines[kept[after]]}" if lines else f": sample {kept[after] + 1}"
+    told = f"times must increase, but {written[after]:g}{unit} follows {written[before]:g}{unit}"
+    raise DataError(f"{path}{where}: {told}; {hint}")
 
-    def require_order(self, times: Array, values: Array) -> None:
-        """Raise :class:`DataError` where ``times`` (K,) of ``values`` (K,) are not in order, or one occurs again and
-        may not."""
-        order = np.argsort(times, kind="stable") if self.layout.unsorted == "sort" else np.arange(len(times))
-        steps = np.diff(times[order])
-        wrong = np.flatnonzero(steps < 0 if self.layout.repeated == "average" else steps <= 0)
-        if not len(wrong):
-            return
-        before, after = order[wrong[0] : wrong[0] + 2]
-        apart = "give each a file of its own"
-        apart += bool(self.lines) * ", or a column that says whose each row is, and name it by data.by"
-        ends = np.flatnonzero(np.diff(times) < 0)
-        if self.bounds and times[after] == times[before]:
-            hint = "bounds of one time are series of their own: one of those that say at_least, one of at_most"
-        elif column := self._telling_apart(times):
-            name = column if column.isidentifier() else repr(column)
-            hint = f"column {column!r} says which of several series a row belongs to (data.by: {name})"
-        elif _several(times, ends):
-            before, after = ends[0], ends[0] + 1
-            hint = f"these look like {len(ends) + 1} series one after another: {apart}"
-        elif times[after] != times[before]:
-            hint = "correct it, or sort the rows (data.unsorted: sort)"
-        elif _differ(times, values):
-            hint = f"readings of one time differ by far more than they scatter: keep one; of several series, {apart}"
-        else:
-            hint = "keep one of the two readings, or their mean (data.repeated: average)"
-        unit = "" if "*" in self.unit or self.unit == "1" else f" {self.unit}"
-        where = f":{self.lines[self.kept[after]]}" if self.lines else f": sample {self.kept[after] + 1}"
-        told = f"times must increase, but {self.written[after]:g}{unit} follows {self.written[before]:g}{unit}"
-        raise DataError(f"{self.path}{where}: {told}; {hint}")
 
-    def _telling_apart(self, times: Array) -> str | None:
-        """The column of a table that tells several series apart, each with increasing ``times`` (K,), and nothing
-        else."""
-        if self.layout.by is not None or not self.lines:
-            return None
-        with opened(self.path, self.layout) as kind:
-            table = table_of(self.path, kind, self.layout, self.wanted)
-        for i, name in enumerate(table.names):
-            cells = np.array([cell(table.rows[k][1], i) for k in self.kept])
-            each, which, counts = np.unique(cells, return_inverse=True, return_counts=True)
-            if name not in ("", *self.wanted) and "" not in each and len(each) > 1 and counts.min() >= SEVERAL:
-                sort = self.layout.unsorted == "sort"
-                rows = np.lexsort((times, which)) if sort else np.argsort(which, kind="stable")
-                increase = np.all((np.diff(times[rows]) > 0) | (np.diff(which[rows]) > 0))
-                stacked = np.count_nonzero(np.diff(which)) < len(each)
-                beside = np.count_nonzero(np.diff(which[np.lexsort((which, times))])) - len(each) >= SEVERAL
-                if increase and beside and (stacked or len(times) - len(np.unique(times)) >= SEVERAL):
-                    return name
+def _telling_apart(
+    path: Path, layout: Layout, kept: Indices, lines: Sequence[int], wanted: Sequence[str], times: Array
+) -> str | None:
+    """The column of a table that tells several series apart, each with increasing ``times`` (K,), and nothing else."""
+    if layout.by is not None or not lines:
         return None
+    with opened(path, layout) as kind:
+        table = table_of(path, kind, layout, wanted)
+    for i, name in enumerate(table.names):
+        cells = np.array([cell(table.rows[k][1], i) for k in kept])
+        each, which, counts = np.unique(cells, return_inverse=True, return_counts=True)
+        if name not in ("", *wanted) and "" not in each and len(each) > 1 and counts.min() >= SEVERAL:
+            sort = layout.unsorted == "sort"
+            rows = np.lexsort((times, which)) if sort else np.argsort(which, kind="stable")
+            increase = np.all((np.diff(times[rows]) > 0) | (np.diff(which[rows]) > 0))
+            stacked = np.count_nonzero(np.diff(which)) < len(each)
+            beside = np.count_nonzero(np.diff(which[np.lexsort((which, times))])) - len(each) >= SEVERAL
+            if increase and beside and (stacked or len(times) - len(np.unique(times)) >= SEVERAL):
+                return name
+    return None
 
 
 def _several(times: Array, ends: npt.NDArray[np.intp]) -> bool:

@@ -13,10 +13,11 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.inputs.implausible import InFile, cut_off, level_top, outlying, placeholders, scatter_of
+from en4dvar.inputs.implausible import check_order, cut_off, level_top, outlying, placeholders, scatter_of, step_doubts
 from en4dvar.inputs.parts import ANY, Column, Layout, TimeStep, columns_of
-from en4dvar.inputs.window import index_of
+from en4dvar.inputs.window import Instant, index_of, select
 from en4dvar.model.state import Array
+from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.errors import DataError, retold
 from en4dvar.plumbing.hints import suggest
 from en4dvar.plumbing.units import convert
@@ -34,7 +35,8 @@ class Readings:
 
     ``errors`` are the columns that were asked for besides, by name, one number a reading; ``left_out`` the times of
     readings that are none, by the reason. ``rows`` are those of the file, counted from 0, that the readings stand in,
-    none where several are one reading, their mean; it has ``count`` rows, of which ``usable`` hold a reading.
+    none where several are one reading, their mean; it has ``count`` rows, of which ``usable`` hold a reading. ``clock``
+    is the column of times, where there is one.
     """
 
     times: Array
@@ -46,6 +48,55 @@ class Readings:
     rows: Rows | None = None
     count: int = 0
     usable: Rows | None = None
+    clock: Column | None = None
+
+    def window(self, start: Instant, end: Instant, prominence: float) -> slice:
+        """Those from one instant to another. Raises :class:`DataError` where there are none."""
+        try:
+            window = select(self.times, self.values, start, end, prominence)
+            if not len(self.times[window]):
+                raise DataError("no observation lies in the window")
+        except DataError as error:
+            span = ""
+            if self.clock is not None:
+                first, last = convert(self.times[[0, -1]], self.clock.target, self.clock.unit)
+                span = f"; the readings go from {first:g} to {last:g} {self.clock.unit}"
+            raise DataError(f"{self.source}: {error}{span}") from None
+        return window
+
+    def next_end(self, begin: int, after: range, prominence: float) -> str:
+        """The first trough among those ``after`` a window that begins with the reading ``begin``; "" for none."""
+        number = 0
+        while after:
+            trough = Instant("trough", number := number + 1)
+            try:
+                at = index_of(self.times, self.values, trough, begin, prominence, last=True)
+            except DataError:
+                return ""
+            if at >= after.start:
+                return f"trough {number}" if at in after else ""
+        return ""
+
+    @property
+    def doubts(self) -> tuple[Caution, ...]:
+        """Readings that were left out, and warnings about implausible times, where the file states them."""
+        clock, times, left_out = self.clock, np.unique(self.times), tuple[Caution, ...]()
+        every = len(self.times) + sum(map(len, self.left_out.values()))
+        for reason, when in self.left_out.items():
+            words = f"readings left out, for they are {reason}: {len(when)} of {every}"
+            if clock is not None:
+                listed = convert(np.array(when[:6]), clock.target, clock.unit)
+                more = " …" if len(when) > 6 else ""
+                words += f", at {', '.join(f'{time:.6g}' for time in listed)}{more} {clock.unit}"
+            left_out += (caution("down-weighted", words),)
+        if len(times) == len(self.times) > 0:
+            cut = cut_off(times, self.values, scatter_of(times, self.values))
+            if cut.any():
+                words = f"{cut.sum()} readings at the top are {CLIPPED}: leave them out (data.outliers: leave out)"
+                left_out += (caution("implausible-data", words),)
+        if clock is None or len(times) < 3:
+            return left_out
+        return left_out + step_doubts(times, clock.target, clock.unit, self.scalars, clock.rate)
 
     def rows_among(self, size: int, used: slice) -> Rows:
         """Where the readings ``used`` stand in a table of ``size`` rows that follow each other as in the file.
@@ -110,7 +161,7 @@ def read_series(
     if isinstance(time, Column) and not repeats:
         written = columns[time.name][kept]
         bounds = any(column.kind == "mark" for column in errors)
-        InFile(path, layout, kept, lines, written, time.unit, wanted, bounds).require_order(times[kept], values[kept])
+        check_order(path, layout, kept, lines, written, time.unit, wanted, bounds, times[kept], values[kept])
         if layout.unsorted == "sort":
             order = np.argsort(times[kept], kind="stable")
             kept, stated = kept[order], {name: stds[order] for name, stds in stated.items()}
@@ -124,7 +175,8 @@ def read_series(
             sums = np.sqrt(np.bincount(which, own**2)) if c.kind == "std" else np.bincount(which, own)
             stated[c.name] = np.asarray(sums / counts)
         times, values, rows = each, np.bincount(which, values) / counts, None
-    read = Readings(times, values, str(path), scalars, stated, left_out, rows, count, usable)
+    clock = time if isinstance(time, Column) else None
+    read = Readings(times, values, str(path), scalars, stated, left_out, rows, count, usable, clock)
     return _rest(read, layout, fewest, value.positive)
 
 

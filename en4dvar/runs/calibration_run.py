@@ -136,7 +136,7 @@ class CalibrationKind(RunKind[Calibration]):
         estimated = build_one(self.config, name, file).prior.parameters
         quantities = [*((p.name, p.display_unit or p.unit) for p in estimated), (FIT, "1"), (ERRORS, "1")]
         write_sets(run.directory.at(self.result), quantities, told)
-        return replace(load_calibration(run.directory.work), directory=self.directory)
+        return replace(load_calibration(run.directory.work), directory=self.config.directory)
 
 
 def _judged(common: CommonValue[tuple[Config, Config, list[tuple[str, DataFile]]]], number: int) -> Judged:

@@ -1,8 +1,7 @@
 """What can be told before a run: every fault of configuration and data at once."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -24,35 +23,21 @@ from en4dvar.results.variables import require_free_names
 T = TypeVar("T")
 
 
-@dataclass(frozen=True)
-class Checked:
-    """A configuration, the ``problems`` of its data sets, and the faults of those that a campaign goes on without."""
-
-    config: AnyConfig
-    problems: Sequence[InverseProblem]
-    unusable: Sequence[Fault]
-
-
 def validate(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> AnyConfig:
-    """Load a configuration and read its data files; nothing is computed or written.
+    """Load a configuration, as :func:`load_config` does, and read its data files; nothing is computed or written.
 
-    Parameters
-    ----------
-    source: the YAML file, paths inside it relative to its folder; or a dict of the same, relative to this folder.
-    overrides: values for dotted keys such as ``"assimilation.members"``; text is read as YAML.
-
-    Raises
-    ------
-    ConfigError: every fault of the file *and* of the data files it names, each with file, line and column.
+    Raises :class:`ConfigError`: every fault of the file *and* of the data files it names, with file, line and column.
     """
-    checked = check_all(source, overrides)
-    if checked.unusable:
-        raise ConfigError(checked.unusable)
-    return checked.config
+    config, _, unusable = check_all(source, overrides)
+    if unusable:
+        raise ConfigError(unusable)
+    return config
 
 
-def check_all(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> Checked:
-    """As :func:`validate`; but what is wrong with some data sets only is told beside the others, as a run does."""
+def check_all(
+    source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None
+) -> tuple[AnyConfig, list[InverseProblem], list[Fault]]:
+    """As :func:`validate`; the problems of the data sets, and the faults of those that a campaign goes on without."""
     document, base = document_from(source)
     document = override(document, overrides or {})
     try:
@@ -68,11 +53,12 @@ def check_all(source: str | Path | Mapping[str, Any], overrides: Mapping[str, An
             build_sequence(config)
     if faults or (unusable and not problems):
         raise ConfigError(in_order([*faults, *unusable]))
-    return Checked(config, problems, in_order(unusable))
+    return config, problems, in_order(unusable)
 
 
 def checked_problem(config: Config, name: str, file: DataFile) -> InverseProblem:
     """The inverse problem of one data set, whose result can be written. Raises :class:`ConfigError`, `DataError`."""
+    config.sharing.of_dataset(name)
     problem = build_one(config, name, file)
     require_free_names(problem)
     return problem
@@ -118,18 +104,12 @@ def _read_files(document: Document, plan: DataPlan, read: Callable[[str, DataFil
 
 @contextmanager
 def _collecting(faults: list[Fault], document: Document) -> Iterator[None]:
-    """Within, errors of settings and data are told as ``faults``; a file's at the place that names the file."""
+    """Within, errors of settings and data are told as ``faults``; a file's where it is named, by one series or all."""
     try:
         yield
     except ConfigError as error:
         faults += error.problems
     except DataError as error:
-        faults.append(document.fault(_place_of(error, document), str(error)))
-
-
-def _place_of(error: DataError, document: Document) -> tuple[str, ...]:
-    """Where the file is named, of one series or of all."""
-    own = ("data", "series", error.series)
-    if not document.has(own):
-        return ("data", "path") if document.has(("data", "path")) else ("data",)
-    return next((path for path in ((*own, "path"), ("data", "path")) if document.has(path)), own)
+        own = ("data", "series", error.series)
+        places = (place for place in ((*own, "path"), ("data", "path"), own) if document.has(place))
+        faults.append(document.fault(next(places, ("data",)), str(error)))

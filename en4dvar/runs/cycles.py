@@ -109,7 +109,7 @@ class Cycles(RunKind[R]):
         return series_group(self.assimilated(executor, None, None), {})
 
     def executor(self) -> Executor:
-        return choose_executor(self.model, workers=self.config.execution.workers)
+        return choose_executor(self.config.model, workers=self.config.execution.workers)
 
     def conduct(self, run: Session, executor: Executor) -> R:
         file = f"{FOLDER}/{self.name}.cycle"
@@ -152,7 +152,7 @@ class TwinKind(Cycles[TwinResult]):
     def _described(self) -> tuple[str, Any, int, str]:
         twin = self.config.experiment
         observed = ", ".join(f"{o.name} (std {twin.error_std[o.name]:.4g}{_unit(o.unit)})" for o in twin.observables)
-        every = f"{twin.cycles} cycles every {twin.interval:g}{_unit(self.model.time_unit)}"
+        every = f"{twin.cycles} cycles every {twin.interval:g}{_unit(self.config.model.time_unit)}"
         told = f"{every} ({twin.burn_in} not counted), observed: {observed}"
         return "twin experiment", twin.prior, twin.members, told
 
@@ -188,7 +188,7 @@ class SequenceKind(Cycles[SeriesResult]):
     def _described(self) -> tuple[str, Any, int, str]:
         problem, times = self.problem, self.problem.series.times
         observed = ", ".join(observable.name for observable in problem.observables)
-        span = f"from {times[0]:g} to {times[-1]:g}{_unit(self.model.time_unit)}"
+        span = f"from {times[0]:g} to {times[-1]:g}{_unit(self.config.model.time_unit)}"
         told = f"{np.isfinite(problem.series.values).sum()} readings of {observed} at {len(times)} times {span}"
         return f"sequence of {problem.name}", problem.start.prior, problem.members, told
 

@@ -16,7 +16,6 @@ from typing import Any, ClassVar, Generic, TypeVar
 from en4dvar.executor import Executor, ExecutorError, choose_executor, one_blas_thread
 from en4dvar.executor.processes import UnguardedError
 from en4dvar.inputs.parts import DataFile
-from en4dvar.model.forward import ForwardModel
 from en4dvar.plumbing.errors import ConfigError, En4dvarError, OutputError
 from en4dvar.plumbing.files import write_text
 from en4dvar.plumbing.user_code import reason_of
@@ -85,18 +84,7 @@ class RunKind(Kind, ABC, Generic[R]):
 
     units: ClassVar[str]
     config: Any
-    """The configuration of the run: its text, what it says resolved, seed, execution and output."""
-
-    @property
-    def directory(self) -> Path:
-        """Where the run writes."""
-        return Path(self.config.directory)
-
-    @property
-    def model(self) -> ForwardModel:
-        """The forward model, whose sources are part of what decides the numbers."""
-        model: ForwardModel = self.config.model
-        return model
+    """The configuration of the run: its text, what it says resolved, model, seed, directory, execution and output."""
 
     @property
     def data(self) -> Mapping[str, DataFile]:
@@ -114,11 +102,11 @@ class RunKind(Kind, ABC, Generic[R]):
     def executor(self) -> Executor:
         """Where the units of work are computed, as the configuration asks."""
         asked = self.config.execution
-        return choose_executor(self.model, asked.executor, asked.workers, asked.address, asked.limits)
+        return choose_executor(self.config.model, asked.executor, asked.workers, asked.address, asked.limits)
 
     def kept(self) -> str:
         """What the user has of a run that is stopped, and where."""
-        return f"the {self.units} are kept in {self.directory}"
+        return f"the {self.units} are kept in {self.config.directory}"
 
     def opened(self, run: "Session") -> frozenset[str]:
         """Look at what an earlier run left; returns the data sets that failed in it, whose files may differ now."""
@@ -252,16 +240,17 @@ def directory_mode(force: bool, resume: bool) -> Mode:
 
 def conduct_run(kind: RunKind[R], force: bool = False, resume: bool = False, command: str = "") -> R:
     """Conduct a run in its directory; arguments and errors as of :func:`en4dvar.run`."""
+    names = (*kind.files, *kind.pages)
     with (
         one_blas_thread(),
         terminate_as_interrupt(),
         # first: what follows may compile the model
-        RunDirectory.open(kind.directory, directory_mode(force, resume), (*kind.files, *kind.pages)) as directory,
+        RunDirectory.open(kind.config.directory, directory_mode(force, resume), names) as directory,
     ):
         kind.check()
         with kind.executor() as executor, _session(kind, directory, command) as run:
             try:
-                run.begin(*kind.files, *kind.pages, retried=kind.opened(run))
+                run.begin(*names, retried=kind.opened(run))
                 result = kind.conduct(run, executor)
                 if kind.writer and kind.config.report:
                     kind.page(directory.work, figures=kind.config.figures)
@@ -310,7 +299,7 @@ def _session(kind: RunKind[Any], directory: RunDirectory, command: str) -> Itera
     """
     config = kind.config
     with tell_interrupt(kind.kept):
-        who = identity(kind.settings, kind.model, kind.data)
+        who = identity(kind.settings, config.model, kind.data)
         attributes = {
             **provenance(config.text, config.document.file, command),
             "configuration_resolved": config.resolved,

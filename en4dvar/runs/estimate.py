@@ -395,15 +395,10 @@ class Given:
     ) -> tuple[ForwardModel, dict[str, Any]]:
         """The model, and what a file says of it, of the data (and ``of_data`` besides) and of the parameters."""
         ready, section = self.model(model, cheap)
-        data = {**self.data(ready), **of_data}
-        return ready, {"name": name, "seed": seed, "model": section, "data": data, "parameters": self.priors}
-
-    def data(self, model: ForwardModel) -> dict[str, Any]:
-        """The ``data:`` section, apart from the window. Raises :class:`DataError`, :class:`ConfigError`."""
-        if self.alone:
-            return {"path": GIVEN, **self.series[0].section(model)}
+        own = {series.name: series.section(ready) for series in self.series}
         correlation = {"correlation": self.correlation} if self.correlation else {}
-        return {"path": GIVEN, "series": {series.name: series.section(model) for series in self.series}, **correlation}
+        data = {"path": GIVEN, **(own[""] if self.alone else {"series": own, **correlation}), **of_data}
+        return ready, {"name": name, "seed": seed, "model": section, "data": data, "parameters": self.priors}
 
     def model(self, model: Any, cheap: bool = False) -> tuple[ForwardModel, dict[str, Any]]:
         """The model, ``cheap`` or not, and what a configuration records of it. Raises :class:`ConfigError`."""
@@ -422,13 +417,8 @@ class Given:
             return checked(model), {"name": HANDED, "object": name_of(type(model)), "digest": _digest_of_model(model)}
         if not callable(model):
             raise ConfigError(f"model: {type(model).__name__} is neither a function nor a model; {MODELS}")
-        section = {
-            "name": HANDED,
-            "object": name_of(model),
-            "digest": digest_of(model),
-            **({"cheap": True} if cheap else {}),
-        }
-        return self._function(model, cheap), section
+        section = {"name": HANDED, "object": name_of(model), "digest": digest_of(model)}
+        return self._function(model, cheap), section | ({"cheap": True} if cheap else {})
 
     def _function(self, function: Any, cheap: bool) -> FunctionModel:
         names = [name for name in self.priors if name not in {p.name for p in OF_READINGS}]

@@ -8,7 +8,6 @@ import numpy as np
 
 from en4dvar.assembly.build import problem_of
 from en4dvar.config import Config
-from en4dvar.config.load import recorded, resolve
 from en4dvar.estimation.population.own import OwnDraws, own_draws
 from en4dvar.executor import choose_executor, one_blas_thread
 from en4dvar.model.state import Array
@@ -19,7 +18,7 @@ from en4dvar.plumbing.user_code import RefusedError
 from en4dvar.problem import InverseProblem
 from en4dvar.results.run_results import result_files
 from en4dvar.results.store import StoredResult, load_stored
-from en4dvar.runs.trust import Ask, of_strangers
+from en4dvar.runs.trust import Ask, recorded_config
 from en4dvar.sampling.modes import TOO_FEW
 
 CARRIED = ("implausible-data", "misfit", "residual-structure", "model-validity")
@@ -58,7 +57,8 @@ def finished(run_dirs: Sequence[Path], trust: bool, ask: Ask | None) -> tuple[Co
     sets: list[Finished] = []
     for run_dir in run_dirs:
         files = result_files(run_dir)
-        config = _recorded(run_dir, load_stored(files[0]), trust, ask)
+        config = recorded_config(run_dir, load_stored(files[0]).attributes, trust, ask)
+        assert isinstance(config, Config)
         first = first or config
         sets += [finished_set(config, load_stored(file), run_dir) for file in files]
     if first is None:
@@ -78,15 +78,6 @@ def carried(sets: Sequence[Finished], spoilt: float = 1.0) -> Iterator[Caution]:
             told = f"{listed((name for name, _ in of_it), MOST_NAMES)}: {of_it[0][1].words}"
             severity: Severity = "serious" if len(of_it) > spoilt * len(sets) else "caution"
             yield caution(code, f"of single data sets, {told}", severity)
-
-
-def _recorded(run_dir: Path, result: StoredResult, trust: bool, ask: Ask | None) -> Config:
-    attributes = result.attributes
-    if "configuration_resolved" not in attributes:
-        raise OutputError(f"{run_dir}: its results do not record a configuration; they were written by a program")
-    document = recorded(str(attributes["configuration_resolved"]), f"{run_dir}: configuration_resolved")
-    with of_strangers(run_dir, ask, trust):
-        return resolve(document, run_dir.absolute())
 
 
 def finished_set(config: Config, result: StoredResult, run_dir: Path) -> Finished:

@@ -12,12 +12,10 @@ from typing import Any
 import numpy as np
 
 from en4dvar.assembly.build import inverse_plan, problem_of
-from en4dvar.config import AnyConfig, Config, resolve_any
-from en4dvar.config.load import recorded as recorded_configuration
+from en4dvar.config import AnyConfig, Config
 from en4dvar.data.observations import SEVERAL
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.executor import choose_executor, one_blas_thread
-from en4dvar.plumbing.errors import OutputError
 from en4dvar.results.campaign_file import failed_datasets
 from en4dvar.results.netcdf import read_groups
 from en4dvar.results.provenance import Identity, digest_of, identity, provenance
@@ -25,7 +23,7 @@ from en4dvar.results.run_results import result_files
 from en4dvar.results.series_file import series_file
 from en4dvar.results.store import StoredResult, load_stored
 from en4dvar.runs.cycles import cycles_of
-from en4dvar.runs.trust import Ask, of_strangers
+from en4dvar.runs.trust import Ask, of_strangers, recorded_config
 
 SURROUNDINGS = ("python_version", "package_versions", "platform", "cpu", "git_commit")
 
@@ -86,7 +84,7 @@ def rerun(run_dir: str | Path, workers: int | None = None, *, trust: bool = Fals
     campaign = run_dir / "posterior.nc"
     files = result_files(run_dir)
     first = load_stored(files[0])
-    config = _configuration(files[0], first.attributes, trust, ask)
+    config = recorded_config(run_dir, first.attributes, trust, ask)
     assert isinstance(config, Config)
     repeated = []
     with one_blas_thread(), choose_executor(config.model, None, workers) as executor:
@@ -106,24 +104,16 @@ def rerun(run_dir: str | Path, workers: int | None = None, *, trust: bool = Fals
 def _of_cycles(file: Path, workers: int | None, trust: bool, ask: Ask | None) -> Rerun:
     """Of a twin experiment or a sequence, whose data are read again. Raises as :func:`rerun`, :class:`DataError`."""
     recorded = read_groups(file)["/"]
-    config = _configuration(file, recorded.attrs, trust, ask)
+    config = recorded_config(file.parent, recorded.attrs, trust, ask)
     assert not isinstance(config, Config)
     kind = cycles_of(config)
     with of_strangers(file.parent, ask, trust):  # data may have weights by a function
         kind.check()
-    with choose_executor(kind.model, workers=workers or 1) as executor:
+    with choose_executor(config.model, workers=workers or 1) as executor:
         again = kind.again(executor)
     was, now = ({f"/{name}": v.values for name, v in result.every.items()} for result in (recorded, again))
     repeated = Repeated(config.name, len(was), differences(was, now), "")
     return _compared([repeated], config, recorded.attrs, {})
-
-
-def _configuration(file: Path, attributes: Mapping[Any, Any], trust: bool, ask: Ask | None) -> AnyConfig:
-    if "identity" not in attributes:
-        raise OutputError(f"{file}: does not record all that a run is made of; it was written by a program")
-    document = recorded_configuration(str(attributes["configuration_resolved"]), f"{file}: configuration_resolved")
-    with of_strangers(file.parent, ask, trust):
-        return resolve_any(document, file.parent.absolute())
 
 
 def _compared(

@@ -11,7 +11,7 @@ from en4dvar.config import Config, load_config, loaded
 from en4dvar.diagnosis.analysis import Progress
 from en4dvar.executor import Executor
 from en4dvar.inputs.parts import DataFile
-from en4dvar.plumbing.errors import ConfigError, DataError, Fault
+from en4dvar.plumbing.errors import ConfigError, DataError
 from en4dvar.results.campaign_file import DamagedError, save_campaign
 from en4dvar.results.pack import PACK
 from en4dvar.results.together import GROUPS, load_groups_of
@@ -114,27 +114,24 @@ class EstimateKind(RunKind[Campaign]):
         for name in files:
             config.sharing.of_dataset(name)
         groups_of(config, files)
-        faults: list[Fault] = []
-        unusable: list[DataError] = []
+        refused: list[ConfigError | DataError] = []
         for name, file in files.items():
             try:
                 require_population(config, checked_problem(config, name, file), files)
-            except ConfigError as error:
-                faults += error.problems
-            except DataError as error:
-                unusable.append(error)
+            except (ConfigError, DataError) as error:
+                refused.append(error)
             else:
                 require_counted_once(config, files)
                 return
-        if faults:
+        if faults := [fault for error in refused if isinstance(error, ConfigError) for fault in error.problems]:
             raise ConfigError(list(dict.fromkeys(faults)))
-        raise DataError("\n".join(map(str, unusable)))
+        raise DataError("\n".join(map(str, refused)))
 
     def kept(self) -> str:
         ended = self.work.ended if self.work else {}
         if self.resume and not ended:  # stopped, perhaps, before it was read what had been done
-            return f"what {self.directory} holds is kept"
-        return f"{len(ended)} of {len(self.data)} data sets are done and kept in {self.directory}"
+            return f"what {self.config.directory} holds is kept"
+        return f"{len(ended)} of {len(self.data)} data sets are done and kept in {self.config.directory}"
 
     def opened(self, run: Session) -> frozenset[str]:
         self.work = Worklist(self.config, run, datasets(self.data), self.progress)

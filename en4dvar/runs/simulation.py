@@ -17,7 +17,8 @@ from en4dvar.assembly.build import data_files, resolve_parameters
 from en4dvar.assembly.reading import read_observations
 from en4dvar.config import Config, time_grid
 from en4dvar.config.data import SeriesPlan
-from en4dvar.config.kinds import CampaignPlan, GroupSection, terms_and_fixed
+from en4dvar.config.kinds import CampaignFile, GroupSection, terms_and_fixed
+from en4dvar.config.load import Read
 from en4dvar.config.parameters import Tied
 from en4dvar.config.quantities import parse_error_std
 from en4dvar.data.series import Places
@@ -224,17 +225,19 @@ class SyntheticSet:
         return nrmse(self.values, self.exact)
 
 
-def draw_campaign(plan: CampaignPlan) -> tuple[SyntheticSet, ...]:
+def draw_campaign(plan: Read[CampaignFile]) -> tuple[SyntheticSet, ...]:
     """Every data set of the campaign, named ``<group>_01`` …. Raises :class:`En4dvarError` where none can be drawn."""
     return tuple(
-        _draw(plan, name, group, i + 1) for name, group in plan.settings.groups.items() for i in range(group.datasets)
+        _draw(plan, name, group, i + 1)
+        for name, group in plan.file.campaign.groups.items()
+        for i in range(group.datasets)
     )
 
 
-def _draw(plan: CampaignPlan, kind: str, group: GroupSection, number: int) -> SyntheticSet:
+def _draw(plan: Read[CampaignFile], kind: str, group: GroupSection, number: int) -> SyntheticSet:
     name = f"{kind}_{number:02d}"
-    stream = member_stream(plan.seed, name)
-    model, asked = plan.model, plan.settings
+    stream = member_stream(plan.file.seed, name)
+    model, asked = plan.model, plan.file.campaign
     reason = ""
     for _ in range(ATTEMPTS):
         terms, theta = terms_and_fixed(group.parameters)
@@ -261,9 +264,10 @@ def _draw(plan: CampaignPlan, kind: str, group: GroupSection, number: int) -> Sy
     raise En4dvarError(f"{name}: no truth could be observed in {ATTEMPTS} attempts ({reason})")
 
 
-def write_campaign(plan: CampaignPlan, sets: tuple[SyntheticSet, ...], command: str, force: bool = False) -> Path:
+def write_campaign(
+    plan: Read[CampaignFile], sets: tuple[SyntheticSet, ...], folder: Path, command: str, force: bool = False
+) -> Path:
     """One CSV file a data set and ``truth.csv``, which no estimation reads. Raises :class:`OutputError`."""
-    folder = plan.directory
     files = [folder / f"{s.name}.csv" for s in sets] + [folder / TRUTH]
     if not force and (there := [file for file in files if file.exists()]):
         raise OutputError(f"{there[0]}: exists; give --force to replace it")
@@ -273,20 +277,20 @@ def write_campaign(plan: CampaignPlan, sets: tuple[SyntheticSet, ...], command: 
     return write_text(folder / TRUTH, truth_csv(plan, sets))
 
 
-def _data_csv(plan: CampaignPlan, dataset: SyntheticSet, command: str) -> str:
+def _data_csv(plan: Read[CampaignFile], dataset: SyntheticSet, command: str) -> str:
     model, seen = plan.model, plan.model.observables[0]
     t, v = f"t_{model.time_display_unit}", f"{seen.symbol.strip('$')}_{seen.display_unit}"
-    noise = convert(plan.settings.noise, seen.unit, seen.display_unit)
+    noise = convert(plan.file.campaign.noise, seen.unit, seen.display_unit)
     comments = [
-        f"SYNTHETIC data, no measurement: set {dataset.name} of the twin campaign {plan.name!r}",
-        f"{command}; seed {plan.seed}",
+        f"SYNTHETIC data, no measurement: set {dataset.name} of the twin campaign {plan.file.name!r}",
+        f"{command}; seed {plan.file.seed}",
         f"{t} in {model.time_display_unit}, {v} in {seen.display_unit}; noise std {noise:.9g} {seen.display_unit}",
     ]
     times = convert(dataset.times, model.time_unit, model.time_display_unit)
     return _commented(comments, [t, v], [times, convert(dataset.values, seen.unit, seen.display_unit)], ".5f")
 
 
-def truth_csv(plan: CampaignPlan, sets: tuple[SyntheticSet, ...]) -> str:
+def truth_csv(plan: Read[CampaignFile], sets: tuple[SyntheticSet, ...]) -> str:
     """One line a data set: parameters in display units, NRMSE of the truth."""
     display = {p.name: (p.unit, p.display_unit or p.unit) for p in plan.model.parameters}
     display[TIME_SHIFT.name] = (plan.model.time_unit, plan.model.time_display_unit)
@@ -295,5 +299,5 @@ def truth_csv(plan: CampaignPlan, sets: tuple[SyntheticSet, ...]) -> str:
     for s in sets:
         row = [f"{convert(s.truth[name], *units):.9g}" for name, units in display.items()]
         rows.append([s.name, s.group, *row, f"{s.nrmse:.4f}"])
-    about = f"# SYNTHETIC campaign {plan.name!r}: the truth behind its data sets; no estimation reads this file\n"
+    about = f"# SYNTHETIC campaign {plan.file.name!r}: the truth behind its data sets; no estimation reads this file\n"
     return about + csv_text(rows)

@@ -24,21 +24,11 @@ from en4dvar.executor import Executor, choose_executor
 from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.errors import ConfigError, TooFewMembersError, retold
 from en4dvar.problem import InverseProblem
+from en4dvar.results import together as stored
 from en4dvar.results.checkpoint import FOLDER, digest, file_digest, write_checkpoint
 from en4dvar.results.journal import Journal, KnownRuns
 from en4dvar.results.provenance import provenance
 from en4dvar.results.store import load_stored
-from en4dvar.results.together import (
-    GROUPS,
-    JOINT,
-    POPULATION,
-    StoredJoint,
-    StoredPopulation,
-    load_joint,
-    load_population,
-    save_joint,
-    save_population,
-)
 from en4dvar.runs.engine import Kind
 from en4dvar.runs.finished import Finished, carried, finished, finished_set
 from en4dvar.runs.rundir import RunDirectory
@@ -135,7 +125,7 @@ class TogetherKind(Kind, ABC):
 
 def join(
     run_dirs: Sequence[Path], names: Sequence[str], out: Path, *, apart: Sequence[str] = (), **how: Any
-) -> tuple[StoredJoint, Path]:
+) -> tuple[stored.StoredJoint, Path]:
     """Estimate the data sets of finished runs together, with the parameters ``names`` in common, or what their
     configurations say where there are none, and with what is common to all data sets of a campaign
     (:attr:`Parameter.common`) but for that named ``apart``; writes ``joint.nc``, ``joint.csv`` and ``joint.html`` to
@@ -143,11 +133,10 @@ def join(
 
     Settings of the ensemble and the seed are those of the first run; ``how`` as of :meth:`TogetherKind.of_runs`.
 
-    Raises :class:`RefusedError`, :class:`OutputError`: as of :meth:`TogetherKind.of_runs`. :class:`ConfigError`: the
-    data sets cannot share these parameters. :class:`TooFewMembersError`: the ensemble is lost.
+    Raises what :meth:`TogetherKind.of_runs` does; :class:`ConfigError`: the data sets cannot share these parameters.
     """
     file, page = JointKind(tuple(names), tuple(apart)).of_runs(run_dirs, out, **how)
-    return load_joint(file), page
+    return stored.load_joint(file), page
 
 
 @dataclass(frozen=True)
@@ -157,7 +146,7 @@ class JointKind(TogetherKind):
     name = "joint"
     what = "joint estimate"
     fewest = 2
-    result = JOINT
+    result = stored.JOINT
     files = (result,)
     records = (f"{FOLDER}/joint",)
     pages = ("joint.html", "joint.csv")
@@ -188,7 +177,9 @@ class JointKind(TogetherKind):
         estimated = _with_carried(estimated, sets)
         alone = [dataset.members for dataset in sets]
         shared = " ".join(dict.fromkeys(name for name, _ in joint.shared))
-        save_joint(path, estimated, alone, {**attributes, "seed": config.seed, "shared": shared, "common": common})
+        stored.save_joint(
+            path, estimated, alone, {**attributes, "seed": config.seed, "shared": shared, "common": common}
+        )
 
 
 def _with_carried(estimate: JointEstimate, sets: Sequence[Finished]) -> JointEstimate:
@@ -206,7 +197,7 @@ def population(
     hyper: HyperPrior | Mapping[str, float] | None = None,
     effort: Effort | None = None,
     **how: Any,
-) -> tuple[StoredPopulation, Path]:
+) -> tuple[stored.StoredPopulation, Path]:
     """Estimate the population of the parameters ``names`` behind the data sets of finished runs; writes
     ``population.nc``, ``.csv``, ``.tex`` and ``.html`` to ``out``. Returns what was found and the path of the page.
 
@@ -214,12 +205,11 @@ def population(
     ``population:`` in the configuration of the first run, whose seed is taken as well; ``how`` as of
     :meth:`TogetherKind.of_runs`.
 
-    Raises :class:`RefusedError`, :class:`OutputError`: as of :meth:`TogetherKind.of_runs`. :class:`ConfigError`: there
-    is no population of these data sets, as :func:`~en4dvar.estimation.population.campaign.population_of` says.
-    :class:`TooFewMembersError`: too many forward runs failed.
+    Raises what :meth:`TogetherKind.of_runs` does, and :class:`ConfigError` where there is no population of these data
+    sets, as :func:`~en4dvar.estimation.population.campaign.population_of` says.
     """
     file, page = PopulationKind(tuple(names), hyper, effort).of_runs(run_dirs, out, **how)
-    return load_population(file), page
+    return stored.load_population(file), page
 
 
 @dataclass(frozen=True)
@@ -229,7 +219,7 @@ class PopulationKind(TogetherKind):
     name = "population"
     what = "population"
     fewest = FEWEST_SETS
-    result = POPULATION
+    result = stored.POPULATION
     files = (result,)
     records = (f"{FOLDER}/population", f"{FOLDER}/population_groups_*")
     pages = ("population.html", "population.csv", "population.tex")
@@ -256,7 +246,7 @@ class PopulationKind(TogetherKind):
         used = [s for s in sets if s.name not in population.left_out]
         cautions = (*_cautions(population), *carried(used))
         about = {**attributes, "seed": config.seed, **_elsewhere(config, population, str(attributes.get("group", "")))}
-        save_population(path, population, [s.members for s in used], cautions, about)
+        stored.save_population(path, population, [s.members for s in used], cautions, about)
 
 
 def groups_of(config: Config, names: Iterable[str]) -> list[SetGroup]:
@@ -270,7 +260,7 @@ def groups_of(config: Config, names: Iterable[str]) -> list[SetGroup]:
     for name in names:
         sets[config.sharing.group_of(kind, name)].add(name)
     return [
-        SetGroup(group, f"{GROUPS}/{i}_{re.sub(r'[^A-Za-z0-9.+-]', '_', group)}", frozenset(of_it))
+        SetGroup(group, f"{stored.GROUPS}/{i}_{re.sub(r'[^A-Za-z0-9.+-]', '_', group)}", frozenset(of_it))
         for i, (group, of_it) in enumerate(sets.items(), 1)
     ]
 

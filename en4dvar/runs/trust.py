@@ -6,13 +6,17 @@ is known only if this user has run or checked a configuration that names it, wit
 """
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import cache
 from importlib.metadata import distributions
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
+from en4dvar.config import AnyConfig, resolve_any
+from en4dvar.config.load import recorded
+from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.user_code import Code, RefusedError, is_installed, permission
 
 Ask = Callable[[str], bool]  # question → whether the user says yes
@@ -42,6 +46,18 @@ def of_strangers(source: Path, ask: Ask | None, trust: bool) -> Iterator[None]:
 
     with permission(require):
         yield
+
+
+def recorded_config(run_dir: Path, attributes: Mapping[Any, Any], trust: bool, ask: Ask | None) -> AnyConfig:
+    """The configuration that a result of a run records. Raises :class:`ConfigError`, :class:`RefusedError`.
+
+    :class:`OutputError`: a program has written the result, and nothing is recorded.
+    """
+    if not {"configuration_resolved", "identity"} <= attributes.keys():
+        raise OutputError(f"{run_dir}: its results do not record a configuration; they were written by a program")
+    document = recorded(str(attributes["configuration_resolved"]), f"{run_dir}: configuration_resolved")
+    with of_strangers(run_dir, ask, trust):
+        return resolve_any(document, run_dir.absolute())
 
 
 def _is_known(code: Code) -> bool:

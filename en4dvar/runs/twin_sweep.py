@@ -188,7 +188,7 @@ class SweepKind(RunKind[TwinSweep]):
         runs, n = self._runs(run, executor), len(self.seeds)
         require_some("runs", [twin.failure for twin in runs])
         of_settings = tuple(tuple(runs[i : i + n]) for i in range(0, len(runs), n))
-        sweep = TwinSweep(self.keys, self.values, self.seeds, of_settings, self.directory)
+        sweep = TwinSweep(self.keys, self.values, self.seeds, of_settings, self.config.directory)
         rows = sweep.rows
         write_csv(run.directory.at("sweep.csv"), [[*rows[0]], *([*map(_text, row.values())] for row in rows)])
         write_csv(run.directory.at("runs.csv"), runs_table(sweep))

@@ -65,7 +65,7 @@ def test_truths_have_the_moments_of_table_1():
     many = plan()
     paper = {"G": (420.0, 62.0), "alpha": (0.029, 0.011), "mu": (0.086, 0.024), "R0": (0.43e-6, 0.31e-6)}
     rng = np.random.default_rng(0)
-    terms, _ = terms_and_fixed(many.settings.groups["agarose_03"].parameters)
+    terms, _ = terms_and_fixed(many.file.campaign.groups["agarose_03"].parameters)
     for term in terms:
         values = term.to_physical(term.mean + term.std * rng.standard_normal(5000))
         mean, std = paper[term.parameter.name]

@@ -221,7 +221,7 @@ def test_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         raise KeyboardInterrupt
 
     path, out = write_toy(tmp_path), tmp_path / "out"
-    monkeypatch.setattr("en4dvar.runs.jobs.assimilate", interrupt)
+    monkeypatch.setattr("en4dvar.runs.worklist.assimilate", interrupt)
     monkeypatch.setattr("sys.argv", ["en4dvar", "run", str(path), "--out", str(out), "--force"])
     outcome = call("run", path, "--out", out)
     assert outcome.exit_code == 130

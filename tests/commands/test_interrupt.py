@@ -82,7 +82,7 @@ def test_a_run_that_has_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, s
 
 @pytest.mark.fault("interrupt")
 def test_a_second_one_while_the_first_is_answered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, before: str) -> None:
-    steps = "en4dvar.runs.worklist.summary_rows", "en4dvar.executor.futures.SerialExecutor.__exit__"
+    steps = "en4dvar.runs.worklist.summary_rows", "en4dvar.executor.base.SerialExecutor.__exit__"
     kept, advice, words = told_at(steps[0], before, tmp_path, monkeypatch, steps[1])
     assert kept.startswith("interrupted; ")
     assert advice == [*(w for w in words if w != before), "--resume"]

@@ -12,7 +12,7 @@ from click.testing import CliRunner
 from run_files import TESTS, environment
 
 from en4dvar.cli import main
-from en4dvar.commands import installation
+from en4dvar.commands import plugins
 
 CONFIGS = TESTS.parent / "configs"
 AFTERWARDS = """
@@ -68,8 +68,8 @@ def test_nothing_is_compiled_after_it(tmp_path):
 
 
 def test_a_package_that_cannot_be_loaded_is_one_error(monkeypatch):
-    entry = EntryPoint("own", "toy_models:nothing_there", installation.WARM_UP)
-    monkeypatch.setattr(installation, "installed", lambda group: {"own": entry})
+    entry = EntryPoint("own", "toy_models:nothing_there", plugins.WARM_UP)
+    monkeypatch.setattr(plugins, "installed", lambda group: {"own": entry})
     outcome = CliRunner().invoke(main, ["warm-up"])
     assert outcome.exit_code == 1
     assert "warm-up of 'own' (toy_models:nothing_there) cannot be loaded: " in outcome.output

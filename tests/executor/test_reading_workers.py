@@ -8,7 +8,7 @@ from run_files import configuration, make_campaign
 
 from en4dvar.executor import ProcessesExecutor
 from en4dvar.executor.base import CommonValue
-from en4dvar.runs import jobs
+from en4dvar.runs import worklist
 from en4dvar.runs.runner import run_campaign
 
 
@@ -30,7 +30,7 @@ def test_what_a_worker_cannot_read_is_told_as_here(tmp_path, monkeypatch):
     path = make_campaign(tmp_path, 3)
     (tmp_path / "data" / "set1.csv").write_text("t_ms,x_um\n")
     here = run_campaign(configuration(path, tmp_path / "here"))
-    monkeypatch.setattr(jobs, "build_one", None)  # nothing is read here any more
+    monkeypatch.setattr(worklist, "build_one", None)  # nothing is read here any more
     there = run_campaign(configuration(path, tmp_path / "there", executor="processes", workers=2))
     assert [one.failure for one in there.outcomes] == [one.failure for one in here.outcomes]
     assert "set1.csv" in there.failures[0].failure

@@ -70,7 +70,7 @@ def test_a_set_has_the_same_bits_alone_and_among_others(campaign):
 def test_files_made_when_all_sets_had_one_seed_are_repeated_to_the_bit(campaign, monkeypatch):
     folder, path = campaign
     with monkeypatch.context() as before:
-        before.setattr("en4dvar.runs.jobs.own_seed", lambda seed, name: seed)
+        before.setattr("en4dvar.runs.worklist.own_seed", lambda seed, name: seed)
         run_campaign(configuration(path, folder / "before"))
     first, second = (load_result(folder / f"before/datasets.pack/set{i}") for i in range(2))
     assert first.attributes["seed"] == 3
