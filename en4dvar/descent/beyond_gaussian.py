@@ -9,7 +9,8 @@ m(u) = m(0) + M u in the other coordinates u ~ N(0, I), all that depends on h is
 
 and needs no run of the model; of a robust cost each h has Laplace's approximation in u, by one step from the mode.
 Rates, where K has any, are those of the mode. p(h|y) is sampled by importance, half of the draws from Student's t about
-the mode and half from the prior, as far as which a posterior of few readings may reach (Kennedy & O'Hagan 2001; nested
+the mode, or the mean of draws before, and half from the prior, as far as which a posterior of few readings may reach:
+the mode of few degrees of freedom may lie outside of the posterior (Kennedy & O'Hagan 2001; nested
 Laplace approximations: Rue, Martino & Chopin 2009, J. R. Stat. Soc. B 71, 319; Hesterberg 1995, Technometrics 37, 185).
 """
 

@@ -147,7 +147,7 @@ def _concluded(
             log_evidence = diag.log_evidence(lowest, newton.hessian.singular_values, len(space.members), observations)
     std = ends.members.std(axis=0, ddof=1)
     shifts: tuple[Shift, ...] = ()
-    judged, freedom = conclusions.given_scale(space, linear, descent.weights.w, ends.members)
+    judged, freedom = conclusions.with_posterior_scale(space, linear, descent.weights.w, ends.members)
     begun = space.forward_runs  # those of fits are told with the shifts
     if stages.settings.what_if:
         fitted = partial(_fitted, stages, response.at, control.centre_cost)

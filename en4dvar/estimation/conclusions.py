@@ -125,7 +125,7 @@ def modes_of(prior: Prior, minima: Sequence[Minimum], sampled: Refined | None) -
     )
 
 
-def given_scale(
+def with_posterior_scale(
     space: WeightSpace, linear: Linearisation, w: Array, members: Array
 ) -> tuple[Linearisation, float | None]:
     """The linearisation at the end, of weights w (N,), and None; where the noise scale σ is estimated, that at the
@@ -140,17 +140,18 @@ def given_scale(
     sigma = of_framework(problem, prior.to_physical(members), NOISE_SCALE, 1.0)
     logs = np.log(sigma[sigma > 0])
     prediction = replace(linear.prediction, noise_scale=np.exp(logs.mean()))
-    d, S = problem.observations.whiten(given := replace(linear, prediction=prediction, log_scale_anomalies=None))
+    held = replace(linear, prediction=prediction, log_scale_anomalies=None)
+    d, S = problem.observations.whiten(held)
     root = math.sqrt(len(w) - 1)
     design = np.vstack([S, root * np.eye(S.shape[1])])
     step = min_norm_fit(design, np.concatenate([d, -root * space.basis.T @ w]))
-    there = replace(given, prediction=replace(prediction, values=prediction.values + step @ linear.anomalies))
+    there = replace(held, prediction=replace(prediction, values=prediction.values + step @ linear.anomalies))
     variance = max(4 * float(logs.var()), LEAST)  # of ln σ², 2/ν + 2/ν² but for higher orders
     return there, (1 + math.sqrt(1 + 2 * variance)) / variance
 
 
 def residuals_of(space: WeightSpace, linear: Linearisation, freedom: float | None = None) -> Residuals:
-    """Residuals of a linearisation at the end, and ν as of :func:`given_scale`."""
+    """Residuals of a linearisation at the end, and ν as of :func:`with_posterior_scale`."""
     observations = space.problem.observations
     speed = np.abs(_rates(space.problem, linear.prediction))
     white, sensitivity = observations.whiten(linear)

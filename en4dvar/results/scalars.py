@@ -120,7 +120,7 @@ SAMPLE_STATS = (
     Attribute("n_weighted", "readings that count", lambda a: len(a.observations.used), needed=True),
     Attribute("nrmse", "1 − ‖y − ŷ‖/‖y − ȳ‖ of the ensemble mean", _nrmse_of_mean, needed=True),
     Attribute("nrmse_centre", "the same at the minimum of J", lambda a: _nrmse(a, a.centre_predictions)),
-    Attribute("chi2_per_observation", "χ² per reading", lambda a: a.fit[0], needed=True),
+    Attribute("chi2_per_observation", "χ² per reading, of σ as its posterior has it", lambda a: a.fit[0], needed=True),
     Attribute("cost", "J at its minimum", lambda a: a.iterations[-1].cost),
     Attribute("dfs", "degrees of freedom for signal", lambda a: a.fit[1], needed=True),
     Attribute("log_evidence", "ln p(y)", lambda a: a.log_evidence),
