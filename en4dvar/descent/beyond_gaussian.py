@@ -9,7 +9,8 @@ m(u) = m(0) + M u in the other coordinates u ~ N(0, I), all that depends on h is
 
 and needs no run of the model; of a robust cost each h has Laplace's approximation in u, by one step from the mode.
 Rates, where K has any, are those of the mode. p(h|y) is sampled by importance, half of the draws from Student's t about
-the mode and half from the prior, as far as which a posterior of few readings may reach (Kennedy & O'Hagan 2001; nested
+the mode, or the mean of draws before, and half from the prior, as far as which a posterior of few readings may reach:
+the mode of few degrees of freedom may lie outside of the posterior (Kennedy & O'Hagan 2001; nested
 Laplace approximations: Rue, Martino & Chopin 2009, J. R. Stat. Soc. B 71, 319; Hesterberg 1995, Technometrics 37, 185).
 """
 
@@ -29,7 +30,8 @@ from en4dvar.priors.prior import member_stream
 DRAWS, FREEDOM = 250, 5.0  # of Student's t, and as many of the prior, for each parameter of the errors
 WIDER = 1.3  # than the Gaussian at the mode
 AT_ONCE = 50
-ENOUGH = 60.0  # effective draws below which the ensemble stays as it is
+ENOUGH, SOME = 60.0, 10.0  # effective draws below which the ensemble stays as it is; to draw again by, a parameter
+ROUNDS = 3  # of draws, each after the first about the mean of those before
 PARTICLES, SWEEPS = 2000, 40  # that bounds are imposed on; moves of each in the end
 
 
@@ -53,37 +55,51 @@ def over_errors(space: WeightSpace, linear: Linearisation, mode: Array, posterio
     of_errors = np.array([name in problem.of_errors for name in prior.names])
     if not of_errors.any() or space.basis.shape[1] < len(mode):
         return None
+    from scipy.special import gammaincinv, ndtri  # scipy is not needed to import the package
+
     stream, count = member_stream(space.seed, "parameters of the errors"), int(of_errors.sum())
     covariance = prior.white_covariance(np.atleast_2d(np.cov(posterior.T)))
     root = WIDER * np.linalg.cholesky(covariance[np.ix_(of_errors, of_errors)])
     about, half = prior.white(mode)[of_errors], DRAWS * count
-    heavy = stream.standard_normal((half, count)) / np.sqrt(stream.chisquare(FREEDOM, (half, 1)) / FREEDOM)
-    draws = np.concatenate([about + heavy @ root.T, stream.standard_normal((half, count))])
-    log_prior = -0.5 * np.sum(draws**2, axis=1) - 0.5 * count * math.log(2 * math.pi)
-    squares = np.sum(np.linalg.solve(root, (draws - about).T) ** 2, axis=0)
-    norm = math.lgamma(0.5 * (FREEDOM + count)) - math.lgamma(0.5 * FREEDOM) - 0.5 * count * math.log(FREEDOM * math.pi)
-    log_t = norm - np.log(np.diag(root)).sum() - 0.5 * (FREEDOM + count) * np.log1p(squares / FREEDOM)
     linearised = _Linear.of(space, linear, mode, of_errors)
-    log_marginal, means, roots = linearised.moments(draws)
-    logs = log_marginal + log_prior - np.logaddexp(log_t, log_prior) + math.log(2)
-    weights = shares_of(logs)
-    if not effective_number(weights) >= ENOUGH:  # also of NaN
+    for _ in range(ROUNDS):
+        # evenly along each coordinate (McKay, Beckman & Conover 1979, Technometrics 21, 239)
+        ranks = stream.permuted(np.tile(np.arange(half), (2 * count + 1, 1)), axis=1)
+        shares = (ranks + stream.uniform(size=ranks.shape)).T / half
+        normal = ndtri(shares[:, 1:])
+        heavy = normal[:, :count] / np.sqrt(gammaincinv(0.5 * FREEDOM, shares[:, :1]) / (0.5 * FREEDOM))
+        draws = np.concatenate([about + heavy @ root.T, normal[:, count:]])
+        log_prior = -0.5 * np.sum(draws**2, axis=1) - 0.5 * count * math.log(2 * math.pi)
+        squares = np.sum(np.linalg.solve(root, (draws - about).T) ** 2, axis=0)
+        norm = math.lgamma(0.5 * (FREEDOM + count)) - math.lgamma(0.5 * FREEDOM)
+        norm -= 0.5 * count * math.log(FREEDOM * math.pi) + float(np.log(np.diag(root)).sum())
+        log_t = norm - 0.5 * (FREEDOM + count) * np.log1p(squares / FREEDOM)
+        log_marginal, means, roots, sizes = linearised.moments(draws)
+        logs = log_marginal + log_prior - np.logaddexp(log_t, log_prior) + math.log(2)
+        weights = shares_of(logs)
+        effective = effective_number(weights)
+        if effective >= ENOUGH or not effective >= SOME * count:  # also of NaN
+            break
+        about, root = weights @ draws, WIDER * np.linalg.cholesky(np.atleast_2d(np.cov(draws.T, aweights=weights)))
+    if not effective >= ENOUGH:
         return None
-    # members (N, n) of the mixture, in units of the prior: systematic in h, random in u
-    chosen = resampled(weights, len(posterior), stream)
+    # members (N, n) of the mixture, in units of the prior: evenly along the size of the errors, random in u
+    order = np.argsort(sizes)
+    chosen = order[stream.permutation(resampled(weights[order], len(posterior), stream))]
     normal = stream.standard_normal((len(posterior), means.shape[1]))
     members = np.empty(posterior.shape)
     members[:, of_errors] = draws[chosen]
     members[:, ~of_errors] = means[chosen] + np.einsum("dij,dj->di", roots[chosen], normal)
     if space.settings.sampling == "exact":
-        # The members mapped linearly so that mean and covariance are those of the whole mixture
-        centres = np.empty((len(draws), len(mode)))
-        centres[:, of_errors], centres[:, ~of_errors] = draws, means
+        # The members mapped linearly so that mean and covariance are those of the whole mixture: h first, since a
+        # coordinate takes in a share of each before it
+        centres = np.hstack([draws, means])
         mean, share = weights @ centres, np.sqrt(weights)
         apart = np.zeros((roots.shape[2], *centres.shape))
-        apart[..., ~of_errors] = np.moveaxis(share[:, None, None] * roots, 2, 0)
+        apart[..., count:] = np.moveaxis(share[:, None, None] * roots, 2, 0)
         rows = np.vstack([share[:, None] * (centres - mean), apart.reshape(-1, len(mode))])
-        members = with_moments(members, mean, np.asarray(np.linalg.qr(rows, mode="r")))
+        first = np.argsort(~of_errors, kind="stable")
+        members[:, first] = with_moments(members[:, first], mean, np.asarray(np.linalg.qr(rows, mode="r")))
     evidence = float(np.logaddexp.reduce(logs)) - math.log(len(logs))
     return Drawn(prior.from_white(members), linearised.cost, evidence)
 
@@ -114,15 +130,15 @@ class _Linear:
         predicted = self._predicted(z[:, self.of_errors], values)
         return np.asarray(0.5 * np.sum(z**2, axis=1) + self.space.problem.observations.cost(predicted))
 
-    def moments(self, draws: Array) -> tuple[Array, Array, Array]:
-        """ln p(y|h) (D,) but for the errors' normalisation, −inf where it is not known, and of u the mean (D, n') and
-        B (D, n', n') with the covariance BBᵀ, for draws of h (D, n'').
+    def moments(self, draws: Array) -> tuple[Array, Array, Array, Array]:
+        """ln p(y|h) (D,) but for the errors' normalisation, −inf where it is not known, of u the mean (D, n') and
+        B (D, n', n') with the covariance BBᵀ, and the mean std of the errors (D,), for draws of h (D, n'').
         """
         each = [self._moments(draws[first : first + AT_ONCE]) for first in range(0, len(draws), AT_ONCE)]
-        log, mean, root = (np.concatenate(parts) for parts in zip(*each, strict=True))
-        return log, mean, root
+        log, mean, root, size = (np.concatenate(parts) for parts in zip(*each, strict=True))
+        return log, mean, root, size
 
-    def _moments(self, draws: Array) -> tuple[Array, Array, Array]:
+    def _moments(self, draws: Array) -> tuple[Array, Array, Array, Array]:
         observations, rest = self.space.problem.observations, self.rest
         predicted = self._predicted(draws, np.tile(self.at.values, (len(draws), 1)))
         log = -observations.cost(predicted) - 0.5 * rest @ rest
@@ -135,7 +151,8 @@ class _Linear:
         triangle = np.asarray(np.linalg.qr(np.concatenate([readings, prior], axis=1), mode="r"))
         root, side = np.linalg.inv(triangle[:, :-1, :-1]), triangle[:, :-1, -1]
         log += 0.5 * np.sum(side**2, axis=1) + np.log(np.abs(np.diagonal(root, axis1=1, axis2=2))).sum(axis=1)
-        return log, rest + np.einsum("dij,dj->di", root, side), root
+        size = observations.noise.total_std(predicted).mean(axis=1)
+        return log, rest + np.einsum("dij,dj->di", root, side), root, size
 
     def _predicted(self, draws: Array, values: Array) -> Predicted:
         """Predictions ``values`` (D, K) beside draws of h (D, n'')."""

@@ -205,6 +205,7 @@ class Analysis:
     down_weights: Array | None = None  # (K,) of observations in a robust cost, at the centre; None with Gaussian errors
     refinement: Mapping[str, float] = field(default_factory=dict)  # summary of the Markov chain, if any
     residuals: Residuals | None = None  # whitened, at the centre, with what is expected of them
+    chi2: float | None = None  # per observation, with an estimated noise scale as the residuals; None without
     discrepancy: Discrepancy | None = None  # of the model, at the centre; None where none is allowed for
     extremes: Array = field(default_factory=lambda: np.empty((0, 0)))  # (N, V) of the model's limits, by the posterior
     beyond: Array = field(default_factory=lambda: np.empty((0, 0)))  # (N, V) since when it exceeds them; +inf: never
@@ -239,6 +240,14 @@ class Analysis:
     def parameters(self) -> tuple[Parameter, ...]:
         """The estimated parameters, (n,)."""
         return self.problem.prior.parameters
+
+    @property
+    def fit(self) -> tuple[float, float]:
+        """χ² per observation and DFS, where the noise scale is estimated with that of the posterior."""
+        last, residuals = self.iterations[-1], self.residuals
+        if self.chi2 is None or residuals is None:
+            return last.chi2_per_observation, last.dfs
+        return self.chi2, residuals.dfs
 
     @property
     def log_evidence_change(self) -> float | None:

@@ -23,6 +23,7 @@ MOST = 500  # of them are looked at, evenly chosen blocks would tell no more
 ROUNDING = 1e-3  # standard deviations: residuals of which none is larger are those of arithmetic, not of readings
 FITTED = 0.005  # of the leverage of a reading: what less leaves of its residual is the error of the linearisation
 NO_VARIANCE = 1e-12  # of the largest eigenvalue of Q; below it a direction was fitted exactly, to rounding
+OF_ERRORS = 0.5  # of the variance of the readings in a direction, beyond which it is of their errors, not of the prior
 FREQUENCIES = np.expm1(np.linspace(np.log1p(1e-4), np.log1p(400.0), 700))
 
 
@@ -31,7 +32,8 @@ class Residuals:
     """Residuals of the K readings that count: whitened ``white`` e (K,), what the fit ``absorbed`` of their noise,
     L (K, r) with I − Q = L Lᵀ, and the ``speed`` |ṁ| (K,) of the observable there, of several series in units of their
     errors. ``which`` (K,) are their places in the data; ``series`` (K,) labels those among which neighbours follow each
-    other in time.
+    other in time. ``dfs``: degrees of freedom for signal of all readings. ``freedom``: ν, where the size of
+    the errors is estimated, of the inverse χ² that its square has in the posterior; e is that of its geometric mean.
     """
 
     white: Array
@@ -39,6 +41,8 @@ class Residuals:
     speed: Array
     which: Indices
     series: Indices
+    dfs: float
+    freedom: float | None = None
 
     @classmethod
     def of(
@@ -49,6 +53,7 @@ class Residuals:
         speed: Array,
         which: Indices,
         series: Indices | None = None,
+        freedom: float | None = None,
     ) -> "Residuals":
         """From whitened sensitivities S (K, r), all rows of which take part in A, and N − 1.
 
@@ -56,9 +61,11 @@ class Residuals:
         """
         k = len(speed)
         prior = math.sqrt(prior_precision) * np.eye(sensitivity.shape[1])
-        absorbed = np.linalg.qr(np.vstack([sensitivity, prior]))[0][:k]  # S R⁻¹ with RᵀR = A, which is not formed
+        # S R⁻¹ with RᵀR = A, which is not formed
+        absorbed = np.linalg.qr(np.vstack([sensitivity, prior]))[0][: len(sensitivity)]
         labels = np.zeros(k, dtype=np.intp) if series is None else series
-        return cls(white[:k][which], absorbed[which], speed[which], which, labels[which])
+        dfs = float(np.sum(absorbed**2))
+        return cls(white[:k][which], absorbed[which], speed[which], which, labels[which], dfs, freedom)
 
     @cached_property
     def leverage(self) -> Array:
@@ -129,21 +136,28 @@ class Residuals:
     def outlier(self) -> tuple[int, float]:
         """The reading of the largest studentised residual, its place in the data, and the probability of one so large.
 
-        Of u = Q^{-1/2}e, independent normal numbers, each studentised residual is a projection, so that its square over
-        uᵀu is Beta(½, (r − 1)/2) for a covariance Q of rank r; times K for the largest of them (Bonferroni). Readings
-        far more exact than the prior leave Q no variance in the directions that the parameters fit.
+        Of u = Q^{-1/2}e, ν independent normal numbers for a covariance Q of rank ν, each studentised residual is a
+        projection, so that its square over uᵀu is Beta(½, (ν − 1)/2); times K for the largest of them (Bonferroni).
+        Readings far more exact than the prior leave Q no variance in the directions that the parameters fit. In those
+        that mostly the prior lets vary, u says how much wider than the truth the prior is: a square counts as one, and
+        residuals are those without these directions. Where the size of the errors is estimated, its posterior, as
+        that of ν squares, takes the place of uᵀu.
         """
-        from scipy.special import betainc
+        from scipy.special import betainc, digamma
 
-        k, worst = len(self.white), int(np.argmax(np.abs(self.studentised)))
         values, vectors = np.linalg.eigh(self.expected)
-        kept = values > NO_VARIANCE * values[-1]
-        rank = int(np.count_nonzero(kept))
-        if rank < 2:  # the residuals have one shape, whose largest part says nothing
+        root = (vectors * np.sqrt(np.maximum(values, 0.0)))[:, values > OF_ERRORS]
+        u, left = self.white @ root / values[values > OF_ERRORS], np.sum(root**2, axis=1)
+        squares = np.where(left > FITTED, (root @ u) ** 2 / np.maximum(left, FITTED), 0.0)
+        worst, rank = int(np.argmax(squares)), float(np.count_nonzero(values > NO_VARIANCE * values[-1]))
+        freedom, total = rank, float(u @ u) + rank - len(u)
+        if self.freedom is not None:
+            freedom, total = self.freedom, 2 * math.exp(digamma(self.freedom / 2))
+        if freedom <= 1:  # the residuals have one shape, whose largest part says nothing
             return int(self.which[worst]), 1.0
-        total = float(np.sum((self.white @ vectors[:, kept]) ** 2 / values[kept]))
-        share = min(1.0, float(self.studentised[worst] ** 2) / total)
-        return int(self.which[worst]), min(1.0, k * float(1 - betainc(0.5, (rank - 1) / 2, share)))
+        share = min(1.0, float(squares[worst]) / total)
+        chance = float(1 - betainc(0.5, (freedom - 1) / 2, share))
+        return int(self.which[worst]), min(1.0, len(squares) * chance)
 
     def _chance(self, form: Array) -> float:
         """P(xᵀFx/xᵀx ≥ eᵀFe/eᵀe) for x ~ N(0, Q)."""

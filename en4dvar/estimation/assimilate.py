@@ -147,6 +147,7 @@ def _concluded(
             log_evidence = diag.log_evidence(lowest, newton.hessian.singular_values, len(space.members), observations)
     std = ends.members.std(axis=0, ddof=1)
     shifts: tuple[Shift, ...] = ()
+    judged, freedom = conclusions.with_posterior_scale(space, linear, descent.weights.w, ends.members)
     begun = space.forward_runs  # those of fits are told with the shifts
     if stages.settings.what_if:
         fitted = partial(_fitted, stages, response.at, control.centre_cost)
@@ -175,7 +176,8 @@ def _concluded(
         refinement=sampled.refined.summary if sampled.refined else {},
         log_evidence=log_evidence,
         log_evidence_constant=log_evidence_constant,
-        residuals=conclusions.residuals_of(space, linear),
+        residuals=conclusions.residuals_of(space, judged, freedom),
+        chi2=None if freedom is None else float(observations.chi2_per_observation(judged.prediction)),
         discrepancy=explained and Discrepancy(*explained, conclusions.shares_of_variance(space, linear)),
         influence=conclusions.influence_of(problem, ends.run, ends.members, response, sampled.refined is None),
         what_if=shifts,

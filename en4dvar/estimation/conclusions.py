@@ -1,6 +1,8 @@
 """Conclusions from a descent and the posterior about it: minima, evidence, residuals, influence, discrepancy."""
 
+import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,14 +17,17 @@ from en4dvar.diagnosis.influence import Influence
 from en4dvar.diagnosis.residuals import Residuals
 from en4dvar.diagnosis.response.what_if import LinearResponse
 from en4dvar.diagnosis.withheld import Withheld
-from en4dvar.ensemble.forecast import Forecast
+from en4dvar.ensemble.forecast import Forecast, of_framework
+from en4dvar.ensemble.linalg import min_norm_fit
 from en4dvar.ensemble.members import InitialStates
-from en4dvar.model.state import Array
+from en4dvar.model.state import NOISE_SCALE, Array
 from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.priors.prior import Prior
 from en4dvar.problem import InverseProblem
 from en4dvar.sampling.refine import Refined
 from en4dvar.schemes.settings import AssimilationSettings
+
+LEAST = 1e-9  # variance of ln σ²
 
 
 def outcome_of(
@@ -120,8 +125,33 @@ def modes_of(prior: Prior, minima: Sequence[Minimum], sampled: Refined | None) -
     )
 
 
-def residuals_of(space: WeightSpace, linear: Linearisation) -> Residuals:
-    """Residuals of the linearisation at the end."""
+def with_posterior_scale(
+    space: WeightSpace, linear: Linearisation, w: Array, members: Array
+) -> tuple[Linearisation, float | None]:
+    """The linearisation at the end, of weights w (N,), and None; where the noise scale σ is estimated, that at the
+    minimum of J given its geometric mean over the posterior ``members`` (N, n), and ν of the inverse χ² that their σ²
+    has.
+
+    At the minimum itself σ is too small, for the fit uses up degrees of freedom.
+    """
+    problem, prior = space.problem, space.problem.prior
+    if not (problem.has_noise_scale and NOISE_SCALE.name in prior.names):
+        return linear, None
+    sigma = of_framework(problem, prior.to_physical(members), NOISE_SCALE, 1.0)
+    logs = np.log(sigma[sigma > 0])
+    prediction = replace(linear.prediction, noise_scale=np.exp(logs.mean()))
+    held = replace(linear, prediction=prediction, log_scale_anomalies=None)
+    d, S = problem.observations.whiten(held)
+    root = math.sqrt(len(w) - 1)
+    design = np.vstack([S, root * np.eye(S.shape[1])])
+    step = min_norm_fit(design, np.concatenate([d, -root * space.basis.T @ w]))
+    there = replace(held, prediction=replace(prediction, values=prediction.values + step @ linear.anomalies))
+    variance = max(4 * float(logs.var()), LEAST)  # of ln σ², 2/ν + 2/ν² but for higher orders
+    return there, (1 + math.sqrt(1 + 2 * variance)) / variance
+
+
+def residuals_of(space: WeightSpace, linear: Linearisation, freedom: float | None = None) -> Residuals:
+    """Residuals of a linearisation at the end, and ν as of :func:`with_posterior_scale`."""
     observations = space.problem.observations
     speed = np.abs(_rates(space.problem, linear.prediction))
     white, sensitivity = observations.whiten(linear)
@@ -133,7 +163,7 @@ def residuals_of(space: WeightSpace, linear: Linearisation) -> Residuals:
     for part in space.problem.parts:
         if part.has_path:
             labels[part.where] = part.begin
-    return Residuals.of(white, sensitivity, precision, speed, observations.used, labels)
+    return Residuals.of(white, sensitivity, precision, speed, observations.used, labels, freedom)
 
 
 def _rates(problem: InverseProblem, at: Predicted) -> Array:

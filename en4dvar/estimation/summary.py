@@ -118,8 +118,8 @@ def remarks(a: Analysis) -> tuple[str, ...]:
     path's parameters are made of, how the readings after the window came out, and the alternatives that move a
     parameter beyond its error bar.
     """
-    last, used = a.iterations[-1], len(a.problem.observations.used)
-    excluded = {s.name: exclusion(last.chi2_per_observation, used, s.cost_change) for s in a.what_if}
+    used = len(a.problem.observations.used)
+    excluded = {s.name: exclusion(a.fit[0], used, s.cost_change) for s in a.what_if}
     large = [shift for shift in a.what_if if shift.exceeds and not excluded[shift.name]]
     lines = [f"what if {shift.words}: {_moved(a.parameters, shift)}" for shift in large[:MOST_REMARKS]]
     more = len(large) - len(lines)

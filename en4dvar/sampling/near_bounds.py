@@ -5,7 +5,8 @@ r"""The posterior where priors end at bounds, by predictions that are linear in 
 Such a prior is Gaussian in its score x = Φ⁻¹(F(θ)), which is bent at the bound, and a posterior within few standard
 deviations of it is no Gaussian about its mode x̂, however linear the model: the Gaussian lies off the bound, for θ
 hardly changes with x there. With these predictions J costs no run, and its posterior is drawn as an emulated one is.
-The members' own runs then say how good it is.
+The members' own runs then say how good it is. Of Gaussian errors W(y − m)/σ, W of no state, the triangle of a QR
+decomposition of W [G, y − m(x̂)] says the same as all readings.
 """
 
 import math
@@ -14,7 +15,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from en4dvar.data.noise import Linearisation
+from en4dvar.data.noise import Linearisation, Predicted
+from en4dvar.data.observations import Observations
 from en4dvar.descent.beyond_gaussian import Drawn
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.diagnosis.diagnostics import effective_share
@@ -28,7 +30,7 @@ from en4dvar.sampling.mixture import StudentMixture
 
 STRAIGHT = 0.995  # effective share of the members for which predictions may as well be linear in x
 LEFT_OUT, KEPT = 3, 6  # turns of the walkers
-MANY = 500  # readings, of which J of all walkers takes seconds, and of correlated ones of four times as many a minute
+MANY = 500  # readings of other errors than Gaussian ones of known ratios, of which J of all walkers takes seconds
 
 
 def near_bounds(space: WeightSpace, linear: Linearisation, mode: Array, posterior: Array) -> Drawn | None:
@@ -41,20 +43,20 @@ def near_bounds(space: WeightSpace, linear: Linearisation, mode: Array, posterio
     mixed = problem.discrepancy or any(walk.spread for walk in problem.walks)
     ending = [t.transform in QUANTILE_MAPS and t.parameter.name != NOISE_SCALE.name for t in prior.terms]
     bent = np.flatnonzero(ending).tolist()
-    if mixed or not bent or space.basis.shape[1] < len(mode) or linear.anomalies.shape[1] > MANY:
+    if mixed or not bent or space.basis.shape[1] < len(mode):
         return None
-    scale, like = linear.log_scale_anomalies, linear.prediction.each(lambda part: np.asarray(part)[None])
-    parts = linear.anomalies, linear.rate_anomalies, None if scale is None else scale[:, None]
-    slopes = np.linalg.solve(space.basis.T @ space.anomalies, np.hstack([part for part in parts if part is not None]))
+    parts = [part for part in (linear.anomalies, linear.rate_anomalies) if part is not None]
+    slopes = np.asarray(np.linalg.solve(space.basis.T @ space.anomalies, np.hstack(parts)), dtype=float)
+    of_readings = _cost_of_readings(problem.observations, linear.prediction, slopes)
+    if of_readings is None:
+        return None
     bend = _bend(prior, bent, mode)
 
     def cost(x: Array, change: Array) -> Array:
         """J (B,) at control vectors (B, n), of predictions that change by ``change`` (B, n) from those at the mode."""
-        predicted = like.unstacked(like.stacked + change @ slopes)
-        if problem.has_noise_scale:
-            exact = of_framework(problem, prior.to_physical(x), NOISE_SCALE, 1.0)
-            predicted = replace(predicted, noise_scale=exact)
-        return np.asarray(prior.cost(x) + problem.observations.cost(predicted))
+        scaled = problem.has_noise_scale
+        sigma = of_framework(problem, prior.to_physical(x), NOISE_SCALE, 1.0) if scaled else np.ones(len(x))
+        return np.asarray(prior.cost(x) + of_readings(change, sigma))
 
     def bent_cost(x: Array) -> Array:
         return cost(x, bend(x))
@@ -76,6 +78,34 @@ def near_bounds(space: WeightSpace, linear: Linearisation, mode: Array, posterio
         members = with_moments(members, draws.mean(axis=0), np.linalg.cholesky(np.atleast_2d(np.cov(draws.T))).T)
     log = float(np.mean([turn.log for turn in turns[-KEPT:]])) - 0.5 * len(mode) * math.log(2 * math.pi)
     return Drawn(members, bent_cost, log)
+
+
+def _cost_of_readings(
+    observations: Observations, at: Predicted, slopes: Array
+) -> Callable[[Array, Array], Array] | None:
+    """J_o (B,) of changes (B, n) from the prediction ``at`` the mode, by ``slopes`` (n, K) and beside them those of the
+    rates, and of σ (B,); None where it takes too long.
+    """
+    like = replace(at, noise_scale=None).each(lambda part: np.asarray(part)[None])
+    if observations.noise.quadratic and like.rates is None:
+        rows = observations.whitened_rows(np.vstack([slopes, observations.values - at.values]), like)[0]
+        triangle, weight = np.asarray(np.linalg.qr(rows.T, mode="r")), float(observations.weights.sum())
+
+        def of_triangle(change: Array, sigma: Array) -> Array:
+            white = triangle[:, -1] - change @ triangle[:, :-1].T
+            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+                total = 0.5 * np.sum(white**2, axis=1) / sigma**2 + weight * np.log(sigma)
+            return np.where(np.isfinite(total), total, np.inf)
+
+        return of_triangle
+    if len(observations) > MANY:
+        return None
+
+    def of_all(change: Array, sigma: Array) -> Array:
+        predicted = like.unstacked(like.stacked + change @ slopes)
+        return observations.cost(replace(predicted, noise_scale=sigma))
+
+    return of_all
 
 
 def _bend(prior: Prior, bent: list[int], mode: Array) -> Callable[[Array], Array]:

@@ -44,8 +44,8 @@ class Case:
     @property
     def scatter(self) -> float:
         """Of the residuals over the stated errors, as one factor."""
-        last, used = self.a.iterations[-1], len(self.a.problem.observations.used)
-        return math.sqrt(last.chi2_per_observation * used / max(1.0, used - last.dfs))
+        (chi2, dfs), used = self.a.fit, len(self.a.problem.observations.used)
+        return math.sqrt(chi2 * used / max(1.0, used - dfs))
 
     @property
     def stated(self) -> float:

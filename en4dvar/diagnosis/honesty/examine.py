@@ -46,7 +46,7 @@ def examine(
     a, prior = analysis, analysis.problem.prior
     alive = active_members(a.posterior_failures)
     members = a.posterior[alive]
-    last, n_used = a.iterations[-1], len(a.problem.observations.used)
+    (chi2, dfs), n_used = a.fit, len(a.problem.observations.used)
     of_events = n_used == len(a.problem.observations) and all(part.observable.event for part in a.problem.parts)
     whole = control.costs is not None  # the ensembles stand for the whole covariance
     warnings = (
@@ -61,7 +61,7 @@ def examine(
         *checks.loss("prior forecast", a.prior_failures, prior, control.prior, of_events, bool(a.refinement)),
         *checks.loss("iterations", worst_loss, prior, None, of_events, bool(a.refinement)),
         *checks.loss("posterior forecast", a.posterior_failures, prior, control.posterior, of_events),
-        *checks.fit(last.chi2_per_observation * n_used, n_used, last.dfs),
+        *checks.fit(chi2 * n_used, n_used, dfs),
         *_allowed(a, checks.structure(a)),
         *checks.missed(a),
         *(checks.conflict(prior, control.centre) if whole else ()),
