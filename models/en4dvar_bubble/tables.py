@@ -21,6 +21,15 @@ _FIRST = np.array([4 / 5, -1 / 5, 4 / 105, -1 / 280])
 _SECOND = np.array([8 / 5, -1 / 5, 8 / 315, -1 / 560])
 _SECOND_CENTRE = -205 / 72
 
+# Places in a cell, from 0 to 1, through whose values a polynomial is laid: with both ends, and without.
+LOBATTO = 0.5 - 0.5 * np.cos(np.pi * np.arange(6) / 5)
+GAUSS = (np.polynomial.legendre.leggauss(5)[0] + 1) / 2
+
+
+def to_coefficients(places: Array) -> Array:
+    """What values (…, n) at ``places`` (n,) of a cell are multiplied by from the right: coefficients, lowest first."""
+    return np.asarray(np.linalg.inv(np.vander(places, increasing=True)).T)
+
 
 @dataclass(frozen=True)
 class Grid:
@@ -33,6 +42,10 @@ class Grid:
     @property
     def nodes(self) -> Array:
         return self.origin + self.step * np.arange(-HALO, self.cells + 1 + HALO, dtype=np.float64)
+
+    def within(self, places: Array) -> Array:
+        """Numbers (cells, n) at ``places`` (n,) of every cell."""
+        return self.origin + self.step * (np.arange(self.cells)[:, None] + places)
 
     @property
     def span(self) -> Array:

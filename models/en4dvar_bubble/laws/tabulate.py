@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from en4dvar.model.state import Array
-from en4dvar_bubble.tables import Grid, evaluate, from_values
+from en4dvar_bubble.tables import GAUSS, Grid, evaluate, from_values, to_coefficients
 
 Function = Callable[[Array], float | Array]
 
@@ -15,9 +15,8 @@ STRETCH = np.exp(GRID.nodes)
 
 # The slope of J_e in a cell is the polynomial through its values at five Gauss points; at 100 MPa a Fung material is
 # then right to 1e-5. No point lies at λ = 1, where the slope is 0/0.
-GAUSS = (np.polynomial.legendre.leggauss(5)[0] + 1) / 2
-_LOG_GAUSS = (GRID.origin + GRID.step * (np.arange(GRID.cells)[:, None] + GAUSS)).ravel()
-_TO_RISE = np.linalg.inv(np.vander(GAUSS, increasing=True)).T * GRID.step / np.arange(1, 6)
+_LOG_GAUSS = GRID.within(GAUSS).ravel()
+_TO_RISE = to_coefficients(GAUSS) * GRID.step / np.arange(1, 6)
 _UNSTRETCHED = int(np.searchsorted(_LOG_GAUSS, 0.0)) // len(GAUSS)
 
 _LOWEST, _HIGHEST = np.log(1e-3), np.log(1e13)
