@@ -252,10 +252,8 @@ def doubts(
         view = lobe(times, radius)
     except DataError:
         return ()
-    ratios, common, within = [], [], np.ones(len(predicted), dtype=bool)
-    for name, most in COMMON._asdict().items():
-        within &= members.get(name, np.zeros(1)) <= most
-    for path, usual in zip(predicted, within, strict=True):
+    ratios, common = [], []
+    for path, usual in zip(predicted, _common(members, len(predicted)), strict=True):
         try:
             ratios.append(lobe(times, path).rayleigh_ratio(medium))
         except DataError:
@@ -267,3 +265,11 @@ def doubts(
         return ()
     told = len(ratios) > 0 and expected.reaches(view.rayleigh_ratio(medium), max(APART, 1 + view.margin))
     return (caution("implausible-data", words, "caution" if told and conceivable(view, medium) else None),)
+
+
+def _common(members: Mapping[str, Array], count: int) -> npt.NDArray[np.bool_]:
+    """Of members, whether neither G nor μ, where the law has one, is beyond what is granted."""
+    within = np.ones(count, dtype=bool)
+    for name, most in COMMON._asdict().items():
+        within &= members.get(name, np.zeros(1)) <= most
+    return within
