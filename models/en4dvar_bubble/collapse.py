@@ -89,7 +89,7 @@ class Lobe:
         return self.t_c / (RAYLEIGH * self.R_max * math.sqrt(medium.rho / medium.p_inf))
 
 
-def lobe(times: Array, radius: Array, with_margin: bool = True) -> Lobe:
+def lobe(times: Array, radius: Array) -> Lobe:
     """Maximum and collapse time, see the head of the module. Raises :class:`DataError`."""
     turning = None
     for lowest in LOWEST:
@@ -97,9 +97,9 @@ def lobe(times: Array, radius: Array, with_margin: bool = True) -> Lobe:
         count = where.stop - where.start
         if count < 4:
             break
-        view, near = _fitted(times, radius, where, with_margin)
+        view, near = _fitted(times, radius, where)
         if count > 4 and not np.any(radius[where.stop : where.stop + 1] <= lowest * radius.max()):
-            before, turns = _fitted(times, radius, slice(where.start, where.stop - 1), with_margin)
+            before, turns = _fitted(times, radius, slice(where.start, where.stop - 1))
             if before is not None and times[where.stop - 1] > before.t_max + before.t_c:
                 view, near = before, turns  # the lowest reading is one of the rebound
         turning = view if near else turning or view
@@ -118,31 +118,21 @@ def lobe(times: Array, radius: Array, with_margin: bool = True) -> Lobe:
     return turning
 
 
-def _fitted(times: Array, radius: Array, where: slice, with_margin: bool) -> tuple[Lobe | None, bool]:
+def _fitted(times: Array, radius: Array, where: slice) -> tuple[Lobe | None, bool]:
     """What the parabola through the readings ``where`` tells, None without a maximum; whether that is near them."""
     begun, r = times[int(np.argmax(radius))], radius[where]
     scale = max(float(np.ptp(times[where])), 1e-300)
     z, y = (times[where] - begun) / scale, np.clip(r / radius.max(), 1e-3, None)
-    c, b, a = fit = np.polyfit(z, y**2.5, 2, w=y**-1.5)  # an error of R is one of 5/2 R^{3/2} in R^{5/2}
+    # an error of R is one of 5/2 R^{3/2} in R^{5/2}
+    (c, b, a), covariance = np.polyfit(z, y**2.5, 2, w=y**-1.5, cov=True)
     if not c < 0:
         return None, False
     middle, peak = -b / (2 * c), a - b**2 / (4 * c)
-    margin = _margin(z, y, fit) if with_margin else 0.0
+    slope = np.array([middle**2, middle, 1.0]) * 0.1 / peak  # of ln t_c/R_max = ln √(−peak/c)/peak^{2/5}
+    slope[0] -= 0.5 / c
+    margin = float(stdtrit(len(z) - 3, SURE) * np.sqrt(slope @ covariance @ slope))
     times_of = float(begun + scale * middle), float(scale * np.sqrt(-peak / c))
     return Lobe(float(radius.max() * peak**0.4), *times_of, margin), middle > z[0] - BEFORE
-
-
-def _margin(z: Array, y: Array, fit: Array) -> float:
-    """Of t_c/R_max = √(−peak/c)/peak^{2/5}, to first order in the errors of the coefficients (c, b, a) = ``fit``."""
-    weight = y**-1.5
-    X = np.vander(z, 3) * weight[:, None]
-    residual = weight * y**2.5 - X @ fit
-    left = len(z) - 3
-    covariance = np.linalg.pinv(X.T @ X) * float(residual @ residual) / left
-    c, b, a = fit
-    slope = np.array([b**2 / (4 * c**2), -b / (2 * c), 1.0]) * 0.1 / (a - b**2 / (4 * c))  # of ln peak^{1/10}
-    slope[0] -= 0.5 / c
-    return float(stdtrit(left, SURE) * np.sqrt(slope @ covariance @ slope))
 
 
 def _falling(radius: Array, lowest: float) -> slice:
@@ -243,7 +233,7 @@ def single(times: Array, radius: Array) -> bool:
     if radius[falling].min() > TOLD * radius.max() or len(maxima(radius[falling])):
         return False
     try:
-        view = lobe(times, radius, with_margin=False)
+        view = lobe(times, radius)
     except DataError:
         return False
     return bool(times[-1] < view.t_max + (1 + REBOUND) * view.t_c)
@@ -279,8 +269,7 @@ def doubts(
 
 def _common(members: Mapping[str, Array], count: int) -> npt.NDArray[np.bool_]:
     """Of members, whether neither G nor μ, where the law has one, is beyond what is granted."""
-    limits = COMMON._asdict().items()
-    within: npt.NDArray[np.bool_] = np.all(
-        [members[k] <= most for k, most in limits if k in members] or [np.ones(count, dtype=bool)], axis=0
-    )
+    within = np.ones(count, dtype=bool)
+    for name, most in COMMON._asdict().items():
+        within &= members.get(name, np.zeros(1)) <= most
     return within

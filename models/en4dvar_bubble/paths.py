@@ -145,10 +145,7 @@ class Paths(Batch):
         stress = law.elastic_stress(stretch, values) / rho
         if system.memory:
             stress = stress + self.raw[:, :, system.first_memory : -2].sum(axis=2)
-        if system.shear or system.strain:
-            nu = law.mean_viscosity(np.abs(V) * 1e6, values, stretch) / rho * 1e6
-        else:
-            nu = self.par[:, None, rows.VISCOSITY]
+        nu = law.mean_viscosity(np.abs(V) * 1e6, values, stretch) / rho * 1e6
         return np.asarray((stress - 4 * nu * V) * rho)
 
 

@@ -72,9 +72,7 @@ def _section(kind: str, function: Callable[..., Driving]) -> type[_Kind]:
     hints, words = get_type_hints(function, include_extras=True), (function.__doc__ or "").splitlines()[0]
     keys: dict[str, Any] = {"kind": (Literal[kind], Field(kind, description=words))}
     for name, argument in signature(function).parameters.items():
-        described = " ".join(text for text in hints[name].__metadata__ if isinstance(text, str))
-        default = ... if argument.default is argument.empty else argument.default
-        keys[name] = (hints[name], Field(default, description=described))
+        keys[name] = (hints[name], ... if argument.default is argument.empty else argument.default)
     section = create_model(kind.capitalize(), __base__=_Kind, __doc__=words, **keys)
     section.pulse = staticmethod(function)
     return section
@@ -223,10 +221,7 @@ def _key(constant: FieldOfMedium[Any]) -> tuple[Any, Any]:
     """Type and default of a constant as a key of the section."""
     about = constant.metadata
     quantity = (Quantity(about["unit"]),) if about["unit"] != "1" else ()
-    return (
-        Annotated[(float, *quantity, Field(**about["bounds"]))],
-        Field(constant.default, description=about["description"]),
-    )
+    return Annotated[(float, *quantity, Field(**about["bounds"]), about["description"])], constant.default
 
 
 _SOURCES = Field(

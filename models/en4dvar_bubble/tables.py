@@ -1,10 +1,10 @@
 """Smooth functions of one variable as piecewise quintics, so that one compiled kernel serves every law and every pulse.
 
-A table is built from samples on a uniform grid with four extra points at either end. Derivatives at the nodes come from
-eighth-order central differences, each cell is the quintic Hermite polynomial of value, slope and curvature. A cell
-takes eight doubles (six coefficients, one cache line). In tables of sharp laws (:mod:`laws.exactness`) a cell may be
-halved, and its halves again: the seventh number is how many times narrower a cell is than those of the grid (zero where
-none is halved), the eighth the place of its left half, which its right half follows.
+Of samples on a uniform grid with four extra points at either end, derivatives at the nodes are eighth-order central
+differences, and each cell is the quintic Hermite polynomial of value, slope and curvature. A cell takes eight doubles
+(six coefficients, one cache line). In tables of sharp laws (:mod:`laws.exactness`) a cell may be halved, and its halves
+again: the seventh number is how many times narrower a cell is than those of the grid (zero where none is halved), the
+eighth the place of its left half, which its right half follows.
 """
 
 import math
@@ -21,6 +21,15 @@ _FIRST = np.array([4 / 5, -1 / 5, 4 / 105, -1 / 280])
 _SECOND = np.array([8 / 5, -1 / 5, 8 / 315, -1 / 560])
 _SECOND_CENTRE = -205 / 72
 
+# Places in a cell, from 0 to 1, through whose values a polynomial is laid: with both ends, and without.
+LOBATTO = 0.5 - 0.5 * np.cos(np.pi * np.arange(6) / 5)
+GAUSS = (np.polynomial.legendre.leggauss(5)[0] + 1) / 2
+
+
+def to_coefficients(places: Array) -> Array:
+    """What values (…, n) at ``places`` (n,) of a cell are multiplied by from the right: coefficients, lowest first."""
+    return np.asarray(np.linalg.inv(np.vander(places, increasing=True)).T)
+
 
 @dataclass(frozen=True)
 class Grid:
@@ -34,26 +43,14 @@ class Grid:
     def nodes(self) -> Array:
         return self.origin + self.step * np.arange(-HALO, self.cells + 1 + HALO, dtype=np.float64)
 
+    def within(self, places: Array) -> Array:
+        """Numbers (cells, n) at ``places`` (n,) of every cell."""
+        return self.origin + self.step * (np.arange(self.cells)[:, None] + places)
+
     @property
     def span(self) -> Array:
         """(first, last, cells per unit, cells, 0 times halved): what the kernel needs to look up a value."""
         return np.array([self.origin, self.origin + self.step * self.cells, 1.0 / self.step, float(self.cells), 0.0])
-
-
-@called
-def quintic(out, i, cell, a, da, dda, b, db, ddb):
-    """Quintic on s ∈ [0, 1] from values and derivatives scaled by the cell width, to ``out[i, cell]``."""
-    rise = b - a - da - 0.5 * dda
-    turn = db - da - dda
-    curl = ddb - dda
-    out[i, cell, 0] = a
-    out[i, cell, 1] = da
-    out[i, cell, 2] = 0.5 * dda
-    out[i, cell, 3] = 10.0 * rise - 4.0 * turn + 0.5 * curl
-    out[i, cell, 4] = -15.0 * rise + 7.0 * turn - curl
-    out[i, cell, 5] = 6.0 * rise - 3.0 * turn + 0.5 * curl
-    out[i, cell, 6] = 0.0
-    out[i, cell, 7] = 0.0
 
 
 @kernel
@@ -80,50 +77,14 @@ def fill_one(samples, member, factor, out, at):
             db += factor * _FIRST[r] * (right - left)
             ddb += factor * _SECOND[r] * (right + left)
         if j > 0:
-            quintic(out, at, j - 1, a, da, dda, b, db, ddb)
+            cell = out[at, j - 1]
+            rise, turn, curl = b - a - da - 0.5 * dda, db - da - dda, ddb - dda
+            cell[0], cell[1], cell[2] = a, da, 0.5 * dda
+            cell[3] = 10.0 * rise - 4.0 * turn + 0.5 * curl
+            cell[4] = -15.0 * rise + 7.0 * turn - curl
+            cell[5] = 6.0 * rise - 3.0 * turn + 0.5 * curl
+            cell[6] = cell[7] = 0.0
         a, da, dda = b, db, ddb
-
-
-@kernel
-def from_slopes(slopes, step, zero, every):
-    """Coefficients (N, cells, 8), of cells ``every`` steps wide, of the antiderivative that vanishes at node ``zero``,
-    from samples of the derivative.
-    """
-    n, total = slopes.shape
-    cells = total - 1 - 2 * HALO
-    out = np.empty((n, cells // every, 8))
-    value = np.empty(cells + 1)
-    first = np.empty(cells + 1)
-    second = np.empty(cells + 1)
-    third = np.empty(cells + 1)
-    for i in range(n):
-        row = slopes[i]
-        for j in range(cells + 1):
-            at = j + HALO
-            d1 = 0.0
-            d2 = _SECOND_CENTRE * row[at]
-            for r in range(HALO):
-                right, left = row[at + r + 1], row[at - r - 1]
-                d1 += _FIRST[r] * (right - left)
-                d2 += _SECOND[r] * (right + left)
-            first[j], second[j], third[j] = row[at] * step, d1 * step, d2 * step
-        # Integral of a cell from slope, curvature and third derivative at its ends (error h⁷).
-        value[zero] = 0.0
-        for j in range(zero, cells):
-            value[j + 1] = value[j] + _area(first, second, third, j)
-        for j in range(zero - 1, -1, -1):
-            value[j] = value[j + 1] - _area(first, second, third, j)
-        for j in range(cells + 1):
-            first[j], second[j] = every * first[j], every * every * second[j]
-        for cell in range(cells // every):
-            j, k = cell * every, (cell + 1) * every
-            quintic(out, i, cell, value[j], first[j], second[j], value[k], first[k], second[k])
-    return out
-
-
-@called
-def _area(first, second, third, j):
-    return 0.5 * (first[j] + first[j + 1]) + 0.1 * (second[j] - second[j + 1]) + (third[j] + third[j + 1]) / 120.0
 
 
 @kernel

@@ -21,14 +21,11 @@ def examples() -> dict[str, Callable[[], object]]:
         models[f"heat, {words}"] = BubbleModel(accuracy=replace(standard, nodes=nodes))
     zener, fung = get_law("zener-neo-hookean"), get_law("fung-kelvin-voigt")
     models["general equations (vapour, conducting medium, memory, Gilmore)"] = BubbleModel(zener, radial="gilmore")
-    models["laws given as a strain energy"] = BubbleModel(fung, "polytropic")
-    models["damage of a released bubble's gel"] = BubbleModel(
-        get_law("softening-kelvin-voigt"), "polytropic", start="laser"
-    )
+    models["tables of laws"] = BubbleModel(fung, "polytropic", start="laser")
     return {f"bubble, {what}": partial(_integrate, model) for what, model in models.items()}
 
 
 def _integrate(model: BubbleModel) -> None:
-    radii = {"R0": 1e-6} if model.start == "acoustic" else {"R_eq": 4e-5, "R_max": 2e-4}
-    values = {**model.law.example_values(), **{name: np.full(1, radius) for name, radius in radii.items()}}
+    radii = {"R0": np.full(1, 1e-6), "R_eq": np.full(1, 4e-5), "R_max": np.full(1, 2e-4)}
+    values = {**model.law.example_values(), **radii}
     model.trajectories(model.initial_states(values), np.array([1e-7, 1e-6]))

@@ -8,14 +8,11 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from en4dvar.model.state import Array, Parameter
-from en4dvar_bubble.tables import Grid, evaluate
+from en4dvar_bubble.tables import LOBATTO, Grid, evaluate, to_coefficients
 
 Reading = Literal["instantaneous", "retarded", "as-printed"]
 Role = Literal["delay", "rate", "stretch", "shape"]
 
-# The quintic of a cell through its values at six Chebyshev–Lobatto points, both ends among them.
-_POINTS = 0.5 - 0.5 * np.cos(np.pi * np.arange(6) / 5)
-_TO_COEFFICIENTS = np.linalg.inv(np.vander(_POINTS, increasing=True))
 _LARGEST_JUMP = 1e-6
 
 
@@ -98,11 +95,10 @@ class Driving:
     @cached_property
     def table(self) -> Array:
         """(cells, 8) coefficients of ``shape``: six of the quintic in the cell's own coordinate, two zeros."""
-        grid = self.grid
-        times = grid.origin + grid.step * (np.arange(self.cells)[:, None] + _POINTS)
+        times = self.grid.within(LOBATTO)
         samples = self.shape(times.ravel() * 1e-6).reshape(times.shape)
         table = np.zeros((self.cells, 8))
-        table[:, :6] = samples @ _TO_COEFFICIENTS.T
+        table[:, :6] = samples @ to_coefficients(LOBATTO)
         return table
 
     def of_members(self, values: Mapping[str, Array]) -> Clocks:

@@ -10,7 +10,7 @@ kernel does not change.
 
 from collections.abc import Mapping
 from copy import deepcopy
-from functools import lru_cache, wraps
+from functools import lru_cache, partial, wraps
 from typing import Any, ClassVar
 
 import numpy as np
@@ -21,7 +21,15 @@ from en4dvar.plumbing.user_file import is_from_file
 from en4dvar_bubble.laws.exactness import Refined, is_sharp, refine
 from en4dvar_bubble.laws.memory import MemoryTables, MemoryVariable
 from en4dvar_bubble.laws.parameters import MU, Values, columns
-from en4dvar_bubble.laws.tabulate import GRID, STRETCH, VISCOUS_GRID, from_function, from_strain_energy, from_viscosity
+from en4dvar_bubble.laws.tabulate import (
+    GRID,
+    STRETCH,
+    VISCOUS_GRID,
+    from_function,
+    from_strain_energy,
+    from_viscosity,
+    slope,
+)
 from en4dvar_bubble.tables import evaluate, from_values
 
 REGISTRY: "dict[str, type[ConstitutiveLaw]]" = {}
@@ -175,18 +183,15 @@ class ConstitutiveLaw:
             return _kept(self, tuple(values), np.stack([*values.values()], dtype=float).tobytes()).copy()
         p = columns(values)
         with np.errstate(all="ignore"):
-            return from_strain_energy(lambda stretch: self.strain_energy_rate(stretch, p), members(values))
+            return from_strain_energy(partial(self.strain_energy_rate, p=p), members(values))
 
     def refined(self, values: Mapping[str, Array]) -> Refined:
         """J_e of one member (``values``: name → (1,)), with cells halved where it takes."""
         p = columns(values)
 
         def function(x: Array) -> Array:
-            stretch = np.exp(x)
-            if self.closed_form:
-                return np.ravel(np.broadcast_to(self.stress(stretch, p), (1, len(x)))).astype(float)
-            slope = -stretch * self.strain_energy_rate(stretch, p) / np.expm1(3 * x)
-            return np.ravel(np.broadcast_to(slope, (1, len(x))))
+            values = self.stress(np.exp(x), p) if self.closed_form else slope(partial(self.strain_energy_rate, p=p), x)
+            return np.ravel(np.broadcast_to(values, (1, len(x)))).astype(float)
 
         with np.errstate(all="ignore"):
             return refine(function, slope=not self.closed_form)
@@ -199,8 +204,8 @@ class ConstitutiveLaw:
         p = columns(values)
         with np.errstate(all="ignore" if self.strain_dependent else None, over="ignore"):
             if self.strain_dependent:
-                return from_function(lambda stretch: self.strained_viscosity(stretch, p), members(values))
-            return from_viscosity(lambda rate: self.viscosity(rate, p), members(values))
+                return from_function(partial(self.strained_viscosity, p=p), members(values))
+            return from_viscosity(partial(self.viscosity, p=p), members(values))
 
     def memory_tables(self, values: Mapping[str, Array]) -> MemoryTables:
         """θ, k and the tables of a and b for values name → (N,) and M memory variables (M = 0 for most laws)."""

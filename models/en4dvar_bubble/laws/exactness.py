@@ -10,8 +10,8 @@ import numpy as np
 
 from en4dvar.model.state import Array
 from en4dvar_bubble.laws.parameters import columns
-from en4dvar_bubble.laws.tabulate import GRID, Function, differentiate, from_function, from_strain_energy
-from en4dvar_bubble.tables import evaluate
+from en4dvar_bubble.laws.tabulate import GRID, Function, accumulated, differentiate, from_function, from_strain_energy
+from en4dvar_bubble.tables import GAUSS, LOBATTO, evaluate, to_coefficients
 
 ERROR = 1e-7
 """Largest error of the stress, relative to the larger of its size there and its largest between λ = 1/2 and 2. Where
@@ -19,10 +19,7 @@ cells may still be halved a hundredth of it is asked for, and of the slope 1e-5 
 HALVINGS = 24
 """A kink lies in a cell of 1/32 · 2⁻²⁴ = 2e-9 of ln λ."""
 _MOST = 2000  # cells that are halved at once: noise would have all of them halved
-_SPREAD = (1 - np.cos(np.linspace(0, np.pi, 6))) / 2
-_GAUSS = (np.polynomial.legendre.leggauss(5)[0] + 1) / 2
 _CHECKED = np.array([1e-3, 0.04, 0.2, 0.41, 0.5, 0.59, 0.8, 0.96, 0.999])
-_POWERS = np.arange(6)
 _TO_THE_END = 12  # halvings of the cell where a function ends: to 1e-5 of λ
 _BESIDE = np.array([-64, 64])  # cells: so near the end of a function it may grow without bound
 
@@ -44,17 +41,17 @@ def refine(function: Callable[[Array], Array], slope: bool) -> Refined:
     1/160 apart, is not seen. Cells in which the function is finite at some points and not at others are halved, so
     that the table ends where the function does, to 1e-5.
     """
-    points = _GAUSS if slope else _SPREAD
-    fit = np.linalg.inv(points[:, None] ** _POWERS[: len(points)])
-    asked, to_checked = np.append(points, _CHECKED), (_CHECKED[:, None] ** _POWERS[: len(points)]).T
-    begins = left = np.asarray(GRID.origin + GRID.step * np.arange(GRID.cells), dtype=float)
+    points = GAUSS if slope else LOBATTO
+    fit = to_coefficients(points)
+    asked, to_checked = np.append(points, _CHECKED), np.vander(_CHECKED, len(points), increasing=True).T
+    begins = left = GRID.within(np.zeros(1))[:, 0]
     places, records, inexact = np.arange(GRID.cells), np.zeros((GRID.cells, 8)), []
     central = floor = 0.0
     for level in range(HALVINGS + 1):
         width = GRID.step * 0.5**level
         both = np.reshape(function((left[:, None] + width * asked).ravel()), (len(left), -1))
         values, exact = both[:, : len(points)], both[:, len(points) :]
-        made = values @ fit.T
+        made = values @ fit
         difference = made @ to_checked - exact
         known = np.isfinite(both)
         error = np.abs(difference).max(axis=1)
@@ -97,15 +94,10 @@ def refine(function: Callable[[Array], Array], slope: bool) -> Refined:
 
 
 def _add_up(records: Array, begins: Array) -> None:
-    """Give each cell of an antiderivative its value on the left: in the order of ln λ, from zero at ln λ = 0.
-    ``begins``: where the cells begin.
-    """
+    """Give each cell of an antiderivative its value on the left. ``begins``: ln λ there, of all cells."""
     leaves = np.flatnonzero(records[:, 7] == 0)
     leaves = leaves[np.argsort(begins[leaves])]
-    unstretched = np.searchsorted(begins[leaves], 0.0)
-    rise = records[leaves, 1:6].sum(axis=1)
-    records[leaves[unstretched:], 0] = np.cumsum(rise[unstretched:]) - rise[unstretched:]
-    records[leaves[:unstretched], 0] = -np.cumsum(rise[:unstretched][::-1])[::-1]
+    records[leaves, 0] = accumulated(records[leaves, 1:6].sum(axis=1), int(np.searchsorted(begins[leaves], 0.0)))
 
 
 TABLE_ERROR = 1e-6

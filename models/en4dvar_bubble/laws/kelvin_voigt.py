@@ -8,7 +8,6 @@ from typing import ClassVar
 import numpy as np
 
 from en4dvar.model.state import Array, Parameter
-from en4dvar.plumbing.compiled import kernel
 from en4dvar_bubble.laws.base import ConstitutiveLaw, Limits
 from en4dvar_bubble.laws.parameters import ALPHA, MU, G, Values, positive
 
@@ -149,17 +148,6 @@ def _stresses(stretches: bytes) -> Array:
     return np.asarray(-np.exp(-grown / 3) * np.expm1(-2 * grown) * _WEIGHT[:, None])
 
 
-@kernel
-def _sum(shares: Array, stresses: Array) -> Array:
-    """The matrix product, member by member: its bits do not depend on how many there are."""
-    out = np.zeros((shares.shape[0], stresses.shape[1]))
-    for i in range(shares.shape[0]):
-        for j in range(shares.shape[1]):
-            for k in range(stresses.shape[1]):
-                out[i, k] += shares[i, j] * stresses[j, k]
-    return out
-
-
 class SofteningKelvinVoigt(NeoHookeanKelvinVoigt):
     r"""$J = -4\mu\dot R/R - \tfrac{2G}3\int_0^1(1-D)\,(l^{-1}-l^{-7})\,\tfrac{dv}v$, $D = d\,(1-e^{-W_m/G})$: each
     shell of a neo-Hookean medium has lost the share $D$ of its stress by its largest strain energy $W_m$ (Simo 1987),
@@ -176,5 +164,6 @@ class SofteningKelvinVoigt(NeoHookeanKelvinVoigt):
     def stress(self, stretch: Array, p: Values) -> Array:
         largest = np.cbrt(1 + _SHARE * ((p.R_max / p.R0) ** 3 - 1))
         lost = -p.damage * np.expm1(1.5 - 0.5 * largest**-4.0 - largest**2)
-        gone = _sum(lost, _stresses(np.ascontiguousarray(stretch).tobytes()))
+        stresses = _stresses(np.ascontiguousarray(stretch).tobytes())
+        gone = np.einsum("is,sk->ik", lost, stresses)  # without BLAS, whose bits depend on how many members there are
         return np.asarray(super().stress(stretch, p) + 2 / 3 * p.G * gone)

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from en4dvar.model.state import Array
-from en4dvar_bubble.tables import HALO, Grid, evaluate, from_slopes, from_values
+from en4dvar_bubble.tables import GAUSS, Grid, evaluate, from_values, to_coefficients
 
 Function = Callable[[Array], float | Array]
 
@@ -13,15 +13,11 @@ GRID = Grid(origin=-5.0, step=1 / 32, cells=496)
 """ln λ from e⁻⁵ to e^10.5."""
 STRETCH = np.exp(GRID.nodes)
 
-# Strain energies that grow exponentially need derivatives from a finer grid than the cells of the table:
-# at 100 MPa a Fung material is then right to 1e-5 instead of 1e-3.
-_REFINE = 2
-_FINE = Grid(GRID.origin, GRID.step / _REFINE, GRID.cells * _REFINE)
-_FINE_LOG = _FINE.nodes
-_FINE_STRETCH = np.exp(_FINE_LOG)
-_UNSTRETCHED = int(np.flatnonzero(_FINE_LOG == 0.0)[0])
-# Interpolation of the removable 0/0 at λ = 1 from the four nodes on either side (eighth order).
-_ACROSS = np.array([0.8, -0.4, 4 / 35, -1 / 70])
+# The slope of J_e in a cell is the polynomial through its values at five Gauss points; at 100 MPa a Fung material is
+# then right to 1e-5. No point lies at λ = 1, where the slope is 0/0.
+_LOG_GAUSS = GRID.within(GAUSS).ravel()
+_TO_RISE = to_coefficients(GAUSS) * GRID.step / np.arange(1, 6)
+_UNSTRETCHED = int(np.searchsorted(_LOG_GAUSS, 0.0)) // len(GAUSS)
 
 _LOWEST, _HIGHEST = np.log(1e-3), np.log(1e13)
 _CELLS = 384
@@ -44,13 +40,27 @@ def from_function(function: Function, n: int) -> Array:
     return from_values(np.array(np.broadcast_to(function(STRETCH), (n, len(STRETCH))), dtype=float, order="C"))
 
 
+def slope(rate: Function, x: Array) -> Array:
+    """dJ_e/d ln λ = −λ W′(λ)/(λ³ − 1) at ln λ = ``x`` (K,), none of them zero, from W′ as ``rate``."""
+    stretch = np.exp(x)
+    return np.asarray(rate(stretch) * (-stretch / np.expm1(3 * x)))
+
+
 def from_strain_energy(rate: Function, n: int) -> Array:
-    """Table (N, cells, 8) of J_e from W′: dJ_e/d ln λ = −λ W′(λ)/(λ³ − 1), J_e(1) = 0."""
-    fine = -_FINE_STRETCH * rate(_FINE_STRETCH) / np.expm1(3 * _FINE_LOG)
-    slopes = np.array(np.broadcast_to(fine, (n, len(_FINE_STRETCH))))
-    near = [slopes[:, _UNSTRETCHED + k] + slopes[:, _UNSTRETCHED - k] for k in (1, 2, 3, 4)]
-    slopes[:, _UNSTRETCHED] = sum(w * s for w, s in zip(_ACROSS, near, strict=True))
-    return np.asarray(from_slopes(slopes, _FINE.step, _UNSTRETCHED - HALO, _REFINE))
+    """Table (N, cells, 8) of J_e from W′, J_e(1) = 0. It ends a cell or two before W′, which may grow without bound."""
+    slopes = np.broadcast_to(slope(rate, _LOG_GAUSS), (n, len(_LOG_GAUSS))).reshape(n, GRID.cells, -1)
+    table, rise = np.zeros((n, GRID.cells, 8)), slopes @ _TO_RISE.sum(axis=1)
+    unknown = np.isnan(rise)
+    rise[:, 2:][unknown[:, :-2]] = rise[:, :-2][unknown[:, 2:]] = np.nan
+    table[..., 1:6] = slopes @ _TO_RISE
+    table[..., 0] = accumulated(rise, _UNSTRETCHED)
+    return table
+
+
+def accumulated(rise: Array, zero: int) -> Array:
+    """On the left of cells (…, cells) in which a function rises by so much: its values, zero on the left of one."""
+    after, before = np.cumsum(rise[..., zero:], axis=-1), np.cumsum(rise[..., :zero][..., ::-1], axis=-1)[..., ::-1]
+    return np.concatenate([-before, after - rise[..., zero:]], axis=-1)
 
 
 def differentiate(table: Array) -> Array:

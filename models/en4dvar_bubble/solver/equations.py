@@ -107,6 +107,7 @@ def _motion(V, u, t, eq, loaded, p, rate):
     return numerator * inverse, inverse, R, mach, Ric, g, h, Jx, Jxx, surface, nu4, P, slope
 
 
+@inlined
 def rhs(y, t, eq, loaded, w):
     """Write dy/dt (n, 8) to ``f`` of the workspace."""
     nodes, par, ops, work, out = eq.nodes, loaded.par, eq.gas, w.work, w.f

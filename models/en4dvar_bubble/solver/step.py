@@ -1,8 +1,6 @@
 """One step of RODAS5P for all lanes: Jacobian, factorisation, stages, error."""
 
 import numba as nb
-from numba.core.types import BaseTuple, NoneType
-from numba.extending import overload
 
 from en4dvar.plumbing.compiled import called, inlined
 from en4dvar_bubble.solver import rodas5p
@@ -48,79 +46,51 @@ def _solve(a, size, b, row):
         store(b, row + i, total * load(a, i * n + i))
 
 
-def _is_general(eq):
-    """Whether a type of :class:`arrays.Equations` is that of the equations with every option."""
-    return isinstance(eq.types[eq.fields.index("nodes")], NoneType)
+# Which equations these are, the compiler knows by what is None of :class:`arrays.Equations`: it leaves out what stands
+# under ``x is not None`` where the argument x is None.
 
 
-def _is_unrolled(eq):
-    """Whether it is that of the paper's equations with few nodes."""
-    return isinstance(eq.types[eq.fields.index("size")], BaseTuple)
-
-
-def _unrolled(lanes, eq, w):
-    """:func:`_linearise` of the paper's equations with few nodes."""
-    jacobian(lanes.y, lanes.t, eq, lanes.loaded, w)
-    n = len(w.f)
-    inverse_h = 1.0 / load(lanes.h, 0)
-    for i in range(n * n):
-        store(w.jac, i, -load(w.jac, i))
-    for i in range(n):
-        store(w.jac, i * n + i, load(w.jac, i * n + i) + inverse_h * (1.0 / _GAMMA))
-    _factorise(w.jac, eq.size)
-
-
-@called
-def _dense(lanes, eq, w):
-    """:func:`_linearise` of the paper's equations with many."""
-    jacobian(lanes.y, lanes.t, eq, lanes.loaded, w)
-    n = len(w.f)
-    for i in range(len(w.tiles)):
-        store(w.tiles, i, 0.0)
-    for i in range(n):
-        for j in range(n):
-            store(w.tiles, place(eq.where, i, j), -load(w.jac, i * n + j))
-    factorise(w.tiles, lanes.h, eq.where, eq.places, (0, 0))
-
-
-@called
-def _general(lanes, eq, w):
-    """:func:`_linearise` of the equations with every option."""
-    general_jacobian(lanes.y, lanes.t, eq, lanes.loaded, w)
-    factorise(w.tiles, lanes.h, eq.where, eq.places, _algebraic_rows(eq))
-
-
-def _linearise(lanes, eq, w):
+@inlined
+def _linearise(nodes, size, medium, where, lanes, eq, w):
     """dy/dt to ``f``, ∂f_V/∂t to ``dt``, factors of 1/(hγ) − ∂f/∂y (algebraic rows: −∂f/∂y) to ``jac`` or ``tiles``."""
+    n = len(w.f)
+    if medium is not None:
+        general_jacobian(lanes.y, lanes.t, eq, lanes.loaded, w)
+        factorise(w.tiles, lanes.h, where, eq.places, _algebraic_rows(eq))
+    if nodes is not None:
+        jacobian(lanes.y, lanes.t, eq, lanes.loaded, w)
+        if where is not None:
+            for i in range(len(w.tiles)):
+                store(w.tiles, i, 0.0)
+            for i in range(n):
+                for j in range(n):
+                    store(w.tiles, place(where, i, j), -load(w.jac, i * n + j))
+            factorise(w.tiles, lanes.h, where, eq.places, (0, 0))
+    if size is not None:
+        inverse_h = 1.0 / load(lanes.h, 0)
+        for i in range(n * n):
+            store(w.jac, i, -load(w.jac, i))
+        for i in range(n):
+            store(w.jac, i * n + i, load(w.jac, i * n + i) + inverse_h * (1.0 / _GAMMA))
+        _factorise(w.jac, size)
 
 
-@overload(_linearise, jit_options={"forceinline": True})
-def _choose_matrix(lanes, eq, w):
-    if _is_general(eq):
-        return lambda lanes, eq, w: _general(lanes, eq, w)
-    return _unrolled if _is_unrolled(eq) else lambda lanes, eq, w: _dense(lanes, eq, w)
-
-
-def _substitute(eq, w, row):
+@inlined
+def _substitute(size, where, eq, w, row):
     """Solve for the stage in rows ``row … row+n−1`` of ``k``."""
+    if size is not None:
+        _solve(w.jac, size, w.k, row)
+    if where is not None:
+        solve(w.tiles, where, eq.places, w.extended, w.k, row)
 
 
-@overload(_substitute, jit_options={"forceinline": True})
-def _choose_solve(eq, w, row):
-    if _is_unrolled(eq):
-        return lambda eq, w, row: _solve(w.jac, eq.size, w.k, row)
-    return lambda eq, w, row: solve(w.tiles, eq.where, eq.places, w.extended, w.k, row)
-
-
-def _rhs(y, t, eq, loaded, w):
+@inlined
+def _rhs(nodes, medium, y, t, eq, loaded, w):
     """The right-hand side alone, to ``f``."""
-
-
-@overload(_rhs, jit_options={"forceinline": True})
-def _choose_rhs(y, t, eq, loaded, w):
-    if _is_general(eq):
-        return lambda y, t, eq, loaded, w: general_rhs(y, t, eq, loaded, w)
-    return rhs
+    if nodes is not None:
+        rhs(y, t, eq, loaded, w)
+    if medium is not None:
+        general_rhs(y, t, eq, loaded, w)
 
 
 @inlined
@@ -134,7 +104,7 @@ def _algebraic_rows(eq):
 def attempt(lanes, eq, w):
     """The stages of one step of all lanes to ``k``, the argument of the last to ``stage``."""
     algebraic = _algebraic_rows(eq)
-    _linearise(lanes, eq, w)
+    _linearise(eq.nodes, eq.size, eq.medium, eq.where, lanes, eq, w)
     n = len(w.f)
     fast_row = n - 2  # V, the only row with an explicit time dependence
     step = load(lanes.h, 0)
@@ -149,7 +119,7 @@ def attempt(lanes, eq, w):
                     value = value + load(w.k, r * n + i) * _A[s, r]
                 store(w.stage, i, value)
             store(w.t_stage, 0, now + step * _ALPHA[s])
-            _rhs(w.stage, w.t_stage, eq, lanes.loaded, w)
+            _rhs(eq.nodes, eq.medium, w.stage, w.t_stage, eq, lanes.loaded, w)
         for i in range(n):
             value = splat(0.0)
             if i < algebraic[0] or i >= algebraic[1]:
@@ -157,7 +127,7 @@ def attempt(lanes, eq, w):
                     value = value + load(w.k, r * n + i) * _C[s, r]
             store(w.k, s * n + i, load(w.f, i) + value * inverse_h)
         store(w.k, s * n + fast_row, load(w.k, s * n + fast_row) + slope_t * _D[s])
-        _substitute(eq, w, s * n)
+        _substitute(eq.size, eq.where, eq, w, s * n)
 
 
 @called

@@ -22,10 +22,10 @@ from en4dvar.inputs.readers import AGAIN, BELOW, CLIPPED, FAR, LEVEL, ODD, Readi
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.files import expanded
 from en4dvar.plumbing.units import UnitError, convert, parse_quantity, parse_unit
-from en4dvar_bubble.starter.elsewhere import known, scale_of
+from en4dvar_bubble.starter.elsewhere import Entry, known, scale_of
 from en4dvar_bubble.starter.grouped import grouped, parted
 from en4dvar_bubble.starter.look import Start, usable
-from en4dvar_bubble.starter.proposal import Entry, Proposal, propose, with_columns
+from en4dvar_bubble.starter.proposal import Proposal, propose, with_columns
 
 SCHEMA_FILE = "en4dvar.schema.json"
 _PLAIN = re.compile(r"[A-Za-z_./][\w ./*-]*[\w./*]|[A-Za-z_]")
@@ -69,12 +69,9 @@ class Source:
     @property
     def time_entry(self) -> str:
         """The ``time`` column as YAML."""
-        if self.step_unit is not None:
-            return f"{{step: {quoted(self.time_step or '')}, unit: {quoted(self.step_unit)}}}"
         if self.time is None:
-            return f"{{step: {quoted(self.time_step or '')}}}"
-        rate = f", rate: {quoted(self.rate)}" if self.rate is not None else ""
-        return f"{{name: {quoted(self.time[0])}, unit: {quoted(self.time[1])}{rate}}}"
+            return braced(step=self.time_step, unit=self.step_unit)
+        return braced(name=self.time[0], unit=self.time[1], rate=self.rate)
 
 
 # the table that 'en4dvar track' writes: its columns say their units
@@ -87,6 +84,11 @@ def quoted(text: str) -> str:
     """``text`` as a YAML scalar that is read as text, also inside braces."""
     plain = _PLAIN.fullmatch(text) and text.lower() not in _WORDS
     return text if plain else json.dumps(text, ensure_ascii=False)
+
+
+def braced(**texts: str | None) -> str:
+    """Keys and texts, but for those that are None, as a YAML mapping on one line."""
+    return f"{{{', '.join(f'{key}: {quoted(text)}' for key, text in texts.items() if text is not None)}}}"
 
 
 def yaml_text(name: str, source: Source, proposal: Proposal, command: str) -> str:
@@ -106,7 +108,7 @@ def yaml_text(name: str, source: Source, proposal: Proposal, command: str) -> st
         *source.layout_entries,
         "  columns:",
         f"    time: {source.time_entry}",
-        f"    {source.observable}: {{name: {quoted(source.radius[0])}, unit: {quoted(source.radius[1])}}}",
+        f"    {source.observable}: {braced(name=source.radius[0], unit=source.radius[1])}",
     ]
     lines = [
         *head,
@@ -314,7 +316,7 @@ def _with_rest(proposal: Proposal, readings: Mapping[str, Readings], unit: str) 
             words = f"{name} {value:g} of the file is not used: it is no radius at rest in {unit}, as its radii are"
             return replace(proposal, warnings=(*proposal.warnings, words))
     words = f"the file's, in the unit of its radii: without it G is uncertain; is it really {unit}?"
-    entry = Entry("R_eq", f"{{from_file: {quoted(name)}, unit: {quoted(unit)}}}", words)
+    entry = Entry("R_eq", braced(from_file=name, unit=unit), words)
     lines = tuple(entry if line.key == "R_eq" else line for line in proposal.parameters)
     return replace(proposal, parameters=lines)
 

@@ -22,7 +22,7 @@ from en4dvar.plumbing.units import UnitError, parse_quantity
 from en4dvar_bubble.collapse import doubt
 from en4dvar_bubble.medium import MEDIA, Medium, known_medium
 from en4dvar_bubble.model import BubbleModel
-from en4dvar_bubble.numbers import P_A
+from en4dvar_bubble.numbers import P_A, WALL_DISTANCE
 from en4dvar_bubble.starter.grouped import NO_GROUPS, Grouped
 from en4dvar_bubble.starter.guess import OF_GELS
 from en4dvar_bubble.starter.look import Look
@@ -55,6 +55,15 @@ LIKE_A_LIQUID = (
 
 
 @dataclass(frozen=True)
+class Entry:
+    """One line of a section: key, value as YAML, and a comment."""
+
+    key: str
+    value: str
+    comment: str = ""
+
+
+@dataclass(frozen=True)
 class Known:
     """A quantity as it stands in a configuration: its key, median with unit, std of its logarithm, the source, and what
     says that data sets do not have one value of it, "" where they do."""
@@ -65,10 +74,15 @@ class Known:
     source: str
     shared: str = ""
 
+    def prior(self, more: str = "") -> Entry:
+        """Its line of the parameters; ``more`` is what else stands in it, where data sets have one value."""
+        value = f"{{prior: lognormal, median: {self.median}, log_std: {self.log_std:g}{self.shared or more}}}"
+        return Entry(self.key, value, self.source)
+
 
 SCALE = Known(READING_SCALE.name, "1", 0.005, "size of a pixel: a calibration target tells it to about 0.5 %")
 PRESSURE = Known("p_inf", "101.3 kPa", 0.01, "weather moves it by 1 %, 100 m of height take 1.2 %: give yours")
-AMPLITUDE = (
+AMPLITUDE = Entry(
     f"# {P_A.name}",
     "{prior: normal, mean: -24 MPa, std: 5 %}",
     "amplitude of the driving: that of your pulse, with what your hydrophone errs by, often 5 or 10 %",
@@ -126,26 +140,21 @@ def centred(model: BubbleModel, medium: str) -> BubbleModel:
     return replace(model, medium=replace(model.medium, rho=rho, c=c, p_inf=parse_quantity(medians["p_inf"], "Pa")))
 
 
-def of_water(radius: float) -> dict[str, tuple[str, str]]:
-    """Priors of the viscosity and of R_eq of a bubble of ``radius`` (m) in water, with words: by name. What damps a
-    collapse in water is sound, heat and vapour, so that a guess from collapse and rebound books them as viscosity.
+def of_water(radius: float) -> tuple[Entry, Entry]:
+    """Priors of the viscosity and of R_eq of a bubble of ``radius`` (m). What damps a collapse in water is sound, heat
+    and vapour, so that a guess from collapse and rebound books them as viscosity.
     """
     off = math.exp(1.645 * 1.5)
-    return {
-        "mu": (
-            "{prior: lognormal, median: 0.002 Pa s, log_std: 1.5}",
-            f"viscosity: water has 0.0009; as a check, may be off by a factor of {off:.2g}; narrow it to what you know",
-        ),
-        "R_eq": (
-            f"{{prior: lognormal, median: {float(f'{5e4 * radius:.2g}'):g} um, log_std: 1}}",
-            "0.05 R_max, the little gas that water leaves; may be off by a factor of 5.2; narrow it to what you know",
-        ),
-    }
+    words = f"viscosity: water has 0.0009; as a check, may be off by a factor of {off:.2g}; narrow it to what you know"
+    rest = f"{{prior: lognormal, median: {float(f'{5e4 * radius:.2g}'):g} um, log_std: 1}}"
+    of_rest = "0.05 R_max, the little gas that water leaves; may be off by a factor of 5.2; narrow it to what you know"
+    mu = Entry("mu", "{prior: lognormal, median: 0.002 Pa s, log_std: 1.5}", words)
+    return mu, Entry("R_eq", rest, of_rest)
 
 
-def wall(radius: float, slowness: float) -> tuple[str, str, str]:
-    """The distance of a plane beside a bubble of ``radius`` (m) whose collapse takes ``slowness`` times Rayleigh's, its
-    prior and the source. Such a liquid may be viscous instead, and the plane, which makes it 1 + 0.205 R_max/h
+def wall(radius: float, slowness: float) -> tuple[Entry, Entry]:
+    """A plane beside a bubble of ``radius`` (m) whose collapse takes ``slowness`` times Rayleigh's, for the model, and
+    the prior of its distance. Such a liquid may be viscous instead, and the plane, which makes it 1 + 0.205 R_max/h
     (Rattray 1951), as far as a cuvette is wide: the prior is nearly flat in ln h, from where the bubble touches the
     plane to where nothing is seen of it.
     """
@@ -153,7 +162,7 @@ def wall(radius: float, slowness: float) -> tuple[str, str, str]:
     distance = f"{float(f'{median:.2g}'):g} um"
     prior = f"{{prior: logit, lower: {nearest:.4g} um, upper: {farthest:.4g} um, median: {distance}, logit_std: 2}}"
     source = f"the collapse takes {slowness:.2f} of the Rayleigh time, as beside a plane or in a viscous liquid"
-    return distance, prior, source
+    return Entry("wall", f"{{distance: {distance}}}", source), Entry(WALL_DISTANCE.name, prior, "of that plane")
 
 
 def plane_in_a_gel(views: Mapping[str, Look], medium: Medium) -> list[str]:

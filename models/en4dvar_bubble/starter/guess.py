@@ -108,7 +108,7 @@ def first_guess(model: BubbleModel, fixed: Mapping[str, float], observed: Mappin
 
 def _features(times: Array, radius: Array) -> dict[str, float]:
     try:
-        peak = lobe(times, radius, with_margin=False)
+        peak = lobe(times, radius)
     except DataError:
         return {"R_max": np.nan, "t_c": np.nan, "rebound": np.nan}
     return {"R_max": peak.R_max, "t_c": peak.t_c, "rebound": second_maximum(radius)}

@@ -116,9 +116,8 @@ def _fit(z: Array, y: Array, weight: Array, error: float, degree: int, curvature
     The place is as uncertain as the slope over the ``curvature`` that the collapse time tells: one that was fitted to
     few readings is small by chance, or large.
     """
-    X = np.vander(z, degree + 1)
-    covariance = np.linalg.pinv((weight[:, None] * X).T @ (weight[:, None] * X))
-    poly = np.poly1d(covariance @ X.T @ (weight**2 * y))
+    coefficients, covariance = np.polyfit(z, y, degree, w=weight, cov="unscaled")
+    poly = np.poly1d(coefficients)
     turning = [float(at.real) for at in poly.deriv().roots if abs(at.imag) < 1e-9 and poly.deriv(2)(at.real) < 0]
     if not turning:
         return None

@@ -19,6 +19,7 @@ from en4dvar_bubble.laws.loading import qualified
 from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.settings import BubbleSettings
 from en4dvar_bubble.starter import elsewhere
+from en4dvar_bubble.starter.elsewhere import Entry
 from en4dvar_bubble.starter.grouped import NO_GROUPS, Grouped
 from en4dvar_bubble.starter.guess import FAR, OF_GELS, Guess, first_guess
 from en4dvar_bubble.starter.look import Look, Start, common_rest, look, typical, usable, without_rebound
@@ -57,15 +58,6 @@ SAME_CLOCK, CLOCK_STD = 2e-6, 1e-6  # s: of a guessed clock; of 30 synthetic bub
 EACH_ALONE = "of each bubble alone, which the gel's numbers do not use; 'true' takes up to twice the time"
 BUBBLES = (1e-7, 0.1)  # m: between these radii
 SEEN = (3e-6, 50e-9, 1e-4)  # m, s, m: one below is not read in shorter steps; radius of a usual bubble
-
-
-@dataclass(frozen=True)
-class Entry:
-    """One line of a section: key, value as YAML, and a comment."""
-
-    key: str
-    value: str
-    comment: str = ""
 
 
 @dataclass(frozen=True)
@@ -146,18 +138,15 @@ def propose(
         warnings += elsewhere.plane_in_a_gel(looks, model.medium)
     elif "G" in guess.values:
         believed = Guess({}, {}, 0.0)  # of a gel that a pulse stretches, readings tell G α/R0 alone
-    wall: tuple[tuple[Entry, ...], tuple[Entry, ...]] = (), ()
     slow = elsewhere.SLOW[0] < ratio < elsewhere.SLOW[1]
-    if slow and _in_a_liquid(model):
-        distance, prior, source = elsewhere.wall(look.lobe.R_max, ratio)
-        wall = (Entry("wall", f"{{distance: {distance}}}", source),), (Entry("wall_distance", prior, "of that plane"),)
+    wall = elsewhere.wall(look.lobe.R_max, ratio) if slow and _in_a_liquid(model) else ()
     sizes = {group: len(looks.keys() & {*names}) for group, names in groups.of.items()}
     vary = [p.name for p in model.law.parameters] + [R0.name] * (R0 in model.parameters and math.isnan(look.before[0]))
     together = elsewhere.population(vary, max(sizes.values(), default=len(views)), medium, _in_a_liquid(model), groups)
     return Proposal(
         _data(look, model, {**others, **guess.values}, views),
-        (*_model(law_name, model, look), *wall[0]),
-        (*_parameters(model, look, believed, tops(looks, histories, scale), medium, scale), *wall[1]),
+        (*_model(law_name, model, look), *wall[:1]),
+        (*_parameters(model, look, believed, tops(looks, histories, scale), medium, scale), *wall[1:]),
         SIMPLER[chosen],
         (*told, *[f"{len(views)} bubbles: {_ends_with(groups.kind, sizes)}"] * bool(together)),
         (*warnings, *unseen),
@@ -220,7 +209,7 @@ def starter(start: Start, law: str | None) -> Proposal:
         data[:0] = [Entry("window", "{from: top, to: end}", words), Entry("time_zero", "top")]
     lines = [example(p, model) for p in model.law.parameters]
     lines += _radii(start, None)
-    lines += [Entry(*elsewhere.AMPLITUDE)] * (start == "acoustic")
+    lines += [elsewhere.AMPLITUDE] * (start == "acoustic")
     lines += [Entry("t_s", "{prior: normal, mean: 0 us, std: 0.5 us}", "the clock of the data against the model's")]
     return Proposal(tuple(data), _model(law_name, model, None), tuple(lines), SIMPLER[start])
 
@@ -392,10 +381,11 @@ def _parameters(
     model: BubbleModel, look: Look, guess: Guess, top: Tops, medium: str, scale: elsewhere.Known
 ) -> tuple[Entry, ...]:
     start, lines = model.start, []
-    water = elsewhere.of_water(look.lobe.R_max) if medium == "water" and _in_a_liquid(model) else {}
+    in_water = medium == "water" and _in_a_liquid(model)
+    water = {line.key: line for line in elsewhere.of_water(look.lobe.R_max) if in_water}
     for p in model.law.parameters:
         if p.name in water:
-            lines.append(Entry(p.name, *water[p.name]))
+            lines.append(water[p.name])
         elif p.name in guess.values:
             width = float(np.clip(guess.log_std[p.name], *WIDTHS[p.name]))
             lines.append(_spread(p, guess.values[p.name], width, f"{guess.source},", "knew before"))
@@ -403,9 +393,9 @@ def _parameters(
             lines.append(example(p, model))
     radii = {line.key: line for line in _radii(start, look, top, scale)}
     if R_EQ.name in water and not np.isfinite(look.rest):
-        radii[R_EQ.name] = Entry(R_EQ.name, *water[R_EQ.name])
+        radii[R_EQ.name] = water[R_EQ.name]
     lines += radii.values()
-    lines += [Entry(*elsewhere.AMPLITUDE)] * (start == "acoustic")
+    lines += [elsewhere.AMPLITUDE] * (start == "acoustic")
     mean, std = (0.0, CLOCK_STD) if start == "acoustic" else top.t_s
     prior = f"{{prior: normal, mean: {_text(mean, 's', 'us', 4)}, std: {_text(std, 's', 'us')}}}"
     words = "the clock of the data against that of the pulse"
@@ -416,15 +406,7 @@ def _parameters(
         *lines,
         Entry("t_s", prior, words),
         Entry("sigma", sigma, "scale of the stated errors"),
-        *known_elsewhere(medium, scale=scale),
-    )
-
-
-def known_elsewhere(medium: str, more: str = "", scale: elsewhere.Known = elsewhere.SCALE) -> tuple[Entry, ...]:
-    """Priors of what is known from elsewhere than from the data; ``more`` is what else stands in each."""
-    return tuple(
-        Entry(k.key, f"{{prior: lognormal, median: {k.median}, log_std: {k.log_std:g}{k.shared or more}}}", k.source)
-        for k in elsewhere.known(medium, scale)
+        *(it.prior() for it in elsewhere.known(medium, scale)),
     )
 
 

@@ -17,7 +17,8 @@ from en4dvar.plumbing.tables import csv_text
 from en4dvar_bubble.collapse import RAYLEIGH
 from en4dvar_bubble.medium import Medium
 from en4dvar_bubble.starter.config import Source
-from en4dvar_bubble.starter.proposal import WHY, Entry, Proposal, built, example, known_elsewhere
+from en4dvar_bubble.starter.elsewhere import Entry, known
+from en4dvar_bubble.starter.proposal import WHY, Proposal, built, example
 
 RADII = (1e-6, 0.1)  # m
 STRETCHES = (1.5, 50.0)  # R_max/R_eq
@@ -91,7 +92,7 @@ def propose_from_times(rows: Summaries, law: str | None, medium: str) -> Proposa
             Entry("start", "laser", "the clock starts at R_max"),
             *(Entry(key, value, WHY[value]) for key, value in {"gas": "heat", "vapour": "transport"}.items()),
         ),
-        (*of_gel, *radii, *known_elsewhere(medium, SHARED)),
+        (*of_gel, *radii, *(it.prior(SHARED) for it in known(medium))),
         {},
         (f"{told}, one a bubble; the gel is common to all",),
         assimilation=(
