@@ -57,8 +57,8 @@ class Outline:
     the contrast of the movie; ``mode_std`` is the std of a mode's amplitude. ``seen`` is the share of the
     outline that can be seen. ``rows`` is by how much even rows show a larger bubble than odd ones, ``rows_std`` what
     noise makes of it. ``joined`` is the std for nested circles that lie too close to be told apart, which all
-    have their mean radius. ``oval`` is the outline as an ellipse, where the frame
-    cuts it, and ``better`` by how much its −log likelihood is less.
+    have their mean radius. ``oval`` is the outline as an ellipse, where the frame cuts it, and ``better`` by how much
+    its −log likelihood is less.
     """
 
     circle: Circle
