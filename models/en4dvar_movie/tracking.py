@@ -17,8 +17,9 @@ from en4dvar_movie.flashes import in_time
 from en4dvar_movie.following import Chain, chains, doubts, reasons, target
 from en4dvar_movie.frames import Frame, Movie
 from en4dvar_movie.outline import Optics, Outline
-from en4dvar_movie.uncertainty import NOTHING, Errors, errors_of
+from en4dvar_movie.uncertainty import NOTHING, Errors, errors_of, with_ellipses
 
+UNREAD = 3  # frames: what makes doubtful whether something beside the bubble stands still
 AWAY = 10.0  # pixels from a bubble that a point may be to mean it
 
 
@@ -117,7 +118,7 @@ def track(
         tuple(_readings(looks, bubble, bubbles, fixed if n == 0 else {}, optics, movie.rate, flashes, share))
         for n, bubble in enumerate(bubbles or [Chain(())])
     ]
-    if not background.frames and any(r.reason in (TOUCHES, NO_CIRCLE) for r in read[0]):
+    if not background.frames and sum(r.reason in (TOUCHES, NO_CIRCLE) for r in read[0]) >= UNREAD:
         notes.append(
             "no frame is empty, and what stands still beside the bubble may have been taken for a part of it: an empty "
             "frame in front shows what that is, and a tight --mask leaves it out"
@@ -148,6 +149,8 @@ def _readings(
         for c, order in zip(bubble.candidates, orders, strict=True)
     }
     readings = [r for look in looks for r in seen.get(look.frame) or [Reading(look.frame, None, why[look.frame])]]
+    read = with_ellipses([r.outline for r in readings])
+    readings = [replace(r, outline=outline) for r, outline in zip(readings, read, strict=True)]
     good = [None if r.frame in doubtful or r.frame in out else r.outline for r in readings]
     for reading, outline, errors in zip(readings, good, errors_of(good, optics, exposure), strict=True):
         correction, doubt = corrections.get(reading.frame), doubtful.get(reading.frame, "")

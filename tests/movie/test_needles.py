@@ -33,13 +33,13 @@ def off(readings, radii):
     return np.array([r.radius for r in readings]) - radii - 0.6 / np.asarray(radii)
 
 
-def needle(towards, gap, width, point=0.0, blur=0.8):
-    """From the border to a ``gap`` from the bubble's centre, ``towards`` which it lies (degrees from x to y); it gets
-    thinner over the length of its ``point``."""
+def needle(towards, gap, width, point=0.0, blur=0.8, centre=CENTRE):
+    """From the border to a ``gap`` from a place, ``towards`` which it lies (degrees from x to y); it gets thinner over
+    the length of its ``point``."""
     y, x = np.indices(SHAPE)
     way = np.deg2rad(towards)
-    along = (x - CENTRE[0]) * np.cos(way) + (y - CENTRE[1]) * np.sin(way) - gap
-    across = np.abs((y - CENTRE[1]) * np.cos(way) - (x - CENTRE[0]) * np.sin(way))
+    along = (x - centre[0]) * np.cos(way) + (y - centre[1]) * np.sin(way) - gap
+    across = np.abs((y - centre[1]) * np.cos(way) - (x - centre[0]) * np.sin(way))
     return ndimage.gaussian_filter((across < width / 2 * np.clip(along / (point + 0.1), 0, 1)).astype(float), blur)
 
 
@@ -118,3 +118,36 @@ def test_an_ellipse_at_rest_at_a_needle_is_told_from_it():
     assert np.sum(np.isfinite(wrong)) >= len(radii) - 2
     assert np.nanmax(np.abs(wrong)) < 0.5
     assert np.nanmax(np.abs(wrong) / [max(r.errors.std, 0.1) if r.used else 1 for r in result.readings]) < 4
+
+
+@pytest.mark.parametrize("radii", [[22.0, 21.1, 20.3, 19.4, 18.6, *[17.7] * 25], 17 + np.sin(np.arange(30) / 2)])
+def test_half_a_disc_at_a_wall_is_told_from_a_needle_that_reaches_into_it(radii):
+    centre = (70.0, SHAPE[0] - 0.5)
+    result = track(movie_of(filmed(needle(180, 10, 6, centre=(70.0, 111.0)), radii, centre)))
+    assert np.abs(off(result.readings, radii)).max() < 0.2
+    assert np.median([r.errors.std for r in result.readings]) < 0.1
+
+
+@pytest.mark.parametrize("ratio", [1.7, 2.0])
+def test_an_ellipse_at_rest_that_the_frame_cuts_is_no_needle_and_has_its_own_radius(ratio):
+    """Its radius is the mean over its outline, as that of a bubble which the frame shows whole."""
+    areal = np.array([24.0, 21, 17, 15, *[14.5] * 26])
+    turns = np.linspace(0, np.pi, 180, endpoint=False)
+    radii = areal * np.mean(1 / np.hypot(np.cos(turns) / ratio**0.5, np.sin(turns) * ratio**0.5))
+    for centre in ((135.2, 58.7), (133.6, 60.1)):
+        movie = movie_of(filmed(0.0, areal, centre, stretch=ratio))
+        result = track(movie)
+        assert not movie.notes
+        assert np.abs(off(result.readings, radii)).max() < 0.3
+        assert result.readings[-1].outline.amplitude(2) > 0.2 * radii[-1]
+
+
+@pytest.mark.parametrize("unread", [1, 4])
+def test_several_frames_that_cannot_be_read_make_what_stands_still_doubtful(unread):
+    radii = [30.0, 26, 22, 18, 15, *[12.0] * 10]
+    frames = filmed(0.0, radii)
+    for frame in frames[6 : 6 + unread]:
+        frame[58:63, 10:130] = 30
+    result = track(movie_of(frames))
+    assert sum(not r.used for r in result.readings) == unread
+    assert len(result.notes) == (unread > 1)
