@@ -232,24 +232,6 @@ def _bound(case: Case) -> str:
     )
 
 
-def _conflict(case: Case) -> str:
-    prior = case.a.problem.prior
-    x = np.array([float(t.from_physical(np.array(v))) for t, v in zip(prior.terms, case.a.centre, strict=True)])
-    z = np.abs(x - prior.mean) / prior.std
-    j = int(np.argmax(z))
-    factor = math.ceil(z[j] / 2)
-    if prior.names[j] == NOISE_SCALE.name and x[j] < prior.mean[j]:
-        return (
-            "state in data.error what a reading has of its own: these scatter far less than is stated. What all of "
-            "them share is no error of each, but a parameter (reading_scale, reading_offset); of a movie, give its "
-            "--exposure to en4dvar track"
-        )
-    return (
-        f"check units and data; if both are right, make the prior of {prior.names[j]} about {factor} times as wide "
-        f"(parameters.{prior.names[j]}) and say so"
-    )
-
-
 def _modes(case: Case) -> str:
     name = case.caution.parameters[0] if case.caution.parameters else case.a.parameters[0].name
     apart = f"what is known from elsewhere, as bounds of the prior (parameters.{name}), tells them apart"
@@ -338,7 +320,6 @@ ADVICE: dict[str, Callable[[Case], str]] = {
     "chain-not-converged": _chain,
     "non-gaussian": _gaussian,
     "at-bound": _bound,
-    "prior-conflict": _conflict,
     "several-modes": _modes,
     "starts-disagree": _starts,
     "members-lost": _lost,

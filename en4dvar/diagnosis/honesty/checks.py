@@ -13,10 +13,10 @@ from en4dvar.diagnosis import diagnostics as diag
 from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.ensemble.members import NOT_FINITE
 from en4dvar.model.forward import ValidityLimit
-from en4dvar.model.state import Array, Mask, Parameter
+from en4dvar.model.state import NOISE_SCALE, Array, Mask, Parameter
 from en4dvar.plumbing.caution import Caution, Severity, caution
 from en4dvar.plumbing.units import convert
-from en4dvar.priors.prior import Prior
+from en4dvar.priors.prior import Prior, PriorTerm
 
 SAME_DIRECTION = 1e-8  # relative singular value below which anomalies do not span a direction
 NEAR = 0.05  # of the width of an interval
@@ -151,25 +151,49 @@ def _chance(probability: float) -> str:
 
 
 def conflict(prior: Prior, centre: Array) -> Findings:
-    """A posterior centre (n,) far from the prior: 2 J_b beyond what χ²_n exceeds once in 4000, or one of the z² beyond
-    what the largest of n does.
+    """A posterior centre (n,) far from the prior."""
+    terms = dict(zip(prior.names, prior.terms, strict=True))
+    return far_from(terms, (centre - prior.mean) / prior.std, prior.white(centre))
+
+
+def far_from(terms: Mapping[str, PriorTerm], z: Array, white: Array) -> Findings:
+    """A minimum of J where 2 J_b is beyond what χ²_n exceeds once in 4000, or one of the z² beyond what the largest of
+    n does.
+
+    ``z`` (n,) are prior standard deviations from the mean of each of ``terms``, by what it is called; ``white`` (n,)
+    are its white coordinates.
     """
-    z, white, each = (centre - prior.mean) / prior.std, prior.white(centre), diag.TAIL / 2
+    each = diag.TAIL / 2
     together, alone = diag.chi2_interval(len(z), each)[1], diag.chi2_interval(1, each / len(z))[1]
     if float(white @ white) <= together and np.max(z**2) <= alone:
         return
-    worst = np.argsort(-np.abs(z))
+    names, priors, worst = list(terms), list(terms.values()), np.argsort(-np.abs(z))
     far = [j for j in worst if abs(z[j]) > 2] or worst[:1]
-    places = "; ".join(_far(prior, z, j) for j in far)
-    yield caution("prior-conflict", f"prior and data conflict: the minimum lies far from the prior mean ({places})")
+    places = "; ".join(_far(names[j], priors[j], float(z[j])) for j in far)
+    told = caution("prior-conflict", f"prior and data conflict: the minimum lies far from the prior mean ({places})")
+    yield replace(told, advice=_wider(priors[worst[0]].parameter.name, float(z[worst[0]])))
 
 
-def _far(prior: Prior, z: Array, j: int) -> str:
+def _far(name: str, term: PriorTerm, z: float) -> str:
     """Where the minimum lies and where the prior does, in the display unit."""
-    term, p = prior.terms[j], prior.parameters[j]
-    value, low, high = term.to_physical(prior.mean[j] + prior.std[j] * np.array([z[j], -1.0, 1.0]))
+    p = term.parameter
+    value, low, high = term.to_physical(term.mean + term.std * np.array([z, -1.0, 1.0]))
     said = f"the prior says {convert(low, p.unit, p.display_unit):.3g} to {shown(high, p)}"
-    return f"{p.name} at {shown(value, p)} where {said}: {z[j]:+.1f} prior standard deviations"
+    return f"{name} at {shown(value, p)} where {said}: {z:+.1f} prior standard deviations"
+
+
+def _wider(name: str, z: float) -> str:
+    """What to do about a parameter so many prior standard deviations from its prior mean."""
+    if name == NOISE_SCALE.name and z < 0:
+        return (
+            "state in data.error what a reading has of its own: these scatter far less than is stated. What all of "
+            "them share is no error of each, but a parameter (reading_scale, reading_offset); of a movie, give its "
+            "--exposure to en4dvar track"
+        )
+    return (
+        f"check units and data; if both are right, make the prior of {name} about {math.ceil(abs(z) / 2)} times as "
+        f"wide (parameters.{name}) and say so"
+    )
 
 
 def shown(value: float, p: Parameter) -> str:

@@ -13,9 +13,10 @@ experiments. Only where both are improbable the experiment is odd; and the rest 
 Identification of Outliers, ch. 5). Where the others scatter by more than their errors themselves, both are compared
 with the others' median by an F distribution: of data sets that all differ, none is odd.
 
-What a joint estimate says against itself follows: data sets that are odd, differ, are not fitted, or follow a trend. A
-value of the material that rises with the size of the bubble, with the order in which data sets were taken or with the
-time between readings is what a wrong scale, a wall, a drift or a wrong law leaves behind.
+What a joint estimate says against itself follows: data sets that are odd, differ, are not fitted, or follow a trend,
+and priors that conflict with them. A value of the material that rises with the size of the bubble, with the order in
+which data sets were taken or with the time between readings is what a wrong scale, a wall, a drift or a wrong law
+leaves behind.
 """
 
 from collections.abc import Collection, Iterator, Sequence
@@ -25,6 +26,8 @@ import numpy as np
 from scipy.special import chdtrc, fdtrc, gammaincinv
 
 from en4dvar.diagnosis.diagnostics import chi2_interval
+from en4dvar.diagnosis.honesty import checks
+from en4dvar.estimation.joint.descent import Place
 from en4dvar.estimation.joint.problem import JointProblem, Single
 from en4dvar.model.state import Array, Indices
 from en4dvar.plumbing.caution import Caution, caution
@@ -161,10 +164,10 @@ def _chance(square: float, freedom: float, scatter: float, degrees: float) -> fl
 
 
 def doubts(
-    joint: JointProblem, border: Array, chi2: Array, agreed: Agreement, kept: Collection[int], singles: Sequence[Single]
+    joint: JointProblem, place: Place, chi2: Array, agreed: Agreement, kept: Collection[int], singles: Sequence[Single]
 ) -> Iterator[Caution]:
-    """Warnings of a joint estimate about its data sets, with the shared values ``border`` (c,) in units of the prior
-    and χ² (E,) per reading; those not ``kept`` are odd.
+    """Warnings of a joint estimate about its data sets and priors, with J lowest at ``place`` and χ² (E,) per reading
+    there; those not ``kept`` are odd.
     """
     odd = [
         f"{name} (χ² {chi2[e]:.3g} per reading, {agreed.squares[e] ** 0.5:.1f} standard deviations from all others, "
@@ -189,7 +192,19 @@ def doubts(
             advice += f", or, where errors were stated too small, state them {agreed.scatter:.1f} times as large"
         yield replace(caution("data-sets-differ", words), advice=advice)
     yield from _misfits(joint, chi2, kept)
-    yield from _trends(joint, border, singles)
+    yield from _conflict(joint, place)
+    yield from _trends(joint, place.border, singles)
+
+
+def _conflict(joint: JointProblem, place: Place) -> Iterator[Caution]:
+    """Of data and priors, of what is shared and of what each data set has of its own."""
+    terms = dict(zip(map(joint.words, joint.shared), joint.terms, strict=True))
+    for e, name in enumerate(joint.names):
+        own = [joint.experiments[e].prior.terms[j] for j in joint.columns(e)[1]]
+        terms |= {f"{term.parameter.name} of {name}": term for term in own}
+    z = np.concatenate([place.border, *place.own])
+    for told in checks.far_from(terms, z, z):
+        yield replace(told, advice=f"{told.advice}; then make the runs again")
 
 
 def _misfits(joint: JointProblem, chi2: Array, kept: Collection[int]) -> Iterator[Caution]:

@@ -155,7 +155,7 @@ class _Estimate:
         kept = [e for e, name in enumerate(joint.names) if name in names]
         costs = [form.cost + 0.5 * float(v @ v) for form, v in zip(lowest.at.forms, lowest.at.place.own, strict=True)]
         agreed = agreement(joint, said, kept, 2 * np.maximum(costs - alone, 0))
-        cautions += doubts(joint, lowest.at.place.border, lowest.at.chi2(joint), agreed, kept, singles)
+        cautions += doubts(joint, lowest.at.place, lowest.at.chi2(joint), agreed, kept, singles)
         normalisation = sum(problem.observations.log_normalisation() for problem in joint.experiments)
         return JointEstimate(
             joint=joint,
