@@ -49,12 +49,16 @@ def test_denkf_is_the_etkf_to_first_order():
 
 
 @pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("k", [3, 20])
-def test_enkf_n_minimises_its_cost(seed, k):
-    e, n = evaluation(k=k, seed=seed), 8
+@pytest.mark.parametrize(("k", "scale"), [(3, 2.0), (20, 1.0), (3, 0.3)])
+def test_enkf_n_minimises_its_cost(seed, k, scale):
+    """Its logarithm has the factor N + 1, and less where less is learned than ε_N degrees of freedom."""
+    e, n = evaluation(k=k, scale=scale, seed=seed), 8
+    learned = np.trace(e.S @ np.linalg.inv((n - 1) * np.eye(n) + e.S.T @ e.S) @ e.S.T)
+    assert (learned < 1 + 1 / n) == (scale < 1)
+    factor = n - 1 / n + min(1 + 1 / n, learned)
 
     def cost(w):
-        return 0.5 * np.sum((e.d - e.S @ w) ** 2) + 0.5 * (n + 1) * np.log(1 + 1 / n + w @ w)
+        return 0.5 * np.sum((e.d - e.S @ w) ** 2) + 0.5 * factor * np.log(1 + 1 / n + w @ w)
 
     found = analysed(EnKFN(), e)
     direct = minimize(cost, found.w + 0.1, method="BFGS", options={"gtol": 1e-9})
@@ -79,9 +83,10 @@ def test_enkf_n_of_an_ensemble_that_is_lost_stays_finite():
     assert np.isfinite(step.w).all()
 
 
-def test_without_information_enkf_n_keeps_the_mean():
-    e = Evaluation(np.ones(3), np.zeros((3, 6)))
-    assert analysed(EnKFN(), e).w == pytest.approx(np.zeros(6), abs=1e-12)
+def test_without_information_enkf_n_keeps_mean_and_spread():
+    weights = analysed(EnKFN(), Evaluation(np.ones(3), np.zeros((3, 6))))
+    assert weights.w == pytest.approx(np.zeros(6), abs=1e-12)
+    assert np.abs(weights.T - np.eye(6)).max() < 1e-12
 
 
 @pytest.mark.parametrize("scheme", ["etkf", "denkf", "enkf", "esrf", "enkf-n"])

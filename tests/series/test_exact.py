@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import multivariate_normal
 
+import en4dvar
 from en4dvar.data.noise import Correlation
 from en4dvar.ensemble.linalg import centre
 from en4dvar.executor import SerialExecutor, ThreadsExecutor
@@ -74,6 +76,29 @@ def test_etkf_is_the_kalman_filter_of_the_ensemble_moments(n_members):
         close(result.analysis.std[k, :8], np.sqrt(np.diag(cov)))
     close(np.cov(result.members[:, :8].T), cov)
     close(result.members[:, 8], 0.1)
+
+
+@pytest.mark.parametrize("n_members", [10, 48])
+@pytest.mark.parametrize("seed", range(3))
+def test_enkf_n_has_the_spread_of_the_kalman_filter_after_many_weak_readings(n_members, seed):
+    """A line, read 200 times with an error of 10. The spread of N drawn members is off by 1 in √(2N − 2)."""
+    times, rng = np.arange(1, 201) / 10, np.random.default_rng(seed)
+    design, prior = np.column_stack([np.ones(200), times]), np.diag([9.0, 4.0])
+    readings = design @ [1.0, -0.2] + 10 * rng.standard_normal(200)
+    result = en4dvar.estimate_sequence(
+        "trend",
+        {"x": (times, readings)},
+        {"level": {"prior": "normal", "mean": 0, "std": 3}, "slope": {"prior": "normal", "mean": 0, "std": 2}},
+        error={"x": 10.0},
+        assimilation={"scheme": "enkf-n", "members": n_members},
+        seed=seed,
+    )
+    cov = np.linalg.inv(np.linalg.inv(prior) + design.T @ design / 100)
+    std = np.sqrt(np.diag(cov))
+    assert result.run.analysis.std[-1, 1:] == pytest.approx(std, rel=1 / np.sqrt(2 * n_members - 2))
+    assert np.all(np.abs(result.run.analysis.mean[-1, 1:] - cov @ design.T @ readings / 100) < 0.3 * std)
+    whole = multivariate_normal(np.zeros(200), design @ prior @ design.T + 100 * np.eye(200))
+    assert result.log_evidence == pytest.approx(whole.logpdf(readings), abs=1)
 
 
 @pytest.mark.parametrize("linearisation", ["transform", "bundle"])

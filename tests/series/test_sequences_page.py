@@ -57,5 +57,8 @@ def test_every_scheme_covers_it(scheme):
 
 def test_from_arrays(capsys):
     result = runpy.run_path("from_arrays.py")["result"]
+    mean, std = (float(moment[-1, 4]) for moment in (result.run.analysis.mean, result.run.analysis.std))
+    assert f"ρ ends at {mean:.2f} ± {std:.2f} here" in PAGE
+    assert abs(mean - 28.5) < 2.5 * std
     assert np.sqrt(np.nanmean(result.normalised**2)) == pytest.approx(1, abs=0.15)
     assert "innovations over their spread" in capsys.readouterr().out
