@@ -43,7 +43,8 @@ def stds(known: Callable[[ForwardModel], Mapping[str, Any]], relative: bool = Fa
 
 
 class SeriesLocalisation(Section):
-    """Gaspari–Cohn taper over the indices of the observed field; it vanishes from ``2 radius`` on."""
+    """Gaspari–Cohn taper over the indices of the observed field; it vanishes from ``2 radius`` on. For parameters an
+    observation has its mean weight over the field."""
 
     radius: Annotated[float, Field(gt=0)]
     """Radius of the taper, in indices: an observation has no influence from twice this distance on."""
@@ -110,9 +111,9 @@ class Sequential(_OnASeries):
     """The scheme and what it does to the ensemble."""
 
     inflation: Annotated[float, Field(gt=0)] = 1.0
-    """Factor on the anomalies after each analysis; 1 is none."""
+    """Factor on the anomalies after each analysis, beside a localisation of the field alone; 1 is none."""
     rtps: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """Relaxation to the prior spread, 0 (none) to 1."""
+    """Relaxation to the prior spread, of what is inflated, 0 (none) to 1."""
     rotation: bool = False
     """Rotate the ensemble at random after each analysis, mean and covariance kept."""
     additive: Literal["drawn", "square-root"] = "drawn"
@@ -205,16 +206,20 @@ def localisation_of(
     if len(fields) != 1 or observed != {fields[0].name}:
         raise ConfigError("needs a model whose state is one field, and this field observed")
     (field,) = fields
+    where = np.arange(model.layout.size)[model.layout[field.name]]
     if settings.shape:
         if math.prod(settings.shape) != field.size:
             grid_cells = " x ".join(map(str, settings.shape))
             raise ConfigError(f"{grid_cells} cells, but {field.name} has {field.size}", "shape")
-        where = np.arange(model.layout.size)[model.layout[field.name]]
-        grid = BlockLocalisation.on_grid(where, settings.shape, settings.radius, settings.periodic)
-        return grid if cells is None else replace(grid, taper=grid.taper[:, np.rint(cells).astype(int)])
-    positions = np.arange(field.size, dtype=float)
-    state = np.full(model.layout.size, np.nan)
-    state[model.layout[field.name]] = positions
-    period = float(field.size) if settings.periodic else None
-    at = positions if cells is None else cells
-    return BlockLocalisation.on_line(state, at, settings.radius, period, settings.block_size)
+        local = BlockLocalisation.on_grid(where, settings.shape, settings.radius, settings.periodic)
+        if cells is not None:
+            local = replace(local, taper=local.taper[:, np.rint(cells).astype(int)])
+    else:
+        positions = np.arange(field.size, dtype=float)
+        state = np.full(model.layout.size, np.nan)
+        state[where] = positions
+        period = float(field.size) if settings.periodic else None
+        at = positions if cells is None else cells
+        local = BlockLocalisation.on_line(state, at, settings.radius, period, settings.block_size)
+    rest = np.setdiff1d(np.arange(model.layout.size), where)
+    return local.with_placeless(rest) if rest.size else local

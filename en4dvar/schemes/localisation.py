@@ -5,8 +5,9 @@ beyond the support. Sources: Hunt, Kostelich & Szunyogh (2007), Physica D 230, 1
 (1999), Q. J. R. Meteorol. Soc. 125, 723, eq. 4.10 (taper).
 """
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -38,11 +39,12 @@ def distances(a: Array, b: Array, period: float | None = None) -> Array:
 class BlockLocalisation:
     """``blocks``: indices of the state variables analysed together; ``taper`` (blocks, K') weighs the observations.
 
-    State variables in no block keep their forecast.
+    State variables in no block keep their forecast. ``placeless``: the last block is of variables without a place.
     """
 
     blocks: Sequence[Indices]
     taper: Array
+    placeless: bool = False
 
     @classmethod
     def on_line(
@@ -69,15 +71,44 @@ class BlockLocalisation:
         squares = sum(distances(x, x, length) ** 2 for x, length in zip(cells, lengths, strict=True))
         return cls([where[i : i + 1] for i in range(len(where))], gaspari_cohn(np.sqrt(squares), radius))
 
+    def with_placeless(self, variables: Indices) -> "BlockLocalisation":
+        """The same with a block of ``variables`` without a place, for which an observation has its mean weight.
+
+        To first order that is the average of the local analyses. If all observations counted fully, chance correlations
+        of few members would make it far too sure.
+        """
+        taper = np.vstack([self.taper, self.taper.mean(axis=0)])
+        return replace(self, blocks=[*self.blocks, variables], taper=taper, placeless=True)
+
+    @property
+    def without_place(self) -> Indices:
+        """The variables without a place; inflation leaves them alone, for :meth:`rows` keeps their spread."""
+        return self.blocks[-1] if self.placeless else np.empty(0, dtype=int)
+
+    def analysed(self, ensemble: Array) -> list[tuple[Indices, Array]]:
+        """Blocks and their tapers, of those that vary among the members (N, n) and have observations."""
+        varies = np.ptp(ensemble, axis=0) > 0
+        pairs = zip(self.blocks, self.taper, strict=True)
+        return [(block, taper) for block, taper in pairs if (taper > 0).any() and varies[block].any()]
+
+    def rows(self, block: Indices, weights: Weights) -> Array:
+        """Rows (N, N) of the analysis of a block.
+
+        Variables without a place get back what T takes by chance from the variance of anything that no observation
+        tells of, on average the share 1 − (‖T‖² − 1)/(N − 1).
+        """
+        transform, wider = weights.dense, 1.0
+        if block is self.without_place:
+            wider = max(1.0, math.sqrt((len(transform) - 1) / (np.sum(transform**2) - 1)))
+        return np.asarray(weights.w + wider * transform)
+
     def analysis(self, scheme: Scheme, ensemble: Array, evaluation: Evaluation, draw: Draw) -> Array:
         """Local analysis (N, n) of members (N, n) by a filter's scheme, block by block."""
         analysed = ensemble.copy()
         prior = Weights.prior(len(ensemble))
-        for block, taper in zip(self.blocks, self.taper, strict=True):
-            if not (taper > 0).any():
-                continue
+        for block, taper in self.analysed(ensemble):
             step = scheme.advance(prior, _tapered(evaluation, taper), 0, _of_some(draw, taper > 0))
-            analysed[:, block] = apply_weights(ensemble[:, block], step.weights.rows)
+            analysed[:, block] = apply_weights(ensemble[:, block], self.rows(block, step.weights))
         return analysed
 
 
@@ -90,15 +121,14 @@ class BlockDescents:
 
     def __init__(self, localisation: BlockLocalisation, ensemble: Array):
         self.ensemble = ensemble
-        self.near = [(block, taper) for block, taper in zip(localisation.blocks, localisation.taper, strict=True)
-                     if (taper > 0).any()]  # fmt: skip
+        self.near = localisation.analysed(ensemble)
         self.weights = [Weights.prior(len(ensemble))] * len(self.near)
 
-    def members(self, rows: Callable[[Weights], Array]) -> Array:
-        """Members (N, n): ``rows`` (N, N) of each block's weights, and what is in no block as it was."""
+    def members(self, rows: Callable[[Indices, Weights], Array]) -> Array:
+        """Members (N, n): ``rows`` (N, N) of each block and its weights, and what is in no block as it was."""
         members = self.ensemble.copy()
         for (block, _), weights in zip(self.near, self.weights, strict=True):
-            members[:, block] = apply_weights(self.ensemble[:, block], rows(weights))
+            members[:, block] = apply_weights(self.ensemble[:, block], rows(block, weights))
         return members
 
     def advance(

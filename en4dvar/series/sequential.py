@@ -158,7 +158,11 @@ class _Run:
                 transform = rotate(transform, turned)
             weights, analysis = descent.weights.w + transform, mean + anomalies
             self.settings.smoother.passed(self.trail, newest - 1, forecasts, analysis, weights, self.put_smoothed)
-        self.ensemble = mean + self.settings.inflation.apply(members, anomalies)
+        inflated = self.settings.inflation.apply(members, anomalies)
+        if window.localisation is not None:
+            kept = window.localisation.without_place
+            inflated[:, kept] = anomalies[:, kept]
+        self.ensemble = mean + inflated
         if not repeated or first == 1:
             self.record_ahead([at for at in window.ahead if at.index >= first])
         complete = self.completed(posterior, newest) if repeated else self.ensemble

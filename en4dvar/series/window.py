@@ -202,7 +202,7 @@ class CycleWindow(Objective[CycleDescent]):
             width = 1.0 if scheme.filters else float(scheme.members(descent.weights)[0, 0])
             members = self.members if width == 1 else self.mean + width * self.anomalies
         elif self.local:
-            members = self.local.members(scheme.members)
+            members = self.local.members(lambda _, weights: scheme.members(weights))
         else:
             members = self.mean + scheme.members(descent.weights) @ self.anomalies
         states = self.flow.forecast(members, self.start, self.indices)
@@ -236,8 +236,8 @@ class CycleWindow(Objective[CycleDescent]):
             step = self.local.advance(scheme, self.runs, self.whiten, descent.iteration, self.draw)
             descent.step = Step(descent.weights, step)
         descent.ended = scheme.done(descent.iteration, descent.step)
-        if self.local and descent.ended:
-            self.localised = self.local.members(lambda weights: weights.rows)
+        if self.local and self.localisation and descent.ended:
+            self.localised = self.local.members(self.localisation.rows)
         descent.iteration += 1
 
     def posterior(self, descent: CycleDescent) -> tuple[Array, Array]:

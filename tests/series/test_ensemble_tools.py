@@ -237,6 +237,34 @@ def test_variables_without_position_or_observation_stay():
     assert not np.allclose(analysed[:, :2], ensemble[:, :2])
 
 
+def test_variables_without_a_place_see_the_mean_of_the_blocks():
+    """By hand; what has no spread and where there is nothing to see stays to the bit."""
+    positions, members = np.arange(12.0), RNG(2).standard_normal((6, 14))
+    members[:, 13] = 0.1
+    plain = BlockLocalisation.on_line(positions, positions, radius=1.5, period=12.0)
+    local, e = plain.with_placeless(np.array([12, 13])), evaluation()
+    assert (plain.without_place.tolist(), local.without_place.tolist()) == ([], [12, 13])
+    analysed = local.analysis(ETKF(), members, e, None)
+    assert np.array_equal(analysed[:, :12], plain.analysis(ETKF(), members, e, None)[:, :12])
+    root = np.sqrt(plain.taper.mean(axis=0))
+    step = gauss_newton(np.zeros(6), Evaluation(root * e.d, root[:, None] * e.S))
+    wider = np.sqrt(5 / (np.sum(step.transform**2) - 1))
+    by_hand = apply_weights(members[:, 12:], step.direction + wider * step.transform)
+    assert analysed[:, 12:] == pytest.approx(by_hand, abs=1e-12)
+    unseen = local.analysis(ETKF(), np.full((6, 14), 0.1), e, None)
+    assert np.array_equal(unseen, np.full((6, 14), 0.1))
+
+
+def test_chance_takes_no_spread_of_what_has_no_place():
+    """Variables that have nothing to do with the observations keep their variance, on average of 4000 of them."""
+    members, e = RNG(4).standard_normal((6, 4000)), evaluation()
+    local = BlockLocalisation([np.empty(0, dtype=int)], np.ones((1, 12))).with_placeless(np.arange(4000))
+    analysed = local.analysis(ETKF(), members, e, None)
+    assert np.mean(np.var(analysed, axis=0)) == pytest.approx(np.mean(np.var(members, axis=0)), rel=0.03)
+    alone = apply_weights(members, gauss_newton(np.zeros(6), e).weights.rows)
+    assert np.mean(np.var(alone, axis=0)) < 0.5
+
+
 @pytest.mark.parametrize("periodic", [False, True])
 def test_localisation_on_a_grid(periodic):
     """The taper between all cells, by hand; a grid of one row is the line."""

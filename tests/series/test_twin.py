@@ -250,6 +250,29 @@ def test_few_members_need_localisation():
     assert rmse(local) < 0.5 < 2.0 < rmse(everywhere)
 
 
+BESIDE_A_FIELD = [
+    {"scheme": "etkf", "members": 10, "inflation": 1.04},
+    {"scheme": "denkf", "members": 24, "inflation": 1.0},
+    pytest.param({"scheme": "ienks", "members": 24, "inflation": 1.02}, marks=pytest.mark.slow),
+]
+
+
+@pytest.mark.parametrize("scheme", BESIDE_A_FIELD)
+def test_a_parameter_beside_a_localised_field(scheme):
+    """F of Lorenz-96, drawn from N(8, 1), is estimated; errors of F and of the state are as large as their spread."""
+    local = {"rotation": True, "localisation": {"radius": 7, "periodic": True}, **scheme}
+    uncertain = {"F": {"prior": "normal", "mean": 8, "std": 1}}
+    changes = {"twin.cycles": 120, "twin.burn_in": 60, "twin.initial_std.x": 1, "parameters": uncertain}
+    experiment = load_twin(CONFIGS / "lorenz96_letkf.yaml", changes | {"assimilation": local}).experiment
+    results = [conduct(experiment, seed) for seed in range(4)]
+    stds = np.array([result.run.analysis.std[-1, 40] for result in results])
+    errors = np.array([result.run.analysis.mean[-1, 40] - result.truth[-1, 40] for result in results])
+    scores = [result.scores["analysis"] for result in results]
+    assert 0.01 < stds.max() < 0.15
+    assert 0.1 < np.sqrt(np.mean((errors / stds) ** 2)) < 2
+    assert np.mean([score.mean_rmse for score in scores]) < 1.2 * np.mean([score.mean_spread for score in scores])
+
+
 @pytest.mark.parametrize("linearisation", ["transform", "bundle"])
 def test_a_taper_of_ones_is_no_localisation(linearisation):
     """Blocks that see every observation in full have the weights of the whole, in every iteration."""
