@@ -92,7 +92,7 @@ def run_design(
     document, base = document_from(source)
     document = override(document, overrides or {})
     if after is not None:
-        document = override(document, _known(document, base, after))
+        document = override(document, _known(document, base, after), "--after")
     every = list(candidates(document, base))
     config = every[0].config
     config = replace(config, directory=out or config.directory.with_name(f"{config.directory.name}_design"))

@@ -192,13 +192,16 @@ def limits_hold(law: ConstitutiveLaw) -> None:
         known = [p.name for p in (*law.parameters, *parent.parameters)]
         unknown = [name for name in special if name not in known]
         assert not unknown, f"limits: {unknown[0]!r} is not a parameter of the law{suggest(unknown[0], known)}"
-        merged = parent.example_values() | law.example_values() | {n: np.array([v]) for n, v in special.items()}
+        told = law.example_values() | {n: np.array([v]) for n, v in special.items()}
+        merged = parent.example_values() | told
+        untold = _at({name: merged[name] for name in parent.example_values() if name not in told})
+        run_at = f"; the parent was run at its own {untold}, which the values do not give" if untold else ""
         for cycle in cycles(law):
             own, theirs = (respond(kind, {name: merged[name] for name in kind.example_values()}, cycle).J
                            for kind in (law, parent))  # fmt: skip
             scale = np.max(np.abs(theirs)) or np.max(np.abs(respond(law, law.example_values(), cycle).J))
             error = np.max(np.abs(own - theirs)) / scale
-            assert error < 1e-7, f"differs from {parent.name} by {error:.2g} of its largest stress at {special}"
+            assert error < 1e-7, f"differs from {parent.name} by {error:.2g} of its largest stress at {special}{run_at}"
 
 
 def dissipates(law: ConstitutiveLaw) -> None:

@@ -267,5 +267,23 @@ class TestCommand:
         done = self.run("--check", f"{yeoh}:Yeoh")
         assert "limits: 'alfa' is not a parameter of the law; did you mean 'alpha'?" in done.output
 
+    def test_a_limit_that_leaves_out_a_parameter_of_the_parent_alone_names_it(self, tmp_path):
+        """A law with a viscosity of its own has no mu, its parent has: unless that is 0, it is not the parent."""
+        body = r'''
+class Mine(NeoHookeanKelvinVoigt):
+    r"""$W$, with a viscosity of its own."""
+    title = "mine"
+    parameters = (G, MU_0)
+    limits = ((NeoHookeanKelvinVoigt, {"mu_0": 0.0}),)
+
+    def viscosity(self, shear_rate, p):
+        return p.mu_0 / (1 + 1e-6 * shear_rate)
+'''
+        done = self.run("--check", write(tmp_path, body))
+        assert done.exit_code == 1
+        assert "; the parent was run at its own mu = 0.1, which the values do not give" in done.output
+        done = self.run("--check", write(tmp_path, body.replace('"mu_0": 0.0', '"mu_0": 0.0, "mu": 0.0')))
+        assert done.exit_code == 0, done.output
+
     def test_unknown_law(self):
         assert self.run("--check", "nowhere.py:Law").exit_code == 2

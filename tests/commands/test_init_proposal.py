@@ -98,6 +98,9 @@ def test_what_is_not_known_exactly_is_estimated(tmp_path: Path) -> None:
     done = call("init", "--data", data, *UNITS, "--medium", "agarrose", "--force")
     assert done.exit_code == 2
     assert "unknown medium 'agarrose'; did you mean 'agarose'?" in done.output
+    done = call("init", "--data", data, *UNITS, "--medium", "glycerol", "--force")
+    assert "unknown medium 'glycerol'; known: gel, water, " in done.output
+    assert done.output.count("known: ") == 1
     done = call("init", "--data", data, *UNITS, "--medium", "polyacrylamide 8 %", "--force")
     assert done.exit_code == 0, done.output
     (rho,) = (term for term in build(load_config(Path("bubble.yaml")))[0].prior.terms if term.parameter.name == "rho")

@@ -98,7 +98,7 @@ def test_what_cannot_be_done_is_told(toy, tmp_path):
         sixty(toy, tmp_path / "out", sets=1)
     with pytest.raises(DataError, match="not at the times"):
         sixty(toy, tmp_path / "out", made_with={"data.window": {"end": "100 ms"}})
-    with pytest.raises(ConfigError, match=r"--made-with data\.windo: data\.windo: unknown key"):
+    with pytest.raises(ConfigError, match=r"--made-with data\.windo: unknown key"):
         sixty(toy, tmp_path / "out", made_with={"data.windo": 3})
     (tmp_path / "out").mkdir(exist_ok=True)
     (tmp_path / "out" / "calibration.csv").write_text("set,data_set\n1,\n")

@@ -107,7 +107,7 @@ def known(medium: str, scale: Known = SCALE) -> Sequence[Known]:
     """
     name, _, text = medium.strip().partition(" ")
     if name not in CHOICES:
-        raise ConfigError(f"unknown medium {shown(name)}{suggest(name, CHOICES)}; known: {', '.join(CHOICES)}")
+        raise ConfigError(f"unknown medium {shown(name)}{suggest(name, CHOICES)}")
     of_medium, concentration = _OF_ANY, None
     if text:
         with retold(UnitError, ConfigError, f"medium {shown(medium)}: "):
