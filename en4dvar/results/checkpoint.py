@@ -34,7 +34,7 @@ FORMAT = "en4dvar-checkpoint"
 VERSION = "4"
 LONGEST = 64_000_000_000  # bytes of a checkpoint
 FOLDER = "checkpoints"
-_HEAD = struct.Struct("<cQ")  # before what holds numbers of arrays: a letter and the size of the text
+_HEAD = struct.Struct("<cQ")  # before what holds numbers of arrays: the letter A and the size of the text
 
 
 class CheckpointError(OutputError):
@@ -120,7 +120,7 @@ def file_digest(path: Path) -> str:
 
 
 def encode(value: Any) -> bytes:
-    """Bytes of a dataclass whose fields are float, int, bool, str, None, float arrays, tuples and dataclasses."""
+    """Bytes of a float, int, bool, str, None, an array of floats, or of a tuple or dataclass of these."""
     numbers = bytearray()
     text = json.dumps(_plain(value, numbers)).encode("ascii")  # repr of a float is exact; NaN and Infinity are kept
     return b"".join((_HEAD.pack(b"A", len(text)), text, numbers)) if numbers else text
@@ -130,7 +130,7 @@ def decode(content: bytes, kind: type[D]) -> D:
     """The dataclass of :func:`encode`. Raises :class:`ValueError`: it is not of ``kind``."""
     with retold((KeyError, TypeError, ValueError, struct.error), ValueError, f"not a {kind.__name__}: "):
         text, numbers = content, bytearray()
-        if not content.startswith(b"{"):
+        if content.startswith(b"A"):
             end = _HEAD.size + _HEAD.unpack_from(content)[1]
             text, numbers = content[_HEAD.size : end], bytearray(content[end:])
         value: D = _reader(typing.cast(Any, kind))(json.loads(text), numbers)
