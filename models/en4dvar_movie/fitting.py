@@ -24,7 +24,6 @@ FREE = 0.3  # of the contrast: what it may then differ by
 MOST_RIM = 20.0  # pixels: what the light of a rim, its distance and its width may be
 WHOLE = 0.9  # of the outline: how much is seen of one that the frame does not cut
 LONG = 1.0  # of the radius: what amplitudes of modes may be
-SLIM = 0.5  # of it: amplitude of mode 2 beyond which an ellipse, of axes of 3 to 1 then, is no bubble
 REACH = 4.0  # how far from the outline pixels are used, in widths of the edge
 APART = 1.5  # widths of the edge: nested circles that are closer are not told apart
 SHARP = 1.35  # widths of the movie's sharp edges: what is no wider is blurred by nothing else
@@ -240,8 +239,6 @@ def _outlines(image: Array, p: Array, parts: Parts, noise: float, optics: Optics
     except np.linalg.LinAlgError:
         return None
     shape = p[SHAPE : parts[0]].reshape(-1, 2).T
-    if shape.size == 2 and np.hypot(*shape[:, 0]) > SLIM * p[R]:
-        return None
     mode_variance = float(np.diag(inverse)[SHAPE : parts[0]].mean()) if shape.size else 0.0
     free = len(p) - 2 * _glare_is_far(p, gaps, ring)
     # how much larger even and odd rows show the radius: Σ r dm/dR / Σ (dm/dR)²

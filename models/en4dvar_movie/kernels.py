@@ -11,9 +11,6 @@ centre of a bubble that acts as a lens, g and ρ_g. Where S flashes light one ex
 contrast; the outermost has the radius R, the others lie d_s inside it. The order of the parameters is that of
 :data:`NAMES`, then A_2, B_2, A_3, …; d_2, d_3, … from ``parts[0]`` on; and from ``parts[1]`` on a, e and s, or nothing
 where there is no rim. Pixels that are not looked at are NaN.
-
-Of mode 2 alone, ρ is the ellipse whose mean is R and whose axes have the ratio (1 + s) / (1 − s), s = |(A_2, B_2)| / R:
-ρ = R N(s) / √(1 + s² − 2 (A_2 cos 2θ + B_2 sin 2θ) / R).
 """
 
 import math
@@ -54,19 +51,6 @@ def _rim(inside, share, p, rim, row):
 
 
 @kernel
-def ellipse(R, A, B, cos, sin):
-    """ρ of an ellipse of mean radius R where 2θ has this ``cos`` and ``sin``, and its derivatives by θ, R, A and B."""
-    square = (A * A + B * B) / R**2
-    mean = 1 + square / 4 + 9 * square**2 / 64  # of the ellipse, 2 K(s) / π
-    under = 1 + square - 2 * (A * cos + B * sin) / R
-    rho = R / mean / under**0.5
-    grows = (0.5 + 9 * square / 16) / mean
-    by_a = rho / R * ((cos - A / R) / under - grows * A / R)
-    by_b = rho / R * ((sin - B / R) / under - grows * B / R)
-    return rho, 2 * rho * (B * cos - A * sin) / (R * under), (rho - A * by_a - B * by_b) / R, by_a, by_b
-
-
-@kernel
 def _row(j, i, p, parts, row):
     """The model at a pixel; ``row`` (P,) gets its derivatives."""
     dx, dy = i - p[0], j - p[1]
@@ -81,9 +65,6 @@ def _row(j, i, p, parts, row):
         row[k], row[k + 1] = cn, sn
         rho += p[k] * cn + p[k + 1] * sn
         slope += n * (p[k + 1] * cn - p[k] * sn)  # dρ/dθ
-    by_radius = 1.0  # dρ/dR
-    if gaps == SHAPE + 2:
-        rho, slope, by_radius, row[SHAPE], row[SHAPE + 1] = ellipse(p[2], p[SHAPE], p[SHAPE + 1], cn, sn)
     w, circles = p[3], 1 + rim - gaps
     edge = row[3] = row[5] = 0.0
     row[rim:] = 0.0
@@ -104,7 +85,7 @@ def _row(j, i, p, parts, row):
     # r falls by cos as x grows, θ grows by sin/r: both move the edge
     row[0] = edge * (cos + slope * sin / r) + glare * cos
     row[1] = edge * (sin - slope * cos / r) + glare * sin
-    row[2] = edge * by_radius
+    row[2] = edge
     row[3] -= glare * zg
     row[4] = 1.0
     row[6] = G

@@ -8,7 +8,6 @@ import numpy.typing as npt
 from scipy import ndimage
 
 from en4dvar.model.state import Array, Indices
-from en4dvar_movie.kernels import ellipse
 
 MODES = 6  # of the outline
 TILE = 2  # pixels are averaged over tiles of this side
@@ -57,8 +56,8 @@ class Outline:
     the contrast of the movie; ``mode_std`` is the std of a mode's amplitude. ``seen`` is the share of the
     outline that can be seen. ``rows`` is by how much even rows show a larger bubble than odd ones, ``rows_std`` what
     noise makes of it. ``joined`` is the std for nested circles that lie too close to be told apart, which all
-    have their mean radius. ``oval`` is the outline as an ellipse, where the frame cuts it, and ``better`` by how much
-    its −log likelihood is less.
+    have their mean radius. ``oval`` is the outline of which mode 2 is fitted too, where the frame
+    cuts it, and ``better`` by how much its −log likelihood is less.
     """
 
     circle: Circle
@@ -98,10 +97,7 @@ class Outline:
     def points(self, angles: Array) -> Array:
         """Points (K, 2) of the outline, x and y, at angles (K,)."""
         n = np.arange(2, 2 + self.modes.shape[1])[:, None]
-        cos, sin = np.cos(n * angles), np.sin(n * angles)
-        rho = self.circle.R + self.modes[0] @ cos + self.modes[1] @ sin
-        if len(n) == 1:
-            rho = ellipse(self.circle.R, self.modes[0, 0], self.modes[1, 0], cos[0], sin[0])[0]
+        rho = self.circle.R + self.modes[0] @ np.cos(n * angles) + self.modes[1] @ np.sin(n * angles)
         return np.stack([self.circle.x + rho * np.cos(angles), self.circle.y + rho * np.sin(angles)], axis=1)
 
 

@@ -17,7 +17,7 @@ OFTEN = 90  # per cent of the frames that are darker than what begins an envelop
 WITHIN = 0.01  # weight of what lies within an envelope, as a share of that of what lies beyond it
 TOPS = 98  # per cent of the pixels that lie lower over an envelope than those that tell its scatter
 MEAN, DIFFERS = 3, 0.3  # pixels: side of squares that differ from a level; by which share of what differs most
-LEAST = 24  # pixels of a patch, or of the rim of one that tells an ellipse
+LEAST = 24  # pixels of a patch
 BETTER = 1 / 3  # of what no disc explains beside the usual surface: what may be left beside another that replaces it
 MOST = 2  # times what no disc explains: what discs must
 DISCS = 0.5  # of what discs explain beside the usual surface: what they must beside another
@@ -29,7 +29,6 @@ BLURRED, SHADE = 12, 0.03  # pixels that its blur reaches at most; the share of 
 SLENDER = 0.25  # of the field: what stands still before the background takes less
 COVERED, BARE = 0.6, 0.5  # of a ring about its middle: what a bubble always covers of it at least; and of one beyond
 ROUND, DISC = 0.5, 0.8  # of a patch and the disc through its rim that both share, if it is all that tells a bubble
-OVAL, LONGEST = 0.9, 2.5  # of a patch and the ellipse through its rim that both share; axis ratio of a bubble at most
 
 
 def surface_beside_discs(frames: Sequence[Frame], blind: Mask, unit: float) -> tuple[Array, Mask] | None:
@@ -64,8 +63,7 @@ def surface_beside_discs(frames: Sequence[Frame], blind: Mask, unit: float) -> t
 
 def _standing(extremes: Array, field: Mask, surface: Array) -> Mask:
     """What stands still (H, W) and comes from the border: patches that differ in nearly every frame, beside a rim of
-    which nothing differs in more than a few, and which are no disc or ellipse. Where they are wider than there, a
-    bubble is.
+    which nothing differs in more than a few, and which are no disc. Where they are wider than there, a bubble is.
 
     ``extremes`` (3, H, W): what differs usually, and most in a few frames to both sides.
     """
@@ -82,15 +80,14 @@ def _standing(extremes: Array, field: Mask, surface: Array) -> Mask:
             patch = labels == number
             depth, nearest = ndimage.distance_transform_edt(patch, return_indices=True)
             by_still = patch & beside[tuple(nearest)]
-            if by_still.sum() < STILL * patch.sum() or is_round(patch, DISC) or _is_oval(patch):
+            if by_still.sum() < STILL * patch.sum() or is_round(patch, DISC):
                 continue
             core = _core(patch, by_still, field & (ever > limit), depth * border)
             stands = ndimage.binary_opening(patch & ~core, np.ones((3, 3)))
             off = ndimage.distance_transform_edt(~stands)
             rings = ((off > n) & (off <= n + 1) & never for n in range(BLURRED))
             blurred = [float(np.median(shade[ring])) > SHADE * most for ring in rings if ring.any()]
-            reached = ndimage.binary_dilation(core, iterations=BESIDE)  # where the edges of both are blurred
-            result |= off <= [*blurred, False].index(False) + BESIDE * reached
+            result |= off <= [*blurred, False].index(False)
     return result & (np.mean(result[field]) < SLENDER)  # or the surface is that of the bubble
 
 
@@ -168,24 +165,6 @@ def _discs_and_rest(differences: Array, field: Mask) -> tuple[float, float]:
             both, either = both + np.sum(patch & disc), either + np.sum(patch | disc)
     of_all = len(differences) * np.sum(field)
     return both / of_all, (either - both) / of_all
-
-
-def _is_oval(patch: Mask) -> bool:
-    """True of an ellipse that is not too long for a bubble and what the frame leaves of it; not of a stripe."""
-    points = rim(patch)
-    if len(points) < LEAST:
-        return False
-    middle, size = points.mean(axis=0), float(points.std())
-
-    def terms(x: Array, y: Array) -> Array:
-        return np.stack([x * x - y * y, 2 * x * y, x, y, np.ones_like(x)])
-
-    of_rim, squares = terms(*(points - middle).T / size), np.sum((points - middle) ** 2, axis=1) / size**2
-    fitted = np.linalg.lstsq(of_rim.T, squares, rcond=None)[0]
-    u, v = ((axis - m) / size for axis, m in zip(np.indices(patch.shape)[::-1], middle, strict=True))
-    inside = u * u + v * v < np.tensordot(fitted, terms(u, v), 1)
-    longest = (LONGEST**2 - 1) / (LONGEST**2 + 1)
-    return bool(np.hypot(*fitted[:2]) < longest and np.sum(patch & inside) > OVAL * np.sum(patch | inside))
 
 
 def is_round(patch: Mask, share: float = ROUND) -> bool:

@@ -17,7 +17,7 @@ from en4dvar_movie.flashes import in_time
 from en4dvar_movie.following import Chain, chains, doubts, reasons, target
 from en4dvar_movie.frames import Frame, Movie
 from en4dvar_movie.outline import Optics, Outline
-from en4dvar_movie.uncertainty import NOTHING, Errors, errors_of, with_ellipses
+from en4dvar_movie.uncertainty import NOTHING, Errors, errors_of
 
 UNREAD = 3  # frames: what makes doubtful whether something beside the bubble stands still
 AWAY = 10.0  # pixels from a bubble that a point may be to mean it
@@ -149,8 +149,6 @@ def _readings(
         for c, order in zip(bubble.candidates, orders, strict=True)
     }
     readings = [r for look in looks for r in seen.get(look.frame) or [Reading(look.frame, None, why[look.frame])]]
-    read = with_ellipses([r.outline for r in readings])
-    readings = [replace(r, outline=outline) for r, outline in zip(readings, read, strict=True)]
     good = [None if r.frame in doubtful or r.frame in out else r.outline for r in readings]
     for reading, outline, errors in zip(readings, good, errors_of(good, optics, exposure), strict=True):
         correction, doubt = corrections.get(reading.frame), doubtful.get(reading.frame, "")

@@ -11,8 +11,8 @@ own a does not stand out of its noise, that of neighbouring frames together may,
 dirt at its edge, say) counts no more than the least that would. What mode 2 has in common in all frames, as a share of
 the radius and with its direction, moves all radii alike by one factor; a is what is left of it.
 
-Cut: where the frame's edge cuts an outline, a circle is fitted, which is off where the bubble is elongated; an ellipse,
-fitted to the same pixels, tells by how much, and is read where it is told well enough.
+Cut: where the frame's edge cuts an outline, a circle is fitted, which is off where the bubble is elongated; an outline
+with mode 2, fitted to the same pixels, tells by how much.
 
 Exposure: over an exposure of length T the mean radius lies T² R̈/24 from that in its middle, R̈ as three frames show it;
 or, where the edge is blurred more than the steps to its neighbours explain, as its speed differs from theirs over half
@@ -34,7 +34,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.model.state import Array, Indices
+from en4dvar.model.state import Array
 from en4dvar_movie.outline import THRESHOLD, Optics, Outline
 
 NEIGHBOURS = 10  # frames to each side
@@ -49,7 +49,6 @@ LIKELY = 2.0  # std of noise beyond which a frame is blurred by motion rather th
 CLEARLY = 3.0  # std of noise by which a frame is blurred more than the sharpest, whose own noise made them so
 BENT = 0.46  # of the exposure in steps: std of the radius in units of the blur that neighbours do not explain
 CUT = 3.0  # amplitudes of mode 2, by the share unseen: circles about cut ellipses are off by 1 to 4
-HALF = 0.5  # of the outline, which must be seen if its ellipse is to be read
 RIM = 0.5  # of its level at the edge: what is not known of a rim's shape
 
 
@@ -82,41 +81,21 @@ def errors_of(outlines: Sequence[Outline | None], optics: Optics, exposure: floa
     ]
 
 
-def with_ellipses(outlines: Sequence[Outline | None]) -> list[Outline | None]:
-    """Outlines (K,), or the ellipses of those that the frame's edge cuts where these fit better by more than noise does
-    and have another radius by more than theirs. Where less than half is seen, an ellipse tells too little."""
-    where, off, noise, better = _beside_ellipses(outlines)
-    told = (_beyond(better, np.ones(len(where))) > 0) & (off**2 > SIGNIFICANT**2 * noise)
-    return [
-        o.oval if o is not None and o.oval is not None and k in where[told] and o.oval.seen > HALF else o
-        for k, o in enumerate(outlines)
-    ]
-
-
-def _beside_ellipses(outlines: Sequence[Outline | None]) -> tuple[Indices, Array, Array, Array]:
-    """Which outlines (K,) have an ellipse beside them; of those, by how much its radius is larger, the variance of that
-    radius, and by how much the ellipse is more likely, for the scatter about it."""
-    where = [k for k, o in enumerate(outlines) if o is not None and o.oval is not None]
-    told = [
-        (v.circle.R - o.circle.R, v.variance * v.ratio, o.better / v.ratio)
-        for o in outlines
-        if o is not None and (v := o.oval) is not None
-    ]
-    off, noise, better = np.array(told).reshape(-1, 3).T
-    return np.array(where, dtype=int), off, noise, better
-
-
 def _unseen(outlines: Sequence[Outline | None], lasting: float) -> Array:
     """Variance of the radius (K,) where the frame's edge cuts an outline, and a circle is fitted to a part of it.
 
-    It is how far the radius of a circle is from that of an ellipse that fits better, or worse, by more than noise does;
-    else what a ``lasting`` mode 2 over R makes of it, as far as noise may hide that.
+    It is how far the radius of a circle is from that of an oval where that fits better by more than noise does; and
+    what a ``lasting`` mode 2 over R makes of it, as far as noise may hide that.
     """
-    amplitudes = [0.0 if o is None or o.modes.size else CUT * lasting * o.circle.R * (1 - o.seen) for o in outlines]
-    variance = np.array(amplitudes) ** 2
-    where, off, noise, better = _beside_ellipses(outlines)
-    told = _beyond(np.abs(better), np.ones(len(where))) > 0
-    variance[where] = np.where(told, off**2 + noise, np.minimum(variance[where], noise))
+    where = [k for k, o in enumerate(outlines) if o is not None and o.seen < 1]
+    cut, variance = [o for k in where if (o := outlines[k]) is not None], np.zeros(len(outlines))
+    ovals = [o.oval for o in cut]
+    off = np.array([(v.circle.R if v else o.circle.R) - o.circle.R for o, v in zip(cut, ovals, strict=True)])
+    noise = np.array([v.variance * v.ratio if v else o.circle.R**2 for o, v in zip(cut, ovals, strict=True)])
+    better = np.array([o.better / v.ratio if v else 0.0 for o, v in zip(cut, ovals, strict=True)])
+    elongated = np.array([(CUT * lasting * o.circle.R * (1 - o.seen)) ** 2 for o in cut])
+    told = _beyond(better, np.ones(len(cut))) > 0
+    variance[where] = np.where(told, off**2 + noise, np.minimum(elongated, noise))
     return variance
 
 

@@ -5,16 +5,12 @@ A disc is sampled on a grid three times as fine, blurred and averaged over pixel
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from movies import movie_of
 from scipy.ndimage import gaussian_filter
 
-from en4dvar_movie.outline import Circle, Optics, Outline
 from en4dvar_movie.tracking import track
-from en4dvar_movie.uncertainty import errors_of, with_ellipses
 
 FINE, PAD, BEFORE, SHAPE = 3, 8, 4, (84, 96)
 RADII = 24 + 3 * np.sin(np.arange(6.0))
@@ -62,13 +58,3 @@ def test_of_an_ellipse_that_the_frame_always_cuts_the_error_holds_the_radius(rat
     off, std = readings(ratio, angle, centre, noise)
     assert np.abs(off / std).max() < 2.5
     assert std.max() < 3 * np.abs(off).max()  # no wider than needed
-
-
-@pytest.mark.parametrize("better", [-200.0, 200.0])
-def test_an_ellipse_that_fits_worse_than_the_circle_tells_nothing_against_an_elongation(better):
-    """Nor one of which too little is seen to be read, which fits better."""
-    oval = Outline(Circle(40.0, 5.0, 26.0), 1.2, -0.5, 0.01, np.array([[2.0], [0.5]]), 1e-4, 1.0, 0.0, 0.01, 0.4)
-    circle = replace(oval, circle=Circle(40.0, 5.0, 24.0), modes=np.zeros((2, 0)), oval=oval, better=better)
-    assert with_ellipses([circle] * 5) == [circle] * 5
-    stds = [of_frame.std for of_frame in errors_of([circle] * 5, Optics(-0.5, 1.2))]
-    np.testing.assert_allclose(stds, 2.0, rtol=0.1)

@@ -128,20 +128,6 @@ def test_half_a_disc_at_a_wall_is_told_from_a_needle_that_reaches_into_it(radii)
     assert np.median([r.errors.std for r in result.readings]) < 0.1
 
 
-@pytest.mark.parametrize("ratio", [1.7, 2.0])
-def test_an_ellipse_at_rest_that_the_frame_cuts_is_no_needle_and_has_its_own_radius(ratio):
-    """Its radius is the mean over its outline, as that of a bubble which the frame shows whole."""
-    areal = np.array([24.0, 21, 17, 15, *[14.5] * 26])
-    turns = np.linspace(0, np.pi, 180, endpoint=False)
-    radii = areal * np.mean(1 / np.hypot(np.cos(turns) / ratio**0.5, np.sin(turns) * ratio**0.5))
-    for centre in ((135.2, 58.7), (133.6, 60.1)):
-        movie = movie_of(filmed(0.0, areal, centre, stretch=ratio))
-        result = track(movie)
-        assert not movie.notes
-        assert np.abs(off(result.readings, radii)).max() < 0.3
-        assert result.readings[-1].outline.amplitude(2) > 0.2 * radii[-1]
-
-
 @pytest.mark.parametrize("unread", [1, 4])
 def test_several_frames_that_cannot_be_read_make_what_stands_still_doubtful(unread):
     radii = [30.0, 26, 22, 18, 15, *[12.0] * 10]
