@@ -110,7 +110,7 @@ def test_the_evidence_of_a_linear_model_is_that_of_quadrature(sides, values):
     assert analysis.log_evidence == pytest.approx(exact, abs=0.1)
 
 
-@pytest.mark.parametrize("seed", [1, 5, 16])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (5, 16))])
 def test_ranges_about_a_line_leave_one_mode_and_no_doubt(seed):
     """J of a linear model is convex, but flat within the ranges: a rough end of a descent is anywhere in them."""
     rng, t = np.random.default_rng(seed), np.linspace(1, 5, 6)

@@ -91,6 +91,7 @@ def test_draws_that_tell_the_mean_are_not_taken_anew():
     assert estimated.posterior.nu.std() == pytest.approx(std, rel=0.05)
 
 
+@pytest.mark.slow
 def test_an_odd_data_set_is_named_where_the_others_are_drawn_anew():
     problems, likely, kept = campaign(2.0, 1.4, 3)
     others, _, its_draws = campaign(-0.5, 0.1, 1, 1)
@@ -112,7 +113,7 @@ def test_draws_taken_anew_are_the_same_on_any_workers():
 
 
 @pytest.mark.parametrize("count", [5, 10])
-@pytest.mark.parametrize("least", [0.0, 0.3])
+@pytest.mark.parametrize("least", [pytest.param(0.0, marks=pytest.mark.slow), 0.3])
 def test_upper_limits_add_up_to_what_they_say(count, least):
     """Above a limit the likelihood falls to ``least`` of what it is below."""
     apart, width = [], []

@@ -24,7 +24,7 @@ def behind(aperture, shown, outside):
 
 
 @pytest.mark.parametrize("outside", [2, 10, 30])
-@pytest.mark.parametrize("before", [0, 3])
+@pytest.mark.parametrize("before", [0, pytest.param(3, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("aperture", [(63.5, 63.5, 58), (60.0, 68.0, 45)])
 def test_a_bubble_is_read_behind_a_round_aperture(outside, before, aperture):
     found = track(movie_of(behind(aperture, frames(before=before), outside)))

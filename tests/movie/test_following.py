@@ -142,6 +142,7 @@ def test_all_bubbles_by_the_command(tmp_path, monkeypatch):
     assert CliRunner().invoke(main, words).exit_code == 2
 
 
+@pytest.mark.slow
 def test_a_region_and_a_mask_choose_too():
     filmed = film("side by side, pointed at", 0)
     height, width = filmed.frames[0].shape
