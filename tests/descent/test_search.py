@@ -257,6 +257,7 @@ def test_a_draw_that_leads_nowhere_is_told(monkeypatch):
     assert "starts-disagree" in {c.code for c in analysis.cautions}
 
 
+@pytest.mark.slow
 def test_a_chain_behind_a_descent_from_a_draw_goes_on_to_the_same_bits(monkeypatch):
     problem, settings = in_the_wrong_well(monkeypatch)
     monkeypatch.setattr(refine, "TOO_FEW", np.inf)

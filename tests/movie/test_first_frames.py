@@ -141,7 +141,7 @@ def test_the_dark_middle_of_a_bubble_that_fills_a_dark_field_is_not_taken_for_th
     assert sum(r.used for r in result.readings) > 8
 
 
-@pytest.mark.parametrize("swing", [0.25, 0.5, 1.28])  # to each side
+@pytest.mark.parametrize("swing", [0.25, 0.5, pytest.param(1.28, marks=pytest.mark.slow)])  # to each side
 @pytest.mark.parametrize(("glare", "dirt"), [(0.0, 0.02), (0.37, 0.02), (0.37, 0.08)])
 @pytest.mark.parametrize(
     ("radius", "shape", "off"),

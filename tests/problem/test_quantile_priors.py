@@ -154,7 +154,10 @@ def test_bounds_that_do_not_suit_a_gaussian(kind, mean, std, bounds, words):
         PriorTerm.bounded(A, kind, mean, std, bounds)
 
 
-@pytest.mark.parametrize("name", ["uniform", "half-normal", "beta", "bounded normal"])
+@pytest.mark.parametrize(
+    "name",
+    ["uniform", *(pytest.param(name, marks=pytest.mark.slow) for name in ("half-normal", "beta", "bounded normal"))],
+)
 def test_posterior_and_evidence_of_a_linear_observation(name):
     """Sampled members, and exp(−J) summed over x, against quadrature over the parameter itself."""
     term, named = NAMED[name]
