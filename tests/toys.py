@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.linalg import expm
 
+import en4dvar
 from en4dvar.data.noise import Kernel, noise_of
 from en4dvar.data.observations import Observations
 from en4dvar.descent.window import DataWindow, Descent
@@ -126,6 +127,20 @@ def make_observations(times, values, std=0.1, time_std=0.0, weights=1.0, name="t
     )
     y = np.asarray(values, dtype=float)
     return Observations(np.asarray(times, dtype=float), y, noise_of(std, time_std), weights, name=name)
+
+
+def cosines_estimated(n, y, std, seed):
+    """The default estimate of a sum of n cosines and of the scale of its errors from readings y over half a period of
+    the slowest; ``std`` is the stated error."""
+    return en4dvar.estimate(
+        lambda p, t: sum(p[f"c{i}"] * np.cos(i * np.pi * t) for i in range(n)),
+        (np.linspace(0, 1, len(y)), y),
+        {f"c{i}": {"prior": "normal", "mean": 0, "std": 3} for i in range(n)}
+        | {"sigma": {"prior": "lognormal", "median": 1, "log_std": 1}},
+        error=std,
+        seed=seed,
+        progress=False,
+    )
 
 
 def with_noise(observations, **kind):

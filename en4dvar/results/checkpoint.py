@@ -127,7 +127,7 @@ def encode(value: Any) -> bytes:
 
 
 def decode(content: bytes, kind: type[D]) -> D:
-    """The dataclass of :func:`encode`. Raises :class:`ValueError`: it is not of ``kind``."""
+    """What :func:`encode` was given. Raises :class:`ValueError`: it is not of ``kind``."""
     with retold((KeyError, TypeError, ValueError, struct.error), ValueError, f"not a {kind.__name__}: "):
         text, numbers = content, bytearray()
         if content.startswith(b"A"):

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from toys import cosines_estimated
 
-import en4dvar
 from en4dvar.diagnosis.diagnostics import member_quantiles
 
 STD, PRIOR = 0.2, 3.0
@@ -21,16 +21,7 @@ def ratios(n, k, seed, truth=1.0):
     below = np.cumsum(np.exp(logs - logs.max()))
     levels = np.array([0.05, 0.5, 0.95])
     exact = np.exp(np.interp(levels, below / below[-1], SCORES))
-    priors = {f"c{i}": {"prior": "normal", "mean": 0, "std": PRIOR} for i in range(n)}
-    estimated = en4dvar.estimate(
-        lambda p, t: sum(p[f"c{i}"] * np.cos(i * np.pi * t) for i in range(n)),
-        (t, y),
-        priors | {"sigma": {"prior": "lognormal", "median": 1, "log_std": 1}},
-        error=STD,
-        seed=seed,
-        progress=False,
-    )
-    return member_quantiles(estimated.posterior["sigma"].values.ravel(), levels) / exact
+    return member_quantiles(cosines_estimated(n, y, STD, seed).posterior["sigma"].values.ravel(), levels) / exact
 
 
 @pytest.mark.parametrize(("n", "k"), [(12, 14), (8, 12)])

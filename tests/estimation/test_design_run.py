@@ -344,3 +344,17 @@ def test_whole_fields_are_refused_with_what_to_do(tmp_path):
     page = (tmp_path / "modes" / "design.html").read_text()
     assert "3, at 4, 8" in page
     assert "<svg" not in page
+
+
+@pytest.mark.parametrize(
+    ("more", "what"),
+    [
+        ({"error": {"y_std": "0.3 m", "at_most": {"column": "limit"}}}, "errors in a column of the file"),
+        ({"error": {"y_std": {"column": "std", "unit": "m"}}}, "errors in a column of the file"),
+        ({"weights": {"column": "weight"}}, "weights of readings"),
+    ],
+)
+def test_what_each_reading_says_of_itself_cannot_be_planned(more, what, tmp_path):
+    plan = _plan()
+    with pytest.raises(ConfigError, match=f"{what} cannot be planned at design.times; leave design.times out"):
+        run_design(plan | {"data": plan["data"] | more}, out=tmp_path / "designs")
