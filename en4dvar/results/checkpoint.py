@@ -11,20 +11,17 @@ that is read is executed (no pickle).
 
 import functools
 import hashlib
-import itertools
 import json
 import math
 import struct
 import time
-import types
-import typing
 from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal, TypeVar
+from typing import Any, ClassVar, Literal, TypeVar, cast
 
 import numpy as np
-import numpy.typing as npt
+from pydantic import ConfigDict, TypeAdapter
 
 from en4dvar.plumbing.errors import OutputError, retold
 from en4dvar.plumbing.files import atomic_path, open_plain, read_at_most
@@ -34,6 +31,7 @@ FORMAT = "en4dvar-checkpoint"
 VERSION = "4"
 LONGEST = 64_000_000_000  # bytes of a checkpoint
 FOLDER = "checkpoints"
+ARRAY = ""  # in place of the name of a field: what follows says where an array is
 _HEAD = struct.Struct("<cQ")  # before what holds numbers of arrays: the letter A and the size of the text
 
 
@@ -133,7 +131,8 @@ def decode(content: bytes, kind: type[D]) -> D:
         if content.startswith(b"A"):
             end = _HEAD.size + _HEAD.unpack_from(content)[1]
             text, numbers = content[_HEAD.size : end], bytearray(content[end:])
-        value: D = _reader(typing.cast(Any, kind))(json.loads(text), numbers)
+        plain = json.loads(text, object_hook=lambda raw: _array(raw, numbers))
+        value: D = _checked(cast(Any, kind)).validate_python([plain])[0]
     return value
 
 
@@ -144,7 +143,7 @@ def _plain(value: Any, numbers: bytearray) -> Any:
         order: Literal["F", "C"] = "F" if value.flags.fnc else "C"  # another order: other sums
         told = [value.dtype.str, value.shape, order, len(numbers)]
         numbers += value.tobytes(order)
-        return told
+        return {ARRAY: told}
     if isinstance(value, tuple):
         return [_plain(item, numbers) for item in value]
     if isinstance(value, np.generic):
@@ -154,46 +153,18 @@ def _plain(value: Any, numbers: bytearray) -> Any:
     raise TypeError(f"cannot store a {type(value).__name__}")
 
 
-_Reader = Callable[[Any, bytearray], Any]  # what the JSON text says, and the numbers of arrays → the value of a type
+@functools.cache  # a campaign reads as many of a kind as it has data sets
+def _checked(kind: Any) -> TypeAdapter[Any]:
+    """What compares with the annotations; inside of a tuple, for a dataclass takes no configuration itself."""
+    return TypeAdapter(tuple[kind], config=ConfigDict(arbitrary_types_allowed=True, extra="forbid"))
 
 
-@functools.cache  # a campaign reads as many of one kind as it has data sets
-def _reader(kind: Any) -> _Reader:
-    """Raises, when it reads, :class:`KeyError`, :class:`TypeError` or :class:`ValueError`."""
-    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-    if origin in (typing.Union, types.UnionType):
-        other = _reader(next(a for a in arguments if a is not type(None)))
-        return lambda raw, numbers: None if raw is None and type(None) in arguments else other(raw, numbers)
-    if origin in (np.ndarray, npt.NDArray):  # from NumPy 2.5 on NDArray is an alias with a name of its own
-        return _array
-    if origin is tuple:
-        several = arguments[1:] == (Ellipsis,)
-        items = itertools.repeat(_reader(arguments[0])) if several else tuple(map(_reader, arguments))
-        return lambda raw, numbers: tuple(read(part, numbers) for read, part in zip(items, raw, strict=not several))
-    if is_dataclass(kind):
-        hints = typing.get_type_hints(kind)
-        return functools.partial(_dataclass, kind, {f.name: _reader(hints[f.name]) for f in fields(kind)})
-    allowed = arguments if origin is typing.Literal else (int, float) if kind is float else (kind,)
-    return functools.partial(_simple, allowed)
-
-
-def _array(raw: Any, numbers: bytearray) -> np.ndarray[Any, Any]:
-    kind, shape, order, begin = raw
+def _array(raw: Any, numbers: bytearray) -> Any:
+    """An object of JSON: the fields of a dataclass, or an array."""
+    if raw.keys() != {ARRAY}:
+        return raw
+    kind, shape, order, begin = raw[ARRAY]
     count = math.prod(shape)
     if np.dtype(kind).hasobject or count < 0 or begin < 0:
         raise ValueError("an array is nowhere")
-    values: np.ndarray[Any, Any] = np.frombuffer(numbers, kind, count, begin).reshape(shape, order=order)
-    return values.copy(order)
-
-
-def _dataclass(kind: Any, readers: dict[str, _Reader], raw: Any, numbers: bytearray) -> Any:
-    if set(raw) != set(readers):
-        raise ValueError(f"the fields of {kind} differ")
-    return kind(**{name: readers[name](item, numbers) for name, item in raw.items()})
-
-
-def _simple(allowed: tuple[Any, ...], raw: Any, _: bytearray) -> Any:
-    """A value of one of the types, or one of the values, that are allowed."""
-    if type(raw) not in allowed and raw not in allowed:
-        raise TypeError(f"{raw!r} is none of {allowed}")
-    return raw
+    return np.frombuffer(numbers, kind, count, begin).reshape(shape, order=order).copy(order)
