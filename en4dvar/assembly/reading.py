@@ -98,9 +98,7 @@ def _unique_names(paths: list[Path], grouped: Set[Path]) -> list[str]:
 
 
 def read_observations(plan: DataPlan, file: DataFile, name: str, weights: str = "sum") -> Observations:
-    """The observations (y, t, R) of one data set inside the window; ``weights``: those of ``assimilation.weights`` on
-    top of their own. Raises :class:`DataError`.
-    """
+    """The observations (y, t, R) of a data set, of its window; ``weights`` of the scheme. Raises :class:`DataError`."""
     files = (file, *file.others)
     series = []
     for series_plan, where in zip(plan.series, files, strict=True):

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from en4dvar.config.design import time_grid
-from en4dvar.config.document import Document, Source, document_from, override
+from en4dvar.config.document import Document, Source, document_from
 from en4dvar.config.kinds import SequenceConfig, TwinConfig, resolve_sequence, resolve_twin
 from en4dvar.config.load import Config, load_config, resolve
 from en4dvar.plumbing.errors import ConfigError, Fault
@@ -21,8 +21,7 @@ AnyConfig = Config | TwinConfig | SequenceConfig
 
 def load_any(source: Source, overrides: Mapping[str, Any] | None = None) -> AnyConfig:
     """A twin experiment or a sequence where the file has a section ``twin:`` or ``sequence:``, else an estimation."""
-    document, base = document_from(source)
-    return resolve_any(override(document, overrides or {}), base)
+    return resolve_any(*document_from(source, overrides))
 
 
 def resolve_any(document: Document, base: Path) -> AnyConfig:

@@ -272,10 +272,7 @@ def read_each(
     read: Callable[[Any, Context], T],
     unknown: Callable[[str], str] | None = None,
 ) -> dict[str, T]:
-    """The result of ``read`` for each entry of a section whose keys are the names of ``known`` things, its subjects.
-
-    ``unknown`` words what is wrong with another name.
-    """
+    """What ``read`` makes of each entry, named after what is ``known``; ``unknown`` words what is wrong with others."""
     values: dict[str, T] = {}
     for name, value in section.items():
         if name not in known:

@@ -280,10 +280,7 @@ _REFERENCE = re.compile(r"\s*([-+.\deE]+)\s*(?:(?:±|\+/?-)\s*([.\deE+-]+))?\s*(
 
 
 def reference_value(text: str, unit: str) -> tuple[float, float]:
-    """Value and std in ``unit`` of a text such as ``7.7 ± 1.1 kPa``; NaN where no std is stated.
-
-    Raises :class:`UnitError`.
-    """
+    """Value and std (NaN: not stated) in ``unit`` of a text such as ``7.7 ± 1.1 kPa``. Raises :class:`UnitError`."""
     match = _REFERENCE.fullmatch(text)
     if match is None:
         raise UnitError(f"{shown(text)} is no value such as '7.7 ± 1.1 kPa'")

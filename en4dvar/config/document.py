@@ -161,22 +161,17 @@ def parse_document(text: str, file: str = "") -> Document:
     return replace(document, data=data)
 
 
-def document_from(source: Source) -> tuple[Document, Path]:
-    """A YAML file, or a dict of the same, and the folder where its relative paths start: the file's, or this one.
-
-    Raises :class:`ConfigError`.
+def document_from(source: Source, overrides: Mapping[str, Any] | None = None) -> tuple[Document, Path]:
+    """A YAML file, or a dict of the same, with overrides, and the folder where its relative paths start: the file's, or
+    this one. Raises :class:`ConfigError`.
     """
     if isinstance(source, Mapping):
-        return document_of(source), Path.cwd()
-    path = Path(source)
-    return read_document(path), path.resolve().parent
+        return override(document_of(source), overrides or {}), Path.cwd()
+    return override(read_document(Path(source)), overrides or {}), Path(source).resolve().parent
 
 
 def override(document: Document, overrides: Mapping[str, Any], option: str = "--set") -> Document:
-    """Set values at dotted paths; text is parsed as YAML.
-
-    Raises :class:`ConfigError`, which names the ``option`` that they were given with.
-    """
+    """Set values at dotted paths; text is YAML. Raises :class:`ConfigError`, naming the ``option`` they came by."""
     data = copy.deepcopy(document.data)
     origins = dict(document.origins)
     faults: list[Fault] = []

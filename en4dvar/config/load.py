@@ -13,7 +13,7 @@ from en4dvar.config.context import Context, Made, check
 from en4dvar.config.data import DATA, DataPlan
 from en4dvar.config.dependence import Groups, PopulationSection, PriorCorrelation, PriorFile, Sharing, resolved
 from en4dvar.config.design import Design, Times, read_times
-from en4dvar.config.document import Document, Source, document_from, override, parse_document
+from en4dvar.config.document import Document, Source, document_from, parse_document
 from en4dvar.config.models import read_model
 from en4dvar.config.parameters import Entry, Fixed, Uncertain, entries
 from en4dvar.config.schema import Assimilation, Execution, File, GivenStart, Output, Section
@@ -113,8 +113,7 @@ def load_config(source: Source, overrides: Mapping[str, Any] | None = None) -> C
     ------
     ConfigError: carries every fault found, with file, line and column.
     """
-    document, base = document_from(source)
-    return resolve(override(document, overrides or {}), base)
+    return resolve(*document_from(source, overrides))
 
 
 def recorded(text: str, file: str) -> Document:
@@ -200,10 +199,7 @@ class Read(Generic[S]):
 
 
 def read_file(kind: type[S], document: Document, base: Path, model: ForwardModel | None = None) -> Read[S]:
-    """Validate a document of one kind, for a ``model`` that is there already or else is read from it.
-
-    Raises :class:`ConfigError`: every fault, in the order of the file.
-    """
+    """Validate a document for a ``model``, by default its own. Raises :class:`ConfigError`: every fault, in order."""
     faults: list[Fault] = []
     section = document.data.get("model")
     built = (model, dict(section or {})) if model else read_model(section, base, document, faults)

@@ -67,10 +67,7 @@ class NoSettings(BaseModel):
 
 
 def find_model(name: str) -> type[ForwardModel]:
-    """The model class called ``name``: registered, ``package:Class`` or ``/path/file.py:Class``.
-
-    Raises :class:`ConfigError`.
-    """
+    """The model ``name``: registered, ``package:Class`` or ``/path/file.py:Class``. Raises :class:`ConfigError`."""
     model: Any
     try:
         with loading(f"model {shown(name)} cannot be loaded"):

@@ -200,9 +200,7 @@ class Error(Section):
             faults.add((std,), "required: the standard deviation of the observation error")
 
     def columns(self, readings: str, times: str) -> dict[str, Column]:
-        """The columns of errors, in the units of ``readings`` and ``times`` where they have none of their own, and of
-        what says which readings are bounds.
-        """
+        """Columns of errors and of marks of bounds; in the units of ``readings`` and ``times`` where they say none."""
         shared = {f"shared {i}": (part, readings) for i, part in enumerate(self.shared)}
         marks = {key: (marked, "1") for key, marked in self.bounds.items()}
         every = {"std": (self.std, readings), "time_std": (self.time_std, times), **shared, **marks}

@@ -186,10 +186,7 @@ class Uncertain:
         return any(isinstance(where, str | Scalar) for where in (self.spec.mean, self.spec.median))
 
     def term(self, of_data: Callable[[str | Scalar], float] | None = None) -> PriorTerm:
-        """The prior; ``of_data`` says what ``maximum`` or a scalar of the file is, in the parameter's unit.
-
-        Raises :class:`ConfigError`, its path the faulty key.
-        """
+        """The prior; ``of_data``: what a file says, in its unit. Raises :class:`ConfigError`, its path the key."""
         try:
             return self._term(self._location("mean", of_data), self._location("median", of_data))
         except ConfigError as error:

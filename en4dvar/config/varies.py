@@ -193,10 +193,7 @@ class VariesSection(Knots):
     unit, which holds at the centre of the prior; or ``estimated``, with a half-normal prior of 50 %."""
 
     def std_of(self, term: PriorTerm) -> float:
-        """Standard deviation of each change in the coordinate of the prior of its parameter.
-
-        Raises :class:`ConfigError`, its path the key: a share of a mean that is zero.
-        """
+        """Std of each change in the prior's coordinate. Raises :class:`ConfigError`: a share of a mean that is zero."""
         centre = float(term.to_physical(np.array(term.mean)))
         if self.std.relative and centre == 0:
             raise ConfigError(f"relative to the mean, which is zero; give it in {term.parameter.unit}", "std")

@@ -47,9 +47,7 @@ class IterationRecord:
 
 @dataclass(frozen=True)
 class ChainRecord:
-    """Where a Markov chain stands (``refine: mcmc``): steps so far, the largest split R-hat of any parameter, and the
-    smallest effective sample size.
-    """
+    """Where a Markov chain (``refine: mcmc``) stands: steps, largest split R-hat, smallest effective sample size."""
 
     steps: int
     r_hat: float

@@ -137,10 +137,7 @@ class Comparison:
         return comparison_table(self)
 
     def verdict(self, dataset: str) -> str:
-        """The preferred model in words, or that the data do not decide, or that evidences do not compare.
-
-        Raises :class:`ConfigError` for a data set that is not among them.
-        """
+        """The preferred model in words, or why none is. Raises :class:`ConfigError`: the data set is not among them."""
         if self.incomparable:
             return f"not compared: {self.incomparable}"
         if dataset not in self.datasets:

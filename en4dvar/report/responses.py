@@ -1,6 +1,4 @@
-"""How a posterior responds to its assumptions and to each reading, read from a result: rows of tables, sentences of the
-page, and a figure.
-"""
+"""How a posterior responds to its assumptions and to each reading: rows of tables, sentences of the page, a figure."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -50,9 +48,7 @@ class StoredShift(NamedTuple):
 
 
 class StoredEntry(NamedTuple):
-    """Where on the path one parameter was informed, in one quantity: cells of :data:`ENTRY_COLUMNS`, then the symbol
-    of the parameter and the label of the quantity.
-    """
+    """Where a parameter was informed in a quantity of the path: :data:`ENTRY_COLUMNS`, its symbol, and the label."""
 
     parameter: str
     quantity: str
@@ -105,9 +101,7 @@ def stored_shifts(result: StoredResult) -> tuple[tuple[StoredShift, ...], ...]:
 
 
 def shift_text(shift: StoredShift) -> str:
-    """``"+15 %"``, ``"× 3.8"`` from a factor of two on, or in the parameter's unit where its value may be negative; an
-    en dash where it is not known.
-    """
+    """``"+15 %"``, ``"× 3.8"`` from a factor of two on, in its unit of what may be negative; "–" of what is unknown."""
     if is_manifold(shift.relative):
         return f"× {plain_number(1 + shift.relative, 2)}"
     value, unit = (100 * shift.relative, "%") if math.isfinite(shift.relative) else (shift.change, shift.unit)

@@ -174,9 +174,6 @@ def _in_display_units(group: xr.Dataset) -> xr.Dataset:
 
 
 def load_result(path: str | Path) -> Result:
-    """Read a result file, or the one in the directory of a run.
-
-    Raises :class:`~en4dvar.plumbing.errors.OutputError` as :func:`~en4dvar.results.store.load_stored`.
-    """
+    """Read a result file, or the one in a run's directory. Raises :class:`OutputError` as :func:`load_stored`."""
     file = Path(path)
     return Result(load_stored(file / "posterior.nc" if file.is_dir() else file).groups)

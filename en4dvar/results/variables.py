@@ -20,7 +20,6 @@ from en4dvar.diagnosis.response.ledger import QUANTILES
 from en4dvar.diagnosis.response.what_if import Shift
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError
-from en4dvar.priors.prior import Prior
 from en4dvar.problem import InverseProblem
 from en4dvar.results.declared import MEMBER, OWN, Declared, Item, Table, UnitRule, When, axes_of, shown_as, text
 
@@ -243,11 +242,6 @@ WITHHELD_READINGS = (
 # What judges the fit, the members, the readings: the group ``sample_stats``
 
 
-def _prior_values(prior: Prior) -> Array:
-    """(n, scores) of the parameters, each by itself."""
-    return np.reshape([term.to_physical(term.mean + term.std * SCORES) for term in prior.terms], (-1, len(SCORES)))
-
-
 MEMBERS = (
     Declared("active", MEMBER, "member survived the posterior forecast",
              lambda a: active_members(a.posterior_failures)[None], needed=True),
@@ -261,7 +255,8 @@ MEMBERS = (
     Declared("dfs", "parameter", "degrees of freedom for signal of the parameter", lambda a: a.dfs_per_parameter,
              needed=True),
     Declared("prior_value", "parameter prior_score", f"value at which its prior has the standard score, {EACH_UNIT}",
-             lambda a: _prior_values(a.problem.prior)),
+             lambda a: np.reshape([term.to_physical(term.mean + term.std * SCORES) for term in a.problem.prior.terms],
+                                  (-1, len(SCORES)))),
     Declared("{series}_centre", "{time}", "{label}, prediction at the minimum of J",
              of_series(lambda a: a.centre_predictions), OWN, needed=True),
     Declared("{limit}_reached", MEMBER, "{label}", lambda a, i: a.extremes[None, :, i.held], LIMIT),

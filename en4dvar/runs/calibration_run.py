@@ -76,8 +76,8 @@ def calibrate(
     own = load_config(config, overrides)
     made, changed = own, ""
     if made_with:
-        document, base = document_from(config)
-        made = resolve(override(override(document, overrides or {}), made_with, "--made-with"), base)
+        document, base = document_from(config, overrides)
+        made = resolve(override(document, made_with, "--made-with"), base)
         changed = yaml.safe_dump({"made_with": {k: str(v) for k, v in made_with.items()}})
     path = Path(out) if out else own.directory.with_name(f"{own.directory.name}_calibration")
     own = replace(own, directory=path, resolved=own.resolved + indent(changed, "# "))
@@ -86,9 +86,7 @@ def calibrate(
 
 @dataclass(frozen=True)
 class CalibrationKind(RunKind[Calibration]):
-    """A configuration, and the one that readings are ``made`` with, which is ``changed`` (YAML); each of the ``sets``
-    is a unit of work.
-    """
+    """A configuration, and the one readings are ``made`` with, ``changed`` (YAML); a set is a unit of work."""
 
     name = "calibrate"
     units = "sets that are done"
@@ -154,10 +152,7 @@ def _judged(common: CommonValue[tuple[Config, Config, list[tuple[str, DataFile]]
 
 
 def draw_set(maker: InverseProblem, seed: int) -> tuple[dict[str, float], Array]:
-    """A truth, physical values by name, and readings (K,) of it.
-
-    Raises :class:`En4dvarError` where the model can run none of the truths that are drawn.
-    """
+    """A truth, physical, by name, and readings (K,) of it. Raises :class:`En4dvarError`: the model can run none."""
     stream, composite = member_stream(seed, "truth"), Composite(maker)
     reason = ""
     for _ in range(ATTEMPTS):

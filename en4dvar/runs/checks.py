@@ -11,7 +11,7 @@ from en4dvar.assembly.reading import read_observations
 from en4dvar.config import AnyConfig, Config, SequenceConfig, resolve_any
 from en4dvar.config.context import check
 from en4dvar.config.data import DATA, DataPlan
-from en4dvar.config.document import Document, document_from, override
+from en4dvar.config.document import Document, document_from
 from en4dvar.config.load import context_of, in_order
 from en4dvar.config.schema import Section
 from en4dvar.data.observations import Observations, require_distinct
@@ -38,8 +38,7 @@ def check_all(
     source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None
 ) -> tuple[AnyConfig, list[InverseProblem], list[Fault]]:
     """As :func:`validate`; the problems of the data sets, and the faults of those that a campaign goes on without."""
-    document, base = document_from(source)
-    document = override(document, overrides or {})
+    document, base = document_from(source, overrides)
     try:
         config = resolve_any(document, base)
     except ConfigError as error:

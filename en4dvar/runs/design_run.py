@@ -89,8 +89,7 @@ def run_design(
     Raises :class:`ConfigError`, :class:`DataError`: the file cannot be used, or none of its designs.
     :class:`OutputError`: the directory cannot.
     """
-    document, base = document_from(source)
-    document = override(document, overrides or {})
+    document, base = document_from(source, overrides)
     if after is not None:
         document = override(document, _known(document, base, after), "--after")
     every = list(candidates(document, base))

@@ -177,9 +177,7 @@ class Session:
         self.begun = True
 
     def restore(self, file: str, fingerprint: str, kind: type[S], otherwise: str) -> S | None:
-        """What a checkpoint of the run that is resumed holds; one that cannot be used is told, with what is done
-        ``otherwise``.
-        """
+        """What a checkpoint of the resumed run holds; one of no use is told, with what is done ``otherwise``."""
         if not self.directory.resumed:
             return None
         try:

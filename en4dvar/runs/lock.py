@@ -89,10 +89,7 @@ def _is_at(file: int, path: Path) -> bool:
 
 
 def _is_dead(owner: str) -> bool:
-    """Whether the process that wrote its name into the lock has ended.
-
-    Its lock then outlives it for a moment only, in a process that it was about to start.
-    """
+    """Whether the process that wrote its name has ended; its lock outlives it in one that it was about to start."""
     if owner == _OTHER:  # not written yet
         return True
     number, _, host = owner.removeprefix("process ").partition(" on ")

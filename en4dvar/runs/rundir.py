@@ -89,10 +89,7 @@ class RunDirectory:
                 raise
 
     def at(self, name: str) -> Path:
-        """Where the run writes the file ``name``.
-
-        Raises :class:`OutputError` as :func:`~en4dvar.plumbing.files.inside`.
-        """
+        """Where the run writes a file. Raises :class:`OutputError` as :func:`~en4dvar.plumbing.files.inside`."""
         return inside(self.work, name)
 
     def claim(self, *names: str) -> None:

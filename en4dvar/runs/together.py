@@ -266,10 +266,7 @@ def groups_of(config: Config, names: Iterable[str]) -> list[SetGroup]:
 
 
 def require_population(config: Config, problem: InverseProblem, names: Collection[str]) -> None:
-    """Refuse a run before anything is computed, whose data sets ``names``, such as ``problem``, have no population.
-
-    Raises :class:`ConfigError`.
-    """
+    """Refuse data sets ``names``, as ``problem``, without a population, before a run. Raises :class:`ConfigError`."""
     if config.population is None:
         return
     groups = groups_of(config, names)
@@ -284,9 +281,7 @@ def require_population(config: Config, problem: InverseProblem, names: Collectio
 
 
 def _elsewhere(config: Config, population: Population, group: str) -> dict[str, str]:
-    """What the configuration says of the same numbers, to compare with and to calibrate with: lines of name, value and
-    std, and the source.
-    """
+    """What the configuration says of the same numbers, to compare and calibrate: name, value and std; the source."""
     if (asked := config.population) is None:
         return {}
     said: dict[str, str] = {}

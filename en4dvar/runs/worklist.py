@@ -6,7 +6,7 @@ import math
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -22,7 +22,7 @@ from en4dvar.executor import Executor, ExecutorError, SerialExecutor, ThreadsExe
 from en4dvar.executor.base import CommonValue
 from en4dvar.inputs.parts import DataFile
 from en4dvar.plumbing.errors import En4dvarError, OutputError
-from en4dvar.plumbing.files import atomic_path, open_plain, readable, remove_file
+from en4dvar.plumbing.files import atomic_path, readable, remove_file
 from en4dvar.plumbing.tables import csv_text
 from en4dvar.priors.prior import own_seed
 from en4dvar.problem import InverseProblem
@@ -64,10 +64,7 @@ class Job:
 
     @cached_property
     def problem(self) -> InverseProblem:
-        """From the data file, read where this is asked for first: it goes with the job then.
-
-        Raises what :func:`~en4dvar.assembly.build.build_one` does.
-        """
+        """From the data file, read where this is first asked for: it goes with the job. Raises as :func:`build_one`."""
         return build_one(self.common.value[0], self.name, self.source)
 
 
@@ -169,9 +166,7 @@ class _Sender:
 
 @dataclass(frozen=True, slots=True)
 class Dataset:
-    """A data set of the run: its data file, its name in a pack, and where its results go, relative to the run
-    directory: an address in a pack, or a file.
-    """
+    """A data set: its file, its name in a pack, where its results go in the run: an address in a pack, or a file."""
 
     name: str
     source: DataFile
@@ -229,11 +224,9 @@ class Worklist:
         return Campaign(self.config.directory, outcomes, tuple(self.run.notices), tuple(filter(None, failed)))
 
     def summarise(self) -> None:
-        """Write the table of all data sets, unless it is there as it should be. Raises :class:`OutputError`."""
-        path = self.run.directory.at(SUMMARY)
-        if not _consists_of(path, self._table()):
-            with atomic_path(path) as partial, partial.open("wb") as file:
-                file.writelines(self._table())
+        """Write the table of all data sets. Raises :class:`OutputError`."""
+        with atomic_path(self.run.directory.at(SUMMARY)) as partial, partial.open("wb") as file:
+            file.writelines(self._table())
 
     def _table(self) -> Iterator[bytes]:
         header, *failures = summary_rows((), self.failures())
@@ -258,9 +251,7 @@ class Worklist:
         )
 
     def recall(self) -> None:
-        """Take over what an earlier run finished, compared with its checksums; what has failed is tried again, and a
-        record that cannot be trusted is not used.
-        """
+        """Take over what an earlier run finished, by its checksums; what failed or cannot be trusted is done again."""
         finished = not self.alone and self.run.directory.at("posterior.nc").exists()
         left = {f"{FOLDER}/{path.name}" for path in self.run.directory.at(FOLDER).iterdir()}
         for d in self.sets:
@@ -412,15 +403,6 @@ class Worklist:
         self._reached.pop(d.name, None)
         if isinstance(self.progress, LiveProgress):
             self.progress.ended(d.name, len(self.ended), _in_one_line(decode(outcome, DatasetOutcome)))
-
-
-def _consists_of(path: Path, parts: Iterable[bytes]) -> bool:
-    """Whether a file is there and holds these parts, one after the other, and nothing else."""
-    try:
-        with open_plain(path) as file:
-            return all(file.read(len(part)) == part for part in parts) and not file.read(1)
-    except OSError:
-        return False
 
 
 def _in_one_line(outcome: DatasetOutcome) -> str:

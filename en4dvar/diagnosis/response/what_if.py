@@ -89,10 +89,7 @@ class LinearResponse:
         return np.asarray(step @ self.directions), -0.5 * float(gradient @ step)
 
     def tangent(self, members: Array) -> ReadingTangent:
-        """The rows of each reading, of independent errors, beside control vectors (N, n).
-
-        Rows of what moves R follow those of the observations, in the same order.
-        """
+        """Rows of each reading, of independent errors, then of what moves R, beside control vectors (N, n)."""
         d, S = self.whitened
         k = len(self.observations)
         rows = d.reshape(-1, k).T, S.reshape(-1, k, S.shape[1]).transpose(1, 0, 2)
