@@ -176,9 +176,8 @@ def _files_of(series: SeriesPlan) -> dict[str, DataFile]:
 def resolve_parameters(
     config: Config | SequenceConfig, observations: Observations | None
 ) -> tuple[tuple[PriorTerm, ...], dict[str, float]]:
-    """Prior terms and fixed values, evaluated on the data where they refer to them.
-
-    Raises :class:`ConfigError`: every entry that cannot be evaluated, located in the file.
+    """Prior terms and fixed values, evaluated on the data where they refer to them. Raises :class:`ConfigError`: every
+    entry that cannot be evaluated, located in the file.
     """
     terms: list[PriorTerm] = []
     fixed: dict[str, float] = {}

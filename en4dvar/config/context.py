@@ -66,7 +66,6 @@ class _Finding:
 
 class Faults:
     """Faults that a validator of ours finds, each with its place below the value; told to pydantic on leaving.
-
     ``names``: declared → as the file has it, where a key is named after something else.
     """
 
@@ -201,7 +200,6 @@ class Unknown(Exception):
 @dataclass
 class Context:
     """``built``: the model of the file, None where it is at fault; then ``default`` is it with default settings.
-
     ``observed``: what the data hold. ``subject``: what the entry of a section by name is about, e.g. a parameter.
     """
 

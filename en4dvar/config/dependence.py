@@ -92,7 +92,6 @@ class PriorFile(Section):
 
 def joined(blocks: Sequence[tuple[tuple[str, ...], Array]]) -> tuple[Dependence, ...]:
     """Blocks of correlations between some names each; what shares a name is one block, zero where nothing is said.
-
     Raises :class:`ConfigError`: a pair of which two say something, or no correlation matrix.
     """
     groups: list[list[int]] = []
@@ -195,9 +194,8 @@ def _of_ensemble(
 
 
 def term_of_members(parameter: Parameter, values: Array, kind: str | None) -> tuple[PriorTerm, Array]:
-    """The Gaussian of members (N,) in the coordinate ``kind``, and the members standardised (N,).
-
-    Raises :class:`ConfigError`: members outside of the parameter's bounds or of the range of its map, or all alike.
+    """The Gaussian of members (N,) in the coordinate ``kind``, and the members standardised (N,). Raises
+    :class:`ConfigError`: members outside of the parameter's bounds or of the range of its map, or all alike.
     """
     low, high = parameter.bounds
     kind = kind or parameter.transform

@@ -117,9 +117,8 @@ def load_config(source: Source, overrides: Mapping[str, Any] | None = None) -> C
 
 
 def recorded(text: str, file: str) -> Document:
-    """The resolved configuration that a result holds. Raises :class:`ConfigError`.
-
-    Version 1.0 also wrote the defaults of keys that the scheme does not read; these are left out.
+    """The resolved configuration that a result holds. Raises :class:`ConfigError`. Version 1.0 also wrote the defaults
+    of keys that the scheme does not read; these are left out.
     """
     document = parse_document(text, file)
     section = document.data.get("assimilation")
@@ -130,9 +129,8 @@ def recorded(text: str, file: str) -> Document:
 
 
 def resolve(document: Document, base: Path, model: ForwardModel | None = None) -> Config:
-    """Validate a document whose relative paths start at ``base``. Raises :class:`ConfigError`.
-
-    ``model``: one that is there already; the ``model:`` section then only records what it is.
+    """Validate a document whose relative paths start at ``base``. Raises :class:`ConfigError`. ``model``: one that is
+    there already; the ``model:`` section then only records what it is.
     """
     for kind, words in KINDS.items():
         if kind in document.data:
@@ -180,9 +178,8 @@ class Read(Generic[S]):
     model_section: dict[str, Any]
 
     def common(self, parameters: Iterable[Entry]) -> dict[str, Any]:
-        """The fields of :class:`Validated`, and ``execution``, of a file with a section ``output``.
-
-        ``resolved`` is the file with overrides and defaults written out and paths absolute, as YAML that loads again.
+        """The fields of :class:`Validated`, and ``execution``, of a file with a section ``output``. ``resolved`` is the
+        file with overrides and defaults written out and paths absolute, as YAML that loads again.
         """
         file: Any = self.file
         where = file.output.directory or Path("runs") / file.name

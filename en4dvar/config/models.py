@@ -138,9 +138,8 @@ Built = tuple[ForwardModel, dict[str, Any]]
 
 
 def read_model(raw: Any, base: Path, document: Document, faults: list[Fault]) -> Built | None:
-    """The model and its resolved section (defaults filled in), or None with the faults appended.
-
-    Paths in a model's settings are relative to ``base``, given to pydantic as validation context ``{"base": base}``.
+    """The model and its resolved section (defaults filled in), or None with the faults appended. Paths in a model's
+    settings are relative to ``base``, given to pydantic as validation context ``{"base": base}``.
     """
     if not isinstance(raw, dict):
         return None  # told with the other keys of the file
@@ -172,9 +171,8 @@ def read_model(raw: Any, base: Path, document: Document, faults: list[Fault]) ->
 
 
 def model_listing() -> str:
-    """Every registered model, built with its default settings: observables and parameters with units.
-
-    A model that cannot be loaded or whose settings have no defaults is listed with the reason.
+    """Every registered model, built with its default settings: observables and parameters with units. A model that
+    cannot be loaded or whose settings have no defaults is listed with the reason.
     """
     return "\n\n".join(map(_description, installed(GROUP)))
 

@@ -237,9 +237,8 @@ class AwayFromMinima(Section):
 
 @dataclass(frozen=True)
 class Weighing:
-    """Weights as they are stated: a ``column`` of the file, or what gives them from times and values (K,).
-
-    ``stated`` is what the resolved file says of a user's function, its absolute path; None: what the file says.
+    """Weights as they are stated: a ``column`` of the file, or what gives them from times and values (K,). ``stated``
+    is what the resolved file says of a user's function, its absolute path; None: what the file says.
     """
 
     column: Column | None = None
@@ -247,9 +246,8 @@ class Weighing:
     stated: Any = None
 
     def weights(self, times: Array, values: Array, prominence: float, read: Array | None) -> Array:
-        """β (K,) of the observations of a window; ``read`` (K,) are those of the column.
-
-        Raises :class:`DataError` where they are not as many as the observations, negative or not finite.
+        """β (K,) of the observations of a window; ``read`` (K,) are those of the column. Raises :class:`DataError`
+        where they are not as many as the observations, negative or not finite.
         """
         weights = read if read is not None else np.ones(len(times))
         if self.of is not None:
@@ -320,9 +318,8 @@ WEIGHTS = Made(weighing, json={"oneOf": [NUMBERS.json_schema(), *(kind.model_jso
 
 @dataclass(frozen=True)
 class Placing:
-    """Places as they are stated: a ``column``, or ``positions`` (one for all readings, or one each).
-
-    ``of``: the field with coordinates that they are on; None: they are indices of its components.
+    """Places as they are stated: a ``column``, or ``positions`` (one for all readings, or one each). ``of``: the field
+    with coordinates that they are on; None: they are indices of its components.
     """
 
     column: Column | None = None

@@ -172,9 +172,8 @@ class Fixed:
 
 @dataclass(frozen=True)
 class Uncertain:
-    """A parameter with a prior; ``maximum`` as a location is the observed maximum in the window.
-
-    ``of_members`` is the prior that an ensemble makes, once its file is read.
+    """A parameter with a prior; ``maximum`` as a location is the observed maximum in the window. ``of_members`` is the
+    prior that an ensemble makes, once its file is read.
     """
 
     parameter: Parameter
@@ -314,9 +313,8 @@ def _needs_of_a_data_set(entry: Entry) -> Iterator[tuple[tuple[str, ...], str]]:
 
 
 def entries(kind: str = "") -> Made:
-    """One entry for every parameter of the model, in its order, then those of the readings if given.
-
-    ``kind``: what the file is, where it names no data from which a value could come.
+    """One entry for every parameter of the model, in its order, then those of the readings if given. ``kind``: what the
+    file is, where it names no data from which a value could come.
     """
 
     def read(section: Mapping[str, Any], context: Context) -> tuple[Entry, ...]:

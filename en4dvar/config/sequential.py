@@ -170,9 +170,8 @@ class Workers(Section):
 
 
 def error_rates(model: ForwardModel, errors: Sequence[ErrorOf], positive: Collection[str] = ()) -> Array:
-    """Variance (n_state,) per unit of time of the model error, in the ensemble's coordinates.
-
-    ``positive``: fields whose coordinate is their logarithm. Raises :class:`ConfigError`, its path the faulty key.
+    """Variance (n_state,) per unit of time of the model error, in the ensemble's coordinates. ``positive``: fields
+    whose coordinate is their logarithm. Raises :class:`ConfigError`, its path the faulty key.
     """
     rate = np.zeros(model.layout.size)
     for error in errors:
@@ -198,9 +197,8 @@ def per_time(spec: Knots, std: float, path: str) -> float:
 def localisation_of(
     settings: SeriesLocalisation, model: ForwardModel, observed: Set[str], cells: Array | None = None
 ) -> BlockLocalisation:
-    """Positions are indices of the one observed field, which fills the state but for the parameters.
-
-    ``cells`` (p,) are the indices of the observations, by default all. Raises :class:`ConfigError`.
+    """Positions are indices of the one observed field, which fills the state but for the parameters. ``cells`` (p,) are
+    the indices of the observations, by default all. Raises :class:`ConfigError`.
     """
     fields = list(dynamic_fields(model).values())
     if len(fields) != 1 or observed != {fields[0].name}:

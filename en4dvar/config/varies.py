@@ -52,9 +52,8 @@ def modes_of(prior: FieldPrior) -> list[Perturbed]:
 
 
 def perturbation(field: Field, std: str | float | Spread) -> Perturbed:
-    """N(0, std²) added to the field, or, for a std in %, a factor whose logarithm is N(0, std²).
-
-    Raises :class:`UnitError`: a unit that is not the field's. :class:`ConfigError`: a std that is not positive.
+    """N(0, std²) added to the field, or, for a std in %, a factor whose logarithm is N(0, std²). Raises
+    :class:`UnitError`: a unit that is not the field's. :class:`ConfigError`: a std that is not positive.
     """
     name, spread = f"initial_{field.name}", std if isinstance(std, Spread) else parse_spread(std, field.unit)
     if spread.relative:

@@ -152,9 +152,8 @@ class Mode:
 
 @dataclass(frozen=True)
 class FieldEstimate:
-    """Prior and posterior of a field of the initial state: values of its cells, in its unit.
-
-    ``members`` (N, size) of the posterior; ``centre``, ``mean`` and ``std`` (size,) of it, and of the prior.
+    """Prior and posterior of a field of the initial state: values of its cells, in its unit. ``members`` (N, size) of
+    the posterior; ``centre``, ``mean`` and ``std`` (size,) of it, and of the prior.
     """
 
     prior: FieldPrior
@@ -168,9 +167,8 @@ class FieldEstimate:
 
 @dataclass(frozen=True)
 class Analysis:
-    """The outcome for one data set: members in order, physical SI values, NaN where a member failed.
-
-    Shapes: N members, n estimated parameters, K observations, M points of the plotting grid.
+    """The outcome for one data set: members in order, physical SI values, NaN where a member failed. Shapes: N members,
+    n estimated parameters, K observations, M points of the plotting grid.
     """
 
     problem: InverseProblem

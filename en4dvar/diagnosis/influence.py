@@ -132,9 +132,8 @@ def prior_distance(values: Array, predictions: Array, std: Array) -> Array:
 
 
 def pareto_smoothed(log_ratios: Array) -> tuple[Array, Array]:
-    """Log weights (N, K) that sum to one in each column, and the Pareto shapes k̂ (K,), of log ratios (N, K).
-
-    k̂ is +inf where there are too few draws for a tail, −inf where the ratios do not differ.
+    """Log weights (N, K) that sum to one in each column, and the Pareto shapes k̂ (K,), of log ratios (N, K). k̂ is
+    +inf where there are too few draws for a tail, −inf where the ratios do not differ.
     """
     draws, k = log_ratios.shape
     x = log_ratios - log_ratios.max(axis=0)

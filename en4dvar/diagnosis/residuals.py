@@ -55,9 +55,8 @@ class Residuals:
         series: Indices | None = None,
         freedom: float | None = None,
     ) -> "Residuals":
-        """From whitened sensitivities S (K, r), all rows of which take part in A, and N − 1.
-
-        ``white`` (K',) and ``sensitivity`` (K'', r) are those of the observations and, below, of what moves R.
+        """From whitened sensitivities S (K, r), all rows of which take part in A, and N − 1. ``white`` (K',) and
+        ``sensitivity`` (K'', r) are those of the observations and, below, of what moves R.
         """
         k = len(speed)
         prior = math.sqrt(prior_precision) * np.eye(sensitivity.shape[1])

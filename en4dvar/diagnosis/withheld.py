@@ -30,9 +30,8 @@ BISECTIONS = 50
 
 @dataclass(frozen=True)
 class Withheld:
-    """Readings ``values`` (K,) at ``times`` (K,) after the window, and 5, 50 and 95 % of what was expected (K,).
-
-    In the units of the model and of the observable. ``runs``: forward runs it took.
+    """Readings ``values`` (K,) at ``times`` (K,) after the window, and 5, 50 and 95 % of what was expected (K,). In the
+    units of the model and of the observable. ``runs``: forward runs it took.
     """
 
     times: Array
@@ -59,9 +58,8 @@ class Withheld:
 
 
 def predict_withheld(problem: InverseProblem, members: Array, executor: Executor) -> Withheld | None:
-    """What posterior ``members`` (N, n), transformed, expect of the readings after the window.
-
-    None where there are none, or fewer than two members can be run so far.
+    """What posterior ``members`` (N, n), transformed, expect of the readings after the window. None where there are
+    none, or fewer than two members can be run so far.
     """
     whole, begin = problem.observations.continued, len(problem.observations)
     expected = expectations(problem, members, executor)

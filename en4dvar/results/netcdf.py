@@ -65,7 +65,6 @@ def understood(path: Path) -> Iterator[None]:
 @dataclass(frozen=True)
 class Variable:
     """Values along named dimensions: floats, integers, truth values or text. ``fill``: NaN means a missing value.
-
     ``single``: floats are stored in single precision; fields are large, so they are converted as they are written.
     """
 

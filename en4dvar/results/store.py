@@ -40,9 +40,8 @@ COMPLETE = ".en4dvar-complete"  # in that: it is being put in place
 
 @dataclass(frozen=True)
 class StoredResult:
-    """The posterior ensemble of one data set with everything that led to it: a thin view of ``groups``.
-
-    Values are SI; members are draws of one chain; a failed member is NaN and ``active`` is False there.
+    """The posterior ensemble of one data set with everything that led to it: a thin view of ``groups``. Values are SI;
+    members are draws of one chain; a failed member is NaN and ``active`` is False there.
     """
 
     groups: Groups
@@ -134,9 +133,8 @@ class StoredResult:
         return np.array([self.of_parameter("centre", name) for name in names])
 
     def observations(self, observables: Mapping[str, Observable] | None = None) -> Observations:
-        """The observations (y, t, R) that the result was estimated from, to the bit.
-
-        ``observables``: what the series hold, by their names; the file does not know how a model predicts them.
+        """The observations (y, t, R) that the result was estimated from, to the bit. ``observables``: what the series
+        hold, by their names; the file does not know how a model predicts them.
         """
         held, axes, later = "observed_data", self.axes, self.groups.get("/withheld")
         data, std = self.group(held), self.of_readings(held, "reading_std")

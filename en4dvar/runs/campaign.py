@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class DatasetOutcome:
     """``file`` is the posterior's netCDF, with its ``sha256``, or None where ``failure`` says why there is none.
-
     ``exit_code`` is that of the failure (1, 2 or 3), 0 where there is none.
     """
 

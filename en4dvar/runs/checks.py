@@ -25,7 +25,6 @@ T = TypeVar("T")
 
 def validate(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> AnyConfig:
     """Load a configuration, as :func:`load_config` does, and read its data files; nothing is computed or written.
-
     Raises :class:`ConfigError`: every fault of the file *and* of the data files it names, with file, line and column.
     """
     config, _, unusable = check_all(source, overrides)

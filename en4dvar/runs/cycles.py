@@ -41,7 +41,6 @@ def run_twin(
     command: str = "",
 ) -> TwinOutcome:
     """Conduct a twin experiment and write its run directory; arguments and errors as of :func:`en4dvar.run`.
-
     ``on_cycle`` is called with the number of each cycle, from 0.
     """
     kind = TwinKind(loaded(config, load_twin, overrides), on_cycle)

@@ -43,7 +43,6 @@ AGREE = 0.1  # nats
 @dataclass(frozen=True)
 class Candidate:
     """A design: what its knobs are set to, and the configuration that this makes. Without settings: as in the file.
-
     ``laws``: the same configuration with each of the laws that are to be told apart.
     """
 
@@ -154,9 +153,8 @@ class DesignKind(RunKind[Designs]):
         return load_designs(file)
 
     def _evaluate_all(self, kept: KeptUnits[Done], executor: Executor) -> None:
-        """By the method asked for; ``auto`` checks the linearised information and replaces it if it is off.
-
-        A nested estimate of few effective draws is no check: the linearised one stands and says so.
+        """By the method asked for; ``auto`` checks the linearised information and replaces it if it is off. A nested
+        estimate of few effective draws is no check: the linearised one stands and says so.
         """
         every, method = range(len(self.every)), self.config.design.method
         if method != "auto" or self.config.design.laws:  # what designs tell of the law, by which they rank, is exact
@@ -327,9 +325,8 @@ def _planned_times(config: Config) -> Array | None:
 
 
 def files_needed(config: Config) -> dict[str, DataFile]:
-    """The data file, by its name, that a plan takes its times or a prior's ``maximum`` from, if it needs one.
-
-    Raises :class:`ConfigError`, :class:`DataError`: there is none.
+    """The data file, by its name, that a plan takes its times or a prior's ``maximum`` from, if it needs one. Raises
+    :class:`ConfigError`, :class:`DataError`: there is none.
     """
     if _planned_times(config) is not None and not any(entry.needs_data for entry in config.parameters):
         return {}

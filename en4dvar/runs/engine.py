@@ -77,9 +77,8 @@ class Kind:
 
 
 class RunKind(Kind, ABC, Generic[R]):
-    """A run with a configuration and a directory of its own, whose units of work are kept as they end.
-
-    ``units``: what the user has of a run that is stopped, in words.
+    """A run with a configuration and a directory of its own, whose units of work are kept as they end. ``units``: what
+    the user has of a run that is stopped, in words.
     """
 
     units: ClassVar[str]
@@ -115,7 +114,6 @@ class RunKind(Kind, ABC, Generic[R]):
     @abstractmethod
     def conduct(self, run: "Session", executor: Executor) -> R:
         """Compute every unit of work that is not kept, combine them, and write the result files; the page follows.
-
         Raises :class:`OutputError` and what the computation raises.
         """
 

@@ -169,7 +169,6 @@ def _configured(
     call: "Given", directory: str | Path | None, replaces: bool,
 ) -> Iterator[C]:  # fmt: skip
     """What the ``content`` of a file asks for, whose arrays lie in the ``directory``, or in one that is there within.
-
     Raises :class:`ConfigError` in the words of the arguments, :class:`OutputError`.
     """
     with ExitStack() as held:

@@ -128,7 +128,6 @@ def sampled_evidences(
     run_dir: Path, workers: int | None, trust: bool, ask: Ask | None, tell: Callable[[str], None]
 ) -> Mapping[str, float]:
     """Data set → log-evidence, by the draws that its estimate has kept or by its own, where enough are effective.
-
     ``tell`` gets a line where there are none: a model that is not cheap, draws that fail, code that is not run unasked.
     """
     try:

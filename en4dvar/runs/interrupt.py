@@ -27,9 +27,8 @@ class Interrupted(KeyboardInterrupt):
 
 @contextmanager
 def terminate_as_interrupt() -> Iterator[None]:
-    """Within, SIGTERM (a batch system's time limit) and SIGHUP (the terminal is gone) act like Ctrl-C.
-
-    Only the main thread can arrange it. A signal that is ignored, as under ``nohup``, stays so.
+    """Within, SIGTERM (a batch system's time limit) and SIGHUP (the terminal is gone) act like Ctrl-C. Only the main
+    thread can arrange it. A signal that is ignored, as under ``nohup``, stays so.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -73,9 +73,8 @@ def intervals(name: str, record: Record, parameters: Sequence[Parameter]) -> str
 
 
 class RunLog:
-    """``run.log``: time and message, each written at once so that a killed run leaves what it knew.
-
-    Raises :class:`OutputError` where it cannot be opened or, while the run is at work, written.
+    """``run.log``: time and message, each written at once so that a killed run leaves what it knew. Raises
+    :class:`OutputError` where it cannot be opened or, while the run is at work, written.
     """
 
     def __init__(self, path: Path, append: bool = False):
@@ -172,9 +171,8 @@ def time_left(gone: float, done: int, total: int, iterations: Sequence[int], len
 
 @contextmanager
 def terminal_progress() -> Iterator[LiveProgress | None]:
-    """A live line on the terminal (standard error) or in a notebook, or None where there is neither.
-
-    NO_COLOR is respected. In a notebook rich needs ipywidgets; without it there is no line.
+    """A live line on the terminal (standard error) or in a notebook, or None where there is neither. NO_COLOR is
+    respected. In a notebook rich needs ipywidgets; without it there is no line.
     """
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, SpinnerColumn, TextColumn, TimeElapsedColumn

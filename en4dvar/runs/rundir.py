@@ -41,7 +41,6 @@ Mode = Literal["new", "force", "resume", "report", "beside"]
 @dataclass(frozen=True)
 class RunDirectory:
     """``path`` as the user named it; files are written to ``work``, which is ``home`` or ``home/.en4dvar-next``.
-
     ``home`` is ``path`` from the root on: a model may change the current directory. ``resumed``: a run was there.
     """
 

@@ -62,9 +62,8 @@ class TogetherKind(Kind, ABC):
         self, sets: Sequence[Finished], config: Config, executor: Executor, attributes: Mapping[str, Any], path: Path,
         tell: Tell,
     ) -> None:  # fmt: skip
-        """Estimate the sets with the seed and settings of ``config``, and write the file ``path``.
-
-        Raises :class:`ConfigError`, :class:`TooFewMembersError`, :class:`OutputError`.
+        """Estimate the sets with the seed and settings of ``config``, and write the file ``path``. Raises
+        :class:`ConfigError`, :class:`TooFewMembersError`, :class:`OutputError`.
         """
 
     def of_runs(
@@ -251,7 +250,6 @@ class PopulationKind(TogetherKind):
 
 def groups_of(config: Config, names: Iterable[str]) -> list[SetGroup]:
     """The groups that have a population each, in the order of the configuration; none where it asks for no groups.
-
     Raises :class:`ConfigError`: a data set is in no group, or in several.
     """
     if config.population is None or (kind := config.population.by) is None:

@@ -50,7 +50,6 @@ def of_strangers(source: Path, ask: Ask | None, trust: bool) -> Iterator[None]:
 
 def recorded_config(run_dir: Path, attributes: Mapping[Any, Any], trust: bool, ask: Ask | None) -> AnyConfig:
     """The configuration that a result of a run records. Raises :class:`ConfigError`, :class:`RefusedError`.
-
     :class:`OutputError`: a program has written the result, and nothing is recorded.
     """
     if not {"configuration_resolved", "identity"} <= attributes.keys():

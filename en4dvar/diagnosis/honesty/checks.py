@@ -61,9 +61,8 @@ def rank(prior: Prior, members: Array, posterior: Array) -> Findings:
 
 
 def fit(chi2: float, n_observations: int, total_dfs: float) -> Findings:
-    """A residual χ² (the sum over the observations) that R does not explain.
-
-    At the minimum its expectation is K − DFS, not K (Talagrand 1999): the fit has absorbed DFS of the noise.
+    """A residual χ² (the sum over the observations) that R does not explain. At the minimum its expectation is K − DFS,
+    not K (Talagrand 1999): the fit has absorbed DFS of the noise.
     """
     degrees = max(1.0, n_observations - total_dfs)
     low, high = diag.chi2_interval(degrees)
@@ -426,9 +425,8 @@ def sides_of_lost(members: Array, lost: Mask) -> list[Side]:
 
 
 def where_lost(prior: Prior, members: Array, lost: Mask) -> str:
-    """Where the lost members lie, in words and display units: the parameters that tell them from the others.
-
-    Of one or two members that no parameter tells from the others each is described.
+    """Where the lost members lie, in words and display units: the parameters that tell them from the others. Of one or
+    two members that no parameter tells from the others each is described.
     """
     sides = sides_of_lost(members, lost)
     if not sides:

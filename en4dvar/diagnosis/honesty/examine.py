@@ -78,7 +78,6 @@ def examine(
 
 def _beside(a: Analysis) -> set[str]:
     """Names of what is known from elsewhere (density, scale, …), where the model names the parameters of its path.
-
     Readings need not inform them; the split of the error bar says what they cost.
     """
     asked = set(a.problem.model.path_parameters)
@@ -86,9 +85,8 @@ def _beside(a: Analysis) -> set[str]:
 
 
 def doubts(problem: InverseProblem, members: Array, predicted: Array) -> Sequence[Caution]:
-    """The model's doubts about the observations, serious ones where it does not say.
-
-    Beside prior ``members`` (N, n), physical, and their predictions (N, K), NaN where one failed; none where all did.
+    """The model's doubts about the observations, serious ones where it does not say. Beside prior ``members`` (N, n),
+    physical, and their predictions (N, K), NaN where one failed; none where all did.
     """
     y, alive = problem.observations, np.all(np.isfinite(predicted), axis=1)
     if not alive.any():

@@ -24,17 +24,15 @@ TOLD = 0.03  # share from which a source is named
 
 
 def shares_of_priors(covariance: Array, prior_variance: Array) -> Array:
-    """(n, n): the share of parameter i's variance that comes from the prior of parameter j.
-
-    ``covariance`` (n, n) of the posterior and ``prior_variance`` (n,), transformed; parameters independent before.
+    """(n, n): the share of parameter i's variance that comes from the prior of parameter j. ``covariance`` (n, n) of
+    the posterior and ``prior_variance`` (n,), transformed; parameters independent before.
     """
     return np.asarray(covariance**2 / (prior_variance * np.diag(covariance)[:, None]))
 
 
 def budget(a: Analysis, name: str) -> Mapping[str, float]:
-    """Sources of the variance of a parameter, transformed, the largest first, and their shares; they sum to one.
-
-    Empty where parameters were correlated before, or too few members are alive.
+    """Sources of the variance of a parameter, transformed, the largest first, and their shares; they sum to one. Empty
+    where parameters were correlated before, or too few members are alive.
     """
     prior, alive = a.problem.prior, active_members(a.posterior_failures)
     if prior.blocks or alive.sum() <= len(prior.names):
@@ -60,9 +58,8 @@ def budget(a: Analysis, name: str) -> Mapping[str, float]:
 
 
 def largest(shares: Mapping[str, float], members: int) -> list[str]:
-    """The largest share, and those that ``members`` do not tell from it.
-
-    A share is a squared correlation ρ², of standard error 2 |ρ| (1 − ρ²) / √N; two errors of a difference are doubt.
+    """The largest share, and those that ``members`` do not tell from it. A share is a squared correlation ρ², of
+    standard error 2 |ρ| (1 − ρ²) / √N; two errors of a difference are doubt.
     """
     spread = {source: 2 * share**0.5 * (1 - share) / members**0.5 for source, share in shares.items()}
     first = next(iter(shares))

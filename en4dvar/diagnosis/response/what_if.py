@@ -151,9 +151,8 @@ def is_manifold(relative: float) -> bool:
 
 
 def exclusion(chi2_per_reading: float, readings: int, cost_change: float) -> str:
-    """Words for an alternative with which the readings cannot be fitted, whose shifts mean nothing; "" for others.
-
-    χ² with it is that of the fit and twice the change of J. Errors count as large as the fit itself finds them.
+    """Words for an alternative with which the readings cannot be fitted, whose shifts mean nothing; "" for others. χ²
+    with it is that of the fit and twice the change of J. Errors count as large as the fit itself finds them.
     """
     chi2 = chi2_per_reading * readings + 2 * cost_change
     limit = max(1.0, chi2_per_reading) * (readings + EXCLUDED * math.sqrt(2 * readings))
