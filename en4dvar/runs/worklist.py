@@ -6,7 +6,7 @@ import math
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -22,7 +22,7 @@ from en4dvar.executor import Executor, ExecutorError, SerialExecutor, ThreadsExe
 from en4dvar.executor.base import CommonValue
 from en4dvar.inputs.parts import DataFile
 from en4dvar.plumbing.errors import En4dvarError, OutputError
-from en4dvar.plumbing.files import atomic_path, readable, remove_file
+from en4dvar.plumbing.files import atomic_path, open_plain, readable, remove_file
 from en4dvar.plumbing.tables import csv_text
 from en4dvar.priors.prior import own_seed
 from en4dvar.problem import InverseProblem
@@ -224,9 +224,11 @@ class Worklist:
         return Campaign(self.config.directory, outcomes, tuple(self.run.notices), tuple(filter(None, failed)))
 
     def summarise(self) -> None:
-        """Write the table of all data sets. Raises :class:`OutputError`."""
-        with atomic_path(self.run.directory.at(SUMMARY)) as partial, partial.open("wb") as file:
-            file.writelines(self._table())
+        """Write the table of all data sets, unless it is there as it should be. Raises :class:`OutputError`."""
+        path = self.run.directory.at(SUMMARY)
+        if not _consists_of(path, self._table()):
+            with atomic_path(path) as partial, partial.open("wb") as file:
+                file.writelines(self._table())
 
     def _table(self) -> Iterator[bytes]:
         header, *failures = summary_rows((), self.failures())
@@ -403,6 +405,15 @@ class Worklist:
         self._reached.pop(d.name, None)
         if isinstance(self.progress, LiveProgress):
             self.progress.ended(d.name, len(self.ended), _in_one_line(decode(outcome, DatasetOutcome)))
+
+
+def _consists_of(path: Path, parts: Iterable[bytes]) -> bool:
+    """Whether a file is there and holds these parts, one after the other, and nothing else."""
+    try:
+        with open_plain(path) as file:
+            return all(file.read(len(part)) == part for part in parts) and not file.read(1)
+    except OSError:
+        return False
 
 
 def _in_one_line(outcome: DatasetOutcome) -> str:
