@@ -30,11 +30,13 @@ from typing import Any
 import numpy as np
 from cheap_model import write_campaign
 
+import en4dvar.results.store
 import en4dvar.runs.worklist
 import en4dvar_bubble
 from en4dvar.assembly.build import data_files, inverse_plan
 from en4dvar.config import Config, load_config
 from en4dvar.ensemble.members import Reading
+from en4dvar.estimation.summary import ParameterSummary
 from en4dvar.executor import Executor, ProcessesExecutor, SerialExecutor, ThreadsExecutor, one_blas_thread
 from en4dvar.executor.base import CommonValue
 from en4dvar.results.pack import PACK, Pack
@@ -147,9 +149,9 @@ def spent(config: Config) -> list[float]:
     clock, rows = time.thread_time, []
     forward = (BubbleModel, "initial_states"), (SerialExecutor, "trajectories"), (Reading, "observe")
     making = (
-        (en4dvar.runs.worklist, "build_groups"),
+        (en4dvar.results.store, "build_groups"),
         (en4dvar.runs.worklist, "packed"),
-        (en4dvar.runs.worklist, "summarise"),
+        (ParameterSummary, "of"),
     )
     with tempfile.TemporaryDirectory() as folder:
         pack = Pack(Path(folder, PACK))

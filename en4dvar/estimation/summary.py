@@ -12,10 +12,10 @@ if TYPE_CHECKING:
     import pandas as pd
 
 from en4dvar.diagnosis.analysis import Analysis
-from en4dvar.diagnosis.diagnostics import HARDLY_INFORMED, active_members, change_words, member_quantiles
+from en4dvar.diagnosis.diagnostics import HARDLY_INFORMED, change_words, member_quantiles
 from en4dvar.diagnosis.response.budget import budget_words
 from en4dvar.diagnosis.response.what_if import Shift, exclusion, is_manifold
-from en4dvar.model.state import Array, Mask, Parameter
+from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.caution import Caution, codes, of_several_modes, untrusted
 from en4dvar.plumbing.tables import table
 from en4dvar.plumbing.units import convert
@@ -90,27 +90,6 @@ def informed_words(name: str, dfs: float, cautions: Sequence[Caution]) -> str:
     if any(c.code == "not-informed" and name in c.parameters for c in cautions):
         return LITTLE
     return next(words for limit, words in DFS_WORDS if dfs < limit or limit == math.inf)
-
-
-def living(values: Array, alive: Mask | bool, p: Parameter) -> Array:
-    """Finite values (N',) of members alive, in the display unit."""
-    return np.asarray(convert(values[np.isfinite(values) & alive], p.unit, p.display_unit))
-
-
-def summarise(a: Analysis) -> tuple[ParameterSummary, ...]:
-    """One row a parameter: prior, mean, std (N−1), 5/50/95 %, centre, DFS; NaN where too few members live."""
-    alive = active_members(a.posterior_failures)
-    return tuple(
-        ParameterSummary.of(
-            p,
-            living(a.prior[:, j], True, p),
-            living(a.posterior[:, j], alive, p),
-            float(a.centre[j]),
-            float(a.dfs_per_parameter[j]),
-            a.cautions,
-        )
-        for j, p in enumerate(a.parameters)
-    )
 
 
 def remarks(a: Analysis) -> tuple[str, ...]:

@@ -22,7 +22,7 @@ from en4dvar.data.noise import SIDES, noise_of_readings, noise_of_record, record
 from en4dvar.data.observations import Observations
 from en4dvar.data.series import Part, Places
 from en4dvar.diagnosis.analysis import Analysis
-from en4dvar.estimation.summary import ParameterSummary, brief, living, results_table
+from en4dvar.estimation.summary import ParameterSummary, brief, results_table
 from en4dvar.model.forward import Observable, Trajectory
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.caution import Caution, parsed
@@ -114,11 +114,12 @@ class StoredResult:
     def members(self, group: str, name: str) -> Array:
         """(N',) finite values of a parameter in ``group`` (prior or posterior), display unit, members in order."""
         values = np.asarray(self.groups[f"/{group}"][name].values, dtype=float).ravel()
-        return living(values, self.alive if group == "posterior" else True, self._parameter(name))
+        p, alive = self._parameter(name), self.alive if group == "posterior" else True
+        return np.asarray(convert(values[np.isfinite(values) & alive], p.unit, p.display_unit))
 
     @property
     def rows(self) -> tuple[ParameterSummary, ...]:
-        """One row a parameter, as of :func:`~en4dvar.estimation.summary.summarise`."""
+        """One row a parameter: prior, mean, std (N−1), 5/50/95 %, centre, DFS; NaN where too few members live."""
         cautions = self.cautions
 
         def row(name: str) -> ParameterSummary:

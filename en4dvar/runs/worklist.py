@@ -17,7 +17,7 @@ from en4dvar.assembly.build import build_one
 from en4dvar.config import Config
 from en4dvar.diagnosis.analysis import IterationRecord, Progress, Record, StartRecord
 from en4dvar.estimation.assimilate import assimilate
-from en4dvar.estimation.summary import brief, dataset_rows, remarks, summarise, summary_rows
+from en4dvar.estimation.summary import brief, dataset_rows, remarks, summary_rows
 from en4dvar.executor import Executor, ExecutorError, SerialExecutor, ThreadsExecutor
 from en4dvar.executor.base import CommonValue
 from en4dvar.inputs.parts import DataFile
@@ -30,7 +30,7 @@ from en4dvar.results.checkpoint import FOLDER, Keeper, decode, digest, encode, f
 from en4dvar.results.journal import Journal, KnownRuns
 from en4dvar.results.netcdf import SealedBytes, to_bytes
 from en4dvar.results.pack import PACK, Entry, Pack, file_names, packed, read_outcome
-from en4dvar.results.store import build_groups
+from en4dvar.results.store import StoredResult
 from en4dvar.runs.campaign import Campaign, DatasetOutcome, Outcomes
 from en4dvar.runs.engine import Session
 from en4dvar.runs.progress import LiveProgress, describe, intervals
@@ -91,10 +91,10 @@ def estimate(job: Job, executor: Executor | None = None, progress: Progress | No
     seed = own_seed(config.seed, job.name)
     journal = Journal(executor or SerialExecutor(), job.before, job.keeper, job.stop)
     analysis = assimilate(job.problem, config.assimilation, seed, journal, journal.untold(progress))
-    groups = build_groups(analysis, {**attributes, **job.attributes})
-    content: SealedBytes | bytes = to_bytes(groups) if job.alone else packed(groups)
+    result = StoredResult.from_analysis(analysis, {**attributes, **job.attributes})
+    content: SealedBytes | bytes = to_bytes(result.groups) if job.alone else packed(result.groups)
     sha256 = content.sha256 if isinstance(content, SealedBytes) else digest(content)
-    summary = summarise(analysis)
+    summary = result.rows
     outcome = DatasetOutcome(
         analysis.name,
         warnings=analysis.cautions,

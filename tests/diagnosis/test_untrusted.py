@@ -11,10 +11,11 @@ from toys import Decay, make_problem
 
 from en4dvar.data.noise import noise_of
 from en4dvar.diagnosis.honesty.checks import conflict, gaussian, information
-from en4dvar.estimation.summary import informed_words, summarise
+from en4dvar.estimation.summary import informed_words
 from en4dvar.model.state import Parameter
 from en4dvar.plumbing.caution import CATALOGUE, SEVERITIES, Caution, caution, gravity, untrusted, worst_first
 from en4dvar.priors.prior import Prior, PriorTerm
+from en4dvar.results.store import StoredResult
 
 G = Parameter("G", "Pa", bounds=(0.0, np.inf), display_unit="kPa")
 MU = Parameter("mu", "Pa s", bounds=(0.0, np.inf))
@@ -79,7 +80,7 @@ def test_checks_say_whose_numbers_they_are_about(code, names):
 def test_the_summary_follows():
     ended = PROVOKED["at-bound"]()
     analysis = replace(ended, cautions=tuple(c for c in ended.cautions if c.code == "at-bound"))
-    rows = {row.name: row for row in summarise(analysis)}
+    rows = {row.name: row for row in StoredResult.from_analysis(analysis, {}).rows}
     assert rows["a"].untrusted == ("at-bound",)
     assert rows["a"].informed == ""
     assert rows["b"].untrusted == ()
@@ -185,7 +186,10 @@ def test_a_structure_far_below_the_errors_spoils_no_interval(std, severity):
     analysis = run(replace(problem, observations=wide))
     (found,) = (c for c in analysis.cautions if c.code == "residual-structure")
     assert found.severity == severity
-    assert all(("residual-structure" in row.untrusted) == (severity == "serious") for row in summarise(analysis))
+    assert all(
+        ("residual-structure" in row.untrusted) == (severity == "serious")
+        for row in StoredResult.from_analysis(analysis, {}).rows
+    )
 
 
 @pytest.mark.slow
@@ -196,5 +200,5 @@ def test_after_a_chain_the_words_are_those_of_the_chain():
     x = problem.prior.from_physical(refined.posterior)
     np.testing.assert_allclose(refined.dfs_per_parameter, 1 - x.var(axis=0) / problem.prior.std**2, atol=0.03)
     assert np.abs(refined.dfs_per_parameter - plain.dfs_per_parameter).max() > 0.05
-    for row, dfs in zip(summarise(refined), refined.dfs_per_parameter, strict=True):
+    for row, dfs in zip(StoredResult.from_analysis(refined, {}).rows, refined.dfs_per_parameter, strict=True):
         assert row.informed == informed_words(row.name, float(dfs), refined.cautions)

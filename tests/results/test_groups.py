@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from en4dvar.estimation.summary import summarise
+from en4dvar.diagnosis.diagnostics import active_members, member_quantiles
+from en4dvar.plumbing.caution import untrusted
+from en4dvar.plumbing.units import convert
 from en4dvar.report.result import Result
 from en4dvar.results import netcdf
 from en4dvar.results.netcdf import Group, Variable, read_groups, seal_file, to_bytes, tree_of
@@ -75,13 +77,29 @@ def test_large_variables_are_written_in_blocks(tmp_path, monkeypatch):
     assert tree_of(groups)["x"].dtype == np.float32
 
 
-def test_summary_of_the_analysis_is_that_of_the_result(analysis):
-    assert summarise(analysis) == Result.from_analysis(analysis, {}).rows
+def shown(analysis, members):
+    """(n, N) in display units."""
+    return [convert(values, p.unit, p.display_unit) for values, p in zip(members.T, analysis.parameters, strict=True)]
+
+
+def test_rows_of_the_result_are_those_of_the_analysis(analysis):
+    alive = active_members(analysis.posterior_failures)
+    members = shown(analysis, analysis.prior), shown(analysis, analysis.posterior[alive])
+    own = zip(*members, shown(analysis, analysis.centre[None]), analysis.dfs_per_parameter, strict=True)
+    rows = Result.from_analysis(analysis, {}).rows
+    assert [row.name for row in rows] == [p.name for p in analysis.parameters]
+    for row, (prior, posterior, centre, dfs) in zip(rows, own, strict=True):
+        quantiles = member_quantiles(posterior, (0.05, 0.5, 0.95))
+        expected = prior.mean(), prior.std(ddof=1), posterior.mean(), posterior.std(ddof=1), *quantiles, *centre, dfs
+        told = (row.prior_mean, row.prior_std, row.mean, row.std, row.q05, row.q50, row.q95, row.centre, row.dfs)
+        assert told == expected
+        assert row.untrusted == untrusted(analysis.cautions, row.name)
 
 
 @pytest.mark.parametrize("survivors", [0, 1])
 def test_summary_without_survivors(make_analysis, survivors):
     analysis = make_analysis(5, posterior_failures=tuple("x" if i >= survivors else "" for i in range(5)))
-    found, expected = summarise(analysis), Result.from_analysis(analysis, {}).rows
-    np.testing.assert_equal([vars(row) for row in found], [vars(row) for row in expected])
-    assert np.isnan(found[0].std)
+    rows, values = Result.from_analysis(analysis, {}).rows, shown(analysis, analysis.posterior[:1])
+    for row, (only,) in zip(rows, values, strict=True):
+        np.testing.assert_equal([row.mean, row.q05, row.q95], [only if survivors else np.nan] * 3)
+        assert np.isnan(row.std)

@@ -12,10 +12,10 @@ from en4dvar.descent.minima import Minimum
 from en4dvar.diagnosis.analysis import Mode
 from en4dvar.estimation.assimilate import assimilate, log_posterior
 from en4dvar.estimation.conclusions import modes_of
-from en4dvar.estimation.summary import summarise
 from en4dvar.executor import ThreadsExecutor
 from en4dvar.model.state import Parameter
 from en4dvar.priors.prior import Prior, PriorTerm
+from en4dvar.results.store import StoredResult
 from en4dvar.sampling import mcmc
 from en4dvar.sampling.modes import belonging, sample_modes
 from en4dvar.sampling.refine import SEEN, Refined, mode_cautions
@@ -40,7 +40,7 @@ def test_weights_are_the_masses_of_the_wells(kind, mean):
     assert sum(mode.weight for mode in analysis.modes) == pytest.approx(1)
     (told,) = (c for c in analysis.cautions if c.code == "several-modes")
     assert told.parameters == ("a",)  # b is the same in both
-    a, b = summarise(analysis)
+    a, b = StoredResult.from_analysis(analysis, {}).rows
     assert (a.modal, b.modal) == (True, False)
     assert a.q05 < 0 < a.q95
 
@@ -100,7 +100,7 @@ def test_of_a_model_that_is_not_cheap_the_other_minimum_is_told():
     assert len(slow.modes) == 2
     (told,) = (c for c in slow.cautions if c.code == "several-modes")
     assert told.severity == "serious"
-    assert all(row.untrusted == ("several-modes",) for row in summarise(slow))
+    assert all(row.untrusted == ("several-modes",) for row in StoredResult.from_analysis(slow, {}).rows)
 
 
 def test_the_evidence_is_that_of_both_wells():
