@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Self
 
-from pydantic import AfterValidator, Field, ValidatorFunctionWrapHandler, WrapValidator, model_validator
+from pydantic import Field, ValidatorFunctionWrapHandler, WrapValidator, model_validator
 
 from en4dvar.config.context import Context, Faults, Made
 from en4dvar.config.data import DATA, DataPlan
@@ -278,15 +278,10 @@ def _ascending(written: Any, validate: ValidatorFunctionWrapHandler) -> tuple[fl
     return low, high
 
 
-def _positive(pair: tuple[float, float]) -> tuple[float, float]:
-    if pair[0] is not None and not pair[0] > 0:
-        raise ValueError("must be positive")
-    return pair
-
-
 NOUGHT = ("0", "0.0")  # needs no unit
 End = Annotated[float, Made(lambda text, c: 0.0 if str(text) in NOUGHT else parse_quantity(text, time_unit(c)))]
 Interval = Annotated[tuple[End, End], WrapValidator(_ascending)]
+Width = Annotated[float, quantity(time_unit, "positive")]
 
 
 def _below(directory: str, context: Context) -> Path:
@@ -303,7 +298,7 @@ class CampaignSection(Section):
     """Folder of the data files, relative to the configuration's."""
     first: Interval
     """Instant of the first reading."""
-    spacing: Annotated[Interval, AfterValidator(_positive)]
+    spacing: Annotated[tuple[Width, Width], WrapValidator(_ascending)]
     """Time between two readings."""
     stop: Annotated[float, Field(gt=0, lt=1)]
     """Readings end with the first one below this times the largest so far."""

@@ -173,11 +173,8 @@ def _modes(result: StoredResult) -> list[tuple[str, ...]]:
 
 def _fixed(result: StoredResult) -> list[tuple[str, str, float, str]]:
     """(symbol, label, value, unit) of the values held fixed."""
-    rows = []
-    for variable in result.group("constant_data").variables.values():
-        about, value = variable.attrs, float(shown(variable))
-        rows.append((about["symbol"], about["long_name"], value, display_unit(variable)))
-    return rows
+    held = result.group("constant_data").variables.values()
+    return [(v.attrs["symbol"], v.attrs["long_name"], float(shown(v)), display_unit(v)) for v in held]
 
 
 def _iterations(result: StoredResult) -> list[tuple[str, ...]]:

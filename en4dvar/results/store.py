@@ -171,9 +171,8 @@ class StoredResult:
         return f"{ended}; chi2/K {s['chi2_per_observation']:.3g}, NRMSE {s['nrmse']:.3g}, DFS {s['dfs']:.3g}"
 
     def __repr__(self) -> str:
-        ended = "converged" if self.groups["/sample_stats"].attrs["converged"] else "not converged"
         warned = f", {len(self.warnings)} warning{'s' * (len(self.warnings) > 1)}" if self.warnings else ""
-        return f"<{type(self).__name__} {self.name}: {brief(self.rows)}; {ended}{warned}>"
+        return f"<{type(self).__name__} {self.name}: {brief(self.rows)}; {self.ended.partition(':')[0]}{warned}>"
 
     def __str__(self) -> str:
         """The summary as a table (display units), how the fit ended, and the warnings."""
