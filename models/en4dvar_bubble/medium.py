@@ -182,9 +182,7 @@ MEDIA: tuple[str, ...] = tuple(_KINDS)
 def known_medium(name: str, concentration: float | None = None) -> KnownMedium:
     """A medium of :data:`MEDIA` at a ``concentration`` (mass of polymer over that of the whole), or at the usual one.
 
-    Raises
-    ------
-    KeyError: a name that is not in :data:`MEDIA`.
+    Raises :class:`KeyError`: a name that is not in :data:`MEDIA`.
     """
     kind = _KINDS[name]
     fraction, spread = kind.usual if concentration is None else (concentration, 0.0)

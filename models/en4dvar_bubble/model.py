@@ -11,7 +11,6 @@ one three times the largest radius away makes a collapse 7 % longer (Rattray: 0.
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from threading import Lock
 from types import MappingProxyType
 from typing import Any, ClassVar, cast
 
@@ -173,13 +172,7 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
         if order is not None:
             micro = np.take_along_axis(np.abs(micro), order, axis=1)
         packed = pack(self, x, t0 * 1e6, micro, halved)
-        kernel, solved = self.solver.prepared(packed.members, packed.memory, packed.viscous, packed.pulse)
-        once = Lock()
-
-        def work() -> None:
-            if once.acquire(blocking=False):
-                packed.complete()
-            kernel()
+        work, solved = self.solver.prepared(*packed)
 
         def finish() -> Paths:
             solution = solved

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, NamedTuple, cast
 
 import numpy as np
-import numpy.typing as npt
 
 from en4dvar.model.forward import Batch, Failure, Trajectory, ValidityLimit
 from en4dvar.model.state import Array, StateLayout
@@ -29,7 +28,6 @@ from en4dvar_bubble.solver import rows
 from en4dvar_bubble.solver.arrays import Members
 from en4dvar_bubble.solver.driver import Solution, System
 from en4dvar_bubble.solver.integrate import BEYOND, END_TIME, MAX_MACH
-from en4dvar_bubble.solver.lanes import WIDTH
 
 THETA, MOLE_FRACTION = "temperature of the gas over that far away", "mole fraction of vapour"
 
@@ -212,17 +210,12 @@ _NO_SAMPLES = np.zeros((0, len(GRID.nodes)))
 
 
 class Packed(NamedTuple):
-    """N members in the kernel's units and what their laws add to the equations; a call that completes them.
-
-    The elastic parts of the first members in the queue are sampled at once; they can be integrated while the call
-    samples the others, which it then makes available.
-    """
+    """N members in the kernel's units, and the tables that their laws and the driving add to the equations."""
 
     members: Members
     memory: Array
     viscous: Array
     pulse: Array
-    complete: Callable[[], None]
 
 
 def pack(model: Dynamics, x: Array, start: Array | float, times: Array, halved: bool = False) -> Packed:
@@ -245,39 +238,17 @@ def pack(model: Dynamics, x: Array, start: Array | float, times: Array, halved: 
     elif "mu" in values:
         par[:, rows.VISCOSITY] = values["mu"] / rho * 1e6
 
-    # Least damped, hence longest ringing, first, so that the lanes run dry together.
-    order = np.argsort(par[:, rows.VISCOSITY], kind="stable")
-    first, others = order[:WIDTH], order[WIDTH:]
-    available = np.full(1, n_members, dtype=np.int64)
-    samples, elastic = _NO_SAMPLES, _NO_TABLE
-    own_density = np.ndim(rho) > 0
-
-    def sampled(which: npt.NDArray[np.intp]) -> Array | None:
-        """Of some members; the kernel divides by one density, those of their own are divided by here."""
-        tabulated = law.samples({name: value[which] for name, value in values.items()})
-        return tabulated * (1 / np.asarray(rho)[which])[:, None] if tabulated is not None and own_density else tabulated
-
-    some = None if halved else sampled(first)
-    if some is None:
-        elastic = law.table(values, halved)
+    samples, elastic, own_density = None if halved else law.samples(values), _NO_TABLE, np.ndim(rho) > 0
+    if samples is None:
+        samples, elastic = _NO_SAMPLES, law.table(values, halved)
         elastic[..., :6] /= model.medium_of(own, 2).rho  # not what tells of halved cells
-    else:
-        samples = np.empty((n_members, some.shape[1]))
-        samples[first] = some
-        available[0] = len(first)
-
-    def complete() -> None:
-        try:
-            if available[0] < n_members:
-                rest = sampled(others)
-                samples[others] = np.nan if rest is None else rest
-        finally:  # threads may be waiting
-            available[0] = n_members
+    elif own_density:  # the kernel divides by one density
+        samples *= (1 / np.asarray(rho))[:, None]
 
     members = Members(
         counter=np.zeros(1, dtype=np.int64),
-        available=available,
-        order=order,
+        # Least damped, hence longest ringing, first, so that the lanes run dry together.
+        order=np.argsort(par[:, rows.VISCOSITY], kind="stable"),
         initial=initial,
         parameters=par,
         start=np.full(n_members, start, dtype=float),
@@ -286,7 +257,7 @@ def pack(model: Dynamics, x: Array, start: Array | float, times: Array, halved: 
         factor=1.0 if own_density else 1 / rho,
         tables=elastic,
     )
-    return Packed(members, memory, viscous, clocks.table, complete)
+    return Packed(members, memory, viscous, clocks.table)
 
 
 def _states(model: Dynamics, x: Array, own: Mapping[str, Array]) -> tuple[Array, Array]:

@@ -12,7 +12,7 @@ from en4dvar.plumbing.compiled import called, kernel_called_by_address, kernel_w
 from en4dvar_bubble.solver import rodas5p
 from en4dvar_bubble.solver.apart import call, kept
 from en4dvar_bubble.solver.arrays import Lanes, Loaded, Workspace
-from en4dvar_bubble.solver.lanes import WIDTH, parted, peek, take
+from en4dvar_bubble.solver.lanes import WIDTH, parted, take
 from en4dvar_bubble.solver.rows import AMPLITUDE, PULSE_RATE, PULSE_SHIFT, SMEARED, TABLE
 from en4dvar_bubble.solver.step import LEAST_ERROR, attempt, interpolant, judge
 from en4dvar_bubble.tables import fill_one
@@ -263,8 +263,6 @@ def _begin_step(shared, lanes):
             if place >= len(members.order):
                 turn[_EXHAUSTED] = 1
             else:
-                while peek(members.available) <= place:
-                    pass
                 turn[_RUNNING] += _begin(members.order[place], lane, shared, lanes)
         if lanes.member[lane] >= 0:
             _cut_step(lane, shared, lanes)

@@ -193,8 +193,8 @@ def propose_config(
     Raises
     ------
     DataError: no usable file, no bubble in any (of several, those that are of no use are named among the warnings), or
-    data sets that suggest different starts. ConfigError: unknown law, or
-    neither ``time`` nor ``time_step``. UnitError: a unit that is not of its kind.
+    data sets that suggest different starts. ConfigError: unknown law, or neither ``time`` nor ``time_step``. UnitError:
+    a unit that is not of its kind.
     """
     if (time is None) == (time_step is None):
         raise ConfigError("give either the column of times and its unit, or a constant time step")
@@ -237,9 +237,7 @@ def _largest(readings: Mapping[str, Readings], name: str) -> float:
 def histories(files: Mapping[str, DataFile], source: Source) -> tuple[dict[str, Readings], list[str]]:
     """Readings in s and m of each data set, and why others cannot be used.
 
-    Raises
-    ------
-    DataError: none can be used. UnitError: a unit that is not of its kind.
+    Raises :class:`DataError`: none can be used. :class:`UnitError`: a unit that is not of its kind.
     """
     time, radius = _times(source), Column(*source.radius, "m", True)
 

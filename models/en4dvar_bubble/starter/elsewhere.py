@@ -101,9 +101,7 @@ _OF_ANY = (
 def known(medium: str, scale: Known = SCALE) -> Sequence[Known]:
     """What is known of an experiment in one of the :data:`CHOICES`, which a concentration may follow: ``agarose 1 %``.
 
-    Raises
-    ------
-    ConfigError: another medium, or no concentration (mass of polymer over that of the whole) between 0 and 50 %.
+    Raises :class:`ConfigError`: another medium, or a concentration (mass over that of the whole) not within 0 to 50 %.
     """
     name, _, text = medium.strip().partition(" ")
     if name not in CHOICES:

@@ -98,9 +98,7 @@ def propose(
     ``medium``: one of those of :mod:`en4dvar_bubble.starter.elsewhere`. ``groups``: of its data sets. ``scale``: what
     is known of what multiplies all radii.
 
-    Raises
-    ------
-    DataError: no history shows a bubble, or the data sets suggest different starts. ConfigError: unknown law.
+    Raises :class:`DataError`: no history shows a bubble, or they suggest different starts. ConfigError: unknown law.
     """
     looks, unseen = _looks(histories, start)
     views = list(looks.values())
