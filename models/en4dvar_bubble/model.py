@@ -32,9 +32,9 @@ from en4dvar.plumbing.caution import Caution
 from en4dvar_bubble.collapse import SINGLE, doubts, single
 from en4dvar_bubble.dynamics import MACH_LIMITS, Dynamics, Wall
 from en4dvar_bubble.events import OBSERVABLES
-from en4dvar_bubble.gas import saturated_vapour_pressure
 from en4dvar_bubble.laws import get_law
 from en4dvar_bubble.laws.tabulate import GRID, ends
+from en4dvar_bubble.medium import saturated_vapour_pressure
 from en4dvar_bubble.numbers import NAMES, WALL_DISTANCE
 from en4dvar_bubble.paths import Paths, pack, with_gas
 from en4dvar_bubble.settings import BubbleSettings

@@ -11,18 +11,8 @@ import numpy as np
 from en4dvar.model.forward import Batch, Failure, Trajectory, ValidityLimit
 from en4dvar.model.state import Array, StateLayout
 from en4dvar_bubble.dynamics import Dynamics
-from en4dvar_bubble.gas import (
-    GAS_CONSTANT,
-    SATURATION,
-    SATURATION_TEMPERATURE,
-    from_kirchhoff,
-    kirchhoff,
-    mass_fraction,
-    mole_fraction,
-    saturated_vapour_pressure,
-)
 from en4dvar_bubble.laws.tabulate import GRID
-from en4dvar_bubble.medium import Medium
+from en4dvar_bubble.medium import GAS_CONSTANT, SATURATION, SATURATION_TEMPERATURE, Medium, saturated_vapour_pressure
 from en4dvar_bubble.numbers import ACCOMMODATION, P_A
 from en4dvar_bubble.solver import rows
 from en4dvar_bubble.solver.arrays import Members
@@ -119,7 +109,7 @@ class Paths(Batch):
         tau = self.raw[:, :, : system.gas]
         if system.wall:
             tau = np.concatenate([tau, self.raw[:, :, system.wall_row, None]], axis=2)
-        return from_kirchhoff(tau, self.medium(2))
+        return self.medium(2).from_kirchhoff(tau)
 
     def _chi(self) -> Array:
         system = self.model.system
@@ -155,7 +145,7 @@ OF_WHOLE: dict[str, Callable[[Paths], Any]] = {
     THETA: Paths._theta,
     MOLE_FRACTION: Paths._chi,
     "T": lambda p: p[THETA] * p.medium(2).T_inf,
-    "C": lambda p: mass_fraction(p[MOLE_FRACTION], p.medium(2)),
+    "C": lambda p: p.medium(2).mass_fraction(p[MOLE_FRACTION]),
     "T_m": lambda p: (1 + p.raw[:, :, p.model.system.first_medium : p.model.system.wall_row]) * p.medium(2).T_inf,
     "Z": lambda p: p.raw[:, :, p.model.system.first_memory : -2] * p.medium(2).rho,
     "p_b": Paths._p_b,
@@ -274,11 +264,11 @@ def _states(model: Dynamics, x: Array, own: Mapping[str, Array]) -> tuple[Array,
         m = system.gas
         around = model.medium_of(own, 1)
         theta = x[:, layout["T"]] / around.T_inf
-        initial[:, :m] = kirchhoff(theta[:, :m], around)
+        initial[:, :m] = around.kirchhoff(theta[:, :m])
         wall = theta[:, m] if system.wall else np.ones(len(x))
         fractions = None
         if system.vapour:
-            fractions = 1 - mole_fraction(x[:, layout["C"]], around)
+            fractions = 1 - around.mole_fraction(x[:, layout["C"]])
             initial[:, m : 2 * m] = fractions[:, :m]
             if system.kinetic:
                 fractions[:, m] = _gas_at_wall(model, par, column, wall, fractions[:, :m])
@@ -287,7 +277,7 @@ def _states(model: Dynamics, x: Array, own: Mapping[str, Array]) -> tuple[Array,
         par[:, rows.LOG_GAS] = np.log(gas * total - outside / medium.rho) + 3 * log_R
         if system.wall:
             initial[:, system.first_medium : system.wall_row] = x[:, layout["T_m"]] / around.T_inf - 1
-            initial[:, system.wall_row] = kirchhoff(wall, medium)
+            initial[:, system.wall_row] = medium.kirchhoff(wall)
     else:
         par[:, rows.LOG_GAS] = np.log(gas) + 3 * model.exponent(medium) * log_R
     par[:, rows.LOG_R0] = np.log(column[model.stress_free_radius] * 1e6)
@@ -328,14 +318,14 @@ def with_gas(model: Dynamics, x: Array, factor: Array) -> Array:
     before = x[:, layout["p_b"].start]
     vapour: float | Array = medium.p_v
     if model.system.kinetic:
-        vapour = mole_fraction(x[:, layout["C"].stop - 1], medium) * before
+        vapour = medium.mole_fraction(x[:, layout["C"].stop - 1]) * before
     elif model.system.vapour:
         vapour = saturated_vapour_pressure(x[:, layout["T"].stop - 1] if model.system.wall else medium.T_inf)
     after = vapour + factor * (before - vapour)
     changed[:, layout["p_b"].start] = after
     if model.system.vapour:
-        gas = (1 - mole_fraction(x[:, layout["C"]], around)) * (factor * before / after)[:, None]
-        changed[:, layout["C"]] = mass_fraction(np.maximum(1 - gas, 0.0), around)
+        gas = (1 - around.mole_fraction(x[:, layout["C"]])) * (factor * before / after)[:, None]
+        changed[:, layout["C"]] = around.mass_fraction(np.maximum(1 - gas, 0.0))
     return changed
 
 
