@@ -95,20 +95,20 @@ class Medium:
         return self.A * self.T_inf / self.K_inf
 
     def kirchhoff(self, theta: Array | float) -> Array:
-        """Kirchhoff's transform of θ = T/T_∞: τ = ∫₁^θ k dθ for the conductivity k = K/K_∞ = a θ + (1−a)."""
+        """Kirchhoff's transform of θ = T/T_∞ of any shape: τ = ∫₁^θ k dθ for the conductivity k = K/K_∞ = a θ + (1−a)."""
         a = self.conduction_slope
         return np.asarray(0.5 * a * (theta**2 - 1) + (1 - a) * (theta - 1))
 
     def from_kirchhoff(self, tau: Array) -> Array:
-        """θ from τ."""
+        """θ from τ, of any shape."""
         return np.asarray(1 + 2 * tau / (np.sqrt(1 + 2 * self.conduction_slope * tau) + 1))
 
     def mole_fraction(self, C: Array) -> Array:
-        """Mole fraction of vapour from its mass fraction."""
+        """Mole fraction of vapour from its mass fraction, of any shape."""
         return np.asarray(C / self.M_v / (C / self.M_v + (1 - C) / self.M_g))
 
     def mass_fraction(self, chi: Array | float) -> Array:
-        """Mass fraction of vapour from its mole fraction."""
+        """Mass fraction of vapour from its mole fraction, of any shape."""
         return np.asarray(chi * self.M_v / (chi * self.M_v + (1 - chi) * self.M_g))
 
     @property
