@@ -95,7 +95,7 @@ class Medium:
         return self.A * self.T_inf / self.K_inf
 
     def kirchhoff(self, theta: Array | float) -> Array:
-        """Kirchhoff's transform of θ = T/T_∞ of any shape: τ = ∫₁^θ k dθ for the conductivity k = K/K_∞ = a θ + (1−a)."""
+        """τ = ∫₁^θ k dθ (Kirchhoff) of θ = T/T_∞ of any shape, for the conductivity k = K/K_∞ = a θ + (1−a)."""
         a = self.conduction_slope
         return np.asarray(0.5 * a * (theta**2 - 1) + (1 - a) * (theta - 1))
 
