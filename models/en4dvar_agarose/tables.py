@@ -92,17 +92,8 @@ def as_csv(study: Study, rows: Sequence[Row], route: Route) -> str:
     return f"{words if study.plan.synthetic else ''}{csv_text(lines)}"
 
 
-def as_markdown(study: Study, rows: Sequence[Row], route: Route) -> str:
-    """A table a gel and model a line, with paper, computed and truth one below the other in a cell."""
-    return _filled("table.md.j2", study, rows, route)
-
-
-def as_latex(study: Study, rows: Sequence[Row], route: Route) -> str:
-    """A ``tabular`` in a ``table*`` with booktabs-free rules, one line a source."""
-    return _filled("table.tex.j2", study, rows, route)
-
-
-def _filled(template: str, study: Study, rows: Sequence[Row], route: Route) -> str:
+def as_text(study: Study, rows: Sequence[Row], route: Route, suffix: Literal["md", "tex"]) -> str:
+    """A table in Markdown, a gel and model a line, or in LaTeX, a source a line."""
     marks = "<%", "%>", "<<", ">>"  # braces are LaTeX's
     loader = PackageLoader("en4dvar_agarose", ".")
     environment = Environment(
@@ -110,7 +101,7 @@ def _filled(template: str, study: Study, rows: Sequence[Row], route: Route) -> s
     )
     environment.filters["escaped"] = escaped
     units = {"10⁻²": r"$10^{-2}$", "µm": r"$\mu$m", "Pa s": r"Pa\,s"}
-    return environment.get_template(template).render(
+    return environment.get_template(f"table.{suffix}.j2").render(
         title=TITLES[route], synthetic=study.plan.synthetic, sources=sources(study), rows=rows, labels=LABELS,
         quantities=QUANTITIES, units=units,
     )  # fmt: skip
