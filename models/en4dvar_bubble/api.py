@@ -104,7 +104,7 @@ def _run(model: BubbleModel, x: Array, t: Array, workers: int) -> tuple[dict[str
         for begin in range(0, n, chunk):
             rows = slice(begin, min(begin + chunk, n))
             size = rows.stop - rows.start
-            work, finish = model.prepared(x[rows], np.broadcast_to(t, (size, len(t))))
+            work, finish = model.prepared(x[rows], t)
             others = [pool.submit(work) for _ in range(min(workers, -(-size // WIDTH)) - 1)] if pool else []
             work()
             for other in others:

@@ -144,20 +144,21 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
         return np.asarray(path.states[0, 0])
 
     def trajectories(self, x: Array, times: Array) -> Sequence[Trajectory | Failure]:
-        return self.integrate(np.asarray(x, dtype=float), np.broadcast_to(times, (len(x), np.shape(times)[-1])))
+        return self.integrate(x, times)
 
     def share(self, x: Array, times: Array) -> Shared:
-        times = np.broadcast_to(times, (len(x), np.shape(times)[-1]))
-        return Shared(*self.prepared(np.asarray(x, dtype=float), times))
+        return Shared(*self.prepared(x, times))
 
     def integrate(self, x: Array, times: Array, t0: Array | float = 0.0) -> Paths:
-        """All members from states ``x`` (N, n_state) at ``t0`` (s, one or (N,)) to ``times`` (N, K) (s, increasing)."""
+        """All members from states ``x`` (N, n_state) at ``t0`` (s, one or (N,)) to increasing ``times`` (N, K) or (K,),
+        in s.
+        """
         work, finish = self.prepared(x, times, t0)
         work()
         return finish()
 
     def resumed(self, x: Array, start: Array, times: Array) -> Sequence[Trajectory | Failure]:
-        return self.integrate(np.asarray(x, dtype=float), times, start)
+        return self.integrate(x, times, start)
 
     def prepared(
         self, x: Array, times: Array, t0: Array | float = 0.0, halved: bool = False
@@ -166,6 +167,7 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
         and its result. Members that come to where a table ends are run again with ``halved`` cells, which end where
         the law does.
         """
+        x, times = np.asarray(x, dtype=float), np.broadcast_to(times, (len(x), np.shape(times)[-1]))
         micro = times * 1e6
         mirror = self.start == "laser" and not np.any(t0) and bool(np.any(times < 0))
         order = np.argsort(np.abs(micro), axis=1, kind="stable") if mirror else None

@@ -19,7 +19,9 @@ from en4dvar_bubble.tables import fill_one
 
 # Status of a member; the reasons users read are made by ``driver.Solution``.
 OK, STEP_LIMIT, NON_FINITE, STEP_UNDERFLOW, MACH_LIMIT, TIME_LIMIT, WALL_LIMIT = 0, 1, 2, 3, 4, 5, 6
-# Columns of the per-member record.
+# Columns of the per-member record: steps, rejected ones, largest wall Mach number, largest τ at the innermost node,
+# smallest ln(R/µm), end time (µs), since when (µs) the wall is faster than the equations bear, numerical diffusivity of
+# the vapour over R |Ṙ| (0 but for violent collapses); when a hundredth of the span began (µs), steps up to then.
 STEPS, REJECTED, MAX_MACH, MAX_THETA, MIN_LOG_R, END_TIME, BEYOND, SMEAR, MARK, TO_MARK = 0, 1, 2, 3, 4, 5, 6, 7, 8, 9
 RECORD = 10
 
