@@ -67,13 +67,6 @@ class Source:
         when = {"time": f"{1e6 * since.time:.9g} us", "maximum": "maximum", "top": "top", "end": "end"}
         return lines + [f"  since: {when.get(since.kind, f'{since.kind} {since.number}')}"] * (since != ANY.since)
 
-    @property
-    def time_entry(self) -> str:
-        """The ``time`` column as YAML."""
-        if self.time is None:
-            return braced(step=self.time_step, unit=self.step_unit)
-        return braced(name=self.time[0], unit=self.time[1], rate=self.rate)
-
 
 # the table that 'en4dvar track' writes: its columns say their units
 TRACKED = Source("", ("t_us", "us"), None, ("R_um", "um"), errors=("R_std_um", "t_std_us"))
