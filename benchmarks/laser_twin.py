@@ -18,8 +18,7 @@ from en4dvar.model.state import TIME_SHIFT
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
 from en4dvar_bubble import BubbleModel, NeoHookeanKelvinVoigt
-from en4dvar_bubble.gas import saturated_vapour_pressure
-from en4dvar_bubble.medium import WATER_25C
+from en4dvar_bubble.medium import WATER_25C, saturated_vapour_pressure
 
 MODEL = BubbleModel(law=NeoHookeanKelvinVoigt(), start="laser", gas="polytropic")
 MEDIANS = {"G": 4e3, "mu": 0.06, "R_eq": 35e-6}

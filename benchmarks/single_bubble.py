@@ -62,7 +62,6 @@ class Bubble:
 
     def __init__(self, model: BubbleModel, x: Array, i: int, smeared: float = 0.0) -> None:
         packed = pack(model, x, 0.0, np.ones((len(x), 1)))
-        packed.complete()
         members, solver, system = packed.members, model.solver, model.system
         self.start, self.n = members.initial[i].copy(), system.size
         self._atol = system.tolerances(1.0)[0]

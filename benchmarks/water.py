@@ -21,8 +21,7 @@ import numpy as np
 
 from en4dvar.model.state import Array
 from en4dvar_bubble import WATER_25C, Accuracy, simulate
-from en4dvar_bubble.gas import saturated_vapour_pressure
-from en4dvar_bubble.medium import known_medium
+from en4dvar_bubble.medium import known_medium, saturated_vapour_pressure
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "bubbles" / "water" / "water_1200um.csv"
 WATER = replace(WATER_25C, rho=known_medium("water").rho, c=known_medium("water").c)

@@ -63,6 +63,7 @@ MOVED |= {f"en4dvar.{old}": f"en4dvar.{new}" for new, several in {
     "runs.design_run": "runs.design_plan", "runs.estimate": "runs.given", "results.checkpoint": "results.codec",
 }.items() for old in several.split()}  # fmt: skip
 MOVED |= {"en4dvar.cycling": "en4dvar.series", "en4dvar.storage": "en4dvar.results"}
+MOVED |= {"en4dvar_lorenz.logarithm": "en4dvar_lorenz.autonomous"}
 MOVED |= {f"en4dvar_agarose.{old}": f"en4dvar_agarose.{new}" for old, new in {
     "summary": "tables", "evidence": "fits", "store": "report", "checkpoints": "run",
 }.items()}  # fmt: skip
@@ -72,7 +73,7 @@ MOVED |= {f"en4dvar_movie.{old}": f"en4dvar_movie.{new}" for old, new in {
 MOVED |= {f"en4dvar_bubble.{old}": f"en4dvar_bubble.{new}" for old, new in {
     "laws.zener": "laws.maxwell", "laws.response": "battery", "emission": "events", "packing": "paths",
     "alternatives": "model", "starter.page": "starter.config", "driving.tabulated": "driving.pulses",
-    "driving.settings": "settings", "solver.lookup": "solver.lanes", "solver.arrow": "solver.general",
+    "driving.settings": "settings", "solver.lookup": "solver.lanes", "solver.arrow": "solver.general", "gas": "medium",
 }.items()}  # fmt: skip
 
 # names that moved by themselves, with what they are called today

@@ -34,8 +34,8 @@ def write_study(study: Study, directory: Path) -> Path:
     for number, route in enumerate(ROUTES, 1):
         rows = tables.table(study, route)
         write_text(directory / f"table{number}.csv", tables.as_csv(study, rows, route))
-        write_text(directory / f"table{number}.md", tables.as_markdown(study, rows, route))
-        write_text(directory / f"table{number}.tex", tables.as_latex(study, rows, route))
+        write_text(directory / f"table{number}.md", tables.as_text(study, rows, route, "md"))
+        write_text(directory / f"table{number}.tex", tables.as_text(study, rows, route, "tex"))
     write_text(directory / "sets.csv", tables.per_set_csv(study))
     write_text(directory / "study.yaml", study.plan.text)
     study_netcdf(study).write(directory / "study.nc")
@@ -44,12 +44,9 @@ def write_study(study: Study, directory: Path) -> Path:
     page = render(
         "page.html.j2",
         "en4dvar_agarose",
-        plan=study.plan,
-        sweep=study.plan.sweep,
-        seconds=study.seconds,
+        study=study,
         hyper=HYPER,
         decisive=DECISIVE,
-        gels=len(study.fits),
         members=study.every_fit[0].analyses[0].settings.members,
         sets=sum(len(study.any_fit(gel).problems) for gel in study.fits),
         findings=findings(study),
@@ -63,7 +60,6 @@ def write_study(study: Study, directory: Path) -> Path:
         narrow=list(_narrow(study)),
         coverage=_coverage(study),
         population=list(_population(study)),
-        effective=_effective(study),
         comparison=_comparison(study),
         judged=_judged(study),
         figures=draw(figures, folder=inside(directory, "figures")),
@@ -146,15 +142,6 @@ def _population(study: Study) -> Cells:
             known = tables.plus_minus((truth.mean(), truth.std(ddof=1))) if len(truth) > 1 else "–"
             cells = [f"{mean:.3g} [{low:.3g}, {high:.3g}]", f"{std:.2g}"]
             yield [gel, f"{q.plain} ({q.unit})", *cells, tables.plus_minus((stacked.mean(), stacked.std())), known]
-
-
-def _effective(study: Study) -> str:
-    """How many draws stand behind each population."""
-    return "; ".join(
-        f"{gel}: {f.size:.0f} effective draws (of the hierarchy {f.effective[0]:.0f}, of its data sets "
-        f"{f.effective[1]:.0f})" + ("" if f.converged else ", NOT CONVERGED: do not use")
-        for gel, f in study.populations.items()
-    )
 
 
 def _comparison(study: Study) -> list[list[str]]:

@@ -59,9 +59,7 @@ class StudyCheckpoints:
     ) -> "Iterator[StudyCheckpoints]":
         """For a new study in ``folder``, which will write ``files``, or the one that is there; complete as this ends.
 
-        Raises
-        ------
-        OutputError: the one there would have other numbers; says what has changed. It cannot be written.
+        Raises :class:`OutputError`: it cannot be written, or the one there would have other numbers, and says why.
         """
         with (
             terminate_as_interrupt(),
@@ -131,11 +129,8 @@ COMPARED: tuple[Model, Model] = ("nh", "qlkv")
 def run_study(plan: StudyPlan, workers: int = 1, say: Say | None = None, keep: StudyCheckpoints | None = None) -> Study:
     """Compute everything; the truth of a twin is read last and enters no estimate.
 
-    ``keep``: where sweeps and populations are kept as they are done, and found by a study that continues.
-
-    Raises
-    ------
-    DataError, ConfigError, TooFewMembersError: as the routes do.
+    ``keep``: where sweeps and populations are kept as they are done, and found by a study that continues. Raises
+    DataError, ConfigError and TooFewMembersError as the routes do.
     """
     problems = {(gel, m): build(c) for gel, models in plan.configs.items() for m, c in models.items()}
     model = next(iter(problems.values()))[0].model

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from en4dvar.plumbing.tables import csv_text
 from en4dvar.plumbing.units import convert
@@ -91,43 +92,19 @@ def as_csv(study: Study, rows: Sequence[Row], route: Route) -> str:
     return f"{words if study.plan.synthetic else ''}{csv_text(lines)}"
 
 
-def as_markdown(study: Study, rows: Sequence[Row], route: Route) -> str:
-    """A table a gel and model a line, with paper, computed and truth one below the other in a cell."""
-    heads = sources(study)
-    lines = [f"**{TITLES[route]}**", "", f"In each cell: {'; '.join(heads.values())}.", ""]
-    lines.append("| gel | model | " + " | ".join(f"{q.plain} ({q.unit})" for q in QUANTITIES) + " |")
-    lines.append("|---" * (2 + len(QUANTITIES)) + "|")
-    for row in rows:
-        cells = ["<br>".join(cell.text(source) for source in heads) for cell in row.cells]
-        lines.append(f"| {row.gel} | {LABELS[row.model]} | " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
-
-
-def as_latex(study: Study, rows: Sequence[Row], route: Route) -> str:
-    """A ``tabular`` in a ``table*`` with booktabs-free rules, one line a source."""
-    caption = escaped(TITLES[route].partition(". ")[2])
-    note = " The computed values come from a synthetic twin campaign, not from measurements."
+def as_text(study: Study, rows: Sequence[Row], route: Route, suffix: Literal["md", "tex"]) -> str:
+    """A table in Markdown, a gel and model a line, or in LaTeX, a source a line."""
+    marks = "<%", "%>", "<<", ">>"  # braces are LaTeX's
+    loader = PackageLoader("en4dvar_agarose", ".")
+    environment = Environment(
+        *marks, trim_blocks=True, keep_trailing_newline=True, loader=loader, undefined=StrictUndefined
+    )
+    environment.filters["escaped"] = escaped
     units = {"10⁻²": r"$10^{-2}$", "µm": r"$\mu$m", "Pa s": r"Pa\,s"}
-    lines = [
-        r"\begin{table*}",
-        rf"\caption{{{caption}.{note if study.plan.synthetic else ''}}}",
-        r"\begin{tabular}{llllll}",
-        r"\hline",
-    ]
-    names = " & ".join(f"{q.latex} ({units.get(q.unit, q.unit)})" for q in QUANTITIES)
-    lines += [rf"Model & Source & {names} \\", r"\hline"]
-    gel = ""
-    for row in rows:
-        if row.gel != gel:
-            gel = row.gel
-            lines += [rf"\multicolumn{{6}}{{l}}{{{escaped(gel)} gel}} \\", r"\hline"]
-        for i, (source, heading) in enumerate(sources(study).items()):
-            cells = [escaped(cell.text(source)) for cell in row.cells]
-            lines.append(
-                rf"{LABELS[row.model] if i == 0 else ''} & {heading.partition(' (')[0]} & {' & '.join(cells)} \\"
-            )
-        lines.append(r"\hline")
-    return "\n".join([*lines, r"\end{tabular}", r"\end{table*}"]) + "\n"
+    return environment.get_template(f"table.{suffix}.j2").render(
+        title=TITLES[route], synthetic=study.plan.synthetic, sources=sources(study), rows=rows, labels=LABELS,
+        quantities=QUANTITIES, units=units,
+    )  # fmt: skip
 
 
 def _estimates(study: Study) -> Iterator[tuple[str, Cell, Pair, Pair]]:

@@ -17,7 +17,6 @@ from en4dvar.plumbing.hints import shown, suggest
 from en4dvar.plumbing.units import parse_quantity
 from en4dvar_bubble.driving import Driving, Reading
 from en4dvar_bubble.dynamics import Gas, Heat, Start, Vapour, Wall
-from en4dvar_bubble.gas import from_kirchhoff
 from en4dvar_bubble.laws import ConstitutiveLaw, get_law
 from en4dvar_bubble.medium import CONSTANT_SETS, WATER_25C, Medium
 from en4dvar_bubble.model import BubbleModel
@@ -105,7 +104,7 @@ def _run(model: BubbleModel, x: Array, t: Array, workers: int) -> tuple[dict[str
         for begin in range(0, n, chunk):
             rows = slice(begin, min(begin + chunk, n))
             size = rows.stop - rows.start
-            work, finish = model.prepared(x[rows], np.broadcast_to(t, (size, len(t))))
+            work, finish = model.prepared(x[rows], t)
             others = [pool.submit(work) for _ in range(min(workers, -(-size // WIDTH)) - 1)] if pool else []
             work()
             for other in others:
@@ -135,7 +134,7 @@ def _dataset(
     data["max_wall_mach"] = ("member", record[:, MAX_MACH], {"units": "1", "long_name": "largest wall Mach number"})
     if model.system.gas:
         own, about = model.medium_of(theta), {"units": "K", "long_name": "highest temperature near the centre"}
-        data["max_temperature"] = ("member", own.T_inf * from_kirchhoff(record[:, MAX_THETA], own), about)
+        data["max_temperature"] = ("member", own.T_inf * own.from_kirchhoff(record[:, MAX_THETA]), about)
     coordinates: dict[str, Any] = {"time": ("time", t, {"units": "s", "long_name": "time"})}
     for p in model.parameters:
         coordinates[p.name] = ("member", theta[p.name], {"units": p.unit, "long_name": p.label})

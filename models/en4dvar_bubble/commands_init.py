@@ -304,14 +304,12 @@ def _answered(asked: Asked) -> Asked:
 def _ask_unit(column: str, dimension: str, examples: str) -> str:
     from en4dvar.plumbing.units import UnitError, convert
 
-    while True:
-        unit = str(click.prompt(f"Unit of {column}, e.g. {examples}", err=True))
-        try:
+    def known(unit: str) -> str:
+        with retold(UnitError, click.UsageError):  # which is told, and the question asked again
             convert(1.0, unit, dimension)
-        except UnitError as error:
-            echo(str(error), err=True)
-        else:
-            return unit
+        return unit
+
+    return str(click.prompt(f"Unit of {column}, e.g. {examples}", err=True, value_proc=known))
 
 
 def _tell(target: Path, proposal: Proposal, example_only: bool) -> None:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from functools import cache, cached_property, lru_cache
+from functools import cache, cached_property
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -14,12 +14,11 @@ from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.hints import shown, suggest
 from en4dvar_bubble.collapse import RAYLEIGH
 from en4dvar_bubble.driving import Driving, Reading, histotripsy, silence
-from en4dvar_bubble.gas import CRITICAL_TEMPERATURE, kirchhoff, mass_fraction, saturated_vapour_pressure
 from en4dvar_bubble.laws import ConstitutiveLaw, QuadraticKelvinVoigt
 from en4dvar_bubble.laws.exactness import refuse_unfit
 from en4dvar_bubble.laws.loading import require_parameters
 from en4dvar_bubble.laws.parameters import MANCIA, positive
-from en4dvar_bubble.medium import WATER_25C, Medium
+from en4dvar_bubble.medium import CRITICAL_TEMPERATURE, WATER_25C, Medium, saturated_vapour_pressure
 from en4dvar_bubble.numbers import ACCOMMODATION, ALL, GAS_CONTENT, OF_MEDIUM, P_A, R_START, RDOT_START, WALL_DISTANCE
 from en4dvar_bubble.solver.driver import GAS_CLUSTERING, MEDIUM_LENGTHS, Accuracy, Radial, Solver, System, preset
 
@@ -187,7 +186,7 @@ class Dynamics:
         """The compiled solver of these equations."""
         hottest = np.inf
         if self.system.vapour and self.system.wall:
-            hottest = float(kirchhoff(CRITICAL_TEMPERATURE / self.medium.T_inf, self.medium))
+            hottest = float(self.medium.kirchhoff(CRITICAL_TEMPERATURE / self.medium.T_inf))
         valid, _ = MACH_LIMITS[self.radial]
         return Solver(self.system, self.driving, self.reading, self.accuracy, hottest, valid)
 
@@ -257,8 +256,20 @@ class Dynamics:
         vapour; wall last where it crosses that at a finite rate), T_m of the medium, Z (memory variables) where the
         model has them; the parameters.
         """
-        least = 0.0 if "p_v" in self.named else self.medium.p_v
-        return _layout(self.system, tuple((p.name, p.unit) for p in self.parameters), least)
+        system, above_zero = self.system, (0.0, np.inf)
+        least_pressure = 0.0 if "p_v" in self.named else self.medium.p_v
+        state = (
+            Field("R", unit="m", bounds=above_zero),
+            Field("Rdot", unit="m/s"),
+            Field("p_b", unit="Pa", bounds=(least_pressure, np.inf)),
+            Field("S", unit="Pa"),
+            Field("T", system.gas + system.wall, "K", above_zero),
+            Field("C", system.vapour + system.kinetic, "1", (0.0, 1.0)),
+            Field("T_m", system.medium, "K", above_zero),
+            Field("Z", system.memory, "Pa"),
+            *(Field(p.name, unit=p.unit) for p in self.parameters),
+        )
+        return StateLayout(tuple(block for block in state if block.size))
 
     def initial_states(self, theta: Mapping[str, Array]) -> Array:
         """States (N, n_state) at time zero for parameters name → (N,), SI.
@@ -296,7 +307,7 @@ class Dynamics:
         if R is not rest:  # there is no elastic stress at the stress-free radius
             fields["S"] = fields["S"] + self.law.elastic_stress((R / rest)[:, None], law_values)[:, 0]
         if system.vapour:
-            fields["C"] = mass_fraction(p_v / (gas + p_v), medium)[:, None]
+            fields["C"] = medium.mass_fraction(p_v / (gas + p_v))[:, None]
         for name, where in layout.slices.items():
             value = np.asarray(fields[name])
             x[:, where] = value[:, None] if value.ndim == 1 else value
@@ -312,23 +323,3 @@ class Dynamics:
         if self.law.sized:
             own["R0"] = values[self.stress_free_radius]
         return own | {"R_max": values["R_max"]} if self.law.released else own
-
-
-@lru_cache(maxsize=64)  # models are made anew by each call of simulate
-def _layout(system: System, parameters: tuple[tuple[str, str], ...], least_pressure: float) -> StateLayout:
-    """See :attr:`Dynamics.layout`; ``parameters`` are names and units."""
-    above_zero = (0.0, np.inf)
-    state = [
-        Field("R", unit="m", bounds=above_zero),
-        Field("Rdot", unit="m/s"),
-        Field("p_b", unit="Pa", bounds=(least_pressure, np.inf)),
-        Field("S", unit="Pa"),
-    ]
-    blocks = (
-        Field("T", system.gas + system.wall, "K", above_zero),
-        Field("C", system.vapour + system.kinetic, "1", (0.0, 1.0)),
-        Field("T_m", system.medium, "K", above_zero),
-        Field("Z", system.memory, "Pa"),
-    )
-    state += [block for block in blocks if block.size]
-    return StateLayout((*state, *(Field(name, unit=unit) for name, unit in parameters)))

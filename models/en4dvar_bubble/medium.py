@@ -1,4 +1,5 @@
-"""Constants of the liquid, the gas, the vapour and their interface, each with its source; named sets of them.
+"""Constants of the liquid, the gas, the vapour and their interface, each with its source; named sets of them; the
+saturation of vapour.
 
 Media by name: density and speed of sound of water, gels and solutions, and how well each is known. The volumes of water
 and polymer add, 1/ρ = (1−w)/ρ_w + w v, and the speed of sound rises in proportion to the mass fraction w,
@@ -15,6 +16,17 @@ from functools import cached_property
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
+
+from en4dvar.model.state import Array
+
+GAS_CONSTANT = 8.314462618
+"""J/(mol K), CODATA 2018."""
+CRITICAL_TEMPERATURE = 647.096
+"""K, of water (IAPWS-95)."""
+SATURATION, SATURATION_TEMPERATURE = 1.17e11, 5200.0
+"""Pa and K: p_sat(T) = SATURATION · exp(−SATURATION_TEMPERATURE/T), fit of the rheometry codes (Estrada 2018)."""
+
 _PHYSICS = "water at 25 °C, 1 atm (customary value of the cavitation literature)"
 _PROSPERETTI = "Prosperetti, J. Fluid Mech. 222, 587 (1991): linear fit for air"
 _TAIT = "Tait equation of water, p + B ∝ ρⁿ (Gilmore 1952; Prosperetti & Lezzi 1986)"
@@ -24,6 +36,11 @@ _VAPOUR = "(vapour: transport)"
 _CODES, _KINETIC = "0 constant, as in the rheometry codes", f"kinetic theory {_VAPOUR}"
 _OF_TAIT, _ENTHALPY = "Tait equation of the medium:", "(enthalpy form and Gilmore)"
 _CONDUCTING = "(medium_heat: conducting)"
+
+
+def saturated_vapour_pressure(temperature: float | Array) -> Any:
+    """p_sat(T) in Pa, of a number or an array; 3.1 kPa at 25 °C."""
+    return SATURATION * np.exp(-SATURATION_TEMPERATURE / temperature)
 
 
 def _constant(value: float, unit: str, description: str, source: str, **bounds: float) -> Any:
@@ -76,6 +93,23 @@ class Medium:
     def conduction_slope(self) -> float:
         """a in the gas's conductivity over K_inf, a θ + (1−a), θ = T/T_inf."""
         return self.A * self.T_inf / self.K_inf
+
+    def kirchhoff(self, theta: Array | float) -> Array:
+        """τ = ∫₁^θ k dθ (Kirchhoff) of θ = T/T_∞ of any shape, for the conductivity k = K/K_∞ = a θ + (1−a)."""
+        a = self.conduction_slope
+        return np.asarray(0.5 * a * (theta**2 - 1) + (1 - a) * (theta - 1))
+
+    def from_kirchhoff(self, tau: Array) -> Array:
+        """θ from τ, of any shape."""
+        return np.asarray(1 + 2 * tau / (np.sqrt(1 + 2 * self.conduction_slope * tau) + 1))
+
+    def mole_fraction(self, C: Array) -> Array:
+        """Mole fraction of vapour from its mass fraction, of any shape."""
+        return np.asarray(C / self.M_v / (C / self.M_v + (1 - C) / self.M_g))
+
+    def mass_fraction(self, chi: Array | float) -> Array:
+        """Mass fraction of vapour from its mole fraction, of any shape."""
+        return np.asarray(chi * self.M_v / (chi * self.M_v + (1 - chi) * self.M_g))
 
     @property
     def constants(self) -> dict[str, float]:
@@ -182,9 +216,7 @@ MEDIA: tuple[str, ...] = tuple(_KINDS)
 def known_medium(name: str, concentration: float | None = None) -> KnownMedium:
     """A medium of :data:`MEDIA` at a ``concentration`` (mass of polymer over that of the whole), or at the usual one.
 
-    Raises
-    ------
-    KeyError: a name that is not in :data:`MEDIA`.
+    Raises :class:`KeyError`: a name that is not in :data:`MEDIA`.
     """
     kind = _KINDS[name]
     fraction, spread = kind.usual if concentration is None else (concentration, 0.0)

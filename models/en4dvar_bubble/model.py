@@ -11,7 +11,6 @@ one three times the largest radius away makes a collapse 7 % longer (Rattray: 0.
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from threading import Lock
 from types import MappingProxyType
 from typing import Any, ClassVar, cast
 
@@ -33,9 +32,9 @@ from en4dvar.plumbing.caution import Caution
 from en4dvar_bubble.collapse import SINGLE, doubts, single
 from en4dvar_bubble.dynamics import MACH_LIMITS, Dynamics, Wall
 from en4dvar_bubble.events import OBSERVABLES
-from en4dvar_bubble.gas import saturated_vapour_pressure
 from en4dvar_bubble.laws import get_law
 from en4dvar_bubble.laws.tabulate import GRID, ends
+from en4dvar_bubble.medium import saturated_vapour_pressure
 from en4dvar_bubble.numbers import NAMES, WALL_DISTANCE
 from en4dvar_bubble.paths import Paths, pack, with_gas
 from en4dvar_bubble.settings import BubbleSettings
@@ -145,20 +144,21 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
         return np.asarray(path.states[0, 0])
 
     def trajectories(self, x: Array, times: Array) -> Sequence[Trajectory | Failure]:
-        return self.integrate(np.asarray(x, dtype=float), np.broadcast_to(times, (len(x), np.shape(times)[-1])))
+        return self.integrate(x, times)
 
     def share(self, x: Array, times: Array) -> Shared:
-        times = np.broadcast_to(times, (len(x), np.shape(times)[-1]))
-        return Shared(*self.prepared(np.asarray(x, dtype=float), times))
+        return Shared(*self.prepared(x, times))
 
     def integrate(self, x: Array, times: Array, t0: Array | float = 0.0) -> Paths:
-        """All members from states ``x`` (N, n_state) at ``t0`` (s, one or (N,)) to ``times`` (N, K) (s, increasing)."""
+        """All members from states ``x`` (N, n_state) at ``t0`` (s, one or (N,)) to increasing ``times`` (N, K) or (K,),
+        in s.
+        """
         work, finish = self.prepared(x, times, t0)
         work()
         return finish()
 
     def resumed(self, x: Array, start: Array, times: Array) -> Sequence[Trajectory | Failure]:
-        return self.integrate(np.asarray(x, dtype=float), times, start)
+        return self.integrate(x, times, start)
 
     def prepared(
         self, x: Array, times: Array, t0: Array | float = 0.0, halved: bool = False
@@ -167,19 +167,14 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
         and its result. Members that come to where a table ends are run again with ``halved`` cells, which end where
         the law does.
         """
+        x, times = np.asarray(x, dtype=float), np.broadcast_to(times, (len(x), np.shape(times)[-1]))
         micro = times * 1e6
         mirror = self.start == "laser" and not np.any(t0) and bool(np.any(times < 0))
         order = np.argsort(np.abs(micro), axis=1, kind="stable") if mirror else None
         if order is not None:
             micro = np.take_along_axis(np.abs(micro), order, axis=1)
         packed = pack(self, x, t0 * 1e6, micro, halved)
-        kernel, solved = self.solver.prepared(packed.members, packed.memory, packed.viscous, packed.pulse)
-        once = Lock()
-
-        def work() -> None:
-            if once.acquire(blocking=False):
-                packed.complete()
-            kernel()
+        work, solved = self.solver.prepared(*packed)
 
         def finish() -> Paths:
             solution = solved

@@ -7,29 +7,17 @@ from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, NamedTuple, cast
 
 import numpy as np
-import numpy.typing as npt
 
 from en4dvar.model.forward import Batch, Failure, Trajectory, ValidityLimit
 from en4dvar.model.state import Array, StateLayout
 from en4dvar_bubble.dynamics import Dynamics
-from en4dvar_bubble.gas import (
-    GAS_CONSTANT,
-    SATURATION,
-    SATURATION_TEMPERATURE,
-    from_kirchhoff,
-    kirchhoff,
-    mass_fraction,
-    mole_fraction,
-    saturated_vapour_pressure,
-)
 from en4dvar_bubble.laws.tabulate import GRID
-from en4dvar_bubble.medium import Medium
+from en4dvar_bubble.medium import GAS_CONSTANT, SATURATION, SATURATION_TEMPERATURE, Medium, saturated_vapour_pressure
 from en4dvar_bubble.numbers import ACCOMMODATION, P_A
 from en4dvar_bubble.solver import rows
 from en4dvar_bubble.solver.arrays import Members
 from en4dvar_bubble.solver.driver import Solution, System
 from en4dvar_bubble.solver.integrate import BEYOND, END_TIME, MAX_MACH
-from en4dvar_bubble.solver.lanes import WIDTH
 
 THETA, MOLE_FRACTION = "temperature of the gas over that far away", "mole fraction of vapour"
 
@@ -121,7 +109,7 @@ class Paths(Batch):
         tau = self.raw[:, :, : system.gas]
         if system.wall:
             tau = np.concatenate([tau, self.raw[:, :, system.wall_row, None]], axis=2)
-        return from_kirchhoff(tau, self.medium(2))
+        return self.medium(2).from_kirchhoff(tau)
 
     def _chi(self) -> Array:
         system = self.model.system
@@ -157,7 +145,7 @@ OF_WHOLE: dict[str, Callable[[Paths], Any]] = {
     THETA: Paths._theta,
     MOLE_FRACTION: Paths._chi,
     "T": lambda p: p[THETA] * p.medium(2).T_inf,
-    "C": lambda p: mass_fraction(p[MOLE_FRACTION], p.medium(2)),
+    "C": lambda p: p.medium(2).mass_fraction(p[MOLE_FRACTION]),
     "T_m": lambda p: (1 + p.raw[:, :, p.model.system.first_medium : p.model.system.wall_row]) * p.medium(2).T_inf,
     "Z": lambda p: p.raw[:, :, p.model.system.first_memory : -2] * p.medium(2).rho,
     "p_b": Paths._p_b,
@@ -212,17 +200,12 @@ _NO_SAMPLES = np.zeros((0, len(GRID.nodes)))
 
 
 class Packed(NamedTuple):
-    """N members in the kernel's units and what their laws add to the equations; a call that completes them.
-
-    The elastic parts of the first members in the queue are sampled at once; they can be integrated while the call
-    samples the others, which it then makes available.
-    """
+    """N members in the kernel's units, and the tables that their laws and the driving add to the equations."""
 
     members: Members
     memory: Array
     viscous: Array
     pulse: Array
-    complete: Callable[[], None]
 
 
 def pack(model: Dynamics, x: Array, start: Array | float, times: Array, halved: bool = False) -> Packed:
@@ -245,39 +228,17 @@ def pack(model: Dynamics, x: Array, start: Array | float, times: Array, halved: 
     elif "mu" in values:
         par[:, rows.VISCOSITY] = values["mu"] / rho * 1e6
 
-    # Least damped, hence longest ringing, first, so that the lanes run dry together.
-    order = np.argsort(par[:, rows.VISCOSITY], kind="stable")
-    first, others = order[:WIDTH], order[WIDTH:]
-    available = np.full(1, n_members, dtype=np.int64)
-    samples, elastic = _NO_SAMPLES, _NO_TABLE
-    own_density = np.ndim(rho) > 0
-
-    def sampled(which: npt.NDArray[np.intp]) -> Array | None:
-        """Of some members; the kernel divides by one density, those of their own are divided by here."""
-        tabulated = law.samples({name: value[which] for name, value in values.items()})
-        return tabulated * (1 / np.asarray(rho)[which])[:, None] if tabulated is not None and own_density else tabulated
-
-    some = None if halved else sampled(first)
-    if some is None:
-        elastic = law.table(values, halved)
+    samples, elastic, own_density = None if halved else law.samples(values), _NO_TABLE, np.ndim(rho) > 0
+    if samples is None:
+        samples, elastic = _NO_SAMPLES, law.table(values, halved)
         elastic[..., :6] /= model.medium_of(own, 2).rho  # not what tells of halved cells
-    else:
-        samples = np.empty((n_members, some.shape[1]))
-        samples[first] = some
-        available[0] = len(first)
-
-    def complete() -> None:
-        try:
-            if available[0] < n_members:
-                rest = sampled(others)
-                samples[others] = np.nan if rest is None else rest
-        finally:  # threads may be waiting
-            available[0] = n_members
+    elif own_density:  # the kernel divides by one density
+        samples *= (1 / np.asarray(rho))[:, None]
 
     members = Members(
         counter=np.zeros(1, dtype=np.int64),
-        available=available,
-        order=order,
+        # Least damped, hence longest ringing, first, so that the lanes run dry together.
+        order=np.argsort(par[:, rows.VISCOSITY], kind="stable"),
         initial=initial,
         parameters=par,
         start=np.full(n_members, start, dtype=float),
@@ -286,7 +247,7 @@ def pack(model: Dynamics, x: Array, start: Array | float, times: Array, halved: 
         factor=1.0 if own_density else 1 / rho,
         tables=elastic,
     )
-    return Packed(members, memory, viscous, clocks.table, complete)
+    return Packed(members, memory, viscous, clocks.table)
 
 
 def _states(model: Dynamics, x: Array, own: Mapping[str, Array]) -> tuple[Array, Array]:
@@ -303,11 +264,11 @@ def _states(model: Dynamics, x: Array, own: Mapping[str, Array]) -> tuple[Array,
         m = system.gas
         around = model.medium_of(own, 1)
         theta = x[:, layout["T"]] / around.T_inf
-        initial[:, :m] = kirchhoff(theta[:, :m], around)
+        initial[:, :m] = around.kirchhoff(theta[:, :m])
         wall = theta[:, m] if system.wall else np.ones(len(x))
         fractions = None
         if system.vapour:
-            fractions = 1 - mole_fraction(x[:, layout["C"]], around)
+            fractions = 1 - around.mole_fraction(x[:, layout["C"]])
             initial[:, m : 2 * m] = fractions[:, :m]
             if system.kinetic:
                 fractions[:, m] = _gas_at_wall(model, par, column, wall, fractions[:, :m])
@@ -316,7 +277,7 @@ def _states(model: Dynamics, x: Array, own: Mapping[str, Array]) -> tuple[Array,
         par[:, rows.LOG_GAS] = np.log(gas * total - outside / medium.rho) + 3 * log_R
         if system.wall:
             initial[:, system.first_medium : system.wall_row] = x[:, layout["T_m"]] / around.T_inf - 1
-            initial[:, system.wall_row] = kirchhoff(wall, medium)
+            initial[:, system.wall_row] = medium.kirchhoff(wall)
     else:
         par[:, rows.LOG_GAS] = np.log(gas) + 3 * model.exponent(medium) * log_R
     par[:, rows.LOG_R0] = np.log(column[model.stress_free_radius] * 1e6)
@@ -357,14 +318,14 @@ def with_gas(model: Dynamics, x: Array, factor: Array) -> Array:
     before = x[:, layout["p_b"].start]
     vapour: float | Array = medium.p_v
     if model.system.kinetic:
-        vapour = mole_fraction(x[:, layout["C"].stop - 1], medium) * before
+        vapour = medium.mole_fraction(x[:, layout["C"].stop - 1]) * before
     elif model.system.vapour:
         vapour = saturated_vapour_pressure(x[:, layout["T"].stop - 1] if model.system.wall else medium.T_inf)
     after = vapour + factor * (before - vapour)
     changed[:, layout["p_b"].start] = after
     if model.system.vapour:
-        gas = (1 - mole_fraction(x[:, layout["C"]], around)) * (factor * before / after)[:, None]
-        changed[:, layout["C"]] = mass_fraction(np.maximum(1 - gas, 0.0), around)
+        gas = (1 - around.mole_fraction(x[:, layout["C"]])) * (factor * before / after)[:, None]
+        changed[:, layout["C"]] = around.mass_fraction(np.maximum(1 - gas, 0.0))
     return changed
 
 

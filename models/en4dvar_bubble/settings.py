@@ -29,10 +29,18 @@ from en4dvar_bubble.driving import Reading
 from en4dvar_bubble.driving.base import MOST_KNOTS, Driving, with_knots
 from en4dvar_bubble.driving.pulses import PULSES, from_file
 from en4dvar_bubble.dynamics import R0, R_EQ, R_MAX, Gas, Heat, Start, Vapour
-from en4dvar_bubble.gas import saturated_vapour_pressure
 from en4dvar_bubble.laws import REGISTRY
 from en4dvar_bubble.laws.loading import qualified
-from en4dvar_bubble.medium import CONSTANT_SETS, CONSTANTS, UNITS, WATER_25C, KnownMedium, Medium, known_medium
+from en4dvar_bubble.medium import (
+    CONSTANT_SETS,
+    CONSTANTS,
+    UNITS,
+    WATER_25C,
+    KnownMedium,
+    Medium,
+    known_medium,
+    saturated_vapour_pressure,
+)
 from en4dvar_bubble.numbers import ALL
 from en4dvar_bubble.solver.driver import Accuracy, AccuracyName, Radial, preset
 

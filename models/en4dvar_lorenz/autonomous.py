@@ -1,12 +1,21 @@
 """Common parts of the models: a state of dynamic variables with the parameters appended, integrated in batches."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict
 
 from en4dvar import Batch, Field, ForwardModel, Observable, Parameter, StateField, StateLayout, Trajectory
 
 Integrate = Callable[[np.ndarray, np.ndarray, float], np.ndarray]
+
+
+class Settings(BaseModel):
+    """Of a model: unknown keys are errors, the texts under its keys are their descriptions."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
 
 class Autonomous(ForwardModel):
@@ -52,3 +61,14 @@ class Analytic(Autonomous):
 def dimensionless(name: str, label: str, symbol: str, source: str) -> Parameter:
     """A parameter without unit and without bounds."""
     return Parameter(name, "1", label=label, symbol=symbol, source=source)
+
+
+@dataclass(frozen=True)
+class Logarithm:
+    """H that reads the natural logarithm of a positive field: errors that are a share of it have one std there."""
+
+    name: str
+    batched: ClassVar[bool] = True
+
+    def __call__(self, trajectory: Any) -> np.ndarray:
+        return np.asarray(np.log(trajectory[self.name]))

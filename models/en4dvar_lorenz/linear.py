@@ -9,11 +9,10 @@ from collections.abc import Mapping
 from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
 from pydantic import Field as Setting
 
 from en4dvar import Field
-from en4dvar_lorenz.autonomous import Autonomous, dimensionless
+from en4dvar_lorenz.autonomous import Autonomous, Settings, dimensionless
 
 
 def advance(start: np.ndarray, times: np.ndarray, longest: float) -> np.ndarray:
@@ -39,10 +38,9 @@ class Trend(Autonomous):
         return np.array([theta["level"], theta["level"], theta["slope"]])
 
 
-class LinearSettings(BaseModel):
+class LinearSettings(Settings):
     """Size of the linear model."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
     oscillators: Annotated[int, Setting(ge=1)] = 4
     """Number of oscillators; at time zero all have z = 1."""
 

@@ -8,20 +8,18 @@ from typing import Annotated
 
 import numpy as np
 from numba import njit
-from pydantic import BaseModel, ConfigDict
 from pydantic import Field as Setting
 
 from en4dvar import Field
-from en4dvar_lorenz.autonomous import Analytic, dimensionless
+from en4dvar_lorenz.autonomous import Analytic, Settings, dimensionless
 from en4dvar_lorenz.rk4 import kept, rk4
 
 SOURCE = "Lorenz (1963)"
 
 
-class Lorenz63Settings(BaseModel):
+class Lorenz63Settings(Settings):
     """Start and integration of Lorenz-63."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
     initial: tuple[float, float, float] = (1.509, -1.531, 25.46)
     """State at time zero."""
     step: Annotated[float, Setting(gt=0)] = 0.01

@@ -8,18 +8,16 @@ from typing import Annotated
 
 import numpy as np
 from numba import njit
-from pydantic import BaseModel, ConfigDict
 from pydantic import Field as Setting
 
 from en4dvar import Field
-from en4dvar_lorenz.autonomous import Analytic, dimensionless
+from en4dvar_lorenz.autonomous import Analytic, Settings, dimensionless
 from en4dvar_lorenz.rk4 import kept, rk4
 
 
-class Lorenz96Settings(BaseModel):
+class Lorenz96Settings(Settings):
     """Size and integration of Lorenz-96."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
     size: Annotated[int, Setting(ge=4)] = 40
     """Number of variables; at time zero the first is 1, the others are 0."""
     step: Annotated[float, Setting(gt=0)] = 0.05

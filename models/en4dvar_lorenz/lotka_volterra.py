@@ -8,21 +8,18 @@ from typing import Annotated
 
 import numpy as np
 from numba import njit
-from pydantic import BaseModel, ConfigDict
 from pydantic import Field as Setting
 
 from en4dvar import Field, Observable, Parameter, StateField, StateLayout
-from en4dvar_lorenz.autonomous import Analytic
-from en4dvar_lorenz.logarithm import Logarithm
+from en4dvar_lorenz.autonomous import Analytic, Logarithm, Settings
 from en4dvar_lorenz.rk4 import kept, rk4
 
 SOURCE = "Lotka (1925), Volterra (1926)"
 
 
-class LotkaVolterraSettings(BaseModel):
+class LotkaVolterraSettings(Settings):
     """Integration of Lotka–Volterra."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
     step: Annotated[float, Setting(gt=0)] = 0.02
     """Longest integration step."""
 

@@ -21,7 +21,7 @@ FLOOR = {name: floor for floor, name in enumerate(LAYERS)}
 
 # the same inside the bubble, as the docstring of its package states
 BUBBLE = (
-    "tables", "medium", "collapse", "gas", "driving", "numbers", "laws", "solver", "dynamics", "paths", "events",
+    "tables", "medium", "collapse", "driving", "numbers", "laws", "solver", "dynamics", "paths", "events",
     "settings", "model", "api", "battery", "starter", "examples", "commands", "commands_init", "warm_up",
 )  # fmt: skip
 

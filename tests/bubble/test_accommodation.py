@@ -13,7 +13,7 @@ from en4dvar.config import load_config
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.runs.runner import run
 from en4dvar_bubble import WATER_25C, Accuracy, BubbleModel, get_law, simulate
-from en4dvar_bubble.gas import GAS_CONSTANT, mole_fraction
+from en4dvar_bubble.medium import GAS_CONSTANT
 from en4dvar_bubble.solver.collocation import ball
 from en4dvar_bubble.solver.driver import GAS_CLUSTERING
 
@@ -62,7 +62,7 @@ def test_mass(nodes, error):
     times = np.linspace(0, 35e-6, 35_001)  # through the collapse and the first rebound
     _, paths = integrated(times, model=model_of(accuracy=replace(TIGHT, nodes=nodes)))
     R, p, T, C = (paths[name][0] for name in ("R", "p_b", "T", "C"))
-    vapour = np.asarray(mole_fraction(C, WATER_25C))
+    vapour = np.asarray(WATER_25C.mole_fraction(C))
     weights = ball(nodes, GAS_CLUSTERING["laser"]).weights
     volume = 4 / 3 * np.pi * R**3
     moles = [volume * p / GAS_CONSTANT * ((share / T) @ weights) for share in (vapour, 1 - vapour)]
@@ -87,7 +87,7 @@ def test_gas_that_is_set_free_leaves_temperatures_and_adds_to_the_pressure():
     x = paths.states[:, 1]
     where = model.layout["C"].stop - 1
     after = model.changed("gas", x, np.array([np.log(2.0)]))
-    p, vapour = ((y[0, model.layout["p_b"].start], float(mole_fraction(y[0, where], model.medium))) for y in (x, after))
+    p, vapour = ((y[0, model.layout["p_b"].start], float(model.medium.mole_fraction(y[0, where]))) for y in (x, after))
     assert p[0] * p[1] == pytest.approx(vapour[0] * vapour[1], rel=1e-12)  # the vapour's partial pressure
     assert vapour[0] * (1 - vapour[1]) == pytest.approx(2 * p[0] * (1 - p[1]), rel=1e-12)
     assert model.integrate(after, np.array([[40e-6]]), 15e-6).whole

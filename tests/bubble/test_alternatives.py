@@ -16,7 +16,7 @@ from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
 from en4dvar.schemes.settings import AssimilationSettings
 from en4dvar_bubble import BubbleModel, NeoHookeanKelvinVoigt
-from en4dvar_bubble.gas import saturated_vapour_pressure
+from en4dvar_bubble.medium import saturated_vapour_pressure
 
 SETTINGS = AssimilationSettings(starts=3, refine="none")  # what is predicted is linear: that of Gaussians
 STD = 1.4e-6

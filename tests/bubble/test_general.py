@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from en4dvar_bubble import WATER_25C, Accuracy, BubbleModel, Medium, get_law, simulate
-from en4dvar_bubble.gas import mole_fraction, saturated_vapour_pressure
+from en4dvar_bubble.medium import saturated_vapour_pressure
 from en4dvar_bubble.solver.collocation import exterior
 from en4dvar_bubble.solver.driver import System
 
@@ -90,7 +90,7 @@ class TestConservation:
         model = BubbleModel(law=law, start="laser", vapour="transport", medium_heat="conducting")
         path = model.trajectories(model.initial_state(LASER)[None], TIMES)[0]
         weights, m = model.system.ball.weights, model.system.gas
-        T, chi = path["T"], mole_fraction(path["C"], model.medium)
+        T, chi = path["T"], model.medium.mole_fraction(path["C"])
         wall = weights[m] / T[:, m] * (path["p_b"] - saturated_vapour_pressure(T[:, m]))
         content = path["R"] ** 3 * (path["p_b"] * ((weights[:m] / T[:, :m]) * (1 - chi)).sum(axis=1) + wall)
         np.testing.assert_allclose(content, content[0], rtol=1e-10)

@@ -12,7 +12,7 @@ from en4dvar.estimation.assimilate import assimilate, forecast
 from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
 from en4dvar.schemes.settings import AssimilationSettings
-from en4dvar_bubble.gas import saturated_vapour_pressure
+from en4dvar_bubble.medium import saturated_vapour_pressure
 from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.settings import BubbleSettings
 

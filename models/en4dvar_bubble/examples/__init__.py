@@ -11,9 +11,7 @@ EXAMPLES = ("quickstart",)
 def write_example(name: str, folder: Path, force: bool = False) -> Path:
     """Write the files of an example below ``folder``; returns the path of its configuration, ``<name>.yaml``.
 
-    Raises
-    ------
-    OutputError: a file is there already (unless ``force``) or cannot be written.
+    Raises :class:`OutputError`: a file is there already (unless ``force``) or cannot be written.
     """
     example = Path(__file__).parent / name
     items = {folder / file.relative_to(example): file for file in sorted(example.rglob("*")) if file.is_file()}

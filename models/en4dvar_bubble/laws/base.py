@@ -1,11 +1,6 @@
-"""Constitutive laws.
-
-An author writes one class: its ``name``, its ``parameters`` and its elastic part, either the closed form of the stress
-integral, :meth:`ConstitutiveLaw.stress`, or W′(λ), :meth:`ConstitutiveLaw.strain_energy_rate` (a :class:`Liquid` has
-none). The viscous part is a Newtonian dashpot where ``parameters`` holds ``mu``, or the method ``viscosity`` or
-``strained_viscosity``. Memory variables are optional. All take and return NumPy arrays that broadcast: ``p.G`` etc. are
-(N, 1), stretch and shear rate (K,). Everything is tabulated per member before the compiled integration starts, so the
-kernel does not change.
+"""Constitutive laws. An author writes one class: its ``name``, its ``parameters`` and its elastic part, as the stress
+integral or as W′(λ) (a :class:`Liquid` has none); where it has no Newtonian dashpot, its viscosity; and its memory, if
+any. Everything is tabulated per member before the compiled integration starts, so the kernel does not change.
 """
 
 from collections.abc import Mapping

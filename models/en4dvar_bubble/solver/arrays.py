@@ -13,13 +13,11 @@ IntArray = np.ndarray[Any, np.dtype[np.int64]]
 
 
 class Members(NamedTuple):
-    """What is integrated. Members are taken in ``order`` (N,); turn ``counter`` (1,) is the next, and one that is not
-    ``available`` (1,) yet is waited for. Threads that integrate the same arrays at once share the members; which of
-    them integrates one makes no difference to it.
+    """What is integrated. Members are taken in ``order`` (N,), number ``counter`` (1,) of it is the next. Threads that
+    integrate the same arrays at once share the members; which of them integrates one makes no difference to it.
     """
 
     counter: IntArray
-    available: IntArray
     order: IntArray
     initial: Array  # (N, n) states at ``start``
     parameters: Array  # (N, rows), see :mod:`rows`

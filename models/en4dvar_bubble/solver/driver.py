@@ -167,9 +167,7 @@ _REFINED_SPAN = np.append(_ELASTIC_SPAN[:4], HALVINGS)
 class Solution:
     """Raw solver output. ``states`` (N, K, n) in the rows of :class:`System`, NaN where a member did not get.
 
-    ``status`` (N,) integers, ``record`` (N, 8): steps, rejected steps, largest wall Mach number, largest τ at the
-    innermost node, smallest ln(R/µm), end time (µs), since when (µs) the wall is faster than the equations bear,
-    numerical diffusivity of the vapour over R |Ṙ| (0 but for violent collapses). ``ends``: of members that are not
+    ``status`` (N,) and the columns of ``record`` (N, RECORD): see :mod:`integrate`. ``ends``: of members that are not
     finite, between which stretches their law is.
     """
 

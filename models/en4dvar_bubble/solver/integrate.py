@@ -12,14 +12,16 @@ from en4dvar.plumbing.compiled import called, kernel_called_by_address, kernel_w
 from en4dvar_bubble.solver import rodas5p
 from en4dvar_bubble.solver.apart import call, kept
 from en4dvar_bubble.solver.arrays import Lanes, Loaded, Workspace
-from en4dvar_bubble.solver.lanes import WIDTH, parted, peek, take
+from en4dvar_bubble.solver.lanes import WIDTH, parted, take
 from en4dvar_bubble.solver.rows import AMPLITUDE, PULSE_RATE, PULSE_SHIFT, SMEARED, TABLE
 from en4dvar_bubble.solver.step import LEAST_ERROR, attempt, interpolant, judge
 from en4dvar_bubble.tables import fill_one
 
 # Status of a member; the reasons users read are made by ``driver.Solution``.
 OK, STEP_LIMIT, NON_FINITE, STEP_UNDERFLOW, MACH_LIMIT, TIME_LIMIT, WALL_LIMIT = 0, 1, 2, 3, 4, 5, 6
-# Columns of the per-member record.
+# Columns of the per-member record: steps, rejected ones, largest wall Mach number, largest τ at the innermost node,
+# smallest ln(R/µm), end time (µs), since when (µs) the wall is faster than the equations bear, numerical diffusivity of
+# the vapour over R |Ṙ| (0 but for violent collapses); when a hundredth of the span began (µs), steps up to then.
 STEPS, REJECTED, MAX_MACH, MAX_THETA, MIN_LOG_R, END_TIME, BEYOND, SMEAR, MARK, TO_MARK = 0, 1, 2, 3, 4, 5, 6, 7, 8, 9
 RECORD = 10
 
@@ -263,8 +265,6 @@ def _begin_step(shared, lanes):
             if place >= len(members.order):
                 turn[_EXHAUSTED] = 1
             else:
-                while peek(members.available) <= place:
-                    pass
                 turn[_RUNNING] += _begin(members.order[place], lane, shared, lanes)
         if lanes.member[lane] >= 0:
             _cut_step(lane, shared, lanes)

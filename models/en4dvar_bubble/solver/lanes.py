@@ -162,23 +162,15 @@ def any_lane(typingctx, condition):
     return types.boolean(mask), codegen
 
 
-def _of_counter(emit: Callable[[Any, Any], Any]) -> Any:
-    """What ``emit`` builds with the place of ``counter[0]``, of an array that several threads share."""
+@intrinsic
+def take(typingctx, counter):
+    """The number ``counter[0]``, one more for whoever asks next; no two threads ever get the same."""
 
-    @intrinsic
-    def operation(typingctx, counter):
-        def codegen(context, builder, sig, args):
-            return emit(builder, context.make_array(sig.args[0])(context, builder, args[0]).data)
+    def codegen(context, builder, sig, args):
+        place = context.make_array(sig.args[0])(context, builder, args[0]).data
+        return builder.atomic_rmw("add", place, ir.Constant(_I64, 1), "monotonic")
 
-        return types.int64(counter), codegen
-
-    return operation
-
-
-take = _of_counter(lambda builder, place: builder.atomic_rmw("add", place, ir.Constant(_I64, 1), "monotonic"))
-"""The number there, one more for whoever asks next; no two threads ever get the same."""
-peek = _of_counter(lambda builder, place: builder.load_atomic(place, "acquire", 8))
-"""The number there, read anew at every call: another thread may be raising it."""
+    return types.int64(counter), codegen
 
 
 def _function(name: str, operands: int) -> Any:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from en4dvar.assembly.build import build_one
 from en4dvar.assembly.reading import find_files, with_parts
@@ -66,13 +67,6 @@ class Source:
         when = {"time": f"{1e6 * since.time:.9g} us", "maximum": "maximum", "top": "top", "end": "end"}
         return lines + [f"  since: {when.get(since.kind, f'{since.kind} {since.number}')}"] * (since != ANY.since)
 
-    @property
-    def time_entry(self) -> str:
-        """The ``time`` column as YAML."""
-        if self.time is None:
-            return braced(step=self.time_step, unit=self.step_unit)
-        return braced(name=self.time[0], unit=self.time[1], rate=self.rate)
-
 
 # the table that 'en4dvar track' writes: its columns say their units
 TRACKED = Source("", ("t_us", "us"), None, ("R_um", "um"), errors=("R_std_um", "t_std_us"))
@@ -93,69 +87,20 @@ def braced(**texts: str | None) -> str:
 
 def yaml_text(name: str, source: Source, proposal: Proposal, command: str) -> str:
     """The whole configuration with comments."""
-    head = [
-        f"# yaml-language-server: $schema={SCHEMA_FILE}",
-        f"# Proposed by: {command}",
-        *(f"# Seen: {line}" for line in proposal.remarks),
-        *(f"# MIND: {line}" for line in proposal.warnings),
-        "# Every value is a proposal; what was guessed from the data says so. Read, change, then:",
-        "#   en4dvar validate THIS_FILE --plot        what would be estimated, and the prior over the data",
-        "#   en4dvar run THIS_FILE",
-        f"name: {quoted(name)}",
-        "seed: 1 # the same seed gives the same bits",
-        "data:",
-        f"  path: {quoted(source.path)}",
-        *source.layout_entries,
-        "  columns:",
-        f"    time: {source.time_entry}",
-        f"    {source.observable}: {braced(name=source.radius[0], unit=source.radius[1])}",
-    ]
-    lines = [
-        *head,
-        *_section(proposal.data),
-        "model:",
-        *_section(proposal.model),
-        *_comparison(name, proposal.simpler),
-        *_longer(name) * proposal.longer,
-        "parameters: # a prior is estimated, a quantity such as 'mu: 0.1 Pa s' is fixed",
-        *_section(proposal.parameters),
-        *proposal.population,
-        "assimilation:",
-        *_section(proposal.assimilation),
-    ]
-    return "\n".join(lines) + "\n"
+    environment = Environment(loader=PackageLoader(__package__, "."), undefined=StrictUndefined)
+    environment.trim_blocks = environment.lstrip_blocks = environment.keep_trailing_newline = True
+    environment.filters |= {"quoted": quoted, "in_shell": shlex.quote, "section": _section}
+    page = environment.get_template("configuration.yaml.j2")
+    return page.render(schema=SCHEMA_FILE, command=command, name=name, source=source, proposal=proposal, braced=braced)
 
 
-def _comparison(name: str, simpler: Mapping[str, str]) -> list[str]:
-    """How to compare with ``simpler`` physics; nothing where there is none."""
-    if not simpler:
-        return []
-    options = " ".join(f"--set model.{key}={value}" for key, value in simpler.items())
-    here, there = shlex.quote(f"runs/{name}"), shlex.quote(f"runs/{name}_{simpler['gas']}")
-    return [
-        f"  # A {simpler['gas']} gas is quicker, but makes R_eq and mu wrong, often without a warning. To compare:",
-        f"  #   en4dvar run THIS_FILE {options} --out {there}",
-        f"  #   en4dvar compare {here} {there}",
-    ]
-
-
-def _longer(name: str) -> list[str]:
-    """How to fit one oscillation more."""
-    options = "--set data.window.to='trough 3' --set model_error.gas='{at: maxima, std: 70 %}'"
-    return [
-        "  # The gas may change within the window, too. Where readings err by less than 2 % of R_max,",
-        "  # one oscillation more often tells mu several times better (docs/physics.md):",
-        f"  #   en4dvar run THIS_FILE {options} --out {shlex.quote(f'runs/{name}_gas')}",
-    ]
-
-
-def _section(entries: Sequence[Entry]) -> list[str]:
+def _section(entries: Sequence[Entry]) -> str:
     bare = [f"  {entry.key}: {entry.value}".rstrip() for entry in entries]
     width = max(len(line) for line in bare if len(line) < 72)
-    return [
+    return "\n".join(
         f"{line.ljust(width)} # {entry.comment}" if entry.comment else line
         for line, entry in zip(bare, entries, strict=True)
-    ]
+    )
 
 
 @dataclass(frozen=True)
@@ -193,8 +138,8 @@ def propose_config(
     Raises
     ------
     DataError: no usable file, no bubble in any (of several, those that are of no use are named among the warnings), or
-    data sets that suggest different starts. ConfigError: unknown law, or
-    neither ``time`` nor ``time_step``. UnitError: a unit that is not of its kind.
+    data sets that suggest different starts. ConfigError: unknown law, or neither ``time`` nor ``time_step``. UnitError:
+    a unit that is not of its kind.
     """
     if (time is None) == (time_step is None):
         raise ConfigError("give either the column of times and its unit, or a constant time step")
@@ -237,9 +182,7 @@ def _largest(readings: Mapping[str, Readings], name: str) -> float:
 def histories(files: Mapping[str, DataFile], source: Source) -> tuple[dict[str, Readings], list[str]]:
     """Readings in s and m of each data set, and why others cannot be used.
 
-    Raises
-    ------
-    DataError: none can be used. UnitError: a unit that is not of its kind.
+    Raises :class:`DataError`: none can be used. :class:`UnitError`: a unit that is not of its kind.
     """
     time, radius = _times(source), Column(*source.radius, "m", True)
 

@@ -6,15 +6,12 @@ estimated with a prior that says how well it is known; the data hardly change it
 interval.
 """
 
-import glob
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from en4dvar.estimation.population.campaign import FEWEST_SETS
 from en4dvar.model.state import READING_SCALE
 from en4dvar.plumbing.errors import ConfigError, retold
 from en4dvar.plumbing.hints import shown, suggest
@@ -23,7 +20,6 @@ from en4dvar_bubble.collapse import doubt
 from en4dvar_bubble.medium import MEDIA, Medium, known_medium
 from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.numbers import P_A, WALL_DISTANCE
-from en4dvar_bubble.starter.grouped import NO_GROUPS, Grouped
 from en4dvar_bubble.starter.guess import OF_GELS
 from en4dvar_bubble.starter.look import Look
 
@@ -41,17 +37,6 @@ WALLS = 8.0, 200.0
 BY_VISCOSITY = 1.6
 """Over Re = R_max √(ρ p_∞)/μ: by what part of the Rayleigh time a collapse in a gel of 5 kPa takes longer, for gas and
 elasticity cancel there (R_eq of 0.1 to 0.2 R_max; tests/bubble/test_wall.py holds it to forward runs)."""
-
-
-LIKE_A_GEL = (
-    "  spread: 0.25 # half-normal, in std of the priors: bubbles of one gel differ by tens of per cent (published are "
-    "14 and 23 %), what is known of the gel by factors"
-)
-LIKE_A_LIQUID = (
-    "  spread: 0.05 # half-normal, in std of the priors: a liquid has one viscosity; a bubble that tells another one "
-    "is odd; where several are, leave the first collapse out of all: init --since 'trough 1'"
-)
-"""How much bubbles differ, as a line of ``population:``."""
 
 
 @dataclass(frozen=True)
@@ -101,9 +86,7 @@ _OF_ANY = (
 def known(medium: str, scale: Known = SCALE) -> Sequence[Known]:
     """What is known of an experiment in one of the :data:`CHOICES`, which a concentration may follow: ``agarose 1 %``.
 
-    Raises
-    ------
-    ConfigError: another medium, or no concentration (mass of polymer over that of the whole) between 0 and 50 %.
+    Raises :class:`ConfigError`: another medium, or a concentration (mass over that of the whole) not within 0 to 50 %.
     """
     name, _, text = medium.strip().partition(" ")
     if name not in CHOICES:
@@ -189,36 +172,3 @@ def plane_in_a_gel(views: Mapping[str, Look], medium: Medium) -> list[str]:
         f"makes it too large); if one is within 10 R_max, state its distance from the bubble's centre: "
         f"--set model.wall.distance='{float(f'{3 * radius:.2g}'):g} um'"
     ]
-
-
-def population(
-    names: Sequence[str], count: int, medium: str, liquid: bool, groups: Grouped = NO_GROUPS
-) -> tuple[str, ...]:
-    """Lines for the section of the parameters ``names`` of one gel behind ``count`` bubbles; () of too few of them.
-
-    ``groups``: where there are several, one gel each; the largest has ``count`` bubbles.
-    How much bubbles of one gel differ is known better than the gel itself; a liquid has one viscosity.
-    """
-    if not names or count < FEWEST_SETS:
-        return ()
-    common = ", ".join(quantity.key for quantity in known(medium))
-    kind = groups.kind if groups.kind.isidentifier() else json.dumps(groups.kind, ensure_ascii=False)
-    return (
-        "population: # of the gel behind its bubbles, at the end of the run",
-        f"  of: [{', '.join(names)}] # these vary from bubble to bubble about one median",
-        LIKE_A_LIQUID if liquid else LIKE_A_GEL,
-        f"  # {common} have one value in all bubbles, unless 'shared: none' is said; the others are each bubble's own",
-        *[f"  by: {kind} # each {groups.kind} has its own median and spread; they are compared"] * bool(groups.of),
-        f"  # reference: {{{names[0]}: VALUE ± STD UNIT, source: NAME}} # a value to compare with, on the page",
-        *(["groups:", f"  {kind}:"] if groups.of else []),
-        *(f"    {json.dumps(name, ensure_ascii=False)}: {_patterns(name, groups.of)}" for name in groups.of),
-    )
-
-
-def _patterns(group: str, groups: Mapping[str, Sequence[str]]) -> str:
-    """How the names of a group's bubbles begin, where all do and no other group's, or else the names."""
-    start = f"{group}_"
-    begins = {key: [name.startswith(start) for name in names] for key, names in groups.items()}
-    if all(begins.pop(group)) and not any(map(any, begins.values())):
-        return json.dumps(f"{glob.escape(start)}*", ensure_ascii=False)
-    return json.dumps([glob.escape(name) for name in groups[group]], ensure_ascii=False)

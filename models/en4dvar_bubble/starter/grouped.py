@@ -1,5 +1,7 @@
 """Which gel, day or concentration each bubble is of: by its folder, or as a column of a table says."""
 
+import glob
+import json
 import re
 import shlex
 from collections.abc import Mapping, Sequence
@@ -24,6 +26,25 @@ class Grouped:
 
     kind: str = FOLDER
     of: Mapping[str, Sequence[str]] = field(default_factory=dict)
+
+    @property
+    def key(self) -> str:
+        """The kind as a key in YAML."""
+        return self.kind if self.kind.isidentifier() else _json(self.kind)
+
+    @property
+    def patterns(self) -> dict[str, str]:
+        """Of each group, as YAML: how the names of its bubbles begin, where all and no other ones do, or else these."""
+        told = {}
+        for group, names in self.of.items():
+            begins = {other: [name.startswith(f"{group}_") for name in its] for other, its in self.of.items()}
+            alone = all(begins.pop(group)) and not any(map(any, begins.values()))
+            told[_json(group)] = _json(f"{glob.escape(group)}_*" if alone else [*map(glob.escape, names)])
+        return told
+
+
+def _json(value: object) -> str:
+    return json.dumps(value, ensure_ascii=False)
 
 
 NO_GROUPS = Grouped()

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from en4dvar.estimation.population.campaign import FEWEST_SETS
 from en4dvar.inputs.window import vertex
 from en4dvar.model.forward import Trajectory
 from en4dvar.model.state import Array, Parameter
@@ -60,12 +61,23 @@ BUBBLES = (1e-7, 0.1)  # m: between these radii
 SEEN = (3e-6, 50e-9, 1e-4)  # m, s, m: one below is not read in shorter steps; radius of a usual bubble
 
 
+class Together(NamedTuple):
+    """Of several bubbles: the ``names`` of the parameters that vary from one to the other of one gel or ``liquid``, and
+    the ``common`` ones. How much bubbles of one gel differ is known better than the gel itself.
+    """
+
+    names: Sequence[str]
+    common: Sequence[str]
+    liquid: bool
+    groups: Grouped
+
+
 @dataclass(frozen=True)
 class Proposal:
     """What goes into the configuration; ``remarks`` and ``warnings`` are told to the user.
 
     ``simpler``: keys of the model, and their values, of quicker physics to compare with; empty where there is none.
-    ``population``: what varies from bubble to bubble of one gel, line by line; empty where there are too few of them.
+    ``population``: what is asked of several bubbles together; None where there are too few of them.
     ``longer``: in a gel, and most histories have a third minimum, at which the window may end.
     ``datasets``: what it was made from; others show no bubble, as ``warnings`` tell.
     """
@@ -76,7 +88,7 @@ class Proposal:
     simpler: Mapping[str, str]
     remarks: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
-    population: tuple[str, ...] = ()
+    population: Together | None = None
     longer: bool = False
     datasets: tuple[str, ...] = ()
     assimilation: tuple[Entry, ...] = (
@@ -98,9 +110,7 @@ def propose(
     ``medium``: one of those of :mod:`en4dvar_bubble.starter.elsewhere`. ``groups``: of its data sets. ``scale``: what
     is known of what multiplies all radii.
 
-    Raises
-    ------
-    DataError: no history shows a bubble, or the data sets suggest different starts. ConfigError: unknown law.
+    Raises :class:`DataError`: no history shows a bubble, or they suggest different starts. ConfigError: unknown law.
     """
     looks, unseen = _looks(histories, start)
     views = list(looks.values())
@@ -142,7 +152,10 @@ def propose(
     wall = elsewhere.wall(look.lobe.R_max, ratio) if slow and _in_a_liquid(model) else ()
     sizes = {group: len(looks.keys() & {*names}) for group, names in groups.of.items()}
     vary = [p.name for p in model.law.parameters] + [R0.name] * (R0 in model.parameters and math.isnan(look.before[0]))
-    together = elsewhere.population(vary, max(sizes.values(), default=len(views)), medium, _in_a_liquid(model), groups)
+    together = None
+    if vary and max(sizes.values(), default=len(views)) >= FEWEST_SETS:
+        common = [quantity.key for quantity in elsewhere.known(medium)]
+        together = Together(vary, common, _in_a_liquid(model), groups)
     return Proposal(
         _data(look, model, {**others, **guess.values}, views),
         (*_model(law_name, model, look), *wall[:1]),
