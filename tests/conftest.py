@@ -184,7 +184,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Iterator[None]:
-    """Modules being imported, and first compiled, make no garbage in circles: to look for it took a third of the time."""
+    """Modules that are compiled and imported make no circular garbage: to look for it took a third of the time."""
     gc.disable()
     yield
     gc.enable()

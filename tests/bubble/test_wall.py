@@ -50,7 +50,7 @@ def scipy_path(sign, h):
     return solve_ivp(rates, (0, TIMES[-1]), (R_max, 0.0), "Radau", TIMES, rtol=1e-11, atol=1e-14).y[0]
 
 
-@pytest.mark.parametrize(("kind", "sign"), [("rigid", 1), ("free", -1)])
+@pytest.mark.parametrize(("kind", "sign"), [("rigid", 1), pytest.param("free", -1, marks=pytest.mark.slow)])
 def test_against_scipy(kind, sign):
     R, exact = path(Wall(500e-6, kind)), scipy_path(sign, 500e-6)
     assert np.abs(R - exact).max() < 2e-6 * 200e-6
