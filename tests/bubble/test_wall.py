@@ -226,7 +226,9 @@ def test_a_slow_collapse_in_a_gel_tells_what_a_plane_would_do_to_its_modulus(wal
         assert [w for w in of_several if w.startswith("b: the collapse takes 1.0")]
 
 
-@pytest.mark.parametrize("name", ["pa_01", "pa_05", "pa_13", "pa_15"])
+@pytest.mark.parametrize(
+    "name", ["pa_01", "pa_13", *(pytest.param(name, marks=pytest.mark.slow) for name in ("pa_05", "pa_15"))]
+)
 def test_a_history_that_begins_behind_its_top_tells_no_plane(name):
     """Its collapse begins at an instant that nobody has seen; with the growth before, it is quicker than usual."""
     table = np.genfromtxt(MEASURED / f"{name}.csv", delimiter=",", skip_header=2) * 1e-6

@@ -117,7 +117,9 @@ def test_a_rim_that_blur_hides_is_within_what_radii_are_said_to_share():
     assert np.sqrt(np.mean(off**2 / (std**2 + common**2))) < 1
 
 
-@pytest.mark.parametrize("kind", ["in focus", "blurred", "bright centre", "dirt"])
+@pytest.mark.parametrize(
+    "kind", ["bright centre", "dirt", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("in focus", "blurred"))]
+)
 def test_no_rim_is_seen_where_there_is_none(kind):
     assert find_background(movie_of(film_plain(kind, 1)[1]))[1].rim == ()
 
