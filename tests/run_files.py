@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -60,7 +61,13 @@ def interrupt(path: Path, out: Path, call: int, resume: bool = False) -> str:
 
 
 def trees(run: Path) -> dict[str, xr.DataTree]:
-    """What is in every netCDF file and every result of a pack, by their names."""
+    """What is in every netCDF file and every result of a pack, by their names; read again where a file has changed."""
+    files = [(path, path.stat()) for path in sorted([*run.rglob(PACK), *run.rglob("*.nc")])]
+    return _trees(run, tuple((path, stat.st_ino, stat.st_mtime_ns, stat.st_size) for path, stat in files))
+
+
+@lru_cache(maxsize=4)
+def _trees(run: Path, state: object) -> dict[str, xr.DataTree]:
     packs = [address for pack in sorted(run.rglob(PACK)) for address in results_of(pack)]
     found = {p.relative_to(run).as_posix(): load_result(p).tree for p in packs}
     return found | {p.relative_to(run).as_posix(): xr.load_datatree(p) for p in sorted(run.rglob("*.nc"))}

@@ -179,7 +179,7 @@ def test_a_gel_stiffer_than_usual_is_told_and_its_estimate_printed() -> None:
     assert impossible.severity == "serious"
 
 
-@pytest.mark.parametrize("step", [0.03, 0.07, 0.15])
+@pytest.mark.parametrize("step", [0.03, pytest.param(0.07, marks=pytest.mark.slow), 0.15])
 @pytest.mark.parametrize("lost", [(0, 1), (0, 2), (-1, 1), (-1, 2)])
 def test_a_collapse_that_no_frame_shows_has_its_time(step: float, lost: tuple[int, int]) -> None:
     """The frame of the minimum, and those beside it, are not there: the readings behind the gap are the rebound's."""

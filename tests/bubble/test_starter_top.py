@@ -24,7 +24,7 @@ def history(stream: np.random.Generator, per_collapse: float, noise_std: float, 
     return t, _PATH.sol(np.clip(at, 0, 0.89))[0] + noise_std * stream.standard_normal(len(t))
 
 
-@pytest.mark.parametrize("grown", [0.0, 0.5, 0.8])
+@pytest.mark.parametrize("grown", [0.0, pytest.param(0.5, marks=pytest.mark.slow), 0.8])
 @pytest.mark.parametrize(("per_collapse", "noise_std"), [(9, 0.005), (20, 0.02), (60, 0.01), (60, 0.03)])
 def test_the_top_lies_where_its_errors_say(per_collapse: float, noise_std: float, grown: float) -> None:
     stream = np.random.default_rng(3)
@@ -102,7 +102,7 @@ def test_a_top_that_is_rounded_is_not_cut_off() -> None:
     assert plateaus > 100
 
 
-@pytest.mark.parametrize("per_collapse", [12, 20, 40])
+@pytest.mark.parametrize("per_collapse", [12, pytest.param(20, marks=pytest.mark.slow), 40])
 @pytest.mark.parametrize(("ceiling", "noise_std"), [(0.96, 0.003), (0.92, 0.003), (0.92, 0.006)])
 def test_a_top_that_is_cut_off_and_scatters_is_told(per_collapse: float, ceiling: float, noise_std: float) -> None:
     stream, told = np.random.default_rng(12), 0

@@ -50,7 +50,7 @@ def scipy_path(sign, h):
     return solve_ivp(rates, (0, TIMES[-1]), (R_max, 0.0), "Radau", TIMES, rtol=1e-11, atol=1e-14).y[0]
 
 
-@pytest.mark.parametrize(("kind", "sign"), [("rigid", 1), ("free", -1)])
+@pytest.mark.parametrize(("kind", "sign"), [("rigid", 1), pytest.param("free", -1, marks=pytest.mark.slow)])
 def test_against_scipy(kind, sign):
     R, exact = path(Wall(500e-6, kind)), scipy_path(sign, 500e-6)
     assert np.abs(R - exact).max() < 2e-6 * 200e-6
@@ -226,7 +226,9 @@ def test_a_slow_collapse_in_a_gel_tells_what_a_plane_would_do_to_its_modulus(wal
         assert [w for w in of_several if w.startswith("b: the collapse takes 1.0")]
 
 
-@pytest.mark.parametrize("name", ["pa_01", "pa_05", "pa_13", "pa_15"])
+@pytest.mark.parametrize(
+    "name", ["pa_01", "pa_13", *(pytest.param(name, marks=pytest.mark.slow) for name in ("pa_05", "pa_15"))]
+)
 def test_a_history_that_begins_behind_its_top_tells_no_plane(name):
     """Its collapse begins at an instant that nobody has seen; with the growth before, it is quicker than usual."""
     table = np.genfromtxt(MEASURED / f"{name}.csv", delimiter=",", skip_header=2) * 1e-6

@@ -308,7 +308,7 @@ def alone(monkeypatch):
     monkeypatch.setattr("en4dvar.estimation.stages.weighs", lambda space: False)  # nor do members of the prior tell it
 
 
-@pytest.mark.parametrize("kind", [Parting, UnlikeParting])
+@pytest.mark.parametrize("kind", [Parting, pytest.param(UnlikeParting, marks=pytest.mark.slow)])
 def test_readings_after_the_window_lead_to_a_minimum_that_was_missed(kind, monkeypatch):
     """The well that they are of is found; the posterior is that of the window alone, by a grid."""
     alone(monkeypatch)

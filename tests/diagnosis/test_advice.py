@@ -173,7 +173,7 @@ LEFT_TO_JUDGEMENT: dict[str, Callable[[], InverseProblem]] = {
 }
 
 
-LONG = ("non-gaussian", "several-modes")  # a chain is run
+LONG = ("non-gaussian", "several-modes", "members-lost")  # a chain is run, or it takes two seconds
 
 
 @pytest.mark.parametrize("code", [pytest.param(c, marks=[pytest.mark.slow] * (c in LONG)) for c in PROVOKED])

@@ -106,7 +106,7 @@ def test_where_lost_is_silent_on_what_does_not_tell():
     assert where_lost(PRIOR, x, some) == "they are spread over the whole ensemble"
 
 
-@pytest.mark.parametrize("count", [2, 3, 4, 9, 44, 46])
+@pytest.mark.parametrize("count", [2, 4, 46, *(pytest.param(count, marks=pytest.mark.slow) for count in (3, 9, 44))])
 def test_any_number_of_lost_members_is_told_from_the_others(count):
     """They are those with the largest of one parameter; as many at random are named for one in a hundred cases."""
     x = PRIOR.sample(48, 5, "random")

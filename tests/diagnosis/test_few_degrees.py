@@ -20,7 +20,9 @@ def doubts(n, k, seed, within=True, outlier=0.0):
     return OF_RESIDUALS & set(stats.attrs["warning_codes"].split()), stats.attrs
 
 
-@pytest.mark.parametrize(("n", "k"), [(12, 14), (6, 8), (8, 12)])
+@pytest.mark.parametrize(
+    ("n", "k"), [(12, 14), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((6, 8), (8, 12)))]
+)
 def test_where_all_is_right_nothing_is_doubted(n, k):
     """With the noise scale of the minimum, which is too small by the degrees of freedom that the fit uses up, half of
     such estimates were doubted.
@@ -32,7 +34,7 @@ def test_where_all_is_right_nothing_is_doubted(n, k):
         assert n - 0.5 < stats["dfs"] < n
 
 
-@pytest.mark.parametrize(("n", "k"), [(3, 30), (10, 40)])
+@pytest.mark.parametrize(("n", "k"), [(3, 30), pytest.param(10, 40, marks=pytest.mark.slow)])
 def test_a_reading_six_standard_deviations_off_is_told(n, k):
     """With its own error it is 4 to 8 off, and the fit takes a share of it."""
     codes = [doubts(n, k, seed, outlier=6.0)[0] for seed in range(6)]

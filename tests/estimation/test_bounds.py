@@ -74,7 +74,12 @@ def _density(problem, mean=0.0, std=1.0):
 
 
 @pytest.mark.parametrize(
-    ("sides", "values"), [([1.0], [-0.5]), ([-1.0, 0.0], [0.7, 0.4]), ([1.0, -1.0], [0.5, 0.2]), ([1.0], [3.0])]
+    ("sides", "values"),
+    [
+        ([-1.0, 0.0], [0.7, 0.4]),
+        ([1.0], [3.0]),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in [([1.0], [-0.5]), ([1.0, -1.0], [0.5, 0.2])]),
+    ],
 )
 def test_the_posterior_is_that_of_quadrature(sides, values):
     problem = _problem(sides, values, 0.1)

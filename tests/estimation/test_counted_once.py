@@ -65,7 +65,8 @@ def test_other_readings_at_the_same_times_are_another_recording(other):
 
 
 @pytest.mark.parametrize(
-    ("count", "step", "sets"), [(4, 1.0, 50), (5, 0.5, 50), (10, 2.0, 50), (30, 0.5, 12), (6, 0.0, 100)]
+    ("count", "step", "sets"),
+    [(4, 1.0, 50), (5, 0.5, 50), pytest.param(10, 2.0, 50, marks=pytest.mark.slow), (30, 0.5, 12), (6, 0.0, 100)],
 )
 def test_replicates_on_a_coarse_scale_are_recordings_of_their_own(count, step, sets):
     """Errors of 0.5 about one curve, written down in steps as large: some of them agree by chance."""

@@ -38,7 +38,7 @@ def campaign(tmp_path_factory):
     """Four oscillators whose springs differ."""
     folder = tmp_path_factory.mktemp("population")
     overrides = {"output.report": False, "output.directory": str(folder / "run")}
-    return run_campaign(make_campaign(folder, n=4), overrides=overrides).directory
+    return run_campaign(make_campaign(folder, 4, "execution_models:Swift"), overrides=overrides).directory
 
 
 DOUBT = caution("chain-not-converged", "only 8 effective draws stand behind the population")

@@ -112,7 +112,7 @@ def test_draws_taken_anew_are_the_same_on_any_workers():
     np.testing.assert_array_equal(apart[0].posterior.nu, apart[1].posterior.nu)
 
 
-@pytest.mark.parametrize("count", [5, 10])
+@pytest.mark.parametrize("count", [5, pytest.param(10, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("least", [pytest.param(0.0, marks=pytest.mark.slow), 0.3])
 def test_upper_limits_add_up_to_what_they_say(count, least):
     """Above a limit the likelihood falls to ``least`` of what it is below."""

@@ -28,8 +28,18 @@ def problems():
     )
 
 
-@pytest.mark.parametrize("workers", [1, 2, pytest.param(3, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("kind", [ThreadsExecutor, ProcessesExecutor])
+@pytest.mark.parametrize(
+    ("kind", "workers"),
+    [
+        (ThreadsExecutor, 1),
+        (ThreadsExecutor, 2),
+        (ProcessesExecutor, 2),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in [(ProcessesExecutor, 1), (ThreadsExecutor, 3), (ProcessesExecutor, 3)]
+        ),
+    ],
+)
 def test_same_bits_for_any_executor(kind, workers):
     with kind(workers) as executor:
         for problem in problems():

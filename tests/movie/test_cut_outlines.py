@@ -52,7 +52,7 @@ def test_a_circle_that_the_frame_cuts_is_as_exact_as_before(centre):
     assert np.median(std) < 0.06
 
 
-@pytest.mark.parametrize("noise", [0.03, 0.12])
+@pytest.mark.parametrize("noise", [pytest.param(0.03, marks=pytest.mark.slow), 0.12])
 @pytest.mark.parametrize(("ratio", "angle", "centre"), [(1.1, 10, TOP), (1.2, 130, CORNER), (1.3, 45, CORNER)])
 def test_of_an_ellipse_that_the_frame_always_cuts_the_error_holds_the_radius(ratio, angle, centre, noise):
     off, std = readings(ratio, angle, centre, noise)

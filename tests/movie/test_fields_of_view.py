@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 from movies import movie_of
@@ -15,6 +17,13 @@ RADII = np.array([12.3, 20.0, 31.7, 35.2, 25.5, 9.1])
 
 def frames(seed=1, **scene):
     return list(render(RADII[:, None], Scene(**{"noise": 2.0, "uneven": 0.0, **scene}), np.random.default_rng(seed)))
+
+
+@cache
+def of_grey_levels(before, bright):
+    """Frames, and the radii that are read from them."""
+    grey = [255 - frame if bright else frame for frame in frames(before=before)]
+    return grey, np.array([r.radius for r in track(movie_of(grey)).readings])
 
 
 def behind(aperture, shown, outside):
@@ -49,13 +58,10 @@ def test_a_bright_bubble_in_the_middle_is_no_field_of_view():
 @pytest.mark.parametrize("before", [0, 3])
 @pytest.mark.parametrize("bright", [False, True])
 def test_frames_of_floats_are_read_as_those_of_grey_levels(light, before, bright):
-    grey = [255 - frame if bright else frame for frame in frames(before=before)]
-    radii = [
-        np.array([r.radius for r in track(movie_of(shown)).readings])
-        for shown in (grey, [(light * frame / 255).astype(np.float32) for frame in grey])
-    ]
-    np.testing.assert_allclose(*radii, atol=0.02)
-    assert np.isfinite(radii[0][before:]).all()
+    grey, radii = of_grey_levels(before, bright)
+    found = track(movie_of([(light * frame / 255).astype(np.float32) for frame in grey])).readings
+    np.testing.assert_allclose([r.radius for r in found], radii, atol=0.02)
+    assert np.isfinite(radii[before:]).all()
 
 
 def test_what_leaves_the_surround_out_is_told_where_no_bubble_is_seen():

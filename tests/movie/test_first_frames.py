@@ -47,7 +47,7 @@ def wrong(readings, radii):
     [
         pytest.param((96, 128), 1.0, False, (0, 0), marks=pytest.mark.slow),
         pytest.param((96, 128), 1.2, False, (0, 0), marks=pytest.mark.slow),
-        ((96, 128), 1.2, True, (0, 0)),
+        pytest.param((96, 128), 1.2, True, (0, 0), marks=pytest.mark.slow),
         pytest.param((128, 128), 1.4, False, (0, 0), marks=pytest.mark.slow),
         pytest.param((128, 96), 1.3, False, (0, 0), marks=pytest.mark.slow),
         pytest.param((64, 192), 1.15, True, (0, 0), marks=pytest.mark.slow),
@@ -141,7 +141,9 @@ def test_the_dark_middle_of_a_bubble_that_fills_a_dark_field_is_not_taken_for_th
     assert sum(r.used for r in result.readings) > 8
 
 
-@pytest.mark.parametrize("swing", [0.25, 0.5, pytest.param(1.28, marks=pytest.mark.slow)])  # to each side
+@pytest.mark.parametrize(
+    "swing", [pytest.param(0.25, marks=pytest.mark.slow), 0.5, pytest.param(1.28, marks=pytest.mark.slow)]
+)  # to each side
 @pytest.mark.parametrize(("glare", "dirt"), [(0.0, 0.02), (0.37, 0.02), (0.37, 0.08)])
 @pytest.mark.parametrize(
     ("radius", "shape", "off"),

@@ -60,7 +60,7 @@ def test_a_lamp_that_flickers_does_not_make_a_bubble_bright():
     assert np.isfinite(of["wrong"][of["good"].astype(bool)]).mean() > 0.9
 
 
-@pytest.mark.parametrize("kind", ["interlaced", "two flashes"])
+@pytest.mark.parametrize("kind", ["interlaced", pytest.param("two flashes", marks=pytest.mark.slow)])
 def test_frames_of_two_images_are_doubted(kind):
     filmed = film(kind, 2)
     radius, result = read(filmed)

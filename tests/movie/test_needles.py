@@ -45,7 +45,14 @@ def needle(towards, gap, width, point=0.0, blur=0.8, centre=CENTRE):
 
 @pytest.mark.parametrize(
     ("towards", "gap", "width", "point"),
-    [(-90, 10, 20, 0), (-90, 8, 8, 0), (0, 3, 10, 0), (-40, 10, 12, 0), (90, 16, 28, 0), (180, 4, 12, 30)],
+    [
+        (-90, 10, 20, 0),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in [(-90, 8, 8, 0), (0, 3, 10, 0), (-40, 10, 12, 0), (90, 16, 28, 0)]
+        ),
+        (180, 4, 12, 30),
+    ],
 )
 def test_a_needle_that_stands_there_throughout_is_no_bubble(towards, gap, width, point):
     movie = movie_of(filmed(needle(towards, gap, width, point)))
@@ -66,14 +73,14 @@ def test_electrodes_and_a_needle_of_a_dark_field():
         assert np.nanmax(np.abs(wrong)) < 0.15
 
 
-@pytest.mark.parametrize("swing", [1.0, 3.0])
+@pytest.mark.parametrize("swing", [1.0, pytest.param(3.0, marks=pytest.mark.slow)])
 def test_a_bubble_at_rest_at_a_needle_is_told_from_it(swing):
     radii = 20 + swing * np.sin(np.arange(24) / 3)
     wrong = off(track(movie_of(filmed(needle(-90, 14, 10), radii))).readings, radii)
     assert np.abs(wrong).max() < 0.15
 
 
-@pytest.mark.parametrize("swing", [0.0, 0.2, 1.0])
+@pytest.mark.parametrize("swing", [0.0, *(pytest.param(swing, marks=pytest.mark.slow) for swing in (0.2, 1.0))])
 def test_a_bubble_at_rest_that_the_frame_cuts_is_no_needle(swing):
     radii = 20 + swing * np.sin(np.arange(24) / 3)
     wrong = off(track(movie_of(filmed(0.0, radii, (7.3, 60.2)))).readings, radii)
@@ -120,7 +127,13 @@ def test_an_ellipse_at_rest_at_a_needle_is_told_from_it():
     assert np.nanmax(np.abs(wrong) / [max(r.errors.std, 0.1) if r.used else 1 for r in result.readings]) < 4
 
 
-@pytest.mark.parametrize("radii", [[22.0, 21.1, 20.3, 19.4, 18.6, *[17.7] * 25], 17 + np.sin(np.arange(30) / 2)])
+@pytest.mark.parametrize(
+    "radii",
+    [
+        [22.0, 21.1, 20.3, 19.4, 18.6, *[17.7] * 25],
+        pytest.param(17 + np.sin(np.arange(30) / 2), marks=pytest.mark.slow),
+    ],
+)
 def test_half_a_disc_at_a_wall_is_told_from_a_needle_that_reaches_into_it(radii):
     centre = (70.0, SHAPE[0] - 0.5)
     result = track(movie_of(filmed(needle(180, 10, 6, centre=(70.0, 111.0)), radii, centre)))

@@ -61,8 +61,22 @@ def errors(frames):
     return off, std, common
 
 
-@pytest.mark.parametrize("blur", [0.7, 2.0])
-@pytest.mark.parametrize("rim", [(0.15, 3.0, 1.5), (0.25, 2.0, 0.8), (0.4, 5.0, 2.5)])
+@pytest.mark.parametrize(
+    ("rim", "blur"),
+    [
+        ((0.15, 3.0, 1.5), 0.7),
+        ((0.4, 5.0, 2.5), 2.0),
+        *(
+            pytest.param(rim, blur, marks=pytest.mark.slow)
+            for rim, blur in [
+                ((0.15, 3.0, 1.5), 2.0),
+                ((0.25, 2.0, 0.8), 0.7),
+                ((0.25, 2.0, 0.8), 2.0),
+                ((0.4, 5.0, 2.5), 0.7),
+            ]
+        ),
+    ],
+)
 def test_a_bright_rim_moves_no_radius(rim, blur):
     off, std, common = errors(filmed(gaussian(*rim), blur))
     assert abs(np.median(off)) < 0.06
@@ -89,7 +103,10 @@ def test_a_rim_beside_noise_moves_radii_less_than_what_they_are_said_to_share(ra
     assert np.std((off - np.median(off)) / std) < 1.5
 
 
-@pytest.mark.parametrize(("height", "length"), [(0.2, 3.0), (0.4, 1.5), (0.4, 3.0)])
+@pytest.mark.parametrize(
+    ("height", "length"),
+    [*(pytest.param(*rim, marks=pytest.mark.slow) for rim in ((0.2, 3.0), (0.4, 1.5))), (0.4, 3.0)],
+)
 def test_a_rim_of_another_shape_is_within_what_radii_are_said_to_share(height, length):
     off, _, common = errors(filmed(one_sided(height, length)))
     assert np.all(np.abs(off) < 1.2 * common)
@@ -100,12 +117,21 @@ def test_a_rim_that_blur_hides_is_within_what_radii_are_said_to_share():
     assert np.sqrt(np.mean(off**2 / (std**2 + common**2))) < 1
 
 
-@pytest.mark.parametrize("kind", ["in focus", "blurred", "bright centre", "dirt"])
+@pytest.mark.parametrize(
+    "kind", ["bright centre", "dirt", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("in focus", "blurred"))]
+)
 def test_no_rim_is_seen_where_there_is_none(kind):
     assert find_background(movie_of(film_plain(kind, 1)[1]))[1].rim == ()
 
 
-@pytest.mark.parametrize(("last", "ratio"), [(0.9, 40.0), (0.7, 40.0), (0.7, 12.0), (1.3, 40.0)])
+@pytest.mark.parametrize(
+    ("last", "ratio"),
+    [
+        *(pytest.param(*change, marks=pytest.mark.slow) for change in ((0.9, 40.0), (0.7, 40.0))),
+        (0.7, 12.0),
+        (1.3, 40.0),
+    ],
+)
 def test_a_contrast_that_changes_within_the_movie_moves_no_radius(last, ratio):
     off, std, _ = errors(filmed(ratio=ratio, changes=np.linspace(1, last, len(RADII))))
     assert np.sqrt(np.mean((off / std) ** 2)) < 2

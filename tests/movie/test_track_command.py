@@ -27,9 +27,9 @@ def history():
     return 3 + 38 * np.abs(np.cos(np.pi * t / 2)) ** 0.7 * np.where(t < 1, 1, 0.6)
 
 
-def tracked(folder, monkeypatch):
+def tracked(folder, monkeypatch, last=27):
     monkeypatch.chdir(folder)
-    frames = list(render(np.maximum(history(), 5)[:, None], Scene(), np.random.default_rng(3)))
+    frames = list(render(np.maximum(history()[:last], 5)[:, None], Scene(), np.random.default_rng(3)))
     tifffile.imwrite(folder / "gel.tif", np.array(frames), photometric="minisblack")
     words = ["track", "gel.tif", *SCALE, "--out", "gel.csv"]
     return CliRunner().invoke(main, words)
@@ -106,7 +106,7 @@ def test_flashes_raw_frames_and_corrections_go_through_that_step_too(tmp_path, m
 
 
 def test_the_table_of_another_movie_of_that_name_is_replaced_only_by_its_name(tmp_path, monkeypatch):
-    assert tracked(tmp_path, monkeypatch).exit_code == 0
+    assert tracked(tmp_path, monkeypatch, 6).exit_code == 0
     own = CliRunner().invoke(main, ["track", "gel.tif", *SCALE, "--out", "gel.csv", "--force"])
     assert own.exit_code == 0, own.output
     (tmp_path / "gel.tif").rename(tmp_path / "gel.tiff")
@@ -120,7 +120,7 @@ def test_the_table_of_another_movie_of_that_name_is_replaced_only_by_its_name(tm
 
 
 def test_the_table_of_a_movie_of_that_name_in_another_folder_is_replaced_only_by_its_name(tmp_path, monkeypatch):
-    assert tracked(tmp_path, monkeypatch).exit_code == 0
+    assert tracked(tmp_path, monkeypatch, 6).exit_code == 0
     before = (tmp_path / "gel.csv").read_bytes()
     (tmp_path / "second").mkdir()
     shutil.copy(tmp_path / "gel.tif", tmp_path / "second")
@@ -133,8 +133,8 @@ def test_the_table_of_a_movie_of_that_name_in_another_folder_is_replaced_only_by
 
 
 def test_nothing_is_replaced_and_the_scale_is_asked_for(tmp_path, monkeypatch):
-    assert tracked(tmp_path, monkeypatch).exit_code == 0
-    again = tracked(tmp_path, monkeypatch)
+    assert tracked(tmp_path, monkeypatch, 6).exit_code == 0
+    again = tracked(tmp_path, monkeypatch, 6)
     assert again.exit_code == 2
     assert "exists" in again.output
     mute = CliRunner().invoke(main, ["track", "gel.tif", "--out", "b.csv"])

@@ -34,7 +34,7 @@ def gels(tmp_path_factory):
     folders = []
     for name, stiffer in (("soft", 1.0), ("stiff", STIFFER)):
         folder = tmp_path_factory.mktemp(name)
-        path = make_campaign(folder, n=4)
+        path = make_campaign(folder, 4, "execution_models:Swift")
         for i in range(4):
             (folder / "data" / f"set{i}.csv").write_text(csv_text(k=stiffer * (1.6 + 0.15 * i)))
         run = run_campaign(path, overrides={"output.report": False, "output.directory": str(folder / name)}).directory

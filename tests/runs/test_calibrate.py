@@ -21,7 +21,8 @@ QUIET = {"output.report": False, "assimilation.members": 24}
 
 @pytest.fixture
 def toy(tmp_path):
-    return write_toy(tmp_path, ("mean: maximum, std: 1 %", "mean: 100 um, std: 3 um"))
+    prior = ("mean: maximum, std: 1 %", "mean: 100 um, std: 3 um")
+    return write_toy(tmp_path, prior, ("toy_models:Oscillator", "execution_models:Swift"))
 
 
 def sixty(toy, out, **options):

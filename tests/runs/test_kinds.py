@@ -26,7 +26,10 @@ WORKED = {  # as `en4dvar` is called, in a folder with the files of `prepared`
     "estimate": ("run", "campaign/toy.yaml"),
     "sequence": ("run", "series/drift.yaml", "--set", "output.figures=true"),
     "twin": ("run", "ring.yaml"),
-    "design": ("design", CONFIGS / "linear_design.yaml"),
+    "design": (
+        "design", CONFIGS / "linear_design.yaml", "--set", "design.knobs.until.values=[2, 8]",
+        "--set", "design.knobs.every.values=[1]",
+    ),
     "sweep-twin": (
         "sweep-twin", "ring.yaml", "--vary", "assimilation.members=[8, 9]", "--seeds", "1", "--workers", "1",
     ),

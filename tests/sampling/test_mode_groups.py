@@ -77,7 +77,7 @@ def test_modes_that_no_descent_ended_in_are_told(monkeypatch):
     assert np.isfinite(modes["mode_cost"].values).all()
 
 
-@pytest.mark.parametrize("seed", [1, 7])
+@pytest.mark.parametrize("seed", [1, pytest.param(7, marks=pytest.mark.slow)])
 def test_of_a_cheap_function_an_alias_is_found(seed):
     """The frequency of a sine read once a second: 30 % of the posterior, by a sum over a grid, is below 3."""
     random = np.random.default_rng(7)

@@ -56,7 +56,7 @@ def test_two_narrow_modes_as_far_apart_as_the_prior_is_wide_are_no_silent_data(s
     assert told.startswith("the posterior has 2 modes")
 
 
-@pytest.mark.parametrize("case", CASES[::2])
+@pytest.mark.parametrize("case", [CASES[0], pytest.param(CASES[2], marks=pytest.mark.slow)])
 def test_a_chain_moves_between_the_wells(case):
     problem = two_wells(*case[:1], mean=case[1])
     analysis = assimilate(problem, AssimilationSettings(refine="mcmc"), 1)

@@ -40,7 +40,7 @@ def line(p, t):
     return p["a"] + p["k"] * t
 
 
-@pytest.mark.parametrize("truth", [0.05, 0.2, 0.4])
+@pytest.mark.parametrize("truth", [0.05, pytest.param(0.2, marks=pytest.mark.slow), 0.4])
 @pytest.mark.parametrize("name", PRIORS)
 def test_near_a_bound_mean_spread_and_evidence_are_the_posteriors(name, truth):
     prior, named = PRIORS[name]

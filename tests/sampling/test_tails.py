@@ -92,7 +92,7 @@ def test_a_cheap_function_is_sampled(name):
 
 
 @pytest.mark.parametrize("name", CASES)
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_of_another_function_it_is_told(name, seed):
     mean, std = exact(CASES[name])
     found = estimated(CASES[name], seed)

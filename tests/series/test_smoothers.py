@@ -133,7 +133,7 @@ def off(size, n_members, std, form, smoother, inflation=1.0, rotation=False, see
 
 @pytest.mark.parametrize("rotation", [False, True])
 @pytest.mark.parametrize("inflation", [1.0, 1.05])
-@pytest.mark.parametrize("std", [0.05, 0.6, 4.0])
+@pytest.mark.parametrize("std", [0.05, pytest.param(0.6, marks=pytest.mark.slow), 4.0])
 @pytest.mark.parametrize("size", [1, 2])
 def test_enrts_is_the_kalman_smoother_with_model_error(size, std, inflation, rotation):
     """By a square root mean and spread, of what is drawn the mean; the spread is unbiased but for its noise."""
