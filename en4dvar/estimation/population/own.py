@@ -244,7 +244,7 @@ def _mixture(y: Array, following: Following, draws: OwnDraws, stream: np.random.
     mean, std = (np.broadcast_to(part, y.shape[1]) for part in draws.about)
     std, beyond = following.prior(y, mean, std)
     constant = float(np.logaddexp.reduce(beyond)) - math.log(len(beyond)) + draws.gain
-    alike = (y.shape[1] + 2) * len(draws.z) / draws.effective
+    alike = len(draws.z) / draws.effective  # of one draw: more make a bent valley fall too steeply beyond its draws
     if following.logs.any():
         shares = shares_of(beyond)
         y = y[resampled(shares, len(shares), stream)]
