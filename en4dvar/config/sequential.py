@@ -64,7 +64,8 @@ class SeriesLocalisation(Section):
 
 
 class Smoothing(Section):
-    """A smoother behind a filter: the states of earlier cycles given later observations; the filter is as without."""
+    """A smoother behind a filter: the states of earlier cycles given later observations; the filter is as without. Not
+    with localisation."""
 
     method: Literal["enks", "enrts"]
     """enks: the weights of each analysis act on the cycles before it. enrts: one pass back from the end of the series,
@@ -118,7 +119,7 @@ class Sequential(_OnASeries):
     """Rotate the ensemble at random after each analysis, mean and covariance kept."""
     additive: Literal["drawn", "square-root"] = "drawn"
     """How a model error enters the ensemble of a filter: drawn, or by a square root in the space of the ensemble (not
-    with smoother enks)."""
+    with smoother enks), which takes more members than variables of the state."""
     localisation: SeriesLocalisation | None = None
     smoother: Smoothing | None = None
     stochastic_model: bool = False

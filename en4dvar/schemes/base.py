@@ -162,17 +162,19 @@ class Scheme:
     ``words``: what it is, in two or three of them. ``on``: what it can be run on, ``window`` (the data of one set, for
     parameters), ``series``, or both. ``filters``: it analyses its members once, where they stand. ``resamples``:
     members survive as a whole, so that no part of the state can be analysed by itself, and its forecast is not
-    Gaussian. ``cycled``: the next forecast of a series starts from the analysis; a baseline's from the forecast, as if
-    nothing was observed. ``climatological``: the covariances of its analysis, where that is not localised, are averages
-    over the forecasts of a series so far. ``approximate``: what it does, in words, that makes its ensemble another than
-    the posterior even where model and errors are linear and Gaussian. ``localised_keys``: the fields that it reads
-    where its gain is localised; None: it cannot be.
+    Gaussian. ``perturbs``: its transform is random, and only on average that of the posterior. ``cycled``: the next
+    forecast of a series starts from the analysis; a baseline's from the forecast, as if nothing was observed.
+    ``climatological``: the covariances of its analysis, where that is not localised, are averages over the forecasts of
+    a series so far. ``approximate``: what it does, in words, that makes its ensemble another than the posterior even
+    where model and errors are linear and Gaussian. ``localised_keys``: the fields that it reads where its gain is
+    localised; None: it cannot be.
     """
 
     words: ClassVar[str] = ""
     on: ClassVar[tuple[str, ...]] = ("window",)
     filters: ClassVar[bool] = False
     resamples: ClassVar[bool] = False
+    perturbs: ClassVar[bool] = False
     cycled: ClassVar[bool] = True
     climatological: ClassVar[bool] = False
     approximate: ClassVar[str] = ""

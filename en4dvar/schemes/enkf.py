@@ -3,12 +3,12 @@
     δ_i = A⁻¹ Sᵀ (d_i + z_i),   A = (N−1) I + SᵀS,   z_i ~ N(0, I)
 
 along the anomalies, d_i the whitened innovation of member i. The z_i are centred, so that the mean moves by the Kalman
-gain without sampling noise, and scaled by √(N/(N−1)), so that their sample covariance has no bias.
+gain without sampling noise. Divided by N−1 their sample covariance then has the mean I, and that of the members after
+the analysis the mean (N−1) A⁻¹ along the anomalies, as it is of the ETKF: no scale is needed.
 
 Sources: Burgers, van Leeuwen & Evensen (1998), Mon. Wea. Rev. 126, 1719; Evensen (2003), Ocean Dynamics 53, 343.
 """
 
-import math
 from dataclasses import dataclass
 from typing import ClassVar, cast
 
@@ -34,11 +34,12 @@ class EnKF(ETKF):
     """The filter."""
 
     words: ClassVar[str] = "perturbed observations"
+    perturbs: ClassVar[bool] = True
 
     def advance(self, weights: Weights, evaluation: Evaluation, iteration: int, draw: Draw) -> Step | GaussNewtonStep:
         hessian, n = Hessian.of(evaluation.S), len(weights.w)
         shift = hessian.solve(evaluation.d @ evaluation.S)
-        noise = math.sqrt(n / (n - 1)) * draw("perturbed observations")
+        noise = draw("perturbed observations")
         if len(evaluation.S) < n:
             innovations = noise - noise.mean(axis=0) - evaluation.S.T
             transform = cast(Array, LowRank(innovations, hessian.solve(evaluation.S)))  # T = I before

@@ -14,6 +14,7 @@ import numpy as np
 from en4dvar.ensemble.linalg import apply_weights
 from en4dvar.model.state import Array, Indices, Mask
 from en4dvar.schemes.base import Draw, Evaluation, Runs, Scheme, Weights
+from en4dvar.schemes.etkf import ETKF
 
 
 def gaspari_cohn(distance: Array, radius: float) -> Array:
@@ -103,11 +104,16 @@ class BlockLocalisation:
         return np.asarray(weights.w + wider * transform)
 
     def analysis(self, scheme: Scheme, ensemble: Array, evaluation: Evaluation, draw: Draw) -> Array:
-        """Local analysis (N, n) of members (N, n) by a filter's scheme, block by block."""
+        """Local analysis (N, n) of members (N, n) by a filter's scheme, block by block.
+
+        Variables without a place take the symmetric root in the place of a random T: that :meth:`rows` keep their
+        variance on average of many analyses lets it fall in most, and so along a series.
+        """
         analysed = ensemble.copy()
         prior = Weights.prior(len(ensemble))
         for block, taper in self.analysed(ensemble):
-            step = scheme.advance(prior, _tapered(evaluation, taper), 0, _of_some(draw, taper > 0))
+            own = ETKF() if scheme.perturbs and block is self.without_place else scheme
+            step = own.advance(prior, _tapered(evaluation, taper), 0, _of_some(draw, taper > 0))
             analysed[:, block] = apply_weights(ensemble[:, block], self.rows(block, step.weights))
         return analysed
 

@@ -92,7 +92,9 @@ class SeriesResult:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Reasons not to trust the spread."""
-        told = [*members_lost(self.run, self.problem.members), *self._too_few()]
+        problem, times = self.problem, len(self.problem.series.times)
+        told = [*members_lost(self.run, problem.members)]
+        told += too_few(problem.start, problem.settings, problem.members, times)
         squares = self.normalised[np.isfinite(self.normalised)] ** 2
         size = float(np.sqrt(squares.mean())) if len(squares) else 1.0
         if size > UNEXPECTED:
@@ -104,20 +106,6 @@ class SeriesResult:
             told.append(f"innovations are only {size:.2g} times what forecast and errors say: these are too large")
         return tuple(told)
 
-    def _too_few(self) -> Iterator[str]:
-        """Where members are fewer than what a window estimates, state and model error, and one more."""
-        problem, settings, times = self.problem, self.problem.settings, len(self.problem.series.times)
-        lag, error = min(settings.scheme.lag, times), settings.model_error
-        if not lag or error is None or settings.localisation is not None:
-            return
-        size = sum(field.size for field in problem.start.model.layout if field.name not in problem.start.fixed)
-        if problem.members < (needed := size + lag * len(error.where) + 1):
-            yield (
-                f"{problem.members} members are fewer than the {needed} that a window of {lag} times with model error "
-                f"needs ({size} for the state, {len(error.where)} a time, and one): the spread may be far too small; "
-                "give more members, or a shorter lag"
-            )
-
 
 def members_lost(run: SequentialResult, members: int) -> Iterator[str]:
     """Where some were: of how many, why and when, and what to do."""
@@ -125,6 +113,27 @@ def members_lost(run: SequentialResult, members: int) -> Iterator[str]:
         yield (
             f"{len(run.failures)} of {members} members were lost: {common_reasons(run.failures)}; the result holds "
             "only where the model runs: narrow what is uncertain at the start, or find out why the model fails"
+        )
+
+
+def too_few(start: InitialEnsemble, settings: SequentialSettings, members: int, times: int) -> Iterator[str]:
+    """Where members are fewer than what they must span, and one more: the state that a square root widens by a model
+    error, or what a window of ``times`` at most estimates, state and model error.
+    """
+    lag, error = min(settings.scheme.lag, times), settings.model_error
+    if error is None:
+        return
+    size = sum(field.size for field in start.model.layout if field.name not in start.fixed)
+    if error.form == "square-root" and members <= size:
+        yield (
+            f"{members} members are fewer than the {size + 1} that a model error by a square root needs ({size} for "
+            "the state, and one): most of it is lost; give more members, or additive: drawn"
+        )
+    if lag and settings.localisation is None and members < (needed := size + lag * len(error.where) + 1):
+        yield (
+            f"{members} members are fewer than the {needed} that a window of {lag} times with model error "
+            f"needs ({size} for the state, {len(error.where)} a time, and one): the spread may be far too small; "
+            "give more members, or a shorter lag"
         )
 
 

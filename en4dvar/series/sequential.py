@@ -152,16 +152,17 @@ class _Run:
         if self.rotations is not None:
             turned = self.rotations.of_cycle(newest - 1, len(anomalies))
             anomalies = rotate(anomalies, turned)
-        if self.settings.smoother is not None:
-            transform = descent.weights.dense
-            if self.rotations is not None:
-                transform = rotate(transform, turned)
-            weights, analysis = descent.weights.w + transform, mean + anomalies
-            self.settings.smoother.passed(self.trail, newest - 1, forecasts, analysis, weights, self.put_smoothed)
         inflated = self.settings.inflation.apply(members, anomalies)
         if window.localisation is not None:
             kept = window.localisation.without_place
             inflated[:, kept] = anomalies[:, kept]
+        if self.settings.smoother is not None:
+            transform = descent.weights.dense
+            if self.rotations is not None:
+                transform = rotate(transform, turned)
+            analyses = [mean + each for each in ((anomalies,) if inflated is anomalies else (anomalies, inflated))]
+            weights = descent.weights.w + transform
+            self.settings.smoother.passed(self.trail, newest - 1, forecasts, analyses, weights, self.put_smoothed)
         self.ensemble = mean + inflated
         if not repeated or first == 1:
             self.record_ahead([at for at in window.ahead if at.index >= first])

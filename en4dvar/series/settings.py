@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 
+from en4dvar import schemes
 from en4dvar.schemes.base import Scheme
 from en4dvar.schemes.inflation import Inflation
 from en4dvar.schemes.localisation import BlockLocalisation
@@ -23,8 +24,8 @@ class SequentialSettings:
     after so many observation times, and the last; 0: the last alone.
     ``smoother``: what goes behind a filter (:mod:`en4dvar.series.smoothers`).
 
-    Raises ValueError: a smoother behind what is no cycled filter, localisation of what has no local analysis, a square
-    root of the model error where members must keep their past.
+    Raises ValueError: a smoother behind what is no cycled filter or is localised, localisation of what has no local
+    analysis, a square root of the model error where members must keep their past.
     """
 
     scheme: Scheme
@@ -43,8 +44,9 @@ class SequentialSettings:
     def __post_init__(self) -> None:
         if self.smoother and (self.scheme.lag or not self.scheme.cycled):
             raise ValueError("a smoother goes behind a filter that is cycled, not behind a smoother or a baseline")
-        if self.localisation and isinstance(self.smoother, EnKS):
-            raise ValueError("enks needs the weights of one analysis for all of the state; with localisation use enrts")
+        if self.localisation and self.smoother:
+            others = " or ".join(name for name, kind in schemes.ON_A_SERIES.items() if "lag" in schemes.keys_of(kind))
+            raise ValueError(f"a smoother behind a filter takes no localisation; scheme {others} smooths with it")
         if self.localisation and self.scheme.resamples:
             raise ValueError("members of this scheme survive as a whole: it takes no localisation")
         if self.model_error and self.model_error.form == "square-root":

@@ -21,7 +21,7 @@ from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError, En4dvarError, retold
 from en4dvar.priors.prior import Prior, member_stream
 from en4dvar.series.moments import Moments, SequentialResult, SequentialState
-from en4dvar.series.problem import members_lost
+from en4dvar.series.problem import members_lost, too_few
 from en4dvar.series.sequential import run_sequential
 from en4dvar.series.series import CycleSeries
 from en4dvar.series.settings import SequentialSettings
@@ -105,7 +105,9 @@ class TwinResult:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Reasons why the scores mean less than they seem to."""
-        warnings = [*members_lost(self.run, self.experiment.members)]
+        experiment = self.experiment
+        warnings = [*members_lost(self.run, experiment.members)]
+        warnings += too_few(experiment.start, experiment.sequential, experiment.members, experiment.cycles)
         fields, prior = self.experiment.model.layout, self.experiment.prior
         names = np.array([f.name for f in fields for _ in range(f.size)])
         hidden = [value for name, value in self.experiment.fixed.items() if name not in fields.names]

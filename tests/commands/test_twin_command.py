@@ -173,8 +173,8 @@ def test_validate(tmp_path):
         ),
         (
             "scheme: ienks\n  lag: 2",
-            "scheme: etkf\n  smoother: {method: enks}\n  localisation: {radius: 2}",
-            r"twin\.yaml:11:\d+: assimilation: .*with localisation use enrts",
+            "scheme: etkf\n  smoother: {method: enrts}\n  localisation: {radius: 2}",
+            r"twin\.yaml:11:\d+: assimilation: .*scheme ienks smooths with it",
         ),
         ("model: {name: lorenz96, size: 12}", "model: {name: lorenz69}", r"unknown model 'lorenz69'; did you mean"),
         (

@@ -129,6 +129,19 @@ def test_perturbed_observations_move_every_member_by_the_gain():
     gain = p[:, :2] @ np.linalg.inv(p[:2, :2] + np.diag(std**2))
     e = Evaluation((y - mean[:2]) / std, (x[:, :2] / std).T)
     found = EnKF().advance(Weights.prior(7), e, 0, lambda purpose: noise).weights
-    errors = np.sqrt(7 / 6) * (noise - noise.mean(axis=0)) * std
+    errors = (noise - noise.mean(axis=0)) * std
     assert mean + found.rows @ x == pytest.approx(members + (y + errors - members[:, :2]) @ gain.T, abs=1e-12)
     assert found.w == pytest.approx(analysed(ETKF(), e).w, abs=1e-12)
+
+
+@pytest.mark.parametrize("n_members", [4, 8])
+@pytest.mark.parametrize("k", [1, 12])
+def test_perturbed_observations_have_the_covariance_of_the_square_root_on_average(n_members, k):
+    """Over 4000 analyses of one forecast, within 4 standard errors, of fewer and more observations than members."""
+    e, rng, squares = evaluation(n_members, k, seed=2), np.random.default_rng(5), []
+    for _ in range(4000):
+        noise = rng.standard_normal((n_members, k))
+        transform = EnKF().advance(Weights.prior(n_members), e, 0, lambda purpose, noise=noise: noise).weights.dense
+        squares.append(transform.T @ transform)
+    exact, error = analysed(ETKF(), e).T, np.std(squares, axis=0) / np.sqrt(len(squares))
+    assert np.all(np.abs(np.mean(squares, axis=0) - exact.T @ exact) < 4 * error + 1e-12)

@@ -9,6 +9,7 @@ import pytest
 
 from en4dvar.ensemble.linalg import GRAM_LIMIT, Hessian, NearPrior, apply_weights, centre
 from en4dvar.schemes.base import Evaluation, gauss_newton
+from en4dvar.schemes.enkf import EnKF
 from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.inflation import Inflation, relaxation
 from en4dvar.schemes.localisation import BlockLocalisation, distances, gaspari_cohn
@@ -263,6 +264,15 @@ def test_chance_takes_no_spread_of_what_has_no_place():
     assert np.mean(np.var(analysed, axis=0)) == pytest.approx(np.mean(np.var(members, axis=0)), rel=0.03)
     alone = apply_weights(members, gauss_newton(np.zeros(6), e).weights.rows)
     assert np.mean(np.var(alone, axis=0)) < 0.5
+
+
+def test_what_has_no_place_is_not_perturbed():
+    """Beside a field that the stochastic EnKF analyses it has the symmetric root."""
+    members, e, noise = RNG(2).standard_normal((6, 14)), evaluation(), RNG(3).standard_normal((6, 12))
+    local = BlockLocalisation.on_line(np.arange(12.0), np.arange(12.0), 1.5).with_placeless(np.array([12, 13]))
+    perturbed, root = (local.analysis(scheme, members, e, lambda purpose: noise) for scheme in (EnKF(), ETKF()))
+    assert np.array_equal(perturbed[:, 12:], root[:, 12:])
+    assert np.all(np.std(perturbed[:, :12] - root[:, :12], axis=0) > 0.01)
 
 
 @pytest.mark.parametrize("periodic", [False, True])

@@ -40,12 +40,10 @@ def test_smoothed_moments_are_those_of_the_kalman_smoother(scheme, n_members, sm
 
 
 def test_both_are_the_same_in_the_space_of_a_small_ensemble():
-    """Fewer members than variables, chaos, inflation and rotation: J_k then is exact along every anomaly."""
+    """Fewer members than variables, chaos and rotation: J_k then is exact along every anomaly."""
     model, start, y = chaotic_twin(n_members=12)
     results = [
-        run_sequential(
-            model, model.observables, start, y, SequentialSettings(EnKFN(), Inflation(1.1), rotation=True, smoother=one)
-        )
+        run_sequential(model, model.observables, start, y, SequentialSettings(EnKFN(), rotation=True, smoother=one))
         for one in (EnKS(20), EnRTS())
     ]
     assert results[0].smoothed.mean == pytest.approx(results[1].smoothed.mean, abs=1e-8)
@@ -95,20 +93,23 @@ UNEVEN, R = np.cumsum([0.4, 1.0, 0.3, 0.8, 0.8, 1.5, 0.2, 0.9, 0.6, 1.1, 0.7, 0.
 def of_kalman(model, ensemble, y, rate, inflation, lag):
     """Mean and standard deviation (K, n) of the Rauch–Tung–Striebel smoother by ``lag`` later observations.
 
-    Inflated anomalies are those of a state that moves away from the analysed mean by the factor ``inflation``.
+    Inflation is an error that joins the analysis, and makes its covariance that of inflated anomalies.
     """
     mean, cov, found, ahead = ensemble.mean(axis=0), np.atleast_2d(np.cov(ensemble.T)), [], []
     for k, dt in enumerate(np.diff(UNEVEN, prepend=0.0)):
-        m, moving = model.flow(dt), model.flow(dt) * (inflation if k else 1)
-        mean, cov, past = m @ mean, moving @ cov @ moving.T + np.diag(rate * dt), moving @ cov
+        m = model.flow(dt)
+        mean, cov, past = m @ mean, m @ cov @ m.T + np.diag(rate * dt), m @ cov
         ahead.append((mean, cov, past))
         gain = cov[:, 0] / (cov[0, 0] + R)
-        mean, cov = mean + gain * (y[k] - mean[0]), cov - np.outer(gain, cov[0])
+        mean, cov = mean + gain * (y[k] - mean[0]), inflation**2 * (cov - np.outer(gain, cov[0]))
         found.append((mean, cov))
     smoothed = []
     for at in range(len(y)):
         mean, cov = found[min(len(y) - 1, at + lag)]
         for k in range(min(len(y) - 1, at + lag), at, -1):
+            analysed, inflated = found[k]  # what joined it is taken away: of the covariance C to C / λ²
+            mean = analysed + (mean - analysed) / inflation**2
+            cov = inflated / inflation**2 + (cov - inflated) / inflation**4
             forecast, spread, past = ahead[k]
             gain = np.linalg.solve(spread, past).T
             before, known = found[k - 1]
@@ -163,8 +164,9 @@ def test_what_takes_no_smoother():
     for scheme in (IEnKS(1), Climatology()):
         with pytest.raises(ValueError, match="behind a filter that is cycled"):
             SequentialSettings(scheme, smoother=EnRTS())
-    with pytest.raises(ValueError, match="with localisation use enrts"):
-        SequentialSettings(ETKF(), localisation=local, smoother=EnKS(2))
+    for smoother in (EnKS(2), EnRTS()):
+        with pytest.raises(ValueError, match="takes no localisation; scheme ienks smooths with it"):
+            SequentialSettings(ETKF(), localisation=local, smoother=smoother)
     with pytest.raises(ValueError, match="leaves no member its past, which enks needs; use enrts, or drawn"):
         SequentialSettings(ETKF(), model_error=ModelError(np.ones(1), "square-root"), smoother=EnKS(2))
     with pytest.raises(ValueError, match="must be at least 1, not 0"):

@@ -19,6 +19,7 @@ from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.ienks import IEnKS
 from en4dvar.schemes.inflation import Inflation
 from en4dvar.schemes.localisation import BlockLocalisation
+from en4dvar.series.model_error import ModelError
 from en4dvar.series.sequential import SequentialSettings, run_sequential
 from en4dvar.series.twin import TwinExperiment, TwinResult, conduct, observe_truth
 from en4dvar_lorenz import Lorenz63, Lorenz96
@@ -253,6 +254,7 @@ def test_few_members_need_localisation():
 BESIDE_A_FIELD = [
     {"scheme": "etkf", "members": 10, "inflation": 1.04},
     pytest.param({"scheme": "denkf", "members": 24, "inflation": 1.0}, marks=pytest.mark.slow),
+    {"scheme": "enkf", "members": 24, "inflation": 1.05},
     pytest.param({"scheme": "ienks", "members": 24, "inflation": 1.02}, marks=pytest.mark.slow),
 ]
 
@@ -271,6 +273,16 @@ def test_a_parameter_beside_a_localised_field(scheme):
     assert 0.01 < stds.max() < 0.15
     assert 0.1 < np.sqrt(np.mean((errors / stds) ** 2)) < 2
     assert np.mean([score.mean_rmse for score in scores]) < 1.2 * np.mean([score.mean_spread for score in scores])
+
+
+@pytest.mark.parametrize("members", [40, 41])
+@pytest.mark.parametrize("local", [False, True])
+def test_a_square_root_of_fewer_members_than_variables_is_told(members, local):
+    twin = lorenz96(ETKF(), 3, members, burn_in=1)
+    taper = BlockLocalisation.on_line(np.arange(40.0), np.arange(40.0), 4.0) if local else None
+    settings = replace(twin.sequential, localisation=taper, model_error=ModelError(np.ones(41), "square-root"))
+    told = [words for words in conduct(replace(twin, sequential=settings), 1).warnings if "square root" in words]
+    assert [words[:37] for words in told] == ["40 members are fewer than the 41 that"] * (members == 40)
 
 
 @pytest.mark.parametrize("linearisation", ["transform", "bundle"])

@@ -1,4 +1,4 @@
-"""What the result of a series says of members that were lost, and of too few for a window with model error."""
+"""What the result of a series says of members that were lost, and of too few for a model error."""
 
 import numpy as np
 import pytest
@@ -7,6 +7,7 @@ from scipy.linalg import expm
 from toys import SLOPE, Swing
 
 import en4dvar
+from en4dvar import Field, ForwardModel, Observable, StateField, StateLayout
 
 TIMES = np.arange(1.0, 9.0) / 2
 READ = np.array([(expm(SLOPE * t) @ [1.1, 0.2])[0] for t in TIMES])
@@ -47,4 +48,39 @@ def test_a_window_says_how_many_members_its_model_error_needs(lag, needed):
     assert np.max(np.abs(few.run.smoothed.std / many.run.smoothed.std - 1)) > 0.01
     words = f"{needed - 1} members are fewer than the {needed} that a window of {min(lag, 8)} times with model error"
     assert few.warnings[0].startswith(words)
+    assert not [words for words in enough.warnings if "fewer" in words]
+
+
+class Still(ForwardModel):
+    """Four variables that stay as they are; the first is read."""
+
+    parameters = ()
+    layout = StateLayout(tuple(Field(name) for name in "abcd"))
+    observables = (Observable("a", "1", StateField("a")),)
+    time_unit = "1"
+
+    def initial_state(self, theta):
+        return np.zeros(4)
+
+    def step(self, x, t0, t1):
+        return x
+
+
+@pytest.mark.parametrize("scheme", ["etkf", "esrf"])
+def test_a_square_root_says_how_many_members_it_needs(scheme):
+    """With as many the spread of what is read is that of the Kalman filter; with one fewer it is told."""
+    few, enough = (
+        en4dvar.estimate_sequence(
+            Still, {"a": (TIMES, READ)}, error={"a": 0.5}, initial_std=dict.fromkeys("abcd", 0.5),
+            model_error={"a": {"std": 0.3, "every": 1}},
+            assimilation={"scheme": scheme, "members": members, "additive": "square-root"},
+        )
+        for members in (4, 5)
+    )  # fmt: skip
+    variance = 0.25
+    for _ in TIMES:
+        variance = 1 / (1 / (variance + 0.09 * 0.5) + 1 / 0.25)
+    assert enough.run.analysis.std[-1, 0] == pytest.approx(np.sqrt(variance), rel=1e-9)
+    assert few.run.analysis.std[-1, 0] < 0.97 * np.sqrt(variance)
+    assert few.warnings[0].startswith("4 members are fewer than the 5 that a model error by a square root needs")
     assert not [words for words in enough.warnings if "fewer" in words]
