@@ -161,20 +161,20 @@ def test_the_clock_of_a_bubble_is_as_certain_in_a_folder_as_alone(tmp_path: Path
 
 
 @pytest.mark.parametrize(
-    ("ends", "words"),
+    ("ends", "to", "words"),
     [
-        ((1.1,), "warning: the readings end before the first rebound has a top, .* upper limits .*: record longer, "),
-        ((1.5,), ""),
-        ((1.5, 1.6), ""),
-        ((3.0,), ""),
-        ((1.1, 3.0), "warning: b0: the readings end .*; the window of the others can .* if those files are moved away"),
-        ((1.5, 3.0), "warning: b0: without a second minimum the window ends before .*; the window of the others can "),
+        ((1.1,), "end", "warning: the readings end before the first rebound has a top, .*: record longer, "),
+        ((1.5,), "end", ""),
+        ((1.5, 1.6), "end", ""),
+        ((3.0,), "trough 2", ""),
+        ((1.1, 3.0), "trough 2 or end", "warning: b0: the readings end .*; move those files away, or accept "),
+        ((1.5, 3.0), "trough 2 or end", ""),
     ],
 )
 def test_a_recording_that_ends_with_the_first_collapse_is_told_at_once(
-    tmp_path: Path, ends: tuple[float, ...], words: str
+    tmp_path: Path, ends: tuple[float, ...], to: str, words: str
 ) -> None:
-    """Where a run of the same files tells upper limits only; a rebound whose top is past is in the window."""
+    """A rebound whose top is past is in the window, and one that ends before it costs the other bubbles nothing."""
     (tmp_path / "gel").mkdir()
     t, R = rebounding(0.05)
     for n, end in enumerate(ends):
@@ -183,9 +183,11 @@ def test_a_recording_that_ends_with_the_first_collapse_is_told_at_once(
     done = call("init", "--data", "gel", "--start", "laser", "--out", "b.yaml")
     assert done.exit_code == 0, done.output
     assert re.search(words, done.stderr)
-    assert ("upper limits" in done.stderr) == bool(words)
-    for problem in build(load_config("b.yaml")):
-        assert single(problem.observations.times, problem.observations.values) == bool(words)
+    assert ("before the first rebound" in done.stderr) == bool(words)
+    assert proposed(Path("b.yaml")).document.data["data"]["window"] == {"from": "top", "to": to}
+    for end, problem in zip(ends, build(load_config("b.yaml")), strict=True):
+        assert single(problem.observations.times, problem.observations.values) == (end == 1.1)
+        assert problem.observations.times[-1] == pytest.approx(20e-6 * min(end, 2.5), abs=1.1e-6)
 
 
 def test_without_data_a_starter_is_written() -> None:
