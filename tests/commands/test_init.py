@@ -190,6 +190,21 @@ def test_a_recording_that_ends_with_the_first_collapse_is_told_at_once(
         assert problem.observations.times[-1] == pytest.approx(20e-6 * min(end, 2.5), abs=1.1e-6)
 
 
+def test_a_bubble_that_shrinks_where_it_should_rest_ends_with_its_only_minimum(tmp_path: Path) -> None:
+    """In a folder, too, where another has a second one; that its rebound is lost is told."""
+    (tmp_path / "gel").mkdir()
+    t, R = rebounding(0.05)
+    shrinking = np.where(t > 1.75, np.interp(t, (1.75, 2.1, 3), (np.interp(1.75, t, R), 0.36, 0.24)), R)
+    for n, radius in enumerate((shrinking, R)):
+        rows = zip(20 * t, 200 * radius, strict=True)
+        (tmp_path / "gel" / f"b{n}.csv").write_text("t_us,R_um\n" + "".join(f"{a:.4f},{b:.4f}\n" for a, b in rows))
+    for data, to in (("gel", {"to": "trough 2 or trough 1"}), ("gel/b0.csv", {"to": "trough 1", "until": "trough 1"})):
+        done = call("init", "--data", data, "--start", "laser", "--out", "b.yaml", "--force")
+        assert "b0: R goes from" in done.stderr
+        assert "and its window ends with the first collapse, before the rebound has a top" in done.stderr
+        assert proposed(Path("b.yaml")).document.data["data"]["window"] == {"from": "top", **to}
+
+
 def test_without_data_a_starter_is_written() -> None:
     done = call("init", "--start", "laser")
     assert done.exit_code == 0, done.output
