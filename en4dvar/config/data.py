@@ -134,8 +134,8 @@ class WindowSection(Section):
     """First observation: start, top, maximum (also written x_max), trough N, minimum N, or a time on the
     file's clock."""
     end: Annotated[Instant, Made(_instant)] = Field("end", alias="to", validate_default=True)
-    """Last observation: end, top, maximum, trough N, minimum N (counted from the window's start), or a time on the
-    file's clock."""
+    """Last observation: end, top, maximum, trough N, minimum N (counted from the window's start), trough N or end
+    (that of files with fewer), or a time on the file's clock."""
     until: Annotated[Instant, Made(_instant)] = Field("end", validate_default=True)
     """Last reading after the window that is predicted; later ones are no longer of the same system."""
     prominence: Annotated[float, Made(_prominence)] = Field("10 %", validate_default=True)

@@ -7,6 +7,8 @@ A window that ends with the smallest sample of several, or begins with the large
 known sign: it was chosen for its value, and those beside it were left out for theirs. ``top`` and ``trough N`` say the
 same instants by what no single sample decides: the vertex of a parabola through the samples about the maximum, and the
 middle between the two crossings of half the depth of a minimum, seen between the minima beside it.
+
+An instant may be followed by another for series that have no such minimum: ``trough 2 or end``.
 """
 
 import re
@@ -31,19 +33,21 @@ class Instant:
     """A sample of a series: an end, an extremum (the ``number``-th minimum), or a ``time`` on the file's clock.
 
     ``top`` and ``trough`` are the maximum and a minimum where several samples, and no single one, put them.
+    ``otherwise`` is what counts where there is no such minimum.
     """
 
     kind: Literal["start", "end", "maximum", "minimum", "top", "trough", "time"]
     number: int = 1
     time: float = 0.0
+    otherwise: "Instant | None" = None
 
 
 BY_NAME: dict[str, Instant] = {kind: Instant(kind) for kind in ("start", "end", "maximum", "top")}
 
 
 def parse_instant(text: str | float, time_unit: str, symbols: Collection[str] = ()) -> Instant:
-    """``start``, ``end``, ``maximum`` (or ``R_max`` for R among ``symbols``), ``top``, ``minimum 2``, ``trough 2``, or
-    a time with its unit.
+    """``start``, ``end``, ``maximum`` (or ``R_max`` for R among ``symbols``), ``top``, ``minimum 2``, ``trough 2``,
+    ``trough 2 or`` another of these, or a time with its unit.
 
     Raises :class:`UnitError` (a ``ValueError``) for anything else.
     """
@@ -52,12 +56,16 @@ def parse_instant(text: str | float, time_unit: str, symbols: Collection[str] = 
         return BY_NAME[word]
     if word.endswith("_max") and word.removesuffix("_max") in symbols:
         return Instant("maximum")
-    numbered = _NUMBERED.fullmatch(word)
+    first, *others = re.split(r"\s+or\s+", word, maxsplit=1)
+    numbered = _NUMBERED.fullmatch(first)
     if numbered and numbered[2] != "0":
-        return Instant("minimum" if numbered[1] == "minimum" else "trough", int(numbered[2] or 1))
+        otherwise = parse_instant(others[0], time_unit, symbols) if others else None
+        kind: Literal["minimum", "trough"] = "minimum" if numbered[1] == "minimum" else "trough"
+        return Instant(kind, int(numbered[2] or 1), otherwise=otherwise)
     if word[:1].isdigit() or word[:1] in "+-.":
         return Instant("time", time=parse_quantity(text, time_unit))
-    raise UnitError(f"{shown(text)} is not an instant: start, end, maximum, top, 'minimum 2', 'trough 2', or '3 us'")
+    kinds = "start, end, maximum, top, 'minimum 2', 'trough 2', 'trough 2 or end', or '3 us'"
+    raise UnitError(f"{shown(text)} is not an instant: {kinds}")
 
 
 def select(times: Array, values: Array, start: Instant, end: Instant, prominence: float = 0.1) -> slice:
@@ -96,8 +104,11 @@ def index_of(
         return int(np.searchsorted(times, vertex(times[first:], values[first:])))
     indices = minima(values[first:], prominence)
     if instant.number > len(indices):
+        if instant.otherwise is not None:
+            return index_of(times, values, instant.otherwise, first, prominence, last)
         few = f"only {len(indices)} minima with a prominence of {prominence:.0%} of the range follow its start"
-        advice = "end it elsewhere ('to: end', or at a time), or lower its prominence"
+        elsewhere = f"'to: {instant.kind} {instant.number} or end', or at a time"
+        advice = f"end it elsewhere ({elsewhere}), or lower its prominence"
         raise DataError(f"asks for minimum {instant.number}, but {few}; {advice}")
     index = int(indices[instant.number - 1])
     if instant.kind == "trough":

@@ -272,7 +272,8 @@ def require_population(config: Config, problem: InverseProblem, names: Collectio
     try:
         if count < FEWEST_SETS:
             where = " in the largest group" if groups else ""
-            raise ConfigError(f"a population needs at least {FEWEST_SETS} data sets, not {count}{where}")
+            words = f"a population needs at least {FEWEST_SETS} data sets, not {count}{where}"
+            raise ConfigError(f"{words}; to estimate each without one: --set population=null")
         of_campaign.require_population([problem], config.population.of)
     except ConfigError as error:
         raise ConfigError([config.document.fault(("population",), str(error), at_key=True)]) from None

@@ -64,10 +64,11 @@ class Gel(NamedTuple):
 COMMON = Gel(20e3, 0.3)  # published: 7.7 kPa (Estrada et al. 2018), stiff polyacrylamide; 0.19 Pa s (Yang et al. 2020)
 EXTREME = Gel(100e3, 1.0)  # no bubble was used on more
 SINGLE = (
-    "the readings end before the first rebound has a top, so that whatever else takes the energy of that collapse "
+    "the window ends before the first rebound has a top, so that whatever else takes the energy of that collapse "
     "(sound, fragments, jets, a shape that is no sphere) is told as viscosity and stiffness: measured bubbles told 2 "
     "to 28 times the viscosity, and up to 4 times the modulus, of a window that holds the rebound",
-    "film the rebound until its top is past, and let the window (data.window) hold it; else quote upper limits",
+    "let the window (data.window) hold the rebound until its top is past; where the recording ends before, film it "
+    "longer; else quote these values not even as limits",
 )  # words and advice of a warning
 
 

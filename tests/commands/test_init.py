@@ -161,20 +161,20 @@ def test_the_clock_of_a_bubble_is_as_certain_in_a_folder_as_alone(tmp_path: Path
 
 
 @pytest.mark.parametrize(
-    ("ends", "words"),
+    ("ends", "to", "words"),
     [
-        ((1.1,), "warning: the readings end before the first rebound has a top, .* upper limits .*: record longer, "),
-        ((1.5,), ""),
-        ((1.5, 1.6), ""),
-        ((3.0,), ""),
-        ((1.1, 3.0), "warning: b0: the readings end .*; the window of the others can .* if those files are moved away"),
-        ((1.5, 3.0), "warning: b0: without a second minimum the window ends before .*; the window of the others can "),
+        ((1.1,), "end", "warning: the readings end before the first rebound has a top, .*: record longer, "),
+        ((1.5,), "end", ""),
+        ((1.5, 1.6), "end", ""),
+        ((3.0,), "trough 2", ""),
+        ((1.1, 3.0), "trough 2 or end", "warning: b0: the readings end .*; move those files away, or accept "),
+        ((1.5, 3.0), "trough 2 or end", ""),
     ],
 )
 def test_a_recording_that_ends_with_the_first_collapse_is_told_at_once(
-    tmp_path: Path, ends: tuple[float, ...], words: str
+    tmp_path: Path, ends: tuple[float, ...], to: str, words: str
 ) -> None:
-    """Where a run of the same files tells upper limits only; a rebound whose top is past is in the window."""
+    """A rebound whose top is past is in the window, and one that ends before it costs the other bubbles nothing."""
     (tmp_path / "gel").mkdir()
     t, R = rebounding(0.05)
     for n, end in enumerate(ends):
@@ -183,9 +183,26 @@ def test_a_recording_that_ends_with_the_first_collapse_is_told_at_once(
     done = call("init", "--data", "gel", "--start", "laser", "--out", "b.yaml")
     assert done.exit_code == 0, done.output
     assert re.search(words, done.stderr)
-    assert ("upper limits" in done.stderr) == bool(words)
-    for problem in build(load_config("b.yaml")):
-        assert single(problem.observations.times, problem.observations.values) == bool(words)
+    assert ("before the first rebound" in done.stderr) == bool(words)
+    assert proposed(Path("b.yaml")).document.data["data"]["window"] == {"from": "top", "to": to}
+    for end, problem in zip(ends, build(load_config("b.yaml")), strict=True):
+        assert single(problem.observations.times, problem.observations.values) == (end == 1.1)
+        assert problem.observations.times[-1] == pytest.approx(20e-6 * min(end, 2.5), abs=1.1e-6)
+
+
+def test_a_bubble_that_shrinks_where_it_should_rest_ends_with_its_only_minimum(tmp_path: Path) -> None:
+    """In a folder, too, where another has a second one; that its rebound is lost is told."""
+    (tmp_path / "gel").mkdir()
+    t, R = rebounding(0.05)
+    shrinking = np.where(t > 1.75, np.interp(t, (1.75, 2.1, 3), (np.interp(1.75, t, R), 0.36, 0.24)), R)
+    for n, radius in enumerate((shrinking, R)):
+        rows = zip(20 * t, 200 * radius, strict=True)
+        (tmp_path / "gel" / f"b{n}.csv").write_text("t_us,R_um\n" + "".join(f"{a:.4f},{b:.4f}\n" for a, b in rows))
+    for data, to in (("gel", {"to": "trough 2 or trough 1"}), ("gel/b0.csv", {"to": "trough 1", "until": "trough 1"})):
+        done = call("init", "--data", data, "--start", "laser", "--out", "b.yaml", "--force")
+        assert "b0: R goes from" in done.stderr
+        assert "and its window ends with the first collapse, before the rebound has a top" in done.stderr
+        assert proposed(Path("b.yaml")).document.data["data"]["window"] == {"from": "top", **to}
 
 
 def test_without_data_a_starter_is_written() -> None:

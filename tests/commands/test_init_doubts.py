@@ -113,7 +113,7 @@ def test_what_is_advised_for_a_few_readings_can_be_run(tmp_path: Path) -> None:
     words = Path("bubble.yaml").read_text().replace("to: end}", "to: trough 2}")
     Path("bubble.yaml").write_text(words)
     assert "only 0 minima" in (said := call("validate", "bubble.yaml").stderr)
-    assert "end it elsewhere ('to: end', or at a time)" in said
+    assert "end it elsewhere ('to: trough 2 or end', or at a time)" in said
 
 
 def test_growth_alone_and_rows_before_the_bubble_are_told_in_words_of_the_recording(tmp_path: Path) -> None:

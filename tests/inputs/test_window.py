@@ -25,6 +25,18 @@ def test_extrema() -> None:
     assert cut(BOUNCES, "start", "end") == (0.0, 4.0)
 
 
+def test_what_ends_a_series_without_such_a_minimum() -> None:
+    assert cut(BOUNCES, "start", "minimum 2 or end") == (0.0, 2.0)
+    assert cut(BOUNCES, "start", "trough 4 or end") == (0.0, 4.0)
+    assert cut(BOUNCES, "start", "trough 5 or  trough 4 or minimum 3") == (0.0, 3.0)
+    with pytest.raises(DataError, match=r"asks for minimum 4, but only 3 .*'to: trough 4 or end'"):
+        cut(BOUNCES, "start", "trough 5 or trough 4")
+    assert parse_instant("minimum 2 or 3 ms", "s") == Instant("minimum", 2, otherwise=Instant("time", time=0.003))
+    for text in ("end or trough 2", "trough 2 or", "trough 2 or R_max", "trough 0 or end", "trough 2 orend"):
+        with pytest.raises(UnitError, match="'trough 2 or end'"):
+            parse_instant(text, "s")
+
+
 def test_top_and_trough() -> None:
     triangles = np.abs((T - 0.52) % 1.0 - 0.5)  # minima at 1.02, 2.02, 3.02: between two samples
     assert cut(triangles, "minimum 2", "trough 1") == pytest.approx((2.025, 3.0))

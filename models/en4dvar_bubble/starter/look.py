@@ -179,11 +179,6 @@ class Look:
     reason: str
     clear: bool
 
-    @property
-    def whole(self) -> bool:
-        """Whether all of it belongs into the window: a rebound has a top, and no second minimum follows."""
-        return self.n_minima < 2 and not (self.short or self.drift)
-
 
 def look(times: Array, radius: Array, start: Start | None = None) -> Look:
     """Look at a history ``times`` (K,) s, increasing, ``radius`` (K,) m; ``start`` where the user says it.
@@ -217,17 +212,15 @@ def look(times: Array, radius: Array, start: Start | None = None) -> Look:
 
 
 def without_rebound(looks: Mapping[str, Look]) -> list[str]:
-    """Which data sets let the window of all end before the first rebound has a top, and what to do."""
+    """Which recordings end before the first rebound has a top, and what to do."""
     short = [name for name, view in looks.items() if view.short]
-    names = short or [name for name, view in looks.items() if view.n_minima == 1 and view.start == "laser"]
-    if not names or all(view.whole for view in looks.values()):
+    if not short:
         return []
-    who = f"{listed(names, 5)}: " * (len(looks) > 1)
-    ends, past = ("the readings end", "that top") if short else ("without a second minimum the window ends", "it")
-    others = "; the window of the others can hold theirs if those files are moved away" * (len(names) < len(looks))
+    who = f"{listed(short, 5)}: " * (len(looks) > 1)
+    away = "; move those files away, or accept that they count beside the others" * (len(short) < len(looks))
     return [
-        f"{who}{ends} before the first rebound has a top, so that a run tells upper limits of stiffness and viscosity: "
-        f"record longer, until {past} is past{others}"
+        f"{who}the readings end before the first rebound has a top, so that a run tells stiffness and viscosity by the "
+        f"collapse alone, often several times too large: record longer, until that top is past{away}"
     ]
 
 

@@ -56,6 +56,7 @@ GAS_FRACTION = 0.12  # R_eq/R_max of laser-induced bubbles, where no radius at r
 WIDTHS = {"G": (2.0, 2.5), "mu": (1.5, 2.0)}  # of 47 synthetic gels ln G/guess had a root mean square of 2.1
 BETWEEN = 1.645  # standard deviations from the median to 5 and 95 %
 SAME_CLOCK, CLOCK_STD = 2e-6, 1e-6  # s: of a guessed clock; of 30 synthetic bubbles it erred by 1.05e-6 (rms)
+COLLAPSE_ALONE = ", and its window ends with the first collapse, before the rebound has a top"
 EACH_ALONE = "of each bubble alone, which the gel's numbers do not use; 'true' takes up to twice the time"
 BUBBLES = (1e-7, 0.1)  # m: between these radii
 SEEN = (3e-6, 50e-9, 1e-4)  # m, s, m: one below is not read in shorter steps; radius of a usual bubble
@@ -78,7 +79,7 @@ class Proposal:
 
     ``simpler``: keys of the model, and their values, of quicker physics to compare with; empty where there is none.
     ``population``: what is asked of several bubbles together; None where there are too few of them.
-    ``longer``: in a gel, and most histories have a third minimum, at which the window may end.
+    ``longer``: where the window may end, too, in a gel of which most histories have a third minimum; "" in others.
     ``datasets``: what it was made from; others show no bubble, as ``warnings`` tell.
     """
 
@@ -89,7 +90,7 @@ class Proposal:
     remarks: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     population: Together | None = None
-    longer: bool = False
+    longer: str = ""
     datasets: tuple[str, ...] = ()
     assimilation: tuple[Entry, ...] = (
         Entry("members", "48"),
@@ -130,7 +131,9 @@ def propose(
     doubt = f"start: {chosen} is only a proposal ({look.reason}); if it was {other}, say --start {other}"
     warnings = [doubt] * (not look.clear)
     warnings += [
-        f"{name}: {view.drift}; no radius at rest is taken from it" for name, view in looks.items() if view.drift
+        f"{name}: {view.drift}; no radius at rest is taken from it{COLLAPSE_ALONE * (view.n_minima < 2)}"
+        for name, view in looks.items()
+        if view.drift
     ]
     warnings += [elsewhere.PULSE] * (chosen == "acoustic")
     doubted, believed = _doubted(looks, model), guess
@@ -152,7 +155,7 @@ def propose(
     wall = elsewhere.wall(look.lobe.R_max, ratio) if slow and _in_a_liquid(model) else ()
     sizes = {group: len(looks.keys() & {*names}) for group, names in groups.of.items()}
     vary = [p.name for p in model.law.parameters] + [R0.name] * (R0 in model.parameters and math.isnan(look.before[0]))
-    together = None
+    together, in_a_gel = None, chosen == "laser" and not _in_a_liquid(model)
     if vary and max(sizes.values(), default=len(views)) >= FEWEST_SETS:
         common = [quantity.key for quantity in elsewhere.known(medium)]
         together = Together(vary, common, _in_a_liquid(model), groups)
@@ -164,7 +167,7 @@ def propose(
         (*told, *[f"{len(views)} bubbles: {_ends_with(groups.kind, sizes)}"] * bool(together)),
         (*warnings, *unseen),
         together,
-        chosen == "laser" and not _in_a_liquid(model) and float(np.median([v.n_minima for v in views])) > 2,
+        _end(views, 3) if in_a_gel and np.median([v.n_minima for v in views]) > 2 else "",
         tuple(looks),
         (*Proposal.assimilation, *[Entry("what_if", "false", EACH_ALONE)] * bool(together)),
     )
@@ -315,16 +318,22 @@ def _data(look: Look, model: BubbleModel, theta: Mapping[str, float], views: Seq
 
 
 def _window(look: Look, views: Sequence[Look]) -> Entry:
-    """From the top to the second minimum; to the end of histories that are whole windows."""
-    whole = all(view.whole for view in views)
-    end = f"trough {min(look.n_minima, 2)}" if look.n_minima and not whole else "end"
+    """From the top to the second minimum, or to the end of histories that have none."""
     low = f", prominence: {100 * look.prominence:g} %" if look.prominence < 0.1 else ""
-    words = "what happens before the top is not modelled"
-    ends = bool(look.drift and look.n_minima and len(views) == 1)  # with its last minimum
-    if ends or (look.drift and not look.n_minima):
-        words += f"; {look.drift}: " + ("no bubble after its last minimum" if ends else "end it before that")
-    until = f", until: trough {look.n_minima}" if ends else ""
-    return Entry("window", f"{{from: top, to: {end}{until}{low}}}", words)
+    words, until = "what happens before the top is not modelled", ""
+    if look.drift and len(views) == 1:
+        words, until = f"{words}; {look.drift}: no bubble after its last minimum", f", until: trough {look.n_minima}"
+    return Entry("window", f"{{from: top, to: {_end(views)}{until}{low}}}", words)
+
+
+def _end(views: Sequence[Look], number: int = 2) -> str:
+    """The minimum of this ``number``, and what ends histories that have fewer: one that has come to rest is not short
+    of minima, and all of it counts; one that drifts where it should rest is a bubble up to its last minimum.
+    """
+    fewest, most = (min(number, extreme(view.n_minima for view in views)) for extreme in (min, max))
+    instants = [f"trough {n}" for n in range(most, max(fewest, 2) - 1, -1)]
+    drifts = any(view.drift and view.n_minima < 2 for view in views)
+    return " or ".join([*instants, *["trough 1" if drifts else "end"] * (fewest < 2)])
 
 
 class Tops(NamedTuple):
