@@ -203,6 +203,7 @@ class Analysis:
     residuals: Residuals | None = None  # whitened, at the centre, with what is expected of them
     chi2: float | None = None  # per observation, with an estimated noise scale as the residuals; None without
     discrepancy: Discrepancy | None = None  # of the model, at the centre; None where none is allowed for
+    timing: float = 0.0  # std of the times that explains the residuals better than what is stated does; 0: none does
     extremes: Array = field(default_factory=lambda: np.empty((0, 0)))  # (N, V) of the model's limits, by the posterior
     beyond: Array = field(default_factory=lambda: np.empty((0, 0)))  # (N, V) since when it exceeds them; +inf: never
     what_if: tuple[Shift, ...] = ()  # under the model's alternatives; the largest first

@@ -139,8 +139,9 @@ class Residuals:
         projection, so that its square over uᵀu is Beta(½, (ν − 1)/2); times K for the largest of them (Bonferroni).
         Readings far more exact than the prior leave Q no variance in the directions that the parameters fit. In those
         that mostly the prior lets vary, u says how much wider than the truth the prior is: a square counts as one, and
-        residuals are those without these directions. Where the size of the errors is estimated, its posterior, as
-        that of ν squares, takes the place of uᵀu.
+        residuals are those without these directions. Where the size of the errors is estimated, a posterior of more
+        squares than u has, which are u and what the prior knows of that size, takes the place of uᵀu. One of fewer,
+        as beside a discrepancy, knows less of the scatter than u does, and does not.
         """
         from scipy.special import betainc, digamma
 
@@ -151,7 +152,8 @@ class Residuals:
         worst, rank = int(np.argmax(squares)), float(np.count_nonzero(values > NO_VARIANCE * values[-1]))
         freedom, total = rank, float(u @ u) + rank - len(u)
         if self.freedom is not None:
-            freedom, total = self.freedom, 2 * math.exp(digamma(self.freedom / 2))
+            freedom = max(self.freedom, float(len(u)))
+            total = max(2 * math.exp(digamma(self.freedom / 2)), float(u @ u))
         if freedom <= 1:  # the residuals have one shape, whose largest part says nothing
             return int(self.which[worst]), 1.0
         share = min(1.0, float(squares[worst]) / total)

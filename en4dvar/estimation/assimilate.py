@@ -178,6 +178,7 @@ def _concluded(
         log_evidence_constant=log_evidence_constant,
         residuals=conclusions.residuals_of(space, judged, freedom),
         chi2=None if freedom is None else float(observations.chi2_per_observation(judged.prediction)),
+        timing=conclusions.timing_of(problem, central),
         discrepancy=explained and Discrepancy(*explained, conclusions.shares_of_variance(space, linear)),
         influence=conclusions.influence_of(problem, ends.run, ends.members, response, sampled.refined is None),
         what_if=shifts,

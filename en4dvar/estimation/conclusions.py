@@ -28,6 +28,7 @@ from en4dvar.sampling.refine import Refined
 from en4dvar.schemes.settings import AssimilationSettings
 
 LEAST = 1e-9  # variance of ln σ²
+ODDS = 20.0  # of residuals by one explanation against another, beyond which that is told
 
 
 def outcome_of(
@@ -164,6 +165,25 @@ def residuals_of(space: WeightSpace, linear: Linearisation, freedom: float | Non
         if part.has_path:
             labels[part.where] = part.begin
     return Residuals.of(white, sensitivity, precision, speed, observations.used, labels, freedom)
+
+
+def timing_of(problem: InverseProblem, at: Predicted) -> float:
+    """Std of the times with which independent errors make the residuals :data:`ODDS` times as probable as what is
+    stated does, with a discrepancy where there is one; 0 where none does. Errors of the times differ from reading to
+    reading and grow with the rate, what the model misses resembles itself from one to the next.
+    """
+    o = problem.observations
+    if o.parts or not o.noise.quadratic or len(o.used) < 2:
+        return 0.0
+    rates, std, values = (part[o.used] for part in (_rates(problem, at), o.noise.std, at.values))
+    shares = np.append(0.0, np.geomspace(0.01, 0.5))[:, None]  # of the time between readings
+    times = np.hypot(o.noise.time_std[o.used], shares * np.median(np.diff(o.times[o.used])))
+    variance = 1 + (rates * times / std) ** 2
+    squares = ((o.values[o.used] - values) / std) ** 2 / variance
+    scale = np.maximum(1.0, squares.mean(axis=1, keepdims=True))  # all errors may be larger than stated
+    cost = 0.5 * np.sum(o.weights[o.used] * (squares / scale + np.log(variance * scale)), axis=1)
+    best, stated = int(np.argmin(cost)), min(float(o.cost(at)), cost[0])
+    return float(np.median(times[best])) if stated - cost[best] > math.log(ODDS) else 0.0
 
 
 def _rates(problem: InverseProblem, at: Predicted) -> Array:

@@ -24,7 +24,7 @@ from diagnosis.provoked import (
 )
 from diagnosis.provoked_by_several import OF_SEVERAL
 from estimation.test_agreement import joint
-from toys import Vectorised, make_observations, make_problem, with_discrepancy, with_noise
+from toys import Vectorised, Wave, make_observations, make_problem, with_discrepancy, with_noise
 
 from en4dvar.data.extrema import maxima
 from en4dvar.diagnosis.analysis import Analysis
@@ -78,6 +78,10 @@ def growing(p: InverseProblem, said: re.Match[str]) -> InverseProblem:
     return read(p, noise=replace(noise, kernel=replace(noise.kernel, grows_beyond=1.0)))
 
 
+def timed(p: InverseProblem, said: re.Match[str]) -> InverseProblem:
+    return read(p, noise=replace(p.observations.noise, time_std=np.full(len(p.observations), float(said[1]))))
+
+
 def shorter(p: InverseProblem, said: re.Match[str]) -> InverseProblem:
     y = p.observations
     kept = y.times < float(said[1]) + 1e-3  # the number is rounded
@@ -109,6 +113,7 @@ SAID: dict[str, Follow] = {
     r"data\.error\.discrepancy: estimated": deduced,
     r"data\.error\.discrepancy\.kernel: (matern-\d/2)": other_kernel,
     r"data\.error\.discrepancy\.grows_beyond": growing,
+    r"the times err by about ([\d.e+-]+) s \(data\.error\.time_std": timed,
     r"data\.error\.robust: huber": robust,
     r"data\.window: \{to: ([\d.]+) s\}": shorter,
     r"the prior of (\w+) about (\d+) times as wide": wider,
@@ -279,6 +284,38 @@ def test_what_the_model_says_may_change_is_let_change_where_a_long_window_shows_
         assert (asked in told(run(bouncing), "discrepancy-found").advice) == (count > 1)
     changes = StateChanges.of(problem.model, Field("y"), [float(t[20])], 0.01, relative=True)
     assert "model_error" not in told(run(bouncing.varied([changes])), "discrepancy-found").advice
+
+
+def late(kind: str, seed: int) -> InverseProblem:
+    """Readings of a wave by a clock that errs by 0.02 s: from reading to reading, or slowly; or beside another wave."""
+    random, k = np.random.default_rng(seed), 50
+    p = make_problem(Wave(), (1.0, 2.0), k=k, std=0.02, time_std=0.001, scale=0.3)
+    t, phase = p.observations.times, random.uniform(0, 6)
+    by = {"each": 0.02 * random.standard_normal(k), "slowly": 0.028 * np.sin(3 * t + phase)}.get(kind, np.zeros(k))
+    values = np.array([p.model.curve(np.array([1.0, 2.0]), time) for time in t + by])
+    values += 0.02 * random.standard_normal(k) + 0.08 * (kind == "another") * np.sin(5 * t + phase)
+    wide = {"amplitude": (0.02, 1.5), "length": (0.2, 0.7)}
+    return with_discrepancy(read(p, values=values), **wide, smoothness=1.5, sigma=0.4, grows_beyond=3.0)
+
+
+def test_errors_of_the_times_are_told_from_what_the_model_misses():
+    """Both are largest where the observable changes fast; a model that errs does so alike at neighbours."""
+    told_by = [run(late("each", seed)) for seed in range(8)]
+    sizes = [a.timing for a in told_by if a.timing]
+    assert len(sizes) >= 4
+    assert np.all(np.abs(np.log(np.array(sizes) / 0.02)) < 0.5)
+    for a in told_by:
+        of_residuals = [c for c in a.cautions if c.code in ("misfit", "odd-residuals", "discrepancy-found")]
+        assert all("data.error.time_std; 0.001 s is stated" in c.advice for c in of_residuals if a.timing)
+        assert all("data.error.time_std" in c.advice for c in of_residuals)
+        for c in of_residuals[: 1 if a.timing else 0]:
+            again = told(follow(a, c, None), c.code)
+            assert again is None or again.advice != c.advice
+
+
+@pytest.mark.parametrize("kind", ["slowly", "another"])
+def test_no_errors_of_the_times_are_seen_in_what_the_model_misses(kind):
+    assert [run(late(kind, seed)).timing for seed in range(6)] == [0.0] * 6
 
 
 def test_a_future_that_is_missed_is_taken_in_up_to_the_next_trough():

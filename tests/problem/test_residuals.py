@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from diagnosis.provoked import bent, run, spiked
-from scipy.special import fdtrc
+from scipy.special import digamma, fdtrc
 from toys import with_discrepancy
 
 from en4dvar.diagnosis.residuals import Residuals, positive_chance
@@ -125,3 +125,30 @@ def test_the_outlier_of_an_exact_fit_is_that_of_least_squares():
     chance = K * beta.sf(left[4] ** 2 / own[4] / squares, 0.5, (K - 3) / 2)
     residuals = Residuals.of(left, 1e9 * design, 19, np.ones(K), np.arange(K))
     assert residuals.outlier == (4, pytest.approx(chance, rel=1e-6))
+
+
+@pytest.mark.parametrize("freedom", [3.43, 12.0, 30.0, 110.0])
+@pytest.mark.parametrize("count", [8, 30, 100])
+def test_a_right_reading_is_odd_no_more_often_than_told_where_the_size_of_the_errors_is_estimated(freedom, count):
+    """A posterior of more squares than there are residuals holds these and what was known before; one of fewer, as
+    beside a discrepancy, is of another size than that of the residuals, each of which may be larger than it allows.
+    """
+    rng, chances, squares = np.random.default_rng(11), [], 2 * np.exp(digamma(freedom / 2))
+    for _ in range(1500):
+        white = rng.standard_normal(count)
+        before = freedom - count
+        size = (rng.chisquare(before) + white @ white) / squares if before > 0 else rng.chisquare(freedom) / squares
+        white /= np.sqrt(size)
+        at = np.arange(count)
+        chances.append(Residuals(white, np.zeros((count, 1)), np.ones(count), at, 0 * at, 0.0, freedom).outlier[1])
+    assert np.mean(np.array(chances) < 0.05) < 0.07
+    assert np.sum(np.array(chances) < 1e-3) <= 6
+
+
+def test_a_reading_beyond_what_the_size_of_the_errors_allows_need_not_be_odd():
+    white, at = np.full(31, 0.3), np.arange(31)
+    for worst, odd in ((0.9, False), (2.66, True)):
+        white[5] = worst
+        residuals = Residuals(white, np.zeros((31, 1)), np.ones(31), at, 0 * at, 0.0, 3.43)
+        assert (residuals.outlier[1] < 1e-3) == odd
+        assert residuals.outlier[1] > 1e-12

@@ -96,6 +96,21 @@ class Case:
         options = " ".join(f"--set model_error.{name}='{text}'" for name, text in self.changes.items())
         return f"let {' and '.join(self.changes)} change on the way ({options})"
 
+    @property
+    def timing(self) -> str:
+        """How to state errors of the times where these explain the residuals better than what is stated; "" else."""
+        if not self.a.timing:
+            return ""
+        model, stated = self.a.problem.model, float(np.median(self.a.observations.noise.time_std))
+        larger, now = (
+            f"{convert(std, model.time_unit, model.time_display_unit):.2g} {model.time_display_unit}"
+            for std in (self.a.timing, stated)
+        )
+        return (
+            f"state that the times err by about {larger} (data.error.time_std; {now} is stated), which explains the "
+            "residuals better"
+        )
+
     def reading(self, value: float) -> str:
         """A size of readings in the unit in which their errors are stated."""
         observable = self.a.problem.observable
@@ -136,8 +151,13 @@ def _members(case: Case) -> str:
 def _misfit(case: Case) -> str:
     if cause := case.cause:
         return cause
+    if case.timing:
+        return case.timing
     if case.a.observations.noise.discrepant:
-        return "widen the prior of data.error.discrepancy.amplitude, choose another model, or a shorter window"
+        return (
+            "widen the prior of data.error.discrepancy.amplitude, choose another model, or a shorter window; where the "
+            "times err, a larger data.error.time_std"
+        )
     if "residual-structure" in case.codes:
         return _structure(case)
     if "odd-residuals" in case.codes and _may_be_robust(case):
@@ -182,6 +202,8 @@ def _structure(case: Case) -> str:
 
 def _missed(case: Case) -> str:
     if case.caution.severity != "serious":
+        if case.timing:
+            return case.timing
         steps = [case.changing]
         if case.a.what_if:
             steps += ["look at the what-if table"]
@@ -201,15 +223,20 @@ def _may_be_robust(case: Case) -> bool:
 
 
 def _odd(case: Case) -> str:
-    if not case.caution.words.startswith("the reading"):
-        if case.absurd or case.a.observations.noise.discrepant:
+    single = case.caution.words.startswith("the reading")
+    if case.timing:
+        return f"{case.timing}{'; delete this reading only if you know that it is wrong' * single}"
+    if not single:
+        if case.absurd:
             return _structure(case)
-        sure = not case.a.observations.noise.time_std.any()
-        first = "state how uncertain the times are (data.error.time_std)" if sure else "a larger data.error.time_std"
-        return f"{first}; if the times are right, the model errs where the observable changes fast"
+        noise = case.a.observations.noise
+        first = "a larger" if noise.time_std.any() else "state how uncertain the times are with"
+        other = _structure(case) if noise.discrepant else "the model errs where the observable changes fast"
+        return f"{first} data.error.time_std; if the times are right, {other}"
     if _may_be_robust(case):
         return f"look at this reading; with {case.with_scheme('data.error.robust: huber')} such readings count less"
-    return "look at this reading; if it is wrong, delete its line from the data file and say so"
+    wrong = "if it is wrong, delete its line from the data file and say so"
+    return f"look at this reading; {wrong}; where the times err, a larger data.error.time_std"
 
 
 def _validity(case: Case) -> str:
