@@ -126,6 +126,7 @@ def estimated(written: Any) -> Any:
 
 HUBER = 1.345  # 95 % efficiency where the errors are Gaussian after all: Huber (1981), Robust Statistics
 
+WITHOUT = "what is missing (NaN) or left out has none"  # of weights and places that are listed
 BOUNDS = ("at_most", "at_least")
 BESIDE = ("covariance", "correlation_time", "shared", "robust", "discrepancy", "time_std")
 
@@ -255,7 +256,7 @@ class Weighing:
         numbers = weights.dtype.kind in "fiub"
         if weights.shape != times.shape or not numbers:
             words = f"{len(weights)} weights" if weights.ndim == 1 and numbers else f"weights {weights.shape}"
-            raise DataError(f"{words} for {len(times)} observations of the window")
+            raise DataError(f"{words} for {len(times)} observations of the window; {WITHOUT}")
         weights = weights.astype(float)
         if not (np.all(np.isfinite(weights)) and np.all(weights >= 0)):
             worst = weights[~(np.isfinite(weights) & (weights >= 0))][0]
@@ -332,7 +333,7 @@ class Placing:
         stated = read if self.positions is None else self.positions
         assert stated is not None
         if len(stated) not in (1, count):
-            raise DataError(f"{len(stated)} places for {count} observations of the window")
+            raise DataError(f"{len(stated)} places for {count} observations of the window; {WITHOUT}")
         positions = np.broadcast_to(stated, (count,))
         if self.of is not None and self.of.coordinates is not None:
             return Places.at_coordinates(positions, self.of.coordinates, self.of.coordinate_unit)

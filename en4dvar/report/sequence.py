@@ -276,7 +276,9 @@ def _some(places: npt.NDArray[np.intp], most: int) -> npt.NDArray[np.intp]:
 
 @dataclass(frozen=True)
 class SequenceScore:
-    """``innovation``: root mean square of normalised innovations; ``difference`` to the largest log-evidence."""
+    """``innovation``: root mean square of normalised innovations; ``difference`` to the largest log-evidence; ``bent``:
+    a window took more than the two iterations of a linear model.
+    """
 
     run: str
     scheme: str
@@ -284,6 +286,7 @@ class SequenceScore:
     difference: float
     probability: float
     innovation: float
+    bent: bool
 
 
 def compare_sequences(run_dirs: Sequence[Path]) -> tuple[SequenceScore, ...]:
@@ -297,7 +300,8 @@ def compare_sequences(run_dirs: Sequence[Path]) -> tuple[SequenceScore, ...]:
     for run, data in runs.items():
         size = float(np.sqrt(np.nanmean(data["normalised_innovation"].values ** 2)))
         scheme, evidence = str(data.attrs["scheme"]), float(data.attrs["log_evidence"])
-        scores.append(SequenceScore(run, scheme, evidence, np.nan, np.nan, size))
+        bent = bool(data["iterations"].values.max() > 2)
+        scores.append(SequenceScore(run, scheme, evidence, np.nan, np.nan, size, bent))
     return tuple(ranked(scores))
 
 
@@ -309,7 +313,13 @@ def sequences_table(scores: Sequence[SequenceScore]) -> str:
         for s in scores
     ]
     best, second = sorted(scores, key=lambda score: -score.log_evidence)[:2]
-    return f"{table([header, *rows])}\n\n{preferred(best.run, second.run, -second.difference)}"
+    told = f"{table([header, *rows])}\n\n{preferred(best.run, second.run, -second.difference)}"
+    if bent := ", ".join(s.run for s in scores if s.bent):
+        told += (
+            f"\ncaution: windows of {bent} took more than two iterations, so that the model is not linear in them; "
+            "such an evidence may be tens too low: see whether lag: 1 and etkf say the same"
+        )
+    return told
 
 
 def _sequence(run_dir: Path) -> Group:

@@ -34,6 +34,7 @@ from en4dvar.priors.prior import member_stream
 from en4dvar.problem import InverseProblem
 
 BATCH = 128  # trajectories whose full solution is in memory at once, a worker
+LARGEST = 250_000_000  # numbers in these solutions, at most
 Progress = Callable[[int, int], None]
 
 
@@ -54,16 +55,24 @@ class Targets:
     reach: int
 
 
-def targets(observations: Sequence[Observations], shift: float, step: float, earliest: float = -np.inf) -> Targets:
+def targets(
+    observations: Sequence[Observations], shift: float, step: float, earliest: float = -np.inf, most: float = np.inf
+) -> Targets:
     """The grid covers every reading at every shift within ±``shift`` (s), from ``earliest`` on.
 
-    Raises ValueError: a reading would be compared before ``earliest``.
+    Raises ValueError: a reading would be compared before ``earliest``; the grid would have more than ``most`` instants.
     """
     reach = int(np.floor(shift / step * (1 + 1e-9)))
     first = min(float(o.times[0]) for o in observations) - reach * step
+    last = max(float(o.times[-1]) for o in observations) + reach * step
+    if (count := (last - first) / step) > most:
+        apart = np.median(np.concatenate([np.diff(o.times) for o in observations]))
+        raise ValueError(
+            f"from {first:g} to {last:g} in steps of {step:g} are {count:.2g} instants, more than memory is meant for "
+            f"({most:.2g}): readings are {apart:g} apart, give a larger --step, and a --shift that fits it"
+        )
     if first < earliest:
         raise ValueError(f"a reading shifted by {-reach * step:g} s would lie {earliest - first:g} s before the start")
-    last = max(float(o.times[-1]) for o in observations) + reach * step
     grid = first + step * np.arange(int(np.ceil((last - first) / step * (1 - 1e-9))) + 1)
     values = np.concatenate([o.values for o in observations])
     nearest = np.concatenate([np.rint((o.times - first) / step).astype(np.int64) for o in observations])
@@ -195,12 +204,13 @@ def run_sweep(
     it has one at any time.
 
     Raises ConfigError: the data sets do not share a model, fixed values or parameters; none of these is the model's.
-    DataError: no trajectory fits a set; a reading would be compared before ``earliest``.
+    DataError: no trajectory fits a set; a reading would be compared before ``earliest``; the step is far too small.
     """
     executor = executor or SerialExecutor()
     ranges = _Ranges.of(problems, settings.width)
     with retold(ValueError, DataError):
-        aims = targets([p.observations for p in problems], settings.shift, settings.step, earliest)
+        most = LARGEST / BATCH / problems[0].model.layout.size
+        aims = targets([p.observations for p in problems], settings.shift, settings.step, earliest, most)
     ones = np.ones(len(aims.grid))
     traced = Observations(aims.grid, ones, noise_of(ones, 0 * ones), ones)
     score = _Score(replace(_searched(problems[0]), observations=traced), ranges, aims)

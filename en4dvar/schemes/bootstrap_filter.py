@@ -4,11 +4,12 @@
 
 No Gaussian is assumed and nothing is linear; the price is a number of members that grows exponentially with that of the
 observations. Systematic resampling makes N equal members of them at every cycle. Copies would stay copies where the
-model is deterministic, so that each is moved by ``jitter`` h: a draw from the kernel N(0, h² P), P the covariance of
-the weighted members, without the mean of the draws. The spread grows by √(1 + h²).
+model is deterministic, so that each is moved by ``jitter`` h: towards the mean, by √(1 − h²), and by a draw from the
+kernel N(0, h² P), P the covariance of the weighted members, without the mean of the draws. Mean and covariance stay.
 
 Sources: Gordon, Salmond & Smith (1993), IEE Proc. F 140, 107; systematic: Kitagawa (1996), J. Comput. Graph. Stat. 5,
-1; jitter: Musso, Oudjane & Le Gland (2001), in Doucet et al., Sequential Monte Carlo Methods in Practice, ch. 12.
+1; jitter: Musso, Oudjane & Le Gland (2001) and, with the shrinkage, Liu & West (2001), in Doucet et al., Sequential
+Monte Carlo Methods in Practice, ch. 12 and 10.
 """
 
 import math
@@ -16,7 +17,7 @@ from dataclasses import dataclass
 from typing import Annotated, ClassVar, cast
 
 import numpy as np
-from annotated_types import Ge
+from annotated_types import Ge, Le
 from scipy.special import ndtr
 
 from en4dvar.ensemble.linalg import centre, shares_of
@@ -31,9 +32,9 @@ class BootstrapFilter(ETKF):
 
     words: ClassVar[str] = "weighed and resampled members"
 
-    jitter: Annotated[float, Ge(0), "What a resampled member is moved by, in standard deviations of the posterior."] = (
-        0.2
-    )
+    jitter: Annotated[
+        float, Ge(0), Le(1), "What a resampled member is moved by, in standard deviations of the posterior."
+    ] = 0.2
 
     on: ClassVar[tuple[str, ...]] = ("series",)
     resamples: ClassVar[bool] = True
@@ -52,7 +53,7 @@ class BootstrapFilter(ETKF):
 @dataclass(frozen=True)
 class Resampled:
     """The transform that takes the members of these ``index`` (N,), about their mean of weights ``w`` (N,), and moves
-    them by draws of the covariance that ``shares`` (N,) give, ``jitter`` times its root.
+    them by draws of the covariance that ``shares`` (N,) give, ``jitter`` times its root, as much nearer to the mean.
     """
 
     index: Indices
@@ -67,7 +68,8 @@ class Resampled:
             return np.asarray(moved)
         spread = np.sqrt(self.shares)[:, None] * (anomalies - self.shares @ anomalies)
         root = np.linalg.qr(spread, mode="r")
-        return np.asarray(moved + self.jitter * centre(self.draw("jitter", len(root)))[1] @ root)
+        draws = self.jitter * centre(self.draw("jitter", len(root)))[1] @ root
+        return np.asarray(math.sqrt(1 - self.jitter**2) * moved + draws)
 
     @property
     def dense(self) -> Array:

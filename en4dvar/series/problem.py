@@ -7,7 +7,7 @@ import numpy as np
 
 from en4dvar.data.observations import Observations
 from en4dvar.data.series import Part, Series
-from en4dvar.diagnosis.diagnostics import common_reasons
+from en4dvar.diagnosis.diagnostics import chi2_interval, common_reasons
 from en4dvar.executor import Executor
 from en4dvar.model.forward import Observable
 from en4dvar.model.state import Array
@@ -17,7 +17,7 @@ from en4dvar.series.series import CycleSeries, aligned
 from en4dvar.series.settings import SequentialSettings
 from en4dvar.series.start import InitialEnsemble
 
-UNEXPECTED = 1.5  # root mean square of normalised innovations that calls for a warning, or its inverse
+UNEXPECTED = 1.5  # root mean square of normalised innovations that calls for a warning, or its inverse, beyond chance
 
 
 @dataclass(frozen=True)
@@ -97,12 +97,13 @@ class SeriesResult:
         told += too_few(problem.start, problem.settings, problem.members, times)
         squares = self.normalised[np.isfinite(self.normalised)] ** 2
         size = float(np.sqrt(squares.mean())) if len(squares) else 1.0
-        if size > UNEXPECTED:
+        low, high = np.sqrt(np.array(chi2_interval(float(len(squares)))) / max(1, len(squares)))
+        if size > max(UNEXPECTED, high):
             told.append(
                 f"innovations are {size:.2g} times as large as forecast and errors say: the ensemble is too sure of "
                 "itself; give model_error, inflation or larger errors"
             )
-        if size < 1 / UNEXPECTED:
+        if size < min(1 / UNEXPECTED, low):
             told.append(f"innovations are only {size:.2g} times what forecast and errors say: these are too large")
         return tuple(told)
 

@@ -180,7 +180,7 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "section": ({"series": {"r": {}}}, "series: no series 'r' in data; known: p, q"),
     "no section": ({"series": {"p": 3}}, "series: p: give a dict"),
     "key": ({"series": {"p": {"wights": [1]}}}, "series.p.wights: unknown key 'wights'; did you mean 'weights'?"),
-    "weights": ({"series": {"p": {"weights": [1.0]}}}, "1 weights for 7 observations"),
+    "weights": ({"series": {"p": {"weights": [1.0]}}}, "7 observations of the window; what is missing (NaN)"),
     "correlation": ({"correlation": {"p": {"r": 0.5}}}, "correlation.p.r: no other series 'r'"),
     "alone": ({"data": (T1, V1), "error": 1, "correlation": {"p": {"q": 0.5}}}, "correlation: data is one series"),
 }  # fmt: skip

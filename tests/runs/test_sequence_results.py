@@ -79,6 +79,18 @@ def test_sequences_are_compared_by_their_evidence(folder):
     assert done.stdout == sequences_table((one, other)) + "\n", done.stderr
 
 
+def test_windows_in_which_a_model_is_bent_are_told_beside_their_evidence(folder):
+    """The window of a linear model ends with the second iteration, whatever its prior."""
+    window = {"scheme": "ienks", "lag": 3, "members": 30}
+    right, _ = conducted()
+    straight, _ = conducted("straight", assimilation=window)
+    assert "caution" not in sequences_table(compare_sequences([right, straight]))
+    rate = {"c": {"prior": "lognormal", "median": 0.5, "log_std": 1}}
+    filtered, _ = conducted("filtered", parameters=rate)
+    windows, _ = conducted("windows", assimilation=window, parameters=rate)
+    assert "\ncaution: windows of windows took more than" in sequences_table(compare_sequences([filtered, windows]))
+
+
 def test_what_has_no_evidence_is_told(folder):
     right, _ = conducted()
     several, result = conducted("several", assimilation={"scheme": "ienks", "lag": 3, "shift": 2, "members": 30})

@@ -196,3 +196,10 @@ def test_a_killed_sweep_is_resumed_to_the_same_numbers(tmp_path):
 def test_readings_before_the_start_are_refused(problems):
     with pytest.raises(DataError, match="before the start"):
         run_sweep(problems, replace(SMALL, shift=6e-6), seed=1)
+
+
+def test_a_step_far_below_the_times_of_the_readings_is_refused_before_memory_is_taken(problems):
+    """Those of the command are meant for bubbles; the readings here are of a minute."""
+    slow = replace(problems[0], observations=readings(np.arange(61.0), np.arange(61.0) ** 2))
+    with pytest.raises(DataError, match=r"2\.4e\+09 instants.* readings are 1 apart, give a larger --step"):
+        run_sweep([slow], SweepSettings(64, 0.8e-6, 0.025e-6), seed=1)

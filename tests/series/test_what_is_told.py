@@ -1,4 +1,6 @@
-"""What the result of a series says of members that were lost, and of too few for a model error."""
+"""What the result of a series says of members that were lost, of too few for a model error, and of innovations that are
+not what they should be.
+"""
 
 import numpy as np
 import pytest
@@ -20,9 +22,9 @@ class Breaking(Swing):
         return super().step(x, t0, t1)
 
 
-def followed(model, scheme, members, directory=None, **sections):
+def followed(model, scheme, members, directory=None, read=(TIMES, READ), error=0.1, **sections):
     return en4dvar.estimate_sequence(
-        model, {"x": (TIMES, READ)}, error={"x": 0.1}, initial_std={"x": "0.5 m", "v": "0.4 m/s"},
+        model, {"x": read}, error={"x": error}, initial_std={"x": "0.5 m", "v": "0.4 m/s"},
         assimilation={"scheme": scheme, "members": members, **sections.pop("keys", {})}, directory=directory,
         **sections,
     )  # fmt: skip
@@ -84,3 +86,22 @@ def test_a_square_root_says_how_many_members_it_needs(scheme):
     assert few.run.analysis.std[-1, 0] < 0.97 * np.sqrt(variance)
     assert few.warnings[0].startswith("4 members are fewer than the 5 that a model error by a square root needs")
     assert not [words for words in enough.warnings if "fewer" in words]
+
+
+@pytest.mark.parametrize("count", [3, 8])
+def test_innovations_of_a_right_run_are_not_doubted_however_few_they_are(count):
+    """Of a χ² of three to eight readings a root mean square of less than 2/3 is no wonder."""
+    told = []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        start, when = [1, 0] + np.array([0.5, 0.4]) * rng.standard_normal(2), TIMES[:count]
+        read = np.array([(expm(SLOPE * t) @ start)[0] for t in when]) + 0.1 * rng.standard_normal(count)
+        told += followed(Swing, "etkf", 8, read=(when, read)).warnings
+    assert told == []
+
+
+@pytest.mark.parametrize(("factor", "words"), [(10, "are only"), (0.1, "times as large")])
+def test_errors_that_are_far_too_large_or_small_are_told(factor, words):
+    read = READ + 0.1 * np.random.default_rng(1).standard_normal(8)
+    (told,) = followed(Swing, "etkf", 8, read=(TIMES, read), error=0.1 * factor).warnings
+    assert words in told
