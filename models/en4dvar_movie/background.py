@@ -55,7 +55,7 @@ STEADY = 10_000  # tiles that say how bright a frame is
 CHANGED = 0.3  # share of tiles that a flash changes
 DIM, FIELD = 0.3, 95  # of the light that most pixels (per cent) have at most: what the field of view's outside has
 SWINGS = 0.015  # of the light: std beside the edge of a bright bubble that moves by half a pixel, as no aperture does
-APERTURE = (2, 6)  # pixels beside such an outside: where the light is blurred, and where it tells that it ends there
+APERTURE = (2, 6, 12)  # pixels beside it: where the light is blurred, tells that it ends there, and tells the lamp
 
 
 @dataclass(frozen=True)
@@ -196,19 +196,23 @@ def _outside(frames: Sequence[Frame]) -> Mask:
     """
     films = np.array(frames, dtype=np.float32)
     usual = ndimage.uniform_filter(np.median(films, axis=0), 5)
-    labels, _ = ndimage.label(usual < DIM * np.percentile(usual, FIELD))
+    bright = np.percentile(usual, FIELD)
+    labels, _ = ndimage.label(usual < DIM * bright)
     corners = labels[[0, 0, -1, -1], [0, -1, 0, -1]]
     dark = np.isin(labels, corners[corners > 0])
-    blurred, beside = (ndimage.binary_dilation(dark, iterations=n) for n in APERTURE)
-    about = beside & ~blurred
-    if np.sum(corners > 0) < 2 or not about.any():
+    blurred, beside, further = (ndimage.binary_dilation(dark, iterations=n) for n in APERTURE)
+    about, within = beside & ~blurred, further & ~beside
+    if np.sum(corners > 0) < 2 or not within.any():
         return np.zeros_like(dark)
     each = ndimage.uniform_filter(films, (0, 5, 5))
     steady = np.mean((each.min(axis=0) > 0.5 * usual)[about])
-    lamp = np.maximum(np.percentile(each, FIELD, axis=(1, 2), keepdims=True), 1e-6)
-    of_pixel, swing = (np.median((f[:, about] / lamp[:, :, 0]).var(axis=0)) for f in (films, each))
-    noise = max(of_pixel - swing, 0.0) / 24  # in a mean of 25 pixels
-    return np.asarray(blurred & (steady > 1 - LIVELY) & (swing - noise < SWINGS**2))
+    near = bright * np.median(each[:, within] / np.maximum(usual[within], 1e-6 * bright), axis=1)
+    swings = []
+    for lamp in (np.percentile(each, FIELD, axis=(1, 2)), near):  # a bubble may cover the brightest, or what is near
+        relative = (f[:, about] / np.maximum(lamp, 1e-6)[:, None] for f in (films, each))
+        of_pixel, swing = (np.median(part.var(axis=0)) for part in relative)
+        swings.append(swing - max(of_pixel - swing, 0.0) / 24)  # without the noise in a mean of 25 pixels
+    return np.asarray(blurred & (steady > 1 - LIVELY) & (min(swings) < SWINGS**2))
 
 
 def _lit_as(frame: Image, other: Image) -> Image:
