@@ -55,7 +55,9 @@ STEADY = 10_000  # tiles that say how bright a frame is
 CHANGED = 0.3  # share of tiles that a flash changes
 DIM, FIELD = 0.3, 95  # of the light that most pixels (per cent) have at most: what the field of view's outside has
 SWINGS = 0.015  # of the light: std beside the edge of a bright bubble that moves by half a pixel, as no aperture does
-APERTURE = (2, 6)  # pixels beside such an outside: where the light is blurred, and where it tells that it ends there
+APERTURE = (2, 6, 12)  # pixels beside it: where the light is blurred, tells that it ends there, and tells the lamp
+WHITE, SMALL, SHARP = 0.95, 0.1, 0.15  # of the brightest, and of a frame: what is burnt in; of its step: what is blur
+BURNT = ((0, 1), (3, 6), 2)  # pixels from it: where no lens shows a step, where the light is its own, what is left out
 
 
 @dataclass(frozen=True)
@@ -130,13 +132,16 @@ def find_background(movie: Movie, circles: int = 1, watched: Mask | None = None)
         white = leading[0].dtype.kind in "ui" and leading[0].flat[0] == np.iinfo(leading[0].dtype).max
         words = "black" if not np.any(first) else "white" if white else "of one brightness"
         raise DataError(f"{movie.path}: every frame is {words}; no bubble can be seen")
-    drift = drift_of(samples, numbers)
-    unseen = np.zeros(first.shape, dtype=bool)  # at the border, of what only some frames show
+    burnt = unseen = _burnt_in(samples)
+    nearest = tuple(ndimage.distance_transform_edt(burnt, return_distances=False, return_indices=True))
+    drift = drift_of([frame[nearest] for frame in samples], numbers)  # what is burnt in does not drift
     if drift is not None:
+        unseen = np.any([np.roll(burnt, np.negative(shift_at(drift, n)), (0, 1)) for n in numbers], axis=0)
         leading = [np.roll(f, np.negative(shift_at(drift, n)), (0, 1)) for n, f in enumerate(leading)]
         samples = [np.roll(f, np.negative(shift_at(drift, n)), (0, 1)) for n, f in zip(numbers, samples, strict=True)]
         height, width = first.shape
         (up, left), (down, right) = drift[:, 1:].min(axis=0).astype(int), drift[:, 1:].max(axis=0).astype(int)
+        # at the border is what only some frames show
         unseen[max(height - down, 0) :] = unseen[:, max(width - right, 0) :] = unseen[:-up] = unseen[:, :-left] = True
     of_integers = samples[0].dtype.kind in "ui"  # frames of any floats, such as shares of the light, are as if of 8 bit
     unit = 1.0 if of_integers else max(float(np.nanmax(np.abs(f))) for f in samples) / 255  # a grey level
@@ -196,19 +201,40 @@ def _outside(frames: Sequence[Frame]) -> Mask:
     """
     films = np.array(frames, dtype=np.float32)
     usual = ndimage.uniform_filter(np.median(films, axis=0), 5)
-    labels, _ = ndimage.label(usual < DIM * np.percentile(usual, FIELD))
+    bright = np.percentile(usual, FIELD)
+    labels, _ = ndimage.label(usual < DIM * bright)
     corners = labels[[0, 0, -1, -1], [0, -1, 0, -1]]
     dark = np.isin(labels, corners[corners > 0])
-    blurred, beside = (ndimage.binary_dilation(dark, iterations=n) for n in APERTURE)
-    about = beside & ~blurred
-    if np.sum(corners > 0) < 2 or not about.any():
+    blurred, beside, further = (ndimage.binary_dilation(dark, iterations=n) for n in APERTURE)
+    about, within = beside & ~blurred, further & ~beside
+    if np.sum(corners > 0) < 2 or not within.any():
         return np.zeros_like(dark)
     each = ndimage.uniform_filter(films, (0, 5, 5))
     steady = np.mean((each.min(axis=0) > 0.5 * usual)[about])
-    lamp = np.maximum(np.percentile(each, FIELD, axis=(1, 2), keepdims=True), 1e-6)
-    of_pixel, swing = (np.median((f[:, about] / lamp[:, :, 0]).var(axis=0)) for f in (films, each))
-    noise = max(of_pixel - swing, 0.0) / 24  # in a mean of 25 pixels
-    return np.asarray(blurred & (steady > 1 - LIVELY) & (swing - noise < SWINGS**2))
+    near = bright * np.median(each[:, within] / np.maximum(usual[within], 1e-6 * bright), axis=1)
+    swings = []
+    for lamp in (np.percentile(each, FIELD, axis=(1, 2)), near):  # a bubble may cover the brightest, or what is near
+        relative = (f[:, about] / np.maximum(lamp, 1e-6)[:, None] for f in (films, each))
+        of_pixel, swing = (np.median(part.var(axis=0)) for part in relative)
+        swings.append(swing - max(of_pixel - swing, 0.0) / 24)  # without the noise in a mean of 25 pixels
+    return np.asarray(blurred & (steady > 1 - LIVELY) & (min(swings) < SWINGS**2))
+
+
+def _burnt_in(frames: Sequence[Frame]) -> Mask:
+    """What is written into all frames (H, W), such as a scale bar: white, and sharper than a lens shows anything."""
+    films = np.array(frames, dtype=np.float32)
+    usual, top = np.median(films, axis=0), films.max()
+    white: Mask = films.min(axis=0) > WHITE * top
+    if not white.any():
+        return white
+    labels, sizes = labelled(ndimage.binary_dilation(white, np.ones((3, 3))))
+    off, nearest = ndimage.distance_transform_edt(~white, return_indices=True)
+    of, numbers = labels[tuple(nearest)], np.arange(1, len(sizes))
+    *rings, about = BURNT
+    beside, light = (ndimage.median(usual, of * ((off > a) & (off <= b)), numbers) for a, b in rings)
+    sharp = (top > (1 + STRUCTURE) * light) & (beside - light < SHARP * (top - light))
+    sharp &= sizes[1:] < SMALL * white.size
+    return np.asarray(np.isin(of, [n for n in numbers[sharp] if not is_round(labels == n)]) & (off <= about))
 
 
 def _lit_as(frame: Image, other: Image) -> Image:

@@ -20,6 +20,7 @@ from en4dvar_movie.outline import Optics, Outline
 from en4dvar_movie.uncertainty import NOTHING, Errors, errors_of
 
 UNREAD = 3  # frames: what makes doubtful whether something beside the bubble stands still
+STANDS, TELLING = 1e-3, 8  # of its radius: scatter of what never moves; readings that tell it
 AWAY = 10.0  # pixels from a bubble that a point may be to mean it
 
 
@@ -122,6 +123,12 @@ def track(
         notes.append(
             "no frame is empty, and what stands still beside the bubble may have been taken for a part of it: an empty "
             "frame in front shows what that is, and a tight --mask leaves it out"
+        )
+    radii = [r.radius for r in read[0] if r.used]
+    if not background.frames and len(radii) >= TELLING and np.std(radii) < STANDS * np.mean(radii):
+        notes.append(
+            f"the radius is the same in all frames, {np.mean(radii):.2f} pixels: if that is the edge of an aperture or "
+            "of something else that stands still, leave it out with --mask"
         )
     return Track(read[0], background, optics, flashes, tuple(read[1:]), tuple(notes))
 

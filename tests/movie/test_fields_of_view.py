@@ -67,3 +67,20 @@ def test_frames_of_floats_are_read_as_those_of_grey_levels(light, before, bright
 def test_what_leaves_the_surround_out_is_told_where_no_bubble_is_seen():
     with pytest.raises(DataError, match="leave that out with --region or --mask"):
         track(movie_of(frames(contrast=0.01)))
+
+
+@pytest.mark.parametrize("before", [0, pytest.param(3, marks=pytest.mark.slow)])
+def test_an_aperture_is_told_where_the_bubble_covers_the_brightest_of_a_vignetted_field(before):
+    j, i = np.indices((128, 128)) - 63.5
+    lit = [(1 - 0.4 * (i**2 + j**2) / 64**2) * frame for frame in frames(before=before)]
+    found = track(movie_of([f.astype(np.uint8) for f in behind((63.5, 63.5, 58), lit, 5)]))
+    off = np.array([r.radius for r in found.readings[before:]]) - RADII
+    assert np.abs(off).max() < 0.1
+
+
+@pytest.mark.parametrize("moves", [0.0, 6.0])
+def test_an_outline_that_stands_still_in_all_frames_is_told(moves):
+    radii = 40 + moves * np.sin(np.arange(12.0))[:, None]
+    found = track(movie_of(list(render(radii, Scene(noise=2.0, before=0), np.random.default_rng(1)))))
+    assert sum(r.used for r in found.readings) == 12
+    assert any("the same in all frames" in note for note in found.notes) == (moves == 0)
