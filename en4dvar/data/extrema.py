@@ -5,9 +5,9 @@ import numpy as np
 from en4dvar.model.state import Array
 
 
-def maxima(values: Array) -> Array:
-    """Indices of the local maxima of ``values`` (K,) behind their first minimum, of 10 % prominence."""
-    first, tops = minima(values)[:1], minima(-values)
+def maxima(values: Array, prominence: float = 0.1) -> Array:
+    """Indices of the local maxima of ``values`` (K,) behind their first minimum, of this prominence."""
+    first, tops = minima(values, prominence)[:1], minima(-values, prominence)
     return tops[tops > first] if len(first) else first
 
 

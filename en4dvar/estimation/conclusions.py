@@ -170,7 +170,8 @@ def residuals_of(space: WeightSpace, linear: Linearisation, freedom: float | Non
 def timing_of(problem: InverseProblem, at: Predicted) -> float:
     """Std of the times with which independent errors make the residuals :data:`ODDS` times as probable as what is
     stated does, with a discrepancy where there is one; 0 where none does. Errors of the times differ from reading to
-    reading and grow with the rate, what the model misses resembles itself from one to the next.
+    reading and grow with the rate, what the model misses resembles itself from one to the next. They must be so without
+    the reading that tells most of them, too: one alone may be wrong.
     """
     o = problem.observations
     if o.parts or not o.noise.quadratic or len(o.used) < 2:
@@ -180,10 +181,19 @@ def timing_of(problem: InverseProblem, at: Predicted) -> float:
     times = np.hypot(o.noise.time_std[o.used], shares * np.median(np.diff(o.times[o.used])))
     variance = 1 + (rates * times / std) ** 2
     squares = ((o.values[o.used] - values) / std) ** 2 / variance
-    scale = np.maximum(1.0, squares.mean(axis=1, keepdims=True))  # all errors may be larger than stated
-    cost = 0.5 * np.sum(o.weights[o.used] * (squares / scale + np.log(variance * scale)), axis=1)
-    best, stated = int(np.argmin(cost)), min(float(o.cost(at)), cost[0])
-    return float(np.median(times[best])) if stated - cost[best] > math.log(ODDS) else 0.0
+
+    def costs(weights: Array) -> Array:
+        """(shares, K) each reading's part."""
+        scale = np.maximum(1.0, np.average(squares, axis=1, weights=weights)[:, None])  # all may err more than stated
+        return np.asarray(0.5 * weights * (squares / scale + np.log(variance * scale)))
+
+    each = costs(o.weights[o.used])
+    cost = each.sum(axis=1)
+    best = int(np.argmin(cost))
+    most = np.arange(len(values)) == np.argmax(each[0] - each[best])
+    others = costs(np.where(most, 0.0, o.weights[o.used])).sum(axis=1)
+    gain = min(float(o.cost(at)) - cost[best], cost[0] - cost[best], others[0] - others[best])
+    return float(np.median(times[best])) if gain > math.log(ODDS) else 0.0
 
 
 def _rates(problem: InverseProblem, at: Predicted) -> Array:

@@ -317,7 +317,7 @@ def sequences_table(scores: Sequence[SequenceScore]) -> str:
     if bent := ", ".join(s.run for s in scores if s.bent):
         told += (
             f"\ncaution: windows of {bent} took more than two iterations, so that the model is not linear in them; "
-            "such an evidence may be tens too low: see whether lag: 1 and etkf say the same"
+            "such an evidence may be tens too low: see whether a scheme without a window says the same"
         )
     return told
 

@@ -4,8 +4,9 @@
 
 No Gaussian is assumed and nothing is linear; the price is a number of members that grows exponentially with that of the
 observations. Systematic resampling makes N equal members of them at every cycle. Copies would stay copies where the
-model is deterministic, so that each is moved by ``jitter`` h: towards the mean, by √(1 − h²), and by a draw from the
-kernel N(0, h² P), P the covariance of the weighted members, without the mean of the draws. Mean and covariance stay.
+model is deterministic, so that each is moved, the more of them are copies: by h = ``jitter`` √(1 − N_e/N), with
+N_e = 1/Σ ω_i², towards the mean, by √(1 − h²), and by a draw from the kernel N(0, h² P), P the covariance of the
+weighted members, without the mean of the draws. Mean and covariance stay; many weak readings do not merge two modes.
 
 Sources: Gordon, Salmond & Smith (1993), IEE Proc. F 140, 107; systematic: Kitagawa (1996), J. Comput. Graph. Stat. 5,
 1; jitter: Musso, Oudjane & Le Gland (2001) and, with the shrinkage, Liu & West (2001), in Doucet et al., Sequential
@@ -33,7 +34,7 @@ class BootstrapFilter(ETKF):
     words: ClassVar[str] = "weighed and resampled members"
 
     jitter: Annotated[
-        float, Ge(0), Le(1), "What a resampled member is moved by, in standard deviations of the posterior."
+        float, Ge(0), Le(1), "What a resampled member is moved by at most, in standard deviations of the posterior."
     ] = 0.2
 
     on: ClassVar[tuple[str, ...]] = ("series",)
@@ -46,8 +47,10 @@ class BootstrapFilter(ETKF):
         start = float(ndtr(draw("resampling", 1)[0, 0]))
         index = systematic(shares, start)
         w = np.bincount(index, minlength=n) / n
-        transform = cast(Array, Resampled(index, w, shares, self.jitter, draw))
-        return Step(Weights(w, transform), math.sqrt(n - 1) * float(np.linalg.norm(w)), 1 / float(shares @ shares))
+        effective = 1 / float(shares @ shares)
+        jitter = self.jitter * math.sqrt(max(1 - effective / n, 0.0))  # as much as members have become copies
+        transform = cast(Array, Resampled(index, w, shares, jitter, draw))
+        return Step(Weights(w, transform), math.sqrt(n - 1) * float(np.linalg.norm(w)), effective)
 
 
 @dataclass(frozen=True)

@@ -128,7 +128,8 @@ def too_few(start: InitialEnsemble, settings: SequentialSettings, members: int, 
     if error.form == "square-root" and members <= size:
         yield (
             f"{members} members are fewer than the {size + 1} that a model error by a square root needs ({size} for "
-            "the state, and one): most of it is lost; give more members, or additive: drawn"
+            "the state, and one): a part of it is lost, most of it for a parameter that varies; give more members, or "
+            "additive: drawn"
         )
     if lag and settings.localisation is None and members < (needed := size + lag * len(error.where) + 1):
         yield (

@@ -51,6 +51,7 @@ APART = 1.05  # noise and physics that the model lacks move r by less than this
 TAILS = 0.5  # of the range of the members' ln r: 48 of a Gaussian reach 2.2 standard deviations, with tails twice that
 SURE = 0.99  # one-sided probability, by the scatter of the samples
 REBOUND = 0.5  # of the collapse time: a rebound that has no top by then is not seen, or there is none
+SLIGHT = 0.03  # of the range of the radii: by so much the top of a slight rebound stands out
 SAME_FACTOR = 1.12  # a factor that is this close to that of a known mistake may be it
 
 
@@ -231,7 +232,7 @@ def single(times: Array, radius: Array) -> bool:
     collapse, viscosity or sound, fragments, jets and a shape that is no sphere, is then told by nothing.
     """
     falling = slice(int(np.argmax(radius)), None)
-    if radius[falling].min() > TOLD * radius.max() or len(maxima(radius[falling])):
+    if radius[falling].min() > TOLD * radius.max() or len(maxima(radius[falling], SLIGHT)):
         return False
     try:
         view = lobe(times, radius)

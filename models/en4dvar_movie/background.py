@@ -221,19 +221,24 @@ def _outside(frames: Sequence[Frame]) -> Mask:
 
 
 def _burnt_in(frames: Sequence[Frame]) -> Mask:
-    """What is written into all frames (H, W), such as a scale bar: white, and sharper than a lens shows anything."""
+    """What is written into all frames (H, W), such as a scale bar: white, and sharper than a lens shows anything, and
+    apart from the frame's border, from which overexposed needles and walls come.
+    """
     films = np.array(frames, dtype=np.float32)
-    usual, top = np.median(films, axis=0), films.max()
+    top = films.max()
     white: Mask = films.min(axis=0) > WHITE * top
     if not white.any():
         return white
+    usual = np.median(films, axis=0)
     labels, sizes = labelled(ndimage.binary_dilation(white, np.ones((3, 3))))
+    rim = np.pad(np.zeros(np.subtract(white.shape, 2), dtype=bool), 1, constant_values=True)
+    inside = ~np.isin(np.arange(1, len(sizes)), labels[rim & white])
     off, nearest = ndimage.distance_transform_edt(~white, return_indices=True)
     of, numbers = labels[tuple(nearest)], np.arange(1, len(sizes))
     *rings, about = BURNT
     beside, light = (ndimage.median(usual, of * ((off > a) & (off <= b)), numbers) for a, b in rings)
     sharp = (top > (1 + STRUCTURE) * light) & (beside - light < SHARP * (top - light))
-    sharp &= sizes[1:] < SMALL * white.size
+    sharp &= inside & (sizes[1:] < SMALL * white.size)
     return np.asarray(np.isin(of, [n for n in numbers[sharp] if not is_round(labels == n)]) & (off <= about))
 
 

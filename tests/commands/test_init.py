@@ -195,10 +195,14 @@ def test_a_bubble_that_shrinks_where_it_should_rest_ends_with_its_only_minimum(t
     (tmp_path / "gel").mkdir()
     t, R = rebounding(0.05)
     shrinking = np.where(t > 1.75, np.interp(t, (1.75, 2.1, 3), (np.interp(1.75, t, R), 0.36, 0.24)), R)
-    for n, radius in enumerate((shrinking, R)):
-        rows = zip(20 * t, 200 * radius, strict=True)
-        (tmp_path / "gel" / f"b{n}.csv").write_text("t_us,R_um\n" + "".join(f"{a:.4f},{b:.4f}\n" for a, b in rows))
-    for data, to in (("gel", {"to": "trough 2 or trough 1"}), ("gel/b0.csv", {"to": "trough 1", "until": "trough 1"})):
+    damped = np.where(t > 0, 0.4 + 0.6 * np.exp(-2 * t**2), R)  # has no minimum
+    (tmp_path / "thick").mkdir()
+    for folder, radii in (("gel", (shrinking, R)), ("thick", (shrinking, R, damped))):
+        for n, radius in enumerate(radii):
+            rows = "".join(f"{a:.4f},{b:.4f}\n" for a, b in zip(20 * t, 200 * radius, strict=True))
+            (tmp_path / folder / f"b{n}.csv").write_text("t_us,R_um\n" + rows)
+    ends = {"gel": {"to": "trough 2 or trough 1"}, "thick": {"to": "trough 2 or trough 1 or end"}}
+    for data, to in (*ends.items(), ("gel/b0.csv", {"to": "trough 1", "until": "trough 1"})):
         done = call("init", "--data", data, "--start", "laser", "--out", "b.yaml", "--force")
         assert "b0: R goes from" in done.stderr
         assert "and its window ends with the first collapse, before the rebound has a top" in done.stderr

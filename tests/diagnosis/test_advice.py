@@ -318,6 +318,19 @@ def test_no_errors_of_the_times_are_seen_in_what_the_model_misses(kind):
     assert [run(late(kind, seed)).timing for seed in range(6)] == [0.0] * 6
 
 
+def test_a_wrong_reading_is_no_error_of_the_times():
+    """It may lie where the observable changes fast; the readings that it leaves say nothing of the times."""
+    p = make_problem(Wave(), (1.0, 2.0), k=50, std=0.02, time_std=0.001, scale=0.3)
+    right = np.array([p.model.curve(np.array([1.0, 2.0]), time) for time in p.observations.times])
+    fastest = int(np.argmax(np.abs(np.gradient(right))))
+    for seed in range(4):
+        values = right + 0.02 * np.random.default_rng(seed).standard_normal(50)
+        values[fastest] += 0.02 * 12
+        analysis = run(read(p, values=values))
+        assert told(analysis, "odd-residuals") is not None
+        assert analysis.timing == 0.0
+
+
 def test_a_future_that_is_missed_is_taken_in_up_to_the_next_trough():
     problem = turned(10)
     assert "data.window.to:" not in told(run(problem), "future-missed").advice

@@ -50,6 +50,10 @@ def test_a_luminous_bubble_and_an_overexposed_field_are_not_burnt_in():
         clipped = np.clip(shown, 0, 255)
         clipped[:, 130:] = 100
         assert not _burnt_in(clipped.astype(np.uint8)).any()
+    needle = np.array(frames)
+    needle[:, 60:64, 130:] = 255  # overexposed, and from the border
+    assert not _burnt_in(needle)[50:74, 100:].any()
+    assert _burnt_in(needle)[136:152, 88:142].sum() == bar.sum()
     wall = np.full((24, 80, 80), 255, dtype=np.uint8)
     wall[:, 50:] = 10  # in a field that is overexposed
     assert not _burnt_in(wall).any()

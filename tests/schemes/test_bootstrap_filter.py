@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from en4dvar.ensemble.linalg import centre
+from en4dvar.model.forward import ForwardModel, Observable, StateField
+from en4dvar.model.state import Field, StateLayout
 from en4dvar.schemes.base import Evaluation, Weights
 from en4dvar.schemes.bootstrap_filter import BootstrapFilter, likelihood_shares, systematic
 from en4dvar.schemes.localisation import BlockLocalisation
@@ -103,6 +105,32 @@ def test_jitter_adds_no_spread_however_many_the_readings(jitter):
     particles, mean, std = linear_case(100, 1500, jitter)
     assert np.mean(particles.analysis.std[50:, :2] / std[50:]) == pytest.approx(1, abs=0.15)
     assert np.sqrt(np.mean(((particles.analysis.mean[50:, :2] - mean[50:]) / std[50:]) ** 2)) < 0.5
+
+
+class Square(ForwardModel):
+    """A constant c, and its square, which is read."""
+
+    layout = StateLayout((Field("c"), Field("y")))
+    observables = (Observable("y", "1", StateField("y")),)
+    parameters, autonomous = (), True
+
+    def initial_state(self, theta):
+        return np.zeros(2)
+
+    def step(self, x, t0, t1):
+        return np.array([x[0], x[0] ** 2])
+
+
+def test_two_modes_of_a_constant_stay_two_however_many_weak_readings():
+    """Members that are no copies need no kernel, which draws modes together as it keeps the spread of all."""
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        members = np.stack([rng.standard_normal(400), np.zeros(400)], axis=1)
+        series = CycleSeries(np.arange(1.0, 301), 1.7 + 3 * rng.standard_normal((300, 1)), np.array([3.0]))
+        run = run_sequential(Square(), Square.observables, members, series, SequentialSettings(BootstrapFilter()), seed)
+        c = run.members[:, 0]
+        assert 0.1 < np.mean(c > 0) < 0.9
+        assert np.mean(np.abs(c) < 0.5) < 0.05
 
 
 def test_no_localisation():

@@ -332,8 +332,9 @@ def _end(views: Sequence[Look], number: int = 2) -> str:
     """
     fewest, most = (min(number, extreme(view.n_minima for view in views)) for extreme in (min, max))
     instants = [f"trough {n}" for n in range(most, max(fewest, 2) - 1, -1)]
-    drifts = any(view.drift and view.n_minima < 2 for view in views)
-    return " or ".join([*instants, *["trough 1" if drifts else "end"] * (fewest < 2)])
+    if drifts := any(view.drift and view.n_minima == 1 for view in views):
+        instants.append("trough 1")
+    return " or ".join([*instants, *["end"] * (fewest < (1 if drifts else 2))])
 
 
 class Tops(NamedTuple):
