@@ -170,8 +170,8 @@ def residuals_of(space: WeightSpace, linear: Linearisation, freedom: float | Non
 def timing_of(problem: InverseProblem, at: Predicted) -> float:
     """Std of the times with which independent errors make the residuals :data:`ODDS` times as probable as what is
     stated does, with a discrepancy where there is one; 0 where none does. Errors of the times differ from reading to
-    reading and grow with the rate, what the model misses resembles itself from one to the next. They must be so without
-    the reading that tells most of them, too: one alone may be wrong.
+    reading and grow with the rate, what the model misses resembles itself from one to the next. The other readings must
+    rather tell of them, too, than not, without the one that tells most: it alone may be wrong.
     """
     o = problem.observations
     if o.parts or not o.noise.quadratic or len(o.used) < 2:
@@ -192,8 +192,8 @@ def timing_of(problem: InverseProblem, at: Predicted) -> float:
     best = int(np.argmin(cost))
     most = np.arange(len(values)) == np.argmax(each[0] - each[best])
     others = costs(np.where(most, 0.0, o.weights[o.used])).sum(axis=1)
-    gain = min(float(o.cost(at)) - cost[best], cost[0] - cost[best], others[0] - others[best])
-    return float(np.median(times[best])) if gain > math.log(ODDS) else 0.0
+    gain = min(float(o.cost(at)), cost[0]) - cost[best]
+    return float(np.median(times[best])) if gain > math.log(ODDS) and others[best] < others[0] else 0.0
 
 
 def _rates(problem: InverseProblem, at: Predicted) -> Array:
