@@ -121,16 +121,16 @@ class Square(ForwardModel):
         return np.array([x[0], x[0] ** 2])
 
 
-def test_two_modes_of_a_constant_stay_two_however_many_weak_readings():
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 4))])
+def test_two_modes_of_a_constant_stay_two_however_many_weak_readings(seed):
     """Members that are no copies need no kernel, which draws modes together as it keeps the spread of all."""
-    for seed in range(4):
-        rng = np.random.default_rng(seed)
-        members = np.stack([rng.standard_normal(400), np.zeros(400)], axis=1)
-        series = CycleSeries(np.arange(1.0, 301), 1.7 + 3 * rng.standard_normal((300, 1)), np.array([3.0]))
-        run = run_sequential(Square(), Square.observables, members, series, SequentialSettings(BootstrapFilter()), seed)
-        c = run.members[:, 0]
-        assert 0.1 < np.mean(c > 0) < 0.9
-        assert np.mean(np.abs(c) < 0.5) < 0.05
+    rng = np.random.default_rng(seed)
+    members = np.stack([rng.standard_normal(400), np.zeros(400)], axis=1)
+    series = CycleSeries(np.arange(1.0, 301), 1.7 + 3 * rng.standard_normal((300, 1)), np.array([3.0]))
+    run = run_sequential(Square(), Square.observables, members, series, SequentialSettings(BootstrapFilter()), seed)
+    c = run.members[:, 0]
+    assert 0.1 < np.mean(c > 0) < 0.9
+    assert np.mean(np.abs(c) < 0.5) < 0.05
 
 
 def test_no_localisation():
