@@ -220,9 +220,8 @@ class Noise:
         return np.where(np.isfinite(total), total, np.inf)
 
     def log_likelihood(self, values: Array, predicted: Predicted) -> Array:
-        """Normalised log density of each observation (…, K) in its own unit, unweighted (β = 1).
-
-        With correlated errors it is that of an observation given those before it, so that the sum is the joint density.
+        """Normalised log density of each observation (…, K) in its own unit, unweighted (β = 1). With correlated errors
+        it is that of an observation given those before it, so that the sum is the joint density.
         """
         v = self.whitened_residual(values, predicted)
         density = -self._loss(v) - np.log(self.error_std(predicted)) - self._log_norm()
