@@ -147,7 +147,7 @@ class DiscrepancyNoise(Noise):
         return self.timed or self.kernel.grows
 
     @property
-    def grows_beyond(self) -> float:
+    def grows_beyond(self) -> float:  # type: ignore[override]
         return self.kernel.grows_beyond
 
     def attributes(self) -> dict[str, float]:
