@@ -46,6 +46,7 @@ class Trajectory:
 
     def largest(self, name: str) -> float:
         """The largest value of a quantity of the model's ``validity`` along the path; by default |field of that name|.
+
         A model whose quantity peaks between the stored instants overrides this.
         """
         return float(np.max(np.abs(self[name])))
@@ -257,16 +258,18 @@ class ForwardModel(ABC):
     unforeseen: Mapping[str, float] = MappingProxyType({})
 
     def changed(self, name: str, x: Array, change: Array) -> Array:
-        """States (N, n_state) in which the quantity ``name`` is exp(``change``) (N,) times what it is in ``x``. By
-        default every component of the field of that name.
+        """States (N, n_state) in which the quantity ``name`` is exp(``change``) (N,) times what it is in ``x``.
+
+        By default every component of the field of that name.
         """
         x = np.array(x)
         x[:, self.layout[name]] *= np.exp(change)[:, None]
         return x
 
     def with_parameters(self, names: Collection[str]) -> "ForwardModel":
-        """This model with those of its ``optional_parameters`` that are in ``names`` among its ``parameters``. Models
-        that have such parameters override it.
+        """This model with those of its ``optional_parameters`` that are in ``names`` among its ``parameters``.
+
+        Models that have such parameters override it.
         """
         return self
 
@@ -315,8 +318,10 @@ class ForwardModel(ABC):
         return [self._march(x[i], own[i]) for i in range(len(x))]
 
     def resumed(self, x: Array, start: Array, times: Array) -> Sequence[Trajectory | Failure]:
-        """:meth:`trajectories` from states ``x`` (N, n_state) at ``start`` (N,) instead of time zero. At those of the
-        ``times`` (N, K) that lie before its start a member is where it started. This default repeats :meth:`step`.
+        """:meth:`trajectories` from states ``x`` (N, n_state) at ``start`` (N,) instead of time zero.
+
+        At those of the ``times`` (N, K) that lie before its start a member is where it started. This default repeats
+        :meth:`step`.
         """
         return [self._march(x[i], np.maximum(times[i], start[i]), float(start[i])) for i in range(len(x))]
 

@@ -373,8 +373,9 @@ _artanh = _polynomial(*(1.0 / k for k in range(21, 1, -2)))
 
 @inlined
 def exp(x):
-    """e^x lane by lane to about 1 ulp, for any |x| (clamped to the range of normal doubles). Cody–Waite reduction x = k
-    ln 2 + r, |r| ≤ ln 2 / 2, then the Taylor polynomial of degree 13 (truncation 4e-18).
+    """e^x lane by lane to about 1 ulp, for any |x| (clamped to the range of normal doubles).
+
+    Cody–Waite reduction x = k ln 2 + r, |r| ≤ ln 2 / 2, then the Taylor polynomial of degree 13 (truncation 4e-18).
     """
     x = minimum(maximum(x, -708.0), 709.0)
     k = floor(x * _LOG2E + 0.5)
@@ -384,8 +385,9 @@ def exp(x):
 
 @inlined
 def log(x):
-    """Natural logarithm lane by lane of positive normal numbers, to about 1 ulp. x = m 2^e with m in [√½, √2), ln m = 2
-    artanh((m−1)/(m+1)) by its series (truncation 2e-18).
+    """Natural logarithm lane by lane of positive normal numbers, to about 1 ulp.
+
+    x = m 2^e with m in [√½, √2), ln m = 2 artanh((m−1)/(m+1)) by its series (truncation 2e-18).
     """
     exponent, m = _split(x)
     large = m > 1.4142135623730951
@@ -398,8 +400,9 @@ def log(x):
 
 @inlined
 def lookup(table, offset, span, x):
-    """Value and two derivatives of a piecewise quintic, extended beyond its ends (:mod:`en4dvar_bubble.tables`). A cell
-    whose eighth number is not zero is halved: the number is the place of its left half, the right one follows.
+    """Value and two derivatives of a piecewise quintic, extended beyond its ends (:mod:`en4dvar_bubble.tables`).
+
+    A cell whose eighth number is not zero is halved: the number is the place of its left half, the right one follows.
     """
     origin, intervals = span[0], span[3]
     per_unit = splat(span[2])
