@@ -117,12 +117,11 @@ def read_observations(plan: DataPlan, file: DataFile, name: str, weights: str = 
 def read_one(plan: SeriesPlan, file: DataFile, fewest: int) -> Series:
     """One series inside its window. Raises :class:`DataError`."""
     data, path, weights, places = plan.data, file.path, plan.data.weights, plan.data.places
-    beside_them = weights.column if weights else None, places.column if places else None
-    stated: tuple[Column | None, ...] = (*data.error_columns.values(), *beside_them)
     read = read_series(
-        path, data.columns.time, data.columns.observable, data.part(Layout), [*filter(None, stated)],
+        path, data.columns.time, data.columns.observable, data.part(Layout), [*data.columns_beside.values()],
         file.part, repeats=places is not None, fewest=fewest,
     )  # fmt: skip
+    beside = {key: read.errors[column.name] for key, column in data.columns_beside.items()}
     asked = data.window
     window = read.window(asked.start, asked.end, asked.prominence)
     times, values = read.times[window], read.values[window]
@@ -137,16 +136,14 @@ def read_one(plan: SeriesPlan, file: DataFile, fewest: int) -> Series:
         words = f"the first observation used lies {early:g}{unit} before time zero, where the model's clock starts"
         raise DataError(f"{path}: {words}; put it earlier (data.time_zero), or begin later (data.window.from)")
 
-    def beside(column: Column | None) -> Array | None:
-        return read.errors[column.name][window] if column else None
-
     def errors(part: slice) -> Noise:
-        of_columns = {key: read.errors[column.name][part] for key, column in data.error_columns.items()}
-        return errors_of(data, read.times[part] - zero, values, of_columns, partial(read.rows_among, used=part))
+        stated = {key: column[part] for key, column in beside.items()}
+        return errors_of(data, read.times[part] - zero, values, stated, partial(read.rows_among, used=part))
 
     try:
         until = read.window(asked.start, asked.until, asked.prominence).stop
         noise, whole = errors(window), slice(window.start, max(window.stop, until))
+        stated = {key: column[window] for key, column in beside.items()}
         if len(times) < fewest:
             held = f"{len(times)} of {len(read.times)} usable observations"
             raise DataError(f"the window data.window holds {held}; at least {fewest} are needed")
@@ -155,10 +152,10 @@ def read_one(plan: SeriesPlan, file: DataFile, fewest: int) -> Series:
             times=times,
             values=values,
             noise=noise,
-            weights=weights.weights(times, values, asked.prominence, beside(weights.column)) if weights else None,
+            weights=weights.weights(times, values, asked.prominence, stated.get("weights")) if weights else None,
             name=plan.name,
             group=plan.group,
-            places=places.places(len(times), beside(places.column)) if places else None,
+            places=places.places(len(times), stated.get("places")) if places else None,
             source=readable(path),
             scalars=read.scalars,
             doubts=read.doubts,

@@ -226,11 +226,13 @@ class Data(Section):
             faults.add(("columns",), f"name the column of one observable of: {', '.join(roles[1:])}")
 
     @property
-    def error_columns(self) -> dict[str, Column]:
-        """The columns that hold errors of readings or times, or say which readings are bounds."""
+    def columns_beside(self) -> dict[str, Column]:
+        """The columns that hold errors of readings or times, say which readings are bounds, their weights or places."""
         time = self.columns.time
         clock = time if isinstance(time, Column) else time.column
-        return self.error.columns(self.columns.observable.unit, clock.unit if clock else "")
+        errors = self.error.columns(self.columns.observable.unit, clock.unit if clock else "")
+        stated = {"weights": self.weights, "places": self.places}
+        return errors | {key: it.column for key, it in stated.items() if it is not None and it.column is not None}
 
     def as_written(self, source: Mapping[str, Any]) -> dict[str, Any]:
         """The section as it was written, with absolute paths."""

@@ -36,7 +36,6 @@ class Places:
     @classmethod
     def at_coordinates(cls, positions: npt.ArrayLike, coordinates: Array, unit: str = "1") -> Self:
         """Linear interpolation between components at ``coordinates`` (n,), in any order; ``positions`` (K,) within.
-
         Raises :class:`DataError` for a position outside.
         """
         asked, order = np.asarray(positions, dtype=float), np.argsort(coordinates, kind="stable")

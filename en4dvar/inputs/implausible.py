@@ -43,9 +43,8 @@ ASIDE = np.array([0, 1, 2, -3, -2, -1])  # the neighbours, of a window
 
 
 def scatter_of(times: Array, values: Array) -> float:
-    """Standard deviation of the errors of readings ``values`` (K,) at ``times`` (K,); NaN without a window.
-
-    It is not less than what the readings are rounded to.
+    """Standard deviation of the errors of readings ``values`` (K,) at ``times`` (K,); NaN without a window. It is not
+    less than what the readings are rounded to.
     """
     if len(values) < WINDOW:
         return math.nan
@@ -186,9 +185,8 @@ def level_top(times: Array, radius: Array, scatter: float) -> npt.NDArray[np.boo
 
 
 def _fitted(t: Array, near: npt.NDArray[np.intp], degree: int, values: Array) -> tuple[Array, Array]:
-    """Polynomials through ``values`` (n, k) at the instants ``near`` (k,) of windows ``t`` (n, m).
-
-    At all instants (n, m), and their standard deviations with that of a reading, in errors of one.
+    """At all instants (n, m) of windows ``t`` (n, m), polynomials through ``values`` (n, k) at the instants ``near``
+    (k,), and their standard deviations with that of a reading, in errors of one.
     """
     z = (t - t.mean(axis=1, keepdims=True)) / np.ptp(t, axis=1)[:, None]
     powers = z[:, :, None] ** np.arange(degree + 1)

@@ -79,9 +79,8 @@ def read_members(path: Path, units: Mapping[str, tuple[str, str]]) -> dict[str, 
 
 
 def read_centres(path: Path, units: Mapping[str, str]) -> dict[str, dict[str, float]]:
-    """Of a ``summary.csv`` of a run, data set → parameter → centre, in ``units``; nothing of another file.
-
-    Raises :class:`DataError`: no data set has any of the parameters, or a number is none.
+    """Of a ``summary.csv`` of a run, data set → parameter → centre, in ``units``; nothing of another file. Raises
+    :class:`DataError`: no data set has any of the parameters, or a number is none.
     """
     if path.suffix.lower() != ".csv":
         return {}
@@ -120,9 +119,8 @@ def _of_table(path: Path, names: Mapping[str, Any]) -> dict[str, tuple[Array, st
 
 
 def netcdf_members(path: Path, names: Sequence[str]) -> Iterator[dict[str, tuple[Array, str]]]:
-    """The numbers of each name, with their unit; of a population those of its next data set, ``G_next``.
-
-    Raises :class:`DataError`.
+    """The numbers of each name, with their unit; of a population those of its next data set, ``G_next``. Raises
+    :class:`DataError`.
     """
     import netCDF4  # a tenth of a second that other files do not need
 

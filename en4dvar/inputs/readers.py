@@ -99,9 +99,8 @@ class Readings:
         return left_out + step_doubts(times, clock.target, clock.unit, self.scalars, clock.rate)
 
     def rows_among(self, size: int, used: slice) -> Rows:
-        """Where the readings ``used`` stand in a table of ``size`` rows that follow each other as in the file.
-
-        There is one a row of the file, one a usable row, or one a reading that is used. Raises :class:`DataError`.
+        """Where the readings ``used`` stand in a table of ``size`` rows that follow each other as in the file. There is
+        one a row of the file, one a usable row, or one a reading that is used. Raises :class:`DataError`.
         """
         number = len(self.times[used])
         if self.rows is None or self.usable is None:

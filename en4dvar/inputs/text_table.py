@@ -70,9 +70,8 @@ def _text(path: Path) -> str:
 
 
 def delimiter_of(line: Line, path: Path) -> str:
-    """What separates the cells of a first line; "" for blanks, and of a sheet.
-
-    Raises :class:`DataError` where it has more cells than a table has columns.
+    """What separates the cells of a first line; "" for blanks, and of a sheet. Raises :class:`DataError` where it has
+    more cells than a table has columns.
     """
     if not isinstance(line, str):
         return ""
@@ -285,7 +284,6 @@ _RANGE = re.compile(r"\$?[A-Za-z]{1,3}\$?[1-9]\d{0,6}(:\$?[A-Za-z]{1,3}\$?[1-9]\
 
 def sheet_lines(path: Path, asked: str) -> Lines:
     """Rows of a sheet that are not blank, with their numbers; ``asked`` is a sheet, ``Sheet!A3:D40`` or ``A3:D40``.
-
     Raises :class:`DataError`.
     """
     return decoded_whole(lines_of_workbook, path, asked, allowed=WORKBOOK, kind="a workbook (save it as CSV)")

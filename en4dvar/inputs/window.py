@@ -69,9 +69,8 @@ def parse_instant(text: str | float, time_unit: str, symbols: Collection[str] = 
 
 
 def select(times: Array, values: Array, start: Instant, end: Instant, prominence: float = 0.1) -> slice:
-    """The window as a slice of the series ``times`` (K,), ``values`` (K,), both ends included.
-
-    Raises :class:`DataError` when an extremum is not there or the window is empty.
+    """The window as a slice of the series ``times`` (K,), ``values`` (K,), both ends included. Raises
+    :class:`DataError` when an extremum is not there or the window is empty.
     """
     with retold(DataError, DataError, "the window "):
         first = index_of(times, values, start, 0, prominence)
@@ -86,9 +85,8 @@ def select(times: Array, values: Array, start: Instant, end: Instant, prominence
 def index_of(
     times: Array, values: Array, instant: Instant, first: int = 0, prominence: float = 0.1, last: bool = False
 ) -> int:
-    """The first sample of ``times`` (K,), ``values`` (K,) from an instant on, or the ``last`` one up to it.
-
-    Extrema are those from the sample ``first`` on. Raises :class:`DataError` when there is none such.
+    """The first sample of ``times`` (K,), ``values`` (K,) from an instant on, or the ``last`` one up to it. Extrema are
+    those from the sample ``first`` on. Raises :class:`DataError` when there is none such.
     """
     if instant.kind == "start":
         return 0

@@ -152,9 +152,8 @@ def name_of(function: object) -> str:
 
 
 def digest_of(function: object) -> str:
-    """SHA-256 of what a function says: its file or, of one that was typed in, its compiled code.
-
-    Values that it reads from outside are not part of it.
+    """SHA-256 of what a function says: its file or, of one that was typed in, its compiled code. Values that it reads
+    from outside are not part of it.
     """
     while isinstance(function, functools.partial):
         function = function.func

@@ -27,9 +27,8 @@ def floats(values: npt.ArrayLike) -> Array:
 
 
 def hold_floats(whole: object, *keys: str) -> None:
-    """Make the attributes ``keys`` of ``whole``, even one that is frozen, :func:`floats`.
-
-    Raises TypeError, ValueError for what is no real numbers.
+    """Make the attributes ``keys`` of ``whole``, even one that is frozen, :func:`floats`. Raises TypeError, ValueError
+    for what is no real numbers.
     """
     for key in keys:
         if np.iscomplexobj(value := getattr(whole, key)):

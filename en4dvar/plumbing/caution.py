@@ -68,9 +68,8 @@ class Caution:
 
 
 def caution(code: str, words: str, severity: Severity | None = None, parameters: tuple[str, ...] = ()) -> Caution:
-    """A warning of the catalogue; ``severity`` replaces the catalogue's where the finding is graver or milder.
-
-    Raises KeyError: the code is not in :data:`CATALOGUE`.
+    """A warning of the catalogue; ``severity`` replaces the catalogue's where the finding is graver or milder. Raises
+    KeyError: the code is not in :data:`CATALOGUE`.
     """
     usual, advice = CATALOGUE[code]
     return Caution(code, severity or usual, words, advice, parameters)
@@ -98,17 +97,15 @@ def codes(cautions: Iterable[Caution]) -> tuple[str, ...]:
 
 
 def of_several_modes(cautions: Iterable[Caution], parameter: str) -> bool:
-    """True if members of a parameter are drawn from modes apart: mean ± std describe none, quantiles all of them.
-
-    Where members were drawn from one mode alone the warning is serious, and nothing of them is to be quoted.
+    """True if members of a parameter are drawn from modes apart: mean ± std describe none, quantiles all of them. Where
+    members were drawn from one mode alone the warning is serious, and nothing of them is to be quoted.
     """
     return any(c.code == "several-modes" and not c.spoils and parameter in c.parameters for c in cautions)
 
 
 def untrusted(cautions: Iterable[Caution], parameter: str) -> tuple[str, ...]:
-    """Codes of the warnings for which no interval of a parameter is to be quoted, the worst first; () where one is.
-
-    The one place that decides it: page, tables, CSV and LaTeX follow.
+    """Codes of the warnings for which no interval of a parameter is to be quoted, the worst first; () where one is. The
+    one place that decides it: page, tables, CSV and LaTeX follow.
     """
     of_it = (c for c in worst_first(cautions) if c.spoils and (not c.parameters or parameter in c.parameters))
     return codes(of_it)

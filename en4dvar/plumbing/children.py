@@ -102,9 +102,8 @@ class Child:
             os.close(self.alive)
 
     def wait(self, seconds: float | None) -> int:
-        """Its exit status. It is not yet forgotten by the system, so that its session cannot be anybody else's.
-
-        Raises :class:`subprocess.TimeoutExpired`.
+        """Its exit status. It is not yet forgotten by the system, so that its session cannot be anybody else's. Raises
+        :class:`subprocess.TimeoutExpired`.
         """
         if not hasattr(os, "pidfd_open"):
             return self.process.wait(seconds)
@@ -174,7 +173,6 @@ def status_named(status: int) -> str:
 
 def limit_memory(size: int) -> None:
     """From now on, an allocation in this process beyond ``size`` bytes more than it has raises MemoryError (Linux).
-
     Compiled code that does not check ends the process.
     """
     if sys.platform == "linux" and resource:

@@ -53,9 +53,8 @@ class SignatureFiles(IndexDataCacheFile):
 
 @cache
 def kernel_folder() -> Path:
-    """The folder of compiled kernels of this version of numba and this processor; it exists and can be written.
-
-    Raises :class:`OutputError`: compiled code can be kept nowhere.
+    """The folder of compiled kernels of this version of numba and this processor; it exists and can be written. Raises
+    :class:`OutputError`: compiled code can be kept nowhere.
     """
     asked = os.environ.get(CACHE)
     folder = (Path(asked) if asked else user_cache_path("en4dvar", appauthor=False)) / _target()
@@ -96,9 +95,8 @@ def _temporary_folder() -> Path:
 
 
 def _own_folder(temporary: Path) -> Path:
-    """A folder that nobody else can write: numba runs what it finds there.
-
-    It has the same name for every process of the user; where somebody else holds that name, a new one is made.
+    """A folder that nobody else can write: numba runs what it finds there. It has the same name for every process of
+    the user; where somebody else holds that name, a new one is made.
     """
     user = os.getuid() if hasattr(os, "getuid") else None
     folder = temporary / f"en4dvar-numba-{'user' if user is None else user}"
@@ -200,9 +198,8 @@ KERNELS: list[Any] = []
 
 
 def _kernels(**options: Any) -> Callable[[F], F]:
-    """Functions compiled by numba with these options, kept on disk, without the interpreter's lock.
-
-    Raises :class:`OutputError`: nowhere can compiled code be kept.
+    """Functions compiled by numba with these options, kept on disk, without the interpreter's lock. Raises
+    :class:`OutputError`: nowhere can compiled code be kept.
     """
 
     def compiled(function: F) -> F:

@@ -182,9 +182,8 @@ def _served(name: str, arguments: tuple[Any, ...], allowed: Allowed, answers: IO
 
 
 def matches(path: Path, pattern: str) -> Iterator[list[str]]:
-    """What a regular expression with one group finds in a file; a decoder.
-
-    Raises :class:`DataError` as :func:`text_of`.
+    """What a regular expression with one group finds in a file; a decoder. Raises :class:`DataError` as
+    :func:`text_of`.
     """
     yield re.findall(pattern, text_of(path), re.MULTILINE)
 
@@ -208,7 +207,6 @@ class ForeignDataError(ValueError):
 
 def require_whole(path: Path) -> None:
     """Raises :class:`ForeignDataError` where something of an HDF5 file lies in another one; files that are none pass.
-
     Raises :class:`OSError`, :class:`RuntimeError` where it is damaged.
     """
     import h5py

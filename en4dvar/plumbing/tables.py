@@ -20,9 +20,8 @@ def table(rows: Sequence[Sequence[str]]) -> str:
 
 
 def csv_text(rows: Iterable[Sequence[object]]) -> str:
-    """Rows of cells as CSV; of numbers every digit is kept.
-
-    Text that a spreadsheet would take for a formula begins with an apostrophe: names come from files of anybody.
+    """Rows of cells as CSV; of numbers every digit is kept. Text that a spreadsheet would take for a formula begins
+    with an apostrophe: names come from files of anybody.
     """
     text = io.StringIO()
     _write(text, rows)

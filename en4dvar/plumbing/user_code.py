@@ -80,7 +80,6 @@ def in_worker() -> None:
 @contextmanager
 def loading(what: str) -> Iterator[None]:
     """Within, code of a user is imported or built. Raises :class:`ConfigError`: it raised anything, told as ``what``.
-
     Errors of ours and :class:`ValueError`, which says what is wrong with a setting, go through.
     """
     with kept_apart():

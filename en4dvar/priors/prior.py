@@ -191,9 +191,8 @@ class PriorTerm:
         return theta if self.transform == "lognormal" else 1.0
 
     def to_physical(self, x: Array) -> Array:
-        """θ for transformed values ``x`` of any shape; overflow gives inf, which no model accepts as a value.
-
-        Between bounds: what would be rounded to one of them stays on this side of it.
+        """θ for transformed values ``x`` of any shape; overflow gives inf, which no model accepts as a value. Between
+        bounds: what would be rounded to one of them stays on this side of it.
         """
         x = np.asarray(x, dtype=float)
         if self.transform == "normal":
@@ -209,10 +208,7 @@ class PriorTerm:
         return np.clip(theta, np.nextafter(low, high), np.nextafter(high, low) if high < math.inf else high)
 
     def from_physical(self, theta: Array) -> Array:
-        """x for physical values ``theta`` of any shape.
-
-        Raises ValueError: a value outside the range of the transform.
-        """
+        """x for physical values ``theta`` of any shape. Raises ValueError: one beyond the range of the transform."""
         theta = np.asarray(theta, dtype=float)
         if self.transform == "normal":
             return theta

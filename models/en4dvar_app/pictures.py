@@ -76,7 +76,6 @@ class Pictures:
 
 def readings(path: Path) -> dict[str, Any]:
     """The table of ``en4dvar track``: pixel (um), and rows with frame, t_us, R_um, R_std_um, x_um, y_um, used, reason.
-
     Raises :class:`DataError` where it is no such table.
     """
     with readable(path):

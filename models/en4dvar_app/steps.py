@@ -37,9 +37,8 @@ def beside(movie: str, suffix: str) -> str:
 
 
 def existing(root: Path, fields: Fields, key: str) -> str:
-    """The name of a file or folder of ``root``, which holds no link that leads out of it.
-
-    Raises FieldError: it is not there, or it is a movie for which the table of another one is in the way.
+    """The name of a file or folder of ``root``, which holds no link that leads out of it. Raises FieldError: it is not
+    there, or it is a movie for which the table of another one is in the way.
     """
     name = fields.get(key, "")
     if not name:
@@ -143,9 +142,8 @@ def text_of(root: Path, fields: Fields) -> str:
 
 
 def kept(root: Path, fields: Fields) -> None:
-    """Write a text of the page: a configuration that is there, or the corrections of a movie.
-
-    Raises FieldError: another window or program has changed the file since the page read it.
+    """Write a text of the page: a configuration that is there, or the corrections of a movie. Raises FieldError:
+    another window or program has changed the file since the page read it.
     """
     path = _text_file(root, fields)
     held, text = text_of(root, fields), fields.get("text", "")
@@ -157,7 +155,6 @@ def kept(root: Path, fields: Fields) -> None:
 
 def masked(root: Path, fields: Fields, shape: tuple[int, ...]) -> None:
     """Blacken or (``uncovers``) whiten the polygon ``outline``, "x,y x,y ...", in the mask of a movie of (H, W) pixels.
-
     Raises FieldError: the outline is none, or the mask is no picture of that size.
     """
     path, outline = below(root, beside(existing(root, fields, "movie"), ".mask.png")), fields.get("outline", "")

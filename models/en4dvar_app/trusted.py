@@ -16,9 +16,8 @@ MOST = 100_000  # files that a pattern names
 
 
 def below(root: Path, name: str) -> Path:
-    """The path of ``name`` in the folder ``root``, which is resolved.
-
-    Raises OutputError: it leads out of the folder, through a link too, or a command would take it for an option.
+    """The path of ``name`` in the folder ``root``, which is resolved. Raises OutputError: it leads out of the folder,
+    through a link too, or a command would take it for an option.
     """
     try:
         path = (root / name).resolve()

@@ -12,27 +12,15 @@ from en4dvar.data.noise.gaussian import Noise, Predicted
 from en4dvar.model.state import Array
 
 
-@dataclass(frozen=True)
-class Correlation:
-    """C (K, K), symmetric with a unit diagonal, positive definite. Raises :class:`ValueError` where it is not."""
+class AnyCorrelation:
+    """C (K, K) of errors, with a unit diagonal: its ``matrix``, and what a kind of them may know without forming it."""
 
     matrix: Array
 
-    def __post_init__(self) -> None:
-        c = self.matrix
-        if c.ndim != 2 or c.shape[0] != c.shape[1] or not np.all(np.isfinite(c)):
-            raise ValueError(f"the correlation of the observation errors must be a finite square matrix, not {c.shape}")
-        if not (np.array_equal(c, c.T) and np.allclose(np.diag(c), 1, rtol=0, atol=1e-12)):
-            raise ValueError("the correlation of the observation errors must be symmetric with a unit diagonal")
-        try:
-            _ = self.root
-        except np.linalg.LinAlgError:
-            raise ValueError("the covariance of the observation errors is not positive definite") from None
-
     def check_size(self, size: int) -> None:
         """Raise :class:`ValueError` unless it is that of so many errors."""
-        if self.matrix.shape != (size, size):
-            raise ValueError(f"correlation {self.matrix.shape} does not match {size} observations")
+        if (k := len(self.log_root)) != size:
+            raise ValueError(f"correlation {(k, k)} does not match {size} observations")
 
     @cached_property
     def root(self) -> Array:
@@ -85,7 +73,25 @@ class Correlation:
 
 
 @dataclass(frozen=True)
-class SharedErrors:
+class Correlation(AnyCorrelation):
+    """C (K, K) as a matrix. Raises :class:`ValueError` where it is no correlation, or not positive definite."""
+
+    matrix: Array
+
+    def __post_init__(self) -> None:
+        c = self.matrix
+        if c.ndim != 2 or c.shape[0] != c.shape[1] or not np.all(np.isfinite(c)):
+            raise ValueError(f"the correlation of the observation errors must be a finite square matrix, not {c.shape}")
+        if not (np.array_equal(c, c.T) and np.allclose(np.diag(c), 1, rtol=0, atol=1e-12)):
+            raise ValueError("the correlation of the observation errors must be symmetric with a unit diagonal")
+        try:
+            _ = self.root
+        except np.linalg.LinAlgError:
+            raise ValueError("the covariance of the observation errors is not positive definite") from None
+
+
+@dataclass(frozen=True)
+class SharedErrors(AnyCorrelation):
     """C = Δ + WWᵀ (K, K) of errors that share k independent parts: ``columns`` W (K, k), and Δ = 1 − Σ_c W_kc² of the
     part of each reading alone, so that C has a unit diagonal. No matrix (K, K) is formed unless errors of the times
     need it: time and memory are those of K k numbers.
@@ -111,14 +117,8 @@ class SharedErrors:
         total = np.sqrt(std**2 + np.sum(columns**2, axis=1))
         return total, cls(columns / total[:, None])
 
-    def check_size(self, size: int) -> None:
-        """Raise :class:`ValueError` unless it is that of so many errors."""
-        if len(self.columns) != size:
-            raise ValueError(f"shared errors {self.columns.shape} do not match {size} observations")
-
     @property
-    def matrix(self) -> Array:
-        """C (K, K)."""
+    def matrix(self) -> Array:  # type: ignore[override]
         matrix = self.columns @ self.columns.T
         np.fill_diagonal(matrix, 1.0)
         return np.asarray(0.5 * (matrix + matrix.T))
@@ -144,40 +144,30 @@ class SharedErrors:
 
     @property
     def precision_diagonal(self) -> Array:
-        """The diagonal of C⁻¹ (K,)."""
         return np.asarray((1 - np.sum((self._a @ self._filter[2]) * self._a, axis=1)) / self._own)
 
     @property
     def log_root(self) -> Array:
-        """ln L_kk (K,)."""
         return np.asarray(np.log(self._filter[1]) + 0.5 * np.log(self._own))
 
     def decorrelated(self, rows: Array) -> Array:
-        """L⁻¹ applied to rows (…, K)."""
         (h, d, _), z = self._filter, rows / np.sqrt(self._own)
         return np.asarray((z - _from_before(h, self._a, z)) / d)
 
     def correlated(self, rows: Array) -> Array:
-        """Independent numbers (…, K) made to have this correlation."""
         h, d, _ = self._filter
         return np.asarray((d * rows + _from_before(self._a, h, rows / d)) * np.sqrt(self._own))
 
     def solved(self, rows: Array) -> Array:
-        """C⁻¹ applied to rows (…, K)."""
         z = rows / np.sqrt(self._own)
         return np.asarray((z - z @ self._a @ self._filter[2] @ self._a.T) / np.sqrt(self._own))
 
-    def of_scale(self, score: Array, slopes: Array) -> tuple[Array, Array]:
-        """As of :class:`Correlation`."""
-        return Correlation(self.matrix).of_scale(score, slopes)
-
     def record(self) -> dict[str, tuple[Array, str]]:
-        """What a file holds of it: name → values and what they are."""
         return {SHARED: (self.columns, "what observation errors share, each column in total standard deviations")}
 
 
 @dataclass(frozen=True)
-class DecayingErrors:
+class DecayingErrors(AnyCorrelation):
     """C = exp(−|Δt|) at ``times`` (K,) in correlation times, increasing: an error, given those before it, depends on
     the last of them alone. So L⁻¹ has two diagonals, C⁻¹ three, and time and memory are those of K numbers.
 
@@ -191,14 +181,8 @@ class DecayingErrors:
             words = "the covariance of the observation errors is not positive definite"
             raise ValueError(f"{words}: readings are too close in time for their correlation time")
 
-    def check_size(self, size: int) -> None:
-        """Raise :class:`ValueError` unless it is that of so many errors."""
-        if len(self.times) != size:
-            raise ValueError(f"correlation of {len(self.times)} errors does not match {size} observations")
-
     @cached_property
-    def matrix(self) -> Array:
-        """C (K, K)."""
+    def matrix(self) -> Array:  # type: ignore[override]
         return np.asarray(np.exp(-np.abs(np.subtract.outer(self.times, self.times))))
 
     @cached_property
@@ -218,28 +202,23 @@ class DecayingErrors:
 
     @cached_property
     def precision_diagonal(self) -> Array:
-        """The diagonal of C⁻¹ (K,)."""
         return np.asarray(self._new**-2 + np.append(self._pull[1:] ** 2, 0.0))
 
     @property
     def log_root(self) -> Array:
-        """ln L_kk (K,)."""
         return np.asarray(np.log(self._new))
 
     def decorrelated(self, rows: Array) -> Array:
-        """L⁻¹ applied to rows (…, K)."""
         v = rows / self._new
         v[..., 1:] -= self._pull[1:] * rows[..., :-1]
         return np.asarray(v)
 
     def correlated(self, rows: Array) -> Array:
-        """Independent numbers (…, K) made to have this correlation."""
         diagonals = np.stack([1 / self._new, -np.append(self._pull[1:], 0.0)])
         columns = solve_banded((1, 0), diagonals, rows.reshape(-1, rows.shape[-1]).T)
         return np.asarray(columns.T.reshape(rows.shape))
 
     def solved(self, rows: Array) -> Array:
-        """C⁻¹ applied to rows (…, K)."""
         v = self.decorrelated(rows)
         u = v / self._new
         u[..., :-1] -= self._pull[1:] * v[..., 1:]
@@ -252,18 +231,15 @@ class DecayingErrors:
         return np.asarray(cholesky_banded(information, lower=True))
 
     def of_scale(self, score: Array, slopes: Array) -> tuple[Array, Array]:
-        """As of :class:`Correlation`."""
         transposed = self._scale_root[0, :, None] * slopes
         transposed[:-1] += self._scale_root[1, :-1, None] * slopes[1:]
         return np.asarray(solve_banded((1, 0), self._scale_root, score)), transposed
 
     def record(self) -> dict[str, tuple[Array, str]]:
-        """What a file holds of it: name → values and what they are."""
         return {DECAY: (self.times, "time in correlation times: errors are correlated by exp(−|Δ|)")}
 
 
 SHARED, DECAY = "shared_errors", "decay_time"  # in the record
-AnyCorrelation = Correlation | SharedErrors | DecayingErrors
 
 
 def recorded(record: Mapping[str, Array]) -> Array | AnyCorrelation | None:

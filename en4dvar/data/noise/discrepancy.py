@@ -147,7 +147,7 @@ class DiscrepancyNoise(Noise):
         return self.timed or self.kernel.grows
 
     @property
-    def grows_beyond(self) -> float:
+    def grows_beyond(self) -> float:  # type: ignore[override]
         return self.kernel.grows_beyond
 
     def attributes(self) -> dict[str, float]:
@@ -423,7 +423,6 @@ def in_rows(predicted: Predicted) -> Predicted:
 
 def whitened(residuals: Array, covariances: Array) -> tuple[Array, Array]:
     """L⁻¹r and the diagonal of L, each (B, K), for residuals (B, K) and covariances (B, K, K); NaN where there is no L.
-
     The Cholesky factor of a covariance that is bordered by the residual has L⁻¹r as its last row.
     """
     count, k = residuals.shape

@@ -111,6 +111,8 @@ class Noise:
     time_std: Array
 
     scale_information = 2.0  # of ln σ in one observation
+    independent = True  # errors are, so that each whitened row belongs to a single reading
+    grows_beyond = math.inf  # rate of the observable beyond which a discrepancy grows in proportion to it
     discrepant: ClassVar[bool] = False  # whether amplitude and length of a discrepancy belong to the parameters
 
     def check(self, weights: Array) -> None:
@@ -126,11 +128,6 @@ class Noise:
         """The kind of these errors in a summary, behind their std."""
         return ""
 
-    @property
-    def independent(self) -> bool:
-        """Errors are independent of each other, so that each whitened row belongs to a single reading."""
-        return True
-
     @cached_property
     def timed(self) -> bool:
         """True if any observation carries a timing error."""
@@ -140,11 +137,6 @@ class Noise:
     def needs_rates(self) -> bool:
         """True if R depends on the rate of the observable."""
         return self.timed
-
-    @property
-    def grows_beyond(self) -> float:
-        """Rate of the observable beyond which a discrepancy grows in proportion to it."""
-        return math.inf
 
     @property
     def quadratic(self) -> bool:
@@ -220,9 +212,8 @@ class Noise:
         return np.where(np.isfinite(total), total, np.inf)
 
     def log_likelihood(self, values: Array, predicted: Predicted) -> Array:
-        """Normalised log density of each observation (…, K) in its own unit, unweighted (β = 1).
-
-        With correlated errors it is that of an observation given those before it, so that the sum is the joint density.
+        """Normalised log density of each observation (…, K) in its own unit, unweighted (β = 1). With correlated errors
+        it is that of an observation given those before it, so that the sum is the joint density.
         """
         v = self.whitened_residual(values, predicted)
         density = -self._loss(v) - np.log(self.error_std(predicted)) - self._log_norm()

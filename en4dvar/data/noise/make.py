@@ -96,7 +96,7 @@ class BlockNoise(Noise):
         return "".join(dict.fromkeys(block.noise.words for block in self.blocks))
 
     @property
-    def independent(self) -> bool:
+    def independent(self) -> bool:  # type: ignore[override]
         return self.correlation is None
 
     @property

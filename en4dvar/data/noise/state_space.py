@@ -133,9 +133,8 @@ def _set_force(r: Array, s: Array, delta: Array, c: float, force: Array) -> bool
 
 @called
 def _step(r: Array, s: Array, c: float, at: Array, pull: Array, u: Array, delta: Array) -> float:
-    """How far from δ = ``at`` with A⁻¹δ = ``pull`` towards ``delta`` with A⁻¹δ = ``u`` J falls, at most 1.
-
-    Its slope is linear in pieces: secants, with the value at an end that stays halved (Illinois), end in its root.
+    """How far from δ = ``at`` with A⁻¹δ = ``pull`` towards ``delta`` with A⁻¹δ = ``u`` J falls, at most 1. Its slope is
+    linear in pieces: secants, with the value at an end that stays halved (Illinois), end in its root.
     """
     low, high = 0.0, 1.0
     rising = _slope(1.0, r, s, c, at, pull, u, delta)

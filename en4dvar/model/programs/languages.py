@@ -114,7 +114,6 @@ def _sign(text: str) -> str:
 @functools.lru_cache(maxsize=64)
 def parsed(instructions: str, source: str = "instructions") -> tuple[list[re.Match[str]], ...]:
     """The items of each line of an instruction file, ``source`` by name, with those of the lines that continue it.
-
     Raises :class:`ProgramError` at what is no instruction.
     """
     sign = re.escape(_sign(instructions))
@@ -219,9 +218,8 @@ class _Cursor:
         raise ProgramError(f"{self.where}: no {marker!r} below line {self.row + 1}")
 
     def moved(self, item: re.Match[str]) -> bool:
-        """Along the line, by ``w``, ``tn`` or a secondary marker, False where there is none.
-
-        Raises :class:`ProgramError`.
+        """Along the line, by ``w``, ``tn`` or a secondary marker, False where there is none. Raises
+        :class:`ProgramError`.
         """
         line = self.lines[self.row]
         if item["blank"]:

@@ -59,9 +59,8 @@ class RandomWalk:
     def of(
         cls, model: ForwardModel, first: PriorTerm, knots: Sequence[float], std: float, estimated: bool = False
     ) -> "RandomWalk":
-        """With changes N(0, std²) in the transformed space of ``first``. Raises :class:`ConfigError`.
-
-        ``estimated``: ``std`` is that of the half-normal prior of their standard deviation.
+        """With changes N(0, std²) in the transformed space of ``first``. Raises :class:`ConfigError`. ``estimated``:
+        ``std`` is that of the half-normal prior of their standard deviation.
         """
 
         def change(k: int, knot: float) -> PriorTerm:
@@ -108,9 +107,8 @@ class RandomWalk:
         return pieces
 
     def pieces(self, theta: Mapping[str, Array]) -> Array:
-        """Physical values (…, m + 1) of the pieces, from those of the parameter and of its changes, (…,) by name.
-
-        NaN where the parameter is outside of the range of its transform.
+        """Physical values (…, m + 1) of the pieces, from those of the parameter and of its changes, (…,) by name. NaN
+        where the parameter is outside of the range of its transform.
         """
         term, value = self.first, np.asarray(theta[self.name], dtype=float)
         low, high = term.range
@@ -245,7 +243,6 @@ class Walk:
 
     def run(self, begin: float, end: float, integrate: Callable[[npt.NDArray[np.intp], Array], Outcomes]) -> Array:
         """The states (N'', n_state) at ``end`` of the members that survive the piece from ``begin`` to there.
-
         ``integrate`` runs members (N',) to the instants (N', C + 1) that it is given; no further than to their last.
         """
         members, inside = self.alive, (self.times > begin) & (self.times <= end)

@@ -82,7 +82,6 @@ def ends(tables: Array) -> list[str]:
 
 def from_viscosity(viscosity: Function, n: int) -> Array:
     """Table (N, cells, 8) on :data:`VISCOUS_GRID` of μ̄(V) = ∫₀¹ μ(2√3 |V| s) ds, Pa s: what a spherical flow sees.
-
     viscosity: shear rate (K,) in 1/s → (N, K) in Pa s, or broadcastable to it.
     """
     mu = np.broadcast_to(viscosity(_SHEAR_RATE), (n, len(_SHEAR_RATE)))

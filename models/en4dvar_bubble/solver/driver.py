@@ -218,7 +218,6 @@ class Solver:
 
     def equations(self, memory: Array, viscous: Array, pulse: Array, halved: bool = False) -> Equations:
         """What the compiled equations read beside the members' parameters; tables of laws and pulses (…, cells, 8).
-
         ``halved``: the elastic tables have halved cells.
         """
         system, driving = self.system, self.driving

@@ -104,12 +104,12 @@ def _keep(typingctx, a, i, numbers):
 
 
 @_of_registers
-def _minus_product(tile, left, up):
+def _minus_product(columns, left, up):
+    """Of a tile, or of a part of a right-hand side, which is one column."""
     for k in range(EDGE):
-        for c in range(EDGE):
-            for r in range(EDGE):
-                tile[c * EDGE + r] -= left[k * EDGE + r] * up[c * EDGE + k]
-    return tile
+        for i in range(len(columns)):
+            columns[i] -= left[k * EDGE + i % EDGE] * up[i // EDGE * EDGE + k]
+    return columns
 
 
 @_of_registers
@@ -134,14 +134,6 @@ def _inverse(tile, _, __):
         for r in others:
             tile[k * EDGE + r] = -(tile[k * EDGE + r] * pivot)
     return tile
-
-
-@_of_registers
-def _minus_part(part, tile, x):
-    for k in range(EDGE):
-        for r in range(EDGE):
-            part[r] -= tile[k * EDGE + r] * x[k]
-    return part
 
 
 @_of_registers
@@ -187,7 +179,7 @@ def _rest(a, where, x, i, first, last):
     part = _part(x, i * EDGE)
     for j in range(first, last):
         if where[i, j] >= 0:
-            part = _minus_part(part, a, where[i, j] * AREA, x, j * EDGE)
+            part = _minus_product(part, a, where[i, j] * AREA, x, j * EDGE)
     return part
 
 

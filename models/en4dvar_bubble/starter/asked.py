@@ -80,9 +80,8 @@ class Asked:
         return f"{name} ({len(values)} values, {span})"
 
     def by_names(self) -> "Asked":
-        """With the columns whose names tell what they are; pixels and frames as units.
-
-        Raises :class:`UnitError`, and :class:`ConfigError` for options that contradict each other.
+        """With the columns whose names tell what they are; pixels and frames as units. Raises :class:`UnitError`, and
+        :class:`ConfigError` for options that contradict each other.
         """
         if self.tracked:
             return self
@@ -217,9 +216,8 @@ class Asked:
 
 
 def first_with_columns(files: Sequence[Path], layout: Layout) -> tuple[Path, Contents, Layout]:
-    """The first file with the columns of numbers that most of the first files hold, and with its decimal sign.
-
-    Raises :class:`DataError`: none holds any.
+    """The first file with the columns of numbers that most of the first files hold, and with its decimal sign. Raises
+    :class:`DataError`: none holds any.
     """
     points, commas = (replace(layout, decimal=sign) for sign in (".", ","))
     faults, alike = list[str](), dict[tuple[str, ...], list[tuple[Path, Contents, Layout]]]()

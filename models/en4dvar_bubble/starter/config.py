@@ -180,9 +180,8 @@ def _largest(readings: Mapping[str, Readings], name: str) -> float:
 
 
 def histories(files: Mapping[str, DataFile], source: Source) -> tuple[dict[str, Readings], list[str]]:
-    """Readings in s and m of each data set, and why others cannot be used.
-
-    Raises :class:`DataError`: none can be used. :class:`UnitError`: a unit that is not of its kind.
+    """Readings in s and m of each data set, and why others cannot be used. Raises :class:`DataError`: none can be used.
+    :class:`UnitError`: a unit that is not of its kind.
     """
     time, radius = _times(source), Column(*source.radius, "m", True)
 

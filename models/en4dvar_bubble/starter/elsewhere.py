@@ -85,7 +85,6 @@ _OF_ANY = (
 
 def known(medium: str, scale: Known = SCALE) -> Sequence[Known]:
     """What is known of an experiment in one of the :data:`CHOICES`, which a concentration may follow: ``agarose 1 %``.
-
     Raises :class:`ConfigError`: another medium, or a concentration (mass over that of the whole) not within 0 to 50 %.
     """
     name, _, text = medium.strip().partition(" ")

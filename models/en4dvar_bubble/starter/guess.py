@@ -59,7 +59,6 @@ class Guess:
 
 def first_guess(model: BubbleModel, fixed: Mapping[str, float], observed: Mapping[str, float]) -> Guess:
     """Guesses of those of G and μ that the law has. ``fixed``: SI values of every other parameter of the model.
-
     ``observed``: ``t_c`` (s) and, where known, ``R_max`` (m; acoustic) or ``rebound`` (laser); NaN is unknown.
     """
     names = [name for name in GRID if any(p.name == name for p in model.parameters)]

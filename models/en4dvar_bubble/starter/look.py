@@ -181,9 +181,8 @@ class Look:
 
 
 def look(times: Array, radius: Array, start: Start | None = None) -> Look:
-    """Look at a history ``times`` (K,) s, increasing, ``radius`` (K,) m; ``start`` where the user says it.
-
-    Raises :class:`DataError`: no maximum with a descent after it.
+    """Look at a history ``times`` (K,) s, increasing, ``radius`` (K,) m; ``start`` where the user says it. Raises
+    :class:`DataError`: no maximum with a descent after it.
     """
     _require_collapse(radius, start)
     scatter = scatter_of(times, radius)

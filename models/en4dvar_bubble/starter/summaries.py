@@ -69,9 +69,8 @@ def source_of(table: str) -> Source:
 
 
 def propose_from_times(rows: Summaries, law: str | None, medium: str) -> Proposal:
-    """A gel, with the constants of ``medium``, common to all bubbles, and each bubble's own radii.
-
-    Raises :class:`ConfigError`: unknown law.
+    """A gel, with the constants of ``medium``, common to all bubbles, and each bubble's own radii. Raises
+    :class:`ConfigError`: unknown law.
     """
     model, law_name = built("laser", law)
     told = f"{', '.join(rows.names)} are {len(rows.t_c)} rows of R_max, R_max/R_eq and collapse time in SI units"
