@@ -82,9 +82,18 @@ def with_moments(members: Array, mean: Array, root: Array) -> Array:
 
 
 def resampled(shares: Array, count: int, stream: np.random.Generator) -> Indices:
-    """(count,) indices, each as often as its share says (systematic resampling); shares add up to one."""
-    quantiles = (np.arange(count) + stream.uniform()) / count
-    return np.searchsorted(np.cumsum(shares), quantiles, side="right").clip(max=len(shares) - 1)
+    """(count,) indices, each as often as its share says; shares add up to one."""
+    return systematic(shares, count, stream.uniform())
+
+
+def systematic(shares: Array, count: int, start: float) -> Indices:
+    """The same by the comb (start + j)/count, 0 < start < 1 (Kitagawa 1996, J. Comput. Graph. Stat. 5, 1).
+
+    >>> systematic(np.array([0.5, 0.0, 0.25, 0.25]), 4, 0.5).tolist()
+    [0, 0, 2, 3]
+    """
+    comb = (np.arange(count) + start) / count
+    return np.searchsorted(np.cumsum(shares), comb, side="right").clip(max=len(shares) - 1)
 
 
 def shares_of(logs: Array) -> Array:
