@@ -21,7 +21,7 @@ import numpy as np
 
 from en4dvar.ensemble.linalg import apply_weights
 from en4dvar.schemes.base import Evaluation, Runs, Weights, gauss_newton
-from en4dvar.schemes.etkf import ETKF
+from en4dvar.schemes.filters import ETKF
 
 
 def best(task: Callable[[], object], repeats: int = 3) -> float:

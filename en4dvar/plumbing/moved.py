@@ -34,6 +34,7 @@ MOVED |= {f"en4dvar.{old}": f"en4dvar.{new}" for new, several in {
     "commands.results": "commands.joint commands.population commands.together", "commands.run": "commands.validate",
     "commands.plugins": "commands.forms commands.installation commands.listings commands.plugin_commands",
     "series.window": "series.moving", "runs.worklist": "runs.jobs",
+    "schemes.filters": "schemes.etkf schemes.denkf schemes.enkf schemes.esrf schemes.baselines",
     "data.noise.discrepancy": "data.noise.kernel",
     "data.noise.gaussian": "data.noise.predicted", "data.noise.losses": "data.noise.huber",
     "series.series": "series.aligned", "series.start": "series.coordinates", "config.context": "config.validate",

@@ -23,7 +23,7 @@ from scipy.special import ndtr
 from en4dvar.ensemble.linalg import centre, shares_of, systematic
 from en4dvar.model.state import Array, Indices
 from en4dvar.schemes.base import Draw, Evaluation, GaussNewtonStep, Step, Weights
-from en4dvar.schemes.etkf import ETKF
+from en4dvar.schemes.filters import ETKF
 
 
 @dataclass(frozen=True)

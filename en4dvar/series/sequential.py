@@ -13,7 +13,7 @@ those of one ensemble; its reason is kept.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import fields
+from dataclasses import replace
 from functools import partial
 from typing import TypeVar
 
@@ -30,7 +30,7 @@ from en4dvar.plumbing.errors import TooFewMembersError
 from en4dvar.priors.prior import member_stream
 from en4dvar.schemes.base import Weights
 from en4dvar.series.model_error import fresh_noise
-from en4dvar.series.moments import InnovationRecorder, Moments, MomentsRecorder, SequentialResult, SequentialState
+from en4dvar.series.moments import InnovationRecorder, Moments, MomentsRecorder, SequentialState
 from en4dvar.series.rotation import Rotations, rotate
 from en4dvar.series.series import CycleSeries as CycleSeries
 from en4dvar.series.settings import SequentialSettings as SequentialSettings
@@ -51,7 +51,7 @@ def run_sequential(
     resume: SequentialState | None = None,
     keep: Callable[[Callable[[], SequentialState]], None] | None = None,
     truth: Array | None = None,
-) -> SequentialResult:
+) -> SequentialState:
     """Assimilate ``series`` into ``members`` (N, n_state), the ensemble at time zero.
 
     The operators of ``observables`` act at each instant by itself; their outputs side by side are the p predictions.
@@ -109,7 +109,7 @@ class _Run:
         earlier: tuple[Moments | None, ...] = (None, None, None)
         self.done = 0
         if resume is not None:
-            self.ensemble, self.start, self.flow.runs = resume.ensemble, resume.start, resume.forward_runs
+            self.ensemble, self.start, self.flow.runs = resume.members, resume.start, resume.forward_runs
             self.failures, self.kept, self.done = list(resume.failures), list(resume.kept), resume.cycle
             self.iterations[: resume.cycle], self.effective[: resume.cycle] = resume.iterations, resume.effective
             self.trail, self.covariances = list(resume.trail), resume.covariances
@@ -128,11 +128,10 @@ class _Run:
             self.start, tuple(self.trail), self.covariances,
         )  # fmt: skip
 
-    def result(self) -> SequentialResult:
+    def result(self) -> SequentialState:
         if self.settings.smoother is not None:
             self.settings.smoother.ended(self.trail, len(self.iterations) - 1, self.put_smoothed)
-        state = self.state()
-        return SequentialResult(*(getattr(state, kept.name) for kept in fields(SequentialResult)))
+        return replace(self.state(), trail=(), covariances=())
 
     def cycle(self) -> None:
         """Assimilate the next observations and move the window to its next start."""

@@ -9,8 +9,7 @@ import pytest
 
 from en4dvar.ensemble.linalg import GRAM_LIMIT, Hessian, NearPrior, apply_weights, centre
 from en4dvar.schemes.base import Evaluation, gauss_newton
-from en4dvar.schemes.enkf import EnKF
-from en4dvar.schemes.etkf import ETKF
+from en4dvar.schemes.filters import ETKF, EnKF
 from en4dvar.schemes.inflation import Inflation, relaxation
 from en4dvar.schemes.localisation import BlockLocalisation, distances, gaspari_cohn
 from en4dvar.series.moments import BLOCK, MomentsRecorder

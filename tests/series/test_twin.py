@@ -15,7 +15,7 @@ from en4dvar.model.forward import ForwardModel, Observable, StateField
 from en4dvar.model.state import Field, Parameter, StateLayout
 from en4dvar.plumbing.errors import En4dvarError
 from en4dvar.priors.prior import Prior, PriorTerm
-from en4dvar.schemes.etkf import ETKF
+from en4dvar.schemes.filters import ETKF
 from en4dvar.schemes.ienks import IEnKS
 from en4dvar.schemes.inflation import Inflation
 from en4dvar.schemes.localisation import BlockLocalisation
