@@ -197,27 +197,19 @@ class Hessian:
         root = np.sqrt(1 + self.singular_values**2 / self.prior_precision)
         return LowRank(-self.rows.T * (1 / (self.prior_precision * root * (1 + root))), self.rows)
 
-    @property
-    def inverse_transform(self) -> Array:
-        """T⁻¹ (N, N)."""
-        # √(1+x) − 1 = x / (1 + √(1+x))
-        root = np.sqrt(1 + self.singular_values**2 / self.prior_precision)
-        return LowRank(self.rows.T * (1 / (self.prior_precision * (1 + root))), self.rows).dense
-
 
 @dataclass(frozen=True)
 class NearPrior:
     """The Hessian of an analysis that stays near its prior: roots by a polynomial, without a decomposition.
 
-    A by its ``transform`` T = √(N−1) A^{-1/2} (N, N) and M = SᵀS/(N−1) (N, N): A = (N−1)(I + M), T = (I + M)^{-1/2}.
-    Where the observations inform no direction more than the prior does, M ≤ 1, as in a filter that keeps up with its
-    observations, a Chebyshev series of (1 + x)^{-½} reaches rounding error with 12 to 24 terms, which are a handful of
-    matrix products (Paterson & Stockmeyer 1973, SIAM J. Comput. 2, 60): three times faster than the eigenvectors of a
-    matrix of 40 rows. A⁻¹ and T⁻¹ follow from T by a product.
+    A by its ``transform`` T = √(N−1) A^{-1/2} (N, N), which with M = SᵀS/(N−1) is (I + M)^{-1/2}. Where observations
+    inform no direction more than the prior does, M ≤ 1, as in a filter that keeps up with them, a Chebyshev series of
+    (1 + x)^{-½} reaches rounding error with 12 to 24 terms, which are a handful of matrix products (Paterson &
+    Stockmeyer 1973, SIAM J. Comput. 2, 60): three times faster than the eigenvectors of a matrix of 40 rows. A⁻¹
+    follows from T by a product.
     """
 
     transform: Array
-    information: Array
 
     @classmethod
     def of(cls, s: Array) -> "NearPrior | Hessian":
@@ -232,7 +224,7 @@ class NearPrior:
         if not bound <= LARGEST:
             return Hessian.of(s)
         upper = 2.0 ** (0.5 * max(-6, math.ceil(2 * math.log2(bound)))) if bound > 0 else 0.125
-        return cls(_inverse_root(information, square, upper), information)
+        return cls(_inverse_root(information, square, upper))
 
     @property
     def prior_precision(self) -> float:
@@ -242,11 +234,6 @@ class NearPrior:
     def solve(self, g: Array) -> Array:
         """A⁻¹ g for g (N,), or for every row of g (M, N)."""
         return np.asarray((self.transform @ (self.transform @ g.T)).T / self.prior_precision)
-
-    @property
-    def inverse_transform(self) -> Array:
-        """T⁻¹ (N, N)."""
-        return np.asarray(self.transform + self.transform @ self.information)
 
 
 @lru_cache(maxsize=16)

@@ -120,7 +120,6 @@ def test_both_decompositions_give_the_same_analysis(scale):
     assert hessian.solve(g) == pytest.approx(np.linalg.solve(a, g), rel=tolerance, abs=tolerance)
     t = hessian.transform
     assert t @ t == pytest.approx(9 * np.linalg.inv(a), abs=tolerance)
-    assert t @ hessian.inverse_transform == pytest.approx(np.eye(10), abs=1e-11 if scale > 100 else 1e-13)
     singular = np.linalg.svd(s, compute_uv=False)
     assert hessian.singular_values[:9] == pytest.approx(singular[:9], rel=1e-12)
     assert hessian.singular_values[9] < 1e-6 * scale * 10
@@ -150,7 +149,6 @@ def test_root_near_the_prior_is_that_of_the_decomposition(shape, bound):
     near, exact, g = NearPrior.of(s), Hessian.of(s), RNG(1).standard_normal((3, shape[1]))
     assert isinstance(near, NearPrior) == (bound < 1)
     assert near.transform == pytest.approx(exact.transform, abs=1e-14)
-    assert near.inverse_transform == pytest.approx(exact.inverse_transform, abs=1e-13 * max(1, bound))
     for rows in (g[0], g, RNG(2).standard_normal((shape[1], shape[1]))):
         assert near.solve(rows) == pytest.approx(exact.solve(rows), rel=1e-13, abs=1e-15)
     assert near.transform @ np.ones(shape[1]) == pytest.approx(np.ones(shape[1]), abs=1e-13)
