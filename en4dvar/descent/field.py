@@ -23,7 +23,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from en4dvar.descent.field_data import FieldData, Pass, mean_of, silent
+from en4dvar.descent.field_data import FieldData, Pass, mean_of
 from en4dvar.descent.loop import Descends, Objective, minimise
 from en4dvar.descent.step_control import Move, Search
 from en4dvar.ensemble.missing import fitted
@@ -60,7 +60,7 @@ class Passes(Objective["Passes"], Descends):
 
     def __init__(
         self, ensemble: Array, data: FieldData, gain: Gain, inflations: Array, seed: int, fewest: int | None = None,
-        first: Array | None = None, tell: Callable[[Pass], None] = silent,
+        first: Array | None = None, tell: Callable[[Pass], None] = lambda at: None,
     ):  # fmt: skip
         self.ensemble, self.data, self.gain, self.inflations, self.seed = ensemble, data, gain, inflations, seed
         self.fewest, self.first, self.tell = fewest, first, tell
@@ -143,7 +143,7 @@ def field_en4dvar(
     tolerance: float = 1e-3,
     cost_tolerance: float = 1e-3,
     seed: int = 0,
-    tell: Callable[[Pass], None] = silent,
+    tell: Callable[[Pass], None] = lambda at: None,
 ) -> FieldDescent:
     """Prior members (N, n) → posterior members, in place, by En4D-Var with localised covariances.
 

@@ -33,6 +33,7 @@ MOVED |= {f"en4dvar.{old}": f"en4dvar.{new}" for new, several in {
     "commands.synthetic": "commands.design commands.sweep_twin commands.simulate",
     "commands.results": "commands.joint commands.population commands.together", "commands.run": "commands.validate",
     "commands.plugins": "commands.forms commands.installation commands.listings commands.plugin_commands",
+    "series.sequential": "series.rotation", "series.settings": "schemes.inflation",
     "series.window": "series.moving", "runs.worklist": "runs.jobs",
     "schemes.filters": "schemes.etkf schemes.denkf schemes.enkf schemes.esrf schemes.baselines",
     "data.noise.discrepancy": "data.noise.kernel",

@@ -10,10 +10,10 @@ import pytest
 from en4dvar.ensemble.linalg import GRAM_LIMIT, Hessian, NearPrior, apply_weights, centre
 from en4dvar.schemes.base import Evaluation, gauss_newton
 from en4dvar.schemes.filters import ETKF, EnKF
-from en4dvar.schemes.inflation import Inflation, relaxation
 from en4dvar.schemes.localisation import BlockLocalisation, distances, gaspari_cohn
 from en4dvar.series.moments import BLOCK, MomentsRecorder
-from en4dvar.series.rotation import Rotations, reflections, rotate
+from en4dvar.series.sequential import Rotations, reflections, rotate
+from en4dvar.series.settings import Inflation, relaxation
 
 RNG = np.random.default_rng
 

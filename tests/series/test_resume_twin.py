@@ -22,11 +22,11 @@ from en4dvar.runs.interrupt import Interrupted
 from en4dvar.schemes.bootstrap_filter import BootstrapFilter
 from en4dvar.schemes.filters import ESRF, ETKF, EnKF, OptimalInterpolation
 from en4dvar.schemes.ienks import IEnKS
-from en4dvar.schemes.inflation import Inflation
 from en4dvar.series.model_error import ModelError
 from en4dvar.series.moments import Moments, SequentialState
 from en4dvar.series.sequential import SequentialSettings, run_sequential
 from en4dvar.series.series import CycleSeries
+from en4dvar.series.settings import Inflation
 from en4dvar.series.smoothers import EnKS, EnRTS
 
 YAML = """\
