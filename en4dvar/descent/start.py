@@ -115,8 +115,13 @@ def lengthened(space: WeightSpace, run: Forecast, tell: Callable[[Record], None]
 
 
 def descent_from(space: WeightSpace, member: int) -> Descent:
-    """One that starts from a member of the prior ensemble, or, of number N, from the mean."""
-    return Descent(space.start(space.at_member(member)), members=(member,))
+    """One that starts from a member of the prior ensemble, or, of number N, from the mean.
+
+    Its weights are the shortest of that member, so that J_b is ½‖x − x̄0‖² in the prior covariance.
+    """
+    count = len(space.members)
+    w = np.zeros(count) if member == count else np.asarray(space.basis @ space.basis[member])
+    return Descent(space.start(w), members=(member,))
 
 
 def descent_at(space: WeightSpace, x: Array, number: int) -> Descent:
