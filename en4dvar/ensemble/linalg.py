@@ -27,19 +27,12 @@ def centre(ensemble: Array) -> tuple[Array, Array]:
     return mean, ensemble - mean
 
 
-def apply_weights(ensemble: Array, rows: Array, out: Array | None = None, chunk: int = 4096) -> Array:
-    """Analysis ensemble 1 x̄ᵀ + rows · X (M, n) of members (N, n) with mean x̄ and anomalies X; ``rows`` (M, N).
-
-    Works through ``chunk`` state variables at a time, so that centring and adding the mean happen in cache and no
-    second array of the size of the ensemble is made besides the result. ``out`` may be ``ensemble`` itself (M = N).
-    """
-    if out is None:
-        out = np.empty((len(rows), ensemble.shape[1]))
-    for first in range(0, ensemble.shape[1], chunk):
-        part = slice(first, first + chunk)
-        mean, anomalies = centre(ensemble[:, part])
-        np.add(mean, rows @ anomalies, out=out[:, part])
-    return out
+def apply_weights(ensemble: Array, rows: Array) -> Array:
+    """Analysis ensemble 1 x̄ᵀ + rows · X (M, n) of members (N, n) with mean x̄ and anomalies X; ``rows`` (M, N)."""
+    mean, anomalies = centre(ensemble)
+    analysed = np.asarray(rows @ anomalies)
+    analysed += mean
+    return analysed
 
 
 def anomaly_basis(anomalies: Array) -> Array:
