@@ -28,14 +28,13 @@ from en4dvar.model.forward import Observable
 from en4dvar.priors.prior import member_stream
 from en4dvar.schemes.base import Draw, Evaluation, Scheme, Step, Weights
 from en4dvar.schemes.bootstrap_filter import BootstrapFilter
-from en4dvar.schemes.enkf import EnKF
 from en4dvar.schemes.enkf_n import EnKFN
-from en4dvar.schemes.etkf import ETKF
+from en4dvar.schemes.filters import ETKF, EnKF
 from en4dvar.schemes.ienks import IEnKS
-from en4dvar.schemes.inflation import Inflation
 from en4dvar.schemes.localisation import BlockLocalisation
 from en4dvar.series.model_error import ModelError
 from en4dvar.series.sequential import CycleSeries, SequentialSettings, run_sequential
+from en4dvar.series.settings import Inflation
 from en4dvar_lorenz import Lorenz63, Lorenz96
 from en4dvar_lorenz.lorenz63 import Lorenz63Settings
 from en4dvar_lorenz.lorenz96 import Lorenz96Settings

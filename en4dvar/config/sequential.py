@@ -16,10 +16,9 @@ from en4dvar.model.forward import ForwardModel
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.schemes import ON_A_SERIES
-from en4dvar.schemes.inflation import Inflation
 from en4dvar.schemes.localisation import BlockLocalisation
 from en4dvar.series.model_error import ModelError
-from en4dvar.series.settings import SequentialSettings
+from en4dvar.series.settings import Inflation, SequentialSettings
 from en4dvar.series.smoothers import EnKS, EnRTS
 from en4dvar.series.start import EnsembleCoordinates
 

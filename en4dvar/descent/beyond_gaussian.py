@@ -22,9 +22,9 @@ import numpy as np
 
 from en4dvar.data.noise import BoundNoise, Linearisation, Predicted, sides_of
 from en4dvar.descent.weight_space import WeightSpace
-from en4dvar.ensemble.forecast import of_framework
+from en4dvar.ensemble.forecast import with_errors
 from en4dvar.ensemble.linalg import effective_number, resampled, shares_of, with_moments
-from en4dvar.model.state import NOISE_SCALE, Array, Mask
+from en4dvar.model.state import Array, Mask
 from en4dvar.priors.prior import member_stream
 
 DRAWS, FREEDOM = 250, 5.0  # of Student's t, and as many of the prior, for each parameter of the errors
@@ -160,14 +160,8 @@ class _Linear:
         z = np.zeros((count, len(prior.names)))
         z[:, self.of_errors] = draws
         physical = prior.to_physical(prior.from_white(z))
-        return Predicted(
-            values,
-            None if self.at.rates is None else np.tile(self.at.rates, (count, 1)),
-            of_framework(problem, physical, NOISE_SCALE, 1.0) if problem.has_noise_scale else None,
-            np.stack([of_framework(problem, physical, p, 1.0) for p in problem.discrepancy], axis=1)
-            if problem.discrepancy
-            else None,
-        )
+        rates = None if self.at.rates is None else np.tile(self.at.rates, (count, 1))
+        return with_errors(problem, physical, values, rates)
 
 
 def beside_bounds(space: WeightSpace, linear: Linearisation, w: Array, cost: float) -> Drawn | None:

@@ -85,10 +85,6 @@ class Pass:
     dfs: float = math.nan
 
 
-def silent(_: Pass) -> None:
-    """Where nobody listens."""
-
-
 def mean_of(ensemble: Array, alive: Members) -> Array:
     """(n,) of some members of (N, n), a part at a time."""
     each = parts(ensemble.shape[1], len(ensemble))

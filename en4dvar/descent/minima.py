@@ -10,9 +10,11 @@ import numpy as np
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.descent.window import Descent
 from en4dvar.model.state import Array
+from en4dvar.plumbing.caution import Caution
 from en4dvar.priors.prior import Prior
 
 AGREE = 2  # descents from different members that must have ended in the lowest minimum
+UNSEEN = 0.115  # chance of ending lower that settles a search: two descents that agree and one elsewhere do, 1/9
 REACHED = 2.0  # posterior standard deviations between a minimum and a descent that ended in it
 SLOPE = 4.0  # as many, within which one that ended early on the slope of a minimum is told from another minimum
 
@@ -54,6 +56,37 @@ class Minimum:
     def log_evidence(self, prior: Prior) -> float:
         """Laplace's approximation of ln ∫ exp(−J_o) N(x; prior) dx over this minimum alone."""
         return float(-self.cost + 0.5 * np.linalg.slogdet(self.covariance)[1] - prior.log_det_root)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The lowest ``descent``, all minima, the lowest first, and the members that were ``tried``, from which descents
+    started (N: the prior mean; beyond it draws that are no members).
+
+    ``runs``: forward runs of a search of so many ``rounds``; ``warnings`` of the start.
+    """
+
+    descent: Descent
+    minima: tuple[Minimum, ...] = ()
+    tried: tuple[int, ...] = ()
+    runs: int = 0
+    rounds: int = 0
+    warnings: tuple[Caution, ...] = ()
+
+    @property
+    def agreed(self) -> bool:
+        """Whether descents from different members ended in the lowest minimum, and another would hardly end lower."""
+        return self.minima[0].descents >= AGREE and self.unseen <= UNSEEN
+
+    @property
+    def unseen(self) -> float:
+        """The chance that one more descent ends lower than the lowest minimum.
+
+        That of a new minimum is the share of descents that ended alone (Good 1953, Biometrika 40, 237), and of all
+        minima with the new one each is as likely the lowest.
+        """
+        ended = [minimum.descents for minimum in self.minima]
+        return ended.count(1) / (sum(ended) * (1 + len(ended)))
 
 
 def merged(minima: Sequence[Minimum]) -> tuple[Minimum, ...]:

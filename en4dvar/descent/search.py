@@ -11,13 +11,13 @@ where all readings together lead.
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 
 from en4dvar.descent.loop import minimise
-from en4dvar.descent.minima import AGREE, Minimum, merged
+from en4dvar.descent.minima import Minimum, Outcome, merged
 from en4dvar.descent.start import Rounds, choose_start, descent_at, descent_from, highest_plausible
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.descent.window import DataWindow, Descent
@@ -34,36 +34,6 @@ WIDER = 20  # times the ensemble: draws of the prior beyond it
 TOGETHER = 6  # descents from these in a round, at least: by 9 % they all miss a basin of a third of such draws
 ROUNDS = 3  # of descents from them, at most
 SURVEY = 24  # descents that a model takes that is said to be cheap: of 12, 1 in 8 missed a mode of 30 % of a posterior
-UNSEEN = 0.115  # chance of ending lower that settles a search: two descents that agree and one elsewhere do, 1/9
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """The lowest ``descent``, converged, all minima, the lowest first, the members that were ``tried``, from which
-    descents started (N: the prior mean; beyond it draws that are no members), and the forward ``runs`` of a search of
-    so many ``rounds``.
-    """
-
-    descent: Descent
-    minima: tuple[Minimum, ...]
-    tried: tuple[int, ...]
-    runs: int = 0
-    rounds: int = 0
-
-    @property
-    def agreed(self) -> bool:
-        """Whether descents from different members ended in the lowest minimum, and another would hardly end lower."""
-        return self.minima[0].descents >= AGREE and self.unseen <= UNSEEN
-
-    @property
-    def unseen(self) -> float:
-        """The chance that one more descent ends lower than the lowest minimum.
-
-        That of a new minimum is the share of descents that ended alone (Good 1953, Biometrika 40, 237), and of all
-        minima with the new one each is as likely the lowest.
-        """
-        ended = [minimum.descents for minimum in self.minima]
-        return ended.count(1) / (sum(ended) * (1 + len(ended)))
 
 
 class Search:

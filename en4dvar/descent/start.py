@@ -14,13 +14,13 @@ where windows only lead on; the whole window has R as it is.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from en4dvar.data.noise import noise_of, sides_of
 from en4dvar.descent.loop import minimise
-from en4dvar.descent.minima import AGREE, REACHED, Minimum, merged
+from en4dvar.descent.minima import AGREE, REACHED, Minimum, Outcome, merged
 from en4dvar.descent.step_control import Move, Search
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.descent.window import DataWindow, Descent
@@ -37,18 +37,10 @@ ROUGH = 1e-2  # relative decrease of J at which a descent stops that only has to
 SAME = 1.0  # posterior standard deviations between descents that have met
 
 
-@dataclass(frozen=True)
-class Start:
-    """The descent to go on with, the other minima that descents ended in, the members that were tried, and warnings."""
+def choose_start(space: WeightSpace, run: Forecast, tell: Callable[[Record], None] = lambda record: None) -> Outcome:
+    """The descent to go on with, and the other minima that descents ended in.
 
-    descent: Descent
-    minima: tuple[Minimum, ...] = ()
-    tried: tuple[int, ...] = ()
-    warnings: tuple[Caution, ...] = ()
-
-
-def choose_start(space: WeightSpace, run: Forecast, tell: Callable[[Record], None] = lambda record: None) -> Start:
-    """``run``: forecast of the prior members and, last, of their mean.
+    ``run``: forecast of the prior members and, last, of their mean.
 
     ``start: best-member`` compares descents from the ``starts`` members of lowest J, where a linearisation takes so
     few runs that all of them cost no more than one bundle of N members; else it takes the member of lowest J.
@@ -57,22 +49,22 @@ def choose_start(space: WeightSpace, run: Forecast, tell: Callable[[Record], Non
     scheme, beyond = space.minimiser, len(space.members) + 1  # the latter numbers what is no member
     if scheme.lengthen > 1:
         led = lengthened(space, run, tell)
-        return Start(Descent(space.start(led), members=(beyond,)), tried=(beyond,))
+        return Outcome(Descent(space.start(led), members=(beyond,)), tried=(beyond,))
     warnings: tuple[Caution, ...] = ()
     begin = scheme.start
     if not isinstance(begin, str):
-        return Start(descent_at(space, given(space.problem, begin), beyond), tried=(beyond,))
+        return Outcome(descent_at(space, given(space.problem, begin), beyond), tried=(beyond,))
     if begin == "prior-mean":
         if np.isfinite(space.problem.observations.cost(run.predicted)[-1]):
             mean = len(space.members)
-            return Start(descent_from(space, mean), tried=(mean,))
+            return Outcome(descent_from(space, mean), tried=(mean,))
         words = f"the prior mean cannot be run ({run.failures[-1]}); started from the best prior member"
         warnings = (caution("start-moved", words),)
     starts = space.affordable(run)
     together = min(scheme.starts, len(starts))
     first = descent_from(space, starts[0])
     if together < 2:
-        return Start(first, tried=(starts[0],), warnings=warnings)
+        return Outcome(first, tried=(starts[0],), warnings=warnings)
     window, rank = Rounds(space, tell, lowest=first), 0
     while rank < len(starts):
         window.begin_round([descent_from(space, i) for i in starts[rank : rank + together]])
@@ -81,7 +73,7 @@ def choose_start(space: WeightSpace, run: Forecast, tell: Callable[[Record], Non
         if window.end_round():
             break
     window.lowest.ended = False  # it goes on, as the first iterations of the assimilation
-    return Start(window.lowest, window.others(), tuple(starts[:rank]), warnings)
+    return Outcome(window.lowest, window.others(), tuple(starts[:rank]), warnings=warnings)
 
 
 def shortened(space: WeightSpace) -> Iterator[WeightSpace]:
@@ -123,8 +115,13 @@ def lengthened(space: WeightSpace, run: Forecast, tell: Callable[[Record], None]
 
 
 def descent_from(space: WeightSpace, member: int) -> Descent:
-    """One that starts from a member of the prior ensemble, or, of number N, from the mean."""
-    return Descent(space.start(space.at_member(member)), members=(member,))
+    """One that starts from a member of the prior ensemble, or, of number N, from the mean.
+
+    Its weights are the shortest of that member, so that J_b is ½‖x − x̄0‖² in the prior covariance.
+    """
+    count = len(space.members)
+    w = np.zeros(count) if member == count else np.asarray(space.basis @ space.basis[member])
+    return Descent(space.start(w), members=(member,))
 
 
 def descent_at(space: WeightSpace, x: Array, number: int) -> Descent:

@@ -52,16 +52,6 @@ class WeightSpace:
         n_members, n = self.members.shape
         return int(max(math.ceil(self.settings.min_active_fraction * n_members), min(n + 1, n_members)))
 
-    def at_member(self, i: int) -> Array:
-        """Weights (N,) of member i; those of the mean follow the last.
-
-        e_i is moved to the minimum-norm weights of the same member, so that J_b is ½‖x − x̄0‖² in the prior covariance.
-        """
-        n_members = len(self.members)
-        if i == n_members:
-            return np.zeros(n_members)
-        return np.asarray(self.basis @ self.basis[i])
-
     def member_costs(self, run: Forecast) -> Array:
         """J (N + 1,) of the members and their mean, whose ``run`` is there."""
         weights = np.vstack([self.basis, np.zeros(self.basis.shape[1])])

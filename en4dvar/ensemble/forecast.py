@@ -149,7 +149,6 @@ class Composite:
         self._initial_states = InitialStates(problem)
         self._operators = _operators(problem)
         self._batched = batched(problem)
-        self._scaled, self._discrepancy = problem.has_noise_scale, problem.discrepancy
         self._spread = spread_rates(problem)
 
     def __call__(self, x: Array, extra_times: Array = NO_TIMES) -> Forecast:
@@ -180,14 +179,8 @@ class Composite:
         for i, reason in zip(np.arange(len(x))[alive], reasons, strict=True):
             failures[i] = reason
         observed = as_read(problem, physical, observed)
-        predicted = Predicted(
-            observed[0][:, at_observations],
-            self._rates(observed, at_observations, at_nodes) if len(observed) > 1 else None,
-            of_framework(problem, physical, NOISE_SCALE, 1.0) if self._scaled else None,
-            np.stack([of_framework(problem, physical, p, np.nan) for p in self._discrepancy], axis=1)
-            if self._discrepancy
-            else None,
-        )
+        rates = self._rates(observed, at_observations, at_nodes) if len(observed) > 1 else None
+        predicted = with_errors(problem, physical, observed[0][:, at_observations], rates)
         extremes, beyond = limits[..., 0], limits[..., 1] - shift[:, None]
         return Forecast(predicted, observed[0][:, at_extra], tuple(failures), extremes, beyond)
 
@@ -321,6 +314,13 @@ def of_framework(problem: InverseProblem, physical: Array, parameter: Parameter,
     if parameter.name in problem.prior.names:
         return np.asarray(physical[:, problem.prior.names.index(parameter.name)])
     return np.full(len(physical), problem.fixed.get(parameter.name, default))
+
+
+def with_errors(problem: InverseProblem, physical: Array, values: Array, rates: Array | None) -> Predicted:
+    """Predictions ``values`` (B, K), beside the parameters of their errors in physical control vectors (B, n)."""
+    scale = of_framework(problem, physical, NOISE_SCALE, 1.0) if problem.has_noise_scale else None
+    discrepancy = [of_framework(problem, physical, p, np.nan) for p in problem.discrepancy]
+    return Predicted(values, rates, scale, np.stack(discrepancy, axis=1) if discrepancy else None)
 
 
 def _union(times: Array, extra: Array) -> tuple[Array, Indices, Indices]:

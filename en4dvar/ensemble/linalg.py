@@ -27,19 +27,12 @@ def centre(ensemble: Array) -> tuple[Array, Array]:
     return mean, ensemble - mean
 
 
-def apply_weights(ensemble: Array, rows: Array, out: Array | None = None, chunk: int = 4096) -> Array:
-    """Analysis ensemble 1 x̄ᵀ + rows · X (M, n) of members (N, n) with mean x̄ and anomalies X; ``rows`` (M, N).
-
-    Works through ``chunk`` state variables at a time, so that centring and adding the mean happen in cache and no
-    second array of the size of the ensemble is made besides the result. ``out`` may be ``ensemble`` itself (M = N).
-    """
-    if out is None:
-        out = np.empty((len(rows), ensemble.shape[1]))
-    for first in range(0, ensemble.shape[1], chunk):
-        part = slice(first, first + chunk)
-        mean, anomalies = centre(ensemble[:, part])
-        np.add(mean, rows @ anomalies, out=out[:, part])
-    return out
+def apply_weights(ensemble: Array, rows: Array) -> Array:
+    """Analysis ensemble 1 x̄ᵀ + rows · X (M, n) of members (N, n) with mean x̄ and anomalies X; ``rows`` (M, N)."""
+    mean, anomalies = centre(ensemble)
+    analysed = np.asarray(rows @ anomalies)
+    analysed += mean
+    return analysed
 
 
 def anomaly_basis(anomalies: Array) -> Array:
@@ -82,9 +75,18 @@ def with_moments(members: Array, mean: Array, root: Array) -> Array:
 
 
 def resampled(shares: Array, count: int, stream: np.random.Generator) -> Indices:
-    """(count,) indices, each as often as its share says (systematic resampling); shares add up to one."""
-    quantiles = (np.arange(count) + stream.uniform()) / count
-    return np.searchsorted(np.cumsum(shares), quantiles, side="right").clip(max=len(shares) - 1)
+    """(count,) indices, each as often as its share says; shares add up to one."""
+    return systematic(shares, count, stream.uniform())
+
+
+def systematic(shares: Array, count: int, start: float) -> Indices:
+    """The same by the comb (start + j)/count, 0 < start < 1 (Kitagawa 1996, J. Comput. Graph. Stat. 5, 1).
+
+    >>> systematic(np.array([0.5, 0.0, 0.25, 0.25]), 4, 0.5).tolist()
+    [0, 0, 2, 3]
+    """
+    comb = (np.arange(count) + start) / count
+    return np.searchsorted(np.cumsum(shares), comb, side="right").clip(max=len(shares) - 1)
 
 
 def shares_of(logs: Array) -> Array:
@@ -188,27 +190,19 @@ class Hessian:
         root = np.sqrt(1 + self.singular_values**2 / self.prior_precision)
         return LowRank(-self.rows.T * (1 / (self.prior_precision * root * (1 + root))), self.rows)
 
-    @property
-    def inverse_transform(self) -> Array:
-        """T⁻¹ (N, N)."""
-        # √(1+x) − 1 = x / (1 + √(1+x))
-        root = np.sqrt(1 + self.singular_values**2 / self.prior_precision)
-        return LowRank(self.rows.T * (1 / (self.prior_precision * (1 + root))), self.rows).dense
-
 
 @dataclass(frozen=True)
 class NearPrior:
     """The Hessian of an analysis that stays near its prior: roots by a polynomial, without a decomposition.
 
-    A by its ``transform`` T = √(N−1) A^{-1/2} (N, N) and M = SᵀS/(N−1) (N, N): A = (N−1)(I + M), T = (I + M)^{-1/2}.
-    Where the observations inform no direction more than the prior does, M ≤ 1, as in a filter that keeps up with its
-    observations, a Chebyshev series of (1 + x)^{-½} reaches rounding error with 12 to 24 terms, which are a handful of
-    matrix products (Paterson & Stockmeyer 1973, SIAM J. Comput. 2, 60): three times faster than the eigenvectors of a
-    matrix of 40 rows. A⁻¹ and T⁻¹ follow from T by a product.
+    A by its ``transform`` T = √(N−1) A^{-1/2} (N, N), which with M = SᵀS/(N−1) is (I + M)^{-1/2}. Where observations
+    inform no direction more than the prior does, M ≤ 1, as in a filter that keeps up with them, a Chebyshev series of
+    (1 + x)^{-½} reaches rounding error with 12 to 24 terms, which are a handful of matrix products (Paterson &
+    Stockmeyer 1973, SIAM J. Comput. 2, 60): three times faster than the eigenvectors of a matrix of 40 rows. A⁻¹
+    follows from T by a product.
     """
 
     transform: Array
-    information: Array
 
     @classmethod
     def of(cls, s: Array) -> "NearPrior | Hessian":
@@ -223,7 +217,7 @@ class NearPrior:
         if not bound <= LARGEST:
             return Hessian.of(s)
         upper = 2.0 ** (0.5 * max(-6, math.ceil(2 * math.log2(bound)))) if bound > 0 else 0.125
-        return cls(_inverse_root(information, square, upper), information)
+        return cls(_inverse_root(information, square, upper))
 
     @property
     def prior_precision(self) -> float:
@@ -233,11 +227,6 @@ class NearPrior:
     def solve(self, g: Array) -> Array:
         """A⁻¹ g for g (N,), or for every row of g (M, N)."""
         return np.asarray((self.transform @ (self.transform @ g.T)).T / self.prior_precision)
-
-    @property
-    def inverse_transform(self) -> Array:
-        """T⁻¹ (N, N)."""
-        return np.asarray(self.transform + self.transform @ self.information)
 
 
 @lru_cache(maxsize=16)

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from en4dvar.data.noise import DiscrepancyNoise, Linearisation, Predicted
-from en4dvar.descent.minima import Minimum
-from en4dvar.descent.search import Outcome
+from en4dvar.descent.minima import Minimum, Outcome
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.diagnosis import diagnostics as diag
 from en4dvar.diagnosis.analysis import BEYOND_5, Analysis, Descents, FieldEstimate, Mode

@@ -2,16 +2,16 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
 from en4dvar.descent.beyond_gaussian import Drawn, beside_bounds, over_errors
 from en4dvar.descent.loop import minimise
-from en4dvar.descent.minima import Minimum, merged
-from en4dvar.descent.search import Outcome, Search
-from en4dvar.descent.start import Start, choose_start
+from en4dvar.descent.minima import Minimum, Outcome, merged
+from en4dvar.descent.search import Search
+from en4dvar.descent.start import choose_start
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.descent.window import DataWindow, Descent
 from en4dvar.diagnosis import diagnostics as diag
@@ -97,7 +97,7 @@ class Stages:
         self.grid = plotting_times(problem)
         self._foreseen: tuple[Array, Withheld | None] | None = None
 
-    def descend(self) -> tuple[Forecast, Start]:
+    def descend(self) -> tuple[Forecast, Outcome]:
         """The prior forecast, and where the iterations started; its descent has ended."""
         space = self.space
         prior_run = space.whole(np.vstack([space.members, space.mean]), self.grid)
@@ -107,7 +107,7 @@ class Stages:
             check_forecast_repeats(self.problem, prior_run[:-1], lambda some: again(space.members[some]))
         space.check_derivatives(prior_run)
         if self.minimiser is None:
-            start = Start(Descent(Weights.prior(len(space.members))))
+            start = Outcome(Descent(Weights.prior(len(space.members))))
         else:
             start = choose_start(space, prior_run, self.tell)
         for record in start.descent.records:
@@ -115,7 +115,7 @@ class Stages:
         minimise(DataWindow(space, self.tell, prior_run, self.grid), [start.descent])
         return prior_run, start
 
-    def searched(self, start: Start, prior_run: Forecast) -> tuple[Outcome, Ends]:
+    def searched(self, start: Outcome, prior_run: Forecast) -> tuple[Outcome, Ends]:
         """All minima, the lowest descent, and the ensemble about it.
 
         After the first descents one from a member far from the minimum looks for another. Of a cheap model, or for a
@@ -126,8 +126,8 @@ class Stages:
         """
         space, scheme, descent = self.space, self.minimiser, start.descent
         if scheme is None:
-            return Outcome(descent, (), ()), self.gaussian(descent)
-        outcome = Outcome(descent, merged([Minimum.of(space, descent), *start.minima]), start.tried)
+            return start, self.gaussian(descent)
+        outcome = replace(start, minima=merged([Minimum.of(space, descent), *start.minima]))
         if not scheme.searches or not scheme.economical(space.basis):
             return outcome, self.gaussian(descent)
         search = Search(space, prior_run, self.tell)

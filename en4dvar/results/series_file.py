@@ -11,7 +11,7 @@ from en4dvar.model.state import Array
 from en4dvar.plumbing.tables import csv_text
 from en4dvar.results.declared import Attribute, Declared, Item, Table, UnitRule, When, attributes_of, lay_out, text
 from en4dvar.results.netcdf import Group, netcdf_attributes
-from en4dvar.series.moments import SequentialResult
+from en4dvar.series.moments import SequentialState
 from en4dvar.series.problem import SeriesProblem, SeriesResult, normalised_innovations
 from en4dvar.series.twin import TwinResult
 
@@ -142,7 +142,7 @@ def _positive(problem: SeriesProblem) -> Any:
     return flags
 
 
-def _members(run: SequentialResult, n_members: int) -> Array:
+def _members(run: SequentialState, n_members: int) -> Array:
     """(T, N, n), those that were lost NaN at the end."""
     rows = np.full((len(run.kept), n_members, run.analysis.mean.shape[1]), np.nan)
     for row, (_, members) in zip(rows, run.kept, strict=True):

@@ -2,18 +2,15 @@ r"""A posterior as weighted draws, by adaptive importance sampling with forward 
 
     p(y) = ∫ L(x) N(x; prior) dx ≈ (1/TM) Σ_i L(x_i) N(x_i) / q(x_i),     q = (1/T) Σ_t q_t
 
-The draws of the first round come from a proposal given from outside. Those of a later round come from a mixture of
-Student t fitted to all before, whose weights are tempered as long as few of them count, so that the proposals close in
-on the posterior from outside. q is the mixture of all rounds (Cornuet, Marin, Mira & Robert 2012, Scand. J. Stat. 39,
-798). Coordinates z are those in which the prior is N(0, 1).
+The draws of the first round come from a proposal given from outside, those of a later round from one that is fitted to
+all before, and q is the mixture of all rounds (Cornuet, Marin, Mira & Robert 2012, Scand. J. Stat. 39, 798).
+Coordinates z are those in which the prior is N(0, 1).
 
 Such a mixture is dense where the draws lie that it was fitted to, which makes the weights of these too small; and where
 none of them lies nothing tells that something is missing. :class:`ClosingDraws` therefore fits its proposals to a power
 of the posterior, with covariances that few draws do not make flat; what judges the posterior are :class:`FixedDraws` of
 the last proposal alone, made afresh: their mean weight is unbiased.
 """
-
-from dataclasses import replace
 
 import numpy as np
 
@@ -22,37 +19,33 @@ from en4dvar.model.state import Array
 from en4dvar.sampling.emulated_draws import EmulatedProposal
 from en4dvar.sampling.mixture import StudentMixture
 
-FEWEST = 60.0  # effective draws that a proposal is fitted to: with fewer, to tempered weights
-COMPONENTS = 4
-SETTLED, PARTS = 150.0, 8  # the same of proposals to a power of the posterior,
-MOST_FITTED = 1000  # and points that these are fitted to
+SETTLED, PARTS = 150.0, 8  # effective draws that a proposal is fitted to, with fewer to tempered weights; components
+MOST_FITTED = 1000  # points that it is fitted to
 EACH = 4  # effective draws for each coordinate of a component: fitted to fewer it is flat in some direction
 MOST = 3.0  # times √D mean weights of D draws: more than that none counts (Ionides 2008)
 Proposal = StudentMixture | EmulatedProposal
 
 
-def flattened(logs: Array, wanted: float, least: float = 0.0) -> tuple[Array, float]:
-    """Shares (D,) by that power of weights, of these logarithms, which leaves so many effective as are ``wanted``, or
-    at the lowest power ``least``; and how many these are.
+def flattened(logs: Array, wanted: float) -> tuple[Array, float]:
+    """Shares (D,) by that power of weights, of these logarithms, which leaves so many effective as are ``wanted``; and
+    how many these are.
     """
     power, shares = 1.0, shares_of(logs)
-    while (effective := effective_number(shares)) < least or (effective < wanted and power > 1e-4):
+    while (effective := effective_number(shares)) < wanted and power > 1e-4:
         power *= 0.8
         shares = shares_of(power * logs)
     return shares, effective
 
 
 class Importance:
-    """The draws and proposals of one data set, ``count`` in a round, the first of them from ``first``.
-
-    Proposals are ``wider`` by that factor than what they are fitted to, so that thin tails are found as well.
+    """The draws of one data set from its proposals, ``count`` in a round, the first of them from ``first``.
 
     ``z`` (D, n) are all draws, ``log_weights`` (D,) their weights, ``log`` is ln ∫ L N dz and ``effective`` the number
     of draws behind it.
     """
 
-    def __init__(self, first: Proposal, stream: np.random.Generator, count: int, wider: float = 1.0):
-        self.stream, self.count, self.wider = stream, count, wider
+    def __init__(self, first: Proposal, stream: np.random.Generator, count: int):
+        self.stream, self.count = stream, count
         self.proposals: list[Proposal] = [first]
         self.z, self.target, self.mixture = np.empty((0, 0)), np.empty(0), np.empty(0)  # mixture: ln Σ_t q_t
         self.log_weights, self.log, self.effective = np.empty(0), -np.inf, 0.0
@@ -69,14 +62,13 @@ class Importance:
 
     def draw(self) -> Array:
         """(M, n) draws of the next round."""
-        if len(self.z):
-            self.proposals.append(self.next_proposal())
         return self.proposals[-1].draw(self.count, self.stream)
 
     def add(self, z: Array, log_likelihood: Array) -> None:
         """Draws (M, n) and what came of them (M,); weights and evidence of all draws follow."""
         target = log_likelihood - 0.5 * np.sum(z**2, axis=1) - 0.5 * z.shape[1] * np.log(2 * np.pi)
-        self.mixture = self._mixed(z)
+        own = np.logaddexp.reduce([q.log_density(z) for q in self.proposals], axis=0)
+        self.mixture = np.concatenate([self.mixture, own])
         self.z = np.concatenate([self.z, z]) if len(self.z) else z
         self.target = np.concatenate([self.target, target])
         self.log_weights = self.target - self.mixture + np.log(len(self.proposals))
@@ -84,31 +76,21 @@ class Importance:
             self.log = float(np.logaddexp.reduce(self.log_weights) - np.log(len(self.z)))
             self.effective = effective_number(self.shares)
 
-    def _mixed(self, z: Array) -> Array:
-        """ln Σ_t q_t of the draws so far, and of ``z``."""
-        before = self.mixture
-        if len(self.z):
-            before = np.logaddexp(before, self.proposals[-1].log_density(self.z))
-        return np.concatenate([before, np.logaddexp.reduce([q.log_density(z) for q in self.proposals], axis=0)])
-
-    def next_proposal(self) -> Proposal:
-        """Fitted to the draws so far; the first one while hardly any of them has a weight."""
-        if np.isfinite(self.log_weights).sum() <= 2 * (self.z.shape[1] + 1):
-            return self.proposals[0]
-        singular = 2.0 * (self.z.shape[1] + 1)  # draws behind a covariance, however little power is left to the weights
-        where = resampled(flattened(self.log_weights, FEWEST, singular)[0], self.count, self.stream)
-        fitted = StudentMixture.fitted(self.z[where], self.stream, COMPONENTS)
-        return replace(fitted, root=self.wider * fitted.root)
-
 
 class ClosingDraws(Importance):
-    """Proposals are fitted to the posterior to the power of ``wider``⁻², which of a Gaussian is wider by that factor,
-    and of another shape most where that has tails.
+    """A proposal each round, fitted to the posterior to the power of ``wider``⁻², which of a Gaussian is wider by that
+    factor, and of another shape most where that has tails, so that thin tails are found as well.
     """
 
     def __init__(self, first: StudentMixture, stream: np.random.Generator, count: int, wider: float):
-        super().__init__(first, stream, count, wider)
-        self.first = first
+        super().__init__(first, stream, count)
+        self.first, self.wider = first, wider
+
+    def draw(self) -> Array:
+        if len(self.z):
+            self.proposals.append(self.next_proposal())
+            self.mixture = np.logaddexp(self.mixture, self.proposals[-1].log_density(self.z))
+        return super().draw()
 
     @property
     def tempered(self) -> Array:
@@ -137,14 +119,8 @@ class FixedDraws(Importance):
     Source: Ionides (2008), J. Comput. Graph. Stat. 17, 295.
     """
 
-    def draw(self) -> Array:
-        return self.proposals[0].draw(self.count, self.stream)
-
     def add(self, z: Array, log_likelihood: Array) -> None:
         super().add(z, log_likelihood)
         if np.isfinite(self.log):
             self.log_weights = np.minimum(self.log_weights, self.log + np.log(MOST * np.sqrt(len(self.z))))
             self.effective = effective_number(self.shares)
-
-    def _mixed(self, z: Array) -> Array:
-        return np.concatenate([self.mixture, self.proposals[0].log_density(z)])

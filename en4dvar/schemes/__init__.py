@@ -1,4 +1,4 @@
-"""Assimilation schemes, one a file: what is computed, and the keys read. A new one is a file and a line below.
+"""Assimilation schemes: what is computed, and the keys read. A new one is a class and a line below.
 
 Another package brings schemes of its own by entry points of the group ``en4dvar.schemes``: a name for ``scheme:`` and a
 subclass of :class:`Scheme`. One that cannot be loaded is left out with a warning; a name of ours is not replaced. They
@@ -12,15 +12,11 @@ from typing import Any
 
 from en4dvar.plumbing.installed import installed
 from en4dvar.schemes.base import Minimiser, Scheme
-from en4dvar.schemes.baselines import Climatology, OptimalInterpolation
 from en4dvar.schemes.bootstrap_filter import BootstrapFilter
-from en4dvar.schemes.denkf import DEnKF
 from en4dvar.schemes.en4dvar import En4DVar
-from en4dvar.schemes.enkf import EnKF
 from en4dvar.schemes.enkf_n import EnKFN
 from en4dvar.schemes.esmda import ESMDA
-from en4dvar.schemes.esrf import ESRF
-from en4dvar.schemes.etkf import ETKF
+from en4dvar.schemes.filters import ESRF, ETKF, Climatology, DEnKF, EnKF, OptimalInterpolation
 from en4dvar.schemes.ienks import IEnKS
 
 DEFAULT = "en4dvar"

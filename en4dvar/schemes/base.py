@@ -37,14 +37,12 @@ class Weights:
 
     w: Array
     T: Array
-    inverse: Array | None = None  # T⁻¹, where it was at hand
     wider: float = 1.0
 
     @classmethod
     def prior(cls, n_members: int) -> "Weights":
         """w = 0, T = I."""
-        identity = np.eye(n_members)
-        return cls(np.zeros(n_members), identity, identity)
+        return cls(np.zeros(n_members), np.eye(n_members))
 
     @property
     def rows(self) -> Array:
@@ -167,7 +165,8 @@ class Scheme:
     ``climatological``: the covariances of its analysis, where that is not localised, are averages over the forecasts of
     a series so far. ``approximate``: what it does, in words, that makes its ensemble another than the posterior even
     where model and errors are linear and Gaussian. ``localised_keys``: the fields that it reads where its gain is
-    localised; None: it cannot be.
+    localised; None: it cannot be. ``lag``: cycles of a series that the window is long, 0 of a filter, and ``shift``: by
+    which it moves on.
     """
 
     words: ClassVar[str] = ""
@@ -179,6 +178,7 @@ class Scheme:
     climatological: ClassVar[bool] = False
     approximate: ClassVar[str] = ""
     localised_keys: ClassVar[frozenset[str] | None] = None
+    lag, shift = 0, 1
 
     @property
     def minimiser(self) -> "Minimiser | None":
@@ -197,16 +197,6 @@ class Scheme:
     def inflations(self) -> Array:
         """By what R is multiplied in each pass."""
         return np.ones(self.passes)
-
-    @property
-    def lag(self) -> int:
-        """Cycles of a series that the window is long; 0 is a filter."""
-        return 0
-
-    @property
-    def shift(self) -> int:
-        """Cycles of a series by which the window moves on."""
-        return 1
 
     @property
     def mda_weights(self) -> tuple[float, ...]:

@@ -8,9 +8,8 @@ model is deterministic, so that each is moved, the more of them are copies: by h
 N_e = 1/Σ ω_i², towards the mean, by √(1 − h²), and by a draw from the kernel N(0, h² P), P the covariance of the
 weighted members, without the mean of the draws. Mean and covariance stay; many weak readings do not merge two modes.
 
-Sources: Gordon, Salmond & Smith (1993), IEE Proc. F 140, 107; systematic: Kitagawa (1996), J. Comput. Graph. Stat. 5,
-1; jitter: Musso, Oudjane & Le Gland (2001) and, with the shrinkage, Liu & West (2001), in Doucet et al., Sequential
-Monte Carlo Methods in Practice, ch. 12 and 10.
+Sources: Gordon, Salmond & Smith (1993), IEE Proc. F 140, 107; jitter: Musso, Oudjane & Le Gland (2001) and, with the
+shrinkage, Liu & West (2001), in Doucet et al., Sequential Monte Carlo Methods in Practice, ch. 12 and 10.
 """
 
 import math
@@ -21,10 +20,10 @@ import numpy as np
 from annotated_types import Ge, Le
 from scipy.special import ndtr
 
-from en4dvar.ensemble.linalg import centre, shares_of
+from en4dvar.ensemble.linalg import centre, shares_of, systematic
 from en4dvar.model.state import Array, Indices
 from en4dvar.schemes.base import Draw, Evaluation, GaussNewtonStep, Step, Weights
-from en4dvar.schemes.etkf import ETKF
+from en4dvar.schemes.filters import ETKF
 
 
 @dataclass(frozen=True)
@@ -45,7 +44,7 @@ class BootstrapFilter(ETKF):
         n = len(weights.w)
         shares = likelihood_shares(evaluation)
         start = float(ndtr(draw("resampling", 1)[0, 0]))
-        index = systematic(shares, start)
+        index = systematic(shares, n, start)
         w = np.bincount(index, minlength=n) / n
         effective = 1 / float(shares @ shares)
         jitter = self.jitter * math.sqrt(max(1 - effective / n, 0.0))  # as much as members have become copies
@@ -83,14 +82,3 @@ class Resampled:
 def likelihood_shares(evaluation: Evaluation) -> Array:
     """Likelihoods (N,) of the members, of sum 1, relative to the largest, so that one is left however far all are."""
     return shares_of(-0.5 * np.sum((evaluation.d[:, None] - evaluation.S) ** 2, axis=0))
-
-
-def systematic(shares: Array, start: float) -> Indices:
-    """Indices (N,) of the members resampled: the comb (start + j)/N, 0 < start < 1, in the cumulated shares (N,).
-
-    >>> systematic(np.array([0.5, 0.0, 0.25, 0.25]), 0.5).tolist()
-    [0, 0, 2, 3]
-    """
-    comb = (start + np.arange(len(shares))) / len(shares)
-    ends = np.cumsum(shares)
-    return np.searchsorted(ends / ends[-1], comb)

@@ -33,7 +33,7 @@ import numpy as np
 from en4dvar.ensemble.linalg import Hessian
 from en4dvar.model.state import Array
 from en4dvar.schemes.base import Draw, Evaluation, GaussNewtonStep, Step, Weights
-from en4dvar.schemes.etkf import ETKF
+from en4dvar.schemes.filters import ETKF
 
 
 @dataclass(frozen=True)

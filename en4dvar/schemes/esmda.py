@@ -22,8 +22,7 @@ from annotated_types import Gt, MinLen
 from en4dvar.ensemble.linalg import Hessian
 from en4dvar.model.state import Array
 from en4dvar.schemes.base import Draw, Evaluation, GaussNewtonStep, Step, Weights, mda_inflations
-from en4dvar.schemes.enkf import perturbed_transform
-from en4dvar.schemes.etkf import ETKF
+from en4dvar.schemes.filters import ETKF, perturbed_transform
 
 
 @dataclass(frozen=True)

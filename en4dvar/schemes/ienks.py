@@ -25,7 +25,7 @@ from annotated_types import Ge, Gt, Le
 
 from en4dvar.ensemble.linalg import centre
 from en4dvar.model.state import Array
-from en4dvar.schemes.base import Draw, Evaluation, GaussNewtonStep, Runs, Scheme, Step, Weights, gauss_newton
+from en4dvar.schemes.base import GaussNewtonStep, Runs, Scheme, Step, Weights
 
 
 @dataclass(frozen=True)
@@ -77,15 +77,7 @@ class IEnKS(Scheme):
         mean, anomalies = centre(runs.predictions)
         if self.linearisation == "bundle":
             return mean, anomalies / self.epsilon
-        if weights.inverse is None:
-            return mean, np.asarray(np.linalg.solve(weights.T, anomalies))
-        return mean, np.asarray(weights.inverse @ anomalies)
-
-    def advance(self, weights: Weights, evaluation: Evaluation, iteration: int, draw: Draw) -> Step:
-        """Weights after a Gauss–Newton step, with the symmetric transform."""
-        step = gauss_newton(weights.w, evaluation)
-        inverse = step.hessian.inverse_transform if self.linearisation == "transform" else None
-        return Step(Weights(step.w + step.direction, step.transform, inverse), step.norm)
+        return mean, np.asarray(np.linalg.solve(weights.T, anomalies))
 
     def done(self, iteration: int, step: Step | GaussNewtonStep) -> bool:
         return step.norm <= self.tolerance or iteration + 1 == self.max_iterations

@@ -14,7 +14,7 @@ import numpy as np
 from en4dvar.ensemble.linalg import apply_weights
 from en4dvar.model.state import Array, Indices, Mask
 from en4dvar.schemes.base import Draw, Evaluation, Runs, Scheme, Weights
-from en4dvar.schemes.etkf import ETKF
+from en4dvar.schemes.filters import ETKF
 
 
 def gaspari_cohn(distance: Array, radius: float) -> Array:

@@ -140,16 +140,21 @@ def log_evidence(gaps: Array, std: Array, correlation: Correlation | None) -> Ar
 
 
 @dataclass(frozen=True)
-class SequentialResult:
-    """The result of a run: moments of forecast, analysis (by y_1…y_k) and smoothed ensemble (by y_1…y_{k+L}).
+class SequentialState:
+    """What a run has found so far: moments of forecast, analysis (by y_1…y_k) and smoothed ensemble (by y_1…y_{k+L}).
 
     The last L smoothed rows of the IEnKS, unless ``to_end``, and all of a filter without a smoother are NaN.
     ``predicted``: moments (K, p) of the forecast where it was observed. ``ranks`` (K, p): share of the members, with
     the errors of the observations, that lie below the observation, NaN where there was none. ``evidence`` (K,): log
     density of the observations of a time given those before, of the Gaussian of the forecast; NaN in a twin experiment.
     ``iterations`` (K,) forecasts of the window. ``effective`` (K,): members that the weights of a particle filter
-    leave, NaN: all. ``members`` (N', n) the final ensemble at the start of the last window; ``kept``: index of a time →
-    analysis members (N', n), physical; ``failures`` the reasons of the members lost.
+    leave, NaN: all. ``members`` (N', n + changes of what varies) at the ``start`` of the window (0: time zero, k:
+    observation time k); ``kept``: index of a time → analysis members (N', n), physical; ``failures`` the reasons of the
+    members lost.
+
+    The rest of a run depends on its arguments and these alone: ``cycle`` observation times are done; ``trail`` is what
+    a smoother keeps, ``covariances`` are averages, (n, p) and (p, p), both empty of a run that has ended. Random
+    numbers are drawn by cycle, so that no generator has a state.
     """
 
     forecast: Moments
@@ -164,17 +169,6 @@ class SequentialResult:
     kept: tuple[tuple[int, Array], ...] = ()
     failures: tuple[str, ...] = ()
     forward_runs: int = 0
-
-
-@dataclass(frozen=True)
-class SequentialState(SequentialResult):
-    """What a run has found so far, with all that the rest of it depends on, besides its arguments.
-
-    ``cycle`` observation times are done; ``ensemble`` (N', n_state + changes) stand at ``start`` (0: time zero, k:
-    observation time k). ``covariances``: averages, (n, p) and (p, p). Random numbers are drawn by cycle, so that no
-    generator has a state.
-    """
-
     cycle: int = 0
     start: int = 0
     trail: tuple[Array, ...] = ()
@@ -182,5 +176,5 @@ class SequentialState(SequentialResult):
 
     @property
     def ensemble(self) -> Array:
-        """The members, with the changes of what varies."""
+        """The members."""
         return self.members

@@ -11,7 +11,7 @@ from en4dvar.diagnosis.diagnostics import chi2_interval, common_reasons
 from en4dvar.executor import Executor
 from en4dvar.model.forward import Observable
 from en4dvar.model.state import Array
-from en4dvar.series.moments import SequentialResult, SequentialState
+from en4dvar.series.moments import SequentialState
 from en4dvar.series.sequential import run_sequential
 from en4dvar.series.series import CycleSeries, aligned
 from en4dvar.series.settings import SequentialSettings
@@ -77,7 +77,7 @@ class SeriesResult:
 
     problem: SeriesProblem
     seed: int
-    run: SequentialResult
+    run: SequentialState
 
     @property
     def normalised(self) -> Array:
@@ -108,7 +108,7 @@ class SeriesResult:
         return tuple(told)
 
 
-def members_lost(run: SequentialResult, members: int) -> Iterator[str]:
+def members_lost(run: SequentialState, members: int) -> Iterator[str]:
     """Where some were: of how many, why and when, and what to do."""
     if run.failures:
         yield (
@@ -139,7 +139,7 @@ def too_few(start: InitialEnsemble, settings: SequentialSettings, members: int, 
         )
 
 
-def normalised_innovations(series: CycleSeries, run: SequentialResult) -> Array:
+def normalised_innovations(series: CycleSeries, run: SequentialState) -> Array:
     """(K, p) innovations over their expected standard deviations, NaN in gaps."""
     return np.asarray((series.values - run.predicted.mean) / np.hypot(run.predicted.std, series.std))
 

@@ -13,7 +13,7 @@ those of one ensemble; its reason is kept.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import fields
+from dataclasses import replace
 from functools import partial
 from typing import TypeVar
 
@@ -30,13 +30,14 @@ from en4dvar.plumbing.errors import TooFewMembersError
 from en4dvar.priors.prior import member_stream
 from en4dvar.schemes.base import Weights
 from en4dvar.series.model_error import fresh_noise
-from en4dvar.series.moments import InnovationRecorder, Moments, MomentsRecorder, SequentialResult, SequentialState
-from en4dvar.series.rotation import Rotations, rotate
+from en4dvar.series.moments import InnovationRecorder, Moments, MomentsRecorder, SequentialState
 from en4dvar.series.series import CycleSeries as CycleSeries
 from en4dvar.series.settings import SequentialSettings as SequentialSettings
 from en4dvar.series.window import Ahead, CycleDescent, CycleWindow, Flow, MembersLost, Share
 
 R = TypeVar("R")
+REFLECTIONS = 4  # of a rotation
+BLOCK = 64  # rotations drawn together; part of the random numbers' definition
 
 
 def run_sequential(
@@ -51,7 +52,7 @@ def run_sequential(
     resume: SequentialState | None = None,
     keep: Callable[[Callable[[], SequentialState]], None] | None = None,
     truth: Array | None = None,
-) -> SequentialResult:
+) -> SequentialState:
     """Assimilate ``series`` into ``members`` (N, n_state), the ensemble at time zero.
 
     The operators of ``observables`` act at each instant by itself; their outputs side by side are the p predictions.
@@ -109,7 +110,7 @@ class _Run:
         earlier: tuple[Moments | None, ...] = (None, None, None)
         self.done = 0
         if resume is not None:
-            self.ensemble, self.start, self.flow.runs = resume.ensemble, resume.start, resume.forward_runs
+            self.ensemble, self.start, self.flow.runs = resume.members, resume.start, resume.forward_runs
             self.failures, self.kept, self.done = list(resume.failures), list(resume.kept), resume.cycle
             self.iterations[: resume.cycle], self.effective[: resume.cycle] = resume.iterations, resume.effective
             self.trail, self.covariances = list(resume.trail), resume.covariances
@@ -128,11 +129,10 @@ class _Run:
             self.start, tuple(self.trail), self.covariances,
         )  # fmt: skip
 
-    def result(self) -> SequentialResult:
+    def result(self) -> SequentialState:
         if self.settings.smoother is not None:
             self.settings.smoother.ended(self.trail, len(self.iterations) - 1, self.put_smoothed)
-        state = self.state()
-        return SequentialResult(*(getattr(state, kept.name) for kept in fields(SequentialResult)))
+        return replace(self.state(), trail=(), covariances=())
 
     def cycle(self) -> None:
         """Assimilate the next observations and move the window to its next start."""
@@ -361,3 +361,42 @@ class _Run:
         alive = np.flatnonzero([not reason for reason in failed])
         self.trail = [ensembles[..., alive, :] for ensembles in self.trail]
         return alive if isinstance(rows, slice) else rows[alive]
+
+
+def reflections(directions: Array) -> tuple[Array, Array]:
+    """Factors (…, N, m) and (…, m, N) of what H_m … H_1 takes away, from directions (…, m, N), not yet in 1⊥."""
+    v = directions - directions.mean(axis=-1, keepdims=True)
+    gram = v @ np.swapaxes(v, -1, -2)
+    inverse = np.tril(gram, -1) + 0.5 * (np.eye(gram.shape[-1]) * gram)
+    return np.asarray(np.swapaxes(np.linalg.solve(np.swapaxes(inverse, -1, -2), v), -1, -2)), v
+
+
+def rotate(anomalies: Array, factors: tuple[Array, Array]) -> Array:
+    """Anomalies (N, n) rotated by what :func:`reflections` made of directions (m, N)."""
+    left, right = factors
+    return np.asarray(anomalies - left @ (right @ anomalies))
+
+
+class Rotations:
+    """Random rotations of an ensemble that keep its mean and covariance; cycle k has its own, whatever came before.
+
+    A rotation is a product of Householder reflections H_j = 1 − 2 v_j v_jᵀ / |v_j|² with directions uniform on the unit
+    sphere of 1⊥: a random walk on the group of such maps whose stationary law is Haar's, at O(N n) where drawing from
+    Haar's law itself costs O(N³). In compact form H_m … H_1 = 1 − V L Vᵀ with L⁻¹ the lower triangle of VᵀV, its
+    diagonal halved. Why rotate: Sakov & Oke (2008), Mon. Wea. Rev. 136, 1042; compact form: Schreiber & Van Loan
+    (1989), SIAM J. Sci. Stat. Comput. 10, 53.
+    """
+
+    def __init__(self, seed: int, n_members: int):
+        self._seed, self._drawn = seed, n_members
+        self._block: tuple[int, int] = (-1, -1)
+        self._factors = (np.empty(0), np.empty(0))
+
+    def of_cycle(self, cycle: int, n_members: int) -> tuple[Array, Array]:
+        """Factors for ``n_members`` ≤ N members, N those of the start."""
+        block, within = divmod(cycle, BLOCK)
+        if self._block != (block, n_members):
+            stream = member_stream(self._seed, "rotation", block)
+            directions = stream.standard_normal((BLOCK, REFLECTIONS, self._drawn))[..., :n_members]
+            self._factors, self._block = reflections(directions), (block, n_members)
+        return self._factors[0][within], self._factors[1][within]

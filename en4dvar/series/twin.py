@@ -20,7 +20,7 @@ from en4dvar.model.forward import ForwardModel, Observable, Trajectory
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError, En4dvarError, retold
 from en4dvar.priors.prior import Prior, member_stream
-from en4dvar.series.moments import Moments, SequentialResult, SequentialState
+from en4dvar.series.moments import Moments, SequentialState
 from en4dvar.series.problem import members_lost, too_few
 from en4dvar.series.sequential import run_sequential
 from en4dvar.series.series import CycleSeries
@@ -92,7 +92,7 @@ class TwinResult:
     seed: int
     truth: Array
     series: CycleSeries
-    run: SequentialResult
+    run: SequentialState
 
     @property
     def scores(self) -> dict[str, Score]:

@@ -23,7 +23,7 @@ from en4dvar.model.forward import Observable, StateField
 from en4dvar.priors.field_prior import FieldPrior
 from en4dvar.priors.prior import Prior
 from en4dvar.problem import InverseProblem
-from en4dvar.schemes.etkf import ETKF
+from en4dvar.schemes.filters import ETKF
 from en4dvar.schemes.ienks import IEnKS
 from en4dvar.schemes.settings import AssimilationSettings, Localisation
 from en4dvar.series.sequential import CycleSeries, SequentialSettings, run_sequential

@@ -19,7 +19,7 @@ from en4dvar.plumbing.errors import ConfigError
 from en4dvar.runs.cycles import run_twin
 from en4dvar.runs.rerun import rerun
 from en4dvar.runs.runner import run
-from en4dvar.schemes.etkf import ETKF
+from en4dvar.schemes.filters import ETKF
 from en4dvar.schemes.settings import AssimilationSettings
 from en4dvar.series.sequential import SequentialSettings
 from en4dvar.series.twin import TwinExperiment, conduct

@@ -88,7 +88,7 @@ def test_files_are_named_from_the_working_directory(tmp_path, monkeypatch, resul
     np.savetxt(
         "members.csv", np.random.default_rng(3).standard_normal((50, 2)), delimiter=",", header="a,b", comments=""
     )
-    (tmp_path / "own.py").write_text("from en4dvar.schemes.etkf import ETKF as Own\n", encoding="utf-8")
+    (tmp_path / "own.py").write_text("from en4dvar.schemes.filters import ETKF as Own\n", encoding="utf-8")
     priors = {name: {"prior": "ensemble", "map": "normal"} for name in "ab"}
     of_members = fit(priors=priors, prior={"ensemble": "members.csv"}, assimilation={"scheme": "./own.py:Own"})
     assert of_members.summary()["mean"].to_numpy() == pytest.approx(told["mean"].to_numpy(), abs=0.3)

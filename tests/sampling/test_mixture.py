@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from en4dvar.sampling.importance import Importance
+from en4dvar.sampling.importance import ClosingDraws
 from en4dvar.sampling.mixture import StudentMixture
 
 
@@ -27,12 +27,12 @@ def test_a_proposal_is_normalised_and_as_heavy_as_it_says():
 def test_an_integral_far_narrower_than_where_the_draws_begin():
     """A likelihood 1000 times as narrow as the prior in four directions: proposals close in on it, none is singular."""
     prior = StudentMixture(np.ones(1), np.zeros((1, 4)), np.eye(4)[None])
-    found, narrow = Importance(prior, np.random.default_rng(0), 200), 1e6
+    found, narrow = ClosingDraws(prior, np.random.default_rng(0), 200, 1.8), 1e6
     for _ in range(12):
         z = found.draw()
         found.add(z, -0.5 * narrow * np.sum((z - 0.3) ** 2, axis=1))
     apart = np.linalg.norm(found.z - 0.3, axis=1)
     assert apart[-200:].min() < 0.2 * apart[:200].min()
-    few = Importance(prior, np.random.default_rng(0), 200)
+    few = ClosingDraws(prior, np.random.default_rng(0), 200, 1.8)
     few.add(few.draw(), np.where(np.arange(200) < 3, 0.0, -np.inf))
     assert few.next_proposal() is few.proposals[0]

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from en4dvar.ensemble.linalg import centre
+from en4dvar.ensemble.linalg import centre, systematic
 from en4dvar.model.forward import ForwardModel, Observable, StateField
 from en4dvar.model.state import Field, StateLayout
 from en4dvar.schemes.base import Evaluation, Weights
-from en4dvar.schemes.bootstrap_filter import BootstrapFilter, likelihood_shares, systematic
+from en4dvar.schemes.bootstrap_filter import BootstrapFilter, likelihood_shares
 from en4dvar.schemes.localisation import BlockLocalisation
 from en4dvar.series.sequential import CycleSeries, SequentialSettings, run_sequential
 from en4dvar_lorenz import Linear
@@ -23,7 +23,7 @@ def draws(purpose, columns=None):
 @pytest.mark.parametrize("start", [1e-12, 0.3, 1 - 1e-12])
 def test_every_member_survives_as_often_as_its_share_says(start):
     shares = np.random.default_rng(0).dirichlet(np.full(50, 0.3))
-    count = np.bincount(systematic(shares, start), minlength=50)
+    count = np.bincount(systematic(shares, 50, start), minlength=50)
     assert count.sum() == 50
     assert np.all(np.abs(count - 50 * shares) < 1 + 1e-9)
 

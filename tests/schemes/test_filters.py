@@ -10,11 +10,8 @@ from toys import Linear, make_problem
 from en4dvar.ensemble.linalg import centre
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.schemes.base import Evaluation, Weights
-from en4dvar.schemes.denkf import DEnKF
-from en4dvar.schemes.enkf import EnKF
 from en4dvar.schemes.enkf_n import EnKFN
-from en4dvar.schemes.esrf import ESRF
-from en4dvar.schemes.etkf import ETKF
+from en4dvar.schemes.filters import ESRF, ETKF, DEnKF, EnKF
 from en4dvar.schemes.settings import AssimilationSettings
 
 

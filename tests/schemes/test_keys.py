@@ -159,7 +159,7 @@ def test_no_scheme_is_named_outside_its_folder() -> None:
     imported = re.compile(rf"en4dvar\.schemes\.({files})\b")
     told = []
     for path in (ROOT / "en4dvar").rglob("*.py"):
-        if path.parent.name == "schemes":
+        if path.parent.name == "schemes" or path.name == "moved.py":  # which knows former names of modules
             continue
         source = path.read_text(encoding="utf-8")
         told += [f"{path.name}: {hit.group()}" for each in (asked, imported) for hit in each.finditer(source)]

@@ -9,9 +9,9 @@ import numpy as np
 from scipy.linalg import sqrtm
 from test_exact import CYCLES, DT, SEEN, STD, close, flow, linear_twin
 
-from en4dvar.schemes.baselines import Climatology, OptimalInterpolation
-from en4dvar.schemes.inflation import Inflation
+from en4dvar.schemes.filters import Climatology, OptimalInterpolation
 from en4dvar.series.sequential import SequentialSettings, run_sequential
+from en4dvar.series.settings import Inflation
 
 
 def test_members_run_freely_and_each_analysis_starts_from_them():

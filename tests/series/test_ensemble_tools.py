@@ -1,4 +1,4 @@
-"""Inflation, rotation, chunked update, localisation: what each must leave unchanged and what it must change."""
+"""Inflation, rotation, update, localisation: what each must leave unchanged and what it must change."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ import pytest
 
 from en4dvar.ensemble.linalg import GRAM_LIMIT, Hessian, NearPrior, apply_weights, centre
 from en4dvar.schemes.base import Evaluation, gauss_newton
-from en4dvar.schemes.enkf import EnKF
-from en4dvar.schemes.etkf import ETKF
-from en4dvar.schemes.inflation import Inflation, relaxation
+from en4dvar.schemes.filters import ETKF, EnKF
 from en4dvar.schemes.localisation import BlockLocalisation, distances, gaspari_cohn
 from en4dvar.series.moments import BLOCK, MomentsRecorder
-from en4dvar.series.rotation import Rotations, reflections, rotate
+from en4dvar.series.sequential import Rotations, reflections, rotate
+from en4dvar.series.settings import Inflation, relaxation
 
 RNG = np.random.default_rng
 
@@ -98,15 +97,12 @@ def test_moments_do_not_depend_on_the_blocks_they_are_taken_in(shape):
         assert np.array_equal(a, b)
 
 
-@pytest.mark.parametrize("chunk", [1, 7, 64, 10_000])
-def test_update_in_chunks(chunk):
+def test_update():
     ensemble, rows = 5 + RNG(0).standard_normal((6, 150)), RNG(1).standard_normal((6, 6))
     mean, anomalies = centre(ensemble)
     expected = mean + rows @ anomalies
-    assert apply_weights(ensemble, rows, chunk=chunk) == pytest.approx(expected, abs=1e-13)
-    assert apply_weights(ensemble, rows, out=ensemble, chunk=chunk) is ensemble
-    assert ensemble == pytest.approx(expected, abs=1e-13)
-    assert apply_weights(expected, rows[:2], chunk=chunk).shape == (2, 150)
+    assert apply_weights(ensemble, rows) == pytest.approx(expected, abs=1e-13)
+    assert apply_weights(expected, rows[:2]).shape == (2, 150)
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 2.9, 3.1, 1e3])
@@ -121,7 +117,6 @@ def test_both_decompositions_give_the_same_analysis(scale):
     assert hessian.solve(g) == pytest.approx(np.linalg.solve(a, g), rel=tolerance, abs=tolerance)
     t = hessian.transform
     assert t @ t == pytest.approx(9 * np.linalg.inv(a), abs=tolerance)
-    assert t @ hessian.inverse_transform == pytest.approx(np.eye(10), abs=1e-11 if scale > 100 else 1e-13)
     singular = np.linalg.svd(s, compute_uv=False)
     assert hessian.singular_values[:9] == pytest.approx(singular[:9], rel=1e-12)
     assert hessian.singular_values[9] < 1e-6 * scale * 10
@@ -151,7 +146,6 @@ def test_root_near_the_prior_is_that_of_the_decomposition(shape, bound):
     near, exact, g = NearPrior.of(s), Hessian.of(s), RNG(1).standard_normal((3, shape[1]))
     assert isinstance(near, NearPrior) == (bound < 1)
     assert near.transform == pytest.approx(exact.transform, abs=1e-14)
-    assert near.inverse_transform == pytest.approx(exact.inverse_transform, abs=1e-13 * max(1, bound))
     for rows in (g[0], g, RNG(2).standard_normal((shape[1], shape[1]))):
         assert near.solve(rows) == pytest.approx(exact.solve(rows), rel=1e-13, abs=1e-15)
     assert near.transform @ np.ones(shape[1]) == pytest.approx(np.ones(shape[1]), abs=1e-13)

@@ -12,7 +12,7 @@ from en4dvar.ensemble.linalg import centre
 from en4dvar.executor import SerialExecutor, ThreadsExecutor
 from en4dvar.model.forward import Observable
 from en4dvar.schemes.base import Evaluation, Runs, Weights
-from en4dvar.schemes.etkf import ETKF
+from en4dvar.schemes.filters import ETKF
 from en4dvar.schemes.ienks import IEnKS
 from en4dvar.series.sequential import CycleSeries, SequentialSettings, run_sequential
 from en4dvar_lorenz import Linear, Lorenz63, Lorenz96

@@ -9,7 +9,7 @@ from en4dvar.data.noise import Correlation
 from en4dvar.model.forward import Failure, ForwardModel, Observable, StateField
 from en4dvar.model.state import Field, StateLayout
 from en4dvar.plumbing.errors import TooFewMembersError
-from en4dvar.schemes.etkf import ETKF
+from en4dvar.schemes.filters import ETKF
 from en4dvar.schemes.ienks import IEnKS
 from en4dvar.schemes.localisation import BlockLocalisation
 from en4dvar.series.sequential import CycleSeries, SequentialSettings, run_sequential

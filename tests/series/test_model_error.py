@@ -11,12 +11,12 @@ import pytest
 
 from en4dvar.model.forward import Observable
 from en4dvar.priors.prior import whiten_sample
-from en4dvar.schemes.etkf import ETKF
+from en4dvar.schemes.filters import ETKF
 from en4dvar.schemes.ienks import IEnKS
-from en4dvar.schemes.inflation import Inflation
 from en4dvar.series.model_error import ModelError, fresh_noise, narrowed
 from en4dvar.series.sequential import SequentialSettings, run_sequential
 from en4dvar.series.series import CycleSeries
+from en4dvar.series.settings import Inflation
 from en4dvar_lorenz import Linear
 from en4dvar_lorenz.linear import LinearSettings
 

@@ -19,17 +19,14 @@ from en4dvar.plumbing.errors import OutputError
 from en4dvar.results.checkpoint import decode, encode
 from en4dvar.runs.cycles import run_twin
 from en4dvar.runs.interrupt import Interrupted
-from en4dvar.schemes.baselines import OptimalInterpolation
 from en4dvar.schemes.bootstrap_filter import BootstrapFilter
-from en4dvar.schemes.enkf import EnKF
-from en4dvar.schemes.esrf import ESRF
-from en4dvar.schemes.etkf import ETKF
+from en4dvar.schemes.filters import ESRF, ETKF, EnKF, OptimalInterpolation
 from en4dvar.schemes.ienks import IEnKS
-from en4dvar.schemes.inflation import Inflation
 from en4dvar.series.model_error import ModelError
 from en4dvar.series.moments import Moments, SequentialState
 from en4dvar.series.sequential import SequentialSettings, run_sequential
 from en4dvar.series.series import CycleSeries
+from en4dvar.series.settings import Inflation
 from en4dvar.series.smoothers import EnKS, EnRTS
 
 YAML = """\

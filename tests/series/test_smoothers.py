@@ -9,16 +9,14 @@ from test_loop import Breaking, Forced, members, series
 
 from en4dvar.model.forward import Batch, ForwardModel, Observable, StateField
 from en4dvar.model.state import Field, StateLayout
-from en4dvar.schemes.baselines import Climatology
 from en4dvar.schemes.enkf_n import EnKFN
-from en4dvar.schemes.esrf import ESRF
-from en4dvar.schemes.etkf import ETKF
+from en4dvar.schemes.filters import ESRF, ETKF, Climatology
 from en4dvar.schemes.ienks import IEnKS
-from en4dvar.schemes.inflation import Inflation
 from en4dvar.schemes.localisation import BlockLocalisation
 from en4dvar.series.model_error import ModelError
 from en4dvar.series.sequential import SequentialSettings, run_sequential
 from en4dvar.series.series import CycleSeries
+from en4dvar.series.settings import Inflation
 from en4dvar.series.smoothers import EnKS, EnRTS
 
 

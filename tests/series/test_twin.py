@@ -15,12 +15,12 @@ from en4dvar.model.forward import ForwardModel, Observable, StateField
 from en4dvar.model.state import Field, Parameter, StateLayout
 from en4dvar.plumbing.errors import En4dvarError
 from en4dvar.priors.prior import Prior, PriorTerm
-from en4dvar.schemes.etkf import ETKF
+from en4dvar.schemes.filters import ETKF
 from en4dvar.schemes.ienks import IEnKS
-from en4dvar.schemes.inflation import Inflation
 from en4dvar.schemes.localisation import BlockLocalisation
 from en4dvar.series.model_error import ModelError
 from en4dvar.series.sequential import SequentialSettings, run_sequential
+from en4dvar.series.settings import Inflation
 from en4dvar.series.twin import TwinExperiment, TwinResult, conduct, observe_truth
 from en4dvar_lorenz import Lorenz63, Lorenz96
 from en4dvar_lorenz.lorenz63 import Lorenz63Settings
