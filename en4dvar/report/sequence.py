@@ -25,7 +25,7 @@ from en4dvar.plumbing.tables import csv_text, table
 from en4dvar.plumbing.units import convert
 from en4dvar.report.chart import PAGE, POINTS, Chart, Panel, Row, interval, stacked
 from en4dvar.report.compare import named, preferred, ranked
-from en4dvar.report.export import Kind, Notes, column_name, escaped, latex_unit, plus_minus, tabular
+from en4dvar.report.export import Kind, column_name, escaped, latex_unit, plus_minus, tabular
 from en4dvar.report.html import render
 from en4dvar.report.page import provenance_rows
 from en4dvar.report.paper import on_paper
@@ -134,10 +134,10 @@ def _factors(data: Group) -> Array:
 
 
 def _last_analysis(data: Group) -> str:
-    last = ((escaped(name), latex_unit(unit), plus_minus(mean, std)) for name, mean, std, unit in last_analysis(data))
-    lines = [f"{name} & {unit or '--'} & {value}" for name, unit, value in last]
-    head = "% en4dvar export: mean and standard deviation of the last analysis; needs \\usepackage{booktabs}"
-    return "\n".join([head, *tabular("llr", "variable & unit & analysis", lines, Notes())]) + "\n"
+    last = last_analysis(data)
+    rows = [(escaped(name), latex_unit(unit) or "--", plus_minus(mean, std)) for name, mean, std, unit in last]
+    what = "mean and standard deviation of the last analysis"
+    return tabular(what, "llr", ("variable", "unit", "analysis"), rows, {})
 
 
 SHOWN = 5  # variables or observations in a figure
