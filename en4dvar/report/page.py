@@ -16,7 +16,7 @@ from en4dvar.report.history import withheld_words
 from en4dvar.report.html import render
 from en4dvar.report.responses import exceeding, stored_ledger, stored_shifts
 from en4dvar.report.svg import draw
-from en4dvar.report.text import display_unit, number_like, plain_number, range_words, shown
+from en4dvar.report.text import number_like, plain_number, range_words, shown
 from en4dvar.results.store import StoredResult
 from en4dvar.results.variables import ITERATIONS, SHARES
 
@@ -60,8 +60,9 @@ def render_set(
         drawn={name: (caption, svg) for name, caption, svg in draw(all_figures(result), IDENTIFIERS, folder, begin)},
         modes=_modes(result),
         lost=[(i, str(reason)) for i, reason in enumerate(judged["failure_reason"].values.ravel()) if reason],
-        iterations=_iterations(result),
-        fixed_values=_fixed(result),
+        iterations=result.group("iterations"),
+        diagnostics=[d.name for d in ITERATIONS if not d.scope and d.name != "active"],
+        fixed_values=result.group("constant_data").variables.values(),
         settings=[*((key.replace("_", " "), str(value)) for key, value in recorded.items()), ("observations", total)],
         provenance=provenance_rows(result.attributes),
     )
@@ -169,24 +170,6 @@ def _modes(result: StoredResult) -> list[tuple[str, ...]]:
         spread = f" (they were ended within {of['cost_spread']:.2g} of its J)" if of["cost_spread"] else ""
         rows.append((f"{of['weight']:.2f}", f"{of['cost']:.2f}", f"{of['descents']:.0f}{spread}", *centre))
     return rows
-
-
-def _fixed(result: StoredResult) -> list[tuple[str, str, float, str]]:
-    """(symbol, label, value, unit) of the values held fixed."""
-    held = result.group("constant_data").variables.values()
-    return [(v.attrs["symbol"], v.attrs["long_name"], float(shown(v)), display_unit(v)) for v in held]
-
-
-def _iterations(result: StoredResult) -> list[tuple[str, ...]]:
-    """One line an iteration: index, J, terms, step, χ²/Ky, DFS, spread, members."""
-    table = result.group("iterations")
-    diagnostics = [d.name for d in ITERATIONS if not d.scope and d.name != "active"]
-    columns = [
-        [str(int(i)) for i in table["iteration"].values],
-        *([plain_number(float(value)) for value in table[key].values] for key in diagnostics),
-        [str(int(n)) for n in table["active"].values],
-    ]
-    return list(zip(*columns, strict=True))
 
 
 def provenance_rows(attributes: Mapping[Any, Any]) -> list[tuple[str, str]]:
