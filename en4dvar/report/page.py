@@ -2,9 +2,8 @@
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from en4dvar.diagnosis.diagnostics import chi2_interval
 from en4dvar.diagnosis.honesty.checks import MOVED
@@ -19,10 +18,6 @@ from en4dvar.report.text import plain_number
 from en4dvar.results.store import StoredResult
 from en4dvar.results.variables import ITERATIONS, SHARES
 
-PROVENANCE = (
-    "history", "date_created", "seed", "data_source", "git_commit", "configuration_file", "configuration_git_commit",
-    "package_versions", "python_version", "platform", "cpu", "institution", "references", "Conventions",
-)  # fmt: skip
 IDENTIFIERS = "d0-"  # begin those of figures, which are addresses
 
 
@@ -33,8 +28,6 @@ def render_set(
     are kept as PDF and PNG too, if anywhere, under names with ``begin``.
     """
     judged, recorded = result.group("sample_stats"), json.loads(str(result.attributes["assimilation_settings"]))
-    weights = result.of_readings("observed_data", "weights", shared=True)
-    total = f"{len(weights)} observations, weights sum to {plain_number(float(weights.sum()))}"
     stats, structured = judged.attrs, any(c.code in ("residual-structure", "odd-residuals") for c in result.cautions)
     chi2, dfs = float(stats["chi2_per_observation"]), float(stats["dfs"])
     return render(
@@ -51,7 +44,6 @@ def render_set(
         shares=SHARES if "variance_from_errors" in judged else (),
         what_if=(what_if := stored_shifts(result)),
         exceeding=exceeding(what_if),
-        what_if_added=recorded.get("what_if") == "added",
         entries=stored_ledger(result),
         readings=responses.reading_words(result),
         walks=stored_walks(result),
@@ -63,8 +55,8 @@ def render_set(
         iterations=result.group("iterations"),
         diagnostics=[d.name for d in ITERATIONS if not d.scope and d.name != "active"],
         fixed_values=result.group("constant_data").variables.values(),
-        settings=[*((key.replace("_", " "), str(value)) for key, value in recorded.items()), ("observations", total)],
-        provenance=provenance_rows(result.attributes),
+        settings=recorded,
+        weights=result.of_readings("observed_data", "weights", shared=True),
     )
 
 
@@ -110,8 +102,3 @@ def judge_chi2(chi2: float, n_observations: int, dfs: float, structured: bool = 
     if structured:
         return f"the size of the misfit is as stated, its structure is not; {expected}", True
     return f"misfit agrees with the stated noise; {expected}", False
-
-
-def provenance_rows(attributes: Mapping[Any, Any]) -> list[tuple[str, str]]:
-    """(what, value) of what a file says of its origin."""
-    return [(key.replace("_", " "), str(attributes[key])) for key in PROVENANCE if str(attributes.get(key, ""))]

@@ -27,7 +27,6 @@ from en4dvar.report.chart import PAGE, POINTS, Chart, Panel, Row, interval, stac
 from en4dvar.report.compare import named, preferred, ranked
 from en4dvar.report.export import Kind, column_name, escaped, latex_unit, plus_minus, tabular
 from en4dvar.report.html import render
-from en4dvar.report.page import provenance_rows
 from en4dvar.report.paper import on_paper
 from en4dvar.report.svg import Captioned, draw
 from en4dvar.report.text import axis_label, percent, plain_number, pretty_unit, shown, with_unit
@@ -55,8 +54,8 @@ def write_cycles_page(
     with ``iterations``: forecasts of the window a cycle, on average.
     """
     drawn = draw(figures, folder=inside(run_dir, "figures") if files else None)
-    shown |= {"attributes": data.attrs, "provenance": provenance_rows(data.attrs), "figures": drawn, "copies": files}
-    return write_text(run_dir / "report.html", render(template, sizes=data.sizes, **shown))
+    shown |= {"attributes": data.attrs, "sizes": data.sizes, "figures": drawn, "copies": files}
+    return write_text(run_dir / "report.html", render(template, **shown))
 
 
 def span_of(time: Array) -> tuple[float, float] | None:
