@@ -6,7 +6,7 @@ netCDF needs no export: ``posterior.nc`` follows the ArviZ schema as it is.
 import itertools
 import re
 import string
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -111,16 +111,8 @@ def latex_table(sets: Sequence[Found]) -> str:
     notes = Notes()
     head, rows = _one_set(sets[0], notes) if len(sets) == 1 else _many_sets(sets, notes)
     columns = "llrrr" if len(sets) == 1 else "l" + "r" * (len(head) - 1)
-    return tabular("posterior mean and standard deviation", columns, head, rows, notes, comments)
-
-
-def tabular(
-    what: str, columns: str, head: Sequence[str], rows: Iterable[Sequence[str]], notes: Mapping[str, str],
-    comments: Sequence[str] = (),
-) -> str:  # fmt: skip
-    """A table of cells in LaTeX that says ``what`` it is; ``notes``: the words of its footnotes → letter."""
-    content = {"what": what, "columns": columns, "head": head, "rows": rows, "notes": notes, "comments": comments}
-    return render_latex("table.tex.j2", **content)
+    table = {"columns": columns, "head": head, "rows": rows, "notes": notes, "comments": comments}
+    return render_latex("table.tex.j2", what="posterior mean and standard deviation", **table)
 
 
 def render_latex(template: str, package: str = "en4dvar.report", /, **content: Any) -> str:

@@ -25,7 +25,7 @@ from en4dvar.plumbing.tables import csv_text, table
 from en4dvar.plumbing.units import convert
 from en4dvar.report.chart import PAGE, POINTS, Chart, Panel, Row, interval, stacked
 from en4dvar.report.compare import named, preferred, ranked
-from en4dvar.report.export import Kind, column_name, escaped, latex_unit, plus_minus, tabular
+from en4dvar.report.export import Kind, column_name, escaped, latex_unit, plus_minus, render_latex
 from en4dvar.report.html import render
 from en4dvar.report.paper import on_paper
 from en4dvar.report.svg import Captioned, draw
@@ -133,8 +133,8 @@ def _factors(data: Group) -> Array:
 def _last_analysis(data: Group) -> str:
     last = last_analysis(data)
     rows = [(escaped(name), latex_unit(unit) or "--", plus_minus(mean, std)) for name, mean, std, unit in last]
-    what = "mean and standard deviation of the last analysis"
-    return tabular(what, "llr", ("variable", "unit", "analysis"), rows, {})
+    head, what = ("variable", "unit", "analysis"), "mean and standard deviation of the last analysis"
+    return render_latex("table.tex.j2", what=what, columns="llr", head=head, rows=rows, notes={}, comments=())
 
 
 SHOWN = 5  # variables or observations in a figure
