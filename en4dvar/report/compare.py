@@ -159,9 +159,8 @@ def compare_runs(runs: Sequence[str | Path] | Mapping[str, str | Path | StoredRe
 
     ``runs``: run directories or result files (``.nc``); or name → one of these, or a result at hand.
 
-    Raises
-    ------
-    OutputError: fewer than two runs, a run given twice, a directory without results, or results without names.
+    Raises :class:`OutputError`: fewer than two runs, a run given twice, a directory without results, or results without
+    names.
     """
     results = {name: _results(run) for name, run in named(runs).items()}
     datasets = list(dict.fromkeys(dataset for held in results.values() for dataset in held))

@@ -8,9 +8,10 @@ import re
 import string
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from en4dvar.config.models import GREEK
 from en4dvar.estimation.summary import LITTLE, MODAL, ParameterSummary, summary_rows
@@ -42,18 +43,14 @@ _ESCAPES |= {"–": "--", "—": "---", "…": r"\dots{}"}
 def export_table(run_dir: str | Path, kind: Kind = "csv") -> str:
     """A table of a run directory as text, in display units.
 
-    Parameters
-    ----------
-    kind: ``csv``: a line for each data set and parameter (prior, mean, std, 5/50/95 %, centre, DFS), every digit kept;
-        ``members``: a line for each data set and living posterior member, a column a parameter; ``latex``: for a paper
-        (package booktabs) mean ± std, or of a skewed posterior the median with its 5 and 95 %, a row a parameter, or
-        of several data sets a row each. Warnings come along: in a column of the CSV, as footnotes in LaTeX, where notes
-        are comments. A number that is not to be trusted stands without an interval.
+    ``kind``: ``csv``: a line for each data set and parameter (prior, mean, std, 5/50/95 %, centre, DFS), every digit
+    kept; ``members``: a line for each data set and living posterior member, a column a parameter; ``latex``: for a
+    paper (package booktabs) mean ± std, or of a skewed posterior the median with its 5 and 95 %, a row a parameter, or
+    of several data sets a row each. Warnings come along: in a column of the CSV, as footnotes in LaTeX, where notes are
+    comments. A number that is not to be trusted stands without an interval.
 
-    Raises
-    ------
-    ConfigError: an unknown kind. OutputError: the directory holds no results. LackingError: it lacks some, which are
-        named; ``rest`` is the table of the others.
+    Raises :class:`ConfigError`: an unknown kind. :class:`OutputError`: the directory holds no results.
+    :class:`LackingError`: it lacks some, which are named; ``rest`` is the table of the others.
     """
     if kind not in get_args(Kind):
         raise ConfigError(f"no kind of table is called {shown(kind)}{suggest(kind, get_args(Kind))}")
@@ -109,19 +106,27 @@ MODAL_NOTE = "5 to 95 % of a posterior of several modes, by their weights"
 
 def latex_table(sets: Sequence[Found]) -> str:
     """Mean ± std for a paper (package booktabs): a row a parameter, or of several ``sets`` a row each."""
-    header = "% en4dvar export: posterior mean and standard deviation; needs \\usepackage{booktabs}"
-    warned = [f"% {c.severity}: {name}: {c}" for name, _, cautions in sets for c in cautions if c.kind == "note"]
+    warned = [f"{c.severity}: {name}: {c}" for name, _, cautions in sets for c in cautions if c.kind == "note"]
     comments = ["".join(c if c.isprintable() else " " for c in line) for line in warned]  # which end where they should
     notes = Notes()
-    table = _one_set(sets[0], notes) if len(sets) == 1 else _many_sets(sets, notes)
-    return "\n".join([header, *comments, *table]) + "\n"
+    head, rows = _one_set(sets[0], notes) if len(sets) == 1 else _many_sets(sets, notes)
+    columns = "llrrr" if len(sets) == 1 else "l" + "r" * (len(head) - 1)
+    table = {"columns": columns, "head": head, "rows": rows, "notes": notes, "comments": comments}
+    return render_latex("table.tex.j2", what="posterior mean and standard deviation", **table)
 
 
-class Notes:
-    """The footnotes of a table: each once, lettered in order of appearance."""
+def render_latex(template: str, package: str = "en4dvar.report", /, **content: Any) -> str:
+    """The text of a template of a package whose marks, ``<% %>`` and ``<< >>``, are not LaTeX's braces."""
+    marks, loader = ("<%", "%>", "<<", ">>"), PackageLoader(package, ".")
+    environment = Environment(
+        *marks, trim_blocks=True, keep_trailing_newline=True, loader=loader, undefined=StrictUndefined
+    )
+    environment.filters["escaped"] = escaped
+    return environment.get_template(template).render(**content)
 
-    def __init__(self) -> None:
-        self._letters: dict[str, str] = {}
+
+class Notes(dict[str, str]):
+    """The footnotes of a table: the words of each, and its letter, in order of appearance."""
 
     def mark(self, row: ParameterSummary, cautions: Sequence[Caution]) -> str:
         """What follows a number: the letters of its footnotes, or nothing."""
@@ -137,46 +142,29 @@ class Notes:
         return self._marks([c.words for c in cautions if not c.parameters and c.kind == "warning"])
 
     def _marks(self, each: Sequence[str]) -> str:
-        known = self._letters
-        letters = [known.setdefault(words, string.ascii_lowercase[len(known) % 26]) for words in each if words]
+        letters = [self.setdefault(words, string.ascii_lowercase[len(self) % 26]) for words in each if words]
         return f"\\textsuperscript{{{','.join(letters)}}}" if letters else ""
 
-    def lines(self, columns: int) -> list[str]:
-        """Rows below the table."""
-        start = f"  \\multicolumn{{{columns}}}{{p{{0.9\\linewidth}}}}{{\\footnotesize \\textsuperscript"
-        return [f"{start}{{{letter}}} {escaped(words)}}} \\\\" for words, letter in self._letters.items()]
 
-
-def _one_set(dataset: Found, notes: Notes) -> list[str]:
+def _one_set(dataset: Found, notes: Notes) -> tuple[list[str], list[list[str]]]:
     _, rows, cautions = dataset
-    head = f"parameter & unit & prior & posterior{notes.warn(cautions)} & 5--95\\,\\%"
-    lines = [
-        f"{latex_symbol(row)} & {latex_unit(row.unit) or '--'} & {plus_minus(row.prior_mean, row.prior_std)} & "
-        f"{_estimate(row, cautions, notes)} & {_interval(row)}"
+    head = ["parameter", "unit", "prior", f"posterior{notes.warn(cautions)}", r"5--95\,\%"]
+    return head, [
+        [latex_symbol(row), latex_unit(row.unit) or "--", plus_minus(row.prior_mean, row.prior_std),
+         _estimate(row, cautions, notes), _interval(row)]
         for row in rows
-    ]
-    return tabular("llrrr", head, lines, notes)
+    ]  # fmt: skip
 
 
-def _many_sets(sets: Sequence[Found], notes: Notes) -> list[str]:
+def _many_sets(sets: Sequence[Found], notes: Notes) -> tuple[list[str], list[list[str]]]:
     first = {row.name: row for _, rows, _ in sets for row in reversed(rows)}
     names = list(dict.fromkeys(row.name for _, rows, _ in sets for row in rows))
     heads = [column_name(latex_symbol(first[n]), latex_unit(first[n].unit) or "1") for n in names]
-    head = " & ".join(["data set", *heads])
     lines = []
     for dataset, rows, cautions in sets:
         own, named = {row.name: row for row in rows}, f"{escaped(dataset)}{notes.warn(cautions)}"
-        lines.append(" & ".join([named, *(_estimate(own[n], cautions, notes) if n in own else "--" for n in names)]))
-    return tabular("l" + "r" * len(names), head, lines, notes)
-
-
-def tabular(columns: str, head: str, lines: list[str], notes: Notes) -> list[str]:
-    """The lines of a table and of the notes below it."""
-    body = [f"  {line} \\\\" for line in lines]
-    return [
-        f"\\begin{{tabular}}{{{columns}}}", "  \\toprule", f"  {head} \\\\", "  \\midrule", *body,
-        "  \\bottomrule", *notes.lines(len(columns)), "\\end{tabular}",
-    ]  # fmt: skip
+        lines.append([named, *(_estimate(own[n], cautions, notes) if n in own else "--" for n in names)])
+    return ["data set", *heads], lines
 
 
 def _estimate(row: ParameterSummary, cautions: Sequence[Caution], notes: Notes) -> str:

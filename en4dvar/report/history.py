@@ -13,7 +13,7 @@ from en4dvar.diagnosis.diagnostics import member_quantiles
 from en4dvar.model.state import Array
 from en4dvar.plumbing.units import convert
 from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, Row, in_columns
-from en4dvar.report.text import axis_label, figure_text, percent, quantity, shown, since, time_axis, with_unit
+from en4dvar.report.text import axis_label, figure_text, shown, since, time_axis, with_unit
 from en4dvar.results.declared import Axis, zero_of
 from en4dvar.results.netcdf import Group, Variable
 from en4dvar.results.store import StoredResult
@@ -196,21 +196,6 @@ def _withheld(result: StoredResult) -> Iterator[Array]:
     name = result.observable
     keys = "withheld_time", name, f"{name}_low", f"{name}_median", f"{name}_high"
     return (shown(result.groups["/withheld"][key]) for key in keys)
-
-
-def withheld_words(result: StoredResult) -> str:
-    """How many lie in their bands, in a sentence; "" where no reading follows the window."""
-    stats = result.group("sample_stats").attrs
-    if "withheld_readings" not in stats:
-        return ""
-    count, inside, stored = (float(stats[f"withheld_{key}"]) for key in ("readings", "inside", "rms"))
-    observed = result.group("observed_data")[result.observable]
-    rms = float(shown(observed, stored))
-    return (
-        f"{inside * count:.0f} of {count:.0f} readings after the window ({percent(inside)}) lie in the 90 % bands of "
-        "what was expected; they are off the medians by "
-        f"{quantity(rms, rms, observed.attrs['display_units'])} (root mean square)."
-    )
 
 
 def expected(result: StoredResult) -> Chart:

@@ -15,9 +15,9 @@ from en4dvar.report import responses, text
 from en4dvar.report.chart import DARK, LIGHT
 
 WRITERS = (  # what templates call
-    text.estimate, text.fixed, text.number_like, text.percent, text.plain_number, text.plus_minus,
-    text.pretty_unit, text.rough_number, text.symbol_html, text.untrusted_words, responses.sentence,
-    responses.shift_text,
+    text.display_unit, text.estimate, text.fixed, text.number_like, text.percent, text.plain_number, text.plus_minus,
+    text.pretty_unit, text.quantity, text.range_words, text.rough_number, text.shown, text.symbol_html,
+    text.untrusted_words, responses.sentence, responses.shift_text,
 )  # fmt: skip
 
 

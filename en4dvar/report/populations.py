@@ -119,11 +119,9 @@ def compare_populations(
     which calibrate what is common; they go before those of its configuration. One that is :data:`TOO_FAR` from what
     its own data say calibrates nothing.
 
-    Raises
-    ------
-    OutputError: fewer than two, no population in a folder or one of an earlier version, no parameter of all of them,
-        data sets that two of them hold, not a number for each or all the same, a name that nothing common has; what is
-        known of no run or no parameter, or is no value with a standard deviation.
+    Raises :class:`OutputError`: fewer than two, no population in a folder or one of an earlier version, no parameter of
+    all of them, data sets that two of them hold, not a number for each or all the same, a name that nothing common has;
+    what is known of no run or no parameter, or is no value with a standard deviation.
     """
     stored = {name: _stored(Path(run)) for name, run in named(runs).items()}
     names = [n for n in next(iter(stored.values())).names if all(n in s.names for s in stored.values())]

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from markupsafe import Markup
 
 from en4dvar.estimation.summary import estimate_cells, frame
 from en4dvar.plumbing.errors import ConfigError, OutputError
@@ -16,6 +14,7 @@ from en4dvar.plumbing.files import write_text
 from en4dvar.plumbing.units import convert
 from en4dvar.report import figures
 from en4dvar.report.history import history
+from en4dvar.report.html import render
 from en4dvar.report.page import render_set
 from en4dvar.report.paper import on_paper
 from en4dvar.results.netcdf import dataset_of, to_bytes, tree_of
@@ -27,7 +26,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FEWEST_DRAWS = 4  # of a chain: ArviZ's diagnostics need as many
-HEADER = ("", "unit", "mean", "std", "5 %", "50 %", "95 %", "DFS")
 
 
 class Result(StoredResult):
@@ -152,15 +150,8 @@ class Result(StoredResult):
 
     def _repr_html_(self) -> str:
         """A piece of HTML; everything in it is escaped."""
-
-        def each(tag: str, values: Iterable[object]) -> Markup:
-            return Markup("").join(Markup(f"<{tag}>{{}}</{tag}>").format(value) for value in values)
-
         rows = [(row.label, row.unit, *estimate_cells(row), f"{row.dfs:.2f}") for row in self.rows]
-        head, body = each("th", HEADER), each("tr", (each("td", row) for row in rows))
-        warned = each("li", (f"{c.kind}: {c.words}" for c in self.cautions))
-        page = Markup("<div><b>{}</b><table><thead><tr>{}</tr></thead><tbody>{}</tbody></table><p>{}</p>{}</div>")
-        return str(page.format(self.name, head, body, self.ended, each("ul", [warned] * bool(warned))))
+        return render("notebook.html.j2", result=self, rows=rows)
 
 
 def _in_display_units(group: xr.Dataset) -> xr.Dataset:

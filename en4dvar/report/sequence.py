@@ -25,9 +25,8 @@ from en4dvar.plumbing.tables import csv_text, table
 from en4dvar.plumbing.units import convert
 from en4dvar.report.chart import PAGE, POINTS, Chart, Panel, Row, interval, stacked
 from en4dvar.report.compare import named, preferred, ranked
-from en4dvar.report.export import Kind, Notes, column_name, escaped, latex_unit, plus_minus, tabular
+from en4dvar.report.export import Kind, column_name, escaped, latex_unit, plus_minus, render_latex
 from en4dvar.report.html import render
-from en4dvar.report.page import provenance_rows
 from en4dvar.report.paper import on_paper
 from en4dvar.report.svg import Captioned, draw
 from en4dvar.report.text import axis_label, percent, plain_number, pretty_unit, shown, with_unit
@@ -39,7 +38,6 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-Table = tuple[str, Sequence[str], Sequence[Sequence[str]], str]  # heading, columns, rows, words below it
 KINDS = ("forecast", "analysis", "smoothed")  # of estimates in time
 BINS = 10
 CERTAIN = 1e-9  # of its size: the spread of what is known
@@ -49,16 +47,15 @@ RANKS = (
 )
 
 
-def write_cycles_page(run_dir: Path, data: Group, figures: Iterable[Captioned], files: bool, **about: Any) -> Path:
-    """Write ``report.html``, with ``files`` also figures as PDF and PNG; returns the path of the page.
-
-    ``about``: the ``kind`` of run and ``what`` it is, ``iterations``: forecasts of the window a ``cycle``, on average;
-    ``facts`` (quantity, value, in words) for the tiles on top, beside those of scheme, members and forward runs;
-    ``tables`` as of :data:`Table`.
+def write_cycles_page(
+    run_dir: Path, template: str, data: Group, figures: Iterable[Captioned], files: bool, **shown: Any
+) -> Path:
+    """Write ``report.html``, with ``files`` also figures as PDF and PNG; returns the path of the page. ``shown``: also,
+    with ``iterations``: forecasts of the window a cycle, on average.
     """
     drawn = draw(figures, folder=inside(run_dir, "figures") if files else None)
-    about |= {"attributes": data.attrs, "provenance": provenance_rows(data.attrs), "figures": drawn, "copies": files}
-    return write_text(run_dir / "report.html", render("cycles.html.j2", **about))
+    shown |= {"attributes": data.attrs, "sizes": data.sizes, "figures": drawn, "copies": files}
+    return write_text(run_dir / "report.html", render(template, **shown))
 
 
 def span_of(time: Array) -> tuple[float, float] | None:
@@ -134,10 +131,10 @@ def _factors(data: Group) -> Array:
 
 
 def _last_analysis(data: Group) -> str:
-    last = ((escaped(name), latex_unit(unit), plus_minus(mean, std)) for name, mean, std, unit in last_analysis(data))
-    lines = [f"{name} & {unit or '--'} & {value}" for name, unit, value in last]
-    head = "% en4dvar export: mean and standard deviation of the last analysis; needs \\usepackage{booktabs}"
-    return "\n".join([head, *tabular("llr", "variable & unit & analysis", lines, Notes())]) + "\n"
+    last = last_analysis(data)
+    rows = [(escaped(name), latex_unit(unit) or "--", plus_minus(mean, std)) for name, mean, std, unit in last]
+    head, what = ("variable", "unit", "analysis"), "mean and standard deviation of the last analysis"
+    return render_latex("table.tex.j2", what=what, columns="llr", head=head, rows=rows, notes={}, comments=())
 
 
 SHOWN = 5  # variables or observations in a figure
@@ -178,13 +175,6 @@ class SequenceOutcome(SeriesResult):
 def write_sequence_report(run_dir: Path, files: bool = False) -> Path:
     """Write ``report.html`` from ``sequence.nc``, with ``files`` also PDF and PNG. Raises :class:`OutputError`."""
     data = read_groups(run_dir / "sequence.nc")["/"]
-    readings = int(np.isfinite(data["observations"].values).sum())
-    words = (
-        "Of a filter or smoother that is right, normalised innovations have a root mean square of 1, and 95 % of the "
-        "innovations lie within two expected standard deviations."
-    )
-    columns = ["observed", "readings", "root mean square of normalised innovations", "within 2 std"]
-    last = "The analysis at the last observation time, given all observations."
     at_end = [
         (name, plain_number(mean, 4), plain_number(std, 2), pretty_unit(unit))
         for name, mean, std, unit in islice(last_analysis(data), LISTED)
@@ -194,24 +184,9 @@ def write_sequence_report(run_dir: Path, files: bool = False) -> Path:
         there = column[np.isfinite(column)]
         size, share = (np.sqrt(np.mean(there**2)), np.mean(np.abs(there) <= 2)) if len(there) else (np.nan, np.nan)
         rows.append((str(name), str(len(there)), plain_number(float(size), 3), percent(float(share))))
-    return write_cycles_page(
-        run_dir,
-        data,
-        sequence_figures(data),
-        files,
-        kind="Sequential assimilation",
-        what=f"the series {data.attrs['data_set']}, cycle by cycle.",
-        cycle="an observation time",
-        iterations=float(data["iterations"].values.mean()),
-        facts=[
-            ("Times", str(data.sizes["time"]), "at which there were observations"),
-            ("Readings", str(readings), f"of {data.sizes['observation']} quantities"),
-        ],
-        tables=[
-            ("State and parameters at the end", ["variable", "mean", "std", "unit"], at_end, last),
-            ("Innovations", columns, rows, words),
-        ],
-    )
+    readings, iterations = int(np.isfinite(data["observations"].values).sum()), float(data["iterations"].values.mean())
+    shown = {"readings": readings, "iterations": iterations, "at_end": at_end, "innovations": rows}
+    return write_cycles_page(run_dir, "sequence.html.j2", data, sequence_figures(data), files, **shown)
 
 
 def sequence_figures(data: Group) -> Iterator[Captioned]:

@@ -63,28 +63,13 @@ def write_twin_report(run_dir: Path, files: bool = False) -> Path:
     """Write ``report.html`` from ``twin.nc``, with ``files`` also PDF and PNG. Raises :class:`OutputError`."""
     data = read_groups(run_dir / "twin.nc")["/"]
     burn_in = int(data.attrs["burn_in"])
-    columns = ["estimate", with_unit("RMSE", _unit(data)), with_unit("spread", _unit(data)), "spread / RMSE"]
-    words = "Averages over the cycles after the burn-in. The spread of a reliable ensemble is about its RMSE."
-    # (estimate, RMSE, spread, spread over RMSE) after the burn-in
-    rows = []
+    rows = []  # estimate, RMSE, spread, spread over RMSE after the burn-in
     for kind, _ in _kinds(data):
         rmse, spread = (float(data[f"{kind}_{what}"].attrs[MEAN]) for what in ("rmse", "spread"))
         rows.append((kind, plain_number(rmse, 4), plain_number(spread, 4), plain_number(spread / rmse, 3)))
-    return sequence.write_cycles_page(
-        run_dir,
-        data,
-        twin_figures(data),
-        files,
-        kind="Twin experiment",
-        what="a truth is drawn and observed, and the assimilation is judged against it.",
-        cycle="a cycle",
-        iterations=float(data["iterations"].values[burn_in:].mean()),
-        facts=[
-            ("Cycles", str(data.sizes["time"]), f"{burn_in} of them do not count in the averages"),
-            ("Observations", str(data.sizes["observation"]), "a cycle"),
-        ],
-        tables=[("Scores", columns, rows, words)],
-    )
+    heads = with_unit("RMSE", _unit(data)), with_unit("spread", _unit(data))
+    shown = {"iterations": float(data["iterations"].values[burn_in:].mean()), "heads": heads, "scores": rows}
+    return sequence.write_cycles_page(run_dir, "twin.html.j2", data, twin_figures(data), files, **shown)
 
 
 def twin_figures(data: Group) -> Iterator[Captioned]:

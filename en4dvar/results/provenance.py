@@ -24,6 +24,7 @@ import yaml
 
 from en4dvar.inputs.parts import DataFile
 from en4dvar.model.forward import ForwardModel
+from en4dvar.plumbing.errors import OutputError
 from en4dvar.results.checkpoint import FOLDER, digest, file_digest
 
 PACKAGES = ("en4dvar", "numpy", "scipy", "numba", "xarray", "netCDF4", "pydantic", "matplotlib")
@@ -127,6 +128,14 @@ class Identity:
             return [*identity.settings.splitlines(), "data files:", *data]
 
         return "\n".join(difflib.unified_diff(lines(earlier), lines(self), "earlier run", "now", lineterm="", n=1))
+
+    def require_same(self, earlier: "Identity | None", path: Path, retried: frozenset[str] = frozenset()) -> None:
+        """Raise :class:`OutputError` where the run in ``path`` was another one, with what :meth:`difference` says."""
+        if earlier is not None and (difference := self.difference(earlier, retried)):
+            raise OutputError(
+                f"{path}: the run cannot be resumed to the same result, for this has changed:\n{difference}\n"
+                "give --force to compute everything again, or another --out"
+            )
 
 
 def identity(resolved: str, model: ForwardModel, data: Mapping[str, DataFile]) -> Identity:

@@ -32,7 +32,7 @@ class LackingError(OutputError):
 class RunResults:
     """The results of a run directory, by name; of a single data set ``posterior.nc``, which need not exist. ``files``:
     where they are; ``lacking``: data sets of a campaign that cannot be read → why, those whose content is damaged as
-    they are read. Raises :class:`OutputError`: a run was killed as it replaced another, or is of an earlier version.
+    they are read. Raises :class:`OutputError`: a run was killed as it replaced another.
     """
 
     def __init__(self, run_dir: Path):
@@ -43,11 +43,6 @@ class RunResults:
         planned = _planned(run_dir)
         self._names = {stem: name for name, stem in file_names(planned).items()}
         pack = run_dir / PACK
-        if not pack.exists() and (run_dir / "datasets").is_dir():
-            raise OutputError(
-                f"{run_dir}: a campaign of an earlier version of en4dvar, with a file for each data set in datasets/; "
-                "run it again, or read these files one by one (load_result)"
-            )
         self.files: list[Path] = []
         if pack.exists() or len(planned) > 1:
             self.files = results_of(pack) if pack.exists() else []

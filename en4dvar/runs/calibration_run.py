@@ -58,18 +58,13 @@ def calibrate(
     Writes ``calibration.csv`` and a page to ``out``, by default runs/<name>_calibration. Resumed with more ``sets`` it
     goes on; what is done stays.
 
-    Parameters
-    ----------
-    config, overrides: as of :func:`en4dvar.run`. The data files say when readings are taken and how good they are; of
-        several the sets take turns.
-    made_with: values for dotted keys with which the readings are made, though not estimated: another law, larger
-        errors. Shows what a wrong assumption does to the intervals.
-    progress: called with the number of sets that are done and of all.
+    ``config`` and ``overrides``: as of :func:`en4dvar.run`. The data files say when readings are taken and how good
+    they are; of several the sets take turns. ``made_with``: values for dotted keys with which the readings are made,
+    though not estimated: another law, larger errors; it shows what a wrong assumption does to the intervals.
+    ``progress``: called with the number of sets that are done and of all.
 
-    Raises
-    ------
-    ConfigError, DataError: the configuration cannot be used, or its readings and those ``made_with`` other values are
-        not at the same times. OutputError: ``out`` cannot be used.
+    Raises :class:`ConfigError`, :class:`DataError`: the configuration cannot be used, or its readings and those
+    ``made_with`` other values are not at the same times. :class:`OutputError`: ``out`` cannot be used.
     """
     if sets < FEWEST:
         raise ConfigError(f"{sets} sets tell nothing; give at least {FEWEST}, better 200")

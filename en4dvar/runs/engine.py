@@ -22,7 +22,7 @@ from en4dvar.plumbing.user_code import reason_of
 from en4dvar.results.checkpoint import FOLDER, CheckpointError, Keeper, read_checkpoint, write_checkpoint
 from en4dvar.results.netcdf import understood
 from en4dvar.results.provenance import IDENTITY, Identity, identity, provenance
-from en4dvar.runs.interrupt import Interrupted, tell_interrupt, terminate_as_interrupt
+from en4dvar.runs.interrupt import tell_interrupt, terminate_as_interrupt
 from en4dvar.runs.progress import RunLog
 from en4dvar.runs.rundir import LOG, OF_EVERY_RUN, Mode, RunDirectory
 
@@ -161,12 +161,7 @@ class Session:
         Raises :class:`OutputError`: the run is not the same (says what has changed), the directory cannot be written.
         """
         directory, config = self.directory, self.config
-        earlier = self.earlier()
-        if earlier is not None and (difference := self.identity.difference(earlier, retried)):
-            raise OutputError(
-                f"{directory.path}: the run cannot be resumed to the same result, for this has changed:\n{difference}\n"
-                "give --force to compute everything again, or another --out"
-            )
+        self.identity.require_same(self.earlier(), directory.path, retried)
         directory.claim(*OF_EVERY_RUN, IDENTITY, *files)  # before anything is made that a failure would leave
         directory.folder(FOLDER)
         write_text(directory.at("config.yaml"), config.text)
@@ -261,15 +256,11 @@ def conduct_run(kind: RunKind[R], force: bool = False, resume: bool = False, com
 def write_report(path: str | Path, datasets: Sequence[str] = (), workers: int = 1, figures: bool = False) -> Path:
     """Write (again) the page of a finished run of any kind from its result files.
 
-    Parameters
-    ----------
-    path: the run directory. datasets: of a campaign, those that get a page in any case. workers: processes that draw.
-    figures: also keep those of ``datasets``, or of all pages, as PDF and PNG.
+    ``path``: the run directory. ``datasets``: of a campaign, those that get a page in any case. ``workers``: processes
+    that draw. ``figures``: also keep those of ``datasets``, or of all pages, as PDF and PNG.
 
-    Raises
-    ------
-    OutputError: there is no result, it is damaged, the directory cannot be written, or a file that no run wrote would
-        be replaced. LackingError: results of some data sets cannot be read; the page names them.
+    Raises :class:`OutputError`: there is no result, it is damaged, the directory cannot be written, or a file that no
+    run wrote would be replaced. :class:`LackingError`: results of some data sets cannot be read; the page names them.
     """
     with RunDirectory.open(path, "report") as directory:
         kind = kind_in(directory.work)
@@ -293,32 +284,29 @@ def _session(kind: RunKind[Any], directory: RunDirectory, command: str) -> Itera
     Raises :class:`OutputError`: the log cannot be written, the result not put in place. :class:`Interrupted`: the block
     was.
     """
+
+    def kept() -> str:
+        if directory.work.is_dir():
+            return kind.kept()
+        return f"the run directory {directory.path} was removed or renamed while the run was at work"
+
     config = kind.config
-    with tell_interrupt(kind.kept):
+    with tell_interrupt(kept):
         who = identity(kind.settings, config.model, kind.data)
         attributes = {
             **provenance(config.text, config.document.file, command),
             "configuration_resolved": config.resolved,
         }
-        with RunLog(directory.at(LOG), append=directory.resumed) as log:
+        with RunLog(directory.at(LOG), append=directory.resumed) as log, tell_interrupt(kept):  # in the log as well
             run = Session(config, directory, log, who, attributes)
             try:
                 log.write(attributes["history"])
                 yield run
                 log.write("done")
-            except (KeyboardInterrupt, ExecutorError, OutputError) as error:
-                if isinstance(error, UnguardedError) or not (run.begun or isinstance(error, KeyboardInterrupt)):
+            except (ExecutorError, OutputError) as error:
+                if isinstance(error, UnguardedError) or not run.begun:
                     raise
-                raise _last_words(error, directory, kind.kept()) from error
+                told = ExecutorError if isinstance(error, ExecutorError) else OutputError
+                advice = "; give --resume to continue" if directory.work.is_dir() else ""
+                raise told(f"{error}; {kept()}{advice}") from error
         directory.publish()
-
-
-def _last_words(error: BaseException, directory: RunDirectory, kept: str) -> BaseException:
-    """The error as the user should see it: with what was kept, and what to do."""
-    if gone := not directory.work.is_dir():
-        kept = f"the run directory {directory.path} was removed or renamed while the run was at work"
-    if isinstance(error, KeyboardInterrupt):
-        return Interrupted(f"interrupted; {kept}")
-    advice = "" if gone else "; give --resume to continue"
-    kind = ExecutorError if isinstance(error, ExecutorError) else OutputError
-    return kind(f"{error}; {kept}{advice}")

@@ -72,11 +72,10 @@ def rerun(run_dir: str | Path, workers: int | None = None, *, trust: bool = Fals
     code the files name, a law or a model of a stranger's too. By default that is code below the working directory and
     of installed packages alone; for other code ``ask`` is asked, which gets the question.
 
-    Raises
-    ------
-    RefusedError: the files name other code, which is not trusted; nothing of it has run.
-    OutputError: there is no result, or it is damaged. ConfigError: the recorded configuration cannot be used any more,
-        for instance because the file of a user's own model is gone. TooFewMembersError: the ensemble is lost.
+    Raises :class:`RefusedError`: the files name other code, which is not trusted; nothing of it has run.
+    :class:`OutputError`: there is no result, or it is damaged. :class:`ConfigError`: the recorded configuration cannot
+    be used any more, for instance because the file of a user's own model is gone. :class:`TooFewMembersError`: the
+    ensemble is lost.
     """
     run_dir = Path(run_dir)
     if cycles := series_file(run_dir):

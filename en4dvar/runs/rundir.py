@@ -29,7 +29,7 @@ from en4dvar.runs.lock import LOCK, locked
 
 LISTING = ".en4dvar-files"
 OLD = ".en4dvar-old"
-FOLDERS = ("datasets", "figures", "pages", "checkpoints")
+FOLDERS = ("figures", "pages", "checkpoints")
 PARTIAL = re.compile(r"\..+\.\d+\.tmp")  # of en4dvar.plumbing.files, left by a process that was killed
 LOG = "run.log"
 OF_EVERY_RUN = ("config.yaml", "config.resolved.yaml", LOG)

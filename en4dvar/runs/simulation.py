@@ -73,14 +73,11 @@ class Simulation:
 def simulate(config: Config, times: npt.ArrayLike | None = None) -> Simulation:
     """Run the model once, at the fixed values and the centres of the priors (median, in the prior's own transform).
 
-    Parameters
-    ----------
-    times: (K,) instants from 0 on, of every series, increasing, in the model's unit; default ``simulate.times`` of the
-        configuration, else those of the first data set.
+    ``times``: (K,) instants from 0 on, of every series, increasing, in the model's unit; default ``simulate.times`` of
+    the configuration, else those of the first data set.
 
-    Raises
-    ------
-    ConfigError, DataError: no times, or a value that only the data know. En4dvarError: the model fails.
+    Raises :class:`ConfigError`, :class:`DataError`: no times, or a value that only the data know.
+    :class:`En4dvarError`: the model fails.
     """
     for series in _series(config):
         _places(series, 1)

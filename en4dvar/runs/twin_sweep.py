@@ -138,16 +138,12 @@ def sweep_twin(
 
     Writes ``sweep.csv`` (averages) and ``runs.csv`` (every run) to ``out``, by default runs/<name>_sweep.
 
-    Parameters
-    ----------
-    vary: dotted key → its values, a list, or text that is one in YAML. overrides: as of :func:`en4dvar.run`.
-    workers: processes, by default one a core; the numbers do not depend on it.
-    resume: take over the finished runs that are in ``out``; seeds and values may have been added at the end.
-    progress: called with the number of runs that are done and of all.
+    ``vary``: dotted key → its values, a list, or text that is one in YAML. ``overrides``: as of :func:`en4dvar.run`.
+    ``workers``: processes, by default one a core; the numbers do not depend on it. ``resume``: take over the finished
+    runs that are in ``out``; seeds and values may have been added at the end. ``progress``: called with the number of
+    runs that are done and of all.
 
-    Raises
-    ------
-    ConfigError: a setting is at fault, before any run. OutputError: ``out`` cannot be used.
+    Raises :class:`ConfigError`: a setting is at fault, before any run. :class:`OutputError`: ``out`` cannot be used.
     """
     values = {key: _values(key, choices) for key, choices in vary.items()}
     if not values or seeds < 1:

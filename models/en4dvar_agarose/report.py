@@ -49,7 +49,9 @@ def write_study(study: Study, directory: Path) -> Path:
         decisive=DECISIVE,
         members=study.every_fit[0].analyses[0].settings.members,
         sets=sum(len(study.any_fit(gel).problems) for gel in study.fits),
-        findings=findings(study),
+        routes=ROUTES,
+        scores=_scores(study),
+        apparent={gel: told for gel in study.fits if (told := _apparent_modulus(study, gel))},
         tables=[(tables.TITLES[route], tables.table(study, route)) for route in ROUTES],
         sources=tables.sources(study),
         labels=LABELS,
@@ -68,40 +70,22 @@ def write_study(study: Study, directory: Path) -> Path:
     return write_text(directory / "study.html", page)
 
 
-def findings(study: Study) -> list[str]:
-    """The paper's qualitative findings, in numbers of this study."""
-    sentences = []
-    for gel, models in study.fits.items():
-        for route in ROUTES:
-            if {"nh", "qlkv"} <= set(models):
-                nh, general = (models[m].summary(route, "G")[0] for m in ("nh", "qlkv"))
-                mu = {m: models[m].summary(route, "mu")[0] for m in models}
-                viscosities = ", ".join(f"{LABELS[m]} {v:.3f}" for m, v in mu.items())
-                sentences.append(
-                    f"{gel}, {ROUTES[route]}: G of the neo-Hookean law is {nh / general:.1f} times that of the general "
-                    f"quadratic law; μ hardly depends on the model ({viscosities} Pa s)."
-                )
-    sentences += [words_of for gel in study.fits if (words_of := _apparent_modulus(study, gel))]
-    for route in ROUTES:
-        each = {m: [fit.nrmse(route) for fit in study.every_fit if fit.model == m] for m in NAMES}
-        scores = {m: np.concatenate(values) for m, values in each.items() if values}
-        words = ", ".join(f"{LABELS[m]} {v.min():.3f} to {v.max():.3f}, mean {v.mean():.3f}" for m, v in scores.items())
-        sentences.append(f"NRMSE, {ROUTES[route]}: {words}.")
-    return sentences
+def _scores(study: Study) -> dict[Route, dict[str, Array]]:
+    """NRMSE of all data sets by route and model."""
+    each = {route: {m: [f.nrmse(route) for f in study.every_fit if f.model == m] for m in NAMES} for route in ROUTES}
+    return {r: {LABELS[m]: np.concatenate(v) for m, v in of.items() if v} for r, of in each.items()}
 
 
-def _apparent_modulus(study: Study, gel: str) -> str:
-    """Why G of the neo-Hookean law scatters; needs the truth and the neo-Hookean fits."""
+def _apparent_modulus(study: Study, gel: str) -> tuple[float, float] | None:
+    """Correlation of ln G of the neo-Hookean law with that of the true G α / R₀, and its std; needs the truth and fits
+    of that law.
+    """
     true = {name: study.true_values(gel, name) for name in ("G", "alpha", "R0")}
     if "nh" not in study.fits[gel] or len(true["G"]) < 3:
-        return ""
+        return None
     sheet = np.log(true["G"] * true["alpha"] / true["R0"])
     apparent = np.log(study.fits[gel]["nh"].values("en4dvar", "G"))
-    return (
-        f"{gel}: G of the neo-Hookean law stands for the stiffening it lacks: from bubble to bubble its logarithm "
-        f"follows that of the true G α / R₀ (correlation {np.corrcoef(sheet, apparent)[0, 1]:.2f}), so it scatters as "
-        f"α and R₀ do, by ± {apparent.std():.2f} in ln G."
-    )
+    return float(np.corrcoef(sheet, apparent)[0, 1]), float(apparent.std())
 
 
 def _dfs(study: Study) -> Cells:

@@ -28,7 +28,7 @@ from en4dvar.estimation.population.campaign import FEWEST_SETS
 from en4dvar.estimation.population.own import OwnDraws, own_draws
 from en4dvar.executor import Executor, choose_executor, one_blas_thread
 from en4dvar.model.forward import ForwardModel
-from en4dvar.plumbing.errors import OutputError, TooFewMembersError, retold
+from en4dvar.plumbing.errors import TooFewMembersError, retold
 from en4dvar.priors.prior import Prior, own_seed
 from en4dvar.problem import InverseProblem
 from en4dvar.results.checkpoint import FOLDER, CheckpointError, digest, read_checkpoint, write_checkpoint
@@ -66,12 +66,7 @@ class StudyCheckpoints:
             RunDirectory.open(folder, directory_mode(force, resume), files) as directory,
             tell_interrupt(lambda: f"finished parts are kept in {folder}"),
         ):
-            earlier = read_checkpoint(directory.at(IDENTITY), "study", Identity)
-            if earlier is not None and (difference := who.difference(earlier, frozenset())):
-                raise OutputError(
-                    f"{directory.path}: it cannot be resumed to the same result, for this has changed:\n{difference}"
-                    "\ngive --force to compute everything again, or another --out"
-                )
+            who.require_same(read_checkpoint(directory.at(IDENTITY), "study", Identity), directory.path)
             directory.claim(*files)
             directory.folder(FOLDER)
             write_checkpoint(directory.at(IDENTITY), "study", who)

@@ -5,12 +5,11 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from en4dvar.plumbing.tables import csv_text
 from en4dvar.plumbing.units import convert
 from en4dvar.report import text
-from en4dvar.report.export import column_name, escaped
+from en4dvar.report.export import column_name, render_latex
 from en4dvar.sampling.sweep import SweepResult
 from en4dvar_agarose.fits import Study
 from en4dvar_agarose.paper import LABELS, QUANTITIES, ROUTES, TABLES, Model, Quantity, Route
@@ -94,16 +93,10 @@ def as_csv(study: Study, rows: Sequence[Row], route: Route) -> str:
 
 def as_text(study: Study, rows: Sequence[Row], route: Route, suffix: Literal["md", "tex"]) -> str:
     """A table in Markdown, a gel and model a line, or in LaTeX, a source a line."""
-    marks = "<%", "%>", "<<", ">>"  # braces are LaTeX's
-    loader = PackageLoader("en4dvar_agarose", ".")
-    environment = Environment(
-        *marks, trim_blocks=True, keep_trailing_newline=True, loader=loader, undefined=StrictUndefined
-    )
-    environment.filters["escaped"] = escaped
     units = {"10⁻²": r"$10^{-2}$", "µm": r"$\mu$m", "Pa s": r"Pa\,s"}
-    return environment.get_template(f"table.{suffix}.j2").render(
-        title=TITLES[route], synthetic=study.plan.synthetic, sources=sources(study), rows=rows, labels=LABELS,
-        quantities=QUANTITIES, units=units,
+    return render_latex(
+        f"table.{suffix}.j2", "en4dvar_agarose", title=TITLES[route], synthetic=study.plan.synthetic,
+        sources=sources(study), rows=rows, labels=LABELS, quantities=QUANTITIES, units=units,
     )  # fmt: skip
 
 
