@@ -14,7 +14,7 @@ from en4dvar.model.state import Array, Mask
 from en4dvar.plumbing.errors import DataError
 from en4dvar_movie.drifting import drift_of, shift_at
 from en4dvar_movie.fitting import FREE, fit_outline, tells_contrast
-from en4dvar_movie.frames import Frame, Movie
+from en4dvar_movie.frames import Frame, Movie, saturated
 from en4dvar_movie.outline import THRESHOLD, TILE, Circle, Optics, Outline, labelled, locate
 from en4dvar_movie.surfaces import is_round, smooth_surface, surface_beside_discs
 
@@ -34,6 +34,7 @@ LEADING = 40  # frames looked at for the background
 SAMPLES = 24  # frames looked at for what they share
 SMOOTH = 12.0  # pixels: the brightness that contrasts are relative to varies slowly
 LEAST_SPREAD = 0.002  # of the contrast
+MIDDLE = 0.2  # of the light in its middle: what a dark bubble lacks about it at least
 FULL = 2  # power of its radius over its edge's width with which a bubble tells the contrast: small ones show less of it
 TELLING, LEAST_TELLING = 8, 4  # frames that are asked for a rim; and those that tell how much contrasts differ
 ANY_RIM, ANY_RIM_STD = (0.1, 2.5, 1.0), (3.0, 2.5, 2.0)  # a rim before it is fitted, in widths of the edge
@@ -43,6 +44,7 @@ NOISY = 0.1  # of a pixel's noise: what a contrast can be uncertain by for the n
 SHARPEST = 5  # per cent of the frames: those where the bubble moved least within the exposure
 CLEAR = 4.0  # times the least variance of an edge's width: up to which noise does not make it a sharp one
 BLOB = 120  # pixels: the smallest patch of a first frame that may be a bubble
+AROUND, CLIPPED, HALF = 5.0, 0.25, 0.5  # pixels beside an edge; the share saturated that hides its place; by how much
 BESIDE, EDGE = 3, 1.5  # pixels about a rim, or along the border, that are compared; std of the blur before that
 FIRST = 0.25  # share of the edges of what changes that tells that the first frame shows a bubble
 DRIFTS = 1.0  # noise of a pixel: means over 3 × 3 pixels that differ by more from frame to frame are dirt that drifts
@@ -55,6 +57,7 @@ STEADY = 10_000  # tiles that say how bright a frame is
 CHANGED = 0.3  # share of tiles that a flash changes
 DIM, FIELD = 0.3, 95  # of the light that most pixels (per cent) have at most: what the field of view's outside has
 SWINGS = 0.015  # of the light: std beside the edge of a bright bubble that moves by half a pixel, as no aperture does
+MOVES = 0.05  # of the light: std on an edge that moves
 APERTURE = (2, 6, 12)  # pixels beside it: where the light is blurred, tells that it ends there, and tells the lamp
 WHITE, SMALL, SHARP = 0.95, 0.1, 0.15  # of the brightest, and of a frame: what is burnt in; of its step: what is blur
 BURNT = ((0, 1), (3, 6), 2)  # pixels from it: where no lens shows a step, where the light is its own, what is left out
@@ -159,13 +162,13 @@ def find_background(movie: Movie, circles: int = 1, watched: Mask | None = None)
             "out with --region or --mask what is neither bubble nor background"
         )
     level, stands = beside
-    if stands.any():
-        blind |= stands
-        patches, sizes = labelled(stands)
-        middles = ndimage.center_of_mass(stands, patches, range(1, len(sizes)))
+    blind |= stands
+    for part, what in (stands, "stands still"), (burnt, "is burnt into the picture, as a scale bar,"):
+        patches, sizes = labelled(part)
+        middles = ndimage.center_of_mass(part, patches, range(1, len(sizes)))
         at = " and ".join(f"{x:.0f},{y:.0f}" for y, x in middles)
-        words = f"{movie.path}: what stands still about {at} (x,y) in all frames is no bubble and is not looked at"
-        movie.notes.extend([words] * (words not in movie.notes))
+        words = f"{movie.path}: what {what} about {at} (x,y) in all frames is no bubble and is not looked at"
+        movie.notes.extend([words] * (at != "" and words not in movie.notes))
     if empty > 2:
         steady = pixel_noise(np.array([f - level for f in leading[:empty]]), unit)
         noise = steady * float(np.sqrt(empty / (empty - 1)))
@@ -212,12 +215,15 @@ def _outside(frames: Sequence[Frame]) -> Mask:
     each = ndimage.uniform_filter(films, (0, 5, 5))
     steady = np.mean((each.min(axis=0) > 0.5 * usual)[about])
     near = bright * np.median(each[:, within] / np.maximum(usual[within], 1e-6 * bright), axis=1)
-    swings = []
+    swings, shares = [], []
+    edge = blurred & ~ndimage.binary_erosion(dark, iterations=APERTURE[0], border_value=1)
     for lamp in (np.percentile(each, FIELD, axis=(1, 2)), near):  # a bubble may cover the brightest, or what is near
         relative = (f[:, about] / np.maximum(lamp, 1e-6)[:, None] for f in (films, each))
         of_pixel, swing = (np.median(part.var(axis=0)) for part in relative)
         swings.append(swing - max(of_pixel - swing, 0.0) / 24)  # without the noise in a mean of 25 pixels
-    return np.asarray(blurred & (steady > 1 - LIVELY) & (min(swings) < SWINGS**2))
+        shares.append(np.mean((each[:, edge] / np.maximum(lamp, 1e-6)[:, None]).var(axis=0) > MOVES**2))
+    stands = steady > 1 - LIVELY and min(swings) < SWINGS**2 and min(shares) < LIVELY
+    return np.asarray(blurred & stands)
 
 
 def _burnt_in(frames: Sequence[Frame]) -> Mask:
@@ -356,11 +362,16 @@ def _without_specks(empty: Sequence[Frame], noise: float) -> Array:
 def _with_sign(
     level: Array, samples: Sequence[Frame], noise: float, empty: int, blind: Mask, unit: float
 ) -> Background:
-    """Dark on bright, relative to the background; or bright on dark, as it is: by what differs most in most frames."""
-    votes = [
-        float(np.percentile(d, 99.5) + np.percentile(d, 0.5))
-        for d in ((_lit_as(f, level) - level)[~blind] for f in samples)
-    ]
+    """Dark on bright, relative to the background; or bright on dark, as it is: by what differs most in most frames, of
+    which what is bright within what is dark is a bubble's middle.
+    """
+    votes = []
+    for frame in samples:
+        off = np.where(blind, np.float32(0), _lit_as(frame, level) - level)
+        least, most = np.percentile(off[~blind], (0.5, 99.5))
+        within = ndimage.binary_fill_holes(off < least / 2)[off > most / 2]
+        middle = -least > max(4 * noise, MIDDLE * most) and np.sum(within) > 0.5 * len(within)
+        votes.append(float(least if middle else least + most))
     if float(np.median([v for v in votes if abs(v) > 4 * noise] or [-1.0])) > 0:
         full = max(float(np.median([np.percentile(f - level, 99.5) for f in samples])), unit)
         gain = np.full_like(level, -1.0 / full)
@@ -387,7 +398,7 @@ def _refined(background: Background, samples: Sequence[Frame]) -> Background:
     total = background.level * background.frames
     count = np.full(total.shape, float(background.frames), dtype=np.float32)
     y, x = np.mgrid[: total.shape[0], : total.shape[1]]
-    for image, places in _steadied(background, samples):
+    for _, image, places in _steadied(background, samples):
         near = ndimage.uniform_filter(image, HALO)  # the halo of a light is no background
         quiet = (np.abs(image) < 5 * background.noise) & (np.abs(near) < max(5 * background.noise / HALO, STILL))
         for circle, _ in places:
@@ -401,13 +412,15 @@ def _refined(background: Background, samples: Sequence[Frame]) -> Background:
     return replace(background, level=(mean + share * (level - mean)).astype(np.float32))
 
 
-def _steadied(background: Background, samples: Sequence[Frame]) -> Iterator[tuple[Array, list[tuple[Circle, float]]]]:
-    """Of frames that show a circle, and no flash, the image in the light of the level, and the circles."""
+def _steadied(
+    background: Background, samples: Sequence[Frame]
+) -> Iterator[tuple[Frame, Array, list[tuple[Circle, float]]]]:
+    """Frames that show a circle, and no flash, the image of each in the light of the level, and the circles."""
     for frame in samples:
         image, tiles = background.normalised(frame)
         places = locate(tiles, background.noise / TILE)
         if places and share_changed(tiles, background.noise) <= CHANGED:
-            yield background.steadied(image, tiles, places[0][0]), places
+            yield frame, background.steadied(image, tiles, places[0][0]), places
 
 
 def share_changed(tiles: Array, noise: float) -> float:
@@ -418,16 +431,21 @@ def share_changed(tiles: Array, noise: float) -> float:
 def _optics(background: Background, samples: Sequence[Frame], movie: Movie, circles: int) -> Optics:
     """What the sampled frames say of contrast, sharpness and rim. Raises :class:`DataError` where none has a bubble."""
     shown: list[tuple[Image, Outline]] = []
-    for image, ((place, contrast), *_) in _steadied(background, samples):
+    clipped: list[float] = []
+    full = saturated(samples)
+    for frame, image, ((place, contrast), *_) in _steadied(background, samples):
         outlines = fit_outline(image, place, Optics(-contrast), circles)
         if outlines is not None and outlines[0].seen > 0.15 and outlines[0].contrast < 0:
             shown.append((image, outlines[0]))
+            clipped.append(float(np.mean(frame[outlines[0].circle.beside(frame.shape, AROUND)] > full)))
     if not shown:
         raise DataError(
             f"{movie.path}: no frame shows a bubble that differs from the background; where the frames show more than "
             "the field about it, such as a holder or a screen, leave that out with --region or --mask"
         )
     optics = _shared([o for _, o in shown], background.noise)
+    if np.median(clipped) > CLIPPED:
+        optics = replace(optics, hidden=max(HALF, optics.width))
     clearest = sorted(shown, key=lambda of: -of[1].seen * of[1].circle.R / of[1].width)[:TELLING]
     rim, rim_std = (tuple(float(optics.width * n) for n in of) for of in (ANY_RIM, ANY_RIM_STD))
     rims = _again(clearest, replace(optics, differs=FREE, rim=rim, rim_std=rim_std), circles)
@@ -437,7 +455,9 @@ def _optics(background: Background, samples: Sequence[Frame], movie: Movie, circ
         return optics
     rim, rim_std = tuple(np.median(values, axis=0)), tuple(_scatter(values))
     rimmed = _again(shown, replace(optics, differs=FREE, rim=rim, rim_std=rim_std), circles)
-    return replace(_shared(rimmed, background.noise), rim=rim, rim_std=rim_std) if rimmed else optics
+    return (
+        replace(_shared(rimmed, background.noise), rim=rim, rim_std=rim_std, hidden=optics.hidden) if rimmed else optics
+    )
 
 
 def _again(shown: Sequence[tuple[Image, Outline]], optics: Optics, circles: int) -> list[Outline]:

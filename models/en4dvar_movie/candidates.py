@@ -1,13 +1,13 @@
 """What may be the bubble in a frame: patches with the outline of a bubble, and what is doubtful in them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from en4dvar.model.state import Array
 from en4dvar_movie.background import BRIGHT, CHANGED, Background, share_changed
 from en4dvar_movie.fitting import SHARP, fit_outline, two_edges
-from en4dvar_movie.frames import Frame
+from en4dvar_movie.frames import Frame, saturated
 from en4dvar_movie.merged import two_circles
 from en4dvar_movie.outline import TILE, Circle, Optics, Outline, locate
 
@@ -19,6 +19,8 @@ ROWS, ROWS_STD = 0.5, 6.0  # pixels and std by which even and odd rows must diff
 BLURS = 3.0  # widths of the movie's sharp edges that another bubble's blur reaches
 TOUCHES = "two bubbles: the outline of another, or of something else as dark, touches it"
 NO_CIRCLE = "no circle fits the outline"
+LIT = "light: a part of the outline is saturated, as by the laser's plasma"
+OUTSIDE, SURELY, GLARING = 3.0, 5.0, 0.05  # pixels outside the outline; std of noise; the share of it that is saturated
 WIDER = 1.4  # widths of the movie's sharp edges from which an edge may be two
 
 
@@ -77,6 +79,8 @@ def look_at(
                 continue
             fault = next((words for o in outlines if (words := _fault_of(o, optics, background.noise))), "")
             doubt = "" if fault else TOUCHES if pair else _doubt(steady, outlines[0], optics, circles)
+            if not fault and background.relative and _lit_outside(frame, steady, outlines[0].circle, background.noise):
+                doubt = LIT
             candidates.append(Candidate(number, tuple(outlines), fault, doubt))
     return Look(number, tuple(candidates), "" if candidates else NO_CIRCLE, spot)
 
@@ -113,6 +117,12 @@ def _fault_of(outline: Outline, optics: Optics, noise: float) -> str:
     if outline.contrast > 0.25 * optics.contrast:
         return "faint: the outline has no contrast"
     return ""
+
+
+def _lit_outside(frame: Frame, image: Array, circle: Circle, noise: float) -> bool:
+    """True if a part of what lies next to a dark bubble is saturated, and brighter than the background."""
+    about = replace(circle, R=circle.R + OUTSIDE / 2).beside(image.shape, OUTSIDE / 2)
+    return bool(np.mean(((frame > saturated([frame])) & (image > SURELY * noise))[about]) > GLARING)
 
 
 def _doubt(image: Array, outline: Outline, optics: Optics, circles: int) -> str:

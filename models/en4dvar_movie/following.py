@@ -19,6 +19,7 @@ MOST = 8  # bubbles that are followed
 DRIFT = 3.0  # pixels a frame that a bubble may travel
 LOOSE = 0.3  # of the radius: how far centres of neighbouring frames lie apart for the fit's sake
 LEAST = 3  # frames of a bubble that is followed beside the first
+BLURRED = 0.25  # widths of an edge: what its place may be off by
 SAME = 0.5  # of the best bubble's score: from which another could be meant as well
 FAINT = 0.1  # of it: below which light says nothing, such as that where dirt of the background was
 BRIEF = 4  # frames that the laser's light lasts at most
@@ -45,8 +46,8 @@ class Chain:
     @property
     def score(self) -> float:
         """How far its wall travels, beyond what errors make of it, and a little of its size."""
-        radii = self.circles[:, 2]
-        travel = np.maximum(np.abs(np.diff(radii)) - 0.3, 0)
+        radii, widths = self.circles[:, 2], np.array([c.outlines[0].width for c in self.candidates])
+        travel = np.maximum(np.abs(np.diff(radii)) - np.maximum(0.3, BLURRED * np.hypot(widths[1:], widths[:-1])), 0)
         return float(np.sum(np.minimum(travel, 0.5 * np.maximum(radii[1:], radii[:-1]))) + 0.02 * radii.sum())
 
     def distance(self, x: float, y: float) -> tuple[float, float]:

@@ -89,6 +89,12 @@ class Movie:
         return f"{self.path}: frame {number}{''.join(f' ({name})' for name in self.within)}"
 
 
+def saturated(frames: Iterable[Frame]) -> float:
+    """The brightness above which a pixel of some frames is saturated, of a camera of as many bits as they need."""
+    most = max(float(np.nanmax(frame)) if frame.dtype.kind in "ui" else np.inf for frame in frames)
+    return 0.99 * max(float(2 ** np.ceil(np.log2(most + 1))) - 1, 255.0)
+
+
 def open_movie(path: str | Path, raw: str | None = None) -> Movie:
     """The movie in a file or folder; ``raw`` is the ``WIDTHxHEIGHTxBITS`` of a file without header.
 

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from en4dvar.model.state import Array, Indices
+from en4dvar.model.state import Array, Indices, Mask
 
 MODES = 6  # of the outline
 TILE = 2  # pixels are averaged over tiles of this side
@@ -25,6 +25,11 @@ class Circle:
     y: float
     R: float
 
+    def beside(self, shape: tuple[int, ...], far: float) -> Mask:
+        """What of an image (H, W) lies no further than so many pixels from the circle."""
+        y, x = np.ogrid[: shape[0], : shape[1]]
+        return np.asarray(np.abs(np.hypot(x - self.x, y - self.y) - self.R) < far)
+
 
 @dataclass(frozen=True)
 class Optics:
@@ -34,7 +39,8 @@ class Optics:
     ``spread`` is how well the contrast is known, as a share of it: 1 where it is not; ``differs`` the share by which
     that of a frame differs from it, ``noise`` the std of a pixel, and ``even`` that bubbles are evenly dark, so that a
     frame may tell a contrast of its own. ``rim`` is that of :mod:`en4dvar_movie.kernels`: light, distance and width in
-    pixels, () without a rim, and ``rim_std`` how well a frame's are known.
+    pixels, () without a rim, and ``rim_std`` how well a frame's are known. ``hidden`` is by how many pixels all edges
+    may be off where the frames are saturated beside them.
     """
 
     contrast: float
@@ -45,6 +51,7 @@ class Optics:
     even: bool = False
     rim: tuple[float, ...] = ()
     rim_std: tuple[float, ...] = ()
+    hidden: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -70,7 +70,8 @@ def _standing(extremes: Array, field: Mask, surface: Array) -> Mask:
     low, usual, high = extremes
     most = float(np.max(np.percentile(np.abs(extremes[:, field]), 99, axis=1)))
     limit = max(DIFFERS * most, LEAST_CONTRAST * float(np.median(np.abs(surface[field]))))
-    border = field & ~ndimage.binary_erosion(field, np.ones((3, 3)))
+    whole = ndimage.binary_fill_holes(field)  # from what is written within the field nothing comes
+    border = whole & ~ndimage.binary_erosion(whole, np.ones((3, 3)))
     result = np.zeros_like(field)
     for always, ever, shade in ((-high, -low, -usual), (low, high, usual)):
         never = field & (ever < limit)

@@ -10,11 +10,11 @@ from en4dvar.executor import SerialExecutor, ThreadsExecutor
 from en4dvar.model.state import Mask
 from en4dvar.plumbing.errors import DataError
 from en4dvar_movie.background import Background, find_background
-from en4dvar_movie.candidates import NO_CIRCLE, TOUCHES, Look, look_at
+from en4dvar_movie.candidates import LIT, NO_CIRCLE, TOUCHES, Look, look_at
 from en4dvar_movie.choice import Correction
 from en4dvar_movie.drifting import shift_at
 from en4dvar_movie.flashes import in_time
-from en4dvar_movie.following import Chain, chains, doubts, reasons, target
+from en4dvar_movie.following import BRIEF, Chain, chains, doubts, reasons, target
 from en4dvar_movie.frames import Frame, Movie
 from en4dvar_movie.outline import Optics, Outline
 from en4dvar_movie.uncertainty import NOTHING, Errors, errors_of
@@ -106,6 +106,11 @@ def track(
             f"the camera drifts: the last frame shows the background {across} pixels to the right and {down} down of "
             "where the first does; a region or mask is that of the first frame and moves with it, x and y do not"
         )
+    if optics.hidden:
+        notes.append(
+            "beside the bubble's edge the frames are saturated, or black and white alone: where in the light's fall it "
+            f"shows is not known, and all radii may be off by {optics.hidden:.1f} pixels alike, which R_common_um holds"
+        )
     if movie.copies:
         notes.append(
             f"the same, bit for bit, as the frame before, and so not used: {_ranges(sorted(movie.copies))}; if a "
@@ -145,7 +150,8 @@ def _readings(
 ) -> Iterator[Reading]:
     """Radii with errors, a frame's circles in the order of flashes; ``exposure`` is a share of the frames' step."""
     doubtful = doubts(bubble, [other for other in bubbles if other is not bubble])
-    doubtful |= {c.frame: c.doubt for c in bubble.candidates if c.doubt}
+    stays = sum(c.doubt == LIT for c in bubble.candidates) > BRIEF  # such light is not the laser's
+    doubtful |= {c.frame: c.doubt for c in bubble.candidates if c.doubt and not (stays and c.doubt == LIT)}
     doubtful = {frame: words for frame, words in doubtful.items() if frame not in corrections}
     out = {frame for frame, correction in corrections.items() if correction.out}
     why = reasons(looks, bubble)

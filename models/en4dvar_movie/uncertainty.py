@@ -187,7 +187,7 @@ def _errors(outline: Outline, ratio: float, hidden: float, turned: bool, optics:
     light, beside, wide = outline.rim or (0.0, 0.0, 0.0)
     blurred = np.hypot(outline.width, wide)
     there = light * np.exp(-0.5 * (beside / blurred) ** 2) / blurred / np.sqrt(2 * np.pi)  # the rim's level at the edge
-    common = float(np.hypot(THRESHOLD, RIM * there) * np.sqrt(2 * np.pi) * outline.width)
+    common = float(np.hypot(np.hypot(THRESHOLD, RIM * there) * np.sqrt(2 * np.pi) * outline.width, optics.hidden))
     return Errors(radius, float(np.sqrt(variance)), common, words, outline.mode_std * float(np.sqrt(ratio)))
 
 

@@ -104,6 +104,13 @@ def test_a_centre_and_a_radius_that_jump_are_doubted_and_a_collapse_is_not():
     assert doubts(Chain(tuple(collapse)), []) == {}
 
 
+def test_the_wall_of_a_blur_travels_no_further_than_its_place_is_unknown():
+    sharp = [circle(k, 50.0, 20 + np.sin(k)) for k in range(15)]
+    blurs = [circle(k, 50.0, 3.9 + 2.4 * (k % 2)) for k in range(8)]
+    blurs = [replace(c, outlines=(replace(c.outlines[0], width=5.5),)) for c in blurs]
+    assert Chain(tuple(sharp)).score > 1.5 * Chain(tuple(blurs)).score
+
+
 def test_a_bubble_that_touches_is_told():
     own = Chain(tuple(circle(k, 50.0, 20.0) for k in range(20)))
     other = Chain(tuple(circle(k, 110.0 - 4 * k, 8.0) for k in range(20)))

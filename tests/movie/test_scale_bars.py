@@ -34,8 +34,10 @@ def barred(empty=0, drift=(0.0, 0.0), texture=0.0, seed=1):
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("empty", "drift", "texture"), [(0, (0.0, 0.0), 0.0), (5, (0.25, 0.4), 0.02)])
 def test_a_bubble_beside_a_scale_bar_is_read(empty, drift, texture, seed):
-    result = track(movie_of(barred(empty, drift, texture, seed)))
+    movie = movie_of(barred(empty, drift, texture, seed))
+    result = track(movie)
     assert (result.background.drift is not None) == any(drift)
+    assert any("what is burnt into the picture, as a scale bar, about 11" in note for note in movie.notes)
     radii = np.array([r.radius for r in result.readings[empty:] if r.used])
     truth = np.array([R for r, R in zip(result.readings[empty:], RADII, strict=True) if r.used])
     assert len(radii) > 0.9 * len(RADII)
@@ -57,3 +59,18 @@ def test_a_luminous_bubble_and_an_overexposed_field_are_not_burnt_in():
     wall = np.full((24, 80, 80), 255, dtype=np.uint8)
     wall[:, 50:] = 10  # in a field that is overexposed
     assert not _burnt_in(wall).any()
+
+
+def test_a_bar_before_a_bubble_is_no_border_from_which_the_bubble_comes():
+    noise = np.random.default_rng(1)
+    y, x = np.mgrid[:120, :136]
+    radii = 21.5 + np.sin(np.arange(15))
+    frames = [
+        150 * (1 - 0.75 * expit((R - np.hypot(x - 42, y - 56)) / 0.5)) + noise.normal(0, 2, x.shape) for R in radii
+    ]
+    for frame in frames:
+        frame[31:36, 20:55] = 255
+    movie = movie_of([np.clip(np.rint(frame), 0, 255).astype(np.uint8) for frame in frames])
+    read = [r.radius for r in track(movie).readings]
+    assert not any("stands still" in note for note in movie.notes)
+    np.testing.assert_allclose(read, radii, atol=0.2)
