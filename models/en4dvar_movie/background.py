@@ -112,10 +112,14 @@ class Background:
         brighter = np.mean((tiles > change + apart) & (tiles != 0))
         return change if abs(change) <= FLICKER or (brighter < CORNERS and not white) else 0.0
 
-    def steadied(self, image: Array, tiles: Array, bubble: Circle) -> Array:
-        """The image at the background's own brightness: what the light does far from the bubble is taken out."""
+    def steadied(self, image: Array, tiles: Array, bubble: Circle, contrast: float) -> Array:
+        """The image at the background's own brightness: what the light does far from the bubble is taken out.
+
+        What is darker than half the ``contrast`` of a bubble is another, or something else before the light.
+        """
         down, across = (TILE * np.arange(side) - at for side, at in zip(tiles.shape, (bubble.y, bubble.x), strict=True))
-        outside = tiles[np.add.outer(down**2, across**2) > (1.4 * bubble.R + 8) ** 2]
+        lit = ndimage.uniform_filter(tiles, 3, mode="nearest") > contrast / 2
+        outside = tiles[(np.add.outer(down**2, across**2) > (1.4 * bubble.R + 8) ** 2) & lit]
         if len(outside) < 0.05 * tiles.size:
             return image
         change = np.float32(np.median(outside[:: -(-len(outside) // STEADY)]))
@@ -420,7 +424,7 @@ def _steadied(
         image, tiles = background.normalised(frame)
         places = locate(tiles, background.noise / TILE)
         if places and share_changed(tiles, background.noise) <= CHANGED:
-            yield frame, background.steadied(image, tiles, places[0][0]), places
+            yield frame, background.steadied(image, tiles, places[0][0], -places[0][1]), places
 
 
 def share_changed(tiles: Array, noise: float) -> float:

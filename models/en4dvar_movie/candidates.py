@@ -70,7 +70,7 @@ def look_at(
         return Look(number, (), "no bubble: nothing differs from the background", spot)
     candidates: list[Candidate] = []
     for place in places:
-        steady = background.steadied(image, tiles, place)
+        steady = background.steadied(image, tiles, place, optics.contrast)
         pair = None if start is not None else two_circles(steady, place, optics.contrast, background.noise)
         for near, other in ((place, None),) if pair is None else (pair, pair[::-1]):
             seen = steady if other is None else _without(steady, other, optics)

@@ -210,14 +210,15 @@ def _from_segment(point: Array, a: Array, b: Array) -> float:
 
 
 def reasons(looks: Sequence[Look], bubble: Chain) -> Mapping[int, str]:
-    """Frame → why the bubble has no outline there."""
+    """Frame → why the bubble has no outline there: what the candidates at its place say, or all where none is."""
     inside = {c.frame for c in bubble.candidates}
     result = {}
     for look in looks:
         if look.frame in inside:
             continue
-        faults = [c.fault for c in look.candidates]
-        if look.candidates and not all(faults):
+        of_place = [c for c in look.candidates if inside and bubble.distance(c.circle.x, c.circle.y)[0] == 0]
+        faults = [c.fault for c in of_place or look.candidates]
+        if not all(faults):
             result[look.frame] = "elsewhere: the outline lies outside the bubble of other frames"
         else:
             result[look.frame] = next(iter(faults), look.reason)

@@ -6,6 +6,7 @@ The movies are those of benchmarks/nasty_movies.py, rendered with other code tha
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,10 +17,11 @@ from nasty_movies import film
 from PIL import Image
 
 from en4dvar.cli import main
-from en4dvar_movie.candidates import Candidate
+from en4dvar_movie.candidates import Candidate, Look
 from en4dvar_movie.choice import Correction
-from en4dvar_movie.following import Chain, doubts
+from en4dvar_movie.following import Chain, doubts, reasons
 from en4dvar_movie.outline import Circle, Outline
+from en4dvar_movie.scene import Scene, render
 from en4dvar_movie.tracking import doubted, track
 
 
@@ -117,6 +119,30 @@ def test_a_bubble_that_touches_is_told():
     doubtful = doubts(own, [other])
     assert min(doubtful) in range(4, 8)  # the gap is 32 − 4 k pixels; it counts from 5 on, and three frames before
     assert all("two bubbles" in words for words in doubtful.values())
+
+
+def test_the_light_beside_a_bubble_is_not_that_within_a_larger_one():
+    radii = np.array([30.0, 38, 44, 46, 46, 44, 38, 30])  # from 44 on it covers more than half of what is far from ours
+    scenes = [
+        Scene(shape=(98, 160), noise=0.0, uneven=0.0, level=5e4, bits=16, bubble=at) for at in ((48, 49), (128, 48))
+    ]
+    films = [
+        np.array(list(render(share * radii[:, None], scene, np.random.default_rng(1))), float)
+        for share, scene in zip((1, 0.4), scenes, strict=True)
+    ]
+    light = 3e-3 * films[0] * films[1] / 5e4
+    frames = list(np.rint(light + np.random.default_rng(2).normal(0, 1, light.shape)).astype(np.uint8))
+    radius, _ = read(SimpleNamespace(frames=frames), point=(128.0, 48.0))
+    assert np.all(np.abs(radius[3:] - 0.4 * radii) < 0.05)
+
+
+def test_why_a_bubble_is_not_read_is_told_of_its_own_place():
+    own, other = circle(1, 52.0, 20.0), circle(1, 150.0, 25.0)
+    bubble = Chain((circle(0, 50.0, 20.0), circle(2, 50.0, 20.0)))
+    looks = [Look(0, bubble.candidates[:1]), Look(1, (other, replace(own, fault="faint"))), Look(2), Look(3, (other,))]
+    why = reasons(looks, bubble)
+    assert why[1] == "faint"
+    assert why[3].startswith("elsewhere")
 
 
 @pytest.mark.slow
