@@ -283,16 +283,18 @@ def _rest(times: Array, radius: Array, peak: Lobe) -> tuple[float, str]:
     """The radius at rest, NaN where there is none; and what a history that seemed to rest does instead, in words.
 
     A radius that goes on growing after the oscillations is that of fragments, of gas that diffuses in, or of an edge
-    that blurs: it is no bubble of a constant amount of gas.
+    that blurs: it is no bubble of a constant amount of gas. One that falls may be that of rebounds which die away: it
+    drifts where it had settled before.
     """
     quarter = max(3, len(radius) // 4)
     tail = radius[-quarter:]
     if not np.all(tail > 0) or float(np.std(np.log(tail))) > SETTLED or times[-quarter] < peak.t_max + 2 * peak.t_c:
         return float("nan"), ""
     rest, begun = float(np.median(tail)), int(np.searchsorted(times, peak.t_max + 2 * peak.t_c))
-    before = radius[max(begun, len(radius) - 2 * quarter) : -quarter]
+    before = np.maximum(radius[max(begun, len(radius) - 2 * quarter) : -quarter], 1e-3 * rest)
     earlier = float(np.median(before)) if len(before) >= 3 else rest
-    if rest > GAS * peak.R_max or not abs(np.log(rest / max(earlier, 1e-3 * rest))) < DRIFTS:
+    change = math.log(rest / earlier)
+    if rest > GAS * peak.R_max or change >= DRIFTS or (change <= -DRIFTS and np.std(np.log(before)) <= SETTLED):
         return float("nan"), f"R goes from {1e6 * earlier:.3g} to {1e6 * rest:.3g} um where it should rest"
     return rest, ""
 
