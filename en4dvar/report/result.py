@@ -156,7 +156,7 @@ class Result(StoredResult):
         def each(tag: str, values: Iterable[object]) -> Markup:
             return Markup("").join(Markup(f"<{tag}>{{}}</{tag}>").format(value) for value in values)
 
-        rows = [(row.label, row.unit, *estimate_cells(row), f"{row.dfs:.2f}") for row in self.rows]
+        rows = [(row.label, row.unit, *estimate_cells(row), f"{row.dfs:z.2f}") for row in self.rows]
         head, body = each("th", HEADER), each("tr", (each("td", row) for row in rows))
         warned = each("li", (f"{c.kind}: {c.words}" for c in self.cautions))
         page = Markup("<div><b>{}</b><table><thead><tr>{}</tr></thead><tbody>{}</tbody></table><p>{}</p>{}</div>")

@@ -309,7 +309,7 @@ def sequences_table(scores: Sequence[SequenceScore]) -> str:
     """What the terminal shows: a row a run, and which is preferred."""
     header = ("run", "scheme", "log-evidence", "difference", "probability", "innovations / expected")
     rows = [
-        (s.run, s.scheme, f"{s.log_evidence:.2f}", f"{s.difference:.2f}", f"{s.probability:.3f}", f"{s.innovation:.3g}")
+        (s.run, s.scheme, f"{s.log_evidence:.2f}", f"{s.difference:z.2f}", f"{s.probability:.3f}", f"{s.innovation:.3g}")
         for s in scores
     ]
     best, second = sorted(scores, key=lambda score: -score.log_evidence)[:2]
