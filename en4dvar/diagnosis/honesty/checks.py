@@ -106,9 +106,10 @@ def structure(analysis: Analysis) -> Findings:
         which, probability = residuals.outlier
         place = int(np.flatnonzero(residuals.which == which)[0])
         words = (
-            f"the reading at {moments(analysis)[which]} {CLOCK} is farther off than the scatter of the residuals explains "
-            f"(probability {_chance(probability)}); by its own error it is {abs(residuals.studentised[place]):.1f} "
-            f"standard deviations off, with a leverage of {residuals.leverage[place]:.0%}"
+            f"the reading at {moments(analysis)[which]} {CLOCK} is farther off than the scatter of the residuals "
+            f"explains (probability {_chance(probability)}); by its own error it is "
+            f"{abs(residuals.studentised[place]):.1f} standard deviations off, with a leverage of "
+            f"{residuals.leverage[place]:.0%}"
         )
         yield caution("odd-residuals", words)
 
