@@ -309,9 +309,12 @@ def sequences_table(scores: Sequence[SequenceScore]) -> str:
     """What the terminal shows: a row a run, and which is preferred."""
     header = ("run", "scheme", "log-evidence", "difference", "probability", "innovations / expected")
     rows = [
-        (s.run, s.scheme, fixed(s.log_evidence, 2), fixed(s.difference, 2), fixed(s.probability, 3), f"{s.innovation:.3g}")
+        (
+            s.run, s.scheme, fixed(s.log_evidence, 2), fixed(s.difference, 2), fixed(s.probability, 3),
+            f"{s.innovation:.3g}",
+        )
         for s in scores
-    ]
+    ]  # fmt: skip
     best, second = sorted(scores, key=lambda score: -score.log_evidence)[:2]
     told = f"{table([header, *rows])}\n\n{preferred(best.run, second.run, -second.difference)}"
     if bent := ", ".join(s.run for s in scores if s.bent):
