@@ -215,9 +215,14 @@ def convert(value: "float | Array", from_unit: str, to_unit: str) -> "float | Ar
 
 
 def split_quantity(text: str) -> tuple[str, str]:
-    """Number and unit as they are written, each "" where there is none."""
+    """Number and unit as they are written, each "" where there is none; the unit of a length per pixel is a length.
+
+    >>> split_quantity("2.76 um"), split_quantity("2.7e5/s"), split_quantity("4 um/px")
+    (('2.76', 'um'), ('2.7e5', '1/s'), ('4', 'um'))
+    """
     number = _NUMBER.match(text.strip())
-    return (number[0], text.strip()[number.end() :].strip()) if number else ("", "")
+    unit = re.sub(r"\s*/\s*(px|pixel)$", "", text.strip()[number.end() :].strip()) if number else ""
+    return number[0] if number else "", f"1{unit}" if unit.startswith("/") else unit
 
 
 def parse_quantity(value: str | float, unit: str, usual: str = "") -> float:

@@ -181,7 +181,7 @@ class Calibration:
     def rows(self) -> list[tuple[str, ...]]:
         """The table, without its head."""
         return [
-            (v.quantity, str(v.sets), f"{v.p:.2g}", f"{v.mean:+.2f}", f"{v.std:.2f}", _held(v.half, v.sets),
+            (v.quantity, str(v.sets), f"{v.p:.2g}", f"{v.mean:+z.2f}", f"{v.std:.2f}", _held(v.half, v.sets),
              _held(v.most, v.sets)) for v in self.verdicts
         ]  # fmt: skip
 

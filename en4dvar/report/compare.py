@@ -201,11 +201,11 @@ def _difference(results: Mapping[str, Mapping[str, StoredResult]]) -> str:
     first, *others = results
     for name in others:
         if odd := sorted(set(results[name]) ^ set(results[first])):
-            return f"{name} and {first} hold different data sets: {listed(odd, 3)}"
+            return f"the runs {name} and {first} hold different data sets: {listed(odd, 3)}"
         for dataset, result in results[name].items():
             if not _same_data(result, results[first][dataset]):
                 why = "evidences of different data, errors or weights do not compare"
-                return f"{name} and {first} used different observations of {dataset}; {why}"
+                return f"the runs {name} and {first} used different observations of {dataset}; {why}"
     return ""
 
 

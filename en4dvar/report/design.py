@@ -121,7 +121,7 @@ def design_table(designs: Designs) -> str:
     cells = [
         (
             settings_text(row), *[str(it.alike)] * several, str(len(it.readings)), f"{row.price:g}",
-            f"{it.worth:.2f} ± {it.worth_error:.2f}", by(it), words(designs, row),
+            f"{it.worth:z.2f} ± {it.worth_error:.2f}", by(it), words(designs, row),
         )
         for row, it in ((row, row.evaluated) for row in dict.fromkeys([*rows[:TOLD], *own]))
     ]  # fmt: skip

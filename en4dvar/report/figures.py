@@ -260,7 +260,7 @@ def _pair(i: int, j: int, x: Array, y: Array) -> Panel:
     else:
         known = np.ptp(x) > 0 and np.ptp(y) > 0
         correlation = float(np.corrcoef(x, y)[0, 1]) if known else math.nan
-        panel.bare, panel.words = True, f"{correlation:+.2f}".replace("-", "−") if known else "–"
+        panel.bare, panel.words = True, f"{correlation:+z.2f}".replace("-", "−") if known else "–"
     return panel
 
 

@@ -150,7 +150,7 @@ class Result(StoredResult):
 
     def _repr_html_(self) -> str:
         """A piece of HTML; everything in it is escaped."""
-        rows = [(row.label, row.unit, *estimate_cells(row), f"{row.dfs:.2f}") for row in self.rows]
+        rows = [(row.label, row.unit, *estimate_cells(row), f"{row.dfs:z.2f}") for row in self.rows]
         return render("notebook.html.j2", result=self, rows=rows)
 
 

@@ -29,7 +29,7 @@ from en4dvar.report.export import Kind, column_name, escaped, latex_unit, plus_m
 from en4dvar.report.html import render
 from en4dvar.report.paper import on_paper
 from en4dvar.report.svg import Captioned, draw
-from en4dvar.report.text import axis_label, percent, plain_number, pretty_unit, shown, with_unit
+from en4dvar.report.text import axis_label, fixed, percent, plain_number, pretty_unit, shown, with_unit
 from en4dvar.results.netcdf import Group, read_groups, understood
 from en4dvar.results.series_file import estimates, series_file, series_group
 from en4dvar.series.problem import SeriesResult
@@ -284,9 +284,12 @@ def sequences_table(scores: Sequence[SequenceScore]) -> str:
     """What the terminal shows: a row a run, and which is preferred."""
     header = ("run", "scheme", "log-evidence", "difference", "probability", "innovations / expected")
     rows = [
-        (s.run, s.scheme, f"{s.log_evidence:.2f}", f"{s.difference:.2f}", f"{s.probability:.3f}", f"{s.innovation:.3g}")
+        (
+            s.run, s.scheme, fixed(s.log_evidence, 2), fixed(s.difference, 2), fixed(s.probability, 3),
+            f"{s.innovation:.3g}",
+        )
         for s in scores
-    ]
+    ]  # fmt: skip
     best, second = sorted(scores, key=lambda score: -score.log_evidence)[:2]
     told = f"{table([header, *rows])}\n\n{preferred(best.run, second.run, -second.difference)}"
     if bent := ", ".join(s.run for s in scores if s.bent):

@@ -131,8 +131,8 @@ def signed(value: float) -> str:
 
 
 def percent(share: float) -> str:
-    """``0.123`` → ``"12 %"``; an en dash for NaN."""
-    return f"{100 * share:.0f} %" if math.isfinite(share) else "–"
+    """``0.123`` → ``"12 %"``, ``-0.001`` → ``"0 %"``; an en dash for NaN."""
+    return f"{100 * share:z.0f} %" if math.isfinite(share) else "–"
 
 
 def fixed(value: float, places: int) -> str:

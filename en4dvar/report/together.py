@@ -310,10 +310,10 @@ def _together(stored: StoredPopulation, combination: Combination) -> str:
     """What is sharp: a product of powers where all are logarithms."""
     names = " and ".join(name for name, _ in combination.parts)
     if not all(_logarithmic(stored.group("posterior")[f"{name}_mean"]) for name, _ in combination.parts):
-        return f"{names}: the data determine a combination of them, and less of each."
+        return f"Of {names} the data determine a combination, and less of each."
     powers = ((name, text.quantity(exponent, 0.1)) for name, exponent in combination.parts)
     product = " · ".join(name if power == "1.00" else f"{name}^{power}" for name, power in powers)
-    return f"{names}: the data determine {product}, to {text.percent(combination.std)}, and less of each."
+    return f"Of {names} the data determine {product}, to {text.percent(combination.std)}, and less of each."
 
 
 def _logarithmic(draws: xr.DataArray) -> bool:

@@ -297,6 +297,8 @@ for (const step of ["track", "init"]) for (const id of MINE[step].slice(1)) $(id
 for (const id of ["movie", "table"]) $(id).addEventListener("change", () => sessionStorage.setItem(id, $(id).value));
 for (const id of ["table", "sheet"]) $(id).addEventListener("change", readTable);
 $("config").addEventListener("change", readConfig);
+// What a hand changes ends a message about what was there; it may itself be the reason of a new one.
+document.addEventListener("change", (event) => { if (event.bubbles) say(""); }, true);
 for (const id of ["time-column", "radius-column", "time-unit", "radius-unit"]) $(id).addEventListener("change", plotTable);
 fetched("laws", {}).then(({ laws }) => $("laws").replaceChildren(...laws.map((law) => new Option(law, law)))).catch(() => {});
 window.addEventListener("beforeunload", (event) => { if ($("text").value !== before || Object.keys(drafts).length) event.preventDefault(); });

@@ -134,7 +134,10 @@ def _command(job: Path, root: Path, words: list[str], output: Any) -> int:
     while process.poll() is None:
         if (job / "cancel").exists():
             process.terminate()
-            return process.wait()
+            code = process.wait()
+            if not (job / "output").stat().st_size:
+                output.write(b"cancelled before the command had begun: nothing was done; click again to begin\n")
+            return code
         time.sleep(0.1)
     return process.wait()
 

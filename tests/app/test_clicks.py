@@ -54,6 +54,8 @@ def test_cancelled_and_resumed_after_the_window_and_the_server_are_gone(visit, s
     page = visit(server)
     page.click("button[data-step=resume]")
     until(page, "message.innerText.includes('choose a configuration first')")
+    page.select_option("#start", "laser")
+    until(page, "message.innerText === ''")
     units = {"time_column": "Zeit", "radius_column": "Radius", "time_unit": "us", "radius_unit": "um"}
     proposed(page, "messung.csv", **units)
     page.click("button[data-step=run]")

@@ -181,6 +181,14 @@ def test_code_is_run_with_trust(serve, tmp_path):
     assert Path(tmp_path / "ran").exists()
 
 
+def test_a_command_that_is_cancelled_before_it_begins_says_so(server):
+    assert server.post("validate", config="a.yaml")[0] == 200
+    server.post("cancel")
+    ended = server.last()
+    assert ended["state"] == "stopped"
+    assert ended["output"] == "cancelled before the command had begun: nothing was done; click again to begin\n"
+
+
 def test_a_link_to_elsewhere_in_place_of_the_jobs_is_refused(server, tmp_path):
     (tmp_path / "jobs").mkdir()
     (server.folder / ".en4dvar_app").symlink_to(tmp_path / "jobs")

@@ -164,6 +164,30 @@ def test_fragments_are_no_bubble_at_rest() -> None:
     assert "where it should rest" in seen.drift
 
 
+@pytest.mark.parametrize("change", [0.8, 1.25])
+def test_a_radius_that_changes_after_it_has_settled_drifts(change: float) -> None:
+    t = np.arange(250) * 1e-6
+    r = np.where(t < 26e-6, 240e-6 * np.clip(1 - (t / 25e-6) ** 2, 0, 1) ** 0.4, 0)
+    r = np.maximum(r, 30e-6 + 50e-6 * np.sin((t - 26e-6) / 8e-6) ** 2 * np.exp(-(t - 26e-6) / 15e-6))
+    assert look(t, r).rest == pytest.approx(30e-6, rel=0.02)
+    assert "where it should rest" in look(t, r * np.where(t > 190e-6, change, 1)).drift
+
+
+@pytest.mark.parametrize("ends", [90, 100, 129])
+@pytest.mark.parametrize("largest", [220e-6, 310e-6])
+def test_rebounds_that_die_away_are_no_drift(largest: float, ends: float) -> None:
+    """Wherever the record ends: the quarter before the last one holds a rebound, whose median is larger."""
+    settings = {"start": "laser", "law": "neo-hookean-kelvin-voigt"}
+    model = BubbleModel.from_settings(BubbleSettings.model_validate(settings))
+    rest, t = 48 / 310 * largest, np.arange(0, 1e-6 * ends, 3.7e-6)
+    theta = {"G": 6e3, "mu": 0.06, "R_max": largest, "R_eq": rest}
+    states = model.initial_states({name: np.array([value]) for name, value in theta.items()})
+    (path,) = model.trajectories(states, t)
+    seen = look(t, path["R"] + 5e-7 * np.random.default_rng(1).standard_normal(len(t)))
+    assert not seen.drift
+    assert np.isnan(seen.rest) or seen.rest == pytest.approx(rest, rel=0.1)
+
+
 @pytest.mark.parametrize(("mu", "grown"), [(0.3, 0.6), (0.5, 0.0), (0.7, 0.0)])
 def test_a_bubble_that_creeps_back_has_a_top_and_is_no_driven_one(mu: float, grown: float) -> None:
     """In a thick gel there is no rebound, and R^(5/2) is a parabola near the top alone."""

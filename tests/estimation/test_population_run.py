@@ -61,6 +61,9 @@ def test_files_and_the_answer(found):
     assert "the median (geometric mean) of the population" in page
     assert page.index("varies by") < page.index('id="forest"') < page.index("<h2>The population</h2>")
     assert "k_mean" not in page
+    population, sets = page.split("Each data set, given all of them")
+    assert "what the data told" in population
+    assert "what the data told" not in sets
     rows = (folder / "population.csv").read_text().splitlines()
     assert rows[1].startswith("median of the population,k,")
     assert "set3,k," in "\n".join(rows)

@@ -110,6 +110,8 @@ def test_an_outlier_is_named():
     late = replace(problem, observations=replace(problem.observations, zero=10.0))
     words = next(c.words for c in run(late).cautions if c.code == "odd-residuals")
     assert f"the reading at {problem.observations.times[12] + 10:.6g} s on the clock of the data" in words
+    assert "than the scatter of the residuals explains (probability" in words  # and not than its own error does
+    assert "by its own error it is" in words
 
 
 def test_the_outlier_of_an_exact_fit_is_that_of_least_squares():

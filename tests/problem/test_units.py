@@ -40,6 +40,10 @@ from en4dvar.plumbing.units import Quantity, UnitError, as_unit, convert, parse_
         ("5 kPa s**0.6", "Pa s^+0.6", 5000.0),
         ("4 kPa^0.5", "Pa^0.5", 4 * 10**1.5),
         ("2 ms^-0.5 ms^-0.5", "kHz", 2.0),
+        ("2.7e5/s", "Hz", 2.7e5),
+        ("270 / ms", "kHz", 270.0),
+        ("4 um/px", "m", 4e-6),
+        ("4um / pixel", "um", 4.0),
     ],
 )
 def test_quantity(text: str, unit: str, value: float) -> None:
@@ -113,6 +117,8 @@ def test_a_multiple_is_a_unit() -> None:
     assert convert(2.0, "1e-6 * m", "um") == 2.0
     assert convert(3.0, "1/(270*kHz)", "s") == pytest.approx(3 / 270e3, rel=1e-15)
     assert as_unit("+500 kfps", "Hz") == "500*kfps"
+    assert as_unit("2.7e5/s", "Hz") == "2.7e5*(1/s)"
+    assert as_unit("4 um/px", "m") == "4*um"
     with pytest.raises(UnitError, match=r"a multiple of a unit has a star: '250\*um'"):
         parse_unit("250 um")
     assert convert(1.0, f"1/({as_unit('5e5 1/s', 'Hz')})", "us") == 2.0

@@ -22,6 +22,7 @@ from en4dvar.report.compare import (
     comparison_table,
     overlay,
     with_evidences,
+    write_comparison,
 )
 from en4dvar.report.result import Result
 from en4dvar.results.store import load_stored
@@ -95,8 +96,8 @@ def test_equal_models_are_undecidable_on_the_command_line(tmp_path):
 def test_evidences_of_different_data_are_not_compared(tmp_path):
     one = run_dir(tmp_path / "one", ("a",))
     for other, message in (
-        (run_dir(tmp_path / "noise", ("a",), std=0.2), "noise and one used different observations of set1"),
-        (run_dir(tmp_path / "sets", ("a",), (1, 2)), "sets and one hold different data sets: set2"),
+        (run_dir(tmp_path / "noise", ("a",), std=0.2), "the runs noise and one used different observations of set1"),
+        (run_dir(tmp_path / "sets", ("a",), (1, 2)), "the runs sets and one hold different data sets: set2"),
     ):
         comparison = compare_runs([one, other])
         assert message in comparison.incomparable
@@ -106,6 +107,8 @@ def test_evidences_of_different_data_are_not_compared(tmp_path):
         done = CliRunner().invoke(main, ["compare", str(one), str(other), "--no-report"])
         assert done.exit_code == 0, done.output
         assert f"not compared: {message}" in done.output
+    page = write_comparison(comparison, tmp_path / "page").read_text(encoding="utf-8")
+    assert "<p>The runs sets and one hold different data sets: set2.</p>" in page
 
 
 def test_what_cannot_be_compared_is_refused(tmp_path):

@@ -30,6 +30,10 @@ def test_plus_minus(mean, std, shown):
     assert text.plus_minus(mean, std) == shown
 
 
+def test_no_minus_stands_before_a_rounded_zero():
+    assert (text.percent(-0.004), text.percent(-0.06), text.percent(float("nan"))) == ("0 %", "-6 %", "–")
+
+
 @pytest.mark.parametrize(
     ("symbol", "html"),
     [

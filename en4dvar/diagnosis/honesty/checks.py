@@ -106,8 +106,10 @@ def structure(analysis: Analysis) -> Findings:
         which, probability = residuals.outlier
         place = int(np.flatnonzero(residuals.which == which)[0])
         words = (
-            f"the reading at {moments(analysis)[which]} {CLOCK} is {abs(residuals.studentised[place]):.1f} standard "
-            f"deviations off (probability {_chance(probability)}); its leverage is {residuals.leverage[place]:.0%}"
+            f"the reading at {moments(analysis)[which]} {CLOCK} is farther off than the scatter of the residuals "
+            f"explains (probability {_chance(probability)}); by its own error it is "
+            f"{abs(residuals.studentised[place]):.1f} standard deviations off, with a leverage of "
+            f"{residuals.leverage[place]:.0%}"
         )
         yield caution("odd-residuals", words)
 
@@ -267,7 +269,7 @@ def information(
             if name in modes:
                 of_fields.setdefault(modes[name], []).append(name)
                 continue
-            words = f"{name} is hardly informed by the data (DFS {value:.2f}): its posterior is close to its prior"
+            words = f"{name} is hardly informed by the data (DFS {value:z.2f}): its posterior is close to its prior"
             yield caution("not-informed", words, parameters=(name,))
     for field, names in of_fields.items():
         count = sum(of == field for of in modes.values())

@@ -138,6 +138,7 @@ COLLAPSED = 0.2  # of R_max: from here on the wall of an acoustic bubble is too 
 SETTLED = 0.15  # std of ln R in the last quarter of a history that has come to rest
 UNKNOWN = 0.01  # of R_max: errors where the scatter cannot be told
 DRIFTS = 0.15  # of ln R from one quarter of a history to the next
+STEADY = 0.9  # correlation of ln R with time in the last quarter of a history that falls without rebounds
 GAS = 0.6  # of R_max: a bubble at rest is smaller
 ACOUSTIC_BEGINS = 0.1  # of R_max: one that begins below has grown from a nucleus
 EMERGES = 0.5  # of R_max: a nucleus that grows is seen before it is as large
@@ -282,16 +283,20 @@ def _rest(times: Array, radius: Array, peak: Lobe) -> tuple[float, str]:
     """The radius at rest, NaN where there is none; and what a history that seemed to rest does instead, in words.
 
     A radius that goes on growing after the oscillations is that of fragments, of gas that diffuses in, or of an edge
-    that blurs: it is no bubble of a constant amount of gas.
+    that blurs: it is no bubble of a constant amount of gas. One that falls may be that of rebounds which die away: it
+    drifts where it had settled before, or where it falls steadily to the end.
     """
     quarter = max(3, len(radius) // 4)
     tail = radius[-quarter:]
     if not np.all(tail > 0) or float(np.std(np.log(tail))) > SETTLED or times[-quarter] < peak.t_max + 2 * peak.t_c:
         return float("nan"), ""
     rest, begun = float(np.median(tail)), int(np.searchsorted(times, peak.t_max + 2 * peak.t_c))
-    before = radius[max(begun, len(radius) - 2 * quarter) : -quarter]
+    before = np.maximum(radius[max(begun, len(radius) - 2 * quarter) : -quarter], 1e-3 * rest)
     earlier = float(np.median(before)) if len(before) >= 3 else rest
-    if rest > GAS * peak.R_max or not abs(np.log(rest / max(earlier, 1e-3 * rest))) < DRIFTS:
+    change, moments = math.log(rest / earlier), np.cov(times[-quarter:], np.log(tail))
+    steadily = moments[0, 1] < -STEADY * math.sqrt(moments[0, 0] * moments[1, 1])
+    falls = change <= -DRIFTS and (steadily or np.std(np.log(before)) <= SETTLED)
+    if rest > GAS * peak.R_max or change >= DRIFTS or falls:
         return float("nan"), f"R goes from {1e6 * earlier:.3g} to {1e6 * rest:.3g} um where it should rest"
     return rest, ""
 
