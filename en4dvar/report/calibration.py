@@ -135,8 +135,8 @@ class Verdict:
             )
             return f"the errors of the readings are {size} (ranks of the errors)"
         if self.quantity == FIT:
-            side = "worse" if self.mean > 0 else "better"
-            return f"{FIT}: the truth fits the readings {side} beside the members than that of a right posterior does"
+            side = "better" if self.mean > 0 else "worse"
+            return f"{FIT}: members fit the readings {side}, beside the truth, than those of a right posterior do"
         too = [f"values are too {'low' if self.mean > 0 else 'high'}"] if abs(self.mean) > APART else []
         shares = [(_share(self.half, self.sets), 0.5), (_share(self.most, self.sets), 0.9)]
         if any(high < stated for (_, high), stated in shares):
@@ -192,16 +192,15 @@ class Calibration:
         """``truth``, ``z`` or another of the numbers (S,) of a quantity over the good sets."""
         return np.array([judged.numbers[j, NUMBERS.index(what)] for judged in self.good])
 
-    def ranks(self, j: int) -> np.ndarray:
+    def ranks(self, j: int) -> Array:
         """Of the truths of a quantity, over the good sets that have one."""
-        ranks = self.column("rank", j)
-        return ranks[np.isfinite(ranks)]
+        return np.array([rank for rank in self.column("rank", j) if np.isfinite(rank)])
 
     def rows(self) -> list[tuple[str, ...]]:
         """The table, without its head."""
         return [
-            (v.quantity, str(v.sets), f"{v.p:.2g}", f"{v.mean:+.2f}", f"{v.std:.2f}", _held(v.half, v.sets),
-             _held(v.most, v.sets)) for v in self.verdicts
+            (v.quantity, str(v.sets), f"{v.p:.2g}", f"{v.mean:+.2f}", f"{v.std:.2f}".replace("nan", "–"),
+             _held(v.half, v.sets), _held(v.most, v.sets)) for v in self.verdicts
         ]  # fmt: skip
 
     def summary(self) -> pd.DataFrame:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import ast
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import yaml
 from click.testing import CliRunner
+from doc_pages import ROOT, blocks
 from toy_config import write_toy
 
 import en4dvar
@@ -105,6 +108,15 @@ def test_a_truth_at_the_limit_of_a_prior_has_the_lowest_rank(toy, tmp_path):
     assert (damping.half, damping.most) == (0, 0)
 
 
+@pytest.mark.slow
+def test_the_other_law_of_the_documentation_is_estimated(tmp_path, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    (example,) = (block for block in blocks(ROOT / "docs" / "calibrate.md") if block.language == "python")
+    made = ast.literal_eval(re.search(r"made_with=({.*?})", example.body)[1])
+    result = en4dvar.calibrate("configs/quickstart.yaml", 2, overrides=QUIET, made_with=made, out=tmp_path / "out")
+    assert [verdict.quantity for verdict in result.verdicts] == ["G", "alpha", "mu", "R0", "t_s", FIT, ERRORS]
+
+
 @pytest.mark.parametrize(
     ("quantity", "mean", "std", "half", "most", "words"),
     [
@@ -112,7 +124,14 @@ def test_a_truth_at_the_limit_of_a_prior_has_the_lowest_rank(toy, tmp_path):
         ("alpha", 0.0, 1.4, 36, 76, "alpha: intervals hold the truth too rarely"),
         ("alpha", 0.0, 0.6, 75, 99, "alpha: intervals hold the truth too often"),
         ("alpha", 0.1, 1.0, 50, 90, "alpha: the shape of the posterior is off"),
-        (FIT, 1.0, 1.2, 40, 85, "fit: the truth fits the readings worse beside the members than that of a right"),
+        (
+            FIT,
+            1.0,
+            1.2,
+            40,
+            85,
+            "fit: members fit the readings better, beside the truth, than those of a right posterior do",
+        ),
         (ERRORS, 1.0, 1.2, 40, 85, "the errors of the readings are larger than data.error says, or the model is wrong"),
         (ERRORS, -1.0, 1.2, 40, 85, "the errors of the readings are smaller than data.error says (ranks"),
     ],
