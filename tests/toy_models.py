@@ -57,6 +57,16 @@ class Oscillator(ForwardModel):
         return np.array([position, velocity, k, c])
 
 
+class Undamped(Oscillator):
+    """Has no damping to be estimated."""
+
+    parameters = Oscillator.parameters[:2]
+    defaults: Mapping[str, float] = {}
+
+    def initial_state(self, theta: Mapping[str, float]) -> Array:
+        return super().initial_state({**theta, "c": 0.0})
+
+
 class Fragile(Oscillator):
     """Cannot be integrated at all."""
 

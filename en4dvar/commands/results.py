@@ -185,10 +185,11 @@ def export(run_dir: Path, kind: Literal["csv", "latex", "members", "netcdf"], ou
     Example:
       en4dvar export runs/quickstart --latex --out table.tex
     """
-    from en4dvar.report.export import export_table, posterior_file
+    from en4dvar.report.export import export_table
     from en4dvar.report.sequence import cycles_table
     from en4dvar.results.run_results import LackingError
     from en4dvar.results.series_file import series_file
+    from en4dvar.results.store import posterior_file
 
     cycles = series_file(run_dir)
     if kind == "netcdf":

@@ -170,13 +170,17 @@ def document_from(source: Source, overrides: Mapping[str, Any] | None = None) ->
     return override(read_document(Path(source)), overrides or {}), Path(source).resolve().parent
 
 
-def override(document: Document, overrides: Mapping[str, Any], option: str = "--set") -> Document:
-    """Set values at dotted paths; text is YAML. Raises :class:`ConfigError`, naming the ``option`` they came by."""
+def override(
+    document: Document, overrides: Mapping[str, Any], option: str = "--set", places: Mapping[str, str] | None = None
+) -> Document:
+    """Set values at dotted paths; text is YAML. Raises :class:`ConfigError`, naming the ``option`` they came by, or the
+    place of this one among ``places``.
+    """
     data = copy.deepcopy(document.data)
     origins = dict(document.origins)
     faults: list[Fault] = []
     for dotted, value in overrides.items():
-        path, origin = tuple(dotted.split(".")), f"{option} {dotted}"
+        path, origin = tuple(dotted.split(".")), (places or {}).get(dotted, f"{option} {dotted}")
         if (dotted, option) == ("data.path", "--set"):
             origin = "--data"
         if isinstance(value, str):

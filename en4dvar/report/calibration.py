@@ -96,7 +96,7 @@ def _set(number: int, lines: Sequence[dict[str, str]]) -> Judged:
 
 
 LEVEL = 0.01  # of the tests of all quantities together, by Holm's rule
-APART, WIDTH = 0.2, 0.1  # mean of z, and std of z from 1, by which what is off is told
+APART = 0.2  # mean of z by which what is off is told
 CURVES = (
     "Share of the sets whose truth has a lower rank among the members, less that of uniform ranks. A calibrated "
     f"posterior stays within the band, {100 * BAND:.0f} of 100 times throughout. A curve that rises and falls: its "
@@ -127,11 +127,22 @@ class Verdict:
         """What is wrong, in a sentence; "" where nothing is seen."""
         if not self.off:
             return ""
-        if self.quantity in (FIT, ERRORS):
-            size = "larger" if self.mean > 0 else "smaller"
-            return f"the errors of the readings are {size} than data.error says (ranks of the {self.quantity})"
+        if self.quantity == ERRORS:
+            size = (
+                "larger than data.error says, or the model is wrong"
+                if self.mean > 0
+                else "smaller than data.error says"
+            )
+            return f"the errors of the readings are {size} (ranks of the errors)"
+        if self.quantity == FIT:
+            side = "better" if self.mean > 0 else "worse"
+            return f"{FIT}: members fit the readings {side}, beside the truth, than those of a right posterior do"
         too = [f"values are too {'low' if self.mean > 0 else 'high'}"] if abs(self.mean) > APART else []
-        too += [f"intervals are too {'narrow' if self.std > 1 else 'wide'}"] if abs(self.std - 1) > WIDTH else []
+        shares = [(_share(self.half, self.sets), 0.5), (_share(self.most, self.sets), 0.9)]
+        if any(high < stated for (_, high), stated in shares):
+            too.append("intervals hold the truth too rarely")
+        elif any(low > stated for (low, _), stated in shares):
+            too.append("intervals hold the truth too often")
         return f"{self.quantity}: {' and '.join(too) or 'the shape of the posterior is off'}"
 
 
@@ -152,8 +163,8 @@ class Calibration:
     @cached_property
     def verdicts(self) -> tuple[Verdict, ...]:
         """One a quantity that has a truth."""
-        known = np.flatnonzero(np.isfinite(self.good[0].numbers[:, -1])).tolist() if self.good else []
-        p = {j: self.uniform.p_value(self.column("rank", j)) for j in known}
+        known = [j for j in range(len(self.quantities)) if len(self.ranks(j))]
+        p = {j: self.uniform(j).p_value(self.ranks(j)) for j in known}
         off: set[int] = set()
         for left, j in zip(range(len(known), 0, -1), sorted(known, key=p.__getitem__), strict=True):
             if p[j] * left > LEVEL:
@@ -170,6 +181,9 @@ class Calibration:
         for reason in dict.fromkeys(judged.failure for judged in self.sets if judged.failure):
             count = sum(judged.failure == reason for judged in self.sets)
             told.append(f"{count} of {len(self.sets)} sets have no posterior: {reason}")
+        told_of = {verdict.quantity for verdict in self.verdicts}
+        if self.good and (absent := [name for name, _ in self.quantities if name not in told_of]):
+            told.append(f"no ranks of {', '.join(absent)}: what made the readings has no such value")
         counts = Counter(code for judged in self.good for code in judged.cautions)
         of = f"of {len(self.good)} sets have the serious warning"
         return told + [f"{count} {of} '{code}'" for code, count in counts.items()]
@@ -178,11 +192,15 @@ class Calibration:
         """``truth``, ``z`` or another of the numbers (S,) of a quantity over the good sets."""
         return np.array([judged.numbers[j, NUMBERS.index(what)] for judged in self.good])
 
+    def ranks(self, j: int) -> Array:
+        """Of the truths of a quantity, over the good sets that have one."""
+        return np.array([rank for rank in self.column("rank", j) if np.isfinite(rank)])
+
     def rows(self) -> list[tuple[str, ...]]:
         """The table, without its head."""
         return [
-            (v.quantity, str(v.sets), f"{v.p:.2g}", f"{v.mean:+z.2f}", f"{v.std:.2f}", _held(v.half, v.sets),
-             _held(v.most, v.sets)) for v in self.verdicts
+            (v.quantity, str(v.sets), f"{v.p:.2g}", f"{v.mean:+z.2f}", f"{v.std:.2f}".replace("nan", "–"),
+             _held(v.half, v.sets), _held(v.most, v.sets)) for v in self.verdicts
         ]  # fmt: skip
 
     def summary(self) -> pd.DataFrame:
@@ -201,35 +219,40 @@ class Calibration:
     def __repr__(self) -> str:
         return f"<Calibration of {self.name}: {len(self.good)} of {len(self.sets)} sets, in {self.directory}>"
 
-    @property
-    def uniform(self) -> Uniform:
-        """What the ranks of a calibrated posterior look like; there must be a good set."""
-        return uniform_ranks(len(self.good), self.good[0].members)
+    def uniform(self, j: int) -> Uniform:
+        """What the ranks of a quantity of a calibrated posterior look like; there must be some."""
+        return uniform_ranks(len(self.ranks(j)), self.good[0].members)
 
     def _verdict(self, j: int, p: float, off: bool) -> Verdict:
-        truth, low, lower, upper, high, z, _ = np.array([judged.numbers[j] for judged in self.good]).T
+        numbers = np.array([judged.numbers[j] for judged in self.good])
+        truth, low, lower, upper, high, z, _ = numbers[np.isfinite(numbers[:, -1])].T
         half, most = int(np.sum((lower <= truth) & (truth <= upper))), int(np.sum((low <= truth) & (truth <= high)))
-        std = float(z.std(ddof=1)) if len(z) > 1 else float("nan")
+        std = float(z.std(ddof=1)) if len(z) > 1 and np.isfinite(z).all() else float("nan")
         return Verdict(*self.quantities[j], len(z), p, float(z.mean()), std, half, most, off)
 
 
-def _held(count: int, sets: int) -> str:
-    """A share with its 95 % interval."""
+def _share(count: int, sets: int) -> tuple[float, float]:
+    """The 95 % interval of a share."""
     interval = binomtest(count, sets).proportion_ci(0.95, "wilson")
-    return f"{100 * count / sets:.0f} % ({100 * interval.low:.0f} to {100 * interval.high:.0f})"
+    return interval.low, interval.high
+
+
+def _held(count: int, sets: int) -> str:
+    low, high = _share(count, sets)
+    return f"{100 * count / sets:.0f} % ({100 * low:.0f} to {100 * high:.0f})"
 
 
 def curves(calibration: Calibration) -> Chart:
     """The distribution of the ranks of each quantity, less that of uniform ones, and the band of these."""
     panels, names = [], [name for name, _ in calibration.quantities]
     for verdict in calibration.verdicts:
-        j, uniform = names.index(verdict.quantity), calibration.uniform
+        uniform = calibration.uniform(j := names.index(verdict.quantity))
         x, (low, high) = uniform.shares, uniform.band
         title = f"{figure_text(verdict.quantity)}: p = {verdict.p:.2g}"
         panel = Panel("rank of the truth, 0 to 1", "difference of shares", title=title, xlim=(0.0, 1.0))
         panel.band(x, low - x, high - x, "prior", 0.25)
         panel.rule(0.0)
-        panel.line(x, uniform.distribution(calibration.column("rank", j)) - x, "centre" if verdict.off else "posterior")
+        panel.line(x, uniform.distribution(calibration.ranks(j)) - x, "centre" if verdict.off else "posterior")
         panels.append(panel)
     return in_columns(panels, 4.4 * POINTS, 3, PAGE)
 

@@ -204,13 +204,18 @@ def fans(designs: Designs) -> Chart:
     rows = [row for row in ranked(designs)[:DRAWN] if row.number]
     rows += [row for row in designs.rows if row.number == 0 and row.result]
     time, value = designs.asked.axes
-    panels = []
+    panels, several = [], any(row.evaluated.alike > 1 for row in rows)
+    same: dict[tuple[int, bytes], list[DesignRow]] = {}
     for row in rows:
+        same.setdefault((row.number, row.evaluated.times.tobytes()), []).append(row)
+    for row, *others in same.values():
         result = row.evaluated
         t, taken = convert(result.grid, *time), convert(result.times, *time)
         low, lower, middle, upper, high = convert(result.fan, *value)
+        worth = [(f"{it.worth:.2f} nats", it.alike) for it in (result, *(other.evaluated for other in others))]
+        told = [f"{nats} of {alike} experiment{'s' * (alike > 1)}" if several else nats for nats, alike in worth]
         settings = ", ".join(figure_text(f"{name} {value}") for name, value in row.settings.items()) or "as in the file"
-        title = fill(f"{settings}: {result.worth:.2f} nats", WIDE)
+        title = fill(f"{settings}: {', '.join(told)}", WIDE)
         panel = Panel(with_unit("time", time[1]), with_unit(designs.asked.seen, value[1]), title=title)
         panel.band(t, low, high, "posterior", 0.18)
         panel.band(t, lower, upper, "posterior", 0.3)

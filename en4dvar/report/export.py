@@ -16,13 +16,13 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from en4dvar.config.models import GREEK
 from en4dvar.estimation.summary import LITTLE, MODAL, ParameterSummary, summary_rows
 from en4dvar.plumbing.caution import Caution, codes
-from en4dvar.plumbing.errors import ConfigError, OutputError
+from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.hints import shown, suggest
 from en4dvar.plumbing.tables import csv_text
 from en4dvar.report.text import GREEK as LETTERS
 from en4dvar.report.text import number_like, plain_number, untrusted_words
 from en4dvar.results.run_results import RunResults
-from en4dvar.results.store import StoredResult, require_settled
+from en4dvar.results.store import StoredResult, posterior_file
 
 _COMMANDS = (
     f"{GREEK}|mathrm|mathit|mathbf|mathsf|mathcal|rm|it|text|frac|sqrt|hat|bar|tilde|dot|ddot|vec|overline|infty|partial|"
@@ -67,15 +67,6 @@ def export_table(run_dir: str | Path, kind: Kind = "csv") -> str:
         text = csv_text(summary_rows(rows, {}))
     stored.require(text)
     return text
-
-
-def posterior_file(run_dir: str | Path) -> Path:
-    """The netCDF file of a run or campaign, in the ArviZ schema as it is. Raises :class:`OutputError`."""
-    path = Path(run_dir) / "posterior.nc"
-    require_settled(path.parent)
-    if not path.is_file():
-        raise OutputError(f"{run_dir}: holds no posterior.nc; is it the directory of a finished run?")
-    return path
 
 
 def _members_csv(results: Iterable[StoredResult]) -> str:

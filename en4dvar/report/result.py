@@ -18,7 +18,7 @@ from en4dvar.report.html import render
 from en4dvar.report.page import render_set
 from en4dvar.report.paper import on_paper
 from en4dvar.results.netcdf import dataset_of, to_bytes, tree_of
-from en4dvar.results.store import StoredResult, load_stored, of_members
+from en4dvar.results.store import StoredResult, load_stored, of_members, posterior_file
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -166,5 +166,4 @@ def _in_display_units(group: xr.Dataset) -> xr.Dataset:
 
 def load_result(path: str | Path) -> Result:
     """Read a result file, or the one in a run's directory. Raises :class:`OutputError` as :func:`load_stored`."""
-    file = Path(path)
-    return Result(load_stored(file / "posterior.nc" if file.is_dir() else file).groups)
+    return Result(load_stored(posterior_file(path) if Path(path).is_dir() else path).groups)

@@ -14,7 +14,7 @@ from en4dvar.diagnosis.honesty.checks import MOVED
 from en4dvar.estimation.population.campaign import DETERMINED, FEWEST, Combination
 from en4dvar.estimation.population.hierarchy import named
 from en4dvar.estimation.summary import ParameterSummary, estimate_cells, results_table, summary_rows
-from en4dvar.plumbing.caution import Caution, parsed, untrusted
+from en4dvar.plumbing.caution import Caution, untrusted
 from en4dvar.plumbing.files import write_text
 from en4dvar.plumbing.tables import table, write_csv
 from en4dvar.report import text
@@ -29,9 +29,7 @@ MOST_FITS = 12  # panels of the figure
 NOTHING = np.full(1, np.nan)
 NINETY = 3.2897073  # std of a normal distribution between its 5 and 95 %
 DOUBTED = "Orange, without an interval: not to be trusted, for its warnings."
-SHARED = (
-    f"Median and 5–95 % of what is shared, as each data set has it alone (grey) and as all have it together. {DOUBTED}"
-)
+SHARED = "Median and 5–95 % of what is shared, of each data set alone (grey) and of all{} together. " + DOUBTED
 FITS = "Observations and 5–95 % of the joint posterior's predictions."
 
 
@@ -47,28 +45,34 @@ class JointRow(ParameterSummary):
 
 
 def estimates(joint: StoredJoint) -> tuple[JointRow, ...]:
-    """What is shared, without the odd data sets too, then what is each data set's own."""
-    posterior, odd, rows = joint.group("posterior"), ", ".join(joint.odd), []
-    for name, values in posterior.data_vars.items():
-        if "dataset" not in values.dims:
-            row = _row(joint.cautions, str(name), values)
-            rows.append(JointRow(**vars(row), stated=not row.untrusted and _as_stated(joint, str(name))))
-            continue
-        for dataset in joint.datasets:
-            own = values.sel(dataset=dataset)
-            if np.isfinite(own.values).any():
-                rows.append(JointRow(**vars(_row(joint.cautions, str(name), own)), dataset=dataset))
-    if odd:
-        doubts = parsed(joint.group("without").attrs["warnings"])
-        rest = (_row(doubts, str(name), values) for name, values in joint.group("without").data_vars.items())
-        rows += [JointRow(**vars(row), without=odd) for row in rest]
+    """What is shared, without the odd data sets first, then what is each data set's own: without these but of them."""
+    rows = {(row.name, row.dataset, row.without): row for row in _rows(joint, "posterior", joint.cautions)}
+    if odd := ", ".join(joint.odd):
+        rest = _rows(joint, "without", joint.doubts, odd)
+        rows |= {(row.name, row.dataset, "" if row.dataset else odd): row for row in rest}
     shared = list(joint.shared)
-    return tuple(sorted(rows, key=lambda row: (1,) if row.dataset else (0, row.stated, shared.index(row.name))))
+
+    def order(row: JointRow) -> tuple[int, ...]:
+        return (1,) if row.dataset else (0, row.stated, shared.index(row.name), not row.without)
+
+    return tuple(sorted(rows.values(), key=order))
+
+
+def _rows(joint: StoredJoint, group: str, cautions: Sequence[Caution], without: str = "") -> Iterator[JointRow]:
+    held = joint.group(group)
+    for name, values in held.data_vars.items():
+        for dataset in map(str, held["dataset"].values) if "dataset" in values.dims else ("",):
+            draws = values.sel(dataset=dataset) if dataset else values
+            if not np.isfinite(draws.values).any():
+                continue
+            row = _row(cautions, str(name), draws)
+            stated = not (dataset or row.untrusted) and _as_stated(joint, str(name))
+            yield JointRow(**vars(row), dataset=dataset, without=without, stated=stated)
 
 
 def _as_stated(joint: StoredJoint, name: str) -> bool:
-    """Whether the posterior of what is shared has the mean and the width of its prior."""
-    draws, (low, middle, high) = joint.group("posterior")[name].values, joint.group("prior")[name].values
+    """Whether the posterior of what is shared, without the odd data sets, has the mean and the width of its prior."""
+    draws, (low, middle, high) = joint.rest[name].values, joint.group("prior")[name].values
     std = (high - low) / NINETY
     return bool(draws.std() > np.sqrt(1 - HARDLY_INFORMED) * std and abs(np.median(draws) - middle) < MOVED * std)
 
@@ -82,10 +86,13 @@ def _row(
 
 
 def joint_lines(joint: StoredJoint) -> list[str]:
-    """What is shared, a line each, for the page of the campaign; one line for what the data leave as it was stated."""
-    lines, shared = [], [e for e in estimates(joint) if not e.dataset]
+    """What is shared, without the odd data sets, a line each, for the page of the campaign; one line for what the data
+    leave as it was stated.
+    """
+    lines, count = [], len(joint.datasets) - len(joint.odd)
+    shared = [e for e in estimates(joint) if not e.dataset and e.without == ", ".join(joint.odd)]
     for e in (e for e in shared if not e.stated):
-        without = f" without {e.without}" if e.without else f", one value in {len(joint.datasets)} data sets"
+        without = f", one value in {count} data sets" + (f", without {e.without}" if e.without else "")
         doubt = f"not to be trusted: {', '.join(e.untrusted)}" if e.untrusted else f"5–95 %: {_range(e)}"
         lines.append(f"{e.label} {e.name} = {_median(e)} ({doubt}){without}")
     if stated := [e.label for e in shared if e.stated]:
@@ -95,9 +102,13 @@ def joint_lines(joint: StoredJoint) -> list[str]:
 
 def joint_figure(joint: StoredJoint) -> str:
     """All data sets over what they share, as SVG; without what the data leave as it was stated, where there is more."""
-    names = [name for name in joint.shared if not _as_stated(joint, name)] or joint.shared
-    shared = {name: joint.group("posterior")[name] for name in names}
-    return svg(forest(joint, joint.datasets, shared), "forest", SHARED)
+    held = [name for name in joint.shared if name in joint.rest]
+    shared = {name: joint.rest[name] for name in [n for n in held if not _as_stated(joint, n)] or held}
+    return svg(forest(joint, joint.datasets, shared), "forest", _caption(joint))
+
+
+def _caption(joint: StoredJoint) -> str:
+    return SHARED.format(f" but {', '.join(joint.odd)}" if joint.odd else "")
 
 
 def joint_table(joint: StoredJoint) -> str:
@@ -123,7 +134,7 @@ def forest(
     for name, draws in common.items():
         low, middle, high = text.shown(draws, member_quantiles(draws.values, QUANTILES))
         panel = Panel(text.axis_label(draws), ylim=(-float(count), 1.0), yticks=ticks, y_names=labels)
-        doubted = bool(untrusted(groups.cautions, name))
+        doubted = bool(untrusted(groups.doubts, name))
         if not doubted:
             panel.band([low, high], np.full(2, -count), np.ones(2), "posterior", 0.2)
         panel.line([middle, middle], [-count, 1], *(("centre", 0.9, "--") if doubted else ("posterior",)))
@@ -179,7 +190,7 @@ def write_joint(folder: Path) -> Path:
         shared=[e for e in rows if not e.dataset],
         own=[e for e in rows if e.dataset],
         forest=joint_figure(joint),
-        caption=SHARED,
+        caption=_caption(joint),
         fits=svg(drawn, "fits", FITS) if (drawn := fits(joint)) else "",
         fits_caption=FITS + (f" The first {MOST_FITS}." if len(joint.datasets) > MOST_FITS else ""),
         sets=[*zip(joint.datasets, *fitted, strict=True)],

@@ -190,6 +190,20 @@ def require_settled(run_dir: Path) -> None:
         raise OutputError(f"{run_dir}: {words}; 'en4dvar run' with --resume finishes that")
 
 
+def posterior_file(run_dir: str | Path) -> Path:
+    """The netCDF file of a run or campaign, in the ArviZ schema as it is. Raises :class:`OutputError`."""
+    path = Path(run_dir) / "posterior.nc"
+    require_settled(path.parent)
+    if not path.is_file():
+        tables = [
+            f"{path.parent / kind}.csv" for kind in ("joint", "population") if path.with_name(f"{kind}.nc").exists()
+        ]
+        words = f"what several data sets say together is in {' and '.join(tables)}"
+        asked = words if tables else "is it the directory of a finished run?"
+        raise OutputError(f"{run_dir}: holds no posterior.nc; {asked}")
+    return path
+
+
 def load_stored(path: str | Path) -> StoredResult:
     """Read ``posterior.nc``, or an address in a pack. Raises :class:`OutputError`: no result, cut short or altered."""
     path = Path(path)
@@ -199,6 +213,9 @@ def load_stored(path: str | Path) -> StoredResult:
             group.check()
             joined(groups, path_in_file).check()
     with understood(path):
+        if "/alone" in groups:
+            words = f"what several data sets say together, not the result of one; its numbers are in {path.stem}.csv"
+            raise OutputError(f"{path}: {words}, its draws are read by xarray.open_datatree")
         if "/posterior" in groups and "dataset" in groups["/posterior"]:
             names = list(map(str, groups["/posterior"]["dataset"].values))
             hint = f"such as {path.parent / PACK / names[0]}, or open all of them with xarray.open_datatree"

@@ -62,7 +62,9 @@ def save_joint(path: Path, estimate: JointEstimate, alone: Sequence[Array], attr
         "/fit": Group(_fit(estimate, names), datasets),
     }
     if estimate.without:
-        groups["/without"] = Group(_shared(estimate.rest), attrs={"warnings": _lines(estimate.rest.cautions)})
+        rest, kept = estimate.rest, list(estimate.rest.joint.names)
+        others, warned = {"dataset": variable("dataset", text(kept), "", "data set")}, _lines(rest.cautions)
+        groups["/without"] = Group(_shared(rest) | _own(rest, kept), others, {"warnings": warned})
     return to_bytes(groups).write(path)
 
 
@@ -119,12 +121,16 @@ def _own(estimate: JointEstimate, names: Sequence[str]) -> dict[str, Variable]:
 
 
 def _fit(estimate: JointEstimate, names: Sequence[str]) -> dict[str, Variable]:
-    """Observations and bands of each data set, padded with NaN, in display units; and each against all others."""
+    """Observations and bands of each data set, padded with NaN, in display units; and each against all others. Bands
+    are those without the odd data sets, but of these.
+    """
     experiments, agreed = estimate.joint.experiments, estimate.agreement
     most = max(len(experiment.observations) for experiment in experiments)
     times, values = np.full((2, len(experiments), most), np.nan)
     bands = np.full((len(experiments), max(map(len, estimate.grids)), 4), np.nan)
-    for e, (experiment, run, grid) in enumerate(zip(experiments, estimate.forecasts, estimate.grids, strict=True)):
+    runs = dict(zip(names, estimate.forecasts, strict=True))
+    runs |= zip(estimate.rest.joint.names, estimate.rest.forecasts, strict=True)
+    for e, (experiment, run, grid) in enumerate(zip(experiments, runs.values(), estimate.grids, strict=True)):
         to_time = (experiment.model.time_unit, experiment.model.time_display_unit)
         to_value = (experiment.observable.unit, experiment.observable.display_unit)
         k = len(experiment.observations)
@@ -134,11 +140,12 @@ def _fit(estimate: JointEstimate, names: Sequence[str]) -> dict[str, Variable]:
         alive = run.path[:-1][run.active[:-1]]
         bands[e, : len(grid), 1:] = convert(member_quantiles(alive, QUANTILES, axis=0).T, *to_value)
     observables = [experiment.observable for experiment in experiments]
+    chi2 = "misfit per observation at the mode, without the odd data sets but of these"
     apart = "from the value of all others, in standard deviations"
     odd = [int(name in estimate.odd) for name in names]
     return {
-        "chi2_per_observation": variable("dataset", estimate.chi2, "1", "misfit per observation at the mode"),
-        "alive": variable("dataset", [run.active[:-1].sum() for run in estimate.forecasts], "1", "members that ran"),
+        "chi2_per_observation": variable("dataset", estimate.chi2, "1", chi2),
+        "alive": variable("dataset", [run.active[:-1].sum() for run in runs.values()], "1", "members that ran"),
         "observable": variable("dataset", text(o.label for o in observables), "", "what was observed"),
         "unit": variable("dataset", text(o.display_unit for o in observables), "", "unit of values and bands"),
         "time_unit": variable("dataset", text(e.model.time_display_unit for e in experiments), "", "unit of times"),
@@ -169,6 +176,11 @@ class StoredGroups:
     def cautions(self) -> tuple[Caution, ...]:
         """Warnings of the estimate, the worst first."""
         return parsed(self.tree.attrs["warnings"])
+
+    @property
+    def doubts(self) -> tuple[Caution, ...]:
+        """Warnings of what is to be quoted, the worst first."""
+        return self.cautions
 
     def group(self, name: str) -> xr.Dataset:
         """The variables of a group."""
@@ -206,6 +218,16 @@ class StoredJoint(StoredGroups):
         fit = self.group("fit")  # of which a file of an earlier version has no such column
         odd = fit["odd"].values if "odd" in fit else np.zeros(len(self.datasets))
         return tuple(name for name, is_odd in zip(self.datasets, odd, strict=True) if is_odd)
+
+    @property
+    def rest(self) -> xr.Dataset:
+        """The posterior, without the odd data sets where there are any."""
+        return self.group("without" if self.odd else "posterior")
+
+    @property
+    def doubts(self) -> tuple[Caution, ...]:
+        """Warnings of the estimate without the odd data sets, the worst first."""
+        return parsed(self.rest.attrs["warnings"]) if self.odd else self.cautions
 
 
 load_joint = StoredJoint.load

@@ -30,7 +30,7 @@ from en4dvar.inputs.parts import DataFile
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError, DataError, En4dvarError
 from en4dvar.plumbing.units import convert
-from en4dvar.priors.prior import member_stream, own_seed
+from en4dvar.priors.prior import PriorTerm, member_stream, own_seed
 from en4dvar.problem import InverseProblem
 from en4dvar.report.calibration import ERRORS, FIT, LEVELS, Calibration, Judged, load_calibration, write_sets
 from en4dvar.results.checkpoint import FOLDER, digest
@@ -164,25 +164,39 @@ def draw_set(maker: InverseProblem, seed: int) -> tuple[dict[str, float], Array]
 def _compared(
     problem: InverseProblem, config: Config, seed: int, truth: Mapping[str, float], number: int, name: str
 ) -> Judged:
-    """Ranks, quantiles and z of every parameter and of J_o, as it is and among that of other readings."""
+    """Ranks, quantiles and z of every parameter and of J_o, as it is and among that of other readings; NaN of J_o where
+    the truth lacks a parameter or lies beyond the prior.
+    """
     prior, observations = problem.prior, problem.observations
     analysis = assimilate(problem, replace(config.assimilation, what_if=False), seed)
     members = prior.from_physical(analysis.posterior)
     known = np.array([truth.get(p.name, np.nan) for p in prior.parameters])
-    x = np.vstack([members, prior.from_physical(known[None])])
+    x = np.vstack([members, [_coordinate(term, value) for term, value in zip(prior.terms, known, strict=True)]])
     run = Composite(problem)(x)
+    physical = prior.to_physical(x)
     fits, stream = observations.cost(run.predicted), member_stream(seed, "other readings")
     others = [
         float(replace(observations, values=observations.noise.drawn(at, stream)).cost(at))
         for at in map(run.predicted.__getitem__, range(len(members)))
     ]
-    errors = np.append(others, fits[-1])
-    physical = zip(prior.to_physical(x).T, prior.parameters, strict=True)
-    shown = np.column_stack([*(convert(v, p.unit, p.display_unit or p.unit) for v, p in physical), fits, errors])
+    fits[-1] = (
+        fits[-1] if np.allclose(physical[-1], known, atol=1e-300) else np.nan
+    )  # the prior's map may end before the truth
+    errors, physical[-1] = np.append(others, fits[-1]), known
+    each = zip(physical.T, prior.parameters, strict=True)
+    shown = np.column_stack([*(convert(v, p.unit, p.display_unit or p.unit) for v, p in each), fits, errors])
     draws, at = (white := np.column_stack([x, fits, errors]))[:-1], white[-1]
     with np.errstate(invalid="ignore", divide="ignore"):
         z = (at - draws.mean(axis=0)) / draws.std(axis=0, ddof=1)
-        rank = np.where(np.isfinite(at), np.sum(draws < at, axis=0), np.nan)
+        rank = np.where(np.isnan(at), np.nan, np.sum(draws < at, axis=0))
     serious = tuple(dict.fromkeys(c.code for c in analysis.cautions if c.severity == "serious"))
     numbers = np.vstack([shown[-1], member_quantiles(shown[:-1], LEVELS, axis=0), z, rank]).T
     return Judged(number, name, numbers, len(members), serious)
+
+
+def _coordinate(term: PriorTerm, value: float) -> float:
+    """Of a truth in the prior's transform: ±inf at a limit that this does not reach, or beyond; NaN of none."""
+    low, high = term.range
+    if low < value < high or term.transform == "normal":
+        return float(term.from_physical(np.array(value)))
+    return -np.inf if value <= low else np.inf if value >= high else np.nan

@@ -54,7 +54,10 @@ class Candidate:
     def of(cls, settings: Mapping[str, Value], document: Document, base: Path) -> "Candidate":
         """From the document that the settings make. Raises :class:`ConfigError`."""
         config = resolve(document, base)
-        laws = (resolve(override(document, keys), base) for keys in config.design.laws.values())
+        laws = []
+        for name, keys in config.design.laws.items():
+            places = dict.fromkeys(keys, str(document.fault(("design", "laws", name), "")))
+            laws.append(resolve(override(document, keys, places=places), base))
         return cls(settings, config, tuple(laws))
 
 
@@ -276,9 +279,10 @@ def candidates(document: Document, base: Path) -> Iterator[Candidate]:
     yield first
     design = first.config.design
     if design.knobs:
+        places = {knob.key: str(document.fault(("design", "knobs", name), "")) for name, knob in design.knobs.items()}
         for settings in design.settings():
             overrides = {design.knobs[name].key: value for name, value in settings.items()}
-            yield Candidate.of(settings, override(document, overrides), base)
+            yield Candidate.of(settings, override(document, overrides, places=places), base)
 
 
 def planned_problem(config: Config) -> InverseProblem:

@@ -16,6 +16,7 @@ from run_files import add_to_pack
 from en4dvar.cli import main
 from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.plumbing.caution import caution
+from en4dvar.plumbing.errors import OutputError
 from en4dvar.report.export import escaped, export_table, latex_table, latex_unit
 from en4dvar.report.result import Result as Posterior
 from en4dvar.report.result import load_result
@@ -143,3 +144,8 @@ def test_files_and_faults(one: Path, tmp_path: Path) -> None:
     for flag in ("--csv", "--netcdf"):
         done = call(tmp_path / "nowhere", flag)
         assert (done.exit_code, done.stderr.count("holds no posterior.nc")) == (2, 1)
+    (tmp_path / "joint.nc").write_bytes(b"")
+    where = f"{tmp_path}: holds no posterior.nc; what several data sets say together is in {tmp_path / 'joint.csv'}"
+    assert call(tmp_path).stderr == f"{where}\n"
+    with pytest.raises(OutputError, match=re.escape(where)):
+        load_result(tmp_path)

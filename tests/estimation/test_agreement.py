@@ -76,6 +76,18 @@ def test_an_odd_data_set_is_named_and_the_estimate_made_without_it():
     assert "odd-data-set" not in codes(rest.cautions)
 
 
+def test_the_others_of_an_odd_data_set_are_judged_without_it():
+    """Four lines of one value fit well; with a fifth, 20 of its errors off, none does."""
+    problems = campaign([0.0] * 4 + [2.0])
+    with_it, rest = joint(problems), joint(problems[:4])
+    assert rest.chi2.max() < 2
+    np.testing.assert_allclose(with_it.chi2[:4], rest.chi2, rtol=1e-6)
+    assert codes(with_it.cautions) == ("odd-data-set", *codes(rest.cautions))
+    conflict = joint(campaign([8.0] * 4 + [0.0]))
+    told = [c for c in conflict.cautions if c.code == "prior-conflict"]
+    assert [c.words[:14] for c in told] == ["without set4: "]
+
+
 def test_clean_campaigns_name_none_and_their_squares_follow_chi_squared():
     found = [joint(campaign([0.0] * 5, seed)) for seed in range(12)]
     agreed = [one.agreement for one in found]

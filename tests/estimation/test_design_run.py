@@ -16,7 +16,7 @@ import en4dvar
 from en4dvar.cli import main
 from en4dvar.model.forward import ValidityLimit
 from en4dvar.plumbing.errors import ConfigError, DataError, En4dvarError, OutputError
-from en4dvar.report.design import front, needs, readings_text, remarks
+from en4dvar.report.design import fans, front, needs, readings_text, remarks
 from en4dvar.results.design_file import load_designs
 from en4dvar.runs import design_run
 from en4dvar.runs.design_run import run_design
@@ -143,6 +143,9 @@ def test_experiments_alike(tmp_path):
     assert (one.alike, four.alike) == (1, 4)
     assert four.gain > one.gain
     assert [row.price for row in found.rows] == [7, 28]
+    (panel,) = (panel for row in fans(found).rows for panel in row.panels)
+    worth = f"{one.worth:.2f} nats of 1 experiment, {four.worth:.2f} nats of 4 experiments"
+    assert panel.title.replace("\n", " ") == f"as in the file: {worth}"
 
 
 @pytest.mark.parametrize("thin", [0.0, 0.9])
@@ -242,6 +245,11 @@ def test_as_a_command(tmp_path, monkeypatch):
         ({"draws": 3}, "design.draws"),
         ({"method": "guess"}, "design.method"),
         ({"experiments": []}, "design.experiments"),
+        (
+            {"knobs": {"n": {"key": "design.experiments", "values": [1, 4]}}},
+            r"^design\.knobs\.n: design\.experiments: expected a list, e\.g\. \[1, 2\], not 1$",
+        ),
+        ({"laws": {"a": {}, "b": {"model.law": "x"}}, "knobs": {}}, r"^design\.laws\.b: model\.law: unknown key"),
         ({"knobs": {k: {"key": "seed", "values": list(range(100))} for k in "ab"}}, "10000 combinations; at most 2000"),
     ],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -14,6 +15,8 @@ from toy_config import csv_text, write_toy
 from en4dvar.cli import main
 from en4dvar.plumbing.caution import caution, untrusted
 from en4dvar.plumbing.errors import ConfigError, OutputError
+from en4dvar.report.result import load_result
+from en4dvar.report.together import joint_lines
 from en4dvar.results.together import load_joint
 from en4dvar.runs.finished import carried
 from en4dvar.runs.runner import run_campaign
@@ -152,4 +155,11 @@ def test_errors_of_every_kind(error, tmp_path):
     assert abs(float(rest.mean()) - 2.4) < 3 * float(rest.std())
     assert float(rest.std()) < 0.03
     assert "without set2" in page.read_text()
-    assert ",set2," in (tmp_path / "out" / "joint.csv").read_text()
+    assert joint_lines(found)[0].endswith(", one value in 4 data sets, without set2")
+    with pytest.raises(OutputError, match=r"joint\.nc: what several data sets say together, .* are in joint\.csv"):
+        load_result(tmp_path / "out" / "joint.nc")
+    first, *others = csv.DictReader((tmp_path / "out" / "joint.csv").read_text().splitlines())
+    assert (first["name"], first["without"], first["warnings"]) == ("k", "set2", "")
+    own = {row["dataset"]: row for row in others if row["name"] == "A"}
+    assert [name for name, row in own.items() if row["warnings"]] == ["set2"]
+    assert {row["without"] for name, row in own.items() if name != "set2"} == {"set2"}

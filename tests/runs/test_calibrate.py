@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import ast
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import yaml
 from click.testing import CliRunner
+from doc_pages import ROOT, blocks
 from toy_config import write_toy
 
 import en4dvar
 from en4dvar.cli import main
 from en4dvar.config import load_config
 from en4dvar.plumbing.errors import ConfigError, DataError, En4dvarError, OutputError
-from en4dvar.report.calibration import ERRORS, FIT, Judged, load_calibration
+from en4dvar.report.calibration import ERRORS, FIT, Judged, Verdict, load_calibration
 
 QUIET = {"output.report": False, "assimilation.members": 24}
 
@@ -49,7 +52,7 @@ def test_errors_of_a_wrong_size_are_seen(toy, tmp_path, std, size):
     assert fit.off
     assert errors.off
     assert errors.p < 1e-3
-    assert f"the errors of the readings are {size} than data.error says (ranks of the errors)" in result.remarks
+    assert errors.words.startswith(f"the errors of the readings are {size} than data.error says")
     others = [verdict for verdict in result.verdicts if verdict.quantity not in (FIT, ERRORS)]
     wide = np.mean([verdict.std for verdict in others])
     assert wide > 1.1 if size == "larger" else wide < 0.9
@@ -79,6 +82,62 @@ def test_more_sets_leave_the_first_as_they_were_for_any_workers(toy, tmp_path):
     assert (tmp_path / "parts" / "calibration.csv").read_bytes() == text
     assert (tmp_path / "two" / "calibration.csv").read_bytes() == text
     assert len(threads.sets) == len(whole.sets) == 9
+
+
+DAMPED = {**QUIET, "parameters.c": {"prior": "lognormal", "median": "0.02 N s/m", "log_std": 0.3}}
+
+
+def test_readings_of_a_law_that_lacks_a_parameter_leave_its_ranks_out(toy, tmp_path):
+    own = {"A": {"prior": "normal", "mean": "100 um", "std": "3 um"}, "k": {"prior": "lognormal", "median": "3 N/m"}}
+    own["k"]["log_std"] = 0.3
+    made = {"model.name": "toy_models:Undamped", "parameters": own}
+    result = en4dvar.calibrate(toy, 3, overrides=DAMPED, made_with=made, out=tmp_path / "out")
+    assert len(result.good) == 3
+    assert [verdict.quantity for verdict in result.verdicts] == ["A", "k"]
+    assert "no ranks of c, fit, errors: what made the readings has no such value" in result.remarks
+
+
+def test_a_truth_at_the_limit_of_a_prior_has_the_lowest_rank(toy, tmp_path):
+    made = {"parameters.c": "0 N s/m"}
+    result = en4dvar.calibrate(toy, 3, overrides=DAMPED, made_with=made, out=tmp_path / "out")
+    names = [name for name, _ in result.quantities]
+    assert result.column("rank", names.index("c")).tolist() == [0, 0, 0]
+    assert result.column("truth", names.index("c")).tolist() == [0, 0, 0]
+    assert np.isfinite(result.column("rank", names.index(FIT))).all()
+    (damping,) = (verdict for verdict in result.verdicts if verdict.quantity == "c")
+    assert (damping.half, damping.most) == (0, 0)
+
+
+@pytest.mark.slow
+def test_the_other_law_of_the_documentation_is_estimated(tmp_path, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    (example,) = (block for block in blocks(ROOT / "docs" / "calibrate.md") if block.language == "python")
+    made = ast.literal_eval(re.search(r"made_with=({.*?})", example.body)[1])
+    result = en4dvar.calibrate("configs/quickstart.yaml", 2, overrides=QUIET, made_with=made, out=tmp_path / "out")
+    assert [verdict.quantity for verdict in result.verdicts] == ["G", "alpha", "mu", "R0", "t_s", FIT, ERRORS]
+
+
+@pytest.mark.parametrize(
+    ("quantity", "mean", "std", "half", "most", "words"),
+    [
+        ("alpha", -3.0, 0.3, 0, 0, "alpha: values are too high and intervals hold the truth too rarely"),  # one truth
+        ("alpha", 0.0, 1.4, 36, 76, "alpha: intervals hold the truth too rarely"),
+        ("alpha", 0.0, 0.6, 75, 99, "alpha: intervals hold the truth too often"),
+        ("alpha", 0.1, 1.0, 50, 90, "alpha: the shape of the posterior is off"),
+        (
+            FIT,
+            1.0,
+            1.2,
+            40,
+            85,
+            "fit: members fit the readings better, beside the truth, than those of a right posterior do",
+        ),
+        (ERRORS, 1.0, 1.2, 40, 85, "the errors of the readings are larger than data.error says, or the model is wrong"),
+        (ERRORS, -1.0, 1.2, 40, 85, "the errors of the readings are smaller than data.error says (ranks"),
+    ],
+)
+def test_what_is_off_is_told_by_how_many_truths_are_held(quantity, mean, std, half, most, words):
+    assert Verdict(quantity, "1", 100, 1e-4, mean, std, half, most, off=True).words.startswith(words)
 
 
 def test_sets_without_a_posterior_are_told(toy, tmp_path):

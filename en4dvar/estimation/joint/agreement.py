@@ -13,10 +13,10 @@ experiments. Only where both are improbable the experiment is odd; and the rest 
 Identification of Outliers, ch. 5). Where the others scatter by more than their errors themselves, both are compared
 with the others' median by an F distribution: of data sets that all differ, none is odd.
 
-What a joint estimate says against itself follows: data sets that are odd, differ, are not fitted, or follow a trend,
-and priors that conflict with them. A value of the material that rises with the size of the bubble, with the order in
-which data sets were taken or with the time between readings is what a wrong scale, a wall, a drift or a wrong law
-leaves behind.
+What a joint estimate says against itself follows: data sets that are odd, or else differ, are not fitted, or follow a
+trend, and priors that conflict with them; where some are odd, what the estimate without them says against itself. A
+value of the material that rises with the size of the bubble, with the order in which data sets were taken or with the
+time between readings is what a wrong scale, a wall, a drift or a wrong law leaves behind.
 """
 
 from collections.abc import Collection, Iterator, Sequence
@@ -164,21 +164,12 @@ def _chance(square: float, freedom: float, scatter: float, degrees: float) -> fl
 
 
 def doubts(
-    joint: JointProblem, place: Place, chi2: Array, agreed: Agreement, kept: Collection[int], singles: Sequence[Single]
+    joint: JointProblem, place: Place, chi2: Array, agreed: Agreement, singles: Sequence[Single]
 ) -> Iterator[Caution]:
-    """Warnings of a joint estimate about its data sets and priors, with J lowest at ``place`` and χ² (E,) per reading
-    there; those not ``kept`` are odd.
+    """Warnings of a joint estimate without odd data sets about its data sets and priors, with J lowest at ``place`` and
+    χ² (E,) per reading there.
     """
-    odd = [
-        f"{name} (χ² {chi2[e]:.3g} per reading, {agreed.squares[e] ** 0.5:.1f} standard deviations from all others, "
-        f"probability {_in_figures(agreed.chances[e])})"
-        for e, name in enumerate(joint.names)
-        if e not in kept
-    ]
-    if odd:
-        words = f"{_several(odd)} {'does' if len(odd) == 1 else 'do'} not share the values of the others"
-        yield caution("odd-data-set", f"{words}: the estimate without stands beside", "serious")
-    elif agreed.chance < DIFFER:
+    if agreed.chance < DIFFER:
         by = f" by {agreed.scatter:.1f} times what their errors explain" if agreed.degrees else ""
         words = (
             f"the data sets differ{by} (probability {_in_figures(agreed.chance)} if they share one value): the "
@@ -191,9 +182,27 @@ def doubts(
         if agreed.degrees:
             advice += f", or, where errors were stated too small, state them {agreed.scatter:.1f} times as large"
         yield replace(caution("data-sets-differ", words), advice=advice)
-    yield from _misfits(joint, chi2, kept)
+    yield from _misfits(joint, chi2)
     yield from _conflict(joint, place)
     yield from _trends(joint, place.border, singles)
+
+
+def left_out(
+    joint: JointProblem, chi2: Array, agreed: Agreement, kept: Collection[int], rest: Sequence[Caution]
+) -> Iterator[Caution]:
+    """Warnings where data sets that are not ``kept`` are odd: they explain what else would be said of all together, so
+    that the ``rest`` is what the estimate without them says of itself.
+    """
+    odd = [e for e in range(len(joint.names)) if e not in kept]
+    told = [
+        f"{joint.names[e]} (χ² {chi2[e]:.3g} per reading, {agreed.squares[e] ** 0.5:.1f} standard deviations from all "
+        f"others, probability {_in_figures(agreed.chances[e])})"
+        for e in odd
+    ]
+    words = f"{_several(told)} {'does' if len(odd) == 1 else 'do'} not share the values of the others"
+    yield caution("odd-data-set", f"{words}: what these share is the estimate without, which stands first", "serious")
+    without = _several([joint.names[e] for e in odd])
+    yield from (replace(c, words=f"without {without}: {c.words}") for c in rest)
 
 
 def _conflict(joint: JointProblem, place: Place) -> Iterator[Caution]:
@@ -207,11 +216,11 @@ def _conflict(joint: JointProblem, place: Place) -> Iterator[Caution]:
         yield replace(told, advice=f"{told.advice}; then make the runs again")
 
 
-def _misfits(joint: JointProblem, chi2: Array, kept: Collection[int]) -> Iterator[Caution]:
+def _misfits(joint: JointProblem, chi2: Array) -> Iterator[Caution]:
     """χ² of data sets under the shared values, beyond what their errors explain."""
     beyond = []
-    for e in kept:
-        readings = len(joint.experiments[e].observations.used)
+    for e, problem in enumerate(joint.experiments):
+        readings = len(problem.observations.used)
         if chi2[e] * readings > chi2_interval(max(1.0, readings - len(joint.columns(e)[1])))[1]:
             beyond.append(f"{joint.names[e]} ({chi2[e]:.3g})")
     if beyond:

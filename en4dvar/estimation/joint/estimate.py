@@ -12,7 +12,16 @@ from en4dvar.descent.weight_space import require_members
 from en4dvar.ensemble.forecast import Forecast, plotting_times
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.estimation.conclusions import missing_readings
-from en4dvar.estimation.joint.agreement import AT_MOST, Agreement, Statement, agreement, doubts, is_odd, oddest
+from en4dvar.estimation.joint.agreement import (
+    AT_MOST,
+    Agreement,
+    Statement,
+    agreement,
+    doubts,
+    is_odd,
+    left_out,
+    oddest,
+)  # fmt: skip
 from en4dvar.estimation.joint.descent import Experiment, JointDescent, JointObjective, Place, assembled
 from en4dvar.estimation.joint.members import JointMembers, challenger, gaussian, sampled
 from en4dvar.estimation.joint.problem import JointProblem, Single
@@ -33,9 +42,10 @@ TRIED = 6  # experiments whose own estimate of what is shared is tried as a star
 class JointEstimate:
     """Posterior of a joint problem.
 
-    ``members`` in units of the prior, ``mode`` where J is lowest, ``chi2`` (E,) per observation there, ``forecasts`` of
-    the N members and, last, the mode, each read at ``grids`` too; ``cautions`` why not to trust it. ``agreement`` of
-    each experiment with all others; ``without`` the oddest of them the same estimate, None where none is odd.
+    ``members`` in units of the prior, ``mode`` where J is lowest, ``chi2`` (E,) per observation there, of others than
+    odd experiments without these, ``forecasts`` of the N members and, last, the mode, each read at ``grids`` too;
+    ``cautions`` why not to trust it. ``agreement`` of each experiment with all others; ``without`` the oddest of them
+    the same estimate, None where none is odd.
     """
 
     joint: JointProblem
@@ -155,13 +165,18 @@ class _Estimate:
         kept = [e for e, name in enumerate(joint.names) if name in names]
         costs = [form.cost + 0.5 * float(v @ v) for form, v in zip(lowest.at.forms, lowest.at.place.own, strict=True)]
         agreed = agreement(joint, said, kept, 2 * np.maximum(costs - alone, 0))
-        cautions += doubts(joint, lowest.at.place, lowest.at.chi2(joint), agreed, kept, singles)
+        chi2 = lowest.at.chi2(joint)
+        if without:
+            chi2[kept] = without.rest.chi2
+            cautions += left_out(joint, chi2, agreed, kept, without.rest.cautions)
+        else:
+            cautions += doubts(joint, lowest.at.place, chi2, agreed, singles)
         normalisation = sum(problem.observations.log_normalisation() for problem in joint.experiments)
         return JointEstimate(
             joint=joint,
             mode=lowest.at.place,
             members=members,
-            chi2=lowest.at.chi2(joint),
+            chi2=chi2,
             forecasts=forecasts,
             grids=grids,
             costs=tuple(lowest.costs),
