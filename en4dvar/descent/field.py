@@ -27,7 +27,7 @@ from en4dvar.descent.field_data import FieldData, Pass, mean_of
 from en4dvar.descent.loop import Descends, Objective, minimise
 from en4dvar.descent.step_control import Move, Search
 from en4dvar.ensemble.missing import fitted
-from en4dvar.model.state import Array, Indices
+from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import En4dvarError
 from en4dvar.schemes.base import mda_inflations
 from en4dvar.schemes.local_gain import ByDistance, Gain, Split, Update, parts
@@ -47,43 +47,49 @@ def field_esmda(
 
     Raises :class:`En4dvarError`: predictions that are not finite.
     """
-    passed(ensemble, data, gain, mda_inflations(coefficients), seed)
+    passes = Passes(ensemble, data, gain, mda_inflations(coefficients), seed)
+    minimise(passes, [passes])
 
 
-def passed(
-    ensemble: Array, data: FieldData, gain: Gain, inflations: Array, seed: int, fewest: int | None = None,
-    first: Array | None = None, tell: Callable[[Pass], None] = lambda at: None,
-) -> Indices:  # fmt: skip
-    """The passes of ES-MDA over members (N, n), in place, with R times each of the ``inflations``.
+class Passes(Objective["Passes"], Descends):
+    """The passes of ES-MDA over an ensemble, which is their only descent, with R times each of the ``inflations``.
 
-    Returns which members came through all, ``fewest`` at least, by default all of them; the others stay where they
-    failed. ``first`` (N, K): predictions of the prior members, where they are known. ``tell`` hears of each pass.
+    ``alive`` are the members that came through all, ``fewest`` at least, by default all of them; the others stay where
+    they failed. ``first`` (N, K): predictions of the prior members, where they are known. ``tell`` hears of each pass.
     """
-    alive = np.arange(len(ensemble))
-    for a, alpha in enumerate(inflations):
-        predictions = _predicted(ensemble, alive, data, fewest) if a or first is None else first
+
+    def __init__(
+        self, ensemble: Array, data: FieldData, gain: Gain, inflations: Array, seed: int, fewest: int | None = None,
+        first: Array | None = None, tell: Callable[[Pass], None] = lambda at: None,
+    ):  # fmt: skip
+        self.ensemble, self.data, self.gain, self.inflations, self.seed = ensemble, data, gain, inflations, seed
+        self.fewest, self.first, self.tell = fewest, first, tell
+        self.alive = np.arange(len(ensemble))
+        self.iteration = 0
+
+    def linearise(self, going: "Sequence[Passes]") -> list[Update]:
+        a, alpha, first = self.iteration, self.inflations[self.iteration], self.first
+        predictions = self._predicted() if a or first is None else first
         finite = np.isfinite(predictions).all(axis=1)
-        alive, predictions = alive[finite], predictions[finite]
-        errors = np.sqrt(alpha) * data.perturbations(seed, f"ES-MDA {a}", alive)
-        tell(_before(ensemble, alive, predictions))
-        anomalies, innovations = predictions - predictions.mean(axis=0), data.values + errors - predictions
-        update = gain.update(anomalies, alpha * data.std**2, innovations)
-        for part in parts(ensemble.shape[1], data.width(len(ensemble))):
-            here = ensemble[alive, part]
-            ensemble[alive, part] = here + update(part, here - here.mean(axis=0))
-    return alive
+        self.alive, predictions = self.alive[finite], predictions[finite]
+        errors = np.sqrt(alpha) * self.data.perturbations(self.seed, f"ES-MDA {a}", self.alive)
+        ensemble, alive = self.ensemble, self.alive
+        self.tell(Pass(mean_of(ensemble, alive), predictions.mean(axis=0), lambda part: ensemble[alive, part]))
+        anomalies, innovations = predictions - predictions.mean(axis=0), self.data.values + errors - predictions
+        return [self.gain.update(anomalies, alpha * self.data.std**2, innovations)]
 
+    def move(self, going: "Sequence[Passes]", moves: Sequence[Move | None]) -> None:
+        for part in parts(self.ensemble.shape[1], self.data.width(len(self.ensemble))):
+            here = self.ensemble[self.alive, part]
+            self.ensemble[self.alive, part] = here + self.step(part, here - here.mean(axis=0))
+        self.iteration += 1
+        self.ended = self.iteration == len(self.inflations)
 
-def _before(ensemble: Array, alive: Indices, predictions: Array) -> Pass:
-    """Where the members ``alive`` stand, of which these are the predictions (M, K)."""
-    return Pass(mean_of(ensemble, alive), predictions.mean(axis=0), lambda part: ensemble[alive, part])
-
-
-def _predicted(ensemble: Array, alive: Indices, data: FieldData, fewest: int | None) -> Array:
-    """(M, K) of the M members ``alive``; what some lack is regressed on the others."""
-    predictions = np.full((len(ensemble), len(data.values)), np.nan)
-    predictions[alive] = data.runs(lambda some: ensemble[alive[some]], len(alive))
-    return data.enough(fitted(ensemble, predictions)[alive], fewest)
+    def _predicted(self) -> Array:
+        """(M, K) of the M members alive; what some lack is regressed on the others."""
+        predictions = np.full((len(self.ensemble), len(self.data.values)), np.nan)
+        predictions[self.alive] = self.data.runs(lambda some: self.ensemble[self.alive[some]], len(self.alive))
+        return self.data.enough(fitted(self.ensemble, predictions)[self.alive], self.fewest)
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,9 @@ from dataclasses import replace
 import numpy as np
 
 from en4dvar.data.noise import Predicted
-from en4dvar.descent.field import field_en4dvar, passed
+from en4dvar.descent.field import Passes, field_en4dvar
 from en4dvar.descent.field_data import FieldData, Pass, gain_of, mean_of, prior_members
+from en4dvar.descent.loop import minimise
 from en4dvar.descent.weight_space import require_members
 from en4dvar.diagnosis import diagnostics as diag
 from en4dvar.diagnosis.analysis import Analysis, FieldEstimate, IterationRecord, Progress
@@ -128,13 +129,14 @@ class Localised:
                 return end.centre, end.converged, end.stop, lost
             first = np.where(prior_run.active[:, None], prior_run.predictions[:, used], np.nan)
             inflations = settings.own.inflations
-            alive = passed(ensemble, data, self.gain, inflations, self.seed, self.fewest, first, self._heard)
+            passes = Passes(ensemble, data, self.gain, inflations, self.seed, self.fewest, first, self._heard)
+            minimise(passes, [passes])
         except En4dvarError as error:
             reasons = diag.common_reasons(self.failures)
             raise TooFewMembersError(f"{observations.name}: {error}. Most frequent reasons: {reasons}") from None
-        for i in set(self.everyone.tolist()) - set(alive.tolist()):
+        for i in set(self.everyone.tolist()) - set(passes.alive.tolist()):
             lost[i] = prior_run.failures[i] or f"failed in a pass of {settings.scheme}"
-        return mean_of(ensemble, alive), True, f"{len(inflations)} assimilations", lost
+        return mean_of(ensemble, passes.alive), True, f"{len(inflations)} assimilations", lost
 
     def _predict(self, members: Array) -> Array:
         run = self.forecast(members)

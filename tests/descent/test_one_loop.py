@@ -13,7 +13,7 @@ from en4dvar.estimation.joint import descent as joint
 from en4dvar.series import window as cycle
 
 OBJECTIVES = {
-    window.DataWindow, start.Rounds, field.FieldObjective, joint.JointObjective, cycle.CycleWindow,
+    window.DataWindow, start.Rounds, field.Passes, field.FieldObjective, joint.JointObjective, cycle.CycleWindow,
 }  # fmt: skip
 
 
