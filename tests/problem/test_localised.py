@@ -125,7 +125,7 @@ def test_a_parameter_with_a_place_beside_a_field():
 
 
 def test_without_a_place_all_readings_act_on_a_parameter():
-    """Of es-mda by an untapered covariance; of En4D-Var as a block of its own of B, written out here."""
+    """Of es-mda by an untapered regression; of En4D-Var as a block of its own of B, written out here."""
     somewhere = Localisation(RADIUS, {"level": (0.5,)})
     problem = line(estimated=True, level=True)
     found = assimilate(problem, settings("es-mda", somewhere), SEED)
