@@ -2,10 +2,10 @@
 
     python benchmarks/pest_files.py FOLDER     # of control files, e.g. the autotests of pyemu and benchmarks of PEST++
 
-Templates and instruction files that are not there are stood in for by empty ones, as nothing is run. Prints how many
-files are read and why others are refused; and, of those that pyemu reads too, the largest difference of its parameters
-(``parval1``, std of the prior from the bounds or ``parcov``, behind the scale) and observations (values, std from the
-weights), relative.
+Templates and instruction files that are not there are stood in for by templates of all parameters and empty
+instructions, as nothing is run. Prints how many files are read and why others are refused; and, of those that pyemu
+reads too, the largest difference of its parameters (``parval1``, std of the prior from the bounds or ``parcov``,
+behind the scale) and observations (values, std from the weights), relative.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from en4dvar.model.programs.control import PARAMETERS, from_pest
 from en4dvar.model.programs.control_file import read_control
 from en4dvar.model.programs.languages import identifier
 
-MISSING = re.compile(r"(\S*): No such file or directory")
+MISSING = re.compile(r"(\S*): no such file.*")
 
 
 def read(path: Path) -> tuple[dict, int]:
@@ -38,7 +38,9 @@ def read(path: Path) -> tuple[dict, int]:
             if not lost or Path(lost[1]).suffix in (".cov", ".jcb", ".jco", ".csv", ".dat"):
                 raise
             Path(lost[1]).parent.mkdir(parents=True, exist_ok=True)
-            Path(lost[1]).write_text("pif @\n" if lost[1].endswith(".ins") else "ptf ~\n")
+            rows = read_control(path).rows("parameter data", PARAMETERS)
+            spaces = "".join(f"~{row.word('parnme')}~\n" for row in rows)
+            Path(lost[1]).write_text("pif @\n" if lost[1].endswith(".ins") else f"ptf ~\n{spaces}")
     raise AssertionError(path)
 
 
@@ -101,7 +103,7 @@ def main(folder: Path) -> None:
                 continue
             except Exception as error:
                 silent.append(f"{path.relative_to(folder)}: pyemu: {type(error).__name__}: {str(error)[:90]}")
-    print(f"{len(paths)} control files: {agree} read ({stood_in} with empty templates), {len(paths) - agree} refused")
+    print(f"{len(paths)} control files: {agree} read ({stood_in} with stand-ins), {len(paths) - agree} refused")
     for text, count in reasons.most_common():
         print(f"{count:4} {text[:180]}")
     if differences:

@@ -76,7 +76,11 @@ class Passes(Objective["Passes"], Descends):
         ensemble, alive = self.ensemble, self.alive
         self.tell(Pass(mean_of(ensemble, alive), predictions.mean(axis=0), lambda part: ensemble[alive, part]))
         anomalies, innovations = predictions - predictions.mean(axis=0), self.data.values + errors - predictions
-        return [self.gain.update(anomalies, alpha * self.data.std**2, innovations)]
+        variance, gain = alpha * self.data.std**2, self.gain
+        if isinstance(gain, ByDistance) and len(gain.common):
+            tangent = Split.by_regression(anomalies, ensemble[np.ix_(alive, gain.common)])
+            return [gain.update(tangent, variance, innovations)]
+        return [gain.update(anomalies, variance, innovations)]
 
     def move(self, going: "Sequence[Passes]", moves: Sequence[Move | None]) -> None:
         for part in parts(self.ensemble.shape[1], self.data.width(len(self.ensemble))):

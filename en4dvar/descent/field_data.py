@@ -128,10 +128,10 @@ def gain_of(problem: InverseProblem, settings: AssimilationSettings) -> Gain:
     observed = _observed(problem, asked)
     places = _places(problem, asked, observed.shape[1])
     lost = [name for name, where in zip(problem.prior.names, places, strict=False) if np.isnan(where[0])]
-    if len(lost) >= settings.members - 1 and settings.own.minimiser:
+    if len(lost) >= settings.members - 1:
         raise ConfigError(
             f"{len(lost)} parameters have no place, as many as {settings.members} members know directions; give them "
-            f"places, 'at: {{{lost[0]}: 0}}', or use {others}"
+            f"places, 'at: {{{lost[0]}: 0}}', or use {others} with 'localisation: {{by: correlation}}'"
         )
     return ByDistance(places, observed[problem.observations.used], asked.radius)
 

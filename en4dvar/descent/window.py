@@ -25,7 +25,7 @@ from en4dvar.ensemble.missing import filled
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import TooFewMembersError
 from en4dvar.priors.prior import member_stream
-from en4dvar.schemes.base import Evaluation, GaussNewtonStep, Runs, Step, Weights, gauss_newton, regression
+from en4dvar.schemes.base import Evaluation, GaussNewtonStep, Runs, Step, Weights, gauss_newton, regression, step_of
 
 WIDER, WIDEST = 5.0, 25.0  # factors of a bundle where J does not fall along the step: of each further look, in all
 FAKED = 3.0  # posterior standard deviations: a longer step does not come from the model's own error
@@ -121,7 +121,7 @@ class DataWindow(Objective[Descent]):
         reference, anomalies = self.scheme.linearise(descent.weights, runs)
         self.tangents.append((descent.weights.w, reference, anomalies))
         evaluation = self.whiten(descent, reference, anomalies)
-        return self.scheme.advance(descent.weights, evaluation, descent.iteration, self.draw)
+        return step_of(self.scheme, descent.weights, evaluation, descent.iteration, self.draw)
 
     def run(self, going: Sequence[Descent]) -> list[Runs | None]:
         """The members of the scheme through F and H, all descents in one call; None where too few of them survive."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from en4dvar.data.series import Part
 from en4dvar.executor import Outcome
-from en4dvar.model.forward import Batch, Failure, RateOperator, ValidityLimit, initial_states
+from en4dvar.model.forward import Batch, Failure, RateOperator, ValidityLimit, gives_rate, initial_states
 from en4dvar.model.state import Array, Field, Indices, floats
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.plumbing.user_code import own_fault, reason_of
@@ -228,7 +228,7 @@ def operators_of(parts: Sequence[Part], needs_rates: str = "") -> tuple[Callable
     operators = list[Callable[[Any], Array]]()
     for part in parts:
         operator, name = part.observable.operator, part.observable.name
-        if needs_rates and not isinstance(operator, RateOperator):
+        if needs_rates and not gives_rate(operator):
             raise ConfigError(f"{needs_rates} needs the rate of {name}, which the model does not provide")
         operators.append(operator.rate if needs_rates and isinstance(operator, RateOperator) else operator)
     return tuple(operators)

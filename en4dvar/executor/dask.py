@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from en4dvar.executor.base import Call, Events, ExecutorError, FuturesExecutor, T, Tell, WorkerLostError
 from en4dvar.executor.limits import NO_LIMITS, Limits, apply_limits
+from en4dvar.executor.processes import ProcessesExecutor, end_unguarded
 from en4dvar.plumbing.user_code import in_worker, own_fault
 
 if TYPE_CHECKING:
@@ -65,6 +66,7 @@ class DaskExecutor(FuturesExecutor):
             logging.getLogger(f"distributed.{name}").setLevel(logging.CRITICAL)
         try:
             if address is None:
+                end_unguarded()
                 self._configured.enter_context(dask.config.set({"distributed.deploy.lost-worker-timeout": FOREVER}))
                 self._cluster = distributed.LocalCluster(
                     n_workers=workers or 1,
@@ -80,6 +82,11 @@ class DaskExecutor(FuturesExecutor):
             self._client.subscribe_topic(TOPIC, self._pass_on)
             self._client.wait_for_workers(1, timeout=CONNECT_TIMEOUT)
             self.workers = workers or max(1, sum(self._client.nthreads().values()))
+        except RuntimeError as error:  # a worker of this machine ends while it starts
+            self.kill()
+            with ProcessesExecutor(1) as own:  # which knows why
+                list(own.map(str, [()]))
+            raise ExecutorError(f"workers of dask end while they start ({error})") from None
         except (OSError, ValueError) as error:
             connected = self._client is not None
             self.kill()

@@ -167,6 +167,12 @@ class StateField:
         return trajectory[self.rate_of]
 
 
+def gives_rate(operator: ObservationOperator) -> bool:
+    """Whether an operator gives its rate; a :class:`StateField` does where ``rate_of`` names a field."""
+    unnamed = isinstance(operator, StateField) and type(operator).rate is StateField.rate and operator.rate_of is None
+    return isinstance(operator, RateOperator) and not unnamed
+
+
 @dataclass(frozen=True)
 class Observable(Shown):
     """A quantity that can be measured: its name in YAML and netCDF, its units, and the operator H that predicts it.

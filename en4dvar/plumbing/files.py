@@ -119,9 +119,12 @@ def read_at_most(file: io.BufferedReader, longest: int) -> bytes:
 
 
 def read_text(path: str | Path, longest: int = 10_000_000) -> str:
-    """The text (UTF-8) of a file. Raises :class:`OSError` as :func:`read_plain`, and where it is no text."""
+    """The text of a file: UTF-8, without its byte order mark.
+
+    Raises :class:`OSError` as :func:`read_plain`, and where it is no text.
+    """
     try:
-        return read_plain(path, longest).decode("utf-8")
+        return read_plain(path, longest).decode("utf-8-sig")
     except UnicodeDecodeError:
         raise OSError(errno.EILSEQ, "is not UTF-8 text", str(path)) from None
 

@@ -36,10 +36,21 @@ Update = Callable[[slice, Array], Array]  # (part of the cells, their anomalies 
 
 @dataclass(frozen=True)
 class Split:
-    """Anomalies (N, K) of predictions along those of what has a place, and of what has none."""
+    """Anomalies (N, K) of predictions along those of what has a place, and of what has none.
+
+    ``related``: what has a place is correlated with what has none, along which ``placed`` has no part.
+    """
 
     placed: Array
     common: Array
+    related: bool = False
+
+    @classmethod
+    def by_regression(cls, anomalies: Array, common: Array) -> "Split":
+        """Of ``anomalies`` of the predictions, what members (N, q) of what has no place explain, and the rest."""
+        X = common - common.mean(axis=0)
+        explained = X @ np.linalg.lstsq(X, anomalies)[0]
+        return cls(anomalies - explained, explained, related=True)
 
     @property
     def whole(self) -> Array:
@@ -58,8 +69,8 @@ class Gain(Protocol):
 class ByDistance:
     """``places`` (n, D) of the cells and ``observed`` (K, D) of the observations; the taper is Gaspari & Cohn's.
 
-    It falls to 5/24 at ``radius`` and to 0 at twice that. All observations act on what has no place (NaN). Where the
-    predictions ``Y`` are a :class:`Split` nothing is tapered of what has none, and it is independent of the rest.
+    It falls to 5/24 at ``radius`` and to 0 at twice that. All observations act on what has no place (NaN), for which
+    the predictions ``Y`` are a :class:`Split`, and nothing is tapered of what it explains.
     """
 
     places: Array
@@ -100,8 +111,9 @@ class ByDistance:
         """(ρ_xy ∘ XᵀY/(N−1)) λ as rows (M, m), for λ (M, K)."""
         cross = self.taper(part) * (anomalies.T @ (Y.placed if isinstance(Y, Split) else Y)) / (len(anomalies) - 1)
         if isinstance(Y, Split):
-            nowhere = np.isnan(self.places[part, 0])
-            cross[nowhere] = anomalies[:, nowhere].T @ Y.common / (len(anomalies) - 1)
+            of_common = anomalies.T @ Y.common / (len(anomalies) - 1)
+            nowhere = np.isnan(self.places[part])[:, :1]
+            cross = np.where(nowhere, of_common, cross + of_common if Y.related else cross)
         return np.asarray(dual @ cross.T)
 
     def update(self, Y: Array | Split, variance: Array, innovations: Array) -> Update:

@@ -13,7 +13,7 @@ import numpy as np
 
 from en4dvar.ensemble.linalg import apply_weights
 from en4dvar.model.state import Array, Indices, Mask
-from en4dvar.schemes.base import Draw, Evaluation, Runs, Scheme, Weights
+from en4dvar.schemes.base import Draw, Evaluation, Runs, Scheme, Weights, step_of
 from en4dvar.schemes.filters import ETKF
 
 
@@ -113,7 +113,7 @@ class BlockLocalisation:
         prior = Weights.prior(len(ensemble))
         for block, taper in self.analysed(ensemble):
             own = ETKF() if scheme.perturbs and block is self.without_place else scheme
-            step = own.advance(prior, _tapered(evaluation, taper), 0, _of_some(draw, taper > 0))
+            step = step_of(own, prior, _tapered(evaluation, taper), 0, _of_some(draw, taper > 0))
             analysed[:, block] = apply_weights(ensemble[:, block], self.rows(block, step.weights))
         return analysed
 
@@ -144,7 +144,7 @@ class BlockDescents:
         largest = 0.0
         for i, (_, taper) in enumerate(self.near):
             evaluation = whiten(*scheme.linearise(self.weights[i], runs))
-            step = scheme.advance(self.weights[i], _tapered(evaluation, taper), iteration, _of_some(draw, taper > 0))
+            step = step_of(scheme, self.weights[i], _tapered(evaluation, taper), iteration, _of_some(draw, taper > 0))
             self.weights[i], largest = step.weights, max(largest, step.norm)
         return largest
 

@@ -14,7 +14,7 @@ from en4dvar.ensemble.missing import fitted
 from en4dvar.executor import Executor
 from en4dvar.model.forward import Batch, Failure, ForwardModel, Observable, Trajectory
 from en4dvar.model.state import Array, floats
-from en4dvar.schemes.base import Evaluation, GaussNewtonStep, Runs, Scheme, Step, Weights
+from en4dvar.schemes.base import Evaluation, GaussNewtonStep, Runs, Scheme, Step, Weights, step_of
 from en4dvar.schemes.localisation import BlockDescents, BlockLocalisation
 from en4dvar.series.model_error import ModelError
 from en4dvar.series.series import CycleSeries
@@ -193,7 +193,7 @@ class CycleWindow(Objective[CycleDescent]):
         evaluation = self.whiten(*scheme.linearise(descent.weights, self.runs))
         if self.localisation is not None and self.local is None:
             self.localised = self.localisation.analysis(scheme, self.members, evaluation, self.draw)
-        return [scheme.advance(descent.weights, evaluation, descent.iteration, self.draw)]
+        return [step_of(scheme, descent.weights, evaluation, descent.iteration, self.draw)]
 
     def run(self, descent: CycleDescent) -> Runs:
         """The members of the scheme through the window. Raises :class:`MembersLost`."""

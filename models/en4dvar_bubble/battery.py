@@ -153,6 +153,18 @@ def members_are_apart(law: ConstitutiveLaw) -> None:
     exactness.refuse_mixed_members(law)
 
 
+def parameters_act(law: ConstitutiveLaw) -> None:
+    """Every parameter acts."""
+    values = law.example_values()
+    own = exactness.numbers_of(law, values)
+    for p in law.parameters:
+        value = values[p.name]
+        moved = np.clip([1.3 * value + (value == 0), 0.7 * value], *p.bounds)
+        other = exactness.numbers_of(law, values | {p.name: moved[0] if moved[0] != value else moved[1]})
+        acts = any(not np.array_equal(own[what], other[what], equal_nan=True) for what in own)
+        assert acts or p.name == law.rest_tension, f"{p.name} changes neither stress nor viscosity nor memory"
+
+
 def finite(law: ConstitutiveLaw) -> None:
     """Finite over the stretch range, and over shear rates from 1e-2 to 1e12 1/s with viscosity ≥ 0."""
     values = law.example_values()
@@ -216,7 +228,7 @@ def dissipates(law: ConstitutiveLaw) -> None:
 
 CHECKS: tuple[Check, ...] = (
     documented, no_stress_without_strain, stress_falls_with_stretch, finite, table_has_the_slope_of_the_law,
-    limits_hold, dissipates, members_are_apart,
+    limits_hold, dissipates, members_are_apart, parameters_act,
 )  # fmt: skip
 
 

@@ -52,6 +52,15 @@ class TestBatteryFinds:
 
         self.expect(Good)
 
+    def test_a_parameter_that_does_nothing(self):
+        class Idle(Base):
+            r"""$J$ without $\alpha$."""
+
+            parameters: ClassVar = (G, ALPHA, MU)
+
+        self.expect(Idle, "parameters_act")
+        assert "alpha changes neither stress nor viscosity nor memory" in run_battery(Idle()).values()
+
     def test_missing_documentation(self):
         class Undocumented(Base):
             """No formula."""

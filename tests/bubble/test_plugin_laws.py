@@ -237,7 +237,7 @@ class TestCommand:
         done = self.run("--check", f"{yeoh}:Yeoh")
         assert done.exit_code == 0, done.output
         assert "FAIL" not in done.output
-        assert "Yeoh: 8 of 8 checks pass" in done.output
+        assert "Yeoh: 9 of 9 checks pass" in done.output
 
     def test_check_fails_and_says_where(self, yeoh):
         yeoh.write_text(YEOH.replace("return 2 *", "return -2 *"))
@@ -245,7 +245,7 @@ class TestCommand:
         assert done.exit_code == 1
         assert "FAIL  The elastic stress opposes the strain" in done.output
         assert "at λ = " in done.output
-        assert "Yeoh: 1 of 8 checks fail" in done.output
+        assert "Yeoh: 1 of 9 checks fail" in done.output
 
     def test_a_factor_shows_at_small_strain_and_against_the_parent(self, yeoh):
         told = "At small strain: shear modulus {} Pa, viscosity 0.1 Pa s (G = 5e+03, "

@@ -148,6 +148,52 @@ def test_spread_of_parameters_without_a_place():
     assert spread(found[:, of]) == pytest.approx(np.sqrt(np.mean(exact[of] ** 2)), rel=0.1)
 
 
+@pytest.mark.parametrize("members", [50, 200])
+@pytest.mark.parametrize("kernel", [lambda d: np.exp(-(d**2) / 2), lambda d: np.exp(-d)])
+def test_esmda_beside_what_has_no_place_is_the_closed_form(kernel, members: int):
+    """A field whose prior is wide beside the errors, and its drift, which the whole ensemble does not confuse."""
+    n, std, times = 40, 0.3, np.repeat([1.0, 2.0], 20)
+    places = np.arange(float(n))[:, None]
+    B = np.zeros((n + 1, n + 1))
+    B[:n, :n], B[n, n] = 4 * kernel(cdist(places, places) / 3.0), 1.0
+    root = np.linalg.cholesky(B + 1e-9 * np.eye(n + 1))
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        read = np.tile(np.sort(rng.choice(n, 20, replace=False)), 2)
+        H = np.column_stack([np.eye(n)[read], times])
+        values = H @ root @ rng.standard_normal(n + 1) + std * rng.standard_normal(40)
+        K = B @ H.T @ np.linalg.inv(H @ B @ H.T + std**2 * np.eye(40))
+        exact, spread = K @ values, np.sqrt(np.diag(B - K @ H @ B))
+        found = rng.standard_normal((members, n + 1)) @ root.T
+        near = ByDistance(np.vstack([places, [[np.nan]]]), places[read], 6.0)
+        field_esmda(found, FieldData(values, np.full(40, std), lambda x, H=H: x @ H.T), near, seed=seed)
+        off = (found.mean(axis=0) - exact) / spread
+        assert np.sqrt(np.mean(off[:n] ** 2)) < 0.7, seed
+        assert abs(off[n]) < 0.7, seed
+        ratio = found.std(axis=0, ddof=1) / spread
+        assert np.mean(ratio[:n]) == pytest.approx(1.0, abs=0.2), seed
+        assert ratio[n] == pytest.approx(1.0, abs=0.25), seed
+
+
+def test_esmda_regresses_on_what_has_no_place_and_tapers_the_rest():
+    """One pass with B = A P_c Aᵀ + ρ ∘ P of what it leaves, every matrix written out."""
+    ensemble, data, read = small()
+    ensemble[:, 7] += ensemble[:, 0]
+    common, placed = ensemble[:, 7:8] - ensemble[:, 7].mean(), np.delete(np.arange(30), 7)
+    places = np.arange(30.0)[:, None]
+    places[7] = np.nan
+    X = ensemble - ensemble.mean(axis=0)
+    along = common @ (common.T @ X) / (common.T @ common)
+    B = np.cov(along.T)
+    tapered = gaspari_cohn(cdist(places[placed], places[placed]), 4.0) * np.cov((X - along)[:, placed].T)
+    B[np.ix_(placed, placed)] += tapered
+    H = np.eye(30)[read]
+    K = B @ H.T @ np.linalg.inv(H @ B @ H.T + np.diag(data.std**2))
+    expected = ensemble + (data.values + drawn(7, "ES-MDA 0", data.std, 8) - ensemble @ H.T) @ K.T
+    field_esmda(ensemble, data, ByDistance(places, places[read], 4.0), coefficients=(1.0,), seed=7)
+    assert np.max(np.abs(ensemble - expected)) < 1e-10
+
+
 def test_memory_is_that_of_the_ensemble_and_of_a_part():
     n, members = 60_000, 20
     rng = np.random.default_rng(0)

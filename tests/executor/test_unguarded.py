@@ -21,10 +21,15 @@ from en4dvar.executor import ProcessesExecutor
 with ProcessesExecutor(2) as executor:
     list(executor.map(abs, [(-1,), (-2,)]))
 """
+CLUSTER = """
+from en4dvar.executor.dask import DaskExecutor
+with DaskExecutor(2) as executor:
+    list(executor.map(abs, [(-1,), (-2,)]))
+"""
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("words", [TWIN, CALLS])
+@pytest.mark.parametrize("words", [TWIN, CALLS, CLUSTER])
 def test_a_script_without_main_guard_gets_one_line_and_no_traceback(tmp_path: Path, words: str) -> None:
     done = told_by(tmp_path, words)
     assert done.returncode == 1

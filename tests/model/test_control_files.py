@@ -393,6 +393,8 @@ def test_chen_and_oliver_have_the_posterior_of_quadrature(tmp_path):
         ("* model command line", "* svd assist", "line.pst: no section '* model command line'"),
         ("line.ins line.out", "", "line.pst: no instruction file"),
         ("line.tpl", "none.tpl", "none.tpl: no such file; the folder holds line.tpl"),
+        ("h2 4.5", "H1 4.5", "line.pst:16: observation h1 stands in {0}/line.pst:15, too"),
+        ("bad 99.0", "h2 99.0", "line.pst:17: observation h2 stands in {0}/line.pst:16, too"),
         ("A log factor 1.0 0.1", "A log factor 1.0 0", "line.pst:9: a is log, but its lower bound 0 is not above 0"),
     ],
 )
@@ -400,4 +402,45 @@ def test_what_cannot_be_read_is_told_with_its_line(control, old, new, words):
     control.write_text(CONTROL.replace(old, new))
     with pytest.raises(en4dvar.ConfigError) as caught:
         from_pest(control)
-    assert str(caught.value).endswith(words)
+    assert str(caught.value).endswith(words.format(control.parent))
+
+
+def test_a_parameter_that_is_estimated_is_in_a_template(control):
+    """What is fixed need not be; nor what has its place in what is tied to it."""
+    template = control.with_name("line.tpl")
+    template.write_text("ptf ~\n~        a           ~\n")
+    with pytest.raises(en4dvar.ConfigError, match=r"line\.pst:10: parameter b is in no template$"):
+        from_pest(control)
+    text = CONTROL.replace("* observation groups", "d tied factor 2.0 1.0 3.0 pg 1.0 0.0 1\nd b\n* observation groups")
+    control.write_text(text.replace("b none relative 0.0", "b none relative 1.0"))
+    template.write_text("ptf ~\n~        a           ~\n~ d  ~\n")
+    assert from_pest(control)["priors"]["d"] == {"tied": "b", "factor": 2.0}
+
+
+def test_a_byte_order_mark_is_no_text(control):
+    plain = from_pest(control, ["line.py"])
+    for name in ("line.pst", "line.tpl", "line.ins"):
+        path = control.with_name(name)
+        path.write_text("\ufeff" + path.read_text(), encoding="utf-8")
+    marked = from_pest(control, ["line.py"])
+    assert marked["priors"] == plain["priors"]
+    model = CommandModel(CommandSettings.model_validate(marked["model"]))
+    (path,) = model.trajectories([[1.0, 0.5, 2.0]], marked["data"]["time"])
+    assert path["observations"] == pytest.approx([3.5, 4.5, 5.5])
+
+
+def test_files_are_read_for_each_model(control):
+    """As they are when it is made: an edited one counts for the next."""
+    template, instructions = control.with_name("line.tpl"), control.with_name("line.ins")
+    files = template.read_text(), instructions.read_text()
+    models = []
+    for changed in (True, False):
+        template.write_text(files[0].replace("~      b             ~", "-1") if changed else files[0])
+        instructions.write_text(files[1].replace("!h1!\nl1 !h2!", "!h2!\nl1 !h1!") if changed else files[1])
+        content = {"command": f"{sys.executable} -S line.py", "templates": {"run/line.in": str(template)}}
+        content |= {"files": [str(control.with_name("line.py"))], "parameters": {"a": "1", "b": "1", "c": "1"}}
+        content["outputs"] = {"h": {"instructions": {"line.out": str(instructions)}, "observations": ["h1", "h2"]}}
+        models.append(CommandModel(CommandSettings.model_validate(content)))
+    first, second = (next(iter(model.trajectories([[1.0, 0.5, 2.0]], [1.0, 2.0])))["h"] for model in models)
+    assert first == pytest.approx([3.0, 2.0])
+    assert second == pytest.approx([3.5, 4.5])

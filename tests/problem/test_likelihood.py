@@ -121,5 +121,11 @@ def test_incomplete_problems_are_refused():
 def test_rate_that_the_field_lacks_is_refused():
     observable = Observable("y", "m", StateField("y"))
     problem = replace(make_problem(Linear(("a", "b")), [1.0, 0.5], time_std=0.1), observable=observable)
-    run = forecast(problem, problem.prior.sample(4, 0))
-    assert set(run.failures) == {"NotImplementedError: the model does not provide d(y)/dt"}
+    with pytest.raises(ConfigError, match="a timing error needs the rate of y, which the model does not provide"):
+        check_problem(problem)
+
+    class Own(StateField):
+        def rate(self, trajectory):
+            return 0 * trajectory["y"]
+
+    check_problem(replace(problem, observable=Observable("y", "m", Own("y"))))

@@ -125,7 +125,7 @@ def test_a_parameter_with_a_place_beside_a_field():
 
 
 def test_without_a_place_all_readings_act_on_a_parameter():
-    """Of es-mda by an untapered covariance; of En4D-Var as a block of its own of B, written out here."""
+    """Of es-mda by an untapered regression; of En4D-Var as a block of its own of B, written out here."""
     somewhere = Localisation(RADIUS, {"level": (0.5,)})
     problem = line(estimated=True, level=True)
     found = assimilate(problem, settings("es-mda", somewhere), SEED)
@@ -151,7 +151,8 @@ def test_without_a_place_all_readings_act_on_a_parameter():
     assert field.members == pytest.approx(field.centre + cells + (along @ gained).T, abs=1e-9)
 
 
-def test_more_parameters_without_a_place_than_members_know():
+@pytest.mark.parametrize("scheme", ["en4dvar", "es-mda"])
+def test_more_parameters_without_a_place_than_members_know(scheme):
     model = Many()
     series = Series(
         model.observables[0], np.ones(3), np.zeros(3), noise_of(np.ones(3)), places=Places.at_indices([0, 1, 2])
@@ -159,7 +160,7 @@ def test_more_parameters_without_a_place_than_members_know():
     prior = Prior(tuple(PriorTerm.normal(p, 0.0, 1.0) for p in model.parameters))
     problem = InverseProblem(model, model.observables[0], Observations.of_series([series]), prior)
     with pytest.raises(ConfigError, match="2000 parameters have no place, as many as 12 members"):
-        assimilate(problem, settings("en4dvar", Localisation(RADIUS, {"k": (0.0,)})), SEED)
+        assimilate(problem, settings(scheme, Localisation(RADIUS, {"k": (0.0,)})), SEED)
 
 
 def test_by_correlation_is_the_adaptive_gain_in_each_pass():

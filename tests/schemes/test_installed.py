@@ -10,6 +10,9 @@ from pathlib import Path
 import pytest
 import yaml
 
+import en4dvar
+from en4dvar.plumbing.errors import ConfigError
+
 QUICK_START = Path(__file__).resolve().parents[2] / "configs" / "quickstart.yaml"
 SCHEME = """
 from dataclasses import dataclass
@@ -79,6 +82,31 @@ def test_a_script_may_import_the_package_first(first, package, tmp_path):
     script = "import patient, en4dvar; print(en4dvar.validate('own.yaml'))"
     done = called("-c", script, environment=package, folder=tmp_path)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("return None", "scheme Bad: advance gives None; it gives a Step or a GaussNewtonStep"),
+        (
+            "return Step(weights, weights.w)",
+            "scheme Bad: advance gives weights (16,) and norm (16,); they are",
+        ),
+        ("return weights.w + 'x'", "scheme Bad: advance raises UFuncTypeError: "),
+        ("return weights.width", "AttributeError: 'Weights' object has no attribute 'width' ({0}:7)"),
+    ],
+)
+def test_a_scheme_that_gives_no_step_is_named(package, tmp_path, line, words):
+    file = tmp_path / "bad.py"
+    begin = "from en4dvar.schemes import ETKF\nfrom en4dvar.schemes.base import Step\nclass Bad(ETKF):\n"
+    head = "    words = 'bad'\n\n    def advance(self, weights, evaluation, iteration, draw):\n        "
+    file.write_text(f"{begin}{head}{line}\n")
+    config = yaml.safe_load((tmp_path / "own.yaml").read_text())
+    config["assimilation"] = {"scheme": f"{file}:Bad", "members": 16, "what_if": False}
+    (tmp_path / "own.yaml").write_text(yaml.safe_dump(config))
+    with pytest.raises(ConfigError) as caught:
+        en4dvar.run(tmp_path / "own.yaml", overrides={"output.directory": str(tmp_path / "runs")})
+    assert words.format(file) in str(caught.value)
 
 
 @pytest.mark.slow

@@ -10,7 +10,8 @@ import en4dvar.schemes
 from en4dvar.schemes.base import Scheme
 
 ALLOWED = {
-    "en4dvar.ensemble.linalg", "en4dvar.model.state", "en4dvar.plumbing.installed",
+    "en4dvar.ensemble.linalg", "en4dvar.model.state", "en4dvar.plumbing.installed", "en4dvar.plumbing.errors",
+    "en4dvar.plumbing.hints", "en4dvar.plumbing.user_code",
 }  # fmt: skip
 FILES = sorted(p for p in Path(en4dvar.schemes.__file__).parent.glob("*.py") if p.stem != "settings")
 

@@ -9,7 +9,7 @@ bounds and weights. What it asks for that would change the estimate and is not d
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +17,7 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from en4dvar.model.programs.control_file import ControlFile, NamedMatrix, PestRow, read_control, read_matrix, text_of
-from en4dvar.model.programs.languages import identifier, is_pest
+from en4dvar.model.programs.languages import identifier, is_pest, names_in
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import ConfigError, retold
 
@@ -76,7 +76,7 @@ def from_pest(path: str | Path, files: Sequence[str] = (), *, prior_information:
     """
     control = read_control(Path(path).absolute())
     rows = control.rows("parameter data", PARAMETERS)
-    observed = [row for row in control.rows("observation data", OBSERVATIONS) if _weight(row) > 0]
+    observed = [row for row in _named_once(control.rows("observation data", OBSERVATIONS)) if _weight(row) > 0]
     parameters = _parameters(control, [row for row in rows if len(row.cells) > 2])
     parents = {row.word("parnme"): row.word("partrans") for row in rows if len(row.cells) == 2}
     equations = _equations(control, parameters) if prior_information else []
@@ -91,6 +91,7 @@ def from_pest(path: str | Path, files: Sequence[str] = (), *, prior_information:
     templates, instructions = _files(control)
     scalings = {name: _scaling(row) for name, row in parameters.items()}
     priors = {name: _prior(control, row, parameters, parents) for name, row in parameters.items()}
+    _check_templates(templates.values(), parameters, priors)
     correlated = priors_in_files(control, parameters, priors, scalings)
     return {
         "model": {
@@ -177,6 +178,26 @@ def _parameters(control: ControlFile, rows: Sequence[PestRow]) -> dict[str, Pest
     if not named:
         raise ConfigError(f"{control.path}: no parameter in '* parameter data'")
     return named
+
+
+def _named_once(rows: Sequence[PestRow]) -> Sequence[PestRow]:
+    """The rows of observations. Raises :class:`ConfigError` where two have one name."""
+    first: dict[str, PestRow] = {}
+    for row in rows:
+        if (before := first.setdefault(row.word("obsnme"), row)) is not row:
+            raise ConfigError(f"{row.where}: observation {row.word('obsnme')} stands in {before.where}, too")
+    return rows
+
+
+def _check_templates(templates: Iterable[str], parameters: Mapping[str, PestRow], priors: Mapping[str, Any]) -> None:
+    """Raise :class:`ConfigError`: no template has a parameter that is estimated, nor what is tied to it."""
+    with retold(ValueError, ConfigError):
+        named = set[str]().union(*(names_in(text_of(Path(file)), Path(file)) for file in templates))
+    tied = {name: prior["tied"] for name, prior in priors.items() if isinstance(prior, dict) and "tied" in prior}
+    named |= {tied[name] for name in named & tied.keys()}
+    for name, row in parameters.items():
+        if name not in named and row.word("partrans") in ("log", "none"):
+            raise ConfigError(f"{row.where}: parameter {row.word('parnme')} is in no template")
 
 
 def _scaling(row: PestRow) -> dict[str, float]:

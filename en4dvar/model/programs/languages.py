@@ -265,27 +265,32 @@ def input_name(template: Path) -> str:
     return template.stem if template.suffix in SUFFIXES else template.name
 
 
+def names_in(text: str, template: Path) -> set[str]:
+    """What is filled into the ``text`` of a template; of PEST as :func:`identifier` has it. Raises ValueError."""
+    if is_pest(text, "tf"):
+        with retold(ProgramError, ValueError, f"{template}: "):
+            return parameters_of(text)
+    try:
+        return find_undeclared_variables(_ENVIRONMENT.parse(text))
+    except TemplateError as error:
+        line = getattr(error, "lineno", None)
+        raise ValueError(f"{template}{f':{line}' if line else ''}: {error}") from None
+
+
 def check_template(template: Path, names: Collection[str]) -> None:
     """Raise ValueError, in words, where a template cannot be read or names an unknown parameter."""
     text = text_of(template)
-    if is_pest(text, "tf"):
-        names = {identifier(name) for name in names}
-        with retold(ProgramError, ValueError, f"{template}: "):
-            wanted: Collection[str] = parameters_of(text)
-    else:
-        try:
-            wanted = find_undeclared_variables(_ENVIRONMENT.parse(text))
-        except TemplateError as error:
-            line = getattr(error, "lineno", None)
-            raise ValueError(f"{template}{f':{line}' if line else ''}: {error}") from None
-    for name in sorted(wanted):
+    names = {identifier(name) for name in names} if is_pest(text, "tf") else names
+    for name in sorted(names_in(text, template)):
         if name not in names and name != TIMES:
             raise ValueError(f"{template}: {name!r} is no parameter of the model{suggest(name, names)}")
 
 
-def filled(template: Path, parameters: Mapping[str, float], times: Array) -> str:
-    """The input file of a member; ``times`` (K,) are where it is observed. Raises :class:`ProgramError`."""
-    text = text_of(template)
+def filled(text: str, template: str, parameters: Mapping[str, float], times: Array) -> str:
+    """The input file of a member, of the ``text`` of a ``template`` by name; ``times`` (K,) are where it is observed.
+
+    Raises :class:`ProgramError`.
+    """
     if is_pest(text, "tf"):
         return spaces_filled(text, parameters)
     values: dict[str, Any] = {name: float(value) for name, value in parameters.items()}
@@ -293,13 +298,12 @@ def filled(template: Path, parameters: Mapping[str, float], times: Array) -> str
     for part in _compiled(text).generate(values | {TIMES: times.tolist()}):
         parts.append(part)
         if (left := left - len(part)) < 0:
-            raise ProgramError(f"{template.name}: makes an input file of more than {in_bytes(LONGEST)}")
+            raise ProgramError(f"{template}: makes an input file of more than {in_bytes(LONGEST)}")
     return "".join(parts)
 
 
-@functools.cache
 def text_of(file: Path) -> str:
-    """A template or instructions, read once in a process. Raises ValueError."""
+    """A template or instructions. Raises ValueError."""
     with retold(OSError, ValueError, f"{file}: "):
         return read_text(file)
 

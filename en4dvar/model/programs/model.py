@@ -5,6 +5,7 @@ out of them by a column, a key of JSON, a pattern, or PEST's instructions.
 """
 
 import csv
+import itertools
 import json
 import math
 import os
@@ -36,8 +37,12 @@ from en4dvar.plumbing.user_code import Code, require_permission
 COMMENT = ("#", "%", "//")
 
 
-def read(output: OutputOf, folder: Path, times: Array, seconds: float | None = None) -> Array:
+def read(
+    output: OutputOf, folder: Path, times: Array, texts: Mapping[Path, str], seconds: float | None = None
+) -> Array:
     """The values at ``times`` (K,) of an observable, in the scratch directory; a pattern may take ``seconds``.
+
+    ``texts``: those of the instruction files.
 
     With a column or key of times, values are interpolated linearly at those that are asked for; without it there is one
     value a time. A value that is missing or no number is NaN, a reading that the run does not give.
@@ -50,7 +55,7 @@ def read(output: OutputOf, folder: Path, times: Array, seconds: float | None = N
         allowed = Allowed(min(Allowed.seconds, math.ceil(seconds or Allowed.seconds)), size=LONGEST_TEXT)
         values = _numbers(decoded_whole(matches, folder / file, output.pattern, allowed=allowed), file)
     elif output.instructions:
-        values = _instructed(output, folder)
+        values = _instructed(output, folder, texts)
     else:
         text, find = text_of(folder / file), _key if output.column is None else _column
         values = find(text, output.key if output.column is None else output.column, file)
@@ -61,12 +66,12 @@ def read(output: OutputOf, folder: Path, times: Array, seconds: float | None = N
     return values
 
 
-def _instructed(output: OutputOf, folder: Path) -> Array:
+def _instructed(output: OutputOf, folder: Path, texts: Mapping[Path, str]) -> Array:
     values: dict[str, float] = {}
     for file, paths in output.instruction_files.items():
         text = text_of(folder / file)
         for path in paths:
-            values |= languages.read(languages.text_of(path), text, file, path.name, output.delimiters)
+            values |= languages.read(texts[path], text, file, path.name, output.delimiters)
     names = list(values) if output.observations is None else [name.lower() for name in output.observations]
     return np.array([values[name] for name in names])
 
@@ -129,11 +134,13 @@ class Program:
     """A command as a function of parameters and times; the same numbers for the same arguments, wherever it runs.
 
     ``words``: program and arguments, in which ``{input}``, ``{output}`` and ``{NAME}`` of a parameter are filled in; a
-    single one where a shell runs it. The first of the templates is ``{input}``.
+    single one where a shell runs it. The first of the templates is ``{input}``. ``texts``: what templates and
+    instruction files held when it was made.
     """
 
     words: tuple[str, ...]
     settings: CommandSettings
+    texts: Mapping[Path, str]
 
     def __call__(self, parameters: Mapping[str, float], times: Array) -> dict[str, Array]:
         """Observable → values (K,). Raises :class:`ProgramError`: the last attempt failed, with its reason."""
@@ -165,7 +172,9 @@ class Program:
                 within_limit(lambda: self._fill(folder, inputs, times))
                 self._run(folder, inputs, end)
                 outputs, limit = self.settings.outputs.items(), self.settings.time_limit
-                values = within_limit(lambda: {n: read(output, folder, times, limit) for n, output in outputs})
+                values = within_limit(
+                    lambda: {n: read(output, folder, times, self.texts, limit) for n, output in outputs}
+                )
                 return {name: np.concatenate([values[name], more[name]]) for name in values}
         except DataError as error:
             raise ProgramError(str(error).replace(f"{folder}{os.sep}", "")) from None
@@ -179,7 +188,8 @@ class Program:
             shutil.copy(file, folder)
         for name, file in self.settings.templates.items():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            (folder / name).write_text(languages.filled(file, parameters, times), encoding="utf-8", newline="")
+            text = languages.filled(self.texts[file], file.name, parameters, times)
+            (folder / name).write_text(text, encoding="utf-8", newline="")
 
     def _run(self, folder: Path, parameters: Mapping[str, float], end: float | None) -> None:
         values = {name: repr(float(value)) for name, value in parameters.items()}
@@ -222,7 +232,11 @@ class CommandModel(FunctionModel):
         own = settings.parameters.items()
         parameters = [Parameter(name, of.unit, bounds=(of.lower, of.upper), label=of.label) for name, of in own]
         units = {name: entry.unit for name, entry in settings.outputs.items()}
-        super().__init__(Program(words, settings), parameters, units, settings.time_unit)
+        read_once = [*settings.templates.values()]
+        for output in settings.outputs.values():
+            read_once += itertools.chain(*output.instruction_files.values())
+        texts = {path: languages.text_of(path) for path in read_once}
+        super().__init__(Program(words, settings, texts), parameters, units, settings.time_unit)
 
     @classmethod
     def from_settings(cls, settings: CommandSettings) -> Self:

@@ -193,7 +193,7 @@ def refuse_mixed_members(law: Any) -> None:
     other = {name: np.clip(1.3 * v, *bounds.get(name, (0, np.inf))) for name, v in alone.items()}
     together = {name: np.append(v, other[name]) for name, v in alone.items()}
     with np.errstate(all="ignore"):
-        both, *single = (_numbers(law, values) for values in (together, alone, other))
+        both, *single = (numbers_of(law, values) for values in (together, alone, other))
     for member, numbers in enumerate(single):
         for what, own in numbers.items():
             if not np.allclose(both[what][member], own[0], rtol=1e-9, atol=0, equal_nan=True):
@@ -203,7 +203,7 @@ def refuse_mixed_members(law: Any) -> None:
                 )
 
 
-def _numbers(law: Any, values: Mapping[str, Array]) -> dict[str, Array]:
+def numbers_of(law: Any, values: Mapping[str, Array]) -> dict[str, Array]:
     """What the solver reads of N members, (N, …) each, by name."""
     n, memory, (lowest, highest) = len(next(iter(values.values()))), law.memory_tables(values), law.stretch_range
     stretch = np.broadcast_to(np.geomspace(lowest, highest, 15), (n, 15))
