@@ -2,6 +2,7 @@
 
 import math
 import os
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime
@@ -108,14 +109,14 @@ class RunLog:
 
 
 class LiveProgress:
-    """One line on a terminal: the iteration that ended last, data sets done, time gone and left. A data set at work is
-    done in part: it is taken to need as many iterations as the mean of those that ended, else eight.
-    """
+    """One line on a terminal: the iteration that ended last, data sets done, time gone and left."""
 
     def __init__(self, bar: Any):
         self._bar = bar
         self._task = bar.add_task("prior forecast", total=None, left="")
-        self._done = self._total = 0  # data sets of the run, with those that an earlier one had done
+        self._began = time.monotonic()
+        self._total = 0  # data sets of the run
+        self._before = self._done = 0  # those that an earlier run had done; that are done
         self._open: dict[str, int] = {}  # data set → its last iteration
         self._lengths: list[int] = []  # iterations of the data sets that have ended
 
@@ -131,7 +132,7 @@ class LiveProgress:
 
     def begin(self, done: int, total: int) -> None:
         """Of ``total`` data sets ``done`` were done by an earlier run."""
-        self._done, self._total = done, total
+        self._before, self._done, self._total = done, done, total
         self._show(None)
 
     def ended(self, name: str, done: int, words: str = "") -> None:
@@ -144,11 +145,28 @@ class LiveProgress:
         self._show("files and report" if done == self._total else None)
 
     def _show(self, description: str | None) -> None:
-        expected = sum(self._lengths) / len(self._lengths) if self._lengths else TYPICAL_ITERATIONS
-        done = self._done + sum(min(0.9, i / max(expected, 1.0)) for i in self._open.values())
-        left = "left" if self._total else ""  # behind the time that is
-        words = description and without_control(description)
-        self._bar.update(self._task, completed=done, total=self._total or None, left=left, description=words)
+        description = description and without_control(description)
+        gone, done, total = time.monotonic() - self._began, self._done - self._before, self._total - self._before
+        left = time_left(gone, done, total, list(self._open.values()), self._lengths)
+        fields = {"completed": self._done, "total": self._total or None, "left": left}
+        self._bar.update(self._task, **fields, **({"description": description} if description else {}))
+
+
+def time_left(gone: float, done: int, total: int, iterations: Sequence[int], lengths: Sequence[int]) -> str:
+    """``"about 12 s left"``, or nothing where that cannot be told yet.
+
+    ``gone`` seconds were spent on ``done`` of ``total`` data sets and on those at work, which have got to
+    ``iterations``. A data set is taken to need as many as the mean of those that ended (``lengths``), else eight.
+    """
+    expected = sum(lengths) / len(lengths) if lengths else TYPICAL_ITERATIONS
+    work = done + sum(min(0.9, i / max(expected, 1.0)) for i in iterations)
+    if gone < 1.0 or work <= 0 or done >= total:
+        return ""
+    seconds = gone * (total - work) / work
+    for limit, size, unit in ((100.0, 1.0, "s"), (6000.0, 60.0, "min"), (math.inf, 3600.0, "h")):
+        if seconds < limit:
+            return f"about {max(1, round(seconds / size))} {unit} left"
+    return ""
 
 
 @contextmanager
@@ -156,25 +174,25 @@ def terminal_progress() -> Iterator[LiveProgress | None]:
     """A live line on the terminal (standard error) or in a notebook, or None where there is neither. NO_COLOR is
     respected. In a notebook rich needs ipywidgets; without it there is no line.
     """
-    from rich import progress as rich
     from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bar
 
     notebook = Console()
     console = notebook if notebook.is_jupyter and find_spec("ipywidgets") else Console(stderr=True)
     if console is not notebook and (notebook.is_jupyter or not console.is_terminal):
         yield None
         return
+    wide = [BarColumn(20)] if console.width >= WIDE else []
     columns = (
-        rich.SpinnerColumn(),
-        rich.TextColumn("{task.description}", markup=False),
-        *([rich.BarColumn(20)] if console.width >= WIDE else []),
-        rich.MofNCompleteColumn(),
-        rich.TimeElapsedColumn(),
-        rich.TimeRemainingColumn(),
-        rich.TextColumn("{task.fields[left]}"),
+        SpinnerColumn(),
+        TextColumn("{task.description}", markup=False),
+        *wide,
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[left]}"),
     )
-    whole = rich.Progress(*columns, console=console, transient=True, speed_estimate_period=math.inf)
-    with shown(whole) as bar:
+    with shown(Bar(*columns, console=console, transient=True)) as bar:
         progress = LiveProgress(bar)
         with watch_compilation(progress.compiling):
             yield progress

@@ -1,19 +1,16 @@
 """Progress: a live line on terminals only; a log that says why a run failed."""
 
-import math
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from numba.core.event import trigger_event
-from rich.progress import Progress as Bar
 from toy_config import csv_text, write_toy
 
 from en4dvar.config import load_config
 from en4dvar.diagnosis.analysis import Analysis, ChainRecord, StartRecord
 from en4dvar.plumbing.errors import OutputError
-from en4dvar.runs.progress import LiveProgress, RunLog, describe, terminal_progress
+from en4dvar.runs.progress import RunLog, describe, terminal_progress, time_left
 from en4dvar.runs.runner import run_campaign
 
 
@@ -107,40 +104,22 @@ def test_iterations_of_data_sets_side_by_side_are_seen(tmp_path: Path, monkeypat
     assert told[-1] == ("", 3)
 
 
-def test_time_left(analysis: Analysis) -> None:
-    now = 0.0
-    bar = Bar(get_time=lambda: now, speed_estimate_period=math.inf)
-    live = LiveProgress(bar)
-    (task,) = bar.tasks
-    assert task.time_remaining is None  # nothing is known yet
-    live.begin(2, 10)  # of which nothing is known either: an earlier run did them
-    assert task.time_remaining is None
-    for done in (3, 4, 5):
-        now += 5.0
-        live.ended(f"set{done}", done)
-    assert task.time_remaining == 25  # five sets, 5 s each
-    now += 2.5
-    live("slow", replace(analysis.iterations[0], iteration=4))  # of eight, for none has told of its iterations
-    assert task.time_remaining == 23  # 4.5 sets, 5 s each
-    live.ended("slow", 6)
-    live("fast", replace(analysis.iterations[0], iteration=1))  # of four, as the mean of those that ended
-    assert task.completed == 6.25
-    live("fast", replace(analysis.iterations[0], iteration=50))
-    assert task.completed == 6.9  # whatever it takes, it is not done
-    live.ended("fast", 10)
-    assert task.time_remaining == 0
-
-
-@pytest.mark.parametrize("seconds", [1.0, 10.0, 60.0])
-def test_time_left_of_a_single_data_set(analysis: Analysis, seconds: float) -> None:
-    now = 0.0
-    bar = Bar(get_time=lambda: now, speed_estimate_period=math.inf)
-    live = LiveProgress(bar)
-    live.begin(0, 1)
-    for iteration in (1, 2, 3):
-        now += seconds
-        live("set", replace(analysis.iterations[0], iteration=iteration))
-    assert bar.tasks[0].time_remaining == math.ceil(5 * seconds)  # of eight iterations three are done
+@pytest.mark.parametrize(
+    ("gone", "done", "total", "iterations", "lengths", "told"),
+    [
+        (0.5, 1, 2, [], [5], ""),  # too early to tell
+        (9.0, 0, 3, [], [], ""),  # nothing done yet
+        (10.0, 1, 3, [], [6], "about 20 s left"),
+        (10.0, 0, 1, [4], [], "about 10 s left"),  # half of eight iterations
+        (10.0, 1, 3, [3], [6], "about 10 s left"),
+        (10.0, 0, 1, [30], [], "about 1 s left"),  # longer than expected: nearly done
+        (600.0, 1, 4, [], [6], "about 30 min left"),
+        (6000.0, 1, 9, [], [6], "about 13 h left"),
+        (10.0, 2, 2, [], [6, 6], ""),
+    ],
+)
+def test_time_left(gone: float, done: int, total: int, iterations: list[int], lengths: list[int], told: str) -> None:
+    assert time_left(gone, done, total, iterations, lengths) == told
 
 
 def test_log(tmp_path: Path, analysis: Analysis) -> None:
