@@ -82,6 +82,7 @@ MOVED |= {f"en4dvar_bubble.{old}": f"en4dvar_bubble.{new}" for old, new in {
 NAMES = {
     "en4dvar.problem.AssimilationSettings": "en4dvar.schemes.settings.AssimilationSettings",
     "en4dvar.problem.Localising": "en4dvar.schemes.settings.Localisation",
+    "en4dvar.series.moments.SequentialResult": "en4dvar.series.moments.SequentialState",
 } | {f"en4dvar.series.{name}": f"en4dvar.data.series.{name}" for name in ("Places", "Part", "Series", "balanced")}
 
 

@@ -1,16 +1,22 @@
 """Ensemble moments along a sequential run, taken of many cycles at once, and the outcome that holds them."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from en4dvar.data.noise import Correlation
 from en4dvar.data.noise.discrepancy import whitened
 from en4dvar.model.state import Array
+from en4dvar.plumbing.moved import former_name
 from en4dvar.series.series import CycleSeries
 
 BLOCK = 64  # ensembles kept until their moments are taken, at most
 BLOCK_SIZE = 2_000_000  # numbers in them, at most
+
+
+def __getattr__(name: str) -> Any:
+    return former_name(__name__, name)
 
 
 @dataclass(frozen=True)

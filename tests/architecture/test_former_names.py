@@ -74,7 +74,10 @@ def test_names_of_today_do_not_warn():
 def test_a_name_that_moved_by_itself_warns_and_is_the_same_object() -> None:
     from en4dvar import problem
     from en4dvar.schemes import settings
+    from en4dvar.series import moments
 
+    with pytest.warns(DeprecationWarning, match=r"SequentialResult is now en4dvar\.series\.moments\.SequentialState"):
+        assert moments.SequentialResult is moments.SequentialState
     with pytest.warns(DeprecationWarning, match="AssimilationSettings is now en4dvar.schemes.settings.Assim"):
         assert problem.AssimilationSettings is settings.AssimilationSettings
     with pytest.warns(DeprecationWarning, match="Localising is now en4dvar.schemes.settings.Localisation"):
