@@ -133,6 +133,12 @@ def gain_of(problem: InverseProblem, settings: AssimilationSettings) -> Gain:
             f"{len(lost)} parameters have no place, as many as {settings.members} members know directions; give them "
             f"places, 'at: {{{lost[0]}: 0}}', or use {others} with 'localisation: {{by: correlation}}'"
         )
+    if 4 * len(lost) > settings.members - 1 and not settings.own.minimiser:
+        raise ConfigError(
+            f"{len(lost)} parameters have no place, more than a quarter of the directions that {settings.members} "
+            f"members know: {settings.scheme} would take chance for what they explain; use more members or "
+            f"scheme: {' or '.join(name for name in LOCALISED if name in MINIMISERS)}"
+        )
     return ByDistance(places, observed[problem.observations.used], asked.radius)
 
 

@@ -221,8 +221,13 @@ def split_quantity(text: str) -> tuple[str, str]:
     (('2.76', 'um'), ('2.7e5', '1/s'), ('4', 'um'))
     """
     number = _NUMBER.match(text.strip())
-    unit = re.sub(r"\s*/\s*(px|pixel)$", "", text.strip()[number.end() :].strip()) if number else ""
-    return number[0] if number else "", f"1{unit}" if unit.startswith("/") else unit
+    if not number:
+        return "", ""
+    unit = text.strip()[number.end() :].strip()
+    per_pixel = re.fullmatch(r"(.+?)\s*/\s*(px|pixel)", unit)
+    if per_pixel and is_unit(per_pixel[1]) and parse_unit(per_pixel[1]).powers == parse_unit("m").powers:
+        unit = per_pixel[1]
+    return number[0], f"1{unit}" if re.match(r"/\s*[a-zµμ]", unit, re.IGNORECASE) else unit
 
 
 def parse_quantity(value: str | float, unit: str, usual: str = "") -> float:

@@ -92,7 +92,8 @@ class Movie:
 def saturated(frames: Iterable[Frame]) -> float:
     """The brightness above which a pixel of some frames is saturated, of a camera of as many bits as they need."""
     most = max(float(np.nanmax(frame)) if frame.dtype.kind in "ui" else np.inf for frame in frames)
-    return 0.99 * max(float(2 ** np.ceil(np.log2(most + 1))) - 1, 255.0)
+    full = max(float(2 ** np.ceil(np.log2(most + 1))) - 1, 255.0)
+    return most - 1.5 if most > 0.99 * full else full
 
 
 def open_movie(path: str | Path, raw: str | None = None) -> Movie:

@@ -113,6 +113,11 @@ def test_the_wall_of_a_blur_travels_no_further_than_its_place_is_unknown():
     assert Chain(tuple(sharp)).score > 1.5 * Chain(tuple(blurs)).score
 
 
+def test_a_wall_that_travels_slowly_scores_more_than_a_larger_one_that_rests():
+    slow, rests = ([circle(k, 50.0, 22 - step * k) for k in range(30)] for step in (0.55, 0.0))
+    assert Chain(tuple(slow)).score > Chain(tuple(rests)).score
+
+
 def test_a_bubble_that_touches_is_told():
     own = Chain(tuple(circle(k, 50.0, 20.0) for k in range(20)))
     other = Chain(tuple(circle(k, 110.0 - 4 * k, 8.0) for k in range(20)))

@@ -55,8 +55,13 @@ def test_edges_beside_which_frames_are_saturated_may_all_be_off(shown):
     assert any("black and white alone" in note for note in result.notes)
 
 
-def test_edges_in_light_that_is_not_saturated_are_not_said_to_be_off():
-    result = track(movie_of(of_8_bit(filmed(light=225.0))))
+@pytest.mark.parametrize(
+    "shown",
+    [of_8_bit(filmed(light=225.0)), [np.rint(image + 865).astype(np.uint16) for image in filmed()]],
+    ids=["of 8 bit", "of 12 bit, near 1023"],
+)
+def test_edges_in_light_that_is_not_saturated_are_not_said_to_be_off(shown):
+    result = track(movie_of(shown))
     assert np.abs(off(result.readings)).max() < 0.1
     assert max(r.errors.common for r in result.readings) < 0.3
     assert not any("saturated" in note for note in result.notes)

@@ -163,6 +163,11 @@ def test_more_parameters_without_a_place_than_members_know(scheme):
         assimilate(problem, settings(scheme, Localisation(RADIUS, {"k": (0.0,)})), SEED)
 
 
+def test_so_many_parameters_without_a_place_that_chance_explains_a_field():
+    with pytest.raises(ConfigError, match=r"more than a quarter of the directions that 4 members .* scheme: en4dvar$"):
+        assimilate(line(estimated=True), replace(settings("es-mda"), members=4), SEED)
+
+
 def test_by_correlation_is_the_adaptive_gain_in_each_pass():
     problem = line(estimated=True)
     adaptive = Localisation(threshold=0.4)
