@@ -7,7 +7,7 @@ from toys import Counted, Decay, Wave, make_observations, make_problem, with_dis
 from varying_models import Ramp
 from wells import Parting, UnlikeWells, Wells, chord, hidden_well, mass_of_positive, parted, two_wells
 
-from en4dvar.descent import search
+from en4dvar.descent import minima, search
 from en4dvar.descent.minima import Minimum
 from en4dvar.descent.preview import preview
 from en4dvar.descent.search import Outcome, Search
@@ -141,7 +141,7 @@ def search_of(problem, members, seed):
 @pytest.mark.slow
 def test_a_search_that_does_not_settle_ends_and_is_told(monkeypatch):
     """Sampled or not; here no share of descents that ended alone is small enough."""
-    monkeypatch.setattr(search, "UNSEEN", -1.0)
+    monkeypatch.setattr(minima, "UNSEEN", -1.0)
     for how, draws in (("auto", 18), ("none", 0)):
         settings = AssimilationSettings(refine=how, draws=50, what_if=False)
         analysis = assimilate(chord(1), settings, 1)
