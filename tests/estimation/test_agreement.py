@@ -80,7 +80,7 @@ def test_the_others_of_an_odd_data_set_are_judged_without_it():
     """Four lines of one value fit well; with a fifth, 20 of its errors off, none does."""
     problems = campaign([0.0] * 4 + [2.0])
     with_it, rest = joint(problems), joint(problems[:4])
-    assert rest.chi2.max() < 2
+    assert 0.2 < rest.chi2.max() < 2
     np.testing.assert_allclose(with_it.chi2[:4], rest.chi2, rtol=1e-6)
     assert codes(with_it.cautions) == ("odd-data-set", *codes(rest.cautions))
     conflict = joint(campaign([8.0] * 4 + [0.0]))
