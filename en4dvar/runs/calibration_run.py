@@ -179,9 +179,8 @@ def _compared(
         float(replace(observations, values=observations.noise.drawn(at, stream)).cost(at))
         for at in map(run.predicted.__getitem__, range(len(members)))
     ]
-    fits[-1] = (
-        fits[-1] if np.allclose(physical[-1], known, atol=1e-300) else np.nan
-    )  # the prior's map may end before the truth
+    if not np.allclose(physical[-1], known, atol=1e-300):  # the prior's map may end before the truth
+        fits[-1] = np.nan
     errors, physical[-1] = np.append(others, fits[-1]), known
     each = zip(physical.T, prior.parameters, strict=True)
     shown = np.column_stack([*(convert(v, p.unit, p.display_unit or p.unit) for v, p in each), fits, errors])
