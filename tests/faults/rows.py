@@ -50,7 +50,7 @@ ROWS = tuple(
         ("requeued", "a batch job was killed before it began, and is started with --resume",
          "note: {run} holds no run yet; this one begins", "0", "nothing was there"),
         ("kill-commands", "study, sweep, report, rerun or export are killed", "", "137",
-         "what was there; study and sweep continue with --resume, the others are given again"),
+         "what was there; study and sweep continue with --resume; run the others again"),
         ("foreign", "a run directory that somebody else prepared: names that lead out of it, links, pipes, devices",
          "{file}: is a symbolic link, which a run neither follows nor replaces; remove it", "2",
          "everything outside the directory"),
@@ -59,7 +59,7 @@ ROWS = tuple(
          "the user's files; nothing is begun, and no page is written"),
         ("half-replaced", "report, export, compare or rerun where a run was killed while it replaced another",
          "{run}: a run was killed while its files took the place of an earlier run's; 'en4dvar run' with --resume "
-         "finishes that", "2", "everything; who reads writes nothing"),
+         "finishes that", "2", "everything; these commands write nothing"),
         ("chdir", "a model changes the current directory (--out is relative)", "", "0", "everything"),
         ("disk-full", "the disk is full",
          "{file}: cannot be written: No space left on device; {n} of {all} data sets are done and kept in {run}; "
@@ -90,7 +90,7 @@ ROWS = tuple(
         ("pack-damaged", "the results of a campaign (`datasets.pack`) are damaged anywhere, cut short or gone",
          "{run}: no result that can be read of {data set} ({reason}); 'en4dvar run' with --resume estimates what is "
          "missing", "1 (export, report: the others are given), 2",
-         "every data set that is intact; the others are missed by name, and --resume estimates them to the same bits"),
+         "every data set that is intact; the others are named as missing, and --resume estimates them to the same bits"),
         ("two-runs", "two runs in one directory",
          "{run}: in use by process {pid} on {machine}; wait for it to end, or give another --out", "2",
          "the first run"),
@@ -155,9 +155,9 @@ ROWS = tuple(
          "interrupted; {n} of {all} data sets are done and kept in {run}\nto continue: en4dvar run {words} --resume",
          "130", "as above; the programs, their children and their scratch folders are gone within two seconds"),
         ("no-file", "a pipe, a socket, a device or a folder where a file is read", "{file}: {what}", "2",
-         "nothing is waited for"),
+         "the command does not wait"),
         ("sparse", "a file of a terabyte, sparse or not", "{file}: {size}; at most {most} are read", "2",
-         "its size is looked at before it is read"),
+         "its size is checked before it is read"),
         ("decoding", "a movie, workbook or MATLAB file that takes its library down, or too much time or memory",
          "{file}: {takes more than it may, or ends its process}; it is damaged, or not what it says it is",
          "2", "everything; a process of its own reads it, and is ended"),
@@ -200,7 +200,7 @@ ROWS = tuple(
          "everything"),
         ("result-incomplete", "a result file that lacks something, or holds a unit or symbol that means nothing, with "
          "a good seal", "{file}: not a result of en4dvar: {what}", "2", "the file stays as it is"),
-        ("environment", "a variable of the environment with which nothing can be computed or drawn "
+        ("environment", "an environment variable that prevents computing or drawing "
          "(`NUMBA_DISABLE_JIT`, a `SOURCE_DATE_EPOCH` that is no number)", "{name}; unset it", "2", "nothing is begun"),
         ("left-behind", "files half written and temporary folders of a process that was killed", "", "0",
          "they are removed by the next that writes there, files of others never"),
