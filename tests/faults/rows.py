@@ -90,7 +90,7 @@ ROWS = tuple(
         ("pack-damaged", "the results of a campaign (`datasets.pack`) are damaged anywhere, cut short or gone",
          "{run}: no result that can be read of {data set} ({reason}); 'en4dvar run' with --resume estimates what is "
          "missing", "1 (export, report: the others are given), 2",
-         "every data set that is intact; the others are named as missing, and --resume estimates them to the same bits"),
+         "every data set that is intact; the others are named, and --resume estimates them to the same bits"),
         ("two-runs", "two runs in one directory",
          "{run}: in use by process {pid} on {machine}; wait for it to end, or give another --out", "2",
          "the first run"),
