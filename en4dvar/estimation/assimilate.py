@@ -105,7 +105,7 @@ def _through(stages: Stages) -> Analysis:
     )
     cautions = [*start.warnings, *(sampled.refined.warnings if sampled.refined else ())]
     if len(outcome.tried) == 1:
-        cautions.append(caution("one-descent", "one descent only: another minimum is not excluded"))
+        cautions.append(caution("one-descent", "only one descent was made: there may be another minimum"))
     cautions += conclusions.future_missed(analysis.withheld)
     cautions += conclusions.missing_readings(ends.run.filled, stages.settings.refine == "mcmc")
     if counting:

@@ -233,14 +233,14 @@ def future_missed(withheld: Withheld | None) -> tuple[Caution, ...]:
         return ()
     count = len(withheld.values)
     words = f"of {count} readings after the window {withheld.inside:.0%} lie in their 90 % bands"
-    return (caution("future-missed", f"{words}: what was estimated does not go on as the data do"),)
+    return (caution("future-missed", f"{words}: the estimate does not predict how the data continue"),)
 
 
 def missing_readings(share: float, chain: bool = False) -> tuple[Caution, ...]:
     """Told where a share of the members' readings is missing; ``chain``: whether a chain was asked for."""
     words = f"{100 * share:.2g} % of the members' readings in the posterior forecast are missing (NaN)"
-    words += "; each is regressed on the members that have it"
-    words += ", and no chain (refine: mcmc) is run, to which a draw without one is impossible" if chain else ""
+    words += "; each is filled in by regression on the members that have it"
+    words += ", and no chain (refine: mcmc) is run, for which a draw without a reading is impossible" if chain else ""
     return (caution("readings-missing", words, "serious" if chain else None),) if share else ()
 
 

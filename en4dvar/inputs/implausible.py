@@ -214,7 +214,7 @@ def step_doubts(
     step = float(np.median(steps))
     told = f"the times are {convert(step, unit, display):.4g} {display} apart"
     if rate is not None and _off(np.array([step * rate]))[0] > SAME * step * rate:
-        words = f"{told}, which is no whole number of frames: at the rate given one takes "
+        words = f"{told}, which is not a whole number of frames: at the given rate one takes "
         cautions.append(caution("implausible-data", f"{words}{convert(1 / rate, unit, display):.4g} {display}"))
     for name, value in scalars.items():
         if value > 0 and (_STEP.fullmatch(name) or _RATE.fullmatch(name)):
@@ -227,7 +227,7 @@ def step_doubts(
     if len(odd) and np.mean(off < WHOLE) >= MOSTLY:
         first, after, whole = convert(np.array([*times[odd[0] : odd[0] + 2], step]), unit, display)
         words = (
-            f"{len(odd)} of {len(steps)} steps between readings are no whole number of frames of {whole:.4g} "
+            f"{len(odd)} of {len(steps)} steps between readings are not a whole number of frames of {whole:.4g} "
             f"{display}, the first from {first:.6g} to {after:.6g} {display}: is a time wrong?"
         )
         cautions.append(caution("implausible-data", words, "caution"))

@@ -294,14 +294,14 @@ def _elsewhere(config: Config, population: Population, group: str) -> dict[str, 
 
 def _cautions(population: Population) -> Iterator[Caution]:
     if not population.converged:
-        words = f"only {population.size:.0f} effective draws stand behind the population"
-        advice = "the median of the data sets one by one, which needs none, stands in the place of its numbers"
+        words = f"only {population.size:.0f} effective draws support the population"
+        advice = "the median of the data sets one by one, which needs no draws, replaces its numbers"
         yield replace(caution("chain-not-converged", words), advice=advice)
     if population.odd:
         names, chances = [p.observations.name for p in population.problems], 1 - population.belongs
         odd = [f"{names[s]} (with probability {chances[s]:.2g})" for s in population.odd]
-        words = f"perhaps not of the population, where {population.hyper.odd:.2g} was expected: {', '.join(odd)}"
-        yield caution("odd-data-set", f"{words}; as far as they are not, mean and spread are those of the others")
+        words = f"perhaps not of the population ({population.hyper.odd:.2g} was expected): {', '.join(odd)}"
+        yield caution("odd-data-set", f"{words}; they count in mean and spread only as far as they belong")
     for name, reason in population.left_out.items():
         yield caution("odd-data-set", f"{name} is left out: {reason}")
     for name, share in zip(population.names, population.learned[0], strict=True):

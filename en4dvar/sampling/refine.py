@@ -282,7 +282,7 @@ def mode_cautions(
     p = prior.parameters[most]
     at = " and ".join(f"{convert(float(m.centre[most]), p.unit, p.display_unit):.3g}" for m in seen)
     unit = "" if p.display_unit == "1" else f" {p.display_unit}"
-    drawn = "members are drawn from all of them" if result else "members describe the first alone"
+    drawn = "members are drawn from all of them" if result else "members describe only the first"
     words = f"the posterior has {len(seen)} modes, {p.name} = {at}{unit}, of weights {shares}; {drawn}"
     if result and not np.any(distances > APART):
         told = caution("several-modes", f"{words}, and overlap in every parameter", "note")

@@ -309,7 +309,7 @@ def test_a_rebound_that_no_gel_gives_is_named_and_not_the_collapse(tmp_path: Pat
 def test_a_rate_that_the_times_contradict_is_told(tmp_path: Path) -> None:
     write(tmp_path / "b.csv")
     done = call("init", "--data", "b.csv", *UNITS, "--frame-rate", "270 kHz")
-    told = "the times are 0.7 us apart, which is no whole number of frames: at the rate given one takes 3.704 us"
+    told = "the times are 0.7 us apart, which is not a whole number of frames: at the given rate one takes 3.704 us"
     assert told in done.stderr
     assert f"# MIND: {told}" in Path("b.yaml").read_text()
     assert f"warning: b: {told}" in call("validate", "b.yaml").stderr

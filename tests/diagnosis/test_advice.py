@@ -337,11 +337,9 @@ def test_a_future_that_is_missed_is_taken_in_up_to_the_next_trough():
     problem = turned(10)
     assert "data.window.to:" not in told(run(problem), "future-missed").advice
     problem = read(problem, next_end="trough 3")
-    assert "(data.window.to: trough 3); not more" in told(run(problem), "future-missed").advice
+    assert "one minimum at a time (data.window.to: trough 3)" in told(run(problem), "future-missed").advice
     problem.model.unforeseen = {"y": 0.01}
-    asked = (
-        "(data.window.to: trough 3), with what may change on the way (model_error: {y: {at: maxima, std: 1 %}}); not"
-    )
+    asked = "(data.window.to: trough 3), with what may change on the way (model_error: {y: {at: maxima, std: 1 %}})"
     assert asked in told(run(problem), "future-missed").advice
 
 

@@ -259,7 +259,7 @@ def test_iterations_that_end_next_to_their_criterion_are_a_note_without_alarm():
     (near,), (far,), (unknown,) = ended(0.15), ended(0.6), ended(np.nan)
     assert ended(0.08) == ()  # another step would move nothing that a user sees
     assert (near.code, near.severity) == ("not-converged", "note")
-    assert near.advice == f"no action is needed where this is little to you; else {far.advice}"
+    assert near.advice == f"no action is needed if this step is small enough for you; else {far.advice}"
     assert far.advice.startswith("set assimilation.refine: mcmc")  # another seed may end in the same place
     assert (far.severity, unknown.severity) == ("serious", "serious")
     assert far.advice == unknown.advice

@@ -41,7 +41,7 @@ def campaign(tmp_path_factory):
     return run_campaign(make_campaign(folder, 4, "execution_models:Swift"), overrides=overrides).directory
 
 
-DOUBT = caution("chain-not-converged", "only 8 effective draws stand behind the population")
+DOUBT = caution("chain-not-converged", "only 8 effective draws support the population")
 
 
 @pytest.fixture(scope="module")

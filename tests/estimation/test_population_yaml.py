@@ -92,7 +92,7 @@ def test_it_is_what_the_command_says_and_has_a_page(finished, tmp_path):
 def test_warnings_of_the_population_are_on_the_page_of_the_run(finished, tmp_path, monkeypatch):
     run = tmp_path / "run"
     shutil.copytree(finished[0], run)
-    few = caution("chain-not-converged", "only 8 effective draws stand behind the population")
+    few = caution("chain-not-converged", "only 8 effective draws support the population")
     monkeypatch.setattr(StoredGroups, "cautions", (few,))
     write_report(run)
     page = (run / "report.html").read_text()

@@ -256,7 +256,7 @@ def test_an_estimated_width_of_changes_is_never_gaussian(seed):
     (told,) = (c for c in found.cautions if c.code == "non-gaussian")
     assert "should be about" not in told.words
     assert "refine: mcmc" in told.advice
-    assert "say that the model is cheap" in told.advice
+    assert "declare the model cheap" in told.advice
 
 
 @pytest.mark.parametrize(("n", "members"), [(1, 16), (12, 16), (1, 200), pytest.param(12, 48, marks=pytest.mark.slow)])

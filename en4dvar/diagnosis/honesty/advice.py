@@ -73,7 +73,7 @@ class Case:
     def or_cheap(self) -> str:
         """What else lets a posterior be sampled, behind ``refine: mcmc``; "" where nothing does."""
         settled = self.a.problem.model.cheap or self.a.settings.own.minimiser is None
-        return "" if settled else ", or say that the model is cheap, if ten thousand runs take seconds"
+        return "" if settled else ", or declare the model cheap, if ten thousand runs take seconds"
 
     @property
     def structure(self) -> str:
@@ -132,7 +132,7 @@ def advised(a: Analysis, cautions: Sequence[Caution]) -> tuple[Caution, ...]:
 def _not_converged(case: Case) -> str:
     if case.a.settings.own.minimiser is None:
         return f"set assimilation.scheme: {MINIMISERS[0]}, which minimises J, or assimilation.refine: mcmc"
-    little = "no action is needed where this is little to you; else " * (case.caution.severity == "note")
+    little = "no action is needed if this step is small enough for you; else " * (case.caution.severity == "note")
     now = getattr(case.a.settings.own, "max_iterations", ENOUGH)
     if now < ENOUGH:
         return f"{little}set assimilation.max_iterations: {max(20, 2 * now)} (it is {now})"
@@ -197,7 +197,7 @@ def _structure(case: Case) -> str:
     other = f"kernel: {smoother[0][1]}" if smoother else "grows_beyond" if not kernel.grows else ""
     if other:
         return f"the discrepancy has another shape than its kernel: try data.error.discrepancy.{other}"
-    return "no kernel has the shape of what is missed: end the window earlier (data.window), or choose another model"
+    return "no kernel has the shape of the discrepancy: end the window earlier (data.window), or choose another model"
 
 
 def _missed(case: Case) -> str:
@@ -261,7 +261,7 @@ def _bound(case: Case) -> str:
 
 def _modes(case: Case) -> str:
     name = case.caution.parameters[0] if case.caution.parameters else case.a.parameters[0].name
-    apart = f"what is known from elsewhere, as bounds of the prior (parameters.{name}), tells them apart"
+    apart = f"prior knowledge, as bounds of the prior (parameters.{name}), can separate them"
     if case.caution.severity == "serious" and case.a.settings.refine != "mcmc":
         return f"set assimilation.refine: mcmc, which draws from all of them; {apart}"
     return f"quote the quantiles or each mode by itself, not mean ± std; {apart}"
@@ -306,7 +306,7 @@ def _lost(case: Case) -> str:
         ways.append(f"cut the prior at {p.name} = {shown(side.edge, p)}, beyond which hardly any member runs ({key})")
     if a.settings.localisation is None and a.settings.refine != "mcmc" and "readings-missing" not in case.codes:
         cheap = case.or_cheap if "non-gaussian" in case.codes else ""
-        ways.append(f"set assimilation.refine: mcmc{cheap}: that posterior is the one given that the model runs")
+        ways.append(f"set assimilation.refine: mcmc{cheap}, which samples the posterior given that the model runs")
     return f"the posterior holds only where the model runs: {', or '.join(ways)}"
 
 
@@ -323,8 +323,8 @@ def _future(case: Case) -> str:
     changes = ", ".join(f"{name}: {text}" for name, text in case.changes.items())
     also = f", with what may change on the way (model_error: {{{changes}}})" if changes else ""
     return (
-        "look at the figure of the readings after the window: as far as they are of the same system, let the model "
-        f"explain them, too, up to the next minimum (data.window.to: {end}){also}; not more at a time"
+        "look at the figure of the readings after the window: if they are of the same system, let the model "
+        f"explain them too, one minimum at a time (data.window.to: {end}){also}"
     )
 
 

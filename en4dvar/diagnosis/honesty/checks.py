@@ -30,12 +30,12 @@ NOTHING = 0.5  # of the readings' own std: a discrepancy beyond it in nearly all
 NINE_OF_TEN = (0.05, 0.95)
 SILENT = 0.1  # DFS of all readings beyond it that count as none
 EXTRAPOLATED = "no action is needed for the parameters; paths beyond the limit are extrapolated"
-EXCLUDED = "no action is needed: it was seen, so that the readings exclude them"
+EXCLUDED = "no action is needed: the event was seen, so the readings exclude these members"
 IMPOSSIBLE = (
-    "no action is needed where these values are impossible: the posterior was sampled, and is the one given that the "
-    "model runs; else find out why it fails"
+    "no action is needed where these values are impossible: the posterior was sampled, given that the "
+    "model runs; otherwise find out why it fails"
 )
-UNREAD = "no action is needed where the field's own spread says so, cell by cell"
+UNREAD = "no action is needed if the spread of the field shows this, cell by cell"
 MANY = 0.1  # share of members whose loss is serious
 BY_CHANCE = 0.01  # of cases in which a parameter is said to tell lost members from others, and does not
 FAR = 1.5  # prior standard deviations from the prior mean that are worth naming for one or two members
@@ -89,8 +89,8 @@ def structure(analysis: Analysis) -> Findings:
         few = f", in {runs} runs of one sign where about {expected:.0f} are expected"
         words = (
             "the residuals have a structure in time: neighbours resemble each other (their correlation is "
-            f"{residuals.lag_one:.2f}{few if residuals.runs_chance < ODD else ''}; probability {_chance(chance)} where "
-            "the model is right): error bars are those of independent errors"
+            f"{residuals.lag_one:.2f}{few if residuals.runs_chance < ODD else ''}; probability {_chance(chance)} if "
+            "the model is right): the error bars assume independent errors"
         )
         # what is missed moves an estimate by no more than |e| of its standard deviations
         small = float(residuals.white @ residuals.white) < 1
@@ -98,7 +98,7 @@ def structure(analysis: Analysis) -> Findings:
     if residuals.collapse_chance < ODD:
         words = (
             "the residuals are larger where the observable changes fast (probability "
-            f"{_chance(residuals.collapse_chance)} where the errors are as stated): the times or the model err there"
+            f"{_chance(residuals.collapse_chance)} if the errors are as stated): the times or the model are wrong there"
         )
         yield caution("odd-residuals", words)
     robust = math.isfinite(analysis.observations.noise.counts_within)
@@ -187,8 +187,8 @@ def _wider(name: str, z: float) -> str:
     """What to do about a parameter so many prior standard deviations from its prior mean."""
     if name == NOISE_SCALE.name and z < 0:
         return (
-            "state in data.error what a reading has of its own: these scatter far less than is stated. What all of "
-            "them share is no error of each, but a parameter (reading_scale, reading_offset); of a movie, give its "
+            "state in data.error only the independent error of a reading: they scatter far less than stated. An "
+            "error that all share belongs to a parameter (reading_scale, reading_offset); for a movie, give its "
             "--exposure to en4dvar track"
         )
     return (

@@ -200,7 +200,7 @@ def left_out(
         for e in odd
     ]
     words = f"{_several(told)} {'does' if len(odd) == 1 else 'do'} not share the values of the others"
-    yield caution("odd-data-set", f"{words}: what these share is the estimate without, which stands first", "serious")
+    yield caution("odd-data-set", f"{words}: the shared values quoted first are those without", "serious")
     without = _several([joint.names[e] for e in odd])
     yield from (replace(c, words=f"without {without}: {c.words}") for c in rest)
 
