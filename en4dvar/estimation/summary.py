@@ -112,7 +112,7 @@ def remarks(a: Analysis) -> tuple[str, ...]:
     known = [name for name in a.problem.model.path_parameters if name in a.problem.prior.names]
     if a.settings.what_if == "added":
         count = sum(shift.settled for shift in a.what_if)
-        lines.insert(0, f"the intervals hold {count} assumptions of the what-if table, each as one standard deviation")
+        lines.insert(0, f"the intervals contain {count} rows of the what-if table, each as one standard deviation")
     lines[:0] = [words for name in known if (words := budget_words(a, name))]
     return (*lines, *([f"what if: {more} more exceed the error bar, or may; see the report"] if more else []))
 
@@ -120,7 +120,7 @@ def remarks(a: Analysis) -> tuple[str, ...]:
 def _moved(parameters: Iterable[Parameter], shift: Shift) -> str:
     """The parameters beyond their error bar under an alternative."""
     if shift.reason:
-        return f"a fit with it tells ({shift.reason})"
+        return f"only a fit with it shows the change ({shift.reason})"
     words = []
     for p, change, relative, in_std in zip(parameters, shift.change, shift.relative, shift.in_std, strict=True):
         if abs(in_std) > 1:

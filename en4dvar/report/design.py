@@ -29,8 +29,8 @@ RARELY = 0.1  # share of experiments that decide which law holds, below which no
 COARSE = 1.0  # relative std beyond which a percentage says nothing
 NUMBER = re.compile(r"\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*")  # begins the value of a knob; its unit follows
 GAINS = "Expected information against what can be turned, each mark a design; bars: Monte Carlo standard errors."
-FRONT = "Expected information against price; joined: the designs that no other beats in both."
-FANS = "What would be seen: median, 50 % and 90 % of the prior; marks below: the readings that are taken."
+FRONT = "Expected information against price; joined: designs that no other beats in both."
+FANS = "Predicted observations: median, 50 % and 90 % of the prior; marks below: the readings that are taken."
 
 
 def ranked(designs: Designs) -> list[DesignRow]:

@@ -350,8 +350,8 @@ def bands(result: StoredResult) -> Chart:
 FIGURES: tuple[tuple[str, str, Callable[[StoredResult], Any], Callable[[StoredResult], Chart]], ...] = (
     ("posterior",
      "What is known after the readings (posterior, blue) and what was before (prior, grey), each scaled to its "
-     "peak. Bar: the 90 % interval; a number whose interval cannot be quoted, for a warning, has no bar "
-     "and says so. Ticks: the members that stand for the posterior. Dashed: the best fit.",
+     "peak. Bar: the 90 % interval; a number whose interval must not be quoted, because of a warning, has no bar "
+     "and says so. Ticks: the members of the posterior ensemble. Dashed: the best fit.",
      lambda result: result.parameters, histograms),
     ("fields",
      "Fields of the initial state: posterior mean, and posterior over prior standard deviation (1: the data say "
@@ -359,7 +359,7 @@ FIGURES: tuple[tuple[str, str, Callable[[StoredResult], Any], Callable[[StoredRe
      "(grey).",
      lambda result: "/fields" in result.groups, maps),
     ("history",
-     "Readings with their standard deviation; what was thought possible before them (prior, grey) and what is after "
+     "Readings with their standard deviation; what was possible before them (prior, grey) and after them "
      "(posterior, blue: bands of 50 and 90 %, without the errors of readings); the best fit (line through its "
      "values at the readings). Below: reading minus best fit, in standard deviations of the reading.{several}",
      lambda result: True, history),
@@ -367,8 +367,8 @@ FIGURES: tuple[tuple[str, str, Callable[[StoredResult], Any], Callable[[StoredRe
     ("varying", "What varies in time: median and 5–95 % of the posterior (blue) over 5–95 % of the prior (grey).",
      stored_walks, bands),
     ("residuals",
-     "Residuals of the best fit, in standard deviations and freed of the correlation of their errors "
-     "(whitened): in time (below it a discrepancy, mean ± std); their correlation with those 1, 2, … readings "
+     "Residuals of the best fit, in standard deviations and without the correlation of their errors "
+     "(whitened): in time (below it any discrepancy, mean ± std); their correlation with those 1, 2, … readings "
      "later (band: 95 % of independent numbers); against normal quantiles; leverage, the share of each "
      "reading in its own prediction.",
      lambda result: len(responses.whitened(result)), residuals),

@@ -42,8 +42,8 @@ FAR, TOO_FAR = 2.5, 4.0  # standard deviations between what is known and what th
 _NUMBER = re.compile(r"(?<![^\W_])(?<!\.)(\d+(?:\.\d+)?)[ _]?(%|[^\W\d_]+)(?![^\W_])")  # with a unit, in a name
 OFF_THE_LINE = 0.05  # probability below which populations differ by more than a line says
 CAPTION = (
-    "Median and 5–95 % of each population's {}: the numbers to quote. Their ratios are those in words. Orange ring "
-    "without a bar: not to be trusted, for the warnings of the population."
+    "Median and 5–95 % of each population's {}: the numbers to quote. Ratios are in the sentences. Orange ring "
+    "without a bar: not to be trusted, because of the warnings of the population."
 )
 
 
@@ -305,11 +305,11 @@ def sentences(c: PopulationsCompared) -> Iterator[str]:
     for name, of_it in c.lines.items():
         yield _line_sentence(c, name, of_it)
     if c.common:
-        yield f"Of one value in all of them, so that it cancels as far as it moves them alike: {', '.join(c.common)}."
+        yield f"These have one value in all of them and cancel as far as they move all alike: {', '.join(c.common)}."
     if not c.calibrated:
         yield (
-            "Of one by itself quote its own median; ratios and differences are of all data together, without the pull "
-            "of the hyperpriors on the medians unless it is said, and need not be those of the own medians."
+            "For a single population quote its own median. Ratios and differences use all data, without the pull "
+            "of the hyperpriors on the medians unless a note says so; they need not be those of the single medians."
         )
     yield from (f"{note}." for note in c.notes)
 

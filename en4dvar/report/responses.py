@@ -115,7 +115,7 @@ def sentence(shifts: Sequence[StoredShift]) -> str:
     """What an alternative would do to the parameters that it moves beyond their error bar."""
     first = shifts[0]
     if first.reason:
-        words = "the numbers may change by more than their error bars; a fit with it tells"
+        words = "the numbers may change by more than their error bars; only a fit with it shows this"
         return f"if {first.words}, {words} ({first.reason})"
     moved = sorted((s for s in shifts if s.exceeds), key=lambda s: -abs(s.in_std))
     told = Markup("{} would be {} ({} times its error bar)")
@@ -136,8 +136,8 @@ def exceeding(rows: Iterable[Sequence[StoredShift]]) -> list[Sequence[StoredShif
 
 CAPTION = (
     "What each reading does. Above, one panel a parameter: change of the posterior mean, in posterior standard "
-    "deviations, if that reading alone is left out; nothing is drawn where that takes a fit without it. Below: "
-    "distance of the reading from what the prior predicts, in the standard deviation of both; beyond 3 they are in "
+    "deviations, if only that reading is left out; nothing is drawn if this needs a new fit. Below: "
+    "distance of the reading from the prior's prediction, in the standard deviation of both; beyond 3 they are in "
     "conflict."
 )
 FAR = 3.0  # std between a reading and the prior that are told
@@ -211,7 +211,7 @@ def _stems(panel: Panel, result: StoredResult, values: Array, alone: str) -> Non
 def reading_words(result: StoredResult) -> list[Markup]:
     """The reading that moves a parameter most, the one farthest from the prior; or why that is not told."""
     reason = str(result.group("sample_stats").attrs.get("influence_reason", ""))
-    not_told = Markup("What leaving out a reading would change is not told: {}.").format(reason) if reason else Markup()
+    not_told = Markup("The effect of leaving out a reading is not known: {}.").format(reason) if reason else Markup()
     sentences = [_most_moving(result) if has_influence(result) else not_told, _farthest(result)]
     return [words for words in sentences if words]
 
@@ -220,7 +220,7 @@ def _most_moving(result: StoredResult) -> Markup:
     keys = "influence_in_std", "influence_change", "influence_how"
     in_std, change, how = (result.of_readings("sample_stats", key, shared=True) for key in keys)
     if not np.isfinite(in_std).any():
-        return Markup("Each reading decides so much that only a fit without it tells what it changes.")
+        return Markup("Each reading is so influential that only a fit without it shows its effect.")
     j, k = np.unravel_index(int(np.nanargmax(np.abs(in_std))), in_std.shape)
     row = result.rows[int(j)]
     size = float(shown(result.parameters[row.name], change[j, k]))
@@ -229,7 +229,7 @@ def _most_moving(result: StoredResult) -> Markup:
         _time(result, int(k)), symbol_html(row.symbol), by, stds
     )
     blank = int(np.sum(how == UNKNOWN))
-    return words + (f" For {blank} of {in_std.shape[1]} readings it takes a fit without them to tell." if blank else "")
+    return words + (f" For {blank} of {in_std.shape[1]} readings only a fit without them shows this." if blank else "")
 
 
 def _farthest(result: StoredResult) -> Markup:

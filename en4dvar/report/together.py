@@ -28,8 +28,8 @@ from en4dvar.results.together import JOINT, POPULATION, QUANTILES, StoredGroups,
 MOST_FITS = 12  # panels of the figure
 NOTHING = np.full(1, np.nan)
 NINETY = 3.2897073  # std of a normal distribution between its 5 and 95 %
-DOUBTED = "Orange, without an interval: not to be trusted, for its warnings."
-SHARED = "Median and 5–95 % of what is shared, of each data set alone (grey) and of all{} together. " + DOUBTED
+DOUBTED = "Orange, without an interval: not to be trusted, because of its warnings."
+SHARED = "Median and 5–95 % of the shared parameters, each data set alone (grey) and all{} together. " + DOUBTED
 FITS = "Observations and 5–95 % of the joint posterior's predictions."
 
 
@@ -96,7 +96,7 @@ def joint_lines(joint: StoredJoint) -> list[str]:
         doubt = f"not to be trusted: {', '.join(e.untrusted)}" if e.untrusted else f"5–95 %: {_range(e)}"
         lines.append(f"{e.label} {e.name} = {_median(e)} ({doubt}){without}")
     if stated := [e.label for e in shared if e.stated]:
-        lines.append(f"left as stated beforehand, for the data say nothing new of them: {', '.join(stated)}")
+        lines.append(f"the data add nothing to what was known before of: {', '.join(stated)}")
     return lines
 
 
@@ -234,14 +234,14 @@ def sentences(stored: StoredPopulation) -> tuple[str, ...]:
     odd = named(np.array([*stored.belongs.values()]), float(stored.tree.attrs.get("hyperprior_odd", 0)))
     if odd:
         names = ", ".join(stored.datasets[i] for i in odd)
-        lines.append(f"Perhaps not of the population, and as far as not, no part of these numbers: {names}.")
+        lines.append(f"Perhaps not of the population; these numbers count them only as far as they are: {names}.")
     if "empirical" in stored.tree.children:
         checked = [_of_sets(stored, centre) for centre in centres if not centre.untrusted]
         lines += [f"Check without a model of the population: {words}." for words in checked]
     lines += [_together(stored, combination) for combination in stored.combinations]
     if float(stored.tree.attrs["effective_draws_without_hyperprior"]) < FEWEST:
         words = f"the data leave {stored.headline} or spread open, or lie in its tail"
-        free = f"What would hold without the hyperprior of {stored.headline} and spread cannot be told: {words}."
+        free = f"The result without the hyperprior of {stored.headline} and spread is not known: {words}."
     else:
         each = zip(free_of[stored.headline], free_of["between"], strict=True)
         ranges = "; ".join(f"{centre.name} {_range(centre)}, spread {_range(spread)}" for centre, spread in each)
@@ -298,8 +298,8 @@ def _in_parts(stored: StoredPopulation, mean: ParameterSummary, of: xr.DataArray
     stds = map(float, text.shown(of, [of.attrs["std_between"], of.attrs["std_common"]]))
     between, common = (text.quantity(part, std, mean.unit) for part in stds)
     return (
-        f"Of it ± {between} is from the data sets and how they differ, and ± {common} from what they have in common "
-        f"({', '.join(stored.common)}), which more of them do not reduce."
+        f"Of this interval ± {between} comes from the data sets and how they differ, ± {common} from common quantities "
+        f"({', '.join(stored.common)}), which more data sets do not reduce."
     )
 
 
@@ -310,7 +310,7 @@ def _of_sets(stored: StoredPopulation, centre: ParameterSummary) -> str:
     std = (high - low) / 3.29
     words = (
         f"the median of {len(stored.datasets)} data sets one by one is {centre.name} = "
-        f"{text.quantity(middle, std, centre.unit)} (5–95 %: {text.range_words(low, high, std)}), where each counts by "
+        f"{text.quantity(middle, std, centre.unit)} (5–95 %: {text.range_words(low, high, std)}), each weighted by "
         "the share of its prior's variance that its data took away"
     )
     parts = _in_parts(stored, centre, of, std).removesuffix(".") if centre.untrusted and stored.common else ""
@@ -321,10 +321,10 @@ def _together(stored: StoredPopulation, combination: Combination) -> str:
     """What is sharp: a product of powers where all are logarithms."""
     names = " and ".join(name for name, _ in combination.parts)
     if not all(_logarithmic(stored.group("posterior")[f"{name}_mean"]) for name, _ in combination.parts):
-        return f"Of {names} the data determine a combination, and less of each."
+        return f"The data determine a combination of {names} better than each of them."
     powers = ((name, text.quantity(exponent, 0.1)) for name, exponent in combination.parts)
     product = " · ".join(name if power == "1.00" else f"{name}^{power}" for name, power in powers)
-    return f"Of {names} the data determine {product}, to {text.percent(combination.std)}, and less of each."
+    return f"The data determine {product}, to {text.percent(combination.std)}, better than {names}."
 
 
 def _logarithmic(draws: xr.DataArray) -> bool:

@@ -170,7 +170,7 @@ class JointKind(TogetherKind):
         asked = self.names or {name for of_it in groups for name in of_it}
         common = ", ".join(name for name, _ in joint.shared if name not in asked)
         if common:
-            tell(f"one value in all data sets too, as constants of medium and camera (unless --apart NAME): {common}")
+            tell(f"constants of medium and camera with one value in all data sets (unless --apart NAME): {common}")
         singles = [Single.of_physical(dataset.problem.prior, dataset.members, dataset.centre) for dataset in sets]
         estimated = estimate_jointly(joint, config.assimilation, config.seed, executor, singles, tell)
         estimated = _with_carried(estimated, sets)

@@ -65,11 +65,11 @@ class Gel(NamedTuple):
 COMMON = Gel(20e3, 0.3)  # published: 7.7 kPa (Estrada et al. 2018), stiff polyacrylamide; 0.19 Pa s (Yang et al. 2020)
 EXTREME = Gel(100e3, 1.0)  # no bubble was used on more
 SINGLE = (
-    "the window ends before the first rebound has a top, so that whatever else takes the energy of that collapse "
-    "(sound, fragments, jets, a shape that is no sphere) is told as viscosity and stiffness: measured bubbles told 2 "
-    "to 28 times the viscosity, and up to 4 times the modulus, of a window that holds the rebound",
-    "let the window (data.window) hold the rebound until its top is past; where the recording ends before, film it "
-    "longer; else quote these values not even as limits",
+    "the window ends before the top of the first rebound, so every other loss of energy in that collapse "
+    "(sound, fragments, jets, a shape that is no sphere) counts as viscosity and stiffness: measured bubbles gave 2 "
+    "to 28 times the viscosity, and up to 4 times the modulus, of a window with the rebound",
+    "let the window (data.window) include the rebound until its top is past; if the recording ends before, film "
+    "longer; otherwise do not quote these values, not even as limits",
 )  # words and advice of a warning
 
 

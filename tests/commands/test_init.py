@@ -121,18 +121,18 @@ def test_a_folder_is_a_campaign_and_its_odd_file_is_named(tmp_path: Path) -> Non
     (folder / "other.truth.yaml").unlink()
     done = call("init", "--data", folder, *UNITS, "--force")
     assert done.exit_code == 2
-    assert "suggest different starts (acoustic: other; laser: b1, b2); say --start" in done.stderr
+    assert "suggest different starts (acoustic: other; laser: b1, b2); give --start" in done.stderr
     (folder / "another.csv").write_text("")  # first of the folder, and empty
     (folder / "other.csv").write_text("a,b\n1,2\n")
     done = call("init", "--data", folder, *UNITS, "--force")
     assert done.exit_code == 0, done.output  # as in a campaign: what cannot be used is named and ends nothing
     assert "other.csv: no column" in done.stderr
     assert "another.csv: the file holds no data" in done.stderr
-    assert Path("gel_one.yaml").read_text().count("# MIND: ") == 2
+    assert Path("gel_one.yaml").read_text().count("# WARNING: ") == 2
     (folder / "other.csv").write_text("t_us,R_um\n" + "".join(f"{t},{20 + t}\n" for t in range(20)))  # shows no bubble
     done = call("init", "--data", folder, *UNITS, "--start", "laser", "--force")
     assert done.exit_code == 0, done.output
-    assert "other: the recording ends with the maximum, reading 20 of 20: it shows growth alone" in done.stderr
+    assert "other: the recording ends with the maximum, reading 20 of 20: it shows only growth" in done.stderr
     for n in (1, 2):
         (folder / f"b{n}.csv").unlink()
     (folder / "other.csv").write_text("a,b\n1,2\n")
@@ -163,7 +163,7 @@ def test_the_clock_of_a_bubble_is_as_certain_in_a_folder_as_alone(tmp_path: Path
 @pytest.mark.parametrize(
     ("ends", "to", "words"),
     [
-        ((1.1,), "end", "warning: the readings end before the first rebound has a top, .*: record longer, "),
+        ((1.1,), "end", "warning: the readings end before the top of the first rebound, .*; record longer, "),
         ((1.5,), "end", ""),
         ((1.5, 1.6), "end", ""),
         ((3.0,), "trough 2", ""),
@@ -183,7 +183,7 @@ def test_a_recording_that_ends_with_the_first_collapse_is_told_at_once(
     done = call("init", "--data", "gel", "--start", "laser", "--out", "b.yaml")
     assert done.exit_code == 0, done.output
     assert re.search(words, done.stderr)
-    assert ("before the first rebound" in done.stderr) == bool(words)
+    assert ("of the first rebound" in done.stderr) == bool(words)
     assert proposed(Path("b.yaml")).document.data["data"]["window"] == {"from": "top", "to": to}
     for end, problem in zip(ends, build(load_config("b.yaml")), strict=True):
         assert single(problem.observations.times, problem.observations.values) == (end == 1.1)
@@ -234,7 +234,7 @@ def test_of_three_bubbles_the_run_ends_with_their_gel(tmp_path: Path) -> None:
     assert proposed(Path("gel.yaml")).assimilation.what_if is True
     write(folder / "b3.csv")
     done = call("init", "--data", folder, *UNITS, "--force")
-    assert "3 bubbles: the run ends with what they say of one gel together" in done.output
+    assert "3 bubbles: at its end the run estimates their one gel" in done.output
     asked = proposed(Path("gel.yaml")).population
     assert asked is not None
     assert asked.of == ("G", "mu")
@@ -255,7 +255,7 @@ def test_subfolders_are_gels_that_are_compared(tmp_path: Path) -> None:
             write(tmp_path / "gels" / folder / f"b{n}.csv", scale=1 + n / 20)
     done = call("init", "--data", tmp_path / "gels", *UNITS)
     assert done.exit_code == 0, done.output
-    assert "the run ends with the numbers of each folder, and compares them: gel (3), gel_8 kPa (3)" in done.output
+    assert "at its end the run estimates each folder, and compares them: gel (3), gel_8 kPa (3)" in done.output
     config = proposed(Path("gels.yaml"))
     assert config.population is not None
     assert config.population.by == "folder"
@@ -298,7 +298,7 @@ def test_groups_are_a_column_of_a_table(tmp_path: Path, table: str, asked: str, 
     Path("gels.csv").write_text(table)
     done = call("init", "--data", folder, *UNITS, "--groups", asked)
     assert done.exit_code == 0, done.output
-    assert f"the run ends with the numbers of each {kind}, and compares them: " in done.output
+    assert f"at its end the run estimates each {kind}, and compares them: " in done.output
     assert groups_in("all.yaml") == expected
 
 
@@ -312,7 +312,7 @@ def test_bubbles_of_groups_are_those_that_are_seen_and_a_column_can_be_typed(tmp
     assert "5 bubbles:" not in done.output
     Path("gels.csv").write_text("file,gel [%],day\n" + "".join(f"{x},{i // 3},{i}\n" for i, x in enumerate("abcdef")))
     done = call("init", "--data", folder, *UNITS, "--groups", "gels.csv:gel [%]", "--force")
-    assert "5 bubbles: the run ends with the numbers of each gel, and compares them: 0 % (2), 1 % (3)" in done.output
+    assert "5 bubbles: at its end the run estimates each gel, and compares them: 0 % (2), 1 % (3)" in done.output
 
 
 def test_groups_are_a_column_of_the_data(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ def test_units_that_cannot_be_right_are_noticed(tmp_path: Path) -> None:
     done = call("init", "--data", write(tmp_path / "b.csv"), "--time-unit", "ms", "--radius-unit", "um")
     assert done.exit_code == 0, done.output
     assert "are the units of both columns right?" in done.stderr
-    assert "# MIND: the collapse takes" in Path("b.yaml").read_text()
+    assert "# WARNING: the collapse takes" in Path("b.yaml").read_text()
     done = call("init", "--data", "b.csv", "--time-unit", "s", "--radius-unit", "m", "--force")  # both, by as much
     assert (
         "no bubble has such a radius; are the units of both columns right? Units 1000000 times smaller" in done.stderr
@@ -61,7 +61,7 @@ def test_frames_without_a_bubble_change_nothing_but_a_note(tmp_path: Path) -> No
         dropped = [f"{row.split(',')[0]},{code}" if i in (12, 30, 55) else row for i, row in enumerate(rows)]
         Path(f"{name}.csv").write_text("\n".join([head, *dropped, ""]))
         done = call("init", "--data", f"{name}.csv", "--out", f"{name}.yaml")
-        told = f"warning: {name}: 3 readings of 0 or below are frames without a bubble, and left out\n"
+        told = f"warning: {name}: 3 readings of 0 or below are frames without a bubble, left out\n"
         assert (told in done.stderr) == (name != "blank")
         text = Path(f"{name}.yaml").read_text().replace(name, "blank")
         written[name] = [line for line in text.splitlines() if "frames without" not in line]
@@ -78,10 +78,10 @@ def test_frames_without_a_bubble_change_nothing_but_a_note(tmp_path: Path) -> No
     [
         ("t_us,R [mm]", UNITS, ["the name of column 'R [mm]' says mm, but its unit is given as um"]),
         ("time (ms),R_um", UNITS, ["the name of column 'time (ms)' says ms, but its unit is given as us"]),
-        ("frame,R_um", UNITS, ["'frame' seems to count frames; then give, instead of a unit, --frame-rate"]),
-        ("t_us,D_um", UNITS, ["'D_um' seems to hold diameters; then give half of their unit, --radius-unit '0.5*um'"]),
+        ("frame,R_um", UNITS, ["'frame' seems to count frames; if so, give --frame-rate instead of a unit"]),
+        ("t_us,D_um", UNITS, ["'D_um' seems to hold diameters; if so, give half their unit, --radius-unit '0.5*um'"]),
         ("t_us,D_um", ("--time-unit", "us", "--radius-unit", "0.5*um"), []),
-        ("t_us,radius_px", UNITS, ["'radius_px' seems to hold pixels; then give, instead of a unit, --pixel"]),
+        ("t_us,radius_px", UNITS, ["'radius_px' seems to hold pixels; if so, give --pixel"]),
         ("t_us,radius_px", ("--time-unit", "us", "--pixel", "1.0 um"), []),
         ("t_us,R_um", ("--time-unit", "us", "--pixel", "1.1 um"), ["'R_um' says um, but its unit is given as 1.1*um"]),
         ("t_us,R_um", UNITS, []),
@@ -124,7 +124,7 @@ def test_growth_alone_and_rows_before_the_bubble_are_told_in_words_of_the_record
     Path("growth.csv").write_text("\n".join([head, *grown, ""]))
     done = call("init", "--data", "growth.csv")
     assert done.exit_code == 2
-    assert "growth: the recording ends with the maximum, reading 8 of 8: it shows growth alone" in done.stderr
+    assert "growth: the recording ends with the maximum, reading 8 of 8: it shows only growth" in done.stderr
     assert call("init", "--data", "growth.csv", "--start", "acoustic").exit_code == 0
     proposed(Path("growth.yaml"))
     empty = [f"{0.7 * i - 80:g},{3 + i % 3}" for i in range(100)]
@@ -274,7 +274,7 @@ def test_a_scale_that_cannot_be_is_told_and_no_prior_is_taken_from_it(tmp_path: 
     assert "or the time step 1.38" in done.stderr
     written = Path("fast.yaml").read_text()
     assert "first guess from collapse time" not in written
-    assert "# MIND: the collapse takes 0.7" in written
+    assert "# WARNING: the collapse takes 0.7" in written
     assert "median: 10 kPa" in written
     assert "within what gels usually are, for the collapse is doubted" in written
     done = call("validate", "fast.yaml")
@@ -283,7 +283,7 @@ def test_a_scale_that_cannot_be_is_told_and_no_prior_is_taken_from_it(tmp_path: 
     Path("none.csv").write_text(f"t_us,radius_um\n{rows}")
     assert call("init", "--data", "none.csv", *UNITS).exit_code == 0
     written = Path("none.yaml").read_text()
-    assert "# MIND: the collapse takes 0.4" in written
+    assert "# WARNING: the collapse takes 0.4" in written
     assert "doubted" not in written
 
 
@@ -311,7 +311,7 @@ def test_a_rate_that_the_times_contradict_is_told(tmp_path: Path) -> None:
     done = call("init", "--data", "b.csv", *UNITS, "--frame-rate", "270 kHz")
     told = "the times are 0.7 us apart, which is not a whole number of frames: at the given rate one takes 3.704 us"
     assert told in done.stderr
-    assert f"# MIND: {told}" in Path("b.yaml").read_text()
+    assert f"# WARNING: {told}" in Path("b.yaml").read_text()
     assert f"warning: b: {told}" in call("validate", "b.yaml").stderr
     (problem,) = build(load_config("b.yaml"))
     assert [c.code for c in problem.observations.doubts] == ["implausible-data"]

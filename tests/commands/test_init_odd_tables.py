@@ -157,11 +157,11 @@ def test_diameters_in_pixels_need_half_the_size_of_a_pixel(tmp_path: Path) -> No
     assert code == 2
     assert "(half the size of one, since 'Diameter [px]' seems to hold diameters, e.g. '1.38 um'; or" in output
     code, output = told(tmp_path, text, "--pixel", "2.76 um")
-    assert "'Diameter [px]' seems to hold diameters; then 2.76*um must be half the size of a pixel: is it?" in output
+    assert "'Diameter [px]' seems to hold diameters; if so, 2.76*um must be half the size of a pixel: is it?" in output
     _, output = told(tmp_path, text, "--radius-unit", "0.5*um", "--force")
     assert "seems to hold diameters" not in output
     _, output = told(tmp_path, text, "--radius-unit", "um", "--force")
-    assert "give, instead of a unit, --pixel with half the size of one" in output
+    assert "give --pixel with half the size of one instead of a unit" in output
     assert "--radius-unit" not in output.partition("warning")[2]
     _, output = told(tmp_path, text.replace(" [px]", ""), "--force")
     assert "add --radius-unit UNIT (e.g. 0.5*um, since 'Diameter' seems to hold diameters)" in output
@@ -179,7 +179,7 @@ def test_glare_in_the_first_readings_is_left_out(tmp_path: Path, glare: list[int
     values[glare] = 390
     code, output = told(tmp_path, rows("t_us,R_um\n", values))
     assert code == 0, output
-    assert f"the {when} none of the bubble by the neighbours, and left out" in output
+    assert f"the {when} too far from the neighbours, and left out" in output
     assert "outliers: leave out" in (tmp_path / "b.yaml").read_text(encoding="utf-8")
 
 
@@ -209,4 +209,4 @@ def test_growth_and_collapse_alone_may_be_of_a_laser(tmp_path: Path) -> None:
     text = rows("t_us,R_um\n", radii() - 100)
     code, output = told(tmp_path, "".join(text.splitlines(keepends=True)[:29]))
     assert code == 0, output
-    assert "R_max and collapse time: is the driving that of your experiment? If a laser made the bubble, say" in output
+    assert "R_max and collapse time: is the driving that of your experiment? If a laser made the bubble, give" in output

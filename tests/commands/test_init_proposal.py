@@ -323,7 +323,7 @@ def test_a_misread_frame_is_no_trough_and_no_top(tmp_path: Path) -> None:
     clean, of_spoilt = (resolve(parse_document(text), tmp_path).document.data for text in texts)
     assert "outliers" not in clean["data"]  # the readings at 44 and 60 µs are collapses, not slips
     assert of_spoilt["data"].pop("outliers") == "leave out"
-    assert "# MIND: b: the 2 readings at 9, 32 us are none of the bubble by the neighbours" in texts[1]
+    assert "# WARNING: b: the 2 readings at 9, 32 us are too far from the neighbours" in texts[1]
     tops = [float(it["parameters"]["R_max"]["mean"].split()[0]) for it in (clean, of_spoilt)]
     assert tops[1] == pytest.approx(tops[0], rel=0.02)
     assert [it["data"]["window"] for it in (clean, of_spoilt)] == [clean["data"]["window"]] * 2
@@ -358,7 +358,7 @@ def test_the_radius_at_rest_is_that_of_the_file(tmp_path: Path) -> None:
     assert np.diff(problem.observations.times) == pytest.approx(0.63e-6)  # no column of times: the file's step
     laser_film(Req=21.79e-6, deltat=0.63)  # in another unit than the radii, which is not guessed
     done = call("init", "--data", "film.mat", *UNITS, "--force")
-    assert "Req 2.179e-05 of the file is not used: it is no radius at rest in um" in done.stderr
+    assert "Req 2.179e-05 of the file is not used: in um, like its radii, it is no plausible R_eq" in done.stderr
     (problem,) = build(load_config("film.yaml"))
     assert "R_eq" in problem.prior.names
 

@@ -90,7 +90,7 @@ def test_the_page_shows_both_and_escapes_words(run_dir):
     assert "If all were 30 % larger, " in page
     assert "times its error bar" in page
     assert "time &lt;ran&gt; 0.1 % slower" in page
-    assert "a fit with it tells" in page
+    assert "only a fit with it shows this" in page
     assert page.index("More than the error bar") < page.index("<h2>More")
     assert 'id="ledger"' in page
 

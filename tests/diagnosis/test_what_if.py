@@ -232,7 +232,7 @@ def test_what_cannot_be_run_or_told_has_a_reason_and_stands_before_what_is_small
     assert analysis.what_if[-1].name == "small"
     assert all(np.isnan(shift.change).all() for shift in analysis.what_if[:-1])
     assert all(shift.runs <= MOST_RUNS for shift in analysis.what_if if shift.name != "far")
-    assert any("a fit with it tells" in line for line in remarks(analysis))
+    assert any("only a fit with it shows the change" in line for line in remarks(analysis))
 
 
 def test_the_posterior_is_the_same_and_its_runs_are_counted():

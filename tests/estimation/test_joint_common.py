@@ -128,13 +128,13 @@ def test_the_terminal_and_the_page_say_what_is_shared_unasked(oscillators, tmp_p
     shared, output, page = told(tmp_path / "run", "--share", "k")
     assert shared == ("k", "reading_scale")
     assert "(unless --apart NAME): reading_scale\n" in output
-    assert "as constants of one medium and one camera: reading_scale" in page
+    assert "one value in all data sets by default: reading_scale" in page
     shared, output, page = told(tmp_path / "run", "--share", "k", "--apart", "reading_scale")
     assert shared == ("k",)
     assert "medium and" not in output + page
     shared, _, page = told(tmp_path / "run", "--share", "k", "--share", "reading_scale")
     assert shared == ("k", "reading_scale")
-    assert "without having been asked" not in page
+    assert "in all data sets by default" not in page
 
 
 def test_a_file_of_an_earlier_version_has_a_page(oscillators, tmp_path):
@@ -144,7 +144,7 @@ def test_a_file_of_an_earlier_version_has_a_page(oscillators, tmp_path):
     groups = read_groups(folder / "joint.nc")
     del groups["/"].attrs["common"]
     to_bytes(groups).write(folder / "joint.nc")
-    assert "without having been asked" not in write_joint(folder).read_text()
+    assert "in all data sets by default" not in write_joint(folder).read_text()
 
 
 def test_a_configuration_says_so_too(oscillators, tmp_path):

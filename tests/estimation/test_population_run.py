@@ -108,7 +108,7 @@ def test_who_is_odd_is_said_beside_the_number(found):
     assert not any("Perhaps not" in line for line in sentences(stored))
     tree = stored.tree.copy(deep=True)
     tree["alone"]["belongs"][2] = 0.3
-    line = "Perhaps not of the population, and as far as not, no part of these numbers: set2."
+    line = "Perhaps not of the population; these numbers count them only as far as they are: set2."
     assert line in sentences(replace(stored, tree=tree))
 
 

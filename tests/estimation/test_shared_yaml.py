@@ -69,7 +69,7 @@ def test_what_the_data_leave_as_stated_comes_last_and_in_one_line(finished):
     std, z = (high - low) / 3.2897, norm.ppf((np.arange(draws.size) + 0.5) / draws.size)
     draws[:] = middle + std * (z / z.std()).reshape(draws.shape)
     assert joint_lines(found) == [
-        stiff, "left as stated beforehand, for the data say nothing new of them: stiffness, soft"
+        stiff, "the data add nothing to what was known before of: stiffness, soft"
     ]  # fmt: skip
     draws[:] += 0.5 * std  # the data moved it
     assert [line.split(" = ")[0] for line in joint_lines(found)] == [line.split(" = ")[0] for line in (soft, stiff)]

@@ -99,11 +99,11 @@ def test_what_the_data_leave_as_stated_is_one_line_unless_they_moved_it(analysis
     label = analysis.parameters[at].label
     lead, rest = lead_and_rest(analysis.posterior)
     assert label not in lead
-    assert re.search(f"as stated beforehand[^<]*: {label}.</p>", rest)
+    assert re.search(f"what was known before of[^<]*: {label}.</p>", rest)
     moved = analysis.posterior + np.eye(len(analysis.parameters))[at] * analysis.prior[:, at].std()
     lead, rest = lead_and_rest(moved)
     assert label in lead
-    assert "as stated beforehand" not in rest
+    assert "what was known before of" not in rest
 
 
 def test_warnings_stand_where_else_the_trust_is_told(analysis):

@@ -99,7 +99,7 @@ def test_the_numbers_to_quote_are_those_of_each_population_by_itself_unless_know
     found = en4dvar.compare_populations(only(gels))
     np.testing.assert_allclose(found.quoted["k"], expected, rtol=0.01)
     assert "each population's own median: the numbers to quote" in found.caption
-    assert "Of one by itself quote its own median" in str(found)
+    assert "For a single population quote its own median" in str(found)
     told = dict(line.split("  k ") for line in medians_table(found).splitlines()[1:])
     for name, middle in zip(own, expected[1], strict=True):
         assert float(told[f"{name:10}"].split()[-2]) == pytest.approx(middle, abs=0.02)

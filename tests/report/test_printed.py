@@ -86,8 +86,8 @@ def test_page_prints_a_value_without_interval(bounded, one_figure, analysis):
     assert f"± {alive[:, 0].std(ddof=1) / 1e3:.2f} kPa" not in text
     assert f"{plus_minus(alive[:, 1].mean(), alive[:, 1].std(ddof=1))} Pa·s" in text
     assert "data say little" in text
-    assert "DFS share (degrees of freedom for signal): how much of the prior variance the data removed" in text
-    assert "– cannot be told where intervals are not to be trusted" in text
+    assert "DFS share (degrees of freedom for signal): the share of the prior variance that the data removed" in text
+    assert "– not known, because intervals are not to be trusted" in text
 
 
 def test_csv_leaves_the_interval_out(bounded):
@@ -233,7 +233,7 @@ def test_page_names_the_reading_that_decides(tmp_path, analysis):
     assert "0.8 posterior standard deviations" in moving
     size = marked.influence.change[1, 7]
     assert f"by {size:.2g} Pa·s".replace("-", "−") in moving
-    assert moving.endswith("For 10 of 40 readings it takes a fit without them to tell.")
+    assert moving.endswith("For 10 of 40 readings only a fit without them shows this.")
     assert "from what the prior predicts" in far
     panels = [panel for row in influence(result).rows for panel in row.panels]
     assert [panel.ylabel for panel in panels[:2]] == ["$G$", r"$\mu$"]
@@ -245,5 +245,5 @@ def test_page_names_the_reading_that_decides(tmp_path, analysis):
 
 def test_page_says_why_influence_is_not_told(analysis):
     result = Result.from_analysis(analysis, provenance("name: test\n"))
-    assert str(reading_words(result)[0]).startswith("What leaving out a reading would change is not told: too few")
+    assert str(reading_words(result)[0]).startswith("The effect of leaving out a reading is not known: too few")
     assert len(influence(result).rows) == 1

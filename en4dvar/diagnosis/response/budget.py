@@ -75,4 +75,4 @@ def budget_words(a: Analysis, name: str) -> str:
     first = largest(sources, int(active_members(a.posterior_failures).sum()))
     if any(source not in a.problem.prior.names for source in first):
         return line
-    return f"{line}; know {' or '.join(first)} better first"
+    return f"{line}; first improve what is known of {' or '.join(first)}"

@@ -205,8 +205,8 @@ def _left_out(name: str, series: Readings) -> list[str]:
     words = []
     if none := series.left_out.get(BELOW):
         which = "reading of 0 or below is a frame" if len(none) == 1 else "readings of 0 or below are frames"
-        words.append(f"{name}: {len(none)} {which} without a bubble, and left out")
-    for reason, why in ((FAR, "none of the bubble by the neighbours"), *((it, it) for it in (AGAIN, CLIPPED, LEVEL))):
+        words.append(f"{name}: {len(none)} {which} without a bubble, left out")
+    for reason, why in ((FAR, "too far from the neighbours"), *((it, it) for it in (AGAIN, CLIPPED, LEVEL))):
         if far := [f"{1e6 * time:.6g}" for time in series.left_out.get(reason, ())]:
             told = f"{', '.join(far[:6])}{' …' * (len(far) > 6)} us"
             which = f"reading at {told} is" if len(far) == 1 else f"{len(far)} readings at {told} are"
@@ -255,9 +255,9 @@ def _with_rest(proposal: Proposal, readings: Mapping[str, Readings], unit: str) 
         value = series.scalars.get(name, float("nan"))
         share = convert(value, unit, "m") / float(series.values.max())
         if not AT_REST[0] < share < AT_REST[1]:
-            words = f"{name} {value:g} of the file is not used: it is no radius at rest in {unit}, as its radii are"
+            words = f"{name} {value:g} of the file is not used: in {unit}, like its radii, it is no plausible R_eq"
             return replace(proposal, warnings=(*proposal.warnings, words))
-    words = f"the file's, in the unit of its radii: without it G is uncertain; is it really {unit}?"
+    words = f"from the file, in the unit of its radii; without it G is uncertain; is it really in {unit}?"
     entry = Entry("R_eq", braced(from_file=name, unit=unit), words)
     lines = tuple(entry if line.key == "R_eq" else line for line in proposal.parameters)
     return replace(proposal, parameters=lines)
@@ -273,13 +273,13 @@ def doubts(source: Source) -> list[str]:
         diameter, pixels, scaled = bool(DIAMETER.match(name)), PIXELS.search(name), "*" in unit
         if pixels and not scaled:
             size = f"{'half ' * diameter}the size of one"
-            words.append(f"{name!r} seems to hold pixels; then give, instead of a unit, --pixel with {size}")
+            words.append(f"{name!r} seems to hold pixels; if so, give --pixel with {size} instead of a unit")
         if what == "times" and FRAMES.fullmatch(name) and not scaled:
-            words.append(f"{name!r} seems to count frames; then give, instead of a unit, --frame-rate")
+            words.append(f"{name!r} seems to count frames; if so, give --frame-rate instead of a unit")
         if what == "radii" and diameter and scaled and not unit.startswith("0.5*"):
-            words.append(f"{name!r} seems to hold diameters; then {unit} must be half the size of a pixel: is it?")
+            words.append(f"{name!r} seems to hold diameters; if so, {unit} must be half the size of a pixel: is it?")
         if what == "radii" and diameter and not scaled and not pixels:
-            words.append(f"{name!r} seems to hold diameters; then give half of their unit, --radius-unit '0.5*{unit}'")
+            words.append(f"{name!r} seems to hold diameters; if so, give half their unit, --radius-unit '0.5*{unit}'")
         named = None if diameter and scaled else unit_in(name, kind)
         if named and parse_unit(named) != parse_unit(unit):
             words.append(f"the name of column {name!r} says {named}, but its unit is given as {unit}")

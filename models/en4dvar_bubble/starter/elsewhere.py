@@ -65,21 +65,21 @@ class Known:
         return Entry(self.key, value, self.source)
 
 
-SCALE = Known(READING_SCALE.name, "1", 0.005, "size of a pixel: a calibration target tells it to about 0.5 %")
-PRESSURE = Known("p_inf", "101.3 kPa", 0.01, "weather moves it by 1 %, 100 m of height take 1.2 %: give yours")
+SCALE = Known(READING_SCALE.name, "1", 0.005, "size of a pixel: known to about 0.5 % from a calibration target")
+PRESSURE = Known("p_inf", "101.3 kPa", 0.01, "weather changes it by 1 %, 100 m of altitude by 1.2 %: enter yours")
 AMPLITUDE = Entry(
     f"# {P_A.name}",
     "{prior: normal, mean: -24 MPa, std: 5 %}",
-    "amplitude of the driving: that of your pulse, with what your hydrophone errs by, often 5 or 10 %",
+    "amplitude of the driving: enter that of your pulse, with the error of your hydrophone, often 5 or 10 %",
 )
 """A line of the parameters, which is a comment until it holds the amplitude of the pulse that the model states."""
 PULSE = (
-    "the amplitude of the pulse is taken as exact: one that is 10 % off can make G wrong by half; put what your "
-    f"hydrophone errs by into the line '# {P_A.name}' of the parameters, and take the '# ' from it"
+    "the amplitude of the pulse is taken as exact, and an error of 10 % can make G wrong by half; enter the error "
+    f"of your hydrophone in the line '# {P_A.name}' of the parameters, and remove the '# ' from it"
 )
 _OF_ANY = (
-    Known("rho", "1030 kg/m^3", 0.02, "density: of 90 % from water, 997, to what rheometry codes take for gels, 1064"),
-    Known("c", "1510 m/s", 0.015, "speed of sound: from water, 1497 m/s, to gels of 15 % of polymer, 1540 m/s"),
+    Known("rho", "1030 kg/m^3", 0.02, "density: 90 % from water, 997, to the gels of rheometry codes, 1064"),
+    Known("c", "1510 m/s", 0.015, "speed of sound: between water, 1497 m/s, and gels with 15 % of polymer, 1540 m/s"),
 )
 
 
@@ -165,9 +165,9 @@ def plane_in_a_gel(views: Mapping[str, Look], medium: Medium) -> list[str]:
     names = f"{', '.join([*slow][:3])}{f' and {len(slow) - 3} more' if len(slow) > 3 else ''}: " * (len(views) > 1)
     near = " and ".join(f"{20.5 / h:.0f} kPa at {h} R_max" for h in (3, 10))
     return [
-        f"{names}the collapse takes {ratio:.2f} of the Rayleigh time, in a gel of {G / 1e3:g} kPa and {mu:g} Pa s it "
-        f"takes {usual:.2f}: a softer or thicker gel does that, and so does a rigid plane nearby (wall of the vessel, "
-        f"cover glass), which makes G too small by about {near} and leaves no other trace (the free surface of the gel "
-        f"makes it too large); if one is within 10 R_max, state its distance from the bubble's centre: "
+        f"{names}the collapse takes {ratio:.2f} of the Rayleigh time; in a gel of {G / 1e3:g} kPa and {mu:g} Pa s it "
+        f"takes {usual:.2f}. The gel may be softer or thicker, or a rigid plane may be nearby (wall of the vessel, "
+        f"cover glass). A plane makes G too small by about {near} and leaves no other trace (a free surface of the gel "
+        f"makes it too large). If one is within 10 R_max, state its distance from the bubble's centre: "
         f"--set model.wall.distance='{float(f'{3 * radius:.2g}'):g} um'"
     ]

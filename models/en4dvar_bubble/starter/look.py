@@ -219,8 +219,8 @@ def without_rebound(looks: Mapping[str, Look]) -> list[str]:
     who = f"{listed(short, 5)}: " * (len(looks) > 1)
     away = "; move those files away, or accept that they count beside the others" * (len(short) < len(looks))
     return [
-        f"{who}the readings end before the first rebound has a top, so that a run tells stiffness and viscosity by the "
-        f"collapse alone, often several times too large: record longer, until that top is past{away}"
+        f"{who}the readings end before the top of the first rebound, so a run takes stiffness and viscosity from the "
+        f"collapse alone, often several times too large; record longer, until that top is past{away}"
     ]
 
 
@@ -264,8 +264,8 @@ def _require_collapse(radius: Array, start: Start | None) -> None:
     if largest > count - 3 and (start == "laser" or (start is None and radius[0] > ACOUSTIC_BEGINS * radius[largest])):
         raise DataError(
             f"the recording ends {'with' if largest == count - 1 else 'next to'} the maximum, reading {largest + 1} of "
-            f"{count}: it shows growth alone, and a bubble that a laser makes is estimated from its maximum on; "
-            "record the collapse, or if ultrasound made it grow, say --start acoustic"
+            f"{count}: it shows only growth, and a bubble made by a laser is estimated from its maximum on; "
+            "record the collapse, or if ultrasound made it grow, give --start acoustic"
         )
 
 

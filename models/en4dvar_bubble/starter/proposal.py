@@ -57,7 +57,7 @@ WIDTHS = {"G": (2.0, 2.5), "mu": (1.5, 2.0)}  # of 47 synthetic gels ln G/guess 
 BETWEEN = 1.645  # standard deviations from the median to 5 and 95 %
 SAME_CLOCK, CLOCK_STD = 2e-6, 1e-6  # s: of a guessed clock; of 30 synthetic bubbles it erred by 1.05e-6 (rms)
 COLLAPSE_ALONE = ", and its window ends with the first collapse, before the rebound has a top"
-EACH_ALONE = "of each bubble alone, which the gel's numbers do not use; 'true' takes up to twice the time"
+EACH_ALONE = "it is for each bubble alone, and the gel's values do not use it; 'true' takes up to twice the time"
 BUBBLES = (1e-7, 0.1)  # m: between these radii
 SEEN = (3e-6, 50e-9, 1e-4)  # m, s, m: one below is not read in shorter steps; radius of a usual bubble
 
@@ -94,7 +94,7 @@ class Proposal:
     datasets: tuple[str, ...] = ()
     assimilation: tuple[Entry, ...] = (
         Entry("members", "48"),
-        Entry("draws", "400", "effective ones where the posterior is sampled: its mean is known to 5 % of its std"),
+        Entry("draws", "400", "effective draws if the posterior is sampled: its mean is then known to 5 % of its std"),
     )
 
 
@@ -128,7 +128,7 @@ def propose(
     ]
     told += [f"start: {chosen} ({look.reason})"] * look.clear
     other = "laser" if chosen == "acoustic" else "acoustic"
-    doubt = f"start: {chosen} is only a proposal ({look.reason}); if it was {other}, say --start {other}"
+    doubt = f"start: {chosen} is only a proposal ({look.reason}); if it was {other}, give --start {other}"
     warnings = [doubt] * (not look.clear)
     warnings += [
         f"{name}: {view.drift}; no radius at rest is taken from it{COLLAPSE_ALONE * (view.n_minima < 2)}"
@@ -175,9 +175,9 @@ def propose(
 
 def _ends_with(kind: str, sizes: Mapping[str, int]) -> str:
     if not sizes:
-        return "the run ends with what they say of one gel together"
+        return "at its end the run estimates their one gel"
     told = ", ".join(f"{name} ({count})" for name, count in sizes.items())
-    return f"the run ends with the numbers of each {kind}, and compares them: {told}"
+    return f"at its end the run estimates each {kind}, and compares them: {told}"
 
 
 def _unmatched(names: Sequence[str], look: Look, model: BubbleModel) -> str:
@@ -190,7 +190,7 @@ def _unmatched(names: Sequence[str], look: Look, model: BubbleModel) -> str:
     }
     questions = [asked[name] for name in names if name in asked]
     if model.start == "acoustic":
-        questions = ["is the driving that of your experiment? If a laser made the bubble, say --start laser"]
+        questions = ["is the driving that of your experiment? If a laser made the bubble, give --start laser"]
     return f"no G and mu of {model.law.name} give this {' and '.join(told[n] for n in names)}: {' '.join(questions)}"
 
 
@@ -219,9 +219,9 @@ def _doubted(looks: Mapping[str, Look], model: BubbleModel) -> list[str]:
 def starter(start: Start, law: str | None) -> Proposal:
     """A proposal without data: examples to be replaced."""
     model, law_name = built(start, law)
-    data = [Entry("error", "{radius_std: 1 % of maximum}", "how well a radius is known: put yours")]
+    data = [Entry("error", "{radius_std: 1 % of maximum}", "how well a radius is known: enter yours")]
     if start == "laser":
-        words = "where readings show two collapses, 'to: trough 2' ends it at the second"
+        words = "if readings show two collapses, 'to: trough 2' ends it at the second"
         data[:0] = [Entry("window", "{from: top, to: end}", words), Entry("time_zero", "top")]
     lines = [example(p, model) for p in model.law.parameters]
     lines += _radii(start, None)
@@ -234,12 +234,12 @@ def with_columns(proposal: Proposal, errors: Sequence[str], common: str) -> Prop
     """The proposal with the errors that the data file states: columns of the std of radii and of times, and the
     ``common`` std of what moves all radii alike, "" where the file states none."""
     own = {
-        "radius_std": Entry("  radius_std", f"{{column: {errors[0]}}}", "each reading's own"),
+        "radius_std": Entry("  radius_std", f"{{column: {errors[0]}}}", "of each reading"),
         "time_std": Entry("  time_std", f"{{column: {errors[1]}}}", "of the exposure"),
     }
     data = tuple(own.get(entry.key.removeprefix("  # ").strip(), entry) for entry in proposal.data)
     alike = Entry(
-        "reading_offset", f"{{prior: normal, mean: 0 um, std: {common}}}", "the level of the edge, of all alike"
+        "reading_offset", f"{{prior: normal, mean: 0 um, std: {common}}}", "the level of the edge, the same for all"
     )
     return replace(proposal, data=data, parameters=(*proposal.parameters, *[alike] * bool(common)))
 
@@ -258,7 +258,7 @@ def _looks(histories: Mapping[str, tuple[Array, Array]], start: Start | None) ->
     if len({view.start for view in looks.values()}) > 1:
         kinds = {kind: [n for n, view in looks.items() if view.start == kind] for kind in ("acoustic", "laser")}
         told = "; ".join(f"{kind}: {', '.join(names[:3])}" for kind, names in kinds.items())
-        raise DataError(f"the data sets suggest different starts ({told}); say --start acoustic or --start laser")
+        raise DataError(f"the data sets suggest different starts ({told}); give --start acoustic or --start laser")
     return looks, unseen
 
 
@@ -294,7 +294,7 @@ def _data(look: Look, model: BubbleModel, theta: Mapping[str, float], views: Seq
     if model.start == "laser":
         lines = [
             _window(look, views),
-            Entry("time_zero", "top", "the model's clock starts at the top, t_s later or earlier"),
+            Entry("time_zero", "top", "the model's clock starts at the top, shifted by t_s"),
         ]
     else:
         end, words = "end", "all readings: none after the maximum is below 20 % of it"
@@ -302,7 +302,7 @@ def _data(look: Look, model: BubbleModel, theta: Mapping[str, float], views: Seq
             end = f"{convert(look.descent, 's', 'us'):.9g} us"
             words = "growth and collapse down to 20 % of R_max; then the wall is too fast for the model"
         lines = [Entry("window", f"{{from: start, to: {end}}}", words), _clock(look, model, theta)]
-    std, words = "1 % of maximum", "too few readings to tell their scatter: put what you know of your camera"
+    std, words = "1 % of maximum", "too few readings to show their scatter: enter what you know of your camera"
     if np.isfinite(look.noise):
         std = _text(max(look.noise, LEAST_NOISE * look.lobe.R_max), "m", "um")
         words = "scatter of the readings where R is smooth; sigma below scales it"
@@ -313,7 +313,7 @@ def _data(look: Look, model: BubbleModel, theta: Mapping[str, float], views: Seq
         Entry("error", "", "how well a reading is known"),
         Entry("  radius_std", std, words),
         Entry(key, timing, "5 % of the step between frames: exposure and jitter matter where R is steep"),
-        Entry("  discrepancy", DISCREPANCY, "what the model misses: its size and correlation time are estimated"),
+        Entry("  discrepancy", DISCREPANCY, "what the model misses; its size and correlation time are estimated"),
     )
 
 
@@ -377,7 +377,7 @@ def _clock(look: Look, model: BubbleModel, theta: Mapping[str, float]) -> Entry:
     if abs(shift) <= SAME_CLOCK:
         return Entry("time_zero", "file", "the file's clock agrees with that of the pulse")
     text = f"{math.floor(1e7 * min(shift, look.begin)) / 10:.9g} us"  # no reading lies before the pulse
-    return Entry("time_zero", text, "puts the guess's R_max on the data's: give the clock of your pulse")
+    return Entry("time_zero", text, "puts the R_max of the guess on that of the data: enter the clock of your pulse")
 
 
 def _in_a_liquid(model: BubbleModel) -> bool:
@@ -396,7 +396,7 @@ def _model(law: str, model: BubbleModel, look: Look | None) -> tuple[Entry, ...]
     ]
     if start == "acoustic":
         pulse = "{kind: histotripsy, amplitude: -24 MPa, frequency: 1 MHz, exponent: 3.7, delay: 5 us}"
-        lines.append(Entry("driving", pulse, "put the pulse of your experiment"))
+        lines.append(Entry("driving", pulse, "enter the pulse of your experiment"))
     return tuple(lines)
 
 
@@ -423,7 +423,7 @@ def _parameters(
     prior = f"{{prior: normal, mean: {_text(mean, 's', 'us', 4)}, std: {_text(std, 's', 'us')}}}"
     words = "the clock of the data against that of the pulse"
     if start == "laser":
-        words = "the vertex of a parabola through the readings about the top against the top itself"
+        words = "the vertex of a parabola through the readings about the top, relative to the top itself"
     sigma = f"{{prior: lognormal, median: 1, log_std: {NOISE_LOG_STD:g}}}"
     return (
         *lines,
@@ -475,7 +475,7 @@ def _radii(
         return [line]
     value, width, words = "20 um", 0.4, R_EQ.label
     if look is not None:
-        value, words = _text(_rest(look), "m", "um"), f"{GAS_FRACTION:g} R_max: no radius at rest is seen"
+        value, words = _text(_rest(look), "m", "um"), f"{GAS_FRACTION:g} R_max, since no radius at rest is seen"
     if look is not None and np.isfinite(look.rest):
         width = 0.3
         words = "the radius at rest; wide, because a real bubble loses gas to the gel and the model's bubble keeps it"

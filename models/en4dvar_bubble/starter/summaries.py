@@ -79,12 +79,12 @@ def propose_from_times(rows: Summaries, law: str | None, medium: str) -> Proposa
     radii = [
         Entry(name, f"{{prior: lognormal, median: {{from_file: {column}, unit: um}}, log_std: {RADIUS_STD}}}", words)
         for name, column, words in (
-            ("R_max", COLUMNS[1], "each bubble's own, read to 0.5 %: put what you know of your camera"),
+            ("R_max", COLUMNS[1], "each bubble's own, read to 0.5 %: enter what you know of your camera"),
             ("R_eq", COLUMNS[2], "the same"),
         )
     ]
     return Proposal(
-        (Entry("error", f"{{collapse_time_std: {TIME_STD}}}", "how well a time is known: put what you know"),),
+        (Entry("error", f"{{collapse_time_std: {TIME_STD}}}", "how well a time is known: enter what you know"),),
         (
             Entry("name", "bubble"),
             Entry("law", law_name, "others: en4dvar laws"),
