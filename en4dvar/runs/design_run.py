@@ -63,7 +63,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Done:
-    """What came of a candidate: its number, ``method``, one evaluation for each number of experiments, or why none."""
+    """What came of a candidate: its number, ``method``, one evaluation for each number of experiments, why not all."""
 
     number: int
     method: str
@@ -256,18 +256,20 @@ def _one(number: int, candidate: Candidate, method: Method, seed: int) -> Done:
         costs = (design.price.of(planned.alike, len(planned.readings)) for planned in every)
         broken = [design.within.broken(len(o.readings), cost, o.beyond) for o, cost in zip(every, costs, strict=True)]
         kept = tuple(planned for planned, reason in zip(every, broken, strict=True) if not reason)
-        return Done(number, method, kept, "" if kept else broken[0])
+        left = (f"{o.alike} experiments: {reason}" for o, reason in zip(every, broken, strict=True) if reason)
+        return Done(number, method, kept, "; ".join(left) if kept else broken[0])
     except En4dvarError as error:
         return Done(number, method, (), str(error))
 
 
 def _line(done: Done) -> str:
-    if done.failure:
+    if not done.results:
         return f"design {done.number}: {done.failure}"
     result = done.results[0]
     of = " of the law" if result.decision else f" ({result.method})"
     worth = f"{result.worth:.4g} nats ± {result.worth_error:.2g}{of}"
-    return f"design {done.number}: {worth}, {result.forward_runs} runs"
+    left = f"; {done.failure}" if done.failure else ""
+    return f"design {done.number}: {worth}, {result.forward_runs} runs{left}"
 
 
 # From a configuration to the experiments it plans
