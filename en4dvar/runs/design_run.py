@@ -209,10 +209,18 @@ def _known(document: Document, base: Path, after: Path) -> dict[str, Any]:
     """What makes the posterior of a finished run the prior of what is asked; the rest belongs to each experiment."""
     config = resolve(document, base)
     estimated = [entry.parameter.name for entry in config.parameters if isinstance(entry, Uncertain)]
-    names = (*(config.design.about or estimated), *config.design.common)
+    names, own = (*(config.design.about or estimated), *config.design.common), []
+    correlated = document.data.get("prior_correlation") or ()
+    for k, entry in enumerate(correlated):
+        taken = [name for name in entry["between"] if name in names]
+        if taken and len(taken) < len(entry["between"]):
+            words = f"--after takes {', '.join(taken)} from {after}; name the others under design.common, too,"
+            raise ConfigError([document.fault(("prior_correlation", k), f"{words} or leave this correlation out")])
+        own += [] if taken else [entry]
     return {
         "prior.ensemble": str(_members_of(after).absolute()),
         **{f"parameters.{name}": {"prior": "ensemble"} for name in names},
+        **({"prior_correlation": own} if correlated else {}),
     }
 
 

@@ -320,6 +320,20 @@ def test_after_a_run_there_is_less_to_learn(tmp_path):
         run_design(plan, out=tmp_path / "bad", after=tmp_path / "nowhere")
 
 
+def test_after_a_run_its_members_hold_the_correlation_of_its_prior(tmp_path):
+    plan, correlated = _plan(knobs={}, method="linear"), {"between": ["a", "b"], "correlation": -0.7}
+    (tmp_path / "measured.csv").write_text("t,y\n0.1,1.2\n0.7,0.9\n1.3,0.5\n")
+    measured = {**plan, "prior_correlation": [correlated]}
+    measured["data"] = {**plan["data"], "path": str(tmp_path / "measured.csv")}
+    en4dvar.run({**measured, "output": {"directory": str(tmp_path / "run"), "report": False}})
+    own, _ = run_design(measured, out=tmp_path / "own", after=tmp_path / "run")
+    without, _ = run_design(plan, out=tmp_path / "without", after=tmp_path / "run")
+    _same(own, without)
+    measured["design"] = {**plan["design"], "about": ["b"]}
+    with pytest.raises(ConfigError, match=r"prior_correlation\.0: --after takes b from .*run; name the others"):
+        run_design(measured, out=tmp_path / "part", after=tmp_path / "run")
+
+
 def test_what_is_wanted_where_nothing_else_is_asked_for(tmp_path):
     plan = _plan(
         about=["a", "b"],
