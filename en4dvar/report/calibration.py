@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FIT, ERRORS = "fit", "errors"  # J_o, half the sum of squares of the readings: at the truth, among that at members, and
-# among that of readings which are drawn at each member
+# among that of other readings drawn at the truth
 LEVELS = (0.05, 0.25, 0.75, 0.95)
 LONGEST = 1_000_000_000  # bytes of the table
 NUMBERS = ("truth", "q05", "q25", "q75", "q95", "z", "rank")

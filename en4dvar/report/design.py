@@ -127,7 +127,7 @@ def design_table(designs: Designs) -> str:
     ]  # fmt: skip
     wanted = []
     for row in dict.fromkeys([*rows[:1], *own]):
-        alike = f"; {row.evaluated.alike} experiments" if several else ""
+        alike = f"; {row.evaluated.alike} experiment{'s' * (row.evaluated.alike > 1)}" if several else ""
         wanted += [f"{settings_text(row)}{alike}: {text}" for text in needs(designs, row)]
     return "\n".join([table([head, *cells]), *wanted])
 

@@ -4,8 +4,8 @@ A truth is drawn from the prior of the user's own configuration, readings from t
 own errors, at the times of the user's own data; then the set is estimated as any other. Of a correct posterior the rank
 of each truth among the members is uniform (:mod:`~en4dvar.diagnosis.ranks`). The half sum of squares J_o of the
 readings is a quantity like the parameters (Modrák et al. 2023, Bayesian Anal., doi:10.1214/23-BA1404). The readings
-tell most of it, so that its rank among that of other readings, one set drawn at each member, is asked too: if the
-errors are as large as stated, that of the truth has their distribution, whatever the posterior.
+tell most of it, so that its rank among that of other readings of the same truth, as many as members, is asked too: if
+the errors are as large as stated, all have one distribution, whatever the posterior and whatever R depends on.
 """
 
 from collections.abc import Mapping
@@ -175,19 +175,17 @@ def _compared(
     run = Composite(problem)(x)
     physical = prior.to_physical(x)
     fits, stream = observations.cost(run.predicted), member_stream(seed, "other readings")
-    others = [
-        float(replace(observations, values=observations.noise.drawn(at, stream)).cost(at))
-        for at in map(run.predicted.__getitem__, range(len(members)))
-    ]
     if not np.allclose(physical[-1], known, atol=1e-300):  # the prior's map may end before the truth
         fits[-1] = np.nan
+    at = run.predicted[-1 if np.isfinite(fits[-1]) else 0]
+    others = [float(replace(observations, values=observations.noise.drawn(at, stream)).cost(at)) for _ in members]
     errors, physical[-1] = np.append(others, fits[-1]), known
     each = zip(physical.T, prior.parameters, strict=True)
     shown = np.column_stack([*(convert(v, p.unit, p.display_unit or p.unit) for v, p in each), fits, errors])
-    draws, at = (white := np.column_stack([x, fits, errors]))[:-1], white[-1]
+    draws, true = (white := np.column_stack([x, fits, errors]))[:-1], white[-1]
     with np.errstate(invalid="ignore", divide="ignore"):
-        z = (at - draws.mean(axis=0)) / draws.std(axis=0, ddof=1)
-        rank = np.where(np.isnan(at), np.nan, np.sum(draws < at, axis=0))
+        z = (true - draws.mean(axis=0)) / draws.std(axis=0, ddof=1)
+        rank = np.where(np.isnan(true), np.nan, np.sum(draws < true, axis=0))
     serious = tuple(dict.fromkeys(c.code for c in analysis.cautions if c.severity == "serious"))
     numbers = np.vstack([shown[-1], member_quantiles(shown[:-1], LEVELS, axis=0), z, rank]).T
     return Judged(number, name, numbers, len(members), serious)

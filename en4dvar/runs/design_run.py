@@ -63,7 +63,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Done:
-    """What came of a candidate: its number, ``method``, one evaluation for each number of experiments, or why none."""
+    """What came of a candidate: its number, ``method``, one evaluation for each number of experiments, why not all."""
 
     number: int
     method: str
@@ -209,10 +209,18 @@ def _known(document: Document, base: Path, after: Path) -> dict[str, Any]:
     """What makes the posterior of a finished run the prior of what is asked; the rest belongs to each experiment."""
     config = resolve(document, base)
     estimated = [entry.parameter.name for entry in config.parameters if isinstance(entry, Uncertain)]
-    names = (*(config.design.about or estimated), *config.design.common)
+    names, own = (*(config.design.about or estimated), *config.design.common), []
+    correlated = document.data.get("prior_correlation") or ()
+    for k, entry in enumerate(correlated):
+        taken = [name for name in entry["between"] if name in names]
+        if taken and len(taken) < len(entry["between"]):
+            words = f"--after takes {', '.join(taken)} from {after}; name the others under design.common, too,"
+            raise ConfigError([document.fault(("prior_correlation", k), f"{words} or leave this correlation out")])
+        own += [] if taken else [entry]
     return {
         "prior.ensemble": str(_members_of(after).absolute()),
         **{f"parameters.{name}": {"prior": "ensemble"} for name in names},
+        **({"prior_correlation": own} if correlated else {}),
     }
 
 
@@ -256,18 +264,20 @@ def _one(number: int, candidate: Candidate, method: Method, seed: int) -> Done:
         costs = (design.price.of(planned.alike, len(planned.readings)) for planned in every)
         broken = [design.within.broken(len(o.readings), cost, o.beyond) for o, cost in zip(every, costs, strict=True)]
         kept = tuple(planned for planned, reason in zip(every, broken, strict=True) if not reason)
-        return Done(number, method, kept, "" if kept else broken[0])
+        left = (f"{o.alike} experiments: {reason}" for o, reason in zip(every, broken, strict=True) if reason)
+        return Done(number, method, kept, "; ".join(left) if kept else broken[0])
     except En4dvarError as error:
         return Done(number, method, (), str(error))
 
 
 def _line(done: Done) -> str:
-    if done.failure:
+    if not done.results:
         return f"design {done.number}: {done.failure}"
     result = done.results[0]
     of = " of the law" if result.decision else f" ({result.method})"
     worth = f"{result.worth:.4g} nats ± {result.worth_error:.2g}{of}"
-    return f"design {done.number}: {worth}, {result.forward_runs} runs"
+    left = f"; {done.failure}" if done.failure else ""
+    return f"design {done.number}: {worth}, {result.forward_runs} runs{left}"
 
 
 # From a configuration to the experiments it plans

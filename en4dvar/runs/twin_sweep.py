@@ -219,6 +219,8 @@ def _one(experiment: TwinExperiment, seed: int) -> TwinRun:
 
 def _values(key: str, choices: Sequence[Any] | str) -> tuple[Any, ...]:
     """The values of a key. Raises :class:`ConfigError`."""
+    if key == "seed":
+        raise ConfigError("--vary seed: all settings have the same seeds, as many as --seeds says, from the file's on")
     if isinstance(choices, str):
         choices = parse_document(f"values: {choices}", f"--vary {key}").data["values"]
     if not isinstance(choices, list | tuple) or not choices:

@@ -16,7 +16,7 @@ import en4dvar
 from en4dvar.cli import main
 from en4dvar.model.forward import ValidityLimit
 from en4dvar.plumbing.errors import ConfigError, DataError, En4dvarError, OutputError
-from en4dvar.report.design import fans, front, needs, readings_text, remarks
+from en4dvar.report.design import design_table, fans, front, needs, readings_text, remarks
 from en4dvar.results.design_file import load_designs
 from en4dvar.runs import design_run
 from en4dvar.runs.design_run import run_design
@@ -188,11 +188,13 @@ class Bounded(Vectorised):
 def test_what_a_design_must_keep_to(tmp_path):
     """More readings than the camera holds, a price too high: left out before the best is looked for, and named."""
     within = {"readings": 7, "price": 12}
-    found, _ = run_design(_plan(within=within, experiments=[1, 2], method="laplace"), out=tmp_path / "out")
+    found, directory = run_design(_plan(within=within, experiments=[1, 2], method="laplace"), out=tmp_path / "out")
     assert {(len(row.result.times), row.result.alike) for row in found.rows if row.result} == {(7, 1), (4, 1), (4, 2)}
     told = "\n".join(remarks(found))
     assert "error 0.1 m, every 0.2 s; error 1 m, every 0.2 s: 13 readings: more than design.within.readings = 7" in told
     assert "a price of 13: more than design.within.price = 12" in told
+    assert "as in the file; error 0.1 m, every 0.4 s; error 1 m, every 0.4 s: 2 experiments: a price of 14: " in told
+    assert "2 experiments: a price of 14" in (directory / "run.log").read_text()
 
 
 @pytest.mark.parametrize(("most", "kept"), [(0.9, True), (0.05, False)])
@@ -318,10 +320,26 @@ def test_after_a_run_there_is_less_to_learn(tmp_path):
         run_design(plan, out=tmp_path / "bad", after=tmp_path / "nowhere")
 
 
+def test_after_a_run_its_members_hold_the_correlation_of_its_prior(tmp_path):
+    plan, correlated = _plan(knobs={}, method="linear"), {"between": ["a", "b"], "correlation": -0.7}
+    (tmp_path / "measured.csv").write_text("t,y\n0.1,1.2\n0.7,0.9\n1.3,0.5\n")
+    measured = {**plan, "prior_correlation": [correlated]}
+    measured["data"] = {**plan["data"], "path": str(tmp_path / "measured.csv")}
+    en4dvar.run({**measured, "output": {"directory": str(tmp_path / "run"), "report": False}})
+    own, _ = run_design(measured, out=tmp_path / "own", after=tmp_path / "run")
+    without, _ = run_design(plan, out=tmp_path / "without", after=tmp_path / "run")
+    _same(own, without)
+    measured["design"] = {**plan["design"], "about": ["b"]}
+    with pytest.raises(ConfigError, match=r"prior_correlation\.0: --after takes b from .*run; name the others"):
+        run_design(measured, out=tmp_path / "part", after=tmp_path / "run")
+
+
 def test_what_is_wanted_where_nothing_else_is_asked_for(tmp_path):
     plan = _plan(
         about=["a", "b"],
         wanted={"a": "50 %", "b": "0.001 m"},
+        experiments=[1, 2],
+        method="laplace",
         knobs={"every": {"key": "design.times.step", "values": ["0.2 s"]}},
     )
     run_design(plan, out=tmp_path / "out", overrides=PAGE)
@@ -329,6 +347,7 @@ def test_what_is_wanted_where_nothing_else_is_asked_for(tmp_path):
     for row in designs.rows:
         assert row.evaluated.others.shape == (2, 0)
         assert needs(designs, row) == ["a to ± 50 %", "b to ± 0.001 m: not with these readings"]
+    assert "as in the file; 1 experiment: a to ± 50 %" in design_table(designs)
 
 
 def test_whole_fields_are_refused_with_what_to_do(tmp_path):

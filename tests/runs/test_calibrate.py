@@ -58,6 +58,39 @@ def test_errors_of_a_wrong_size_are_seen(toy, tmp_path, std, size):
     assert wide > 1.1 if size == "larger" else wide < 0.9
 
 
+ESTIMATED = {
+    "sigma": {"parameters.sigma": {"prior": "lognormal", "median": 1, "log_std": 1}},
+    "discrepancy": {
+        "data.error.position_std": "0.5 um",
+        "data.error.discrepancy": {
+            "amplitude": {"median": "2 um", "log_std": 1},
+            "length": {"median": "30 ms", "log_std": 0.5},
+        },
+    },
+}
+
+
+@pytest.mark.parametrize("kind", ["sigma", pytest.param("discrepancy", marks=pytest.mark.slow)])
+def test_errors_of_a_size_that_parameters_tell_are_right(toy, tmp_path, kind):
+    """Each member has a size of its own, by which J_o of readings drawn at it differs."""
+    estimated = {**QUIET, **ESTIMATED[kind]}
+    result = en4dvar.calibrate(toy, 40, overrides=estimated, out=tmp_path / "out")
+    (errors,) = (verdict for verdict in result.verdicts if verdict.quantity == ERRORS)
+    assert errors.p > 0.05
+
+
+@pytest.mark.slow
+def test_errors_larger_than_their_estimated_scale_says_are_seen(toy, tmp_path):
+    """The scale explains them, so that the other parameters are right."""
+    std = {"data.error.position_std": "3 um"}
+    estimated = {**QUIET, "parameters.sigma": {"prior": "lognormal", "median": 1, "log_std": 0.2}}
+    result = en4dvar.calibrate(toy, 60, overrides=estimated, made_with=std, out=tmp_path / "out")
+    off = {verdict.quantity: verdict.words for verdict in result.verdicts if verdict.off}
+    assert {"A", "k"}.isdisjoint(off)
+    assert off["sigma"].startswith("sigma: values are too high")
+    assert off[ERRORS].startswith("the errors of the readings are larger than data.error says")
+
+
 @pytest.mark.slow
 def test_a_value_that_is_wrong_is_seen(toy, tmp_path):
     """A damping that the readings have and the estimate has not moves k."""

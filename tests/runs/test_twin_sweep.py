@@ -125,6 +125,7 @@ def test_warnings_of_single_runs_are_told(tmp_path):
         ({"assimilation.inflation": "[1, 2"}, r"--vary assimilation\.inflation:1:"),
         ({"assimilation.scheme": ["etkf", "best"]}, r"--set assimilation\.scheme.*'best' is not one of"),
         ({"assimilation.schema": ["etkf"]}, "unknown key 'schema'"),
+        ({"seed": [1, 2]}, r"^--vary seed: .* --seeds"),
         ({}, "at least one key to vary"),
     ],
 )
