@@ -20,6 +20,7 @@ from en4dvar.estimation.population.own import (
     OwnLikelihood,
     empirical,
     median_of,
+    own_draws,
     own_likelihoods,
     pooled_slopes,
 )
@@ -34,6 +35,7 @@ A, B = (Parameter(name, "m") for name in "ab")
 D = Parameter("d", "m", common=True)
 OF_A, OF_B, OF_D = PriorTerm.normal(A, 0.6, 0.9), PriorTerm.normal(B, 0.2, 0.5), PriorTerm.normal(D, 0.0, 0.4)
 HYPER = HyperPrior(1.0, 0.5, odd=0.0)
+ROUGH = Effort(hyper_rounds=20, hyper_components=3, draws=600, effective=60)
 
 
 class Shifted(Vectorised):
@@ -127,7 +129,8 @@ def test_an_odd_data_set_is_named_and_moves_nothing():
     values = truths(0.1)
     values[3] = -1.8
     problems, hyper = campaign(values), replace(HYPER, odd=0.05)
-    found = population_of(problems, members(problems), ["a"], 2, hyper=hyper)
+    kept = [own_draws(p, start, 2) for p, start in zip(problems, members(problems), strict=True)]
+    found = population_of(problems, members(problems), ["a"], 2, kept=kept, hyper=hyper)
     assert found.belongs[3] < 0.05
     assert np.delete(found.belongs, 3).min() > 0.8
     (one,) = (c for c in _cautions(found) if c.code == "odd-data-set")
@@ -137,7 +140,7 @@ def test_an_odd_data_set_is_named_and_moves_nothing():
     assert found.posterior.mean.mean() == pytest.approx(mean, abs=0.15 * std)
     assert found.posterior.mean.std() == pytest.approx(std, rel=0.1)
     assert found.posterior.between.mean() == pytest.approx(between, rel=0.15)
-    strict = population_of(problems, members(problems), ["a"], 2, hyper=HYPER)
+    strict = population_of(problems, members(problems), ["a"], 2, kept=kept, hyper=HYPER, effort=ROUGH)
     assert np.median(strict.posterior.tau) > 2 * np.median(found.posterior.tau)
 
 
@@ -258,7 +261,7 @@ def test_the_median_one_by_one_of_sets_that_only_what_is_common_makes_uncertain(
 def test_data_sets_that_cannot_be_sampled_are_named():
     problems = campaign(truths(0.2))
     problems[2] = replace(problems[2], model=Broken())
-    found = population_of(problems, members(problems), ["a"], 2, hyper=HYPER)
+    found = population_of(problems, members(problems), ["a"], 2, hyper=HYPER, effort=ROUGH)
     assert list(found.left_out) == ["set2"]
     assert len(found.problems) == SETS - 1
     assert any("set2 is left out" in c.words for c in _cautions(found))

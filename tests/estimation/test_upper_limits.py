@@ -107,7 +107,7 @@ def test_draws_taken_anew_are_the_same_on_any_workers():
     apart = []
     for workers in (1, 3):
         with ThreadsExecutor(workers) as executor:
-            apart.append(population(problems, kept, executor=executor))
+            apart.append(population(problems, kept, executor=executor, effort=Effort(16, 20, 3, 600, 60)))
     assert apart[0].forward_runs == apart[1].forward_runs > 0
     np.testing.assert_array_equal(apart[0].posterior.nu, apart[1].posterior.nu)
 

@@ -5,11 +5,12 @@ import time
 import zlib
 
 import pytest
+from click.testing import CliRunner
 from mat_damage import seeds, survive
 from rows import row
-from run_files import run_cli
 from toy_config import write_toy
 
+from en4dvar.cli import main
 from en4dvar.config.document import read_document
 from en4dvar.inputs.members import read_covariance
 from en4dvar.inputs.parts import Column, Matrix, read_contents
@@ -34,8 +35,8 @@ def test_damaged_mat_files(tmp_path, first, count):
 def test_a_damaged_mat_file_is_told(tmp_path):
     path = write_toy(tmp_path, ("path: toy.csv", "path: toy.mat"))
     (tmp_path / "toy.mat").write_bytes(seeds()[0][:-8])
-    done = run_cli("validate", path)
-    assert done.returncode == 2
+    done = CliRunner().invoke(main, ["validate", str(path)])
+    assert done.exit_code == 2
     assert row("mat-damaged").told(done.stderr), done.stderr
 
 

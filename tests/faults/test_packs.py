@@ -7,10 +7,12 @@ import shutil
 from contextlib import suppress
 
 import pytest
+from click.testing import CliRunner
 from rows import row
-from run_files import assert_same_results, configuration, make_campaign, run_cli
+from run_files import assert_same_results, configuration, make_campaign
 
 from en4dvar import report
+from en4dvar.cli import main
 from en4dvar.report.compare import compare_runs
 from en4dvar.report.export import export_table
 from en4dvar.results.pack import PACK, Pack
@@ -201,8 +203,8 @@ def test_what_compares_and_repeats_refuses(quiet, tmp_path):
 def test_the_command_gives_the_others_and_fails(quiet, tmp_path):
     run = shutil.copytree(quiet[1], tmp_path / "run")
     line_of(run / PACK, "set1")
-    done = run_cli("export", run)
-    assert done.returncode == 1
+    done = CliRunner().invoke(main, ["export", str(run)])
+    assert done.exit_code == 1
     assert rows_of(done.stdout).keys() == SETS - {"set1"}
     assert done.stderr.count("\n") == 1
     assert row("pack-damaged").told(done.stderr)

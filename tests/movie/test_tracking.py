@@ -149,14 +149,15 @@ def test_what_a_lasting_shape_hides_is_one_factor_of_all_radii():
     assert 0.5 < np.sqrt(np.mean(np.square(scatter))) < 1.5
 
 
-def test_an_elongated_bubble_that_the_frame_cuts_has_an_error_to_match():
+@pytest.mark.parametrize("first", [80, pytest.param(83, marks=pytest.mark.slow)])
+def test_an_elongated_bubble_that_the_frame_cuts_has_an_error_to_match(first):
     """A circle about the parts of its outline that are seen is another one than about the whole."""
     true, off = np.array([12.0, 18.0, 22.0, 30.0, 34.0, 31.0, 24.0, 19.0, 15.0]), []
-    for seed in range(80, 86):
+    for seed in range(first, first + 3):
         shown = frames(Scene((56, 128), noise=2.0, ellipticity=0.05), true, seed)
         read = track(movie_of(shown)).readings[Scene.before :]
         off += [(r.radius - R) / r.errors.std for r, R in zip(read, true, strict=True) if r.used and R > 28]
-    assert len(off) > 12
+    assert len(off) > 6
     assert np.max(np.abs(off)) < 4
     assert np.sqrt(np.mean(np.square(off))) > 0.2  # nor is it said to be hardly known
 

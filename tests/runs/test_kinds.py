@@ -28,7 +28,7 @@ WORKED = {  # as `en4dvar` is called, in a folder with the files of `prepared`
     "twin": ("run", "ring.yaml"),
     "design": (
         "design", CONFIGS / "linear_design.yaml", "--set", "design.knobs.until.values=[2, 8]",
-        "--set", "design.knobs.every.values=[1]",
+        "--set", "design.knobs.every.values=[1]", "--set", "design.draws=20", "--set", "design.simulated=20",
     ),
     "sweep-twin": (
         "sweep-twin", "ring.yaml", "--vary", "assimilation.members=[8, 9]", "--seeds", "1", "--workers", "1",

@@ -153,13 +153,16 @@ def test_replacement_interrupted_anywhere_is_finished_later(earlier, monkeypatch
                 raise KeyboardInterrupt
         return moved(self, target)
 
+    shutil.rmtree(out)
+    kept.rename(out)
+    monkeypatch.setattr(rundir, "replace_earlier_run", lambda path: None)
+    run_campaign(configuration(path, out), force=True)  # complete, but not yet in place
+    monkeypatch.undo()
+    shutil.copytree(out, kept)
     interrupted = 0
     for at in range(1, 30):
         shutil.rmtree(out)
         shutil.copytree(kept, out)
-        monkeypatch.setattr(rundir, "replace_earlier_run", lambda path: None)
-        run_campaign(configuration(path, out), force=True)  # complete, but not yet in place
-        monkeypatch.undo()
         steps = at
         monkeypatch.setattr(rundir.Path, "replace", dies)
         try:

@@ -26,6 +26,21 @@ class Patient(ESMDA):
     words: ClassVar[str] = "ES-MDA, and patient"
     patience: Annotated[int, Ge(0), "How long it waits."] = 3
 """
+REFUSED = """
+import sys
+from click.testing import CliRunner
+from en4dvar.cli import main
+told = [CliRunner().invoke(main, ["validate", path]) for path in sys.argv[1:]]
+print(*(f"{done.exit_code} {done.stderr}" for done in told), sep="---\\n")
+"""
+FIRST_AND_FORKED = """
+import os, patient, en4dvar
+if os.fork():
+    assert os.wait()[1] == 0
+    en4dvar.validate("own.yaml")
+else:
+    print(en4dvar.AssimilationSettings("patient", patience=5).patience)
+"""
 
 
 @pytest.fixture
@@ -61,27 +76,23 @@ def test_it_runs_by_its_name_and_its_keys_are_checked(package, tmp_path):
     assert resolved["assimilation"]["scheme"] == "patient"
     assert resolved["assimilation"]["patience"] == 4
     text = (tmp_path / "own.yaml").read_text()
-    (tmp_path / "own.yaml").write_text(text.replace("patience: 4", "patience: -1"))
-    refused = called("-m", "en4dvar.cli", "validate", "own.yaml", environment=package, folder=tmp_path)
-    assert refused.returncode == 2
-    assert "assimilation.patience" in refused.stderr
-    (tmp_path / "own.yaml").write_text(text.replace("scheme: patient", "scheme: etkf"))
-    refused = called("-m", "en4dvar.cli", "validate", "own.yaml", environment=package, folder=tmp_path)
-    assert "scheme etkf does not read it; it is a key of patient" in refused.stderr  # not replaced
+    (tmp_path / "negative.yaml").write_text(text.replace("patience: 4", "patience: -1"))
+    (tmp_path / "other.yaml").write_text(text.replace("scheme: patient", "scheme: etkf"))
+    refused = called("-c", REFUSED, "negative.yaml", "other.yaml", environment=package, folder=tmp_path)
+    negative, other = refused.stdout.split("---\n")
+    assert negative.startswith("2 ")
+    assert "assimilation.patience" in negative
+    assert "scheme etkf does not read it; it is a key of patient" in other  # not replaced
 
 
 @pytest.mark.parametrize("first", ["en4dvar.schemes.base", "en4dvar.AssimilationSettings"])
 def test_a_script_may_import_the_package_first(first, package, tmp_path):
-    """Which imports from ours, while it is not yet there itself."""
+    """Which imports from ours, while it is not yet there itself; a new process for each of the two that follow it."""
     module, _, name = first.rpartition(".")
     (tmp_path / "patient.py").write_text(f"from {module} import {name}\n{SCHEME}")
-    script = "import patient, en4dvar; print(en4dvar.AssimilationSettings('patient', patience=5).patience)"
-    done = called("-c", script, environment=package, folder=tmp_path)
-    assert done.stdout == "5\n", done.stderr
+    done = called("-c", FIRST_AND_FORKED, environment=package, folder=tmp_path)
+    assert (done.stdout, done.returncode) == ("5\n", 0), done.stderr
     assert "'patient'" not in done.stderr
-    script = "import patient, en4dvar; print(en4dvar.validate('own.yaml'))"
-    done = called("-c", script, environment=package, folder=tmp_path)
-    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize(

@@ -254,7 +254,7 @@ def test_few_members_need_localisation():
 BESIDE_A_FIELD = [
     {"scheme": "etkf", "members": 10, "inflation": 1.04},
     pytest.param({"scheme": "denkf", "members": 24, "inflation": 1.0}, marks=pytest.mark.slow),
-    {"scheme": "enkf", "members": 24, "inflation": 1.05},
+    pytest.param({"scheme": "enkf", "members": 24, "inflation": 1.05}, marks=pytest.mark.slow),
     pytest.param({"scheme": "ienks", "members": 24, "inflation": 1.02}, marks=pytest.mark.slow),
 ]
 
