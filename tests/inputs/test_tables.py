@@ -334,7 +334,7 @@ STEP = 1.4
         (STEP * np.r_[0:7, 7.5, 8:20], {}, None, "2 of 19 steps .* frames of 1.4 us, the first from 8.4 to 10.5 us"),
         (STEP * np.arange(20), {"deltat": 3.7037e-6}, None, "the times are 1.4 us apart, but deltat .* is 3.7037e-06"),
         (STEP * np.arange(20), {"FrameRate": 27.0}, None, "but FrameRate of the file is 27"),
-        (STEP * np.arange(20), {}, 0.27, "at the rate given one takes 3.704 us"),
+        (STEP * np.arange(20), {}, 0.27, "at the given rate one takes 3.704 us"),
     ],
 )
 def test_steps_beside_frames(times, scalars, rate, words):
