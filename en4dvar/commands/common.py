@@ -137,10 +137,10 @@ def config_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 workers_option = click.option(
-    "--workers", type=click.IntRange(min=1), help="Parallel workers; the numbers do not depend on it."
+    "--workers", type=click.IntRange(min=1), help="Parallel workers; results do not depend on their number."
 )
 trust_option = click.option(
-    "--trust", is_flag=True, help="Run code that the files name, wherever it lies; read it first."
+    "--trust", is_flag=True, help="Run code that the files name, wherever it is; read it first."
 )
 
 

@@ -46,15 +46,15 @@ def _medians(texts: Sequence[str]) -> Known:
 
 @click.command()
 @click.argument("run_dir", type=click.Path(path_type=Path))
-@click.option("--dataset", "datasets", multiple=True, metavar="NAME", help="A page for this data set, too.")
+@click.option("--dataset", "datasets", multiple=True, metavar="NAME", help="Also write a page for this data set.")
 @click.option(
-    "--figures", is_flag=True, help="Also keep the figures as PDF and PNG: of these data sets, or of all pages."
+    "--figures", is_flag=True, help="Also keep the figures as PDF and PNG, of these data sets or of all pages."
 )
 def report(run_dir: Path, datasets: tuple[str, ...], figures: bool) -> None:
     """Write the report of a finished run again, from its netCDF files.
 
-    In a campaign of many data sets only those with the gravest warnings have a page of their own; --dataset (any
-    number of times) adds one.
+    In a campaign of many data sets only those with the gravest warnings have their own page; --dataset (any number
+    of times) adds one.
 
     \b
     Example:
@@ -72,19 +72,19 @@ def report(run_dir: Path, datasets: tuple[str, ...], figures: bool) -> None:
     "--out", type=click.Path(path_type=Path), help="Folder of the results; default compare_... beside the first."
 )
 @click.option("--no-report", is_flag=True, help="Print the tables only.")
-@click.option("--stored", is_flag=True, help="Take the evidences stored in the results; run nothing.")
+@click.option("--stored", is_flag=True, help="Use the evidences stored in the results; run nothing.")
 @click.option(
     "--against", metavar="A,B,...", callback=lambda _, __, text: _numbers(text),
-    help="A number of each run, in their order, e.g. concentrations: the populations' medians as a line of it.",
+    help="A number for each run, in their order, e.g. concentrations; fits a line to the populations' medians.",
 )  # fmt: skip
 @click.option(
     "--apart", multiple=True, metavar="NAME",
-    help="A common quantity that each population has a value of its own of, e.g. rho; any number of times.",
+    help="A common quantity of which each population has its own value, e.g. rho; any number of times.",
 )  # fmt: skip
 @click.option(
     "--known", multiple=True, metavar="RUN:NAME=VALUE", callback=lambda _, __, texts: _medians(texts),
-    help="A median that is known from elsewhere, by a rheometer for instance, e.g. 'gel_5:G=5.1 ± 0.2 kPa': it "
-    "calibrates what the populations have in common; any number of times.",
+    help="A median known from elsewhere, e.g. from a rheometer: 'gel_5:G=5.1 ± 0.2 kPa'. It calibrates what the "
+    "populations have in common; any number of times.",
 )  # fmt: skip
 @workers_option
 @trust_option
@@ -94,14 +94,14 @@ def compare(
 ) -> None:  # fmt: skip
     """Compare runs: posteriors over each other and, on the same data, evidence and model probabilities.
 
-    Of runs of different data that end with populations (or of folders of 'en4dvar population') the medians alone are
-    compared: by how much that of one is larger, and how surely, where what all have in common cancels.
+    For runs of different data that end with populations (or folders of 'en4dvar population') only the medians are
+    compared: by how much one is larger, and how surely. What all have in common cancels.
 
     Evidences are sampled with forward runs if the model is cheap. Code outside the current folder and installed
-    packages is run only with --trust.
+    packages runs only with --trust.
 
     The runs may be models on the same data or different materials. Writes compare.html, a figure (PNG, PDF) and CSV
-    tables. For sequences, a table of their evidences is printed.
+    tables. For sequences, it prints a table of their evidences.
 
     \b
     Example:
@@ -173,7 +173,7 @@ def _populations(
 )
 @click.option("--members", "kind", flag_value="members", help="CSV of the posterior members.")
 @click.option("--latex", "kind", flag_value="latex", help="Table for a paper (package booktabs).")
-@click.option("--netcdf", "kind", flag_value="netcdf", help="Say where posterior.nc is, which needs no export.")
+@click.option("--netcdf", "kind", flag_value="netcdf", help="Say where posterior.nc is; it needs no export.")
 @click.option("--out", type=click.Path(path_type=Path), help="File to write; default standard output.")
 @click.option("--force", is_flag=True, help="Replace that file.")
 def export(run_dir: Path, kind: Literal["csv", "latex", "members", "netcdf"], out: Path | None, force: bool) -> None:
@@ -214,9 +214,9 @@ def rerun(run_dir: Path, workers: int | None, trust: bool) -> None:
     """Repeat a run from what its result files record, and compare to the last bit. Nothing is written.
 
     Configuration, seed and observations are those in the files; the data of a sequence are read again. It says if a bit
-    differs, or if anything that decides the bits has changed since (versions, sources, processor, data files); the
-    exit code is 1 if a bit differs. A law or model outside the current folder and installed packages is run only if
-    you agree when asked, or with --trust.
+    differs (exit code 1), or if anything that decides the bits has changed since (versions, sources, processor, data
+    files). A law or model outside the current folder and installed packages runs only if you agree when asked, or
+    with --trust.
 
     \b
     Example:
@@ -245,7 +245,7 @@ def several_runs(command: Callable[..., Told]) -> Callable[..., None]:
         "--out", type=click.Path(path_type=Path), help=f"Folder of the result; default {kind}_... beside the first."
     )
     @click.option(
-        "--force", is_flag=True, expose_value=False, help="As of 'run'; an earlier result is replaced without it too."
+        "--force", is_flag=True, expose_value=False, help="Accepted as by 'run'; an earlier result is replaced anyway."
     )
     @workers_option
     @trust_option
@@ -266,11 +266,11 @@ def several_runs(command: Callable[..., Told]) -> Callable[..., None]:
 @click.command()
 @click.option(
     "--share", "names", multiple=True, metavar="NAME",
-    help="A parameter that has one value in all data sets, e.g. G; default: what their configurations share.",
+    help="A parameter with one value in all data sets, e.g. G; default: what their configurations share.",
 )  # fmt: skip
 @click.option(
     "--apart", multiple=True, metavar="NAME",
-    help="A constant of medium or camera of which each data set has a value of its own, e.g. p_inf; any number.",
+    help="A constant of medium or camera of which each data set has its own value, e.g. p_inf; any number of times.",
 )  # fmt: skip
 @several_runs
 def joint(
@@ -278,9 +278,9 @@ def joint(
 ) -> Told:
     """Estimate data sets together that share parameters: samples of one material, records of one instrument.
 
-    Takes finished runs, any of which may be a campaign, of different readings; models, windows and errors may differ.
-    Constants of the medium and of the camera that are estimated have one value in all, but for those --apart; each
-    data set has its own values of what is not shared. Writes joint.nc, joint.csv and a page.
+    Takes finished runs of different readings, any of which may be a campaign; models, windows and errors may differ.
+    Estimated constants of the medium and the camera have one value in all, except those --apart. Each data set has
+    its own values of what is not shared. Writes joint.nc, joint.csv and a page.
 
     \b
     Example:
@@ -300,7 +300,7 @@ def joint(
 )  # fmt: skip
 @click.option(
     "--mean-std", type=click.FloatRange(min=0, min_open=True), show_default="as in the run's population:, or 1",
-    help="Hyperprior of the mean: normal about that of the prior; its std as a multiple of the prior's.",
+    help="Hyperprior of the mean: normal about the prior's mean; its std as a multiple of the prior's.",
 )  # fmt: skip
 @click.option(
     "--spread", type=click.FloatRange(min=0, min_open=True), show_default="as in the run's population:, or 0.5",
@@ -308,7 +308,7 @@ def joint(
 )  # fmt: skip
 @click.option(
     "--odd", type=click.FloatRange(min=0, max=1, max_open=True), show_default="as in the run's population:, or 0.05",
-    help="Probability that a data set is odd: of another population, in all parameters or in one.",
+    help="Probability that a data set is odd, i.e. of another population, in all parameters or in one.",
 )  # fmt: skip
 @several_runs
 def population(
@@ -316,9 +316,9 @@ def population(
 ) -> Told:
     """Estimate the mean of parameters over data sets and how much they vary: a material behind its samples.
 
-    Takes finished runs of the same parameters, with at least three data sets together, whatever their errors. Unlike
-    stacked posteriors it counts the prior once. Constants of the medium and of the camera that are estimated have one
-    value in all data sets. Writes population.nc, .csv, .tex and a page.
+    Takes finished runs of the same parameters, with at least three data sets in all, whatever their errors. Unlike
+    stacked posteriors it counts the prior once. Estimated constants of the medium and the camera have one value in
+    all data sets. Writes population.nc, .csv, .tex and a page.
 
     \b
     Example:

@@ -29,10 +29,10 @@ MOST_NAMED = 3  # data sets of a warning
 @click.option(
     "--resume",
     is_flag=True,
-    help="Continue the interrupted run in the run directory, to the same bits; if there is none, begin.",
+    help="Continue the interrupted run in the run directory, to the same bits; if there is none, begin one.",
 )
 @click.option("--no-report", is_flag=True, help="Write no page; 'en4dvar report' writes it later.")
-@click.option("--with-what-if", is_flag=True, help="Let the intervals hold the assumptions of the what-if table too.")
+@click.option("--with-what-if", is_flag=True, help="Widen the intervals by the assumptions of the what-if table.")
 @workers_option
 @click.option("--scheduler", metavar="ADDRESS", help="Work on a dask cluster, e.g. tcp://10.0.0.1:8786.")
 def run(source: Source, force: bool, resume: bool, workers: int | None, scheduler: str | None, **asked: Any) -> None:
@@ -40,7 +40,7 @@ def run(source: Source, force: bool, resume: bool, workers: int | None, schedule
 
     Several data files (a list, a pattern or a folder) are a campaign; a file that cannot be used does not stop it.
     A configuration with a 'twin:' section is a twin experiment: RMSE and spread against its truth. One with a
-    'sequence:' section is followed in time by a filter or a sliding-window smoother.
+    'sequence:' section is assimilated cycle by cycle, by a filter or a sliding-window smoother.
 
     \b
     Example:

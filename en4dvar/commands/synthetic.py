@@ -25,7 +25,7 @@ def simulate(
     """Run the model once and write the observable as CSV: at fixed values and prior medians.
 
     Set parameters with --set; the columns are those of the configuration's data section.
-    A configuration with a 'campaign:' section instead draws truths and writes a folder of data sets.
+    A configuration with a 'campaign:' section draws truths instead, and writes a folder of data sets.
 
     \b
     Example:
@@ -76,18 +76,18 @@ def simulate(
 @click.option("--sets", type=click.IntRange(min=2), default=200, show_default=True, help="Number of synthetic sets.")
 @click.option(
     "--made-with", "made", multiple=True, metavar="KEY=VALUE",
-    help="Make the readings, not the estimates, with another value; any number of times."
+    help="Another value for making the readings, not for the estimates; any number of times."
 )  # fmt: skip
 @click.option("--out", type=click.Path(path_type=Path), help="Folder; default runs/<name>_calibration.")
 @click.option("--force", is_flag=True, help="Replace an earlier calibration, once this one is complete.")
-@click.option("--resume", is_flag=True, help="Go on with an interrupted one, or with more sets.")
+@click.option("--resume", is_flag=True, help="Continue an interrupted calibration, or add sets.")
 @workers_option
 def calibrate(source: Source, sets: int, made: tuple[str, ...], workers: int | None, **how: Any) -> None:
-    """Make synthetic data sets by the configuration itself, estimate them, and test the ranks of the truths.
+    """Make synthetic data sets from the configuration, estimate them, and test the ranks of the truths.
 
-    Truths are drawn from the priors, readings from the model with the errors of the file, at the times of its data. Of
-    a correct posterior 90 % intervals hold nine truths in ten. With --made-with the readings are made otherwise, which
-    shows what a wrong assumption would do. Writes calibration.csv and a page.
+    Truths are drawn from the priors, readings from the model with the errors of the file, at the times of its data. If
+    a posterior is correct, its 90 % intervals hold nine truths in ten. --made-with makes the readings under another
+    assumption, which shows what a wrong one would do. Writes calibration.csv and a page.
 
     \b
     Example:
@@ -112,12 +112,12 @@ def calibrate(source: Source, sets: int, made: tuple[str, ...], workers: int | N
 )
 @click.option("--out", type=click.Path(path_type=Path), help="Directory of the result; default runs/<name>_design.")
 @click.option("--force", is_flag=True, help="Replace an earlier result in the directory.")
-@click.option("--resume", is_flag=True, help="Go on with an interrupted comparison; the numbers are the same.")
+@click.option("--resume", is_flag=True, help="Continue an interrupted comparison, to the same numbers.")
 def design(source: Source, **how: Any) -> None:
     """Compare planned experiments by the information they are expected to give.
 
     The configuration is that of 'run'; its data file need not exist. A 'design:' section says when readings are
-    taken, which settings can be changed, and which parameters are asked about. Writes design.nc, designs.csv and a
+    taken, which settings can change, and which parameters are asked about. Writes design.nc, designs.csv and a
     page.
 
     \b
@@ -146,11 +146,11 @@ def design(source: Source, **how: Any) -> None:
 )  # fmt: skip
 @click.option(
     "--seeds", type=click.IntRange(min=1), default=5, show_default=True,
-    help="Number of seeds per combination, from the file's on.",
+    help="Number of seeds per combination, starting with the file's.",
 )  # fmt: skip
 @click.option("--out", type=click.Path(path_type=Path), help="Folder of the table; default runs/<name>_sweep.")
 @click.option("--force", is_flag=True, help="Replace an earlier sweep, once this one is complete.")
-@click.option("--resume", is_flag=True, help="Take over finished runs; seeds and values may be added at the end.")
+@click.option("--resume", is_flag=True, help="Keep finished runs; seeds and values may be added at the end.")
 @workers_option
 def sweep_twin(source: Source, varied: tuple[str, ...], seeds: int, **how: Any) -> None:
     """Compare settings in twin experiments: RMSE and spread, mean ± standard error over seeds.

@@ -23,7 +23,7 @@ from en4dvar.commands.common import Source, continuable, note_beginning
 @click.option("--out", type=click.Path(path_type=Path), help="Folder of the results; default runs/<name>_sweep.")
 @click.option("--force", is_flag=True, help="Replace an earlier sweep.")
 @click.option("--resume", is_flag=True, help="Continue an interrupted sweep.")
-@click.option("--workers", type=click.IntRange(min=1), help="Threads; the numbers do not depend on it.")
+@click.option("--workers", type=click.IntRange(min=1), help="Threads; results do not depend on their number.")
 def sweep(
     configs: tuple[str, ...], settings: tuple[str, ...], data: str | None, trajectories: int, shift: str, step: str,
     width: float, refine: int, out: Path | None, force: bool, resume: bool, workers: int | None,
@@ -81,11 +81,11 @@ def sweep(
 @click.option("--out", type=click.Path(path_type=Path), help="Folder of the results; default runs/<name>.")
 @click.option("--force", is_flag=True, help="Replace an earlier study.")
 @click.option("--resume", is_flag=True, help="Continue a study that was interrupted.")
-@click.option("--workers", type=click.IntRange(min=1), help="Threads; the numbers do not depend on it.")
+@click.option("--workers", type=click.IntRange(min=1), help="Threads; results do not depend on their number.")
 def study(
     config: str, settings: tuple[str, ...], out: Path | None, force: bool, resume: bool, workers: int | None
 ) -> None:
-    """Repeat the paper's study: sweep and En4D-Var, three models, tables, figures, population.
+    """Repeat the paper's study: sweep and En4D-Var, three models, tables, figures and population.
 
     \b
     Example:

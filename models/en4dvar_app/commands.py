@@ -9,14 +9,14 @@ from en4dvar.commands.common import echo, trust_option
 
 @click.command()
 @click.argument("path", metavar="[FILE or FOLDER]", type=click.Path(exists=True, path_type=Path), default=".")
-@click.option("--port", type=click.IntRange(0, 65535), default=0, help="Port of this computer; default: a free one.")
+@click.option("--port", type=click.IntRange(0, 65535), default=0, help="Port on this computer; default: a free one.")
 @click.option("--no-browser", is_flag=True, help="Only print the address.")
 @trust_option
 def app(path: Path, port: int, no_browser: bool, trust: bool) -> None:
     """Open a page in the browser that leads from a movie or a table to an estimate.
 
-    Only files of the folder, or of the folder of the file, are read and written. Every step shows the command line
-    that repeats it. The address is for this computer only and holds a secret.
+    It reads and writes only in the folder, or in the folder of the file. Every step shows the command line that
+    repeats it. The address is for this computer only and holds a secret.
 
     \b
     Example:

@@ -31,7 +31,7 @@ def completed_law(context: click.Context, parameter: click.Parameter, typed: str
 def laws(names: tuple[str, ...], check: bool) -> None:
     """List constitutive laws with parameters and units, or check them.
 
-    LAW is a name of the list, my_law.py:ClassName or package.module:ClassName; default is every registered law.
+    LAW is a name from the list, my_law.py:ClassName or package.module:ClassName; default is every registered law.
 
     \b
     Example:

@@ -40,17 +40,15 @@ _MOVIES = (".tif", ".tiff", ".png", ".bmp", ".jpg", ".jpeg", ".gif", ".mp4", ".a
     help="CSV, Excel, .mat file, folder or pattern; without it, an empty starter.",
 )
 @click.option("--movie", type=click.Path(path_type=Path), help="Movie to read first, as 'en4dvar track' does.")
-@click.option("--pixel", metavar="LENGTH", help="Size of a pixel, e.g. '2.76 um': of the movie, or radii are pixels.")
-@click.option("--frame-rate", metavar="RATE", help="Frame rate, e.g. '270 kHz': of the movie, or times are frames.")
+@click.option("--pixel", metavar="LENGTH", help="Size of a pixel, e.g. '2.76 um': of the movie, or of radii in pixels.")
+@click.option("--frame-rate", metavar="RATE", help="Frame rate, e.g. '270 kHz': of the movie, or of times in frames.")
 @click.option("--exposure", metavar="TIME", help="Exposure of a frame of the movie, e.g. '500 ns'.")
 @click.option("--flashes", metavar="TIMES", help="Flashes of one exposure of the movie, as '0 us, 2 us, 4 us'.")
 @click.option("--raw", metavar="WxHxBITS", help="Shape of the frames of a movie without header, e.g. 512x128x8.")
 @click.option("--corrections", metavar="FILE", type=click.Path(), help="Frames of the movie corrected by hand.")
-@click.option("--bubble", metavar="X,Y", help="A place within the bubble that is meant in the movie (pixels).")
-@click.option("--region", metavar="X,Y,WIDTH,HEIGHT", help="Part of the movie's frames that is looked at (pixels).")
-@click.option(
-    "--mask", metavar="FILE", type=click.Path(), help="Picture: where it is black the movie is not looked at."
-)
+@click.option("--bubble", metavar="X,Y", help="A point inside the bubble to follow in the movie (pixels).")
+@click.option("--region", metavar="X,Y,WIDTH,HEIGHT", help="Part of the movie's frames to look at (pixels).")
+@click.option("--mask", metavar="FILE", type=click.Path(), help="Picture; its black parts are ignored in the movie.")
 @click.option("--example", type=click.Choice(["quickstart"]), help="An example and its synthetic data instead.")
 @click.option("--time-unit", metavar="UNIT", help="Unit of the times in the file, e.g. us, or frame.")
 @click.option("--radius-unit", metavar="UNIT", help="Unit of the radii in the file, e.g. um.")
@@ -61,15 +59,17 @@ _MOVIES = (".tif", ".tiff", ".png", ".bmp", ".jpg", ".jpeg", ".gif", ".mp4", ".a
 @click.option(
     "--groups",
     metavar="NAME",
-    help="Which gel, day or concentration each bubble is of: a column of the data, or a table of files (gels.csv, or "
+    help="Gel, day or concentration of each bubble: a column of the data, or a table of files (gels.csv, or "
     "gels.csv:COLUMN).",
 )
-@click.option("--format", type=click.Choice(get_args(Format)), help="Of the data, if their name does not tell.")
+@click.option("--format", type=click.Choice(get_args(Format)), help="Format of the data, if their name does not tell.")
 @click.option("--sheet", metavar="SHEET", help="Sheet of a workbook or a range of it, e.g. 'Film 3!A3:D40'.")
 @click.option("--unsorted", type=click.Choice(get_args(Disorder)), help="What to do if times do not increase.")
 @click.option("--repeated", type=click.Choice(get_args(Repeated)), help="What to do with several readings of a time.")
 @click.option(
-    "--since", metavar="INSTANT", help="Leave out what is before, e.g. 'trough 1': the first collapse, or '60 us'."
+    "--since",
+    metavar="INSTANT",
+    help="Leave out readings before, e.g., 'trough 1' (the first collapse) or '60 us'.",
 )
 @click.option("--start", type=click.Choice(["acoustic", "laser"]), help="Start; default: what the data suggest.")
 @click.option("--law", metavar="LAW", shell_complete=completed_law, help="Constitutive law, see 'en4dvar laws'.")
@@ -87,7 +87,7 @@ def init(
     start: Literal["acoustic", "laser"] | None, law: str | None, medium: str, out: Path | None, force: bool,
     **options: str | None,
 ) -> None:  # fmt: skip
-    """Write a commented starter configuration for bubble radius data, proposed from what they show.
+    """Write a commented starter configuration for bubble radius data, proposed from the data.
 
     Units are never guessed: give them, or answer the questions on a terminal.
 

@@ -27,15 +27,15 @@ if TYPE_CHECKING:
     type=click.Path(path_type=Path),
     help="Text file: FRAME out, FRAME ok, or FRAME X Y RADIUS (pixels).",
 )
-@click.option("--bubble", metavar="X,Y", help="A place within the bubble that is meant, in some frame (pixels).")
-@click.option("--region", metavar="X,Y,WIDTH,HEIGHT", help="Part of the frames that is looked at (pixels).")
-@click.option("--mask", type=click.Path(path_type=Path), help="Picture of a frame's size: black is not looked at.")
-@click.option("--all", "every", is_flag=True, help="Also write the tables of other bubbles, a file each.")
+@click.option("--bubble", metavar="X,Y", help="A point inside the bubble to follow, in any frame (pixels).")
+@click.option("--region", metavar="X,Y,WIDTH,HEIGHT", help="Part of the frames to look at (pixels).")
+@click.option("--mask", type=click.Path(path_type=Path), help="Picture of a frame's size; black parts are ignored.")
+@click.option("--all", "every", is_flag=True, help="Also write the tables of other bubbles, one file each.")
 @click.option("--out", type=click.Path(path_type=Path), help="CSV file to write; default <name of the movie>.csv.")
 @click.option("--page", type=click.Path(path_type=Path), help="HTML page to write; default beside the CSV file.")
-@click.option("--outlined", type=click.Path(path_type=Path), help="Also write the movie with the outlines drawn in.")
+@click.option("--outlined", type=click.Path(path_type=Path), help="Also write the movie with outlines drawn in.")
 @click.option("--force", is_flag=True, help="Replace these files.")
-@click.option("--workers", type=click.IntRange(min=1), help="Threads; the numbers do not depend on it.")
+@click.option("--workers", type=click.IntRange(min=1), help="Threads; results do not depend on their number.")
 def track(
     movie: Path, pixel: str | None, frame_rate: str | None, exposure: str | None,
     flashes: str | None, raw: str | None, corrections: Path | None, out: Path | None, page: Path | None,
@@ -43,8 +43,8 @@ def track(
 ) -> None:  # fmt: skip
     """Read the bubble's radius and its error from every frame of a movie.
 
-    MOVIE is a TIFF stack, a folder of pictures, an mp4, avi or gif file, or a raw file with --raw. The table is read
-    by 'en4dvar init' and 'en4dvar run' as it is; a page shows every outline and what was left out.
+    MOVIE is a TIFF stack, a folder of pictures, an mp4, avi or gif file, or a raw file with --raw. 'en4dvar init'
+    and 'en4dvar run' read the table as it is; a page shows every outline and what was left out.
 
     \b
     Example:
