@@ -34,7 +34,7 @@ class _Started(ForwardModel):
     """A model seen from a later time zero."""
 
     def __init__(self, model: ForwardModel, start: float):
-        self.model, self.start = model, start
+        self.model, self._begins = model, start
         self.parameters, self.layout, self.observables = model.parameters, model.layout, model.observables
         self.batch, self.compiled, self.threaded = model.batch, model.compiled, model.threaded
 
@@ -43,7 +43,7 @@ class _Started(ForwardModel):
 
     def trajectories(self, x: Array, times: Array) -> Sequence[Trajectory | Failure]:
         own = np.broadcast_to(times, (len(x), np.shape(times)[-1]))
-        return self.model.resumed(x, np.full(len(x), self.start), self.start + own)
+        return self.model.resumed(x, np.full(len(x), self._begins), self._begins + own)
 
 
 def propagate(model: ForwardModel, states: Array, start: float, times: Array, executor: Executor) -> Array:
