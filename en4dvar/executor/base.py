@@ -99,23 +99,22 @@ def unlike(model: ForwardModel, outcomes: Sequence[Outcome], n_members: int, tim
         return ""
     rows = np.broadcast_to(asked, (n_members, np.shape(asked)[-1]))
     if isinstance(outcomes, Batch):
-        told: Any = np.broadcast_to(outcomes.times, (n_members, np.shape(outcomes.times)[-1]))
+        stated: Any = np.broadcast_to(outcomes.times, (n_members, np.shape(outcomes.times)[-1]))
     elif strange := {type(item).__name__ for item in outcomes if not isinstance(item, Outcome)}:
         return f"{who} items of type {', '.join(strange)}; give a Batch, or a Trajectory or Failure for each member"
     else:
-        told = [row if isinstance(item, Failure) else item.times for item, row in zip(outcomes, rows, strict=True)]
-        if _same(told, rows):
+        stated = [row if isinstance(item, Failure) else item.times for item, row in zip(outcomes, rows, strict=True)]
+        if _same(stated, rows):
             return ""
-    pair = next(pair for pair in zip(told, rows, strict=True) if not _same(*pair))
-    odd, at = (f"{len(t)} time{'s' * (len(t) > 1)} from {t[0]:.6g} to {t[-1]:.6g} {model.time_unit}" for t in pair)
+    pair = next(pair for pair in zip(stated, rows, strict=True) if not _same(*pair))
+    unit = "" if model.time_unit == "1" else f" {model.time_unit}"
+    odd, at = (f"{len(t)} time{'s' * (len(t) > 1)} from {t[0]:.6g} to {t[-1]:.6g}{unit}" for t in pair)
     return f"{who} {odd}, asked for {at}"
 
 
-def _same(told: Any, asked: Array) -> bool:
+def _same(stated: Any, asked: Array) -> bool:
     with suppress(ValueError):  # another number of times
-        return bool(np.equal(told, asked).all()) or np.allclose(
-            told, asked, SAME_INSTANT, SAME_INSTANT * np.abs(asked).max()
-        )
+        return bool(np.equal(stated, asked).all()) or np.allclose(stated, asked, 0, SAME_INSTANT * np.abs(asked).max())
     return False
 
 
