@@ -216,7 +216,10 @@ class Scheme:
         return gauss_newton(weights.w, evaluation)
 
     def done(self, iteration: int, step: Step | GaussNewtonStep) -> bool:
-        """Whether iterations end with this step, which is taken (a minimiser is not asked)."""
+        """Whether iterations end with this step, which is taken (a minimiser is not asked).
+
+        One that is false a hundred times is an error; a key ``max_iterations`` allows for more.
+        """
         return iteration + 1 == self.passes
 
 
