@@ -225,13 +225,14 @@ class Hierarchy:
 
 
 @kernel
-def _draw(mixture: Mixture, mean: Array, variance: Array, numbers: Array, uniform: Array, out: Array) -> None:
-    """Draws ``out`` (B, p) of L(x) N(x; mean, variance) from standard normal ``numbers``, which are overwritten."""
+def _draw(mixture: Mixture, mean: Array, inverse: Array, numbers: Array, uniform: Array, out: Array) -> None:
+    """Draws ``out`` (B, p) of L(x) N(x; mean, inverse⁻¹) from standard normal ``numbers``, which are overwritten."""
     n_parts, n = mixture.linear.shape
     middle, root, logs = np.empty((n_parts, n)), np.zeros((n_parts, n, n)), np.empty(n_parts)
     for b in range(mean.shape[0]):
+        pull = inverse[b] @ mean[b]
         for m in range(n_parts):
-            part = condition(mixture.precision[m], mixture.linear[m], mean[b], variance[b], middle[m], root[m])
+            part = condition(mixture.precision[m], mixture.linear[m], inverse[b], pull, middle[m], root[m])
             logs[m] = mixture.constant[m] + part
         cumulated = np.cumsum(np.exp(logs - logs.max()))
         chosen = min(np.searchsorted(cumulated, uniform[b] * cumulated[-1]), n_parts - 1)
