@@ -65,4 +65,11 @@ def test_draws_of_what_an_emulator_says_of_a_valley_are_many():
     problem = replace(base, model=model, observations=observed, prior=prior)
     start = np.array([0.9, -1.1]) + 0.1 * np.random.default_rng(0).standard_normal((30, 2))
     drawn = own_draws(problem, start, 0)
-    assert drawn.forward_runs < 3001 < drawn.effective
+    density = np.exp(
+        -0.5 * (A**2 + B**2) - 0.5 * np.sum(((values - np.stack(bent(A, B), axis=-1)) / ERRORS) ** 2, axis=-1)
+    )
+    for k, shares in enumerate((density.sum(axis=1), density.sum(axis=0))):
+        mean = shares @ AXIS / shares.sum()
+        assert drawn.z[:, k].std() == pytest.approx(np.sqrt(shares @ (AXIS - mean) ** 2 / shares.sum()), rel=0.05)
+    assert drawn.log_evidence == pytest.approx(np.log(density.sum() * STEP**2 / (2 * np.pi)), abs=0.1)
+    assert drawn.effective > 2500
