@@ -3,9 +3,9 @@
     python benchmarks/valleys.py [--n 6] [--start 0] [--sets 6] [--spread 0.03] [--minutes 14]
 
 Each data set reads (2a + 1.4b + bend, 1.4b) of its a and b with errors of 0.1 and 3, priors are N(0, 1), the truth lies
-at (0.9, −1.1). The bend is none (straight), 0.3 t² (bent) or that of a knee, t = a − 0.7b; of what is common, θ ~ N(0, 1),
-nothing, as much along the valley (shifts), or the more the farther along (turns) is added to a and b beforehand. The
-exact posterior of the medians is a sum over a grid of spacing 0.015, smoothed by the spreads in Fourier space, and over
+at (0.9, −1.1). The bend is none (straight), 0.3 t² (bent) or that of a knee, t = a − 0.7b; of what is common, θ, which
+is N(0, 1), nothing, as much along the valley (shifts), or the more the farther along (turns) is taken from a. The exact
+posterior of the medians is a sum over a grid of spacing 0.015, smoothed by the spreads in Fourier space, and over
 nodes of θ and of the spreads. Records stand in runs/valleys and are continued.
 """
 

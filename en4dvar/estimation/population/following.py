@@ -1,8 +1,9 @@
 r"""How parameters that vary between data sets follow the quantities θ ~ N(0, I) which all data sets have in common.
 
 Data tell a coordinate y of each parameter, and x follows from it and from θ. Where what is common shifts the
-transformed parameter (a density that multiplies a viscosity), y = x − Bθ. Where it adds to a parameter that is
-positive, as a pressure adds as many pascals to every modulus,
+transformed parameter (a density that multiplies a viscosity), x = y + B(y)θ, B constant or, along a valley that the
+data leave open, changing linearly with y. Where it adds to a parameter that is positive, as a pressure adds as many
+pascals to every modulus,
 
     e^{sy} = e^{sx} − Aθ,
 

@@ -16,7 +16,7 @@ With L_i in units of its evidence (:mod:`~en4dvar.estimation.population.own`) th
     p(h) Π_i [ (1 − ε) ∫ L_i(y) N(y; ν − B θ, τ²) dy + ε/2 + ε/2p Σ_j … ],
 
 every integral in closed form; where y is another function of x (:mod:`~en4dvar.estimation.population.following`), with
-mean and variance of y. Walkers find where it is; a mixture of Student t distributions fitted to them is the
+mean and covariance of y. Walkers find where it is; a mixture of Student t distributions fitted to them is the
 proposal, whose weighted draws are independent and give the evidence (adaptive importance sampling: Cappé et al. 2008,
 Stat. Comput. 18, 447). A walker left behind in a secondary mode moves the proposal a little; the weights know what it
 is worth.

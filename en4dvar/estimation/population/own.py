@@ -3,20 +3,22 @@ r"""What each data set says by itself about the parameters of a population: draw
 The draws follow p(y|x) π(x) with the data set's own prior π, weighted forward runs from its members and from the prior
 (:mod:`en4dvar.sampling.modes`), so that all modes count by their weight and any kind of observation errors is taken as
 it is: the scale of the errors and a discrepancy are further parameters of the data set. Where its posterior was sampled
-by its own estimate, the draws are those that this has kept.
+by its own estimate, the draws are those that this has kept. Where an emulator of the predictions, fitted to all these
+runs, says J of fresh ones, thousands of its draws are taken without a run: what scarce draws leave uncertain of each
+likelihood makes the population of several data sets too narrow along a valley that all of them leave open.
 
 Of the coordinates x that vary and the quantities θ that all data sets have in common (a density, a scale) the draws
 tell how x follows θ (:mod:`~en4dvar.estimation.population.following`): the likelihood is one of y, such as x − Bθ,
 which gives the regression of x on θ in the posterior the slopes (I − C) B, where C is the covariance of x given θ and
-the prior of x is N(0, I). A Gaussian mixture describes y; dividing by its prior leaves the likelihood of the data set,
-with which :mod:`~en4dvar.estimation.population.hierarchy` works. No component is wider than the prior, so that each is
-one of the likelihood. There are always four: what too few get wrong is alike in all data sets and adds up, what scarce
-draws get wrong averages out, and a criterion for fewer took upper limits for measurements. Where the population lies in
-the tails of its data sets, where hardly a draw is, neither holds: then they are drawn with another prior, about the
-population, which is divided out instead of their own. What the data tell of θ
-itself is left aside: it keeps its prior, and therefore all data sets of a population have the same slopes. Their own
-would tell of θ, and falsely: those of ln G are steeper for a soft gel, and a θ that makes all of them stiffer would
-make them more alike.
+the prior of x is N(0, I). B may change along the likelihood: components of a mixture of x and θ tell it where they are.
+A Gaussian mixture describes y; dividing by its prior leaves the likelihood of the data set, with which
+:mod:`~en4dvar.estimation.population.hierarchy` works. No component is wider than the prior, so that each is one of the
+likelihood. There are four, or eight of many draws: what too few get wrong is alike in all data sets and adds up, what
+scarce draws get wrong averages out, and a criterion for fewer took upper limits for measurements. Where the population
+lies in the tails of its data sets, where hardly a draw is, neither holds: then they are drawn with another prior, about
+the population, which is divided out instead of their own. What the data tell of θ itself is left aside: it keeps its
+prior, and therefore all data sets of a population have the same slopes. Their own would tell of θ, and falsely: those
+of ln G are steeper for a soft gel, and a θ that makes all of them stiffer would make them more alike.
 """
 
 import math
@@ -47,9 +49,10 @@ from en4dvar.sampling.modes import sample_modes
 ENOUGH = 500.0  # effective draws that are asked for: they know a mean to 4 % of its std
 NARROWEST = 0.03  # standard deviation of the first draws about members, in units of the prior's
 KEPT = 4000  # equally likely draws of each data set
-HEAT, JUDGING, TRUSTED = 1.5, 400, 0.9
-MANY = 2500.0
+HEAT, JUDGING = 1.5, 400  # of fresh draws of the emulated posterior, and the number of these, of which such a share
+TRUSTED = 0.9  # must stay effective under J, for others of its draws to be taken without a run
 PARTS, ROUNDS = 4, 200  # components of each mixture; rounds of expectation maximisation, of which four need more
+MANY = 2500.0  # effective draws from which the components are twice as many
 BESIDE = 1e-3  # prior standard deviations that runs for readings that one lacks are apart
 SMALLEST = 1e-12  # variance that every slope is taken to have
 INFORMED = 0.1  # least share of the prior's variance that the data take away, for a slope to be read from draws
