@@ -244,12 +244,13 @@ def before(times: Array, radius: Array, scatter: float) -> tuple[float, float]:
     return float("nan"), float("nan")
 
 
-def common_rest(levels: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    """One radius at rest of several bubbles, each with its std, and a std that covers theirs; NaN of none."""
+def common_rest(levels: Sequence[tuple[float, float]], edge: float) -> tuple[float, float]:
+    """One radius at rest of several bubbles, each with its std, and a std that covers theirs and that of the ``edge``
+    of all (m); NaN of none."""
     if not levels:
         return float("nan"), float("nan")
     level, std = np.median(levels, axis=0)
-    return float(level), math.hypot(std, float(np.std([each for each, _ in levels])))
+    return float(level), math.hypot(std, edge, float(np.std([each for each, _ in levels])))
 
 
 def _begins(radius: Array, largest: int) -> int:
