@@ -134,7 +134,7 @@ def propose(
     warnings += [
         f"{name}: {view.drift}; no radius at rest is taken from it{COLLAPSE_ALONE * (view.n_minima < 2)}"
         for name, view in looks.items()
-        if view.drift
+        if view.drift and chosen == "laser"  # ultrasound's is seen before it grows
     ]
     warnings += [elsewhere.PULSE] * (chosen == "acoustic")
     doubted, believed = _doubted(looks, model), guess
