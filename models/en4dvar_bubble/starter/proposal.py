@@ -44,7 +44,7 @@ SIMPLER: Mapping[Start, Mapping[str, str]] = {
 }
 LEAST_NOISE = 0.0005  # of R_max: no camera reads better
 NOISE_LOG_STD = 0.4  # of the noise scale: a scatter is told by a dozen windows, and not alike at all radii
-TOP_WIDTH = 3.0  # standard errors of the top that the prior takes: it is not to count the readings there twice
+TOP_WIDTH = 3.0  # standard errors of a top or rest that its prior takes: it is not to count the readings there twice
 DISCREPANCY = "{kernel: matern-3/2, grows_beyond: 10 m/s}"
 STIFFENING = (0.12, 1.4)  # median and log_std of α
 SPAN = {"alpha": "agarose 0.03 (Mancia 2021), polyacrylamide 0.48 (Yang 2020)"}
@@ -105,11 +105,12 @@ def propose(
     medium: str = "gel",
     groups: Grouped = NO_GROUPS,
     scale: elsewhere.Known = elsewhere.SCALE,
+    edge: float = 0.0,
 ) -> Proposal:
     """A proposal for one or several data sets: name → times (K,) s, radius (K,) m.
 
     ``medium``: one of those of :mod:`en4dvar_bubble.starter.elsewhere`. ``groups``: of its data sets. ``scale``: what
-    is known of what multiplies all radii.
+    is known of what multiplies all radii; ``edge``: std (m) of what moves them all alike.
 
     Raises :class:`DataError`: no history shows a bubble, or they suggest different starts. ConfigError: unknown law.
     """
@@ -117,7 +118,7 @@ def propose(
     views = list(looks.values())
     chosen = views[0].start
     model, law_name = built(chosen, law)
-    look = _typical(views)
+    look = _typical(views, edge)
     others = _others(model, look)
     observed = {"R_max": look.lobe.R_max, "t_c": look.lobe.t_c, "rebound": look.rebound}
     guess = first_guess(elsewhere.centred(model, medium), others, observed)
@@ -133,7 +134,7 @@ def propose(
     warnings += [
         f"{name}: {view.drift}; no radius at rest is taken from it{COLLAPSE_ALONE * (view.n_minima < 2)}"
         for name, view in looks.items()
-        if view.drift
+        if view.drift and chosen == "laser"  # ultrasound's is seen before it grows
     ]
     warnings += [elsewhere.PULSE] * (chosen == "acoustic")
     doubted, believed = _doubted(looks, model), guess
@@ -262,7 +263,7 @@ def _looks(histories: Mapping[str, tuple[Array, Array]], start: Start | None) ->
     return looks, unseen
 
 
-def _typical(views: Sequence[Look]) -> Look:
+def _typical(views: Sequence[Look], edge: float) -> Look:
     """One look at several data sets: medians of the numbers, words of the first that is not clear."""
     medians = {key: typical([getattr(v, key) for v in views]) for key in ("step", "noise", "rebound", "rest")}
     least: dict[str, Any] = {key: min(getattr(v, key) for v in views) for key in ("begin", "n_minima", "prominence")}
@@ -271,7 +272,7 @@ def _typical(views: Sequence[Look]) -> Look:
         **medians | least,
         lobe=Lobe(*(typical([getattr(v.lobe, k) for v in views]) for k in ("R_max", "t_max", "t_c"))),
         drift=next((v.drift for v in views if v.drift), ""),
-        before=common_rest([v.before for v in views if np.isfinite(v.before[0])]),
+        before=common_rest([v.before for v in views if np.isfinite(v.before[0])], edge),
         descent=max((v.descent for v in views if np.isfinite(v.descent)), default=float("nan")),
     )
 
@@ -469,8 +470,8 @@ def _radii(
         line = _spread(R0, *NUCLEUS, "of agarose, 0.3 and 1 % (Mancia 2021);", "know of your gel")
         if look is not None and np.isfinite(look.before[0]):
             level, std = look.before
-            value, log_std = _text(level, "m", "um", 4), f"{math.hypot(std / level, scale.log_std):.2g}"
-            words = "the readings before it grows, with the errors of one and of the scale"
+            value, log_std = _text(level, "m", "um", 4), f"{TOP_WIDTH * math.hypot(std / level, scale.log_std):.2g}"
+            words = f"the readings before it grows; {TOP_WIDTH:g} times their errors wide, for they are in the fit"
             line = _lognormal(R0, value, log_std, words)
         return [line]
     value, width, words = "20 um", 0.4, R_EQ.label
