@@ -198,8 +198,9 @@ class OwnLikelihood:
 
 
 def own_draws(
-    problem: InverseProblem, start: Array, seed: int, executor: Executor | None = None, enough: float = ENOUGH
-) -> OwnDraws:
+    problem: InverseProblem, start: Array, seed: int, executor: Executor | None = None, enough: float = ENOUGH,
+    emulate: bool = True,
+) -> OwnDraws:  # fmt: skip
     """Draws of one posterior until ``enough`` are effective, from members (N, n) near it in white coordinates.
 
     The same for a data set whatever others there are. Raises :class:`ValueError` where no run succeeds.
@@ -213,7 +214,7 @@ def own_draws(
     runs = RecordedRuns(composite, partial(costs, problem), prior, observations)
     draws, stream = sample_modes(runs, prior, [about], seed, enough), member_stream(seed, "population: kept draws")
     z = prior.white(draws.x[resampled(draws.shares, KEPT, stream)])
-    emulated = _emulated(runs, z, stream)
+    emulated = emulate and _emulated(runs, z, stream)
     if emulated:
         return OwnDraws(*emulated, composite.forward_runs)
     return OwnDraws(z, draws.log_evidence, _worth(KEPT, draws.effective), composite.forward_runs)
