@@ -364,6 +364,26 @@ def test_every_law_has_a_starter_that_validates(tmp_path: Path, start: str, law:
     assert {e.parameter.name for e in config.parameters} == {*(p.name for p in config.model.parameters), "t_s"}
 
 
+@pytest.mark.parametrize("resting", [3, 1])
+def test_the_radius_at_rest_of_bubbles_that_differ_in_size_is_that_of_each(tmp_path: Path, resting: int) -> None:
+    """In all proportions of the largest reading, which tells it as well of those that are not seen at rest."""
+    (tmp_path / "gel").mkdir()
+    sizes = {"large": 2.0, "middle": 1.0, "small": 0.5}
+    for n, (name, size) in enumerate(sizes.items()):
+        film = np.loadtxt(write(tmp_path / "film.csv"), delimiter=",", skiprows=1)[: None if n < resting else 46] * size
+        np.savetxt(tmp_path / "gel" / f"{name}.csv", film, delimiter=",", header="t_us,R_um", comments="")
+    assert call("init", "--data", write(tmp_path / "film.csv"), *UNITS, "--out", "alone.yaml").exit_code == 0
+    done = call("init", "--data", "gel", *UNITS)
+    assert done.exit_code == 0, done.output
+    (alone,) = build(proposed(Path("alone.yaml")))
+    for size, problem in zip(sizes.values(), build(proposed(Path("gel.yaml"))), strict=True):
+        for term, other in zip(problem.prior.terms, alone.prior.terms, strict=True):
+            if term.parameter.name in ("G", "mu", "R_eq"):
+                moved = np.log(size) if term.parameter.name == "R_eq" else 0
+                assert term.mean == pytest.approx(other.mean + moved, abs=0.05), term.parameter.name
+                assert term.std == pytest.approx(other.std, rel=0.1)
+
+
 def laser_film(**scalars: float) -> None:
     t = np.arange(0, 90, 0.63)
     R = 194 * np.maximum(0.14, np.abs(np.cos(np.pi * t / 37)) ** 0.6 * np.exp(-t / 90))

@@ -15,8 +15,8 @@ off and is too high by about ε √(2 ln n).
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Literal, TypeVar
+from dataclasses import dataclass, replace
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from en4dvar.inputs.implausible import scatter_of
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import DataError
 from en4dvar.plumbing.hints import listed
-from en4dvar_bubble.collapse import Lobe, lobe, single
+from en4dvar_bubble.collapse import TOLD, Lobe, lobe, single
 
 WINDOWS = (0.15, 0.2, 0.27, 0.35, 0.45, 0.55, 0.65, 0.75, 0.85)  # half widths in collapse times
 LOWEST = 0.45  # of R_max: what lies lower belongs to the end of the collapse, or to the beginning of the growth
@@ -159,7 +159,8 @@ class Look:
     ``before`` is the radius at rest before an acoustic bubble grows, and the std of a reading of it, NaN without one.
     ``begin`` is the first instant, ``step`` the median time between samples; ``descent`` the last instant of the first
     descent, NaN where the history ends with it. ``n_minima`` follow the maximum with a ``prominence`` relative to the
-    range; a ``short`` laser bubble ends before the first rebound has a top. ``reason`` says in words why ``start`` is
+    range; a ``short`` laser bubble ends before the first rebound has a top, an ``early`` one before it has collapsed,
+    so that the time of the collapse is where a fit goes on to. ``reason`` says in words why ``start`` is
     proposed, ``clear`` whether the data leave no doubt.
     """
 
@@ -176,6 +177,7 @@ class Look:
     prominence: float
     descent: float
     short: bool
+    early: bool
     start: Start
     reason: str
     clear: bool
@@ -209,9 +211,11 @@ def look(times: Array, radius: Array, start: Start | None = None) -> Look:
         )
     step, descent = float(np.median(np.diff(times))), _end_of_descent(times, radius)
     noise = min(scatter, rests[1]) if chosen == "acoustic" else scatter  # NaN is not smaller
+    early = bool(radius[largest:].min() > TOLD * radius[largest] and times[-1] < peak.t_max + peak.t_c)
     return Look(
         float(times[0]), peak, highest, step, noise, rebound, rest, drift, rests,
-        n_minima, prominence, descent, chosen == "laser" and single(times, radius), chosen, reason, clear,
+        n_minima, prominence, descent, chosen == "laser" and (early or single(times, radius)), early,
+        chosen, reason, clear,
     )  # fmt: skip
 
 
@@ -376,3 +380,22 @@ def typical(values: Sequence[float]) -> float:
     """Median of the finite values; NaN where there is none."""
     finite = [v for v in values if np.isfinite(v)]
     return float(np.median(finite)) if finite else float("nan")
+
+
+def typical_look(views: Sequence[Look], edge: float) -> Look:
+    """One look at several data sets: medians of the numbers, words of the first that is not clear. Bubbles of one gel
+    differ in size more than in their radius at rest over the maximum, which not all of them show.
+    """
+    medians = {key: typical([getattr(v, key) for v in views]) for key in ("step", "noise", "rebound")}
+    least: dict[str, Any] = {key: min(getattr(v, key) for v in views) for key in ("begin", "n_minima", "prominence")}
+    R_max, t_max, t_c = (typical([getattr(v.lobe, k) for v in views]) for k in ("R_max", "t_max", "t_c"))
+    return replace(
+        next((v for v in views if not v.clear), views[0]),
+        **medians | least,
+        lobe=Lobe(R_max, t_max, t_c),
+        rest=R_max * typical([v.rest / v.lobe.R_max for v in views]),
+        drift=next((v.drift for v in views if v.drift), ""),
+        before=common_rest([v.before for v in views if np.isfinite(v.before[0])], edge),
+        descent=max((v.descent for v in views if np.isfinite(v.descent)), default=float("nan")),
+        early=all(v.early for v in views),
+    )

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from en4dvar.model.forward import Trajectory
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.errors import ConfigError, DataError, retold
 from en4dvar.plumbing.units import convert
-from en4dvar_bubble.collapse import Lobe, conceivable, doubt, lobe
+from en4dvar_bubble.collapse import conceivable, doubt, lobe
 from en4dvar_bubble.dynamics import R0, R_EQ, R_MAX
 from en4dvar_bubble.laws.loading import qualified
 from en4dvar_bubble.model import BubbleModel
@@ -23,7 +23,7 @@ from en4dvar_bubble.starter import elsewhere
 from en4dvar_bubble.starter.elsewhere import Entry
 from en4dvar_bubble.starter.grouped import NO_GROUPS, Grouped
 from en4dvar_bubble.starter.guess import FAR, OF_GELS, Guess, first_guess
-from en4dvar_bubble.starter.look import Look, Start, common_rest, look, typical, usable, without_rebound
+from en4dvar_bubble.starter.look import Look, Start, look, typical_look, usable, without_rebound
 
 LAWS: Mapping[Start, str] = {"acoustic": "quadratic-kelvin-voigt", "laser": "neo-hookean-kelvin-voigt"}
 MODEL: Mapping[Start, Mapping[str, str]] = {
@@ -118,13 +118,14 @@ def propose(
     views = list(looks.values())
     chosen = views[0].start
     model, law_name = built(chosen, law)
-    look = _typical(views, edge)
+    look = typical_look(views, edge)
     others = _others(model, look)
     observed = {"R_max": look.lobe.R_max, "t_c": look.lobe.t_c, "rebound": look.rebound}
     guess = first_guess(elsewhere.centred(model, medium), others, observed)
     ratio = look.lobe.rayleigh_ratio(model.medium)
     told = [
-        f"R_max {_text(look.lobe.R_max, 'm', 'um', 3)}, collapse {_text(look.lobe.t_c, 's', 'us', 3)} later, "
+        f"R_max {_text(look.lobe.R_max, 'm', 'um', 3)}, collapse {_text(look.lobe.t_c, 's', 'us', 3)} later"
+        f"{' (not recorded: where the readings before it lead to)' * look.early}, "
         f"{ratio:.2f} of the Rayleigh time (elasticity shortens it, viscosity and gas prolong it)"
     ]
     told += [f"start: {chosen} ({look.reason})"] * look.clear
@@ -263,20 +264,6 @@ def _looks(histories: Mapping[str, tuple[Array, Array]], start: Start | None) ->
     return looks, unseen
 
 
-def _typical(views: Sequence[Look], edge: float) -> Look:
-    """One look at several data sets: medians of the numbers, words of the first that is not clear."""
-    medians = {key: typical([getattr(v, key) for v in views]) for key in ("step", "noise", "rebound", "rest")}
-    least: dict[str, Any] = {key: min(getattr(v, key) for v in views) for key in ("begin", "n_minima", "prominence")}
-    return replace(
-        next((v for v in views if not v.clear), views[0]),
-        **medians | least,
-        lobe=Lobe(*(typical([getattr(v.lobe, k) for v in views]) for k in ("R_max", "t_max", "t_c"))),
-        drift=next((v.drift for v in views if v.drift), ""),
-        before=common_rest([v.before for v in views if np.isfinite(v.before[0])], edge),
-        descent=max((v.descent for v in views if np.isfinite(v.descent)), default=float("nan")),
-    )
-
-
 def _others(model: BubbleModel, look: Look) -> dict[str, float]:
     """Every parameter but G and μ at the centre of its proposed prior, SI."""
     example = {name: float(v[0]) for name, v in model.law.example_values().items() if name not in WIDTHS}
@@ -381,6 +368,12 @@ def _clock(look: Look, model: BubbleModel, theta: Mapping[str, float]) -> Entry:
     return Entry("time_zero", text, "puts the R_max of the guess on that of the data: enter the clock of your pulse")
 
 
+def _of_each(radius: float, look: Look, top: Tops) -> str:
+    """A radius of the ``look``, where it is one at several bubbles as a share of the largest reading of each."""
+    share = f"{100 * radius / look.lobe.R_max:.2g} % of maximum"
+    return share if top.R_max[0] == "maximum" else _text(radius, "m", "um")
+
+
 def _in_a_liquid(model: BubbleModel) -> bool:
     """True of a laser's bubble that no elasticity holds together."""
     return model.start == "laser" and "G" not in {p.name for p in model.law.parameters}
@@ -406,7 +399,7 @@ def _parameters(
 ) -> tuple[Entry, ...]:
     start, lines = model.start, []
     in_water = medium == "water" and _in_a_liquid(model)
-    water = {line.key: line for line in elsewhere.of_water(look.lobe.R_max) if in_water}
+    water = {line.key: line for line in elsewhere.of_water(_of_each(0.05 * look.lobe.R_max, look, top)) if in_water}
     for p in model.law.parameters:
         if p.name in water:
             lines.append(water[p.name])
@@ -475,8 +468,8 @@ def _radii(
             line = _lognormal(R0, value, log_std, words)
         return [line]
     value, width, words = "20 um", 0.4, R_EQ.label
-    if look is not None:
-        value, words = _text(_rest(look), "m", "um"), f"{GAS_FRACTION:g} R_max, since no radius at rest is seen"
+    if look is not None and top is not None:
+        value, words = _of_each(_rest(look), look, top), f"{GAS_FRACTION:g} R_max, since no radius at rest is seen"
     if look is not None and np.isfinite(look.rest):
         width = 0.3
         words = "the radius at rest; wide, because a real bubble loses gas to the gel and the model's bubble keeps it"
