@@ -11,6 +11,7 @@ from en4dvar.config import Config
 from en4dvar.config.data import DataPlan, SeriesPlan
 from en4dvar.config.kinds import SequenceConfig
 from en4dvar.config.parameters import Fixed, Scalar, Tied, Uncertain, inside_bounds
+from en4dvar.config.quantities import Spread
 from en4dvar.config.sequential import SeriesLocalisation, error_rates, localisation_of, per_time
 from en4dvar.config.varies import Estimated, Perturbed, VariesSection, modes_of
 from en4dvar.data.observations import Observations
@@ -205,15 +206,17 @@ def resolve_parameters(
     return tuple(terms), fixed
 
 
-def _of_data(config: Config | SequenceConfig, observations: Observations, unit: str) -> Callable[[str | Scalar], float]:
+def _of_data(
+    config: Config | SequenceConfig, observations: Observations, unit: str
+) -> Callable[[Spread | Scalar], float]:
     """What a location of a prior is that the data say, in the parameter's ``unit``."""
 
-    def value(where: str | Scalar) -> float:
+    def value(where: Spread | Scalar) -> float:
         if isinstance(where, Scalar):
             return where.value(observations.scalars, observations.source)
         if observations.parts:
             raise ConfigError("'maximum' is defined only for a single series without places; give a value")
-        return convert(float(observations.values.max()), config.observable.unit, unit)
+        return where.value * convert(float(observations.values.max()), config.observable.unit, unit)
 
     return value
 

@@ -4,6 +4,7 @@ Its labels and symbols are tried before any work: matplotlib reads them when eve
 """
 
 import re
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -125,6 +126,7 @@ def checked(model: ForwardModel) -> ForwardModel:
     for what, unit, display_unit in (("its times", model.time_unit, model.time_display_unit), *units):
         with retold(UnitError, ConfigError, f"{type(model).__name__}: unit and display unit of {what}: "):
             convert(1.0, unit, display_unit)
+    _require_defaults(model)
     for observable in observables:
         if isinstance(observable.operator, StateField):
             for field in (observable.operator.name, observable.operator.rate_of):
@@ -132,6 +134,17 @@ def checked(model: ForwardModel) -> ForwardModel:
                     words = f"the observable {observable.name!r} reads {field!r}, which is not in the layout"
                     raise ConfigError(f"{words}{suggest(field, model.layout.names)}")
     return model
+
+
+def _require_defaults(model: ForwardModel) -> None:
+    known, who = {p.name: p for p in model.parameters}, f"{type(model).__name__}: defaults: "
+    for name, value in model.defaults.items():
+        if name not in known:
+            raise ConfigError(f"{who}{shown(name)} is not one of its parameters{suggest(name, known)}")
+        low, high = known[name].bounds
+        if not (isinstance(value, Real) and low <= value <= high):
+            words = f"give a number from {low:g} to {high:g} {known[name].unit}"
+            raise ConfigError(f"{who}{name} is {shown(value)}; {words}")
 
 
 Built = tuple[ForwardModel, dict[str, Any]]

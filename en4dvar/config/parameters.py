@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field
 
 from en4dvar.config.context import Context, Faults, Made, read_each
-from en4dvar.config.quantities import SPREAD, Spread, subject_unit, unit_of
+from en4dvar.config.quantities import SPREAD, Spread, require_sign, share_of, subject_unit, unit_of
 from en4dvar.config.schema import Section
 from en4dvar.config.varies import VariesSection
 from en4dvar.model.forward import ForwardModel
@@ -78,14 +78,18 @@ class Scalar:
         return _bounded(f"{scalars[self.name]!r} {self.unit}", self.parameter)
 
 
-def _location(written: Any, context: Context) -> float | str | Scalar:
-    """Of a prior: a quantity, ``maximum``, or a scalar of the data file."""
+def _location(written: Any, context: Context) -> float | Spread | Scalar:
+    """Of a prior: a quantity, ``maximum`` or a share of it, or a scalar of the data file."""
     if isinstance(written, dict):
         return Scalar.of(written, context)
-    return written if written == "maximum" else _bounded(written, context.subject)
+    share = share_of("100 % of maximum" if written == "maximum" else written)
+    if share is None:
+        return _bounded(written, context.subject)
+    require_sign(share.value, "positive", written)
+    return share
 
 
-Location = Annotated[float | Literal["maximum"] | Scalar | None, Made(_location)]
+Location = Annotated[float | Spread | Scalar | None, Made(_location)]
 
 
 class PriorSection(Section):
@@ -97,9 +101,9 @@ class PriorSection(Section):
     uniform (lower, upper), half-normal (std, and lower, by default 0), beta (lower, upper, alpha, beta), or ensemble:
     mean, spread and correlations are those of the members in the file of ``prior: {ensemble: FILE}``."""
     mean: Location = None
-    """Mean with its unit, or ``maximum``: the largest observation of the window."""
+    """Mean with its unit, or ``maximum``, the largest observation of the window, or ``13 % of maximum``."""
     median: Location = None
-    """Median with its unit, or ``maximum``: the largest observation of the window."""
+    """Median with its unit, or ``maximum``, the largest observation of the window, or ``13 % of maximum``."""
     std: Annotated[Spread | None, SPREAD] = None
     """Standard deviation with its unit, or in % of the mean; of a half-normal, that of the whole Gaussian."""
     log_std: Annotated[float, Field(gt=0)] | None = None
@@ -182,9 +186,9 @@ class Uncertain:
 
     @property
     def needs_data(self) -> bool:
-        return any(isinstance(where, str | Scalar) for where in (self.spec.mean, self.spec.median))
+        return any(isinstance(where, Spread | Scalar) for where in (self.spec.mean, self.spec.median))
 
-    def term(self, of_data: Callable[[str | Scalar], float] | None = None) -> PriorTerm:
+    def term(self, of_data: Callable[[Spread | Scalar], float] | None = None) -> PriorTerm:
         """The prior; ``of_data``: what a file says, in its unit. Raises :class:`ConfigError`, its path the key."""
         try:
             return self._term(self._location("mean", of_data), self._location("median", of_data))
@@ -237,12 +241,12 @@ class Uncertain:
         elif self.spec.prior != "logit":
             self.term(lambda where: 1.0)  # the other values do not wait for the data
 
-    def _location(self, key: Literal["mean", "median"], of_data: Callable[[str | Scalar], float] | None) -> float:
-        value: float | str | Scalar | None = getattr(self.spec, key)
-        if not isinstance(value, str | Scalar):
+    def _location(self, key: Literal["mean", "median"], of_data: Callable[[Spread | Scalar], float] | None) -> float:
+        value: float | Spread | Scalar | None = getattr(self.spec, key)
+        if not isinstance(value, Spread | Scalar):
             return value or 0.0
         if of_data is None:
-            name = value.name if isinstance(value, Scalar) else value
+            name = value.name if isinstance(value, Scalar) else "maximum"
             raise ConfigError(f"{name!r} is known only from the data, and there are none", key)
         with retold(ConfigError, ConfigError, "", key):
             return of_data(value)

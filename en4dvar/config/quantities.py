@@ -74,11 +74,17 @@ def unit_of(target: Unit) -> Made:
     return Made(fits, str)
 
 
+def share_of(text: Any, whole: str = "maximum") -> Spread | None:
+    """``"1 % of maximum"`` or of another ``whole``; None of what says no such thing. Raises :class:`UnitError`."""
+    relative = re.fullmatch(rf"(.*%)\s+of\s+(?:the\s+)?{whole}", str(text).strip())
+    return Spread(parse_quantity(relative[1], "1"), relative=True) if relative else None
+
+
 def parse_error_std(text: Any, unit: str, whole: str = "maximum") -> Spread:
     """``"1.4 um"``, or ``"1 % of maximum"`` or of another ``whole``. Raises :class:`UnitError`."""
+    if share := share_of(text, whole):
+        return share
     word = str(text).strip()
-    if relative := re.fullmatch(rf"(.*%)\s+of\s+(?:the\s+)?{whole}", word):
-        return Spread(parse_quantity(relative[1], "1"), relative=True)
     require_no_share(word, unit, f"'{word} of {whole}' or ")
     return Spread(parse_quantity(text, unit), unit=split_quantity(word)[1])
 

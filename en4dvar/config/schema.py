@@ -6,7 +6,7 @@ the JSON schema and the reference of keys follow from that.
 
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import fields
+from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, TypeVar, cast, get_type_hints
 
@@ -263,6 +263,8 @@ class OfScheme(Section):
         if taken := [name for name in names if name in own or hasattr(cls, name) or name.startswith("_")]:
             why = f"{shown(taken[0])} cannot be the name of a key, since it is that of something else in this section"
             raise ConfigError(f"{why}; give the field of {kind.__name__} another name")
+        if bare := [key.name for key in fields(kind) if key.default is key.default_factory is MISSING]:
+            raise ConfigError(f"{shown(bare[0])} of {kind.__name__} has no default; each key of a scheme has one")
 
     @classmethod
     def unread(cls, section: Mapping[str, Any]) -> dict[str, str]:

@@ -75,8 +75,11 @@ class WeightSpace:
 
     def weights_of(self, x: Array) -> Array:
         """The shortest weights (…, N) of control vectors (…, n) that the anomalies reach."""
+        return self._shortest(self.anomalies, x)
+
+    def _shortest(self, anomalies: Array, x: Array) -> Array:
         scale = np.sqrt(self.prior_variance)
-        return np.asarray(np.linalg.lstsq((self.anomalies / scale).T, ((x - self.mean) / scale).T, rcond=None)[0].T)
+        return np.asarray(np.linalg.lstsq((anomalies / scale).T, ((x - self.mean) / scale).T, rcond=None)[0].T)
 
     def ensemble(self, w: Array, transform: Array | LowRank) -> Array:
         """Control vectors (N + 1, n) of the members w + T_i of a transform T and, last, of w (N,)."""
@@ -131,7 +134,8 @@ class WeightSpace:
 
     def with_sampled_prior(self, x: Array, costs: Array) -> Array:
         """J (B,) of control vectors (B, n) with the prior's mean and covariance of the members, from ``costs``."""
-        return costs - self.problem.prior.cost(x) + diag.background_cost(self.weights_of(x))
+        coordinates = self._shortest(self.basis.T @ self.anomalies, x)  # weights of all x are a square of the members
+        return costs - self.problem.prior.cost(x) + diag.background_cost(coordinates, len(self.members))
 
     def try_out(self, w: Array, expected: Callable[[Array], Array] | None = None) -> Trials:
         """J and predictions of central trajectories at weights (B, N).

@@ -25,7 +25,8 @@ from en4dvar.ensemble.missing import filled
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import TooFewMembersError
 from en4dvar.priors.prior import member_stream
-from en4dvar.schemes.base import Evaluation, GaussNewtonStep, Runs, Step, Weights, gauss_newton, regression, step_of
+from en4dvar.schemes.asked import is_done, linearised, members_of, step_of
+from en4dvar.schemes.base import Evaluation, GaussNewtonStep, Runs, Step, Weights, gauss_newton, regression
 
 WIDER, WIDEST = 5.0, 25.0  # factors of a bundle where J does not fall along the step: of each further look, in all
 FAKED = 3.0  # posterior standard deviations: a longer step does not come from the model's own error
@@ -118,7 +119,7 @@ class DataWindow(Objective[Descent]):
         return [None if runs is None else self._advanced(descent, runs) for descent, runs in each]
 
     def _advanced(self, descent: Descent, runs: Runs) -> Step | GaussNewtonStep:
-        reference, anomalies = self.scheme.linearise(descent.weights, runs)
+        reference, anomalies = linearised(self.scheme, descent.weights, runs)
         self.tangents.append((descent.weights.w, reference, anomalies))
         evaluation = self.whiten(descent, reference, anomalies)
         return step_of(self.scheme, descent.weights, evaluation, descent.iteration, self.draw)
@@ -128,7 +129,7 @@ class DataWindow(Objective[Descent]):
         space, scheme = self.space, self.scheme
         if not scheme.minimiser:
             return [self._run_ensemble(descent) for descent in going]
-        rows = [[*scheme.members(d.weights, space.basis), d.weights.w] for d in going]
+        rows = [[*members_of(scheme, d.weights, space.basis), d.weights.w] for d in going]
         runs = space.about(space.control(np.array([row for each in rows for row in each])), list(map(len, rows)))
         return [self._arrive(descent, run) for descent, run in zip(going, runs, strict=True)]
 
@@ -275,7 +276,7 @@ class DataWindow(Objective[Descent]):
         # The Gauss–Newton step of J that an ensemble that was run as a whole tells
         at = descent.iterate
         runs = Runs(at.members.predicted.stacked, at.central.predicted.stacked[0], at.members.active)
-        reference, anomalies = self._regressed(descent.weights, runs)
+        reference, anomalies = self._regressed(descent, runs)
         linear = Linearisation.of_stacked(at.central.predicted[0], reference, anomalies)
         taken, descent.step = descent.step, gauss_newton(descent.weights.w, self._evaluation(descent, linear))
         self.record(descent, descent.weights.T, 0.0 if descent.stop else 1.0)
@@ -285,32 +286,30 @@ class DataWindow(Objective[Descent]):
             return
         assert taken is not None
         count = descent.iteration
-        if self.scheme.done(count - 1, taken):
+        if is_done(self.scheme, count - 1, taken):
             descent.stop = f"{count} assimilation{'s' * (count > 1)}"
         basis = self.space.basis  # of the weights of the mean, those that move no parameter are no part of J_b
         descent.weights = Weights(basis @ (basis.T @ taken.weights.w), taken.weights.dense)
 
     def _run_ensemble(self, descent: Descent) -> Runs | None:
-        space = self.space
-        if self.first is not None:
-            run, self.first = self.first, None
-        else:
-            rows = np.array([*self.scheme.members(descent.weights), descent.weights.w])
-            run = space.forecast(space.control(rows), self.grid if descent.stop else NO_TIMES)
+        space, rows, w = self.space, self._rows(descent), descent.weights.w
+        run, self.first = self.first, None
+        if run is None or not np.array_equal(rows, descent.weights.rows):
+            run = space.forecast(space.control(np.array([*rows, w])), self.grid if descent.stop else NO_TIMES)
         runs = self._arrive(descent, run)
         if descent.stop or runs is None or runs.active is None or runs.active.all():
             return None if descent.stop else runs
         # a failed member takes the prediction that the regression on the survivors gives it
         zeros = np.zeros(runs.predictions.shape[1])
-        reference, anomalies = self._regressed(descent.weights, Runs(runs.predictions, zeros, runs.active))
-        regressed = reference + descent.weights.T @ space.basis @ anomalies
+        reference, anomalies = self._regressed(descent, Runs(runs.predictions, zeros, runs.active))
+        regressed = reference + (rows - w) @ space.basis @ anomalies
         return Runs(np.where(runs.active[:, None], runs.predictions, regressed))
 
     def _arrive(self, descent: Descent, run: Forecast) -> Runs | None:
         """J at the new iterate; what its runs, members and centre, are to the scheme."""
         space, weights = self.space, descent.weights
         if any(run.failures[:-1]) or run.partial.any():
-            x = space.control(np.array([*self.scheme.members(weights), weights.w]))
+            x = space.control(np.array([*self._rows(descent), weights.w]))
             directions = len(run) <= len(space.members)  # one is lost: run all members
             run = space.whole(x) if directions else filled(run, x)
         members, central = run[:-1], run[-1:]
@@ -330,8 +329,13 @@ class DataWindow(Objective[Descent]):
         descent.at = replace(descent.iterate, linear=linear)
         return Evaluation(*self.observations.whiten(linear), self.space.basis)
 
-    def _regressed(self, weights: Weights, runs: Runs) -> tuple[Array, Array]:
-        return regression((weights.rows - weights.w) @ self.space.basis, runs)
+    def _rows(self, descent: Descent) -> Array:
+        """The members (M, N) of an ensemble as a whole: those of the scheme, in the end those of the posterior."""
+        over = descent.stop and not self.scheme.minimiser
+        return descent.weights.rows if over else members_of(self.scheme, descent.weights)
+
+    def _regressed(self, descent: Descent, runs: Runs) -> tuple[Array, Array]:
+        return regression((self._rows(descent) - descent.weights.w) @ self.space.basis, runs)
 
     def _point(self, descent: Descent) -> Point:
         at, tangent = descent.iterate, None

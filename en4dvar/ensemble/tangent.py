@@ -34,9 +34,9 @@ class _LinearPaths(SerialExecutor):
         try:
             path, changes = model.tangent(x[-1], (x[:-1] - x[-1]) / self.size, np.array(times[-1]))
             states = path.states + self.size * floats(changes)
+            return [*(Trajectory(path.times, own, path.layout) for own in states), path]
         except BaseException as error:  # a model may fail in any way; the reason is kept
             return [Failure(reason_of(error))] * len(x)
-        return [*(Trajectory(path.times, own, path.layout) for own in states), path]
 
 
 class Derivatives:

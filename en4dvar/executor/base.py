@@ -12,6 +12,7 @@ from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
@@ -25,6 +26,7 @@ from en4dvar.plumbing.user_code import describe, own_fault, reason_of
 
 T = TypeVar("T")
 Outcome = Trajectory | Failure
+SAME_INSTANT = 1e-6  # of the largest: a time this close to the one asked for is it
 Call = tuple[Any, ...]
 Tell = Callable[[Any], None]  # what a call says while it runs: a message
 Hear = Callable[[int, Any], None]  # who hears it: index of the call, message
@@ -69,12 +71,12 @@ def run_chunk(model: ForwardModel, x: Array, times: Array) -> Sequence[Outcome]:
         try:
             with without_warnings():
                 outcomes = within_time_limit(lambda: kept(model.trajectories(x, times)))
-            reason = f"the model returned {len(outcomes)} trajectories for {len(x)} members"
+            reason = unlike(model, outcomes, len(x), times)
         except TimeLimitError as error:
             outcomes, reason = [], describe(error)
         except BaseException as error:  # a model may fail in any way; the reason is kept
             outcomes, reason = [], reason_of(error)
-        if len(outcomes) == len(x):
+        if not reason:
             return outcomes
         if len(x) <= model.batch:
             return [Failure(reason)] * len(x)
@@ -84,8 +86,36 @@ def run_chunk(model: ForwardModel, x: Array, times: Array) -> Sequence[Outcome]:
 
 
 def kept(outcomes: Sequence[Outcome]) -> Sequence[Outcome]:
-    """A batch as it is, anything else as a list."""
-    return outcomes if isinstance(outcomes, Batch) else list(outcomes)
+    """A batch as it is, anything else as a list, empty where a model forgot to return."""
+    return outcomes if isinstance(outcomes, Batch) else list(() if outcomes is None else outcomes)
+
+
+def unlike(model: ForwardModel, outcomes: Sequence[Outcome], n_members: int, times: Array) -> str:
+    """Why ``outcomes`` are not those of N members at ``times`` (K,) or (N, K); "" where they are."""
+    if len(outcomes) != n_members:
+        return f"the model returned {len(outcomes)} trajectories for {n_members} members"
+    asked, who = times + model._begins, f"{type(model).__name__}.trajectories gives"
+    if isinstance(outcomes, Batch) and _same(outcomes.times, asked):
+        return ""
+    rows = np.broadcast_to(asked, (n_members, np.shape(asked)[-1]))
+    if isinstance(outcomes, Batch):
+        stated: Any = np.broadcast_to(outcomes.times, (n_members, np.shape(outcomes.times)[-1]))
+    elif strange := {type(item).__name__ for item in outcomes if not isinstance(item, Outcome)}:
+        return f"{who} items of type {', '.join(strange)}; give a Batch, or a Trajectory or Failure for each member"
+    else:
+        stated = [row if isinstance(item, Failure) else item.times for item, row in zip(outcomes, rows, strict=True)]
+        if _same(stated, rows):
+            return ""
+    pair = next(pair for pair in zip(stated, rows, strict=True) if not _same(*pair))
+    unit = "" if model.time_unit == "1" else f" {model.time_unit}"
+    odd, at = (f"{len(t)} time{'s' * (len(t) > 1)} from {t[0]:.6g} to {t[-1]:.6g}{unit}" for t in pair)
+    return f"{who} {odd}, asked for {at}"
+
+
+def _same(stated: Any, asked: Array) -> bool:
+    with suppress(ValueError):  # another number of times
+        return bool(np.equal(stated, asked).all()) or np.allclose(stated, asked, 0, SAME_INSTANT * np.abs(asked).max())
+    return False
 
 
 def without_warnings() -> np.errstate:
@@ -330,7 +360,7 @@ class ThreadsExecutor(PoolExecutor):
                     shared.work()
                     for future in futures:
                         future.result()
-                    if len(results := kept(shared.results())) == len(x):
+                    if not unlike(model, results := kept(shared.results()), len(x), times):
                         return results
         except BaseException as error:  # told member by member
             own_fault(error)

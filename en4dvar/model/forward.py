@@ -32,6 +32,15 @@ def instants_of(times: npt.ArrayLike, unit: str) -> Array:
     return instants
 
 
+def _require_path(times: Array, states: Array, layout: StateLayout) -> None:
+    """ValueError unless ``states`` (…, K, n_state) are real numbers at ``times`` (K,) or (…, K)."""
+    if np.iscomplexobj(states):
+        raise ValueError("the states of a path are complex numbers; give real ones")
+    if np.shape(states)[-1 - np.ndim(times) :] != (*np.shape(times), layout.size):
+        shapes = f"shape {np.shape(states)} at times of shape {np.shape(times)}"
+        raise ValueError(f"a path has states of {shapes}, where its layout has {layout.size} numbers at each time")
+
+
 @dataclass(frozen=True)
 class Trajectory:
     """One member's path: ``states`` (K, n_state) at ``times`` (K,) in seconds (or the model's own time unit)."""
@@ -39,6 +48,9 @@ class Trajectory:
     times: Array
     states: Array
     layout: StateLayout
+
+    def __post_init__(self) -> None:
+        _require_path(self.times, self.states, self.layout)
 
     def __getitem__(self, name: str) -> Array:
         """The field ``name`` along the path: (K,) or (K, size)."""
@@ -262,6 +274,7 @@ class ForwardModel(ABC):
     optional_parameters: tuple[Parameter, ...] = ()
     known_by: ClassVar[Mapping[str, tuple[str, ...]]] = MappingProxyType({})
     unforeseen: Mapping[str, float] = MappingProxyType({})
+    _begins: float = 0.0  # on the clock of the paths, where ``trajectories`` begin
 
     def changed(self, name: str, x: Array, change: Array) -> Array:
         """States (N, n_state) in which the quantity ``name`` is exp(``change``) (N,) times what it is in ``x``.
@@ -400,6 +413,7 @@ class Batch(Sequence[Trajectory | Failure]):
     """
 
     def __init__(self, times: Array, states: Array, layout: StateLayout):
+        _require_path(times, states, layout)
         self.times, self.states, self.layout = times, states, layout
         self.whole = bool(np.isfinite(states).all())  # no member failed
 

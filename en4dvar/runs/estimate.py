@@ -243,8 +243,8 @@ class GivenSeries:
             return self.observable
         others = [name for name in known if name in self.columns and name not in _columns_in(self.error)]
         if len(others) != 1:
-            there = ", ".join(name for name in self.columns if name != TIME)
-            raise ConfigError(f"observable: name the column of readings, one of: {there}")
+            what = "name the column of readings" if others else "call the column of readings what the model observes"
+            raise ConfigError(f"observable: {what}, one of: {', '.join(others or known)}")
         return others[0]
 
     def section(self, model: ForwardModel) -> dict[str, Any]:
@@ -337,6 +337,7 @@ class Given:
         units: Mapping[str, str], priors: Mapping[str, Any], series: Mapping[str, Any], correlation: Any,
     ):  # fmt: skip
         self.units, self.priors, self.correlation = units, priors, correlation
+        self.of_section = _of_section(model) if isinstance(model, str | Mapping) else None
         error, series = _from_here(error), _from_here(series)
         self.beside: dict[str, str] = {}
         with retold(DataError, DataError, "data: "):
@@ -354,7 +355,7 @@ class Given:
             more, own = ({}, error) if self.alone else (series.get(name, {}), error[name])
             chosen: Any = observable if self.alone else str(more.get("observable", name))
             with retold(DataError, DataError, f"data: {name}: " if name else "data: "):
-                columns = columns_of(table, time, chosen or _only(model))
+                columns = columns_of(table, time, chosen or _only(self.of_section[0] if self.of_section else model))
             self.series.append(GivenSeries(name, columns, chosen, own, more))
 
     def prior(self, section: Any) -> Any:
@@ -403,13 +404,8 @@ class Given:
         """The model, ``cheap`` or not, and what a configuration records of it. Raises :class:`ConfigError`."""
         if cheap and isinstance(model, str | Mapping | type | ForwardModel):
             raise ConfigError("cheap: it is said of a function; a model says it itself (ForwardModel.cheap)")
-        if isinstance(model, str | Mapping):
-            section = {"name": model} if isinstance(model, str) else dict(model)
-            faults: list[Fault] = []
-            built = read_model(section, Path.cwd(), document_of({"model": section}), faults)
-            if built is None:
-                raise ConfigError(faults)
-            return built
+        if self.of_section is not None:
+            return self.of_section
         if isinstance(model, type) and issubclass(model, ForwardModel):
             model = model()
         if isinstance(model, ForwardModel):
@@ -456,9 +452,19 @@ def _columns_in(sections: Any) -> list[str]:
     return [str(value["column"]) for value in values if isinstance(value, Mapping) and "column" in value]
 
 
+def _of_section(model: str | Mapping[str, Any]) -> tuple[ForwardModel, dict[str, Any]]:
+    section = {"name": model} if isinstance(model, str) else dict(model)
+    faults: list[Fault] = []
+    built = read_model(section, Path.cwd(), document_of({"model": section}), faults)
+    if built is None:
+        raise ConfigError(faults)
+    return built
+
+
 def _only(model: Any) -> str:
     """What values without a name are called: the model's first observable, else y."""
-    observables = getattr(model, "observables", ())
+    made = model() if isinstance(model, type) and issubclass(model, ForwardModel) else model  # which may set them
+    observables = getattr(made, "observables", ())
     return observables[0].name if isinstance(observables, tuple) and observables else VALUE
 
 

@@ -11,6 +11,7 @@ is wrong from runs at its own draws, first hot (τ > 1), so that they reach beyo
 Source: surrogates refined where they say that the posterior is, Li & Marzouk (2014), SIAM J. Sci. Comput. 36, A1163.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -21,7 +22,7 @@ from en4dvar.ensemble.forecast import Forecast
 from en4dvar.ensemble.linalg import effective_number, resampled, shares_of
 from en4dvar.model.state import Array
 from en4dvar.priors.prior import Prior
-from en4dvar.sampling.emulated_cost import EmulatedCost, ModelRuns, fitted_cost, needed_runs
+from en4dvar.sampling.emulated_cost import RUNS_PER_TERM, EmulatedCost, ModelRuns, fitted_cost, needed_runs
 from en4dvar.sampling.mixture import StudentMixture
 from en4dvar.sampling.walkers import advance
 
@@ -30,6 +31,7 @@ WALKERS, MOVES = 600, 20  # they are drawn by their weights, and move about wher
 RENEWED, PARTS = 25, 8  # so many draws of a mixture of so many parts may then replace each of them;
 FIRST_TURNS, TURNS = 10, 3  # both so often
 HALF = 0.5  # of the walkers stay effective from a density to the next
+HIGHEST = 8  # degree of its polynomials, where runs are many
 LARGEST = 2000  # outputs of a run beyond which emulating them costs more than it is worth
 
 
@@ -67,6 +69,8 @@ class RecordedRuns:
         (degree, fewest), n = self._wanted, len(self.prior.names)
         near = int(np.sum(self.runs.costs - self.runs.costs.min() < NEAR * n * heat))
         chosen = np.argsort(self.runs.costs, kind="stable")[: max(fewest, near)]
+        while degree < HIGHEST and RUNS_PER_TERM * math.comb(n + degree + 1, n) <= len(chosen):
+            degree += 1
         return fitted_cost(self.prior, self.observations, degree, self.runs[chosen], n * heat)
 
 

@@ -18,9 +18,6 @@ from annotated_types import Ge, Gt, Le
 
 from en4dvar.ensemble.linalg import Hessian, NearPrior, centre, min_norm_fit
 from en4dvar.model.state import Array
-from en4dvar.plumbing.errors import ConfigError, En4dvarError
-from en4dvar.plumbing.hints import short
-from en4dvar.plumbing.user_code import describe, line_of
 
 
 class Draw(Protocol):
@@ -219,27 +216,11 @@ class Scheme:
         return gauss_newton(weights.w, evaluation)
 
     def done(self, iteration: int, step: Step | GaussNewtonStep) -> bool:
-        """Whether iterations end with this step, which is taken (a minimiser is not asked)."""
+        """Whether iterations end with this step, which is taken (a minimiser is not asked).
+
+        One that is false a hundred times is an error; a key ``max_iterations`` allows for more.
+        """
         return iteration + 1 == self.passes
-
-
-def step_of(
-    scheme: Scheme, weights: Weights, evaluation: Evaluation, iteration: int, draw: Draw
-) -> Step | GaussNewtonStep:
-    """What the scheme advances by. Raises :class:`ConfigError`: one of the user's own fails, or gives no step."""
-    who = f"scheme {type(scheme).__name__}: advance "
-    try:
-        step = scheme.advance(weights, evaluation, iteration, draw)
-    except Exception as error:
-        if isinstance(error, En4dvarError) or not (where := line_of(error)):
-            raise
-        raise ConfigError(f"{who}raises {describe(error)}{where}") from None
-    if not isinstance(step, Step | GaussNewtonStep):
-        raise ConfigError(f"{who}gives {short(repr(step))}; it gives a Step or a GaussNewtonStep")
-    if isinstance(step, Step) and np.shape(w := step.weights.w) + np.shape(step.norm) != weights.w.shape:
-        shapes = f"weights {np.shape(w)} and norm {np.shape(step.norm)}"
-        raise ConfigError(f"{who}gives {shapes}; they are {weights.w.shape} and a number")
-    return step
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,8 @@ import numpy as np
 
 from en4dvar.ensemble.linalg import apply_weights
 from en4dvar.model.state import Array, Indices, Mask
-from en4dvar.schemes.base import Draw, Evaluation, Runs, Scheme, Weights, step_of
+from en4dvar.schemes.asked import linearised, step_of
+from en4dvar.schemes.base import Draw, Evaluation, Runs, Scheme, Weights
 from en4dvar.schemes.filters import ETKF
 
 
@@ -143,7 +144,7 @@ class BlockDescents:
         """A step of every block; the largest, in posterior standard deviations of its block."""
         largest = 0.0
         for i, (_, taper) in enumerate(self.near):
-            evaluation = whiten(*scheme.linearise(self.weights[i], runs))
+            evaluation = whiten(*linearised(scheme, self.weights[i], runs))
             step = step_of(scheme, self.weights[i], _tapered(evaluation, taper), iteration, _of_some(draw, taper > 0))
             self.weights[i], largest = step.weights, max(largest, step.norm)
         return largest

@@ -14,7 +14,8 @@ from en4dvar.ensemble.missing import fitted
 from en4dvar.executor import Executor
 from en4dvar.model.forward import Batch, Failure, ForwardModel, Observable, Trajectory
 from en4dvar.model.state import Array, floats
-from en4dvar.schemes.base import Evaluation, GaussNewtonStep, Runs, Scheme, Step, Weights, step_of
+from en4dvar.schemes.asked import is_done, linearised, members_of, step_of
+from en4dvar.schemes.base import Evaluation, GaussNewtonStep, Runs, Scheme, Step, Weights
 from en4dvar.schemes.localisation import BlockDescents, BlockLocalisation
 from en4dvar.series.model_error import ModelError
 from en4dvar.series.series import CycleSeries
@@ -34,7 +35,7 @@ class _Started(ForwardModel):
     """A model seen from a later time zero."""
 
     def __init__(self, model: ForwardModel, start: float):
-        self.model, self.start = model, start
+        self.model, self._begins = model, start
         self.parameters, self.layout, self.observables = model.parameters, model.layout, model.observables
         self.batch, self.compiled, self.threaded = model.batch, model.compiled, model.threaded
 
@@ -43,7 +44,7 @@ class _Started(ForwardModel):
 
     def trajectories(self, x: Array, times: Array) -> Sequence[Trajectory | Failure]:
         own = np.broadcast_to(times, (len(x), np.shape(times)[-1]))
-        return self.model.resumed(x, np.full(len(x), self.start), self.start + own)
+        return self.model.resumed(x, np.full(len(x), self._begins), self._begins + own)
 
 
 def propagate(model: ForwardModel, states: Array, start: float, times: Array, executor: Executor) -> Array:
@@ -190,7 +191,7 @@ class CycleWindow(Objective[CycleDescent]):
     def linearise(self, going: Sequence[CycleDescent]) -> list[Step | GaussNewtonStep]:
         (descent,), scheme = going, self.scheme
         self.runs = self.run(descent)
-        evaluation = self.whiten(*scheme.linearise(descent.weights, self.runs))
+        evaluation = self.whiten(*linearised(scheme, descent.weights, self.runs))
         if self.localisation is not None and self.local is None:
             self.localised = self.localisation.analysis(scheme, self.members, evaluation, self.draw)
         return [step_of(scheme, descent.weights, evaluation, descent.iteration, self.draw)]
@@ -199,12 +200,12 @@ class CycleWindow(Objective[CycleDescent]):
         """The members of the scheme through the window. Raises :class:`MembersLost`."""
         scheme = self.scheme
         if descent.iteration == 0:  # here w = 0 and the members are those of the window, or close to their mean
-            width = 1.0 if scheme.filters else float(scheme.members(descent.weights)[0, 0])
+            width = 1.0 if scheme.filters else float(members_of(scheme, descent.weights)[0, 0])
             members = self.members if width == 1 else self.mean + width * self.anomalies
         elif self.local:
-            members = self.local.members(lambda _, weights: scheme.members(weights))
+            members = self.local.members(lambda _, weights: members_of(scheme, weights))
         else:
-            members = self.mean + scheme.members(descent.weights) @ self.anomalies
+            members = self.mean + members_of(scheme, descent.weights) @ self.anomalies
         states = self.flow.forecast(members, self.start, self.indices)
         each = [self.flow.predict(at, index) for at, index in zip(states, self.indices, strict=True)]
         predicted = each[0] if len(each) == 1 else np.hstack(each)
@@ -235,7 +236,7 @@ class CycleWindow(Objective[CycleDescent]):
             assert self.runs is not None
             step = self.local.advance(scheme, self.runs, self.whiten, descent.iteration, self.draw)
             descent.step = Step(descent.weights, step)
-        descent.ended = scheme.done(descent.iteration, descent.step)
+        descent.ended = is_done(scheme, descent.iteration, descent.step)
         if self.local and self.localisation and descent.ended:
             self.localised = self.local.members(self.localisation.rows)
         descent.iteration += 1

@@ -19,7 +19,7 @@ function plot(canvas, points, xName, yName, cursor) {
   if (!seen.length) { draw.fillText("no readings yet", 20, 30); return; }
   const xs = seen.map((p) => p.x), ys = seen.map((p) => p.y);
   const low = Math.min(...xs), high = Math.max(...xs), bottom = Math.min(0, ...ys), top = Math.max(...ys) * 1.05 || 1;
-  const left = 62, right = width - 12, base = height - 42;
+  const left = 30 + Math.max(32, ...ticks(bottom, top).map((t) => draw.measureText(t).width)), right = width - 12, base = height - 42;
   const px = (x) => left + ((x - low) / (high - low || 1)) * (right - left);
   const py = (y) => base - ((y - bottom) / (top - bottom || 1)) * (base - 10);
   draw.strokeStyle = "#d8d8de"; draw.fillStyle = "#44444c";

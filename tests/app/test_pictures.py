@@ -1,6 +1,8 @@
-"""Frames of a movie in any order, with room for a few of them only."""
+"""Frames of a movie in any order, with room for a few of them only; and the axis of a table's plot."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,3 +24,24 @@ def test_frames_are_the_same_in_any_order_with_little_room(tmp_path, monkeypatch
     seen = [opened.frame(int(n)) for n in order]
     assert np.array_equal(seen, frames[order])
     assert len(opened._room) == 4
+
+
+@pytest.mark.slow
+def test_the_numbers_beside_a_plot_leave_room_for_the_name_of_its_axis(browser):
+    page = browser.new_page()
+    page.set_content("<canvas id=c style='width: 400px; height: 200px'></canvas>")
+    page.add_script_tag(content=(Path(pictures.__file__).parent / "plot.js").read_text(encoding="utf-8"))
+    lefts = page.evaluate(
+        """() => {
+        const lefts = [], pen = CanvasRenderingContext2D.prototype, write = pen.fillText;
+        pen.fillText = function (text, x, y) {
+          if (this.textAlign === "right") lefts.push(x - this.measureText(text).width);
+          write.call(this, text, x, y);
+        };
+        for (const top of [4e-4, 400, 4e9]) plot(c, [{ x: 0, y: 0 }, { x: 1, y: top }], "t s", "R m");
+        return lefts;
+        }"""
+    )
+    page.close()
+    assert len(lefts) > 9
+    assert min(lefts) > 14 + 4  # where the name stands, and what hangs below its line

@@ -165,6 +165,18 @@ class TestRefusing:
             ("    def memory(self, p):\n        return (MemoryVariable(0.0),)\n", "must be positive"),
             ("    def memory(self, p):\n        return (MemoryVariable(p.mu[:, 0]),)\n", "shape (3,)"),
             ("    def memory(self, p):\n        return (MemoryVariable(1.0, stiffness=p.mu[:, 0]),)\n", "stiffness"),
+            (
+                "    def memory(self, p):\n        return (MemoryVariable(1.0, convection=-p.mu),)\n",
+                "convection of memory variable 1: float64 of shape (3, 1), not a number",
+            ),
+            (
+                "    def viscosity(self, shear_rate, p):\n        return -p.mu + 0 * shear_rate\n",
+                "viscosity(shear_rate, p): returned -0.1 at the example values; it cannot be negative",
+            ),
+            (
+                "    def strained_viscosity(self, stretch, p):\n        return p.mu * (1 - stretch)\n",
+                "strained_viscosity(stretch, p): returned -0.2 at the example values; it cannot be negative",
+            ),
             ("    parameters = (MU, MU)\n", "two parameters are called 'mu'"),
             ("    parameters = ()\n", "parameters is empty"),
             ("    parameters = (Parameter('E', 'kPa'), MU)\n", "parameter E is declared in kPa"),

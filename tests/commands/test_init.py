@@ -164,6 +164,8 @@ def test_the_clock_of_a_bubble_is_as_certain_in_a_folder_as_alone(tmp_path: Path
     ("ends", "to", "words"),
     [
         ((1.1,), "end", "warning: the readings end before the top of the first rebound, .*; record longer, "),
+        ((0.7,), "end", "warning: the readings end before the top of the first rebound, .*; record longer, "),
+        ((0.7, 1.1, 3.0), "trough 2 or end", "warning: b0, b1: the readings end .*; move those files away, or accept "),
         ((1.5,), "end", ""),
         ((1.5, 1.6), "end", ""),
         ((3.0,), "trough 2", ""),
@@ -184,6 +186,7 @@ def test_a_recording_that_ends_with_the_first_collapse_is_told_at_once(
     assert done.exit_code == 0, done.output
     assert re.search(words, done.stderr)
     assert ("of the first rebound" in done.stderr) == bool(words)
+    assert ("us later (not recorded: where the readings before it lead to), " in done.output) == (ends == (0.7,))
     assert proposed(Path("b.yaml")).document.data["data"]["window"] == {"from": "top", "to": to}
     for end, problem in zip(ends, build(load_config("b.yaml")), strict=True):
         assert single(problem.observations.times, problem.observations.values) == (end == 1.1)

@@ -11,6 +11,7 @@ from init_files import call, proposed
 from en4dvar.assembly.build import build
 from en4dvar.priors.prior import PriorTerm
 from en4dvar_bubble import simulate as bubble_path
+from en4dvar_bubble.driving import sine_burst
 
 SOFT = {"G": 420.0, "alpha": 0.025, "mu": 0.086, "R0": 0.43e-6}  # agarose of 0.3 and of 1 %: Mancia et al. (2021)
 STIFF = {"G": 6900.0, "alpha": 0.025, "mu": 0.15, "R0": 1.3e-6}
@@ -74,3 +75,22 @@ def test_bubbles_of_one_gel_grow_from_alike_nuclei() -> None:
         Path(f"gel/b{k}.csv").write_text("\n".join([head, *rest, *rows, ""]))
     assert call("init", "--data", "gel", "--start", "acoustic", "--force").exit_code == 0
     assert proposed(Path("gel.yaml")).document.data["population"]["of"] == ["G", "alpha", "mu"]
+
+
+@pytest.mark.parametrize("a_cycle", [5, 6, 10])
+@pytest.mark.parametrize("said", [(), ("--start", "acoustic")], ids=["unsaid", "said"])
+def test_a_bubble_that_rests_and_then_swings_needs_no_collapse(a_cycle: int, said: tuple[str, ...]) -> None:
+    sound = sine_burst(-90e3, 60e3, 6, delay=10e-6, envelope="hann")
+    gel, times = {"G": 12e3, "mu": 0.06, "R0": 39e-6}, np.arange(0.5e-6, 150e-6, 1 / 60e3 / a_cycle)
+    swing = bubble_path("neo-hookean-kelvin-voigt", gel, times, driving=sound, gas="polytropic").R[0].values
+    radius = 1e6 * swing + 0.06 * np.random.default_rng(1).standard_normal(len(times))
+    rows = [f"{1e6 * t:.3f},{r:.4f}" for t, r in zip(times, radius, strict=True)]
+    Path("burst.csv").write_text("\n".join(["t_us,R_um", *rows, ""]))
+    done = call("init", "--data", "burst.csv", *said)
+    assert done.exit_code == 0, done.output
+    assert "it rests at 39 um before it grows" in done.output
+    assert ("acoustic is only a proposal" in done.output) == (not said)
+    assert "where it should rest" not in done.output
+    (problem,) = build(proposed(Path("burst.yaml")))
+    assert problem.model.start == "acoustic"  # type: ignore[attr-defined]
+    assert 0.02e-6 < np.median(problem.observations.std) < 0.2e-6

@@ -222,3 +222,31 @@ def test_outliers_that_were_left_out_are_told(tmp_path):
     assert told.code == "down-weighted"
     assert told.words.endswith("say: 1 of 30, at 8 ms")
     assert "note: toy: readings left out" in CliRunner().invoke(main, ["validate", str(path)]).output
+
+
+def test_a_share_of_the_maximum_is_that_of_each_data_set(tmp_path: Path) -> None:
+    prior = "{prior: normal, mean: maximum, std: 1 %}"
+    path = write_toy(tmp_path, ("toy.csv", "'*.csv'"), (prior, prior.replace("maximum", "13 % of maximum")))
+    (tmp_path / "toy2.csv").write_text("t_ms,x_um\n" + "\n".join(f"{5 * i},{300 - 2 * i}" for i in range(25)))
+    assert [problem.prior.terms[0].mean for problem in build(load_config(path))] == pytest.approx([13e-6, 39e-6])
+    assert [problem.prior.terms[0].std for problem in build(load_config(path))] == pytest.approx([13e-8, 39e-8])
+    whole, share = (load_config(path, {"parameters.A.mean": where}) for where in ("maximum", "100 % of the maximum"))
+    assert [p.prior.terms[0].mean for p in build(whole)] == [p.prior.terms[0].mean for p in build(share)]
+
+
+@pytest.mark.parametrize(
+    ("where", "told"),
+    [
+        ("0 % of maximum", "must be positive, not 0 % of maximum"),
+        ("-5 % of maximum", "must be positive, not -5 % of maximum"),
+        ("x % of maximum", "'x %' is not a quantity"),
+        ("5 % of minimum", "unknown unit 'of'"),
+        ("5 of maximum", "unknown unit 'of'"),
+    ],
+)
+def test_what_is_no_share_of_the_maximum_is_told_in_place(tmp_path: Path, where: str, told: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_config(write_toy(tmp_path, ("mean: maximum", f"mean: {where}")))
+    (fault,) = caught.value.problems
+    assert fault.path == "parameters.A.mean"
+    assert told in fault.message

@@ -51,3 +51,20 @@ def test_its_check_refuses_every_name_that_is_taken(name):
 
 def test_what_is_declared_with_its_own_names_is_not_refused():
     assert checked(BubbleModel()).parameters
+
+
+@pytest.mark.parametrize(
+    ("defaults", "words"),
+    [
+        ({"qq": 1.0}, "Linear: defaults: 'qq' is not one of its parameters; known: a, b"),
+        ({"b": "3 cm"}, "Linear: defaults: b is '3 cm'; give a number from -inf to inf m"),
+        ({"b": float("nan")}, "Linear: defaults: b is nan; give a number from -inf to inf m"),
+        ({"c": -5.0}, "Linear: defaults: c is -5.0; give a number from 0 to 1 m"),
+    ],
+)
+def test_defaults_are_numbers_within_the_bounds_of_its_parameters(defaults, words):
+    model = Linear()
+    model.defaults = defaults
+    model.parameters += (Parameter("c", "m", bounds=(0, 1)),) if "c" in defaults else ()
+    with pytest.raises(ConfigError, match=re.escape(words)):
+        checked(model)

@@ -1,5 +1,6 @@
 """The economical tangent, the bent line search, and several starts."""
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -58,6 +59,22 @@ def test_no_economy_where_the_members_span_no_more_than_their_number():
     for settings in (AssimilationSettings(members=3), AssimilationSettings(members=12, linearisation="transform")):
         basis = WeightSpace(problem, settings, 1, SerialExecutor()).basis
         assert not settings.own.economical(basis)
+
+
+def test_the_sampled_prior_of_many_members_takes_no_square_of_them():
+    """Weights of 3000 control vectors would have 72 MB; J_b by the members' own mean and covariance."""
+    problem, count = make_problem(Decay(), [1.5, 1.2]), 3000
+    space = WeightSpace(problem, AssimilationSettings(members=count), 1, SerialExecutor())
+    x = 0.9 * space.members
+    of_prior = problem.prior.cost(x)
+    tracemalloc.start()
+    costs = space.with_sampled_prior(x, of_prior)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    off = x - space.mean
+    exact = 0.5 * np.sum(off @ np.linalg.inv(np.cov(space.members.T)) * off, axis=1)
+    np.testing.assert_allclose(costs, exact, rtol=1e-8, atol=1e-8)
+    assert peak < count**2  # bytes
 
 
 class Bend(Toy):

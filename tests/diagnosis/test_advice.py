@@ -333,6 +333,18 @@ def test_a_wrong_reading_is_no_error_of_the_times():
         assert analysis.timing == 0.0
 
 
+def test_errors_of_the_times_that_are_stated_too_large_are_named():
+    """Of a clock that keeps time; an exposure is asked for where nothing is said of times."""
+    p = make_problem(Wave(), (1.0, 2.0), k=80, std=0.002, time_std=0.1)
+    p = with_discrepancy(p, amplitude=(0.02, 1.5), length=(0.2, 0.7), sigma=0.4)
+    c = told(run(p), "prior-conflict")
+    assert "data.error.time_std='3 ns'" in c.advice
+    assert "--exposure" not in c.advice
+    assert told(run(read(p, noise=replace(p.observations.noise, time_std=np.zeros(80)))), "prior-conflict") is None
+    plain = replace_std(with_discrepancy(make_problem(Wave(), (1.0, 2.0), k=80, std=0.002), sigma=0.4), 0.05)
+    assert "give its --exposure" in told(run(plain), "prior-conflict").advice
+
+
 def test_a_future_that_is_missed_is_taken_in_up_to_the_next_trough():
     problem = turned(10)
     assert "data.window.to:" not in told(run(problem), "future-missed").advice

@@ -15,6 +15,7 @@ from toys import Linear
 import en4dvar
 from en4dvar.runs.checks import validate
 from en4dvar.runs.rerun import rerun
+from en4dvar_lorenz import Trend
 
 TIMES = np.linspace(0.0, 3.0, 12)
 NOISE = 0.1
@@ -167,6 +168,10 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "dates": ({"data": (TIMES.astype("M8[s]"), VALUES)}, "data: 'time' holds dates; give elapsed time"),
     "words": ({"data": (TIMES, ["a"] * 12)}, "data: 'y' holds no numbers but 'a'"),
     "tables": ({"data": (TIMES, VALUES[:, None])}, "data: 'y' has shape (12, 1); give one number a time"),
+    "no column of the model's": (
+        {"model": "trend", "data": {"time": TIMES, "u": VALUES}, "priors": {"level": 0, "slope": 1}},
+        "observable: call the column of readings what the model observes, one of: x",
+    ),
     "two columns": ({"data": {"time": TIMES, "u": VALUES, "v": VALUES}}, "observable: name the column of readings"),
     "no such column": ({"observable": "z", "data": {"time": TIMES, "y": VALUES}}, "data: no column 'z'; the columns"),
     "no std": ({"error": 0.0}, "error.y_std: must be positive, not 0.0"),
@@ -314,3 +319,12 @@ def test_a_function_hears_of_each_iteration():
     assert len(costs) >= 2
     assert costs[-1] < costs[0]
     assert len(result.summary()) == 2
+
+
+@pytest.mark.parametrize("section", ["trend", {"name": "trend"}])
+def test_values_without_a_name_are_what_a_model_named_observes(section):
+    """As of the model itself: its first observable."""
+    prior = {"level": {"prior": "normal", "mean": 0, "std": 1}, "slope": 1}
+    named = en4dvar.estimate(section, (TIMES, VALUES), prior, error=0.1, progress=False)
+    handed = en4dvar.estimate(Trend, (TIMES, VALUES), prior, error=0.1, progress=False)
+    np.testing.assert_array_equal(named.posterior["level"], handed.posterior["level"])

@@ -101,7 +101,7 @@ def test_a_script_may_import_the_package_first(first, package, tmp_path):
         ("return None", "scheme Bad: advance gives None; it gives a Step or a GaussNewtonStep"),
         (
             "return Step(weights, weights.w)",
-            "scheme Bad: advance gives weights (16,) and norm (16,); they are",
+            "scheme Bad: advance gives weights (16,), transform (16, 16) and norm (16,); they are",
         ),
         ("return weights.w + 'x'", "scheme Bad: advance raises UFuncTypeError: "),
         ("return weights.width", "AttributeError: 'Weights' object has no attribute 'width' ({0}:7)"),

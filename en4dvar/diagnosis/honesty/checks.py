@@ -151,13 +151,13 @@ def _chance(probability: float) -> str:
     return f"{probability:.1g}" if probability > 1e-6 else "below 1e-6"
 
 
-def conflict(prior: Prior, centre: Array) -> Findings:
-    """A posterior centre (n,) far from the prior."""
+def conflict(prior: Prior, centre: Array, timed: bool = False) -> Findings:
+    """A posterior centre (n,) far from the prior; ``timed``: the stated errors hold errors of the times."""
     terms = dict(zip(prior.names, prior.terms, strict=True))
-    return far_from(terms, (centre - prior.mean) / prior.std, prior.white(centre))
+    return far_from(terms, (centre - prior.mean) / prior.std, prior.white(centre), timed)
 
 
-def far_from(terms: Mapping[str, PriorTerm], z: Array, white: Array) -> Findings:
+def far_from(terms: Mapping[str, PriorTerm], z: Array, white: Array, timed: bool = False) -> Findings:
     """A minimum of J where 2 J_b is beyond what χ²_n exceeds once in 4000, or one of the z² beyond what the largest of
     n does.
 
@@ -172,7 +172,7 @@ def far_from(terms: Mapping[str, PriorTerm], z: Array, white: Array) -> Findings
     far = [j for j in worst if abs(z[j]) > 2] or worst[:1]
     places = "; ".join(_far(names[j], priors[j], float(z[j])) for j in far)
     told = caution("prior-conflict", f"prior and data conflict: the minimum lies far from the prior mean ({places})")
-    yield replace(told, advice=_wider(priors[worst[0]].parameter.name, float(z[worst[0]])))
+    yield replace(told, advice=_wider(priors[worst[0]].parameter.name, float(z[worst[0]]), timed))
 
 
 def _far(name: str, term: PriorTerm, z: float) -> str:
@@ -183,13 +183,17 @@ def _far(name: str, term: PriorTerm, z: float) -> str:
     return f"{name} at {shown(value, p)} where {said}: {z:+.1f} prior standard deviations"
 
 
-def _wider(name: str, z: float) -> str:
+def _wider(name: str, z: float, timed: bool) -> str:
     """What to do about a parameter so many prior standard deviations from its prior mean."""
     if name == NOISE_SCALE.name and z < 0:
+        of_times = (
+            "if a camera keeps its time better than data.error.time_std says (en4dvar track states a tenth of the "
+            "exposure), put its jitter there (--set data.error.time_std='3 ns')"
+        )
         return (
             "state in data.error only the independent error of a reading: they scatter far less than stated. An "
-            "error that all share belongs to a parameter (reading_scale, reading_offset); for a movie, give its "
-            "--exposure to en4dvar track"
+            "error that all share belongs to a parameter (reading_scale, reading_offset); "
+            + (of_times if timed else "for a movie, give its --exposure to en4dvar track")
         )
     return (
         f"check units and data; if both are right, make the prior of {name} about {math.ceil(abs(z) / 2)} times as "

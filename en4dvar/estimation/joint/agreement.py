@@ -212,7 +212,8 @@ def _conflict(joint: JointProblem, place: Place) -> Iterator[Caution]:
         own = [joint.experiments[e].prior.terms[j] for j in joint.columns(e)[1]]
         terms |= {f"{term.parameter.name} of {name}": term for term in own}
     z = np.concatenate([place.border, *place.own])
-    for told in checks.far_from(terms, z, z):
+    timed = any(problem.observations.noise.timed for problem in joint.experiments)
+    for told in checks.far_from(terms, z, z, timed):
         yield replace(told, advice=f"{told.advice}; then make the runs again")
 
 

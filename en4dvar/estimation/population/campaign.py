@@ -272,7 +272,7 @@ def _drawn_about(
     """Draws with a prior of ``names`` that is ``about`` their population; those ``before`` where no run succeeds."""
     near, own = _about(problem, names, *about), problem.prior
     try:
-        draws = own_draws(near, near.prior.white(own.from_white(start)), seed, executor, enough)
+        draws = own_draws(near, near.prior.white(own.from_white(start)), seed, executor, enough, emulate=False)
     except ValueError:
         return before
     z, runs = own.white(near.prior.from_white(draws.z)), before.forward_runs + draws.forward_runs

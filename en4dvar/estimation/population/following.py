@@ -1,8 +1,9 @@
 r"""How parameters that vary between data sets follow the quantities θ ~ N(0, I) which all data sets have in common.
 
 Data tell a coordinate y of each parameter, and x follows from it and from θ. Where what is common shifts the
-transformed parameter (a density that multiplies a viscosity), y = x − Bθ. Where it adds to a parameter that is
-positive, as a pressure adds as many pascals to every modulus,
+transformed parameter (a density that multiplies a viscosity), x = y + B(y)θ, B constant or, along a valley that the
+data leave open, changing linearly with y. Where it adds to a parameter that is positive, as a pressure adds as many
+pascals to every modulus,
 
     e^{sy} = e^{sx} − Aθ,
 
@@ -22,24 +23,44 @@ from en4dvar.model.state import Array
 LEAST = 0.01  # of a positive parameter is left where what is common would take away more
 NODES, NODE_WEIGHTS = np.array([-math.sqrt(3.0), 0.0, math.sqrt(3.0)]), np.array([1.0, 4.0, 1.0]) / 6
 TINY = np.finfo(float).tiny
+LARGE, CHANGE = 3.0, 0.3  # of slopes, and of them along a prior standard deviation, in units of the prior
 NARROWEST = 1e-12  # variance of y, where what is common decides it alone
 LEVELS = ndtri((np.arange(200) + 0.5) / 200)  # equally likely values of a normal quantity
 
 
 @dataclass(frozen=True)
 class Following:
-    """``slopes`` (p, c): B, or A in units of the prior median where ``logs`` (p,) holds s, which is 0 beside B."""
+    """``slopes`` (p, c): B about ``centre`` (p,), or A in units of the prior median where ``logs`` (p,) holds s, which
+    is 0 beside B; ``bends`` (p, c, p): how B changes with y.
+    """
 
     slopes: Array
     logs: Array
+    bends: Array | None = None
+    centre: Array | float = 0.0
 
     def own(self, x: Array, theta: Array) -> Array:
         """y (…, p) of x (…, p) and θ (…, c)."""
-        return self._moved(x, -theta @ self.slopes.T)
+        return self._shrunk(self._moved(x, -theta @ self.slopes.T), theta)
 
     def together(self, y: Array, theta: Array) -> Array:
         """x (…, p) of y (…, p) and θ (…, c)."""
-        return self._moved(y, theta @ self.slopes.T)
+        grown = (self._grown(theta) @ (y - self.centre)[..., None])[..., 0]
+        return self._moved(self.centre + grown, theta @ self.slopes.T)
+
+    def _shrunk(self, x: Array, theta: Array) -> Array:
+        apart = np.linalg.solve(self._grown(theta), (x - self.centre)[..., None])[..., 0]
+        return np.asarray(self.centre + apart, dtype=float)
+
+    def at(self, y: Array) -> Array:
+        """B (D, p, c) at y (D, p)."""
+        slopes = np.broadcast_to(self.slopes, (len(y), *self.slopes.shape))
+        return slopes if self.bends is None else slopes + np.einsum("dk,jck->djc", y - self.centre, self.bends)
+
+    def _grown(self, theta: Array) -> Array:
+        """(…, p, p): ∂x/∂y, but for what adds."""
+        of_all = np.broadcast_to(np.eye(len(self.slopes)), (*theta.shape[:-1], *[len(self.slopes)] * 2))
+        return of_all if self.bends is None else of_all + np.einsum("...c,jck->...jk", theta, self.bends)
 
     def _moved(self, x: Array, shift: Array) -> Array:
         adds, moved = self.logs > 0, x + shift
@@ -48,10 +69,14 @@ class Following:
         return np.asarray(moved)
 
     def moments(self, mean: Array, variance: Array, theta: Array) -> tuple[Array, Array]:
-        """Mean and variance (B, p) of y where x is normal, of three nodes (Gauss and Hermite): exact for y = x − Bθ."""
-        y = np.stack([self.own(mean + node * np.sqrt(variance), theta) for node in NODES])
-        centre = np.tensordot(NODE_WEIGHTS, y, 1)
-        return centre, np.tensordot(NODE_WEIGHTS, (y - centre) ** 2, 1) + NARROWEST
+        """Mean (B, p) and precision (B, p, p) of y where x is normal, of three nodes (Gauss and Hermite) where what is
+        common adds, else exact.
+        """
+        shift = -theta @ self.slopes.T
+        y = np.stack([self._moved(mean + node * np.sqrt(variance), shift) for node in NODES])
+        middle, grown = np.tensordot(NODE_WEIGHTS, y, 1), self._grown(theta)
+        precision = 1 / (np.tensordot(NODE_WEIGHTS, (y - middle) ** 2, 1) + NARROWEST)
+        return self._shrunk(middle, theta), np.einsum("bji,bj,bjk->bik", grown, precision, grown)
 
     def around(self, x: float, own: float, common: float) -> Array:
         """(3,): a coordinate x, where there is one, less and more by ``own`` and, independently, by so many standard
@@ -69,7 +94,15 @@ class Following:
         prior's of y (D, p): of x ~ N(mean, diag std²), θ ~ N(0, I).
         """
         size = np.sqrt(np.sum(self.slopes**2, axis=1))
-        logs = np.zeros(len(y))
+        of_y, shifts = np.where(self.logs > 0, std, np.sqrt(std**2 + size**2)), self.logs == 0
+        apart, slopes = (y - mean)[:, shifts], self.at(y)[:, shifts]
+        covariance = np.diag(std[shifts] ** 2) + slopes @ slopes.swapaxes(1, 2)
+        pull = np.linalg.solve(covariance, apart[..., None])[..., 0]
+        logs = np.asarray(
+            0.5 * np.sum(apart * (pull - apart / of_y[shifts] ** 2), axis=1) - np.sum(np.log(of_y[shifts]))
+        )
+        logs += 0.5 * np.linalg.slogdet(covariance)[1]
+        logs -= np.linalg.slogdet(self._grown(-np.einsum("djc,dj->dc", slopes, pull)))[1]
         for j in np.flatnonzero(self.logs):
             s, whole, shift = self.logs[j], np.exp(self.logs[j] * y[:, j, None]), size[j] * LEVELS
             least = whole < shift * LEAST / (1 - LEAST)  # where as much was left
@@ -79,7 +112,7 @@ class Following:
             slope = np.where(least, 1.0, whole / np.where(possible, before, 1.0))
             density = np.where(possible, np.exp(-0.5 * ((x - mean[j]) / std[j]) ** 2) * slope, 0.0).mean(axis=1)
             logs += -0.5 * ((y[:, j] - mean[j]) / std[j]) ** 2 - np.log(density + TINY)
-        return np.where(self.logs > 0, std, np.sqrt(std**2 + size**2)), logs
+        return of_y, logs
 
 
 def following_of(
@@ -99,3 +132,31 @@ def following_of(
     stretched = np.mean([np.mean(logs * each, axis=0) for each in x], axis=0) + np.log(np.where(positive, logs, 1.0))
     adds = positive & (widths[1] - stretched < widths[0])
     return Following(np.where(adds[:, None], adding, shifting), np.where(adds, logs, 0.0))
+
+
+def bent(following: Following, centre: Array, parts: Sequence[tuple[Array, Array, Array, Array]]) -> Following:
+    """With slopes that change along the likelihoods, where what is common does not add.
+
+    ``parts`` of each data set: numbers of draws (M,), centres (M, p), and precisions Λ_xx (M, p, p) and Λ_xθ (M, p, c)
+    of the likelihood about them, which has Λ_xθ = −Λ_xx B there. Least squares, by the errors that so many draws leave,
+    with slopes of 0 ± :data:`LARGE` and changes of 0 ± :data:`CHANGE` where these say nothing.
+    """
+    count, at, own, cross = (np.concatenate(each) for each in zip(*parts, strict=True))
+    values, vectors = np.linalg.eigh(own)
+    values = np.maximum(values, 0.0)
+    weight = np.sqrt(count[:, None] / (values + 1))
+    p, c = following.slopes.shape
+    adds = following.logs > 0
+    s = np.where(adds, following.logs, 1.0)
+    known = np.where(adds, np.exp(-s * at) / s, 0.0)[..., None] * following.slopes  # B of those that add
+    axes = vectors.swapaxes(1, 2)
+    target = -weight[..., None] * (axes @ cross + values[..., None] * (axes @ known))
+    terms = np.hstack([np.ones((len(at), 1)), at - centre])
+    free = np.flatnonzero(~adds)
+    design = np.einsum("ml,mlj,mk->mljk", weight * values, axes[..., free], terms).reshape(len(at) * p, -1)
+    ridge = np.diag(np.tile(1 / np.append(LARGE, np.full(p, CHANGE)), len(free)))
+    rows = np.vstack([design, ridge]), np.vstack([target.reshape(-1, c), np.zeros((len(ridge), c))])
+    solved = np.linalg.lstsq(*rows, rcond=None)[0].reshape(len(free), 1 + p, c)
+    slopes, bends = following.slopes.copy(), np.zeros((p, c, p))
+    slopes[free], bends[free] = solved[:, 0], solved[:, 1:].swapaxes(1, 2)
+    return Following(slopes, following.logs, bends, centre)

@@ -16,7 +16,7 @@ With L_i in units of its evidence (:mod:`~en4dvar.estimation.population.own`) th
     p(h) Π_i [ (1 − ε) ∫ L_i(y) N(y; ν − B θ, τ²) dy + ε/2 + ε/2p Σ_j … ],
 
 every integral in closed form; where y is another function of x (:mod:`~en4dvar.estimation.population.following`), with
-mean and variance of y. Walkers find where it is; a mixture of Student t distributions fitted to them is the
+mean and covariance of y. Walkers find where it is; a mixture of Student t distributions fitted to them is the
 proposal, whose weighted draws are independent and give the evidence (adaptive importance sampling: Cappé et al. 2008,
 Stat. Comput. 18, 447). A walker left behind in a secondary mode moves the proposal a little; the weights know what it
 is worth.
@@ -225,13 +225,14 @@ class Hierarchy:
 
 
 @kernel
-def _draw(mixture: Mixture, mean: Array, variance: Array, numbers: Array, uniform: Array, out: Array) -> None:
-    """Draws ``out`` (B, p) of L(x) N(x; mean, variance) from standard normal ``numbers``, which are overwritten."""
+def _draw(mixture: Mixture, mean: Array, inverse: Array, numbers: Array, uniform: Array, out: Array) -> None:
+    """Draws ``out`` (B, p) of L(x) N(x; mean, inverse⁻¹) from standard normal ``numbers``, which are overwritten."""
     n_parts, n = mixture.linear.shape
     middle, root, logs = np.empty((n_parts, n)), np.zeros((n_parts, n, n)), np.empty(n_parts)
     for b in range(mean.shape[0]):
+        pull = inverse[b] @ mean[b]
         for m in range(n_parts):
-            part = condition(mixture.precision[m], mixture.linear[m], mean[b], variance[b], middle[m], root[m])
+            part = condition(mixture.precision[m], mixture.linear[m], inverse[b], pull, middle[m], root[m])
             logs[m] = mixture.constant[m] + part
         cumulated = np.cumsum(np.exp(logs - logs.max()))
         chosen = min(np.searchsorted(cumulated, uniform[b] * cumulated[-1]), n_parts - 1)

@@ -3,20 +3,22 @@ r"""What each data set says by itself about the parameters of a population: draw
 The draws follow p(y|x) π(x) with the data set's own prior π, weighted forward runs from its members and from the prior
 (:mod:`en4dvar.sampling.modes`), so that all modes count by their weight and any kind of observation errors is taken as
 it is: the scale of the errors and a discrepancy are further parameters of the data set. Where its posterior was sampled
-by its own estimate, the draws are those that this has kept.
+by its own estimate, the draws are those that this has kept. Where an emulator of the predictions, fitted to all these
+runs, says J of fresh ones, thousands of its draws are taken without a run: what scarce draws leave uncertain of each
+likelihood makes the population of several data sets too narrow along a valley that all of them leave open.
 
 Of the coordinates x that vary and the quantities θ that all data sets have in common (a density, a scale) the draws
 tell how x follows θ (:mod:`~en4dvar.estimation.population.following`): the likelihood is one of y, such as x − Bθ,
 which gives the regression of x on θ in the posterior the slopes (I − C) B, where C is the covariance of x given θ and
-the prior of x is N(0, I). A Gaussian mixture describes y; dividing by its prior leaves the likelihood of the data set,
-with which :mod:`~en4dvar.estimation.population.hierarchy` works. No component is wider than the prior, so that each is
-one of the likelihood. There are always four: what too few get wrong is alike in all data sets and adds up, what scarce
-draws get wrong averages out, and a criterion for fewer took upper limits for measurements. Where the population lies in
-the tails of its data sets, where hardly a draw is, neither holds: then they are drawn with another prior, about the
-population, which is divided out instead of their own. What the data tell of θ
-itself is left aside: it keeps its prior, and therefore all data sets of a population have the same slopes. Their own
-would tell of θ, and falsely: those of ln G are steeper for a soft gel, and a θ that makes all of them stiffer would
-make them more alike.
+the prior of x is N(0, I). B may change along the likelihood: components of a mixture of x and θ tell it where they are.
+A Gaussian mixture describes y; dividing by its prior leaves the likelihood of the data set, with which
+:mod:`~en4dvar.estimation.population.hierarchy` works. No component is wider than the prior, so that each is one of the
+likelihood. There are four, or eight of many draws: what too few get wrong is alike in all data sets and adds up, what
+scarce draws get wrong averages out, and a criterion for fewer took upper limits for measurements. Where the population
+lies in the tails of its data sets, where hardly a draw is, neither holds: then they are drawn with another prior, about
+the population, which is divided out instead of their own. What the data tell of θ itself is left aside: it keeps its
+prior, and therefore all data sets of a population have the same slopes. Their own would tell of θ, and falsely: those
+of ln G are steeper for a soft gel, and a θ that makes all of them stiffer would make them more alike.
 """
 
 import math
@@ -33,20 +35,24 @@ from en4dvar.diagnosis.response.ledger import weighted_quantiles
 from en4dvar.ensemble.forecast import Composite, costs
 from en4dvar.ensemble.linalg import effective_number, resampled, shares_of
 from en4dvar.ensemble.missing import Beside
-from en4dvar.estimation.population.following import Following, following_of
+from en4dvar.estimation.population.following import Following, bent, following_of
 from en4dvar.executor import Executor
 from en4dvar.model.state import Array
 from en4dvar.plumbing.compiled import kernel
 from en4dvar.priors.prior import PriorTerm, member_stream, own_seed
 from en4dvar.problem import InverseProblem
-from en4dvar.sampling.emulated_draws import RecordedRuns
-from en4dvar.sampling.mixture import fit_gaussians
+from en4dvar.sampling.emulated_cost import RIDGE, Coordinates, Emulator
+from en4dvar.sampling.emulated_draws import EmulatedProposal, RecordedRuns
+from en4dvar.sampling.mixture import StudentMixture, fit_gaussians
 from en4dvar.sampling.modes import sample_modes
 
 ENOUGH = 500.0  # effective draws that are asked for: they know a mean to 4 % of its std
 NARROWEST = 0.03  # standard deviation of the first draws about members, in units of the prior's
-KEPT = 2000  # equally likely draws of each data set
+KEPT = 4000  # equally likely draws of each data set
+HEAT, JUDGING = 1.5, 400  # of fresh draws of the emulated posterior, and the number of these, of which such a share
+TRUSTED = 0.9  # must stay effective under J, for others of its draws to be taken without a run
 PARTS, ROUNDS = 4, 200  # components of each mixture; rounds of expectation maximisation, of which four need more
+MANY = 2500.0  # effective draws from which the components are twice as many
 BESIDE = 1e-3  # prior standard deviations that runs for readings that one lacks are apart
 SMALLEST = 1e-12  # variance that every slope is taken to have
 INFORMED = 0.1  # least share of the prior's variance that the data take away, for a slope to be read from draws
@@ -93,27 +99,25 @@ class Mixture(NamedTuple):
 
 
 @kernel
-def condition(precision: Array, linear: Array, mean: Array, variance: Array, middle: Array, root: Array) -> float:
-    """A⁻¹b and the lower root of A; returns ½ bᵀA⁻¹b − ½ ln|DA| − ½ νᵀD⁻¹ν."""
-    n = mean.size
+def condition(precision: Array, linear: Array, inverse: Array, pull: Array, middle: Array, root: Array) -> float:
+    """A⁻¹b and the lower root of A = Λ + D⁻¹, b = η + D⁻¹ν; returns ½ bᵀA⁻¹b − ½ ln|A|."""
+    n = linear.size
     value = 0.0
     for i in range(n):
         for j in range(i + 1):
-            total = precision[i, j]
-            if i == j:
-                total += 1.0 / variance[i]
+            total = precision[i, j] + inverse[i, j]
             for k in range(j):
                 total -= root[i, k] * root[j, k]
             if i == j:
                 root[i, i] = np.sqrt(total)
-                value -= np.log(root[i, i]) + 0.5 * np.log(variance[i])
+                value -= np.log(root[i, i])
             else:
                 root[i, j] = total / root[j, j]
-        total = linear[i] + mean[i] / variance[i]
+        total = linear[i] + pull[i]
         for k in range(i):
             total -= root[i, k] * middle[k]
         middle[i] = total / root[i, i]
-        value += 0.5 * middle[i] ** 2 - 0.5 * mean[i] ** 2 / variance[i]
+        value += 0.5 * middle[i] ** 2
     _back(root, middle)
     return value
 
@@ -138,16 +142,19 @@ def draw_conditioned(middle: Array, root: Array, z: Array, out: Array) -> None:
 
 
 @kernel
-def log_marginal(mixture: Mixture, mean: Array, variance: Array) -> Array:
-    """(B,) ln ∫ L(x) N(x; mean, diag variance) dx, for ``mean`` and ``variance`` (B, n)."""
+def log_marginal(mixture: Mixture, mean: Array, inverse: Array) -> Array:
+    """(B,) ln ∫ L(x) N(x; mean, inverse⁻¹) dx, for ``mean`` (B, n) and ``inverse`` (B, n, n)."""
     n_parts, n = mixture.linear.shape
     middle, root, logs, out = np.empty(n), np.zeros((n, n)), np.empty(n_parts), np.empty(mean.shape[0])
+    nothing = np.zeros(n)
     for b in range(mean.shape[0]):
+        pull = inverse[b] @ mean[b]
+        own = condition(inverse[b], nothing, 0.0 * inverse[b], nothing, middle, root) + 0.5 * mean[b] @ pull
         for m in range(n_parts):
-            part = condition(mixture.precision[m], mixture.linear[m], mean[b], variance[b], middle, root)
+            part = condition(mixture.precision[m], mixture.linear[m], inverse[b], pull, middle, root)
             logs[m] = mixture.constant[m] + part
         top = logs.max()
-        out[b] = top + np.log(np.sum(np.exp(logs - top)))
+        out[b] = top + np.log(np.sum(np.exp(logs - top))) - own
     return out
 
 
@@ -191,8 +198,9 @@ class OwnLikelihood:
 
 
 def own_draws(
-    problem: InverseProblem, start: Array, seed: int, executor: Executor | None = None, enough: float = ENOUGH
-) -> OwnDraws:
+    problem: InverseProblem, start: Array, seed: int, executor: Executor | None = None, enough: float = ENOUGH,
+    emulate: bool = True,
+) -> OwnDraws:  # fmt: skip
     """Draws of one posterior until ``enough`` are effective, from members (N, n) near it in white coordinates.
 
     The same for a data set whatever others there are. Raises :class:`ValueError` where no run succeeds.
@@ -204,13 +212,44 @@ def own_draws(
     covariance = np.atleast_2d(np.cov(x, rowvar=False)) + np.diag((NARROWEST * prior.std) ** 2)
     about = Minimum(x.mean(axis=0), covariance, 0.0)  # of one alone, J does not matter
     runs = RecordedRuns(composite, partial(costs, problem), prior, observations)
-    draws = sample_modes(runs, prior, [about], seed, enough)
-    taken = resampled(draws.shares, KEPT, member_stream(seed, "population: kept draws"))
-    effective = _worth(KEPT, draws.effective)
-    return OwnDraws(prior.white(draws.x[taken]), draws.log_evidence, effective, composite.forward_runs)
+    draws, stream = sample_modes(runs, prior, [about], seed, enough), member_stream(seed, "population: kept draws")
+    z = prior.white(draws.x[resampled(draws.shares, KEPT, stream)])
+    emulated = emulate and _emulated(runs, z, stream)
+    if emulated:
+        return OwnDraws(*emulated, composite.forward_runs)
+    return OwnDraws(z, draws.log_evidence, _worth(KEPT, draws.effective), composite.forward_runs)
 
 
-def _worth(count: int, effective: float) -> float:
+def _emulated(runs: RecordedRuns, z: Array, stream: np.random.Generator) -> tuple[Array, float, float] | None:
+    """Draws, ln evidence and effective number as of :class:`OwnDraws`, of J emulated by all ``runs`` that led to draws
+    ``z`` (D, n). None where fresh runs say that this is not J.
+
+    What these say of Ĵ − J is a quadratic of z, by which the draws are weighed.
+    """
+    made = EmulatedProposal.fitted(runs, StudentMixture.fitted(z, stream, PARTS), stream, HEAT)
+    if made is None:
+        return None
+    tried = made.draw(JUDGING, stream)
+    apart = HEAT * made.cost(tried) - runs(runs.prior.from_white(tried))  # Ĵ − J, −∞ where a run fails
+    cooled = (1 - HEAT) * made.cost(tried)
+    of_emulated, shares = shares_of(cooled), shares_of(cooled + apart)
+    share = effective_number(shares) / effective_number(of_emulated)
+    if share < TRUSTED:
+        return None
+    count, n, alive = len(tried), z.shape[1], np.isfinite(apart)
+    left = Emulator.fitted(Coordinates.about(z), 2, tried[alive], apart[alive, None], shares[alive], RIDGE)
+    every = []
+    for _ in range(KEPT // len(made.walkers)):
+        made = made.settled(stream)
+        every.append(made.walkers)
+    free = np.concatenate(every)
+    weights = shares_of((1 - HEAT) * made.cost(free) + left.predictions(free)[:, 0])
+    evidence = float(np.logaddexp.reduce(cooled + apart)) - math.log(count) + made.log - 0.5 * n * math.log(2 * math.pi)
+    worth = _worth(effective_number(weights), effective_number(shares) / max(1 - share, SMALLEST))
+    return free[resampled(weights, KEPT, stream)], evidence, worth
+
+
+def _worth(count: float, effective: float) -> float:
     """How many independent draws so many are worth that were taken from others, worth ``effective`` of them."""
     return 1 / (1 / effective + 1 / count)
 
@@ -230,6 +269,10 @@ def own_likelihoods(
         return pooled_slopes(*zip(*of_sets, strict=True))
 
     following = following_of(x, theta, logs, slopes)
+    if common:
+        each = zip(x, theta, drawn, names, strict=True)
+        parts = [_parts(z, t, of, member_stream(own_seed(seed, name), "population: slopes")) for z, t, of, name in each]
+        following = bent(following, np.mean([z.mean(axis=0) for z in x], axis=0), parts)
     streams = (member_stream(own_seed(seed, name), "population: mixture") for name in names)
     likelihoods = []
     for z, t, draws, stream in zip(x, theta, drawn, streams, strict=True):
@@ -245,12 +288,24 @@ def _mixture(y: Array, following: Following, draws: OwnDraws, stream: np.random.
     std, beyond = following.prior(y, mean, std)
     constant = float(np.logaddexp.reduce(beyond)) - math.log(len(beyond)) + draws.gain
     alike = len(draws.z) / draws.effective  # of one draw: more make a bent valley fall too steeply beyond its draws
-    if following.logs.any():
+    if np.any(beyond):
         shares = shares_of(beyond)
         y = y[resampled(shares, len(shares), stream)]
         alike *= len(shares) / effective_number(shares)
-    share, centre, covariance = fit_gaussians(y, stream, PARTS, ROUNDS, alike, std)
+    parts = PARTS if draws.effective < MANY else 2 * PARTS
+    share, centre, covariance = fit_gaussians(y, stream, parts, ROUNDS, alike, std)
     return Mixture.divided(centre, covariance, np.log(share) + constant, std, mean)
+
+
+def _parts(x: Array, theta: Array, draws: OwnDraws, stream: np.random.Generator) -> tuple[Array, Array, Array, Array]:
+    """Of draws x (D, p) and θ (D, c), what :func:`~en4dvar.estimation.population.following.bent` asks for."""
+    p, c = x.shape[1], theta.shape[1]
+    std = np.append(np.broadcast_to(draws.about[1], p), np.ones(c))
+    number = PARTS if draws.effective < MANY else 2 * PARTS
+    both, alike = np.hstack([x, theta]), len(x) / draws.effective
+    share, centre, covariance = fit_gaussians(both, stream, number, ROUNDS // 4, alike, std)
+    precision = np.asarray(np.linalg.inv(covariance) - np.diag(1 / std**2), dtype=float)
+    return share * draws.effective, centre[:, :p], precision[:, :p, :p], precision[:, :p, p:]
 
 
 def _slopes(x: Array, u: Array, theta: Array, effective: float, std: Array) -> tuple[Array, Array]:

@@ -86,9 +86,9 @@ def _probe(law: ConstitutiveLaw, name: str) -> None:
     elastic = "stress" if law.closed_form else "strain_energy_rate"
     _call(getattr(law, elastic), (stretch, p), f"{name}: {elastic}(stretch, p)")
     if law.shear_dependent:
-        _call(law.viscosity, (rate, p), f"{name}: viscosity(shear_rate, p)")
+        _call(law.viscosity, (rate, p), f"{name}: viscosity(shear_rate, p)", least=0.0)
     if law.strain_dependent:
-        _call(law.strained_viscosity, (stretch, p), f"{name}: strained_viscosity(stretch, p)")
+        _call(law.strained_viscosity, (stretch, p), f"{name}: strained_viscosity(stretch, p)", least=0.0)
     variables = _run(lambda: law.memory(p), f"{name}: memory(p)")
     if not (isinstance(variables, tuple) and all(isinstance(v, MemoryVariable) for v in variables)):
         raise ConfigError(f"{name}: memory(p) must return a tuple of MemoryVariable")
@@ -100,9 +100,13 @@ def _probe(law: ConstitutiveLaw, name: str) -> None:
             raise ConfigError(f"{name}: relaxation_time of memory variable {i + 1}: shape {times.shape}, not (N, 1)")
         if not np.all(times > 0):
             raise ConfigError(f"{name}: relaxation_time of memory variable {i + 1} must be positive")
+        if (k := np.asarray(variable.convection)).ndim or k.dtype.kind not in "fiu":
+            raise ConfigError(
+                f"{name}: convection of memory variable {i + 1}: {k.dtype} of shape {k.shape}, not a number"
+            )
 
 
-def _call(method: Callable[..., Any], arguments: tuple[Any, ...], where: str) -> None:
+def _call(method: Callable[..., Any], arguments: tuple[Any, ...], where: str, least: float = -np.inf) -> None:
     result = np.asarray(_run(lambda: method(*arguments), where))
     x = arguments[0]
     try:
@@ -114,6 +118,8 @@ def _call(method: Callable[..., Any], arguments: tuple[Any, ...], where: str) ->
             f"{where}: returned {result.dtype} of shape {result.shape}; for a row ({len(x)},) and parameters of shape "
             f"({_MEMBERS}, 1) it must be real and broadcast to ({_MEMBERS}, {len(x)})"
         )
+    if np.any(result < least):
+        raise ConfigError(f"{where}: returned {np.nanmin(result):.4g} at the example values; it cannot be negative")
 
 
 def _run(call: Callable[[], Any], where: str) -> Any:

@@ -151,6 +151,7 @@ def propose_config(
         find_files(Path.cwd(), [str(data)]), Column(*source.radius, "m"), layout, time[0] if time else None
     )
     readings, unusable = histories(files, replace(source, layout=replace(layout, outliers="leave out")))
+    common = _largest(readings, TRACKED_COMMON) if errors else 0.0
     proposal = propose(
         {name: (series.times, series.values) for name, series in readings.items()},
         start,
@@ -158,13 +159,13 @@ def propose_config(
         medium,
         grouped(files, data, groups, layout),
         scale_of(_largest(readings, TRACKED_SHAPE)),
+        convert(common, source.radius[1], "m"),
     )
     odd = [words for name, series in readings.items() for words in _left_out(name, series)]
     if any(ODD.keys() & series.left_out.keys() for series in readings.values()):
         source = replace(source, layout=replace(layout, outliers="leave out"))
     proposal = _with_rest(proposal, readings, source.radius[1])
     if errors:
-        common = _largest(readings, TRACKED_COMMON)
         proposal = with_columns(proposal, errors, f"{common:g} {source.radius[1]}" if common > 0 else "")
     told = (*proposal.warnings, *odd, *doubts(source), *scales(readings, source), *_steps(readings, source), *unusable)
     proposal = replace(proposal, warnings=told)

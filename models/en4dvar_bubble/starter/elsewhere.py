@@ -122,16 +122,15 @@ def centred(model: BubbleModel, medium: str) -> BubbleModel:
     return replace(model, medium=replace(model.medium, rho=rho, c=c, p_inf=parse_quantity(medians["p_inf"], "Pa")))
 
 
-def of_water(radius: float) -> tuple[Entry, Entry]:
-    """Priors of the viscosity and of R_eq of a bubble of ``radius`` (m). What damps a collapse in water is sound, heat
+def of_water(rest: str) -> tuple[Entry, Entry]:
+    """Priors of the viscosity and of R_eq, its median as text. What damps a collapse in water is sound, heat
     and vapour, so that a guess from collapse and rebound books them as viscosity.
     """
     off = math.exp(1.645 * 1.5)
     words = f"viscosity: water has 0.0009; as a check, may be off by a factor of {off:.2g}; narrow it to what you know"
-    rest = f"{{prior: lognormal, median: {float(f'{5e4 * radius:.2g}'):g} um, log_std: 1}}"
     of_rest = "0.05 R_max, the little gas that water leaves; may be off by a factor of 5.2; narrow it to what you know"
     mu = Entry("mu", "{prior: lognormal, median: 0.002 Pa s, log_std: 1.5}", words)
-    return mu, Entry("R_eq", rest, of_rest)
+    return mu, Entry("R_eq", f"{{prior: lognormal, median: {rest}, log_std: 1}}", of_rest)
 
 
 def wall(radius: float, slowness: float) -> tuple[Entry, Entry]:

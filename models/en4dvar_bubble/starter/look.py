@@ -15,8 +15,8 @@ off and is too high by about ε √(2 ln n).
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Literal, TypeVar
+from dataclasses import dataclass, replace
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from en4dvar.inputs.implausible import scatter_of
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import DataError
 from en4dvar.plumbing.hints import listed
-from en4dvar_bubble.collapse import Lobe, lobe, single
+from en4dvar_bubble.collapse import TOLD, Lobe, lobe, single
 
 WINDOWS = (0.15, 0.2, 0.27, 0.35, 0.45, 0.55, 0.65, 0.75, 0.85)  # half widths in collapse times
 LOWEST = 0.45  # of R_max: what lies lower belongs to the end of the collapse, or to the beginning of the growth
@@ -159,7 +159,8 @@ class Look:
     ``before`` is the radius at rest before an acoustic bubble grows, and the std of a reading of it, NaN without one.
     ``begin`` is the first instant, ``step`` the median time between samples; ``descent`` the last instant of the first
     descent, NaN where the history ends with it. ``n_minima`` follow the maximum with a ``prominence`` relative to the
-    range; a ``short`` laser bubble ends before the first rebound has a top. ``reason`` says in words why ``start`` is
+    range; a ``short`` laser bubble ends before the first rebound has a top, an ``early`` one before it has collapsed,
+    so that the time of the collapse is where a fit goes on to. ``reason`` says in words why ``start`` is
     proposed, ``clear`` whether the data leave no doubt.
     """
 
@@ -176,6 +177,7 @@ class Look:
     prominence: float
     descent: float
     short: bool
+    early: bool
     start: Start
     reason: str
     clear: bool
@@ -187,7 +189,8 @@ def look(times: Array, radius: Array, start: Start | None = None) -> Look:
     """
     _require_collapse(radius, start)
     scatter = scatter_of(times, radius)
-    peak = lobe(times, radius)
+    rests = before(times, radius, scatter)
+    peak = _lobe(times, radius, start != "laser" and np.isfinite(rests[0]))
     highest = top(times, radius, scatter if np.isfinite(scatter) else UNKNOWN * float(radius.max()))
     largest = highest.reading
     prominence, n_minima = _minima(radius[largest:], scatter)
@@ -196,6 +199,8 @@ def look(times: Array, radius: Array, start: Start | None = None) -> Look:
     first = float(radius[begins] / radius[largest])
     rest, drift = _rest(times, radius, peak) if np.isfinite(rebound) else (float("nan"), "")
     chosen, reason, clear = _start(first, np.isfinite(rebound), times[-1] > peak.t_max + CREEPS * peak.t_c, begins)
+    if np.isfinite(rests[0]) and chosen == "laser":
+        chosen, reason, clear = "acoustic", f"it rests at {1e6 * rests[0]:.3g} um before it grows", False
     if start is not None:
         chosen, reason, clear = start, reason if start == chosen else "as you say", True
     if chosen == "acoustic" and begins:
@@ -205,9 +210,12 @@ def look(times: Array, radius: Array, start: Start | None = None) -> Look:
             f"grow from there; leave out what is before (data.since: '{when}')"
         )
     step, descent = float(np.median(np.diff(times))), _end_of_descent(times, radius)
+    noise = min(scatter, rests[1]) if chosen == "acoustic" else scatter  # NaN is not smaller
+    early = bool(radius[largest:].min() > TOLD * radius[largest] and times[-1] < peak.t_max + peak.t_c)
     return Look(
-        float(times[0]), peak, highest, step, scatter, rebound, rest, drift, before(times, radius, scatter),
-        n_minima, prominence, descent, chosen == "laser" and single(times, radius), chosen, reason, clear,
+        float(times[0]), peak, highest, step, noise, rebound, rest, drift, rests,
+        n_minima, prominence, descent, chosen == "laser" and (early or single(times, radius)), early,
+        chosen, reason, clear,
     )  # fmt: skip
 
 
@@ -228,34 +236,51 @@ def before(times: Array, radius: Array, scatter: float) -> tuple[float, float]:
     """The level (m) of several readings before the bubble grows, and their std; NaN where there is no such plateau.
 
     It is resolved, and rises less than half as fast as the bubble does from there to its maximum: a history that
-    begins in the midst of growth rises fastest at first.
+    begins in the midst of growth rises fastest at first. The std is ``scatter``, or that of the level where it is far
+    smaller: few readings a cycle are not smooth between each other.
     """
     largest = int(np.argmax(radius))
     std = scatter if np.isfinite(scatter) else UNKNOWN * float(radius[largest])
-    away = np.abs(radius[:largest] - np.median(radius[:SEVERAL])) > AWAY * std
+    unsure = math.sqrt(1 + 0.5 * math.pi / SEVERAL)  # the median of few errs, too
+    away = np.abs(radius[:largest] - np.median(radius[:SEVERAL])) > AWAY * std * unsure
     left = np.flatnonzero(away[1:] & away[:-1])  # one reading alone may be odd
     count = int(left[0]) if len(left) else 0
     if count >= SEVERAL:
-        t, level = times[:count], float(np.median(radius[: max(SEVERAL, count // 2)]))  # before growth begins
+        t, resting = times[:count], radius[: max(SEVERAL, count // 2)]  # before growth begins
+        level, own = float(np.median(resting)), float(np.std(resting, ddof=1))
         slope = np.polyfit(t, radius[:count], 1)[0] + AGREE * std / (np.std(t) * np.sqrt(count))
         slow = slope < 0.5 * (radius[largest] - level) / (times[largest] - t[-1])
         if slow and level > max(RESOLVED * std, ACOUSTIC_BEGINS * radius[largest]):
-            return level, std
+            return level, own if AWAY * own < std else std
     return float("nan"), float("nan")
 
 
-def common_rest(levels: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    """One radius at rest of several bubbles, each with its std, and a std that covers theirs; NaN of none."""
+def common_rest(levels: Sequence[tuple[float, float]], edge: float) -> tuple[float, float]:
+    """One radius at rest of several bubbles, each with its std, and a std that covers theirs and that of the ``edge``
+    of all (m); NaN of none."""
     if not levels:
         return float("nan"), float("nan")
     level, std = np.median(levels, axis=0)
-    return float(level), math.hypot(std, float(np.std([each for each, _ in levels])))
+    return float(level), math.hypot(std, edge, float(np.std([each for each, _ in levels])))
 
 
 def _begins(radius: Array, largest: int) -> int:
     """The reading in which a bubble appears large at once, behind several that show next to nothing; else the first."""
     after = int(np.flatnonzero(np.append(0.0, radius[:largest]) < ACOUSTIC_BEGINS * radius[largest])[-1])
     return after if after >= SEVERAL and radius[after] > EMERGES * radius[largest] else 0
+
+
+def _lobe(times: Array, radius: Array, rests: bool) -> Lobe:
+    """That of :func:`~en4dvar_bubble.collapse.lobe`; of a bubble that rests and then swings, with too few readings for
+    it, from the largest reading to the lowest one behind it. Raises :class:`DataError`."""
+    try:
+        return lobe(times, radius)
+    except DataError:
+        top = int(np.argmax(radius))
+        lowest = minima(radius[top:])[:1] + top
+        if not rests or not len(lowest):
+            raise
+        return Lobe(float(radius[top]), float(times[top]), float(times[lowest[0]] - times[top]))
 
 
 def _require_collapse(radius: Array, start: Start | None) -> None:
@@ -355,3 +380,22 @@ def typical(values: Sequence[float]) -> float:
     """Median of the finite values; NaN where there is none."""
     finite = [v for v in values if np.isfinite(v)]
     return float(np.median(finite)) if finite else float("nan")
+
+
+def typical_look(views: Sequence[Look], edge: float) -> Look:
+    """One look at several data sets: medians of the numbers, words of the first that is not clear. Bubbles of one gel
+    differ in size more than in their radius at rest over the maximum, which not all of them show.
+    """
+    medians = {key: typical([getattr(v, key) for v in views]) for key in ("step", "noise", "rebound")}
+    least: dict[str, Any] = {key: min(getattr(v, key) for v in views) for key in ("begin", "n_minima", "prominence")}
+    R_max, t_max, t_c = (typical([getattr(v.lobe, k) for v in views]) for k in ("R_max", "t_max", "t_c"))
+    return replace(
+        next((v for v in views if not v.clear), views[0]),
+        **medians | least,
+        lobe=Lobe(R_max, t_max, t_c),
+        rest=R_max * typical([v.rest / v.lobe.R_max for v in views]),
+        drift=next((v.drift for v in views if v.drift), ""),
+        before=common_rest([v.before for v in views if np.isfinite(v.before[0])], edge),
+        descent=max((v.descent for v in views if np.isfinite(v.descent)), default=float("nan")),
+        early=all(v.early for v in views),
+    )

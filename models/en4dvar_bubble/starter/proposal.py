@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from en4dvar.model.forward import Trajectory
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.errors import ConfigError, DataError, retold
 from en4dvar.plumbing.units import convert
-from en4dvar_bubble.collapse import Lobe, conceivable, doubt, lobe
+from en4dvar_bubble.collapse import conceivable, doubt, lobe
 from en4dvar_bubble.dynamics import R0, R_EQ, R_MAX
 from en4dvar_bubble.laws.loading import qualified
 from en4dvar_bubble.model import BubbleModel
@@ -23,7 +23,7 @@ from en4dvar_bubble.starter import elsewhere
 from en4dvar_bubble.starter.elsewhere import Entry
 from en4dvar_bubble.starter.grouped import NO_GROUPS, Grouped
 from en4dvar_bubble.starter.guess import FAR, OF_GELS, Guess, first_guess
-from en4dvar_bubble.starter.look import Look, Start, common_rest, look, typical, usable, without_rebound
+from en4dvar_bubble.starter.look import Look, Start, look, typical_look, usable, without_rebound
 
 LAWS: Mapping[Start, str] = {"acoustic": "quadratic-kelvin-voigt", "laser": "neo-hookean-kelvin-voigt"}
 MODEL: Mapping[Start, Mapping[str, str]] = {
@@ -44,7 +44,7 @@ SIMPLER: Mapping[Start, Mapping[str, str]] = {
 }
 LEAST_NOISE = 0.0005  # of R_max: no camera reads better
 NOISE_LOG_STD = 0.4  # of the noise scale: a scatter is told by a dozen windows, and not alike at all radii
-TOP_WIDTH = 3.0  # standard errors of the top that the prior takes: it is not to count the readings there twice
+TOP_WIDTH = 3.0  # standard errors of a top or rest that its prior takes: it is not to count the readings there twice
 DISCREPANCY = "{kernel: matern-3/2, grows_beyond: 10 m/s}"
 STIFFENING = (0.12, 1.4)  # median and log_std of α
 SPAN = {"alpha": "agarose 0.03 (Mancia 2021), polyacrylamide 0.48 (Yang 2020)"}
@@ -105,11 +105,12 @@ def propose(
     medium: str = "gel",
     groups: Grouped = NO_GROUPS,
     scale: elsewhere.Known = elsewhere.SCALE,
+    edge: float = 0.0,
 ) -> Proposal:
     """A proposal for one or several data sets: name → times (K,) s, radius (K,) m.
 
     ``medium``: one of those of :mod:`en4dvar_bubble.starter.elsewhere`. ``groups``: of its data sets. ``scale``: what
-    is known of what multiplies all radii.
+    is known of what multiplies all radii; ``edge``: std (m) of what moves them all alike.
 
     Raises :class:`DataError`: no history shows a bubble, or they suggest different starts. ConfigError: unknown law.
     """
@@ -117,13 +118,14 @@ def propose(
     views = list(looks.values())
     chosen = views[0].start
     model, law_name = built(chosen, law)
-    look = _typical(views)
+    look = typical_look(views, edge)
     others = _others(model, look)
     observed = {"R_max": look.lobe.R_max, "t_c": look.lobe.t_c, "rebound": look.rebound}
     guess = first_guess(elsewhere.centred(model, medium), others, observed)
     ratio = look.lobe.rayleigh_ratio(model.medium)
     told = [
-        f"R_max {_text(look.lobe.R_max, 'm', 'um', 3)}, collapse {_text(look.lobe.t_c, 's', 'us', 3)} later, "
+        f"R_max {_text(look.lobe.R_max, 'm', 'um', 3)}, collapse {_text(look.lobe.t_c, 's', 'us', 3)} later"
+        f"{' (not recorded: where the readings before it lead to)' * look.early}, "
         f"{ratio:.2f} of the Rayleigh time (elasticity shortens it, viscosity and gas prolong it)"
     ]
     told += [f"start: {chosen} ({look.reason})"] * look.clear
@@ -133,7 +135,7 @@ def propose(
     warnings += [
         f"{name}: {view.drift}; no radius at rest is taken from it{COLLAPSE_ALONE * (view.n_minima < 2)}"
         for name, view in looks.items()
-        if view.drift
+        if view.drift and chosen == "laser"  # ultrasound's is seen before it grows
     ]
     warnings += [elsewhere.PULSE] * (chosen == "acoustic")
     doubted, believed = _doubted(looks, model), guess
@@ -262,20 +264,6 @@ def _looks(histories: Mapping[str, tuple[Array, Array]], start: Start | None) ->
     return looks, unseen
 
 
-def _typical(views: Sequence[Look]) -> Look:
-    """One look at several data sets: medians of the numbers, words of the first that is not clear."""
-    medians = {key: typical([getattr(v, key) for v in views]) for key in ("step", "noise", "rebound", "rest")}
-    least: dict[str, Any] = {key: min(getattr(v, key) for v in views) for key in ("begin", "n_minima", "prominence")}
-    return replace(
-        next((v for v in views if not v.clear), views[0]),
-        **medians | least,
-        lobe=Lobe(*(typical([getattr(v.lobe, k) for v in views]) for k in ("R_max", "t_max", "t_c"))),
-        drift=next((v.drift for v in views if v.drift), ""),
-        before=common_rest([v.before for v in views if np.isfinite(v.before[0])]),
-        descent=max((v.descent for v in views if np.isfinite(v.descent)), default=float("nan")),
-    )
-
-
 def _others(model: BubbleModel, look: Look) -> dict[str, float]:
     """Every parameter but G and μ at the centre of its proposed prior, SI."""
     example = {name: float(v[0]) for name, v in model.law.example_values().items() if name not in WIDTHS}
@@ -380,6 +368,12 @@ def _clock(look: Look, model: BubbleModel, theta: Mapping[str, float]) -> Entry:
     return Entry("time_zero", text, "puts the R_max of the guess on that of the data: enter the clock of your pulse")
 
 
+def _of_each(radius: float, look: Look, top: Tops) -> str:
+    """A radius of the ``look``, where it is one at several bubbles as a share of the largest reading of each."""
+    share = f"{100 * radius / look.lobe.R_max:.2g} % of maximum"
+    return share if top.R_max[0] == "maximum" else _text(radius, "m", "um")
+
+
 def _in_a_liquid(model: BubbleModel) -> bool:
     """True of a laser's bubble that no elasticity holds together."""
     return model.start == "laser" and "G" not in {p.name for p in model.law.parameters}
@@ -405,7 +399,7 @@ def _parameters(
 ) -> tuple[Entry, ...]:
     start, lines = model.start, []
     in_water = medium == "water" and _in_a_liquid(model)
-    water = {line.key: line for line in elsewhere.of_water(look.lobe.R_max) if in_water}
+    water = {line.key: line for line in elsewhere.of_water(_of_each(0.05 * look.lobe.R_max, look, top)) if in_water}
     for p in model.law.parameters:
         if p.name in water:
             lines.append(water[p.name])
@@ -469,13 +463,13 @@ def _radii(
         line = _spread(R0, *NUCLEUS, "of agarose, 0.3 and 1 % (Mancia 2021);", "know of your gel")
         if look is not None and np.isfinite(look.before[0]):
             level, std = look.before
-            value, log_std = _text(level, "m", "um", 4), f"{math.hypot(std / level, scale.log_std):.2g}"
-            words = "the readings before it grows, with the errors of one and of the scale"
+            value, log_std = _text(level, "m", "um", 4), f"{TOP_WIDTH * math.hypot(std / level, scale.log_std):.2g}"
+            words = f"the readings before it grows; {TOP_WIDTH:g} times their errors wide, for they are in the fit"
             line = _lognormal(R0, value, log_std, words)
         return [line]
     value, width, words = "20 um", 0.4, R_EQ.label
-    if look is not None:
-        value, words = _text(_rest(look), "m", "um"), f"{GAS_FRACTION:g} R_max, since no radius at rest is seen"
+    if look is not None and top is not None:
+        value, words = _of_each(_rest(look), look, top), f"{GAS_FRACTION:g} R_max, since no radius at rest is seen"
     if look is not None and np.isfinite(look.rest):
         width = 0.3
         words = "the radius at rest; wide, because a real bubble loses gas to the gel and the model's bubble keeps it"
