@@ -31,12 +31,13 @@ WALKERS, MOVES = 600, 20  # they are drawn by their weights, and move about wher
 RENEWED, PARTS = 25, 8  # so many draws of a mixture of so many parts may then replace each of them;
 FIRST_TURNS, TURNS = 10, 3  # both so often
 HALF = 0.5  # of the walkers stay effective from a density to the next
-HIGHEST = 8  # degree of its polynomials, where runs are many
 LARGEST = 2000  # outputs of a run beyond which emulating them costs more than it is worth
 
 
 class RecordedRuns:
-    """J (B,) of control vectors (B, n) by the model, +inf where that fails; what the runs gave is kept."""
+    """J (B,) of control vectors (B, n) by the model, +inf where that fails; what the runs gave is kept. An emulator of
+    many runs has polynomials up to degree ``highest``, if that is more than few runs allow.
+    """
 
     def __init__(
         self,
@@ -44,9 +45,10 @@ class RecordedRuns:
         costs: Callable[[Array, Forecast], Array],
         prior: Prior,
         observations: Observations,
+        highest: int = 0,
     ):
         self._run, self._costs, self.prior, self.observations = run, costs, prior, observations
-        self._wanted = needed_runs(len(prior.names))
+        self._wanted, self._highest = needed_runs(len(prior.names)), highest
         self.runs: ModelRuns | None = None
 
     def __call__(self, x: Array) -> Array:
@@ -69,7 +71,7 @@ class RecordedRuns:
         (degree, fewest), n = self._wanted, len(self.prior.names)
         near = int(np.sum(self.runs.costs - self.runs.costs.min() < NEAR * n * heat))
         chosen = np.argsort(self.runs.costs, kind="stable")[: max(fewest, near)]
-        while degree < HIGHEST and RUNS_PER_TERM * math.comb(n + degree + 1, n) <= len(chosen):
+        while degree < self._highest and RUNS_PER_TERM * math.comb(n + degree + 1, n) <= len(chosen):
             degree += 1
         return fitted_cost(self.prior, self.observations, degree, self.runs[chosen], n * heat)
 

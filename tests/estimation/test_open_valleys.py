@@ -15,7 +15,10 @@ from en4dvar.data.observations import Observations
 from en4dvar.estimation.population import Effort, HyperPrior
 from en4dvar.estimation.population.hierarchy import Hierarchy
 from en4dvar.estimation.population.own import OwnDraws, own_draws, own_likelihoods
+from en4dvar.model.function_model import FunctionModel
+from en4dvar.model.state import Parameter
 from en4dvar.priors.prior import Prior, PriorTerm
+from en4dvar.problem import InverseProblem
 
 ERRORS, SPREAD, SETS, DRAWS = np.array([0.1, 3.0]), 0.03, 6, 2500
 STEP, COUNT = 0.02, 512
@@ -73,3 +76,37 @@ def test_draws_of_what_an_emulator_says_of_a_valley_are_many():
         assert drawn.z[:, k].std() == pytest.approx(np.sqrt(shares @ (AXIS - mean) ** 2 / shares.sum()), rel=0.05)
     assert drawn.log_evidence == pytest.approx(np.log(density.sum() * STEP**2 / (2 * np.pi)), abs=0.1)
     assert drawn.effective > 2500
+
+
+def saturated(a, b):
+    return 3 / (1 + np.exp(-3 * (a - 0.5))), b + 0 * a
+
+
+def cusped(a, b):
+    return a + b + 0.6 * b**2, 1.5 * np.sqrt(np.abs(a - 0.4 * b - 0.5))
+
+
+@pytest.mark.parametrize(
+    ("seen", "values", "errors", "seed"),
+    [(saturated, (2.9, 0.3), (0.3, 0.5), 4), (cusped, (0.9, 0.3), (0.1, 0.5), 3)],
+)
+def test_an_emulator_that_is_wrong_in_a_tail_gives_no_draws(seen, values, errors, seed):
+    """Of 400 fresh runs a tenth that told otherwise passed: standard deviations were 1.6 times too large."""
+    model = FunctionModel(
+        lambda p, t: np.where(t < 0.5, *seen(p["a"], p["b"])), [Parameter("a", "1"), Parameter("b", "1")],
+        {"y": "1"}, members=400, cheap=True,
+    )  # fmt: skip
+    prior = Prior(tuple(PriorTerm.normal(p, 0.0, 1.0) for p in model.parameters))
+    observed = Observations(
+        np.array([0.2, 1.0]), np.array(values), noise_of(np.array(errors), np.zeros(2)), np.ones(2), name="tail"
+    )
+    misfits = (np.stack(seen(A, B), axis=-1) - values) / np.array(errors)
+    density = np.exp(-0.5 * (A**2 + B**2) - 0.5 * np.sum(misfits**2, axis=-1))
+    density /= density.sum()
+    begin = np.random.default_rng([seed, 7]).choice(density.size, 40, p=density.ravel())
+    start = np.stack([AXIS[begin // COUNT], AXIS[begin % COUNT]], axis=1)
+    drawn = own_draws(InverseProblem(model, model.observables[0], observed, prior), start, seed)
+    mean = density.sum(axis=1) @ AXIS
+    std = np.sqrt(density.sum(axis=1) @ (AXIS - mean) ** 2)
+    assert drawn.z[:, 0].std() == pytest.approx(std, rel=0.15)
+    assert drawn.z[:, 0].mean() == pytest.approx(mean, abs=0.2 * std)

@@ -50,7 +50,8 @@ ENOUGH = 500.0  # effective draws that are asked for: they know a mean to 4 % of
 NARROWEST = 0.03  # standard deviation of the first draws about members, in units of the prior's
 KEPT = 4000  # equally likely draws of each data set
 HEAT, JUDGING = 1.5, 400  # of fresh draws of the emulated posterior, and the number of these, of which such a share
-TRUSTED = 0.9  # must stay effective under J, for others of its draws to be taken without a run
+TRUSTED = 0.98  # must stay effective under J, for others of its draws to be taken without a run
+HIGHEST = 8  # degree of an emulator's polynomials, where runs are many
 PARTS, ROUNDS = 4, 200  # components of each mixture; rounds of expectation maximisation, of which four need more
 MANY = 2500.0  # effective draws from which the components are twice as many
 BESIDE = 1e-3  # prior standard deviations that runs for readings that one lacks are apart
@@ -211,7 +212,7 @@ def own_draws(
     x = prior.from_white(start)
     covariance = np.atleast_2d(np.cov(x, rowvar=False)) + np.diag((NARROWEST * prior.std) ** 2)
     about = Minimum(x.mean(axis=0), covariance, 0.0)  # of one alone, J does not matter
-    runs = RecordedRuns(composite, partial(costs, problem), prior, observations)
+    runs = RecordedRuns(composite, partial(costs, problem), prior, observations, HIGHEST)
     draws, stream = sample_modes(runs, prior, [about], seed, enough), member_stream(seed, "population: kept draws")
     z = prior.white(draws.x[resampled(draws.shares, KEPT, stream)])
     emulated = emulate and _emulated(runs, z, stream)
@@ -233,11 +234,11 @@ def _emulated(runs: RecordedRuns, z: Array, stream: np.random.Generator) -> tupl
     apart = HEAT * made.cost(tried) - runs(runs.prior.from_white(tried))  # Ĵ − J, −∞ where a run fails
     cooled = (1 - HEAT) * made.cost(tried)
     of_emulated, shares = shares_of(cooled), shares_of(cooled + apart)
-    share = effective_number(shares) / effective_number(of_emulated)
-    if share < TRUSTED:
+    share = 1 / float(np.sum(shares**2 / of_emulated))  # of draws of exp(−Ĵ) that stay effective under J
+    if share < TRUSTED or not np.all(np.isfinite(apart)):
         return None
-    count, n, alive = len(tried), z.shape[1], np.isfinite(apart)
-    left = Emulator.fitted(Coordinates.about(z), 2, tried[alive], apart[alive, None], shares[alive], RIDGE)
+    count, n = len(tried), z.shape[1]
+    left = Emulator.fitted(Coordinates.about(z), 2, tried, apart[:, None], shares, RIDGE)
     every = []
     for _ in range(KEPT // len(made.walkers)):
         made = made.settled(stream)
