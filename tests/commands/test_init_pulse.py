@@ -77,14 +77,16 @@ def test_bubbles_of_one_gel_grow_from_alike_nuclei() -> None:
     assert proposed(Path("gel.yaml")).document.data["population"]["of"] == ["G", "alpha", "mu"]
 
 
-@pytest.mark.parametrize("a_cycle", [5, 6, 10])
+@pytest.mark.parametrize(("a_cycle", "decimals"), [(5, 4), (6, 4), (10, 4), (10, 0)])
 @pytest.mark.parametrize("said", [(), ("--start", "acoustic")], ids=["unsaid", "said"])
-def test_a_bubble_that_rests_and_then_swings_needs_no_collapse(a_cycle: int, said: tuple[str, ...]) -> None:
+def test_a_bubble_that_rests_and_then_swings_needs_no_collapse(
+    a_cycle: int, said: tuple[str, ...], decimals: int
+) -> None:
     sound = sine_burst(-90e3, 60e3, 6, delay=10e-6, envelope="hann")
     gel, times = {"G": 12e3, "mu": 0.06, "R0": 39e-6}, np.arange(0.5e-6, 150e-6, 1 / 60e3 / a_cycle)
     swing = bubble_path("neo-hookean-kelvin-voigt", gel, times, driving=sound, gas="polytropic").R[0].values
     radius = 1e6 * swing + 0.06 * np.random.default_rng(1).standard_normal(len(times))
-    rows = [f"{1e6 * t:.3f},{r:.4f}" for t, r in zip(times, radius, strict=True)]
+    rows = [f"{1e6 * t:.3f},{r:.{decimals}f}" for t, r in zip(times, radius, strict=True)]
     Path("burst.csv").write_text("\n".join(["t_us,R_um", *rows, ""]))
     done = call("init", "--data", "burst.csv", *said)
     assert done.exit_code == 0, done.output
@@ -93,4 +95,5 @@ def test_a_bubble_that_rests_and_then_swings_needs_no_collapse(a_cycle: int, sai
     assert "where it should rest" not in done.output
     (problem,) = build(proposed(Path("burst.yaml")))
     assert problem.model.start == "acoustic"  # type: ignore[attr-defined]
-    assert 0.02e-6 < np.median(problem.observations.std) < 0.2e-6
+    error = np.hypot(0.06e-6, 10**-decimals * 1e-6 / 12**0.5)  # of noise and rounding
+    assert 0.4 * error < np.median(problem.observations.std) < 3 * error

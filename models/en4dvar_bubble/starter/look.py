@@ -144,6 +144,9 @@ ACOUSTIC_BEGINS = 0.1  # of R_max: one that begins below has grown from a nucleu
 EMERGES = 0.5  # of R_max: a nucleus that grows is seen before it is as large
 SEVERAL = 4  # readings before a bubble, or at least of one
 AWAY = 3.0  # standard deviations: farther from the first readings a bubble has left its rest
+TOP_WIDTH = 3.0  # standard errors of a top or rest that its prior takes: it is not to count the readings there twice
+SWINGS = 0.5  # of R_max: a bubble that rests above and then grows is driven; a laser leaves far more than it found
+EQUAL = 1e-6  # of a level: what rounded readings that are equal differ by
 RESOLVED = 5.0  # standard deviations: of a level that is read, and is not what a camera shows of next to nothing
 CREEPS = 1.5  # collapse times after the maximum: a history that goes on for longer without a rebound is damped
 
@@ -199,7 +202,7 @@ def look(times: Array, radius: Array, start: Start | None = None) -> Look:
     first = float(radius[begins] / radius[largest])
     rest, drift = _rest(times, radius, peak) if np.isfinite(rebound) else (float("nan"), "")
     chosen, reason, clear = _start(first, np.isfinite(rebound), times[-1] > peak.t_max + CREEPS * peak.t_c, begins)
-    if np.isfinite(rests[0]) and chosen == "laser":
+    if rests[0] > SWINGS * radius[largest] and chosen == "laser":
         chosen, reason, clear = "acoustic", f"it rests at {1e6 * rests[0]:.3g} um before it grows", False
     if start is not None:
         chosen, reason, clear = start, reason if start == chosen else "as you say", True
@@ -251,17 +254,17 @@ def before(times: Array, radius: Array, scatter: float) -> tuple[float, float]:
         slope = np.polyfit(t, radius[:count], 1)[0] + AGREE * std / (np.std(t) * np.sqrt(count))
         slow = slope < 0.5 * (radius[largest] - level) / (times[largest] - t[-1])
         if slow and level > max(RESOLVED * std, ACOUSTIC_BEGINS * radius[largest]):
-            return level, own if AWAY * own < std else std
+            return level, own if EQUAL * level < AWAY * own < std else std
     return float("nan"), float("nan")
 
 
 def common_rest(levels: Sequence[tuple[float, float]], edge: float) -> tuple[float, float]:
-    """One radius at rest of several bubbles, each with its std, and a std that covers theirs and that of the ``edge``
-    of all (m); NaN of none."""
+    """One radius at rest of several bubbles, each with its std, and the std of its prior: by how much they differ, and
+    :data:`TOP_WIDTH` times their errors and that of the ``edge`` of all (m); NaN of none."""
     if not levels:
         return float("nan"), float("nan")
     level, std = np.median(levels, axis=0)
-    return float(level), math.hypot(std, edge, float(np.std([each for each, _ in levels])))
+    return float(level), math.hypot(TOP_WIDTH * math.hypot(std, edge), float(np.std([each for each, _ in levels])))
 
 
 def _begins(radius: Array, largest: int) -> int:

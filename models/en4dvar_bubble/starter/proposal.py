@@ -23,7 +23,7 @@ from en4dvar_bubble.starter import elsewhere
 from en4dvar_bubble.starter.elsewhere import Entry
 from en4dvar_bubble.starter.grouped import NO_GROUPS, Grouped
 from en4dvar_bubble.starter.guess import FAR, OF_GELS, Guess, first_guess
-from en4dvar_bubble.starter.look import Look, Start, look, typical_look, usable, without_rebound
+from en4dvar_bubble.starter.look import TOP_WIDTH, Look, Start, look, typical_look, usable, without_rebound
 
 LAWS: Mapping[Start, str] = {"acoustic": "quadratic-kelvin-voigt", "laser": "neo-hookean-kelvin-voigt"}
 MODEL: Mapping[Start, Mapping[str, str]] = {
@@ -44,7 +44,6 @@ SIMPLER: Mapping[Start, Mapping[str, str]] = {
 }
 LEAST_NOISE = 0.0005  # of R_max: no camera reads better
 NOISE_LOG_STD = 0.4  # of the noise scale: a scatter is told by a dozen windows, and not alike at all radii
-TOP_WIDTH = 3.0  # standard errors of a top or rest that its prior takes: it is not to count the readings there twice
 DISCREPANCY = "{kernel: matern-3/2, grows_beyond: 10 m/s}"
 STIFFENING = (0.12, 1.4)  # median and log_std of α
 SPAN = {"alpha": "agarose 0.03 (Mancia 2021), polyacrylamide 0.48 (Yang 2020)"}
@@ -463,7 +462,7 @@ def _radii(
         line = _spread(R0, *NUCLEUS, "of agarose, 0.3 and 1 % (Mancia 2021);", "know of your gel")
         if look is not None and np.isfinite(look.before[0]):
             level, std = look.before
-            value, log_std = _text(level, "m", "um", 4), f"{TOP_WIDTH * math.hypot(std / level, scale.log_std):.2g}"
+            value, log_std = _text(level, "m", "um", 4), f"{math.hypot(std / level, TOP_WIDTH * scale.log_std):.2g}"
             words = f"the readings before it grows; {TOP_WIDTH:g} times their errors wide, for they are in the fit"
             line = _lognormal(R0, value, log_std, words)
         return [line]
