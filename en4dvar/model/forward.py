@@ -414,7 +414,8 @@ class Batch(Sequence[Trajectory | Failure]):
 
     def __init__(self, times: Array, states: Array, layout: StateLayout):
         _require_path(times, states, layout)
-        self.times, self.states, self.layout = times, states, layout
+        self.times = times if np.ndim(times) > 1 else np.broadcast_to(times, np.shape(states)[:2])
+        self.states, self.layout = states, layout
         self.whole = bool(np.isfinite(states).all())  # no member failed
 
     def __len__(self) -> int:

@@ -69,23 +69,45 @@ def test_what_was_not_asked_for_loses_the_members_with_a_reason(make, reason):
     assert [reason in outcome.reason for outcome in outcomes if isinstance(outcome, Failure)] == [True] * 4, outcomes
 
 
-def test_a_member_that_is_odd_is_lost_alone():
-    """Of a list and of threads that share the work, too, which then is done member by member."""
+def short(x, times):
+    return [Trajectory(p.times[:k], p.states[:k], LAYOUT) for p, k in zip(listed(x, times), ends(x), strict=True)]
 
-    def make(x, times):
-        return [path if own[2] < 2 else listed(x, times - 1)[0] for path, own in zip(listed(x, times), x, strict=True)]
 
-    class Sharing(Odd):
+def ends(x):
+    return np.where(x[:, 2] < 2, 15, 4)
+
+
+def nan_times(x, times):
+    return Batch(np.where(x[:, 2:3] < 2, times, np.nan), np.ones((*times.shape, 5)), LAYOUT)
+
+
+def strange(x, times):
+    return [path if k == 15 else path.states for path, k in zip(listed(x, times), ends(x), strict=True)]
+
+
+@pytest.mark.parametrize("size", [1, 3, 64])
+@pytest.mark.parametrize("make", [short, nan_times, strange])
+def test_a_member_that_is_odd_is_lost_alone(make, size):
+    """Without another run, whatever the batch; of threads that share the work, too."""
+    calls = []
+
+    class Counted(Odd):
+        batch = size
+
+        def trajectories(self, x, times):
+            calls.append(len(x))
+            return super().trajectories(x, times)
+
+    class Sharing(Counted):
         def share(self, x, times):
             return Shared(lambda: None, lambda: self.trajectories(x, times))
 
     x = np.ones((4, 5))
     x[2, 2] = 3
     with ThreadsExecutor(2) as threads:
-        each = run_chunk(Odd(make), x, TIMES), threads.trajectories(Sharing(make), x, TIMES)
-    assert [[isinstance(outcome, Failure) for outcome in outcomes] for outcomes in each] == [
-        [False, False, True, False]
-    ] * 2
+        each = run_chunk(Counted(make), x, TIMES), threads.trajectories(Sharing(make), x, TIMES)
+    lost = [[isinstance(outcome, Failure) for outcome in outcomes] for outcomes in each]
+    assert (lost, calls) == ([[False, False, True, False]] * 2, [4, 4])
 
 
 @pytest.mark.parametrize("make", [batch, listed])
@@ -98,6 +120,7 @@ def test_times_that_are_those_asked_for_but_for_rounding_are_taken(make):
 def test_a_batch_may_state_its_times_once():
     outcomes = run_chunk(Odd(lambda x, t: Batch(t[0], np.ones((*t.shape, 5)), LAYOUT)), np.ones((4, 5)), TIMES)
     assert isinstance(outcomes, Batch)
+    np.testing.assert_array_equal(outcomes[1].times, TIMES)
 
 
 def test_a_series_asks_for_times_on_the_models_clock():
