@@ -92,7 +92,7 @@ def kept(outcomes: Sequence[Outcome]) -> Sequence[Outcome]:
 def as_asked(model: ForwardModel, outcomes: Sequence[Outcome], times: Array) -> Sequence[Outcome]:
     """``outcomes`` of N members at ``times`` (K,) or (N, K); a member that is not at its own is a :class:`Failure`."""
     rows = np.broadcast_to(times + model._begins, (len(outcomes), np.shape(times)[-1]))
-    if isinstance(outcomes, Batch) and not _off(outcomes.times, rows).any():
+    if isinstance(outcomes, Batch) and not _off(outcomes.times, rows, model._begins).any():
         return outcomes
     return [_own(model, outcome, row) for outcome, row in zip(outcomes, rows, strict=True)]
 
@@ -106,18 +106,20 @@ def _own(model: ForwardModel, outcome: Outcome, asked: Array) -> Outcome:
         kind = type(outcome).__name__
         return Failure(f"{who} items of type {kind}; give a Batch, or a Trajectory or Failure for each member")
     stated = np.ravel(floats(outcome.times))
-    if not _off(stated, asked).any():
+    if not _off(stated, asked, model._begins).any():
         return outcome
     unit = "" if model.time_unit == "1" else f" {model.time_unit}"
     odd, at = (f"{len(t)} time{'s' * (len(t) > 1)} from {t[0]:.6g} to {t[-1]:.6g}{unit}" for t in (stated, asked))
     return Failure(f"{who} {odd}, asked for {at}")
 
 
-def _off(stated: Array, asked: Array) -> Array:
-    """Which times (…, K) are not those asked for: all, where they are more or fewer."""
+def _off(stated: Array, asked: Array, begins: float) -> Array:
+    """Which times (…, K) are not those asked for; the beginning is any before it."""
     if np.shape(stated) != asked.shape:
-        return np.ones(1, bool)
-    return ~(np.abs(stated - asked) <= SAME_INSTANT * np.abs(asked).max(initial=0))
+        return np.ones(1)  # more of them, or fewer
+    within: float = SAME_INSTANT * np.abs(asked).max(initial=0)
+    off = np.minimum(np.abs(stated - asked), np.abs(stated - np.maximum(asked, begins)))
+    return np.where(off <= within, 0.0, 1.0)
 
 
 def without_warnings() -> np.errstate:

@@ -117,6 +117,15 @@ def test_times_that_are_those_asked_for_but_for_rounding_are_taken(make):
     assert all(isinstance(outcome, Trajectory) for outcome in rounded)
 
 
+@pytest.mark.parametrize("make", [batch, listed])
+def test_a_model_may_hold_its_state_before_time_zero(make):
+    """It says so by the times it gives: where readings are shifted in time, some are asked for before zero."""
+    times = TIMES - 10
+    held = run_chunk(Odd(lambda x, t: make(x, np.maximum(t, 0))), np.ones((4, 5)), times)
+    late = run_chunk(Odd(lambda x, t: make(x, np.maximum(t, 5))), np.ones((4, 5)), times)
+    assert [isinstance(outcome, Failure) for outcome in (*held, *late)] == [False] * 4 + [True] * 4
+
+
 def test_a_batch_may_state_its_times_once():
     outcomes = run_chunk(Odd(lambda x, t: Batch(t[0], np.ones((*t.shape, 5)), LAYOUT)), np.ones((4, 5)), TIMES)
     assert isinstance(outcomes, Batch)
