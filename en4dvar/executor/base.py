@@ -101,16 +101,22 @@ def _own(model: ForwardModel, outcome: Outcome, asked: Array) -> Outcome:
     """A member's outcome where it is at the times (K,) ``asked`` for."""
     if isinstance(outcome, Failure):
         return outcome
-    who = f"{type(model).__name__}.trajectories gives"
+    who = f"{model._who or f'{type(model).__name__}.trajectories'} gives"
     if not isinstance(outcome, Trajectory):
         kind = type(outcome).__name__
         return Failure(f"{who} items of type {kind}; give a Batch, or a Trajectory or Failure for each member")
     stated = np.ravel(floats(outcome.times))
-    if not _off(stated, asked, model._begins).any():
+    off = _off(stated, asked, model._begins)
+    if not off.any():
         return outcome
     unit = "" if model.time_unit == "1" else f" {model.time_unit}"
-    odd, at = (f"{len(t)} time{'s' * (len(t) > 1)} from {t[0]:.6g} to {t[-1]:.6g}{unit}" for t in (stated, asked))
-    return Failure(f"{who} {odd}, asked for {at}")
+    odd, at = (
+        f"{len(t)} time{'s' * (len(t) > 1)} from {t[0]:.6g} to {t[-1]:.6g}{unit}" if len(t) else "no times"
+        for t in (stated, asked)
+    )
+    k = np.argmax(off)
+    first = f"; the first that differs is {stated[k]:.9g}, not {asked[k]:.9g}" if len(stated) == len(asked) else ""
+    return Failure(f"{who} {odd}, asked for {at}{first}")
 
 
 def _off(stated: Array, asked: Array, begins: float) -> Array:

@@ -275,6 +275,7 @@ class ForwardModel(ABC):
     known_by: ClassVar[Mapping[str, tuple[str, ...]]] = MappingProxyType({})
     unforeseen: Mapping[str, float] = MappingProxyType({})
     _begins: float = 0.0  # on the clock of the paths, where ``trajectories`` begin
+    _who: str = ""  # of whom messages about the paths speak, where not of ``trajectories``
 
     def changed(self, name: str, x: Array, change: Array) -> Array:
         """States (N, n_state) in which the quantity ``name`` is exp(``change``) (N,) times what it is in ``x``.

@@ -62,6 +62,9 @@ def step_of(
         raise _wrong(scheme, "advance", f"gives {short(repr(step))}; it gives a Step or a GaussNewtonStep")
     w, T = np.asarray(step.weights.w), step.weights.T
     square = T.shape in ((n, n), (0, 0)) if isinstance(T, np.ndarray) else hasattr(type(T), "dense")
+    if not (square or isinstance(T, np.ndarray)):
+        kind = type(T).__name__
+        raise _wrong(scheme, "advance", f"gives a transform of type {kind}; it is a numpy array of shape {(n, n)}")
     if w.shape + np.shape(step.norm) != (n,) or not square:
         shapes = f"weights {w.shape}, transform {np.shape(T)} and norm {np.shape(step.norm)}"
         raise _wrong(scheme, "advance", f"gives {shapes}; they are {(n,)}, {(n, n)} and a number")

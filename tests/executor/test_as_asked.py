@@ -8,7 +8,7 @@ from toys import Vectorised
 
 from en4dvar.executor import SerialExecutor, ThreadsExecutor, run_chunk
 from en4dvar.model.forward import Batch, Failure, Shared, Trajectory
-from en4dvar.series.window import propagate
+from en4dvar.series.window import MembersLost, propagate
 
 TIMES = np.linspace(1.0, 60.0, 15)
 LAYOUT = Vectorised("abc").layout
@@ -40,6 +40,12 @@ CASES = [
     (lambda x, t: batch(x, t[:, 1:]), f"{GIVES} 14 times from 5.21429 to 60 s, {ASKED}"),
     (lambda x, t: listed(x, t[:, 1:]), f"{GIVES} 14 times from 5.21429 to 60 s, {ASKED}"),
     (lambda x, t: batch(x, t[:, -1:]), f"{GIVES} 1 time from 60 to 60 s, {ASKED}"),
+    (lambda x, t: batch(x, t[:, :0]), f"{GIVES} no times, {ASKED}"),
+    (lambda x, t: listed(x, t[:, :0]), f"{GIVES} no times, {ASKED}"),
+    (
+        lambda x, t: batch(x, t + 0.5 * (np.arange(15) == 3)),
+        f"{GIVES} 15 times from 1 to 60 s, {ASKED}; the first that differs is 14.1428571, not 13.6428571",
+    ),
     (lambda x, t: batch(x, t * np.nan), f"{GIVES} 15 times from nan to nan s, {ASKED}"),
     (
         lambda x, t: np.ones((*t.shape, 5)),
@@ -138,3 +144,14 @@ def test_a_series_asks_for_times_on_the_models_clock():
     whole = propagate(Vectorised(), start[None], 0.0, np.array([1.0, 2.0]), SerialExecutor())
     later = propagate(Vectorised(), whole[:, 0], 1.0, np.array([2.0]), SerialExecutor())
     np.testing.assert_allclose(later[:, 0], whole[:, 1], rtol=1e-12)
+
+
+def test_a_resumed_that_gives_other_times_is_told_by_its_name():
+    class Late(Vectorised):
+        def resumed(self, x, start, times):
+            return super().resumed(x, start, times - 0.5)
+
+    with pytest.raises(MembersLost) as caught:
+        propagate(Late(), np.ones((1, 4)), 1.0, np.array([2.0]), SerialExecutor())
+    reason = "Late.resumed gives 1 time from 1.5 to 1.5 s, asked for 1 time from 2 to 2 s; the first that differs is"
+    assert caught.value.reasons[0].startswith(reason)

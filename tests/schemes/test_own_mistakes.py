@@ -63,7 +63,14 @@ CASES = [
         f"{STEP}        return Step(Weights(s.w, s.transform[:3]), s.norm)",
         "advance gives weights (16,), transform (3, 16) and norm (); they are (16,), (16, 16) and a number",
     ),
-    (f"{STEP}        return Step(Weights(s.w, None), s.norm)", "advance gives weights (16,), transform () and norm ()"),
+    (
+        f"{STEP}        return Step(Weights(s.w, None), s.norm)",
+        "advance gives a transform of type NoneType; it is a num",
+    ),
+    (
+        f"{STEP}        return Step(Weights(s.w, s.transform.tolist()), s.norm)",
+        "advance gives a transform of type list; it is a numpy array of shape (16, 16)",
+    ),
     (f"{STEP}        return Step(s.w, s.norm)", "advance gives Step(weights=array("),
     (
         f"{STEP}        return Step(Weights(np.nan * s.w, s.transform), s.norm)",
