@@ -99,7 +99,7 @@ def as_asked(model: ForwardModel, outcomes: Sequence[Outcome], times: Array) -> 
 
 def _own(model: ForwardModel, outcome: Outcome, asked: Array) -> Outcome:
     """A member's outcome where it is at the times (K,) ``asked`` for."""
-    if isinstance(outcome, Failure):
+    if isinstance(outcome, Failure) or (isinstance(outcome, Trajectory) and np.array_equal(outcome.times, asked)):
         return outcome
     who = f"{model._who or f'{type(model).__name__}.trajectories'} gives"
     if not isinstance(outcome, Trajectory):
