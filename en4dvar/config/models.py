@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict
 from en4dvar.config.context import check
 from en4dvar.config.document import Document
 from en4dvar.model.forward import ForwardModel, StateField
-from en4dvar.model.state import Parameter
+from en4dvar.model.state import OF_READINGS, Parameter
 from en4dvar.plumbing import user_file
 from en4dvar.plumbing.errors import ConfigError, En4dvarError, Fault, retold
 from en4dvar.plumbing.files import PathError
@@ -137,10 +137,11 @@ def checked(model: ForwardModel) -> ForwardModel:
 
 
 def _require_defaults(model: ForwardModel) -> None:
-    known, who = {p.name: p for p in model.parameters}, f"{type(model).__name__}: defaults: "
+    own = {p.name: p for p in (*model.optional_parameters, *model.parameters)}
+    known, who = {p.name: p for p in OF_READINGS} | own, f"{type(model).__name__}: defaults: "
     for name, value in model.defaults.items():
         if name not in known:
-            raise ConfigError(f"{who}{shown(name)} is not one of its parameters{suggest(name, known)}")
+            raise ConfigError(f"{who}{shown(name)} is not one of its parameters{suggest(name, own)}")
         low, high = known[name].bounds
         if not (isinstance(value, Real) and low <= value <= high):
             words = f"give a number from {low:g} to {high:g} {known[name].unit}"

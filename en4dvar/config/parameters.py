@@ -336,7 +336,8 @@ def entries(kind: str = "") -> Made:
                 return f"{kind} makes its own readings: keys of their own say when and with which errors"
             return f"unknown parameter {shown(name)}{suggest(name, labels)}"
 
-        parameters: dict[str, Entry] = {name: Fixed(known[name], value) for name, value in model.defaults.items()}
+        defaults = {name: float(value) for name, value in model.defaults.items() if name in known}
+        parameters: dict[str, Entry] = {name: Fixed(known[name], value) for name, value in defaults.items()}
         with Faults() as faults:
             parameters |= read_each(section, known, context, faults, _entry, unknown)
             for name, entry in parameters.items():

@@ -236,7 +236,8 @@ class OfScheme(Section):
         known = cls.model_fields["scheme"].annotation is str
         if known or not (isinstance(name, str) and user_file.is_file_reference(name)):
             with Faults() as faults, faults.at("scheme"):
-                cls._require_free(cls.kinds.get(name, Scheme) if isinstance(name, str) and not known else Scheme)
+                kind = cls.kinds.get(name, Scheme) if isinstance(name, str) and not known else Scheme
+                cls._require_free(kind, section)
             return validate(section)
         reference = user_file.absolute(name, info.context.base)
         with Faults() as faults, faults.at("scheme"):
@@ -244,7 +245,7 @@ class OfScheme(Section):
             kind = user_file.load(reference, f"scheme {shown(reference)}")
             if not (isinstance(kind, type) and issubclass(kind, Scheme)):
                 raise ConfigError(f"{shown(reference)} is not a subclass of en4dvar.schemes.Scheme")
-            cls._require_free(kind)
+            cls._require_free(kind, section)
             cls.kinds[reference] = kind
         own = cast(Any, create_model(cls.__name__, __base__=section_of(cls.kinds[reference], base=cls), scheme=str))
         made: Self = own.model_validate({**section, "scheme": reference}, context=info.context)
@@ -256,15 +257,18 @@ class OfScheme(Section):
             faults.add((key,), message, at_key=True)
 
     @classmethod
-    def _require_free(cls, kind: type[Scheme]) -> None:
-        """Raise :class:`ConfigError` where a key of the scheme has a name that means something else in the section."""
+    def _require_free(cls, kind: type[Scheme], section: Any) -> None:
+        """Raise :class:`ConfigError` where a key of the scheme has a name that means something else in the section,
+        or has no default and is not given.
+        """
         own = cls.model_fields.keys() - frozenset().union(*map(keys_of, cls.kinds.values()))
         names = [key.name for key in fields(kind)]
         if taken := [name for name in names if name in own or hasattr(cls, name) or name.startswith("_")]:
             why = f"{shown(taken[0])} cannot be the name of a key, since it is that of something else in this section"
             raise ConfigError(f"{why}; give the field of {kind.__name__} another name")
-        if bare := [key.name for key in fields(kind) if key.default is key.default_factory is MISSING]:
-            raise ConfigError(f"{shown(bare[0])} of {kind.__name__} has no default; each key of a scheme has one")
+        bare = [key.name for key in fields(kind) if key.default is key.default_factory is MISSING]
+        if missing := [name for name in bare if name not in section]:
+            raise ConfigError(f"{shown(missing[0])} of {kind.__name__} has no default; give the key here, or a default")
 
     @classmethod
     def unread(cls, section: Mapping[str, Any]) -> dict[str, str]:

@@ -12,14 +12,13 @@ from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
 from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
 
 from en4dvar.executor.limits import TimeLimitError, has_time_limit, within_time_limit
 from en4dvar.model.forward import Batch, Failure, ForwardModel, Trajectory
-from en4dvar.model.state import Array
+from en4dvar.model.state import Array, floats
 from en4dvar.plumbing.children import HaltedError, end_those_of, raise_in, starts_again
 from en4dvar.plumbing.errors import En4dvarError
 from en4dvar.plumbing.user_code import describe, own_fault, reason_of
@@ -71,13 +70,13 @@ def run_chunk(model: ForwardModel, x: Array, times: Array) -> Sequence[Outcome]:
         try:
             with without_warnings():
                 outcomes = within_time_limit(lambda: kept(model.trajectories(x, times)))
-            reason = unlike(model, outcomes, len(x), times)
+            if len(outcomes) == len(x):
+                return as_asked(model, outcomes, times)
+            reason = f"the model returned {len(outcomes)} trajectories for {len(x)} members"
         except TimeLimitError as error:
-            outcomes, reason = [], describe(error)
+            reason = describe(error)
         except BaseException as error:  # a model may fail in any way; the reason is kept
-            outcomes, reason = [], reason_of(error)
-        if not reason:
-            return outcomes
+            reason = reason_of(error)
         if len(x) <= model.batch:
             return [Failure(reason)] * len(x)
     times = np.broadcast_to(times, (len(x), np.shape(times)[-1]))
@@ -90,32 +89,43 @@ def kept(outcomes: Sequence[Outcome]) -> Sequence[Outcome]:
     return outcomes if isinstance(outcomes, Batch) else list(() if outcomes is None else outcomes)
 
 
-def unlike(model: ForwardModel, outcomes: Sequence[Outcome], n_members: int, times: Array) -> str:
-    """Why ``outcomes`` are not those of N members at ``times`` (K,) or (N, K); "" where they are."""
-    if len(outcomes) != n_members:
-        return f"the model returned {len(outcomes)} trajectories for {n_members} members"
-    asked, who = times + model._begins, f"{type(model).__name__}.trajectories gives"
-    if isinstance(outcomes, Batch) and _same(outcomes.times, asked):
-        return ""
-    rows = np.broadcast_to(asked, (n_members, np.shape(asked)[-1]))
-    if isinstance(outcomes, Batch):
-        stated: Any = np.broadcast_to(outcomes.times, (n_members, np.shape(outcomes.times)[-1]))
-    elif strange := {type(item).__name__ for item in outcomes if not isinstance(item, Outcome)}:
-        return f"{who} items of type {', '.join(strange)}; give a Batch, or a Trajectory or Failure for each member"
-    else:
-        stated = [row if isinstance(item, Failure) else item.times for item, row in zip(outcomes, rows, strict=True)]
-        if _same(stated, rows):
-            return ""
-    pair = next(pair for pair in zip(stated, rows, strict=True) if not _same(*pair))
+def as_asked(model: ForwardModel, outcomes: Sequence[Outcome], times: Array) -> Sequence[Outcome]:
+    """``outcomes`` of N members at ``times`` (K,) or (N, K); a member that is not at its own is a :class:`Failure`."""
+    rows = np.broadcast_to(times + model._begins, (len(outcomes), np.shape(times)[-1]))
+    if isinstance(outcomes, Batch) and not _off(outcomes.times, rows, model._begins).any():
+        return outcomes
+    return [_own(model, outcome, row) for outcome, row in zip(outcomes, rows, strict=True)]
+
+
+def _own(model: ForwardModel, outcome: Outcome, asked: Array) -> Outcome:
+    """A member's outcome where it is at the times (K,) ``asked`` for."""
+    if isinstance(outcome, Failure) or (isinstance(outcome, Trajectory) and np.array_equal(outcome.times, asked)):
+        return outcome
+    who = f"{model._who or f'{type(model).__name__}.trajectories'} gives"
+    if not isinstance(outcome, Trajectory):
+        kind = type(outcome).__name__
+        return Failure(f"{who} items of type {kind}; give a Batch, or a Trajectory or Failure for each member")
+    stated = np.ravel(floats(outcome.times))
+    off = _off(stated, asked, model._begins)
+    if not off.any():
+        return outcome
     unit = "" if model.time_unit == "1" else f" {model.time_unit}"
-    odd, at = (f"{len(t)} time{'s' * (len(t) > 1)} from {t[0]:.6g} to {t[-1]:.6g}{unit}" for t in pair)
-    return f"{who} {odd}, asked for {at}"
+    odd, at = (
+        f"{len(t)} time{'s' * (len(t) > 1)} from {t[0]:.6g} to {t[-1]:.6g}{unit}" if len(t) else "no times"
+        for t in (stated, asked)
+    )
+    k = np.argmax(off)
+    first = f"; the first that differs is {stated[k]:.9g}, not {asked[k]:.9g}" if len(stated) == len(asked) else ""
+    return Failure(f"{who} {odd}, asked for {at}{first}")
 
 
-def _same(stated: Any, asked: Array) -> bool:
-    with suppress(ValueError):  # another number of times
-        return bool(np.equal(stated, asked).all()) or np.allclose(stated, asked, 0, SAME_INSTANT * np.abs(asked).max())
-    return False
+def _off(stated: Array, asked: Array, begins: float) -> Array:
+    """Which times (…, K) are not those asked for; the beginning is any before it."""
+    if np.shape(stated) != asked.shape:
+        return np.ones(1)  # more of them, or fewer
+    within: float = SAME_INSTANT * np.abs(asked).max(initial=0)
+    off = np.minimum(np.abs(stated - asked), np.abs(stated - np.maximum(asked, begins)))
+    return np.where(off <= within, 0.0, 1.0)
 
 
 def without_warnings() -> np.errstate:
@@ -360,8 +370,8 @@ class ThreadsExecutor(PoolExecutor):
                     shared.work()
                     for future in futures:
                         future.result()
-                    if not unlike(model, results := kept(shared.results()), len(x), times):
-                        return results
+                    if len(results := kept(shared.results())) == len(x):
+                        return as_asked(model, results, times)
         except BaseException as error:  # told member by member
             own_fault(error)
         return super().trajectories(model, x, times)

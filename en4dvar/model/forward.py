@@ -275,6 +275,7 @@ class ForwardModel(ABC):
     known_by: ClassVar[Mapping[str, tuple[str, ...]]] = MappingProxyType({})
     unforeseen: Mapping[str, float] = MappingProxyType({})
     _begins: float = 0.0  # on the clock of the paths, where ``trajectories`` begin
+    _who: str = ""  # of whom messages about the paths speak, where not of ``trajectories``
 
     def changed(self, name: str, x: Array, change: Array) -> Array:
         """States (N, n_state) in which the quantity ``name`` is exp(``change``) (N,) times what it is in ``x``.
@@ -414,7 +415,8 @@ class Batch(Sequence[Trajectory | Failure]):
 
     def __init__(self, times: Array, states: Array, layout: StateLayout):
         _require_path(times, states, layout)
-        self.times, self.states, self.layout = times, states, layout
+        self.times = times if np.ndim(times) > 1 else np.broadcast_to(times, np.shape(states)[:2])
+        self.states, self.layout = states, layout
         self.whole = bool(np.isfinite(states).all())  # no member failed
 
     def __len__(self) -> int:

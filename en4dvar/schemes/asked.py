@@ -4,7 +4,7 @@ Each function raises :class:`ConfigError` where the method of its name in the sc
 """
 
 import math
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from en4dvar.plumbing.hints import short
 from en4dvar.plumbing.user_code import describe, line_of
 from en4dvar.schemes.base import Draw, Evaluation, GaussNewtonStep, Runs, Scheme, Step, Weights
 
-MOST = 100  # iterations of a scheme that says nothing of how many it takes
+MOST = 1000  # iterations of a scheme that says nothing of how many it takes
 
 
 def _asked(scheme: Scheme, method: str, *arguments: Any) -> Any:
@@ -44,11 +44,11 @@ def linearised(scheme: Scheme, weights: Weights, runs: Runs) -> tuple[Array, Arr
     """:meth:`Scheme.linearise`."""
     told, size = _asked(scheme, "linearise", weights, runs), runs.predictions.shape[1]
     n = len(weights.w) if scheme.minimiser is None or runs.basis is None else runs.basis.shape[1]
-    shapes = [np.shape(part) for part in told] if isinstance(told, tuple) else type(told).__name__
+    shapes = [np.shape(part) for part in told] if isinstance(told, tuple | list) else type(told).__name__
     if shapes != [(size,), (n, size)] or not math.isfinite(np.sum(told[0]) + np.sum(told[1])):
         right = f"a pair of arrays of finite numbers, of shapes {(size,)} and {(n, size)}"
         raise _wrong(scheme, "linearise", f"gives {shapes}; it gives {right}")
-    return cast(tuple[Array, Array], told)
+    return np.asarray(told[0]), np.asarray(told[1])
 
 
 def step_of(
@@ -62,6 +62,9 @@ def step_of(
         raise _wrong(scheme, "advance", f"gives {short(repr(step))}; it gives a Step or a GaussNewtonStep")
     w, T = np.asarray(step.weights.w), step.weights.T
     square = T.shape in ((n, n), (0, 0)) if isinstance(T, np.ndarray) else hasattr(type(T), "dense")
+    if not (square or isinstance(T, np.ndarray)):
+        kind = type(T).__name__
+        raise _wrong(scheme, "advance", f"gives a transform of type {kind}; it is a numpy array of shape {(n, n)}")
     if w.shape + np.shape(step.norm) != (n,) or not square:
         shapes = f"weights {w.shape}, transform {np.shape(T)} and norm {np.shape(step.norm)}"
         raise _wrong(scheme, "advance", f"gives {shapes}; they are {(n,)}, {(n, n)} and a number")
@@ -72,8 +75,9 @@ def step_of(
 
 def is_done(scheme: Scheme, iteration: int, step: Step | GaussNewtonStep) -> bool:
     """:meth:`Scheme.done`, true in the end."""
-    done, most = bool(_asked(scheme, "done", iteration, step)), max(MOST, getattr(scheme, "max_iterations", 0))
-    if not done and iteration + 1 >= max(most, scheme.passes):
+    done = bool(_asked(scheme, "done", iteration, step))
+    said = scheme.passes, getattr(scheme, "max_iterations", 0), *vars(scheme).values()  # any key may be their number
+    if not done and iteration + 1 >= max(MOST, *(value for value in said if isinstance(value, int))):
         why = f"is not true after {iteration + 1} iterations; a scheme that takes more has a key max_iterations"
         raise _wrong(scheme, "done", why)
     return done

@@ -218,7 +218,8 @@ class Scheme:
     def done(self, iteration: int, step: Step | GaussNewtonStep) -> bool:
         """Whether iterations end with this step, which is taken (a minimiser is not asked).
 
-        One that is false a hundred times is an error; a key ``max_iterations`` allows for more.
+        One that is false a thousand times is an error; a key that is a larger integer, say ``max_iterations``, allows
+        for more.
         """
         return iteration + 1 == self.passes
 

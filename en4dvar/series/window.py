@@ -35,7 +35,7 @@ class _Started(ForwardModel):
     """A model seen from a later time zero."""
 
     def __init__(self, model: ForwardModel, start: float):
-        self.model, self._begins = model, start
+        self.model, self._begins, self._who = model, start, f"{type(model).__name__}.resumed"
         self.parameters, self.layout, self.observables = model.parameters, model.layout, model.observables
         self.batch, self.compiled, self.threaded = model.batch, model.compiled, model.threaded
 

@@ -72,6 +72,7 @@ def test_an_odd_data_set_is_named_and_the_estimate_made_without_it():
     (told,) = [c for c in with_it.cautions if c.code == "odd-data-set"]
     assert told.severity == "serious"
     assert "set7 (χ²" in told.words
+    assert told.words.endswith("the shared values quoted first are those without it")
     assert not rest.odd
     assert "odd-data-set" not in codes(rest.cautions)
 

@@ -208,6 +208,7 @@ def test_the_command_prints_the_table_and_writes_the_page(toy, tmp_path):
     assert "12 sets show no sign" in done.stderr
     page = (out / "calibration.html").read_text()
     assert "Calibration of" in page
+    assert '"errors" is the same half sum' in page
     assert page.count("<svg") >= 1
     assert load_config(out / "config.resolved.yaml").name == "toy"
     (out / "calibration.html").unlink()

@@ -48,12 +48,12 @@ CASES = [
         "linearise gives ndarray; it gives a pair",
     ),
     (
-        "    def linearise(self, weights, runs):\n        raise ValueError('no')",
-        "linearise raises ValueError: no ({0}:15)",
+        "    def linearise(self, weights, runs):\n        return [runs.predictions, runs.predictions]",
+        "linearise gives [(16, 9), (16, 9)]; it gives a pair",
     ),
     (
-        "    def linearise(self, weights, runs):\n        return [*super().linearise(weights, runs)]",
-        "linearise gives list; it gives a pair of arrays of finite numbers, of shapes (9,) and (16, 9)",
+        "    def linearise(self, weights, runs):\n        raise ValueError('no')",
+        "linearise raises ValueError: no ({0}:15)",
     ),
     (
         "    def linearise(self, weights, runs):\n        return np.full(9, np.inf), runs.predictions",
@@ -63,7 +63,14 @@ CASES = [
         f"{STEP}        return Step(Weights(s.w, s.transform[:3]), s.norm)",
         "advance gives weights (16,), transform (3, 16) and norm (); they are (16,), (16, 16) and a number",
     ),
-    (f"{STEP}        return Step(Weights(s.w, None), s.norm)", "advance gives weights (16,), transform () and norm ()"),
+    (
+        f"{STEP}        return Step(Weights(s.w, None), s.norm)",
+        "advance gives a transform of type NoneType; it is a num",
+    ),
+    (
+        f"{STEP}        return Step(Weights(s.w, s.transform.tolist()), s.norm)",
+        "advance gives a transform of type list; it is a numpy array of shape (16, 16)",
+    ),
     (f"{STEP}        return Step(s.w, s.norm)", "advance gives Step(weights=array("),
     (
         f"{STEP}        return Step(Weights(np.nan * s.w, s.transform), s.norm)",
@@ -83,12 +90,12 @@ CASES = [
     ),
     (
         "    def done(self, iteration, step):\n        return False",
-        "done is not true after 100 iterations; a scheme that ",
+        "done is not true after 1000 iterations; a scheme that ",
     ),
-    ("    passes = 0", "done is not true after 100 iterations"),
+    ("    passes = 0", "done is not true after 1000 iterations"),
     (
-        "    max_iterations: int = 120\n    def done(self, iteration, step):\n        pass",
-        "done is not true after 120 itera",
+        "    max_iterations: int = 1200\n    def done(self, iteration, step):\n        pass",
+        "done is not true after 1200 itera",
     ),
 ]
 
@@ -98,15 +105,40 @@ def written(folder, lines):
     return f"{folder / 'bad.py'}:Bad"
 
 
+def estimated(scheme, **keys):
+    t, priors = np.linspace(0, 2, 9), {name: {"prior": "normal", "mean": 0, "std": 1} for name in "ab"}
+    assimilation = {"scheme": scheme, "members": 16, **keys}
+    en4dvar.estimate(lambda p, t: p["a"] + p["b"] * t, (t, t), priors, error=0.1, assimilation=assimilation)
+
+
 @pytest.mark.parametrize(("lines", "words"), CASES)
 def test_the_scheme_and_its_method_are_named(tmp_path, lines, words):
-    scheme, t = written(tmp_path, lines), np.linspace(0, 2, 9)
-    priors = {name: {"prior": "normal", "mean": 0, "std": 1} for name in "ab"}
     with pytest.raises(ConfigError) as caught:
-        en4dvar.estimate(
-            lambda p, t: p["a"] + p["b"] * t, (t, t), priors, error=0.1, assimilation={"scheme": scheme, "members": 16}
-        )
+        estimated(written(tmp_path, lines))
     assert f"scheme Bad: {words}".format(tmp_path / "bad.py") in str(caught.value)
+
+
+SLOWLY = f"{STEP}        return Step(Weights(weights.w + 0.05 * (s.w - weights.w), s.transform), s.norm)\n"
+
+
+@pytest.mark.parametrize(
+    ("lines", "keys"),
+    [
+        ("    def linearise(self, weights, runs):\n        return [*super().linearise(weights, runs)]", {}),
+        ("    max_iterations: int | None = None", {}),
+        ("    patience: int", {"patience": 3}),
+        (f"{SLOWLY}    def done(self, iteration, step):\n        return iteration == 150", {}),
+        (
+            f"    steps: int = 1010\n{SLOWLY}    def done(self, iteration, step):\n"
+            "        return iteration + 1 == self.steps",
+            {},
+        ),
+    ],
+    ids=["list", "none", "given", "150", "own-key"],
+)
+def test_what_is_no_mistake_runs(tmp_path, lines, keys):
+    """A list for a pair; a limit that may be none; a key without a default that is given; more than 100 iterations."""
+    estimated(written(tmp_path, lines), **keys)
 
 
 @pytest.mark.parametrize("localisation", ["", "  localisation: {radius: 4}\n"])
@@ -137,8 +169,5 @@ def test_a_key_without_a_default_is_refused(tmp_path):
     scheme = written(tmp_path, "@dataclass(frozen=True)\nclass Eager(ETKF):\n    patience: int\n").replace(
         "Bad", "Eager"
     )
-    with pytest.raises(ConfigError, match="'patience' of Eager has no default; each key of a scheme has one"):
-        en4dvar.estimate(
-            lambda p, t: p["a"] * t, ([1, 2, 3], [1, 2, 3]), {"a": {"prior": "normal", "mean": 0, "std": 1}}, error=0.1,
-            assimilation={"scheme": scheme, "members": 16},
-        )  # fmt: skip
+    with pytest.raises(ConfigError, match="'patience' of Eager has no default; give the key here, or a default"):
+        estimated(scheme)

@@ -133,7 +133,8 @@ def unfinished(analysis: Analysis) -> checks.Findings:
     words = f"not converged: {analysis.stop_reason}"
     following = f"the next step would be {step_norm:.2g} posterior standard deviations"
     if analysis.refinement:
-        words = f"the search for the minimum has {words}; members are drawn from the posterior itself, which needs none"
+        words = f"the search for the minimum has {words}; members are drawn from the posterior itself"
+        words += ", which needs no minimum"
         yield replace(caution("not-converged", words, "note"), advice="no action is needed")
     elif step_norm <= SHORT_STEP:
         yield caution("not-converged", f"{words}; {following}", "note")

@@ -199,8 +199,9 @@ def left_out(
         f"others, probability {_in_figures(agreed.chances[e])})"
         for e in odd
     ]
-    words = f"{_several(told)} {'does' if len(odd) == 1 else 'do'} not share the values of the others"
-    yield caution("odd-data-set", f"{words}: the shared values quoted first are those without", "serious")
+    verb, them = ("does", "it") if len(odd) == 1 else ("do", "them")
+    words = f"{_several(told)} {verb} not share the values of the others"
+    yield caution("odd-data-set", f"{words}: the shared values quoted first are those without {them}", "serious")
     without = _several([joint.names[e] for e in odd])
     yield from (replace(c, words=f"without {without}: {c.words}") for c in rest)
 
