@@ -9,8 +9,7 @@ from scipy.integrate import solve_ivp
 from en4dvar.inputs.implausible import cut_off, level_top, outlying, scatter_of
 from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.settings import BubbleSettings
-from en4dvar_bubble.starter.look import Top, look, top
-from en4dvar_bubble.starter.proposal import TOP_WIDTH
+from en4dvar_bubble.starter.look import TOP_WIDTH, Top, look, top
 
 _PATH = solve_ivp(
     lambda _, y: [y[1], (-1 - 1.5 * y[1] ** 2) / y[0]], (0, 0.9), [1.0, 0.0], dense_output=True, rtol=1e-10

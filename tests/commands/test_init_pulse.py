@@ -6,12 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from init_files import call, proposed
+from init_files import call, proposed, rebounding
 
 from en4dvar.assembly.build import build
 from en4dvar.priors.prior import PriorTerm
 from en4dvar_bubble import simulate as bubble_path
 from en4dvar_bubble.driving import sine_burst
+from en4dvar_bubble.starter.look import TOP_WIDTH, common_rest, look
 
 SOFT = {"G": 420.0, "alpha": 0.025, "mu": 0.086, "R0": 0.43e-6}  # agarose of 0.3 and of 1 %: Mancia et al. (2021)
 STIFF = {"G": 6900.0, "alpha": 0.025, "mu": 0.15, "R0": 1.3e-6}
@@ -97,3 +98,19 @@ def test_a_bubble_that_rests_and_then_swings_needs_no_collapse(
     assert problem.model.start == "acoustic"  # type: ignore[attr-defined]
     error = np.hypot(0.06e-6, 10**-decimals * 1e-6 / 12**0.5)  # of noise and rounding
     assert 0.4 * error < np.median(problem.observations.std) < 3 * error
+
+
+@pytest.mark.parametrize("seed_of", [0.15, 0.3])
+def test_a_seed_of_which_a_laser_makes_a_far_larger_bubble_is_no_rest_of_a_driven_one(seed_of: float) -> None:
+    """Dirt or an old bubble where the laser is focused, seen in six frames before it."""
+    t, R = rebounding(0.05)
+    radius = np.append(np.full(6, seed_of), R) + 0.003 * np.random.default_rng(5).standard_normal(len(t) + 6)
+    times = 20e-6 * (np.append(t[0] + 0.05 * np.arange(-6, 0), t) + 1)
+    assert look(times, 200e-6 * radius).start == "laser"
+
+
+def test_bubbles_that_differ_at_rest_widen_the_prior_of_one_once() -> None:
+    """Errors of their readings count threefold, since these are in the fit, and what they differ by counts once."""
+    levels = [(25e-6, 0.1e-6), (35e-6, 0.1e-6), (60e-6, 0.1e-6)]
+    assert common_rest(levels, 0.0)[1] == pytest.approx(np.std([25e-6, 35e-6, 60e-6]), rel=1e-3)
+    assert common_rest(levels[:1], 0.2e-6)[1] == pytest.approx(TOP_WIDTH * np.hypot(0.1e-6, 0.2e-6))
