@@ -10,7 +10,7 @@ from en4dvar.assembly.reading import find_files, read_observations, with_parts
 from en4dvar.config import Config
 from en4dvar.config.data import DataPlan, SeriesPlan
 from en4dvar.config.kinds import SequenceConfig
-from en4dvar.config.parameters import Fixed, Scalar, Tied, Uncertain, inside_bounds
+from en4dvar.config.parameters import READINGS, Fixed, Scalar, Tied, Uncertain, inside_bounds
 from en4dvar.config.quantities import Spread
 from en4dvar.config.sequential import SeriesLocalisation, error_rates, localisation_of, per_time
 from en4dvar.config.varies import Estimated, Perturbed, VariesSection, modes_of
@@ -215,8 +215,8 @@ def _of_data(
         if isinstance(where, Scalar):
             return where.value(observations.scalars, observations.source)
         if observations.parts:
-            raise ConfigError("'maximum' is defined only for a single series without places; give a value")
-        return where.value * convert(float(observations.values.max()), config.observable.unit, unit)
+            raise ConfigError(f"'{where.whole}' is defined only for a single series without places; give a value")
+        return where.value * convert(READINGS[where.whole](observations.values), config.observable.unit, unit)
 
     return value
 

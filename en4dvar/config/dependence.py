@@ -239,7 +239,7 @@ class PopulationSection(Section, HyperPrior):
                 if name not in estimated:
                     raise ConfigError(f"{name}: not estimated, it has no prior{suggest(name, estimated)}")
                 if estimated[name].needs_data:
-                    raise ConfigError(f"{name}: its prior depends on the data set ('maximum'), a population has one")
+                    raise ConfigError(f"{name}: its prior depends on the data set, a population has one")
         of_kind = groups.get(self.by or "", {})
         for group in self.known:
             with document.collecting(faults, "population", "known", *([group] if self.by else [])):
@@ -310,7 +310,7 @@ class Sharing:
             if kind not in (known := [ALL, NONE, *groups]):
                 wrong.append((name, "shared", f"no kind of 'groups:' is called {shown(kind)}{suggest(kind, known)}"))
             if asked[name].needs_data:
-                words = "its prior depends on the data set ('maximum'), but what is shared has one prior"
+                words = "its prior depends on the data set, but what is shared has one prior"
                 wrong.append((name, "shared", words))
         if kinds:
             first = next(iter(kinds))

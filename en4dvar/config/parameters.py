@@ -12,7 +12,7 @@ from en4dvar.config.quantities import SPREAD, Spread, require_sign, share_of, su
 from en4dvar.config.schema import Section
 from en4dvar.config.varies import VariesSection
 from en4dvar.model.forward import ForwardModel
-from en4dvar.model.state import OF_READINGS, READING_OFFSET, TIME_SHIFT, Parameter
+from en4dvar.model.state import OF_READINGS, READING_OFFSET, TIME_SHIFT, Array, Parameter
 from en4dvar.plumbing.errors import ConfigError, retold
 from en4dvar.plumbing.hints import brief, shown, suggest
 from en4dvar.plumbing.units import parse_quantity
@@ -78,11 +78,15 @@ class Scalar:
         return _bounded(f"{scalars[self.name]!r} {self.unit}", self.parameter)
 
 
+READINGS: Mapping[str, Callable[[Array], float]] = {"maximum": lambda y: float(y.max()), "first": lambda y: float(y[0])}
+"""Of the observations (K,) of a window, those whose share a prior's location may be."""
+
+
 def _location(written: Any, context: Context) -> float | Spread | Scalar:
-    """Of a prior: a quantity, ``maximum`` or a share of it, or a scalar of the data file."""
+    """Of a prior: a quantity, one of :data:`READINGS` or a share of it, or a scalar of the data file."""
     if isinstance(written, dict):
         return Scalar.of(written, context)
-    share = share_of("100 % of maximum" if written == "maximum" else written)
+    share = share_of(f"100 % of {written}" if written in READINGS else written, *READINGS)
     if share is None:
         return _bounded(written, context.subject)
     require_sign(share.value, "positive", written)
@@ -101,9 +105,11 @@ class PriorSection(Section):
     uniform (lower, upper), half-normal (std, and lower, by default 0), beta (lower, upper, alpha, beta), or ensemble:
     mean, spread and correlations are those of the members in the file of ``prior: {ensemble: FILE}``."""
     mean: Location = None
-    """Mean with its unit, or ``maximum``, the largest observation of the window, or ``13 % of maximum``."""
+    """Mean with its unit, or ``maximum`` or ``first``, the largest or first observation of the window, or a share of
+    it, ``13 % of maximum``."""
     median: Location = None
-    """Median with its unit, or ``maximum``, the largest observation of the window, or ``13 % of maximum``."""
+    """Median with its unit, or ``maximum`` or ``first``, the largest or first observation of the window, or a share of
+    it, ``13 % of maximum``."""
     std: Annotated[Spread | None, SPREAD] = None
     """Standard deviation with its unit, or in % of the mean; of a half-normal, that of the whole Gaussian."""
     log_std: Annotated[float, Field(gt=0)] | None = None
@@ -176,9 +182,7 @@ class Fixed:
 
 @dataclass(frozen=True)
 class Uncertain:
-    """A parameter with a prior; ``maximum`` as a location is the observed maximum in the window. ``of_members`` is the
-    prior that an ensemble makes, once its file is read.
-    """
+    """A parameter with a prior. ``of_members`` is the prior that an ensemble makes, once its file is read."""
 
     parameter: Parameter
     spec: PriorSection
@@ -246,7 +250,7 @@ class Uncertain:
         if not isinstance(value, Spread | Scalar):
             return value or 0.0
         if of_data is None:
-            name = value.name if isinstance(value, Scalar) else "maximum"
+            name = value.name if isinstance(value, Scalar) else value.whole
             raise ConfigError(f"{name!r} is known only from the data, and there are none", key)
         with retold(ConfigError, ConfigError, "", key):
             return of_data(value)

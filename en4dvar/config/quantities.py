@@ -40,11 +40,12 @@ def require_sign(value: float, sign: Literal["positive", "not negative"], text: 
 
 @dataclass(frozen=True)
 class Spread:
-    """A standard deviation: ``value`` in a unit, or a share of something known later."""
+    """A standard deviation: ``value`` in a unit, or a share of something known later, of readings of a ``whole``."""
 
     value: float
     relative: bool = False
     unit: str = ""  # as it is written
+    whole: str = "maximum"
 
     def absolute(self, whole: float) -> float:
         """The standard deviation in the unit of ``whole``."""
@@ -74,10 +75,14 @@ def unit_of(target: Unit) -> Made:
     return Made(fits, str)
 
 
-def share_of(text: Any, whole: str = "maximum") -> Spread | None:
-    """``"1 % of maximum"`` or of another ``whole``; None of what says no such thing. Raises :class:`UnitError`."""
-    relative = re.fullmatch(rf"(.*%)\s+of\s+(?:the\s+)?{whole}", str(text).strip())
-    return Spread(parse_quantity(relative[1], "1"), relative=True) if relative else None
+def share_of(text: Any, *wholes: str) -> Spread | None:
+    """``"1 % of maximum"`` or of another of ``wholes``; None of what says no such thing. Raises :class:`UnitError`."""
+    if not (said := re.fullmatch(r"(.*?)\s*\bof\s+(?:the\s+)?(.*)", str(text).strip())):
+        return None
+    if not said[1].endswith("%") or said[2] not in wholes:
+        example = f"write a number in % of {' or '.join(wholes)}, as '5 % of {wholes[0]}'"
+        raise UnitError(f"{shown(str(text))} is no share; {example}")
+    return Spread(parse_quantity(said[1], "1"), relative=True, whole=said[2])
 
 
 def parse_error_std(text: Any, unit: str, whole: str = "maximum") -> Spread:

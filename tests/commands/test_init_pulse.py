@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from en4dvar.assembly.build import build
 from en4dvar.priors.prior import PriorTerm
 from en4dvar_bubble import simulate as bubble_path
 from en4dvar_bubble.driving import sine_burst
-from en4dvar_bubble.starter.look import TOP_WIDTH, common_rest, look
+from en4dvar_bubble.starter.look import TOP_WIDTH, look
 
 SOFT = {"G": 420.0, "alpha": 0.025, "mu": 0.086, "R0": 0.43e-6}  # agarose of 0.3 and of 1 %: Mancia et al. (2021)
 STIFF = {"G": 6900.0, "alpha": 0.025, "mu": 0.15, "R0": 1.3e-6}
@@ -109,8 +110,36 @@ def test_a_seed_of_which_a_laser_makes_a_far_larger_bubble_is_no_rest_of_a_drive
     assert look(times, 200e-6 * radius).start == "laser"
 
 
-def test_bubbles_that_differ_at_rest_widen_the_prior_of_one_once() -> None:
-    """Errors of their readings count threefold, since these are in the fit, and what they differ by counts once."""
-    levels = [(25e-6, 0.1e-6), (35e-6, 0.1e-6), (60e-6, 0.1e-6)]
-    assert common_rest(levels, 0.0)[1] == pytest.approx(np.std([25e-6, 35e-6, 60e-6]), rel=1e-3)
-    assert common_rest(levels[:1], 0.2e-6)[1] == pytest.approx(TOP_WIDTH * np.hypot(0.1e-6, 0.2e-6))
+def driven(folder: str, rests: dict[str, float], odd: float = 0.0) -> tuple[str, dict[str, PriorTerm]]:
+    """The proposed line of R0 and its priors of bubbles that swing about their ``rests`` (um); one of 0 shows none."""
+    Path(folder).mkdir()
+    t, stream = np.arange(0.0, 60.0, 1.0), np.random.default_rng(3)
+    for name, rest in rests.items():
+        swing = np.where(t > 20, 0.4 * np.sin((t - 20) / 5) * np.exp(-((t - 40) ** 2) / 200), 0.0)
+        radius = (rest or 30.0) * (1 + swing) + 0.1 * stream.standard_normal(len(t))
+        radius[0] += odd
+        kept = t >= (0 if rest else 25)
+        rows = [f"{a:.1f},{r:.3f}" for a, r in zip(t[kept], radius[kept], strict=True)]
+        Path(folder, f"{name}.csv").write_text("\n".join(["t_us,R_um", *rows, ""]))
+    done = call("init", "--data", folder, "--start", "acoustic")
+    assert done.exit_code == 0, done.output
+    (line,) = (it for it in Path(f"{folder}.yaml").read_text().splitlines() if it.startswith("  R0:"))
+    problems = build(proposed(Path(f"{folder}.yaml")))
+    return line, {p.observations.name: next(x for x in p.prior.terms if x.parameter.name == "R0") for p in problems}
+
+
+@pytest.mark.parametrize("odd", [0.0, 0.5])
+def test_each_driven_bubble_of_a_folder_rests_where_its_own_readings_say(odd: float) -> None:
+    rests = {"a": 12.0, "b": 30.0, "c": 75.0}
+    line, terms = driven("gel", rests, odd)
+    assert "median: first" in line
+    for name, rest in rests.items():
+        assert abs(terms[name].mean - np.log(1e-6 * rest)) < 1.2 * terms[name].std
+        assert TOP_WIDTH * 0.05 / 12 < terms[name].std < 0.07
+
+
+def test_where_a_bubble_shows_no_rest_all_have_one_prior_as_wide_as_they_differ() -> None:
+    line, terms = driven("gel", {"a": 25.0, "b": 35.0, "c": 60.0, "d": 0.0})
+    assert re.search(r"median: (34\.9|35)", line)
+    assert terms["d"].std == pytest.approx(np.std([25, 35, 60]) / 35, rel=0.02)
+    assert len({term.mean for term in terms.values()}) == 1

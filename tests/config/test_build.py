@@ -236,14 +236,30 @@ def test_a_share_of_the_maximum_is_that_of_each_data_set(tmp_path: Path) -> None
     assert of_share == pytest.approx(of_whole)
 
 
+@pytest.mark.parametrize(("mean", "share"), [("first", 1.0), ("40 % of first", 0.4), ("40 % of the first", 0.4)])
+def test_a_share_of_the_first_reading_is_that_of_each_data_set_in_its_window(
+    tmp_path: Path, mean: str, share: float
+) -> None:
+    path = write_toy(tmp_path, ("toy.csv", "'*.csv'"), ("mean: maximum", f"mean: {mean}"))
+    (tmp_path / "toy2.csv").write_text("t_ms,x_um\n" + "\n".join(f"{5 * i},{300 - 2 * i}" for i in range(25)))
+    problems = build(load_config(path, {"data.window.from": "10 ms"}))
+    firsts = [float(problem.observations.values[0]) for problem in problems]
+    assert firsts[1] == pytest.approx(296e-6)
+    assert [problem.prior.terms[0].mean for problem in problems] == pytest.approx([share * y for y in firsts])
+
+
 @pytest.mark.parametrize(
     ("where", "told"),
     [
         ("0 % of maximum", "must be positive, not 0 % of maximum"),
         ("-5 % of maximum", "must be positive, not -5 % of maximum"),
         ("x % of maximum", "'x %' is not a quantity"),
-        ("5 % of minimum", "unknown unit 'of'"),
-        ("5 of maximum", "unknown unit 'of'"),
+        (
+            "5 % of minimum",
+            "'5 % of minimum' is no share; write a number in % of maximum or first, as '5 % of maximum'",
+        ),
+        ("5 of maximum", "'5 of maximum' is no share"),
+        ("13 um of maximum", "'13 um of maximum' is no share"),
     ],
 )
 def test_what_is_no_share_of_the_maximum_is_told_in_place(tmp_path: Path, where: str, told: str) -> None:

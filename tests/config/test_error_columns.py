@@ -48,6 +48,12 @@ def test_the_unit_of_the_error_as_it_is_stated_is_that_of_the_advice(tmp_path, e
     assert problem(tmp_path, f"{{radius_std: {error}}}").observations.error_unit == unit
 
 
+@pytest.mark.parametrize("std", ["5 % of minimum", "13 um of maximum", "5 % of first", "of maximum"])
+def test_an_error_that_is_no_share_says_how_one_is_written(std):
+    with pytest.raises(ValueError, match=f"'{std}' is no share; write a number in % of maximum, as '5 % of maximum'"):
+        parse_error_std(std, "um")
+
+
 @pytest.mark.parametrize("std", ["5 %", " 5%", "x %"])
 @pytest.mark.parametrize(("unit", "own"), [("1", "a plain number"), ("um", "a quantity in um")])
 def test_a_share_says_of_what(std, unit, own):

@@ -258,13 +258,25 @@ def before(times: Array, radius: Array, scatter: float) -> tuple[float, float]:
     return float("nan"), float("nan")
 
 
-def common_rest(levels: Sequence[tuple[float, float]], edge: float) -> tuple[float, float]:
-    """One radius at rest of several bubbles, each with its std, and the std of its prior: by how much they differ, and
-    :data:`TOP_WIDTH` times their errors and that of the ``edge`` of all (m); NaN of none."""
-    if not levels:
-        return float("nan"), float("nan")
-    level, std = np.median(levels, axis=0)
-    return float(level), math.hypot(TOP_WIDTH * math.hypot(std, edge), float(np.std([each for each, _ in levels])))
+def at_rest(
+    looks: Mapping[str, Look], histories: Mapping[str, tuple[Array, Array]], edge: float, scale: float
+) -> tuple[str, float] | None:
+    """Median, as text, and log_std of a prior of R0 from readings before the bubbles grow; None where none shows any.
+
+    The errors of these readings, of the ``edge`` (m) and of the ``scale`` (relative) of all count :data:`TOP_WIDTH`
+    times. Of several bubbles that all rest it is the first reading of each, off by what it is; else one for all, off by
+    as much as they differ.
+    """
+    seen = {name: view.before for name, view in looks.items() if np.isfinite(view.before[0])}
+    if not seen:
+        return None
+    levels, stds = np.array([*seen.values()]).T
+    text, off = "first", levels - [histories[name][1][0] for name in seen]
+    if not 1 < len(seen) == len(looks):
+        levels, stds, off = np.median(levels), np.median(stds), np.std(levels)
+        text = f"{1e6 * levels:.4g} um"
+    relative = np.max(np.hypot(TOP_WIDTH * np.hypot(stds, edge), off) / levels)
+    return text, math.hypot(relative, TOP_WIDTH * scale)
 
 
 def _begins(radius: Array, largest: int) -> int:
@@ -385,7 +397,7 @@ def typical(values: Sequence[float]) -> float:
     return float(np.median(finite)) if finite else float("nan")
 
 
-def typical_look(views: Sequence[Look], edge: float) -> Look:
+def typical_look(views: Sequence[Look]) -> Look:
     """One look at several data sets: medians of the numbers, words of the first that is not clear. Bubbles of one gel
     differ in size more than in their radius at rest over the maximum, which not all of them show.
     """
@@ -398,7 +410,7 @@ def typical_look(views: Sequence[Look], edge: float) -> Look:
         lobe=Lobe(R_max, t_max, t_c),
         rest=R_max * typical([v.rest / v.lobe.R_max for v in views]),
         drift=next((v.drift for v in views if v.drift), ""),
-        before=common_rest([v.before for v in views if np.isfinite(v.before[0])], edge),
+        before=(typical([v.before[0] for v in views]), typical([v.before[1] for v in views])),
         descent=max((v.descent for v in views if np.isfinite(v.descent)), default=float("nan")),
         early=all(v.early for v in views),
     )

@@ -23,7 +23,7 @@ from en4dvar_bubble.starter import elsewhere
 from en4dvar_bubble.starter.elsewhere import Entry
 from en4dvar_bubble.starter.grouped import NO_GROUPS, Grouped
 from en4dvar_bubble.starter.guess import FAR, OF_GELS, Guess, first_guess
-from en4dvar_bubble.starter.look import TOP_WIDTH, Look, Start, look, typical_look, usable, without_rebound
+from en4dvar_bubble.starter.look import TOP_WIDTH, Look, Start, at_rest, look, typical_look, usable, without_rebound
 
 LAWS: Mapping[Start, str] = {"acoustic": "quadratic-kelvin-voigt", "laser": "neo-hookean-kelvin-voigt"}
 MODEL: Mapping[Start, Mapping[str, str]] = {
@@ -117,7 +117,7 @@ def propose(
     views = list(looks.values())
     chosen = views[0].start
     model, law_name = built(chosen, law)
-    look = typical_look(views, edge)
+    look = typical_look(views)
     others = _others(model, look)
     observed = {"R_max": look.lobe.R_max, "t_c": look.lobe.t_c, "rebound": look.rebound}
     guess = first_guess(elsewhere.centred(model, medium), others, observed)
@@ -156,6 +156,7 @@ def propose(
     wall = elsewhere.wall(look.lobe.R_max, ratio) if slow and _in_a_liquid(model) else ()
     sizes = {group: len(looks.keys() & {*names}) for group, names in groups.of.items()}
     vary = [p.name for p in model.law.parameters] + [R0.name] * (R0 in model.parameters and math.isnan(look.before[0]))
+    rest = at_rest(looks, histories, edge, scale.log_std)
     together, in_a_gel = None, chosen == "laser" and not _in_a_liquid(model)
     if vary and max(sizes.values(), default=len(views)) >= FEWEST_SETS:
         common = [quantity.key for quantity in elsewhere.known(medium)]
@@ -163,7 +164,7 @@ def propose(
     return Proposal(
         _data(look, model, {**others, **guess.values}, views),
         (*_model(law_name, model, look), *wall[:1]),
-        (*_parameters(model, look, believed, tops(looks, histories, scale), medium, scale), *wall[1:]),
+        (*_parameters(model, look, believed, tops(looks, histories, scale), medium, scale, rest), *wall[1:]),
         SIMPLER[chosen],
         (*told, *[f"{len(views)} bubbles: {_ends_with(groups.kind, sizes)}"] * bool(together)),
         (*warnings, *unseen),
@@ -394,7 +395,13 @@ def _model(law: str, model: BubbleModel, look: Look | None) -> tuple[Entry, ...]
 
 
 def _parameters(
-    model: BubbleModel, look: Look, guess: Guess, top: Tops, medium: str, scale: elsewhere.Known
+    model: BubbleModel,
+    look: Look,
+    guess: Guess,
+    top: Tops,
+    medium: str,
+    scale: elsewhere.Known,
+    rest: tuple[str, float] | None,
 ) -> tuple[Entry, ...]:
     start, lines = model.start, []
     in_water = medium == "water" and _in_a_liquid(model)
@@ -407,7 +414,7 @@ def _parameters(
             lines.append(_spread(p, guess.values[p.name], width, f"{guess.source},", "knew before"))
         else:
             lines.append(example(p, model))
-    radii = {line.key: line for line in _radii(start, look, top, scale)}
+    radii = {line.key: line for line in _radii(start, look, top, rest)}
     if R_EQ.name in water and not np.isfinite(look.rest):
         radii[R_EQ.name] = water[R_EQ.name]
     lines += radii.values()
@@ -456,15 +463,13 @@ def _lognormal(p: Parameter, median: str, log_std: str, words: str) -> Entry:
 
 
 def _radii(
-    start: Start, look: Look | None, top: Tops | None = None, scale: elsewhere.Known = elsewhere.SCALE
+    start: Start, look: Look | None, top: Tops | None = None, rest: tuple[str, float] | None = None
 ) -> list[Entry]:
     if start == "acoustic":
         line = _spread(R0, *NUCLEUS, "of agarose, 0.3 and 1 % (Mancia 2021);", "know of your gel")
-        if look is not None and np.isfinite(look.before[0]):
-            level, std = look.before
-            value, log_std = _text(level, "m", "um", 4), f"{math.hypot(std / level, TOP_WIDTH * scale.log_std):.2g}"
+        if rest is not None:
             words = f"the readings before it grows; {TOP_WIDTH:g} times their errors wide, for they are in the fit"
-            line = _lognormal(R0, value, log_std, words)
+            line = _lognormal(R0, rest[0], f"{rest[1]:.2g}", words)
         return [line]
     value, width, words = "20 um", 0.4, R_EQ.label
     if look is not None and top is not None:
