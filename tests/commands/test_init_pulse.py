@@ -101,6 +101,31 @@ def test_a_bubble_that_rests_and_then_swings_needs_no_collapse(
     assert 0.4 * error < np.median(problem.observations.std) < 3 * error
 
 
+def test_a_pulse_that_is_an_example_is_told_as_one_and_no_bubble_is_held_against_it() -> None:
+    """It made none of the user's bubbles, so that a gel which gives their R_max with it says nothing."""
+    sound = sine_burst(-90e3, 60e3, 6, delay=10e-6, envelope="hann")
+    gel, times = {"G": 12e3, "mu": 0.06, "R0": 39e-6}, np.arange(0.5e-6, 150e-6, 2e-6)
+    swing = bubble_path("neo-hookean-kelvin-voigt", gel, times, driving=sound, gas="polytropic").R[0].values
+    Path("b.csv").write_text(
+        "t_us,R_um\n" + "".join(f"{1e6 * t:.3f},{1e6 * r:.4f}\n" for t, r in zip(times, swing, strict=True))
+    )
+    done = call("init", "--data", "b.csv", "--start", "acoustic")
+    (told,) = (line for line in done.stderr.splitlines() if "pulse is" in line)
+    assert "the pulse is an example: enter that of your experiment in the line 'driving' of the model" in told
+    assert "no G and mu" not in done.stderr
+
+
+@pytest.mark.parametrize("last", [0.9, 0.3])
+def test_growth_without_a_rebound_is_not_said_to_show_a_collapse(last: float) -> None:
+    """A bubble of ultrasound and one of a laser grow alike from 40 % on, and this one ends before it has collapsed."""
+    times = np.arange(0.0, 40e-6, 1e-6)
+    radius = 1e-4 * np.clip(1 - (times / 18e-6 - 1) ** 2 * 0.9, 0, 1) ** 0.4
+    ends = int(np.argmax((radius < last * 1e-4) & (times > 18e-6)))
+    seen = look(times[:ends], radius[:ends])
+    assert (seen.start, seen.clear) == ("acoustic", False)
+    assert seen.reason == "the history begins at 40 % of R_max, grows and shows no rebound"
+
+
 @pytest.mark.parametrize("seed_of", [0.15, 0.3])
 def test_a_seed_of_which_a_laser_makes_a_far_larger_bubble_is_no_rest_of_a_driven_one(seed_of: float) -> None:
     """Dirt or an old bubble where the laser is focused, seen in six frames before it."""

@@ -74,7 +74,8 @@ AMPLITUDE = Entry(
 )
 """A line of the parameters, which is a comment until it holds the amplitude of the pulse that the model states."""
 PULSE = (
-    "the amplitude of the pulse is taken as exact, and an error of 10 % can make G wrong by half; enter the error "
+    "the pulse is an example: enter that of your experiment in the line 'driving' of the model; the amplitude of the "
+    "pulse is taken as exact, and an error of 10 % can make G wrong by half; enter the error "
     f"of your hydrophone in the line '# {P_A.name}' of the parameters, and remove the '# ' from it"
 )
 _OF_ANY = (

@@ -373,7 +373,7 @@ def _start(first: float, rebounds: bool, creeps: bool, before: int) -> tuple[Sta
         return "laser", f"{begins}: one that grows from a nucleus is seen before", False
     if creeps:
         return "laser", f"{begins}, but goes on after the collapse, which a thick gel damps", False
-    return "acoustic", f"{begins}, grows and ends with the first collapse", False
+    return "acoustic", f"{begins}, grows and shows no rebound", False
 
 
 def usable(

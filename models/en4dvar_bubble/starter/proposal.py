@@ -127,8 +127,9 @@ def propose(
         f"{' (not recorded: where the readings before it lead to)' * look.early}, "
         f"{ratio:.2f} of the Rayleigh time (elasticity shortens it, viscosity and gas prolong it)"
     ]
-    told += [f"start: {chosen} ({look.reason})"] * look.clear
     other = "laser" if chosen == "acoustic" else "acoustic"
+    or_other = f"; if it was {other}, give --start {other}" * (chosen == "acoustic" and start is None)
+    told += [f"start: {chosen} ({look.reason}){or_other}"] * look.clear
     doubt = f"start: {chosen} is only a proposal ({look.reason}); if it was {other}, give --start {other}"
     warnings = [doubt] * (not look.clear)
     warnings += [
@@ -144,9 +145,10 @@ def propose(
         believed = guess.common() if possible else Guess({}, {}, 0.0)
     elif words := _implausible(look):
         warnings.append(words)
-    elif guess.misfit > FAR:  # no node comes close to what was observed
+    elif guess.misfit > FAR and chosen == "laser":  # no node comes close to what was observed
         warnings.append(_unmatched(guess.unmatched, look, model))
-        believed = Guess({}, {}, 0.0) if chosen == "acoustic" else guess  # made with a pulse that is not theirs
+    elif guess.misfit > FAR:
+        believed = Guess({}, {}, 0.0)  # made with an example of a pulse
     warnings += without_rebound(looks)
     if chosen == "laser" and "G" in guess.values:
         warnings += elsewhere.plane_in_a_gel(looks, model.medium)
@@ -185,14 +187,12 @@ def _ends_with(kind: str, sizes: Mapping[str, int]) -> str:
 def _unmatched(names: Sequence[str], look: Look, model: BubbleModel) -> str:
     """Which of the observed numbers no gel gives, and what may be wrong then."""
     rest = _text(_rest(look), "m", "um")
-    told = {"R_max": "R_max", "t_c": "collapse time", "rebound": f"rebound to {look.rebound:.2f} R_max"}
+    told = {"t_c": "collapse time", "rebound": f"rebound to {look.rebound:.2f} R_max"}
     asked = {
         "t_c": "are scale and frame rate right?",
         "rebound": f"is {rest} its radius at rest (R_eq), and does its gas lose heat as the model's does (model.gas)?",
     }
     questions = [asked[name] for name in names if name in asked]
-    if model.start == "acoustic":
-        questions = ["is the driving that of your experiment? If a laser made the bubble, give --start laser"]
     return f"no G and mu of {model.law.name} give this {' and '.join(told[n] for n in names)}: {' '.join(questions)}"
 
 
