@@ -28,6 +28,7 @@ from toys import Vectorised, Wave, make_observations, make_problem, with_discrep
 
 from en4dvar.data.extrema import maxima
 from en4dvar.diagnosis.analysis import Analysis
+from en4dvar.estimation import conclusions
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.model.forward import Alternative, ValidityLimit
 from en4dvar.model.state import Field, Parameter
@@ -343,6 +344,25 @@ def test_errors_of_the_times_that_are_stated_too_large_are_named():
     assert told(run(read(p, noise=replace(p.observations.noise, time_std=np.zeros(80)))), "prior-conflict") is None
     plain = replace_std(with_discrepancy(make_problem(Wave(), (1.0, 2.0), k=80, std=0.002), sigma=0.4), 0.05)
     assert "give its --exposure" in told(run(plain), "prior-conflict").advice
+
+
+@pytest.mark.parametrize("stated", [0.1, 0.3])
+def test_no_warning_asks_for_larger_errors_of_the_times_beside_one_that_asks_for_smaller_ones(stated):
+    """A wave that the model misses, read by a clock that keeps time better than is stated."""
+    p = make_problem(Wave(), (1.0, 2.0), k=80, std=0.002, time_std=stated)
+    values = p.observations.values + 0.02 * np.sin(5 * p.observations.times)
+    wide = {"amplitude": (0.02, 1.5), "length": (0.2, 0.7), "smoothness": 1.5}
+    a = run(with_discrepancy(read(p, values=values), **wide, sigma=0.4))
+    assert "put its jitter there" in told(a, "prior-conflict").advice
+    assert told(a, "discrepancy-found").advice.endswith("a model with the missing physics removes this warning")
+    assert not any("larger data.error.time_std" in c.advice for c in a.cautions)
+
+
+def test_errors_of_the_times_that_explain_the_residuals_are_not_said_to_be_stated_too_large(monkeypatch):
+    monkeypatch.setattr(conclusions, "timing_of", lambda *_: 0.5)
+    p = make_problem(Wave(), (1.0, 2.0), k=80, std=0.002, time_std=0.1)
+    a = run(with_discrepancy(p, amplitude=(0.02, 1.5), length=(0.2, 0.7), sigma=0.4))
+    assert "put its jitter there" not in told(a, "prior-conflict").advice
 
 
 def test_a_future_that_is_missed_is_taken_in_up_to_the_next_trough():

@@ -30,11 +30,13 @@ SIGMA = "estimate their size (parameters.sigma: {prior: lognormal, median: 1, lo
 
 @dataclass(frozen=True)
 class Case:
-    """One warning of an analysis, and the ``codes`` of all that it has."""
+    """One warning of an analysis, and the ``codes`` of all that it has; ``exact``: one of them asks for smaller errors
+    of the times, so that no other may ask for larger ones without evidence."""
 
     a: Analysis
     caution: Caution
     codes: frozenset[str]
+    exact: bool = False
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -111,6 +113,11 @@ class Case:
             "residuals better"
         )
 
+    @property
+    def or_times(self) -> str:
+        """What else residuals may be due to that the model does not explain, unless the times are ``exact``."""
+        return "" if self.exact else "; where the times err, a larger data.error.time_std"
+
     def reading(self, value: float) -> str:
         """A size of readings in the unit in which their errors are stated."""
         observable = self.a.problem.observable
@@ -121,8 +128,9 @@ class Case:
 def advised(a: Analysis, cautions: Sequence[Caution]) -> tuple[Caution, ...]:
     """The warnings with the advice of this configuration, where the catalogue's alone has been given."""
     codes = frozenset(c.code for c in cautions)
+    exact = any(c.code == "prior-conflict" and "data.error.time_std" in c.advice for c in cautions)
     return tuple(
-        replace(c, advice=ADVICE[c.code](Case(a, c, codes)))
+        replace(c, advice=ADVICE[c.code](Case(a, c, codes, exact)))
         if c.code in ADVICE and c.advice == CATALOGUE[c.code][1]
         else c
         for c in cautions
@@ -155,8 +163,8 @@ def _misfit(case: Case) -> str:
         return case.timing
     if case.a.observations.noise.discrepant:
         return (
-            "widen the prior of data.error.discrepancy.amplitude, choose another model, or a shorter window; where the "
-            "times err, a larger data.error.time_std"
+            "widen the prior of data.error.discrepancy.amplitude, choose another model, or a shorter window"
+            f"{case.or_times}"
         )
     if "residual-structure" in case.codes:
         return _structure(case)
@@ -210,7 +218,8 @@ def _missed(case: Case) -> str:
         elif case.a.problem.alternatives and not case.a.settings.what_if:
             steps += ["ask for the what-if table (--set assimilation.what_if=true)"]
         first = "".join(f"{step} and " for step in steps if step)
-        return CATALOGUE["discrepancy-found"][1].replace("compare", f"{first}compare", 1)
+        general = CATALOGUE["discrepancy-found"][1].replace("compare", f"{first}compare", 1)
+        return general.partition(", or a larger")[0] if case.exact else general
     return (
         "quote nothing of this fit: look at the prior over the readings (en4dvar validate --plot); check units and "
         "columns (data), how the history starts, the law and the medium (model), and values that are fixed (parameters)"
@@ -232,11 +241,13 @@ def _odd(case: Case) -> str:
         noise = case.a.observations.noise
         first = "a larger" if noise.time_std.any() else "state how uncertain the times are with"
         other = _structure(case) if noise.discrepant else "the model errs where the observable changes fast"
+        if case.exact:
+            return other
         return f"{first} data.error.time_std; if the times are right, {other}"
     if _may_be_robust(case):
         return f"look at this reading; with {case.with_scheme('data.error.robust: huber')} such readings count less"
     wrong = "if it is wrong, delete its line from the data file and say so"
-    return f"look at this reading; {wrong}; where the times err, a larger data.error.time_std"
+    return f"look at this reading; {wrong}{case.or_times}"
 
 
 def _validity(case: Case) -> str:

@@ -152,7 +152,8 @@ def _chance(probability: float) -> str:
 
 
 def conflict(prior: Prior, centre: Array, timed: bool = False) -> Findings:
-    """A posterior centre (n,) far from the prior; ``timed``: the stated errors hold errors of the times."""
+    """A posterior centre (n,) far from the prior; ``timed``: the stated errors hold errors of the times, which may be
+    too large."""
     terms = dict(zip(prior.names, prior.terms, strict=True))
     return far_from(terms, (centre - prior.mean) / prior.std, prior.white(centre), timed)
 

@@ -64,7 +64,7 @@ def examine(
         *checks.fit(chi2 * n_used, n_used, dfs),
         *_allowed(a, checks.structure(a)),
         *checks.missed(a),
-        *(checks.conflict(prior, control.centre, a.observations.noise.timed) if whole else ()),
+        *(checks.conflict(prior, control.centre, a.observations.noise.timed and not a.timing) if whole else ()),
         *checks.at_bound(prior, control.prior, control.posterior, a.posterior_failures),
         *_allowed(a, _validity(a, alive)),
         *checks.gaussian(prior, members, a.shape, a.settings.own.approximate),
