@@ -86,7 +86,7 @@ def _location(written: Any, context: Context) -> float | Spread | Scalar:
     """Of a prior: a quantity, one of :data:`READINGS` or a share of it, or a scalar of the data file."""
     if isinstance(written, dict):
         return Scalar.of(written, context)
-    share = share_of(f"100 % of {written}" if written in READINGS else written, *READINGS)
+    share = share_of(f"100 % of {written}" if written in [*READINGS] else written, *READINGS)
     if share is None:
         return _bounded(written, context.subject)
     require_sign(share.value, "positive", written)
