@@ -18,7 +18,7 @@ from en4dvar.data.noise.correlated import SharedErrors
 from en4dvar.estimation.population import Effort, HyperPrior
 from en4dvar.estimation.population.campaign import Draws, Population, population_of
 from en4dvar.estimation.population.own import OwnDraws
-from en4dvar.model.state import READING_OFFSET
+from en4dvar.model.state import READING_OFFSET, READING_SCALE
 from en4dvar.plumbing.caution import caution
 from en4dvar.plumbing.errors import ConfigError, OutputError
 from en4dvar.priors.prior import Prior, PriorTerm
@@ -197,7 +197,7 @@ def test_what_is_determined_together_only():
 
 
 def test_what_is_a_data_sets_own_follows_what_all_have_in_common():
-    """b + offset is what each data set reads: where the offset is less certain in all than in one, b moves with it."""
+    """b + offset is what each data set reads, and each knows the offset to 0.3: all together know it as one does."""
     rng, model = np.random.default_rng(1), Vectorised()
     terms = [PriorTerm.normal(p, 0.0, 1.0) for p in (*model.parameters, READING_OFFSET)]
     problems, kept = [], []
@@ -209,10 +209,36 @@ def test_what_is_a_data_sets_own_follows_what_all_have_in_common():
         kept.append(OwnDraws(np.stack([a, 0.1 * s - offset + b, offset], axis=1), 0.0, 500.0, 0))
     found = population_of(problems, [k.z[:20] for k in kept], ["a"], 2, kept=kept, effort=SMALL)
     assert found.common == ("reading_offset",)
-    assert found.theta.std() > 0.8
+    assert found.theta.std() == pytest.approx(0.3, rel=0.1)
     read = found.sets[:, :, 1] + found.theta
     np.testing.assert_allclose(read.mean(axis=0), 0.1 * np.arange(SETS), atol=0.01)
     assert np.all(read.std(axis=0) < 0.02)
+
+
+def test_common_quantities_are_as_certain_as_what_one_data_set_leaves_of_them():
+    """Each reads a + 2(d − offset) and d − offset, which the priors of d and offset leave open to √2."""
+    rng, model = np.random.default_rng(2), Vectorised()
+    terms = [PriorTerm.normal(p, 0.0, 1.0) for p in (*model.parameters, READING_OFFSET)]
+    terms.append(PriorTerm.lognormal(READING_SCALE, 1.0, 1.0))
+    columns, errors = np.array([[1.0, 0.0, 2.0, -2.0], [0.0, 0.0, 1.0, -1.0]]), np.array([0.02, 0.1])
+    inverse = np.eye(4) + (columns.T / errors**2) @ columns
+    problems, kept, read = [], [], []
+    for s in range(SETS):
+        problem = make_problem(model, [1.0, 0.4], seed=s)
+        observed = replace(problem.observations, name=f"set{s}")
+        problems.append(replace(problem, observations=observed, prior=Prior(tuple(terms))))
+        read.append(columns @ [0.5 + 0.01 * rng.standard_normal(), 0.0, 0.8, -0.4] + errors * rng.standard_normal(2))
+        z = rng.multivariate_normal(
+            np.linalg.solve(inverse, columns.T @ (read[-1] / errors**2)), np.linalg.inv(inverse), 2000
+        )
+        kept.append(OwnDraws(z, 0.0, 1000.0, 0))
+    found = population_of(problems, [k.z[:20] for k in kept], ["a"], 2, kept=kept, effort=SMALL)
+    of_combination = 1 / (1 / 2 + 1 / errors[1] ** 2)
+    mean, combination = np.mean(read, axis=0)
+    variance = 1 / (1 + 1 / (4 * of_combination))  # of ν ~ N(0, 1), beside which spread and errors are small
+    expected = variance / (4 * of_combination) * (mean - 2 * combination * of_combination / errors[1] ** 2)
+    assert found.posterior.nu.mean() == pytest.approx(expected, abs=0.15 * np.sqrt(variance))
+    assert found.posterior.nu.std() == pytest.approx(np.sqrt(variance), rel=0.1)
 
 
 @pytest.mark.slow

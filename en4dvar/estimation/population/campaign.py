@@ -27,6 +27,7 @@ from en4dvar.estimation.population.own import (
     empirical,
     own_draws,
     own_likelihoods,
+    with_common_told,
 )
 from en4dvar.executor import Executor, one_blas_thread
 from en4dvar.model.state import Array
@@ -321,11 +322,14 @@ def population_from(
     varying, shared = [columns.index(name) for name in names], [columns.index(name) for name in common]
     sets = [problem.observations.name for problem in problems]
     logs = np.array([term.log_std for term in terms])
-    likelihoods = own_likelihoods(list(drawn.values()), varying, shared, seed, sets, logs)
+    draws, mean, root = with_common_told(list(drawn.values()), varying, shared, logs)
+    likelihoods = own_likelihoods(draws, varying, shared, seed, sets, logs)
     estimated = Hierarchy(likelihoods, scales).sampled(seed, effort)
-    stream = member_stream(seed, "hyperprior")
+    theta, stream = mean + estimated.theta @ root.T, member_stream(seed, "hyperprior")
     nu, tau = stream.standard_normal(estimated.nu.shape), np.abs(stream.standard_normal(estimated.nu.shape))
-    z = _sets(estimated, list(drawn.values()), likelihoods, varying, shared, member_stream(seed, "sets given all"))
+    z = _sets(estimated, draws, likelihoods, varying, shared, member_stream(seed, "sets given all"))
+    for own in z:
+        own[:, shared] = theta
     sets_of = ((entry.prior, own) for entry, own in zip(problems, z, strict=True))
     physical = [prior.to_physical(prior.from_white(own))[:, : len(columns)] for prior, own in sets_of]
     return Population(
@@ -339,7 +343,7 @@ def population_from(
         log_evidence=estimated.log_evidence + sum(draws.log_evidence for draws in drawn.values()),
         forward_runs=sum(draws.forward_runs for draws in drawn.values()),
         common=common,
-        theta=estimated.theta,
+        theta=theta,
         belongs=estimated.belongs,
         empirical=_empirical(terms, [start[s][:, varying] for s in drawn], likelihoods, seed),
         uncertain=float(estimated.uncertain.sum()),
@@ -377,7 +381,6 @@ def _sets(
         slopes = np.linalg.lstsq(theta - theta.mean(axis=0), apart, rcond=None)[0]
         own[:, rest] += (estimated.theta - theta[chosen]) @ slopes
         own[:, list(varying)] = likelihood.following.together(estimated.x[:, s], estimated.theta)
-        own[:, list(shared)] = estimated.theta
         z.append(own)
     return z
 

@@ -89,6 +89,12 @@ class Following:
         moved = whole[1] + sides * np.hypot(whole - whole[1], size)
         return np.asarray(np.log(np.maximum(moved, LEAST * whole)) / s)
 
+    def against(self, x: Array, theta: Array, mean: Array | float, std: Array | float) -> Array:
+        """(D,) ln of how many times a normal prior's density at y is that at x of draws x (D, p) and θ (D, c)."""
+        y = self.own(x, theta)
+        logs = 0.5 * np.sum(((x - mean) / std) ** 2 - ((y - mean) / std) ** 2, axis=1)
+        return np.asarray(logs + (x - y) @ self.logs)
+
     def prior(self, y: Array, mean: Array, std: Array) -> tuple[Array, Array]:
         """Standard deviations (p,) of a normal density about ``mean`` (p,), and ln (D,) of how many times it is the
         prior's of y (D, p): of x ~ N(mean, diag std²), θ ~ N(0, I).

@@ -16,14 +16,15 @@ A Gaussian mixture describes y; dividing by its prior leaves the likelihood of t
 likelihood. There are four, or eight of many draws: what too few get wrong is alike in all data sets and adds up, what
 scarce draws get wrong averages out, and a criterion for fewer took upper limits for measurements. Where the population
 lies in the tails of its data sets, where hardly a draw is, neither holds: then they are drawn with another prior, about
-the population, which is divided out instead of their own. What the data tell of θ itself is left aside: it keeps its
-prior, and therefore all data sets of a population have the same slopes. Their own would tell of θ, and falsely: those
-of ln G are steeper for a soft gel, and a θ that makes all of them stiffer would make them more alike.
+the population, which is divided out instead of their own. θ is known by its prior and by what one data
+set tells of it: where data tell a combination of density and scale, slopes hold only for what they leave of it. All
+data sets of a population have the same slopes. Their own would tell of θ, and falsely: those of ln G are steeper for a
+soft gel, and a θ that makes all of them stiffer would make them more alike.
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -262,14 +263,7 @@ def own_likelihoods(
     """The likelihoods in the coordinates ``varying`` given those in ``common``; ``seed`` and the data sets' ``names``
     name the streams; ``logs`` (p,): the prior standard deviation of the logarithm of a positive parameter, else 0.
     """
-    x, theta = ([draws.z[:, list(columns)] for draws in drawn] for columns in (varying, common))
-
-    def slopes(coordinates: Sequence[Array]) -> Array:
-        each = zip(x, coordinates, theta, drawn, strict=True)
-        of_sets = (_slopes(z, u, t, draws.effective, draws.about[1] * np.ones(len(varying))) for z, u, t, draws in each)
-        return pooled_slopes(*zip(*of_sets, strict=True))
-
-    following = following_of(x, theta, logs, slopes)
+    x, theta, following = _straight(drawn, varying, common, logs)
     if common:
         each = zip(x, theta, drawn, names, strict=True)
         parts = [_parts(z, t, of, member_stream(own_seed(seed, name), "population: slopes")) for z, t, of, name in each]
@@ -281,6 +275,48 @@ def own_likelihoods(
         whole, half = (_mixture(part, following, draws, stream) for part in (y, y[: len(y) // 2]))
         likelihoods.append(OwnLikelihood(whole, half, following, y))
     return likelihoods
+
+
+def _straight(
+    drawn: Sequence[OwnDraws], varying: Sequence[int], common: Sequence[int], logs: Array
+) -> tuple[list[Array], list[Array], Following]:
+    """Draws x (D, p) and θ (D, c) of each data set, and how x follows θ along straight lines."""
+    x, theta = ([draws.z[:, list(columns)] for draws in drawn] for columns in (varying, common))
+
+    def slopes(coordinates: Sequence[Array]) -> Array:
+        each = zip(x, coordinates, theta, drawn, strict=True)
+        of_sets = (_slopes(z, u, t, draws.effective, draws.about[1] * np.ones(len(varying))) for z, u, t, draws in each)
+        return pooled_slopes(*zip(*of_sets, strict=True))
+
+    return x, theta, following_of(x, theta, logs, slopes)
+
+
+def with_common_told(
+    drawn: Sequence[OwnDraws], varying: Sequence[int], common: Sequence[int], logs: Array
+) -> tuple[list[OwnDraws], Array, Array]:
+    """The draws with what is common in units of what is known of it, θ = mean + root ξ; ``mean`` (c,), ``root`` (c, c).
+
+    Known are its prior and what one data set tells of it. Draws of the posterior that are weighed so that the prior of
+    x is one of y have the θ that the data tell, since the likelihood is one of y. Precisions and what they pull to are
+    averaged over the data sets: draws lie where their data leave θ, and slopes hold there alone; but what all of them
+    tell alike counts once, since an error of the model is alike in all and no number of data sets averages it out.
+    """
+    every, shared, (x, theta, following) = list(drawn), list(common), _straight(drawn, varying, common, logs)
+    precision, pull = np.zeros((len(shared), len(shared))), np.zeros(len(shared))
+    for z, t, draws in zip(x, theta, every, strict=True):
+        shares = shares_of(following.against(z, t, *draws.about))
+        apart = t - shares @ t
+        own = np.linalg.inv(apart.T @ (shares[:, None] * apart))
+        precision, pull = precision + own / len(every), pull + own @ (shares @ t) / len(every)
+    values, vectors = np.linalg.eigh(precision)
+    told = values > 1
+    mean = vectors[:, told] @ (vectors[:, told].T @ pull / values[told])
+    root = vectors / np.sqrt(np.maximum(values, 1.0))
+    for i, draws in enumerate(every):
+        moved = draws.z.copy()
+        moved[:, shared] = np.linalg.solve(root, (theta[i] - mean).T).T
+        every[i] = replace(draws, z=moved)
+    return every, mean, root
 
 
 def _mixture(y: Array, following: Following, draws: OwnDraws, stream: np.random.Generator) -> Mixture:
