@@ -197,7 +197,7 @@ def test_what_is_determined_together_only():
 
 
 def test_what_is_a_data_sets_own_follows_what_all_have_in_common():
-    """b + offset is what each data set reads, and each knows the offset to 0.3: all together know it as one does."""
+    """b + offset is what each data set reads, and each knows the offset to 0.3."""
     rng, model = np.random.default_rng(1), Vectorised()
     terms = [PriorTerm.normal(p, 0.0, 1.0) for p in (*model.parameters, READING_OFFSET)]
     problems, kept = [], []
@@ -209,13 +209,13 @@ def test_what_is_a_data_sets_own_follows_what_all_have_in_common():
         kept.append(OwnDraws(np.stack([a, 0.1 * s - offset + b, offset], axis=1), 0.0, 500.0, 0))
     found = population_of(problems, [k.z[:20] for k in kept], ["a"], 2, kept=kept, effort=SMALL)
     assert found.common == ("reading_offset",)
-    assert found.theta.std() == pytest.approx(0.3, rel=0.1)
+    assert found.theta.std() == pytest.approx((1 + SETS * (0.3**-2 - 1)) ** -0.5, rel=0.1)
     read = found.sets[:, :, 1] + found.theta
     np.testing.assert_allclose(read.mean(axis=0), 0.1 * np.arange(SETS), atol=0.01)
     assert np.all(read.std(axis=0) < 0.02)
 
 
-def test_common_quantities_are_as_certain_as_what_one_data_set_leaves_of_them():
+def test_common_quantities_are_as_certain_as_what_the_data_sets_leave_of_them():
     """Each reads a + 2(d − offset) and d − offset, which the priors of d and offset leave open to √2."""
     rng, model = np.random.default_rng(2), Vectorised()
     terms = [PriorTerm.normal(p, 0.0, 1.0) for p in (*model.parameters, READING_OFFSET)]
@@ -233,10 +233,10 @@ def test_common_quantities_are_as_certain_as_what_one_data_set_leaves_of_them():
         )
         kept.append(OwnDraws(z, 0.0, 1000.0, 0))
     found = population_of(problems, [k.z[:20] for k in kept], ["a"], 2, kept=kept, effort=SMALL)
-    of_combination = 1 / (1 / 2 + 1 / errors[1] ** 2)
+    of_combination = 1 / (1 / 2 + SETS / errors[1] ** 2)
     mean, combination = np.mean(read, axis=0)
     variance = 1 / (1 + 1 / (4 * of_combination))  # of ν ~ N(0, 1), beside which spread and errors are small
-    expected = variance / (4 * of_combination) * (mean - 2 * combination * of_combination / errors[1] ** 2)
+    expected = variance / (4 * of_combination) * (mean - 2 * combination * of_combination * SETS / errors[1] ** 2)
     assert found.posterior.nu.mean() == pytest.approx(expected, abs=0.15 * np.sqrt(variance))
     assert found.posterior.nu.std() == pytest.approx(np.sqrt(variance), rel=0.1)
 

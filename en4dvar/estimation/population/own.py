@@ -16,8 +16,8 @@ A Gaussian mixture describes y; dividing by its prior leaves the likelihood of t
 likelihood. There are four, or eight of many draws: what too few get wrong is alike in all data sets and adds up, what
 scarce draws get wrong averages out, and a criterion for fewer took upper limits for measurements. Where the population
 lies in the tails of its data sets, where hardly a draw is, neither holds: then they are drawn with another prior, about
-the population, which is divided out instead of their own. θ is known by its prior and by what one data
-set tells of it: where data tell a combination of density and scale, slopes hold only for what they leave of it. All
+the population, which is divided out instead of their own. θ is known by its prior and by what the data
+sets tell of it: where they tell a combination of density and scale, slopes hold only for what they leave of it. All
 data sets of a population have the same slopes. Their own would tell of θ, and falsely: those of ln G are steeper for a
 soft gel, and a θ that makes all of them stiffer would make them more alike.
 """
@@ -296,27 +296,26 @@ def with_common_told(
 ) -> tuple[list[OwnDraws], Array, Array]:
     """The draws with what is common in units of what is known of it, θ = mean + root ξ; ``mean`` (c,), ``root`` (c, c).
 
-    Known are its prior and what one data set tells of it. Draws of the posterior that are weighed so that the prior of
-    x is one of y have the θ that the data tell, since the likelihood is one of y. Precisions and what they pull to are
-    averaged over the data sets: draws lie where their data leave θ, and slopes hold there alone; but what all of them
-    tell alike counts once, since an error of the model is alike in all and no number of data sets averages it out.
+    Known are its prior and what the data sets tell. Draws of a posterior that are weighed so that the prior of x is
+    one of y have the θ that their data tell, since the likelihood is one of y. Of a direction counts only by how much
+    it is narrower than the narrowest of so few draws of the prior (Marchenko & Pastur 1967, Math. USSR Sb. 1, 457): by
+    chance all data sets would tell a little, and it would add up.
     """
     every, shared, (x, theta, following) = list(drawn), list(common), _straight(drawn, varying, common, logs)
-    precision, pull = np.zeros((len(shared), len(shared))), np.zeros(len(shared))
+    precision, pull = np.eye(len(shared)), np.zeros(len(shared))
     for z, t, draws in zip(x, theta, every, strict=True):
         shares = shares_of(following.against(z, t, *draws.about))
-        apart = t - shares @ t
-        own = np.linalg.inv(apart.T @ (shares[:, None] * apart))
-        precision, pull = precision + own / len(every), pull + own @ (shares @ t) / len(every)
-    values, vectors = np.linalg.eigh(precision)
-    told = values > 1
-    mean = vectors[:, told] @ (vectors[:, told].T @ pull / values[told])
-    root = vectors / np.sqrt(np.maximum(values, 1.0))
+        few = len(shared) * len(shares) / (effective_number(shares) * draws.effective)
+        values, vectors = np.linalg.eigh((t - shares @ t).T @ (shares[:, None] * (t - shares @ t)))
+        gain = max(1 - math.sqrt(few), 0.0) ** 2 / values
+        precision += (vectors * np.maximum(gain - 1, 0.0)) @ vectors.T
+        pull += (vectors * np.where(gain > 1, gain, 0.0)) @ vectors.T @ (shares @ t)
+    mean, root = np.linalg.solve(precision, pull), np.linalg.cholesky(np.linalg.inv(precision))
     for i, draws in enumerate(every):
         moved = draws.z.copy()
         moved[:, shared] = np.linalg.solve(root, (theta[i] - mean).T).T
         every[i] = replace(draws, z=moved)
-    return every, mean, root
+    return every, np.asarray(mean, dtype=float), np.asarray(root, dtype=float)
 
 
 def _mixture(y: Array, following: Following, draws: OwnDraws, stream: np.random.Generator) -> Mixture:
