@@ -354,3 +354,22 @@ def test_a_top_that_leaves_the_picture_is_left_out_by_init_and_doubted_without(t
     assert "data.outliers: leave out" not in call("validate", "b.yaml").stderr
     Path("b.yaml").write_text(text.replace("  outliers: leave out\n", ""))
     assert "lead higher, as where a bubble leaves the picture: leave them out" in call("validate", "b.yaml").stderr
+
+
+def test_a_hole_where_a_bubble_collapses_is_told_and_makes_no_first_guess() -> None:
+    """What follows the hole is a later minimum, and no rebound behind it is the first."""
+    t, R = rebounding(0.05)
+    t, R = 20 * (t + 1), 200 * R + 0.3 * np.random.default_rng(1).standard_normal(len(t))
+    for name, until in {"whole": 0.0, "frames": 40.5, "hole": 66.0}.items():
+        kept = (t < 36) | (t > until)
+        rows = [f"{a:.2f},{r:.3f}" for a, r in zip(t[kept], R[kept], strict=True)]
+        Path(f"{name}.csv").write_text("\n".join(["t_us,R_um", *rows, ""]))
+        done = call("init", "--data", f"{name}.csv")
+        assert done.exit_code == 0, done.output
+        told = "no readings from 35 to 67 us, where it collapses; the minima behind are later ones"
+        assert (told in done.stderr) == (name == "hole"), done.stderr
+    whole, hole = (re.search(r"collapse (\S+) us later", Path(f"{n}.yaml").read_text()) for n in ("whole", "hole"))
+    assert whole
+    assert hole
+    assert float(hole[1]) == pytest.approx(float(whole[1]), rel=0.03)
+    assert "first guess from collapse time, may be off" in Path("hole.yaml").read_text()

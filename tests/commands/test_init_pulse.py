@@ -168,3 +168,29 @@ def test_where_a_bubble_shows_no_rest_all_have_one_prior_as_wide_as_they_differ(
     assert re.search(r"median: (34\.9|35)", line)
     assert terms["d"].std == pytest.approx(np.std([25, 35, 60]) / 35, rel=0.02)
     assert len({term.mean for term in terms.values()}) == 1
+
+
+def test_files_that_begin_in_the_growth_started_as_those_of_their_folder_that_show_a_nucleus() -> None:
+    Path("gel").mkdir()
+    for name, first in {"a": 0.5, "b": 17.0, "c": 0.8, "d": 1.0, "e": 0.6}.items():
+        times = np.arange(0.0, 40.0, 1.0)
+        swings = [(5.0, 5.5, 90.0), (13.0, 3.0, 40.0), (18.0, 2.5, 25.0)]
+        radius = np.max([h * np.clip(1 - ((times - at) / w) ** 2, 1e-3, 1) ** 0.4 for at, w, h in swings], axis=0)
+        radius[0] = first
+        rows = [f"{t:.2f},{r:.3f}" for t, r in zip(times, radius, strict=True)]
+        Path(f"gel/{name}.csv").write_text("\n".join(["t_us,R_um", *rows, ""]))
+    done = call("init", "--data", "gel")
+    assert done.exit_code == 0, done.output
+    assert "start: acoustic is only a proposal (so begin 4 of 5 histories; b in the growth)" in done.stderr
+    assert "start: acoustic" in Path("gel.yaml").read_text()
+
+
+def test_a_driven_bubble_of_a_gel_that_stiffens_may_collapse_in_half_of_the_rayleigh_time() -> None:
+    t = np.arange(0.0, 30.0, 1.0)
+    radius = 130 * np.clip(1 - ((t - 12) / np.where(t < 12, 12.02, 6.2)) ** 2, 1e-4, 1) ** 0.4
+    Path("b.csv").write_text("t_us,R_um\n" + "".join(f"{a:.1f},{r:.3f}\n" for a, r in zip(t, radius, strict=True)))
+    done = call("init", "--data", "b.csv", "--start", "acoustic")
+    assert done.exit_code == 0, done.output
+    assert "Rayleigh time 0.915" not in done.stderr
+    done = call("init", "--data", "b.csv", "--start", "laser", "--force")
+    assert "Rayleigh time 0.915" in done.stderr

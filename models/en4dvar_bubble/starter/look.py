@@ -15,6 +15,7 @@ off and is too high by about ε √(2 ln n).
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeVar
 
@@ -25,7 +26,7 @@ from en4dvar.inputs.implausible import scatter_of
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import DataError
 from en4dvar.plumbing.hints import listed
-from en4dvar_bubble.collapse import TOLD, Lobe, lobe, single
+from en4dvar_bubble.collapse import REBOUND, TOLD, Lobe, lobe, single
 
 WINDOWS = (0.15, 0.2, 0.27, 0.35, 0.45, 0.55, 0.65, 0.75, 0.85)  # half widths in collapse times
 LOWEST = 0.45  # of R_max: what lies lower belongs to the end of the collapse, or to the beginning of the growth
@@ -148,6 +149,7 @@ TOP_WIDTH = 3.0  # standard errors of a top or rest that its prior takes: it is 
 SWINGS = 0.5  # of R_max: a bubble that rests above and then grows is driven; a laser leaves far more than it found
 EQUAL = 1e-6  # of a level: what rounded readings that are equal differ by
 RESOLVED = 5.0  # standard deviations: of a level that is read, and is not what a camera shows of next to nothing
+FALLS = 0.9  # of R_max: readings that end above do not tell when it collapses
 CREEPS = 1.5  # collapse times after the maximum: a history that goes on for longer without a rebound is damped
 
 
@@ -163,8 +165,8 @@ class Look:
     ``begin`` is the first instant, ``step`` the median time between samples; ``descent`` the last instant of the first
     descent, NaN where the history ends with it. ``n_minima`` follow the maximum with a ``prominence`` relative to the
     range; a ``short`` laser bubble ends before the first rebound has a top, an ``early`` one before it has collapsed,
-    so that the time of the collapse is where a fit goes on to. ``reason`` says in words why ``start`` is
-    proposed, ``clear`` whether the data leave no doubt.
+    or has a ``hole`` there, told in words, so that the time of the collapse is where a fit goes on to. ``reason`` says
+    in words why ``start`` is proposed, ``clear`` whether the data leave no doubt.
     """
 
     begin: float
@@ -181,6 +183,7 @@ class Look:
     descent: float
     short: bool
     early: bool
+    hole: str
     start: Start
     reason: str
     clear: bool
@@ -193,8 +196,9 @@ def look(times: Array, radius: Array, start: Start | None = None) -> Look:
     _require_collapse(radius, start)
     scatter = scatter_of(times, radius)
     rests = before(times, radius, scatter)
-    peak = _lobe(times, radius, start != "laser" and np.isfinite(rests[0]))
-    highest = top(times, radius, scatter if np.isfinite(scatter) else UNKNOWN * float(radius.max()))
+    seen = _before_a_hole(times, radius)
+    peak = _lobe(times[:seen], radius[:seen], start != "laser" and np.isfinite(rests[0]))
+    highest = top(times[:seen], radius[:seen], scatter if np.isfinite(scatter) else UNKNOWN * float(radius.max()))
     largest = highest.reading
     prominence, n_minima = _minima(radius[largest:], scatter)
     rebound = second_maximum(radius)
@@ -214,24 +218,34 @@ def look(times: Array, radius: Array, start: Start | None = None) -> Look:
         )
     step, descent = float(np.median(np.diff(times))), _end_of_descent(times, radius)
     noise = min(scatter, rests[1]) if chosen == "acoustic" else scatter  # NaN is not smaller
-    early = bool(radius[largest:].min() > TOLD * radius[largest] and times[-1] < peak.t_max + peak.t_c)
+    early, hole = bool(radius[largest:].min() > TOLD * radius[largest] and times[-1] < peak.t_max + peak.t_c), ""
+    if seen < len(times) and chosen == "laser":
+        early, rebound = True, float("nan")
+        hole = f"no readings from {1e6 * times[seen - 1]:.4g} to {1e6 * times[seen]:.4g} us, where it collapses"
     return Look(
         float(times[0]), peak, highest, step, noise, rebound, rest, drift, rests,
-        n_minima, prominence, descent, chosen == "laser" and (early or single(times, radius)), early,
-        chosen, reason, clear,
+        n_minima, prominence, descent, chosen == "laser" and not hole and (early or single(times, radius)), early,
+        hole, chosen, reason, clear,
     )  # fmt: skip
 
 
 def without_rebound(looks: Mapping[str, Look]) -> list[str]:
-    """Which recordings end before the first rebound has a top, and what to do."""
+    """Which recordings end before the first rebound has a top, or have a hole there, and what to do."""
     short = [name for name, view in looks.items() if view.short]
+    holes = [
+        f"{name}: {view.hole}; the minima behind are later ones ('trough 1' is not the first), and what a run makes of "
+        "them may be wrong by a factor of 2: leave the file out, or recover those readings"
+        for name, view in looks.items()
+        if view.hole
+    ]
     if not short:
-        return []
+        return holes
     who = f"{listed(short, 5)}: " * (len(looks) > 1)
     away = "; move those files away, or accept that they count beside the others" * (len(short) < len(looks))
     return [
+        *holes,
         f"{who}the readings end before the top of the first rebound, so a run takes stiffness and viscosity from the "
-        f"collapse alone, often several times too large; record longer, until that top is past{away}"
+        f"collapse alone, often several times too large; record longer, until that top is past{away}",
     ]
 
 
@@ -296,6 +310,18 @@ def _lobe(times: Array, radius: Array, rests: bool) -> Lobe:
         if not rests or not len(lowest):
             raise
         return Lobe(float(radius[top]), float(times[top]), float(times[lowest[0]] - times[top]))
+
+
+def _before_a_hole(times: Array, radius: Array) -> int:
+    """How many readings precede a hole of several steps in which a bubble collapses and its rebound has a top; all."""
+    largest, steps = int(np.argmax(radius)), np.diff(times)
+    for last in largest + np.flatnonzero(steps[largest:] > SEVERAL * np.median(steps))[:1]:
+        with suppress(DataError):  # too few to tell
+            peak = lobe(times[: last + 1], radius[: last + 1])
+            hidden = times[last] < peak.t_max + peak.t_c < times[last + 1] - REBOUND * peak.t_c
+            if hidden and radius[last] < FALLS * radius[largest]:
+                return int(last) + 1
+    return len(times)
 
 
 def _require_collapse(radius: Array, start: Start | None) -> None:

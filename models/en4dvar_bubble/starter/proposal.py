@@ -13,6 +13,7 @@ from en4dvar.inputs.window import vertex
 from en4dvar.model.forward import Trajectory
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.errors import ConfigError, DataError, retold
+from en4dvar.plumbing.hints import listed
 from en4dvar.plumbing.units import convert
 from en4dvar_bubble.collapse import conceivable, doubt, lobe
 from en4dvar_bubble.dynamics import R0, R_EQ, R_MAX
@@ -212,8 +213,9 @@ def _doubted(looks: Mapping[str, Look], model: BubbleModel) -> list[str]:
     """Data sets whose scales cannot be right, one line for those with the same words."""
     doubts: dict[str, list[str]] = {}
     for name, view in looks.items():
-        holds_gas = model.start == "acoustic" and np.isfinite(view.before[0])  # and is no Rayleigh's empty bubble
-        if not holds_gas and (words := doubt(view.lobe, model.medium)):
+        holds_gas = np.isfinite(view.before[0])  # and is no Rayleigh's empty bubble
+        bounded = not holds_gas and view.lobe.rayleigh_ratio(model.medium) > 1  # a gel stretched far stiffens
+        if (model.start == "laser" or bounded) and (words := doubt(view.lobe, model.medium)):
             doubts.setdefault(words, []).append(name)
     return [words if len(looks) == 1 else f"{', '.join(names)}: {words}" for words, names in doubts.items()]
 
@@ -257,6 +259,12 @@ def built(start: Start, law: str | None) -> tuple[BubbleModel, str]:
 def _looks(histories: Mapping[str, tuple[Array, Array]], start: Start | None) -> tuple[dict[str, Look], list[str]]:
     """What each history shows, and why others show no bubble. Raises :class:`DataError` where none shows one."""
     looks, unseen = usable(histories, lambda name: look(*histories[name], start))
+    clear = [view.start for view in looks.values() if view.clear]
+    others = [name for name, view in looks.items() if view.start not in clear]
+    if others and len({*clear}) == 1 and 2 * len(clear) > len(looks):  # bubbles of a folder are made in one way
+        words = f"so begin {len(clear)} of {len(looks)} histories; {listed(others, 5)} in the growth"
+        looks, unseen = usable(histories, lambda name: look(*histories[name], clear[0]))
+        looks = {name: replace(view, reason=words, clear=False) for name, view in looks.items()}
     if len({view.start for view in looks.values()}) > 1:
         kinds = {kind: [n for n, view in looks.items() if view.start == kind] for kind in ("acoustic", "laser")}
         told = "; ".join(f"{kind}: {', '.join(names[:3])}" for kind, names in kinds.items())
