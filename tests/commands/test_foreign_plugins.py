@@ -26,7 +26,7 @@ def test_a_warm_up_without_calls_is_named(monkeypatch):
     entry = EntryPoint("mine", f"{__name__}:nothing", plugins.WARM_UP)
     monkeypatch.setattr(plugins, "installed", lambda group: {"mine": entry})
     monkeypatch.setattr(plugins, "loaded", lambda entry, what: nothing)
-    with pytest.raises(En4dvarError, match="warm-up of 'mine': .* must return a dict of calls, not None"):
+    with pytest.raises(En4dvarError, match=r"warm-up of 'mine': .* must return a dict of calls, not None"):
         list(plugins.examples())
 
 
