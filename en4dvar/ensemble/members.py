@@ -77,7 +77,7 @@ class InitialStates:
         theta |= {tie.parameter.name: _followed(tie, physical[:, j]) for tie, j in self.tied}
         states = floats(initial_states(self.problem.model, theta, len(physical)))
         if states.shape != (len(physical), self.size):
-            raise ValueError("misshapen initial state")
+            raise ValueError(f"misshapen initial state: {states.shape}, not {(len(physical), self.size)}")
         if self.perturbed or self.problem.fields:
             states = self._perturb(states.copy(), physical, cells)
         if not np.isfinite(states).all():

@@ -35,7 +35,7 @@ Lines = Sequence[tuple[int, Line]]
 COMMENT = ("#", "%", "//")
 LONGEST = 1_000_000_000  # bytes of a file
 WIDEST = 10_000  # columns
-BLANK = ("", "nan", "na", "n/a", "-")
+BLANK = ("", "nan", "na", "n/a", "#n/a", "-")
 PREAMBLE = 200  # lines among which the names of the columns are looked for
 SEVERAL = 3  # lines of numbers that a table has at least, so that words below them are in its midst
 _SCALAR = re.compile(r"(?:#|%|//)\s*([A-Za-z_]\w*)\s*=\s*([-+.\deE]+)\s*")

@@ -7,8 +7,9 @@ from typing import Any
 
 
 def installed(group: str) -> dict[str, EntryPoint]:
-    """Entry points of a group by name, in its order; nothing is imported."""
-    return {entry.name: entry for entry in sorted(_all().select(group=group))}
+    """Entry points of a group by name, in its order; nothing is imported, and no package takes the place of ours."""
+    ours_last = sorted(_all().select(group=group), key=lambda e: (bool(e.dist) and e.dist.name == "en4dvar", e))
+    return dict(sorted({entry.name: entry for entry in ours_last}.items()))
 
 
 @cache
