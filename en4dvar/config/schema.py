@@ -285,7 +285,8 @@ class OfScheme(Section):
     def as_written(self, section: Mapping[str, Any]) -> dict[str, Any]:
         """As given, without what the scheme does not read."""
         written = {**super().as_written(section), "scheme": getattr(self, "scheme")}  # noqa: B009
-        return {key: value for key, value in written.items() if key not in type(self).unread(written)}
+        unread = type(self).unread(written)
+        return {key: value for key, value in written.items() if key not in unread}
 
 
 def listed(kinds: Mapping[str, type[Scheme]]) -> str:

@@ -387,7 +387,7 @@ class ForwardModel(ABC):
                 t = float(t_next)
             if x.shape != (self.layout.size,):
                 return Failure(f"step returned shape {x.shape}, expected ({self.layout.size},)", t)
-            if not np.all(np.isfinite(x)):
+            if not np.isfinite(x).all():
                 return Failure("non-finite state", t)
             states[k] = x
         return Trajectory(np.asarray(times, dtype=float), states, self.layout)

@@ -5,6 +5,7 @@ import warnings
 from importlib import import_module
 from importlib.abc import Loader
 from importlib.machinery import ModuleSpec
+from itertools import accumulate
 from types import ModuleType
 from typing import Any
 
@@ -105,9 +106,9 @@ class FormerNames(Loader):
     """Finds modules by their former names, and loads them from where they are."""
 
     def find_spec(self, name: str, path: object = None, target: object = None) -> ModuleSpec | None:
-        for old, new in MOVED.items():
-            if name == old or name.startswith(f"{old}."):
-                today = new + name[len(old) :]
+        for old in accumulate(name.split("."), "{}.{}".format):
+            if old in MOVED:
+                today = MOVED[old] + name[len(old) :]
                 warn(name, today, 2)
                 return ModuleSpec(name, self, origin=today)
         return None

@@ -147,7 +147,7 @@ def test_what_is_no_mistake_runs(tmp_path, lines, keys):
     [
         (
             "    lag = 1\n    filters = False\n    def done(self, iteration, step):\n        return False",
-            "done is not true a",
+            "done is not true after 40 iterations",
         ),
         (
             "    def linearise(self, weights, runs):\n        return runs.predictions",
@@ -155,7 +155,8 @@ def test_what_is_no_mistake_runs(tmp_path, lines, keys):
         ),
     ],
 )
-def test_on_a_series_too(tmp_path, localisation, lines, words):
+def test_on_a_series_too(tmp_path, monkeypatch, localisation, lines, words):
+    monkeypatch.setattr("en4dvar.schemes.asked.MOST", 40)  # of 1000, which are counted on a window above
     (tmp_path / "twin.yaml").write_text(
         "name: twin\nseed: 1\nmodel: {name: lorenz96}\n"
         "twin: {cycles: 3, burn_in: 0, interval: 0.05, error: {x_std: 1}, initial_std: {x: 0.03}}\n"

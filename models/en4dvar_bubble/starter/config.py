@@ -7,6 +7,7 @@ import re
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -87,11 +88,16 @@ def braced(**texts: str | None) -> str:
 
 def yaml_text(name: str, source: Source, proposal: Proposal, command: str) -> str:
     """The whole configuration with comments."""
+    page = _environment().get_template("configuration.yaml.j2")
+    return page.render(schema=SCHEMA_FILE, command=command, name=name, source=source, proposal=proposal, braced=braced)
+
+
+@cache
+def _environment() -> Environment:
     environment = Environment(loader=PackageLoader(__package__, "."), undefined=StrictUndefined)
     environment.trim_blocks = environment.lstrip_blocks = environment.keep_trailing_newline = True
     environment.filters |= {"quoted": quoted, "in_shell": shlex.quote, "section": _section}
-    page = environment.get_template("configuration.yaml.j2")
-    return page.render(schema=SCHEMA_FILE, command=command, name=name, source=source, proposal=proposal, braced=braced)
+    return environment
 
 
 def _section(entries: Sequence[Entry]) -> str:
