@@ -128,7 +128,7 @@ def _closed_output() -> Failed:
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
 @click.version_option(package_name="en4dvar")
 def main() -> None:
-    """Calibrate a model on measured time series with an ensemble (En4D-Var).
+    """Estimate the parameters of a model from time series, with an ensemble (En4D-Var).
 
     \b
     Example:

@@ -106,7 +106,7 @@ def asked(options: Mapping[str, Any]) -> dict[str, tuple[EntryPoint, Path, dict[
 
 @click.command()
 def models() -> None:
-    """List the models with their observables, parameters, units and settings.
+    """List models with observables, parameters, units and settings.
 
     \b
     Example:
@@ -120,9 +120,10 @@ def models() -> None:
 @click.command()
 @click.option("--out", type=click.Path(path_type=Path), help="JSON file to write; default standard output.")
 def schema(out: Path | None) -> None:
-    """Print the JSON schema of configuration files: completion and checks in an editor.
+    """Print the JSON schema of configuration files.
 
-    Name it in the first line of a configuration:  # yaml-language-server: $schema=en4dvar.schema.json
+    An editor completes and checks what you type if the first line of a configuration names it:
+    # yaml-language-server: $schema=en4dvar.schema.json
 
     \b
     Example:
@@ -135,7 +136,7 @@ def schema(out: Path | None) -> None:
 
 @click.command("warm-up")
 def warm_up() -> None:
-    """Compile now what is otherwise compiled at first use: for images, clusters and first runs.
+    """Compile now what is otherwise compiled at first use.
 
     Each kind of equations, and each method with compiled loops, is used once on a tiny problem.
 

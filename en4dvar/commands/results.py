@@ -51,7 +51,7 @@ def _medians(texts: Sequence[str]) -> Known:
     "--figures", is_flag=True, help="Also keep the figures as PDF and PNG, of these data sets or of all pages."
 )
 def report(run_dir: Path, datasets: tuple[str, ...], figures: bool) -> None:
-    """Write the report of a finished run again, from its netCDF files.
+    """Write the report of a finished run again, from its files.
 
     In a campaign of many data sets only those with the gravest warnings have their own page; --dataset (any number
     of times) adds one.
@@ -92,7 +92,9 @@ def compare(
     run_dirs: tuple[Path, ...], out: Path | None, no_report: bool, stored: bool, against: tuple[float, ...],
     apart: tuple[str, ...], known: Known, workers: int | None, trust: bool,
 ) -> None:  # fmt: skip
-    """Compare runs: posteriors over each other and, on the same data, evidence and model probabilities.
+    """Compare runs: posteriors and, on the same data, evidence.
+
+    Posteriors are drawn over each other. On the same data, evidences give the probabilities of the models.
 
     For runs of different data that end with populations (or folders of 'en4dvar population') only the medians are
     compared: by how much one is larger, and how surely. What all have in common cancels.
@@ -211,12 +213,12 @@ def export(run_dir: Path, kind: Literal["csv", "latex", "members", "netcdf"], ou
 @workers_option
 @trust_option
 def rerun(run_dir: Path, workers: int | None, trust: bool) -> None:
-    """Repeat a run from what its result files record, and compare to the last bit. Nothing is written.
+    """Repeat a run from its result files, and compare every bit.
 
-    Configuration, seed and observations are those in the files; the data of a sequence are read again. It says if a bit
-    differs (exit code 1), or if anything that decides the bits has changed since (versions, sources, processor, data
-    files). A law or model outside the current folder and installed packages runs only if you agree when asked, or
-    with --trust.
+    Nothing is written. Configuration, seed and observations are those in the files; the data of a sequence are read
+    again. It says if a bit differs (exit code 1), or if anything that decides the bits has changed since (versions,
+    sources, processor, data files). A law or model outside the current folder and installed packages runs only if
+    you agree when asked, or with --trust.
 
     \b
     Example:
@@ -276,11 +278,12 @@ def several_runs(command: Callable[..., Told]) -> Callable[..., None]:
 def joint(
     runs: tuple[Path, ...], out: Path, how: dict[str, Any], names: tuple[str, ...], apart: tuple[str, ...]
 ) -> Told:
-    """Estimate data sets together that share parameters: samples of one material, records of one instrument.
+    """Estimate data sets together that share parameters.
 
-    Takes finished runs of different readings, any of which may be a campaign; models, windows and errors may differ.
-    Estimated constants of the medium and the camera have one value in all, except those --apart. Each data set has
-    its own values of what is not shared. Writes joint.nc, joint.csv and a page.
+    They are, for example, samples of one material or records of one instrument. Takes finished runs of different
+    readings, any of which may be a campaign; models, windows and errors may differ. Estimated constants of the
+    medium and the camera have one value in all, except those --apart. Each data set has its own values of what is
+    not shared. Writes joint.nc, joint.csv and a page.
 
     \b
     Example:
@@ -314,11 +317,11 @@ def joint(
 def population(
     runs: tuple[Path, ...], out: Path, how: dict[str, Any], names: tuple[str, ...], **hyper: float | None
 ) -> Told:
-    """Estimate the mean of parameters over data sets and how much they vary: a material behind its samples.
+    """Estimate how parameters vary over data sets, and their mean.
 
-    Takes finished runs of the same parameters, with at least three data sets in all, whatever their errors. Unlike
-    stacked posteriors it counts the prior once. Estimated constants of the medium and the camera have one value in
-    all data sets. Writes population.nc, .csv, .tex and a page.
+    The data sets are samples of one material. Takes finished runs of the same parameters, with at least three data
+    sets in all, whatever their errors. Unlike stacked posteriors it counts the prior once. Estimated constants of
+    the medium and the camera have one value in all data sets. Writes population.nc, .csv, .tex and a page.
 
     \b
     Example:

@@ -36,7 +36,7 @@ MOST_NAMED = 3  # data sets of a warning
 @workers_option
 @click.option("--scheduler", metavar="ADDRESS", help="Work on a dask cluster, e.g. tcp://10.0.0.1:8786.")
 def run(source: Source, force: bool, resume: bool, workers: int | None, scheduler: str | None, **asked: Any) -> None:
-    """Estimate the parameters; write posterior and report to the run directory.
+    """Estimate the parameters; write posterior and report.
 
     Several data files (a list, a pattern or a folder) are a campaign; a file that cannot be used does not stop it.
     A configuration with a 'twin:' section is a twin experiment: RMSE and spread against its truth. One with a
@@ -201,10 +201,11 @@ def _follow(config: TwinConfig | SequenceConfig, force: bool, resume: bool) -> N
 @config_options
 @click.option("--plot", is_flag=True, help="Draw the prior predictive over the data (PNG and PDF).")
 def validate(source: Source, plot: bool) -> None:
-    """Check a configuration and its data; say what would be estimated and what it costs.
+    """Check a configuration and its data; say what a run costs.
 
-    All mistakes are listed at once, with file, line and column. A data file that cannot be used is named, and does not
-    stop the others, as in a run. The cost is estimated by running a few prior members.
+    It says what would be estimated. All mistakes are listed at once, with file, line and column. A data file that
+    cannot be used is named, and does not stop the others, as in a run. The cost is estimated by running a few prior
+    members.
 
     \b
     Example:

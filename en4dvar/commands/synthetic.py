@@ -22,10 +22,11 @@ from en4dvar.commands.plugins import WithForms, asked, loaded
 def simulate(
     source: Source, out: Path | None, times: str | None, noise: str | None, seed: int | None, force: bool, **forms: Any
 ) -> None:
-    """Run the model once and write the observable as CSV: at fixed values and prior medians.
+    """Run the model once and write the observable as CSV.
 
-    Set parameters with --set; the columns are those of the configuration's data section.
-    A configuration with a 'campaign:' section draws truths instead, and writes a folder of data sets.
+    Parameters have their fixed values, or the medians of their priors. Set parameters with --set; the columns are
+    those of the configuration's data section. A configuration with a 'campaign:' section draws truths instead, and
+    writes a folder of data sets.
 
     \b
     Example:
@@ -83,11 +84,12 @@ def simulate(
 @click.option("--resume", is_flag=True, help="Continue an interrupted calibration, or add sets.")
 @workers_option
 def calibrate(source: Source, sets: int, made: tuple[str, ...], workers: int | None, **how: Any) -> None:
-    """Make synthetic data sets from the configuration, estimate them, and test the ranks of the truths.
+    """Test on synthetic data whether the intervals are right.
 
-    Truths are drawn from the priors, readings from the model with the errors of the file, at the times of its data. If
-    a posterior is correct, its 90 % intervals hold nine truths in ten. --made-with makes the readings under another
-    assumption, which shows what a wrong one would do. Writes calibration.csv and a page.
+    Makes data sets from the configuration, estimates them, and tests the ranks of the truths. Truths are drawn from
+    the priors, readings from the model with the errors of the file, at the times of its data. If a posterior is
+    correct, its 90 % intervals hold nine truths in ten. --made-with makes the readings under another assumption,
+    which shows what a wrong one would do. Writes calibration.csv and a page.
 
     \b
     Example:
@@ -114,7 +116,7 @@ def calibrate(source: Source, sets: int, made: tuple[str, ...], workers: int | N
 @click.option("--force", is_flag=True, help="Replace an earlier result in the directory.")
 @click.option("--resume", is_flag=True, help="Continue an interrupted comparison, to the same numbers.")
 def design(source: Source, **how: Any) -> None:
-    """Compare planned experiments by the information they are expected to give.
+    """Compare planned experiments by the information they will give.
 
     The configuration is that of 'run'; its data file need not exist. A 'design:' section says when readings are
     taken, which settings can change, and which parameters are asked about. Writes design.nc, designs.csv and a
@@ -153,9 +155,10 @@ def design(source: Source, **how: Any) -> None:
 @click.option("--resume", is_flag=True, help="Keep finished runs; seeds and values may be added at the end.")
 @workers_option
 def sweep_twin(source: Source, varied: tuple[str, ...], seeds: int, **how: Any) -> None:
-    """Compare settings in twin experiments: RMSE and spread, mean ± standard error over seeds.
+    """Compare settings in twin experiments by RMSE and spread.
 
-    All settings see the same truths and observations. Writes sweep.csv and, with every run, runs.csv.
+    The table has means over seeds, ± standard error. All settings see the same truths and observations. Writes
+    sweep.csv and, with every run, runs.csv.
 
     \b
     Example:

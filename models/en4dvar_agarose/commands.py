@@ -28,10 +28,11 @@ def sweep(
     configs: tuple[str, ...], settings: tuple[str, ...], data: str | None, trajectories: int, shift: str, step: str,
     width: float, refine: int, out: Path | None, force: bool, resume: bool, workers: int | None,
 ) -> None:  # fmt: skip
-    """Fit every data set by a search over simulations (the paper's IMR approach, NRMSE).
+    """Fit every data set by a search over simulations.
 
-    The design spans the priors of the configuration; the time shift is searched within --shift. Several
-    configurations of one model share a design, and each trajectory is computed once for all their data sets.
+    This is the paper's IMR approach, by NRMSE. The design spans the priors of the configuration; the time shift is
+    searched within --shift. Several configurations of one model share a design, and each trajectory is computed
+    once for all their data sets.
 
     \b
     Examples:
@@ -85,7 +86,9 @@ def sweep(
 def study(
     config: str, settings: tuple[str, ...], out: Path | None, force: bool, resume: bool, workers: int | None
 ) -> None:
-    """Repeat the paper's study: sweep and En4D-Var, three models, tables, figures and population.
+    """Repeat the paper's study of agarose.
+
+    Sweep and En4D-Var with three models, tables, figures and populations.
 
     \b
     Example:

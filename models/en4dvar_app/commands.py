@@ -13,7 +13,7 @@ from en4dvar.commands.common import echo, trust_option
 @click.option("--no-browser", is_flag=True, help="Only print the address.")
 @trust_option
 def app(path: Path, port: int, no_browser: bool, trust: bool) -> None:
-    """Open a page in the browser that leads from a movie or a table to an estimate.
+    """Go from a movie or a table to an estimate, in the browser.
 
     It reads and writes only in the folder, or in the folder of the file. Every step shows the command line that
     repeats it. The address is for this computer only and holds a secret.

@@ -87,7 +87,7 @@ def init(
     start: Literal["acoustic", "laser"] | None, law: str | None, medium: str, out: Path | None, force: bool,
     **options: str | None,
 ) -> None:  # fmt: skip
-    """Write a commented starter configuration for bubble radius data, proposed from the data.
+    """Propose a commented configuration from bubble radius data.
 
     Units are never guessed: give them, or answer the questions on a terminal.
 

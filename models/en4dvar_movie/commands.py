@@ -41,7 +41,7 @@ def track(
     flashes: str | None, raw: str | None, corrections: Path | None, out: Path | None, page: Path | None,
     outlined: Path | None, force: bool, workers: int | None, **choice: Any,
 ) -> None:  # fmt: skip
-    """Read the bubble's radius and its error from every frame of a movie.
+    """Read a bubble's radius and its error from each movie frame.
 
     MOVIE is a TIFF stack, a folder of pictures, an mp4, avi or gif file, or a raw file with --raw. 'en4dvar init'
     and 'en4dvar run' read the table as it is; a page shows every outline and what was left out.
