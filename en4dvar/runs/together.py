@@ -12,6 +12,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
+
 from en4dvar.config import Config
 from en4dvar.config.dependence import SOURCE, reference_value
 from en4dvar.diagnosis.diagnostics import HARDLY_INFORMED
@@ -23,6 +25,7 @@ from en4dvar.estimation.population.campaign import FEWEST_SETS, Population, popu
 from en4dvar.executor import Executor, choose_executor
 from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.errors import ConfigError, TooFewMembersError, retold
+from en4dvar.plumbing.hints import listed
 from en4dvar.problem import InverseProblem
 from en4dvar.results import together as stored
 from en4dvar.results.checkpoint import FOLDER, digest, file_digest, write_checkpoint
@@ -36,6 +39,11 @@ from en4dvar.runs.trust import Ask
 from en4dvar.runs.worklist import Worklist
 
 Tell = Callable[[str], None]
+VARIES = 0.3  # of the mean: one gel is not known to vary by more between its bubbles (published are 14 and 23 %)
+DIFFER = (
+    "look at what the first and the last of these do not share, as scale, frame rate, gel or batch: mend what is wrong, "
+    "and estimate different gels each by itself; if there is nothing, the parameter itself varies so"
+)
 SPOILT = 1 / 3  # of the data sets: where more are warned of alike, the warning is serious for all together
 
 
@@ -301,10 +309,20 @@ def _cautions(population: Population) -> Iterator[Caution]:
         names, chances = [p.observations.name for p in population.problems], 1 - population.belongs
         odd = [f"{names[s]} (with probability {chances[s]:.2g})" for s in population.odd]
         words = f"perhaps not of the population ({population.hyper.odd:.2g} was expected): {', '.join(odd)}"
-        yield caution("odd-data-set", f"{words}; they count in mean and spread only as far as they belong")
+        odd_sets = caution("odd-data-set", f"{words}; they count in mean and spread only as far as they belong")
+        yield replace(odd_sets, advice="check their data, scale, frame rate and residuals")
     for name, reason in population.left_out.items():
         yield caution("odd-data-set", f"{name} is left out: {reason}")
     for name, share in zip(population.names, population.learned[0], strict=True):
         if share < HARDLY_INFORMED:
             words = f"the data say little about the population's {name}: its interval is that of the hyperprior"
             yield caution("not-informed", words, parameters=(name,))
+    for j, term in enumerate(population.terms):
+        shares = population.posterior.between[:, j] / population.posterior.mean[:, j]
+        if term.transform == "lognormal" and (least := float(np.quantile(shares, 0.05))) > VARIES:
+            name, of_sets = population.names[j], [p.observations.name for p in population.problems]
+            column = population.problems[0].prior.names.index(name)
+            order = np.argsort(np.median(population.sets[:, :, column], axis=0), kind="stable")
+            words = f"{name} differs between data sets by {100 * least:.0f} % or more; from the lowest to the highest: "
+            told = caution("data-sets-differ", words + listed([of_sets[i] for i in order]), "caution")
+            yield replace(told, advice=DIFFER)

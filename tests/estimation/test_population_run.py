@@ -17,6 +17,7 @@ from en4dvar.data.noise import noise_of
 from en4dvar.data.noise.correlated import SharedErrors
 from en4dvar.estimation.population import Effort, HyperPrior
 from en4dvar.estimation.population.campaign import Draws, Population, population_of
+from en4dvar.estimation.population.campaign import _draws as of_white
 from en4dvar.estimation.population.own import OwnDraws
 from en4dvar.model.state import READING_OFFSET, READING_SCALE
 from en4dvar.plumbing.caution import caution
@@ -27,7 +28,7 @@ from en4dvar.problem import InverseProblem
 from en4dvar.report.together import forest, sentences
 from en4dvar.results.together import load_population
 from en4dvar.runs.runner import run_campaign
-from en4dvar.runs.together import population
+from en4dvar.runs.together import _cautions, population
 
 STD, SETS = 0.3, 6
 SMALL = Effort(hyper_walkers=32, draws=1500)
@@ -194,6 +195,29 @@ def test_what_is_determined_together_only():
     kept, effective = found.without_hyperprior(1)
     assert kept.nu[:, 0].std() > 0.9 * nu[:, 0].std()
     assert effective < 200
+
+
+def varying_by(spread, medians):
+    """Warnings about a population of G alone whose spread is known to a tenth of itself."""
+    rng, model = np.random.default_rng(1), Vectorised()
+    toy = make_problem(model, [1.0, 0.4])
+    terms = (PriorTerm.lognormal(model.parameters[0], 1.0, 1.0), *toy.prior.terms[1:])
+    named = ((f"set{s}", replace(toy.observations, name=f"set{s}")) for s in range(len(medians)))
+    problems = tuple(replace(toy, observations=readings, prior=Prior(terms)) for _, readings in named)
+    nu, tau = 0.1 * rng.standard_normal((400, 1)), spread * (1 + 0.1 * rng.standard_normal((400, 1)))
+    draws = of_white(terms[:1], nu, tau, rng)
+    sets = np.stack([np.array(medians), np.ones(len(medians))], axis=1) * np.exp(
+        0.01 * rng.standard_normal((400, 1, 1))
+    )
+    found = Population(("a",), problems, HyperPrior(odd=0.0), draws, draws, sets, (400.0, 400.0), 0.0, 0)
+    return [told for told in _cautions(found) if told.code == "data-sets-differ"]
+
+
+def test_a_population_that_varies_more_than_one_gel_names_its_sets_in_order():
+    (told,) = varying_by(0.6, [17.0, 5.0, 18.0, 6.0])
+    assert told.severity == "caution"
+    assert "from the lowest to the highest: set1, set3, set0, set2" in told.words
+    assert not varying_by(0.25, [9.0, 10.0, 11.0, 12.0])
 
 
 def test_what_is_a_data_sets_own_follows_what_all_have_in_common():
