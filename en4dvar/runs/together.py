@@ -41,7 +41,7 @@ from en4dvar.runs.worklist import Worklist
 Tell = Callable[[str], None]
 VARIES = 0.3  # of the mean: one gel is not known to vary by more between its bubbles (published are 14 and 23 %)
 DIFFER = (
-    "look at what the first and the last of these do not share, as scale, frame rate, gel or batch: mend what is wrong, "
+    "look at what the first and the last of these do not share, as scale, frame rate, gel, batch: mend what is wrong, "
     "and estimate different gels each by itself; if there is nothing, the parameter itself varies so"
 )
 SPOILT = 1 / 3  # of the data sets: where more are warned of alike, the warning is serious for all together
