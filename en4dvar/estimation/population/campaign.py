@@ -25,9 +25,9 @@ from en4dvar.estimation.population.own import (
     OwnDraws,
     OwnLikelihood,
     empirical,
+    in_units_of_the_common,
     own_draws,
     own_likelihoods,
-    with_common_told,
 )
 from en4dvar.executor import Executor, one_blas_thread
 from en4dvar.model.state import Array
@@ -322,7 +322,7 @@ def population_from(
     varying, shared = [columns.index(name) for name in names], [columns.index(name) for name in common]
     sets = [problem.observations.name for problem in problems]
     logs = np.array([term.log_std for term in terms])
-    draws, mean, root = with_common_told(list(drawn.values()), varying, shared, logs)
+    draws, mean, root = in_units_of_the_common(list(drawn.values()), varying, shared, logs)
     likelihoods = own_likelihoods(draws, varying, shared, seed, sets, logs)
     estimated = Hierarchy(likelihoods, scales).sampled(seed, effort)
     theta, stream = mean + estimated.theta @ root.T, member_stream(seed, "hyperprior")

@@ -291,7 +291,7 @@ def _straight(
     return x, theta, following_of(x, theta, logs, slopes)
 
 
-def with_common_told(
+def in_units_of_the_common(
     drawn: Sequence[OwnDraws], varying: Sequence[int], common: Sequence[int], logs: Array
 ) -> tuple[list[OwnDraws], Array, Array]:
     """The draws with what is common in units of what is known of it, θ = mean + root ξ; ``mean`` (c,), ``root`` (c, c).
