@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from init_files import call, proposed, write
 
 from en4dvar.cli import main
 from en4dvar.inputs.implausible import outlying, placeholders, scatter_of
@@ -171,6 +172,14 @@ def test_diameters_in_german(tmp_path: Path) -> None:
     code, output = told(tmp_path, rows("Zeit_us;Durchmesser_um\n", 2 * radii(), "{:.3f};{:.3f}\n"))
     assert code == 0, output
     assert "'Durchmesser_um' seems to hold diameters" in output
+
+
+def test_a_radius_at_rest_beside_diameters_is_not_halved(tmp_path: Path) -> None:
+    path = write(tmp_path / "film.csv", "# Req = 22\nt_us,D_um", scale=2.0)
+    done = call("init", "--data", path, "--out", tmp_path / "film.yaml", "--radius-unit", "0.5*um")
+    assert done.exit_code == 0, done.output
+    proposed(tmp_path / "film.yaml")
+    assert "R_eq: {from_file: Req, unit: um}" in (tmp_path / "film.yaml").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(("glare", "when"), [([1], "reading at 3.2 us is"), ([0, 1], "2 readings at 1.6, 3.2 us are")])

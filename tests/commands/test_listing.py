@@ -21,6 +21,13 @@ def test_models_are_listed_with_parameters_and_units() -> None:
     assert any(line.startswith("settings: law, ") for line in lines)
 
 
+def test_the_list_of_commands_cuts_no_sentence_short() -> None:
+    done = CliRunner().invoke(main, ["--help"], terminal_width=80)
+    assert done.exit_code == 0, done.output
+    cut = [line for line in done.output.splitlines() if line.endswith(("...", "…")) and not line.startswith("Usage")]
+    assert cut == []
+
+
 def test_a_model_that_cannot_be_loaded_is_listed_with_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     entries = {"gone": EntryPoint("gone", "no_such_package:Model", models.GROUP)}
     monkeypatch.setattr(models, "installed", lambda group: entries)

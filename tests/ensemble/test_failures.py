@@ -1,5 +1,6 @@
 """A failed member is a value with a reason; a linear problem does not notice it."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -106,6 +107,13 @@ def test_parameter_outside_its_bounds_fails_and_is_not_clipped():
 def test_observation_operator_that_fails_is_a_failure(operator, reason):
     problem = replace(make_problem(Linear(("a", "b")), [1.0, 1.0]), observable=Observable("y", "m", operator))
     assert set(forecast(problem, problem.prior.sample(4, 0)).failures) == {reason}
+
+
+def test_an_initial_state_of_a_wrong_shape_is_told_with_both_shapes(monkeypatch):
+    problem = make_problem(Linear(("a", "b")), [1.0, 1.0])
+    monkeypatch.setattr(Linear, "initial_state", lambda self, theta: np.zeros(7))
+    (reason,) = set(forecast(problem, problem.prior.sample(4, 0)).failures)
+    assert re.fullmatch(r".*misshapen initial state: \(\d+, 7\), not \(\d+, 4\)", reason)
 
 
 def test_non_finite_prediction_is_a_failure():

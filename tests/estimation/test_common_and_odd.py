@@ -136,6 +136,7 @@ def test_an_odd_data_set_is_named_and_moves_nothing():
     (one,) = (c for c in _cautions(found) if c.code == "odd-data-set")
     assert "set3" in one.words
     assert "set2" not in one.words
+    assert "left out" not in one.advice
     mean, std, between = exact(problems, hyper)
     assert found.posterior.mean.mean() == pytest.approx(mean, abs=0.15 * std)
     assert found.posterior.mean.std() == pytest.approx(std, rel=0.1)
