@@ -74,9 +74,18 @@ AMPLITUDE = Entry(
 )
 """A line of the parameters, which is a comment until it holds the amplitude of the pulse that the model states."""
 PULSE = (
-    "the amplitude of the pulse is taken as exact, and an error of 10 % can make G wrong by half; enter the error "
+    "the amplitude of the pulse is taken as exact, and an error of 10 % can {}; enter the error "
     f"of your hydrophone in the line '# {P_A.name}' of the parameters, and remove the '# ' from it"
 )
+COATING = {
+    "sigma_0": Entry(
+        "sigma_0",
+        "{prior: logit, lower: 0 mN/m, upper: 72 mN/m, median: 20 mN/m, logit_std: 1}",
+        "tension of the coating at rest: an example value, below that of water",
+    ),
+    "sigma_w": Entry("sigma_w", "72 mN/m", "tension of the broken coating: that of water"),
+}
+MU_OF_WATER = Entry("mu", "0.89 mPa s", "viscosity of water at 25 °C (IAPWS 2008); what else damps is the coating")
 _OF_ANY = (
     Known("rho", "1030 kg/m^3", 0.02, "density: 90 % from water, 997, to the gels of rheometry codes, 1064"),
     Known("c", "1510 m/s", 0.015, "speed of sound: between water, 1497 m/s, and gels with 15 % of polymer, 1540 m/s"),
