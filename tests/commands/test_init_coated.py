@@ -32,6 +32,7 @@ def test_a_coated_bubble_in_water(law: str) -> None:
     assert done.exit_code == 0, done.output
     assert "no bubble has such a radius" not in done.stderr
     assert "make G wrong" not in done.stderr
+    assert "no G and mu" not in done.stderr
     (problem,) = build(load_config("s0.yaml"))
     assert problem.fixed["mu"] == pytest.approx(0.89e-3, rel=0.02)  # IAPWS 2008, 25 °C
     if "marmottant" in law:

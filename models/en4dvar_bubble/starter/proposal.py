@@ -146,7 +146,7 @@ def propose(
     elif words := _implausible(look, model.law.sized):
         warnings.append(words)
     elif guess.misfit > FAR:  # no node comes close to what was observed
-        warnings.append(_unmatched(guess.unmatched, look, model))
+        warnings += [_unmatched(guess.unmatched, look, model)] * (not model.law.sized)
         believed = Guess({}, {}, 0.0) if chosen == "acoustic" else guess  # made with a pulse that is not theirs
     warnings += without_rebound(looks)
     if chosen == "laser" and "G" in guess.values:
