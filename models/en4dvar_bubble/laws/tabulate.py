@@ -76,6 +76,11 @@ def ends(tables: Array) -> list[str]:
     x, words = np.arange(GRID.origin, GRID.span[1], GRID.step / 8), []
     for known in np.isfinite(evaluate(tables, GRID.span, np.tile(x, (len(tables), 1)))):
         low, high = np.max(x[~known & (x <= 0)], initial=x[0]), np.min(x[~known & (x >= 0)], initial=x[-1])
+        if not known.any():
+            words.append(
+                ": the law has no value at any stretch with these parameters; 'en4dvar laws NAME' says what it needs"
+            )
+            continue
         words.append(f": the law has values at stretches between {np.exp(low):.3g} and {np.exp(high):.3g} alone")
     return words
 

@@ -75,9 +75,18 @@ AMPLITUDE = Entry(
 """A line of the parameters, which is a comment until it holds the amplitude of the pulse that the model states."""
 PULSE = (
     "the pulse is an example: enter that of your experiment in the line 'driving' of the model; the amplitude of the "
-    "pulse is taken as exact, and an error of 10 % can make G wrong by half; enter the error "
+    "pulse is taken as exact, and an error of 10 % can {}; enter the error "
     f"of your hydrophone in the line '# {P_A.name}' of the parameters, and remove the '# ' from it"
 )
+COATING = {
+    "sigma_0": Entry(
+        "sigma_0",
+        "{prior: logit, lower: 0 mN/m, upper: 72 mN/m, median: 20 mN/m, logit_std: 1}",
+        "tension of the coating at rest: an example value, below that of water",
+    ),
+    "sigma_w": Entry("sigma_w", "72 mN/m", "tension of the broken coating: that of water"),
+}
+MU_OF_WATER = Entry("mu", "0.89 mPa s", "viscosity of water at 25 °C (IAPWS 2008); what else damps is the coating")
 _OF_ANY = (
     Known("rho", "1030 kg/m^3", 0.02, "density: 90 % from water, 997, to the gels of rheometry codes, 1064"),
     Known("c", "1510 m/s", 0.015, "speed of sound: between water, 1497 m/s, and gels with 15 % of polymer, 1540 m/s"),
@@ -171,3 +180,14 @@ def plane_in_a_gel(views: Mapping[str, Look], medium: Medium) -> list[str]:
         f"makes it too large). If one is within 10 R_max, state its distance from the bubble's centre: "
         f"--set model.wall.distance='{float(f'{3 * radius:.2g}'):g} um'"
     ]
+
+
+def doubted(looks: Mapping[str, Look], model: BubbleModel) -> list[str]:
+    """Data sets whose scales cannot be right, one line for those with the same words."""
+    doubts: dict[str, list[str]] = {}
+    for name, view in looks.items():
+        holds_gas = np.isfinite(view.before[0])  # and is no Rayleigh's empty bubble
+        bounded = not holds_gas and view.lobe.rayleigh_ratio(model.medium) > 1  # a gel stretched far stiffens
+        if (model.start == "laser" or bounded) and (words := doubt(view.lobe, model.medium)):
+            doubts.setdefault(words, []).append(name)
+    return [words if len(looks) == 1 else f"{', '.join(names)}: {words}" for words, names in doubts.items()]

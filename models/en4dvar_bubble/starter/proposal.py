@@ -15,7 +15,7 @@ from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.errors import ConfigError, DataError, retold
 from en4dvar.plumbing.hints import listed
 from en4dvar.plumbing.units import convert
-from en4dvar_bubble.collapse import conceivable, doubt, lobe
+from en4dvar_bubble.collapse import conceivable, lobe
 from en4dvar_bubble.dynamics import R0, R_EQ, R_MAX
 from en4dvar_bubble.laws.loading import qualified
 from en4dvar_bubble.model import BubbleModel
@@ -138,13 +138,14 @@ def propose(
         for name, view in looks.items()
         if view.drift and chosen == "laser"  # ultrasound's is seen before it grows
     ]
-    warnings += [elsewhere.PULSE] * (chosen == "acoustic")
-    doubted, believed = _doubted(looks, model), guess
+    wrong = "make G wrong by half" if "G" in {*others, *guess.values} else "move an estimate by several error bars"
+    warnings += [elsewhere.PULSE.format(wrong)] * (chosen == "acoustic")
+    doubted, believed = elsewhere.doubted(looks, model), guess
     if doubted:
         warnings += doubted
         possible = all(conceivable(view.lobe, model.medium) for view in views)
         believed = guess.common() if possible else Guess({}, {}, 0.0)
-    elif words := _implausible(look):
+    elif words := _implausible(look, model.law.sized):
         warnings.append(words)
     elif guess.misfit > FAR and chosen == "laser":  # no node comes close to what was observed
         warnings.append(_unmatched(guess.unmatched, look, model))
@@ -158,8 +159,12 @@ def propose(
     slow = elsewhere.SLOW[0] < ratio < elsewhere.SLOW[1]
     wall = elsewhere.wall(look.lobe.R_max, ratio) if slow and _in_a_liquid(model) else ()
     sizes = {group: len(looks.keys() & {*names}) for group, names in groups.of.items()}
-    vary = [p.name for p in model.law.parameters] + [R0.name] * (R0 in model.parameters and math.isnan(look.before[0]))
     rest = at_rest(looks, histories, edge, scale.log_std)
+    lines = (*_parameters(model, look, believed, tops(looks, histories, scale), medium, scale, rest), *wall[1:])
+    free = {line.key for line in lines if line.value.startswith("{")}
+    vary = [p.name for p in model.law.parameters if p.name in free] + [R0.name] * (
+        R0 in model.parameters and math.isnan(look.before[0])
+    )
     together, in_a_gel = None, chosen == "laser" and not _in_a_liquid(model)
     if vary and max(sizes.values(), default=len(views)) >= FEWEST_SETS:
         common = [quantity.key for quantity in elsewhere.known(medium)]
@@ -167,7 +172,7 @@ def propose(
     return Proposal(
         _data(look, model, {**others, **guess.values}, views),
         (*_model(law_name, model, look), *wall[:1]),
-        (*_parameters(model, look, believed, tops(looks, histories, scale), medium, scale, rest), *wall[1:]),
+        lines,
         SIMPLER[chosen],
         (*told, *[f"{len(views)} bubbles: {_ends_with(groups.kind, sizes)}"] * bool(together)),
         (*warnings, *unseen),
@@ -197,27 +202,17 @@ def _unmatched(names: Sequence[str], look: Look, model: BubbleModel) -> str:
     return f"no G and mu of {model.law.name} give this {' and '.join(told[n] for n in names)}: {' '.join(questions)}"
 
 
-def _implausible(look: Look) -> str:
-    """Why nobody has seen a bubble of this size and duration, though the one fits the other; "" where many have."""
+def _implausible(look: Look, coated: bool) -> str:
+    """Why nobody has seen a bubble of this size and duration, though the one fits the other; "" where many have.
+    A ``coated`` one may be small."""
     smallest, shortest, usual = SEEN
     R, step = look.lobe.R_max, look.step
-    if BUBBLES[0] < R < BUBBLES[1] and not (smallest > R and step < shortest):
+    if BUBBLES[0] < R < BUBBLES[1] and (coated or not (smallest > R and step < shortest)):
         return ""
     power = round(math.log10(usual / R) / 3)
     factor = f"Units {1000 ** abs(power)} times {'larger' if power > 0 else 'smaller'} would make it a usual one"
     told = f"R_max {_text(R, 'm', 'um', 3)}, read every {_text(step, 's', 'us', 3)}"
     return f"{told}: no bubble has such a radius; are the units of both columns right? {factor}"
-
-
-def _doubted(looks: Mapping[str, Look], model: BubbleModel) -> list[str]:
-    """Data sets whose scales cannot be right, one line for those with the same words."""
-    doubts: dict[str, list[str]] = {}
-    for name, view in looks.items():
-        holds_gas = np.isfinite(view.before[0])  # and is no Rayleigh's empty bubble
-        bounded = not holds_gas and view.lobe.rayleigh_ratio(model.medium) > 1  # a gel stretched far stiffens
-        if (model.start == "laser" or bounded) and (words := doubt(view.lobe, model.medium)):
-            doubts.setdefault(words, []).append(name)
-    return [words if len(looks) == 1 else f"{', '.join(names)}: {words}" for words, names in doubts.items()]
 
 
 def starter(start: Start, law: str | None) -> Proposal:
@@ -414,6 +409,8 @@ def _parameters(
     start, lines = model.start, []
     in_water = medium == "water" and _in_a_liquid(model)
     water = {line.key: line for line in elsewhere.of_water(_of_each(0.05 * look.lobe.R_max, look, top)) if in_water}
+    if medium == "water" and model.law.sized:
+        water["mu"] = elsewhere.MU_OF_WATER
     for p in model.law.parameters:
         if p.name in water:
             lines.append(water[p.name])
@@ -443,6 +440,8 @@ def _parameters(
 
 def example(p: Parameter, model: BubbleModel) -> Entry:
     """A prior about the law's example value; of α, and of a gel's G and μ, one that spans the gels."""
+    if p.name in elsewhere.COATING:
+        return elsewhere.COATING[p.name]
     gels = {"alpha": STIFFENING}
     if any(other.name == "G" for other in model.law.parameters):
         gels |= OF_GELS

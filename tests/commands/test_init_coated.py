@@ -1,0 +1,54 @@
+"""``en4dvar init`` of a coated bubble in water: what belongs to the water is not estimated, and no gel is spoken of."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from init_files import UNITS, call
+
+from en4dvar.assembly.build import build
+from en4dvar.config import load_config
+from en4dvar_bubble.laws.tabulate import GRID, ends
+
+pytestmark = pytest.mark.usefixtures("own_folder")
+ASKED = ("--medium", "water", "--start", "acoustic")
+
+
+def _films(count: int) -> None:
+    """Bubbles of 1.8 um that swing by 8 % in a burst."""
+    Path("sh").mkdir()
+    t = np.arange(0, 4.6, 0.04)
+    for n in range(count):
+        burst = np.where(t > 0.5, np.sin(2 * np.pi * 1.8 * (t - 0.5)) * np.sin(np.pi * (t - 0.5) / 4.2), 0.0)
+        radii = 1.8 * (1 + n / 20) * (1 + 0.08 * burst) + np.random.default_rng(n).normal(0, 0.01, t.size)
+        rows = [f"{time:.3f},{radius:.4f}\n" for time, radius in zip(t, radii, strict=True)]
+        Path(f"sh/s{n}.csv").write_text("".join(["t_us,R_um\n", *rows]))
+
+
+@pytest.mark.parametrize("law", ["marmottant-shell", "gompertz-shell", "sarkar-shell", "church-shell"])
+def test_a_coated_bubble_in_water(law: str) -> None:
+    _films(1)
+    done = call("init", "--data", "sh/s0.csv", *UNITS, "--law", law, *ASKED)
+    assert done.exit_code == 0, done.output
+    assert "no bubble has such a radius" not in done.stderr
+    assert "make G wrong" not in done.stderr
+    assert "no G and mu" not in done.stderr
+    (problem,) = build(load_config("s0.yaml"))
+    assert problem.fixed["mu"] == pytest.approx(0.89e-3, rel=0.02)  # IAPWS 2008, 25 °C
+    if "marmottant" in law:
+        draws = np.random.default_rng(0).standard_normal((2000, len(problem.prior.names)))
+        values = problem.prior.to_physical(problem.prior.mean + problem.prior.std * draws)
+        assert values[:, problem.prior.names.index("sigma_0")].max() < problem.fixed["sigma_w"]
+
+
+def test_what_is_known_of_the_water_does_not_vary_from_bubble_to_bubble() -> None:
+    _films(4)
+    done = call("init", "--data", "sh", *UNITS, "--law", "marmottant-shell", *ASKED)
+    assert done.exit_code == 0, done.output
+    assert "  of: [chi, kappa_s, sigma_0] #" in Path("sh.yaml").read_text()
+    assert call("validate", "sh.yaml").exit_code == 0
+
+
+def test_a_law_without_any_value_says_so() -> None:
+    (words,) = ends(np.full((1, GRID.cells, 8), np.nan))
+    assert words.startswith(": the law has no value at any stretch with these parameters")
