@@ -301,13 +301,14 @@ def _elsewhere(config: Config, population: Population, group: str) -> dict[str, 
 
 
 def _cautions(population: Population) -> Iterator[Caution]:
+    sets = [p.observations.name for p in population.problems]
     if not population.converged:
         words = f"only {population.size:.0f} effective draws support the population"
         advice = "the median of the data sets one by one, which needs no draws, replaces its numbers"
         yield replace(caution("chain-not-converged", words), advice=advice)
     if population.odd:
-        names, chances = [p.observations.name for p in population.problems], 1 - population.belongs
-        odd = [f"{names[s]} (with probability {chances[s]:.2g})" for s in population.odd]
+        chances = 1 - population.belongs
+        odd = [f"{sets[s]} (with probability {chances[s]:.2g})" for s in population.odd]
         words = f"perhaps not of the population ({population.hyper.odd:.2g} was expected): {', '.join(odd)}"
         odd_sets = caution("odd-data-set", f"{words}; they count in mean and spread only as far as they belong")
         yield replace(odd_sets, advice="check their data, scale, frame rate and residuals")
@@ -320,9 +321,9 @@ def _cautions(population: Population) -> Iterator[Caution]:
     for j, term in enumerate(population.terms):
         shares = population.posterior.between[:, j] / population.posterior.mean[:, j]
         if term.transform == "lognormal" and (least := float(np.quantile(shares, 0.05))) > VARIES:
-            name, of_sets = population.names[j], [p.observations.name for p in population.problems]
+            name = population.names[j]
             column = population.problems[0].prior.names.index(name)
             order = np.argsort(np.median(population.sets[:, :, column], axis=0), kind="stable")
             words = f"{name} differs between data sets by {100 * least:.0f} % or more; from the lowest to the highest: "
-            told = caution("data-sets-differ", words + listed([of_sets[i] for i in order]), "caution")
+            told = caution("data-sets-differ", words + listed([sets[i] for i in order]), "caution")
             yield replace(told, advice=DIFFER)

@@ -92,11 +92,7 @@ def first_guess(model: BubbleModel, fixed: Mapping[str, float], observed: Mappin
     weights /= weights.sum()
     mean = weights @ logs
     spread = np.sqrt(weights @ (logs - mean) ** 2)
-    told = (
-        "R_max and collapse time"
-        if model.start == "acoustic"
-        else "collapse time" + " and rebound" * ("rebound" in keys)
-    )
+    told = "R_max and collapse time" if "R_max" in keys else "collapse time" + " and rebound" * ("rebound" in keys)
     return Guess(
         {name: float(np.exp(m)) for name, m in zip(names, mean, strict=True)},
         {name: float(s) for name, s in zip(names, spread, strict=True)},
