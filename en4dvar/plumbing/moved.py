@@ -44,7 +44,7 @@ MOVED |= {f"en4dvar.{old}": f"en4dvar.{new}" for new, several in {
     "results.store": "results.groups results.beside results.complete results.record",
     "report.result": "report.notebook", "report.svg": "report.words report.drawing report.paths",
     "report.chart": "report.ticks report.palette", "report.history": "report.predictive",
-    "report.figures": "report.fields report.varying", "report.sequence": "report.cycles",
+    "report.figures": "report.fields report.varying", "report.sequence": "report.cycles report.twin",
     "report.responses": "report.readings", "report.together": "report.joint report.population",
     "runs.finished": "runs.evidence_run", "estimation.joint.members": "estimation.joint.challenge",
     "estimation.stages": "loop_state", "results.declared": "results.axes",

@@ -17,8 +17,7 @@ from en4dvar.config import SequenceConfig, TwinConfig, load_sequence, load_twin,
 from en4dvar.executor import Executor, choose_executor
 from en4dvar.inputs.parts import DataFile
 from en4dvar.plumbing.files import write_text
-from en4dvar.report.sequence import SequenceOutcome
-from en4dvar.report.twin import TwinOutcome
+from en4dvar.report.sequence import SequenceOutcome, TwinOutcome
 from en4dvar.results.checkpoint import FOLDER, digest
 from en4dvar.results.netcdf import Group, to_bytes
 from en4dvar.results.series_file import sequence_csv, series_group, twin_csv
@@ -138,7 +137,7 @@ class TwinKind(Cycles[TwinResult]):
     name = "twin"
     result = "twin.nc"
     files = (result, "summary.csv", f"{FOLDER}/twin.cycle")
-    writer = "en4dvar.report.twin:write_twin_report"
+    writer = "en4dvar.report.sequence:write_twin_report"
     summary = staticmethod(twin_csv)
 
     @property
