@@ -16,10 +16,8 @@ LEAST = 500  # at least so many
 
 
 def standing_for(x: Array, kind: Indices, chosen: Indices, mean: Array, covariance: Array) -> Array:
-    """(N, n) of equally likely draws ``x`` (D, n), of nearly this mean (n,) and covariance (n, n).
-
-    They are the ``chosen`` (N,) ones, exchanged for others of the same ``kind`` (D,) as long as that brings moments and
-    quantiles nearer to those of all. Where too few differ, the chosen ones.
+    """(N, n) of equally likely draws ``x`` (D, n), of nearly this mean (n,) and covariance (n, n): the ``chosen`` (N,)
+    ones, exchanged for others of the same ``kind`` (D,) as long as that helps. Where too few differ, the chosen ones.
     """
     n = x.shape[1]
     if len(chosen) <= n or np.linalg.matrix_rank(x[chosen] - x[chosen].mean(axis=0)) < n:

@@ -2,11 +2,10 @@ r"""A proposal that is the emulated posterior itself, for posteriors that are to
 
     x_i ~ exp(−Ĵ/τ),   w_i = exp(Ĵ(x_i)/τ − J(x_i)),   ∫ exp(−J) dx = ∫ exp(−Ĵ/τ) dx · E[w]
 
-Where ten parameters are tied together to some thousandths of their spread, a mixture fitted to a few hundred draws
-keeps 2 to 5 % of its draws effective and loses the tails. Predictions bend far less than J does, and J of quadratic
-predictions costs microseconds: of it tens of thousands of draws can be made, which show the whole of that valley, and
-10 to 60 % of them stay effective under the model. The emulator is fitted to all runs made so far, and learns where it
-is wrong from runs at its own draws, first hot (τ > 1), so that they reach beyond the runs before them.
+Where ten parameters are tied together to some thousandths of their spread, a mixture keeps 2 to 5 % of its draws
+effective and loses the tails. Of J of quadratic predictions tens of thousands of draws can be made, of which 10 to 60 %
+stay effective under the model. The emulator is fitted to all runs made so far, and learns where it is wrong from runs
+at its own draws, first hot (τ > 1), so that they reach beyond the runs before them.
 
 Source: surrogates refined where they say that the posterior is, Li & Marzouk (2014), SIAM J. Sci. Comput. 36, A1163.
 """
@@ -120,6 +119,10 @@ class EmulatedProposal:
 
     def bridged(self, cost: Callable[[Array], Array], stream: np.random.Generator) -> "EmulatedProposal":
         """The proposal exp(−``cost``), from this one."""
+
+        def between(at: float) -> Callable[[Array], Array]:
+            return lambda z: (1 - at) * self.cost(z) + at * cost(z)
+
         at, z = 0.0, self.walkers
         while at < 1.0:
             change, step = self.cost(z) - cost(z), 1.0 - at
@@ -127,7 +130,7 @@ class EmulatedProposal:
                 step *= 0.8
             at = at + step if at + step < 1.0 - 1e-9 else 1.0
             z = z[resampled(shares_of(step * change), WALKERS, stream)]
-            z = _moved(cost if at == 1.0 else _between(self.cost, cost, at), z, z, stream)
+            z = _moved(cost if at == 1.0 else between(at), z, z, stream)
         return replace(self, cost=cost, walkers=z)
 
     def settled(self, stream: np.random.Generator) -> "EmulatedProposal":
@@ -151,10 +154,6 @@ class EmulatedProposal:
     def log_density(self, x: Array) -> Array:
         """(B,) at points (B, n)."""
         return np.asarray(-self.cost(x) - self.log)
-
-
-def _between(first: Callable[[Array], Array], last: Callable[[Array], Array], at: float) -> Callable[[Array], Array]:
-    return lambda z: (1 - at) * first(z) + at * last(z)
 
 
 def _moved(cost: Callable[[Array], Array], z: Array, others: Array, stream: np.random.Generator) -> Array:

@@ -7,9 +7,8 @@ all before, and q is the mixture of all rounds (Cornuet, Marin, Mira & Robert 20
 Coordinates z are those in which the prior is N(0, 1).
 
 Such a mixture is dense where the draws lie that it was fitted to, which makes the weights of these too small; and where
-none of them lies nothing tells that something is missing. :class:`ClosingDraws` therefore fits its proposals to a power
-of the posterior, with covariances that few draws do not make flat; what judges the posterior are :class:`FixedDraws` of
-the last proposal alone, made afresh: their mean weight is unbiased.
+none of them lies nothing tells that something is missing. So :class:`ClosingDraws` fits its proposals to a power of the
+posterior; what judges the posterior are :class:`FixedDraws` of the last proposal alone: their mean weight is unbiased.
 """
 
 import numpy as np
@@ -26,22 +25,9 @@ MOST = 3.0  # times √D mean weights of D draws: more than that none counts (Io
 Proposal = StudentMixture | EmulatedProposal
 
 
-def flattened(logs: Array, wanted: float) -> tuple[Array, float]:
-    """Shares (D,) by that power of weights, of these logarithms, which leaves so many effective as are ``wanted``; and
-    how many these are.
-    """
-    power, shares = 1.0, shares_of(logs)
-    while (effective := effective_number(shares)) < wanted and power > 1e-4:
-        power *= 0.8
-        shares = shares_of(power * logs)
-    return shares, effective
-
-
 class Importance:
-    """The draws of one data set from its proposals, ``count`` in a round, the first of them from ``first``.
-
-    ``z`` (D, n) are all draws, ``log_weights`` (D,) their weights, ``log`` is ln ∫ L N dz and ``effective`` the number
-    of draws behind it.
+    """Draws ``z`` (D, n) from proposals, ``count`` in a round, the first of them from ``first``; ``log_weights`` (D,)
+    are their weights, ``log`` is ln ∫ L N dz and ``effective`` the number of draws behind it.
     """
 
     def __init__(self, first: Proposal, stream: np.random.Generator, count: int):
@@ -78,9 +64,7 @@ class Importance:
 
 
 class ClosingDraws(Importance):
-    """A proposal each round, fitted to the posterior to the power of ``wider``⁻², which of a Gaussian is wider by that
-    factor, and of another shape most where that has tails, so that thin tails are found as well.
-    """
+    """Proposals fitted each round to the posterior to the power of ``wider``⁻²; a Gaussian is wider by that factor."""
 
     def __init__(self, first: StudentMixture, stream: np.random.Generator, count: int, wider: float):
         super().__init__(first, stream, count)
@@ -107,7 +91,10 @@ class ClosingDraws(Importance):
         n = self.z.shape[1]
         if np.isfinite(self.log_weights).sum() <= 2 * (n + 1):
             return self.first
-        shares, effective = flattened(self.tempered, SETTLED)
+        power, shares = 1.0, shares_of(self.tempered)
+        while (effective := effective_number(shares)) < SETTLED and power > 1e-4:
+            power *= 0.8
+            shares = shares_of(power * self.tempered)
         where = resampled(shares, min(2 * self.count, MOST_FITTED), self.stream)
         parts = max(1, min(PARTS, int(effective / (EACH * n))))
         return StudentMixture.fitted(self.z[where], self.stream, parts, alike=2 * n * len(where) / effective)

@@ -62,7 +62,10 @@ def fit_gaussians(
     share = np.full(components, 1 / components)
     common = alike * components ** (-2.0 / n) * np.eye(n)
     for _ in range(rounds):
-        logs = log_gaussians(z, share, centre, covariance)
+        of_each = np.linalg.cholesky(covariance)  # ln share_m N(z; centre_m, covariance_m) (M, D), (2π)^{−n/2} apart
+        white = np.linalg.inv(of_each) @ (z - centre[:, None]).swapaxes(1, 2)
+        logs = (np.log(share) - np.log(np.einsum("mii->mi", of_each)).sum(axis=1))[:, None]
+        logs = logs - 0.5 * np.sum(white**2, axis=1)
         of_part = np.exp(logs - logs.max(axis=0))
         of_part /= of_part.sum(axis=0)
         size = of_part.sum(axis=1) + 1e-9 * count
@@ -76,11 +79,3 @@ def fit_gaussians(
             axes = np.linalg.inv(unit) @ vectors
             covariance = axes * np.minimum(values, 1.0)[:, None] @ axes.swapaxes(1, 2)
     return share, middle + centre @ root.T, root @ covariance @ root.T
-
-
-def log_gaussians(x: Array, share: Array, centre: Array, covariance: Array) -> Array:
-    """ln share_m N(x; centre_m, covariance_m) (M, D) of points (D, n), (2π)^{−n/2} apart."""
-    root = np.linalg.cholesky(covariance)
-    z = np.linalg.inv(root) @ (x - centre[:, None]).swapaxes(1, 2)
-    logs = np.log(share) - np.log(np.einsum("mii->mi", root)).sum(axis=1)
-    return np.asarray(logs[:, None] - 0.5 * np.sum(z**2, axis=1))

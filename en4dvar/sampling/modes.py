@@ -41,10 +41,9 @@ Cost = Callable[[Array], Array]
 
 @dataclass(frozen=True)
 class WeightedDraws:
-    """Draws (D, n) of a posterior, transformed, with ``shares`` (D,) that sum to one.
-
-    ``mode`` (D,) is the number of the minimum that each draw belongs to, see :func:`belonging`, ``costs`` (D,) its J,
-    ``log_evidence`` ln ∫ exp(−J_o) N(x) dx, ``best`` (n,) the lowest draw, ``proposal`` a mixture that resembles them.
+    """Draws (D, n) of a posterior, transformed, with ``shares`` (D,) that sum to one, the ``mode`` (D,) of each by
+    :func:`belonging` and its J, ``costs`` (D,); ``log_evidence`` ln ∫ exp(−J_o) N(x) dx, ``best`` (n,) the lowest draw,
+    ``proposal`` a mixture that resembles them.
     """
 
     x: Array
@@ -97,7 +96,6 @@ def sample_modes(
     Rounds of draws from proposals that close in on the posterior tell the proposal of those that count: a mixture, or
     where that keeps too few of its draws and ``cost`` has recorded what the runs gave, the emulated posterior.
     ``cost``: J (B,) of control vectors (B, n), with the prior's own mean and covariance, +inf where the model fails.
-    Deterministic in ``seed``.
     """
     enough, n = ENOUGH if enough is None else enough, len(prior.names)
     most, closing = math.ceil(LAST_RUNS * enough / DRAWS), _closing(n)
@@ -109,6 +107,9 @@ def sample_modes(
         sampler.add(z, 0.5 * np.sum(z**2, axis=1) - cost(prior.from_white(z)))
         return bool(sampler.costs.min() >= below)
 
+    def unsettled() -> bool:
+        return sampler.effective < (enough if len(sampler.z) < MOST_RUNS * enough else min(TOO_FEW, enough))
+
     mixture = _about(prior, minima)
     first = ClosingDraws(mixture, member_stream(seed, "modes"), DRAWS, WIDER ** min(1.0, FEW / n))
     rounds, going = 1, more(first)
@@ -119,7 +120,7 @@ def sample_modes(
         mixture = first.next_proposal()
         sampler, rounds = FixedDraws(mixture, first.stream, DRAWS), rounds + 1
         going = more(sampler)
-    while going and _unsettled(sampler, enough) and rounds < most:
+    while going and unsettled() and rounds < most:
         if runs and sampler.effective < THIN * len(sampler.z):
             sampler, mixture, going = _guided(runs, sampler, mixture, more)
             runs = None
@@ -156,8 +157,8 @@ def typical_runs(n: int, enough: float | None) -> int:
 def _guided(
     runs: RecordedRuns, mixed: Importance, mixture: StudentMixture, more: Callable[[Importance], bool]
 ) -> tuple[Importance, StudentMixture, bool]:
-    """A round of draws of the emulated posterior, after others that train the emulator, or ``mixed``, those of a
-    mixture, where these keep a larger share effective; and a mixture about them. False where a draw ends them all.
+    """A round of draws of the emulated posterior, after others that train the emulator, or the ``mixed`` ones where
+    these keep a larger share effective; a mixture about them; and whether no draw ends them all.
     """
     start: StudentMixture | EmulatedProposal = mixture
     share, of_mixture = 0.0, mixed.effective / len(mixed.z)
@@ -176,11 +177,6 @@ def _guided(
         return mixed, mixture, True
     sampler = FixedDraws(final, mixed.stream, DRAWS)
     return sampler, final.mixture, more(sampler)
-
-
-def _unsettled(sampler: Importance, enough: float) -> bool:
-    wanted = enough if len(sampler.z) < MOST_RUNS * enough else min(TOO_FEW, enough)
-    return sampler.effective < wanted
 
 
 def _about(prior: Prior, minima: Sequence[Minimum]) -> StudentMixture:
@@ -203,8 +199,8 @@ def nearest(prior: Prior, minima: Sequence[Minimum], x: Array) -> Indices:
 
 
 def belonging(prior: Prior, minima: Sequence[Minimum], x: Array, shares: Array, for_one: float = 1.0) -> Indices:
-    """Numbers (D,) of the minima that draws (D, n) with ``shares`` (D,) belong to, each of those in its own group; a
-    group in which there is none has a number beyond them. ``for_one``: how many of a chain are worth one draw.
+    """Numbers (D,) of the minima that draws (D, n) with ``shares`` (D,) belong to; a group of draws without a minimum
+    has a number beyond them. ``for_one``: how many of a chain are worth one draw.
     """
     mode, new = np.zeros(len(x), dtype=np.intp), len(minima)
     if not minima:
@@ -245,27 +241,23 @@ def separated(x: Array, shares: Array, beside: float = BESIDE) -> list[Indices]:
 
 def _gap(values: Array, shares: Array, beside: float) -> float | None:
     """The middle of a gap among values (D,), of the :data:`LOOKED` widest."""
+
+    def span(part: slice) -> float:
+        """How far ``beside`` effective draws reach from the first of a part on; infinite where these are fewer."""
+        enough = np.cumsum(held[part]) ** 2 >= beside * np.cumsum(held[part] ** 2)
+        return float(abs(at[part][np.argmax(enough)] - at[part][0])) if enough.any() else math.inf
+
     at, same = np.unique(values, return_inverse=True)  # a walker may stay where it is
     held, widths = np.asarray(np.bincount(same, shares), dtype=float), np.diff(at)
     for i in np.argsort(-widths, kind="stable")[:LOOKED]:
-        below, above = (_span(at[j], held[j], beside) for j in (slice(i, None, -1), slice(i + 1, None)))
-        if widths[i] > GAP * max(below, above):
+        if widths[i] > GAP * max(span(slice(i, None, -1)), span(slice(i + 1, None))):
             return float(at[i] + 0.5 * widths[i])
     return None
 
 
-def _span(values: Array, shares: Array, beside: float) -> float:
-    """How far ``beside`` effective draws reach from the first of values (D,) on; infinite where these are fewer."""
-    enough = np.cumsum(shares) ** 2 >= beside * np.cumsum(shares**2)
-    return float(abs(values[np.argmax(enough)] - values[0])) if enough.any() else math.inf
-
-
 def _by_valleys(prior: Prior, minima: Sequence[Minimum], x: Array, shares: Array) -> Indices:
     """Numbers (D,) of the minima on whose side of the valley between them draws (D, n) with ``shares`` (D,) lie, and
-    where there is none all that of the lower one.
-
-    Which Gaussian is densest says only where to look: far from all minima, along a bent posterior, it is an accident of
-    how wide they are.
+    where there is none all that of the lower one: which Gaussian is densest says only where to look.
     """
     mode = nearest(prior, minima, x)
     for j in range(1, len(minima)):

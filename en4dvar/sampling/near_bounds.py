@@ -52,20 +52,17 @@ def near_bounds(space: WeightSpace, linear: Linearisation, mode: Array, posterio
         return None
     bend = _bend(prior, bent, mode)
 
-    def cost(x: Array, change: Array) -> Array:
-        """J (B,) at control vectors (B, n), of predictions that change by ``change`` (B, n) from those at the mode."""
+    def cost(x: Array, change: Array | None = None) -> Array:
+        """J (B,) at control vectors (B, n), of predictions that change by ``change`` (B, n), or those bent."""
         scaled = problem.has_noise_scale
         sigma = of_framework(problem, prior.to_physical(x), NOISE_SCALE, 1.0) if scaled else np.ones(len(x))
-        return np.asarray(prior.cost(x) + of_readings(change, sigma))
+        return np.asarray(prior.cost(x) + of_readings(bend(x) if change is None else change, sigma))
 
-    def bent_cost(x: Array) -> Array:
-        return cost(x, bend(x))
-
-    if effective_share(cost(posterior, posterior - mode) - bent_cost(posterior)) > STRAIGHT:
+    if effective_share(cost(posterior, posterior - mode) - cost(posterior)) > STRAIGHT:
         return None
     stream = member_stream(space.seed, "near bounds")
     start = StudentMixture.fitted(prior.white(posterior), stream, 1)
-    turns = [EmulatedProposal.bridged_from(start, lambda z: bent_cost(prior.from_white(z)), stream)]
+    turns = [EmulatedProposal.bridged_from(start, lambda z: cost(prior.from_white(z)), stream)]
     for _ in range(LEFT_OUT + KEPT):
         turns.append(turns[-1].settled(stream))
     draws = prior.from_white(np.concatenate([turn.walkers for turn in turns[-KEPT:]]))
@@ -77,7 +74,7 @@ def near_bounds(space: WeightSpace, linear: Linearisation, mode: Array, posterio
     if space.settings.sampling == "exact":
         members = with_moments(members, draws.mean(axis=0), np.linalg.cholesky(np.atleast_2d(np.cov(draws.T))).T)
     log = float(np.mean([turn.log for turn in turns[-KEPT:]])) - 0.5 * len(mode) * math.log(2 * math.pi)
-    return Drawn(members, bent_cost, log)
+    return Drawn(members, cost, log)
 
 
 def _cost_of_readings(
@@ -111,17 +108,14 @@ def _cost_of_readings(
 def _bend(prior: Prior, bent: list[int], mode: Array) -> Callable[[Array], Array]:
     """(s(x) − s(x̂))/s'(x̂) (B, n) of control vectors (B, n); in the other coordinates x − x̂."""
 
-    def straight(x: Array, j: int) -> Array:
-        theta = prior.terms[j].to_physical(x)
-        return np.log(theta) if prior.terms[j].transform == "bounded-lognormal" else theta
-
     def bend(x: Array) -> Array:
         change = x - mode
         for j in bent:
-            slope = prior.terms[j].slope(float(mode[j]))
-            if prior.terms[j].transform == "bounded-lognormal":
-                slope /= float(prior.terms[j].to_physical(mode[j]))
-            change[:, j] = (straight(x[:, j], j) - straight(mode[j], j)) / slope
+            term = prior.terms[j]
+            s, at, slope = term.to_physical(x[:, j]), term.to_physical(mode[j]), term.slope(float(mode[j]))
+            if term.transform == "bounded-lognormal":
+                s, at, slope = np.log(s), np.log(at), slope / float(at)
+            change[:, j] = (s - at) / slope
         return change
 
     return bend

@@ -1,13 +1,13 @@
 """When an ensemble about one minimum of J leaves a doubt, and the sampled posterior that takes its place.
 
-The members' own J, known from the posterior forecast, clear most runs. Where they do not, and the model is cheap, an
-emulator of J is fitted about the ensemble and sampled: its mean and standard deviations are those of the posterior
-within about a tenth, and what they differ from the ensemble's is what a Markov chain would find
+The members' own J clear most runs. Where they do not, and the model is cheap, an emulator of J is fitted about the
+ensemble and sampled: its mean and standard deviations are those of the posterior within about a tenth
 (benchmarks/gaussianity.py). A Gaussian that is too narrow draws no member where the tails of the posterior are, and a
 tangent does not see what is elsewhere: members of the prior may, and as many runs twice as far out as members, or
 along a way on which J hardly rises. Weighted, they tell mean and spread of any model.
 """
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -51,6 +51,8 @@ ROUNDING = 1e-9  # of the standard deviation of all points: where one has all of
 ELSEWHERE = 0.5  # share of the posterior at members of the prior beyond the ensemble's own share there
 CLEARED = 0.85  # effective share of the members above which no run was found that was off (docs: calibration)
 LogDensity = Callable[[Array], Array]
+Points = tuple[Array, Array, LogDensity]
+"""(B, n), J (B,) of them and the logarithm of the density that they are drawn from, but for (2π)^(−n/2)."""
 OVERLAP = "no action is needed: mean ± std describe the members"
 
 
@@ -60,11 +62,9 @@ def examine_shape(
     """Numbers for :func:`~en4dvar.diagnosis.diagnostics.is_non_gaussian`, and its answer.
 
     Of the ``ensemble`` (N, n), transformed, whose ``shape`` has ``gaussian_fit``, the effective share of the members.
-    Deterministic in ``seed``. ``settle``: a doubt of the emulator's is looked into with more moves of its walkers.
-    Where an emulator was needed there are ``mean_shift``, the largest distance of the ensemble's mean from the
-    posterior's in posterior standard deviations, ``spread_ratio``, the standard deviation of the ensemble over the
-    posterior's where that is farthest from 1, ``emulator_fit``, and
-    ``emulated_mean_<name>``, ``emulated_std_<name>`` of each parameter, physical and SI.
+    ``settle``: a doubt of the emulator's is looked into with more moves of its walkers. Where an emulator was needed
+    there are the numbers of :func:`_off`, ``emulator_fit``, and ``emulated_mean_<name>``, ``emulated_std_<name>`` of
+    each parameter, physical and SI.
     """
     numbers = dict(shape)
     if shape["gaussian_fit"] < CLEARED:
@@ -92,36 +92,32 @@ def examine_tails(
     drawn: Drawn | None = None,
 ) -> dict[str, float]:
     """How far mean, standard deviation and ends of the ensemble (N, n) about a minimum are from the posterior's in what
-    is printed.
+    is printed; nothing of an ensemble without a covariance.
 
     By members of J known by their forecast ``after``, those of the prior by that ``before``, runs along each parameter
-    and, ``always`` or where members leave a doubt or J rises too little along a parameter, as many runs :data:`FAR`
-    times as far out as the members. Points are weighted with the density that they are drawn from, for the posterior
-    and for that of the ensemble, which is Gaussian unless it was ``drawn`` otherwise: where it is the posterior both
-    weights are the same, whatever the points are.
+    and, ``always`` or where these leave a doubt, as many runs :data:`FAR` times as far out as the members. Points are
+    weighted with the density that they are drawn from, for the posterior and for that of the ensemble, which is
+    Gaussian unless it was ``drawn`` otherwise: where it is the posterior both weights are the same.
     ``tail_shift`` is the largest distance of both means in posterior standard deviations, ``tail_ratio`` the standard
     deviation of the ensemble over the posterior's where that is farthest from 1, ``tail_excess`` by how many standard
     errors of theirs a distance or ratio is beyond :data:`SHIFT` or :data:`SPREAD`. ``tail_mean_<name>``,
     ``tail_std_<name>`` are those of a parameter that is surely off by what is warned of, NaN where ``tail_members``,
-    the effective number of the points, is below :data:`TOO_FEW` to say to what.
-    ``tail_elsewhere``: most of the posterior is where the ensemble is not. ``tail_end`` is the largest distance of a 5
-    or 95 % point of that density and of members from those of :func:`~en4dvar.sampling.ends.examine_ends`, in posterior
-    standard deviations, and ``tail_q05_<name>``, ``tail_q95_<name>`` are the points of a parameter where that is what
-    is warned of; there are none where J of all members is what that density says. Nothing of an ensemble without a
-    covariance.
+    the effective number of the points, is below :data:`TOO_FEW`. ``tail_elsewhere``: most of the posterior is where the
+    ensemble is not. ``tail_end`` is the largest ``off`` of :func:`~en4dvar.sampling.ends.examine_ends`, and
+    ``tail_q05_<name>``, ``tail_q95_<name>`` are its points of a parameter where that is what is warned of.
     """
     weighed: dict[str, float] = {}
     with suppress(np.linalg.LinAlgError):
         prior, own = space.problem.prior, _of_drawn(drawn, space.problem.prior) if drawn else _gaussian(ensemble)
         costs, before_costs = space.costs(ensemble, after), space.costs(space.members, before)
-        parts = [Points(ensemble, costs, own), Points(space.members, before_costs, _gaussian(space.members))]
+        parts: list[Points] = [(ensemble, costs, own), (space.members, before_costs, _gaussian(space.members))]
         weighed = _by_weights(prior, parts)
         runs = ModelRuns.of(ensemble, after, costs).joined(ModelRuns.of(space.members, before, before_costs))
         ends = examine_ends(space, minimum, ensemble, runs, drawn)
         if always or weighed["tail_excess"] > 0 or (ends and not ends.rises):
             mean, wider = ensemble.mean(axis=0), len(prior.names) * math.log(FAR)
             x = mean + FAR * (ensemble - mean)
-            farther = Points(x, space.costs(x, space.forecast(x)), lambda x: own(mean + (x - mean) / FAR) - wider)
+            farther = x, space.costs(x, space.forecast(x)), lambda x: own(mean + (x - mean) / FAR) - wider
             weighed = _by_weights(prior, [*parts, farther])
         if ends:
             weighed["tail_end"] = float(ends.off.max())
@@ -129,15 +125,6 @@ def examine_tails(
                 of_it = {"q05": ends.quantiles[0, j], "q95": ends.quantiles[-1, j]}
                 weighed |= {f"tail_{q}_{prior.names[j]}": float(value) for q, value in of_it.items()}
     return weighed
-
-
-@dataclass(frozen=True)
-class Points:
-    """Points (B, n), J (B,) of them and the logarithm of the density that they are drawn from, but for (2π)^(−n/2)."""
-
-    points: Array
-    costs: Array
-    log_density: LogDensity
 
 
 def _gaussian(points: Array) -> LogDensity:
@@ -153,18 +140,18 @@ def _of_drawn(drawn: Drawn, prior: Prior) -> LogDensity:
 def _by_weights(prior: Prior, parts: Sequence[Points]) -> dict[str, float]:
     """The numbers of :func:`examine_tails`, of the ensemble, the prior's members and others.
 
-    The posterior is that of the prior's members, which the ensemble stands for where they are drawn at random, too.
     Few weights may be most of the posterior, which their errors say. Where that is at members of the prior which the
     ensemble does not reach, it is elsewhere, however few these are: a model with steps, of which a bundle sees one.
     """
-    x, costs = (np.concatenate([getattr(part, of) for part in parts]) for of in ("points", "costs"))
-    logs = [part.log_density(x) for part in parts]
+    points, of_points, densities = zip(*parts, strict=True)
+    x, costs = np.concatenate(points), np.concatenate(of_points)
+    logs = [log_density(x) for log_density in densities]
     drawn, theta = np.logaddexp.reduce(logs), prior.to_physical(x)
     likelihood = prior.cost(x) - costs
     shares, its_shares = shares_of(likelihood + logs[1] - drawn), shares_of(logs[0] - drawn)
     mean, std, at, wide = _moments(theta, shares)
     its_mean, its_std, its_at, its_wide = _moments(theta, its_shares)
-    begin, end = np.cumsum([len(part.points) for part in parts[:2]])
+    begin, end = np.cumsum([len(part) for part in points[:2]])
     elsewhere = np.sum((shares - its_shares)[begin:end]) > ELSEWHERE
     shift, ratio = np.abs(its_mean - mean) / std, its_std / std
     off = np.array([shift - SHIFT, np.abs(np.log(ratio)) - math.log1p(SPREAD)])
@@ -197,15 +184,15 @@ def _moments(theta: Array, shares: Array) -> tuple[Array, Array, Array, Array]:
 
 
 def doubtful(shape: Mapping[str, float]) -> bool:
-    """True if mean or spread of the ensemble are off by half of what is warned of, by the emulator or, by more than
-    their standard error, by weights, or an end of its Gaussian by what is warned of.
-    """
+    """True if mean or spread of the ensemble are off by half of what is warned of, or an end by what is warned of."""
     off = shape.get("mean_shift", 0.0) > SHIFT or abs(shape.get("spread_ratio", 1.0) - 1) > SPREAD
     return off or shape.get("tail_excess", 0.0) > 1 or shape.get("tail_end", 0.0) > diag.ENDS_OFF
 
 
 def _off(emulator: EmulatedCost, ensemble: Array) -> dict[str, float]:
-    """How far an ensemble (N, n) is from the emulator's draws."""
+    """Of an ensemble (N, n), by the emulator's draws: ``mean_shift``, the largest distance of its mean in posterior
+    standard deviations, and ``spread_ratio``, its standard deviation over theirs where that is farthest from 1.
+    """
     draws = emulator.draws
     std = draws.std(axis=0)
     ratio = ensemble.std(axis=0, ddof=1) / std
@@ -232,10 +219,9 @@ class Refined:
     """Members (N, n), transformed, that take the ensemble's place, and what judges them.
 
     ``modes``: of each minimum, and each group of draws without one, the weight, the quantiles (3, n) of the draws that
-    belong to it, NaN where none does, and the lowest J of these;
-    ``log_evidence`` ln ∫ exp(−J_o) N(x; prior) dx, NaN where it is not known;
-    ``lowest`` J that was met, at ``best`` (n,) where a chain met it. ``draws`` (:data:`KEPT`, n) are equally likely;
-    there are none of a chain. ``lower`` (n,) is a draw that lies lower than all minima; then nothing else was sampled.
+    belong to it, NaN where none does, and the lowest J of these; ``log_evidence`` ln ∫ exp(−J_o) N(x; prior) dx, or
+    NaN; ``lowest`` J that was met, at ``best`` (n,) where a chain met it. ``draws`` (:data:`KEPT`, n) are equally
+    likely, none of a chain. ``lower`` (n,) lies lower than all minima; then nothing else was sampled.
     """
 
     members: Array
@@ -258,10 +244,8 @@ def that_count(minima: Sequence[Minimum], prior: Prior, beyond: float = COUNTS) 
 def mode_cautions(
     prior: Prior, minima: Sequence[Minimum], modes: Sequence[Mode], settled: bool, result: Refined | None
 ) -> Iterator[Caution]:
-    """Warnings about the minima that count, and the ``modes`` about them; ``result`` is there where sampled.
-
-    ``settled``: whether the search for the lowest of them is. Where not sampled, the first is the one that members
-    describe, which counts however little of the probability it holds: the lowest may be the narrowest.
+    """Warnings about the minima that count and the ``modes`` about them; ``result`` is there where sampled, ``settled``
+    tells whether the search for the lowest is. Where not sampled, the first counts however little it holds.
     """
     lowest = minima[0].cost
     if result is not None and result.lowest < lowest - MISSED:
@@ -320,9 +304,7 @@ def may_sample(problem: InverseProblem, settings: AssimilationSettings) -> bool:
 
 
 def runs_of_doubt(problem: InverseProblem, settings: AssimilationSettings) -> int:
-    """Forward runs that a doubt takes, typically, where it may be settled by sampling: draws of the prior and a round
-    of descents from them, an emulator of J, and all rounds of sampling.
-    """
+    """Forward runs that a doubt takes, typically, where it may be settled by sampling."""
     n = len(problem.prior.names)
     wanted = needed_runs(n) if _emulates(problem, settings) else None
     emulator = 2 * wanted[1] if wanted else 0
@@ -401,9 +383,7 @@ def refined(
 
 
 def _own_draws(x: Array, shares: Array, mode: Indices, costs: Array, count: int) -> list[tuple[float, Array, float]]:
-    """Of each of ``count`` modes, and those beyond them, what :attr:`Refined.modes` says, of draws (D, n) of J
-    ``costs`` (D,).
-    """
+    """What :attr:`Refined.modes` says of ``count`` modes, and those beyond, by draws (D, n) of ``costs`` (D,)."""
     own = []
     for number in range(max(count, int(mode.max()) + 1) if count else 0):
         there = mode == number
@@ -418,13 +398,12 @@ def _own_draws(x: Array, shares: Array, mode: Indices, costs: Array, count: int)
 def _in_all(minima: Sequence[Minimum], count: int, seed: int) -> Array:
     """(N, n) draws about each minimum in turn."""
     normal = member_stream(seed, "start in all modes").standard_normal((count, len(minima[0].x)))
-    roots = [np.linalg.cholesky(m.covariance) for m in minima]
-    every = range(count)
-    return np.stack([minima[i % len(minima)].x + roots[i % len(minima)] @ normal[i] for i in every])
+    about = [(m.x, np.linalg.cholesky(m.covariance)) for m in minima]
+    return np.stack([x + root @ z for z, (x, root) in zip(normal, itertools.cycle(about), strict=False)])
 
 
 def _summary(draws: WeightedDraws, posterior: Array) -> dict[str, float]:
-    """The numbers that judge weighted draws, and how far they are from the ensemble they replace, for the result."""
+    """The numbers that judge weighted draws, and how far they are from the ensemble they replace."""
     std = np.sqrt(np.diag(draws.covariance))
     moved = (draws.mean - posterior.mean(axis=0)) / std
     widened = np.log(std / posterior.std(axis=0, ddof=1))
