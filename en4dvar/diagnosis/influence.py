@@ -66,9 +66,8 @@ class ReadingTangent:
 
 @dataclass(frozen=True)
 class Influence:
-    """Influence of K readings on n parameters: the change of the posterior mean if one reading is left out.
-
-    ``change`` (n, K), physical and SI, NaN where it cannot be told; ``in_std`` (n, K) in posterior standard deviations.
+    """Influence of K readings on n parameters: the change of the posterior mean if one reading is left out. ``change``
+    (n, K), physical and SI, NaN where it cannot be told; ``in_std`` (n, K) in posterior standard deviations.
     ``pareto_shape`` (K,) is k̂, NaN without weights; ``how`` (K,) is 0 by importance weights, 1 by the tangent, 2 where
     it is not known without a fit that lacks the reading.
     """

@@ -140,8 +140,7 @@ class Residuals:
         Readings far more exact than the prior leave Q no variance in the directions that the parameters fit. In those
         that mostly the prior lets vary, u says how much wider than the truth the prior is: a square counts as one, and
         residuals are those without these directions. Where the size of the errors is estimated, a posterior of more
-        squares than u has, which are u and what the prior knows of that size, takes the place of uᵀu. One of fewer,
-        as beside a discrepancy, knows less of the scatter than u does, and does not.
+        squares than u has, which are u and what the prior knows of that size, takes the place of uᵀu.
         """
         from scipy.special import betainc, digamma
 

@@ -1,8 +1,7 @@
 """What a figure shows, free of how it is drawn: panels in rows, marks in panels, round numbers for the axes, colours.
-
-One description serves the page (:mod:`en4dvar.report.svg`, in milliseconds) and paper (:mod:`en4dvar.report.paper`,
-PDF and PNG by matplotlib, whose import and layout would take longer than the estimate). Colours are names of
-:data:`LIGHT` or hexadecimal, lengths points (1/72 inch), labels text with mathtext symbols.
+One description serves the page (:mod:`en4dvar.report.svg`, in milliseconds) and paper (:mod:`en4dvar.report.paper`, PDF
+and PNG by matplotlib, whose import and layout would take longer than the estimate). Colours are names of :data:`LIGHT`
+or hexadecimal, lengths points (1/72 inch), labels text with mathtext symbols.
 """
 
 import math
@@ -25,11 +24,10 @@ Values = npt.ArrayLike
 
 @dataclass(frozen=True)
 class Mark:
-    """``x`` and ``y`` (n,) in the panel's units, ``top`` (n,) of what has a lower and an upper edge.
-
-    ``size``: width of a line, diameter of a dot. ``dash``: "", "--" or ":". Marks of one ``label`` are one entry of the
-    legend. A ``rule`` lies at ``y``, an ``upright`` at ``x`` up to 85 % of the height; a ``span`` reaches from ``y`` to
-    ``top``. ``tiles`` are rectangles about ``x`` and ``y``, whose width and height are ``top``.
+    """``x`` and ``y`` (n,) in the panel's units, ``top`` (n,) of what has a lower and an upper edge. ``size``: width of
+    a line, diameter of a dot. ``dash``: "", "--" or ":". Marks of one ``label`` are one entry of the legend. A ``rule``
+    lies at ``y``, an ``upright`` at ``x`` up to 85 % of the height; a ``span`` reaches from ``y`` to ``top``. ``tiles``
+    are rectangles about ``x`` and ``y``, whose width and height are ``top``.
     """
 
     kind: Kind
@@ -55,11 +53,9 @@ class Mark:
 
 @dataclass
 class Panel:
-    """Two axes and what is drawn between them.
-
-    ``xticks``, ``yticks``: how many intervals at most, or the ticks themselves; ``names``, ``y_names``: words in place
-    of their numbers. A ``title`` may have several lines. ``bare``: nothing but ``words``, in the middle. Limits
-    that are None follow the marks.
+    """Two axes and what is drawn between them. ``xticks``, ``yticks``: how many intervals at most, or the ticks
+    themselves; ``names``, ``y_names``: words in place of their numbers. A ``title`` may have several lines. ``bare``:
+    nothing but ``words``, in the middle. Limits that are None follow the marks.
     """
 
     xlabel: str = ""

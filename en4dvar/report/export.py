@@ -1,6 +1,5 @@
-"""Tables of a run for other programs: CSV of summary or members, LaTeX for a paper.
-
-netCDF needs no export: ``posterior.nc`` follows the ArviZ schema as it is.
+"""Tables of a run for other programs: CSV of summary or members, LaTeX for a paper. netCDF needs no export:
+``posterior.nc`` follows the ArviZ schema as it is.
 """
 
 import itertools

@@ -51,7 +51,6 @@ CAPTION = (
 class Difference:
     """The median of one parameter in ``first`` against that in ``second``: 5, 50 and 95 % of their ratio (NaN where the
     prior allows values of both signs) and of their difference in ``unit``; ``greater``: probability that the first is.
-
     ``apart`` (3,): the quantiles of ratio or difference if nothing were common. ``untrusted``: codes of warnings.
     """
 

@@ -129,7 +129,7 @@ def datasets_in(path: Path) -> list[str]:
 
 def _said(path: Path, damaged: bool = False) -> dict[str, Any]:
     """Attributes of the root, and the names of the data sets; nothing where there is no file or, if it may be
-    ``damaged``, where it cannot be read. Raises :class:`OutputError`.
+    ``damaged``, where it cannot be read.
     """
     try:
         return dict(netcdf.read_sealed(said_in, path)) if path.is_file() else {}

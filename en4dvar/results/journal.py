@@ -1,7 +1,6 @@
-"""The forward runs of a data set under way, in the order in which they were asked for.
-
-Between them nothing is random and nothing is read, so that an interrupted estimate that begins again asks for the same
-ones: it is given those that were kept, makes the others, and comes to the same bits.
+"""The forward runs of a data set under way, in the order in which they were asked for. Between them nothing is random
+and nothing is read, so that an interrupted estimate that begins again asks for the same ones: it is given those that
+were kept, makes the others, and comes to the same bits.
 """
 
 import threading

@@ -175,9 +175,7 @@ def _read(path: Path, name: str, begin: int, size: int, expected: str) -> bytes:
 
 
 def _scan(path: Path) -> tuple[dict[str, Entry], int, bool]:
-    """The records by name, where the last of them ends, and whether there is nothing else. Where no record follows
-    another, the next line is looked for from that one's own line on: bytes may have gone.
-    """
+    """The records by name, where the last of them ends, and whether there is nothing else."""
     entries: dict[str, Entry] = {}
     end = place = looked = 0
     whole = True

@@ -101,9 +101,8 @@ class ClosingDraws(Importance):
 
 
 class FixedDraws(Importance):
-    """Draws of one proposal that stays. The largest of their weights are cut off, but not those behind ``log``.
-
-    Source: Ionides (2008), J. Comput. Graph. Stat. 17, 295.
+    """Draws of one proposal that stays. The largest of their weights are cut off, but not those behind ``log``. Source:
+    Ionides (2008), J. Comput. Graph. Stat. 17, 295.
     """
 
     def add(self, z: Array, log_likelihood: Array) -> None:

@@ -62,9 +62,8 @@ class Chain:
         return np.asarray(self.samples.reshape(-1, self.samples.shape[-1]))
 
     def thin(self, n_members: int, exact: bool = False) -> Array:
-        """(N, n) draws, evenly spaced over the chain, walkers in turn.
-
-        ``exact``: nearly of the moments and quantiles of the whole chain, see :mod:`~en4dvar.sampling.alike`.
+        """(N, n) draws, evenly spaced over the chain, walkers in turn. ``exact``: nearly of the moments and quantiles
+        of the whole chain, see :mod:`~en4dvar.sampling.alike`.
         """
         steps, walkers, _ = self.samples.shape
         count = max(POOL * n_members, LEAST) if exact else n_members
@@ -220,10 +219,9 @@ def split_r_hat(samples: Array) -> Array:
 
 
 def effective_sample_size(samples: Array) -> Array:
-    """Effective number of independent draws (n,) in chains (steps, chains, n), for the mean.
-
-    steps · chains / τ with τ = 1 + 2 Σ ρ_t, ρ_t the autocorrelation averaged over the chains and about the common mean,
-    summed while pairs ρ_{2t} + ρ_{2t+1} are positive and decreasing (Geyer 1992, Stat. Sci. 7, 473).
+    """Effective number of independent draws (n,) in chains (steps, chains, n), for the mean. steps · chains / τ with τ
+    = 1 + 2 Σ ρ_t, ρ_t the autocorrelation averaged over the chains and about the common mean, summed while pairs ρ_{2t}
+    + ρ_{2t+1} are positive and decreasing (Geyer 1992, Stat. Sci. 7, 473).
     """
     steps, chains, n = samples.shape
     centred = samples - samples.mean(axis=(0, 1))

@@ -1,5 +1,4 @@
 """The posterior as a mixture of its modes: weighted draws about every minimum that descents ended in, and the prior.
-
 Importance weights against J correct what the Gaussians about the minima are not, so that the weight of a mode is its
 share of the evidence, whatever its shape.
 """
@@ -74,9 +73,8 @@ class WeightedDraws:
         return np.asarray((self.shares[:, None] * apart).T @ apart)
 
     def members(self, count: int, stream: np.random.Generator, exact: bool) -> Array:
-        """(N, n) equally likely ones, of every mode as many as its weight says, to one.
-
-        ``exact``: nearly of the moments and quantiles of all draws, see :mod:`~en4dvar.sampling.alike`.
+        """(N, n) equally likely ones, of every mode as many as its weight says, to one. ``exact``: nearly of the
+        moments and quantiles of all draws, see :mod:`~en4dvar.sampling.alike`.
         """
         vectors = np.linalg.eigh(self.covariance)[1]
         order = np.lexsort(((self.x - self.mean) @ vectors[:, -1], self.mode))
@@ -217,10 +215,9 @@ def belonging(prior: Prior, minima: Sequence[Minimum], x: Array, shares: Array, 
 
 def separated(x: Array, shares: Array, beside: float = BESIDE) -> list[Indices]:
     """Numbers of the draws (D, n), with ``shares`` (D,), of each group: empty gaps of one coordinate lie between them.
-
-    A gap is :data:`GAP` times as wide as ``beside`` effective draws to either side of it. Of draws of any density
-    with one peak that has a chance below 1e-4, and what is curved or bent leaves no gap. Draws that together hold less
-    than :data:`NOTHING` leave it empty.
+    A gap is :data:`GAP` times as wide as ``beside`` effective draws to either side of it. Of draws of any density with
+    one peak that has a chance below 1e-4, and what is curved or bent leaves no gap. Draws that together hold less than
+    :data:`NOTHING` leave it empty.
     """
     order = np.argsort(shares, kind="stable")
     held = np.zeros(len(x), dtype=bool)

@@ -138,10 +138,9 @@ def _of_drawn(drawn: Drawn, prior: Prior) -> LogDensity:
 
 
 def _by_weights(prior: Prior, parts: Sequence[Points]) -> dict[str, float]:
-    """The numbers of :func:`examine_tails`, of the ensemble, the prior's members and others.
-
-    Few weights may be most of the posterior, which their errors say. Where that is at members of the prior which the
-    ensemble does not reach, it is elsewhere, however few these are: a model with steps, of which a bundle sees one.
+    """The numbers of :func:`examine_tails`, of the ensemble, the prior's members and others. Where that is at members
+    of the prior which the ensemble does not reach, it is elsewhere, however few these are: a model with steps, of which
+    a bundle sees one.
     """
     points, of_points, densities = zip(*parts, strict=True)
     x, costs = np.concatenate(points), np.concatenate(of_points)
@@ -313,9 +312,8 @@ def runs_of_doubt(problem: InverseProblem, settings: AssimilationSettings) -> in
 
 
 def in_doubt(minima: Sequence[Minimum], agree: bool, shape: Mapping[str, float]) -> bool:
-    """True if the Gaussian about the lowest of the minima that count may not be the posterior.
-
-    ``agree``: whether descents from different members ended there. ``shape`` is that of :func:`examine_shape`.
+    """True if the Gaussian about the lowest of the minima that count may not be the posterior. ``agree``: whether
+    descents from different members ended there. ``shape`` is that of :func:`examine_shape`.
     """
     unclear = shape.get("emulator_fit", 1.0) < diag.EMULATED_ENOUGH
     return not agree or len(minima) > 1 or bool(shape.get("non_gaussian")) or doubtful(shape) or unclear

@@ -39,10 +39,9 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Targets:
-    """Readings of S data sets on one time grid.
-
-    ``grid`` (M,) s; ``values`` and ``nearest`` (sum K,) readings and indices of the grid without shift; readings of
-    set s are ``offsets[s]:offsets[s+1]``; ``scale`` (S,) ‖y − ȳ‖²; ``reach``: the shifts are −reach…reach steps.
+    """Readings of S data sets on one time grid. ``grid`` (M,) s; ``values`` and ``nearest`` (sum K,) readings and
+    indices of the grid without shift; readings of set s are ``offsets[s]:offsets[s+1]``; ``scale`` (S,) ‖y − ȳ‖²;
+    ``reach``: the shifts are −reach…reach steps.
     """
 
     grid: Array

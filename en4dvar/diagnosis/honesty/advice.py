@@ -1,7 +1,5 @@
-"""What to do about a warning in this very configuration: options as they stand in YAML, values in the user's units.
-
-The catalogue says what can be done in general. Here each advice leaves out what is done already, so that following it
-does not bring the same words back.
+"""What to do about a warning in this very configuration: options as they stand in YAML, values in the user's units;
+each advice leaves out what is done already.
 """
 
 import math
@@ -59,6 +57,11 @@ class Case:
         """Whether the stated error is larger than half of what the readings span: hardly an error, perhaps its unit."""
         span = float(np.ptp(self.a.observations.values))
         return 0 < span < 2 * self.stated and self.scatter < SHARE
+
+    @property
+    def may_be_robust(self) -> bool:
+        noise = self.a.observations.noise
+        return noise.independent and not math.isfinite(noise.counts_within)
 
     @property
     def cause(self) -> str:
@@ -168,7 +171,7 @@ def _misfit(case: Case) -> str:
         )
     if "residual-structure" in case.codes:
         return _structure(case)
-    if "odd-residuals" in case.codes and _may_be_robust(case):
+    if "odd-residuals" in case.codes and case.may_be_robust:
         return "see the advice about single readings; look at the residuals before a larger error is stated"
     larger = (
         f"state an error of about {case.reading(case.scatter * case.stated)} ({case.reading(case.stated)} is stated)"
@@ -226,11 +229,6 @@ def _missed(case: Case) -> str:
     )
 
 
-def _may_be_robust(case: Case) -> bool:
-    noise = case.a.observations.noise
-    return noise.independent and not math.isfinite(noise.counts_within)
-
-
 def _odd(case: Case) -> str:
     single = case.caution.words.startswith("the reading")
     if case.timing:
@@ -244,7 +242,7 @@ def _odd(case: Case) -> str:
         if case.exact:
             return other
         return f"{first} data.error.time_std; if the times are right, {other}"
-    if _may_be_robust(case):
+    if case.may_be_robust:
         return f"look at this reading; with {case.with_scheme('data.error.robust: huber')} such readings count less"
     wrong = "if it is wrong, delete its line from the data file and say so"
     return f"look at this reading; {wrong}{case.or_times}"
@@ -322,8 +320,8 @@ def _lost(case: Case) -> str:
 
 
 def _chain(case: Case) -> str:
-    guided = case.a.settings.emulator == "on"
-    first = "" if guided else "set assimilation.emulator: on, which guides the chain, or "
+    on = case.a.settings.emulator == "on"
+    first = "" if on else "set assimilation.emulator: on, which guides the chain, or "
     return f"do not quote these intervals; {first}run again with more data or narrower priors"
 
 

@@ -22,15 +22,13 @@ NO_SPREAD = 1e-14  # of the size of values: members that agree to rounding
 
 @dataclass(frozen=True)
 class ControlEnsembles:
-    """The ensembles of an analysis as control vectors, that is in transformed space, and J of the posterior.
-
-    N members, n parameters. ``costs`` (N,) are +inf where a member failed, and None of a localised scheme, whose J is
-    not that of these members; whole fields are no part of it.
+    """The ensembles (N, n) and the centre (n,) of an analysis in transformed space, without fields, and J of the
+    posterior: ``costs`` (N,) are +inf where a member failed, and None of a localised scheme.
     """
 
-    prior: Array  # (N, n)
-    posterior: Array  # (N, n)
-    centre: Array  # (n,)
+    prior: Array
+    posterior: Array
+    centre: Array
     costs: Array | None
     centre_cost: float
 
@@ -39,9 +37,7 @@ def examine(
     analysis: Analysis, control: ControlEnsembles, worst_loss: Sequence[str] = (), earlier: tuple[Caution, ...] = ()
 ) -> tuple[Caution, ...]:
     """Everything that should keep a reader from trusting the posterior, or that they should know, worst first.
-
-    ``worst_loss`` (N,) are the reasons of failure, "" for a member alive, in the iteration that lost most; ``earlier``
-    are warnings met on the way.
+    ``worst_loss`` (N,) are the failures in the iteration that lost most; ``earlier`` are warnings met on the way.
     """
     a, prior = analysis, analysis.problem.prior
     alive = active_members(a.posterior_failures)
@@ -69,24 +65,18 @@ def examine(
         *_allowed(a, _validity(a, alive)),
         *checks.gaussian(prior, members, a.shape, a.settings.own.approximate),
     )
-    silent = {n for n in prior.names if untrusted(warnings, n) or of_several_modes(warnings, n)} | _beside(a)
+    silent = {n for n in prior.names if untrusted(warnings, n) or of_several_modes(warnings, n)}
+    if path := a.problem.model.path_parameters:  # what is known from elsewhere need not be informed
+        silent |= {*prior.names} - {*path}
     silent |= {term.parameter.name for change in a.problem.varying for term in change.terms}  # data may say little
     modes = {p.parameter.name: p.of.field.name for p in a.problem.perturbations if p.of is not None}
     little = checks.information(prior, control.posterior[alive], a.dfs_per_parameter, silent, modes)
     return advised(a, worst_first((*warnings, *little)))
 
 
-def _beside(a: Analysis) -> set[str]:
-    """Names of what is known from elsewhere (density, scale, …), where the model names the parameters of its path.
-    Readings need not inform them; the split of the error bar says what they cost.
-    """
-    asked = set(a.problem.model.path_parameters)
-    return set(a.problem.prior.names) - asked if asked else set()
-
-
 def doubts(problem: InverseProblem, members: Array, predicted: Array) -> Sequence[Caution]:
-    """The model's doubts about the observations, serious ones where it does not say. Beside prior ``members`` (N, n),
-    physical, and their predictions (N, K), NaN where one failed; none where all did.
+    """The model's doubts about the observations, beside prior ``members`` (N, n), physical, and their predictions (N,
+    K), NaN where one failed; none where all did.
     """
     y, alive = problem.observations, np.all(np.isfinite(predicted), axis=1)
     if not alive.any():
@@ -123,9 +113,6 @@ def _validity(a: Analysis, alive: Mask) -> checks.Findings:
 def unfinished(analysis: Analysis) -> checks.Findings:
     """Iterations that stopped before their own criterion; a note where the next step would have been short, or members
     were drawn from the posterior itself afterwards, and nothing where no user would see it.
-
-    Draws and chains warn of themselves where they are too few, or find a lower J. A gradient regressed over the
-    ensemble need not vanish where J is smallest, so that variant often ends like this.
     """
     step_norm = analysis.iterations[-1].step_norm  # of the next step, had there been one
     if analysis.converged or step_norm <= UNSEEN:
@@ -145,10 +132,8 @@ def unfinished(analysis: Analysis) -> checks.Findings:
 
 
 def collapse(prior: Prior, control: ControlEnsembles, alive: Mask) -> checks.Findings:
-    """A spread far below what J allows: for a Gaussian posterior 2 (J − J_min) of its members is χ²_n, with mean n; of
-    draws of another one it may be less.
-
-    The lowest J met, of a member or of the centre, stands for the minimum.
+    """A spread far below what J allows: for a Gaussian posterior 2 (J − J_min) of its members is χ²_n, with mean n. The
+    lowest J met, of a member or of the centre, stands for the minimum.
     """
     assert control.costs is not None
     costs = control.costs

@@ -24,8 +24,8 @@ TOLD = 0.03  # share from which a source is named
 
 
 def shares_of_priors(covariance: Array, prior_variance: Array) -> Array:
-    """(n, n): the share of parameter i's variance that comes from the prior of parameter j. ``covariance`` (n, n) of
-    the posterior and ``prior_variance`` (n,), transformed; parameters independent before.
+    """(n, n): the share of parameter i's variance that comes from the prior of parameter j, both (n, n), (n,)
+    transformed.
     """
     return np.asarray(covariance**2 / (prior_variance * np.diag(covariance)[:, None]))
 
@@ -58,9 +58,7 @@ def budget(a: Analysis, name: str) -> Mapping[str, float]:
 
 
 def largest(shares: Mapping[str, float], members: int) -> list[str]:
-    """The largest share, and those that ``members`` do not tell from it. A share is a squared correlation ρ², of
-    standard error 2 |ρ| (1 − ρ²) / √N; two errors of a difference are doubt.
-    """
+    """The largest share, and those within two standard errors of it: of a squared correlation 2 |ρ| (1 − ρ²) / √N."""
     spread = {source: 2 * share**0.5 * (1 - share) / members**0.5 for source, share in shares.items()}
     first = next(iter(shares))
     return [s for s in shares if shares[first] - shares[s] <= 2 * np.hypot(spread[first], spread[s])]

@@ -10,8 +10,7 @@ whose integral is the parameter's degrees of freedom for signal but for what act
 of |a_j| that falls into a cell of time is the weight of what the path went through there.
 
 L comes from runs that resume the path at the edges of the cells with the parameter changed from there on; neighbours
-differ by what the change does within one cell. The reading of an instant is thus credited to all of its past, as it
-should: a rebound tells of the viscosity in the collapse before it.
+differ by what the change does within one cell.
 """
 
 from dataclasses import dataclass
@@ -71,10 +70,8 @@ def weighted_quantiles(values: Array, weights: Array) -> Array:
 
 
 def ledger(problem: InverseProblem, response: LinearResponse, std: Array) -> Ledger | None:
-    """The ledger of a posterior with standard deviations ``std`` (n,), transformed, in this process.
-
-    None where the model names no quantities of its path, none of its path parameters is estimated, or it cannot be run
-    like this: a model may fail in any way, and the posterior is there already.
+    """The ledger of a posterior with standard deviations ``std`` (n,), transformed, in this process; None where the
+    model names no quantities of its path, none of its path parameters is estimated, or it cannot be run like this.
     """
     names = tuple(name for name in problem.prior.names if name in problem.model.path_parameters)
     if not names or not problem.model.path_quantities or not response.defined or not np.all(std > 0):
@@ -105,9 +102,8 @@ def _ledger(problem: InverseProblem, response: LinearResponse, std: Array, names
     ]
     local = _localised(problem, states[:-1], edges[:-1], shift, changes)
     local = scale * local / (CHANGE * std[columns])[:, None, None]
-    kernel = np.stack(
-        [gain @ _whitened(response, noise) for gain, noise in zip(response.gain[columns], local, strict=True)]
-    )
+    kernels = (gain @ _whitened(response, of) for gain, of in zip(response.gain[columns], local, strict=True))
+    kernel = np.stack(list(kernels))
     return Ledger(names, model.path_quantities, edges, values, kernel, 2 + (len(names) + 1) * (len(edges) - 1))
 
 
@@ -128,7 +124,7 @@ def _path(problem: InverseProblem, start: Array, end: float) -> tuple[Array, Arr
     share = np.arange(CELLS * FINE) / FINE
     fine = np.append(np.interp(share, np.arange(CELLS + 1), edges), edges[-1])
     (path,) = model.trajectories(start, fine)
-    if isinstance(path, Failure) or not isinstance(path, Trajectory):
+    if not isinstance(path, Trajectory):
         return None
     sizes = np.abs(np.stack([path[q.name] for q in model.path_quantities]))
     means = 0.5 * (sizes[:, 1:] + sizes[:, :-1])

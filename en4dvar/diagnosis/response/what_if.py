@@ -8,10 +8,9 @@ tangent S (K', r) at the mode x̂ of J,
 g' the gradient of the changed problem and g that of the problem itself (0 at its minimum, within what the iterations
 leave). With a constant R and the same prior this is δx = C JᵀR⁻¹ (δy − δm), C = EᵀA⁻¹E the covariance of the posterior.
 
-A wrong assumption is an alternative that the model offers. Its first run, at the mode, gives the linear response.
-Unless that is small anyway each further one, where it leads, corrects it with the same tangent (a chord iteration),
-until what it changes is small in every parameter. An alternative that does not settle within :data:`MOST_RUNS` is
-beyond linear response and is fitted again.
+A wrong assumption is an alternative that the model offers. Its first run, at the mode, gives the linear response; each
+further one, where it leads, corrects it with the same tangent (a chord iteration), until what it changes is small in
+every parameter. An alternative that does not settle within :data:`MOST_RUNS` is fitted again.
 """
 
 import math
@@ -42,10 +41,8 @@ SMALL = 0.3  # posterior standard deviations of a first step that is believed wi
 
 @dataclass(frozen=True)
 class LinearResponse:
-    """The tangent of the predictions at a control vector ``at`` (n,), and the prior about it.
-
-    ``linear`` holds anomalies (r, K) per unit of r coordinates, ``directions`` E (r, n) the control vector's change per
-    unit of each, ``precision`` is N − 1.
+    """The tangent of the predictions at a control vector ``at`` (n,): ``linear`` holds anomalies (r, K) per unit of r
+    coordinates, ``directions`` E (r, n) the control vector's change per unit of each, ``precision`` is N − 1.
     """
 
     at: Array
@@ -117,8 +114,7 @@ class Shift:
 
     ``change`` (n,) of the mode in physical SI values, ``relative`` (n,) to the mode where a parameter cannot be
     negative (else NaN), ``in_std`` (n,) in transformed space per posterior standard deviation. ``cost_change``: J there
-    minus J of the fit, positive where the data speak against the alternative. Where linear response does not tell,
-    these are NaN and ``reason`` says why. ``runs``: forward runs it took.
+    minus J of the fit. Where linear response does not tell, these are NaN and ``reason`` says why.
     """
 
     name: str
@@ -169,11 +165,7 @@ def what_if(
     """
     if not response.defined or not np.all(std > 0):
         return ()
-    offered = [
-        alternative
-        for alternative in problem.alternatives
-        if alternative.values == 1.0 or not problem.has_reading_scale
-    ]
+    offered = (of_it for of_it in problem.alternatives if of_it.values == 1.0 or not problem.has_reading_scale)
     shifts = [_shift(problem, response, std, cost, executor, fitted, alternative) for alternative in offered]
     return tuple(sorted(shifts, key=lambda shift: -shift.largest))
 
@@ -181,10 +173,9 @@ def what_if(
 def with_shifts(members: Array, shifts: Sequence[Shift], seed: int) -> Array:
     """Members (N, n) of a posterior, transformed, whose variance holds that of the assumptions as well.
 
-    Every settled shift s_k (n,) counts as one standard deviation along its direction, as far as the data allow it:
-    a member is moved by Σ_k ξ_k s_k exp(−½ max(ΔJ_k, 0)) with ξ of zero mean and unit covariance over the members that
-    is uncorrelated with them (where N exceeds n and the number of shifts together), so that
-    C + Σ_k s_k s_kᵀ exp(−max(ΔJ_k, 0)) is met exactly.
+    A member is moved by Σ_k ξ_k s_k exp(−½ max(ΔJ_k, 0)), s_k (n,) the settled shifts, with ξ of zero mean and unit
+    covariance over the members that is uncorrelated with them (where N exceeds n and the number of shifts together), so
+    that C + Σ_k s_k s_kᵀ exp(−max(ΔJ_k, 0)) is met exactly.
     """
     moved = in_std_as_likely(shifts) * members.std(axis=0, ddof=1)
     z = member_stream(seed, "what if").standard_normal((len(members), len(moved)))
@@ -234,12 +225,16 @@ def _shift(
     unknown = np.full(len(std), np.nan)
     estimated = any(name in problem.prior.names for name in alternative.parameters)  # the prior says what it is
     about = alternative.name, f"the prior said that {alternative.words}" if estimated else alternative.words
+
+    def untold(reason: str, runs: int = 0) -> Shift:
+        return Shift(*about, unknown, unknown, unknown, np.nan, runs, reason)
+
     try:
         changed = changed_problem(problem, alternative)
         of_prior = prior_shift(problem, tuple(alternative.parameters.items()))
         composite = Composite(changed, executor)
     except Exception as error:  # a model may offer what does not suit the problem; the reason is kept
-        return Shift(*about, unknown, unknown, unknown, np.nan, 0, f"cannot be set up: {error}")
+        return untold(f"cannot be set up: {error}")
     of_errors = np.array([name in problem.of_errors for name in problem.prior.names])
     same_times = np.array_equal(problem.observations.times, changed.observations.times)
     same_run = changed.model is problem.model and same_times and changed.fixed == problem.fixed
@@ -247,13 +242,13 @@ def _shift(
     chord = _chord(composite, response, std, of_prior, of_errors, first)
     moved, runs = chord.moved, chord.runs
     if chord.failure:
-        return Shift(*about, unknown, unknown, unknown, np.nan, runs, f"cannot be run: {chord.failure}")
+        return untold(f"cannot be run: {chord.failure}", runs)
     prior = problem.prior
     if not chord.settled:
         terms = tuple(replace(t, mean=t.mean + by) for t, by in zip(prior.terms, of_prior, strict=True))
         fit = fitted(replace(changed, prior=prior.of(terms)))
         if fit is None:
-            return Shift(*about, unknown, unknown, unknown, np.nan, runs, NOWHERE)
+            return untold(NOWHERE, runs)
         moved, there, runs = fit.centre - response.at, fit.cost, runs + fit.runs
     else:
         z = prior.white_change(response.at + chord.known - prior.mean - of_prior)
