@@ -6,8 +6,7 @@ from same_bits import assert_same_bits
 
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.executor import SerialExecutor
-from en4dvar.results.checkpoint import decode, encode
-from en4dvar.results.journal import Journal, KnownRuns
+from en4dvar.results.checkpoint import Journal, KnownRuns, decode, encode
 
 
 class Memory:

@@ -45,6 +45,7 @@ MOVED |= {f"en4dvar.{old}": f"en4dvar.{new}" for new, several in {
     "report.result": "report.notebook", "report.svg": "report.words report.drawing report.paths",
     "report.chart": "report.ticks report.palette", "report.history": "report.predictive",
     "report.figures": "report.fields report.varying", "report.sequence": "report.cycles report.twin",
+    "report.page": "report.overview",
     "report.responses": "report.readings", "report.together": "report.joint report.population",
     "runs.finished": "runs.evidence_run", "estimation.joint.members": "estimation.joint.challenge",
     "estimation.stages": "loop_state", "results.declared": "results.axes",
@@ -63,7 +64,8 @@ MOVED |= {f"en4dvar.{old}": f"en4dvar.{new}" for new, several in {
     "diagnosis.response.what_if": "diagnosis.response.linear", "runs.rundir": "runs.replacement",
     "runs.cycles": "runs.twin_run runs.sequence_run", "runs.engine": "runs.session",
     "runs.together": "runs.joint_run runs.population_run", "runs.simulation": "runs.synthetic",
-    "runs.design_run": "runs.design_plan", "runs.estimate": "runs.given", "results.checkpoint": "results.codec",
+    "runs.design_run": "runs.design_plan", "runs.estimate": "runs.given",
+    "results.checkpoint": "results.codec results.journal",
 }.items() for old in several.split()}  # fmt: skip
 MOVED |= {"en4dvar.cycling": "en4dvar.series", "en4dvar.storage": "en4dvar.results"}
 MOVED |= {"en4dvar_lorenz.logarithm": "en4dvar_lorenz.autonomous"}

@@ -18,8 +18,7 @@ from en4dvar.plumbing.hints import suggest
 from en4dvar.plumbing.tables import write_csv
 from en4dvar.report.figures import PIECE_COLUMNS, stored_walks
 from en4dvar.report.history import WITHHELD_COLUMNS, withheld_lines
-from en4dvar.report.overview import Headline, SetSummary, overview_figures, render_overview
-from en4dvar.report.page import render_set
+from en4dvar.report.page import Headline, SetSummary, overview_figures, render_overview, render_set
 from en4dvar.report.responses import ENTRY_COLUMNS, SHIFT_COLUMNS, stored_ledger, stored_shifts
 from en4dvar.report.svg import draw, svg
 from en4dvar.report.text import upper_first

@@ -1,20 +1,29 @@
-"""What the page of one data set says: a result turned into rows, sentences and figures for the template."""
+"""What the pages of a campaign say: of one data set, a result turned into rows, sentences and figures for the template;
+of all, one table that sorts, warnings counted, estimates side by side.
+"""
 
 import json
 import math
-from collections.abc import Sequence
+import sys
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from en4dvar.diagnosis.diagnostics import chi2_interval
 from en4dvar.diagnosis.honesty.checks import MOVED
 from en4dvar.estimation.summary import AS_WIDE, ParameterSummary
-from en4dvar.plumbing.caution import worst_first
+from en4dvar.plumbing.caution import Caution, codes, gravity, worst_first
 from en4dvar.report import responses
+from en4dvar.report.chart import COLUMN, PAGE, POINTS, Chart, Panel, Row
 from en4dvar.report.figures import all_figures, neighbours, stored_walks, verdict
 from en4dvar.report.html import render
 from en4dvar.report.responses import exceeding, stored_ledger, stored_shifts
-from en4dvar.report.svg import draw
-from en4dvar.report.text import plain_number
+from en4dvar.report.svg import Captioned, draw
+from en4dvar.report.text import figure_text, number_like, plain_number, pretty_unit, symbol_html, with_unit
 from en4dvar.results.store import StoredResult
 from en4dvar.results.variables import ITERATIONS, SHARES
 
@@ -102,3 +111,146 @@ def judge_chi2(chi2: float, n_observations: int, dfs: float, structured: bool = 
     if structured:
         return f"the size of the misfit is as stated, its structure is not; {expected}", True
     return f"misfit agrees with the stated noise; {expected}", False
+
+
+# The first page of a campaign
+
+NAMED = 40  # data sets whose names fit below a figure
+LISTED = 2000  # data sets in the table: a browser shows as many at once
+Headline = tuple[str, str, Sequence[str], str, str, Sequence[Caution]]
+"""What data sets say together: the address of a page and words for it, lines of the answer, a figure (SVG), caption,
+warnings."""
+
+
+@dataclass(frozen=True)
+class SetSummary:
+    """What the overview keeps of one data set: a row a parameter, the scalars of its fit, its warnings."""
+
+    name: str
+    stem: str
+    rows: Mapping[str, ParameterSummary]
+    cautions: tuple[Caution, ...]
+    scalars: Mapping[str, float]
+    about: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, result: StoredResult, stem: str) -> "SetSummary":
+        """``stem``: name of the file without suffix."""
+        stats = result.groups["/sample_stats"].attrs
+        keys = ("n_observations", "chi2_per_observation", "nrmse", "dfs", "n_active", "n_members")
+        about = {key: sys.intern(str(result.attributes.get(key, ""))) for key in ("date_created", "configuration")}
+        scalars = {key: float(stats[key]) for key in keys}
+        rows = {row.name: row for row in result.rows}
+        return cls(result.name, stem, rows, result.cautions, scalars, about)
+
+    @property
+    def worst(self) -> str:
+        """The gravest severity among the warnings, "" where there are none."""
+        return worst_first(self.cautions)[0].severity if self.cautions else ""
+
+    @property
+    def gravity(self) -> float:
+        """Sorts by warnings: 0 none; what the worst of them does to the numbers counts most."""
+        return gravity(self.cautions)
+
+    @property
+    def codes(self) -> str:
+        return ", ".join(codes(self.cautions))
+
+
+def render_overview(sets: Sequence[SetSummary], **shown: Any) -> str:
+    """The page as HTML. Also shown: ``pages``, stem of a data set → address of its page, for those that have one;
+    ``failures``, name of one without a posterior → reason; drawn ``figures``; ``headlines`` (:data:`Headline`).
+    """
+    worst = set(map(id, sorted(sets, key=lambda s: -s.gravity)[:LISTED]))
+    listed, parameters = [s for s in sets if id(s) in worst], [_parameter(name, sets) for name in _parameters(sets)]
+    return render("campaign.html.j2", sets=sets, listed=listed, parameters=parameters, tally=_tally(sets), **shown)
+
+
+def estimates(sets: Sequence[SetSummary], names: Sequence[str] = ()) -> Chart:
+    """Mean and 5–95 % of every data set, a panel a name (default: each parameter); many are sorted, as a band."""
+    names, few = names or _parameters(sets), len(sets) <= NAMED
+    panels = [_estimates(name, sets, few) for name in names]
+    rows = [Row(3.0 * POINTS, [panel]) for panel in panels]
+    if few:
+        labels = [figure_text(dataset.name) for dataset in sets]
+        panels[-1].x_numbers, panels[-1].names = True, labels
+        rows[-1] = Row((3.0 + 0.14 * max(map(len, labels))) * POINTS, [panels[-1]])
+    return Chart(rows, PAGE if few else COLUMN)
+
+
+def _estimates(name: str, sets: Sequence[SetSummary], few: bool) -> Panel:
+    x = np.array([i for i, dataset in enumerate(sets) if name in dataset.rows])
+    rows = [sets[i].rows[name] for i in x]
+    mean, low, high = (np.array([getattr(row, key) for row in rows]) for key in ("middle", "q05", "q95"))
+    trusted = np.array([not row.untrusted for row in rows], dtype=bool)
+    low, high = (np.where(trusted, bound, np.nan) for bound in (low, high))
+    panel = Panel(ylabel=with_unit(rows[0].symbol, rows[0].unit), yticks=4, x_numbers=False)
+    order = np.argsort(mean)
+    means, stds = np.array([(row.prior_mean, row.prior_std) for row in rows]).T
+    least, most = means - stds, means + stds
+    if np.ptp(means) <= 0.5 * stds.min() and stds.max() <= 2 * stds.min():  # as two sets of members of a prior are
+        panel.span(float(least[0]), float(most[0]), "prior", 0.2)
+    elif few:
+        for at, bottom, top in zip(x, least, most, strict=True):
+            panel.band((at - 0.5, at + 0.5), (bottom, bottom), (top, top), "prior", 0.2)
+    else:
+        panel.band(np.arange(len(x)), least[order], most[order], "prior", 0.2)
+    if few:
+        panel.xlim, panel.xticks = (-0.6, len(sets) - 0.4), range(len(sets))
+        panel.bars(x, low, high, "posterior", 1.4, 0.6)
+        panel.dots(x, mean, "posterior", 3.0)
+        panel.dots(x[~trusted], mean[~trusted], "centre", 5.5, kind="rings")
+    else:
+        ranks = np.arange(len(mean))
+        panel.xlabel, panel.xticks = f"{len(order)} data sets, sorted", ()
+        panel.band(ranks, low[order], high[order], "posterior", 0.3)
+        panel.line(ranks, mean[order], "posterior", 0.9)
+    reach = [v for values in (mean, low, high) for v in values[np.isfinite(values)]]
+    if reach and max(reach) > min(reach):
+        margin = 0.08 * (max(reach) - min(reach))
+        panel.ylim = float(min(reach) - margin), float(max(reach) + margin)
+    return panel
+
+
+def overview_figures(sets: Sequence[SetSummary], population: Collection[str] = ()) -> list[Captioned]:
+    """The estimates; where there is a ``population``, those of its parameters first and the others by themselves."""
+    caption = (
+        "Each data set by itself: posterior mean and 5–95 % (blue), prior mean ± std (grey, each data set's own where "
+        "they differ clearly). Orange rings without a bar: not to be trusted, for their warnings."
+        if len(sets) <= NAMED
+        else "Data sets sorted by the posterior mean, with 5–95 % (blue, none where it is not to be trusted); prior "
+        "mean ± std (grey, each data set's own where they differ clearly)."
+    )
+    names = _parameters(sets)
+    first = [name for name in names if name in population] or names
+    parts = {"estimates": first, "others": [name for name in names if name not in first]}
+    return [(name, caption, estimates(sets, of)) for name, of in parts.items() if of]
+
+
+def _parameters(sets: Sequence[SetSummary]) -> list[str]:
+    return list(dict.fromkeys(name for dataset in sets for name in dataset.rows))
+
+
+def _parameter(name: str, sets: Sequence[SetSummary]) -> dict[str, Any]:
+    rows = [dataset.rows[name] for dataset in sets if name in dataset.rows]
+    means = np.array([row.mean for row in rows if math.isfinite(row.mean) and not row.untrusted])
+    quartiles = np.quantile(means, (0.25, 0.5, 0.75)).tolist() if means.size else (math.nan,) * 3
+    precision = float(np.nanmedian([row.std for row in rows])) if means.size else math.nan
+    numbers = {key: number_like(x, precision) for key, x in zip(("low", "median", "high"), quartiles, strict=True)}
+    symbol, unit = symbol_html(rows[0].symbol), pretty_unit(rows[0].unit)
+    return {"name": name, "label": rows[0].label, "symbol": symbol, "unit": unit, **numbers}
+
+
+def _tally(sets: Sequence[SetSummary]) -> list[dict[str, Any]]:
+    """One line a code: in how many data sets, with the words of the first of them."""
+    every = [(c, dataset.name) for dataset in sets for c in dataset.cautions]
+    count = Counter(key for dataset in sets for key in {(c.severity, c.code) for c in dataset.cautions})
+    first: dict[tuple[str, str], tuple[Caution, str]] = {}
+    for c, name in every:
+        first.setdefault((c.severity, c.code), (c, name))
+    return [
+        {"severity": c.severity, "code": c.code, "count": count[c.severity, c.code], "advice": c.advice,
+         "example": f"e.g. {first[c.severity, c.code][1]}: {c.words}"}
+        for c in worst_first(tuple(c for c, _ in first.values()))
+    ]  # fmt: skip

@@ -199,9 +199,7 @@ def opened_netcdf(path: Path) -> Iterator[netCDF4.Dataset]:
 def groups_in(path: Path) -> Iterator[tuple[str, Group]]:
     """The groups of a file by their paths. Raises :class:`OutputError`."""
     with opened_netcdf(path) as file:
-        for name, group in _read(file):
-            group.check()
-            yield name, group
+        yield from _read(file)
 
 
 def _read(group: Any) -> Iterator[tuple[str, Group]]:
@@ -213,7 +211,9 @@ def _read(group: Any) -> Iterator[tuple[str, Group]]:
         listed.append(also)
     aside = {*group.dimensions, *" ".join(listed).split()}
     variables, coords = ({name: v for name, v in held.items() if (name in aside) == part} for part in (False, True))
-    yield group.path, Group(variables, coords, attributes)
+    read = Group(variables, coords, attributes)
+    read.check()
+    yield group.path, read
     for child in group.groups.values():
         yield from _read(child)
 

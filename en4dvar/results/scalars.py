@@ -27,17 +27,20 @@ UNTOLD = "with heavy tails beside a discrepancy no single reading has a density 
 SCALAR = "scalar_"  # begins the attribute of a number that came with the data
 
 
-def _correlated(a: Analysis) -> str | None:
-    blocks = [
+def _json(name: str, meaning: str, value: Callable[[Analysis], Any]) -> Attribute:
+    """An attribute that is written as JSON where there is anything."""
+    return Attribute(name, f"{meaning}, JSON", lambda a: json.dumps(held) if (held := value(a)) else None)
+
+
+def _correlated(a: Analysis) -> list[dict[str, Any]]:
+    return [
         {"names": block.names, "correlation": block.matrix.tolist() if len(block.names) <= MOST_WRITTEN else []}
         for block in a.problem.prior.blocks
     ]
-    return json.dumps(blocks) if blocks else None
 
 
-def _tied(a: Analysis) -> str | None:
-    tied = {tie.parameter.name: [tie.to, tie.factor] for tie in a.problem.tied}
-    return json.dumps(tied) if tied else None
+def _tied(a: Analysis) -> dict[str, Any]:
+    return {tie.parameter.name: [tie.to, tie.factor] for tie in a.problem.tied}
 
 
 def _thresholds(a: Analysis) -> dict[str, float]:
@@ -161,8 +164,8 @@ SAMPLE_STATS = (
 )  # fmt: skip
 ATTRIBUTES: dict[str, tuple[Attribute, ...]] = {
     "/": ROOT,
-    "/prior": (Attribute("correlated", "parameters that are correlated in the prior, JSON", _correlated),),
+    "/prior": (_json("correlated", "parameters that are correlated in the prior", _correlated),),
     "/observed_data": OBSERVED,
-    "/constant_data": (Attribute("tied", "parameters that follow another one, and the factors, JSON", _tied),),
+    "/constant_data": (_json("tied", "parameters that follow another one, and the factors", _tied),),
     "/sample_stats": SAMPLE_STATS,
 }

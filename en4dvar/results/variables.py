@@ -221,11 +221,6 @@ DRAWS = (
 )  # fmt: skip
 
 
-def _of_later(key: str) -> Callable[..., Array]:
-    """Of the errors of the readings after the window."""
-    return lambda a, *_: getattr(a.observations.continued.noise, key)[len(a.observations) :]
-
-
 LATER = "withheld_time"
 WITHHELD_READINGS = (
     Declared("{series}", LATER, "{label}, read after the window", lambda a, _: a.withheld.values, OWN, WITHHELD),
@@ -234,8 +229,9 @@ WITHHELD_READINGS = (
              lambda a, _: a.withheld.median, OWN, WITHHELD),
     Declared("{series}_high", LATER, "{label}, 95 % of what was expected", lambda a, _: a.withheld.high, OWN, WITHHELD),
     Declared("{series}_reading_std", LATER, "{label}, observation-error std of the reading alone",
-             _of_later("std"), OWN, WITHHELD),
-    Declared("time_std", LATER, "std of the observation times", _of_later("time_std"), TIME, WITHHELD, fill=False),
+             lambda a, _: a.observations.continued.noise.std[len(a.observations) :], OWN, WITHHELD),
+    Declared("time_std", LATER, "std of the observation times",
+             lambda a: a.observations.continued.noise.time_std[len(a.observations) :], TIME, WITHHELD, fill=False),
 )  # fmt: skip
 
 
@@ -271,11 +267,6 @@ def _of_residuals(a: Analysis, key: str) -> Array:
     return row
 
 
-def _prior_distance(a: Analysis) -> Array:
-    living = a.prior_predictions[active_members(a.prior_failures)]
-    return prior_distance(a.observations.values, living, a.error_std)
-
-
 READINGS = (
     Declared("{series}_whitened_residual", "{time}", "whitened residual at the minimum of J",
              of_series(lambda a: _of_residuals(a, "white")), when=WHITENED),
@@ -294,7 +285,9 @@ READINGS = (
         for k, source in enumerate(SHARES)
     ),
     Declared("{series}_prior_distance", "{time}",
-             "distance of the reading from the prior's prediction, in the std of both", of_series(_prior_distance)),
+             "distance of the reading from the prior's prediction, in the std of both",
+             of_series(lambda a: prior_distance(
+                 a.observations.values, a.prior_predictions[active_members(a.prior_failures)], a.error_std))),
     Declared("{shared}influence_change", "parameter {time}", f"{WITHOUT}, {EACH_UNIT}",
              of_series(lambda a: a.influence.change), when=TOLD),
     Declared("{shared}influence_in_std", "parameter {time}", f"{WITHOUT}, in posterior standard deviations",

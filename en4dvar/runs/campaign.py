@@ -76,7 +76,7 @@ class Campaign:
 
     def plot(self) -> "Figure":
         """The estimates of all data sets side by side."""
-        from en4dvar.report.overview import SetSummary, estimates
+        from en4dvar.report.page import SetSummary, estimates
         from en4dvar.report.paper import on_paper
 
         return on_paper(estimates([SetSummary.of(result, result.name) for result in self]))

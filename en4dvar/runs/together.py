@@ -28,8 +28,7 @@ from en4dvar.plumbing.errors import ConfigError, TooFewMembersError, retold
 from en4dvar.plumbing.hints import listed
 from en4dvar.problem import InverseProblem
 from en4dvar.results import together as stored
-from en4dvar.results.checkpoint import FOLDER, digest, file_digest, write_checkpoint
-from en4dvar.results.journal import Journal, KnownRuns
+from en4dvar.results.checkpoint import FOLDER, Journal, KnownRuns, digest, file_digest, write_checkpoint
 from en4dvar.results.provenance import provenance
 from en4dvar.results.store import load_stored
 from en4dvar.runs.engine import Kind

@@ -26,8 +26,7 @@ from en4dvar.plumbing.files import atomic_path, open_plain, readable, remove_fil
 from en4dvar.plumbing.tables import csv_text
 from en4dvar.priors.prior import own_seed
 from en4dvar.problem import InverseProblem
-from en4dvar.results.checkpoint import FOLDER, Keeper, decode, digest, encode, file_digest
-from en4dvar.results.journal import Journal, KnownRuns
+from en4dvar.results.checkpoint import FOLDER, Journal, Keeper, KnownRuns, decode, digest, encode, file_digest
 from en4dvar.results.netcdf import SealedBytes, to_bytes
 from en4dvar.results.pack import PACK, Entry, Pack, file_names, packed, read_outcome
 from en4dvar.results.store import StoredResult

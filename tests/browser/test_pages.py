@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from en4dvar.report.figures import all_figures
-from en4dvar.report.overview import LISTED, SetSummary, overview_figures, render_overview
+from en4dvar.report.page import LISTED, SetSummary, overview_figures, render_overview
 from en4dvar.report.svg import draw
 from en4dvar.results.pack import PACK
 from en4dvar.results.store import load_stored

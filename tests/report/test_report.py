@@ -28,8 +28,7 @@ from en4dvar.report import write_pages
 from en4dvar.report.figures import FIGURES, all_figures, traces
 from en4dvar.report.history import history
 from en4dvar.report.html import render
-from en4dvar.report.overview import LISTED, SetSummary, overview_figures, render_overview
-from en4dvar.report.page import judge_chi2
+from en4dvar.report.page import LISTED, SetSummary, judge_chi2, overview_figures, render_overview
 from en4dvar.report.result import Result, load_result
 from en4dvar.report.svg import draw
 from en4dvar.results.pack import PACK

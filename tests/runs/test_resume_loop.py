@@ -8,8 +8,8 @@ from cut_anywhere import assert_cut_anywhere, gone_on, kept_runs
 from same_bits import assert_same_bits
 from toys import Decay, Linear, Wave, make_problem, with_noise
 
-from en4dvar.results import journal
-from en4dvar.results.journal import KnownRuns
+from en4dvar.results import checkpoint
+from en4dvar.results.checkpoint import KnownRuns
 from en4dvar.sampling import mcmc
 from en4dvar.schemes.settings import AssimilationSettings
 
@@ -58,7 +58,7 @@ def test_a_journal_that_is_full_keeps_what_it_has(monkeypatch):
     """What did not find room is run again, and the bits are the same."""
     problem, settings = make_problem(Decay(), [1.5, 1.2]), AssimilationSettings(members=9)
     whole, runs = kept_runs(problem, settings, 3)
-    monkeypatch.setattr(journal, "LARGEST", sum(run.nbytes for run in runs.forecasts[:3]))
+    monkeypatch.setattr(checkpoint, "LARGEST", sum(run.nbytes for run in runs.forecasts[:3]))
     full, some = kept_runs(problem, settings, 3)
     assert_same_bits(full, whole)
     assert some.keys == runs.keys[:3]

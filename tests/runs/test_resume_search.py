@@ -12,8 +12,7 @@ from wells import UnlikeWells, two_wells
 from en4dvar.diagnosis.analysis import StartRecord
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.executor import SerialExecutor
-from en4dvar.results.checkpoint import Keeper, read_checkpoint
-from en4dvar.results.journal import Journal, KnownRuns
+from en4dvar.results.checkpoint import Journal, Keeper, KnownRuns, read_checkpoint
 from en4dvar.schemes.settings import AssimilationSettings
 
 SETTINGS, SEED = AssimilationSettings(start="prior-mean"), 3

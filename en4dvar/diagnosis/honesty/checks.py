@@ -317,21 +317,22 @@ def gaussian(prior: Prior, members: Array, shape: Mapping[str, float], approxima
 
 def _both(p: Parameter, members: Array, shape: Mapping[str, float], by: str) -> str:
     """Mean ± std of the members and of the posterior, ``by`` an emulator or weights (NaN: not known), as displayed."""
-    si = (members.mean(), members.std(ddof=1), shape[f"{by}_mean_{p.name}"], shape[f"{by}_std_{p.name}"])
-    mean, std, estimate, spread = (convert(float(v), p.unit, p.display_unit) for v in si)
-    unit = "" if p.display_unit == "1" else f" {p.display_unit}"
-    rather = "" if math.isnan(estimate) else f" where it should be about {estimate:.2g} ± {spread:.2g}{unit}"
-    return f"{p.name} = {mean:.2g} ± {std:.2g}{unit}{rather}"
+    estimate, spread = shape[f"{by}_mean_{p.name}"], shape[f"{by}_std_{p.name}"]
+    rather = "" if math.isnan(estimate) else f" where it should be about {_two(p, ' ± ', estimate, spread)}"
+    return f"{p.name} = {_two(p, ' ± ', members.mean(), members.std(ddof=1))}{rather}"
 
 
 def _ends(p: Parameter, members: Array, shape: Mapping[str, float]) -> str:
     """The 5 and 95 % points of the members and of the posterior, as displayed."""
-    si = (*diag.member_quantiles(members, (0.05, 0.95)), shape[f"tail_q05_{p.name}"], shape[f"tail_q95_{p.name}"])
-    low, high, begin, end = (convert(float(v), p.unit, p.display_unit) for v in si)
-    unit = "" if p.display_unit == "1" else f" {p.display_unit}"
-    return (
-        f"5–95 % of {p.name} is {low:.2g} to {high:.2g}{unit} where it should be about {begin:.2g} to {end:.2g}{unit}"
-    )
+    is_now = _two(p, " to ", *diag.member_quantiles(members, NINE_OF_TEN))
+    rather = _two(p, " to ", shape[f"tail_q05_{p.name}"], shape[f"tail_q95_{p.name}"])
+    return f"5–95 % of {p.name} is {is_now} where it should be about {rather}"
+
+
+def _two(p: Parameter, between: str, first: float, second: float) -> str:
+    """Two values of a parameter, SI, as displayed, with the unit behind."""
+    numbers = (f"{convert(float(v), p.unit, p.display_unit):.2g}" for v in (first, second))
+    return f"{between.join(numbers)} {p.display_unit}".removesuffix(" 1")
 
 
 def down_weighted(analysis: Analysis) -> Findings:
