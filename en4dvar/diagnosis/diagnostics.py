@@ -121,8 +121,7 @@ def is_non_gaussian(shape: Mapping[str, float], scaled: bool = False) -> bool:
     parameter is the scale of others, so that no posterior is Gaussian; an emulator may say that it is.
     """
     if shape.get("emulator_fit", 0.0) >= EMULATED_ENOUGH:
-        off = abs(shape["spread_ratio"] - 1)
-        return shape["mean_shift"] > MEAN_OFF or off > SPREAD_OFF
+        return shape["mean_shift"] > MEAN_OFF or abs(shape["spread_ratio"] - 1) > SPREAD_OFF
     tails = any(key.startswith(("tail_mean", "tail_q")) for key in shape)
     return scaled or shape.get("gaussian_fit", 1.0) < GAUSSIAN_ENOUGH or tails
 

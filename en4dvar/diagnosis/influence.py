@@ -10,8 +10,8 @@ independent, are told by importance weights: leaving reading k out changes the p
 the members, weighted by it, stand for the posterior without k (Gelfand, Dey & Chang 1992). The largest weights become
 quantiles of a generalised Pareto distribution fitted to them, whose shape k̂ tells whether the weighted mean is to be
 believed (Vehtari, Simpson, Gelman, Yao & Gabry 2024, J. Mach. Learn. Res. 25, 72; fit: Zhang & Stephens 2009,
-Technometrics 51, 316): with N draws where k̂ < min(0.7, 1 − 1/log₁₀ N). Elsewhere the influence is not known
-without a fit that lacks the reading.
+Technometrics 51, 316): with N draws where k̂ < min(0.7, 1 − 1/log₁₀ N). Elsewhere the influence is not known without a
+fit that lacks the reading.
 """
 
 import math

@@ -1,5 +1,4 @@
 r"""Are the ranks of truths among posterior members uniform? Simulation-based calibration, tested on its distribution.
-
 Where a truth is drawn from the prior and readings from the model, its rank among N members of the posterior takes each
 of the N + 1 places with the same chance, whatever the readings tell (Cook, Gelman & Rubin 2006, J. Comput. Graph. Stat.
 15, 675; Talts et al. 2018, arXiv:1804.06788). Of S sets the number with a rank below k is then binomial, of the chance
@@ -56,8 +55,7 @@ def uniform_ranks(sets: int, members: int) -> Uniform:
     stream = member_stream(0, f"uniform ranks of {sets} among {members}")
     places = stream.multinomial(sets, np.full(members + 1, 1 / (members + 1)), size=SIMULATED)
     shares = np.arange(1, members + 1) / (members + 1)
-    least = _least(np.cumsum(places[:, :-1], axis=1), sets, shares)
-    return Uniform(sets, members, least)
+    return Uniform(sets, members, _least(np.cumsum(places[:, :-1], axis=1), sets, shares))
 
 
 def _least(counts: Array, sets: int, shares: Array) -> Array:

@@ -134,7 +134,6 @@ class Residuals:
     @cached_property
     def outlier(self) -> tuple[int, float]:
         """The reading of the largest studentised residual, its place in the data, and the probability of one so large.
-
         Of u = Q^{-1/2}e, ν independent normal numbers for a covariance Q of rank ν, each studentised residual is a
         projection, so that its square over uᵀu is Beta(½, (ν − 1)/2); times K for the largest of them (Bonferroni).
         Readings far more exact than the prior leave Q no variance in the directions that the parameters fit. In those

@@ -175,8 +175,7 @@ def gains(designs: Designs) -> Chart:
     panels = []
     for name in names:
         rows = [row for row in ranked(designs) if name in row.settings or name == "experiments"]
-        values = [row.settings.get(name, row.evaluated.alike) for row in rows]
-        x, labels, unit = _positions(values)
+        x, labels, unit = _positions([row.settings.get(name, row.evaluated.alike) for row in rows])
         worth = np.array([row.evaluated.worth for row in rows])
         errors = np.array([row.evaluated.worth_error for row in rows])
         panel = Panel(figure_text(name) + unit, "information [nats]", names=labels)

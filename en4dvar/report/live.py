@@ -54,8 +54,7 @@ def bands(standing: Standing, columns: int = 4) -> Chart | None:
     for (parameter, unit), band in standing.bands.items():
         steps = sorted(band)
         low, middle, high = np.array([band[step] for step in steps]).T
-        title = with_unit(figure_text(parameter), unit)
-        panel = Panel("iteration", title=title, whole=True, xticks=4, yticks=4)
+        panel = Panel("iteration", title=with_unit(figure_text(parameter), unit), whole=True, xticks=4, yticks=4)
         panel.band(steps, low, high, "posterior", 0.3)
         panel.line(steps, middle, "posterior")
         panel.dots(steps, middle, "posterior")

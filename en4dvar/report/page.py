@@ -140,8 +140,7 @@ class SetSummary:
         keys = ("n_observations", "chi2_per_observation", "nrmse", "dfs", "n_active", "n_members")
         about = {key: sys.intern(str(result.attributes.get(key, ""))) for key in ("date_created", "configuration")}
         scalars = {key: float(stats[key]) for key in keys}
-        rows = {row.name: row for row in result.rows}
-        return cls(result.name, stem, rows, result.cautions, scalars, about)
+        return cls(result.name, stem, {row.name: row for row in result.rows}, result.cautions, scalars, about)
 
     @property
     def worst(self) -> str:

@@ -1,6 +1,5 @@
-"""A chart as a matplotlib figure: PDF and PNG for a paper, and a figure for whoever works on with it.
-
-Only this module draws with matplotlib, whose import takes longer than all charts of a page: each function does it.
+"""A chart as a matplotlib figure: PDF and PNG for a paper, and a figure for whoever works on with it. Only this module
+draws with matplotlib, whose import takes longer than all charts of a page: each function does it.
 """
 
 from __future__ import annotations

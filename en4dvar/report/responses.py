@@ -62,20 +62,19 @@ class StoredEntry(NamedTuple):
 
 def stored_ledger(result: StoredResult) -> tuple[tuple[StoredEntry, ...], ...]:
     """A row a parameter that acts along the path, in it one entry a quantity of the path; display units."""
-    stats, about = result.groups["/sample_stats"], {name: v.attrs for name, v in result.parameters.items()}
+    stats = result.groups["/sample_stats"]
     if "ledger_weight" not in stats.variables:
         return ()
-    ending = "_quantiles"
-    quantities = [name.removesuffix(ending) for name in stats.variables if name.endswith(ending)]
 
-    def entry(i: int, parameter: str, quantity: str) -> StoredEntry:
-        v = stats.variables[quantity + ending]
-        low, median, high = shown(v)[i].tolist()
-        name, symbol, label = quantity.removeprefix("ledger_"), about[parameter]["symbol"], v.attrs["long_name"]
-        return StoredEntry(parameter, name, v.attrs["display_units"], low, median, high, symbol, label)
+    def entry(i: int, parameter: str, key: str) -> StoredEntry:
+        v, quantity = stats.variables[key], key.removeprefix("ledger_").removesuffix("_quantiles")
+        (low, median, high), unit = shown(v)[i].tolist(), v.attrs["display_units"]
+        symbol, label = result.parameters[parameter].attrs["symbol"], v.attrs["long_name"]
+        return StoredEntry(parameter, quantity, unit, low, median, high, symbol, label)
 
-    names = list(map(str, stats.coords["path_parameter"].values))
-    return tuple(tuple(entry(i, name, q) for q in quantities) for i, name in enumerate(names))
+    keys = [key for key in stats.variables if key.endswith("_quantiles")]
+    names = map(str, stats.coords["path_parameter"].values)
+    return tuple(tuple(entry(i, name, key) for key in keys) for i, name in enumerate(names))
 
 
 def stored_shifts(result: StoredResult) -> tuple[tuple[StoredShift, ...], ...]:
@@ -151,14 +150,12 @@ def has_influence(result: StoredResult) -> bool:
 
 def times(result: StoredResult) -> Array:
     """(K,) of all readings, in the display unit."""
-    observed = result.group("observed_data")
-    return np.concatenate([shown(observed[axis.time]) for axis in result.axes])
+    return np.concatenate([shown(result.group("observed_data")[axis.time]) for axis in result.axes])
 
 
 def time_label(result: StoredResult) -> str:
     """Of an axis of :func:`times`."""
-    observed = result.group("observed_data")
-    return time_axis(*(observed[axis.time] for axis in result.axes))
+    return time_axis(*(result.group("observed_data")[axis.time] for axis in result.axes))
 
 
 def whitened(result: StoredResult) -> Array:
@@ -171,8 +168,7 @@ def whitened(result: StoredResult) -> Array:
 
 def each_series(result: StoredResult, alone: str = "ink") -> list[tuple[npt.NDArray[np.intp], str]]:
     """Places among all readings of each series, and its colour; ``alone``: that of a single one."""
-    observed = result.group("observed_data")
-    sizes = [len(observed[axis.name].values) for axis in result.axes]
+    sizes = [len(result.group("observed_data")[axis.name].values) for axis in result.axes]
     parts = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
     names = [alone] if len(parts) == 1 else [COLOURS[i % len(COLOURS)] for i in range(len(parts))]
     return list(zip(parts, names, strict=True))

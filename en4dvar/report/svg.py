@@ -155,8 +155,7 @@ def _axes(panel: Panel, place: Frame, below: float) -> Iterator[str]:
 
 
 def _placed(ticks: list[tuple[float, str]], along: Callable[[Array], Array]) -> Iterator[tuple[float, str]]:
-    places = along(np.array([value for value, _ in ticks]))
-    return zip(places.tolist(), (text for _, text in ticks), strict=True)
+    return zip(along(np.array([value for value, _ in ticks])).tolist(), (text for _, text in ticks), strict=True)
 
 
 def _legend(panel: Panel, x: float, top: float, width: float) -> tuple[list[str], float]:

@@ -340,8 +340,7 @@ def population_lines(stored: StoredPopulation) -> Iterator[str]:
 
 def population_figure(stored: StoredPopulation) -> str:
     """All data sets over the population, as SVG."""
-    posterior = stored.group("posterior")
-    centres = {name: posterior[f"{name}_{stored.headline}"] for name in stored.names}
+    centres = {name: stored.group("posterior")[f"{name}_{stored.headline}"] for name in stored.names}
     return svg(forest(stored, stored.datasets, centres, stored.reference), "forest", caption(stored))
 
 

@@ -1,7 +1,6 @@
 """Variables and attributes of a result file, each declared once: name, dimensions, unit, meaning, and its values. The
-declarations say what is written, what is asked of a file that is read, and the reference page of the documentation.
-
-A name may hold a placeholder, as in ``{parameter}_centre``. Such a variable exists once for each item of a scope (each
+declarations say what is written, what is asked of a file that is read, and the reference page of the documentation. A
+name may hold a placeholder, as in ``{parameter}_centre``. Such a variable exists once for each item of a scope (each
 parameter, each series), whose names take the places of all placeholders in its name and its dimensions.
 """
 

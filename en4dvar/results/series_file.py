@@ -45,8 +45,7 @@ def _series(r: Any) -> Any:
 
 def _states(r: Any) -> list[tuple[str, str]]:
     """Name and unit of the variables of the state."""
-    layout = _model(r).layout
-    return [(f"{f.name}_{j}" if f.size > 1 else f.name, f.unit) for f in layout for j in range(f.size)]
+    return [(f"{f.name}_{j}" if f.size > 1 else f.name, f.unit) for f in _model(r).layout for j in range(f.size)]
 
 
 def _kinds(r: Any) -> Iterator[Item]:
@@ -108,10 +107,10 @@ STATE_COORDINATES: Table = (
 
 # Of data
 
-CLOCK = UnitRule(
-    "time of the model", lambda r, _: {"units": _model(r).time_unit, "display_units": _model(r).time_display_unit}
-)
 MODEL_TIME = UnitRule("time of the model", lambda r, _: {"units": _model(r).time_unit})
+CLOCK = UnitRule(
+    MODEL_TIME.words, lambda r, _: {"units": _model(r).time_unit, "display_units": _model(r).time_display_unit}
+)
 
 
 def _columns(r: SeriesResult) -> list[Observable]:

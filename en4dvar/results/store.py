@@ -1,9 +1,7 @@
 """A stored result: what a run hands back, as its groups, without xarray; an analysis laid out in the ArviZ schema.
-
 Errors of readings and paths have groups of their own beside those of ArviZ: tools take every variable of the observed
-data for one that is predicted, and every dimension of the predictions for one of the readings.
-
-A file that is read is checked for what a result consists of, also behind a good seal, for anybody can seal a file.
+data for one that is predicted, and every dimension of the predictions for one of the readings. A file that is read is
+checked for what a result consists of, also behind a good seal, for anybody can seal a file.
 """
 
 import math
@@ -289,8 +287,7 @@ def _declared(
     series_names: tuple[str, ...], fixed: tuple[str, ...], parameters: tuple[str, ...]
 ) -> dict[str, dict[str, Declared]]:
     """By group, the declarations of the variables that it may have, by name; those of coordinates by themselves."""
-    axes = axes_of(series_names)
-    series = [{"series": axis.name, "shared": axis.own(""), "time": axis.time} for axis in axes]
+    series = [{"series": axis.name, "shared": axis.own(""), "time": axis.time} for axis in axes_of(series_names)]
     names: dict[str, list[dict[str, str]]] = {
         "": [{}],
         "parameter": [{"parameter": name} for name in parameters],

@@ -1,8 +1,6 @@
 """Few draws of a posterior that stand for all of them, exchanged until they have the same moments and quantiles.
-
-Forty-eight draws at random miss means by a seventh of a standard deviation and standard deviations by a tenth. A linear
-map onto the moments of all draws mends that, but leads off a posterior that is bent: readings fit such members worse
-than they fit draws. Exchanged draws miss means by a hundredth, standard deviations by a few hundredths, and are draws.
+Forty-eight draws at random miss means by a seventh of a standard deviation and standard deviations by a tenth.
+Exchanged draws miss means by a hundredth, standard deviations by a few hundredths, and are draws.
 """
 
 import numpy as np

@@ -75,9 +75,8 @@ class Emulator(NamedTuple):
     def fitted(
         cls, coordinates: Coordinates, degree: int, x: Array, outputs: Array, counts: Array, ridge: float
     ) -> "Emulator":
-        """Least squares on runs at ``x`` (B, n) that gave ``outputs`` (B, K) and count so much (B,).
-
-        ``ridge`` is relative to the normal equations of scaled columns: it decides where runs leave a coefficient open.
+        """Least squares on runs at ``x`` (B, n) that gave ``outputs`` (B, K) and count so much (B,). ``ridge`` is
+        relative to the normal equations of scaled columns: it decides where runs leave a coefficient open.
         """
         parents = monomials(x.shape[1], degree)
         matrix = np.ascontiguousarray(basis(coordinates.of(x), parents).T)
@@ -91,14 +90,12 @@ class Emulator(NamedTuple):
 
     def predictions(self, x: Array) -> Array:
         """Outputs (B, K) at control vectors (B, n)."""
-        values = basis(self.coordinates.of(x), self.parents)
-        return np.asarray(np.ascontiguousarray(values.T) @ self.coefficients)
+        return np.asarray(np.ascontiguousarray(basis(self.coordinates.of(x), self.parents).T) @ self.coefficients)
 
 
 def monomials(n: int, degree: int) -> npt.NDArray[np.int64]:
-    """(M, 2) of the monomials in n coordinates up to ``degree``, in order of degree; the first is 1.
-
-    Monomial j is monomial ``[j, 0]`` times coordinate ``[j, 1]``.
+    """(M, 2) of the monomials in n coordinates up to ``degree``, in order of degree; the first is 1. Monomial j is
+    monomial ``[j, 0]`` times coordinate ``[j, 1]``.
     """
     index: dict[tuple[int, ...], int] = {(): 0}
     parents = [(0, 0)]
@@ -145,11 +142,9 @@ class Bend:
 @dataclass(frozen=True)
 class EmulatedCost:
     """Ĵ (B,) of control vectors (B, n): J of the predictions (and rates, ln σ) of ``emulator``, a polynomial of what
-    ``bend`` makes of them, stacked as those of ``make``.
-
-    J_o is cut at ``ceiling``: far from its runs a polynomial says only that J is large, and a walker that true J lets
-    in there must find its way out. ``share`` is the effective share of the runs that judge it, ``draws`` (S, n) are of
-    exp(−Ĵ).
+    ``bend`` makes of them, stacked as those of ``make``. J_o is cut at ``ceiling``: far from its runs a polynomial says
+    only that J is large, and a walker that true J lets in there must find its way out. ``share`` is the effective share
+    of the runs that judge it, ``draws`` (S, n) are of exp(−Ĵ).
     """
 
     emulator: Emulator

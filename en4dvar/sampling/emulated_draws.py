@@ -77,11 +77,10 @@ class RecordedRuns:
 
 @dataclass(frozen=True)
 class EmulatedProposal:
-    """exp(−Ĵ/τ), normalised by exp(``log``), in the coordinates z in which the prior is N(0, 1).
-
-    ``walkers`` (W, n) sample it. From a ``mixture`` to the first proposal, and from proposal to proposal, they are
-    drawn by the ratio of both densities, in steps that leave half of them effective, and move in each (Del Moral,
-    Doucet & Jasra 2006, J. R. Stat. Soc. B 68, 411).
+    """exp(−Ĵ/τ), normalised by exp(``log``), in the coordinates z in which the prior is N(0, 1). ``walkers`` (W, n)
+    sample it. From a ``mixture`` to the first proposal, and from proposal to proposal, they are drawn by the ratio of
+    both densities, in steps that leave half of them effective, and move in each (Del Moral, Doucet & Jasra 2006, J. R.
+    Stat. Soc. B 68, 411).
     """
 
     cost: Callable[[Array], Array]
@@ -114,8 +113,7 @@ class EmulatedProposal:
         cls, start: StudentMixture, cost: Callable[[Array], Array], stream: np.random.Generator
     ) -> "EmulatedProposal":
         """The proposal exp(−``cost``), from a mixture."""
-        first = cls(lambda z: -start.log_density(z), start, start.draw(WALKERS, stream), 0.0)
-        return first.bridged(cost, stream)
+        return cls(lambda z: -start.log_density(z), start, start.draw(WALKERS, stream), 0.0).bridged(cost, stream)
 
     def bridged(self, cost: Callable[[Array], Array], stream: np.random.Generator) -> "EmulatedProposal":
         """The proposal exp(−``cost``), from this one."""

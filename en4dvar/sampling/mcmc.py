@@ -9,8 +9,7 @@ accepted on the density itself, so that the chain samples it exactly whatever th
 transition method: Liu 2001, Monte Carlo Strategies in Scientific Computing, § 9.4.3).
 
 Where the posterior has several modes, walkers start in all of them and half of the steps are jumps to independent draws
-of a mixture that covers them (Tierney 1994, Ann. Stat. 22, 1701). R-hat compares walkers of different modes, so that it
-is near 1 only where jumps were accepted often enough to tell the weights.
+of a mixture that covers them (Tierney 1994, Ann. Stat. 22, 1701).
 
 emcee's snooker move is not used: with 48 walkers in 5 dimensions it gave standard deviations 30 % too small.
 """
@@ -106,15 +105,12 @@ def sample(
     emulated: EmulatedCost | None = None,
     proposal: StudentMixture | None = None,
 ) -> Chain:
-    """Sample a density from the neighbourhood of an ensemble; the same seed gives the same bits.
-
-    ``log_density``: of positions (B, n) → (B,), −inf where it vanishes; called with half of the walkers at a time.
-    ``ensemble`` (N, n): walkers start from its members, slightly scattered. ``walkers``: raised to an even number of at
-    least 2 (n + 1). ``target``: effective sample size to reach in each direction (default: :data:`ENOUGH`). ``look``:
-    called with what each look at convergence shows. ``emulated``: guides the walkers, which start from draws of it.
-    ``proposal``: covers all modes; walkers jump to draws of it.
-
-    Raises En4dvarError: the density vanishes at (nearly) every member.
+    """Sample a density from the neighbourhood of an ensemble; the same seed gives the same bits. ``log_density``: of
+    positions (B, n) → (B,), −inf where it vanishes; called with half of the walkers at a time. ``ensemble`` (N, n):
+    walkers start from its members, slightly scattered. ``walkers``: raised to an even number of at least 2 (n + 1).
+    ``target``: effective sample size to reach in each direction (default: :data:`ENOUGH`). ``look``: called with what
+    each look at convergence shows. ``emulated``: guides the walkers, which start from draws of it. ``proposal``: covers
+    all modes; walkers jump to draws of it. Raises En4dvarError: the density vanishes at (nearly) every member.
     """
     import emcee  # a twentieth of a second that most runs do not need
 

@@ -89,11 +89,10 @@ def sample_modes(
     cost: Cost, prior: Prior, minima: Sequence[Minimum], seed: int, enough: float | None = None, below: float = -np.inf
 ) -> WeightedDraws:
     """Draws of exp(−J) until ``enough`` of them (default: :data:`ENOUGH`) are effective, by eight runs each, or more as
-    long as these are :data:`TOO_FEW`, or until J of one is ``below`` a value.
-
-    Rounds of draws from proposals that close in on the posterior tell the proposal of those that count: a mixture, or
-    where that keeps too few of its draws and ``cost`` has recorded what the runs gave, the emulated posterior.
-    ``cost``: J (B,) of control vectors (B, n), with the prior's own mean and covariance, +inf where the model fails.
+    long as these are :data:`TOO_FEW`, or until J of one is ``below`` a value. Rounds of draws from proposals that close
+    in on the posterior tell the proposal of those that count: a mixture, or where that keeps too few of its draws and
+    ``cost`` has recorded what the runs gave, the emulated posterior. ``cost``: J (B,) of control vectors (B, n), with
+    the prior's own mean and covariance, +inf where the model fails.
     """
     enough, n = ENOUGH if enough is None else enough, len(prior.names)
     most, closing = math.ceil(LAST_RUNS * enough / DRAWS), _closing(n)

@@ -98,8 +98,7 @@ def _cost_of_readings(
         return None
 
     def of_all(change: Array, sigma: Array) -> Array:
-        predicted = like.unstacked(like.stacked + change @ slopes)
-        return observations.cost(replace(predicted, noise_scale=sigma))
+        return observations.cost(replace(like.unstacked(like.stacked + change @ slopes), noise_scale=sigma))
 
     return of_all
 

@@ -59,12 +59,11 @@ OVERLAP = "no action is needed: mean ± std describe the members"
 def examine_shape(
     space: WeightSpace, ensemble: Array, shape: Mapping[str, float], seed: int, settle: bool = True
 ) -> dict[str, float]:
-    """Numbers for :func:`~en4dvar.diagnosis.diagnostics.is_non_gaussian`, and its answer.
-
-    Of the ``ensemble`` (N, n), transformed, whose ``shape`` has ``gaussian_fit``, the effective share of the members.
-    ``settle``: a doubt of the emulator's is looked into with more moves of its walkers. Where an emulator was needed
-    there are the numbers of :func:`_off`, ``emulator_fit``, and ``emulated_mean_<name>``, ``emulated_std_<name>`` of
-    each parameter, physical and SI.
+    """Numbers for :func:`~en4dvar.diagnosis.diagnostics.is_non_gaussian`, and its answer. Of the ``ensemble`` (N, n),
+    transformed, whose ``shape`` has ``gaussian_fit``, the effective share of the members. ``settle``: a doubt of the
+    emulator's is looked into with more moves of its walkers. Where an emulator was needed there are the numbers of
+    :func:`_off`, ``emulator_fit``, and ``emulated_mean_<name>``, ``emulated_std_<name>`` of each parameter, physical
+    and SI.
     """
     numbers = dict(shape)
     if shape["gaussian_fit"] < CLEARED:
@@ -92,19 +91,18 @@ def examine_tails(
     drawn: Drawn | None = None,
 ) -> dict[str, float]:
     """How far mean, standard deviation and ends of the ensemble (N, n) about a minimum are from the posterior's in what
-    is printed; nothing of an ensemble without a covariance.
-
-    By members of J known by their forecast ``after``, those of the prior by that ``before``, runs along each parameter
-    and, ``always`` or where these leave a doubt, as many runs :data:`FAR` times as far out as the members. Points are
-    weighted with the density that they are drawn from, for the posterior and for that of the ensemble, which is
-    Gaussian unless it was ``drawn`` otherwise: where it is the posterior both weights are the same.
-    ``tail_shift`` is the largest distance of both means in posterior standard deviations, ``tail_ratio`` the standard
-    deviation of the ensemble over the posterior's where that is farthest from 1, ``tail_excess`` by how many standard
-    errors of theirs a distance or ratio is beyond :data:`SHIFT` or :data:`SPREAD`. ``tail_mean_<name>``,
-    ``tail_std_<name>`` are those of a parameter that is surely off by what is warned of, NaN where ``tail_members``,
-    the effective number of the points, is below :data:`TOO_FEW`. ``tail_elsewhere``: most of the posterior is where the
-    ensemble is not. ``tail_end`` is the largest ``off`` of :func:`~en4dvar.sampling.ends.examine_ends`, and
-    ``tail_q05_<name>``, ``tail_q95_<name>`` are its points of a parameter where that is what is warned of.
+    is printed; nothing of an ensemble without a covariance. By members of J known by their forecast ``after``, those of
+    the prior by that ``before``, runs along each parameter and, ``always`` or where these leave a doubt, as many runs
+    :data:`FAR` times as far out as the members. Points are weighted with the density that they are drawn from, for the
+    posterior and for that of the ensemble, which is Gaussian unless it was ``drawn`` otherwise: where it is the
+    posterior both weights are the same. ``tail_shift`` is the largest distance of both means in posterior standard
+    deviations, ``tail_ratio`` the standard deviation of the ensemble over the posterior's where that is farthest from
+    1, ``tail_excess`` by how many standard errors of theirs a distance or ratio is beyond :data:`SHIFT` or
+    :data:`SPREAD`. ``tail_mean_<name>``, ``tail_std_<name>`` are those of a parameter that is surely off by what is
+    warned of, NaN where ``tail_members``, the effective number of the points, is below :data:`TOO_FEW`.
+    ``tail_elsewhere``: most of the posterior is where the ensemble is not. ``tail_end`` is the largest ``off`` of
+    :func:`~en4dvar.sampling.ends.examine_ends`, and ``tail_q05_<name>``, ``tail_q95_<name>`` are its points of a
+    parameter where that is what is warned of.
     """
     weighed: dict[str, float] = {}
     with suppress(np.linalg.LinAlgError):
@@ -215,12 +213,11 @@ def _emulates(problem: InverseProblem, settings: AssimilationSettings) -> bool:
 
 @dataclass(frozen=True)
 class Refined:
-    """Members (N, n), transformed, that take the ensemble's place, and what judges them.
-
-    ``modes``: of each minimum, and each group of draws without one, the weight, the quantiles (3, n) of the draws that
-    belong to it, NaN where none does, and the lowest J of these; ``log_evidence`` ln ∫ exp(−J_o) N(x; prior) dx, or
-    NaN; ``lowest`` J that was met, at ``best`` (n,) where a chain met it. ``draws`` (:data:`KEPT`, n) are equally
-    likely, none of a chain. ``lower`` (n,) lies lower than all minima; then nothing else was sampled.
+    """Members (N, n), transformed, that take the ensemble's place, and what judges them. ``modes``: of each minimum,
+    and each group of draws without one, the weight, the quantiles (3, n) of the draws that belong to it, NaN where none
+    does, and the lowest J of these; ``log_evidence`` ln ∫ exp(−J_o) N(x; prior) dx, or NaN; ``lowest`` J that was met,
+    at ``best`` (n,) where a chain met it. ``draws`` (:data:`KEPT`, n) are equally likely, none of a chain. ``lower``
+    (n,) lies lower than all minima; then nothing else was sampled.
     """
 
     members: Array
@@ -254,8 +251,7 @@ def mode_cautions(
         costs = ", ".join(f"{m.cost:.1f}" for m in minima[1:])
         others = f"others ended at {costs}" if costs else "the others came to no minimum"
         number = "one descent" if minima[0].descents < 2 else f"{minima[0].descents} descents"
-        words = f"only {number} ended in the lowest minimum, J = {lowest:.1f}; {others}"
-        yield caution("starts-disagree", words)
+        yield caution("starts-disagree", f"only {number} ended in the lowest minimum, J = {lowest:.1f}; {others}")
     seen = [m for i, m in enumerate(modes) if m.weight >= SEEN or (i == 0 and result is None)]
     if len(seen) < 2:
         return
@@ -268,8 +264,7 @@ def mode_cautions(
     drawn = "members are drawn from all of them" if result else "members describe only the first"
     words = f"the posterior has {len(seen)} modes, {p.name} = {at}{unit}, of weights {shares}; {drawn}"
     if result and not np.any(distances > APART):
-        told = caution("several-modes", f"{words}, and overlap in every parameter", "note")
-        yield replace(told, advice=OVERLAP)
+        yield replace(caution("several-modes", f"{words}, and overlap in every parameter", "note"), advice=OVERLAP)
         return
     names = tuple(name for j, name in enumerate(prior.names) if distances[j] > APART or j == most)
     yield caution("several-modes", words, None if result else "serious", names if result else ())

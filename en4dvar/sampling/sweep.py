@@ -56,9 +56,8 @@ class Targets:
 def targets(
     observations: Sequence[Observations], shift: float, step: float, earliest: float = -np.inf, most: float = np.inf
 ) -> Targets:
-    """The grid covers every reading at every shift within ±``shift`` (s), from ``earliest`` on.
-
-    Raises ValueError: a reading would be compared before ``earliest``; the grid would have more than ``most`` instants.
+    """The grid covers every reading at every shift within ±``shift`` (s), from ``earliest`` on. Raises ValueError: a
+    reading would be compared before ``earliest``; the grid would have more than ``most`` instants.
     """
     reach = int(np.floor(shift / step * (1 + 1e-9)))
     first = min(float(o.times[0]) for o in observations) - reach * step
@@ -191,25 +190,23 @@ def run_sweep(
     progress: Progress | None = None,
     earliest: float = 0.0,
 ) -> SweepResult:
-    """Fit every data set.
-
-    ``problems``: of one model and the same parameters with the same transforms, whose priors may differ; those on
-    ``t_s`` and on parameters of the errors play no part. ``folder``: where finished chunks are kept, and found again;
-    the caller clears it. ``progress``: called with the trajectories done and to do. ``earliest``: the instant before
-    which the model has no path; −inf where it has one at any time.
-
-    Raises ConfigError: the data sets do not share a model, fixed values or parameters; none of these is the model's.
-    DataError: no trajectory fits a set; a reading would be compared before ``earliest``; the step is far too small.
+    """Fit every data set. ``problems``: of one model and the same parameters with the same transforms, whose priors may
+    differ; those on ``t_s`` and on parameters of the errors play no part. ``folder``: where finished chunks are kept,
+    and found again; the caller clears it. ``earliest``: the instant before which the model has no path; −inf where it
+    has one at any time. Raises ConfigError: the data sets do not share a model, fixed values or parameters; none of
+    these is the model's. DataError: no trajectory fits a set; a reading would be compared before ``earliest``; the step
+    is far too small.
     """
     executor = executor or SerialExecutor()
-    ranges = _Ranges.of(problems, settings.width)
+    mean, std = _moments(problems)
     with retold(ValueError, DataError):
         most = LARGEST / BATCH / problems[0].model.layout.size
         aims = targets([p.observations for p in problems], settings.shift, settings.step, earliest, most)
     ones = np.ones(len(aims.grid))
     traced = Observations(aims.grid, ones, noise_of(ones, 0 * ones), ones)
-    score = _Score(replace(_searched(problems[0]), observations=traced), ranges, aims)
-    low, high = ranges.low.min(axis=0), ranges.high.max(axis=0)
+    searched, reach = replace(_searched(problems[0]), observations=traced), settings.width * std
+    score = _Score(searched, aims, mean - reach, mean + reach, std)
+    low, high = score.low.min(axis=0), score.high.max(axis=0)
     design = sobol_box((low + high) / 2, (high - low) / 2, settings.trajectories, seed)
     parts = [design[i : i + settings.chunk] for i in range(0, len(design), settings.chunk)]
     files = [inside(folder, f"chunk_{i:05d}.npz") if folder else None for i in range(len(parts))]
@@ -260,36 +257,30 @@ def _searched(problem: InverseProblem) -> InverseProblem:
     return replace(problem, prior=problem.prior.of(terms), fixed=fixed)
 
 
-@dataclass(frozen=True)
-class _Ranges:
-    """The ranges searched for each set, ``low`` to ``high`` (S, n), transformed, and the prior's ``std`` (S, n)."""
-
-    low: Array
-    high: Array
-    std: Array
-
-    @classmethod
-    def of(cls, problems: Sequence[InverseProblem], width: float) -> "_Ranges":
-        """Raises :class:`ConfigError` where the data sets cannot share a design."""
-        first = problems[0]
-        for other in problems[1:]:
-            if other.model is not first.model or _in_common(other) != _in_common(first):
-                raise ConfigError(
-                    "the design is shared: all data sets need one model, the same parameters and the same fixed "
-                    f"values, unlike {other.observations.name}"
-                )
-        priors = [_searched(p).prior for p in problems]
-        mean, std = np.stack([p.mean for p in priors]), np.stack([p.std for p in priors])
-        return cls(mean - width * std, mean + width * std, std)
+def _moments(problems: Sequence[InverseProblem]) -> tuple[Array, Array]:
+    """Mean and std (S, n) of the priors, transformed. Raises :class:`ConfigError`: they cannot share a design."""
+    first = problems[0]
+    for other in problems[1:]:
+        if other.model is not first.model or _in_common(other) != _in_common(first):
+            raise ConfigError(
+                "the design is shared: all data sets need one model, the same parameters and the same fixed values, "
+                f"unlike {other.observations.name}"
+            )
+    priors = [_searched(p).prior for p in problems]
+    return np.stack([p.mean for p in priors]), np.stack([p.std for p in priors])
 
 
 @dataclass(frozen=True)
 class _Score:
-    """The data that all chunks share; it can be sent to workers of any kind."""
+    """The data that all chunks share, also with workers of any kind; each set is searched from ``low`` to ``high`` (S,
+    n), transformed, where its prior has the ``std`` (S, n).
+    """
 
     problem: InverseProblem  # its observations are those of a trace, on the time grid
-    ranges: _Ranges
     aims: Targets
+    low: Array
+    high: Array
+    std: Array
 
     def chunk(self, x: Array, file: Path | None) -> Best:
         """The best fits among coordinates (B, n), from ``file`` where they are, or kept there."""
@@ -304,8 +295,8 @@ class _Score:
     def _best(self, x: Array) -> Best:
         nrmse, shift = self.of(x)
         # the box around all priors holds coordinates that belong to no range of a set; a rounding is not outside
-        edge = 1e-9 * self.ranges.std
-        inside = np.all((x[:, None] >= self.ranges.low - edge) & (x[:, None] <= self.ranges.high + edge), axis=2)
+        edge = 1e-9 * self.std
+        inside = np.all((x[:, None] >= self.low - edge) & (x[:, None] <= self.high + edge), axis=2)
         nrmse = np.where(inside, nrmse, -np.inf)
         row, sets = np.argmax(nrmse, axis=0), np.arange(nrmse.shape[1])
         return Best(x[row], shift[row, sets], nrmse[row, sets])
@@ -321,13 +312,13 @@ def _refined(
     """Trajectories run and the best fits after each round."""
     if not settings.rounds:
         return
-    n_sets, half = len(best.nrmse), settings.width / 4 * score.ranges.std
+    n_sets, half = len(best.nrmse), settings.width / 4 * score.std
     x = np.stack([sobol_box(best.x[s], half[s], settings.local, seed + 1 + s) for s in range(n_sets)])
     nrmse, shift = _own(score, x, executor)
     stream = member_stream(seed, "sweep refinement")
     for number in range(settings.rounds + 1):
         if number:
-            trial = _trials(score.ranges, x, best, stream)
+            trial = _trials(score, x, best, stream)
             new, moved = _own(score, trial, executor)
             better = new > nrmse
             x, shift = np.where(better[..., None], trial, x), np.where(better, moved, shift)
@@ -337,13 +328,13 @@ def _refined(
         yield nrmse.size, best
 
 
-def _trials(ranges: _Ranges, x: Array, best: Best, stream: np.random.Generator) -> Array:
+def _trials(score: _Score, x: Array, best: Best, stream: np.random.Generator) -> Array:
     """best + F (x_b − x_c) of each set, inside the range of the design."""
     n_sets, count, _ = x.shape
     pairs = np.argsort(stream.uniform(size=(n_sets, count, count)), axis=2)[..., :2]
     b, c = (np.take_along_axis(x, pairs[..., k, None], axis=1) for k in (0, 1))
     step = stream.uniform(0.4, 1.0, (n_sets, count, 1)) * (b - c)
-    return np.clip(best.x[:, None] + step, ranges.low[:, None], ranges.high[:, None])
+    return np.clip(best.x[:, None] + step, score.low[:, None], score.high[:, None])
 
 
 def _own(score: _Score, x: Array, executor: Executor) -> tuple[Array, Array]:

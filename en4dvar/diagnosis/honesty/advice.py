@@ -71,8 +71,7 @@ class Case:
 
     def with_scheme(self, option: str) -> str:
         """What only a scheme that minimises J takes, with such a scheme where there is another."""
-        own = self.a.settings.own.minimiser
-        return option if own else f"{option}, with assimilation.scheme: {MINIMISERS[0]}"
+        return option if self.a.settings.own.minimiser else f"{option}, with assimilation.scheme: {MINIMISERS[0]}"
 
     @property
     def or_cheap(self) -> str:
@@ -239,13 +238,10 @@ def _odd(case: Case) -> str:
         noise = case.a.observations.noise
         first = "a larger" if noise.time_std.any() else "state how uncertain the times are with"
         other = _structure(case) if noise.discrepant else "the model errs where the observable changes fast"
-        if case.exact:
-            return other
-        return f"{first} data.error.time_std; if the times are right, {other}"
+        return other if case.exact else f"{first} data.error.time_std; if the times are right, {other}"
     if case.may_be_robust:
         return f"look at this reading; with {case.with_scheme('data.error.robust: huber')} such readings count less"
-    wrong = "if it is wrong, delete its line from the data file and say so"
-    return f"look at this reading; {wrong}{case.or_times}"
+    return f"look at this reading; if it is wrong, delete its line from the data file and say so{case.or_times}"
 
 
 def _validity(case: Case) -> str:
@@ -320,9 +316,8 @@ def _lost(case: Case) -> str:
 
 
 def _chain(case: Case) -> str:
-    on = case.a.settings.emulator == "on"
-    first = "" if on else "set assimilation.emulator: on, which guides the chain, or "
-    return f"do not quote these intervals; {first}run again with more data or narrower priors"
+    on = "set assimilation.emulator: on, which guides the chain, or " * (case.a.settings.emulator != "on")
+    return f"do not quote these intervals; {on}run again with more data or narrower priors"
 
 
 def _future(case: Case) -> str:

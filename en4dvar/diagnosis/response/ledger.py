@@ -35,10 +35,9 @@ QUANTILES = (0.05, 0.5, 0.95)
 
 @dataclass(frozen=True)
 class Ledger:
-    """P parameters, M cells of time, V quantities of the path, at the centre of the posterior.
-
-    ``edges`` (M + 1,) of the cells in the model's time; ``values`` (V, M), the mean size of each quantity in a cell;
-    ``kernel`` (P, M), a_j integrated over each cell; ``runs`` (parts of) forward runs it took. NaN where a run failed.
+    """P parameters, M cells of time, V quantities of the path, at the centre of the posterior. ``edges`` (M + 1,) of
+    the cells in the model's time; ``values`` (V, M), the mean size of each quantity in a cell; ``kernel`` (P, M), a_j
+    integrated over each cell; ``runs`` (parts of) forward runs it took. NaN where a run failed.
     """
 
     parameters: tuple[str, ...]

@@ -75,9 +75,8 @@ class LinearResponse:
         self, observations: Observations, linear: Linearisation, moved: Array, prior_shift: Array
     ) -> tuple[Array, float]:
         """δx (n,) to the mode of a changed problem, from ``at`` + ``moved`` (n,), where ``linear`` has its prediction
-        and a tangent, and by how much its J falls on the way, as far as it is quadratic.
-
-        ``observations`` are the changed ones, ``prior_shift`` (n,) is the change of the prior's mean.
+        and a tangent, and by how much its J falls on the way, as far as it is quadratic. ``observations`` are the
+        changed ones, ``prior_shift`` (n,) is the change of the prior's mean.
         """
         d, S = self.whitened
         changed, tangent = observations.whiten(linear)
@@ -110,11 +109,10 @@ Fitted = Callable[[InverseProblem], Fit | None]
 
 @dataclass(frozen=True)
 class Shift:
-    """Where the posterior would go under the alternative ``name``; ``words`` complete "if …".
-
-    ``change`` (n,) of the mode in physical SI values, ``relative`` (n,) to the mode where a parameter cannot be
-    negative (else NaN), ``in_std`` (n,) in transformed space per posterior standard deviation. ``cost_change``: J there
-    minus J of the fit. Where linear response does not tell, these are NaN and ``reason`` says why.
+    """Where the posterior would go under the alternative ``name``; ``words`` complete "if …". ``change`` (n,) of the
+    mode in physical SI values, ``relative`` (n,) to the mode where a parameter cannot be negative (else NaN),
+    ``in_std`` (n,) in transformed space per posterior standard deviation. ``cost_change``: J there minus J of the fit.
+    Where linear response does not tell, these are NaN and ``reason`` says why.
     """
 
     name: str
@@ -159,9 +157,8 @@ def what_if(
     problem: InverseProblem, response: LinearResponse, std: Array, cost: float, executor: Executor, fitted: Fitted
 ) -> tuple[Shift, ...]:
     """The shifts of all alternatives of the problem's model: the largest first, then those unknown, then small ones.
-
     ``std`` (n,) of the posterior, transformed; ``cost`` J at ``response.at``; ``fitted`` minimises J of a problem, None
-    where that fails. A scale that is estimated has an uncertainty of its own.
+    where that fails.
     """
     if not response.defined or not np.all(std > 0):
         return ()
@@ -171,11 +168,10 @@ def what_if(
 
 
 def with_shifts(members: Array, shifts: Sequence[Shift], seed: int) -> Array:
-    """Members (N, n) of a posterior, transformed, whose variance holds that of the assumptions as well.
-
-    A member is moved by Σ_k ξ_k s_k exp(−½ max(ΔJ_k, 0)), s_k (n,) the settled shifts, with ξ of zero mean and unit
-    covariance over the members that is uncorrelated with them (where N exceeds n and the number of shifts together), so
-    that C + Σ_k s_k s_kᵀ exp(−max(ΔJ_k, 0)) is met exactly.
+    """Members (N, n) of a posterior, transformed, whose variance holds that of the assumptions as well. A member is
+    moved by Σ_k ξ_k s_k exp(−½ max(ΔJ_k, 0)), s_k (n,) the settled shifts, with ξ of zero mean and unit covariance over
+    the members that is uncorrelated with them (where N exceeds n and the number of shifts together), so that C + Σ_k
+    s_k s_kᵀ exp(−max(ΔJ_k, 0)) is met exactly.
     """
     moved = in_std_as_likely(shifts) * members.std(axis=0, ddof=1)
     z = member_stream(seed, "what if").standard_normal((len(members), len(moved)))
