@@ -114,11 +114,7 @@ def _parts(k: int, draws: int) -> Iterator[slice]:
 
 
 def believed_shape(draws: int) -> float:
-    """k̂ below which a mean weighted over so many draws is to be believed.
-
-    >>> round(believed_shape(48), 3), believed_shape(4000)
-    (0.405, 0.7)
-    """
+    """k̂ below which a mean weighted over so many draws is to be believed."""
     return min(BELIEVED, 1 - 1 / math.log10(max(draws, 2)))
 
 

@@ -289,11 +289,7 @@ GREYS = ("#ffffff", "#bdbdbd", "#636363", "#000000")
 
 
 def ramp(anchors: Sequence[str], share: float) -> str:
-    """The colour at a ``share`` of the way along ``anchors``.
-
-    >>> ramp(GREYS, 0.0), ramp(GREYS, 1.0)
-    ('#ffffff', '#000000')
-    """
+    """The colour at a ``share`` of the way along ``anchors``."""
     place = min(max(share, 0.0), 1.0) * (len(anchors) - 1)
     first = min(int(place), len(anchors) - 2)
     low, high = (bytes.fromhex(code[1:]) for code in anchors[first : first + 2])

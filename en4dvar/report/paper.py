@@ -102,9 +102,7 @@ def _panel(ax: Axes, panel: Panel) -> None:
 
 
 def _legends(figure: Figure, chart: Chart) -> None:
-    """Each legend above its panel; where a row has several panels and one legend, above all of them, and where it has
-    several legends, in one column: one that is wider than its panel would leave the panels no room.
-    """
+    """Each legend above its panel; the only one of a row above all of its panels, several in one column each."""
     axes = iter(figure.axes)
     for row in chart.rows:
         drawn = [(next(axes), panel) for panel in row.panels if not panel.bare or panel.words]

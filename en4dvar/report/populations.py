@@ -250,9 +250,7 @@ def _calibrated(
     name: str, stored: Mapping[str, StoredPopulation], values: Mapping[str, Values],
     off: Mapping[str, Mapping[str, float]], median: Array, alone: Array | None,
 ) -> Iterator[str]:  # fmt: skip
-    """What groups that are known from elsewhere, ``off`` from their own data, do to the median (M, K) of a parameter in
-    the others; ``alone``: the same were nothing common, None where nothing is.
-    """
+    """What groups that are known do to the median (M, K) of the others; ``alone``: the same were nothing common."""
     known = [label for label, of_it in off.items() if any(by <= TOO_FAR for by in of_it.values())]
     for k, (label, s) in enumerate(stored.items()):
         parameter = s.prior_of(name).parameter

@@ -107,9 +107,6 @@ def read_outcome(path: Path, name: str, entry: Entry) -> bytes:
 def file_names(names: Iterable[str]) -> dict[str, str]:
     """Name of the data set → name of a file, without suffix, that every file system takes and that is unique there:
     blanks and signs become ``_``; names that differ only in case or accents' encoding get a number.
-
-    >>> file_names(["gel 1", "gel/1", "Gel_1", "ゲル"])
-    {'gel 1': 'gel_1', 'gel/1': 'gel_1_2', 'Gel_1': 'Gel_1_3', 'ゲル': 'ゲル'}
     """
     used: set[str] = set()
     chosen = {}

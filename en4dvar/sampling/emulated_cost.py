@@ -162,9 +162,7 @@ class EmulatedCost:
         return np.minimum(observed, self.ceiling) + self.prior.cost(x)
 
     def settled(self, random: np.random.Generator) -> "EmulatedCost":
-        """With draws of the walkers after :data:`LONGER` more rounds: where the posterior is bent, those of a hundred
-        moves from a Gaussian were up to 40 % too narrow.
-        """
+        """With draws after :data:`LONGER` more rounds; of a bent posterior those before were up to 40 % too narrow."""
         walkers = len(self.draws) // (SETTLED - SETTLED // 3)
         positions = self.walk(self.draws[-walkers:], self.draws, random, LONGER)
         return replace(self, draws=np.concatenate(positions[LONGER // 3 :]))

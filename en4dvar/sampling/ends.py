@@ -50,9 +50,7 @@ class Intervals(NamedTuple):
 
 
 class _Walk:
-    """Along each parameter j, to both sides, from a minimum; ``costs`` of each side are J − ln V (relative to that at
-    the minimum) by the distance in standard deviations, and ``of_drawn`` those of what members are drawn from.
-    """
+    """Along each parameter, to both sides of a minimum; ``costs``: J − ln V by the distance in standard deviations."""
 
     def __init__(self, space: WeightSpace, minimum: Minimum, runs: ModelRuns, drawn: Drawn | None):
         self.space, self.runs, self.start, self.drawn, n = space, runs, minimum.x, drawn, len(minimum.x)
@@ -130,9 +128,7 @@ class _Walk:
         return [side for side in sides if self.rise(side, far) < 0.5 * END**2 - SHORT]
 
     def density(self, j: int, sides: Costs) -> tuple[Array, Array]:
-        """Distances (P,) along parameter j and shares (P,) of its density there, from costs of all ``sides``: √(2 (J −
-        min J)), which is the distance where J is quadratic, is interpolated, and goes on as far again.
-        """
+        """Distances (P,) along parameter j, shares (P,) of its density: √(2 (J − min J)) is interpolated."""
         distances, roots = [0.0], [0.0]
         for sign, costs in zip((-1, 1), sides[2 * j : 2 * j + 2], strict=True):
             far = sorted(costs)

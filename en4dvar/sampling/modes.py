@@ -154,9 +154,7 @@ def typical_runs(n: int, enough: float | None) -> int:
 def _guided(
     runs: RecordedRuns, mixed: Importance, mixture: StudentMixture, more: Callable[[Importance], bool]
 ) -> tuple[Importance, StudentMixture, bool]:
-    """A round of draws of the emulated posterior, after others that train the emulator, or the ``mixed`` ones where
-    these keep a larger share effective; a mixture about them; and whether no draw ends them all.
-    """
+    """Draws of the emulated posterior, or the ``mixed`` ones if better; a mixture about them; whether to go on."""
     start: StudentMixture | EmulatedProposal = mixture
     share, of_mixture = 0.0, mixed.effective / len(mixed.z)
     for heat in (*HEATS, *(LAST_HEAT,) * TRIED):
@@ -252,9 +250,7 @@ def _gap(values: Array, shares: Array, beside: float) -> float | None:
 
 
 def _by_valleys(prior: Prior, minima: Sequence[Minimum], x: Array, shares: Array) -> Indices:
-    """Numbers (D,) of the minima on whose side of the valley between them draws (D, n) with ``shares`` (D,) lie, and
-    where there is none all that of the lower one: which Gaussian is densest says only where to look.
-    """
+    """Minima (D,) on whose side of the valley between them draws (D, n) lie; where there is none that of the lower one."""
     mode = nearest(prior, minima, x)
     for j in range(1, len(minima)):
         for i in range(j):
@@ -266,9 +262,7 @@ def _by_valleys(prior: Prior, minima: Sequence[Minimum], x: Array, shares: Array
 
 
 def _beyond_valley(x: Array, first: Array, second: Array) -> Mask:
-    """Which draws (D, n) lie beyond the place that has fewest, on the way from those with shares ``first`` (D,) to
-    those with shares ``second`` (D,), along the direction that tells them apart best; none where the way is filled.
-    """
+    """Which draws (D, n) lie beyond the emptiest place between those of ``first`` and ``second``; none if filled."""
     both = first + second
     a, b = (shares @ x / shares.sum() for shares in (first, second))
     apart = x - both @ x / both.sum()

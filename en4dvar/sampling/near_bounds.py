@@ -79,9 +79,7 @@ def near_bounds(space: WeightSpace, linear: Linearisation, mode: Array, posterio
 def _cost_of_readings(
     observations: Observations, at: Predicted, slopes: Array
 ) -> Callable[[Array, Array], Array] | None:
-    """J_o (B,) of changes (B, n) from the prediction ``at`` the mode, by ``slopes`` (n, K) and beside them those of the
-    rates, and of σ (B,); None where it takes too long.
-    """
+    """J_o (B,) of changes (B, n) from the prediction ``at`` the mode and of σ (B,); None where it takes too long."""
     like = replace(at, noise_scale=None).each(lambda part: np.asarray(part)[None])
     if observations.noise.quadratic and like.rates is None:
         rows = observations.whitened_rows(np.vstack([slopes, observations.values - at.values]), like)[0]

@@ -136,10 +136,7 @@ def _of_drawn(drawn: Drawn, prior: Prior) -> LogDensity:
 
 
 def _by_weights(prior: Prior, parts: Sequence[Points]) -> dict[str, float]:
-    """The numbers of :func:`examine_tails`, of the ensemble, the prior's members and others. Where that is at members
-    of the prior which the ensemble does not reach, it is elsewhere, however few these are: a model with steps, of which
-    a bundle sees one.
-    """
+    """The numbers of :func:`examine_tails`, of the ensemble, the prior's members and others."""
     points, of_points, densities = zip(*parts, strict=True)
     x, costs = np.concatenate(points), np.concatenate(of_points)
     logs = [log_density(x) for log_density in densities]
@@ -149,7 +146,7 @@ def _by_weights(prior: Prior, parts: Sequence[Points]) -> dict[str, float]:
     mean, std, at, wide = _moments(theta, shares)
     its_mean, its_std, its_at, its_wide = _moments(theta, its_shares)
     begin, end = np.cumsum([len(part) for part in points[:2]])
-    elsewhere = np.sum((shares - its_shares)[begin:end]) > ELSEWHERE
+    elsewhere = np.sum((shares - its_shares)[begin:end]) > ELSEWHERE  # where the ensemble does not reach
     shift, ratio = np.abs(its_mean - mean) / std, its_std / std
     off = np.array([shift - SHIFT, np.abs(np.log(ratio)) - math.log1p(SPREAD)])
     errors = 0.0 if elsewhere else np.linalg.norm([(at - its_at) / std, wide - its_wide], axis=1)
@@ -171,9 +168,7 @@ def _by_weights(prior: Prior, parts: Sequence[Points]) -> dict[str, float]:
 
 
 def _moments(theta: Array, shares: Array) -> tuple[Array, Array, Array, Array]:
-    """Mean and standard deviation (n,) of points (B, n) of ``shares`` (B,), and by what (B, n) mean and logarithm of
-    the standard deviation differ without each point, the latter to first order: their jackknife.
-    """
+    """Mean, std (n,) of points (B, n) of ``shares`` (B,), and by what (B, n) mean and ln std differ without each."""
     mean, left = shares @ theta, shares / np.maximum(1 - shares, TINY)
     squares = (theta - mean) ** 2
     std = np.maximum(np.sqrt(shares @ squares), ROUNDING * theta.std(axis=0))

@@ -272,9 +272,7 @@ def _moments(problems: Sequence[InverseProblem]) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class _Score:
-    """The data that all chunks share, also with workers of any kind; each set is searched from ``low`` to ``high`` (S,
-    n), transformed, where its prior has the ``std`` (S, n).
-    """
+    """What all chunks share; each set is searched from ``low`` to ``high`` (S, n), its prior has the ``std`` (S, n)."""
 
     problem: InverseProblem  # its observations are those of a trace, on the time grid
     aims: Targets

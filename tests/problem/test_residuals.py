@@ -37,6 +37,11 @@ def test_chances_are_uniform_where_the_model_is_right():
         assert np.mean(np.array(chances) < 0.05) < 0.09
 
 
+def test_imhof_of_few_numbers():
+    assert positive_chance(np.array([1.0, -1.0])) == pytest.approx(0.5, abs=1e-6)
+    assert positive_chance(np.array([1.0, 1.0, -1.0])) == pytest.approx(np.sqrt(0.5), abs=1e-4)
+
+
 def test_imhof_against_draws():
     weights = np.random.default_rng(1).standard_normal(12)
     z = np.random.default_rng(2).standard_normal((200_000, 12))

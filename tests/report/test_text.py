@@ -2,15 +2,32 @@
 
 from __future__ import annotations
 
-import doctest
-
 import pytest
 
 from en4dvar.report import text
+from en4dvar.report.chart import GREYS, ramp
+from en4dvar.report.export import is_math, latex_unit
+
+NAN = float("nan")
 
 
-def test_examples_of_the_module():
-    assert doctest.testmod(text).failed == 0
+@pytest.mark.parametrize(
+    ("written", "arguments", "expected"),
+    [
+        (text.pretty_unit, ["um", "Pa s^0.6", "J/m^2", "1", "m s-1"], ["µm", "Pa·s^0.6", "J/m²", "", "m·s⁻¹"]),
+        (text.rough_number, [287.4, 1.333, 6.18e6, NAN], ["290", "1.3", "6.2×10⁶", "–"]),
+        (text.number_like, [(2.80123, 0.104), (-0.0, 0.1), (NAN, 1.0)], ["2.80", "0.00", "–"]),
+        (text.signed, [0.234, -4.0], ["+0.23", "−4"]),
+        (text.fixed, [(-1.25, 1), (-0.01, 1), (NAN, 2)], ["-1.2", "0.0", "–"]),
+        (text.symbol_html, [r"$\mu$", r"$R_{\mathrm{eq}}$", "<b>"], ["<i>μ</i>", "<i>R</i><sub>eq</sub>", "&lt;b&gt;"]),
+        (text.math_pieces, [r"R_{\mathrm{eq}}"], [[("", "R"), ("_", "eq")]]),
+        (is_math, [r"$\mu_{max}$", r"$\frac{1}{2}R^2$", r"$\input{x}$", "$a}b{c$"], [True, True, False, False]),
+        (latex_unit, ["um", "Pa s", "m s-1", "%", "1"], [r"$\mu$m", r"Pa\,s", r"m\,s$^{-1}$", r"\%", ""]),
+        (ramp, [(GREYS, 0.0), (GREYS, 1.0)], ["#ffffff", "#000000"]),
+    ],
+)
+def test_what_is_written(written, arguments, expected):
+    assert [written(*(each if isinstance(each, tuple) else (each,))) for each in arguments] == expected
 
 
 @pytest.mark.parametrize(

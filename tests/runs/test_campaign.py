@@ -157,6 +157,7 @@ def test_names_of_files():
     assert len(set(folded)) == len(names)
     assert all(0 < len(f.encode()) < 140 and not set(f) & set(' /\\:*?"<>|\0') and f[0] != "." for f in files.values())
     assert "con" not in folded
+    assert [*file_names(["gel 1", "gel/1", "Gel_1", "ゲル"]).values()] == ["gel_1", "gel_1_2", "Gel_1_3", "ゲル"]
 
 
 def test_unicode_blanks_and_same_names(tmp_path):

@@ -300,9 +300,7 @@ def _gaussian(case: Case) -> str:
 
 
 def _lost(case: Case) -> str:
-    """A cut of the prior is advised where it takes no values that the model allows: where the model fails along a
-    curve, no parameter alone has such an edge.
-    """
+    """A cut of the prior is advised where it takes no values that the model allows."""
     a, lost = case.a, ~active_members(case.a.prior_failures)
     edges = [(a.parameters[s.j], s) for s in sides_of_lost(a.prior, lost) if s.others <= FEW * lost.sum()]
     ways = ["find out why it fails"]

@@ -133,9 +133,7 @@ def _path(problem: InverseProblem, start: Array, end: float) -> tuple[Array, Arr
 def _localised(
     problem: InverseProblem, states: Array, start: Array, shift: float, changes: list[tuple[int, float]]
 ) -> Array:
-    """The change of predictions (P, M, K) by each change (column of the state, value) within each cell. ``states`` (M,
-    n_state) of the path at ``start`` (M,) of each cell; readings are ``shift`` later than they say.
-    """
+    """Change of predictions (P, M, K) by each change (column, value) in each cell, from ``states`` at ``start``."""
     n_cells, variants = len(states), [states]
     for column, value in changes:
         changed = states.copy()

@@ -257,9 +257,7 @@ def _shift(
 
 @dataclass(frozen=True)
 class _Chord:
-    """Where a chord iteration led: ``moved`` (n,), its last run at ``known`` (n,), the readings' part of J at the end,
-    as far as it is quadratic; ``failure`` of the run at the mode.
-    """
+    """Where a chord iteration led, its last run at ``known``, J of the readings at the end; ``failure`` at the mode."""
 
     settled: bool
     moved: Array
