@@ -126,7 +126,7 @@ def datasets_in(path: Path) -> list[str]:
 
 
 def _said(path: Path, damaged: bool = False) -> dict[str, Any]:
-    """Attributes of the root, names of data sets; nothing without a file or, if it may be ``damaged``, of such a one."""
+    """Attributes of the root, names of data sets; nothing of no file or, if it may be ``damaged``, of such a one."""
     try:
         return dict(netcdf.read_sealed(said_in, path)) if path.is_file() else {}
     except OutputError:

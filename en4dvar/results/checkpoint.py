@@ -54,9 +54,8 @@ def write_checkpoint(path: Path, fingerprint: str, content: object) -> None:
 
 @dataclass
 class Keeper:
-    """Keeps the latest state of a computation in a file, flushed to the disk: neither a kill nor a loss of power takes
-    more than what was done since. It is written at most every ``every`` seconds, and so seldom that writing takes a
-    twentieth of the time; with ``every`` 0 each one is.
+    """Keeps the latest state of a computation in a file, flushed to the disk, at most every ``every`` seconds, and so
+    seldom that writing takes a twentieth of the time; with ``every`` 0 each one is.
     """
 
     path: Path
@@ -195,8 +194,7 @@ class StoppedError(Exception):
 
 class Journal(Executor):
     """An ``executor`` of forward runs that are not made where they are known from ``before``. ``keeper`` writes them to
-    a file, unless this worker does not see its folder. ``stop`` gives the data set up at its next forecast (within one
-    process only).
+    a file, where its folder is seen. ``stop`` gives the data set up at its next forecast (in one process only).
     """
 
     def __init__(

@@ -64,8 +64,7 @@ ALWAYS = When("", lambda _, item: True)
 @dataclass(frozen=True)
 class Declared:
     """A variable. ``meaning``: its ``long_name``, with ``{label}`` for that of the item. ``values``: of a subject and,
-    where the name has a placeholder, of an item. ``needed``: no result is without it. ``fill`` and ``single`` as of
-    :class:`~en4dvar.results.netcdf.Variable`.
+    where the name has a placeholder, of an item. ``needed``: no result is without it. Else as of ``netcdf.Variable``.
     """
 
     name: str

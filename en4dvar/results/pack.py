@@ -234,8 +234,7 @@ _ALIGNED = 8  # bytes
 @dataclass(frozen=True, eq=False)
 class PackedLayout:
     """Which variables there are: of each group the path, then of its variables and of its coordinates the name and what
-    :func:`_place` tells; ``named``: which texts stand along dimensions; ``sizes`` of these by path; ``texts``: how many
-    words each has; ``length`` of the numbers in bytes.
+    :func:`_place` tells; texts ``named`` along dimensions, ``sizes`` by path, words of ``texts``, ``length`` in bytes.
     """
 
     groups: list[tuple[str, list[Any], list[Any]]]

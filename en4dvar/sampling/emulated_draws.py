@@ -132,9 +132,8 @@ class EmulatedProposal:
         return replace(self, cost=cost, walkers=z)
 
     def settled(self, stream: np.random.Generator) -> "EmulatedProposal":
-        """After moves of the walkers, and with draws of a mixture about them in the place of those that their weights
-        say: small moves do not take them from end to end of a thin valley (iterated sampling importance resampling:
-        Andrieu, Lee & Vihola 2018, Bernoulli 24, 842).
+        """After moves of the walkers, and draws of a mixture in the place of some, which go from end to end of a thin
+        valley (iterated sampling importance resampling: Andrieu, Lee & Vihola 2018, Bernoulli 24, 842).
         """
         z = _moved(self.cost, self.walkers, self.walkers, stream)
         mixture = StudentMixture.fitted(z, stream, PARTS)

@@ -39,9 +39,8 @@ Costs = list[dict[float, float]]
 
 
 class Intervals(NamedTuple):
-    """The 5, 50 and 95 % points (3, n) of the posterior in what is printed, and by how much the 5 or 95 % point both of
-    what members are drawn from and of them, which may be by chance, is ``off`` (n,), in posterior standard deviations.
-    Whether J ``rises`` to all points at :data:`END`.
+    """The 5, 50 and 95 % points (3, n) of the posterior in what is printed; by how much the 5 or 95 % point of members
+    and of what they are drawn from is ``off`` (n,), in its std; whether J ``rises`` to all points at :data:`END`.
     """
 
     quantiles: Array

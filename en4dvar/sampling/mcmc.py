@@ -41,9 +41,8 @@ ASTRAY = 10.0  # by which J exceeds the emulator's where a walker must not start
 
 @dataclass(frozen=True)
 class Chain:
-    """``samples`` (steps, walkers, n) after burn-in; split R-hat ``r_hat`` and ``effective`` sample size (n,);
-    ``moved`` (n,) is the change of the mean against the ensemble it started from, in posterior standard deviations,
-    ``widened`` (n,) the ratio of the standard deviations.
+    """``samples`` (steps, walkers, n) after burn-in, split R-hat and ``effective`` sample size (n,); by how much the
+    mean ``moved`` (n,) from the ensemble, in posterior std, and the std ``widened`` (n,), as a ratio.
     """
 
     samples: Array

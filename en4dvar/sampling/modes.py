@@ -1,6 +1,5 @@
-"""The posterior as a mixture of its modes: weighted draws about every minimum that descents ended in, and the prior.
-Importance weights against J correct what the Gaussians about the minima are not, so that the weight of a mode is its
-share of the evidence, whatever its shape.
+"""The posterior as a mixture of its modes: draws about every minimum that descents ended in, and the prior, with
+importance weights against J, so that the weight of a mode is its share of the evidence, whatever its shape.
 """
 
 import math
@@ -40,9 +39,9 @@ Cost = Callable[[Array], Array]
 
 @dataclass(frozen=True)
 class WeightedDraws:
-    """Draws (D, n) of a posterior, transformed, with ``shares`` (D,) that sum to one, the ``mode`` (D,) of each by
-    :func:`belonging` and its J, ``costs`` (D,); ``log_evidence`` ln ∫ exp(−J_o) N(x) dx, ``best`` (n,) the lowest draw,
-    ``proposal`` a mixture that resembles them.
+    """Draws (D, n) of a posterior, transformed, their ``shares`` (D,), the ``mode`` (D,) of each by :func:`belonging`,
+    J, ``costs`` (D,), ln ∫ exp(−J_o) N(x) dx, the lowest, ``best`` (n,), and a mixture that resembles them,
+    ``proposal``.
     """
 
     x: Array
@@ -211,10 +210,9 @@ def belonging(prior: Prior, minima: Sequence[Minimum], x: Array, shares: Array, 
 
 
 def separated(x: Array, shares: Array, beside: float = BESIDE) -> list[Indices]:
-    """Numbers of the draws (D, n), with ``shares`` (D,), of each group: empty gaps of one coordinate lie between them.
-    A gap is :data:`GAP` times as wide as ``beside`` effective draws to either side of it. Of draws of any density with
-    one peak that has a chance below 1e-4, and what is curved or bent leaves no gap. Draws that together hold less than
-    :data:`NOTHING` leave it empty.
+    """Numbers of the draws (D, n), with ``shares`` (D,), of each group: gaps of one coordinate lie between them,
+    :data:`GAP` times as wide as ``beside`` effective draws to either side, and empty but for :data:`NOTHING`. Of a
+    density with one peak such a gap has a chance below 1e-4.
     """
     order = np.argsort(shares, kind="stable")
     held = np.zeros(len(x), dtype=bool)
@@ -250,7 +248,7 @@ def _gap(values: Array, shares: Array, beside: float) -> float | None:
 
 
 def _by_valleys(prior: Prior, minima: Sequence[Minimum], x: Array, shares: Array) -> Indices:
-    """Minima (D,) on whose side of the valley between them draws (D, n) lie; where there is none that of the lower one."""
+    """Minima (D,) on whose side of the valley between them draws (D, n) lie; if there is none the lower one."""
     mode = nearest(prior, minima, x)
     for j in range(1, len(minima)):
         for i in range(j):

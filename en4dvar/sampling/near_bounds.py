@@ -35,8 +35,7 @@ MANY = 500  # readings of other errors than Gaussian ones of known ratios, of wh
 
 def near_bounds(space: WeightSpace, linear: Linearisation, mode: Array, posterior: Array) -> Drawn | None:
     """Members (N, n) in place of ``posterior`` (N, n), the Gaussian about the ``mode`` (n,), all transformed. None
-    where predictions that are linear in x say the same, where these are too many or not known in all directions, and
-    where the posterior is a mixture of its own: beside an estimated discrepancy or scale of what varies.
+    where predictions linear in x say the same, or these are too many, unknown in some direction, or of a mixture.
     """
     problem, prior = space.problem, space.problem.prior
     mixed = problem.discrepancy or any(walk.spread for walk in problem.walks)

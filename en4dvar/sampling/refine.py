@@ -318,10 +318,9 @@ def refined(
     looking: bool,
     look: Callable[[ChainRecord], None],
 ) -> Refined:
-    """Members of the posterior that ``minima`` are the modes of, in place of ``posterior`` (N, n).
-
-    By a Markov chain where the settings want one or weighted draws are too few. ``looking``: end at a draw that lies
-    lower than all minima. ``look``: see :func:`~en4dvar.sampling.mcmc.sample`.
+    """Members of the posterior that ``minima`` are the modes of, in place of ``posterior`` (N, n): of a Markov chain
+    where the settings want one or weighted draws are too few. ``looking``: end at a draw that lies lower than all
+    minima.
     """
 
     def cost(x: Array) -> Array:

@@ -190,12 +190,11 @@ def run_sweep(
     progress: Progress | None = None,
     earliest: float = 0.0,
 ) -> SweepResult:
-    """Fit every data set. ``problems``: of one model and the same parameters with the same transforms, whose priors may
-    differ; those on ``t_s`` and on parameters of the errors play no part. ``folder``: where finished chunks are kept,
-    and found again; the caller clears it. ``earliest``: the instant before which the model has no path; −inf where it
-    has one at any time. Raises ConfigError: the data sets do not share a model, fixed values or parameters; none of
-    these is the model's. DataError: no trajectory fits a set; a reading would be compared before ``earliest``; the step
-    is far too small.
+    """Fit every data set: ``problems`` of one model and the same parameters with the same transforms, whose priors may
+    differ. ``folder``: where finished chunks are kept, and found again; the caller clears it. ``earliest``: the instant
+    before which the model has no path; −inf where it has one at any time. Raises ConfigError: the data sets do not
+    share a model, fixed values or parameters; none of these is the model's. DataError: no trajectory fits a set; a
+    reading would be compared before ``earliest``; the step is far too small.
     """
     executor = executor or SerialExecutor()
     mean, std = _moments(problems)

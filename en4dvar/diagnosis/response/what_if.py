@@ -75,8 +75,7 @@ class LinearResponse:
         self, observations: Observations, linear: Linearisation, moved: Array, prior_shift: Array
     ) -> tuple[Array, float]:
         """δx (n,) to the mode of a changed problem, from ``at`` + ``moved`` (n,), where ``linear`` has its prediction
-        and a tangent, and by how much its J falls on the way, as far as it is quadratic. ``observations`` are the
-        changed ones, ``prior_shift`` (n,) is the change of the prior's mean.
+        and a tangent, and by how much its J falls on the way; ``prior_shift`` (n,) is the change of the prior's mean.
         """
         d, S = self.whitened
         changed, tangent = observations.whiten(linear)
@@ -156,9 +155,8 @@ def exclusion(chi2_per_reading: float, readings: int, cost_change: float) -> str
 def what_if(
     problem: InverseProblem, response: LinearResponse, std: Array, cost: float, executor: Executor, fitted: Fitted
 ) -> tuple[Shift, ...]:
-    """The shifts of all alternatives of the problem's model: the largest first, then those unknown, then small ones.
-    ``std`` (n,) of the posterior, transformed; ``cost`` J at ``response.at``; ``fitted`` minimises J of a problem, None
-    where that fails.
+    """The shifts of all alternatives of the model: the largest first, then those unknown. ``std`` (n,) of the
+    posterior, transformed; ``cost`` J at ``response.at``; ``fitted`` minimises J of a problem, None where that fails.
     """
     if not response.defined or not np.all(std > 0):
         return ()
