@@ -84,16 +84,25 @@ class ComparedEstimate:
 
 
 @dataclass(frozen=True)
+class ComparedCaution:
+    """A warning of one run about one data set."""
+
+    run: str
+    dataset: str
+    caution: Caution
+
+
+@dataclass(frozen=True)
 class Comparison:
     """Scores and estimates of every data set in turn, runs in the order given; with several data sets the sums of the
     scores come last. ``incomparable`` says why evidences do not compare; empty where they do. ``cautions`` are the
-    warnings of all runs, the worst first, each with its run and data set.
+    warnings of all runs, the worst first.
     """
 
     scores: tuple[ModelScore, ...]
     estimates: tuple[ComparedEstimate, ...] = ()
     incomparable: str = ""
-    cautions: tuple[tuple[str, str, Caution], ...] = ()
+    cautions: tuple[ComparedCaution, ...] = ()
 
     @property
     def runs(self) -> tuple[str, ...]:
@@ -160,8 +169,8 @@ def compare_runs(runs: Sequence[str | Path] | Mapping[str, str | Path | StoredRe
         for name, dataset, result in pairs
         for row in result.rows
     )
-    of_runs = [(name, dataset, c) for name, dataset, result in pairs for c in result.cautions]
-    cautions = tuple(sorted(of_runs, key=lambda compared: compared[2].rank))
+    of_runs = [ComparedCaution(name, dataset, c) for name, dataset, result in pairs for c in result.cautions]
+    cautions = tuple(sorted(of_runs, key=lambda compared: compared.caution.rank))
     if reason := _difference(results):
         scores = [_score(name, dataset, result) for name, held in results.items() for dataset, result in held.items()]
         return Comparison(tuple(scores), estimates, reason, cautions)
@@ -219,7 +228,7 @@ def comparison_table(comparison: Comparison) -> str:
     told = [f"{name}: {comparison.verdict(name)}" for name in comparison.datasets]
     verdicts = [comparison.verdict("")] if comparison.incomparable else told
     notes = [STORED] if any(s.stored for s in comparison.scores) and not comparison.incomparable else []
-    warned = [f"{c.kind}: {run}: {dataset}: {c}" for run, dataset, c in comparison.cautions]
+    warned = [f"{c.caution.kind}: {c.run}: {c.dataset}: {c.caution}" for c in comparison.cautions]
     if (more := len(warned) - MOST_WARNINGS) > 0:
         warned[MOST_WARNINGS:] = [f"and {more} more warnings and notes; see the report"]
     return "\n".join([table([header, *rows]), *notes, "", *verdicts, *warned])

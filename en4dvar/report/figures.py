@@ -296,16 +296,15 @@ def stored_walks(result: StoredResult) -> tuple[StoredWalk, ...]:
 
 
 def _stored_walk(result: StoredResult, name: str) -> StoredWalk:
-    posterior, observed = result.groups["/posterior"], result.groups["/observed_data"].every
+    posterior = result.groups["/posterior"]
     pieces, time = posterior.variables[name + PIECES], posterior.coords[name + PIECE]
     begins = np.asarray(time.values, dtype=float)
-    last = max(float(observed[axis.time].values[-1]) for axis in result.axes)
+    last = max(float(result.groups["/observed_data"][axis.time].values[-1]) for axis in result.axes)
     edges = np.append(begins, max(last, begins[-1] + 0.02 * (begins[-1] - begins[0])))
 
     def quantiles(group: str) -> Array:
         values = np.asarray(result.groups[f"/{group}"].variables[name + PIECES].values[0], dtype=float)
-        values = values[result.alive] if group == "posterior" else values
-        values = values[np.isfinite(values).all(axis=1)]
+        values = values[(result.alive | (group != "posterior")) & np.isfinite(values).all(axis=1)]
         there = values if len(values) else np.full((1, len(begins)), np.nan)
         return shown(pieces, member_quantiles(there, BAND, axis=0))
 

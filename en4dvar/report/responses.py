@@ -15,6 +15,7 @@ from en4dvar.model.state import Array
 from en4dvar.report.chart import POINTS, Chart, Panel, Row
 from en4dvar.report.text import fixed, plain_number, quantity, shown, signed, symbol_html, time_axis, unit_behind
 from en4dvar.results.declared import zero_of
+from en4dvar.results.netcdf import Variable
 from en4dvar.results.store import StoredResult
 
 SHIFT_COLUMNS = (
@@ -82,21 +83,17 @@ def stored_shifts(result: StoredResult) -> tuple[tuple[StoredShift, ...], ...]:
     stats = result.groups["/sample_stats"]
     if "what_if_change" not in stats.variables:
         return ()
-    of = {key: stats.variables[f"what_if_{key}"].values for key in ("words", "cost_change", "reason")}
-    keys = "change", "relative_change", "change_in_std"
-    change, relative, in_std = (stats.variables[f"what_if_{key}"].values for key in keys)
-    parameters, alternatives = result.parameters, stats.coords["alternative"].values
+    keys = "words", "cost_change", "reason", "change", "relative_change", "change_in_std"
+    words, cost, reason, change, relative, in_std = (stats.variables[f"what_if_{key}"].values for key in keys)
+    chi2, readings = float(stats.attrs["chi2_per_observation"]), int(stats.attrs["n_weighted"])
 
-    def shift(i: int, j: int, name: str) -> StoredShift:
-        about, value = parameters[name].attrs, float(shown(parameters[name], change[i, j]))
-        numbers = value, float(relative[i, j]), float(in_std[i, j]), float(of["cost_change"][i])
-        known = str(alternatives[i]), str(of["words"][i]), name, about["display_units"]
-        excluded = exclusion(float(stats.attrs["chi2_per_observation"]), int(stats.attrs["n_weighted"]), numbers[-1])
-        return StoredShift(*known, *numbers, str(of["reason"][i]), about["symbol"], excluded)
+    def shift(i: int, j: int, name: str, v: Variable) -> StoredShift:
+        known = str(stats.coords["alternative"].values[i]), str(words[i]), name, v.attrs["display_units"]
+        numbers = float(shown(v, change[i, j])), float(relative[i, j]), float(in_std[i, j]), float(cost[i])
+        return StoredShift(*known, *numbers, str(reason[i]), v.attrs["symbol"], exclusion(chi2, readings, numbers[-1]))
 
-    largest = np.where(of["reason"] == "", np.abs(in_std).max(axis=1), 1.0)
-    order = np.argsort(-largest, kind="stable").tolist()
-    return tuple(tuple(shift(i, j, name) for j, name in enumerate(parameters)) for i in order)
+    order = np.argsort(-np.where(reason == "", np.abs(in_std).max(axis=1), 1.0), kind="stable").tolist()
+    return tuple(tuple(shift(i, j, *p) for j, p in enumerate(result.parameters.items())) for i in order)
 
 
 def shift_text(shift: StoredShift) -> str:

@@ -301,8 +301,7 @@ def sequences_table(scores: Sequence[SequenceScore]) -> str:
 
 
 def _sequence(run_dir: Path) -> Group:
-    file = series_file(run_dir)
-    if file is None:
+    if (file := series_file(run_dir)) is None:
         raise OutputError(f"{run_dir}: no sequence; sequences are compared with sequences of the same readings")
     if file.stem == "twin":
         raise OutputError(f"{run_dir}: a twin experiment has no evidence; RMSE and spread are in its summary.csv")
@@ -391,7 +390,7 @@ def scores(data: Group) -> Chart:
     time, panels = data["time"].values, []
     for kind, colour in _kinds(data):
         rmse, spread = data[f"{kind}_rmse"], data[f"{kind}_spread"]
-        average, top = float(rmse.attrs[MEAN]), _upper(rmse.values, spread.values)
+        average, top = float(rmse.attrs[MEAN]), _upper(np.concatenate([rmse.values, spread.values]))
         title = f"{kind}: RMSE {plain_number(average, 3)}"
         panel = Panel(ylabel=with_unit("error", _unit(data)), title=title, xlim=span_of(time), ylim=(0.0, top))
         if burn_in := int(data.attrs["burn_in"]):
@@ -469,7 +468,7 @@ def _unit(data: Group) -> str:
     return pretty_unit(str(data["analysis_rmse"].attrs["units"]))
 
 
-def _upper(*series: Any) -> float:
+def _upper(values: Array) -> float:
     """A limit that one bad beginning does not set: twice the 98 % quantile, no more than the maximum."""
-    values = np.concatenate([s[np.isfinite(s)] for s in series])
-    return float(min(1.05 * values.max(), 2 * np.quantile(values, 0.98))) if len(values) else 1.0
+    known = values[np.isfinite(values)]
+    return float(min(1.05 * known.max(), 2 * np.quantile(known, 0.98))) if len(known) else 1.0
