@@ -42,7 +42,6 @@ class WeightSpace:
 
     @property
     def minimiser(self) -> Minimiser:
-        """The scheme, of descents to the minimum of J."""
         assert self.scheme.minimiser is not None
         return self.scheme.minimiser
 
@@ -165,7 +164,6 @@ def require_members(problem: InverseProblem, run: Forecast, needed: int, stage: 
 
 
 def _lacking(problem: InverseProblem, readings: Sequence[int]) -> str:
-    """Which readings too few members have, and what to do."""
     if not readings:
         return ""
     parts, times = problem.parts, problem.observations.times

@@ -22,7 +22,6 @@ FARTHEST = 30.0  # difference of log-evidences that the axis shows
 
 
 def all_figures(study: Study) -> Iterator[Captioned]:
-    """Every figure."""
     count = "; ".join(f"{len(study.any_fit(gel).problems)} in {gel} gel" for gel in study.fits)
     yield "scaled", f"Scaled radius against time, R/R_max against t/t_c: {count}.", scaled_data(study)
     for fit in study.every_fit:

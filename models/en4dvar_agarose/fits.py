@@ -59,7 +59,6 @@ class Fit:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the data sets."""
         return tuple(p.observations.name for p in self.problems)
 
     @property
@@ -129,7 +128,6 @@ class Study:
 
     @property
     def every_fit(self) -> tuple[Fit, ...]:
-        """Of all gels and models, in their order."""
         return tuple(fit for models in self.fits.values() for fit in models.values())
 
     def any_fit(self, gel: str) -> Fit:

@@ -87,7 +87,6 @@ class Lobe:
     margin: float = 0.0
 
     def rayleigh_ratio(self, medium: Medium) -> float:
-        """The collapse time over Rayleigh's."""
         return self.t_c / (RAYLEIGH * self.R_max * math.sqrt(medium.rho / medium.p_inf))
 
 

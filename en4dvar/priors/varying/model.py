@@ -76,22 +76,18 @@ class RandomWalk:
 
     @property
     def terms(self) -> tuple[PriorTerm, ...]:
-        """Priors of the quantities that join the control vector."""
         return (*([self.spread] if self.spread else []), *self.changes)
 
     @property
     def parameter(self) -> Parameter:
-        """The parameter that varies."""
         return self.first.parameter
 
     @property
     def name(self) -> str:
-        """Name of the parameter."""
         return self.parameter.name
 
     @property
     def label(self) -> str:
-        """The varying quantity in words."""
         return self.parameter.label
 
     @property
@@ -146,17 +142,14 @@ class StateChanges:
 
     @property
     def name(self) -> str:
-        """Name of the field that varies."""
         return self.field.name
 
     @property
     def label(self) -> str:
-        """The varying quantity in words."""
         return f"{self.name} of the state"
 
     @property
     def terms(self) -> tuple[PriorTerm, ...]:
-        """Priors of the quantities that join the control vector."""
         return self.changes
 
     @property
@@ -261,7 +254,6 @@ class Walk:
         return np.array([path.states[-1] for path in outcomes if isinstance(path, Trajectory)])
 
     def outcomes(self) -> Outcomes:
-        """The whole paths."""
         return [
             self.failures.get(i) or JoinedTrajectory(times, x, self.layout, self.parts[i])
             for i, (times, x) in enumerate(zip(self.times, self.x, strict=True))
@@ -283,16 +275,13 @@ class JoinedTrajectory(Trajectory):
         return self._joined(lambda path: path[name])
 
     def largest(self, name: str) -> float:
-        """The largest of all pieces."""
         return max(path.largest(name) for path, _ in self._parts)
 
     def beyond(self, limit: ValidityLimit) -> float:
-        """The earliest of all pieces."""
         return min(path.beyond(limit) for path, _ in self._parts)
 
     @property
     def states(self) -> Array:
-        """(K, n_state)."""
         inner = self._joined(lambda path: path.states)
         return np.hstack([inner, self._constant(self._x[inner.shape[1] :])])
 
@@ -321,7 +310,6 @@ class PiecewiseModel(ForwardModel):
 
     @property
     def unforeseen(self) -> Mapping[str, float]:  # type: ignore[override]
-        """The same as of the model."""
         return self.model.unforeseen
 
     @property
@@ -342,7 +330,6 @@ class PiecewiseModel(ForwardModel):
         return np.hstack([inner, *(change.values(theta) for change in self.varying)])
 
     def changed(self, name: str, x: Array, change: Array) -> Array:
-        """As of the model."""
         inner = self.model.layout.size
         return np.hstack([self.model.changed(name, x[:, :inner], change), x[:, inner:]])
 
