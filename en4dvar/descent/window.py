@@ -266,7 +266,7 @@ class DataWindow(Objective[Descent]):
 
     def _onwards(self, descent: Descent, w: Array) -> Weights:
         """Weights at w (N,), with the transform of where the descent comes from and a bundle as wide."""
-        return replace(self.space.onwards(w, descent.newton.hessian), wider=descent.weights.wider)
+        return replace(self.space.weights_at(w, descent.newton.hessian), wider=descent.weights.wider)
 
     def _take(self, descent: Descent) -> None:
         """The whole step; the iterate after the last one is recorded, too."""
