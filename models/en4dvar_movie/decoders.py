@@ -12,8 +12,8 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from en4dvar.model.state import Indices
 from en4dvar.plumbing.errors import DataError
 
 MOST_PIXELS = 64_000_000  # of a frame
@@ -98,7 +98,7 @@ def tiff_frames(path: Path) -> Iterator[Any]:
             yield np.stack([*planes, *dark], axis=-1) if len(planes) > 1 else planes[0]
 
 
-def _pages(file: Any, path: Path) -> npt.NDArray[np.int64]:
+def _pages(file: Any, path: Path) -> Indices:
     """The pages (frames, colours) of each frame, by the axes that ImageJ, OME or tifffile has written.
 
     Raises :class:`DataError` where a frame has slices in depth, or more channels than colours.

@@ -24,7 +24,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
-import numpy.typing as npt
 
 from en4dvar.model.forward import (
     Alternative,
@@ -35,7 +34,7 @@ from en4dvar.model.forward import (
     ValidityLimit,
     initial_states,
 )
-from en4dvar.model.state import Array, Field, Parameter, StateLayout
+from en4dvar.model.state import Array, Field, Indices, Mask, Parameter, StateLayout
 from en4dvar.plumbing.units import convert
 from en4dvar.priors.prior import PriorTerm
 
@@ -161,7 +160,7 @@ class StateChanges:
         """Changes (N, m) from those of the control vector, (N,) by name."""
         return np.stack([theta[term.parameter.name] for term in self.changes], axis=-1)
 
-    def applied(self, model: ForwardModel, x: Array, change: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
+    def applied(self, model: ForwardModel, x: Array, change: Array) -> tuple[Array, Mask]:
         """The states ``x`` (N, n_state) after a ``change`` (N,), and which members (N,) stay inside the bounds."""
         low, high = self.field.bounds
         if self.relative:
@@ -205,7 +204,7 @@ ATTRIBUTES = (
 )  # fmt: skip
 
 Outcomes = Sequence[Trajectory | Failure]
-Part = tuple[Trajectory, npt.NDArray[np.bool_]]
+Part = tuple[Trajectory, Mask]
 Varying = RandomWalk | StateChanges
 
 
@@ -230,11 +229,11 @@ class Walk:
     failures: dict[int, Failure] = field(default_factory=dict)
 
     @property
-    def alive(self) -> npt.NDArray[np.intp]:
+    def alive(self) -> Indices:
         """The members (N',) that have not failed."""
         return np.array([i for i in range(len(self.x)) if i not in self.failures], dtype=np.intp)
 
-    def run(self, begin: float, end: float, integrate: Callable[[npt.NDArray[np.intp], Array], Outcomes]) -> Array:
+    def run(self, begin: float, end: float, integrate: Callable[[Indices, Array], Outcomes]) -> Array:
         """The states (N'', n_state) at ``end`` of the members that survive the piece from ``begin`` to there.
         ``integrate`` runs members (N',) to the instants (N', C + 1) that it is given; no further than to their last.
         """
@@ -354,7 +353,7 @@ class PiecewiseModel(ForwardModel):
                 inner[:, self.model.layout[change.name]] = x[:, [self.layout[change.own.name].start + piece]]
             since = np.maximum(start, begin)
 
-            def integrate(members: npt.NDArray[np.intp], asked: Array, since: Array = since) -> Outcomes:
+            def integrate(members: Indices, asked: Array, since: Array = since) -> Outcomes:
                 return self.model.resumed(inner[members], since[members], asked)
 
             ends = walk.run(begin, end, integrate)
@@ -362,7 +361,7 @@ class PiecewiseModel(ForwardModel):
             self._change(walk, inner, end, start <= end)
         return walk.outcomes()
 
-    def _change(self, walk: Walk, inner: Array, knot: float, concerned: npt.NDArray[np.bool_]) -> None:
+    def _change(self, walk: Walk, inner: Array, knot: float, concerned: Mask) -> None:
         """Change the states (N, n_state) at a knot, of the members (N,) ``concerned``; some may not survive it."""
         for process in self.state_changes:
             if knot not in process.knots:
